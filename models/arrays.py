@@ -12,23 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.errors import ModelError, ModelWarning
+from models.input_files import INPUT_LIMITS
 
 Array: TypeAlias = NDArray[np.float64]
 
 ArrayInput: TypeAlias = Any
 
-IDENTITY = np.eye(3)
-MOST = 100_000
-"""Of what is counted: more than these take longer than anybody waits."""
-MOST_NUMBERS = 2**22
-"""Of one array that a user gives."""
-MOST_DIMENSIONS = 64  # of an array of numpy
-TWO_TURNS, ENDLESS = 4 * np.pi, 1e4
-"""rad: angles between the two look like degrees; beyond the second they are written for no limit at all."""
-LONGEST_PART = 50.0
-"""m: longer parts look like millimetres."""
-LONGEST_NAME = 500
-LONGEST_SHOWN = 12  # entries of a vector in a message
+ROUNDING = 1e-9
+"""Share of the largest of its kind, or m or rad, below which a difference is rounding, after many operations."""
+MAX_LISTED = 12
+"""Entries of a vector, or names, that a message lists."""
 
 NOT_NUMBERS = (TypeError, ValueError, OverflowError, RuntimeError, NotImplementedError)
 """What numpy and casadi raise of values that are no numbers."""
@@ -85,28 +78,28 @@ def checked_array(
 
 
 def check_entries(value: Any) -> None:
-    """Raise ValueError of more than MOST_NUMBERS entries: a view or a range may be larger than all memory.
+    """Raise ValueError of too many entries: a view or a range may be larger than all memory.
 
     Nothing is copied or gone through: the first entry of a list stands for all.
     """
     entries, part = 1, value
-    for _ in range(MOST_DIMENSIONS):
+    for _ in range(INPUT_LIMITS.nesting):  # as many dimensions as numpy's arrays have at most
         if isinstance(part, np.ndarray):
             entries *= part.size
         if not isinstance(part, Sequence) or isinstance(part, str | bytes):
             break
         entries *= len(part)
-        if not 0 < entries <= MOST_NUMBERS:
+        if not 0 < entries <= INPUT_LIMITS.array_entries:
             break
         part = part[0]
-    if entries > MOST_NUMBERS:
-        raise ValueError(f"{entries} entries, at most {MOST_NUMBERS} are read")
+    if entries > INPUT_LIMITS.array_entries:
+        raise ValueError(f"{entries} entries, at most {INPUT_LIMITS.array_entries} are read")
 
 
 def floats(value: ArrayInput) -> Array:
     """`value` as a new array of floats; one of NOT_NUMBERS where it is none.
 
-    That is also where they are more than MOST_NUMBERS, which are not copied, and where numpy would read a number all
+    That is also where they are too many, which are not copied, and where numpy would read a number all
     the same: in a text, in True, in None and in a symbol (nan), in the real part of a complex number.
     """
     check_entries(value)
@@ -145,7 +138,7 @@ def _shaped(array: Array, shape: tuple[int | str, ...], owner: str, what: str, l
 
 def _shown(array: Array, wrong: Any, what: str) -> str:
     """Name and values; of a table only the first row that is wrong, of a long vector the first entry."""
-    if array.ndim < 2 and array.size <= LONGEST_SHOWN:
+    if array.ndim < 2 and array.size <= MAX_LISTED:
         return f"{what} {array.tolist()}"
     if array.ndim == 1:
         entry = int(np.flatnonzero(wrong)[0])
@@ -178,7 +171,7 @@ def checked_nonnegative(value: ArrayInput, owner: str, what: str, unit: str = ""
     return number
 
 
-def checked_count(value: Any, owner: str, what: str, least: int = 1, most: int = MOST) -> int:
+def checked_count(value: Any, owner: str, what: str, least: int = 1, most: int = INPUT_LIMITS.count) -> int:
     """`value` as an int; ModelError naming `owner` and `what` unless it is a whole number from `least` to `most`."""
     if not isinstance(value, int | np.integer) or isinstance(value, bool) or not least <= value <= most:
         message = f"{owner}: {what} must be a whole number, {least} to {most}, not {value!r}"
@@ -222,18 +215,20 @@ def warn_of_degrees(angles: ArrayInput, owner: str, name: str, what: str) -> Non
     Warns:
         ModelWarning: With `name`, of a joint or argument, and the angle.
     """
-    odd = _first_between(angles, TWO_TURNS, ENDLESS)
+    limit = 4 * np.pi
+    odd = _first_between(angles, limit, 1e4)  # beyond, it is written for no limit at all
     if odd is not None:
         message = f"{owner}: {what} {odd:g} rad is more than two turns; angles are in rad, is it in degrees?"
-        warn(ModelWarning(message, name=name, value=odd, limit=TWO_TURNS), stacklevel=1)
+        warn(ModelWarning(message, name=name, value=odd, limit=limit), stacklevel=1)
 
 
 def warn_of_millimetres(lengths: ArrayInput, owner: str, name: str, what: str) -> None:
     """Warn where a length, m, is that large that it looks like millimetres; as warn_of_degrees."""
-    odd = _first_between(lengths, LONGEST_PART, np.inf)
+    limit = 50.0  # m: no part of an arm is longer
+    odd = _first_between(lengths, limit, np.inf)
     if odd is not None:
         message = f"{owner}: {what} {odd:g} m is long for a robot; lengths are in m, is it in millimetres?"
-        warn(ModelWarning(message, name=name, value=odd, limit=LONGEST_PART), stacklevel=1)
+        warn(ModelWarning(message, name=name, value=odd, limit=limit), stacklevel=1)
 
 
 def _first_between(values: ArrayInput, low: float, high: float) -> float | None:
@@ -245,7 +240,7 @@ def _first_between(values: ArrayInput, low: float, high: float) -> float | None:
 def checked_rotation(value: ArrayInput, owner: str, what: str) -> Array:
     """Read-only copy of a rotation matrix; ModelError naming `owner` and `what` when it is none."""
     matrix = checked_array(value, (3, 3), owner, what)
-    error = float(np.abs(matrix @ matrix.T - IDENTITY).max())
+    error = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
     (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()  # numpy's determinant costs as much as all the rest
     if error > 1e-6 or a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) < 0:
         message = f"{owner}: {what} {matrix.tolist()} is not a rotation matrix (orthonormal, determinant 1)"
@@ -294,9 +289,10 @@ def checked_name(value: Any, owner: str, what: str) -> str:
     if not isinstance(value, str) or not value:
         message = f"{owner}: {what} must be a name, a string that is not empty, not {value!r}"
         raise ModelError(message, name=what, value=value)
-    if len(value) > LONGEST_NAME or not value.isprintable():
-        message = f"{owner}: {what} must be at most {LONGEST_NAME} printable characters, not {value[:LONGEST_NAME]!r}"
-        raise ModelError(message, name=what, value=value, limit=LONGEST_NAME)
+    most = INPUT_LIMITS.name_characters
+    if len(value) > most or not value.isprintable():
+        message = f"{owner}: {what} must be at most {most} printable characters, not {value[:most]!r}"
+        raise ModelError(message, name=what, value=value, limit=most)
     return value
 
 

@@ -36,7 +36,6 @@ MOST_KEPT = 2**28  # bytes of all libraries: the least recently used are removed
 KINDS = (".json", ".so", ".lock", ".part")
 UNREADABLE = (OSError, ValueError, RuntimeError, RecursionError)
 """What a file raises that is broken or not there; RuntimeError where there is no home."""
-MOMENT = 0.02  # s between two looks at a lock
 
 
 def key_of(version: str, *contents: Any) -> str:
@@ -214,7 +213,7 @@ def _locked(file: Path, ask: Callable[[], Any]) -> IO[bytes]:
             raise
         stream.close()
         ask()
-        time.sleep(MOMENT)
+        time.sleep(0.02)
 
 
 def _name(key: str, library: bytes) -> str:

@@ -8,13 +8,58 @@ from __future__ import annotations
 import errno
 import os
 import stat
+from dataclasses import dataclass
 from io import BufferedReader
 from xml.etree import ElementTree
 
-__all__ = ["MOST_ELEMENTS", "UnfitFile", "open_regular", "parse_xml", "read_regular"]
+__all__ = ["INPUT_LIMITS", "InputLimits", "UnfitFile", "open_regular", "parse_xml", "read_regular"]
 
-MOST_ELEMENTS = 2**20
-"""Elements and attributes of an XML document: each takes some 200 bytes of memory."""
+
+@dataclass(frozen=True)
+class InputLimits:
+    """How much of what others give is read: the largest that is known, some times over, and what memory has room for.
+
+    Attributes:
+        count: Of what a user counts, nodes say: more take longer than anybody waits.
+        array_entries: Of one array that a user gives.
+        name_characters: Of the name of a link or joint.
+        description_bytes: Of URDF and SRDF: the largest public ones have 1 MB.
+        xml_elements: Elements and attributes of a document: each takes some 200 bytes of memory.
+        mesh_bytes, mesh_text_bytes: Of a mesh; numbers in a text take several times their bytes while they are read.
+        mesh_triangles: After all instances in a scene are placed.
+        scene_nodes: Of a Collada scene, each counted as often as it is borrowed.
+        text_bytes, text_lines, line_characters: Of waypoints, trajectories and G-code: a path takes 1 or 2 kB a line.
+        number_characters: Of a number of G-code.
+        task_bytes: Of a task or obstacle file.
+        nesting: Containers within containers, nodes within nodes, parts of a name.
+        tree_values: Values and keys of a JSON or YAML file.
+        log_bytes: Of an MCAP file, and of all that it unpacks to.
+        log_record_bytes: Of a record or chunk of it, unpacked.
+        log_message_bytes: Of all its messages of joints, which take five times as much memory.
+    """
+
+    count: int = 100_000
+    array_entries: int = 2**22
+    name_characters: int = 500
+    description_bytes: int = 2**23
+    xml_elements: int = 2**20
+    mesh_bytes: int = 2**28
+    mesh_text_bytes: int = 2**26
+    mesh_triangles: int = 2**22
+    scene_nodes: int = 2**12
+    text_bytes: int = 2**25
+    text_lines: int = 500_000
+    line_characters: int = 10_000
+    number_characters: int = 32
+    task_bytes: int = 2**20
+    nesting: int = 64
+    tree_values: int = 2**21
+    log_bytes: int = 2**30
+    log_record_bytes: int = 2**26
+    log_message_bytes: int = 2**26
+
+
+INPUT_LIMITS = InputLimits()
 
 
 class UnfitFile(OSError):
@@ -91,13 +136,13 @@ def parse_xml(data: str | bytes) -> ElementTree.Element:
 
     Raises:
         ElementTree.ParseError: It is not well-formed.
-        ValueError, LookupError: It declares entities, has more than MOST_ELEMENTS elements and attributes, or its
+        ValueError, LookupError: It declares entities, has too many elements and attributes, or its
             encoding is unknown.
     """
     plain = data.encode(errors="surrogatepass") if isinstance(data, str) else data.replace(b"\0", b"")  # of UTF-16
     if b"<!ENTITY" in plain:
         raise ValueError("it declares entities, which are not read")
     count = plain.count(b"<") - plain.count(b"</") + plain.count(b"=")
-    if count > MOST_ELEMENTS:
-        raise ValueError(f"it has {count} elements and attributes, at most {MOST_ELEMENTS} are read")
+    if count > INPUT_LIMITS.xml_elements:
+        raise ValueError(f"it has {count} elements and attributes, at most {INPUT_LIMITS.xml_elements} are read")
     return ElementTree.fromstring(data)

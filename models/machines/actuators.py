@@ -12,15 +12,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from models.arrays import ArrayInput, checked_array, checked_instance, checked_text, one_for_each
+from models.arrays import ROUNDING, ArrayInput, checked_array, checked_instance, checked_text, one_for_each
 from models.errors import ModelError
 from models.robot.parts import Joint, Link
 from models.robot.robot import Robot
-
-ACROSS = 0.6
-"""Of the moment of a rotor about its axis; of a thin ring it is a half."""
-SYMMETRY = 1e-9
-"""Relative: of the moments and of the place of the mass of a body whose angle does not matter."""
 
 
 def with_wheels(
@@ -39,7 +34,7 @@ def with_wheels(
 
     Args:
         axes: Of the wheels, in the link that carries them; of any length but zero. Shape (k, 3).
-        inertia: Of each rotor about its axis, one number or (k,), kg m^2. It is a disc: ACROSS of it across. The
+        inertia: Of each rotor about its axis, one number or (k,), kg m^2. It is a disc: 0.6 of it across. The
             carrier's own mass and inertia are those without the rotors.
         momentum: At which each saturates, relative to the carrier, one number or (k,), N m s. The joint's speed limit
             is this over the inertia.
@@ -72,7 +67,7 @@ def with_wheels(
         joint = Joint(f"{prefix}{k + 1}", "continuous", carrier, f"{prefix}{k + 1}_rotor", places[k], axis=along[k])
         joints.append(replace(joint, velocity=float(fastest[k]), effort=float(most[k])))
         across = np.eye(3) - np.outer(joint.axis, joint.axis)
-        links.append(Link(joint.child, masses[k], (0.0, 0.0, 0.0), moments[k] * (np.eye(3) - (1 - ACROSS) * across)))
+        links.append(Link(joint.child, masses[k], (0.0, 0.0, 0.0), moments[k] * (np.eye(3) - (1 - 0.6) * across)))
     return replace(robot, links=tuple(links), joints=tuple(joints))
 
 
@@ -97,6 +92,6 @@ def wheels_of(robot: Robot) -> dict[str, float]:
         across = np.eye(3) - np.outer(axis, axis)
         ring = about * np.outer(axis, axis) + across * np.trace(across @ inertia) / 2
         away = np.linalg.norm(across @ np.asarray(body.center_of_mass))
-        if about > 0 and np.abs(inertia - ring).max() <= SYMMETRY * about and away**2 * body.mass <= SYMMETRY * about:
+        if about > 0 and np.abs(inertia - ring).max() <= ROUNDING * about and away**2 * body.mass <= ROUNDING * about:
             found[joint.name] = about
     return found

@@ -20,9 +20,6 @@ from models.spatial import FULL_TURN, Frame
 RIM = 32
 """Points by which the rim of a cylinder is described: its contact is this polygon, inside the true one."""
 
-LEVEL = 1e-3
-"""Slope up to which the end of a cylinder counts as level."""
-
 
 class Footprint(NamedTuple):
     """What a robot stands on.
@@ -139,6 +136,7 @@ def _corners(shape: CollisionShape) -> Array:
             lowest = np.arctan2(down[1], down[0])  # the rim's own lowest point is one of its corners
             angles = lowest + FULL_TURN * np.arange(RIM) / RIM
             rim = radius * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(RIM)])
-            rim = rim[rim @ down >= (rim @ down).max() - LEVEL * radius]  # a wheel stands on its lowest line alone
+            # level, but for a slope of a thousandth; a wheel stands on its lowest line alone
+            rim = rim[rim @ down >= (rim @ down).max() - 1e-3 * radius]
             corners = (ends[:, None] + rim[None]).reshape(-1, 3)
     return np.asarray(corners @ shape.rotation.T + shape.translation)

@@ -12,15 +12,11 @@ import casadi as ca
 import numpy as np
 from scipy.interpolate import BSpline
 
-from models.arrays import Array, checked_array, checked_rotation
+from models.arrays import ROUNDING, Array, checked_array, checked_rotation
 from models.errors import ModelError
 from models.shapes.shapes import HalfSpace, Shape, checked_shape
 from models.spatial import Expression, Frame, expression
 
-CHECKED = 513
-"""Times at which the motion of an obstacle is looked at before anything is planned."""
-SAME = 1e-9
-"""Share of a table's values by which what is written out may differ from it."""
 LINEAR = re.compile(r"casadi_interpn\(res\[0\], 1, (\w+), \w+, (\w+), arg\[0\]")
 SPLINE = re.compile(r"nd_boor_eval\)?\([^;]*?,1,(\w+),\w+,(\w+),\w+,(\w+),")
 NUMBERS = re.compile(r"static const casadi_(?:real|int) (\w+)\[\d+\] =\s*\{([^}]*)\}")
@@ -84,7 +80,7 @@ class Moving:
 
     def check(self, begin: float, end: float) -> None:
         """Raise ModelError where the position is no number, or the rotation none, at a time between two, s."""
-        times = np.linspace(begin, end, CHECKED)
+        times = np.linspace(begin, end, 513)
         turns, places = (np.array(part) for part in self._at(times[None]))
         broken = ~np.isfinite(places).all(axis=0)
         if broken.any():
@@ -149,7 +145,7 @@ def _table(function: Any, inputs: list[Any]) -> list[Any]:
     table = ca.Function("table", [x], [_polynomials(marks, pieces, x, beyond=bool(linear))])
     tried = np.concatenate([marks, (marks[1:] + marks[:-1]) / 2, marks[:1] - 1.0, marks[-1:] + 1.0])[None]
     one, other = np.array(function(tried)), np.array(table(tried))
-    if not np.abs(one - other).max() <= SAME * (1 + np.abs(one).max()):
+    if not np.abs(one - other).max() <= ROUNDING * (1 + np.abs(one).max()):
         message = f"the table {function.name()!r} is written by casadi in a way that is not known; write it out"
         raise ModelError(message, name=function.name(), value=float(np.abs(one - other).max()))
     return list(ca.vertsplit(table(inputs[0])))

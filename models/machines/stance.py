@@ -16,6 +16,7 @@ import casadi as ca
 import numpy as np
 
 from models.arrays import (
+    ROUNDING,
     Array,
     ArrayInput,
     checked_array,
@@ -39,12 +40,8 @@ from models.spatial import Expression, Frame, cross
 
 __all__ = ["Foot", "Foothold", "Stance"]
 
-UNMOVED = 1e-9
-"""Share of what the joints move most, below which they do not move something at all."""
 SAMPLES = 5
 """Random motions in which it is looked at what the joints move."""
-DISC = 2.0 / 3.0
-"""Moment about its axis that a disc evenly pressed bears, over friction, load and radius."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,8 +265,8 @@ class Stance(FixedBase):
             )
             sampled = [np.array(frames(rng.normal(size=self.joint_size))) for _ in range(SAMPLES)]
             sizes = np.max([np.abs(each).max(axis=1) for each in sampled], axis=0)
-            rows = tuple(int(i) for i in np.flatnonzero(sizes > UNMOVED * sizes.max(initial=0.0)))
-            ranks = [np.linalg.matrix_rank(each[list(rows)], tol=UNMOVED * sizes.max()) for each in sampled]
+            rows = tuple(int(i) for i in np.flatnonzero(sizes > ROUNDING * sizes.max(initial=0.0)))
+            ranks = [np.linalg.matrix_rank(each[list(rows)], tol=ROUNDING * sizes.max()) for each in sampled]
             if not rows or max(ranks) < len(rows):
                 message = (
                     f"foot {name!r}: the joints move it in {max(ranks, default=0)} directions only, which are not "
@@ -316,9 +313,9 @@ class Stance(FixedBase):
         sole = self.feet[name].sole
         assert sole is not None
         distances = self._pressed[name] @ sole.normals.T - (sole.normals * sole.vertices).sum(axis=1)
-        moved = np.ptp(distances, axis=0) > UNMOVED
+        moved = np.ptp(distances, axis=0) > ROUNDING
         for i in np.flatnonzero(~moved):
-            if distances[0, i] < margin - UNMOVED:
+            if distances[0, i] < margin - ROUNDING:
                 message = (
                     f"foot {name!r}: the center of pressure is {margin - distances[0, i]:.4g} m beyond an edge of the "
                     "sole, less its margin, whatever the joints do"
@@ -356,7 +353,8 @@ class Stance(FixedBase):
         moment, force = self.in_sole(name, load)
         x, y = sole.center
         turning = moment[2] - (x * force[1] - y * force[0])
-        return (friction * force[2]) ** 2 - force[0] ** 2 - force[1] ** 2 - (turning / (DISC * sole.inner_radius)) ** 2
+        arm = 2 / 3 * sole.inner_radius  # of a disc evenly pressed: the moment that it bears over friction and load
+        return (friction * force[2]) ** 2 - force[0] ** 2 - force[1] ** 2 - (turning / arm) ** 2
 
     @cached_property
     def support(self) -> Support | None:

@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 import casadi as ca
 import numpy as np
 
-from models.arrays import Array, ArrayInput, checked_array
+from models.arrays import ROUNDING, Array, ArrayInput, checked_array
 from models.machines.standing import External, Standing, center_of_pressure, wrenches_at
 from models.robot.indices import joint_excess, joint_limit_index, manipulability_of
 from models.robot.kinematics import center_of_mass
@@ -17,9 +17,6 @@ from models.spatial import Expression
 
 Rows: TypeAlias = Sequence[int] | Callable[[Expression], Expression]
 """Whose manipulability is reported: rows of the tip's twist, or any Jacobian as a function of q, (m, n)."""
-
-ROUNDING_SLACK = 1e-9
-"""How far beyond a limit rounding may carry a motion that stands exactly at it; m, rad, N."""
 
 
 @dataclass(frozen=True)
@@ -74,12 +71,12 @@ class StandingMotion:
     @property
     def stays_in_foot(self) -> bool:
         """Whether the zero moment point never leaves the support."""
-        return bool((self.foot_margin >= -ROUNDING_SLACK).all())
+        return bool((self.foot_margin >= -ROUNDING).all())
 
     @property
     def stays_in_limits(self) -> bool:
         """Whether every joint stays within its position limits."""
-        return bool((self.joint_excess <= ROUNDING_SLACK).all())
+        return bool((self.joint_excess <= ROUNDING).all())
 
     @property
     def stands(self) -> bool:
@@ -113,9 +110,9 @@ class StandingMotion:
         lines = [f"Motion of {self.t[-1]:g} s: {'stands' if self.stands else 'DOES NOT STAND'}"]
         for what, values, wrong in (
             ("vertical ground force, N", self.ground_force[:, 2], ~(self.ground_force[:, 2] > 0)),
-            ("zero moment point inside the foot by, m", self.foot_margin, ~(self.foot_margin >= -ROUNDING_SLACK)),
+            ("zero moment point inside the foot by, m", self.foot_margin, ~(self.foot_margin >= -ROUNDING)),
             ("stability index", self.index.min(axis=1), np.zeros(len(self.t), dtype=bool)),
-            ("room to the joint limits", -self.joint_excess, ~(self.joint_excess <= ROUNDING_SLACK)),
+            ("room to the joint limits", -self.joint_excess, ~(self.joint_excess <= ROUNDING)),
         ):
             k = int(np.argmin(values))
             verdict = f", wrong from {self.t[wrong][0]:.4g} s on" if wrong.any() else ""

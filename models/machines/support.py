@@ -9,13 +9,10 @@ from itertools import combinations
 import casadi as ca
 import numpy as np
 
-from models.arrays import Array, ArrayInput, checked_array, frozen
+from models.arrays import ROUNDING, Array, ArrayInput, checked_array, frozen
 from models.errors import ModelError
 from models.robot.kinematics import checked_vector
 from models.spatial import Expression
-
-FLAT = 1e-9
-"""Sine of an angle, and area relative to the squared size, below which a corner or a polygon counts as flat."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,14 +33,14 @@ class Support:
         corners: Array = checked_array(self.vertices, ("corners", 2), "support", "vertices", least=3, unit="m")
         size = float(np.ptp(corners, axis=0).max())
         area = _area(corners)
-        if abs(area) <= FLAT * size**2:
+        if abs(area) <= ROUNDING * size**2:
             message = f"support: the polygon {corners.tolist()} has no area; give corners that are not in line"
             raise ModelError(message, name="vertices", value=corners)
         if area < 0:
             corners = corners[::-1]
         edges = np.roll(corners, -1, axis=0) - corners
         lengths = np.linalg.norm(edges, axis=1)
-        if lengths.min() <= FLAT * size:
+        if lengths.min() <= ROUNDING * size:
             twice = corners[lengths.argmin()].tolist()
             raise ModelError(
                 f"support: corner {twice} occurs twice in a row; give it once", name="vertices", value=twice
@@ -51,7 +48,7 @@ class Support:
         ahead = np.roll(edges, -1, axis=0)
         turns = np.arctan2(_cross(edges, ahead), (edges * ahead).sum(axis=1))
         worst = int(turns.argmin())
-        if turns[worst] < -FLAT:
+        if turns[worst] < -ROUNDING:
             corner = np.roll(corners, -1, axis=0)[worst]
             message = (
                 f"support: the polygon {corners.tolist()} is not convex at {corner.tolist()}; "
@@ -61,7 +58,7 @@ class Support:
         if turns.sum() > 3 * np.pi:
             message = f"support: the polygon {corners.tolist()} crosses itself; give its corners in order"
             raise ModelError(message, name="vertices", value=corners)
-        object.__setattr__(self, "vertices", frozen(corners[np.roll(turns, 1) > FLAT]))
+        object.__setattr__(self, "vertices", frozen(corners[np.roll(turns, 1) > ROUNDING]))
 
     @property
     def area(self) -> float:
@@ -86,9 +83,9 @@ class Support:
         for chosen in combinations(range(len(offsets)), 3):  # it touches three edges (two parallel ones and another)
             edges = list(chosen)
             system = np.column_stack([self.normals[edges], -np.ones(3)])
-            if abs(np.linalg.det(system)) > FLAT:
+            if abs(np.linalg.det(system)) > ROUNDING:
                 *point, radius = np.linalg.solve(system, offsets[edges])
-                if (self.normals @ point - offsets >= radius - FLAT).all():
+                if (self.normals @ point - offsets >= radius - ROUNDING).all():
                     best = max(best, float(radius))
         return best
 

@@ -15,8 +15,9 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from models.arrays import MOST, Array, checked_flag, checked_indices, checked_nonnegative
+from models.arrays import Array, checked_flag, checked_indices, checked_nonnegative
 from models.errors import ModelError
+from models.input_files import INPUT_LIMITS
 from models.machines.machine import Machine
 from models.machines.moving import Moving
 from models.machines.pair_gradients import WORLD, Placed, distance_gradients
@@ -29,12 +30,8 @@ from models.shapes.rigid_parts import RigidParts, arms
 from models.shapes.shapes import KINDS, Box, Shape, checked_shape
 from models.spatial import Expression, Frame, expression
 
-CLOSE = 3
-"""Joints between links whose meshes are looked at as they are."""
 FINEST = 1e-6
 """m: of the least of several distances."""
-TURN_OF_QUATERNION = 2.0
-"""rad: a unit quaternion that changes by dq turns by 2 |dq|."""
 
 
 class Levers(NamedTuple):
@@ -345,7 +342,8 @@ class Surroundings:
         for i, j in checked:
             one, other = own[i], own[j]
             up, down = self._parts.path(*(self._parts.of_link[body.link] for body in (one, other)))
-            near = len(up) + len(down) <= CLOSE or self.left.get((one.link, other.link)) == COVERED
+            # meshes of links with few joints between them are looked at as they are, not as their covers
+            near = len(up) + len(down) <= 3 or self.left.get((one.link, other.link)) == COVERED
             if near and one.mesh is not None and other.mesh is not None:
                 found.setdefault((one.mesh, other.mesh), []).append((i, j))
         return found
@@ -377,8 +375,9 @@ class Surroundings:
             raise ModelError(message, name=name, value=np.inf)
         if seen == WORLD and size:
             planar = size == 3
-            base[:] = (1.0, 1.0, reach) if planar else [1.0] * 3 + [TURN_OF_QUATERNION * reach] * 4
-            base_turns[:] = (0.0, 0.0, 1.0) if planar else [0.0] * 3 + [TURN_OF_QUATERNION] * 4
+            # a unit quaternion that changes by dq turns by 2 |dq|
+            base[:] = (1.0, 1.0, reach) if planar else [1.0] * 3 + [2.0 * reach] * 4
+            base_turns[:] = (0.0, 0.0, 1.0) if planar else [0.0] * 3 + [2.0] * 4
         return found
 
 
@@ -403,9 +402,9 @@ def _by_mesh(robot: Robot, bodies: Sequence[Body]) -> dict[tuple[str, int], tupl
 
 
 def _listed(values: Any, what: str) -> tuple[Any, ...]:
-    if not isinstance(values, list | tuple) or len(values) > MOST:
-        message = f"surroundings: {what} must be a list of at most {MOST}, not {repr(values)[:80]}"
-        raise ModelError(message, name=what, value=values, limit=MOST)
+    if not isinstance(values, list | tuple) or len(values) > INPUT_LIMITS.count:
+        message = f"surroundings: {what} must be a list of at most {INPUT_LIMITS.count}, not {repr(values)[:80]}"
+        raise ModelError(message, name=what, value=values, limit=INPUT_LIMITS.count)
     return tuple(values)
 
 

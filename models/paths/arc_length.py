@@ -15,12 +15,16 @@ from numpy.typing import NDArray
 from models.arrays import Array
 from models.errors import ModelError
 
-__all__ = ["Cells", "arc_length", "cells", "parameter", "speed"]
+__all__ = ["GAUSS_NODES", "GAUSS_WEIGHTS", "Cells", "arc_length", "cells", "gauss_rule", "parameter", "speed"]
 
-GAUSS_NODES, GAUSS_WEIGHTS = (np.array(v) for v in np.polynomial.legendre.leggauss(10))
-GAUSS_NODES, GAUSS_WEIGHTS = (GAUSS_NODES + 1) / 2, GAUSS_WEIGHTS / 2
-STEEPEST = 3.0
-"""Largest slope du/ds at a cell's ends over its mean: up to it the cubic between them is monotone."""
+
+def gauss_rule(count: int) -> tuple[Array, Array]:
+    """Nodes and weights of the rule of Gauss and Legendre on 0 to 1."""
+    nodes, weights = np.polynomial.legendre.leggauss(count)
+    return (nodes + 1) / 2, weights / 2
+
+
+GAUSS_NODES, GAUSS_WEIGHTS = gauss_rule(10)
 MOST_STEPS = 4
 
 
@@ -101,7 +105,8 @@ def cells(coefficients: Array) -> Cells:
         left, right = _lengths(mine, start, half), _lengths(mine, start + half, half)
         fine = np.abs(whole - left - right) <= 1e-13 * scale[curve]  # rounding of twenty terms
         slowest = np.minimum(_speed(mine, start), _speed(mine, start + width))
-        fine &= left + right <= STEEPEST * width * slowest
+        # the cubic of u between the ends is monotone up to slopes of 3 over the mean (Fritsch & Carlson 1980)
+        fine &= left + right <= 3 * width * slowest
         done.append((curve[fine], start[fine], width[fine], (left + right)[fine]))
         rough = ~fine
         curve = np.repeat(curve[rough], 2)

@@ -24,19 +24,15 @@ from models.arrays import (
     checked_instance,
 )
 from models.errors import ModelError
-from models.paths.arc_length import GAUSS_NODES, GAUSS_WEIGHTS, speed
+from models.paths.arc_length import GAUSS_NODES, GAUSS_WEIGHTS, gauss_rule, speed
 from models.paths.orientation import orientation_function
 from models.paths.segments import screw_axes
 from models.paths.smooth_path import SmoothPath
 
 __all__ = ["gauss_newton", "march", "path_function", "predictor_corrector", "turn_function"]
 
-# rows of the table of cells
 MOST_TERMS = 100
 """Corrections, or nodes, of a mapping, whose expression grows with them."""
-SEGMENT = slice(0, 13)  # start; parts along, round and towards the axis of the screw, rate of turning
-CURVE = slice(13, 31)  # coefficients, three a power
-CELL = slice(31, 38)  # distance, length, whether on a blend; u at the start, width in u, speed at both ends
 
 
 def path_function(path: SmoothPath) -> Any:
@@ -76,10 +72,10 @@ def _inside(distance: Any, length: float) -> Any:
 
 @lru_cache(maxsize=1)
 def _in_cell() -> Any:
-    row, s = ca.SX.sym("row", CELL.stop), ca.SX.sym("s")
-    start, climb, ahead, inward, rate = row[0:3], row[3:6], row[6:9], row[9:12], row[12]
-    coefficients = ca.reshape(row[CURVE], 3, 6)
-    first_s, length, curved, first_u, width, speed0, speed1 = (row[i] for i in range(CELL.start, CELL.stop))
+    row, s = ca.SX.sym("row", 38), ca.SX.sym("s")
+    start, climb, ahead, inward, rate, powers, cell = ca.vertsplit(row, [0, 3, 6, 9, 12, 13, 31, 38])
+    coefficients = ca.reshape(powers, 3, 6)
+    first_s, length, curved, first_u, width, speed0, speed1 = ca.vertsplit(cell)
     distance = s - first_s
 
     # segment; a line has the rate 0: then sin(rate s)/rate is s
@@ -133,34 +129,31 @@ def _horner(columns: Any, u: Any) -> Any:
 
 
 def _table(path: SmoothPath) -> tuple[Array, Array]:
+    """Where cells begin and the path ends, and a column for each cell: what `_in_cell` takes apart.
+
+    Of a segment its start, the parts along, round and towards the axis of its screw, and its rate of turning; the
+    coefficients of a curve, three a power; distance, length, whether on a blend; u at the start, width in u, speeds.
+    """
     on_segment = np.flatnonzero(path.piece_segment >= 0)
-    count = len(on_segment) + len(path.cells.curve)
-    rows = np.zeros((count, CELL.stop))
-    parts = slice(0, len(on_segment))
-    segment = path.piece_segment[on_segment]
-    task = path.path
+    count, segment, task, cells = len(on_segment), path.piece_segment[on_segment], path.path, path.cells
     skipped = np.concatenate([[0.0], path.remaining])[segment]
     position, tangent, bend, _ = task.at(segment, skipped)
     k = task.curvature[segment]
     normal = bend / np.where(k == 0, 1.0, k)[:, None]
-    climb, ahead, inward, rate = screw_axes(tangent, normal, k, task.torsion[segment])
-    rows[parts, SEGMENT] = np.column_stack([position, climb, ahead, inward, rate])
+    screw = screw_axes(tangent, normal, k, task.torsion[segment])
     # any regular curve will do where none is used: its speed must not be zero
-    rows[parts, CURVE] = np.tile([0, 0, 0, 1, 0, 0] + [0] * 12, (len(on_segment), 1))
-    ones = np.ones(len(on_segment))
-    length = path.piece_lengths[on_segment]
-    rows[parts, CELL] = np.stack([path.bounds[on_segment], length, 0 * ones, 0 * ones, ones, length, length], axis=1)
+    unused = np.tile([0, 0, 0, 1, 0, 0] + [0] * 12, (count, 1))
+    begin, length, none, one = path.bounds[on_segment], path.piece_lengths[on_segment], np.zeros(count), np.ones(count)
+    segments = np.column_stack([position, *screw, unused, begin, length, none, none, one, length, length])
 
-    curves = slice(len(on_segment), count)
-    cells = path.cells
     coefficients = path.coefficients[cells.curve]
-    rows[curves, CURVE] = coefficients.reshape(-1, 18)
     speeds = speed(coefficients, cells.start), speed(coefficients, cells.start + cells.width)
-    flag = np.ones(len(cells.curve))
-    rows[curves, CELL] = np.stack([path.cell_bounds, cells.length, flag, cells.start, cells.width, *speeds], axis=1)
-    order = np.argsort(rows[:, CELL.start], kind="stable")
-    rows = rows[order]
-    return np.append(rows[:, CELL.start], path.length), rows.T
+    flag, unused, begin_cells = np.ones(len(cells.curve)), np.zeros((len(cells.curve), 13)), path.cell_bounds
+    shape = coefficients.reshape(-1, 18)
+    curves = np.column_stack([unused, shape, begin_cells, cells.length, flag, cells.start, cells.width, *speeds])
+    starts = np.concatenate([begin, begin_cells])
+    order = np.argsort(starts, kind="stable")
+    return np.append(starts[order], path.length), np.concatenate([segments, curves])[order].T
 
 
 def predictor_corrector(degree: int = 3, corrections: int = 3) -> Any:
@@ -212,10 +205,8 @@ def _gauss_newton(degree: int, nodes: tuple[int, ...]) -> Any:
     u, step = state[1], steps[1]
     guess = _predicted(state, steps, rate(u))
     for number in nodes:
-        points, weights = np.polynomial.legendre.leggauss(number)
-        points, weights = (points + 1) / 2, weights / 2
         width = guess - u
-        mean = sum(float(w) * rate(u + float(x) * width) for x, w in zip(points, weights, strict=True))
+        mean = sum(float(w) * rate(u + float(x) * width) for x, w in zip(*gauss_rule(number), strict=True))
         guess = guess - (width * mean - step) / rate(guess)
     return ca.Function("gauss_newton", [state, coefficients, steps], [ca.cse(ca.vertcat(u, guess))])
 

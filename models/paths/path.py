@@ -9,15 +9,22 @@ from typing import Any
 
 import numpy as np
 
-from models.arrays import NOT_NUMBERS, Array, ArrayInput, check_entries, checked_array, checked_indices, checked_numbers
+from models.arrays import (
+    NOT_NUMBERS,
+    ROUNDING,
+    Array,
+    ArrayInput,
+    check_entries,
+    checked_array,
+    checked_indices,
+    checked_numbers,
+)
 from models.errors import ModelError
 from models.paths.orientation import product, rotation_matrix, rotation_vector, unit_quaternion
 from models.paths.segments import Arc, Helix, Line, Segment, screw
 
 __all__ = ["Path"]
 
-LARGEST_GAP = 1e-9
-"""m; and rad between orientations."""
 SMALLEST_ANGLE = 1e-6
 """Interior angle (rad) below which a corner counts as a reversal: its blend would bend with 4e12 / remaining."""
 FRAME = ("start", "tangent", "normal", "curvature", "torsion")
@@ -135,13 +142,13 @@ class Path:
     def _check_gaps(self) -> None:
         ends = self.at(np.arange(len(self.segments)), self.lengths)[0]
         gaps = np.linalg.norm(ends[:-1] - self.start[1:], axis=1)
-        if gaps.size and gaps.max() > LARGEST_GAP:
+        if gaps.size and gaps.max() > ROUNDING:
             i = int(gaps.argmax())
             message = (
                 f"segment {i} ends at {ends[i].tolist()} m, segment {i + 1} starts at {self.start[i + 1].tolist()} m: "
                 f"a gap of {gaps[i]:.3g} m; join them by a Line"
             )
-            raise ModelError(message, name=f"segment {i}", value=float(gaps[i]), limit=LARGEST_GAP)
+            raise ModelError(message, name=f"segment {i}", value=float(gaps[i]), limit=ROUNDING)
 
     def _check_corners(self) -> None:
         angles = self.corner_angles()
@@ -160,12 +167,12 @@ class Path:
             begin = current if segment.start_orientation is None else np.asarray(segment.start_orientation)
             if i and begin is not current:
                 gap = float(np.linalg.norm(rotation_vector(current, begin, f"vertex {i}")))
-                if gap > LARGEST_GAP:
+                if gap > ROUNDING:
                     message = (
                         f"at vertex {i} the tool orientation jumps by {np.degrees(gap):.4g} deg, from "
                         f"{current.tolist()} to {begin.tolist()}; turn it along a segment"
                     )
-                    raise ModelError(message, name=f"vertex {i}", value=gap, limit=LARGEST_GAP)
+                    raise ModelError(message, name=f"vertex {i}", value=gap, limit=ROUNDING)
             if begin @ current < 0 and i:
                 begin = -begin  # the same orientation: the sign goes on from segment to segment
             starts.append(begin)

@@ -25,8 +25,6 @@ __all__ = ["Arc", "Helix", "Line", "Segment", "screw", "screw_axes"]
 
 SHORTEST_SEGMENT = 1e-9
 """Segments below this length (m) count as points."""
-STEEPEST = 1e-6
-"""Cosine between the axis and a radius above which they do not count as perpendicular."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -337,12 +335,13 @@ def _set_circle(segment: Any, owner: str) -> float:
         message = f"{owner}: start {segment.start.tolist()} is its center; its radius {radius:g} m is no circle"
         raise ModelError(message, name="radius", value=radius, limit=SHORTEST_SEGMENT)
     slope = abs(float(segment.axis @ (segment.start - segment.center))) / radius
-    if slope > STEEPEST:
+    most = 1e-6
+    if slope > most:
         message = (
             f"{owner}: axis {segment.axis.tolist()} is not perpendicular to the radius from {segment.center.tolist()} "
             f"to {segment.start.tolist()} (cosine {slope:.3g}); move the center along the axis to the start's height"
         )
-        raise ModelError(message, name="axis", value=slope, limit=STEEPEST)
+        raise ModelError(message, name="axis", value=slope, limit=most)
     return radius
 
 

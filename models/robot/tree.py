@@ -9,11 +9,9 @@ from difflib import get_close_matches
 
 import numpy as np
 
+from models.arrays import MAX_LISTED
 from models.errors import ModelError
 from models.robot.parts import Joint, Link
-
-MANY = 12
-"""More names than these are not listed in full in a message."""
 
 
 def absent(what: str, name: object, known: Iterable[str]) -> ModelError:
@@ -22,7 +20,7 @@ def absent(what: str, name: object, known: Iterable[str]) -> ModelError:
     folded = {each.casefold(): each for each in reversed(names)}
     near = [folded[each] for each in get_close_matches(str(name).casefold(), folded, n=3, cutoff=0.5)]
     hint = f"did you mean {' or '.join(repr(each) for each in near)}? " if near else ""
-    listed = f"{names[:MANY]} and {len(names) - MANY} more" if len(names) > MANY else f"{names}"
+    listed = f"{names[:MAX_LISTED]} and {len(names) - MAX_LISTED} more" if len(names) > MAX_LISTED else f"{names}"
     message = f"{what} {name!r} does not exist; {hint}there are {listed if names else 'none'}"
     return ModelError(message, name=str(name) or what, value=name, limit=tuple(names))
 

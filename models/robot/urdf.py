@@ -24,15 +24,13 @@ import numpy as np
 
 from models.arrays import Array, checked_choice, warn_of_degrees
 from models.errors import ModelError, ModelWarning
-from models.input_files import parse_xml, read_regular
+from models.input_files import INPUT_LIMITS, parse_xml, read_regular
 from models.robot.parts import SHAPES, CollisionShape, Joint, Kind, Link, Mimic, VisualShape
 
 Source: TypeAlias = str | os.PathLike[str]
 InertiaRule: TypeAlias = Literal["warn", "as_given"]
 _Shape = TypeVar("_Shape", bound=CollisionShape)
 
-MOST_BYTES = 2**23
-"""Of a file: the largest public ones have 1 MB."""
 MOVING: dict[str, Kind] = {"revolute": "revolute", "continuous": "continuous", "prismatic": "prismatic"}
 XACRO = "this is xacro, the macro language that URDF files are made from; expand it first: xacro FILE > FILE.urdf"
 BLANK = "\ufeff \t\r\n"
@@ -52,8 +50,6 @@ ATTRIBUTES: dict[str, tuple[str, ...]] = {
     "mesh": ("filename", "scale"),
 }
 """Elements in which a misspelt attribute would go unseen, and the attributes that they have."""
-MISSPELT = 0.8
-"""Likeness to an attribute that is given too, from which another one is that, misspelt; `iyx` beside `ixy` is not."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,7 +240,7 @@ def parsed(source: Source) -> ElementTree.Element:
             if not isinstance(source, str | os.PathLike):
                 message = f"a URDF source is a text or a path, not {type(source).__name__}"
                 raise ModelError(message, name="source", value=source)
-            data = read_regular(source, MOST_BYTES)
+            data = read_regular(source, INPUT_LIMITS.description_bytes)
         tree = parse_xml(data)
     except ElementTree.ParseError as error:
         line, column = error.position
@@ -393,7 +389,8 @@ def _unread(owner: ElementTree.Element) -> list[str]:
         for key in [key for key in element.attrib if known and key not in known and "}" not in key]:
             where = f"{owner.tag} {name_of(owner)!r}: {key}={element.get(key)!r} of <{element.tag}>"
             word = key.casefold()
-            if near := get_close_matches(word, lacking, 1) or get_close_matches(word, known, 1, MISSPELT):
+            # so alike to one that is given too is misspelt, but not `iyx` beside `ixy`
+            if near := get_close_matches(word, lacking, 1) or get_close_matches(word, known, 1, 0.8):
                 message = f"{where} is no attribute of URDF; did you mean {near[0]!r}?"
                 raise ModelError(message, name=key, value=element.get(key), limit=known)
             found += [where] if lacking else []

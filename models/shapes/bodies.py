@@ -23,13 +23,8 @@ from models.shapes.shapes import CORNERS, SIDES, Box, Capsule, Cylinder, Mesh, S
 MissingRule: TypeAlias = Literal["raise", "skip"]
 Folders: TypeAlias = Sequence[str | os.PathLike[str]]
 
-THIN = 1e-6
-"""m: by which a mesh in a plane is thickened."""
 FLAT = 1.25
 """A capsule of this many times the volume of the cylinder that it stands for is too much: the cylinder is kept."""
-RADII = np.linspace(0.0, 1.0, 400) ** 3
-"""Where the radius of a capsule is tried: shares of the way from the cylinder's own to that of the ball around it. They
-are closest at the first, where a little more lets the caps begin much earlier."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,11 +41,11 @@ class LinkMesh:
 
     @cached_property
     def hull(self) -> Mesh:
-        """Its convex hull, in the frame of the link; of points in a plane, which have none, that of THIN cubes."""
+        """Its convex hull, in the frame of the link; of points in a plane, that of cubes of 1 um around them."""
         try:
             return Mesh.around(convex_hull(self.points))
         except ModelError:
-            return Mesh.around(convex_hull((self.points[:, None] + THIN * CORNERS).reshape(-1, 3)))
+            return Mesh.around(convex_hull((self.points[:, None] + 1e-6 * CORNERS).reshape(-1, 3)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,7 +170,8 @@ def capsule_around(radius: float, length: float) -> tuple[float, tuple[float, fl
         Volume, m^3; radius R and length without the caps, m; how far its poles stand out, m.
     """
     most = float(np.hypot(radius, length / 2))
-    tried = radius + (most - radius) * RADII
+    # closest at the first, where a little more lets the caps begin much earlier
+    tried = radius + (most - radius) * np.linspace(0.0, 1.0, 400) ** 3
     lengths = np.maximum(length - 2 * np.sqrt(np.maximum(tried**2 - radius**2, 0)), 0)
     volumes = np.pi * tried**2 * (lengths + 4 / 3 * tried)
     k = int(volumes.argmin())

@@ -15,13 +15,10 @@ from xml.etree import ElementTree
 import numpy as np
 
 from models.errors import ModelError
-from models.input_files import parse_xml
-from models.shapes.triangles import MOST_FACES, Triangles, together, wrong
+from models.input_files import INPUT_LIMITS, parse_xml
+from models.shapes.triangles import Triangles, together, wrong
 
 __all__ = ["read_collada"]
-
-MOST_NODES, DEEPEST = 2**12, 64
-"""Of a scene, each counted as often as it is borrowed; nodes within nodes."""
 
 
 def read_collada(file: Path, data: bytes) -> Triangles:
@@ -56,8 +53,8 @@ def read_collada(file: Path, data: bytes) -> Triangles:
                     continue
                 triangles = primitive.triangleset() if hasattr(primitive, "triangleset") else primitive
                 count += len(triangles)
-                if count > MOST_FACES:
-                    raise wrong(file, f"{count} triangles in the scene", count, MOST_FACES)
+                if count > INPUT_LIMITS.mesh_triangles:
+                    raise wrong(file, f"{count} triangles in the scene", count, INPUT_LIMITS.mesh_triangles)
                 if not len(triangles):
                     continue
                 faces = np.asarray(triangles.vertex_index, dtype=np.intp).reshape(-1, 3)
@@ -135,8 +132,8 @@ def _place_borrowed(file: Path, root: ElementTree.Element) -> None:
     counts: dict[ElementTree.Element, int] = {}
 
     def count(node: ElementTree.Element, depth: int) -> int:
-        if depth > DEEPEST:
-            raise wrong(file, f"nodes within nodes, more than {DEEPEST} deep, or in a ring", depth)
+        if depth > INPUT_LIMITS.nesting:
+            raise wrong(file, f"nodes within nodes, more than {INPUT_LIMITS.nesting} deep, or in a ring", depth)
         if node in counts:
             return counts[node]
         children = [child for child in node if child.tag not in ("instance_camera", "instance_light")]
@@ -151,8 +148,8 @@ def _place_borrowed(file: Path, root: ElementTree.Element) -> None:
         return counts[node]
 
     whole = sum(count(node, 0) for node in root.findall("library_visual_scenes/visual_scene/node"))
-    if whole > MOST_NODES:
-        raise wrong(file, f"{whole} nodes in the scene", whole, MOST_NODES)
+    if whole > INPUT_LIMITS.scene_nodes:
+        raise wrong(file, f"{whole} nodes in the scene", whole, INPUT_LIMITS.scene_nodes)
 
 
 def _with_colors(given: ElementTree.Element) -> ElementTree.Element:

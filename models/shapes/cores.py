@@ -24,8 +24,6 @@ Hold: TypeAlias = Callable[[Expression], Expression]
 
 KINK = 1e-12
 """m: what rounds off the kink of an exact distance at zero."""
-PARALLEL = 1e-13
-"""Squared sine of an angle: segments at less are parallel, which costs at most 3e-7 of their length."""
 NO_EDGE = 1e-18
 """Squared sine of an angle: edges at less span no direction that could separate."""
 
@@ -143,7 +141,8 @@ def _segments(gap: Triple, u: Triple, v: Triple, weight: float, hold: Hold) -> E
     """
     a, e, b = dot(u, u) + weight + KINK**2, dot(v, v) + weight + KINK**2, dot(u, v)
     c, f = dot(u, gap) - weight / 2, dot(v, gap) + weight / 2
-    s = _clip((b * f - c * e) / ca.fmax(a * e - b * b, PARALLEL * a * e))
+    # less than 1e-13 of the squared sine counts as parallel, which costs at most 3e-7 of the length
+    s = _clip((b * f - c * e) / ca.fmax(a * e - b * b, 1e-13 * a * e))
     t = _clip((b * s + f) / e)
     s = _clip((b * t - c) / a)
     s, t = hold(s), hold(t)

@@ -1,7 +1,7 @@
 """A mesh covered by a few capsules, or by one box: what distances are cheap and exact for.
 
 One capsule of least volume is fitted to the mesh. Then the mesh is cut across where that lowers the volume of what is
-covered most, each side gets a capsule of its own, and so on up to MOST_PARTS; as many parts are kept as are worth it. A
+covered most, each side gets a capsule of its own, and so on up to a few parts; as many are kept as are worth it. A
 box is taken instead where it is clearly smaller: distances of boxes take many times longer.
 Every triangle, cut at the planes, lies in the capsule of its part, and so do all points that a closed surface encloses:
 from a point between two planes of a cut a line parallel to the planes meets the surface between them.
@@ -14,33 +14,56 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
+from scipy.optimize import minimize
 
 from models.arrays import Array, ArrayInput, checked_array, checked_indices
 from models.cache import keep, kept, key_of, version_of
 from models.errors import ModelError
 from models.shapes.hull import convex_hull
+from models.shapes.nearest import nearest_directions
 from models.shapes.shapes import Box, Capsule
 
-MOST_PARTS = 3
-WORTH_A_PART = 1.07
-"""By how much the volume covered must fall for each part more: by less where the largest overhang falls, too, of which
-the fourth root counts."""
-WORTH_A_BOX = 0.7
-"""Share of the volume covered by capsules below which a box is taken."""
-CUTS = (0.12, 0.25, 0.38, 0.5, 0.62, 0.75, 0.88)
-"""Where cuts are tried: share of the extent along an axis."""
-GROWTH = 1e-9
-"""Share of the mesh's size by which covers are larger than the fit: more than rounding takes away."""
-THINNEST = 1e-6
-"""Share of the mesh's size that a box is thick at least."""
-DIRECTIONS, EXTREMES = 48, 256
-POPULATION, CHOSEN, GENERATIONS, LEARNING = 32, 8, 45, 0.4
-SPREAD = np.array([0.25, 0.25, 0.05, 0.05, 0.2])
-FATTER = np.array([1.0, 1.02, 1.06, 1.15, 1.3])
-SIFTED = 1500
-"""Triangles that cuts are tried on: the largest, and the corners that are farthest out."""
-GRID = 6000  # points, of which those in a cover tell its volume
-SAMPLES = 150  # points of a cover's surface, for its overhang
+
+@dataclass(frozen=True)
+class CoverSettings:
+    """How far covers are searched. Lengths and volumes are relative to those of the mesh, whose largest extent is 1.
+
+    Attributes:
+        parts: Capsules at most: distances of more of them cost more than their tighter fit saves.
+        worth_a_part: By how much the volume covered must fall for each part more; by less where the largest overhang
+            falls, too, of which the fourth root counts.
+        worth_a_box: Share of the volume covered by capsules below which a box is taken, whose distances cost more.
+        cuts: Where cuts are tried, shares of the extent along an axis; the best is then moved by halves of the first.
+        growth: By which covers are larger than the fit: more than rounding takes away.
+        thinnest: Thickness of a box at least, which must not be zero.
+        directions: Axes at which capsules begin, on half a sphere.
+        extremes: Directions in which a point that is farthest takes part in a fit, a multiple of 32.
+        simplex: The first steps of a search: two slopes of the axis, its place across, root of the excess radius.
+        parameter_tolerance, volume_tolerance: Of these parameters, and share of the volume, at which it ends.
+        radii: Radii at which a search may begin, of that of the cylinder around all.
+        sifted: Triangles that cuts are tried on: the largest, and the corners that are farthest out.
+        grid: Points, of which those in a cover tell its volume, to about a hundredth.
+        samples: Points of a cover's surface at which its overhang is measured.
+    """
+
+    parts: int = 3
+    worth_a_part: float = 1.07
+    worth_a_box: float = 0.7
+    cuts: tuple[float, ...] = (0.12, 0.25, 0.38, 0.5, 0.62, 0.75, 0.88)
+    growth: float = 1e-9
+    thinnest: float = 1e-6
+    directions: int = 48
+    extremes: int = 256
+    simplex: tuple[float, ...] = (0.25, 0.25, 0.05, 0.05, 0.2)
+    parameter_tolerance: float = 4e-3
+    volume_tolerance: float = 4e-4
+    radii: tuple[float, ...] = (1.0, 1.02, 1.06, 1.15, 1.3)
+    sifted: int = 1500
+    grid: int = 6000
+    samples: int = 150
+
+
+SETTINGS = CoverSettings()
 
 Covering: TypeAlias = Capsule | Box
 
@@ -51,7 +74,7 @@ class Cover:
 
     Attributes:
         shape: Capsule or box in the frame of the mesh.
-        overhang: How far it stands out of the convex hull of the mesh, m: the largest of SAMPLES points of its surface.
+        overhang: How far it stands out of the convex hull of the mesh, m: at some points of its surface.
     """
 
     shape: Covering
@@ -88,7 +111,8 @@ def fitted(triangles: Array) -> tuple[Cover, ...]:
     """The cover of triangles, shape (m, 3, 3), m, whether it is kept or not."""
     middle, size = _middle(triangles.reshape(-1, 3))
     unit = (triangles - middle) / size
-    points, hull = _points(unit), _hull_triangles(unit)
+    points = _points(unit)
+    hull = _hull_corners(points)
     outermost = points[_farthest(points, _principal(points))]
     grid, room = _grid(points)
     parts, capsules = [unit], [_capsule(points)]
@@ -98,9 +122,9 @@ def fitted(triangles: Array) -> tuple[Cover, ...]:
         shapes: list[Covering] = [_grown(each, _points(part)) for each, part in zip(capsules, parts, strict=True)]
         volume, out = _covered(shapes, grid), max(_overhang(each, hull) for each in shapes)
         whole, far = (whole, far) if choices else (max(volume, 1e-12), max(out, 1e-12))
-        score = volume / whole * min(1.0, out / far) ** 0.25 * WORTH_A_PART ** (len(parts) - 1)
+        score = volume / whole * min(1.0, out / far) ** 0.25 * SETTINGS.worth_a_part ** (len(parts) - 1)
         choices.append((score, len(parts), shapes))
-        if len(parts) == MOST_PARTS:
+        if len(parts) == SETTINGS.parts:
             break
         others = [capsules[:k] + capsules[k + 1 :] for k in range(len(parts))]
         found = [_best_cut(part, others[k], capsules[k], grid) for k, part in enumerate(parts)]
@@ -110,7 +134,7 @@ def fitted(triangles: Array) -> tuple[Cover, ...]:
         _, parts[k : k + 1], capsules[k : k + 1] = found[k]
     shapes = min(choices, key=lambda each: each[0])[2]
     box = _box(points, outermost)
-    if float(np.prod(box.size)) < WORTH_A_BOX * room * _covered(shapes, grid):
+    if float(np.prod(box.size)) < SETTINGS.worth_a_box * room * _covered(shapes, grid):
         shapes = [_grown_box(box, points)]
     return tuple(Cover(_scaled(each, middle, size), size * _overhang(each, hull)) for each in shapes)
 
@@ -127,55 +151,27 @@ def inside(shape: Covering, points: Array) -> Array:
 
 
 def _capsule(points: Array) -> Capsule:
-    """The capsule of least volume around points, as far as the search finds it.
-
-    Only points that are farthest in some direction count at first, and then those that were left outside.
-    """
+    """The capsule of least volume around points, as far as the search finds it; those farthest out tell it."""
     frame = _principal(points)
     few = points[_farthest(points, frame)]
-    best = _searched(few, frame)
-    for _ in range(3):
-        outside = inside(best, points)
-        worst = np.argsort(outside, kind="stable")[-16:]
-        if outside[worst[-1]] <= 1e-7:
-            break
-        few = np.concatenate([few, points[worst]])
-        best = _searched(few, frame)
-    return _grown(best, points)
-
-
-def _searched(points: Array, frame: Array) -> Capsule:
-    """Axes all around, the best of them varied in direction, place and radius."""
-    bases = _bases(np.concatenate([frame.T, _sphere(DIRECTIONS, half=True) @ frame.T]))
-    volumes, centres, excess = _quick(points, bases)
-    found: list[tuple[float, Array, Array]] = []
+    bases = _bases(np.concatenate([frame.T, _sphere(SETTINGS.directions, half=True) @ frame.T]))
+    volumes, centres, excess = _quick(few, bases)
+    found = []
     for k in np.argsort(volumes, kind="stable")[:2]:
-        start = np.array([0.0, 0.0, *centres[k], np.sqrt(excess[k])])
-        found.append((*_evolved(points @ bases[k], start, SPREAD), bases[k]))
-    _, best, basis = min(found, key=lambda each: each[0])
-    _, best = _evolved(points @ basis, best, SPREAD / 12)
-    return _capsule_of(_measured(points @ basis, best[None]), basis)
-
-
-def _evolved(points: Array, start: Array, spread: Array) -> tuple[float, Array]:
-    """Volume and parameters after an evolution strategy that learns the covariance of what succeeds; seeded."""
-    rng = np.random.default_rng(0)
-    mean, covariance = start, np.diag(spread**2)
-    best, least = start, float(_measured(points, start[None])[0][0])
-    weights = np.log(CHOSEN + 0.5) - np.log(np.arange(1, CHOSEN + 1))
-    weights /= weights.sum()
-    for _ in range(GENERATIONS):
-        root = np.linalg.cholesky(covariance + 1e-18 * np.eye(len(start)))
-        tried = mean + rng.normal(size=(POPULATION, len(start))) @ root.T
-        tried[0] = best
-        volumes = _measured(points, tried)[0]
-        order = np.argsort(volumes, kind="stable")[:CHOSEN]
-        if volumes[order[0]] < least:
-            least, best = float(volumes[order[0]]), tried[order[0]]
-        steps = tried[order] - mean
-        covariance = (1 - LEARNING) * covariance + LEARNING * (steps.T * weights) @ steps
-        mean = mean + weights @ steps
-    return least, best
+        own, start = few @ bases[k], np.array([0.0, 0.0, *centres[k], np.sqrt(excess[k])])
+        result = minimize(
+            lambda x, own=own: float(_measured(own, x[None])[0][0]),
+            start,
+            method="Nelder-Mead",
+            options={
+                "initial_simplex": start + np.vstack([np.zeros(5), np.diag(SETTINGS.simplex)]),
+                "xatol": SETTINGS.parameter_tolerance,
+                "fatol": SETTINGS.volume_tolerance * float(volumes[k]),
+            },
+        )
+        found.append((float(result.fun), int(k), result.x))
+    _, k, best = min(found, key=lambda each: each[:2])
+    return _grown(_capsule_of(few, best, bases[k]), points)
 
 
 def _measured(points: Array, parameters: Array) -> tuple[Array, Array, Array, Array, Array, Array]:
@@ -214,14 +210,14 @@ def _quick(points: Array, bases: Array) -> tuple[Array, Array, Array]:
         centres = centres + (across[rows, farthest] - centres) / (k + 4)
     distances = ((across - centres[:, None]) ** 2).sum(axis=2)
     volumes = []
-    for factor in FATTER:
+    for factor in SETTINGS.radii:
         radius = np.sqrt(distances.max(axis=1)) * factor
         caps = np.sqrt(np.maximum(radius[:, None] ** 2 - distances, 0))
         length = np.maximum((along - caps).max(axis=1) - (along + caps).min(axis=1), 0)
         volumes.append(np.pi * radius**2 * (length + 4 / 3 * radius))
     found = np.array(volumes)
     best = found.argmin(axis=0)
-    return found[best, rows], centres, FATTER[best] - 1
+    return found[best, rows], centres, np.array(SETTINGS.radii)[best] - 1
 
 
 def _quick_capsule(points: Array, bases: Array) -> Capsule:
@@ -229,18 +225,18 @@ def _quick_capsule(points: Array, bases: Array) -> Capsule:
     volumes, centres, excess = _quick(points, bases)
     k = int(volumes.argmin())
     start = np.array([[0.0, 0.0, *centres[k], np.sqrt(excess[k])]])
-    return _capsule_of(_measured(points @ bases[k], start), bases[k])
+    return _capsule_of(points, start[0], bases[k])
 
 
-def _capsule_of(measured: tuple[Array, ...], basis: Array) -> Capsule:
-    _, radius, low, high, axis, place = (each[0] for each in measured)
-    return Capsule(float(radius) + GROWTH, basis @ (place + low * axis), basis @ (place + high * axis))
+def _capsule_of(points: Array, parameters: Array, basis: Array) -> Capsule:
+    _, radius, low, high, axis, place = (each[0] for each in _measured(points @ basis, parameters[None]))
+    return Capsule(float(radius) + SETTINGS.growth, basis @ (place + low * axis), basis @ (place + high * axis))
 
 
 def _grown(capsule: Capsule, points: Array) -> Capsule:
-    """The capsule with a radius that every point is proven to lie in, and GROWTH."""
+    """The capsule with a radius that every point is proven to lie in, and a little more."""
     start, end = np.asarray(capsule.start), np.asarray(capsule.end)
-    radius = max(capsule.radius, float(_to_segment(points, start, end).max())) + GROWTH
+    radius = max(capsule.radius, float(_to_segment(points, start, end).max())) + SETTINGS.growth
     return Capsule(radius, start, end)
 
 
@@ -269,7 +265,7 @@ def _best_cut(
     along = along / max(float(np.linalg.norm(along)), 1e-300)
     if 0 < np.abs(along @ frame).max() < 0.98:
         axes.append(along)
-    bases = _bases(np.concatenate([frame.T, _sphere(DIRECTIONS // 2, half=True) @ frame.T]))
+    bases = _bases(np.concatenate([frame.T, _sphere(SETTINGS.directions // 2, half=True) @ frame.T]))
     sifted = _sifted(part, frame)
     free = grid[np.min([inside(each, grid) for each in others], axis=0) > 0] if others else grid
 
@@ -283,9 +279,9 @@ def _best_cut(
         return covered([_quick_capsule(side[_farthest(side, frame)], bases) for side in sides])
 
     spans = [(float((points @ axis).min()), float(np.ptp(points @ axis))) for axis in axes]
-    levels = [(k, low + share * span) for k, (low, span) in enumerate(spans) for share in CUTS]
+    levels = [(k, low + share * span) for k, (low, span) in enumerate(spans) for share in SETTINGS.cuts]
     _, k, level = min((tried(k, level), k, level) for k, level in levels)
-    for share in (CUTS[0] / 2, CUTS[0] / 4):
+    for share in (SETTINGS.cuts[0] / 2, SETTINGS.cuts[0] / 4):
         step = share * spans[k][1]
         _, level = min((tried(k, each), each) for each in (level - step, level, level + step))
     sides = [side for side in cut(part, axes[k], level) if len(side)]
@@ -299,12 +295,12 @@ def _grid(points: Array) -> tuple[Array, float]:
     """Points spread evenly in a box half as large again as some points, which holds their covers but for a little.
 
     Returns:
-        The points, shape (GRID, 3), and the volume of the box.
+        The points, shape (k, 3), and the volume of the box.
     """
     frame = _principal(points)
     low, high = (points @ frame).min(axis=0), (points @ frame).max(axis=0)
     # The additive recurrence of the generalised golden ratio in three dimensions, the root of x^4 = x + 1.
-    shares = (np.arange(1, GRID + 1)[:, None] / 1.2207440846057596 ** np.arange(1, 4) + 0.5) % 1
+    shares = (np.arange(1, SETTINGS.grid + 1)[:, None] / 1.2207440846057596 ** np.arange(1, 4) + 0.5) % 1
     wide = 1.5 * np.maximum(high - low, 0.6 * float((high - low).max()))
     return np.asarray(((low + high) / 2 + (shares - 0.5) * wide) @ frame.T), float(np.prod(wide))
 
@@ -318,10 +314,10 @@ def _covered(shapes: Sequence[Covering], grid: Array) -> float:
 
 def _sifted(triangles: Array, frame: Array) -> Array:
     """The triangles, or where they are many the largest of them and the farthest corners, as triangles of no size."""
-    if len(triangles) <= SIFTED:
+    if len(triangles) <= SETTINGS.sifted:
         return triangles
     length = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2).max(axis=1)
-    largest = triangles[np.argsort(-length, kind="stable")[:SIFTED]]
+    largest = triangles[np.argsort(-length, kind="stable")[: SETTINGS.sifted]]
     points = _points(triangles)
     return np.concatenate([largest, np.repeat(points[_farthest(points, frame)][:, None], 3, axis=1)])
 
@@ -377,77 +373,44 @@ def _box(points: Array, outermost: Array) -> Box:
             areas = np.ptp(corners @ first.T, axis=0) * np.ptp(corners @ second.T, axis=0)
             k = int(areas.argmin())
             frames.append(np.stack([first[k], second[k], normal], axis=1))
-    volumes = [float(np.prod(np.maximum(np.ptp(corners @ frame, axis=0), THINNEST))) for frame in frames]
+    volumes = [float(np.prod(np.maximum(np.ptp(corners @ frame, axis=0), SETTINGS.thinnest))) for frame in frames]
     frame = frames[int(np.argmin(volumes))]
     frame = frame if np.linalg.det(frame) > 0 else frame * [1, 1, -1]
     low, high = (points @ frame).min(axis=0), (points @ frame).max(axis=0)
-    return Box(np.maximum(high - low, THINNEST), frame @ ((low + high) / 2), frame)
+    return Box(np.maximum(high - low, SETTINGS.thinnest), frame @ ((low + high) / 2), frame)
 
 
 def _grown_box(box: Box, points: Array) -> Box:
-    """The box with edges that every point is proven to lie in, and GROWTH."""
-    return Box(box.size + 2 * max(0.0, float(inside(box, points).max())) + 2 * GROWTH, box.position, box.rotation)
+    """The box with edges that every point is proven to lie in, and a little more."""
+    return Box(
+        box.size + 2 * max(0.0, float(inside(box, points).max())) + 2 * SETTINGS.growth, box.position, box.rotation
+    )
 
 
 # --------------------------------------------------------------------------------------------------- overhang
 
 
 def _overhang(shape: Covering, hull: Array) -> float:
-    """Largest distance of points of a shape's surface from the hull of a mesh, given by its triangles."""
-    around = _sphere(SAMPLES)
+    """Largest distance of points of a shape's surface from the hull of some points."""
+    around = _sphere(SETTINGS.samples)
     if isinstance(shape, Capsule):
         along = np.asarray(shape.end) - np.asarray(shape.start)
         ends = np.where((around @ along > 0)[:, None], shape.end, shape.start)
         samples = ends + shape.radius * around  # the farthest points of a capsule from a convex set are on its caps
     else:
         samples = shape.core
-    normals = np.cross(hull[:, 1] - hull[:, 0], hull[:, 2] - hull[:, 0])
-    outside = np.ones(len(samples), dtype=bool)
-    if _closed(hull):
-        outside = ((samples @ normals.T) > (normals * hull[:, 0]).sum(axis=1)).any(axis=1)
-    if not outside.any():
-        return 0.0
-    return float(_to_triangles(samples[outside], hull).max())
+    _, inner, outer = nearest_directions(np.broadcast_to(hull, (len(samples), *hull.shape)), samples[:, None])
+    return float(np.linalg.norm(outer - inner, axis=1).max())
 
 
-def _closed(hull: Array) -> bool:
-    """Whether triangles enclose some volume, all of them seen from outside counter-clockwise."""
-    middle = hull.reshape(-1, 3).mean(axis=0)
-    a, b, c = (hull[:, k] - middle for k in range(3))
-    return bool((np.cross(a, b) * c).sum() > 1e-12)
-
-
-def _to_triangles(points: Array, triangles: Array) -> Array:
-    """Distance of each point from the nearest of some triangles. Shape (n,)."""
-    corners = triangles.transpose(1, 0, 2)
-    normals = np.cross(corners[1] - corners[0], corners[2] - corners[0])
-    sizes = np.linalg.norm(normals, axis=1)
-    whole = sizes > 0
-    least = np.full(len(points), np.inf)
-    for k, point in enumerate(points):
-        within, squares = whole.copy(), np.full(len(triangles), np.inf)
-        for a, b in ((0, 1), (1, 2), (2, 0)):
-            edge, arm = corners[b] - corners[a], point - corners[a]
-            length = (edge * edge).sum(axis=1)
-            share = np.clip((arm * edge).sum(axis=1) / np.where(length > 0, length, 1), 0, 1)
-            squares = np.minimum(squares, ((arm - share[:, None] * edge) ** 2).sum(axis=1))
-            within &= (np.cross(edge, arm) * normals).sum(axis=1) >= 0
-        flat = ((point - corners[0]) * normals).sum(axis=1) / np.where(whole, sizes, 1)
-        least[k] = np.sqrt(np.where(within, flat**2, squares).min())
-    return least
-
-
-def _hull_triangles(triangles: Array) -> Array:
-    """Of a large mesh the hull of its outermost points: not larger than its own, so that an overhang is not less."""
-    points = _points(triangles)
-    if len(points) > SIFTED:
-        frame = _principal(points)
-        points = points[_farthest(points, frame, 2 * EXTREMES)]
+def _hull_corners(points: Array) -> Array:
+    """Of a large mesh those of its outermost points alone: their hull is no larger, so that an overhang is not less."""
+    if len(points) > SETTINGS.sifted:
+        points = points[_farthest(points, _principal(points), 2 * SETTINGS.extremes)]
     try:
-        hull = convex_hull(points)
-    except ModelError:  # flat: the mesh is as good as its hull
-        return triangles[:SIFTED]
-    return np.asarray(hull.vertices[hull.faces])
+        return convex_hull(points).vertices
+    except ModelError:  # flat: no hull with a volume
+        return points
 
 
 # ---------------------------------------------------------------------------------------------------- helpers
@@ -488,7 +451,7 @@ def _sphere(count: int, half: bool = False) -> Array:
     return np.stack([flat * np.cos(angle), flat * np.sin(angle), z], axis=1)
 
 
-def _farthest(points: Array, frame: Array, count: int = EXTREMES) -> Any:
+def _farthest(points: Array, frame: Array, count: int = SETTINGS.extremes) -> Any:
     """Indices of the points that are farthest in some of `count` directions, a multiple of 32."""
     if len(points) <= count:
         return np.arange(len(points))
@@ -515,7 +478,7 @@ def _written(each: Cover) -> dict[str, Any]:
 
 def _read(value: Any, points: Array) -> tuple[Cover, ...] | None:
     """Covers that were kept, where they are whole and hold the mesh's points still."""
-    if not isinstance(value, list) or not 0 < len(value) <= MOST_PARTS:
+    if not isinstance(value, list) or not 0 < len(value) <= SETTINGS.parts:
         return None
     try:
         found = []

@@ -20,8 +20,9 @@ from typing import Any, NamedTuple, TypeAlias
 import casadi as ca
 import numpy as np
 
-from models.arrays import MOST, Array, checked_array, checked_instance, checked_nonnegative, checked_number
+from models.arrays import Array, checked_array, checked_instance, checked_nonnegative, checked_number
 from models.errors import ModelError
+from models.input_files import INPUT_LIMITS
 from models.shapes.cores import (
     Block,
     Hold,
@@ -42,9 +43,6 @@ from models.shapes.cores import (
 from models.shapes.hull import Hull
 from models.shapes.shapes import Box, Capsule, Cylinder, HalfSpace, Mesh, Shape, Sphere, checked_shape
 from models.spatial import Expression, Frame, expression, on_scalars
-
-SHARP = pi / 4
-"""rad: between the normals of faces; past their edge these alone see 8 % too little of a distance."""
 
 
 class Solid(NamedTuple):
@@ -230,9 +228,9 @@ def soft_minimum(values: Sequence[Expression], width: float) -> Expression:
     Raises:
         ModelError: No value, or a width that is not positive.
     """
-    if not isinstance(values, list | tuple) or not 0 < len(values) <= MOST:
-        message = f"soft_minimum of no values, or not of a list of at most {MOST}: {repr(values)[:80]}"
-        raise ModelError(message, name="values", value=values, limit=MOST)
+    if not isinstance(values, list | tuple) or not 0 < len(values) <= INPUT_LIMITS.count:
+        message = f"soft_minimum of no values, or not of a list of at most {INPUT_LIMITS.count}: {repr(values)[:80]}"
+        raise ModelError(message, name="values", value=values, limit=INPUT_LIMITS.count)
     checked_number(width, "soft_minimum", "width", positive=True)
     for value in values:
         if not isinstance(value, ca.SX | ca.MX | ca.DM):
@@ -364,9 +362,9 @@ def _gaps(one: Core, other: Core, rounding: float) -> list[Expression]:
 
 
 def _across_edges(hull: Hull) -> Array:
-    """Unit directions half-way between faces that meet in an edge or corner, each two at more than SHARP. Shape (k, 3).
+    """Unit directions half-way between faces that meet in an edge or corner, each two at more than pi/4. Shape (k, 3).
 
-    Past an edge the normals of its two faces, an angle a apart, see no more than cos(a/2) of a distance.
+    Past an edge the normals of its two faces, an angle a apart, see cos(a/2) of a distance at most, 92 % at pi/4.
     """
     a, b, c = (hull.vertices[hull.faces[:, k]] for k in range(3))
     face = (np.cross(b - a, c - a) @ hull.normals.T).argmax(axis=1)
@@ -378,7 +376,7 @@ def _across_edges(hull: Hull) -> Array:
     found = []
     for faces in sorted({tuple(sorted(each)) for each in meeting.values() if len(each) > 1}):
         normals = hull.normals[list(faces)]
-        if (normals @ normals.T)[np.triu_indices(len(faces), 1)].max() < cos(SHARP):
+        if (normals @ normals.T)[np.triu_indices(len(faces), 1)].max() < cos(pi / 4):
             middle = normals.sum(axis=0)
             found.append(middle / np.linalg.norm(middle))
     return np.array(found).reshape(-1, 3)

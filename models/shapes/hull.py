@@ -12,17 +12,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
-from models.arrays import Array, frozen
+from models.arrays import ROUNDING, Array, frozen
 from models.errors import ModelError
-
-FLAT = 1e-10
-"""Share of the size of all points: thinner is flat."""
-SAME_PLANE = 1e-9
-"""Normals of faces that differ by less are one."""
-ROUNDING = 1e-12
-"""Share of the size of all points by which planes stand out: more than qhull leaves points outside."""
-SPREAD = 1000
-"""Points, at most about twice, by which the plane that they may lie in is told."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,15 +61,16 @@ def _convex_hull(points: Array) -> Hull:
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     size = float(np.abs(points - middle).max()) or 1.0
     centred = (points - middle) / size
-    few = centred[:: 1 + len(centred) // SPREAD]
+    few = centred[:: 1 + len(centred) // 1000]  # they tell the plane that all may lie in
+    flat = 1e-10
     across = np.linalg.svd(few - few.mean(axis=0), full_matrices=False)[2][-1]
     try:
-        if len(points) < 4 or np.ptp(centred @ across) <= FLAT:
+        if len(points) < 4 or np.ptp(centred @ across) <= flat:
             raise QhullError
         found = ConvexHull(centred, qhull_options="Qt")
     except QhullError as error:
         message = "mesh: its vertices lie in a plane; it has no volume. Give a Box as thick as it is"
-        raise ModelError(message, name="vertices", value=len(points), limit=FLAT * size) from error
+        raise ModelError(message, name="vertices", value=len(points), limit=flat * size) from error
     corners, faces = np.unique(found.simplices, return_inverse=True)
     faces = faces.reshape(found.simplices.shape)
     a, b, c = (centred[corners][faces[:, k]] for k in range(3))
@@ -92,12 +84,13 @@ def _convex_hull(points: Array) -> Hull:
     offsets = np.full(len(first), -np.inf)
     np.maximum.at(offsets, same, heights)
     normals = outwards[first]
-    return Hull(frozen(points[corners]), faces, frozen(normals), frozen(size * (offsets + ROUNDING) + normals @ middle))
+    offsets = size * (offsets + 1e-12) + normals @ middle  # out by more than qhull leaves points outside
+    return Hull(frozen(points[corners]), faces, frozen(normals), frozen(offsets))
 
 
 def _distinct(normals: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Each direction once, by where it comes first, and which of these each of them is. Shapes (f,), (k,)."""
-    near = cKDTree(normals).query_pairs(SAME_PLANE, p=np.inf, output_type="ndarray")
+    near = cKDTree(normals).query_pairs(ROUNDING, p=np.inf, output_type="ndarray")
     links = coo_array((np.ones(len(near)), near.T), shape=(len(normals), len(normals)))
     _, same = connected_components(links, directed=False)
     first = np.unique(same, return_index=True)[1]

@@ -19,11 +19,11 @@ import numpy as np
 
 from models.arrays import Array, checked_text
 from models.errors import ModelError
-from models.input_files import UnfitFile, read_regular
+from models.input_files import INPUT_LIMITS, UnfitFile, read_regular
 from models.shapes.collada import read_collada
-from models.shapes.triangles import MOST_BYTES, MOST_FACES, Faces, Triangles, bare, lines_of, numbers, wrong
+from models.shapes.triangles import Faces, Triangles, bare, lines_of, numbers, wrong
 
-STL_HEAD, STL_FACE = 84, 50  # bytes
+STL_HEAD = 84  # bytes
 RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 
@@ -109,7 +109,7 @@ def read_painted_mesh(path: str | os.PathLike[str]) -> Triangles:
 
     Raises:
         ModelError: No such file, an unknown ending, contents that are not the format's (with the line or element),
-            no triangle, more than MOST_BYTES or MOST_FACES.
+            no triangle, more than INPUT_LIMITS.
     """
     if not isinstance(path, str | os.PathLike):
         raise ModelError(f"mesh: path must be a path, not {path!r}", name="path", value=path)
@@ -119,7 +119,9 @@ def read_painted_mesh(path: str | os.PathLike[str]) -> Triangles:
         message = f"mesh {str(file)!r}: only the endings {', '.join(READERS)} are read; convert the file to one of them"
         raise ModelError(message, name=str(file), value=file.suffix, limit=tuple(READERS))
     try:
-        data = read_regular(file, MOST_BYTES["binary" if file.suffix.lower() == ".stl" else "text"])
+        data = read_regular(
+            file, INPUT_LIMITS.mesh_bytes if file.suffix.lower() == ".stl" else INPUT_LIMITS.mesh_text_bytes
+        )
     except (OSError, ValueError) as error:
         size, most = (error.value, error.limit) if isinstance(error, UnfitFile) else (path, None)
         reason = getattr(error, "strerror", None) or error
@@ -142,14 +144,14 @@ def read_painted_mesh(path: str | os.PathLike[str]) -> Triangles:
 def _read_stl(file: Path, data: bytes) -> Triangles:
     """A text begins with "solid", but so do binary files of some programs: the count of triangles decides."""
     count = int.from_bytes(data[STL_HEAD - 4 : STL_HEAD], "little") if len(data) >= STL_HEAD else -1
-    exact = count >= 0 and len(data) == STL_HEAD + STL_FACE * count
+    exact = count >= 0 and len(data) == STL_HEAD + RECORD.itemsize * count
     if not exact and data[:512].lstrip()[:5].lower() == b"solid":
         return _read_stl_text(file, data)
-    if count < 0 or len(data) < STL_HEAD + STL_FACE * count:
+    if count < 0 or len(data) < STL_HEAD + RECORD.itemsize * count:
         message = f"it is no STL text and, as binary, cut off: {len(data)} bytes, {max(count, 0)} triangles announced"
-        raise wrong(file, message, len(data), STL_HEAD + STL_FACE * max(count, 0))
-    if count > MOST_FACES:
-        raise wrong(file, f"it has {count} triangles", count, MOST_FACES)
+        raise wrong(file, message, len(data), STL_HEAD + RECORD.itemsize * max(count, 0))
+    if count > INPUT_LIMITS.mesh_triangles:
+        raise wrong(file, f"it has {count} triangles", count, INPUT_LIMITS.mesh_triangles)
     corners = np.frombuffer(data, RECORD, count, STL_HEAD)["corners"].reshape(-1, 3).astype(float)
     return _joined(corners)
 
@@ -171,8 +173,8 @@ def _read_stl_text(file: Path, data: bytes) -> Triangles:
             if corners != 3:
                 raise wrong(file, f"line {number}: a facet of {corners} corners", corners, 3)
             corners = 0
-            if len(places) > 9 * MOST_FACES:
-                raise wrong(file, f"line {number}: too many triangles", len(places) // 9, MOST_FACES)
+            if len(places) > 9 * INPUT_LIMITS.mesh_triangles:
+                raise wrong(file, f"line {number}: too many triangles", len(places) // 9, INPUT_LIMITS.mesh_triangles)
     if corners:
         raise wrong(file, f"line {last}: the file ends within a facet", corners)
     return _joined(np.array(places).reshape(-1, 3))
@@ -213,8 +215,8 @@ def _read_obj(file: Path, data: bytes) -> Triangles:
         for one, other in pairwise(corners[1:]):
             faces.extend((corners[0], one, other))
             paints.append(paint)
-        if len(paints) > MOST_FACES:
-            raise wrong(file, f"{place}: too many triangles", len(paints), MOST_FACES)
+        if len(paints) > INPUT_LIMITS.mesh_triangles:
+            raise wrong(file, f"{place}: too many triangles", len(paints), INPUT_LIMITS.mesh_triangles)
     found = np.array(faces, dtype=np.intp).reshape(-1, 3)
     if found.size and found.max() >= count:
         raise wrong(file, f"a face names vertex {int(found.max()) + 1} of {count}", int(found.max()) + 1)
@@ -225,7 +227,7 @@ def _read_obj(file: Path, data: bytes) -> Triangles:
 def _library(file: Path, name: str) -> Iterator[tuple[str, Array]]:
     """Names and diffuse colours of a library of materials beside an OBJ file; nothing where it cannot be read."""
     try:
-        data = read_regular(file.parent / name, MOST_BYTES["text"])
+        data = read_regular(file.parent / name, INPUT_LIMITS.mesh_text_bytes)
     except (OSError, ValueError):
         return
     lines = data.decode("utf-8", errors="replace").splitlines()

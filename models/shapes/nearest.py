@@ -12,16 +12,12 @@ import numpy as np
 
 __all__ = ["gap_along", "is_box", "nearest_directions"]
 
-ITERATIONS = 64
 CLOSE = 1e-12
 """Relative: the distance is found when the gap along its direction is no less by more."""
 FLAT = 1e-14
 """Of the squares of the edges: a triangle or tetrahedron of less content is none."""
-FIRSTS, SECONDS = np.array([0, 0, 1]), np.array([1, 2, 2])
+FIRSTS, SECONDS = np.triu_indices(3, 1)
 """Of three edges the pairs."""
-NEXT, LAST = [1, 2, 0], [2, 0, 1]
-SIGNS = np.array([-1.0, 1.0, -1.0])
-"""With the normals of pairs (1, 2), (0, 2), (0, 1): of a place among three edges (Cramer)."""
 
 
 def gap_along(direction: np.ndarray, one: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -128,7 +124,7 @@ def _between_hulls(one: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.n
     a, b = np.repeat(here[:, None], 4, axis=1), np.repeat(there[:, None], 4, axis=1)
     found = there - here
     towards = found.copy()
-    for _ in range(ITERATIONS):
+    for _ in range(64):  # a few are enough, but for rounding
         if not active.size:
             break
         rows = np.arange(active.size)
@@ -181,7 +177,8 @@ def _weights(w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     valid[:, 4:7] = sound & (s > 0) & (t > 0) & (s + t < 1)
     content = (edges[:, 0] * normals[:, 2]).sum(axis=1)
     full = content**2 > FLAT * squares.prod(axis=1)
-    inside = (normals @ last[:, :, None])[:, ::-1, 0] * SIGNS / np.where(full, content, 1.0)[:, None]
+    inside = (normals @ last[:, :, None])[:, ::-1, 0] * [-1.0, 1.0, -1.0]
+    inside /= np.where(full, content, 1.0)[:, None]  # Cramer: the normals are those of edges 12, 02 and 01
     shares[:, 7, :3], valid[:, 7] = inside, full & (inside > 0).all(axis=1) & (inside.sum(axis=1) < 1)
     shares[:, :, 3] = 1 - shares[:, :, :3].sum(axis=2)
     means = shares @ w
@@ -196,7 +193,8 @@ def _weights(w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _cross(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Of vectors, their entries last; with less ado than numpy's own."""
-    return np.asarray(one[..., NEXT] * other[..., LAST] - one[..., LAST] * other[..., NEXT])
+    i, j = [1, 2, 0], [2, 0, 1]
+    return np.asarray(one[..., i] * other[..., j] - one[..., j] * other[..., i])
 
 
 def _least_overlap(one: np.ndarray, other: np.ndarray, boxes: tuple[bool, bool]) -> np.ndarray:

@@ -49,8 +49,6 @@ class Reason(StrEnum):
 NEIGHBOURS, RIGID, ALWAYS, COVERED, NEVER, SRDF, TOLD, STILL = Reason
 ASSUMED = (ALWAYS, COVERED)
 """Reasons that no proof stands behind: bodies touch in each of many configurations."""
-LIMITLESS = 1.0
-"""m: how far a prismatic joint without limits is moved to see whether bodies always touch."""
 SURE = 1e-6
 """m: more than rounding takes away from a proof of distance."""
 
@@ -236,7 +234,7 @@ def _disabled(robot: Robot, source: str | os.PathLike[str]) -> list[frozenset[st
 def _postures(robot: Robot, low: Array, high: Array, count: int, rng: np.random.Generator) -> Array:
     """Random joint vectors within limits. Shape (count, dof)."""
     slides = np.array([joint.kind == "prismatic" for joint in robot.moving_joints], dtype=bool)
-    room = np.where(slides, LIMITLESS, np.pi)
+    room = np.where(slides, 1.0, np.pi)  # m, rad: how far joints without limits are moved
     first = np.where(np.isfinite(low), low, np.where(np.isfinite(high), high - 2 * room, -room))
     last = np.where(np.isfinite(high), high, first + 2 * room)
     return np.asarray(first + (last - first) * rng.random((count, robot.dof)))  # uniform refuses 0.0 to -0.0

@@ -12,13 +12,9 @@ from numpy.typing import NDArray
 
 from models.arrays import Array
 from models.errors import ModelError
+from models.input_files import INPUT_LIMITS
 
 Faces: TypeAlias = NDArray[np.intp]
-
-MOST_BYTES = {"binary": 2**28, "text": 2**26}
-"""Of a file: numbers in a text take several times their bytes while they are read."""
-MOST_FACES = 2**22
-"""Of a mesh, after all its instances in a scene are placed."""
 
 
 class Triangles(NamedTuple):
@@ -57,9 +53,9 @@ def wrong(file: Path, what: str, value: object = None, limit: object = None) -> 
 
 
 def lines_of(file: Path, data: bytes) -> Iterator[tuple[int, str]]:
-    """Numbers from 1 and texts of the lines of a text of at most MOST_BYTES, one after the other."""
-    if len(data) > MOST_BYTES["text"]:
-        raise wrong(file, f"it has {len(data)} bytes of text", len(data), MOST_BYTES["text"])
+    """Numbers from 1 and texts of the lines of a text that is not too long, one after the other."""
+    if len(data) > INPUT_LIMITS.mesh_text_bytes:
+        raise wrong(file, f"it has {len(data)} bytes of text", len(data), INPUT_LIMITS.mesh_text_bytes)
     return enumerate(TextIOWrapper(BytesIO(data), "utf-8", errors="replace"), start=1)
 
 

@@ -19,24 +19,38 @@ from models.arrays import Array
 from models.shapes.mesh_files import find_mesh, read_painted_mesh
 from models.shapes.triangles import Triangles, bare, together
 
-__all__ = ["MOST_FACES", "ZONE", "Appearance", "Part", "appearance_of", "part_of", "rod"]
+__all__ = ["SURFACE_STYLE", "Appearance", "Part", "SurfaceStyle", "appearance_of", "part_of", "rod"]
 
-GREY = (0.72, 0.74, 0.78, 1.0)
-ZONE = (0.55, 0.58, 0.62, 0.22)
-"""Colour of what a link touches with that a description shows nothing of, while it shows others: a zone, no body."""
-ROD = (0.35, 0.38, 0.42, 1.0)
-MOST_FACES = 200_000
-"""Of a robot."""
-FINEST = 2.5e-4
-"""m, the first size of the cells in which corners become one; doubled until the faces are few enough."""
-CREASE = np.cos(np.deg2rad(38.0))
-"""Faces that meet in a sharper edge are not shaded as one surface."""
-MOST_AROUND = 48
-"""Faces at a corner, beyond which each is shaded by itself."""
-ROUND = 32
-"""Sides of what is round."""
-THIN = 0.012
-"""Radius of rods, of the greatest reach of the robot's joints."""
+
+@dataclass(frozen=True)
+class SurfaceStyle:
+    """How surfaces look, and how fine they are.
+
+    Attributes:
+        grey, rod: Colours of links without one, and of links without a shape: red, green, blue, opacity.
+        zone: Of what a link touches with that a description shows nothing of, while it shows others: a zone, no body.
+        most_faces: Of a robot.
+        finest: First size of the cells in which corners become one, m; doubled until the faces are few enough.
+        crease: Faces that meet in a sharper edge are not shaded as one surface, rad.
+        most_around: Faces at a corner, beyond which each is shaded by itself.
+        sides: Of what is round.
+        rod_radius: Of the greatest reach of the robot's joints.
+        patch: Half the side of the piece of a plane that is drawn, of the diagonal of what moves before it.
+    """
+
+    grey: tuple[float, ...] = (0.72, 0.74, 0.78, 1.0)
+    rod: tuple[float, ...] = (0.35, 0.38, 0.42, 1.0)
+    zone: tuple[float, ...] = (0.55, 0.58, 0.62, 0.22)
+    most_faces: int = 200_000
+    finest: float = 2.5e-4
+    crease: float = np.deg2rad(38.0)
+    most_around: int = 48
+    sides: int = 32
+    rod_radius: float = 0.012
+    patch: float = 0.8
+
+
+SURFACE_STYLE = SurfaceStyle()
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +85,7 @@ class Appearance:
 
 
 def appearance_of(
-    robot: Robot, folders: Sequence[Any] = (), *, meshes: bool = True, most: int = MOST_FACES
+    robot: Robot, folders: Sequence[Any] = (), *, meshes: bool = True, most: int = SURFACE_STYLE.most_faces
 ) -> Appearance:
     """The surfaces of a robot's links.
 
@@ -88,7 +102,9 @@ def appearance_of(
         shown = _shown(link.visuals, folders, meshes, missing)
         if not shown:  # what a description that shows others leaves out is a zone rather than a body
             zone = dressed and not link.visuals
-            shown = _shown(link.collisions, folders, meshes, missing, ZONE if zone else GREY)
+            shown = _shown(
+                link.collisions, folders, meshes, missing, SURFACE_STYLE.zone if zone else SURFACE_STYLE.grey
+            )
         found += [(link.name, triangles) for triangles in shown]
     seen = {name for name, _ in found}
     found += [(name, rod) for name, rod in _rods(robot, seen)]
@@ -100,7 +116,7 @@ def _shown(
     folders: Sequence[Any],
     meshes: bool,
     missing: dict[str, str],
-    plain: tuple[float, ...] = GREY,
+    plain: tuple[float, ...] = SURFACE_STYLE.grey,
 ) -> list[Triangles]:
     """The shapes of a link as triangles, in its frame."""
     found = []
@@ -138,7 +154,7 @@ def _triangles(shape: CollisionShape, folders: Sequence[Any]) -> Triangles:
         half = size[1] / 2
         return _turned(np.array([[0.0, -half], [size[0], -half], [size[0], half], [0.0, half]]))
     half = size[1] / 2 if shape.kind == "capsule" else 0.0
-    angles = np.linspace(-np.pi / 2, 0, ROUND // 4 + 1)
+    angles = np.linspace(-np.pi / 2, 0, SURFACE_STYLE.sides // 4 + 1)
     cap = np.column_stack([np.cos(angles), np.sin(angles)]) * size[0]
     upper = cap[::-1] * [1, -1] + [0, half]
     return _turned(np.concatenate([cap - [0, half], upper if half else upper[1:]]))
@@ -146,13 +162,14 @@ def _triangles(shape: CollisionShape, folders: Sequence[Any]) -> Triangles:
 
 def _turned(profile: Array) -> Triangles:
     """What a line of (radius, z), (k, 2), from the axis to the axis, sweeps as it turns about z."""
-    angle = np.arange(ROUND) * (2 * np.pi / ROUND)
+    sides = SURFACE_STYLE.sides
+    angle = np.arange(sides) * (2 * np.pi / sides)
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     radii, heights = profile[:, 0], profile[:, 1]
-    points = np.concatenate([radii[:, None, None] * ring, np.tile(heights[:, None, None], (1, ROUND, 1))], axis=2)
-    k, i = (part.ravel() for part in np.meshgrid(np.arange(len(profile) - 1), np.arange(ROUND), indexing="ij"))
-    a, b = k * ROUND + i, k * ROUND + (i + 1) % ROUND
-    quads = np.stack([a, b, b + ROUND, a + ROUND], axis=1)
+    points = np.concatenate([radii[:, None, None] * ring, np.tile(heights[:, None, None], (1, sides, 1))], axis=2)
+    k, i = (part.ravel() for part in np.meshgrid(np.arange(len(profile) - 1), np.arange(sides), indexing="ij"))
+    a, b = k * sides + i, k * sides + (i + 1) % sides
+    quads = np.stack([a, b, b + sides, a + sides], axis=1)
     return bare(points.reshape(-1, 3), np.concatenate([quads[:, :3], quads[:, [0, 2, 3]]]))
 
 
@@ -168,7 +185,7 @@ def rod(start: Array, end: Array, radius: float) -> Triangles:
     half = length / 2
     profile = np.array([[0.0, -half], [radius, -half], [radius, half], [0.0, half]])
     vertices, faces, _ = _turned(profile)
-    return Triangles(vertices @ turn.T + (start + end) / 2, faces, np.tile(ROD, (len(faces), 1)))
+    return Triangles(vertices @ turn.T + (start + end) / 2, faces, np.tile(SURFACE_STYLE.rod, (len(faces), 1)))
 
 
 def _rods(robot: Robot, seen: set[str]) -> list[tuple[str, Triangles]]:
@@ -176,7 +193,7 @@ def _rods(robot: Robot, seen: set[str]) -> list[tuple[str, Triangles]]:
     ends = [(joint.parent, np.asarray(joint.translation, dtype=float)) for joint in robot.joints]
     if robot.tip is not None:
         ends.append((robot.tip, np.asarray(robot.tip_translation, dtype=float)))
-    radius = THIN * max((float(np.linalg.norm(end)) for _, end in ends), default=0.0)
+    radius = SURFACE_STYLE.rod_radius * max((float(np.linalg.norm(end)) for _, end in ends), default=0.0)
     tool = robot.tip if robot.tip is not None and np.any(robot.tip_translation) else None
     moved = {joint.child for joint in robot.joints if joint.moves}
     bare_links = {link.name for link in robot.links if link.name not in seen and (link.name in moved or not seen)}
@@ -190,7 +207,7 @@ def _rods(robot: Robot, seen: set[str]) -> list[tuple[str, Triangles]]:
 
 def _few(found: list[tuple[str, Triangles]], most: int) -> list[tuple[str, Triangles]]:
     """The same, of at most so many faces in all."""
-    size = FINEST
+    size = SURFACE_STYLE.finest
     coarse = found
     while sum(len(one.faces) for _, one in coarse) > most and size < 1.0:
         coarse = [(link, _coarser(one, size)) for link, one in found]
@@ -238,14 +255,14 @@ def part_of(link: str, vertices: Array, faces: NDArray[np.intp], color: Any) -> 
     counts = np.bincount(corners, minlength=len(places))
     starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
     around = counts[corners]
-    few = np.flatnonzero(around <= MOST_AROUND)
+    few = np.flatnonzero(around <= SURFACE_STYLE.most_around)
     mine = np.repeat(few, around[few])  # corners, and beside each those at the same place
     step = np.arange(len(mine)) - np.repeat(np.cumsum(around[few]) - around[few], around[few])
     theirs = order[starts[corners[mine]] + step] // 3
-    smooth = (units[mine // 3] * units[theirs]).sum(axis=1) > CREASE
+    smooth = (units[mine // 3] * units[theirs]).sum(axis=1) > np.cos(SURFACE_STYLE.crease)
     mine, theirs = mine[smooth], theirs[smooth]
     sums = np.stack([np.bincount(mine, areas[theirs, k], len(corners)) for k in range(3)], axis=1)
-    alone = around > MOST_AROUND
+    alone = around > SURFACE_STYLE.most_around
     sums[alone] = units[np.flatnonzero(alone) // 3]
     normals = sums / np.maximum(np.linalg.norm(sums, axis=1), 1e-300)[:, None]
     fine = np.round(normals * 100).astype(np.int64)

@@ -9,7 +9,7 @@ from models import FreeFloating, Standing, momentum, robot_inertia
 from models.arrays import Array
 from models.machines.standing import center_of_pressure
 from models.spatial import cross, rotation_from_quaternion
-from ocp.app.joint_limits import Row, states_along
+from ocp.app.joint_limits import Row, RowVerdict, states_along
 from ocp.app.oddities import Fault
 from ocp.app.pieces import Motion
 from ocp.problem.formulation import Sampler
@@ -38,7 +38,7 @@ def standing_rows(machine: Standing, motion: Motion, friction: float) -> tuple[l
         k = int(value.argmin())
         failed = not value[k] >= least
         time = float(times[k])
-        rows.append(Row(what, float(value[k]), least, unit, time, "FAILED" if failed else "ok", note))
+        rows.append(Row(what, float(value[k]), least, unit, time, RowVerdict.of(failed), note))
         if failed:
             first = float(times[np.flatnonzero(~(value >= least))[0]])
             text = f"{words} at {time:.6g} s, first at {first:.6g} s"
@@ -93,8 +93,8 @@ def floating_base(machine: FreeFloating, motion: Motion) -> tuple[Array, list[Ro
     k, j = int(far.argmax()), int(turns.argmax())
     note = "integrated; momentum is conserved by that"
     rows = [
-        Row("way of the base", float(far[k]), None, "m", float(motion.t[k]), "told", note),
-        Row("turn of the base", float(turns[j]), None, "rad", float(motion.t[j]), "told", note),
+        Row("way of the base", float(far[k]), None, "m", float(motion.t[k]), RowVerdict.TOLD, note),
+        Row("turn of the base", float(turns[j]), None, "rad", float(motion.t[j]), RowVerdict.TOLD, note),
     ]
     return bases, rows
 
@@ -133,7 +133,7 @@ def momentum_rows(machine: FreeFloating, motion: Motion, bases: Array) -> tuple[
         k = int(off.argmax())
         value, time = float(off[k]), float(motion.t[k + 1])
         failed = value > limit
-        rows.append(Row(f"change of {what}", value, limit, unit, time, "FAILED" if failed else "ok", "base as told"))
+        rows.append(Row(f"change of {what}", value, limit, unit, time, RowVerdict.of(failed), "base as told"))
         if failed:
             first = float(motion.t[1:-1][np.flatnonzero(off > limit)[0]])
             change = f"{what} changes by {value:.4g} {unit} at {time:.6g} s"

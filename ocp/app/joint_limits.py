@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -16,14 +18,30 @@ from models import FixedBase, FreeFloating, Robot, inverse_dynamics, simplified
 from models.arrays import Array
 from ocp.app.oddities import Fault
 from ocp.app.pieces import Along, Indices, Motion, highest
+from ocp.audit.audit import Audit
 from ocp.problem.formulation import Sampler
 from ocp.tasks.limits import JointBounds
 
-__all__ = ["ORDERS", "Row", "floating_torques", "limit_rows", "states_along", "torque_rows"]
+__all__ = ["ORDERS", "Row", "RowVerdict", "floating_torques", "limit_rows", "rows_of", "states_along", "torque_rows"]
 
 ORDERS = {"position": "", "velocity": "/s", "acceleration": "/s^2", "jerk": "/s^3"}
-PLACES = (0.0, 0.25, 0.5, 0.75, 1.0)
-"""Of a piece, where torques are looked at."""
+
+
+class RowVerdict(StrEnum):
+    """What is said of what was looked at."""
+
+    OK = "ok"
+    FAILED = "FAILED"
+    UNDECIDED = "not decided"
+    """The file has too few digits, or the proof went not far enough."""
+    UNLIMITED = "unlimited"
+    TOLD = "told"
+    """There is nothing to hold it against."""
+
+    @classmethod
+    def of(cls, failed: Any) -> RowVerdict:
+        """Of what is held against something."""
+        return cls.FAILED if failed else cls.OK
 
 
 @dataclass(frozen=True)
@@ -33,8 +51,7 @@ class Row:
     Attributes:
         name: What was looked at, of which joint or bodies.
         value: The worst found. limit: What it may be; None: nothing limits it. Both in `unit`; time: s.
-        verdict: "ok", "FAILED", "unlimited", "told" (nothing to hold it against) or "not decided" (the file has too few
-            digits to say).
+        verdict: What is said of it.
         note: How it was looked at, where that is not plain.
     """
 
@@ -43,7 +60,7 @@ class Row:
     limit: float | None
     unit: str
     time: float | None
-    verdict: str
+    verdict: RowVerdict
     note: str = ""
 
 
@@ -76,49 +93,81 @@ def limit_rows(
     return rows, faults, unseen
 
 
-def _looked(
-    along: Along, column: int, what: str, name: str, unit: str, low: float, high: float, share: float
-) -> tuple[tuple[float, float | None, str, float | None, str], str, list[Fault]]:
-    """Value, limit, unit, time and verdict of a row, that it is slightly beyond, and the fault it is."""
-    coefficients, t = along.pieces.coefficients[:, :, column], along.pieces.t
-    blur = np.asarray(along.blur)[:, column]
-    room = share * max(abs(one) for one in (low, high) if np.isfinite(one)) if np.isfinite([low, high]).any() else 0.0
-    sides, extra = [], ""
-    for sign, limit, needed in zip((1.0, -1.0), (high, -low), along.needed, strict=True):
-        towards = sign * coefficients
-        most = np.broadcast_to(needed, along.blur.shape)[:, column]
+def rows_of(audit: Audit) -> list[Row]:
+    """The findings of an audit as rows of a table."""
+    verdicts = [RowVerdict.TOLD if f.limit is None else RowVerdict.of(not f.passed) for f in audit.findings]
+    return [
+        Row(f.name, f.value, f.limit, f.unit, f.time, verdict, f.note)
+        for f, verdict in zip(audit.findings, verdicts, strict=True)
+    ]
+
+
+class _Side(NamedTuple):
+    """How far every piece of a curve goes towards one of its two limits: values and limit are times `sign`.
+
+    Attributes:
+        values: Greatest of each piece, at most what any motion through the samples needs. Shape (N,).
+        time: Of the greatest of all. eased: Whether the interpolant itself is beyond where no motion needs to be.
+    """
+
+    sign: float
+    limit: float
+    values: Array
+    time: float
+    eased: bool
+
+    @classmethod
+    def of(cls, along: Along, column: int, sign: float, limit: float, room: float) -> _Side:
+        towards, t = sign * along.pieces.coefficients[:, :, column], along.pieces.t
+        most = np.broadcast_to(along.needed[0 if sign > 0 else 1], along.blur.shape)[:, column]
         ends, enclosed = np.maximum(towards[:, 0], towards[:, -1]), towards.max(axis=1)
         # of a piece whose enclosure is above the greatest end, or beyond the limit, the greatest value is looked for
         above = np.minimum(enclosed, most) > np.minimum(ends, most).max()
         open_ = np.flatnonzero(above | ((enclosed > limit) & (ends <= limit)))
-        value, place = ends.copy(), (towards[:, -1] > towards[:, 0]).astype(float)
+        values, place = ends.copy(), (towards[:, -1] > towards[:, 0]).astype(float)
         if open_.size and towards.shape[1] > 2:
-            value[open_], place[open_] = highest(towards[open_])
-        if (value > np.maximum(most, limit + room)).any():
-            extra = "the interpolant is beyond, which no motion through the samples needs"
-        value = np.minimum(value, most)
-        k = int(value.argmax())
-        time = float(t[k] + place[k] * (t[k + 1] - t[k])) if towards.shape[1] > 1 else float((t[k] + t[k + 1]) / 2)
-        sides.append((value, limit, sign, k, time))
-    worst = max(sides, key=lambda side: side[0][side[3]] - side[1] if np.isfinite(side[1]) else -np.inf)
-    if not np.isfinite(worst[1]):
-        worst = max(sides, key=lambda side: float(side[0][side[3]]))
-    value, limit, sign, k, time = worst
-    found = sign * float(value[k])
-    if not np.isfinite(limit):
-        return (found, None, unit, time, "unlimited"), "", []
-    beyond = [side[0] > side[1] + room for side in sides]
-    sure = [over & (side[0] > side[1] + room + blur) for over, side in zip(beyond, sides, strict=True)]
-    allowed = sign * float(limit)
-    if not (beyond[0] | beyond[1]).any():
-        slight = extra or (f"beyond, by less than the {100 * share:g} % allowed" if value[k] > limit else "")
-        return (found, allowed, unit, time, "ok"), slight, []
-    if not (sure[0] | sure[1]).any():
-        return (found, allowed, unit, time, "not decided"), "", []
-    if not sure[0 if sign > 0 else 1].any():
-        value, limit, sign, k, time = sides[1] if sign > 0 else sides[0]
-        found, allowed = sign * float(value[k]), sign * float(limit)
+            values[open_], place[open_] = highest(towards[open_])
+        eased = bool((values > np.maximum(most, limit + room)).any())
+        values = np.minimum(values, most)
+        k = int(values.argmax())
+        share = place[k] if towards.shape[1] > 1 else 0.5
+        return cls(sign, limit, values, float(t[k] + share * (t[k + 1] - t[k])), eased)
+
+    @property
+    def excess(self) -> float:
+        """Of the greatest value; below zero of one that has no limit, more so than of any that has."""
+        return float(self.values.max() - self.limit)
+
+    @property
+    def found(self) -> float:
+        return self.sign * float(self.values.max())
+
+
+def _looked(
+    along: Along, column: int, what: str, name: str, unit: str, low: float, high: float, share: float
+) -> tuple[tuple[float, float | None, str, float | None, RowVerdict], str, list[Fault]]:
+    """Value, limit, unit, time and verdict of a row, that it is slightly beyond, and the fault it is."""
+    t, blur = along.pieces.t, np.asarray(along.blur)[:, column]
+    room = share * max((abs(one) for one in (low, high) if np.isfinite(one)), default=0.0)
+    sides = [_Side.of(along, column, *one, room) for one in ((1.0, high), (-1.0, -low))]
+    if not np.isfinite([low, high]).any():
+        worst = max(sides, key=lambda side: float(side.values.max()))
+        return (worst.found, None, unit, worst.time, RowVerdict.UNLIMITED), "", []
+    sides.sort(key=lambda side: side.excess, reverse=True)
+    worst = sides[0]
+    beyond = np.any([side.values > side.limit + room for side in sides], axis=0)
+    sure = [side.values > side.limit + room + blur for side in sides]
     over = sure[0] | sure[1]
+    verdict = RowVerdict.FAILED if over.any() else RowVerdict.UNDECIDED if beyond.any() else RowVerdict.OK
+    if verdict is RowVerdict.FAILED and not sure[0].any():
+        worst = sides[1]
+    found, allowed, time = worst.found, worst.sign * worst.limit, worst.time
+    row = found, allowed, unit, time, verdict
+    if verdict != "FAILED":
+        slight = f"beyond, by less than the {100 * share:g} % allowed" if worst.excess > 0 else ""
+        if any(side.eased for side in sides):
+            slight = "the interpolant is beyond, which no motion through the samples needs"
+        return row, slight if verdict is RowVerdict.OK else "", []
     starts = np.flatnonzero(over & ~np.concatenate([[False], over[:-1]]))
     first = float(t[starts[0]])
     between = ", between two samples" if along.closed and time not in t else ""
@@ -126,7 +175,7 @@ def _looked(
     share_over = abs(found) / abs(allowed) - 1 if allowed else np.inf
     much = f", {100 * share_over:.3g} % beyond" if 1e-4 < share_over < 10 else ""
     text = f"{found:.5g} {unit} at {time:.6g} s{between}, limit {allowed:.5g}{much}{stretches}"
-    return (found, allowed, unit, time, "FAILED"), "", [Fault(what, name, text, time, first, found, allowed, unit)]
+    return row, "", [Fault(what, name, text, time, first, found, allowed, unit)]
 
 
 def torque_rows(
@@ -166,11 +215,11 @@ def torque_rows(
         unit, limit = robot.joint(name).effort_unit, float(bounds.torque[k])
         at = int(np.abs(found[:, k]).argmax())
         value, time = float(found[at, k]), float(times[at])
-        verdict = "unlimited"
+        verdict = RowVerdict.UNLIMITED
         if np.isfinite(limit):
             beyond = np.abs(found[:, k]) > limit * (1 + share)
             sure = beyond & (np.abs(found[:, k]) > limit * (1 + share) + blur[k])
-            verdict = "FAILED" if sure.any() else "not decided" if beyond.any() else "ok"
+            verdict = RowVerdict.FAILED if sure.any() else RowVerdict.UNDECIDED if beyond.any() else RowVerdict.OK
             if sure.any():
                 first = float(times[np.flatnonzero(sure)[0]])
                 text = f"{value:.5g} {unit} at {time:.6g} s, limit {limit:.5g}"
@@ -210,8 +259,9 @@ def states_along(motion: Motion) -> tuple[Array, Array, Array, Array]:
         left, right = h[:-1, None], h[1:, None]
         v = (slope[:-1] * right + slope[1:] * left) / (left + right)
         return t[1:-1], motion.q[1:-1], v, 2 * np.diff(slope, axis=0) / (left + right)
-    piece = np.repeat(np.arange(len(h)), len(PLACES))
-    place = np.tile(PLACES, len(h))
+    places = np.linspace(0.0, 1.0, 5)
+    piece = np.repeat(np.arange(len(h)), len(places))
+    place = np.tile(places, len(h))
     q, v, a = (one.within(piece, place) for one in (motion.position, motion.velocity, motion.acceleration))
     least = np.broadcast_to(motion.needed("acceleration")[0], (len(h), a.shape[1]))[piece]
     return t[piece] + place * h[piece], q, v, np.clip(a, -least, least)

@@ -13,6 +13,7 @@ from models import HalfSpace
 from models.arrays import Array
 from models.shapes.hull import convex_hull
 from models.shapes.shapes import Shape
+from ocp.app.appearance import SURFACE_STYLE
 from ocp.audit.clearance import placements_along
 from ocp.planning import Plan
 from ocp.problem.problem import Problem
@@ -23,8 +24,6 @@ __all__ = ["Obstacle", "Solid", "looks_of", "obstacles_of", "of_shapes"]
 
 Solid = tuple[Array, NDArray[np.intp]]
 """Corners (k, 3), m, and triangles of them (f, 3)."""
-PATCH = 0.8
-"""Half the side of the piece of a plane that is drawn, of the diagonal of what moves before it."""
 
 
 class Obstacle(NamedTuple):
@@ -59,7 +58,7 @@ class Obstacle(NamedTuple):
         middle = middle - self.normal * (self.normal @ (middle - self.core[0]))
         one = np.cross(self.normal, np.eye(3)[int(np.abs(self.normal).argmin())])
         one /= np.linalg.norm(one)
-        sides = PATCH * float(np.linalg.norm(high - low)) * np.stack([one, np.cross(self.normal, one)])
+        sides = SURFACE_STYLE.patch * float(np.linalg.norm(high - low)) * np.stack([one, np.cross(self.normal, one)])
         return middle + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) @ sides, np.array([[0, 1, 2], [0, 2, 3]])
 
 

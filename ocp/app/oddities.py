@@ -20,19 +20,36 @@ from ocp.app.pieces import Indices, Motion, half_digits
 from ocp.errors import ProblemError
 from ocp.files import RawTrajectory
 
-__all__ = ["SMALL_UNITS", "Fault", "Readable", "likely_unit", "readable"]
+__all__ = ["SMALL_UNITS", "THRESHOLDS", "Fault", "OddityThresholds", "Readable", "likely_unit", "readable"]
 
-WILD = 1.5
-"""Of a limit, and 1 rad or m more: beyond that a position is hardly one of these units."""
-LEAP = 10.0
-"""Times how far the steps around it differ: a step that is a jump, if it is twice as long, too."""
-HARDEST = 50.0
-"""rad/s^2, m/s^2: a step that takes more, alone among others, is a jump; arms of industry give up to about 30."""
-LONGEST_STEP = 1000.0
-"""s between samples: no controller waits so long."""
+
+@dataclass(frozen=True)
+class OddityThresholds:
+    """From where on a file is doubted.
+
+    Attributes:
+        wild: Of a limit, and 1 rad or m more: a position beyond is hardly in rad or m.
+        leap: Times how far the steps around it differ: a step that is a jump, if it is twice as long as they, too.
+        hardest: Acceleration that a lone step takes, rad/s^2 or m/s^2: arms of industry give up to about 30.
+        around: Steps before and after one with which it is compared: enough for a median that one outlier leaves.
+        longest_step: Time between samples, s: no controller waits so long.
+        tip_samples: Samples at which the tip is compared with that of exchanged joints.
+        straight, even: The tip's distance from a line over its length, and the relative spread of its speed, below
+            which it goes straight or keeps its speed: far below what joints make by chance.
+    """
+
+    wild: float = 1.5
+    leap: float = 10.0
+    hardest: float = 50.0
+    around: int = 3
+    longest_step: float = 1000.0
+    tip_samples: int = 65
+    straight: float = 3e-4
+    even: float = 5e-4
+
+
+THRESHOLDS = OddityThresholds()
 SMALL_UNITS = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
-AROUND = 3
-"""Steps before and after one with which it is compared."""
 FACTORS = {
     180 / np.pi: "degrees per second",
     np.pi / 180: "radians per second where the positions are degrees",
@@ -265,11 +282,11 @@ def likely_unit(t: Array, q: Array, velocity: Array) -> tuple[str, float]:
 
 def _in_seconds(t: Array, q: Array, velocity: Array, faults: list[Fault]) -> Array:
     """The times; in seconds where they are whole numbers that far apart that they must be in a smaller unit."""
-    if len(t) < 3 or not (t == np.rint(t)).all() or (step := float(np.median(np.diff(t)))) < LONGEST_STEP:
+    if len(t) < 3 or not (t == np.rint(t)).all() or (step := float(np.median(np.diff(t)))) < THRESHOLDS.longest_step:
         return t
     unit = likely_unit(t, q, velocity)[0] or ("nanoseconds" if step >= 1e5 else "microseconds")
     words = f"times look like {unit}: whole numbers, {step:.6g} apart; what follows is of times in {unit}"
-    faults.append(Fault("units", "time", words, None, None, step, LONGEST_STEP, "s"))
+    faults.append(Fault("units", "time", words, None, None, step, THRESHOLDS.longest_step, "s"))
     return t / SMALL_UNITS[unit]
 
 
@@ -283,51 +300,57 @@ def _in_units(
     limits: tuple[Array, Array, Array],
     faults: list[Fault],
 ) -> tuple[Array, Array | None, Array | None]:
-    """Positions, velocities and accelerations, of joints that look like degrees or millimetres in rad and m.
+    """Positions, velocities and accelerations, of joints that look like degrees or millimetres in rad and m."""
+    lower, upper, _ = limits
+    most, scale = np.maximum(np.abs(lower), np.abs(upper)), np.ones(len(names))
+    room = 0.05 * np.where(np.isfinite(most), upper - lower, 1.0)
 
-    Joints without position limits may turn on for ever: they are judged by how fast they would be.
-    """
-    lower, upper, velocity = limits
-    far = np.abs(q).max(axis=0)
-    most = np.maximum(np.abs(lower), np.abs(upper))
-    scale = np.ones(len(names))
-    turning = [k for k, kind in enumerate(kinds) if kind != "prismatic"]
-    limited = [k for k in turning if np.isfinite(most[k])]
-    in_degrees = q * np.pi / 180
-    room = np.asarray(0.05 * np.where(np.isfinite(most), upper - lower, 1.0))
-    fits: Any = ((in_degrees >= lower - room) & (in_degrees <= upper + room)).all(axis=0)
-    wild = [k for k in limited if far[k] > max(WILD * most[k] + 1, 2 * np.pi)]
-    moving = [k for k in limited if np.ptp(q[:, k]) > 0 or far[k] > 0]
-    if limited:
-        suspected = bool(wild) and 2 * len(wild) >= len(moving) and all(fits[k] for k in limited)
-    else:
-        fast = np.zeros(len(names))
-        if len(t) > 1:
-            fast = np.median(np.abs(np.diff(np.unwrap(q, axis=0), axis=0)) / np.diff(t)[:, None], axis=0)
-        wild = [k for k in turning if fast[k] > velocity[k]]
-        calm = all(fast[k] * np.pi / 180 <= velocity[k] for k in turning)
-        suspected = bool(wild) and 2 * len(wild) >= len(turning) and calm and far.max() > 2 * np.pi
-    if suspected:
-        k = max(wild, key=lambda k: far[k])
+    def doubt(k: int, unit: str, why: str, plain: str) -> None:
         at = int(np.abs(q[:, k]).argmax())
         words = (
-            f"positions look like degrees: it is at {q[at, k]:.5g} at {t[at]:.6g} s, which in rad is beyond any limit, "
-            "and in degrees all joints keep theirs; what follows is of the motion in degrees, taken as such"
+            f"positions look like {unit}: {q[at, k]:.5g} at {t[at]:.6g} s, {why}; what follows is of the motion in "
+            f"{unit}, taken as such"
         )
-        faults.append(Fault("units", names[k], words, float(t[at]), None, float(q[at, k]), float(most[k]), "rad"))
+        faults.append(Fault("units", names[k], words, float(t[at]), None, float(q[at, k]), float(most[k]), plain))
+
+    turning = [k for k, kind in enumerate(kinds) if kind != "prismatic"]
+    worst = _worst_in_degrees(t, q, turning, limits, room)
+    if worst is not None:
+        doubt(worst, "degrees", "which in rad is beyond any limit, and in degrees all joints keep theirs", "rad")
         scale[turning] = np.pi / 180
     for k, kind in enumerate(kinds):
-        if kind == "prismatic" and np.isfinite(most[k]) and far[k] > max(10 * most[k], 1.0):
-            in_m = q[:, k] * 1e-3
-            if (in_m >= lower[k] - room[k]).all() and (in_m <= upper[k] + room[k]).all():
-                at = int(np.abs(q[:, k]).argmax())
-                words = (
-                    f"positions look like millimetres: {q[at, k]:.5g} at {t[at]:.6g} s, limits {lower[k]:g} .. "
-                    f"{upper[k]:g} m; what follows is of the motion in mm, taken as such"
-                )
-                faults.append(Fault("units", names[k], words, float(t[at]), None, float(q[at, k]), float(most[k]), "m"))
-                scale[k] = 1e-3
+        in_m, far = q[:, k] * 1e-3, np.abs(q[:, k]).max()
+        fits = ((in_m >= lower[k] - room[k]) & (in_m <= upper[k] + room[k])).all()
+        if kind == "prismatic" and np.isfinite(most[k]) and far > max(10 * most[k], 1.0) and fits:
+            doubt(k, "millimetres", f"limits {lower[k]:g} .. {upper[k]:g} m", "m")
+            scale[k] = 1e-3
     return q * scale, None if v is None else v * scale, None if a is None else a * scale
+
+
+def _worst_in_degrees(
+    t: Array, q: Array, turning: Sequence[int], limits: tuple[Array, Array, Array], room: Array
+) -> int | None:
+    """The joint that is farthest beyond what is possible in rad, where all are possible in degrees.
+
+    At least half of the joints that move must be so. Those without position limits may turn on for ever: where no joint
+    has any, they are judged by how fast they would be.
+    """
+    lower, upper, velocity = limits
+    far, most, in_degrees = np.abs(q).max(axis=0), np.maximum(np.abs(lower), np.abs(upper)), np.deg2rad(q)
+    limited = [k for k in turning if np.isfinite(most[k])]
+    if limited:
+        wild = [k for k in limited if far[k] > max(THRESHOLDS.wild * most[k] + 1, 2 * np.pi)]
+        moving = [k for k in limited if np.ptp(q[:, k]) > 0 or far[k] > 0]
+        inside = (in_degrees >= lower - room) & (in_degrees <= upper + room)
+        possible = bool(inside[:, limited].all())
+    else:
+        fast = np.zeros(q.shape[1])
+        if len(t) > 1:
+            fast = np.median(np.abs(np.diff(np.unwrap(q, axis=0), axis=0)) / np.diff(t)[:, None], axis=0)
+        wild, moving = [k for k in turning if fast[k] > velocity[k]], list(turning)
+        possible = all(np.deg2rad(fast[k]) <= velocity[k] for k in turning) and far.max() > 2 * np.pi
+    suspected = wild and 2 * len(wild) >= len(moving) and possible
+    return max(wild, key=lambda k: far[k]) if suspected else None
 
 
 def _unwrapped(
@@ -343,7 +366,7 @@ def _unwrapped(
         on, steps = np.unwrap(q[:, k]), np.diff(q[:, k])
         leaps = np.abs(np.diff(on) - steps) > np.pi
         if kind != "continuous":
-            swift = (np.abs(steps) > velocity[k] * h) | (np.abs(steps) > HARDEST * h**2)
+            swift = (np.abs(steps) > velocity[k] * h) | (np.abs(steps) > THRESHOLDS.hardest * h**2)
             leaps &= swift & (np.abs(np.diff(on)) < 0.5)
             on = q[:, k] - np.cumsum([0.0, *np.where(leaps, steps - np.diff(on), 0.0)])
             if on.min() < lower[k] or on.max() > upper[k]:
@@ -382,9 +405,8 @@ def _time_by_velocities(t: Array, q: Array, v: Array | None, names: Sequence[str
         for unit, power in SMALL_UNITS.items():
             if abs(whole / power - 1) < 0.1:
                 words = f"times look like {unit}: velocities are {whole:.4g} times those of the positions over them"
-                faults.append(
-                    Fault("units", "time", f"{words}; what follows is of times in {unit}", None, value=float(whole))
-                )
+                words += f"; what follows is of times in {unit}"
+                faults.append(Fault("units", "time", words, value=float(whole)))
                 return t / power
     for k, ratio in ratios.items():
         near = next((words for factor, words in FACTORS.items() if abs(ratio / factor - 1) < 0.1), "")
@@ -392,9 +414,7 @@ def _time_by_velocities(t: Array, q: Array, v: Array | None, names: Sequence[str
         if np.isnan(ratio):
             words = "velocities are not those of its positions"
         else:
-            words = f"velocities are {ratio:.4g} times those of its positions" + (
-                f": they look like {near}" if near else ""
-            )
+            words = f"velocities are {ratio:.4g} times those of its positions" + (near and f": they look like {near}")
         text = f"{words}, most so at {t[at]:.6g} s: {told[at, k]:.4g} told, {by_positions[at, k]:.4g} by positions"
         kind = "units" if near else "velocities"
         found = float(told[at, k]), float(by_positions[at, k])
@@ -412,17 +432,17 @@ def _jumps(
     count = len(h)
     if count < 3:
         return
-    digits = half_digits(q)
-    places = np.arange(count)[:, None] + np.array([d for d in range(-AROUND, AROUND + 1) if d])
+    digits, around = half_digits(q), THRESHOLDS.around
+    places = np.arange(count)[:, None] + np.array([d for d in range(-around, around + 1) if d])
     inside = (places >= 0) & (places < count)
     for k, name in enumerate(names):
-        around = np.where(inside, speeds[np.clip(places, 0, count - 1), k], np.nan)
-        usual = np.nanmedian(around, axis=1)
-        spread = np.nanmedian(np.abs(around - usual[:, None]), axis=1)
+        beside = np.where(inside, speeds[np.clip(places, 0, count - 1), k], np.nan)
+        usual = np.nanmedian(beside, axis=1)
+        spread = np.nanmedian(np.abs(beside - usual[:, None]), axis=1)
         off = np.abs(speeds[:, k] - usual)
         spread = np.maximum(spread, np.median(off))  # of noise
-        tall = (off > LEAP * spread) & (off > np.abs(usual))
-        tall &= (off / h > HARDEST) | (np.abs(speeds[:, k]) > velocity[k])
+        tall = (off > THRESHOLDS.leap * spread) & (off > np.abs(usual))
+        tall &= (off / h > THRESHOLDS.hardest) | (np.abs(speeds[:, k]) > velocity[k])
         tall &= off * h > np.maximum(6 * digits[k], 1e-6 * max(1.0, float(np.abs(q[:, k]).max())))
         where = np.flatnonzero(tall)
         if not where.size:
@@ -435,19 +455,9 @@ def _jumps(
             + (", a whole turn: it was wrapped, and this joint cannot turn on" if turn else "")
             + (f"; {len(where)} such steps, the first at {t[where[0]]:.6g} s" if len(where) > 1 else "")
         )
-        usual_step = float(abs(usual[worst]) * h[worst])
-        faults.append(
-            Fault(
-                "jump",
-                name,
-                words,
-                float(t[worst + 1]),
-                float(t[where[0] + 1]),
-                float(steps[worst, k]),
-                usual_step,
-                unit,
-            )
-        )
+        times = float(t[worst + 1]), float(t[where[0] + 1])
+        step, usual_step = float(steps[worst, k]), float(abs(usual[worst]) * h[worst])
+        faults.append(Fault("jump", name, words, *times, step, usual_step, unit))
 
 
 def _followers(raw: RawTrajectory, robot: Robot, rows: Indices, faults: list[Fault]) -> None:
@@ -464,8 +474,6 @@ def _followers(raw: RawTrajectory, robot: Robot, rows: Indices, faults: list[Fau
         k = int(np.nanargmax(off)) if np.isfinite(off).any() else 0
         room = 1e-3 * max(1e-3, float(np.nanmax(np.abs(told), initial=0.0)))
         if not off[k] <= room:
-            words = (
-                f"follows {leader} and is {off[k]:.4g} {joint.unit} from where that takes it at {raw.t[rows[k]]:.6g} s"
-            )
             time = float(raw.t[rows[k]])
+            words = f"follows {leader} and is {off[k]:.4g} {joint.unit} from where that takes it at {time:.6g} s"
             faults.append(Fault("follower", joint.name, words, time, time, float(off[k]), room, joint.unit))

@@ -15,23 +15,11 @@ from ocp.app.colors import COMPARED, FAULT, LIMIT, PLAN, SURROUNDINGS, TIP
 from ocp.app.frames import frames_along
 from ocp.app.obstacles import Obstacle
 from ocp.app.pieces import Motion
-from ocp.app.rendering import Camera, Floor, Layer, placed, render, tube
+from ocp.app.rendering import PICTURE_STYLE, Camera, Floor, Layer, placed, render, tube
 from ocp.tasks.limits import JointBounds
 
 __all__ = ["STYLE", "add_names", "as_svg", "curves", "draw_joints", "look", "scene", "show_limits"]
 
-SHOWN = 4
-"""Times at which the robot is shown."""
-POINTS = 400
-"""Of a curve."""
-FAR = 1.5
-"""Of the span of a curve: limits further from it would leave nothing of its shape to see."""
-NOTHING = 1e-3
-"""Of the largest value of a kind: what changes by less is rounding."""
-PIXELS, LINE = (960, 680), 0.003
-"""Of a rendered picture; and radius of a line in it, of the size of what it shows."""
-WIDTH = 7.4
-"""Of a picture, inches."""
 STYLE: Any = {"font.size": 7.5, "axes.titlesize": 8.5, "axes.spines.top": False, "axes.spines.right": False}
 STYLE |= {"text.parse_math": False}  # a dollar in a joint's name is a dollar
 DASHES: tuple[Any, ...] = ((0, (1, 1)), (0, (5, 1.5)), (0, (4, 1.2, 1, 1.2)))
@@ -48,11 +36,11 @@ def scene(
     from matplotlib.colors import to_rgb
     from matplotlib.image import imsave
 
-    times = np.linspace(motion.t[0], motion.t[-1], POINTS)
+    times = np.linspace(motion.t[0], motion.t[-1], PICTURE_STYLE.curve_points)
     places = None if bases is None else np.column_stack([np.interp(times, motion.t, column) for column in bases.T])
     frames = frames_along(machine, motion.position.at(times), places)
     looks = appearance_of(machine.robot, folders)
-    shown = [placed(looks, frames, int(k)) for k in np.linspace(0, POINTS - 1, SHOWN)]
+    shown = [placed(looks, frames, int(k)) for k in np.linspace(0, PICTURE_STYLE.curve_points - 1, PICTURE_STYLE.poses)]
     clouds = [part.vertices for parts in shown for part in parts]
     before, still = np.vstack(clouds), []
     for one in around:
@@ -68,11 +56,11 @@ def scene(
     low, high = cloud.min(axis=0), cloud.max(axis=0)
     size = float((high - low).max())
     if machine.robot.tip is not None:
-        still.append(tube(frames.tip, LINE * size, to_rgb(TIP)))
+        still.append(tube(frames.tip, PICTURE_STYLE.line * size, to_rgb(TIP)))
     pale = [Layer(parts, 0.12 + 0.08 * k, to_rgb(PLAN)) for k, parts in enumerate(shown[:-1])]
     floor = None if machine.base_size else Floor(low[2], tuple((low + high)[:2] / 2), 1.1 * size, 0.1)
     layers = [Layer(shown[-1]), Layer(still), *pale]
-    picture = render(layers, Camera.around(cloud, PIXELS), floor=floor)
+    picture = render(layers, Camera.around(cloud, PICTURE_STYLE.size), floor=floor)
     stream = io.BytesIO()
     imsave(stream, picture, format="png")
     return stream.getvalue()
@@ -84,7 +72,7 @@ def curves(
     """Position, velocity and acceleration of every joint with its limits, and where faults are; an SVG."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(WIDTH, 0.4 + 1.15 * len(names)), layout="constrained")
+    figure = Figure(figsize=(PICTURE_STYLE.width, 0.4 + 1.15 * len(names)), layout="constrained")
     draw_joints(figure, {"": motion}, names, units, bounds, faults)
     return as_svg(figure)
 
@@ -109,13 +97,17 @@ def draw_joints(
         for column, (kind, per) in enumerate(kinds):
             drawn = []
             for number, motion in reversed([*enumerate(motions.values())]):  # the plan on top
-                spread = motion.t[:: len(motion.t) // POINTS + 1]
-                times = np.unique(np.concatenate([np.linspace(motion.t[0], motion.t[-1], POINTS), spread]))
+                spread = motion.t[:: len(motion.t) // PICTURE_STYLE.curve_points + 1]
+                times = np.unique(
+                    np.concatenate([np.linspace(motion.t[0], motion.t[-1], PICTURE_STYLE.curve_points), spread])
+                )
                 one = motion.along(kind)
                 drawn.append((number, times, None if one is None else one.pieces.at(times)))
             most = getattr(bounds, kind, None)
             lower, upper = (bounds.lower, bounds.upper) if most is None else (-most, most)
-            least = NOTHING * max((np.abs(values).max() for _, _, values in drawn if values is not None), default=1.0)
+            least = PICTURE_STYLE.flat * max(
+                (np.abs(values).max() for _, _, values in drawn if values is not None), default=1.0
+            )
             grid[0, column].set_title(kind)
             for row, name in enumerate(names):
                 ax = grid[row, column]
@@ -145,7 +137,7 @@ def show_limits(ax: Any, lower: float, upper: float, least: float) -> None:
     span = max(high - low, least) or 1.0
     far = []
     for limit in (lower, upper):
-        if low - FAR * span <= limit <= high + FAR * span:
+        if low - PICTURE_STYLE.limit_room * span <= limit <= high + PICTURE_STYLE.limit_room * span:
             ax.axhline(limit, color=LIMIT, lw=0.9, ls=(0, (5, 2)))
             low, high = min(low, limit), max(high, limit)
         elif np.isfinite(limit):

@@ -31,10 +31,6 @@ __all__ = ["Along", "Indices", "Motion", "Pieces", "Rule", "half_digits", "highe
 Indices: TypeAlias = NDArray[np.intp]
 Rule: TypeAlias = Literal["linear", "cubic", "quintic"]
 
-HALVINGS = 40
-SHARP = 1e-10
-"""Of the size of its coefficients, to which the greatest value of a piece is found."""
-
 
 @dataclass(frozen=True, eq=False)
 class Pieces:
@@ -79,10 +75,10 @@ def highest(coefficients: Array) -> tuple[Array, Array]:
     """Greatest values of polynomials by their Bernstein coefficients (K, d + 1), and where, 0 to 1. Shape (K,) each."""
     first, last = coefficients[:, 0], coefficients[:, -1]
     best, place = np.maximum(first, last), np.where(last > first, 1.0, 0.0)
-    enough = SHARP * np.abs(coefficients).max(axis=1, initial=0.0)
+    enough = 1e-10 * np.abs(coefficients).max(axis=1, initial=0.0)  # far below what any limit is known to
     owner = np.arange(len(coefficients))
     begin, width, part = np.zeros(len(owner)), 1.0, coefficients
-    for _ in range(HALVINGS):
+    for _ in range(40):  # a part is then 1e-12 of its piece
         open_ = part.max(axis=1) > best[owner] + enough[owner]
         if not open_.any():
             break

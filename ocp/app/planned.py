@@ -18,6 +18,9 @@ from ocp.storage import write_text
 
 __all__ = ["EXPORTED", "check_period", "export", "run_task"]
 
+TOLD = ("name", "value", "limit", "unit", "time", "passed", "verdict", "note")
+"""Of a finding of the audit."""
+
 
 def run_task(
     task: Task, output: Path | None, progress: Callable[[str], None], force: bool = False
@@ -70,19 +73,7 @@ def run_task(
         "candidates": [
             {"cost": one.cost, "reason": None if one.reason is None else str(one.reason)} for one in made.candidates
         ],
-        "audit": [
-            {
-                "name": f.name,
-                "value": f.value,
-                "limit": f.limit,
-                "unit": f.unit,
-                "time": f.time,
-                "passed": f.passed,
-                "verdict": f.verdict,
-                "note": f.note,
-            }
-            for f in audit.findings
-        ],
+        "audit": [{name: getattr(finding, name) for name in TOLD} for finding in audit.findings],
         "written": {kind: str(file) for kind, file in outputs.items()},
     }
     return (0 if audit.passed else 1), "\n".join(lines), told

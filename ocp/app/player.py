@@ -26,15 +26,11 @@ from models.arrays import Array
 from models.spatial import quaternion_from_rotation
 from ocp.app.appearance import Appearance, appearance_of
 from ocp.app.frames import TIP, Frames, frames_along
-from ocp.app.shown import Shown
+from ocp.app.shown import PAGE_SETTINGS, Shown
 from ocp.errors import ProblemError
 
-__all__ = ["MOST_BYTES", "Buffers", "Page", "page", "unpacked"]
+__all__ = ["Buffers", "Page", "page", "unpacked"]
 
-MOST_BYTES = 8_000_000
-"""Of a page."""
-POSES = 301
-"""Times at which poses are told, at most; between them they are interpolated."""
 SCRIPTS = ("scene.js", "curves.js", "player.js")
 
 
@@ -78,7 +74,7 @@ def page(shown: Sequence[Shown], *, title: str = "", folders: Sequence[Any] = ()
         meshes: Whether files of meshes are read; else what links touch with is shown.
 
     Raises:
-        ProblemError: Nothing to show, or a page of more than MOST_BYTES.
+        ProblemError: Nothing to show, or a page that is too large.
     """
     if not shown:
         raise ProblemError("a page shows at least one motion", name="shown", value=0)
@@ -101,10 +97,10 @@ def page(shown: Sequence[Shown], *, title: str = "", folders: Sequence[Any] = ()
     whole = len(head).to_bytes(4, "little") + head + b"".join(buffers.parts)
     data = base64.b64encode(gzip.compress(whole, 9, mtime=0)).decode()
     text = _filled(name, shown[0], data)
-    if len(text.encode()) > MOST_BYTES:
-        size = len(text.encode())
-        words = f"the page has {size / 1e6:.3g} MB, at most {MOST_BYTES / 1e6:g} are written; show fewer motions"
-        raise ProblemError(words, name="page", value=size, limit=MOST_BYTES)
+    size, most = len(text.encode()), PAGE_SETTINGS.most_bytes
+    if size > most:
+        words = f"the page has {size / 1e6:.3g} MB, at most {most / 1e6:g} are written; show fewer motions"
+        raise ProblemError(words, name="page", value=size, limit=most)
     return Page(text, missing)
 
 
@@ -219,7 +215,7 @@ def _poses(frames: Frames, names: Sequence[str]) -> Array:
 
 
 def _motion(one: Shown, buffers: Buffers) -> dict[str, Any]:
-    rows = np.unique(np.linspace(0, len(one.t) - 1, min(len(one.t), POSES)).round().astype(int))
+    rows = np.unique(np.linspace(0, len(one.t) - 1, min(len(one.t), PAGE_SETTINGS.poses)).round().astype(int))
     frames = frames_along(one.machine, one.joints[rows], one.base[rows])
     tip = one.machine.robot.tip is not None
     before = np.vstack([*frames.positions.values()])

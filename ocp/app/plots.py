@@ -14,8 +14,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from models.arrays import Array
-from ocp.app.pictures import NOTHING, STYLE, WIDTH, add_names, as_svg, draw_joints, look, show_limits
+from ocp.app.pictures import STYLE, add_names, as_svg, draw_joints, look, show_limits
 from ocp.app.pieces import Motion
+from ocp.app.rendering import PICTURE_STYLE
 from ocp.errors import ProblemError, checked_instance
 from ocp.local.accelerations import AccelerationSolution
 from ocp.local.rates import LocalSolution
@@ -24,16 +25,9 @@ from ocp.problem.formulation import Formulation
 from ocp.schedule.trajectory import JointTrajectory
 from ocp.solution import Solution
 from ocp.tasks.limits import Limits
+from ocp.tolerances import ROUNDING_SHARE
 
 __all__ = ["Picture", "html_of_plan", "html_of_solution", "plot_plan", "plot_solution"]
-
-SAMPLES = 400
-"""Of a plan's motion."""
-COLUMNS = 3
-MOST = 60
-"""Entries of states and controls that are drawn."""
-AFTER = 1e-9
-"""Of the horizon: by so much beside a node both sides of a jump are."""
 
 
 class Picture(Figure):
@@ -64,7 +58,7 @@ def plot_plan(plan: Plan, against: Any = None, figure: Any = None) -> Any:
     names = plan.names
     others = {name: _compared(name, one, names) for name, one in _named(against).items()}
     motions = {"plan": _motion_of(plan), **{name: motion for name, (motion, _) in others.items()}}
-    made = _figure(figure, (WIDTH, 0.9 + 1.15 * len(names)))
+    made = _figure(figure, (PICTURE_STYLE.width, 0.9 + 1.15 * len(names)))
     robot = plan.machine.robot
     units = [joint.unit for joint in robot.moving_joints]
     draw_joints(made, motions, names, units, Limits().bounds(plan.machine))
@@ -87,7 +81,7 @@ def html_of_plan(plan: Plan) -> str:
 
 
 def _motion_of(plan: Plan) -> Motion:
-    sample = plan.sample(plan.horizon / SAMPLES)
+    sample = plan.sample(plan.horizon / PICTURE_STYLE.curve_points)
     return Motion(sample.t, sample.joints, sample.rates, sample.accelerations)
 
 
@@ -144,14 +138,14 @@ def plot_solution(solution: Solution, against: Any = None, figure: Any = None) -
             words = f"plot: {name!r} has {told}, the solution has {shapes}"
             raise ProblemError(words, name="against", value=told, limit=shapes)
     entries = [(name, k) for name, width in shapes.items() for k in range(width)]
-    left_out, entries = entries[MOST:], entries[:MOST]
+    left_out, entries = entries[PICTURE_STYLE.entries :], entries[: PICTURE_STYLE.entries]
     bounds, units = _bounds(solution)
-    rows = -(-len(entries) // COLUMNS)
-    made = _figure(figure, (WIDTH, 0.9 + 1.35 * rows))
+    rows = -(-len(entries) // PICTURE_STYLE.columns)
+    made = _figure(figure, (PICTURE_STYLE.width, 0.9 + 1.35 * rows))
     import matplotlib
 
     with matplotlib.rc_context(STYLE):
-        grid: Any = made.subplots(rows, min(COLUMNS, len(entries)), squeeze=False, sharex=True)
+        grid: Any = made.subplots(rows, min(PICTURE_STYLE.columns, len(entries)), squeeze=False, sharex=True)
         for ax in grid.ravel()[len(entries) :]:
             ax.remove()
         curves = [_along(one) for one in (solution, *others.values())]
@@ -161,7 +155,9 @@ def plot_solution(solution: Solution, against: Any = None, figure: Any = None) -
                     times, values = curve[name]
                     ax.plot(times, values[:, k], **look(number))
             lower, upper = bounds[name][:, k] if name in bounds else (-np.inf, np.inf)
-            show_limits(ax, lower, upper, NOTHING * max(np.abs(c[name][1]).max() for c in curves if name in c))
+            show_limits(
+                ax, lower, upper, PICTURE_STYLE.flat * max(np.abs(c[name][1]).max() for c in curves if name in c)
+            )
             ax.set_title(name if shapes[name] == 1 else f"{name} [{k}]")
             ax.set_ylabel(units.get(name, ""), fontsize=7)
             ax.margins(x=0.01)
@@ -210,8 +206,8 @@ def _along(one: Any) -> dict[str, tuple[Array, Array]]:
     if isinstance(one, LocalSolution):
         return {name: (one.t, values) for name, values in _local(one).items()}
     nodes = one.control_interpolant.breaks[1:-1]
-    even = np.linspace(0.0, 1.0, SAMPLES + 1)
-    at = np.unique(np.concatenate([even, nodes - AFTER, nodes + AFTER]))
+    even = np.linspace(0.0, 1.0, PICTURE_STYLE.curve_points + 1)
+    at = np.unique(np.concatenate([even, nodes - ROUNDING_SHARE, nodes + ROUNDING_SHARE]))
     spans = one.phases
     found = {}
     for name, values in one.at_fraction(at).items():

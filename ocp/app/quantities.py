@@ -11,16 +11,12 @@ import numpy as np
 from models import FreeFloating, Machine, Standing, inverse_dynamics, simplified
 from models.arrays import Array
 from models.machines.standing import center_of_pressure
+from models.robot.dynamics import GRAVITY
 from ocp.app.joint_limits import floating_torques
 from ocp.problem.formulation import Sampler
 from ocp.tasks.limits import JointBounds
 
-__all__ = ["EARTH", "Curve", "Footing", "footing_of", "joint_curves", "machine_curves", "so_far"]
-
-CONSISTENT = 1e-8
-"""m, by which distances to the edges of a foot may not fit one point."""
-EARTH = (0.0, 0.0, -9.81)
-"""m/s^2, of machines on a fixed base."""
+__all__ = ["Curve", "Footing", "footing_of", "joint_curves", "machine_curves", "so_far"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +80,7 @@ def _torques(machine: Machine, joints: Array, rates: Array, accelerations: Array
     if isinstance(machine, FreeFloating):
         torque = floating_torques(machine, q, v, a)
     else:
-        gravity = getattr(machine, "gravity_in_world", EARTH)
+        gravity = getattr(machine, "gravity_in_world", GRAVITY)
         frame = machine.world_from_base(())
         torque = inverse_dynamics(simplified(robot), q, v, a, (), gravity, frame)
     found: Array = Sampler([q, v, a], [torque])(joints, rates, accelerations)[0]
@@ -138,7 +134,7 @@ def footing_of(
         rows = np.column_stack([normals, -np.ones(len(normals))])
         told = np.column_stack([one.values for one in inside]) - edges
         found, *_ = np.linalg.lstsq(rows, told.T, rcond=None)
-        if np.abs(rows @ found - told.T).max() < CONSISTENT:
+        if np.abs(rows @ found - told.T).max() < 1e-8:  # m: rounding; they are those of one point
             points = np.ascontiguousarray(found[:2].T)
             distances = edges + points @ normals.T
             margin = Curve("Standing", "zero moment point from the edge of the foot", "m", distances.min(axis=1), 0.0)

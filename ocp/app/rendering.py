@@ -19,28 +19,60 @@ from ocp.app.appearance import Appearance, Part
 from ocp.app.frames import Frames
 from ocp.errors import ProblemError
 
-__all__ = ["Camera", "Floor", "Layer", "placed", "render", "tube"]
+__all__ = ["PICTURE_STYLE", "Camera", "Floor", "Layer", "PictureStyle", "placed", "render", "tube"]
 
-LENS = 1.0 / np.tan(0.22)
-"""Half a picture's height over the distance at which it is seen is the inverse of this."""
-FINER = 2
-"""Places along each side of a pixel."""
-LOT = 1_000_000
-"""Places that are looked at together."""
-EDGE = 0.1
-"""Of the lesser side of a picture, within which the floor fades towards its edge."""
-SUN = (np.deg2rad(38.0), np.deg2rad(52.0))
-"""Of the sun: azimuth from the camera's, to its left, and elevation."""
-MAP = 1.25
-"""Places along each side of the map of shadows, of the pixels along the greater side of the picture."""
-BEHIND = 3e-3
-"""A veil that is less than this share of its distance before what is solid counts as behind it."""
-BLUR, BIAS = (-2, 0, 2), 6.0
-"""Places of that map around one at which it is looked at, and how far off a surface its shadow is asked for."""
-MOST_PIXELS = 2**24
-"""Of a picture."""
-SIDES = 10
-"""Of a tube."""
+
+@dataclass(frozen=True)
+class PictureStyle:
+    """How pictures and curves look.
+
+    Attributes:
+        size: Of a rendered picture, pixels. most_pixels: Of any.
+        half_view: Angle under which half of a picture's height is seen, rad.
+        finer: Places along each side of a pixel, of which it is the mean.
+        at_once: Places that are looked at together, for the sake of memory.
+        fading: Share of the lesser side of a picture within which the floor fades towards its edge.
+        sun: Azimuth from the camera's, to its left, and elevation, rad.
+        shadow_map: Places along each side of the map of shadows, of the pixels along the greater side of the picture.
+        shadow_blur: Places of that map around one at which it is looked at.
+        shadow_bias: How far off a surface its shadow is asked for, places of that map.
+        behind: A veil that is less than this share of its distance before what is solid counts as behind it.
+        tube_sides: Of a round line. line: Its radius, of the size of what a picture shows.
+        poses: Times at which the robot is shown.
+        curve_points: Of a curve.
+        limit_room: Limits further from a curve than this many of its spans would leave nothing of its shape to see.
+        flat: Share of the largest value of a kind: what changes by less is rounding.
+        width: Of a figure, inches. columns: Of solutions' curves in it. entries: Of states and controls in it at most.
+    """
+
+    size: tuple[int, int] = (960, 680)
+    most_pixels: int = 2**24
+    half_view: float = 0.22
+    finer: int = 2
+    at_once: int = 1_000_000
+    fading: float = 0.1
+    sun: tuple[float, float] = (np.deg2rad(38.0), np.deg2rad(52.0))
+    shadow_map: float = 1.25
+    shadow_blur: tuple[int, ...] = (-2, 0, 2)
+    shadow_bias: float = 6.0
+    behind: float = 3e-3
+    tube_sides: int = 10
+    line: float = 0.003
+    poses: int = 4
+    curve_points: int = 400
+    limit_room: float = 1.5
+    flat: float = 1e-3
+    width: float = 7.4
+    columns: int = 3
+    entries: int = 60
+
+    @property
+    def lens(self) -> float:
+        """The distance at which a picture is seen over half its height."""
+        return float(1 / np.tan(self.half_view))
+
+
+PICTURE_STYLE = PictureStyle()
 
 
 class Camera(NamedTuple):
@@ -65,16 +97,17 @@ class Camera(NamedTuple):
         `room` is left at every edge, a share of the picture. Each edge of the picture is a plane through the eye that
         must leave all points on its inner side, so that the eye's place is known in closed form.
         """
-        if min(size) < 1 or size[0] * size[1] > MOST_PIXELS:
-            text = f"a picture of {size[0]} by {size[1]} pixels: from 1 to {MOST_PIXELS} in all"
-            raise ProblemError(text, name="size", value=size, limit=MOST_PIXELS)
+        most, lens = PICTURE_STYLE.most_pixels, PICTURE_STYLE.lens
+        if min(size) < 1 or size[0] * size[1] > most:
+            text = f"a picture of {size[0]} by {size[1]} pixels: from 1 to {most} in all"
+            raise ProblemError(text, name="size", value=size, limit=most)
         rise, turn = np.deg2rad(elevation), np.deg2rad(azimuth)
         back = np.array([np.cos(rise) * np.cos(turn), np.cos(rise) * np.sin(turn), np.sin(rise)])
         right = np.array([-np.sin(turn), np.cos(turn), 0.0])
         axes = np.stack([right, np.cross(back, right), back])
         x, y, z = axes @ np.asarray(points, dtype=float).reshape(-1, 3).T
         eye = np.zeros(3)
-        for k, (along, slope) in enumerate(((x, LENS * size[1] / size[0]), (y, LENS))):
+        for k, (along, slope) in enumerate(((x, lens * size[1] / size[0]), (y, lens))):
             slope /= 1 - 2 * room
             upper, lower = (z + slope * along).max(), (z - slope * along).max()
             eye[k], eye[2] = (upper - lower) / (2 * slope), max(eye[2] if k else -np.inf, (upper + lower) / 2)
@@ -85,14 +118,14 @@ class Camera(NamedTuple):
         x, y, z = np.moveaxis((np.asarray(points, dtype=float) - self.eye) @ self.axes.T, -1, 0)
         far = np.maximum(-z, 1e-9)
         width, height = self.size
-        scale = LENS * height / 2 / far
+        scale = PICTURE_STYLE.lens * height / 2 / far
         return np.stack([width / 2 + scale * x, height / 2 - scale * y], axis=-1), far
 
     def rays(self, cells: NDArray[np.intp]) -> Array:
         """Ways from the eye through the middles of cells, numbered row by row, one m deep each. Shape (k, 3), m."""
         width, height = self.size
         row, column = np.divmod(cells, width)
-        step = 2 / (LENS * height)
+        step = 2 / (PICTURE_STYLE.lens * height)
         x, y = (column + 0.5 - width / 2) * step, (height / 2 - row - 0.5) * step
         return np.asarray(x[:, None] * self.axes[0] + y[:, None] * self.axes[1] - self.axes[2])
 
@@ -149,17 +182,18 @@ def tube(points: Any, radius: float, color: tuple[float, float, float]) -> Part:
         side = side - one * (one @ side)
         side /= np.linalg.norm(side)
         sides[k] = side
-    angle = np.arange(SIDES) * (2 * np.pi / SIDES)
+    count = PICTURE_STYLE.tube_sides
+    angle = np.arange(count) * (2 * np.pi / count)
     around = np.cos(angle)[:, None] * sides[:, None] + np.sin(angle)[:, None] * np.cross(along, sides)[:, None]
-    rings, places = (one.ravel() for one in np.meshgrid(np.arange(len(line) - 1), np.arange(SIDES), indexing="ij"))
-    a, b = rings * SIDES + places, rings * SIDES + (places + 1) % SIDES
-    faces = np.concatenate([np.stack([a, b, b + SIDES], axis=1), np.stack([a, b + SIDES, a + SIDES], axis=1)])
+    rings, places = (one.ravel() for one in np.meshgrid(np.arange(len(line) - 1), np.arange(count), indexing="ij"))
+    a, b = rings * count + places, rings * count + (places + 1) % count
+    faces = np.concatenate([np.stack([a, b, b + count], axis=1), np.stack([a, b + count, a + count], axis=1)])
     flat = around.reshape(-1, 3)
     return Part("", (line[:, None] + radius * around).reshape(-1, 3), flat, faces, (*color, 1.0))
 
 
 def render(
-    layers: Sequence[Layer], camera: Camera, *, floor: Floor | None = None, finer: int = FINER
+    layers: Sequence[Layer], camera: Camera, *, floor: Floor | None = None, finer: int = PICTURE_STYLE.finer
 ) -> NDArray[np.uint8]:
     """The picture, on white, each pixel the mean of `finer` places to a side. Shape (height, width, 3)."""
     width, height = camera.size
@@ -180,7 +214,7 @@ def render(
                 continue
             veil = _Mesh.of([part for part in layer.parts if part.color[3] == opacity], layer.tint)
             near, faces = _nearest(*_projected(fine, veil), fine.size)
-            cells = np.flatnonzero((faces >= 0) & (near > (1 + BEHIND) * nearness))
+            cells = np.flatnonzero((faces >= 0) & (near > (1 + PICTURE_STYLE.behind) * nearness))
             share = np.float32(layer.opacity * opacity)
             lit = _shaded(veil, faces[cells], fine.rays(cells), fine, None)
             picture[cells] = (1 - share) * picture[cells] + share * lit
@@ -266,11 +300,11 @@ def _counted(counts: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.in
 
 
 def _lots(counts: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
-    """Ranges whose counts are LOT together, or little more."""
+    """Ranges whose counts are at most `at_once` together, or little more."""
     ends = np.cumsum(counts)
     begin = 0
     while begin < len(counts):
-        end = min(int(np.searchsorted(ends, ends[begin] - counts[begin] + LOT)) + 1, len(counts))
+        end = min(int(np.searchsorted(ends, ends[begin] - counts[begin] + PICTURE_STYLE.at_once)) + 1, len(counts))
         yield begin, end
         begin = end
 
@@ -289,11 +323,11 @@ class _Sun:
     @classmethod
     def on(cls, mesh: _Mesh, camera: Camera) -> _Sun:
         back = camera.axes[2]
-        turn, rise = np.arctan2(back[1], back[0]) - SUN[0], SUN[1]
+        turn, rise = np.arctan2(back[1], back[0]) - PICTURE_STYLE.sun[0], PICTURE_STYLE.sun[1]
         way = np.array([np.cos(rise) * np.cos(turn), np.cos(rise) * np.sin(turn), np.sin(rise)])
         right = np.array([-np.sin(turn), np.cos(turn), 0.0])
         axes = np.stack([right, np.cross(way, right), way])
-        points, places = mesh.corners @ axes.T, round(MAP * max(camera.size)) + 16
+        points, places = mesh.corners @ axes.T, round(PICTURE_STYLE.shadow_map * max(camera.size)) + 16
         low = points.min(axis=0)[:2]
         step = float((points.max(axis=0)[:2] - low).max()) / (places - 8) or 1.0
         low = low - 4 * step
@@ -307,12 +341,12 @@ class _Sun:
             np.floor((one - at) / self.step).astype(np.int64) for one, at in zip((x, y), self.low, strict=True)
         )
         found = np.zeros(len(points), dtype=np.float32)
-        for i in BLUR:
-            for j in BLUR:
+        for i in PICTURE_STYLE.shadow_blur:
+            for j in PICTURE_STYLE.shadow_blur:
                 inside = (row + i >= 0) & (row + i < self.places) & (column + j >= 0) & (column + j < self.places)
                 cell = np.where(inside, (row + i) * self.places + column + j, 0)
                 found += ~(inside & (self.height[cell] > z + self.step))
-        return np.asarray(found / len(BLUR) ** 2)
+        return np.asarray(found / len(PICTURE_STYLE.shadow_blur) ** 2)
 
 
 def _lay(picture: NDArray[np.float32], floor: Floor, camera: Camera, sun: _Sun | None) -> None:
@@ -324,7 +358,7 @@ def _lay(picture: NDArray[np.float32], floor: Floor, camera: Camera, sun: _Sun |
     near = np.flatnonzero(fade > 0)
     place, (column, row) = place[near], np.divmod(below[near], camera.size[0])[::-1]
     edge = np.minimum(np.minimum(row, camera.size[1] - 1 - row), np.minimum(column, camera.size[0] - 1 - column))
-    fade = np.minimum(fade[near], 1.0) * np.minimum(edge / (EDGE * min(camera.size)), 1.0)
+    fade = np.minimum(fade[near], 1.0) * np.minimum(edge / (PICTURE_STYLE.fading * min(camera.size)), 1.0)
     lines = np.abs((place[:, :2] / floor.grid + 0.5) % 1.0 - 0.5).min(axis=1) < 0.011
     tone = (0.965 - 0.1 * lines) * (1.0 if sun is None else 0.8 + 0.2 * sun.lit(place))
     picture[below[near]] = (1 - fade * (1 - tone))[:, None]
@@ -348,7 +382,11 @@ def _shaded(mesh: _Mesh, faces: NDArray[np.intp], ray: Array, camera: Camera, su
     facing = _dot(normal, back)
     normal *= np.where(facing < 0, -1.0, 1.0)[:, None]
     way = camera.axes[2] if sun is None else sun.way
-    reaches = 1.0 if sun is None else sun.lit(place + BIAS * sun.step * np.sign(normal @ way)[:, None] * normal)
+    reaches = (
+        1.0
+        if sun is None
+        else sun.lit(place + PICTURE_STYLE.shadow_bias * sun.step * np.sign(normal @ way)[:, None] * normal)
+    )
     key = np.maximum(normal @ way, 0.0)
     gloss = np.maximum(2 * key * np.abs(facing) - back @ way, 0.0)
     light = 0.44 + 0.1 * normal[:, 2] + 0.44 * key * reaches + 0.12 * np.abs(facing)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from models import Machine
-from ocp.app.joint_limits import Row
+from ocp.app.joint_limits import Row, RowVerdict, rows_of
 from ocp.app.obstacles import Obstacle, looks_of, obstacles_of
 from ocp.app.pictures import curves, scene
 from ocp.app.pieces import Motion
@@ -114,7 +114,7 @@ def _table(rows: Sequence[Row]) -> str:
         f"<tr><td>{escape(row.name)}</td><td class=n>{row.value:.5g}</td>"
         f"<td class=n>{'' if row.limit is None else f'{row.limit:.4g}'}</td><td>{escape(row.unit)}</td>"
         f"<td class=n>{'' if row.time is None else f'{row.time:.5g}'}</td>"
-        f'<td class="{"bad" if row.verdict == "FAILED" else ""}">{escape(row.verdict)}</td>'
+        f'<td class="{"bad" if row.verdict is RowVerdict.FAILED else ""}">{escape(row.verdict)}</td>'
         f"<td>{escape(row.note)}</td></tr>"
         for row in rows
     ]
@@ -134,7 +134,7 @@ def report_of_check(
     taken = JointBounds(*(one[columns] for one in bounds))
     units = [robot.joint(name).unit for name in check.joints]
     picture = scene(machine, motion, bases, around, folders) if whole else b""
-    shown = [row for row in check.rows if row.verdict != "unlimited"]
+    shown = [row for row in check.rows if row.verdict is not RowVerdict.UNLIMITED]
     return Report(
         f"{check.file} for {robot.name}",
         f"The trajectory {check.sentence}.",
@@ -159,37 +159,19 @@ def report_of_plan(plan: Plan, period: float, title: str) -> Report:
     motion = Motion(sample.t, sample.joints, sample.rates, sample.accelerations)
     verdict = verdict_of(plan, sample, title)
     audit, check = verdict.audit, verdict.check
-    rows = tuple(
-        Row(
-            f.name,
-            f.value,
-            f.limit,
-            f.unit,
-            f.time,
-            "told" if f.limit is None else "ok" if f.passed else "FAILED",
-            f.note,
-        )
-        for f in audit.findings
-    )
     bounds = bounds_of(robot)
     bases = plan.at(sample.t)["base"] if machine.base_size else None
     units = [joint.unit for joint in robot.moving_joints]
     cost = f"cost {plan.cost:.5g}" + ("" if plan.bound is None else f", none below {plan.bound:.5g}")
-    told = [row for row in check.rows if row.verdict != "unlimited"]
+    told = [row for row in check.rows if row.verdict is not RowVerdict.UNLIMITED]
     return Report(
         title,
         f"The plan {verdict.sentence}.",
         verdict.passed,
-        (
-            f"{robot.name}",
-            f"{plan.horizon:.5g} s",
-            f"{robot.dof} joints",
-            cost,
-            f"{len(plan.candidates)} motions found",
-        ),
+        (robot.name, f"{plan.horizon:.5g} s", f"{robot.dof} joints", cost, f"{len(plan.candidates)} motions found"),
         tuple(str(fault) for fault in check.faults),
         scene(machine, motion, bases, obstacles_of(plan.solution, looks_of(plan, sample.t))),
         curves(motion, plan.names, units, bounds, check.faults),
-        (("The audit", rows), (f"Samples of {period:g} s against the robot's limits", tuple(told))),
+        (("The audit", tuple(rows_of(audit))), (f"Samples of {period:g} s against the robot's limits", tuple(told))),
         tuple(f"unlimited: {one}" for one in check.unlimited),
     )

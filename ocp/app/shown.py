@@ -1,4 +1,4 @@
-"""A motion as it is shown: a plan, a solution of a problem of one's own, a local motion or anybody's trajectory.
+"""A motion as it is shown: a plan, a solution of a problem of one's own or anybody's trajectory.
 
 Whatever it was made by, it is sampled once, with what is known of it: what was asked, limits, costs, the bodies that
 come nearest, the audit.
@@ -15,7 +15,7 @@ import numpy as np
 from models import FreeFloating, Machine, Standing
 from models.arrays import Array
 from ocp.app.bases import floating_base
-from ocp.app.joint_limits import Row
+from ocp.app.joint_limits import Row, rows_of
 from ocp.app.obstacles import Obstacle, looks_of, obstacles_of
 from ocp.app.oddities import readable
 from ocp.app.plan_verdict import PlanVerdict, verdict_of
@@ -26,22 +26,39 @@ from ocp.audit.clearance import nearest_along
 from ocp.builders.tool_motion import CLOCK
 from ocp.errors import ProblemError, unknown_name
 from ocp.files import RawTrajectory
-from ocp.local.rates import LocalSolution
 from ocp.planning import Plan
 from ocp.problem.formulation import Formulation
 from ocp.solution import Solution, in_order_of
 from ocp.tasks.targets import Target
 
-__all__ = ["Near", "Shown", "shown_local", "shown_plan", "shown_solution", "shown_trajectory"]
+__all__ = ["PAGE_SETTINGS", "Near", "PageSettings", "Shown", "shown_plan", "shown_solution", "shown_trajectory"]
 
-PER_SECOND, LEAST, MOST = 50, 200, 600
-"""Times at which a motion is sampled."""
-SAME = 1e-3
-"""Relative: costs that end nearer to each other are told once."""
 FOOT = "zero moment point"
 """What problems of standing machines call the constraint that keeps it in the foot."""
-LOOKS = 161
-"""Times at which the nearest bodies are looked for."""
+
+
+@dataclass(frozen=True)
+class PageSettings:
+    """How finely a page shows a motion.
+
+    Attributes:
+        per_second, least, most: Times at which a motion is sampled.
+        poses: Of them those at which poses are told, at most; between them they are interpolated.
+        near: Times at which the nearest bodies are looked for, which takes longer.
+        same_cost: Relative: costs that end nearer to each other are told once.
+        most_bytes: Of a page.
+    """
+
+    per_second: int = 50
+    least: int = 200
+    most: int = 600
+    poses: int = 301
+    near: int = 161
+    same_cost: float = 1e-3
+    most_bytes: int = 8_000_000
+
+
+PAGE_SETTINGS = PageSettings()
 
 
 class Near(NamedTuple):
@@ -162,20 +179,11 @@ def shown_solution(
     about: dict[str, Any] = {"cost": solution.cost, "around": tuple(obstacles_of(solution, [("", times)]))}
     about |= _audited(solution, lambda: solution.audit(**settings))
     if solution.problem is not None:
-        looks = np.linspace(0.0, solution.horizon, LOOKS)
+        looks = np.linspace(0.0, solution.horizon, PAGE_SETTINGS.near)
         about["near"] = _joined(looks, nearest_along(solution.problem, solution, looks))
     smooth = _torque_like(solution, joints)
     told = _told(solution, fractions, times)
     return _shown(name, machine, times, place, q, v, a if smooth else None, moves, told, **about)
-
-
-def shown_local(local: LocalSolution, machine: Machine, name: str = "pseudo-inverse") -> Shown:
-    """A motion by instantaneous resolution."""
-    times = _times(float(local.t[-1]))
-    at = [local.at(time) for time in times]
-    base, joints, rates = (np.array([one[what] for one in at]) for what in ("base", "joints", "joint_rates"))
-    moves = _between(times, local.t, local.base_rates) if machine.base_size else base
-    return _shown(name, machine, times, base, joints, rates, None, moves, [])
 
 
 def shown_trajectory(raw: RawTrajectory, machine: Machine, name: str = "") -> Shown:
@@ -213,15 +221,6 @@ def _between(times: Array, t: Array, values: Array) -> Array:
     return np.column_stack([np.interp(times, t, column) for column in values.T])
 
 
-def rows_of(audit: Any) -> list[Row]:
-    """The findings of an audit as rows of a table."""
-    words = {True: "ok", False: "FAILED"}
-    return [
-        Row(f.name, f.value, f.limit, f.unit, f.time, "told" if f.limit is None else words[bool(f.passed)], f.note)
-        for f in audit.findings
-    ]
-
-
 def _shown(
     name: str,
     machine: Machine,
@@ -238,7 +237,9 @@ def _shown(
     effort = so_far(t, (rates**2).sum(axis=1) / 2)
     curves = [Curve("Cost", "half the squared joint rates, so far", "", effort)]
     own = [one for one in told if one.group == "Cost"]
-    curves += [one for one in own if abs(one.values[-1] - effort[-1]) > SAME * max(abs(effort[-1]), 1e-12)]
+    curves += [
+        one for one in own if abs(one.values[-1] - effort[-1]) > PAGE_SETTINGS.same_cost * max(abs(effort[-1]), 1e-12)
+    ]
     curves += machine_curves(machine, base, joints, rates, base_rates)
     near = about.get("near")
     if near is not None:
@@ -254,7 +255,7 @@ def _shown(
 
 
 def _times(horizon: float) -> Array:
-    count = int(np.clip(np.ceil(PER_SECOND * horizon), LEAST, MOST))
+    count = int(np.clip(np.ceil(PAGE_SETTINGS.per_second * horizon), PAGE_SETTINGS.least, PAGE_SETTINGS.most))
     return np.linspace(0.0, horizon, count + 1)
 
 
@@ -318,7 +319,7 @@ def _near(plan: Plan) -> Near | None:
     problem = plan.solution.problem
     if problem is None:
         return None
-    looks = np.linspace(0.0, plan.horizon, LOOKS)
+    looks = np.linspace(0.0, plan.horizon, PAGE_SETTINGS.near)
     found = []
     for suffix, times in looks_of(plan, looks):
         found += nearest_along(problem, plan.solution, times, suffix)

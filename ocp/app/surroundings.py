@@ -9,7 +9,7 @@ import numpy as np
 
 from models import Machine, Surroundings
 from models.arrays import Array
-from ocp.app.joint_limits import Row
+from ocp.app.joint_limits import Row, RowVerdict
 from ocp.app.oddities import Fault
 from ocp.app.pieces import Motion
 from ocp.audit.clearance import Clearance
@@ -23,10 +23,6 @@ __all__ = ["clearance_rows", "path_rows", "proof", "within_limits"]
 
 SHOWN = 20
 """Pairs that are named."""
-MOST_LOOKS = 1000
-"""Samples at which the beginning of a touch is looked for."""
-BETWEEN = 4
-"""Places of every piece where the tip is looked at."""
 
 
 def within_limits(machine: Machine, motion: Motion) -> Machine:
@@ -69,9 +65,10 @@ def clearance_rows(around: Surroundings, motion: Motion, bases: Array | None) ->
     """
     assumed = [f"{pair} ({why})" for pair, why in around.assumed.items()]
     left = f"left out by assumption: {', '.join(assumed)}"
-    told = [Row("pairs not looked at", len(assumed), None, "", None, "told", left)] if assumed else []
+    told = [Row("pairs not looked at", len(assumed), None, "", None, RowVerdict.TOLD, left)] if assumed else []
     if not len(around.pairs):
-        return [Row("clearance", np.inf, around.clearance, "m", None, "told", "no pairs that may touch"), *told], []
+        none = Row("clearance", np.inf, around.clearance, "m", None, RowVerdict.TOLD, "no pairs that may touch")
+        return [none, *told], []
     if bases is not None:
         rows, faults = _sampled(around, motion, bases)
         return [*rows, *told], faults
@@ -83,18 +80,16 @@ def clearance_rows(around: Surroundings, motion: Motion, bases: Array | None) ->
         one, other = near.bodies
         time = start + near.time
         if near.distance < near.asked - CLEARANCE_TOLERANCE_M:
-            verdict, note = "FAILED", "touching" if near.distance < 0 else "too near"
+            verdict, note = RowVerdict.FAILED, "touching" if near.distance < 0 else "too near"
             between = "" if np.isclose(motion.t, time, rtol=0, atol=1e-12).any() else ", between two samples"
             how = f"overlap by {-near.distance:.4g} m" if near.distance < 0 else f"are {near.distance:.4g} m apart"
             text = f"{how} at {time:.6g} s{between}, at least {near.asked:g} m asked"
             faults.append(Fault("clearance", f"{one} and {other}", text, time, None, near.distance, near.asked, "m"))
         elif near.missed > CLEARANCE_TOLERANCE_M:
-            verdict, note = "not decided", f"at least {near.least:.4g} m is proven"
+            verdict, note = RowVerdict.UNDECIDED, f"at least {near.least:.4g} m is proven"
         else:
-            verdict, note = (
-                "ok",
-                f"proven: at no time are any two nearer than {proven:.4g} m" if not faults else "proven",
-            )
+            least = "" if faults else f": at no time are any two nearer than {proven:.4g} m"
+            verdict, note = RowVerdict.OK, f"proven{least}"
         rows.append(Row(f"clearance of {one} and {other}", near.distance, near.asked, "m", time, verdict, note))
         if verdict == "ok":
             break  # what is farther is proven as well, or told as not decided
@@ -105,7 +100,7 @@ def clearance_rows(around: Surroundings, motion: Motion, bases: Array | None) ->
         touches = near.distance < near.asked - CLEARANCE_TOLERANCE_M
         if near.missed > CLEARANCE_TOLERANCE_M and not touches and name not in shown:
             note = f"at least {near.least:.4g} m is proven"
-            rows.append(Row(name, near.distance, near.asked, "m", start + near.time, "not decided", note))
+            rows.append(Row(name, near.distance, near.asked, "m", start + near.time, RowVerdict.UNDECIDED, note))
     return [*rows, *told], faults
 
 
@@ -114,7 +109,7 @@ def _with_beginnings(around: Surroundings, motion: Motion, faults: list[Fault]) 
     if not faults:
         return []
     worst = np.array([fault.time for fault in faults])
-    times = np.unique(np.concatenate([motion.t[:: len(motion.t) // MOST_LOOKS + 1], worst]))
+    times = np.unique(np.concatenate([motion.t[:: len(motion.t) // 1000 + 1], worst]))
     base = around.machine.base_home()
     apart = distances_along(around, base, motion.position.at(times), times, around.clearance)
     columns = {f"{one} and {other}": k for k, (one, other) in enumerate(around.labels)}
@@ -138,18 +133,8 @@ def _sampled(around: Surroundings, motion: Motion, bases: Array) -> tuple[list[R
         one, other = around.labels[pair]
         value, time = float(apart[k, pair]), float(times[k])
         failed = value < around.clearance - CLEARANCE_TOLERANCE_M
-        note = "at samples and middles; not proven between them"
-        rows.append(
-            Row(
-                f"clearance of {one} and {other}",
-                value,
-                around.clearance,
-                "m",
-                time,
-                "FAILED" if failed else "ok",
-                note,
-            )
-        )
+        told = RowVerdict.of(failed), "at samples and middles; not proven between them"
+        rows.append(Row(f"clearance of {one} and {other}", value, around.clearance, "m", time, *told))
         if not failed:
             break
         how = f"overlap by {-value:.4g} m" if value < 0 else f"are {value:.4g} m apart"
@@ -172,8 +157,9 @@ def path_rows(
     base, q = ca.SX.sym("base", machine.base_size), ca.SX.sym("q", machine.joint_size)
     pose = machine.tip_pose(base, q)
     sampler = Sampler([base, q], [pose.position, pose.rotation[:, 2]])
-    piece = np.repeat(np.arange(len(motion.t) - 1), BETWEEN)
-    place = np.tile(np.arange(BETWEEN) / BETWEEN, len(motion.t) - 1)
+    quarters = np.arange(4) / 4
+    piece = np.repeat(np.arange(len(motion.t) - 1), len(quarters))
+    place = np.tile(quarters, len(motion.t) - 1)
     times = np.append(motion.t[piece] + place * np.diff(motion.t)[piece], motion.t[-1])
 
     def tips(at: Array) -> list[Array]:
@@ -218,7 +204,7 @@ def path_rows(
 
 def _row(name: str, value: float, limit: float, unit: str, time: float | None) -> Row:
     bounded = bool(np.isfinite(limit))
-    verdict = ("FAILED" if value > limit else "ok") if bounded else "told"
+    verdict = RowVerdict.of(value > limit) if bounded else RowVerdict.TOLD
     return Row(name, value, limit if bounded else None, unit, time, verdict)
 
 

@@ -13,17 +13,11 @@ import numpy as np
 
 from models import FixedBase, Robot
 from models.arrays import Array
-from ocp.app.oddities import SMALL_UNITS, Fault, likely_unit
+from ocp.app.oddities import SMALL_UNITS, THRESHOLDS, Fault, likely_unit
 from ocp.app.pieces import Indices, Motion
 from ocp.problem.formulation import Sampler
 
 __all__ = ["doubtful_times", "exchanged_joints"]
-
-PLACES = 65
-"""Samples at which the tip is compared."""
-SIMPLE = np.array([3e-4, 5e-4])
-"""The tip's distance from a line over its length, and the relative spread of its speed, below which it goes straight or
-keeps its speed: far below what joints that know nothing of the tip make by chance."""
 
 
 def doubtful_times(motion: Motion, velocity: Array) -> list[Fault]:
@@ -65,7 +59,7 @@ def exchanged_joints(motion: Motion, robot: Robot, columns: Indices, tip: bool =
     ]
     if len(mending) == 1:
         return [_exchanged(names, mending[0], "all joints are inside their limits")]
-    rows = np.unique(np.linspace(0, len(motion.t) - 1, PLACES).astype(int))
+    rows = np.unique(np.linspace(0, len(motion.t) - 1, THRESHOLDS.tip_samples).astype(int))
     joints = motion.q[rows]
     reach = np.ptp(joints, axis=0)
     if not tip or robot.tip is None or len(rows) < 10 or (reach > 0.1 * reach.max()).sum() < 3:
@@ -85,7 +79,8 @@ def exchanged_joints(motion: Motion, robot: Robot, columns: Indices, tip: bool =
     steps = np.linalg.norm(np.diff(tips, axis=1), axis=2)
     length = np.maximum(steps.sum(axis=1), 1e-12)
     speeds = (steps / np.diff(motion.t[rows]))[:, len(rows) // 5 : -(len(rows) // 5)]  # without its ends
-    off = np.column_stack([beside / length, speeds.std(axis=1) / np.maximum(speeds.mean(axis=1), 1e-12)]) / SIMPLE
+    off = np.column_stack([beside / length, speeds.std(axis=1) / np.maximum(speeds.mean(axis=1), 1e-12)])
+    off /= [THRESHOLDS.straight, THRESHOLDS.even]
     off[length < max(0.01, 0.1 * length[0])] = np.inf  # m: hardly a motion of the tip
     best, kind = divmod(int(off.argmin()), 2)
     if off[best, kind] > min(1.0, off[0, kind] / 20) or off[0].min() < 3:

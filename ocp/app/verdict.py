@@ -11,10 +11,11 @@ import numpy as np
 
 from models import FixedBase, FreeFloating, Machine, Robot, Standing, Support, Surroundings, footprint
 from models.arrays import Array, ArrayInput
+from models.robot.dynamics import GRAVITY
 from models.shapes.mesh_files import find_mesh
 from models.shapes.shapes import Shape
 from ocp.app.bases import floating_base, momentum_rows, standing_rows
-from ocp.app.joint_limits import Row, limit_rows, torque_rows
+from ocp.app.joint_limits import Row, RowVerdict, limit_rows, torque_rows
 from ocp.app.oddities import Fault, Readable, readable
 from ocp.app.pieces import Motion, Rule
 from ocp.app.surroundings import clearance_rows, path_rows, within_limits
@@ -41,8 +42,6 @@ __all__ = ["BaseKind", "Check", "Fault", "Limit", "Row", "bounds_of", "check_tra
 BaseKind: TypeAlias = Literal["fixed", "standing", "floating"]
 Limit: TypeAlias = float | Mapping[str, float] | None
 """One number for all joints, or numbers by name; "" is the name of all others. None: the robot's own."""
-
-GRAVITY = (0.0, 0.0, -9.81)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +79,7 @@ class Check:
     @property
     def sentence(self) -> str:
         """The verdict."""
-        open_ = [row.name for row in self.rows if row.verdict == "not decided"]
+        open_ = [row.name for row in self.rows if row.verdict is RowVerdict.UNDECIDED]
         but = f"; not decided: {', '.join(open_[:3])}{' ...' if len(open_) > 3 else ''}" if open_ else ""
         without = f"; not looked at: {'; '.join(self.unseen)}" if self.unseen else ""
         if self.passed:
@@ -104,7 +103,7 @@ class Check:
         if self.faults:
             lines.append("faults:")
             lines += [f"  {fault}" for fault in self.faults]
-        shown = [row for row in self.rows if row.verdict != "unlimited"]
+        shown = [row for row in self.rows if row.verdict is not RowVerdict.UNLIMITED]
         if shown:
             width = max(len(row.name) for row in shown)
             lines.append(f"  {'':<{width}}  {'worst':>11}  {'limit':>10}  {'unit':<8}{'at, s':>10}")
@@ -420,7 +419,7 @@ def _efforts(found: Readable, robot: Robot, bounds: JointBounds, share: float) -
         k = int(np.abs(found.efforts[:, column]).argmax())
         value, time = float(found.efforts[k, column]), float(found.motion.t[k])
         failed = abs(value) > limit * (1 + share)
-        verdict = "FAILED" if failed else "ok" if np.isfinite(limit) else "unlimited"
+        verdict = RowVerdict.FAILED if failed else RowVerdict.OK if np.isfinite(limit) else RowVerdict.UNLIMITED
         told = limit if np.isfinite(limit) else None
         rows.append(Row(f"told torque of {name}", value, told, unit, time, verdict, "as the file has it"))
         if failed:

@@ -11,21 +11,16 @@ import numpy as np
 
 from models.arrays import Array
 from models.paths import Arc, Helix
+from models.paths.segments import SHORTEST_SEGMENT
 from models.spatial import FULL_TURN
+from ocp.tolerances import STANDSTILL
 
 __all__ = ["PLANES", "Gap", "about_center", "center_of_radius"]
 
 PLANES = {170: (0, 1, 2), 180: (2, 0, 1), 190: (1, 2, 0)}
 """First axis, second axis and normal of G17, G18, G19: right-handed, so that G3 turns about the normal."""
-SMALLEST_SWEEP = 1e-6
-"""rad; an arc that turns by less is meant as a full circle."""
-ROUNDING = 1e-3
-"""Share of the radius that the distances from the centre may differ by, where that is less than WORST gaps."""
-WORST = 100.0
-SMALLEST_RADIUS = 1e-9
-"""m."""
-LEVEL = 1e-12
-"""m; a rise of less is none."""
+RADIUS_SHARE = 1e-3
+"""Of the radius: by so much the distances from the centre may differ where numbers have few digits."""
 
 
 class Gap(Exception):
@@ -52,7 +47,7 @@ def center_of_radius(start: Array, end: Array, radius: float, clockwise: bool, g
     if length == 0:
         raise Gap("an arc by its radius ends where it starts; give I, J, K for a full circle", 0.0, gap)
     short = length / 2 - abs(radius)
-    if short > gap and short > ROUNDING * length / 2:
+    if short > gap and short > RADIUS_SHARE * length / 2:
         raise Gap(f"R is {short:.3g} m less than half the way from start to end", short, gap)
     height = np.sqrt(max(radius**2 - length**2 / 4, 0.0))
     left = np.array([-chord[1], chord[0]]) / length
@@ -79,10 +74,10 @@ def about_center(
     inside, normal = list(plane[:2]), plane[2]
     first, last = start[inside], end[inside]
     radii = float(np.hypot(*(first - center))), float(np.hypot(*(last - center)))
-    if min(radii) <= SMALLEST_RADIUS:
+    if min(radii) <= SHORTEST_SEGMENT:
         raise Gap("the centre is the start or the end of the arc", max(radii), gap)
     off = abs(radii[0] - radii[1])
-    allowed = max(gap, min(ROUNDING * max(radii), WORST * gap))
+    allowed = max(gap, min(RADIUS_SHARE * max(radii), 100 * gap))  # two digits fewer than usual, at most
     if off > allowed:
         what = f"start and end are {radii[0]:.6g} and {radii[1]:.6g} m from the centre, {off:.3g} m apart"
         raise Gap(what, off, allowed)
@@ -122,7 +117,7 @@ def _turned(
     axis[plane[2]] = -1.0 if clockwise else 1.0
     middle[list(plane[:2])] = center
     rise = float((end - start) @ axis)
-    if sweep <= FULL_TURN * (1 + 1e-12) and abs(rise) <= LEVEL:
+    if sweep <= FULL_TURN * (1 + 1e-12) and abs(rise) <= STANDSTILL:
         return Arc(start, middle, axis, min(sweep, FULL_TURN))
     return Helix(start, middle, axis, sweep, rise)
 
@@ -130,4 +125,4 @@ def _turned(
 def _sweep(first: Array, last: Array, clockwise: bool) -> float:
     angle = float(np.arctan2(first[0] * last[1] - first[1] * last[0], first @ last))
     angle = (-angle if clockwise else angle) % FULL_TURN
-    return angle if angle > SMALLEST_SWEEP else FULL_TURN
+    return angle if angle > 1e-6 else FULL_TURN  # no arc is meant to turn by less

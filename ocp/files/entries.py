@@ -11,20 +11,17 @@ from typing import Any
 import numpy as np
 
 from models.arrays import Array
+from models.input_files import INPUT_LIMITS
 from ocp.errors import NOT_NUMBERS, ProblemError, floats, real
 from ocp.files.lines import FileName, read_lines, wrong_line
-from ocp.files.trees import DEEPEST, checked_depth
+from ocp.files.trees import checked_depth
 
 __all__ = ["Entries", "read_entries"]
 
-LARGEST_TOML = 2**20
-"""Bytes."""
 TABLE = re.compile(r"(\[\[?)([^\[\]#]+)\]\]?\s*(?:#.*)?$")
 KEY = re.compile(r"""((?:[\w-]+|"[^"]*"|'[^']*')(?:\s*\.\s*(?:[\w-]+|"[^"]*"|'[^']*'))*)\s*=""")
 BETWEEN = re.compile(r"[,=\[\]{}#]")
 AT_LINE = re.compile(r"\(at line (\d+)")
-NEARLY = 0.5
-"""How alike two names are of which the one is taken for the other, 1 if they are equal."""
 Place = tuple[Any, ...]
 
 
@@ -56,7 +53,7 @@ class Entries:
     def missing(self, name: str, expected: str) -> ProblemError:
         """The error of an entry that is not there; of one that nobody asks for, where its name is nearly this one."""
         strange = [one for one in self._values if one not in self._asked]
-        if near := get_close_matches(name, strange, n=1, cutoff=NEARLY):
+        if near := get_close_matches(name, strange, n=1, cutoff=0.5):
             return self.wrong(near[0], f"{near[0]} means nothing here; did you mean {name}? It is {expected}")
         table = ".".join(str(part) for part in self.place if isinstance(part, str))
         where = f"in [{table}]" if table else "at the top"
@@ -207,10 +204,14 @@ def read_entries(file: FileName) -> Entries:
     Raises:
         ProblemError: A file that cannot be read, or is no TOML, by line.
     """
-    texts = read_lines(file, largest=LARGEST_TOML)
+    texts = read_lines(file, largest=INPUT_LIMITS.task_bytes)
     for number, text in enumerate(texts, 1):
-        if any(part.count(".") > DEEPEST for part in BETWEEN.split(text)):  # the parser's time grows by the square
-            raise wrong_line(file, number, text, f"a name has more than {DEEPEST} parts", DEEPEST)
+        if any(
+            part.count(".") > INPUT_LIMITS.nesting for part in BETWEEN.split(text)
+        ):  # the parser's time grows by the square
+            raise wrong_line(
+                file, number, text, f"a name has more than {INPUT_LIMITS.nesting} parts", INPUT_LIMITS.nesting
+            )
     try:
         values = checked_depth(tomllib.loads("\n".join(texts)))
     except tomllib.TOMLDecodeError as error:

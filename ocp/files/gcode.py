@@ -21,23 +21,9 @@ from models.paths.reversals import Reversal
 from models.paths.segments import SHORTEST_SEGMENT
 from ocp.errors import ProblemError, checked_choice, checked_flag, checked_positive
 from ocp.files.arcs import PLANES, Gap, about_center, center_of_radius
-from ocp.files.blocks import Block, blocks
-from ocp.files.codes import (
-    CALLS,
-    ENDS,
-    GROUPS,
-    KEPT,
-    LETTERS,
-    MACHINE,
-    MOTIONS,
-    NONMODAL,
-    POST,
-    REFUSED,
-    STOPS,
-    code_name,
-)
 from ocp.files.lines import FileName, read_lines, wrong_line
 from ocp.files.program import Cut, Note, Pause, Program, Rapid, Stretch, checked_reversal
+from ocp.files.words import GROUPS, KEPT, LETTERS, M_WORDS, MACHINE, MOTIONS, POST, REFUSED, Block, blocks, code_name
 
 __all__ = ["read_gcode"]
 
@@ -201,7 +187,7 @@ class _Reader:
             if code in REFUSED:
                 self._refuse(f"{code_name(code)}: {REFUSED[code]}")
             group = GROUPS.get(code)
-            if group is None and code not in KEPT and code not in NONMODAL:
+            if group is None and code not in KEPT and code not in (40, 90, 920, 921, 922, *MACHINE):
                 self._refuse(f"{code_name(code)} is not known; {POST}")
             if group in seen:
                 self._refuse(
@@ -394,14 +380,15 @@ class _Reader:
     def _stop(self, words: dict[str, float]) -> bool:
         ended = False
         for code in (code for letter, code in self.block.codes if letter == "M"):
-            if code in CALLS:
-                self._refuse(f"{CALLS[code]}: subroutines are not run; post the program without them")
-            if code in STOPS:
+            kind, name = M_WORDS.get(code, ""), f"M{code // 10}"
+            if kind == "call":
+                self._refuse(f"{name}: subroutines are not run; post the program without them")
+            if kind == "stop":
                 self._end_path()
-                self.stretches.append(Pause(0.0, self.block.number, f"M{code // 10}"))
-            ended |= code in ENDS
-            if code not in ENDS:
-                self._note(f"M{code // 10}: {'a stop' if code in STOPS else 'passed over'}")
+                self.stretches.append(Pause(0.0, self.block.number, name))
+            ended |= kind == "end"
+            if kind != "end":
+                self._note(f"{name}: {'a stop' if kind == 'stop' else 'passed over'}")
         if any(letter == "M" for letter, _ in self.block.codes):
             words.clear()  # P of M66 and the like
         if words:

@@ -7,21 +7,19 @@ from os import PathLike, fspath
 from pathlib import Path
 from typing import Any
 
-from models.input_files import UnfitFile, read_regular
+from models.input_files import INPUT_LIMITS, UnfitFile, read_regular
 from ocp.errors import ProblemError
 
-__all__ = ["LARGEST_FILE", "MOST_LINES", "FileName", "cells_of", "is_number", "read_lines", "wrong_line"]
+__all__ = ["FileName", "cells_of", "is_number", "read_lines", "wrong_line"]
 
 FileName = str | PathLike[str]
-LARGEST_FILE = 32 * 2**20
-"""Bytes."""
-MOST_LINES, LONGEST_LINE = 500_000, 10_000
-"""A path takes 1 or 2 kB a line."""
 BEFORE_UNIT = re.compile(r"(?<!\s)\s+(?=[\[(])")
 LONGEST_SHOWN = 120  # characters of a line in a message
 
 
-def read_lines(file: FileName, *, longest: int | None = LONGEST_LINE, largest: int = LARGEST_FILE) -> list[str]:
+def read_lines(
+    file: FileName, *, longest: int | None = INPUT_LIMITS.line_characters, largest: int = INPUT_LIMITS.text_bytes
+) -> list[str]:
     """The lines of a text file, of any line ends, without a byte order mark; what is no UTF-8 is read as Latin-1.
 
     None may have more than `longest` characters, and the file at most `largest` bytes.
@@ -46,9 +44,9 @@ def read_lines(file: FileName, *, longest: int | None = LONGEST_LINE, largest: i
     except UnicodeDecodeError:
         text = raw.decode("latin-1")
     lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
-    if len(lines) > MOST_LINES:
-        message = f"{path}: {len(lines)} lines, at most {MOST_LINES} are read; split it"
-        raise ProblemError(message, name="file", value=len(lines), limit=MOST_LINES)
+    if len(lines) > INPUT_LIMITS.text_lines:
+        message = f"{path}: {len(lines)} lines, at most {INPUT_LIMITS.text_lines} are read; split it"
+        raise ProblemError(message, name="file", value=len(lines), limit=INPUT_LIMITS.text_lines)
     if longest is not None and max(len(line) for line in lines) > longest:
         i = next(i for i, line in enumerate(lines) if len(line) > longest)
         raise wrong_line(path, i + 1, lines[i], f"longer than {longest} characters; break it", longest)

@@ -15,17 +15,12 @@ from typing import IO, Any
 
 import numpy as np
 
-from models.input_files import open_regular
+from models.input_files import INPUT_LIMITS, open_regular
 from ocp.errors import ProblemError, checked_instance, checked_text
 from ocp.planning import Plan
 from ocp.storage import write_whole
 
 __all__ = ["read_joint_messages", "write_mcap"]
-
-LARGEST_LOG, MOST_UNPACKED, LARGEST_RECORD = 2**30, 2**30, 2**26
-"""Bytes: of a log's file, of all that it unpacks to, and of one record or chunk, unpacked."""
-MOST_OF_JOINTS = 2**26
-"""Bytes of all messages that are kept: they take five times as much memory."""
 
 
 def _with_parts(fields: str, **parts: str) -> str:
@@ -132,7 +127,7 @@ def read_joint_messages(file: str | os.PathLike[str], topic: str | None = None) 
     channels: dict[int, tuple[str, Any]] = {}  # topics, and how their messages are read
     size = 0
     try:
-        with open_regular(file, LARGEST_LOG) as stream:
+        with open_regular(file, INPUT_LIMITS.log_bytes) as stream:
             for record in _records(stream):
                 if isinstance(record, Schema):
                     if record.name in (STATE, TRAJECTORY):
@@ -144,8 +139,8 @@ def read_joint_messages(file: str | os.PathLike[str], topic: str | None = None) 
                     name, read = channels.get(record.channel_id, ("", None))
                     if read is not None:
                         size += len(record.data)
-                        if size > MOST_OF_JOINTS:
-                            raise ValueError(f"its messages of joints have more than {MOST_OF_JOINTS} bytes; split it")
+                        if size > (most := INPUT_LIMITS.log_message_bytes):
+                            raise ValueError(f"its messages of joints have more than {most} bytes; split it")
                         told = _fields(read(record.data))
                         stamp = told["header"]["stamp"]["sec"] * 10**9 + told["header"]["stamp"]["nanosec"]
                         stamp = stamp or record.log_time
@@ -176,14 +171,14 @@ def _records(stream: IO[bytes]) -> Iterator[Any]:
     from mcap.records import Chunk
     from mcap.stream_reader import StreamReader
 
-    room = MOST_UNPACKED
-    for record in StreamReader(stream, emit_chunks=True, record_size_limit=LARGEST_RECORD).records:
+    room, largest = INPUT_LIMITS.log_bytes, INPUT_LIMITS.log_record_bytes
+    for record in StreamReader(stream, emit_chunks=True, record_size_limit=largest).records:
         if not isinstance(record, Chunk):
             yield record
             continue
         room -= record.uncompressed_size
-        if record.uncompressed_size > LARGEST_RECORD or room < 0:
-            raise ValueError(f"it unpacks to more than {MOST_UNPACKED} bytes, or a part of it to {LARGEST_RECORD}")
+        if record.uncompressed_size > largest or room < 0:
+            raise ValueError(f"it unpacks to more than {INPUT_LIMITS.log_bytes} bytes, or a part of it to {largest}")
         with suppress(EndOfFile):
             yield from StreamReader(io.BytesIO(_unpacked(record)), skip_magic=True).records
 
@@ -192,7 +187,7 @@ def _unpacked(chunk: Any) -> bytes:
     """The contents of a chunk, never more than it says that it has."""
     data, size = chunk.data, chunk.uncompressed_size
     if chunk.compression == "zstd":
-        zstd = import_module("zstandard").ZstdDecompressor(max_window_size=LARGEST_RECORD)
+        zstd = import_module("zstandard").ZstdDecompressor(max_window_size=INPUT_LIMITS.log_record_bytes)
         data = zstd.stream_reader(data).read(size + 1)
     elif chunk.compression == "lz4":
         data = import_module("lz4.frame").LZ4FrameDecompressor().decompress(data, size + 1)

@@ -35,7 +35,6 @@ BEGINNINGS = {
     "urdf": re.compile(rf"<\?xml [^>]*>\n<!-- {MARK} -->\n".encode()),
     "report": re.compile(rb'<!doctype html>\n<html[^>]*>\s*<head>\s*<meta name="generator" content="selfmotion">'),
 }
-LONGEST_BEGINNING = 2**20
 
 
 def checked_output(kind: str, file: str | os.PathLike[str], folder: Path | None = None, force: bool = False) -> Path:
@@ -70,7 +69,7 @@ def _is_own(kind: str, place: Path) -> bool:
         if kind == "plan":
             return "head" in read_arrays(place)
         with open_regular(place, sys.maxsize) as stream:
-            start = stream.read(LONGEST_BEGINNING)
+            start = stream.read(2**20)  # the head of a table of some thousand joints
     except (OSError, ProblemError):
         return False
     if kind == "csv":

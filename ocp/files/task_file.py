@@ -79,10 +79,6 @@ LIMITED = {
     "power": "W",
 }
 """What of joints is limited."""
-LEAST, MOST = 0.999e-6, 1e6
-"""Of what a schedule is asked for, in SI units: what is beyond is no machine's."""
-STRAY = 1e-3
-"""m, that rounded corners may stray where nothing is told."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,12 +181,9 @@ def _machine(entries: Entries, urdf: Path) -> Machine:
 
 def _task(entries: Entries, folder: Path) -> TipTask:
     path = _path(entries, folder)
-    speed = entries.number("speed", "a number above 0, m/s, of 1e-6 to 1e6", REQUIRED, least=LEAST, most=MOST)
-    acceleration = entries.number("acceleration", "a number above 0, m/s^2, of 1e-6 to 1e6", least=LEAST, most=MOST)
-    jerk = entries.number("jerk", "a number above 0, m/s^3, of 1e-6 to 1e6", np.inf, least=LEAST, most=MOST)
-    centripetal = entries.number(
-        "centripetal", "a number above 0, m/s^2, of 1e-6 to 1e6", np.inf, least=LEAST, most=MOST
-    )
+    speed = _pace(entries, "speed", "m/s", REQUIRED)
+    acceleration = _pace(entries, "acceleration", "m/s^2")
+    jerk, centripetal = _pace(entries, "jerk", "m/s^3", np.inf), _pace(entries, "centripetal", "m/s^2", np.inf)
     pace: Any = speed
     if acceleration is not None:
         with _about(entries, "acceleration"):
@@ -216,8 +209,13 @@ def _task(entries: Entries, folder: Path) -> TipTask:
         return replace(task, rows=(3, 4, 5), direction=None, orientation=None) if tool == "free" else task
 
 
+def _pace(entries: Entries, name: str, unit: str, default: Any = None) -> Any:
+    """What a schedule is asked for; what is beyond is no machine's."""
+    return entries.number(name, f"a number above 0, {unit}, of 1e-6 to 1e6", default, least=0.999e-6, most=1e6)
+
+
 def _path(entries: Entries, folder: Path) -> SmoothPath:
-    stray = entries.number("rounding", "a number above 0, m: how far rounded corners may stray", STRAY, least=0.0)
+    stray = entries.number("rounding", "a number above 0, m: how far rounded corners may stray", 1e-3, least=0.0)
     name = entries.text("file", "the name of a file of waypoints")
     points = entries.raw("points")
     if (name is None) == (points is None):

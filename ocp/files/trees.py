@@ -10,15 +10,12 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
+from models.input_files import INPUT_LIMITS
 from ocp.errors import ProblemError
 from ocp.files.lines import FileName, read_lines
 
-__all__ = ["DEEPEST", "MOST_VALUES", "checked_depth", "parts_of", "read_tree"]
+__all__ = ["checked_depth", "parts_of", "read_tree"]
 
-MOST_VALUES = 2**21
-"""Values and keys of a tree."""
-DEEPEST = 64
-"""Containers within containers."""
 NUMBER = re.compile(r"[-+]?(?:\d[\d_]*(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?")
 WORDS: dict[str, Any] = {
     **dict.fromkeys(("", "~", "null", "Null", "NULL")),
@@ -29,7 +26,7 @@ WORDS: dict[str, Any] = {
 }
 """What plain scalars of YAML stand for that are no numbers and no texts."""
 TAGS = {None, "!", *(f"tag:yaml.org,2002:{kind}" for kind in ("str", "int", "float", "bool", "null", "seq", "map"))}
-TOO_DEEP = f"containers stand in each other more than {DEEPEST} deep"
+TOO_DEEP = f"containers stand in each other more than {INPUT_LIMITS.nesting} deep"
 _NO_KEY = object()
 
 
@@ -37,14 +34,16 @@ def read_tree(file: FileName, kind: str) -> Any:
     """Return what a JSON file, or the first document of a YAML file, holds.
 
     Raises:
-        ProblemError: It cannot be read, is not of its kind, has more than MOST_VALUES values or more than DEEPEST
-            containers within each other, or for YAML, the package pyyaml is not installed.
+        ProblemError: It cannot be read, is not of its kind, has too many values or too many containers within each
+            other, or for YAML, the package pyyaml is not installed.
     """
     text = "\n".join(read_lines(file, longest=None))
     try:
         return _json(text) if kind == "json" else _yaml(text)
     except RecursionError as error:
-        raise ProblemError(f"{file} is nested too deep", name="file", value=str(file), limit=DEEPEST) from error
+        raise ProblemError(
+            f"{file} is nested too deep", name="file", value=str(file), limit=INPUT_LIMITS.nesting
+        ) from error
     except ValueError as error:
         if isinstance(error, ProblemError):
             raise
@@ -109,7 +108,7 @@ def _first_document(events: Any) -> Any:
             value, count, anchor = _scalar(event), 1, event.anchor
         elif name in ("SequenceStartEvent", "MappingStartEvent"):
             waiting.append(_Container([] if name[0] == "S" else {}, _checked_tag(event).anchor))
-            if len(waiting) > DEEPEST:
+            if len(waiting) > INPUT_LIMITS.nesting:
                 raise ValueError(TOO_DEEP)
             continue
         else:
@@ -136,14 +135,14 @@ def _checked_tag(event: Any) -> Any:
 
 
 def _check_count(count: int) -> None:
-    if count > MOST_VALUES:
-        raise ValueError(f"it holds {count} values, at most {MOST_VALUES} are read")
+    if count > INPUT_LIMITS.tree_values:
+        raise ValueError(f"it holds {count} values, at most {INPUT_LIMITS.tree_values} are read")
 
 
 def checked_depth(tree: Any) -> Any:
-    """Return a tree; raise ValueError where its containers stand in each other more than DEEPEST deep."""
+    """Return a tree; raise ValueError where its containers stand in each other more than INPUT_LIMITS.nesting deep."""
     level = [tree]
-    for _ in range(DEEPEST + 1):
+    for _ in range(INPUT_LIMITS.nesting + 1):
         level = [part for one in level for part in parts_of(one)]
     if level:
         raise ValueError(TOO_DEEP)

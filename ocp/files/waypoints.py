@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models import ModelError, Path, SmoothPath
-from models.arrays import Array, warn_of_degrees, warn_of_millimetres
+from models.arrays import ROUNDING, Array, warn_of_degrees, warn_of_millimetres
 from models.paths import Line, chains
 from models.paths.orientation import product, rotation_vector
 from models.paths.reversals import Reversal
@@ -56,12 +56,6 @@ ANGLES = {"rad": 1.0, "deg": np.pi / 180, "°": np.pi / 180}
 TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 HEAD = re.compile(r"^([\w.]+?)\s*(?:[\[(/ _]\s*(m|mm|cm|um|µm|in|inch|rad|deg|°|s|ms|us|ns)\s*[\])]?)?$")
 SKIPPED = ("", "-", "index")
-LOOSEST = 1e-2
-"""Difference of a quaternion's norm from 1 that is put down to the digits written."""
-OPPOSITE = 1e-7
-"""1 + cosine between two axes below which they are opposite."""
-SAME_TURN = 1e-9
-"""rad between the tool at two waypoints of one place that count as one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,9 +156,9 @@ class Waypoints:
         turn = np.pi
         with suppress(ModelError):  # half a turn
             turn = float(np.linalg.norm(rotation_vector(self.orientations[last], self.orientations[i])))
-        if turn > SAME_TURN:
+        if turn > ROUNDING:
             why = f"the tool turns by {np.degrees(turn):.4g} deg in one place; turn it along a way, or drop the line"
-            raise wrong_line(self.file, int(self.lines[i]), self._shown(i), why, SAME_TURN)
+            raise wrong_line(self.file, int(self.lines[i]), self._shown(i), why, ROUNDING)
 
     def _shown(self, i: int) -> str:
         return f"waypoint {i} at {self.positions[i].tolist()} m"
@@ -341,11 +335,12 @@ def _table(file: FileName, rows: list[tuple[int, str, list[str]]], read: Sequenc
 
 def _quaternions(file: FileName, values: Array, lines: NDArray[np.intp], texts: Sequence[str]) -> Array:
     norm = np.linalg.norm(values, axis=1)
-    wrong = np.abs(norm - 1) > LOOSEST
+    most = 1e-2  # more is not put down to the digits written
+    wrong = np.abs(norm - 1) > most
     if wrong.any():
         i = int(wrong.argmax())
         why = f"the quaternion has the norm {norm[i]:.6g}; give a unit quaternion"
-        raise wrong_line(file, int(lines[i]), texts[i], why, LOOSEST)
+        raise wrong_line(file, int(lines[i]), texts[i], why, most)
     return np.asarray(values / norm[:, None])
 
 
@@ -372,7 +367,7 @@ def _least_roll(file: FileName, axes: Array, lines: NDArray[np.intp], texts: Seq
     """Orientations whose z axis is the tool's: from row to row the least turn, which is parallel transport."""
     before = np.vstack([[0.0, 0.0, 1.0], axes[:-1]])
     steps = np.column_stack([1 + (before * axes).sum(axis=1), np.cross(before, axes)])
-    opposite = steps[:, 0] < OPPOSITE
+    opposite = steps[:, 0] < 1e-7  # 1 + cosine: half the digits of a number
     if opposite[0]:
         steps[0], opposite[0] = (0.0, 1.0, 0.0, 0.0), False  # upside down: about x
     if opposite.any():

@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 
 from models import Robot
 from models.arrays import Array
-from ocp.app.appearance import MOST_FACES, ZONE, Appearance, Part, appearance_of, part_of, rod
+from ocp.app.appearance import SURFACE_STYLE, Appearance, Part, appearance_of, part_of, rod
 from ocp.app.frames import Frames
 from ocp.app.rendering import Camera, Floor, Layer, placed, render, tube
 from scripts.drawing import COLORS, DASHES, add_note, gif, sheet
@@ -73,13 +73,13 @@ class Scene:
     mark: Array | None = None
     nearest_points: Array | None = None
     solids: tuple[Part, ...] = ()
-    detail: int = MOST_FACES
+    detail: int = SURFACE_STYLE.most_faces
 
     @cached_property
     def looks(self) -> Appearance:
         """Of the robot; without the zones of its description that are no bodies."""
         looks = appearance_of(self.robot, most=self.detail)
-        return Appearance(tuple(part for part in looks.parts if part.color != ZONE), looks.missing)
+        return Appearance(tuple(part for part in looks.parts if part.color != SURFACE_STYLE.zone), looks.missing)
 
     @cached_property
     def corners(self) -> Array:

@@ -161,10 +161,9 @@ def test_the_overhang_is_the_farthest_point_from_the_hull() -> None:
 def test_what_lies_within_the_hull_does_not_stand_out_of_it(shift: tuple[float, float, float]) -> None:
     """Of capsules from the middle of a cube of 2 m on, one that ends in it, and two beyond a face by 0.1 m and 3 m."""
     cube = convex_hull(np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, -1).T + shift)
-    triangles = cube.vertices[cube.faces]
     for beyond, out in ((0.3, 0.0), (0.8, 0.1), (3.7, 3.0)):
         for axis in np.vstack([np.eye(3), -np.eye(3)]):
-            found = covering._overhang(Capsule(0.3, shift, shift + beyond * axis), triangles)
+            found = covering._overhang(Capsule(0.3, shift, shift + beyond * axis), cube.vertices)
             assert 0.9 * out <= found <= out + 1e-12
 
 

@@ -6,6 +6,7 @@ import os
 import struct
 import sys
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ import trimesh
 
 from models import ModelError
 from models.arrays import Array
+from models.input_files import INPUT_LIMITS
 from models.shapes import collada, mesh_files, triangles
 from models.shapes.mesh_files import find_mesh, read_mesh, read_painted_mesh
 from models.shapes.triangles import Faces
@@ -230,8 +232,9 @@ def test_a_broken_file_is_named_with_the_place(tmp_path: Path, name: str, conten
 
 
 def test_a_large_file_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for kind, most in (("binary", 1000), ("text", 100)):
-        monkeypatch.setitem(triangles.MOST_BYTES, kind, most)
+    limits = replace(INPUT_LIMITS, mesh_bytes=1000, mesh_text_bytes=100)
+    for module in (mesh_files, triangles):
+        monkeypatch.setattr(module, "INPUT_LIMITS", limits)
     for name, contents in [("a.stl", b"solid" + b" " * 200), ("a.obj", b" " * 101), ("a.dae", b" " * 101)]:
         with pytest.raises(ModelError, match=r"bytes of text, limit 100|at most 100 are read"):
             read_mesh(written(tmp_path, name, contents))
@@ -243,7 +246,7 @@ def test_a_large_file_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 def test_too_many_triangles_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for module in (mesh_files, collada):
-        monkeypatch.setattr(module, "MOST_FACES", 3)
+        monkeypatch.setattr(module, "INPUT_LIMITS", replace(INPUT_LIMITS, mesh_triangles=3))
     corner = "vertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendfacet\n"
     broken: list[tuple[str, str | bytes]] = [
         ("a.stl", binary_stl(CORNERS, FACES)),

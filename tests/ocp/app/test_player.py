@@ -6,6 +6,7 @@ import json
 import re
 import urllib.error
 import urllib.request
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -38,14 +39,14 @@ from models import (
 )
 from models.arrays import Array
 from models.robot.kinematics import centers_of_mass
-from ocp import Clear, Collocation, Plan, ProblemError, Solution, TipTask, minimum_velocity_problem, resolve, solve
-from ocp.app import appearance, main, player, serving
+from ocp import Clear, Collocation, Plan, ProblemError, Solution, TipTask, minimum_velocity_problem, solve
+from ocp.app import appearance, main, serving
 from ocp.app.appearance import appearance_of
 from ocp.app.frames import frames_along
 from ocp.app.player import page, unpacked
 from ocp.app.quantities import Curve, footing_of
 from ocp.app.serving import Served
-from ocp.app.shown import shown_local, shown_plan, shown_solution, shown_trajectory
+from ocp.app.shown import PAGE_SETTINGS, shown_plan, shown_solution, shown_trajectory
 from ocp.files import read_trajectory
 from ocp.local.touching import distances_along
 from ocp.planning.motion import Part
@@ -200,7 +201,9 @@ def test_a_robot_that_was_changed_looks_the_same(folder: Path, robot: Robot, cha
     for one in (robot, changed):
         q = START[: one.dof]
         frames = frames_along(FixedBase(one), q)
-        parts = [part for part in appearance_of(one, [folder / "share"]).parts if part.color != appearance.ROD]
+        parts = [
+            part for part in appearance_of(one, [folder / "share"]).parts if part.color != appearance.SURFACE_STYLE.rod
+        ]
         points = [part.vertices @ frames.rotations[part.link][0].T + frames.positions[part.link][0] for part in parts]
         clouds.append(np.unique(np.vstack(points).round(4), axis=0))
     np.testing.assert_allclose(clouds[0], clouds[1], atol=2e-4)
@@ -235,7 +238,7 @@ def test_simple_shapes_are_closed_and_their_normals_point_out(shape: VisualShape
 
 
 def test_meshes_of_many_faces_become_coarse_and_stay_where_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(appearance, "ROUND", 200)
+    monkeypatch.setattr(appearance, "SURFACE_STYLE", replace(appearance.SURFACE_STYLE, sides=200))
     robot = Robot((Link("a", visuals=(VisualShape("sphere", (0.2,)),)),))
     (fine,) = appearance_of(robot).parts
     (coarse,) = appearance_of(robot, most=4000).parts
@@ -392,7 +395,7 @@ def test_where_the_ground_pushes_is_found_from_the_rows_of_the_problem(robot: Ro
     assert not rest.forces
 
 
-def test_solutions_local_motions_and_files_are_shown_as_plans_are(
+def test_solutions_and_files_are_shown_as_plans_are(
     plans: dict[str, Plan], machines: dict[str, Machine], tmp_path: Path
 ) -> None:
     for kind, plan in plans.items():
@@ -400,24 +403,18 @@ def test_solutions_local_motions_and_files_are_shown_as_plans_are(
         wanted = shown_plan(plan)
         plan.solution.save(tmp_path / "solution.npz")
         plan.write_csv(tmp_path / "motion.csv", 0.01)
-        local = resolve(machine, TipTask(rows=(3, 4), velocity=(0.1, -0.1)), START, 1.5)
         raw = read_trajectory(tmp_path / "motion.csv", joints=plan.names)
-        shown = [
-            shown_solution(Solution.load(tmp_path / "solution.npz"), machine),
-            shown_trajectory(raw, machine),
-            shown_local(local, machine),
-        ]
-        for one in shown[:2]:
+        shown = [shown_solution(Solution.load(tmp_path / "solution.npz"), machine), shown_trajectory(raw, machine)]
+        for one in shown:
             np.testing.assert_allclose(one.t, wanted.t, atol=1e-12)
             np.testing.assert_allclose(one.joints, wanted.joints, atol=1e-4)
             np.testing.assert_allclose(one.base, wanted.base, atol=1e-4)
         assert shown[0].verdict == wanted.verdict
         assert shown[0].passed is wanted.passed is True
         assert shown[1].passed is None
-        np.testing.assert_allclose(shown[2].joints[0], START)
-        told, _ = unpacked(page([wanted, *shown], title="four").text)
+        told, _ = unpacked(page([wanted, *shown], title="three").text)
         assert len(told["robots"]) == 1  # the same robot is held once
-        assert [motion["robot"] for motion in told["motions"]] == [0, 0, 0, 0]
+        assert [motion["robot"] for motion in told["motions"]] == [0, 0, 0]
     with pytest.raises(ProblemError, match="elbows"):
         shown_solution(plans["fixed"].solution, machines["fixed"], joints="elbows")
     with pytest.raises(ProblemError, match="base"):
@@ -443,7 +440,7 @@ def test_a_page_is_whole_small_the_same_again_and_asks_nobody(plans: dict[str, P
 
 
 def test_a_page_that_is_too_large_is_not_written(plans: dict[str, Plan], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(player, "MOST_BYTES", 10_000)
+    monkeypatch.setattr("ocp.app.player.PAGE_SETTINGS", replace(PAGE_SETTINGS, most_bytes=10_000))
     with pytest.raises(ProblemError, match="MB"):
         page([shown_plan(plans["fixed"])])
     with pytest.raises(ProblemError, match="at least one"):

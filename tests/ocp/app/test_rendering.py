@@ -8,7 +8,7 @@ import pytest
 from models.arrays import Array
 from ocp import ProblemError
 from ocp.app.appearance import Part, part_of
-from ocp.app.rendering import LENS, SUN, Camera, Floor, Layer, render, tube
+from ocp.app.rendering import PICTURE_STYLE, Camera, Floor, Layer, render, tube
 
 RNG = np.random.default_rng(17)
 PURE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -85,7 +85,7 @@ def test_a_ball_covers_the_disc_that_perspective_says() -> None:
     camera = camera._replace(eye=distance * camera.axes[2])
     picture = render([Layer([ball(0.5)])], camera)
     covered = (picture < 250).any(axis=2).sum()
-    radius = LENS * 150 * 0.5 / np.sqrt(distance**2 - 0.5**2)
+    radius = PICTURE_STYLE.lens * 150 * 0.5 / np.sqrt(distance**2 - 0.5**2)
     assert covered == pytest.approx(np.pi * radius**2, rel=0.01)
 
 
@@ -95,7 +95,7 @@ def test_the_shadow_of_a_plate_lies_where_the_sun_puts_it() -> None:
         np.array([[-1.5, -1.5, 0], [1.5, 1.5, 1.0], [-1.5, 1.5, 0], [1.5, -1.5, 0]]), (240, 200), 60.0
     )
     picture = render([Layer([plate(size, height)])], camera, floor=floor).astype(float).mean(axis=2)
-    turn, rise = np.deg2rad(-58.0) - SUN[0], SUN[1]
+    turn, rise = np.deg2rad(-58.0) - PICTURE_STYLE.sun[0], PICTURE_STYLE.sun[1]
     shift = -height / np.tan(rise) * np.array([np.cos(turn), np.sin(turn)])
 
     def tone(x: float, y: float) -> float:

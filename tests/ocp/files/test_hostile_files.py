@@ -8,6 +8,7 @@ import subprocess
 import sys
 import textwrap
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,14 +19,14 @@ from mcap.data_stream import RecordBuilder
 from mcap.records import Chunk
 
 from models import ModelError, Robot, planar_chain
-from models.input_files import MOST_ELEMENTS, UnfitFile, open_regular, parse_xml, read_regular
+from models.input_files import INPUT_LIMITS, UnfitFile, open_regular, parse_xml, read_regular
 from models.shapes.mesh_files import read_mesh
 from models.shapes.pairs import checked_pairs
 from ocp import ProblemError, Solution
 from ocp.files import read_gcode, read_trajectory, read_waypoints, trees
 from ocp.files.obstacles import read_obstacles
 from ocp.files.task_file import read_task
-from ocp.files.trees import DEEPEST, MOST_VALUES, read_tree
+from ocp.files.trees import read_tree
 from ocp.schedule import JointTrajectory
 
 READERS: dict[str, tuple[str, Callable[[Any], Any]]] = {
@@ -123,7 +124,7 @@ def test_entities_are_not_read_in_any_encoding(encoding: str, what: str, tmp_pat
 
 def test_elements_and_attributes_are_counted_before_they_are_read() -> None:
     for text in (
-        "<a>" + "<b/>" * MOST_ELEMENTS + "</a>",
+        "<a>" + "<b/>" * INPUT_LIMITS.xml_elements + "</a>",
         "<a " + " ".join(f"b{k}=''" for k in range(1000)) * 1100 + "/>",
     ):
         with pytest.raises(ValueError, match="elements and attributes"):
@@ -157,7 +158,7 @@ BOMBS = {
 def test_a_tree_of_yaml_is_bounded(bomb: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     if bomb == "many values":
-        monkeypatch.setattr(trees, "MOST_VALUES", 10_000)
+        monkeypatch.setattr(trees, "INPUT_LIMITS", replace(INPUT_LIMITS, tree_values=10_000))
     (tmp_path / "a.yaml").write_text(BOMBS[bomb])
     with pytest.raises(ProblemError):
         read_trajectory(tmp_path / "a.yaml")
@@ -187,8 +188,8 @@ points:
     "text",
     [
         "[" * 10**6,
-        "[" * (DEEPEST + 2) + "]" * (DEEPEST + 2),
-        "[" + "0," * MOST_VALUES + "0]",
+        "[" * (INPUT_LIMITS.nesting + 2) + "]" * (INPUT_LIMITS.nesting + 2),
+        "[" + "0," * INPUT_LIMITS.tree_values + "0]",
         "9" * 5000,
         '{"a": 1e999, "joint_names": [' + "[" * 60 + "]" * 60 + '], "points": []}',
     ],
