@@ -16,7 +16,7 @@ from models import FixedBase, FreeFloating, Robot, inverse_dynamics, simplified
 from models.arrays import Array
 from ocp.app.oddities import Fault
 from ocp.app.pieces import Along, Indices, Motion, highest
-from ocp.problem.formulation import Sampler
+from ocp.problem.sampling import Sampler
 from ocp.tasks.limits import JointBounds
 
 __all__ = ["ORDERS", "Row", "floating_torques", "limit_rows", "states_along", "torque_rows"]

@@ -12,7 +12,7 @@ from models import FreeFloating, Machine, Standing, inverse_dynamics, simplified
 from models.arrays import Array
 from models.machines.standing import center_of_pressure
 from ocp.app.joint_limits import floating_torques
-from ocp.problem.formulation import Sampler
+from ocp.problem.sampling import Sampler
 from ocp.tasks.limits import JointBounds
 
 __all__ = ["EARTH", "Curve", "Footing", "footing_of", "joint_curves", "machine_curves", "so_far"]

@@ -36,9 +36,10 @@ from ocp.indirect.minimality import not_least
 from ocp.indirect.newton import Found, newton
 from ocp.indirect.seed import ControlArcs, read_arcs, read_unknowns
 from ocp.indirect.sensitivity import Extremal, cost_gradient
-from ocp.problem.formulation import Bounds, Formulation, at_samples
+from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.invariants import bounds_to_solve
 from ocp.problem.problem import Problem
+from ocp.problem.sampling import at_samples
 from ocp.solution import ByName, Guess, Solution, check_belongs
 from ocp.status import SolverStatus
 

@@ -13,7 +13,8 @@ import numpy as np
 
 from ocp.errors import ProblemError, SolveError
 from ocp.indirect.hamiltonian import Hamiltonian
-from ocp.problem.formulation import Bounds, Formulation, at_samples
+from ocp.problem.formulation import Bounds, Formulation
+from ocp.problem.sampling import at_samples
 from ocp.solution import Solution
 
 __all__ = ["ControlArcs", "read_arcs", "read_unknowns"]
