@@ -15,6 +15,7 @@ __all__ = ["ENDS", "Constraint", "Declarations", "Guess", "Horizon", "PhaseTimes
 
 Guess = Any  # a value, or a function of time that returns one
 ENDS = ("initial", "terminal")
+RESERVED = ("t", "time", "horizon")
 
 
 @dataclass(frozen=True)
@@ -169,6 +170,23 @@ class Declarations:
     horizon: Horizon | None = None
     running: Any = None
     terminal: Any = None
+
+    def check_new_variable(self, kind: str, name: Any) -> None:
+        """Raise ProblemError unless a name can be that of a new variable; ``kind`` is that of the message."""
+        if not isinstance(name, str) or not name:
+            raise ProblemError(f"{kind} name must be a non-empty string, not {name!r}")
+        if name in RESERVED:
+            raise ProblemError(f"{kind} {name!r}: this name is reserved ({', '.join(RESERVED)})")
+        for other in ("states", "controls", "parameters", "signals"):
+            if name in getattr(self, other):
+                raise ProblemError(f"{kind} {name!r}: a {other[:-1]} of this name exists already")
+
+    def check_new_constraint(self, kind: str, name: Any) -> None:
+        """Raise ProblemError unless a name can be that of a new constraint; ``kind`` is that of the message."""
+        if not isinstance(name, str) or not name:
+            raise ProblemError(f"{kind}: its name must be a non-empty string, not {name!r}")
+        if any(name in pool for pool in (self.path, self.start, self.end, self.watch, self.apart)):
+            raise ProblemError(f"{kind} {name!r}: a constraint of this name exists already")
 
     def check(self, symbols: Any) -> None:
         """Raise ProblemError, which names the part, where declarations that were read from a file do not fit together.
