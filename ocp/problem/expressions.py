@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,7 +23,7 @@ from ocp.problem.values import (
     stacked,
 )
 
-__all__ = ["ExpressionReader", "Value", "check_guess", "number_of_entries", "read_scale", "read_tolerance"]
+__all__ = ["ExpressionReader", "Value", "check_guess", "number_of_entries", "read_scale", "signal_function"]
 
 Value = Any  # a number, an array, or a casadi expression of parameters
 
@@ -182,6 +182,16 @@ def read_tolerance(what: str, given: Value, size: int) -> list[float] | None:
         words = f"{what}: tolerance must be positive numbers, 1 or {size} of them, not {given!r}"
         raise ProblemError(words, value=given, limit=size)
     return [float(entry) for entry in np.broadcast_to(array, size)]
+
+
+def signal_function(what: str, track: Callable[[Any], Any]) -> Any:
+    """The casadi Function time -> column of a function of the time alone."""
+    time = ca.MX.sym("time")
+    try:
+        return ca.Function("signal", [time], [ca.densify(ca.vec(ca.MX(track(time))))])
+    except Exception as error:  # of the function's own, too
+        words = f"{what}: a function of the time alone is expected, that gives a column: {error}"
+        raise ProblemError(words, value=track) from error
 
 
 def _check_number(what: str, label: str, bound: Value) -> None:

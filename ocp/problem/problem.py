@@ -15,9 +15,9 @@ from typing import Any, ParamSpec, TypeVar, cast
 import casadi as ca
 import numpy as np
 
-from ocp.errors import ProblemError, about, checked_count, checked_flag, checked_text, unknown_name
+from ocp.errors import ProblemError, about, checked_count, checked_text, unknown_name
 from ocp.problem.declarations import ENDS, Constraint, Declarations, Guess, Horizon, PhaseTimes, Signal, Variable
-from ocp.problem.expressions import ExpressionReader, Value, check_guess, number_of_entries, read_scale
+from ocp.problem.expressions import ExpressionReader, Value, check_guess, number_of_entries, read_scale, signal_function
 from ocp.problem.hulls import Hull
 from ocp.problem.prescribed import PrescribedMotion
 from ocp.problem.separation import Separation, index_rows, motion_by_pair
@@ -248,14 +248,8 @@ class Problem:
             name: Unique name.
             track: casadi time (s), an MX symbol -> a column of expressions.
         """
-        time = ca.MX.sym("time")
-        try:
-            value = ca.densify(ca.vec(ca.MX(track(time))))
-            function = ca.Function("signal", [time], [value])
-        except Exception as error:  # of the function's own, too
-            words = f"signal {name!r}: a function of the time alone is expected, that gives a column: {error}"
-            raise ProblemError(words, value=track) from error
-        self.declared.signals[name] = Signal(name, self._symbol("signal", name, value.numel()), function)
+        function = signal_function(f"signal {name!r}", track)
+        self.declared.signals[name] = Signal(name, self._symbol("signal", name, function.numel_out(0)), function)
         return self.declared.signals[name].symbol
 
     def horizon(
@@ -350,7 +344,8 @@ class Problem:
                 integral of ``way`` goes along the plan. None: to what the expression is made of.
             unit: Of the expression, or of its integral. tolerance: As of :meth:`path`, in this unit.
         """
-        integral = checked_flag(f"watch {name!r}: integral", integral)
+        if not isinstance(integral, bool):
+            raise ProblemError(f"watch {name!r}: integral must be True or False, not {integral!r}", value=integral)
         known = list(self.declared.at_start.values())
         found = self._constraint("watch", name, expression, (lower, upper), unit, tolerance, known)
         rate = None if way is None else self._reader.expression(f"watch {name!r}: way", way, [*self._inner(), *known])
