@@ -20,6 +20,7 @@ from ocp.direct.collocation import Collocation
 from ocp.direct.fragment import Fragment
 from ocp.direct.kkt import Conditions, conditions
 from ocp.direct.nlp import Outcome
+from ocp.direct.results import controls_at
 from ocp.direct.scaling import Pattern, fitting_scales, sizes_along
 from ocp.direct.shooting import MultipleShooting
 from ocp.errors import ProblemError, unknown_name
@@ -67,13 +68,7 @@ def sensitivity(solution: Solution, name: str) -> Sensitivity:
     columns = list(range(place.start, place.stop))
     v, lam = built.v, solution.multipliers
     bounds = built.lower, built.upper
-    arguments = {
-        "p": p,
-        "lbx": built.lower[fragment.variable_bounds],
-        "ubx": built.upper[fragment.variable_bounds],
-        "lbg": built.lower[fragment.row_bounds],
-        "ubg": built.upper[fragment.row_bounds],
-    }
+    arguments = fragment.arguments(p, bounds)
     pattern = Pattern(form, fragment, built.program)
     told = {*form.states, *form.controls, "horizon"}
     scales = fitting_scales(pattern, sizes_along(pattern, v, told, bounds, p), v, p)
@@ -234,8 +229,6 @@ def moved(
 def control_rates(built: Built, solution: Solution, dv: np.ndarray) -> np.ndarray:
     """Derivatives of the controls at the reported times (M, nu, k): controls are linear in their variables."""
     piece, place = built.fragment.report
-    mesh = built.fragment.mesh
-    fractions = mesh[piece] + np.diff(mesh)[piece] * place
     columns = []
     for direction in dv.T:
         step = max(1.0, float(np.abs(built.v).max())) / max(float(np.abs(direction).max()), 1e-300)
@@ -243,10 +236,7 @@ def control_rates(built: Built, solution: Solution, dv: np.ndarray) -> np.ndarra
             built.fragment.interpolants(built.v + sign * step * direction, built.p, solution.horizon)[1]
             for sign in (1.0, -1.0)
         ]
-        if len(curves[0].breaks) == len(mesh):
-            up, down = (curve.within(piece, place) for curve in curves)
-        else:
-            up, down = (curve(fractions) for curve in curves)
+        up, down = (controls_at(curve, built.fragment, piece, place) for curve in curves)
         columns.append((up - down) / (2 * step))
     return np.stack(columns, axis=-1)
 
