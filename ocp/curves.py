@@ -159,7 +159,7 @@ def integrator(
     places: Sequence[float] = (1.0,),
     *,
     tolerance: float = 1e-12,
-    max_steps: int = 20_000,
+    max_steps: int = 100_000,
     smooth: bool = True,
     start: float = 0.0,
 ) -> Any:

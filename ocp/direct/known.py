@@ -13,7 +13,7 @@ import numpy as np
 
 from ocp.direct.assembly import Program
 from ocp.direct.fragment import Fragment
-from ocp.direct.nlp import ROUNDING, Outcome
+from ocp.direct.nlp import SOLVER_RESIDUAL, Outcome
 from ocp.direct.scaling import Scales
 from ocp.problem.formulation import Formulation
 from ocp.status import SolverStatus
@@ -68,7 +68,7 @@ class Known:
         miss = np.abs(inside - v) / (scales.variables + np.abs(v))
         beyond = np.maximum(arguments["lbg"] - outcome.rows, outcome.rows - arguments["ubg"])
         beyond = np.where(self.declared, beyond, 0.0) / (scales.rows + np.abs(outcome.rows))
-        if not outcome.success or max(miss.max(initial=0.0), beyond.max(initial=0.0)) <= ROUNDING:
+        if not outcome.success or max(miss.max(initial=0.0), beyond.max(initial=0.0)) <= SOLVER_RESIDUAL:
             return replace(outcome, variables=inside) if outcome.success else outcome
         return replace(outcome, status=SolverStatus.INFEASIBLE, message=SolverStatus.INFEASIBLE.message)
 

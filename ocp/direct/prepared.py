@@ -27,7 +27,7 @@ from ocp.direct.mesh import MeshedMethod
 from ocp.direct.nlp import SOLVERS, Outcome, broken_down, build_solver, call_solver, largest_number_of_iterations
 from ocp.direct.results import horizon_of, solution_of
 from ocp.direct.scaling import Pattern, Scales, badness, fitting_scales, scaled_program, sizes_along, unscaled
-from ocp.direct.starts import ELASTIC, GUESS, other_starts
+from ocp.direct.starts import ELASTIC, GUESS, STARTS, other_starts
 from ocp.errors import (
     Interrupted,
     ProblemError,
@@ -45,8 +45,6 @@ from ocp.status import SolverStatus
 from ocp.storage import checked_path
 
 __all__ = ["DirectMethod", "Prepared"]
-
-MAX_ITERATIONS_ELSEWHERE = 200  # from each start but the guess, where the solver failed already
 
 
 class DirectMethod(MeshedMethod):
@@ -295,7 +293,7 @@ class Prepared:
     @cached_property
     def _solver_of_other_starts(self) -> tuple[Any, Any]:
         """The solver with fewer iterations, for what is tried where it failed already; and its progress."""
-        return self._built_solver({**self._own_options, "max_iter": min(MAX_ITERATIONS_ELSEWHERE, self._most)})
+        return self._built_solver({**self._own_options, "max_iter": min(STARTS.iterations, self._most)})
 
     def _attempt(
         self,

@@ -18,7 +18,7 @@ import scipy.sparse.linalg as sla
 from ocp.direct.assembly import Program, assemble
 from ocp.direct.collocation import Collocation
 from ocp.direct.fragment import Fragment
-from ocp.direct.kkt import Conditions, conditions
+from ocp.direct.kkt import RESOLVED, Conditions, conditions
 from ocp.direct.nlp import Outcome
 from ocp.direct.results import controls_at
 from ocp.direct.scaling import Pattern, fitting_scales, sizes_along
@@ -32,12 +32,19 @@ from ocp.solution import Sensitivity, Solution
 __all__ = ["sensitivity"]
 
 METHODS = {"Collocation": Collocation, "MultipleShooting": MultipleShooting}
-SOFTENED = 1e-11
-"""By which rows that others imply may be missed, relative to their own size and to the curvature, while solving."""
-REFINEMENTS = 4
-MISSED = 1e-7  # of the system, relative to its right side: more, and the limits that push contradict each other
-ON_THE_EDGE = 1e-7
-"""Distance to a limit, in units of the solver, at which it is touched though it does not push."""
+
+
+@dataclass(frozen=True)
+class SystemSettings:
+    """How the linear system is solved.
+
+    Attributes:
+        softening: By which rows that others imply may be missed, relative to their own size and to the curvature.
+        refinements: Passes that make up for it.
+    """
+
+    softening: float = 1e-11
+    refinements: int = 4
 
 
 @dataclass(frozen=True)
@@ -109,11 +116,11 @@ def sensitivity(solution: Solution, name: str) -> Sensitivity:
         ]
     for room, rate in loose:
         some = np.flatnonzero(np.isfinite(room))
-        size = np.where(room[some] < ON_THE_EDGE, 0.0, room[some])
+        size = np.where(room[some] < RESOLVED, 0.0, room[some])
         for k in range(len(columns)):
             for side, sign in ((0, -1.0), (1, 1.0)):
                 toward = -sign * rate[some, k]
-                nearer = np.flatnonzero(toward > ON_THE_EDGE * np.abs(rate[some, k]).max(initial=0.0))
+                nearer = np.flatnonzero(toward > RESOLVED * np.abs(rate[some, k]).max(initial=0.0))
                 if not nearer.size:
                     continue
                 reach = size[nearer] / toward[nearer]
@@ -187,7 +194,12 @@ def by_parameters(
 
 
 def moved(
-    at: Conditions, slope: np.ndarray, change: np.ndarray, at_x: np.ndarray, at_g: np.ndarray
+    at: Conditions,
+    slope: np.ndarray,
+    change: np.ndarray,
+    at_x: np.ndarray,
+    at_g: np.ndarray,
+    settings: SystemSettings = SystemSettings(),
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Derivatives of the variables (n, k) and of the multipliers of rows (m, k) and bounds (n, k), scaled.
 
@@ -209,13 +221,14 @@ def moved(
     system = (
         sp.block_array([[hessian[free][:, free], own.T], [own, None]], format="csc") if m else hessian[free][:, free]
     )
-    softened = system - sp.diags_array(np.concatenate([np.zeros(n), np.full(m, SOFTENED * largest)]))
+    softened = system - sp.diags_array(np.concatenate([np.zeros(n), np.full(m, settings.softening * largest)]))
     solve = sla.splu(sp.csc_array(softened))
     found = solve.solve(right)
-    for _ in range(REFINEMENTS):
+    for _ in range(settings.refinements):
         found += solve.solve(right - system @ found)
     missed = float(np.abs(right - system @ found).max(initial=0.0))
-    if not missed <= MISSED * max(float(np.abs(right).max(initial=0.0)), 1e-300):
+    # more, and the limits that push contradict each other
+    if not missed <= RESOLVED * max(float(np.abs(right).max(initial=0.0)), 1e-300):
         words = "the limits at which the plan stands contradict each other, or leave it open, when the parameter moves"
         raise ProblemError(words, name="parameters", value=missed)
     dv[free] = found[:n]
