@@ -26,7 +26,7 @@ from ocp.problem.problem import Problem
 from ocp.status import SolverStatus
 from ocp.tolerances import RESOLVED_SHARE, SOLVER_SHARE
 
-__all__ = ["Conflict", "Elastic", "diagnosis", "elastic_plan"]
+__all__ = ["Conflict", "Elastic", "diagnosis", "elastic_plan", "variable_names"]
 
 ELASTIC_IPOPT = {"tol": 1e-6, "max_iter": 300, "print_level": 0, "sb": "yes"}
 REMEDY = "leave scaling on, give ends, bounds and a guess of the right size, or choose units in which they are near 1"
@@ -152,15 +152,10 @@ def residuals(
         g = np.asarray(built.program.values(v, arguments["p"])[1].full()).reshape(-1)
     except RuntimeError:  # an integrator breaks down
         g = np.full(fragment.n_rows, np.nan)
-    names = variable_labels(form, fragment)
-    bounds = [
-        f"{'' if role == 'horizon' else role + ' '}{name}" if role else "a stage variable"
-        for role, name in zip(fragment.variable_role, names, strict=True)
-    ]
     value = np.concatenate([g, v])
     lower, upper = both_bounds(arguments)
     at = np.concatenate([fragment.row_fractions, fragment.variable_fraction])
-    labels = [*fragment.row_labels, *(f"bound of {name}" for name in bounds)]
+    labels = [*fragment.row_labels, *(f"bound of {name}" for name in variable_names(form, fragment))]
     return labels, at, value, np.maximum(lower - value, value - upper)
 
 
@@ -176,6 +171,14 @@ def variable_labels(form: Formulation, fragment: Fragment) -> list[str]:
     return [
         names[role][entry] if role else ""
         for role, entry in zip(fragment.variable_role, fragment.variable_entry, strict=True)
+    ]
+
+
+def variable_names(form: Formulation, fragment: Fragment) -> list[str]:
+    """The same with what it is before it, "state q[2]"; "a stage variable" of a copy that a stage carries."""
+    return [
+        f"{'' if role == 'horizon' else role + ' '}{name}" if role else "a stage variable"
+        for role, name in zip(fragment.variable_role, variable_labels(form, fragment), strict=True)
     ]
 
 

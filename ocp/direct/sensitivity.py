@@ -8,7 +8,6 @@ one factorization of it, and one back-substitution for each entry of the paramet
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -17,6 +16,7 @@ import scipy.sparse.linalg as sla
 
 from ocp.direct.assembly import Program, assemble
 from ocp.direct.collocation import Collocation
+from ocp.direct.diagnosis import variable_names
 from ocp.direct.fragment import Fragment
 from ocp.direct.kkt import RESOLVED, Conditions, conditions
 from ocp.direct.nlp import Outcome
@@ -252,17 +252,6 @@ def control_rates(built: Built, solution: Solution, dv: np.ndarray) -> np.ndarra
         up, down = (controls_at(curve, built.fragment, piece, place) for curve in curves)
         columns.append((up - down) / (2 * step))
     return np.stack(columns, axis=-1)
-
-
-def variable_names(form: Formulation, fragment: Fragment) -> list[str]:
-    """A name for each variable."""
-    labels: dict[str, Any] = {"state": form.state_labels, "control": form.control_labels, "horizon": ("horizon",)}
-    found = []
-    for role, entry in zip(fragment.variable_role, fragment.variable_entry, strict=True):
-        found.append(
-            f"{role} {labels[role][entry]}" if role in ("state", "control") else str(role) or "a stage variable"
-        )
-    return found
 
 
 def split(places: dict[str, slice], values: np.ndarray) -> dict[str, np.ndarray]:
