@@ -16,6 +16,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import partial, wraps
 from typing import Any, ParamSpec, TypeVar
 
@@ -40,10 +41,23 @@ __all__ = [
 ]
 
 LOG = logging.getLogger("ocp")
-GRACE = 0.5  # s of the processor after Ctrl-C in which a call may end by itself, with what it has found
-SHARED = 20  # times as long where others hold the processor, or nothing is at work
 P = ParamSpec("P")
 T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Patience:
+    """How long a call may go on after Ctrl-C to end by itself, with what it has found.
+
+    Attributes:
+        busy: s of the processor. waiting: s where others hold the processor, or nothing is at work.
+    """
+
+    busy: float = 0.5
+    waiting: float = 10.0
+
+
+PATIENCE = Patience()
 
 
 # ---- Ctrl-C ------------------------------------------------------------------------------------------------------
@@ -89,8 +103,8 @@ class _Call(threading.Thread):
         try:
             while (
                 (self.listeners or self.heard)
-                and time.process_time() - worked < GRACE
-                and time.monotonic() - began < SHARED * GRACE
+                and time.process_time() - worked < PATIENCE.busy
+                and time.monotonic() - began < PATIENCE.waiting
             ):
                 if self.left.wait(0.02):
                     return
@@ -101,7 +115,7 @@ class _Call(threading.Thread):
                         ctypes.c_ulong(self.ident), ctypes.py_object(KeyboardInterrupt)
                     )
         if self.ident is not None:
-            self.left.wait(max(0.02, began + GRACE - time.monotonic()))
+            self.left.wait(max(0.02, began + PATIENCE.busy - time.monotonic()))
 
 
 _CALL: contextvars.ContextVar[_Call | None] = contextvars.ContextVar("call", default=None)

@@ -19,7 +19,6 @@ __all__ = [
     "dormand_prince_step",
     "integrator",
     "lagrange",
-    "lagrange_expressions",
     "newton_coefficients",
     "quadrature_weights",
     "rk4_step",
@@ -35,7 +34,6 @@ DORMAND_PRINCE = (
     (1.0, (35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84)),
 )  # place and weights of each stage; the last are those of the step
 DORMAND_PRINCE_ERROR = (71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40)
-TOUCHING = 1e-100  # a place nearer to a node than this is the node: its barycentric weight would overflow
 
 
 @dataclass(frozen=True)
@@ -91,7 +89,7 @@ def lagrange(nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
     if len(nodes) == 1:
         return np.ones((len(at), 1))
     distance = at[:, None] - nodes[None, :]
-    hit = np.abs(distance) < TOUCHING
+    hit = np.abs(distance) < np.sqrt(np.finfo(float).tiny)  # nearer to a node, its weight would overflow
     terms = barycentric_weights(nodes) / np.where(hit, 1.0, distance)
     on_node = hit.any(axis=1, keepdims=True)
     total = np.where(on_node, 1.0, terms.sum(axis=1, keepdims=True))
@@ -113,18 +111,6 @@ def quadrature_weights(points: np.ndarray) -> np.ndarray:
     """Weights of the interpolatory quadrature on 0..1 at ``points`` (d,). Shape (d,)."""
     at, weight = np.polynomial.legendre.leggauss(len(points))
     return np.asarray(0.5 * weight @ lagrange(points, 0.5 * (at + 1.0)))
-
-
-def lagrange_expressions(nodes: np.ndarray, place: Any) -> Any:
-    """Lagrange basis polynomials of ``nodes`` (d,) as expressions of the scalar ``place``. Shape (d, 1)."""
-    polynomials = []
-    for i, node in enumerate(nodes):
-        product: Any = 1.0
-        for j, other in enumerate(nodes):
-            if j != i:
-                product = product * (place - other) / (node - other)
-        polynomials.append(product)
-    return ca.vertcat(*polynomials)
 
 
 def newton_coefficients(nodes: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -173,7 +159,7 @@ def integrator(
     places: Sequence[float] = (1.0,),
     *,
     tolerance: float = 1e-12,
-    max_steps: int = 20_000,
+    max_steps: int = 100_000,
     smooth: bool = True,
     start: float = 0.0,
 ) -> Any:

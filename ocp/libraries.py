@@ -34,12 +34,6 @@ VERSION = "1"  # of what is made of contents
 FLAGS = ("-fPIC", "-shared", "-w", "-ffp-contract=off", *(("-Wl,-z,defs",) if sys.platform == "linux" else ()))
 """What is not defined is an error here, where it is the end of Python when it is called."""
 LINK = "-lm"  # behind the C
-VECTORS = ("-ftree-vectorize", "-ftree-loop-if-convert", "-fschedule-insns", "-fno-math-errno", "-fno-trapping-math")
-"""None of them changes a number, nor takes one for finite: what is none stays none."""
-LARGE = 300_000
-"""Characters of C: more take minutes with optimization, and without it half as long again to run."""
-MOST = 8_000_000
-"""Characters of C: gcc takes 130 bytes of memory for each."""
 SERIALISED = "casadi:"  # before the text of a function
 WATCHED = """
 exec 3<&0
@@ -53,6 +47,22 @@ class CompilerError(RuntimeError):
     """C code that cannot be made, compiled or loaded, and why."""
 
 
+@dataclass(frozen=True)
+class CodeSizes:
+    """Characters of C.
+
+    Attributes:
+        optimized: The most that are optimized: more take minutes, and without it half as long again to run.
+        accepted: The most that are compiled: gcc takes 130 bytes of memory for each.
+    """
+
+    optimized: int = 300_000
+    accepted: int = 8_000_000
+
+
+SIZES = CodeSizes()
+
+
 # ---- libraries ---------------------------------------------------------------------------------------------------
 
 
@@ -63,12 +73,10 @@ class Library:
     Attributes:
         contents: All that its C follows from, such as serialised functions. text: Makes the C; not called where the
             library is kept.
-        vectors: Loops become instructions of this machine's processor that do several numbers at once.
     """
 
     contents: tuple[str, ...]
     text: Callable[[], str]
-    vectors: bool = False
 
     @property
     def key(self) -> str:
@@ -77,9 +85,8 @@ class Library:
         Raises:
             CompilerError: There is no compiler.
         """
-        machine = (platform.machine(), sys.platform, ca.__version__, str(LARGE))
-        own = processor() if self.vectors else ()
-        return cache.key_of(VERSION, *machine, *compiler(), *FLAGS, *own, LINK, *self.contents)
+        machine = (platform.machine(), sys.platform, ca.__version__, str(SIZES.optimized))
+        return cache.key_of(VERSION, *machine, *compiler(), *FLAGS, LINK, *self.contents)
 
 
 def code(functions: Iterable[Any]) -> str:
@@ -173,27 +180,6 @@ def _version(command: str, path: str) -> str:
         return ""
 
 
-def processor() -> tuple[str, ...]:
-    """What the compiler says of the processor at hand, and is told to make the most of it.
-
-    Raises:
-        CompilerError: There is no compiler.
-    """
-    command, _ = compiler()
-    return _processor(command, os.environ.get("PATH", ""))
-
-
-@lru_cache
-def _processor(command: str, path: str) -> tuple[str, ...]:
-    words = [*shlex.split(command), "-march=native", "-dM", "-E", "-"]
-    try:
-        told = subprocess.run(words, capture_output=True, stdin=subprocess.DEVNULL, timeout=10, check=True).stdout
-    except (OSError, subprocess.SubprocessError):
-        return ("", *VECTORS)  # for any processor of this kind
-    wide = ("-mprefer-vector-width=512",) if b"__AVX512F__" in told else ()
-    return (told.decode(errors="replace"), *VECTORS, "-march=native", *wide)
-
-
 def _compiled(library: Library) -> bytes:
     """What the compiler makes of the C of a library.
 
@@ -201,15 +187,14 @@ def _compiled(library: Library) -> bytes:
         CompilerError: It fails, or there is no C. OutOfTime: The time limit is over.
     """
     text = library.text()
-    if len(text) > MOST:
-        raise CompilerError(f"{len(text)} characters of C are more than {MOST}")
-    levels = ("-O2", "-O1") if library.vectors else ("-O1", "-O0")
-    speed = (levels[len(text) > LARGE], *(processor()[1:] if library.vectors else ()))
+    if len(text) > SIZES.accepted:
+        raise CompilerError(f"{len(text)} characters of C are more than {SIZES.accepted}")
+    speed = "-O1" if len(text) <= SIZES.optimized else "-O0"
     place = Path(tempfile.mkdtemp(prefix="selfmotion-"))
     process = None
     try:
         (place / "unit.c").write_text(text, encoding="utf-8")
-        words = [*shlex.split(compiler()[0]), *speed, *FLAGS, "unit.c", "-o", "unit.so", LINK]
+        words = [*shlex.split(compiler()[0]), speed, *FLAGS, "unit.c", "-o", "unit.so", LINK]
         process = begun(words, place)
         if wait(process):
             told = (place / "words").read_text(errors="replace").strip().splitlines()

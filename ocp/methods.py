@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -20,9 +20,22 @@ from ocp.tolerances import FLAT_SHARE
 
 __all__ = ["Method", "PreparedProblem", "prepare", "solve"]
 
-MOST_DESCENTS = 3
-VISIBLE = 0.1
-"""By which share of its spread along the plan, or of its range, or by how much, a plan is moved to start beside it."""
+
+@dataclass(frozen=True)
+class DescentSettings:
+    """How a plan that is stationary but no minimum is left.
+
+    Attributes:
+        descents: The most, one after the other.
+        move: By which share of its spread along the plan, or of its range, or by how much, a plan is moved to start
+            beside it.
+    """
+
+    descents: int = 3
+    move: float = 0.1
+
+
+SETTINGS = DescentSettings()
 
 
 class PreparedProblem(Protocol):
@@ -146,7 +159,7 @@ def lowered(prepared: PreparedProblem, solution: Solution) -> Solution:
     form = Formulation.of(solution.problem)
     p = form.parameter_vector(solution.parameters)
     bounds = form.bound_values(p)
-    for _ in range(MOST_DESCENTS):
+    for _ in range(SETTINGS.descents):
         if not solution.regularised:
             break
         found = optimality(form, solution, p, bounds, allowed=np.inf).curvature
@@ -196,7 +209,7 @@ def beside(form: Formulation, solution: Solution, found: Curvature, bounds: Boun
         curves = [*((breaks, column) for column in states.T), *((found.t, column) for column in controls.T)]
         move = np.column_stack([np.interp(times, at, column) for at, column in curves])
     share = float((np.abs(move) / size).max(initial=0.0)) or float(np.abs(move).max(initial=0.0))
-    moved = plan + sign * VISIBLE / share * move
+    moved = plan + sign * SETTINGS.move / share * move
     places = {**form.states, **{name: slice(s.start + form.nx, s.stop + form.nx) for name, s in form.controls.items()}}
     guess: dict[str, Any] = {name: Samples(times, moved[:, place]) for name, place in places.items()}
     return guess | {"horizon": solution.horizon}

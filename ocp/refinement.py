@@ -13,7 +13,8 @@ import numpy as np
 from ocp.audit.audit import Audit, Finding
 from ocp.audit.audit import audit as judge
 from ocp.console import OutOfTime, limited, time_left
-from ocp.direct.prepared import DirectMethod, check_meshed
+from ocp.direct.mesh import check_meshed
+from ocp.direct.prepared import DirectMethod
 from ocp.errors import (
     ProblemError,
     RefinementWarning,

@@ -66,9 +66,7 @@ __all__ = [
 ByName: TypeAlias = Mapping[str, Any] | None  # parameters, options of a solver
 Guess: TypeAlias = "Solution | Mapping[str, Any] | None"
 VERSION = 3
-SLACK = 1e-12  # relative, of what rounding may do to times
-MOST_LINES = 15  # of a solution that is printed
-GAUSS = 8  # points in a piece, of the cost of a phase
+MAX_LINES = 15  # of a solution that is printed
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,12 +152,12 @@ class Solution:
             lines[0] += f"; about {self.tightening_cost:.2g} of the cost are for limits held between the nodes"
         pools = {**self.states, **self.controls}
         width = max(map(len, pools), default=0)
-        for name, values in list(pools.items())[: MOST_LINES - 2]:
+        for name, values in list(pools.items())[: MAX_LINES - 2]:
             kind = "state" if name in self.states else "control"
             span = f"{values.min():.5g} to {values.max():.5g}" if values.size else "nothing"
             lines.append(f"  {name:<{width}}  {kind:<7}  {values.shape[1]} wide, {span}")
-        if len(pools) > MOST_LINES - 2:
-            lines.append(f"  {len(pools) - MOST_LINES + 2} more")
+        if len(pools) > MAX_LINES - 2:
+            lines.append(f"  {len(pools) - MAX_LINES + 2} more")
         return "\n".join(lines)
 
     @property
@@ -231,7 +229,7 @@ class Solution:
             raise ProblemError(
                 f"a time or an array of times is expected, not {time!r}", name="time", value=time
             ) from error
-        slack = SLACK * self.horizon
+        slack = AT_NODE * self.horizon
         if not np.all((times >= -slack) & (times <= self.horizon + slack)):
             words = f"time {time!r} is outside the plan, 0 to {self.horizon:g} s"
             raise ProblemError(words, name="time", value=time, limit=(0.0, self.horizon), time=time)
@@ -241,7 +239,7 @@ class Solution:
         """As :meth:`at`, at fractions 0..1 of the horizon."""
         try:
             at = floats(fraction)
-            inside = bool(((at >= -SLACK) & (at <= 1 + SLACK)).all())
+            inside = bool(((at >= -AT_NODE) & (at <= 1 + AT_NODE)).all())
         except NOT_NUMBERS:
             inside = False
         if not inside:
@@ -283,9 +281,9 @@ class Solution:
             parts[kind] = replace(curve, values=curve.values[:, :, np.repeat(columns, sizes)])
         own = self.problem.declared.phases[name]
         grid = np.union1d(self.state_interpolant.breaks, self.control_interpolant.breaks)
-        places, weights = np.polynomial.legendre.leggauss(GAUSS)
+        places, weights = np.polynomial.legendre.leggauss(8)
         at = (grid[:-1, None] + np.diff(grid)[:, None] * (places + 1) / 2).ravel()
-        density = self._sampled([own.running], at)[0].reshape(-1, GAUSS)
+        density = self._sampled([own.running], at)[0].reshape(-1, len(places))
         cost = float(density @ weights @ np.diff(grid)) / 2 + float(self._sampled([own.terminal], np.ones(1))[0].item())
         return replace(
             self,

@@ -11,6 +11,7 @@ import numpy as np
 
 from ocp.errors import ProblemError, unknown_name
 from ocp.status import SolverStatus
+from ocp.tolerances import ROUNDING_SHARE
 
 __all__ = [
     "AT_NODE",
@@ -55,7 +56,6 @@ HEAD = {
 }
 POOLS = ("states", "controls", "costates", "parameters", "cost_gradients")
 AT_NODE = 1e-12  # of the horizon: a fraction nearer to a node is the node
-TIME_SLACK = 1e-9  # of the horizon: what rounding may do to reported times
 PLAIN = ("t", "variables", "multipliers")
 PARTS = ("breaks", "nodes", "values")  # of an interpolant
 INTERPOLANTS = ("state_interpolant", "control_interpolant", "costate_interpolant")
@@ -235,7 +235,7 @@ def check_structure(solution: Any) -> None:
             _real(solution, f"{pool[:-1].replace('_', ' ')} {name!r}", values, 1)
     for name in ("variables", "multipliers"):
         _real(solution, name, getattr(solution, name), 1)
-    t, slack = _real(solution, "t", solution.t, 1), TIME_SLACK * solution.horizon
+    t, slack = _real(solution, "t", solution.t, 1), ROUNDING_SHARE * solution.horizon
     if t.size < 2 or not (np.diff(t) >= -slack).all() or abs(t[0]) > slack:
         raise _refused(solution, "t", "does not increase from 0")
     for pool, interpolant in zip(("states", "controls", "costates"), INTERPOLANTS, strict=True):

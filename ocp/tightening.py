@@ -13,7 +13,8 @@ import numpy as np
 
 from ocp.console import interruptible, limited, time_left
 from ocp.direct.fragment import Fragment
-from ocp.direct.prepared import DirectMethod, check_meshed
+from ocp.direct.mesh import check_meshed
+from ocp.direct.prepared import DirectMethod
 from ocp.errors import SolveError, checked_mapping, checked_time_limit
 from ocp.problem.formulation import Formulation
 from ocp.solution import AT_NODE, ByName, Guess, Solution

@@ -12,7 +12,7 @@ from models.spatial import cross, rotation_from_quaternion
 from ocp.app.joint_limits import Row, RowVerdict, states_along
 from ocp.app.oddities import Fault
 from ocp.app.pieces import Motion
-from ocp.problem.formulation import Sampler
+from ocp.problem.sampling import Sampler
 from ocp.tolerances import MOMENTUM_SHARE, ROUNDING_SHARE
 
 __all__ = ["floating_base", "momentum_rows", "standing_rows"]

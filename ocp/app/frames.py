@@ -11,7 +11,7 @@ import numpy as np
 
 from models import Machine, ModelError, Robot, link_frames
 from models.arrays import Array
-from ocp.problem.formulation import Sampler
+from ocp.problem.sampling import Sampler
 
 __all__ = ["TIP", "Frames", "chain", "frames_along", "frames_function"]
 

@@ -19,7 +19,7 @@ from models.arrays import Array
 from ocp.app.oddities import Fault
 from ocp.app.pieces import Along, Indices, Motion, highest
 from ocp.audit.audit import Audit
-from ocp.problem.formulation import Sampler
+from ocp.problem.sampling import Sampler
 from ocp.tasks.limits import JointBounds
 
 __all__ = ["ORDERS", "Row", "RowVerdict", "floating_torques", "limit_rows", "rows_of", "states_along", "torque_rows"]

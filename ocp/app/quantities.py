@@ -13,7 +13,7 @@ from models.arrays import Array
 from models.machines.standing import center_of_pressure
 from models.robot.dynamics import GRAVITY
 from ocp.app.joint_limits import floating_torques
-from ocp.problem.formulation import Sampler
+from ocp.problem.sampling import Sampler
 from ocp.tasks.limits import JointBounds
 
 __all__ = ["Curve", "Footing", "footing_of", "joint_curves", "machine_curves", "so_far"]

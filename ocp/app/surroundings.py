@@ -16,7 +16,7 @@ from ocp.audit.clearance import Clearance
 from ocp.builders.clearance import clearance_of
 from ocp.files import Waypoints
 from ocp.local.touching import distances_along
-from ocp.problem.formulation import Sampler
+from ocp.problem.sampling import Sampler
 from ocp.tolerances import CLEARANCE_TOLERANCE_M
 
 __all__ = ["clearance_rows", "path_rows", "proof", "within_limits"]

@@ -15,7 +15,7 @@ from models import FixedBase, Robot
 from models.arrays import Array
 from ocp.app.oddities import SMALL_UNITS, THRESHOLDS, Fault, likely_unit
 from ocp.app.pieces import Indices, Motion
-from ocp.problem.formulation import Sampler
+from ocp.problem.sampling import Sampler
 
 __all__ = ["doubtful_times", "exchanged_joints"]
 

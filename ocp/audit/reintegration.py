@@ -18,7 +18,8 @@ from ocp.audit.linearisation import Linearisation
 from ocp.audit.sizes import FineGrid
 from ocp.console import check_time
 from ocp.curves import dormand_prince_step, newton_coefficients
-from ocp.problem.formulation import Formulation, in_blocks
+from ocp.problem.formulation import Formulation
+from ocp.problem.sampling import in_blocks
 
 __all__ = ["Reintegration", "integrated", "reintegrate"]
 

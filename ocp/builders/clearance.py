@@ -23,9 +23,9 @@ from ocp.audit.clearance import Clearance, Track, clearance_along
 from ocp.errors import ProblemError, SolveError, checked_instance, checked_mapping, checked_nonnegative
 from ocp.local.touching import Touch, hulls_of, touches
 from ocp.problem.declarations import Variable
-from ocp.problem.formulation import Sampler
 from ocp.problem.hulls import frames_of
 from ocp.problem.problem import Problem
+from ocp.problem.sampling import Sampler
 from ocp.problem.separation import Separation
 from ocp.problem.values import constant
 from ocp.solution import Solution

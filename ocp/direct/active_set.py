@@ -20,24 +20,36 @@ from ocp.direct.assembly import Program
 from ocp.direct.banded import Bordered, Cholesky
 from ocp.direct.fragment import Fragment
 from ocp.direct.kkt import Sides, corrected
-from ocp.direct.nlp import ROUNDING, Outcome
+from ocp.direct.nlp import SOLVER_RESIDUAL, Outcome
 from ocp.direct.scaling import Scales
 from ocp.status import SolverStatus
+from ocp.tolerances import ROUNDING_SHARE
 
 __all__ = ["Newton"]
 
-TOLERANCE = 1e-10
-"""Of slopes, relative to a hundredth of the largest multiplier, of rows, relative to the largest variable, and of the
-cost, by what rows are missed; all relative to 1 at least."""
-WEIGHT = 100.0  # of multipliers, as ipopt judges slopes by them
-ROOM = 1e-9  # by which limits that are let go may be passed, relative to the value and at least to 1
-MOST_SETS = 8  # of limits held in turn
-MOST_STEPS = 24  # in all: more, and an interior point from the guess is as quick
-EXACT = 1e-6  # of what a step misses in its linear system: so little is left, unless a pass gains less than a tenth
-GAIN = 0.1  # of what is missed, by each step at least: else the matrix is made anew
-PRICE = 1e6
-"""Of what misses the limits, against the largest curvature: as much as rounding allows."""
-ROUNDED = 4 * float(np.finfo(float).eps)  # of each entry of the diagonal: what is as flat may be rounding
+
+@dataclass(frozen=True)
+class NewtonSettings:
+    """When Newton's method has ended, and when it gives up.
+
+    Attributes:
+        tolerance: Of slopes, relative to the largest multiplier over ``multipliers``, of rows, relative to the largest
+            variable, and of the cost, by what rows are missed; all relative to 1 at least.
+        multipliers: By which ipopt, too, divides the largest multiplier to judge slopes (its s_max).
+        sets: The most sets of limits that are held in turn.
+        steps: The most steps in all: more, and an interior point from the guess is as quick.
+        exact: Share of what a step misses in its linear system that is left, unless a pass gains less than ``gain``.
+        gain: Share of what is missed that each step leaves at most: else the matrix is made anew.
+        price: Of what misses the limits, against the largest curvature: as much as rounding allows.
+    """
+
+    tolerance: float = 1e-10
+    multipliers: float = 100.0
+    sets: int = 8
+    steps: int = 24
+    exact: float = 1e-6
+    gain: float = 0.1
+    price: float = 1e6
 
 
 class Newton:
@@ -47,8 +59,8 @@ class Newton:
         program, fragment: What is solved.
     """
 
-    def __init__(self, program: Program, fragment: Fragment) -> None:
-        self._program = program
+    def __init__(self, program: Program, fragment: Fragment, settings: NewtonSettings = NewtonSettings()) -> None:
+        self._program, self._settings = program, settings
         n, m = fragment.size, fragment.n_rows
         row, column = (np.array(part, dtype=np.int64) for part in program.jacobian.sparsity_out(1).get_triplet())
         first, second = (np.array(part, dtype=np.int64) for part in program.hessian.sparsity_out(0).get_triplet())
@@ -78,14 +90,14 @@ class Newton:
             arguments: p and the bounds. scales: By which misses and multipliers are judged.
         """
         began, tried, steps = time.monotonic(), list[Sides](), 0
-        while len(tried) < MOST_SETS and not any(_same(sides, each) for each in tried):
+        while len(tried) < self._settings.sets and not any(_same(sides, each) for each in tried):
             tried.append(sides)
-            at = self._root(start, sides, arguments, scales, MOST_STEPS - steps)
+            at = self._root(start, sides, arguments, scales, self._settings.steps - steps)
             if at is None:
                 return None
             steps += at.steps
             start = Outcome(at.v, 0.0, at.rows, at.lam, SolverStatus.SOLVED, "", steps, 0.0, False, "newton")
-            after = corrected(self._program, start, arguments, scales, sides, ROOM)
+            after = corrected(self._program, start, arguments, scales, sides, ROUNDING_SHARE)
             if after is None:
                 return None
             if _same(after, sides):
@@ -104,7 +116,7 @@ class Newton:
         self, start: Outcome, sides: Sides, arguments: dict[str, np.ndarray], scales: Scales, most: int
     ) -> _Root | None:
         """``most`` of Newton's steps, with some limits held and the others let go; None where they lead nowhere."""
-        a, b, c, p = scales.variables, scales.rows, scales.cost, arguments["p"]
+        a, b, c, p, own = scales.variables, scales.rows, scales.cost, arguments["p"], self._settings
         fixed, held = _held(sides, arguments)
         goal = np.where(sides["x"] > 0, arguments["ubx"], arguments["lbx"])
         aim = np.where(sides["g"] > 0, arguments["ubg"], arguments["lbg"])
@@ -118,15 +130,16 @@ class Newton:
             gaps = np.where(held, rows - aim, 0.0) / b
             push = np.abs(lam * b / c)
             missed = max(
-                np.abs(falls).max(initial=0.0) / max(1.0, push.max(initial=0.0) / WEIGHT),
+                np.abs(falls).max(initial=0.0) / max(1.0, push.max(initial=0.0) / own.multipliers),
                 np.abs(gaps).max(initial=0.0) / np.abs(v / a).max(initial=1.0),
                 float(push @ np.abs(gaps)) / max(1.0, abs(cost / c)),  # what the gaps are worth
             )
-            if missed <= TOLERANCE or (is_new and GAIN * before < missed <= ROUNDING):  # rounding leaves no more
+            stalls = is_new and own.gain * before < missed <= SOLVER_RESIDUAL  # rounding leaves no more
+            if missed <= own.tolerance or stalls:
                 return _Root(step, v, rows, lam)
             if step == most or not missed < np.inf or (is_new and missed > before and step > 1) or reason_to_stop():
                 return None
-            is_new = matrix is None or missed > GAIN * before
+            is_new = matrix is None or missed > own.gain * before
             if is_new:
                 matrix = self._matrix(v, p, lam, (fixed, held), scales)
             if matrix is None:
@@ -172,7 +185,7 @@ class Newton:
             np.maximum.at(among, self._row, np.where(slopes != 0, own[self._column], 0.0))
         weight = np.divide(np.sqrt(np.where(among > 0, among / largest, 1.0)), size, out=np.zeros(m), where=size > 0)
         slopes *= weight[self._row]
-        price = PRICE * largest
+        price = self._settings.price * largest
         by_row = sp.csr_array((slopes[self._by_row], self._within[0], self._starts[0]), shape=(m, n))
         by_column = sp.csr_array((slopes[self._by_column], self._within[1], self._starts[1]), shape=(n, m))
         missing = by_column @ by_row
@@ -181,10 +194,10 @@ class Newton:
         values = np.zeros(self._order.length)
         values[self._order.at(i[lower], j[lower])] = price * missing.data[lower]
         values[self._of_hessian] += curves
-        values[self._of_diagonal] *= 1.0 + ROUNDED
+        values[self._of_diagonal] *= 1.0 + 4 * np.finfo(float).eps  # what is as flat may be rounding
         values[self._of_diagonal[fixed]] = 1.0
         factors = self._order.cholesky(values)
-        return None if factors is None else _Matrix(factors, by_row, by_column, weight, price)
+        return None if factors is None else _Matrix(factors, by_row, by_column, weight, price, self._settings)
 
 
 @dataclass(frozen=True)
@@ -201,6 +214,7 @@ class _Matrix:
     by_column: sp.csr_array
     weight: np.ndarray
     price: float
+    settings: NewtonSettings
 
     def step(self, falls: np.ndarray, gaps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Newton's step of variables and multipliers, scaled.
@@ -216,8 +230,8 @@ class _Matrix:
             missed = self.by_row @ move + gaps
             push = push + self.price * missed
             worst = float(np.abs(missed).max(initial=0.0))
-            goal = goal or EXACT * max(worst, float(np.abs(gaps).max(initial=0.0)))
-            if not goal < worst < (1 - GAIN) * last:
+            goal = goal or self.settings.exact * max(worst, float(np.abs(gaps).max(initial=0.0)))
+            if not goal < worst < (1 - self.settings.gain) * last:
                 break
             last = worst
         return move[place], self.weight * push

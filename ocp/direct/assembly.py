@@ -19,10 +19,25 @@ from ocp.console import check_time
 from ocp.direct.fragment import Block, Fragment
 from ocp.problem.values import symbols_of
 
-__all__ = ["Derivatives", "Program", "assemble", "derivatives"]
+__all__ = ["SIZES", "Derivatives", "Program", "assemble", "derivatives"]
 
-LARGE = 50_000
-"""Instructions: to look for equal ones among more takes longer than a solve with all of them."""
+
+@dataclass(frozen=True)
+class FunctionSizes:
+    """Numbers of instructions of a function.
+
+    Attributes:
+        compared: To look for equal ones among more takes longer than a solve with all of them.
+        inlined: Up to so many, an interval of multiple shooting is one flat SX function.
+        called: So few take as long to call as to do, and are not compiled.
+    """
+
+    compared: int = 50_000
+    inlined: int = 3000
+    called: int = 10
+
+
+SIZES = FunctionSizes()
 
 
 @dataclass(frozen=True)
@@ -268,8 +283,8 @@ def places_of(pattern: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def without_repeats(name: str, given: list[Any], outputs: list[Any]) -> Any:
-    """A casadi Function in which nothing is computed twice, unless it is LARGE."""
-    large = ca.Function(name, given, outputs).n_instructions() > LARGE
+    """A casadi Function in which nothing is computed twice, unless it is large."""
+    large = ca.Function(name, given, outputs).n_instructions() > SIZES.compared
     return ca.Function(name, given, outputs, {"cse": not large})
 
 

@@ -13,13 +13,12 @@ from typing import Any
 import casadi as ca
 
 from ocp.direct import assembly
-from ocp.direct.assembly import Derivatives, derivatives
+from ocp.direct.assembly import SIZES, Derivatives, derivatives
 from ocp.direct.fragment import Fragment
 from ocp.libraries import SERIALISED, CompilerError, Library, built, code, notice, serialised
 
 __all__ = ["block_derivatives"]
 
-FEW = 10  # instructions of a block, which take as long to call as to do
 RECIPE = hashlib.sha256(Path(assembly.__file__).read_bytes()).hexdigest()
 """What tells how derivatives are made of a block: the text that does it."""
 
@@ -45,7 +44,8 @@ def block_derivatives(fragment: Fragment, compiled: bool) -> list[Derivatives]:
 
 def _is_worth_it(function: Any, text: str) -> bool:
     """Whether a function has a text, so that it can be known again, and does more than it takes to call it."""
-    return text.startswith(SERIALISED) and not (function.is_a("SXFunction") and function.n_instructions() <= FEW)
+    is_short = function.is_a("SXFunction") and function.n_instructions() <= SIZES.called
+    return text.startswith(SERIALISED) and not is_short
 
 
 def _compiled(function: Any, text: str) -> Derivatives:

@@ -19,21 +19,35 @@ from ocp.console import Progress, listening, time_left
 from ocp.direct.assembly import Program, sparse
 from ocp.direct.fragment import Fragment
 from ocp.direct.nlp import Outcome
-from ocp.direct.scaling import USUAL, Scales
+from ocp.direct.scaling import SCALING, Scales
 from ocp.errors import Interrupted, SolveError
 from ocp.problem.formulation import Formulation
 from ocp.problem.problem import Problem
 from ocp.status import SolverStatus
+from ocp.tolerances import RESOLVED_SHARE, SOLVER_SHARE
 
-__all__ = ["Conflict", "Elastic", "diagnosis", "elastic_plan"]
+__all__ = ["Conflict", "Elastic", "diagnosis", "elastic_plan", "variable_names"]
 
-WORST = 6  # lines of one kind
-MISSED = 1e-6  # residual from which a plan counts as not feasible
 ELASTIC_IPOPT = {"tol": 1e-6, "max_iter": 300, "print_level": 0, "sb": "yes"}
-COST_SHARE = 1e-3  # of the problem's own cost, which makes the elastic plan unique
-EQUALITY_PRICE = 10.0  # how much dearer it is to miss an equality, which is what is asked for, than a limit
 REMEDY = "leave scaling on, give ends, bounds and a guess of the right size, or choose units in which they are near 1"
-HELD = 1e-5  # amount below which a constraint holds, relative to its size
+
+
+@dataclass(frozen=True)
+class ElasticSettings:
+    """What an elastic plan costs, and how much is said of it.
+
+    Attributes:
+        cost: Share of the problem's own cost, which makes the plan unique.
+        equality: How much dearer it is to miss an equality, which is what is asked for, than a limit.
+        lines: The most of one kind.
+    """
+
+    cost: float = 1e-3
+    equality: float = 10.0
+    lines: int = 6
+
+
+SETTINGS = ElasticSettings()
 
 
 class Built(Protocol):
@@ -77,7 +91,7 @@ def diagnosis(
     lines = [f"problem {built.problem.name!r}: {outcome.solver} ended with {message}"]
     if found:
         lines.append("not all constraints can hold together near the guess; with the dynamics and the given ends held,")
-        lines += [f"  {conflict}" for conflict in found[:WORST]]
+        lines += [f"  {conflict}" for conflict in found[: SETTINGS.lines]]
     elif elastic is not None and not badly_scaled:
         lines.append(
             "all constraints can hold together at the points of this grid, but for some 1e-5 of their sizes: take "
@@ -90,12 +104,12 @@ def diagnosis(
         {"name": c.label, "value": c.amount, "limit": c.bound, "time": c.time} for c in found[:1]
     ]
     broken = np.flatnonzero(~np.isfinite(value))
-    for i in broken[:WORST]:
+    for i in broken[: SETTINGS.lines]:
         lines.append(f"  {labels[i]} is not finite at {at[i] * horizon:.4g} s")
         worst.append({"name": labels[i], "value": float(value[i]), "time": float(at[i] * horizon)})
     seen: set[str] = set()
     for i in np.argsort(-np.where(np.isfinite(miss), miss, -np.inf)):
-        if len(seen) == WORST or not miss[i] > 1e-8:
+        if len(seen) == SETTINGS.lines or not miss[i] > 1e-8:
             break
         if labels[i] not in seen:
             seen.add(labels[i])
@@ -138,15 +152,10 @@ def residuals(
         g = np.asarray(built.program.values(v, arguments["p"])[1].full()).reshape(-1)
     except RuntimeError:  # an integrator breaks down
         g = np.full(fragment.n_rows, np.nan)
-    names = variable_labels(form, fragment)
-    bounds = [
-        f"{'' if role == 'horizon' else role + ' '}{name}" if role else "a stage variable"
-        for role, name in zip(fragment.variable_role, names, strict=True)
-    ]
     value = np.concatenate([g, v])
     lower, upper = both_bounds(arguments)
     at = np.concatenate([fragment.row_fractions, fragment.variable_fraction])
-    labels = [*fragment.row_labels, *(f"bound of {name}" for name in bounds)]
+    labels = [*fragment.row_labels, *(f"bound of {name}" for name in variable_names(form, fragment))]
     return labels, at, value, np.maximum(lower - value, value - upper)
 
 
@@ -162,6 +171,14 @@ def variable_labels(form: Formulation, fragment: Fragment) -> list[str]:
     return [
         names[role][entry] if role else ""
         for role, entry in zip(fragment.variable_role, fragment.variable_entry, strict=True)
+    ]
+
+
+def variable_names(form: Formulation, fragment: Fragment) -> list[str]:
+    """The same with what it is before it, "state q[2]"; "a stage variable" of a copy that a stage carries."""
+    return [
+        f"{'' if role == 'horizon' else role + ' '}{name}" if role else "a stage variable"
+        for role, name in zip(fragment.variable_role, variable_labels(form, fragment), strict=True)
     ]
 
 
@@ -218,7 +235,7 @@ def elastic_plan(
         Interrupted: Ctrl-C.
     """
     _, _, value, miss = residuals(built, outcome.variables, arguments)
-    if time_left() <= 0 or not (np.all(np.isfinite(value)) and np.any(miss > MISSED)):
+    if time_left() <= 0 or not (np.all(np.isfinite(value)) and np.any(miss > SOLVER_SHARE)):
         return None
     form, fragment, program = built.formulation, built.fragment, built.scaled
     own = scales.inside(arguments)
@@ -229,7 +246,7 @@ def elastic_plan(
     rows, columns = soft.picks(n, m, k)
     with np.errstate(all="ignore"):
         size = float(program.values(own["x0"], own["p"])[0])
-    share = COST_SHARE / max(1.0 if scales.cost <= 1 else USUAL, abs(size)) if np.isfinite(size) else 0.0
+    share = SETTINGS.cost / max(1.0 if scales.cost <= 1 else SCALING.usual, abs(size)) if np.isfinite(size) else 0.0
     lam, sigma = ca.MX.sym("lam", rows.shape[0]), ca.MX.sym("sigma")
     cost, slope = program.gradient(v, p)
     values, jacobian = program.jacobian(v, p)
@@ -304,7 +321,7 @@ class _Soft:
         self.sizes = np.full(len(self.labels), np.inf)
         np.minimum.at(self.sizes, index, size[np.concatenate([self.lower, self.upper])])
         self.prices = 1 / self.sizes
-        self.prices[index[(low == high)[np.concatenate([self.lower, self.upper])]]] *= EQUALITY_PRICE
+        self.prices[index[(low == high)[np.concatenate([self.lower, self.upper])]]] *= SETTINGS.equality
         relaxed = is_soft[fragment.n_rows :]
         horizon = fragment.variable_role == "horizon"
         self.low = np.where(relaxed & ~horizon, -np.inf, arguments["lbx"])
@@ -345,7 +362,7 @@ class _Soft:
             miss = bound - values[index] if side == "lower" else values[index] - bound
             for i in np.argsort(-miss):
                 j = int(slack[i])
-                if miss[i] <= HELD * self.sizes[j]:
+                if miss[i] <= RESOLVED_SHARE * self.sizes[j]:
                     break
                 if j not in found or miss[i] > found[j].amount:
                     at, by[j] = float(self.fractions[index[i]]), float(units[index[i]])

@@ -7,7 +7,7 @@ so building costs the same for 10 intervals and for 1000. Fragments of several p
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -15,7 +15,7 @@ import numpy as np
 
 from ocp.curves import PiecewisePolynomial
 
-__all__ = ["Block", "Fragment", "Interpolants", "Stages", "shifted"]
+__all__ = ["Block", "Fragment", "Interpolants", "Stages"]
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class Interpolants:
 
 @dataclass(frozen=True)
 class Fragment:
-    """The nonlinear program of one phase.
+    """The nonlinear program of a problem.
 
     Attributes:
         mesh: Fractions of the horizon where intervals begin and end. Shape (N + 1,).
@@ -141,23 +141,21 @@ class Fragment:
 
     @property
     def start(self) -> np.ndarray:
-        """Indices of the first state, the joint to an earlier phase. Shape (nx,)."""
+        """Indices of the first state. Shape (nx,)."""
         return self.nodes[:, 0]
 
     @property
     def end(self) -> np.ndarray:
-        """Indices of the last state, the joint to a later phase. Shape (nx,)."""
+        """Indices of the last state. Shape (nx,)."""
         return self.nodes[:, -1]
 
-
-def shifted(fragment: Fragment, variables: int, rows: int) -> Fragment:
-    """The same fragment with its variables and rows moved up, to stand behind another one in a larger program."""
-    blocks = tuple(replace(b, variables=b.variables + variables, rows=b.rows + rows) for b in fragment.blocks)
-    at, columns, values = fragment.linear
-    return replace(
-        fragment,
-        blocks=blocks,
-        linear=(at + rows, columns + variables, values),
-        nodes=fragment.nodes + variables,
-        horizon=None if fragment.horizon is None else fragment.horizon + variables,
-    )
+    def arguments(self, p: np.ndarray, bounds: tuple[np.ndarray, np.ndarray]) -> dict[str, np.ndarray]:
+        """Parameters, and the bounds of variables and rows from those of the bound table, as a solver takes them."""
+        lower, upper = bounds
+        return {
+            "p": p,
+            "lbx": lower[self.variable_bounds],
+            "ubx": upper[self.variable_bounds],
+            "lbg": lower[self.row_bounds],
+            "ubg": upper[self.row_bounds],
+        }

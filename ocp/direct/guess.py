@@ -13,10 +13,10 @@ from ocp.errors import ProblemError, about, unknown_name
 from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.values import numeric, table
 from ocp.solution import Guess, Solution
+from ocp.tolerances import ROUNDING_SHARE
 
 __all__ = ["Samples", "initial_point", "later", "names_told"]
 
-SAME = 1e-9  # of the horizon: times nearer to each other are the same
 Trajectory = Callable[[np.ndarray], np.ndarray]  # fractions of the horizon (M,) -> values (M, n)
 
 
@@ -101,9 +101,9 @@ def later(fragment: Fragment, intervals: int) -> tuple[np.ndarray, np.ndarray]:
         _, label = np.unique(words, return_inverse=True)
         order = np.lexsort((fractions, label))
         at = label[order] + fractions[order] / 2  # one meaning after the other, in time
-        there = np.searchsorted(at, label + (fractions + step - SAME) / 2)
+        there = np.searchsorted(at, label + (fractions + step - ROUNDING_SHARE) / 2)
         other = order[np.minimum(there, len(order) - 1)]
-        fits = (label[other] == label) & (np.abs(fractions[other] - fractions - step) < SAME)
+        fits = (label[other] == label) & (np.abs(fractions[other] - fractions - step) < ROUNDING_SHARE)
         found.append(np.where(fits, other, np.arange(len(label))))
     return found[0], found[1]
 

@@ -12,17 +12,16 @@ import numpy as np
 import scipy.sparse as sp
 
 from ocp.direct.assembly import Program
-from ocp.direct.nlp import Outcome
+from ocp.direct.nlp import SOLVER_RESIDUAL, Outcome
 from ocp.direct.scaling import Scales
 
-__all__ = ["Conditions", "Sides", "conditions", "corrected", "held_by", "scaled"]
+__all__ = ["RESOLVED", "Conditions", "Sides", "conditions", "corrected", "held_by", "scaled"]
 
 Sides: TypeAlias = dict[str, np.ndarray]
 """On which side each variable (x) and row (g) is held: -1 below, 1 above, 0 at none."""
-PUSHES = 1e-8
-"""Multiplier, in units of the solver, from which on a limit pushes; the distance from which on it is not touched."""
-FLAT = 1e-7
-"""Largest slope, in units of the solver, along what no limit holds; a plan costs the square of it too much."""
+RESOLVED = 10 * SOLVER_RESIDUAL
+"""In units of the solver: the largest slope along what no limit holds, a plan costs the square of it too much; the
+distance to a limit at which it is touched though it does not push; and what a linear system may be missed by."""
 
 
 @dataclass(frozen=True)
@@ -89,14 +88,14 @@ def corrected(
     push = dict(zip("xg", pushes(program, outcome, arguments["p"], scales), strict=True))
     values, units = {"x": outcome.variables, "g": outcome.rows}, {"x": scales.variables, "g": scales.rows}
     free = (sides["x"] == 0) & (arguments["lbx"] < arguments["ubx"])
-    if not np.all(np.abs(push["x"][free]) <= FLAT):  # nor where it is no number
+    if not np.all(np.abs(push["x"][free]) <= RESOLVED):  # nor where it is no number
         return None
     found = {}
     for kind, unit in units.items():
         value, side = values[kind] / unit, sides[kind]
         low, high = arguments[f"lb{kind}"] / unit, arguments[f"ub{kind}"] / unit
         room = tolerance * np.maximum(1.0, np.abs(value))
-        kept = np.where(push[kind] * side > PUSHES, side, 0.0)  # the others pull, or more do their work
+        kept = np.where(push[kind] * side > SOLVER_RESIDUAL, side, 0.0)  # the others pull, or more do their work
         missed = np.where(low < high, 1.0 * (value > high + room) - (value < low - room), 0.0)
         found[kind] = np.where(missed != 0, missed, kept)
     return found
@@ -105,8 +104,8 @@ def corrected(
 def at_limit(value: np.ndarray, lower: np.ndarray, upper: np.ndarray, push: np.ndarray) -> np.ndarray:
     """Which values are given, or held by a limit that pushes more than it is away."""
     with np.errstate(invalid="ignore"):
-        below = (push < -PUSHES) & (value - lower < -push)
-        above = (push > PUSHES) & (upper - value < push)
+        below = (push < -SOLVER_RESIDUAL) & (value - lower < -push)
+        above = (push > SOLVER_RESIDUAL) & (upper - value < push)
     return np.asarray((lower == upper) | below | above)
 
 

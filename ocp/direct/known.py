@@ -13,7 +13,8 @@ import numpy as np
 
 from ocp.direct.assembly import Program
 from ocp.direct.fragment import Fragment
-from ocp.direct.nlp import ROUNDING, Outcome
+from ocp.direct.nlp import SOLVER_RESIDUAL, Outcome
+from ocp.direct.scaling import Scales
 from ocp.problem.formulation import Formulation
 from ocp.status import SolverStatus
 
@@ -56,18 +57,18 @@ class Known:
             own[f"ub{key}"] = np.where(mask, np.inf, arguments[f"ub{key}"])
         return own
 
-    def checked(self, outcome: Outcome, arguments: dict[str, np.ndarray], scales: dict[str, np.ndarray]) -> Outcome:
+    def checked(self, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales) -> Outcome:
         """An outcome held against the limits that were let go; no success where one is missed.
 
         Args:
-            scales: Of variables (x) and rows (g), that a miss is judged by.
+            scales: By which a miss is judged.
         """
         v = outcome.variables
         inside = np.where(self.later, np.clip(v, arguments["lbx"], arguments["ubx"]), v)
-        miss = np.abs(inside - v) / (scales["x"] + np.abs(v))
+        miss = np.abs(inside - v) / (scales.variables + np.abs(v))
         beyond = np.maximum(arguments["lbg"] - outcome.rows, outcome.rows - arguments["ubg"])
-        beyond = np.where(self.declared, beyond, 0.0) / (scales["g"] + np.abs(outcome.rows))
-        if not outcome.success or max(miss.max(initial=0.0), beyond.max(initial=0.0)) <= ROUNDING:
+        beyond = np.where(self.declared, beyond, 0.0) / (scales.rows + np.abs(outcome.rows))
+        if not outcome.success or max(miss.max(initial=0.0), beyond.max(initial=0.0)) <= SOLVER_RESIDUAL:
             return replace(outcome, variables=inside) if outcome.success else outcome
         return replace(outcome, status=SolverStatus.INFEASIBLE, message=SolverStatus.INFEASIBLE.message)
 

@@ -19,8 +19,8 @@ from ocp.status import SolverStatus
 
 __all__ = [
     "DEFAULTS",
-    "ROUNDING",
     "SOLVERS",
+    "SOLVER_RESIDUAL",
     "Outcome",
     "broken_down",
     "build_solver",
@@ -28,11 +28,14 @@ __all__ = [
     "largest_number_of_iterations",
 ]
 
+SOLVER_RESIDUAL = 1e-8
+"""What a solver may leave of slopes and rows, relative to multipliers and variables, where rounding lets it no farther;
+in units of the solver the least multiplier that says anything."""
 IPOPT = {
     "tol": 1e-10,
     "constr_viol_tol": 1e-9,
-    "acceptable_tol": 1e-8,
-    "acceptable_constr_viol_tol": 1e-8,
+    "acceptable_tol": SOLVER_RESIDUAL,
+    "acceptable_constr_viol_tol": SOLVER_RESIDUAL,
     "acceptable_iter": 10,
     "max_iter": 1000,
     "bound_relax_factor": 0.0,
@@ -51,7 +54,6 @@ SOLVERS = tuple(DEFAULTS)
 """What may be asked for."""
 
 FATROP_FLAGS = {0: SolverStatus.SOLVED, 1: SolverStatus.ITERATION_LIMIT, 2: SolverStatus.ACCEPTABLE}
-FATROP_RELAXATION = 1e-8  # by which fatrop widens every inequality; its casadi interface has no option for it
 WORDS = {
     "optimal": SolverStatus.SOLVED,
     "unbounded": SolverStatus.DIVERGING,
@@ -62,8 +64,6 @@ WORDS = {
 """What SLEQP says, and IPOPT of as many equations as variables."""
 KINDS = {"IpoptInterface": "ipopt", "FatropInterface": "fatrop", "SLEQPInterface": "sleqp"}
 """Names of solvers by the class that calls them."""
-HUGE = 1e20
-ROUNDING = 1e-8  # of the residuals at which ipopt cannot move any more, relative to variables and multipliers
 
 
 @dataclass(frozen=True)
@@ -194,7 +194,7 @@ def fatrop_functions(program: Program, watch: Watch) -> dict[str, Any]:
 
 def finite(expression: Any) -> Any:
     """The same with a huge number for every entry that is infinite, of its sign, or is not a number."""
-    return ca.MX(expression.sparsity(), ca.fmax(ca.fmin(expression.nz[:], HUGE), -HUGE))
+    return ca.MX(expression.sparsity(), ca.fmax(ca.fmin(expression.nz[:], 1e20), -1e20))
 
 
 def call_solver(solver: Any, progress: Progress | Watch, arguments: dict[str, np.ndarray]) -> Outcome:
@@ -228,7 +228,7 @@ def call_solver(solver: Any, progress: Progress | Watch, arguments: dict[str, np
     values = {key: np.asarray(result[key], dtype=float).reshape(-1) for key in ("x", "f", "g", "lam_g")}
     if status.is_success and not all(np.all(np.isfinite(v)) for v in values.values()):
         status = SolverStatus.NOT_FINITE
-    if status is SolverStatus.ACCEPTABLE and missed(values, arguments) > ROUNDING:
+    if status is SolverStatus.ACCEPTABLE and missed(values, arguments) > SOLVER_RESIDUAL:
         status = SolverStatus.STEP_FAILED
     iterations, seconds = int(stats.get("iter_count", 0)), time.monotonic() - began
     cost, message = float(values["f"][0]), word if status is SolverStatus.FAILED else status.message
@@ -272,7 +272,7 @@ def as_good_as_rounding_allows(stats: dict[str, Any], result: dict[str, Any]) ->
     """Whether ipopt stands still at a solution: its tolerances are absolute, and large states round above them."""
     history = stats["iterations"]
     states, forces = (max(1.0, float(ca.norm_inf(result[key]))) for key in ("x", "lam_g"))
-    return bool(history["inf_pr"][-1] <= ROUNDING * states and history["inf_du"][-1] <= ROUNDING * forces)
+    return bool(history["inf_pr"][-1] <= SOLVER_RESIDUAL * states and history["inf_du"][-1] <= SOLVER_RESIDUAL * forces)
 
 
 def missed(values: dict[str, np.ndarray], arguments: dict[str, np.ndarray]) -> float:
@@ -284,14 +284,14 @@ def missed(values: dict[str, np.ndarray], arguments: dict[str, np.ndarray]) -> f
 
 def tightened(arguments: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Bounds drawn in by as much as fatrop widens them, so that plans keep the bounds that were asked."""
-    own = dict(arguments)
+    relaxation, own = 1e-8, dict(arguments)  # fatrop's own; its casadi interface has no option for it
     for low, high in (("lbx", "ubx"), ("lbg", "ubg")):
         lower, upper = arguments[low], arguments[high]
         room = lower < upper
         for key, bound, sign in ((low, lower, 1.0), (high, upper, -1.0)):
             move = room & np.isfinite(bound)
             size = np.maximum(1.0, np.abs(np.where(move, bound, 0.0)))
-            own[key] = np.where(move, bound + sign * FATROP_RELAXATION * size, bound)
+            own[key] = np.where(move, bound + sign * relaxation * size, bound)
     return own
 
 

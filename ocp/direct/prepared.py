@@ -6,82 +6,49 @@ import dataclasses
 import os
 import threading
 import time
-from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
 from ocp.console import OutOfTime, check_time, interruptible, limited
-from ocp.curves import PiecewisePolynomial
 from ocp.direct.active_set import Newton
 from ocp.direct.assembly import Program, assemble
 from ocp.direct.compiled import block_derivatives
 from ocp.direct.controller import write_controller
-from ocp.direct.diagnosis import diagnosis, elastic_plan
-from ocp.direct.fragment import Fragment
+from ocp.direct.diagnosis import Elastic, diagnosis, elastic_plan
 from ocp.direct.guess import initial_point, later, names_told
 from ocp.direct.kkt import held_by
 from ocp.direct.known import Known
+from ocp.direct.mesh import MeshedMethod
 from ocp.direct.nlp import SOLVERS, Outcome, broken_down, build_solver, call_solver, largest_number_of_iterations
+from ocp.direct.results import horizon_of, solution_of
 from ocp.direct.scaling import Pattern, Scales, badness, fitting_scales, scaled_program, sizes_along, unscaled
-from ocp.direct.starts import ELASTIC, GUESS, other_starts
+from ocp.direct.starts import ELASTIC, GUESS, STARTS, other_starts
 from ocp.errors import (
-    NOT_NUMBERS,
     Interrupted,
     ProblemError,
     SolveError,
-    about,
     checked_choice,
     checked_count,
     checked_mapping,
-    checked_positive,
     checked_time_limit,
-    floats,
 )
 from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.invariants import bounds_to_solve
 from ocp.problem.problem import Problem
-from ocp.problem.values import numeric
 from ocp.solution import ByName, Guess, Solution
 from ocp.status import SolverStatus
 from ocp.storage import checked_path
 
-__all__ = ["DirectMethod", "Prepared", "check_meshed"]
-
-SAME_NODE = 1e-9  # of the horizon: nodes nearer to each other are one
-MOST_ELSEWHERE = 200  # iterations from each other start
+__all__ = ["DirectMethod", "Prepared"]
 
 
-class DirectMethod(ABC):
-    """A direct method: turns a problem into a nonlinear program on a mesh of intervals.
-
-    Attributes:
-        intervals: Number of intervals.
-        control: How the controls move inside an interval.
-        mesh: Fractions 0..1 where intervals begin and end, N + 1 of them; None for equal intervals.
-    """
-
-    intervals: int
-    control: str
-    mesh: tuple[float, ...] | None
-
-    @property
-    @abstractmethod
-    def order(self) -> int:
-        """Power of the width with which the integration error of one interval falls."""
-
-    @property
-    @abstractmethod
-    def control_order(self) -> int:
-        """Power of the width with which a smooth control is missed between its points."""
-
-    @abstractmethod
-    def transcribe(self, form: Formulation, *, staged: bool = False) -> Fragment:
-        """The nonlinear program of a problem. ``staged`` lays it out for a structure-exploiting solver."""
+class DirectMethod(MeshedMethod):
+    """A direct method: a problem is prepared for it once, to be solved many times."""
 
     @interruptible
     def prepare(
@@ -103,80 +70,6 @@ class DirectMethod(ABC):
         except OutOfTime as error:
             words = f"problem {problem.name!r} was still being built: {SolverStatus.TIME_LIMIT}: raise time_limit"
             raise SolveError(words, name="time_limit") from error
-
-    @property
-    def fractions(self) -> np.ndarray:
-        """Where intervals begin and end, as fractions of the horizon. Shape (N + 1,)."""
-        return np.linspace(0.0, 1.0, self.intervals + 1) if self.mesh is None else np.asarray(self.mesh, dtype=float)
-
-    def with_mesh(self, mesh: np.ndarray) -> Self:
-        """The same method on another mesh (N + 1,)."""
-        return dataclasses.replace(self, intervals=len(mesh) - 1, mesh=tuple(mesh.tolist()))  # type: ignore[type-var]
-
-    def halved(self) -> Self:
-        """The same method with every interval cut in two."""
-        if self.mesh is None:
-            return dataclasses.replace(self, intervals=2 * self.intervals)  # type: ignore[type-var]
-        nodes = self.fractions
-        return self.with_mesh(np.union1d(nodes, (nodes[1:] + nodes[:-1]) / 2))
-
-    def with_nodes_at(self, fractions: Any) -> Self:
-        """The same method with nodes at some fractions 0..1 of the horizon too, where something jumps or bends.
-
-        A mesh that was given keeps its nodes. Without one the intervals between the fractions are equal, as many as
-        make none wider than it was.
-
-        Raises:
-            ProblemError: Fractions that are no numbers from 0 to 1.
-        """
-        told: dict[str, Any] = {"name": "fractions", "value": fractions}
-        with about("fractions"):
-            asked = numeric("with_nodes_at: fractions", fractions)
-        if not np.all((asked >= 0.0) & (asked <= 1.0)):
-            raise ProblemError(f"with_nodes_at: fractions must be numbers from 0 to 1, not {fractions!r}", **told)
-        if not asked.size:
-            return self
-        nodes = np.array([0.0, 1.0]) if self.mesh is None else self.fractions
-        own = np.abs(asked[:, None] - nodes).min(axis=1) < SAME_NODE
-        asked = np.unique(asked[~own])
-        nodes = np.union1d(nodes, asked[np.diff(asked, prepend=-1.0) >= SAME_NODE])
-        if self.mesh is None:
-            counts = np.maximum(np.ceil(np.diff(nodes) * self.intervals - SAME_NODE), 1).astype(int)
-            pieces = [np.linspace(a, b, n + 1)[:-1] for a, b, n in zip(nodes[:-1], nodes[1:], counts, strict=True)]
-            nodes = np.concatenate([*pieces, [1.0]])
-        return self.with_mesh(nodes)
-
-    def _settle(self, count: str, most: int | None = None) -> None:
-        """Check the mesh and the whole number by the name ``count``; turn them into plain Python, as is saved.
-
-        Raises:
-            ProblemError: No positive integers, or a mesh that does not increase from 0 to 1 in so many intervals.
-        """
-        kind = type(self).__name__
-        for name, limit in (("intervals", None), (count, most)):
-            object.__setattr__(self, name, checked_count(f"{kind}: {name}", getattr(self, name), most=limit))
-        if self.mesh is None:
-            return
-        told: dict[str, Any] = {"name": "mesh", "value": self.mesh}
-        try:
-            at = floats(self.mesh)
-        except NOT_NUMBERS as error:
-            words = f"{kind}: mesh must be fractions from 0 to 1, not {self.mesh!r}"
-            raise ProblemError(words, **told) from error
-        if at.shape != (self.intervals + 1,):
-            words = f"{kind}: mesh has {at.size} entries, {self.intervals + 1} expected (fractions 0 to 1)"
-            raise ProblemError(words, **told)
-        if not (at[0] == 0.0 and at[-1] == 1.0 and np.all(np.diff(at) > 0)):
-            raise ProblemError(f"{kind}: mesh must increase from 0 to 1, not {at.tolist()}", **told)
-        object.__setattr__(self, "mesh", tuple(at.tolist()))
-
-
-def check_meshed(caller: str, method: Any, tolerance: Any) -> None:
-    """Raise ProblemError unless a method has a mesh of intervals, and a tolerance is positive and finite."""
-    if not isinstance(method, DirectMethod):
-        words = f"{caller}: Collocation(...) or MultipleShooting(...) is expected, not {method!r}"
-        raise ProblemError(words, name="method", value=method)
-    checked_positive(f"{caller}: tolerance", tolerance)
 
 
 class Prepared:
@@ -283,18 +176,18 @@ class Prepared:
         bounds = form.bound_values(form.parameter_vector(checked_mapping("parameters", parameters)))
         with self._lock:
             point = initial_point(form, fragment, guess, bounds)
-            if isinstance(guess, Solution) and guess.method == self._told_method:
+            if isinstance(guess, Solution) and guess.method == self.method.settings:
                 # of this very grid; a layout in stages has more variables than one without
                 point = guess.variables if guess.variables.size == point.size else point
             return write_controller(form, fragment, point, place)
 
     def _solve(
-        self, parameters: ByName, guess: Guess, check: bool, tighter: Mapping[str, np.ndarray] | None, ahead: int = 0
+        self, parameters: ByName, guess: Guess, check: bool, tighter: Mapping[str, np.ndarray] | None, ahead: int
     ) -> Solution:
         form, fragment = self.formulation, self.fragment
         p = form.parameter_vector(checked_mapping("parameters", parameters))
         bounds = form.bound_values(p)
-        arguments = self._arguments(p, bounds_to_solve(form, p))
+        arguments = fragment.arguments(p, bounds_to_solve(form, p))
         if tighter is not None:
             draw_in(arguments, tighter)
         again = self._again(guess, arguments, bounds, ahead)
@@ -307,29 +200,14 @@ class Prepared:
         first = self._attempt(GUESS, point, told, arguments, bounds)
         if first.solution is not None and (first.outcome.success or not check):
             return first.solution
-        attempts, left = [first], self._most
-        if check and not first.is_final:
-            solver = self._solver_of_other_starts()
-            limits = arguments["lbx"], arguments["ubx"]
-            for start, other in other_starts(form, fragment, first.arguments["x0"], p, limits):
-                if left <= 0 or np.array_equal(other, first.arguments["x0"]):
-                    continue
-                attempts.append(self._attempt(start, other, told, arguments, bounds, solver))
-                if attempts[-1].is_final or all(attempt.is_broken for attempt in attempts):
-                    break  # found, stopped, or not a matter of the start
-                left -= attempts[-1].outcome.iterations
-            if attempts[-1].found is not None:
-                return attempts[-1].found
-        found = None
-        if not attempts[-1].is_final:
-            try:
-                horizon = self._horizon(first.outcome, p)
-                found = elastic_plan(self, first.outcome, first.arguments, first.scales, horizon)
-            except Interrupted as error:
-                raise Interrupted(str(error), first.solution) from error
-        if found is not None and check and left > 0:
-            names = {*form.states, *form.controls, "horizon"}
-            attempts.append(self._attempt(ELASTIC, found.plan, names, arguments, bounds, solver))
+        attempts: list[Attempt] = [first, *(self._attempts_elsewhere(first, arguments, bounds) if check else ())]
+        if attempts[-1].found is not None:
+            return attempts[-1].found
+        elastic = None if attempts[-1].is_final else self._elastic(first)
+        left = self._most - sum(attempt.outcome.iterations for attempt in attempts[1:])
+        if elastic is not None and check and left > 0:
+            solver = self._solver_of_other_starts
+            attempts.append(self._attempt(ELASTIC, elastic.plan, self._all_names, arguments, bounds, solver))
             if attempts[-1].found is not None:
                 return attempts[-1].found
         told_of = attempts[-1] if attempts[-1].is_final else first
@@ -337,27 +215,44 @@ class Prepared:
             self,
             told_of.outcome,
             told_of.arguments,
-            self._horizon(told_of.outcome, p),
+            horizon_of(form, fragment, told_of.outcome, p),
             told_of.solution,
-            found,
+            elastic,
             [str(attempt) for attempt in attempts],
             self._badness(told_of, bounds),
         ) from told_of.error
 
-    def _arguments(self, p: np.ndarray, bounds: Bounds) -> dict[str, np.ndarray]:
-        """Parameters, and the bounds of variables and rows, of the program."""
-        (lower, upper), fragment = bounds, self.fragment
-        return {
-            "p": p,
-            "lbx": lower[fragment.variable_bounds],
-            "ubx": upper[fragment.variable_bounds],
-            "lbg": lower[fragment.row_bounds],
-            "ubg": upper[fragment.row_bounds],
-        }
+    def _attempts_elsewhere(self, first: Attempt, arguments: dict[str, np.ndarray], bounds: Bounds) -> list[Attempt]:
+        """What became of the starts beside the guess, one after the other until one succeeds or the time is over.
+
+        They take as many iterations together as the first attempt may. Where no function is ever finite it is not a
+        matter of the start.
+        """
+        attempts, left, x0 = list[Attempt](), self._most, first.arguments["x0"]
+        if first.is_final:
+            return attempts
+        starts = other_starts(self.formulation, self.fragment, x0, arguments["p"], (arguments["lbx"], arguments["ubx"]))
+        for start, point in starts:
+            if left <= 0 or np.array_equal(point, x0):
+                continue
+            solver = self._solver_of_other_starts
+            attempts.append(self._attempt(start, point, first.told, arguments, bounds, solver))
+            if attempts[-1].is_final or all(attempt.is_broken for attempt in (first, *attempts)):
+                break
+            left -= attempts[-1].outcome.iterations
+        return attempts
+
+    def _elastic(self, first: Attempt) -> Elastic | None:
+        """The plan that misses the constraints least; Ctrl-C carries the last iterate of the first attempt."""
+        horizon = horizon_of(self.formulation, self.fragment, first.outcome, first.arguments["p"])
+        try:
+            return elastic_plan(self, first.outcome, first.arguments, first.scales, horizon)
+        except Interrupted as error:
+            raise Interrupted(str(error), first.solution) from error
 
     def _fits(self, guess: Guess) -> bool:
         """Whether a guess is a plan of this very program, by its method, mesh, sizes and parameters."""
-        if not isinstance(guess, Solution) or guess.method != self._told_method:
+        if not isinstance(guess, Solution) or guess.method != self.method.settings:
             return False
         sizes = guess.variables.shape, guess.multipliers.shape, set(guess.parameters)
         return sizes == ((self.fragment.size,), (self.fragment.n_rows,), set(self.formulation.parameters))
@@ -371,9 +266,9 @@ class Prepared:
             return None
         try:
             p = form.parameter_vector(guess.parameters)
-            before = self._known.relaxed(self._arguments(p, bounds_to_solve(form, p)))
+            before = self._known.relaxed(self.fragment.arguments(p, bounds_to_solve(form, p)))
             v, lam = guess.variables, guess.multipliers
-            scales = self._scales(v, {*form.states, *form.controls, "horizon"}, bounds, arguments["p"])
+            scales = self._scales(v, self._all_names, bounds, arguments["p"])
             cost, rows = self.program.numbers.values(v, p)
             start = Outcome(v, cost, rows, lam, guess.status, "", 0, 0.0)
             sides = held_by(self.program, start, before, scales)
@@ -383,7 +278,7 @@ class Prepared:
                 sides = {"x": sides["x"][of_x], "g": sides["g"][of_g]}
             outcome = self._newton.beside(start, sides, self._known.relaxed(arguments), scales)
             if outcome is not None:
-                outcome = self._known.checked(outcome, arguments, {"x": scales.variables, "g": scales.rows})
+                outcome = self._known.checked(outcome, arguments, scales)
             if outcome is None or not outcome.success:
                 return None
             return self._solution(outcome, arguments["p"], GUESS)
@@ -395,9 +290,10 @@ class Prepared:
         """What solves beside a plan."""
         return Newton(self.program, self.fragment)
 
+    @cached_property
     def _solver_of_other_starts(self) -> tuple[Any, Any]:
         """The solver with fewer iterations, for what is tried where it failed already; and its progress."""
-        return self._built_solver({**self._own_options, "max_iter": min(MOST_ELSEWHERE, self._most)})
+        return self._built_solver({**self._own_options, "max_iter": min(STARTS.iterations, self._most)})
 
     def _attempt(
         self,
@@ -423,7 +319,7 @@ class Prepared:
         except RuntimeError as error:
             outcome = broken_down(run, own, error)
         outcome = scales.outside(outcome)
-        outcome = self._known.checked(outcome, arguments, {"x": scales.variables, "g": scales.rows})
+        outcome = self._known.checked(outcome, arguments, scales)
         try:
             solution = self._solution(outcome, p, start)
         except RuntimeError as error:  # an integrator breaks down at the last iterate, which is no plan
@@ -452,92 +348,22 @@ class Prepared:
         return badness(self._pattern, x0, p, attempt.scales, sizes)
 
     @property
-    def _told_method(self) -> dict[str, Any]:
-        settings = {k: v for k, v in dataclasses.asdict(self.method).items() if v is not None}  # type: ignore[call-overload]
-        return {"type": type(self.method).__name__, **settings}
-
-    def _horizon(self, outcome: Outcome, p: np.ndarray) -> float:
-        index = self.fragment.horizon
-        return float(self.formulation.horizon_at(p) if index is None else outcome.variables[index])
+    def _all_names(self) -> set[str]:
+        """Names of all that a plan says the values of, see :func:`sizes_along`."""
+        return {*self.formulation.states, *self.formulation.controls, "horizon"}
 
     def _solution(self, outcome: Outcome, p: np.ndarray, start: str) -> Solution:
-        form, fragment = self.formulation, self.fragment
-        v = outcome.variables
-        horizon = self._horizon(outcome, p)
-        states, controls = fragment.interpolants(v, p, horizon)
-        piece, place = fragment.report
-        mesh = fragment.mesh
-        at = mesh[piece] + np.diff(mesh)[piece] * place
-        at[-1] = 1.0
-        costates = self._costates(outcome, p)
-        by_parameter = self._cost_gradient(outcome, p) if form.np else np.zeros(0)
-        x, u = v[fragment.report_states], controls_at(controls, fragment, piece, place)
-        return Solution(
-            name=form.name,
-            method=self._told_method,
-            solver=outcome.solver,
-            success=outcome.success,
-            status=outcome.status,
-            message=outcome.message,
-            cost=outcome.cost,
-            iterations=outcome.iterations,
-            horizon=horizon,
-            t=at * horizon,
-            states={name: x[:, s] for name, s in form.states.items()},
-            controls={name: u[:, s] for name, s in form.controls.items()},
-            costates={name: costates[:, s] for name, s in form.states.items()},
-            parameters={name: p[s] for name, s in form.parameters.items()},
-            cost_gradients={name: by_parameter[s] for name, s in form.parameters.items()},
-            state_interpolant=states,
-            control_interpolant=controls,
-            costate_interpolant=costate_interpolant(fragment, costates),
-            variables=v,
-            multipliers=outcome.multipliers,
-            seconds={"build": self.seconds, "solve": outcome.seconds},
-            problem=self.problem,
+        seconds = {"build": self.seconds, "solve": outcome.seconds}
+        return solution_of(
+            self.formulation,
+            self.fragment,
+            self.program,
+            outcome,
+            p,
+            method=self.method.settings,
+            seconds=seconds,
             start=start,
-            regularised=outcome.regularised,
         )
-
-    def _costates(self, outcome: Outcome, p: np.ndarray) -> np.ndarray:
-        """Costates at the reported points, from the multipliers.
-
-        At a node: the derivative, with respect to its state, of what the intervals behind it add to the Lagrangian;
-        at the end: minus what the intervals before it say.
-        """
-        fragment = self.fragment
-        costates = outcome.multipliers[fragment.costate_rows] * fragment.costate_scale[:, None]
-        inner = np.where(fragment.row_stages < 0, 0.0, outcome.multipliers)
-        numbers = self.program.numbers
-        _, jacobian = numbers.first(outcome.variables, p)
-        rows, columns = jacobian.indices, np.repeat(np.arange(fragment.size), np.diff(jacobian.indptr))
-        with np.errstate(invalid="ignore"):  # the iterate of a solver that failed may be anywhere
-            terms = jacobian.data * inner[rows]
-        running = numbers.inside(outcome.variables, p)
-
-        node_of = np.full(fragment.size, -2)
-        node_of[fragment.nodes] = np.arange(len(fragment.mesh))
-        own = fragment.row_stages[rows] == node_of[columns]
-        behind = np.bincount(columns[own], weights=terms[own], minlength=fragment.size)
-        behind[fragment.start] += running[fragment.start]
-        before = np.bincount(columns, weights=terms, minlength=fragment.size) + running
-        behind[fragment.end] = -before[fragment.end]
-        at_node = fragment.costate_rows < 0
-        costates[at_node] = behind[fragment.nodes.T[fragment.costate_nodes]][at_node]
-        return np.asarray(costates)
-
-    def _cost_gradient(self, outcome: Outcome, p: np.ndarray) -> np.ndarray:
-        """Derivative of the optimal cost in the parameters: of the Lagrangian, and through every active bound."""
-        form, fragment = self.formulation, self.fragment
-        v, lam = outcome.variables, outcome.multipliers
-        direct = self.program.numbers.parametric(v, p, lam)
-        slope, jacobian = self.program.numbers.first(v, p)
-        lam_x = -(slope + jacobian.T @ lam)
-        push = np.zeros((2, sum(len(place) for place in form.bounds.places.values())))
-        for index, force in ((fragment.variable_bounds, lam_x), (fragment.row_bounds, lam)):
-            np.add.at(push[0], index, np.minimum(force, 0.0))  # at a lower bound
-            np.add.at(push[1], index, np.maximum(force, 0.0))
-        return np.asarray(direct - form.bounds.pull(p, push))
 
 
 @dataclass(frozen=True)
@@ -586,22 +412,3 @@ def draw_in(arguments: dict[str, np.ndarray], by: Mapping[str, np.ndarray]) -> N
             middle = np.where(room & np.isfinite(high - low), (low + high) / 2, np.nan)
         arguments[f"lb{kind}"] = np.where(room, np.fmin(low + by[f"lb{kind}"], middle), low)
         arguments[f"ub{kind}"] = np.where(room, np.fmax(high - by[f"ub{kind}"], middle), high)
-
-
-def costate_interpolant(fragment: Fragment, costates: np.ndarray) -> PiecewisePolynomial:
-    """The polynomials through the reported costates of every interval, both its ends included."""
-    piece, place = fragment.report
-    n = len(fragment.mesh) - 1
-    starts = np.searchsorted(piece + (place == 1.0), np.arange(n))
-    width = starts[1] - starts[0] if n > 1 else len(piece) - 1
-    index = starts[:, None] + np.arange(width + 1)
-    nodes = np.append(place[(piece + (place == 1.0)) == 0], 1.0)
-    return PiecewisePolynomial(fragment.mesh, nodes, costates[index])
-
-
-def controls_at(controls: Any, fragment: Fragment, piece: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """Controls at reported points, from the side of the interval that reports them."""
-    if len(controls.breaks) == len(fragment.mesh):
-        return np.asarray(controls.within(piece, place))
-    mesh = fragment.mesh
-    return np.asarray(controls(mesh[piece] + np.diff(mesh)[piece] * place))

@@ -2,8 +2,8 @@
 
 A solver's tolerances are absolute: they suit numbers near 1. Each variable is divided by its size, each row and the
 cost by how far they move when the variables move by theirs. Scaling is linear, so the optimum stays the same; sizes are
-powers of two, so nothing is rounded; and what lies within :data:`USUAL` of 1 is left alone, so that plans in usual
-units do not depend on it at all, but for what the problem tells the size of.
+powers of two, so nothing is rounded; and what lies within a thousand of 1 is left alone, so that plans in usual units
+do not depend on it at all, but for what the problem tells the size of.
 
 Sizes are those of given ends and guesses. What has none of these takes the size that the dynamics give it, since a
 state moves by its derivative times the horizon, in the least-squares sense over all couplings (Curtis, Reid 1972), then
@@ -25,7 +25,7 @@ from ocp.direct.nlp import Outcome
 from ocp.problem.formulation import Bounds, Formulation
 
 __all__ = [
-    "USUAL",
+    "SCALING",
     "Pattern",
     "Scales",
     "Sizes",
@@ -36,17 +36,30 @@ __all__ = [
     "unscaled",
 ]
 
-USUAL = 1e3
-"""Sizes from 1/USUAL to USUAL are left alone: the tolerances of 1e-10 leave seven digits there."""
-ROUNDING = 1e-13
-"""Of the largest size: what is smaller is the rounding of a zero, such as the sine of pi in a guess."""
-BAD = 1e6
-"""From which factor on between sizes, or between a state and what drives it, a program counts as badly scaled."""
-WEAK = 1e-3
-"""Weight of the bounds against the dynamics where a size is sought, and of the size 1 against the bounds."""
-LEAST = float(np.sqrt(np.finfo(float).tiny))
-"""Size below which squares are no numbers any more, so that a cost has no size to fit; it counts as none."""
 SIDES = ("lbx", "ubx", "lbg", "ubg")
+
+
+@dataclass(frozen=True)
+class ScalingSettings:
+    """Which sizes are told from others.
+
+    Attributes:
+        usual: Sizes from 1/usual to usual are left alone: the tolerances of 1e-10 leave seven digits there.
+        rounding: Of the largest size: what is smaller is the rounding of a zero, such as the sine of pi in a guess.
+        weak: Weight of the bounds against the dynamics where a size is sought, and of the size 1 against the bounds.
+    """
+
+    usual: float = 1e3
+    rounding: float = 1e-13
+    weak: float = 1e-3
+
+    @property
+    def bad(self) -> float:
+        """Factor between sizes, or between a state and what drives it, from which on a program is badly scaled."""
+        return self.usual**2
+
+
+SCALING = ScalingSettings()
 
 
 @dataclass(frozen=True)
@@ -184,7 +197,7 @@ def sizes_along(pattern: Pattern, point: np.ndarray, given: Collection[str], bou
     ends[0, -1] = 0.0  # the least horizon is a fence, no size
     reach = np.where(np.isfinite(ends), ends, 0.0).max(axis=0)
     # what is rounding beside its own limits, or beside all else where it has none, has not been seen
-    known = seen > ROUNDING * np.where(reach > 0, reach, seen.max())
+    known = seen > SCALING.rounding * np.where(reach > 0, reach, seen.max())
     if known.all():
         return Sizes(seen[:nx], seen[nx:-1], horizon)
 
@@ -199,8 +212,8 @@ def sizes_along(pattern: Pattern, point: np.ndarray, given: Collection[str], bou
     right = np.log(pull[to, source]) - np.log(horizon) - equations @ logs
     bounded = np.flatnonzero((reach > 0) & ~known)
     eye = np.eye(len(seen))
-    rows = np.vstack([equations, WEAK * eye[bounded], WEAK**2 * eye[~known]])[:, ~known]
-    values = np.concatenate([right, WEAK * np.log(reach[bounded]), np.zeros(int(np.sum(~known)))])
+    rows = np.vstack([equations, SCALING.weak * eye[bounded], SCALING.weak**2 * eye[~known]])[:, ~known]
+    values = np.concatenate([right, SCALING.weak * np.log(reach[bounded]), np.zeros(int(np.sum(~known)))])
     logs[~known] = np.linalg.lstsq(rows, values, rcond=None)[0]
     sizes = np.exp(logs)
     return Sizes(sizes[:nx], sizes[nx:-1], float(sizes[-1]))
@@ -222,7 +235,8 @@ def couplings(pattern: Pattern, point: np.ndarray, p: np.ndarray) -> np.ndarray:
 def fitting_scales(pattern: Pattern, sizes: Sizes, point: np.ndarray, p: np.ndarray) -> Scales:
     """Scales of a program for variables of these sizes; rows and cost by how far they move from a start."""
     program, by = pattern.program, sizes.of_variables(pattern.fragment)
-    by = np.where(by > LEAST, by, 1.0)
+    # below, squares are no numbers any more, so that a cost has no size to fit
+    by = np.where(by > np.sqrt(np.finfo(float).tiny), by, 1.0)
     largest = np.zeros(pattern.fragment.n_rows)  # of all rows of a label, the same at all times
     slopes = _slopes(program, point, p)
     if slopes is not None:
@@ -238,8 +252,8 @@ def fitting_scales(pattern: Pattern, sizes: Sizes, point: np.ndarray, p: np.ndar
     usual = [move for move in moves if np.isfinite(move) and move > 0]
     cost = min(usual, default=1.0)
     # a large slope at the start may be small where the cost is least, so it is brought to the edge of the usual only
-    cost = cost / USUAL if cost > USUAL else cost if cost < 1 / USUAL else 1.0
-    largest = np.where(largest > ROUNDING * largest.max(initial=0.0), largest, 1.0)
+    cost = cost / SCALING.usual if cost > SCALING.usual else cost if cost < 1 / SCALING.usual else 1.0
+    largest = np.where(largest > SCALING.rounding * largest.max(initial=0.0), largest, 1.0)
     return Scales(_told(pattern, _powers(by)), _powers(largest[pattern.label]), float(2.0 ** np.round(np.log2(cost))))
 
 
@@ -248,7 +262,7 @@ def badness(pattern: Pattern, point: np.ndarray, p: np.ndarray, scales: Scales, 
     form, fragment = pattern.form, pattern.fragment
     by = sizes.of_variables(fragment) / scales.variables
     off = np.abs(np.log(by))
-    if by.size and off.max() > np.log(BAD):
+    if by.size and off.max() > np.log(SCALING.bad):
         k = int(np.argmax(off))
         role, entry = str(fragment.variable_role[k]), int(fragment.variable_entry[k])
         label = {"state": form.state_labels, "control": form.control_labels}.get(role, ("",))[entry]
@@ -259,7 +273,7 @@ def badness(pattern: Pattern, point: np.ndarray, p: np.ndarray, scales: Scales, 
     if form.horizon_is_free:
         drive *= sizes.horizon / point[fragment.horizon]
     off = np.abs(np.log(np.where(drive > 0, drive, 1.0)))
-    if off.max(initial=0.0) > np.log(BAD):
+    if off.max(initial=0.0) > np.log(SCALING.bad):
         i = int(np.argmax(off))
         return f"state {form.state_labels[i]} moves by {drive[i]:.1g} times its size {sizes.states[i]:.1g}"
     return ""
@@ -275,7 +289,7 @@ def _told(pattern: Pattern, found: np.ndarray) -> np.ndarray:
 
 def _powers(sizes: np.ndarray) -> np.ndarray:
     """The nearest powers of two of sizes out of the usual; 1 of the others."""
-    odd = (sizes < 1 / USUAL) | (sizes > USUAL)
+    odd = (sizes < 1 / SCALING.usual) | (sizes > SCALING.usual)
     return np.where(odd, np.exp2(np.round(np.log2(np.where(odd, sizes, 1.0)))), 1.0)
 
 

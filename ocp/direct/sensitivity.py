@@ -8,7 +8,6 @@ one factorization of it, and one back-substitution for each entry of the paramet
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -17,9 +16,11 @@ import scipy.sparse.linalg as sla
 
 from ocp.direct.assembly import Program, assemble
 from ocp.direct.collocation import Collocation
+from ocp.direct.diagnosis import variable_names
 from ocp.direct.fragment import Fragment
-from ocp.direct.kkt import Conditions, conditions
+from ocp.direct.kkt import RESOLVED, Conditions, conditions
 from ocp.direct.nlp import Outcome
+from ocp.direct.results import controls_at
 from ocp.direct.scaling import Pattern, fitting_scales, sizes_along
 from ocp.direct.shooting import MultipleShooting
 from ocp.errors import ProblemError, unknown_name
@@ -31,12 +32,19 @@ from ocp.solution import Sensitivity, Solution
 __all__ = ["sensitivity"]
 
 METHODS = {"Collocation": Collocation, "MultipleShooting": MultipleShooting}
-SOFTENED = 1e-11
-"""By which rows that others imply may be missed, relative to their own size and to the curvature, while solving."""
-REFINEMENTS = 4
-MISSED = 1e-7  # of the system, relative to its right side: more, and the limits that push contradict each other
-ON_THE_EDGE = 1e-7
-"""Distance to a limit, in units of the solver, at which it is touched though it does not push."""
+
+
+@dataclass(frozen=True)
+class SystemSettings:
+    """How the linear system is solved.
+
+    Attributes:
+        softening: By which rows that others imply may be missed, relative to their own size and to the curvature.
+        refinements: Passes that make up for it.
+    """
+
+    softening: float = 1e-11
+    refinements: int = 4
 
 
 @dataclass(frozen=True)
@@ -67,13 +75,7 @@ def sensitivity(solution: Solution, name: str) -> Sensitivity:
     columns = list(range(place.start, place.stop))
     v, lam = built.v, solution.multipliers
     bounds = built.lower, built.upper
-    arguments = {
-        "p": p,
-        "lbx": built.lower[fragment.variable_bounds],
-        "ubx": built.upper[fragment.variable_bounds],
-        "lbg": built.lower[fragment.row_bounds],
-        "ubg": built.upper[fragment.row_bounds],
-    }
+    arguments = fragment.arguments(p, bounds)
     pattern = Pattern(form, fragment, built.program)
     told = {*form.states, *form.controls, "horizon"}
     scales = fitting_scales(pattern, sizes_along(pattern, v, told, bounds, p), v, p)
@@ -114,11 +116,11 @@ def sensitivity(solution: Solution, name: str) -> Sensitivity:
         ]
     for room, rate in loose:
         some = np.flatnonzero(np.isfinite(room))
-        size = np.where(room[some] < ON_THE_EDGE, 0.0, room[some])
+        size = np.where(room[some] < RESOLVED, 0.0, room[some])
         for k in range(len(columns)):
             for side, sign in ((0, -1.0), (1, 1.0)):
                 toward = -sign * rate[some, k]
-                nearer = np.flatnonzero(toward > ON_THE_EDGE * np.abs(rate[some, k]).max(initial=0.0))
+                nearer = np.flatnonzero(toward > RESOLVED * np.abs(rate[some, k]).max(initial=0.0))
                 if not nearer.size:
                     continue
                 reach = size[nearer] / toward[nearer]
@@ -192,7 +194,12 @@ def by_parameters(
 
 
 def moved(
-    at: Conditions, slope: np.ndarray, change: np.ndarray, at_x: np.ndarray, at_g: np.ndarray
+    at: Conditions,
+    slope: np.ndarray,
+    change: np.ndarray,
+    at_x: np.ndarray,
+    at_g: np.ndarray,
+    settings: SystemSettings = SystemSettings(),
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Derivatives of the variables (n, k) and of the multipliers of rows (m, k) and bounds (n, k), scaled.
 
@@ -214,13 +221,14 @@ def moved(
     system = (
         sp.block_array([[hessian[free][:, free], own.T], [own, None]], format="csc") if m else hessian[free][:, free]
     )
-    softened = system - sp.diags_array(np.concatenate([np.zeros(n), np.full(m, SOFTENED * largest)]))
+    softened = system - sp.diags_array(np.concatenate([np.zeros(n), np.full(m, settings.softening * largest)]))
     solve = sla.splu(sp.csc_array(softened))
     found = solve.solve(right)
-    for _ in range(REFINEMENTS):
+    for _ in range(settings.refinements):
         found += solve.solve(right - system @ found)
     missed = float(np.abs(right - system @ found).max(initial=0.0))
-    if not missed <= MISSED * max(float(np.abs(right).max(initial=0.0)), 1e-300):
+    # more, and the limits that push contradict each other
+    if not missed <= RESOLVED * max(float(np.abs(right).max(initial=0.0)), 1e-300):
         words = "the limits at which the plan stands contradict each other, or leave it open, when the parameter moves"
         raise ProblemError(words, name="parameters", value=missed)
     dv[free] = found[:n]
@@ -234,8 +242,6 @@ def moved(
 def control_rates(built: Built, solution: Solution, dv: np.ndarray) -> np.ndarray:
     """Derivatives of the controls at the reported times (M, nu, k): controls are linear in their variables."""
     piece, place = built.fragment.report
-    mesh = built.fragment.mesh
-    fractions = mesh[piece] + np.diff(mesh)[piece] * place
     columns = []
     for direction in dv.T:
         step = max(1.0, float(np.abs(built.v).max())) / max(float(np.abs(direction).max()), 1e-300)
@@ -243,23 +249,9 @@ def control_rates(built: Built, solution: Solution, dv: np.ndarray) -> np.ndarra
             built.fragment.interpolants(built.v + sign * step * direction, built.p, solution.horizon)[1]
             for sign in (1.0, -1.0)
         ]
-        if len(curves[0].breaks) == len(mesh):
-            up, down = (curve.within(piece, place) for curve in curves)
-        else:
-            up, down = (curve(fractions) for curve in curves)
+        up, down = (controls_at(curve, built.fragment, piece, place) for curve in curves)
         columns.append((up - down) / (2 * step))
     return np.stack(columns, axis=-1)
-
-
-def variable_names(form: Formulation, fragment: Fragment) -> list[str]:
-    """A name for each variable."""
-    labels: dict[str, Any] = {"state": form.state_labels, "control": form.control_labels, "horizon": ("horizon",)}
-    found = []
-    for role, entry in zip(fragment.variable_role, fragment.variable_entry, strict=True):
-        found.append(
-            f"{role} {labels[role][entry]}" if role in ("state", "control") else str(role) or "a stage variable"
-        )
-    return found
 
 
 def split(places: dict[str, slice], values: np.ndarray) -> dict[str, np.ndarray]:

@@ -12,6 +12,7 @@ import casadi as ca
 import numpy as np
 
 from ocp.curves import integrator, rk4_step
+from ocp.direct.assembly import SIZES
 from ocp.direct.fragment import Block, Fragment, Interpolants
 from ocp.direct.prepared import DirectMethod
 from ocp.direct.transcription import FragmentBuilder
@@ -21,9 +22,7 @@ from ocp.problem.values import symbols_of
 
 __all__ = ["MultipleShooting"]
 
-THIRDS = np.array([0.0, 1.0 / 3.0, 2.0 / 3.0, 1.0])
-INLINE = 3000  # instructions of a stage up to which it is one flat SX function
-MOST_STEPS = 100_000  # of cvodes in an interval, for stiff dynamics
+THIRDS = np.linspace(0.0, 1.0, 4)  # nodes of a cubic
 
 
 @dataclass(frozen=True)
@@ -160,7 +159,7 @@ def step_function(form: Formulation, method: MultipleShooting) -> tuple[Any, boo
     after = rk4_step(slope, ca.vertcat(x, 0), h)
     outputs = [after[: form.nx], after[form.nx]]
     step = ca.Function("step", [x, w, d, i, horizon, p], outputs)
-    flat = step.is_a("SXFunction") and step.n_instructions() * method.steps < INLINE
+    flat = step.is_a("SXFunction") and step.n_instructions() * method.steps < SIZES.inlined
     return step, flat
 
 
@@ -173,7 +172,7 @@ def cvodes(form: Formulation, method: MultipleShooting, places: list[float]) -> 
     function = form.function("f", [form.f, form.running], ["f", "running"])
     rate, cost = function(x, control_at(form, method, w, place), (s + h * place) * horizon, horizon, p)
     dae = {"x": x, "t": place, "p": q, "ode": h * horizon * rate, "quad": h * horizon * cost}
-    whole = integrator("cvodes", dae, places, max_steps=MOST_STEPS, smooth=False)
+    whole = integrator("cvodes", dae, places, smooth=False)
     x, w, d, i = ca.MX.sym("x", form.nx), ca.MX.sym("w", nw), ca.MX.sym("d", 2), ca.MX.sym("i")
     horizon, p = ca.MX.sym("T"), ca.MX.sym("p", form.np)
     result = whole(x0=x, p=ca.vertcat(w, d, horizon, p))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
@@ -11,12 +12,26 @@ from ocp.curves import rk4_step
 from ocp.direct.fragment import Fragment
 from ocp.problem.formulation import Formulation
 
-__all__ = ["ELASTIC", "GUESS", "other_starts"]
+__all__ = ["ELASTIC", "GUESS", "STARTS", "other_starts"]
 
 GUESS, ELASTIC = "guess", "elastic plan"
-LONGER = 4.0
-"""Zeros begin with a free horizon so many times the guessed one: a long horizon has a plan in it, too short a one none.
-"""
+
+
+@dataclass(frozen=True)
+class StartSettings:
+    """Where and for how long a solver starts anew.
+
+    Attributes:
+        horizon: Zeros begin with a free horizon so many times the guessed one: a long horizon has a plan in it, too
+            short a one none.
+        iterations: The most from each start: the solver failed already from another one.
+    """
+
+    horizon: float = 4.0
+    iterations: int = 200
+
+
+STARTS = StartSettings()
 
 
 def other_starts(
@@ -27,7 +42,7 @@ def other_starts(
     Args:
         bounds: Of the variables, which the starts are moved into.
     """
-    zeros = np.where(fragment.variable_role == "horizon", LONGER * point, 0.0)
+    zeros = np.where(fragment.variable_role == "horizon", STARTS.horizon * point, 0.0)
     yield "zeros", np.clip(zeros, *bounds)
     yield "roll-out", np.clip(roll_out(form, fragment, point, p), *bounds)
 

@@ -19,7 +19,6 @@ from ocp.problem.values import symbols_of
 __all__ = ["LOBATTO", "BoundaryProblem"]
 
 LOBATTO = 0.5 - 0.5 * np.cos(np.pi * np.arange(10) / 9)  # Chebyshev-Lobatto nodes of a reported piece, 0..1
-MOST_STEPS = 50_000  # of the integrator in a segment
 
 
 class BoundaryProblem:
@@ -158,7 +157,7 @@ class BoundaryProblem:
         x_rate, lam_rate, cost, by_horizon = flow(*self.arguments(y, q[0] + place * q[1], q[2], q))
         ode, quad = q[1] * ca.vertcat(x_rate, lam_rate), q[1] * ca.vertcat(cost, by_horizon)
         dae = {"x": y, "t": place, "p": q, "ode": ode, "quad": quad}
-        flown = integrator("flow", dae, places.tolist(), tolerance=self.tolerance, max_steps=MOST_STEPS)
+        flown = integrator("flow", dae, places.tolist(), tolerance=self.tolerance)
         y, q = ca.MX.sym("y", 2 * sizes[0]), ca.MX.sym("q", q.numel())
         result = flown(x0=y, p=q)
         return ca.Function("segment", [y, q], [result["xf"], result["qf"][:, -1]])

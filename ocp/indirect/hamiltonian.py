@@ -15,11 +15,9 @@ import numpy as np
 from ocp.errors import ProblemError, about
 from ocp.problem.formulation import Formulation
 from ocp.problem.values import symbols_of
+from ocp.tolerances import ROUNDING_SHARE
 
 __all__ = ["Hamiltonian"]
-
-SEED = 20110106  # of the random points at which matrices are looked at
-REGULAR = 1e-9  # least eigenvalue, relative to the largest, of a matrix that may be divided by
 
 
 @dataclass(frozen=True)
@@ -186,16 +184,16 @@ class Hamiltonian:
         """Raise where the equations of the control are singular at a random point."""
         if 0 in matrix.shape:
             return
-        rng = np.random.default_rng(SEED)
+        rng = np.random.default_rng(0)
         sample = numbers(matrix, symbols, rng)
         singular = np.linalg.svd(sample, compute_uv=False) if np.all(np.isfinite(sample)) else np.ones(1)
-        if singular[-1] < REGULAR * singular[0]:
+        if singular[-1] < ROUNDING_SHARE * singular[0]:
             raise ProblemError(
                 "the Hamiltonian does not determine the control: its second derivative is singular on the directions "
                 "that the path equalities leave; add a quadratic term in the control to the cost",
                 name="control",
                 value=float(singular[-1]),
-                limit=float(REGULAR * singular[0]),
+                limit=float(ROUNDING_SHARE * singular[0]),
             )
 
 
@@ -245,7 +243,7 @@ def nonzeros(matrix: Any, symbols: list[Any]) -> Any:
     """Sparsity of the entries that are not zero; of an MX expression, not zero at one of three random points."""
     if isinstance(matrix, ca.SX):
         return ca.sparsify(matrix).sparsity()
-    rng = np.random.default_rng(SEED)
+    rng = np.random.default_rng(0)
     size = np.abs([numbers(matrix, symbols, rng) for _ in range(3)]).max(axis=0)  # nan stays and counts
     return ca.sparsify(ca.DM(np.where(size == 0, 0.0, 1.0))).sparsity()
 
@@ -287,6 +285,6 @@ def symmetric_solve(matrix: Any, rhs: Any, n: int) -> Any:
 
 def positive(matrix: Any) -> bool:
     """Whether a symmetric matrix is positive definite at a random point."""
-    sample = numbers(matrix, ca.symvar(matrix), np.random.default_rng(SEED))
+    sample = numbers(matrix, ca.symvar(matrix), np.random.default_rng(0))
     values = np.linalg.eigvalsh(sample)
-    return bool(np.all(np.isfinite(values)) and values[0] > REGULAR * values[-1])
+    return bool(np.all(np.isfinite(values)) and values[0] > ROUNDING_SHARE * values[-1])

@@ -36,11 +36,13 @@ from ocp.indirect.minimality import not_least
 from ocp.indirect.newton import Found, newton
 from ocp.indirect.seed import ControlArcs, read_arcs, read_unknowns
 from ocp.indirect.sensitivity import Extremal, cost_gradient
-from ocp.problem.formulation import Bounds, Formulation, at_samples
+from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.invariants import bounds_to_solve
 from ocp.problem.problem import Problem
+from ocp.problem.sampling import at_samples
 from ocp.solution import ByName, Guess, Solution, check_belongs
 from ocp.status import SolverStatus
+from ocp.tolerances import ROUNDING_SHARE
 
 __all__ = ["Indirect", "PreparedIndirect"]
 
@@ -98,9 +100,6 @@ class Indirect:
             "scaling": scaling,
         }
         return PreparedIndirect(problem, self, how)
-
-
-SLACK = 1e-9  # relative, of what rounding may do to times
 
 
 class PreparedIndirect:
@@ -206,7 +205,7 @@ class PreparedIndirect:
             horizon = float(found.unknowns[at["horizon"]][0])
             place = self.formulation.bounds.places["horizon"][0]
             low, high = bounds[0][place], bounds[1][place]
-            if not low * (1 - SLACK) <= horizon <= high * (1 + SLACK):
+            if not low * (1 - ROUNDING_SHARE) <= horizon <= high * (1 + ROUNDING_SHARE):
                 words = (
                     f"the horizon comes out as {horizon:.6g} s, beyond its bounds {low:g} .. {high:g} s; where a bound "
                     "holds it, fix it there"
@@ -214,7 +213,8 @@ class PreparedIndirect:
                 return dataclasses.replace(found, status=SolverStatus.REJECTED, message=words)
         switches = found.unknowns[at["switches"]]
         knots = np.concatenate([[0.0], switches, [horizon]])
-        if np.all(np.diff(knots) > -SLACK * np.max(np.abs(switches), initial=0.0)):  # two controls may switch at once
+        # two controls may switch at once
+        if np.all(np.diff(knots) > -ROUNDING_SHARE * np.max(np.abs(switches), initial=0.0)):
             return found
         words = f"the switches are not in order within the horizon: {np.round(knots[1:], 6).tolist()} s"
         return dataclasses.replace(found, status=SolverStatus.REJECTED, message=words)
@@ -311,7 +311,7 @@ class PreparedIndirect:
                     if np.any(before != after):
                         cuts.append(bisect(partial(at_bound, first, q), a, b, before))
             cuts = [cut for cut in cuts if cut < 1.0 - 1e-9]
-            if abs(q[1]) <= SLACK * (abs(q[0]) + abs(q[1])):
+            if abs(q[1]) <= ROUNDING_SHARE * (abs(q[0]) + abs(q[1])):
                 continue  # an arc between two switches at once
             for a, b in zip(cuts, [*cuts[1:], 1.0], strict=True):
                 piece = np.concatenate([[q[0] + a * q[1], (b - a) * q[1]], q[2:]])

@@ -14,12 +14,9 @@ import numpy as np
 from ocp.indirect.hamiltonian import Hamiltonian
 from ocp.indirect.sensitivity import Extremal
 from ocp.problem.formulation import Bounds
+from ocp.tolerances import FLAT_SHARE, ROUNDING_SHARE, SOLVER_SHARE
 
 __all__ = ["not_least"]
-
-HELD_WITHIN = 1e-9  # a bound nearer than this, relative to its range, holds the control
-SLOPE_LIMIT = 1e-6  # largest slope of H against what holds the control, relative to its parts and to its curvature
-CURVATURE_LIMIT = 1e-8  # most negative curvature of H in the free controls, relative to its largest entry
 
 
 def not_least(ham: Hamiltonian, path: Extremal, p: np.ndarray, bounds: Bounds) -> str:
@@ -35,17 +32,17 @@ def not_least(ham: Hamiltonian, path: Extremal, p: np.ndarray, bounds: Bounds) -
     low, high = bounds[0][index], bounds[1][index]
     with np.errstate(invalid="ignore"):
         width = np.where(np.isfinite(high - low), high - low, 1.0)
-    at_low, at_high = u <= low + HELD_WITHIN * width, u >= high - HELD_WITHIN * width
+    at_low, at_high = u <= low + ROUNDING_SHARE * width, u >= high - ROUNDING_SHARE * width
     slope, parts, curvature, rows, by_control = samples(ham, path, p)
     if not all(np.all(np.isfinite(v)) for v in (slope, curvature, rows)):
         return "the Hamiltonian is not finite along the plan"
 
     wrong = np.where(at_low, np.maximum(-slope, 0.0), np.where(at_high, np.maximum(slope, 0.0), np.abs(slope)))
     # all parts may vanish at the optimum; then the slope is judged by what a change of the control's own size makes
-    scale = float(np.max(parts)) + float(np.max(np.abs(curvature))) * max(HELD_WITHIN, float(np.max(np.abs(u))))
+    scale = float(np.max(parts)) + float(np.max(np.abs(curvature))) * max(ROUNDING_SHARE, float(np.max(np.abs(u))))
     wrong = np.where(at_low & at_high, 0.0, wrong) / max(scale, np.finfo(float).tiny)
     k, i = np.unravel_index(int(np.argmax(wrong)), wrong.shape)
-    if wrong[k, i] > SLOPE_LIMIT:
+    if wrong[k, i] > SOLVER_SHARE:
         label, time = form.control_labels[i], path.t.ravel()[k]
         if i in ham.linear:
             return (
@@ -54,14 +51,14 @@ def not_least(ham: Hamiltonian, path: Extremal, p: np.ndarray, bounds: Bounds) -
                 "use a direct method with held controls"
             )
         return f"the Hamiltonian is not least in control {label!r} at {time:.4g} s"
-    if len(form.path) and np.max(np.abs(rows)) > SLOPE_LIMIT * max(1.0, float(np.max(np.abs(u)))):
+    if len(form.path) and np.max(np.abs(rows)) > SOLVER_SHARE * max(1.0, float(np.max(np.abs(u)))):
         return "the path equalities are not met"
     free = ~(at_low | at_high)
     for k in np.flatnonzero(free.any(axis=1)):
         inside = curvature[k][np.ix_(free[k], free[k])]
         tangent = null_space(by_control[k][:, free[k]])
         least = np.min(np.linalg.eigvalsh(tangent.T @ inside @ tangent), initial=0.0)
-        if least < -CURVATURE_LIMIT * np.max(np.abs(curvature[k])):
+        if least < -FLAT_SHARE * np.max(np.abs(curvature[k])):
             names = ", ".join(
                 repr(label) for label, is_free in zip(form.control_labels, free[k], strict=True) if is_free
             )

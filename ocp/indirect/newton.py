@@ -14,8 +14,19 @@ from ocp.status import SolverStatus
 
 __all__ = ["Found", "newton"]
 
-HALVINGS = 12  # of a step before it counts as none
-MOST_STEPS = 40
+
+@dataclass(frozen=True)
+class NewtonSettings:
+    """When Newton's method gives up.
+
+    Attributes:
+        steps: The most steps. halvings: Of a step, before it counts as none.
+        descent: Share of the fall that a step of this length promises which it must bring (Armijo's rule).
+    """
+
+    steps: int = 40
+    halvings: int = 12
+    descent: float = 1e-4
 
 
 @dataclass(frozen=True)
@@ -34,7 +45,14 @@ class Found:
         return self.status.is_success
 
 
-def newton(system: tuple[Any, ...], start: np.ndarray, data: np.ndarray, scale: float, tolerance: float) -> Found:
+def newton(
+    system: tuple[Any, ...],
+    start: np.ndarray,
+    data: np.ndarray,
+    scale: float,
+    tolerance: float,
+    settings: NewtonSettings = NewtonSettings(),
+) -> Found:
     """Damped Newton's method on a sparse system; the step is halved until the residual falls."""
     residual, jacobian = system
 
@@ -51,7 +69,7 @@ def newton(system: tuple[Any, ...], start: np.ndarray, data: np.ndarray, scale: 
         raise ProblemError(words, name="conditions", value=value.size, limit=start.size)
     polished, stopped = False, None
     with listening():
-        for steps in range(MOST_STEPS + 1):
+        for steps in range(settings.steps + 1):
             size = float(np.max(np.abs(value), initial=0.0))
             if not np.isfinite(size):
                 return Found(z, size, steps, SolverStatus.NOT_FINITE, "the integration broke down at the seed")
@@ -59,7 +77,7 @@ def newton(system: tuple[Any, ...], start: np.ndarray, data: np.ndarray, scale: 
                 return Found(z, size, steps, SolverStatus.SOLVED, f"Converged in {steps} Newton steps")
             polished = size <= tolerance * scale  # one more step: it costs little and gains digits
             stopped = reason_to_stop()
-            if stopped or steps == MOST_STEPS:
+            if stopped or steps == settings.steps:
                 break
             try:
                 with quiet():
@@ -77,10 +95,10 @@ def newton(system: tuple[Any, ...], start: np.ndarray, data: np.ndarray, scale: 
                     return Found(z, size, steps, SolverStatus.SOLVED, f"Converged in {steps} Newton steps; {word}")
                 return Found(z, size, steps, SolverStatus.STEP_FAILED, word)
             length = 1.0
-            for _ in range(HALVINGS):
+            for _ in range(settings.halvings):
                 trial = z + length * step
                 new = evaluate(trial)
-                if np.linalg.norm(new) < (1.0 - 1e-4 * length) * np.linalg.norm(value) or polished:
+                if np.linalg.norm(new) < (1.0 - settings.descent * length) * np.linalg.norm(value) or polished:
                     break
                 length *= 0.5
             else:
@@ -91,4 +109,4 @@ def newton(system: tuple[Any, ...], start: np.ndarray, data: np.ndarray, scale: 
             z, value = trial, new
     if stopped is not None:
         return Found(z, size, steps, stopped, str(stopped))
-    return Found(z, size, steps, SolverStatus.ITERATION_LIMIT, f"not converged in {MOST_STEPS} Newton steps")
+    return Found(z, size, steps, SolverStatus.ITERATION_LIMIT, f"not converged in {settings.steps} Newton steps")

@@ -13,17 +13,30 @@ import numpy as np
 
 from ocp.errors import ProblemError, SolveError
 from ocp.indirect.hamiltonian import Hamiltonian
-from ocp.problem.formulation import Bounds, Formulation, at_samples
+from ocp.problem.formulation import Bounds, Formulation
+from ocp.problem.sampling import at_samples
 from ocp.solution import Solution
+from ocp.tolerances import RESOLVED_SHARE, SOLVER_SHARE
 
 __all__ = ["ControlArcs", "read_arcs", "read_unknowns"]
 
-INSIDE = 0.1  # share of its range by which a control must be off both bounds to count as inside them
-SINGULAR = 0.1  # share of the horizon that a control may spend inside its bounds, for the sake of coarse seeds
-LONG = 3  # and the number of the seed's samples in a row
-NOISE = 1e-6  # share of the largest value of a switching function that says nothing of its sign
-CHATTER = 3  # arcs in a row that are shorter than an interval of the seed
-FREE_BEYOND = 1e-5  # a control of the seed nearer to its bound is at it
+
+@dataclass(frozen=True)
+class SeedSettings:
+    """Which seeds are refused, for the sake of coarse ones not all that look odd.
+
+    Attributes:
+        inside: Share of its range by which a control must be off both bounds to count as inside them.
+        singular: Share of the horizon, and number of samples in a row, that a control may spend inside its bounds.
+        quick: Arcs in a row that are shorter than an interval of the seed, at which it chatters.
+    """
+
+    inside: float = 0.1
+    singular: tuple[float, int] = 0.1, 3
+    quick: int = 3
+
+
+SETTINGS = SeedSettings()
 
 
 @dataclass(frozen=True)
@@ -117,7 +130,7 @@ def signs(slope: np.ndarray) -> np.ndarray:
     """
     found = np.sign(slope)
     for j in range(slope.shape[1]):
-        clear = np.flatnonzero(np.abs(slope[:, j]) > NOISE * np.max(np.abs(slope[:, j])))
+        clear = np.flatnonzero(np.abs(slope[:, j]) > SOLVER_SHARE * np.max(np.abs(slope[:, j])))
         if clear.size:
             nearest = np.clip(np.searchsorted(clear, np.arange(len(slope))), 0, len(clear) - 1)
             found[:, j] = np.sign(slope[clear[nearest], j])
@@ -134,12 +147,12 @@ def check_singular(ham: Hamiltonian, seed: Solution, low: np.ndarray, high: np.n
     order = np.concatenate([columns[name] for name in ham.form.controls])[list(ham.linear)]  # the seed's own
     values = samples.values.reshape(len(at), -1)[:, order]
     for j, index in enumerate(ham.linear):
-        margin = INSIDE * (high[j] - low[j])
+        margin = SETTINGS.inside * (high[j] - low[j])
         inside = (values[:, j] > low[j] + margin) & (values[:, j] < high[j] - margin)
         edges = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]]).astype(int)))
         for begin, end in zip(edges[::2], edges[1::2], strict=True):
             width = at[end - 1] - at[begin]
-            if end - begin > LONG and width > SINGULAR:
+            if width > SETTINGS.singular[0] and end - begin > SETTINGS.singular[1]:
                 label = ham.form.control_labels[index]
                 raise SolveError(
                     f"control {label!r} has a singular arc from {at[begin] * seed.horizon:.4g} to "
@@ -157,8 +170,8 @@ def check_chattering(ham: Hamiltonian, events: list[tuple[float, int]], seed: So
         label = ham.form.control_labels[index]
         at = np.array([time for time, component in events if component == j])
         quick = np.diff(at) < width
-        for k in range(len(quick) - CHATTER + 1):
-            if quick[k : k + CHATTER].all():
+        for k in range(len(quick) - SETTINGS.quick + 1):
+            if quick[k : k + SETTINGS.quick].all():
                 raise SolveError(
                     f"control {label!r} switches in every interval from {at[k] * seed.horizon:.4g} s on: "
                     "a singular arc or chattering, where the Hamiltonian does not determine it; use a direct method "
@@ -216,6 +229,6 @@ def control_guess(
     mu = np.zeros((count, len(form.path)))
     if len(form.path):
         low, high = (bound[form.bounds.places["control"]] for bound in bounds)
-        free = (control > low + FREE_BEYOND) & (control < high - FREE_BEYOND)
+        free = (control > low + RESOLVED_SHARE) & (control < high - RESOLVED_SHARE)
         mu = ham.multipliers(free, x, control, lam, fractions * horizon, horizon, p)
     return np.hstack([control[:, list(ham.smooth)], mu])

@@ -13,8 +13,8 @@ import numpy as np
 from models import Machine, Surroundings
 from models.arrays import Array
 from ocp.errors import ProblemError, checked_instance
-from ocp.problem.formulation import Sampler
 from ocp.problem.hulls import Hull, PairsOfBodies, frames_of
+from ocp.problem.sampling import Sampler
 
 __all__ = ["Touch", "checked_surroundings", "distances_along", "hulls_of", "touches"]
 

@@ -24,7 +24,7 @@ from ocp.errors import ProblemError
 from ocp.local.branches import Branches, branches_of
 from ocp.local.inverse_kinematics import Unreachable, postures_of
 from ocp.planning.joint_space import TOLERANCE, JointSpace
-from ocp.problem.formulation import Sampler
+from ocp.problem.sampling import Sampler
 from ocp.tasks.equations import TaskEquations
 from ocp.tolerances import ROUNDING_SHARE
 

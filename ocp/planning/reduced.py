@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from models import Machine
 from models.arrays import Array
 from ocp.planning.joint_space import TOLERANCE
-from ocp.problem.formulation import Sampler
+from ocp.problem.sampling import Sampler
 from ocp.tasks.equations import TaskEquations
 from ocp.tolerances import ROUNDING_SHARE
 

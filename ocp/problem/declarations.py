@@ -15,7 +15,7 @@ __all__ = ["ENDS", "Constraint", "Declarations", "Guess", "Horizon", "PhaseTimes
 
 Guess = Any  # a value, or a function of time that returns one
 ENDS = ("initial", "terminal")
-WIDTH = 100  # of an expression shown as text
+RESERVED = ("t", "time", "horizon")
 
 
 @dataclass(frozen=True)
@@ -98,6 +98,15 @@ class Constraint:
     def size(self) -> int:
         return int(self.expression.numel())
 
+    def check(self, symbols: Any) -> None:
+        """Raise ProblemError where its parts do not fit together; see :meth:`Declarations.check`."""
+        what = f"constraint {self.name!r}"
+        way = () if self.way is None else (self.way,)
+        _require_columns(symbols, self.size, what, self.expression, self.lower, self.upper, *way)
+        _require(isinstance(self.unit, str) and isinstance(self.integral, bool), what)
+        given = np.ones(1) if self.tolerance is None else np.asarray(self.tolerance, dtype=float)
+        _require(given.size in (1, self.size) and bool((given > 0).all()), what)
+
     def __str__(self) -> str:
         low, high = column_text(self.lower), column_text(self.upper)
         what = f"integral of {short(self.expression)} dt" if self.integral else short(self.expression)
@@ -113,6 +122,12 @@ class Horizon:
     upper: Any
     guess: float | None
     fixed: bool
+
+    def check(self, symbols: Any) -> None:
+        """Raise ProblemError where its parts do not fit together; see :meth:`Declarations.check`."""
+        _require(isinstance(self.fixed, bool), "horizon")
+        _require_columns(symbols, 1, "horizon", self.symbol, self.lower, self.upper)
+        _require(self.guess is None or bool(np.isfinite(float(self.guess))), "horizon")
 
     def __str__(self) -> str:
         low, high = column_text(self.lower), column_text(self.upper)
@@ -156,6 +171,23 @@ class Declarations:
     running: Any = None
     terminal: Any = None
 
+    def check_new_variable(self, kind: str, name: Any) -> None:
+        """Raise ProblemError unless a name can be that of a new variable; ``kind`` is that of the message."""
+        if not isinstance(name, str) or not name:
+            raise ProblemError(f"{kind} name must be a non-empty string, not {name!r}")
+        if name in RESERVED:
+            raise ProblemError(f"{kind} {name!r}: this name is reserved ({', '.join(RESERVED)})")
+        for other in ("states", "controls", "parameters", "signals"):
+            if name in getattr(self, other):
+                raise ProblemError(f"{kind} {name!r}: a {other[:-1]} of this name exists already")
+
+    def check_new_constraint(self, kind: str, name: Any) -> None:
+        """Raise ProblemError unless a name can be that of a new constraint; ``kind`` is that of the message."""
+        if not isinstance(name, str) or not name:
+            raise ProblemError(f"{kind}: its name must be a non-empty string, not {name!r}")
+        if any(name in pool for pool in (self.path, self.start, self.end, self.watch, self.apart)):
+            raise ProblemError(f"{kind} {name!r}: a constraint of this name exists already")
+
     def check(self, symbols: Any) -> None:
         """Raise ProblemError, which names the part, where declarations that were read from a file do not fit together.
 
@@ -163,54 +195,48 @@ class Declarations:
             symbols: ``casadi.SX`` or ``casadi.MX``, of which every expression is made.
         """
 
-        def require(holds: bool, what: str) -> None:
-            if not holds:
-                raise ProblemError(f"{what} does not fit the rest of its problem", name=what)
-
-        def column(value: Any, size: int, what: str) -> None:
-            require(isinstance(value, symbols) and value.shape == (size, 1), what)
-
         for pool, kind in PART_KINDS.items():
             for name, part in getattr(self, pool).items():
-                require(isinstance(part, kind) and isinstance(name, str) and part.name == name, f"{pool}: {name!r}")
-        columns = {"parameters": ["symbol"], "controls": ["symbol", "lower", "upper"]}
-        columns["states"] = [*columns["controls"], *ENDS]
-        for pool, needed in columns.items():
-            for name, one in getattr(self, pool).items():
-                what, n = f"{pool[:-1]} {name!r}", int(np.prod(one.symbol.shape))
-                for part in needed:
-                    column(getattr(one, part), n, what)
-                for value, sizes in ((one.guess, (1, n)), (one.scale, (n,))):
-                    require(value is None or np.asarray(value, dtype=float).size in sizes, what)
-                require(isinstance(one.unit, str), what)
-        for name, rate in self.dynamics.items():
-            require(name in self.states, f"dynamics of {name!r}")
-            column(rate, self.states[name].size, f"dynamics of {name!r}")
-        for name, symbol in self.at_start.items():
-            require(name in self.states or name in self.controls, f"start of {name!r}")
-            column(symbol, {**self.states, **self.controls}[name].size, f"start of {name!r}")
-        for signal in self.signals.values():
-            shape = isinstance(signal.function, ca.Function) and (signal.function.n_in(), signal.function.size_in(0))
-            require(shape == (1, (1, 1)) and signal.function.numel_out(0) == signal.size, f"signal {signal.name!r}")
+                _require(isinstance(part, kind) and isinstance(name, str) and part.name == name, f"{pool}: {name!r}")
+        self._check_variables(symbols)
+        self._check_equations(symbols)
         for one in (*self.path.values(), *self.start.values(), *self.end.values(), *self.watch.values()):
-            for value in (one.expression, one.lower, one.upper, *(() if one.way is None else (one.way,))):
-                column(value, one.size, f"constraint {one.name!r}")
-            require(isinstance(one.unit, str) and isinstance(one.integral, bool), f"constraint {one.name!r}")
-            given = np.ones(1) if one.tolerance is None else np.asarray(one.tolerance, dtype=float)
-            require(given.size in (1, one.size) and bool((given > 0).all()), f"constraint {one.name!r}")
+            one.check(symbols)
         for apart in self.apart.values():
             movers = {name: self.states[name].size for name in apart.movers if name in self.states}
-            require(movers == apart.movers and isinstance(apart.placements, symbols), f"separation {apart.name!r}")
+            _require(movers == apart.movers and isinstance(apart.placements, symbols), f"separation {apart.name!r}")
         for phase in self.phases.values():
-            for value in (phase.begin, phase.duration, phase.running, phase.terminal):
-                column(value, 1, f"phase {phase.name!r}")
+            parts = phase.begin, phase.duration, phase.running, phase.terminal
+            _require_columns(symbols, 1, f"phase {phase.name!r}", *parts)
         if self.horizon is not None:
-            require(isinstance(self.horizon, Horizon) and isinstance(self.horizon.fixed, bool), "horizon")
-            for value in (self.horizon.symbol, self.horizon.lower, self.horizon.upper):
-                column(value, 1, "horizon")
-            require(self.horizon.guess is None or np.isfinite(float(self.horizon.guess)), "horizon")
+            _require(isinstance(self.horizon, Horizon), "horizon")
+            self.horizon.check(symbols)
+
+    def _check_variables(self, symbols: Any) -> None:
+        """Check sizes, guesses, scales and units of states, controls and parameters."""
+        bounded = ("symbol", "lower", "upper")
+        for pool, needed in (("parameters", ("symbol",)), ("controls", bounded), ("states", (*bounded, *ENDS))):
+            for name, one in getattr(self, pool).items():
+                what, n = f"{pool[:-1]} {name!r}", int(np.prod(one.symbol.shape))
+                _require_columns(symbols, n, what, *(getattr(one, part) for part in needed))
+                for value, sizes in ((one.guess, (1, n)), (one.scale, (n,))):
+                    _require(value is None or np.asarray(value, dtype=float).size in sizes, what)
+                _require(isinstance(one.unit, str), what)
+
+    def _check_equations(self, symbols: Any) -> None:
+        """Check dynamics, symbols at the start, signals and cost."""
+        for name, rate in self.dynamics.items():
+            _require(name in self.states, f"dynamics of {name!r}")
+            _require_columns(symbols, self.states[name].size, f"dynamics of {name!r}", rate)
+        for name, symbol in self.at_start.items():
+            _require(name in self.states or name in self.controls, f"start of {name!r}")
+            size = {**self.states, **self.controls}[name].size
+            _require_columns(symbols, size, f"start of {name!r}", symbol)
+        for signal in self.signals.values():
+            shape = isinstance(signal.function, ca.Function) and (signal.function.n_in(), signal.function.size_in(0))
+            _require(shape == (1, (1, 1)) and signal.function.numel_out(0) == signal.size, f"signal {signal.name!r}")
         for value in (self.running, self.terminal):
-            require(value is None or (isinstance(value, symbols) and value.numel() == 1), "cost")
+            _require(value is None or (isinstance(value, symbols) and value.numel() == 1), "cost")
 
     def __str__(self) -> str:
         """States, controls, parameters, horizon, dynamics, constraints and cost by name, one a line."""
@@ -239,6 +265,18 @@ PART_KINDS: dict[str, Any] = {
 }
 
 
+def _require(holds: bool, what: str) -> None:
+    """Raise ProblemError, which names a part, unless it fits the rest of its problem."""
+    if not holds:
+        raise ProblemError(f"{what} does not fit the rest of its problem", name=what)
+
+
+def _require_columns(symbols: Any, size: int, what: str, *values: Any) -> None:
+    """Require that the values of a part are columns of so many entries, of these symbols."""
+    for value in values:
+        _require(isinstance(value, symbols) and value.shape == (size, 1), what)
+
+
 def column_text(value: Any) -> str:
     """A column of numbers or expressions; one number where all entries are the same."""
     if isinstance(value, ca.MX):
@@ -253,5 +291,5 @@ def short(expression: Any) -> str:
     """An expression on one line of bounded length. SX prints its shared parts first; only bounded text is kept."""
     if not isinstance(expression, str) and ca.Function("size", ca.symvar(expression), [expression]).n_nodes() > 60:
         return f"expression of {', '.join(s.name() for s in ca.symvar(expression)[:8])}, ..."
-    text = " ".join(str(expression).split())
-    return text if len(text) <= WIDTH else text[: WIDTH - 3] + "..."
+    text, width = " ".join(str(expression).split()), 100
+    return text if len(text) <= width else text[: width - 3] + "..."

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from itertools import product
+from math import tau
 from typing import Any, NamedTuple, TypeAlias
 
 import casadi as ca
@@ -20,12 +21,6 @@ from ocp.errors import ProblemError
 __all__ = ["NAMES", "RULES", "Interval", "check_instructions", "constant", "decided", "evaluate", "multiple_of"]
 
 Array: TypeAlias = np.ndarray
-FULL_TURN = 2 * np.pi
-OUTWARD = 4 * float(np.finfo(float).eps)
-"""Share of a bound by which every result is let out; the functions of a C library are that good."""
-SMALLEST = 1e-300
-WHERE = 1e-14
-"""Share of an angle that its multiples of a turn are known to."""
 
 
 class Interval(NamedTuple):
@@ -83,7 +78,9 @@ def check_instructions(what: str, function: Any) -> None:
 def _out(low: Any, high: Any) -> Interval:
     """Bounds let out by what rounding may do; what is no number is no bound."""
     low, high = np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)
-    spread = [OUTWARD * np.where(np.isfinite(end), np.abs(end), 0.0) + SMALLEST for end in (low, high)]
+    # the functions of a C library are good to four units of the last place
+    share, least = 4 * np.finfo(float).eps, 1e-300
+    spread = [share * np.where(np.isfinite(end), np.abs(end), 0.0) + least for end in (low, high)]
     return Interval(low - spread[0], high + spread[1])
 
 
@@ -211,7 +208,8 @@ def _negative(x: Interval) -> Interval:
 
 def _holds_one_of(x: Interval, first: float, step: float) -> Any:
     """Whether first + k step lies in the interval for a whole k, or so near that rounding may have moved it."""
-    slack = WHERE * (1 + np.maximum(np.abs(x.low), np.abs(x.high)))
+    # multiples of a turn are known to fifty units of the last place of the angle
+    slack = 1e-14 * (1 + np.maximum(np.abs(x.low), np.abs(x.high)))
     return np.floor((x.high + slack - first) / step) >= np.ceil((x.low - slack - first) / step)
 
 
@@ -221,8 +219,8 @@ def _wave(function: Callable[[Any], Any], crest: float) -> Callable[..., Interva
     def rule(x: Interval) -> Interval:
         ends = function(x.low), function(x.high)
         found = _out(np.minimum(*ends), np.maximum(*ends))
-        high = np.where(_holds_one_of(x, crest, FULL_TURN), 1.0, np.minimum(found.high, 1.0))
-        low = np.where(_holds_one_of(x, crest + FULL_TURN / 2, FULL_TURN), -1.0, np.maximum(found.low, -1.0))
+        high = np.where(_holds_one_of(x, crest, tau), 1.0, np.minimum(found.high, 1.0))
+        low = np.where(_holds_one_of(x, crest + tau / 2, tau), -1.0, np.maximum(found.low, -1.0))
         endless = ~(np.isfinite(x.low) & np.isfinite(x.high))
         return Interval(np.where(endless, -1.0, low), np.where(endless, 1.0, high))
 
@@ -230,7 +228,7 @@ def _wave(function: Callable[[Any], Any], crest: float) -> Callable[..., Interva
 
 
 def _tangent(x: Interval) -> Interval:
-    pole = _holds_one_of(x, FULL_TURN / 4, FULL_TURN / 2) | ~(np.isfinite(x.low) & np.isfinite(x.high))
+    pole = _holds_one_of(x, tau / 4, tau / 2) | ~(np.isfinite(x.low) & np.isfinite(x.high))
     found = _out(np.tan(x.low), np.tan(x.high))
     return Interval(np.where(pole, -np.inf, found.low), np.where(pole, np.inf, found.high))
 
@@ -353,7 +351,7 @@ _BY_NAME: dict[str, Callable[..., Interval]] = {
     "EXPM1": _rising(np.expm1),
     "LOG": _rising(np.log, low=0.0),
     "LOG1P": _rising(np.log1p, low=-1.0),
-    "SIN": _wave(np.sin, FULL_TURN / 4),
+    "SIN": _wave(np.sin, tau / 4),
     "COS": _wave(np.cos, 0.0),
     "TAN": _tangent,
     "ASIN": _rising(np.arcsin, -1.0, 1.0),

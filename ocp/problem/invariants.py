@@ -10,6 +10,7 @@ linear in its coefficients, at random samples of x, u and t. Invariants that are
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import combinations_with_replacement
 from math import comb
 
@@ -19,15 +20,32 @@ import scipy.linalg
 from scipy.sparse.csgraph import connected_components
 
 from ocp.problem.formulation import Bounds, Formulation, is_free
+from ocp.tolerances import ROUNDING_SHARE, SOLVER_SHARE
 
 __all__ = ["bounds_to_solve"]
 
 DEGREE = 3  # of the polynomials, at most
-MAX_MONOMIALS = 300  # of one coupled part of the dynamics
-ZERO, SMALL = 1e-9, 1e-6  # relative: what is smaller is rounding, and what follows from others but for rounding
-ROUNDED = 1e-3  # of its terms, by which a condition may contradict a first integral: few digits of a quaternion
-LEEWAY = 0.5  # of its terms, by which a condition that is not held may be missed: -q is as long as q
-NEWTON_STEPS = 20
+
+
+@dataclass(frozen=True)
+class InvariantSettings:
+    """What is looked for, and what counts as following from it.
+
+    Attributes:
+        monomials: The most of one coupled part of the dynamics.
+        steps: Of Newton's method to a point that meets all conditions.
+        contradiction: Share of its terms by which a condition may contradict a first integral: quaternions are given
+            with few digits.
+        leeway: Share of its terms by which a condition that is not held may be missed: -q is as long as q.
+    """
+
+    monomials: int = 300
+    steps: int = 20
+    contradiction: float = 1e-3
+    leeway: float = 0.5
+
+
+SETTINGS = InvariantSettings()
 
 
 class FirstIntegrals:
@@ -50,7 +68,7 @@ class FirstIntegrals:
             size[size == 0.0] = 1.0
             every.append(own)
             _, values, directions = np.linalg.svd(terms.sum(axis=2) / size, full_matrices=False)
-            factors.append(directions[values <= ZERO * values[0]] / size)
+            factors.append(directions[values <= ROUNDING_SHARE * values[0]] / size)
         self.monomials, self.factors = np.vstack(every), scipy.linalg.block_diag(*factors)
 
     def at(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -83,7 +101,7 @@ def coupled_parts(form: Formulation) -> list[np.ndarray]:
 
 def monomials(part: np.ndarray) -> np.ndarray:
     """All monomials of some states, of as high a degree as there may be; see `FirstIntegrals`. Shape (m, 3)."""
-    degree = max(d for d in range(DEGREE + 1) if comb(len(part) + d, d) <= MAX_MONOMIALS + 1)
+    degree = max(d for d in range(DEGREE + 1) if comb(len(part) + d, d) <= SETTINGS.monomials + 1)
     chosen = combinations_with_replacement([0, *(part + 1)], degree)
     return np.array([(0,) * (DEGREE - degree) + each for each in chosen if any(each)], int).reshape(-1, DEGREE)
 
@@ -134,7 +152,7 @@ def implied(form: Formulation, integrals: FirstIntegrals, bounds: Bounds, p: np.
     # a point that meets all conditions, by Newton's method from a random one
     z = np.random.default_rng(0).normal(size=2 * nx + 1)
     z[-1] = 1.0 if form.horizon_is_free else float(form.horizon_at(p))
-    for _ in range(NEWTON_STEPS):
+    for _ in range(SETTINGS.steps):
         values, slope = (np.array(part) for part in rows(z, p))
         slope[:, -1] *= form.horizon_is_free
         (before, before_x), (after, after_x) = integrals.at(z[:nx]), integrals.at(z[nx:-1])
@@ -144,30 +162,30 @@ def implied(form: Formulation, integrals: FirstIntegrals, bounds: Bounds, p: np.
         both = np.vstack([conditions, kept])
         if not (np.isfinite(both).all() and np.isfinite(left).all()):
             return []
-        if np.abs(left).max() <= ZERO * np.abs(z).max():
+        if np.abs(left).max() <= ROUNDING_SHARE * np.abs(z).max():
             break
-        z = z - np.linalg.pinv(both, rcond=ZERO) @ left
-    if (np.abs(left) > ROUNDED * (np.abs(both) @ np.abs(z)) + ZERO * np.abs(z).max()).any():
+        z = z - np.linalg.pinv(both, rcond=ROUNDING_SHARE) @ left
+    if (np.abs(left) > SETTINGS.contradiction * (np.abs(both) @ np.abs(z)) + ROUNDING_SHARE * np.abs(z).max()).any():
         return []  # what is asked is not possible: the solver says so
     # what may be let go is an end condition of states that all conditions together determine
-    loose = np.diag(projector(both)) > ZERO
+    loose = np.diag(projector(both)) > ROUNDING_SHARE
     own = (np.flatnonzero(equal) >= last) & ~conditions[:, loose].any(axis=1)
     others, ends = conditions[~own], conditions[own]
     if not own.any():
         return []
     say = (ends @ projector(np.vstack([others, kept]))).T
     triangle, order = scipy.linalg.qr(say, mode="r", pivoting=True)
-    small = SMALL * np.abs(ends).max()
+    small = SOLVER_SHARE * np.abs(ends).max()
     rank = int((np.abs(np.diag(triangle)) > small).sum())
     if rank == np.linalg.matrix_rank(ends @ projector(others), tol=small):
         return []  # what follows from other conditions alone is held as it was asked
-    room, at = LEEWAY * np.abs(ends) @ np.abs(z), index[equal][own]
+    room, at = SETTINGS.leeway * np.abs(ends) @ np.abs(z), index[equal][own]
     return [(int(at[k]), float(room[k]) or np.inf) for k in order[rank:]]
 
 
 def projector(rows: np.ndarray) -> np.ndarray:
     """Onto what is orthogonal to rows (k, n). Shape (n, n)."""
-    return np.asarray(np.eye(rows.shape[1]) - np.linalg.pinv(rows, rcond=ZERO) @ rows)
+    return np.asarray(np.eye(rows.shape[1]) - np.linalg.pinv(rows, rcond=ROUNDING_SHARE) @ rows)
 
 
 def rows_of_ends(form: Formulation) -> ca.Function:

@@ -155,7 +155,7 @@ class Phases(Problem):
             if any(what in pool for pool in (self.declared.start, self.declared.end)):
                 raise ProblemError(f"{what} is joined twice", name=name)
             with about(name):
-                expression = self._expression(what, value, [*known, *self.declared.at_start.values()])
+                expression = self._reader.expression(what, value, [*known, *self.declared.at_start.values()])
             if expression.numel() not in (1, begins[name].size):
                 words = f"{what} has {expression.numel()} entries, the state has {begins[name].size}"
                 raise ProblemError(words, name=name, value=expression.numel(), limit=begins[name].size)

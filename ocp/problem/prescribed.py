@@ -27,8 +27,6 @@ __all__ = ["PrescribedMotion"]
 
 ENTRIES = 12
 """Of a frame: its rotation column by column, its position."""
-HUGE = 1e150
-"""Stands for a bound that there is none of: products and squares of it are finite."""
 
 
 class PrescribedMotion:
@@ -79,8 +77,9 @@ class PrescribedMotion:
             return strays, bows
         ends, where = np.unique(np.stack([begin[mine], end[mine]]), axis=1, return_inverse=True)
         found = self._enclosures(*ends)
+        huge = 1e150  # for a bound that there is none of: products and squares of it are finite
         low, high, least, most = (
-            np.clip(np.nan_to_num(side, posinf=HUGE, neginf=-HUGE), -HUGE, HUGE) for side in found
+            np.clip(np.nan_to_num(side, posinf=huge, neginf=-huge), -huge, huge) for side in found
         )
         half = (ends[1] - ends[0])[:, None] / 2
         bodies = self._of_pair[pair[mine]]
@@ -119,6 +118,6 @@ def _coordinates(core: np.ndarray) -> np.ndarray:
 
 
 def _longest(coordinates: np.ndarray) -> np.ndarray:
-    """Length of the longest of some vectors (M, 3 C), coordinate by coordinate; inf where one is HUGE. Shape (M,)."""
+    """Length of the longest of some vectors (M, 3 C), coordinate by coordinate; inf where one is huge. Shape (M,)."""
     found = np.linalg.norm(coordinates.reshape(len(coordinates), -1, 3), axis=2).max(axis=1)
-    return np.where(found < HUGE / 1e50, found, np.inf)
+    return np.where(found < 1e100, found, np.inf)

@@ -17,27 +17,15 @@ import numpy as np
 
 from ocp.errors import ProblemError, about, checked_count, checked_text, unknown_name
 from ocp.problem.declarations import ENDS, Constraint, Declarations, Guess, Horizon, PhaseTimes, Signal, Variable
+from ocp.problem.expressions import ExpressionReader, Value, check_guess, number_of_entries, read_scale, signal_function
 from ocp.problem.hulls import Hull
 from ocp.problem.prescribed import PrescribedMotion
-from ocp.problem.separation import Separation, index_rows
+from ocp.problem.separation import Separation, index_rows, motion_by_pair
 from ocp.problem.stored import restored, stored
-from ocp.problem.values import (
-    check_finite,
-    check_horizon,
-    check_inside,
-    check_order,
-    constant,
-    identity,
-    is_symbolic,
-    numeric,
-    stacked,
-    table,
-)
+from ocp.problem.values import check_inside, constant, identity
 
 __all__ = ["Problem", "checked_problem", "remembers_request"]
 
-Value = Any  # a number, an array, or a casadi expression of parameters
-RESERVED = ("t", "time", "horizon")
 Declare = TypeVar("Declare", bound=Callable[..., Any])
 Given = ParamSpec("Given")
 
@@ -173,7 +161,7 @@ class Problem:
         what, given = f"state {name!r}", {"initial": initial, "terminal": terminal, "lower": lower, "upper": upper}
         variable = self._variable("state", name, size, given, guess, unit, scale)
         low, high = constant(variable.lower), constant(variable.upper)
-        ends = {label: self._column(f"{what}: {label}", given[label], variable.size, np.nan) for label in ENDS}
+        ends = {label: self._reader.column(f"{what}: {label}", given[label], variable.size, np.nan) for label in ENDS}
         for label, value in ends.items():
             check_inside(f"{what}: {label}", constant(value), low, high)
         self.declared.states[name] = replace(variable, **ends)
@@ -236,12 +224,12 @@ class Problem:
             unit: Of the integral.
         """
         what = f"integral {name!r}"
-        size = self._expression(what, rate, self._inner()).numel()
+        size = self._reader.expression(what, rate, self._inner()).numel()
         if size == 0:
             raise ProblemError(f"{what} is empty")
         if lower is not None or upper is not None:  # all is looked at before anything is declared
-            self._unused_constraint("integral", name)
-            self._bounds(what, size, lower, upper)
+            self.declared.check_new_constraint("integral", name)
+            self._reader.bounds(what, size, lower, upper)
         state = self.state(name, size, initial=0.0, unit=unit)
         self.dynamics(state, rate)
         if lower is not None or upper is not None:
@@ -260,14 +248,8 @@ class Problem:
             name: Unique name.
             track: casadi time (s), an MX symbol -> a column of expressions.
         """
-        time = ca.MX.sym("time")
-        try:
-            value = ca.densify(ca.vec(ca.MX(track(time))))
-            function = ca.Function("signal", [time], [value])
-        except Exception as error:  # of the function's own, too
-            words = f"signal {name!r}: a function of the time alone is expected, that gives a column: {error}"
-            raise ProblemError(words, value=track) from error
-        self.declared.signals[name] = Signal(name, self._symbol("signal", name, value.numel()), function)
+        function = signal_function(f"signal {name!r}", track)
+        self.declared.signals[name] = Signal(name, self._symbol("signal", name, function.numel_out(0)), function)
         return self.declared.signals[name].symbol
 
     def horizon(
@@ -277,8 +259,11 @@ class Problem:
 
         A free horizon starts at 0 excluded: ``lower`` must be positive (default 1e-6 s).
         """
+        what = f"problem {self.name!r}: horizon"
         with about("horizon"):
-            self.declared.horizon = self._horizon(f"problem {self.name!r}: horizon", value, lower, upper, guess)
+            if self.declared.horizon is not None:
+                raise ProblemError(f"{what} is declared twice")
+            self.declared.horizon = self._reader.horizon(what, value, lower, upper, guess)
         return self.declared.horizon.symbol
 
     def at_start(self, variable: Any) -> Any:
@@ -297,7 +282,7 @@ class Problem:
             raise ProblemError(f"state {found.name!r}: dynamics declared twice", name=found.name)
         what = f"dynamics of {found.name!r}"
         with about(found.name):
-            expression = self._expression(what, derivative, self._inner())
+            expression = self._reader.expression(what, derivative, self._inner())
             if expression.numel() != found.size:
                 raise ProblemError(f"{what} has {expression.numel()} entries, the state has {found.size}")
         self.declared.dynamics[found.name] = expression
@@ -319,17 +304,18 @@ class Problem:
             tolerance: Largest violation that the audit lets pass, in the unit of the expression, where that is less
                 than its share of the constraint's size; positive numbers, one for all rows or for each.
         """
-        self._constrain("path", name, expression, lower, upper, unit, tolerance)
+        self.declared.path[name] = self._constraint("path", name, expression, (lower, upper), unit, tolerance)
 
     @_about_its_name
     def start(self, name: str, expression: Value, lower: Value = None, upper: Value = None, *, unit: str = "") -> None:
         """Declare ``lower <= expression <= upper`` at the start."""
-        self._constrain("start", name, expression, lower, upper, unit)
+        self.declared.start[name] = self._constraint("start", name, expression, (lower, upper), unit)
 
     @_about_its_name
     def end(self, name: str, expression: Value, lower: Value = None, upper: Value = None, *, unit: str = "") -> None:
         """Declare ``lower <= expression <= upper`` at the end; ``at_start`` symbols tie it to the start."""
-        self._constrain("end", name, expression, lower, upper, unit, known=list(self.declared.at_start.values()))
+        known = list(self.declared.at_start.values())
+        self.declared.end[name] = self._constraint("end", name, expression, (lower, upper), unit, known=known)
 
     @_about_its_name
     def watch(
@@ -361,9 +347,8 @@ class Problem:
         if not isinstance(integral, bool):
             raise ProblemError(f"watch {name!r}: integral must be True or False, not {integral!r}", value=integral)
         known = list(self.declared.at_start.values())
-        self._constrain("watch", name, expression, lower, upper, unit, tolerance, known)
-        found = self.declared.watch.pop(name)
-        rate = None if way is None else self._expression(f"watch {name!r}: way", way, [*self._inner(), *known])
+        found = self._constraint("watch", name, expression, (lower, upper), unit, tolerance, known)
+        rate = None if way is None else self._reader.expression(f"watch {name!r}: way", way, [*self._inner(), *known])
         if rate is not None and rate.numel() != found.size:
             words = f"watch {name!r}: way has {rate.numel()} entries, the expression has {found.size}"
             raise ProblemError(words, value=rate.numel(), limit=found.size)
@@ -398,21 +383,19 @@ class Problem:
             covers: By the place of a pair, pairs of bodies that hold its two between them. Shape (m, 2) each.
             assumed: Pairs that are left out by assumption, in words, and why: the audit tells them.
         """
-        self._unused_constraint("separation", name)
+        self.declared.check_new_constraint("separation", name)
         movers = {}
         for each in (*levers, *turns):
             movers[each] = self._find(self.declared.states, each, "separation").size
-        parts: dict[str, Any] = {}
-        count = len(index_rows(f"separation {name!r}", "pairs", pairs, 3))
-        for label, given in (("levers", levers), ("turns", turns)):
-            what = f"separation {name!r}: {label}"
-            columns = [table(what, given.get(each, np.zeros((count, size)))) for each, size in movers.items()]
-            parts[label] = (
-                np.hstack([np.reshape(column, (count, -1)) for column in columns]) if columns else np.zeros((count, 0))
-            )
-        parameters = [v.symbol for v in self.declared.parameters.values()]
+        what = f"separation {name!r}"
+        count = len(index_rows(what, "pairs", pairs, 3))
+        parts: dict[str, Any] = {
+            label: motion_by_pair(f"{what}: {label}", given, movers, count)
+            for label, given in (("levers", levers), ("turns", turns))
+        }
+        parameters = self._reader.parameters
         known = [*(v.symbol for v in self.declared.states.values()), *parameters, self.time]
-        frames = self._expression(f"separation {name!r}: placements", placements, known)
+        frames = self._reader.expression(f"{what}: placements", placements, known)
         parts |= {"covers": {} if covers is None else covers, "assumed": {} if assumed is None else assumed}
         apart = Separation(name, frames, dict(hulls), pairs, least, movers, **parts)
         PrescribedMotion(apart, frames, self.time, parameters, [ca.DM.zeros(each.shape) for each in parameters])
@@ -427,7 +410,7 @@ class Problem:
         costs = {}
         for label, cost, known in (("running", running, self._inner()), ("terminal", terminal, ends)):
             with about(label):
-                costs[label] = self._expression(f"{label} cost", cost, known)
+                costs[label] = self._reader.expression(f"{label} cost", cost, known)
                 if (size := costs[label].numel()) != 1:
                     raise ProblemError(f"{label} cost must be a scalar, it has {size} entries", value=size, limit=1)
         self.declared.running, self.declared.terminal = costs["running"], costs["terminal"]
@@ -457,59 +440,16 @@ class Problem:
     ) -> Variable:
         what = f"{kind} {name!r}"
         checked_text(f"{what}: unit", unit)
-        size = self._size(what, size, {**given, "guess": guess})
+        size = number_of_entries(what, size, {**given, "guess": guess})
         symbol = self._symbol(kind, name, size)
-        low, high = self._bounds(what, size, given["lower"], given["upper"])
-        if guess is not None and not callable(guess):
-            array = numeric(f"{what}: guess", guess)
-            check_finite(f"{what}: guess", array)
-            if array.size not in (1, size):
-                raise ProblemError(
-                    f"{what}: guess has {array.size} entries, {size} expected", value=array.size, limit=size
-                )
-        return Variable(name, symbol, low, high, guess=guess, unit=unit, scale=self._scale(what, scale, size))
+        low, high = self._reader.bounds(what, size, given["lower"], given["upper"])
+        check_guess(what, guess, size)
+        return Variable(name, symbol, low, high, guess=guess, unit=unit, scale=read_scale(what, scale, size))
 
-    @staticmethod
-    def _scale(what: str, given: Value, size: int) -> Any:
-        """Sizes of the entries, nan where none is told. Shape (size,), or None."""
-        if given is None:
-            return None
-        array = numeric(f"{what}: scale", given)
-        if array.size not in (1, size) or not (np.isnan(array) | (np.isfinite(array) & (array > 0))).all():
-            words = f"{what}: scale must be positive, one number or {size}, nan where none is told, not {given!r}"
-            raise ProblemError(words, value=given, limit=size)
-        return np.array(np.broadcast_to(array.ravel(), size))
-
-    def _horizon(self, what: str, value: Value, lower: Value, upper: Value, guess: float | None) -> Horizon:
-        if self.declared.horizon is not None:
-            raise ProblemError(f"{what} is declared twice")
-        for label, bound in (("value", value), ("lower", lower), ("upper", upper)):
-            self._check_number(what, label, bound)
-        symbol = self.symbols.sym("horizon")
-        if value is not None:
-            if not (lower is None and upper is None and guess is None):
-                raise ProblemError(f"{what}: give a fixed value or lower, upper and guess, not both")
-            fixed = self._column(what, value, 1, np.nan)
-            check_horizon(what, constant(fixed))
-            return Horizon(symbol, fixed, fixed, None, fixed=True)
-        low = self._column(f"{what}: lower", lower, 1, 1e-6)
-        high = self._column(f"{what}: upper", upper, 1, np.inf)
-        check_horizon(f"{what}: lower", constant(low))
-        check_order(what, constant(low), constant(high))
-        if guess is not None:
-            number = numeric(f"{what}: guess", guess)
-            if number.size != 1 or np.isnan(number[0]):
-                raise ProblemError(f"{what}: guess must be one number, not {guess!r}", value=guess)
-            check_horizon(f"{what}: guess", number)
-            check_inside(f"{what}: guess", number, constant(low), constant(high))
-            guess = float(number[0])
-        return Horizon(symbol, low, high, guess, fixed=False)
-
-    @staticmethod
-    def _check_number(what: str, label: str, bound: Value) -> None:
-        """Raise where a bound that is given as numbers holds one that is nan."""
-        if bound is not None and not is_symbolic(bound) and np.any(np.isnan(numeric(what, bound))):
-            raise ProblemError(f"{what}: {label} is not a number: {bound!r}", value=bound)
+    @property
+    def _reader(self) -> ExpressionReader:
+        """Reads values of this problem's symbols; ends and bounds may refer to the parameters declared so far."""
+        return ExpressionReader(self.symbols, tuple(v.symbol for v in self.declared.parameters.values()))
 
     def _horizon_symbol(self) -> list[Any]:
         return [] if self.declared.horizon is None else [self.declared.horizon.symbol]
@@ -517,82 +457,12 @@ class Problem:
     def _inner(self) -> list[Any]:
         """Symbols that may stand inside the horizon."""
         d = self.declared
-        variables = (*d.states.values(), *d.controls.values(), *d.parameters.values())
-        known = [s.symbol for s in d.signals.values()]
-        return [v.symbol for v in variables] + [*known, self.time, *self._horizon_symbol()]
+        pools = (d.states, d.controls, d.parameters, d.signals)
+        return [v.symbol for pool in pools for v in pool.values()] + [self.time, *self._horizon_symbol()]
 
     def _symbol(self, kind: str, name: str, size: int) -> Any:
-        if not isinstance(name, str) or not name:
-            raise ProblemError(f"{kind} name must be a non-empty string, not {name!r}")
-        if name in RESERVED:
-            raise ProblemError(f"{kind} {name!r}: this name is reserved ({', '.join(RESERVED)})")
-        for other in ("states", "controls", "parameters", "signals"):
-            if name in getattr(self.declared, other):
-                raise ProblemError(f"{kind} {name!r}: a {other[:-1]} of this name exists already")
+        self.declared.check_new_variable(kind, name)
         return self.symbols.sym(name, size)
-
-    def _size(self, what: str, size: int | None, given: dict[str, Value]) -> int:
-        if size is not None:
-            return checked_count(f"{what}: size", size)
-        plain = {f"{what}: {k}": v for k, v in given.items() if v is not None and not callable(v)}
-        lengths = {k: stacked(k, v).numel() if is_symbolic(v) else numeric(k, v).size for k, v in plain.items()}
-        for label, n in lengths.items():
-            if n == 0:
-                raise ProblemError(f"{label} is empty")
-        sizes = {label.rpartition(" ")[2]: n for label, n in lengths.items() if n != 1}
-        if len(set(sizes.values())) > 1:
-            detail = ", ".join(f"{k} has {n}" for k, n in sizes.items())
-            raise ProblemError(f"{what}: sizes do not match: {detail} entries")
-        return int(next(iter(sizes.values()), 1))
-
-    def _column(self, what: str, value: Value, size: int, default: float) -> Any:
-        """A value as a column of the problem's symbols, free of anything but parameters. Shape (size, 1)."""
-        if value is None:
-            return self.symbols(ca.DM.ones(size, 1) * default)
-        if is_symbolic(value):
-            known = [v.symbol for v in self.declared.parameters.values()]
-            expression = self._expression(what, value, known, finite=False)  # nan frees an entry
-        else:
-            array = numeric(what, value)
-            expression = self.symbols(ca.DM(array))
-        if expression.numel() == 1:
-            expression = ca.repmat(expression, size, 1)
-        if expression.numel() != size:
-            words = f"{what} has {expression.numel()} entries, {size} expected"
-            raise ProblemError(words, value=expression.numel(), limit=size)
-        return ca.densify(ca.vec(expression))
-
-    def _bounds(self, what: str, size: int, lower: Value, upper: Value) -> tuple[Any, Any]:
-        low = self._column(f"{what}: lower", lower, size, -np.inf)
-        high = self._column(f"{what}: upper", upper, size, np.inf)
-        for label, value in (("lower", lower), ("upper", upper)):
-            self._check_number(what, label, value)
-        check_order(what, constant(low), constant(high))
-        return low, high
-
-    def _expression(self, what: str, value: Value, known: Sequence[Any], *, finite: bool = True) -> Any:
-        if value is None or isinstance(value, str):
-            raise ProblemError(f"{what}: a number or an expression is expected, not {value!r}")
-        if is_symbolic(value):
-            expression = stacked(what, value)
-            if not isinstance(expression, self.symbols):
-                have, want = type(expression).__name__, self.symbols.__name__
-                raise ProblemError(f"{what} is made of {have} symbols, the problem of {want} symbols")
-            entries = ca.vertsplit(expression) if isinstance(expression, ca.SX) and expression.numel() else []
-            if finite and not all(np.isfinite(float(entry)) for entry in entries if entry.is_constant()):
-                raise ProblemError(f"{what} is not finite: {expression}")
-        else:
-            array = numeric(what, value)
-            check_finite(what, array)
-            expression = self.symbols(ca.DM(array))
-        identities = {identity(s) for symbol in known for s in ca.symvar(symbol)}
-        for symbol in ca.symvar(expression):
-            if identity(symbol) not in identities:
-                raise ProblemError(
-                    f"{what} uses the symbol {symbol.name()!r}, which may not stand there: it is not part of this "
-                    f"problem, was declared later, or has no meaning at this place"
-                )
-        return expression
 
     def _find(self, pool: dict[str, Variable], symbol: Any, what: str) -> Variable:
         if isinstance(symbol, str):
@@ -611,40 +481,16 @@ class Problem:
             limit=tuple(pool),
         )
 
-    def _constrain(
+    def _constraint(
         self,
         kind: str,
         name: str,
         expression: Value,
-        lower: Value,
-        upper: Value,
+        bounds: tuple[Value, Value],
         unit: str,
         tolerance: Value = None,
         known: Sequence[Any] = (),
-    ) -> None:
-        """Declare a constraint of the symbols inside the horizon and of those ``known`` besides."""
-        what = self._unused_constraint(f"{kind} constraint", name)
-        checked_text(f"{what}: unit", unit)
-        vector = self._expression(what, expression, [*self._inner(), *known])
-        if vector.numel() == 0:
-            raise ProblemError(f"{what} is empty")
-        if lower is None and upper is None:
-            raise ProblemError(f"{what} has neither lower nor upper bound")
-        low, high = self._bounds(what, vector.numel(), lower, upper)
-        allowed = None
-        if tolerance is not None:
-            allowed = numeric(f"{what}: tolerance", tolerance)
-            if allowed.size not in (1, vector.numel()) or not (allowed > 0).all():
-                words = f"{what}: tolerance must be positive numbers, 1 or {vector.numel()} of them, not {tolerance!r}"
-                raise ProblemError(words, value=tolerance, limit=vector.numel())
-            allowed = np.broadcast_to(allowed, vector.numel()).tolist()
-        getattr(self.declared, kind)[name] = Constraint(name, vector, low, high, unit, allowed)
-
-    def _unused_constraint(self, kind: str, name: Any) -> str:
-        """``kind 'name'``; ProblemError where it is no name of a constraint that can be new."""
-        if not isinstance(name, str) or not name:
-            raise ProblemError(f"{kind}: its name must be a non-empty string, not {name!r}")
-        d = self.declared
-        if any(name in pool for pool in (d.path, d.start, d.end, d.watch, d.apart)):
-            raise ProblemError(f"{kind} {name!r}: a constraint of this name exists already")
-        return f"{kind} {name!r}"
+    ) -> Constraint:
+        """A new constraint of the symbols inside the horizon and of those ``known`` besides."""
+        self.declared.check_new_constraint(f"{kind} constraint", name)
+        return self._reader.constraint(kind, name, expression, [*self._inner(), *known], bounds, unit, tolerance)

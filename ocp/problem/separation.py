@@ -28,7 +28,7 @@ from ocp.errors import ProblemError, checked_mapping, checked_text
 from ocp.problem.hulls import Covered, Hull
 from ocp.problem.values import check_finite, table
 
-__all__ = ["Separation", "index_rows"]
+__all__ = ["Separation", "index_rows", "motion_by_pair"]
 
 WORLD = -1
 """In the place of a frame: the world."""
@@ -156,3 +156,13 @@ def index_rows(what: str, label: str, values: Any, count: int) -> np.ndarray:
         words = f"{what}: {label} must be rows of {count} indices, not {values!r}"
         raise ProblemError(words, name=label, value=values)
     return found.astype(int).reshape(-1, count)
+
+
+def motion_by_pair(what: str, given: Mapping[str, Any], movers: Mapping[str, int], count: int) -> np.ndarray:
+    """Levers or turns by the name of a state, side by side for all movers; zero of those that are not given.
+
+    Args:
+        movers: Size of each state that moves a body. count: Number of pairs.
+    """
+    columns = [table(what, given.get(each, np.zeros((count, size)))) for each, size in movers.items()]
+    return np.hstack([np.zeros((count, 0)), *(np.reshape(column, (count, -1)) for column in columns)])

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.polynomial import Polynomial
 
-from ocp.curves import PiecewisePolynomial, differentiation_matrix, integrator, lagrange, lagrange_expressions, rk4_step
+from ocp.curves import PiecewisePolynomial, differentiation_matrix, integrator, lagrange, rk4_step
 from tests.ocp.problems import Array, order
 
 DEGREES = range(1, 11)
@@ -78,14 +78,6 @@ def test_one_node_makes_a_piecewise_constant() -> None:
 def test_no_entries_are_interpolated_too() -> None:
     nothing = PiecewisePolynomial(np.array([0.0, 1.0]), np.array([0.0, 1.0]), np.zeros((1, 2, 0)))
     assert nothing(np.linspace(0, 1, 5)).shape == (5, 0)
-
-
-@pytest.mark.parametrize("count", DEGREES)
-def test_the_basis_as_expressions_is_the_basis_in_numbers(count: int) -> None:
-    nodes, place = nodes_of(count, "legendre"), ca.SX.sym("place")
-    basis = ca.Function("basis", [place], [lagrange_expressions(nodes, place)])
-    at = np.linspace(0.0, 1.0, 7)
-    np.testing.assert_allclose(np.asarray(basis(at[None]).full()).T, lagrange(nodes, at), atol=1e-9)
 
 
 def swung(t: float, x: Array) -> Array:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import casadi as ca
@@ -12,12 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ocp import Collocation, MultipleShooting, Problem, solve
+from ocp import Collocation, MultipleShooting, Problem
 from ocp.curves import differentiation_matrix, lagrange
 from ocp.direct.assembly import Program, assemble
-from ocp.direct.fragment import Fragment, shifted
 from ocp.problem.formulation import Formulation
-from tests.ocp.problems import EVERY_METHOD, METHODS, Array, Method, energy, plant, swing, van_der_pol
+from tests.ocp.problems import EVERY_METHOD, METHODS, Array, Method, plant, swing, van_der_pol
 
 KINDS: dict[str, Callable[[Any], Problem]] = {
     "swing": lambda symbols: swing(symbols),
@@ -189,62 +187,3 @@ def test_collocation_rows_are_the_textbook_equations(scheme: str, control: str) 
     np.testing.assert_allclose(rows[labels == "dynamics"], np.ravel(equations), atol=1e-12)
     np.testing.assert_allclose(rows[labels == "continuity"], np.ravel(joints)[: 4 * (scheme == "legendre")], atol=1e-12)
     assert cost[0] == pytest.approx(expected_cost, rel=1e-12)
-
-
-# ---- fragments are joined to chains ----------------------------------------------------------------------------
-
-
-def chain(first: Fragment, second: Fragment) -> Fragment:
-    """Two phases as one program, with linear rows that join the end of the first to the start of the second."""
-    moved = shifted(second, first.size, first.n_rows)
-    n, rows = len(first.end), first.n_rows + second.n_rows
-    join = (np.tile(rows + np.arange(n), 2), np.concatenate([first.end, moved.start]), np.repeat([1.0, -1.0], n))
-    at, columns, values = (np.concatenate(part) for part in zip(first.linear, moved.linear, join, strict=True))
-    return replace(
-        first,
-        size=first.size + second.size,
-        row_labels=(*first.row_labels, *second.row_labels, *(f"join {i}" for i in range(n))),
-        blocks=(*first.blocks, *moved.blocks),
-        linear=(at, columns, values),
-    )
-
-
-@pytest.mark.parametrize("method", [Collocation(4, 3), Collocation(4, 3, "legendre"), MultipleShooting(4)])
-def test_two_joined_phases_cost_what_one_phase_costs(method: Method) -> None:
-    def half(initial: Any, terminal: Any) -> Fragment:
-        problem = energy()
-        declared = problem.declared.states
-        declared["q"] = replace(declared["q"], initial=ca.SX(initial[0]), terminal=ca.SX(terminal[0]))
-        declared["v"] = replace(declared["v"], initial=ca.SX(initial[1]), terminal=ca.SX(terminal[1]))
-        return method.transcribe(Formulation(problem))
-
-    free = (np.nan, np.nan)
-    first, second = half((0.0, 0.0), free), half(free, (1.0, 0.0))
-    program = assemble(chain(first, second), 0)
-    pairs = zip(limits(first, (0.0, 0.0), None), limits(second, None, (1.0, 0.0)), strict=True)
-    lower, upper = (np.concatenate(pair) for pair in pairs)
-    m = program.nlp["g"].numel()
-    solver = ca.nlpsol(
-        "solver",
-        "ipopt",
-        program.nlp,
-        {
-            "jac_g": program.jacobian,
-            "grad_f": program.gradient,
-            "hess_lag": program.hessian,
-            "print_time": False,
-            "ipopt": {"print_level": 0, "sb": "yes"},
-        },
-    )
-    result = solver(x0=0.0, lbx=lower, ubx=upper, lbg=np.zeros(m), ubg=np.zeros(m))
-    whole = solve(energy(), replace(method, intervals=2 * method.intervals))
-    assert float(result["f"]) == pytest.approx(whole.cost / 8, abs=1e-8)  # 2 s for the same way cost an eighth
-
-
-def limits(fragment: Fragment, initial: Any, terminal: Any) -> tuple[Array, Array]:
-    """Bounds of the variables of a phase whose ends are given or free."""
-    lower, upper = np.full(fragment.size, -np.inf), np.full(fragment.size, np.inf)
-    for place, value in ((fragment.start, initial), (fragment.end, terminal)):
-        if value is not None:
-            lower[place] = upper[place] = value
-    return lower, upper

@@ -11,7 +11,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -150,7 +149,7 @@ def test_what_cannot_hold_together_is_named_in_the_same_words(shared: Path, solv
 
 
 def test_no_optimization_changes_no_number(shared: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(libraries, "LARGE", 0)
+    monkeypatch.setattr(libraries, "SIZES", libraries.CodeSizes(optimized=0))
     plans = [prepare(van_der_pol(), Collocation(6), compiled=how).solve() for how in (True, False)]
     np.testing.assert_array_equal(plans[0].variables, plans[1].variables)
 
@@ -200,11 +199,9 @@ def test_processes_compile_once(own: Path, tmp_path: Path, monkeypatch: pytest.M
     assert [file.suffix for file in own.iterdir()] == [".so"]
 
 
-def test_compilers_flags_and_contents_are_told_apart(
-    own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_compilers_and_contents_are_told_apart(own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     one, two = number(1), number(2)
-    keys = [library.key for library in (one, two, replace(one, vectors=True))]
+    keys = [library.key for library in (one, two)]
     monkeypatch.setenv("CC", script(tmp_path / "another", COUNTED))
     keys.append(one.key)
     newer = (tmp_path / "another").read_text().replace("ours 1", "ours 2")
@@ -212,7 +209,7 @@ def test_compilers_flags_and_contents_are_told_apart(
     assert one.key == keys[-1]  # asked once a process for its version
     libraries._version.cache_clear()
     keys.append(one.key)
-    assert len(set(keys)) == len(keys) == 5
+    assert len(set(keys)) == len(keys) == 4
 
 
 # ---- what goes wrong ---------------------------------------------------------------------------------------------
@@ -301,7 +298,7 @@ def test_what_is_not_defined_is_no_library() -> None:
 
 
 def test_what_is_too_long_is_not_compiled(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(libraries, "MOST", 10)
+    monkeypatch.setattr(libraries, "SIZES", libraries.CodeSizes(accepted=10))
     with pytest.raises(CompilerError, match="characters"):
         built(number(8))
 

@@ -129,7 +129,7 @@ def test_halves_cover_what_they_came_from() -> None:
     charts = sets.cover(*found(machine, task, times, 16, 0), 0.07, 50_000)
     layer, joints = found(machine, task, times, 64, 99)
     for _ in range(3):
-        charts = sets.halved(charts)
+        charts = sets.parts(charts).charts
         assert sets.covered(charts, layer, joints).all()
     assert np.median(charts.radii) < 0.07 / 8 * 1.1
 

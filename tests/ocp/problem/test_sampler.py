@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from ocp.problem.formulation import Sampler
+from ocp.problem.sampling import Sampler
 
 
 @pytest.mark.parametrize("symbols", [ca.SX, ca.MX])
