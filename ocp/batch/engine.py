@@ -119,7 +119,7 @@ class Engine:
         """Begin workers on this machine."""
         import dask
 
-        rules = {
+        rules: dict[str, Any] = {
             "distributed.scheduler.allowed-failures": 0,
             "distributed.scheduler.worker-ttl": None,  # one call of CasADi may keep a worker silent for long
             "distributed.deploy.lost-worker-timeout": "1000 days",  # a worker that ended begins again, however late
