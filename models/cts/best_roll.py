@@ -4,11 +4,11 @@ The best roll on a set of arcs is a stationary point of the index inside an arc,
 points come first, in closed form for I1 (trigonometric.least_point); for I2, the index with the squared change of roll,
 by Newton steps on intervals where it is convex. Where the best of them is within reach and limits that is all.
 
-Else the ends matter. Those by joints 4 to 6 and by the reach of the pitch link are cheap and are all compared, and so
-are the other stationary points. Those by joints 2 and 3 and by the reach of the yaw link are compared where a roll
-better than the best found so far breaks that very limit. Walking downhill-to-uphill from a roll that meets all but a
-limit of joint 1, the first roll that meets that limit too sits on it: so the ends by a limit of joint 1, which cost
-most, are looked for only where a roll better than the best breaks that very limit.
+Else the ends matter, and `Search` says which to look at, in what order, and when no more can matter. Ends by joints 4
+to 6 and by the reach of the pitch link are cheap and are all compared. The others are first known roughly: one is
+polished and checked only where the index there is below the best found so far. Walking downhill-to-uphill from a roll
+that meets all but a limit of joint 1, the first roll that meets that limit too sits on it: so the ends by a limit of
+joint 1, which cost most, are looked for only where a roll better than the best breaks that very limit.
 
 What the functions of the search hand to each other are records of scalars, one column each.
 """
@@ -26,21 +26,22 @@ import numpy as np
 from models.arrays import checked_flag, checked_instance
 from models.cts.rig import HOME, Branch, Rig, RigPosture, Tunnel, checked_branch, joints_of, posture_at
 from models.cts.roll import (
-    COSINE_SLACK,
     Candidate,
     index_harmonics,
     inside_limit,
-    level_ends,
+    level_points,
     limit_code,
+    sharp_level,
+    sharp_point,
     simple_ends,
-    slide_ends,
+    slide_points,
     verdict,
     why_no_roll,
     yaw_chart,
     yaw_levels,
 )
 from models.cts.roll_change import checked_gain, convex_minima, unrolled
-from models.cts.trigonometric import Harmonics, least_point, roots
+from models.cts.trigonometric import ROOTS, Harmonics, Point, least_point, polish, roots
 from models.errors import ModelError
 from models.spatial import Expression
 
@@ -65,6 +66,25 @@ class Best(NamedTuple):
     above: Expression
 
 
+class Rough(NamedTuple):
+    """A point near a roll that may be the best one.
+
+    Attributes:
+        bound: No cost near the point is below it; inf where the roll cannot be.
+        c, s: Cosine and sine.
+        value: What cos q2, or q1, takes at the roll it is polished to; at a stationary point cos q2 as it is.
+        code: Of the constraint that the roll sits on.
+        side: 1 where that constraint is met above the value, -1 where it is met below.
+    """
+
+    bound: Expression
+    c: Expression
+    s: Expression
+    value: Expression
+    code: Expression
+    side: Expression
+
+
 class Seen(NamedTuple):
     """A roll that was looked at: its cost, inf where joints 4 to 6 do not allow it, and cos q2."""
 
@@ -73,7 +93,7 @@ class Seen(NamedTuple):
 
 
 class Suspect(NamedTuple):
-    """A roll.Level that may matter: no cost on it is below `bound`; `side` is 1 where it is met above its value."""
+    """A roll.Level that may matter: no cost on it is below `bound`; `side` as of Rough."""
 
     bound: Expression
     cosine: Expression
@@ -84,6 +104,7 @@ class Suspect(NamedTuple):
 
 BEST_SIZE, ANSWER_SIZE = len(Best._fields), 9
 NOTHING = Best(ca.inf, 1, 0, 0, ca.inf, ca.inf)
+NOWHERE = Rough(ca.inf, 1, 0, 0, 0, 0)
 
 
 class Answer(NamedTuple):
@@ -161,7 +182,7 @@ def _built(rig: Rig, tunnel: Tunnel, branch: Branch, gain: float, limits: bool) 
 
 @dataclass(frozen=True)
 class Search:
-    """The steps of the search as casadi Functions. Their `best` is a Best, `seen` a row of Seen.
+    """The steps of the search as casadi Functions. Their `best` is a Best, `seen` a row of Seen, `rough` of Rough.
 
     Attributes:
         gain: w4 / (2 pi) of I2; 0 for I1.
@@ -212,57 +233,82 @@ class Search:
     def thorough(self, count: int) -> Any:
         """Function (target, previous, best, seen) -> answer, from the ends of the arcs; `count` rolls were seen."""
         target, previous = _given(ca.MX)
-        first, known = ca.MX.sym("best", BEST_SIZE), ca.MX.sym("seen", len(Seen._fields), count)
+        first, seen = ca.MX.sym("best", BEST_SIZE), ca.MX.sym("seen", len(Seen._fields), count)
         best, more = self._simple()(target, previous, first)
-        seen = ca.horzcat(known, more)
-        best = self._levels(seen.shape[1])(target, previous, seen, best)
+        known = [seen, more]
+        chart = yaw_chart(self.rig, self.branch)
+        if not self.gain:
+            rough = self._rough_stationary()(target)
+            best = self._gates(self._sharpen(self._stationary), 4)(target, previous, rough, best)
+            known.append(stacked(Seen, [Seen(point.bound, point.value) for point in unstacked(Rough, rough)]))
+        seen = ca.horzcat(*known)
+        best = self._levels(chart, seen.shape[1])(target, previous, seen, best)
         for upper in (False, True):
             if np.isfinite(self.rig.limit(1, upper)):
                 now = _record(Best, best)
                 settled = (now.above if upper else now.below) >= now.cost
-                best = choose(self._slide(upper), (BEST_SIZE, 1))(settled, best, target, previous, best)
+                best = choose(self._slide(chart, upper), (BEST_SIZE, 1))(settled, best, target, previous, best)
         found = self._finish()(target, previous, best)
         result = choose(self._nowhere(), (ANSWER_SIZE, 1))(_record(Best, best).cost < ca.inf, found, target)
-        return ca.Function("thorough", [target, previous, first, known], [result])
+        return ca.Function("thorough", [target, previous, first, known[0]], [result])
 
     # ---- candidates ------------------------------------------------------------------------------------------
 
     def _simple(self) -> Any:
-        """Function (target, previous, best) -> (best, seen) of the simple ends and the stationary points of I1."""
+        """Function (target, previous, best) -> (best, seen), with the ends that are known to rounding."""
         target, previous = _given(ca.SX)
         first = ca.SX.sym("best", BEST_SIZE)
-        points = simple_ends(self.rig, target, self.branch)
-        if not self.gain:
-            points += [Candidate(c, s, 0) for c, s in roots(self._index(target).derivative())]
-        best, seen, _ = self._compare(target, previous, points, _record(Best, first))
+        ends = simple_ends(self.rig, target, self.branch)
+        best, seen, _ = self._compare(target, previous, ends, _record(Best, first))
         return ca.Function("simple", [target, previous, first], ca.cse([ca.vertcat(*best), stacked(Seen, seen)]))
 
-    def _levels(self, count: int) -> Any:
+    def _rough_stationary(self) -> Any:
+        """Function (target) -> points near the minima of I1; nowhere where it certainly has one minimum only.
+
+        In the axes of trigonometric.least_point there are two stationary points alone outside the astroid
+        |p|^(2/3) + |q|^(2/3) = (4 r)^(2/3), which the circle hypot(p, q) = 4 r encloses.
+        """
+        target, _ = _given(ca.SX)
+        rough, f = self._rough(target), self._index(target)
+        points = [rough(c, s) for c, s in roots(f.derivative(), steps=0)]
+        near = ca.Function("rough", [target], ca.cse([stacked(Rough, points)]))
+        first, second = ca.sqrt(f.a1**2 + f.b1**2), ca.sqrt(f.a2**2 + f.b2**2)
+        one_minimum = ca.Function("one_minimum", [target], [first > 4 * second])
+        x, nowhere = ca.MX.sym("target", 5), stacked(Rough, [NOWHERE] * len(points))
+        found = choose(near, nowhere.shape)(one_minimum(x), nowhere, x)
+        return ca.Function("rough_stationary", [x], [found])
+
+    def _levels(self, chart: Any, count: int) -> Any:
         """Function (target, previous, seen, best) -> best, with the ends by joints 2 and 3 and the yaw link's reach.
 
         A level is looked at where a roll that was seen, better than the best, is on its wrong side; all are where one
         breaks a limit of joint 1 alone, since the arc that it is on may end before that limit is met.
         """
-        target, previous = _given(ca.SX)
+        target, _ = _given(ca.SX)
         rolls, suspect = ca.SX.sym("seen", len(Seen._fields), count), ca.SX.sym("suspect", len(Suspect._fields))
-        suspects = []
+        suspects, (_, slack) = [], self._slack()
         for level in yaw_levels(self.rig, target, self.branch):
             bound = ca.SX(ca.inf)
             for roll in unstacked(Seen, rolls):
                 over = roll.cos2 - level.cosine if level.above else level.cosine - roll.cos2
-                bound = ca.fmin(bound, ca.if_else(over < COSINE_SLACK, roll.cost, ca.inf))
+                bound = ca.fmin(bound, ca.if_else(over < slack, roll.cost, ca.inf))
             bound = ca.if_else(level.relevant, bound, ca.inf)
             suspects.append(Suspect(bound, level.cosine, level.code, level.relevant, 1 if level.above else -1))
         needed = ca.Function("levels", [target, rolls], ca.cse([stacked(Suspect, suspects)]))
 
-        _, cosine, code, _, side = _record(Suspect, suspect)
-        chart, known = yaw_chart(self.rig, self.branch), ca.SX.sym("best", BEST_SIZE)
-        ends = [Candidate(c, s, code) for c, s in level_ends(self.rig, chart, target, cosine, side)]
-        best, _, _ = self._compare(target, previous, ends, _record(Best, known))
-        level_function = ca.Function("level", [target, previous, suspect, known], ca.cse([ca.vertcat(*best)]))
-        one = choose(level_function, (BEST_SIZE, 1))
+        (_, cosine, code, _, side), rough = _record(Suspect, suspect), self._rough(target)
+        ends = level_points(self.rig, target, cosine)
+        points = [rough(c, s, cosine, code, side, about=(cosine, slack)) for c, s in ends]
+        near_level = ca.Function("rough", [target, suspect], ca.cse([stacked(Rough, points)]))
+
+        def polished(at: Expression, end: Rough) -> Point:
+            return sharp_level(self.rig, chart, at, end.value, end.side, (end.c, end.s))
+
         x, before = _given(ca.MX)
-        first, seen = ca.MX.sym("best", BEST_SIZE), ca.MX.sym("seen", *rolls.shape)
+        first, column = ca.MX.sym("best", BEST_SIZE), ca.MX.sym("suspect", len(Suspect._fields))
+        found = self._gates(self._sharpen(polished), len(points))(x, before, near_level(x, column), first)
+        one = choose(ca.Function("level", [x, before, column, first], [found]), (BEST_SIZE, 1))
+        seen = ca.MX.sym("seen", *rolls.shape)
         best = first
         for level in ca.horzsplit(needed(x, seen)):
             best = one(_record(Suspect, level).bound >= _record(Best, best).cost, best, x, before, level, best)
@@ -273,17 +319,71 @@ class Search:
                 best = one(settled, best, x, before, level, best)
         return ca.Function("levels", [x, before, seen, first], [best])
 
-    def _slide(self, upper: bool) -> Any:
+    def _slide(self, chart: Any, upper: bool) -> Any:
         """Function (target, previous, best) -> best, with the ends by one limit of joint 1."""
-        target, previous = _given(ca.SX)
-        points, first = ca.SX.sym("points", 2, 8), ca.SX.sym("best", BEST_SIZE)
-        ends = [Candidate(points[0, k], points[1, k], limit_code(1, upper)) for k in range(8)]
-        found, _, _ = self._compare(target, previous, ends, _record(Best, first))
-        compare = ca.Function("compare", [target, previous, points, first], ca.cse([ca.vertcat(*found)]))
+        target, points = ca.SX.sym("target", 5), ca.SX.sym("points", 2, 8)
+        rough, reach = self._rough(target), (0, 1 + self._slack()[1])
+        datum = inside_limit(self.rig, 1, upper), limit_code(1, upper)
+        ends = [rough(points[0, k], points[1, k], *datum, about=reach) for k in range(8)]
+        near_limit = ca.Function("rough", [target, points], ca.cse([stacked(Rough, ends)]))
+
+        def polished(at: Expression, end: Rough) -> Point:
+            return sharp_point(chart, at, 2, end.value, (end.c, end.s))
+
         x, before = _given(ca.MX)
         best = ca.MX.sym("best", BEST_SIZE)
-        known = compare(x, before, slide_ends(self.rig, self.branch, upper)(x), best)
-        return ca.Function("slide", [x, before, best], [known])
+        found = near_limit(x, slide_points(self.rig, upper)(x))
+        gates = self._gates(self._sharpen(polished), len(ends))
+        return ca.Function("slide", [x, before, best], [gates(x, before, found, best)])
+
+    def _slack(self) -> tuple[float, float]:
+        """How much sin q4 and cos q2 can change within ROOTS.reach of a roll."""
+        rig = self.rig
+        sin4 = ROOTS.reach * rig.goose_neck / rig.pitch_link
+        cos4 = float(np.sqrt(2 * sin4)) + sin4
+        return sin4, (ROOTS.reach * rig.goose_neck + rig.pitch_link * cos4) / rig.yaw_link_1
+
+    def _rough(self, target: Expression) -> Callable[..., Rough]:
+        """Maker of a Rough from all but its bound; cos q2 must be within (middle, half) where they are given."""
+        f, (slack4, _) = self._index(target), self._slack()
+        slack = ROOTS.reach * (ca.fabs(f.a1) + ca.fabs(f.b1) + 2 * (ca.fabs(f.a2) + ca.fabs(f.b2)))
+
+        def rough(
+            c: Expression, s: Expression, value: Expression = None, code: Any = 0, side: Any = 0, about: Any = None
+        ) -> Rough:
+            posture = self._posture(target, c, s)
+            near = ca.fabs(posture.sin4) < 1 + slack4
+            if about is not None:
+                near = ca.logic_and(near, ca.fabs(posture.cos2 - about[0]) < about[1])
+            bound = ca.if_else(near, f.value(c, s) - slack, ca.inf)
+            return Rough(bound, c, s, posture.cos2 if value is None else value, code, side)
+
+        return rough
+
+    def _gates(self, sharpen: Any, count: int) -> Any:
+        """Function (target, previous, rough, best) -> best: points one by one, those that may matter sharpened."""
+        target, previous = _given(ca.MX)
+        first, rough = ca.MX.sym("best", BEST_SIZE), ca.MX.sym("rough", len(Rough._fields), count)
+        gate, best = choose(sharpen, (BEST_SIZE, 1)), first
+        for point in ca.horzsplit(rough):
+            settled = _record(Rough, point).bound >= _record(Best, best).cost
+            best = gate(settled, best, target, previous, point, best)
+        return ca.Function("gates", [target, previous, rough, first], [best])
+
+    def _sharpen(self, polished: Callable[[Expression, Rough], Point]) -> Any:
+        """Function (target, previous, rough, best) -> best: one point polished and compared."""
+        target, previous = _given(ca.SX)
+        rough, first = ca.SX.sym("rough", len(Rough._fields)), ca.SX.sym("best", BEST_SIZE)
+        point = _record(Rough, rough)
+        sharp = Candidate(*polished(target, point), point.code)
+        best, _, _ = self._compare(target, previous, [sharp], _record(Best, first))
+        return ca.Function("sharpen", [target, previous, rough, first], ca.cse([ca.vertcat(*best)]))
+
+    def _stationary(self, target: Expression, rough: Rough) -> Point:
+        """The stationary point of I1 near a point."""
+        slope = self._index(target).derivative()
+        bend = slope.derivative()
+        return polish((rough.c, rough.s), lambda c, s: (slope.value(c, s), bend.value(c, s)))
 
     def _compare(
         self, target: Expression, previous: Expression, points: Sequence[Candidate], best: Best

@@ -152,8 +152,9 @@ def angle_ends(rig: Rig, target: Expression, branch: Branch) -> list[Candidate]:
     ends = simple_ends(rig, target, branch)
     chart = yaw_chart(rig, branch)
     for level in yaw_levels(rig, target, branch):
-        points = level_ends(rig, chart, target, level.cosine, 1 if level.above else -1)
-        ends += [Candidate(c, s, level.code) for c, s in points]
+        for point in level_points(rig, target, level.cosine):
+            above = 1 if level.above else -1
+            ends.append(Candidate(*sharp_level(rig, chart, target, level.cosine, above, point), level.code))
     return ends
 
 
@@ -202,13 +203,11 @@ def yaw_levels(rig: Rig, target: Expression, branch: Branch) -> list[Level]:
     return found
 
 
-def level_ends(rig: Rig, chart: Any, target: Expression, cosine: Expression, above: Any) -> list[Point]:
-    """Four points, among which are the rolls at which cos q2 takes a value in the branch of the chart.
+def level_points(rig: Rig, target: Expression, cosine: Expression) -> list[Point]:
+    """Four points near the rolls at which cos q2 takes a value, in any branch; to be polished by sharp_point.
 
-    The roots are those of the squared equation: where the pitch link is nearly stretched it is smooth and cos q2 is
-    not, where the yaw is nearly 0 it has nearly double roots and cos q2 has not. Each is polished by both, and ends
-    beyond the value, above it where ``above`` is 1, below where it is -1, by as much as rounding may take away again:
-    where the pitch link is nearly stretched the rounding of sin q4 is amplified by 1 / cos q4.
+    Here the equation is squared: where the pitch link is nearly stretched it is smooth and cos q2 is not, where the
+    yaw is nearly 0 it has nearly double roots and cos q2 has not.
     """
     axle, e_c, e_s = corner_circle(rig, target)
     lg, lp = rig.goose_neck, rig.pitch_link
@@ -218,14 +217,10 @@ def level_ends(rig: Rig, chart: Any, target: Expression, cosine: Expression, abo
     square = first_square(level - rig.yaw_link_1 * cosine, lg * e_c[1], lg * e_s[1])
     f = minus(square, scaled(stretched, s_yaw * s_yaw))
     slope = f.derivative()
-    found = []
-    for root in roots(f, steps=0):
-        # a double root leaves Newton nothing but rounding to go by: hence the short reach
-        point = polish(root, lambda c, s: (f.value(c, s), slope.value(c, s)), 2, SQUARED_POLISH_REACH)
-        c, s = polish(point, sharper(chart, target, 0, cosine))
-        margin = SINE_ROUNDING * lp / rig.yaw_link_1 / (ca.fabs(chart(target, c, s)[4]) + 1e-8)
-        found.append(polish((c, s), sharper(chart, target, 0, cosine + above * margin), 1))
-    return found
+    # a double root leaves Newton nothing but rounding to go by: hence the short reach
+    return [
+        polish(p, lambda c, s: (f.value(c, s), slope.value(c, s)), 2, SQUARED_POLISH_REACH) for p in roots(f, steps=0)
+    ]
 
 
 def _pitch_sines(rig: Rig, target: Expression, branch: Branch) -> list[tuple[Expression, int]]:
@@ -274,6 +269,23 @@ def yaw_chart(rig: Rig, branch: Branch) -> Any:
     return ca.Function("chart", [t, c, s], [values[0], slope[0], values[1], slope[1], posture.cos4])
 
 
+def sharp_point(chart: Any, target: Expression, output: int, value: Expression, point: Point) -> Point:
+    """A point polished until cos q2 (output 0 of the chart) or q1 (output 2) takes a value."""
+    return polish(point, sharper(chart, target, output, value))
+
+
+def sharp_level(rig: Rig, chart: Any, target: Expression, value: Expression, above: Any, point: Point) -> Point:
+    """A point polished until cos q2 takes a value, or is beyond it by as much as rounding may take away again.
+
+    Where the pitch link is nearly stretched the rounding of sin q4 is amplified by 1 / cos q4. `above` is 1 where the
+    constraint is met above the value, -1 where it is met below.
+    """
+    c, s = sharp_point(chart, target, 0, value, point)
+    cos4 = ca.fabs(chart(target, c, s)[4])
+    margin = SINE_ROUNDING * rig.pitch_link / rig.yaw_link_1 / (cos4 + 1e-8)
+    return polish((c, s), sharper(chart, target, 0, value + above * margin), 1)
+
+
 def sharper(chart: Any, target: Expression, output: int, value: Expression) -> Slope:
     """Output 0 or 2 of the chart less a value, and its derivative by roll, to polish with."""
 
@@ -298,8 +310,19 @@ def slide_ends(rig: Rig, branch: Branch, upper: bool) -> Any:
 
     Output shape (2, 8): rows cosine and sine of the roll.
     """
-    limit = inside_limit(rig, 1, upper)
     t, points = ca.SX.sym("target", 5), ca.SX.sym("points", 2, 8)
+    slope = sharper(yaw_chart(rig, branch), t, 2, inside_limit(rig, 1, upper))
+    sharp = [ca.vertcat(*polish((points[0, k], points[1, k]), slope)) for k in range(8)]
+    polished = ca.Function("polished", [t, points], [ca.horzcat(*sharp)])
+    target = ca.MX.sym("target", 5)
+    found = polished(target, slide_points(rig, upper)(target))
+    return ca.Function("slide_ends", [target], [found], ["target"], ["points"])
+
+
+def slide_points(rig: Rig, upper: bool) -> Any:
+    """Function of the target -> points near the ends of arcs by one limit of joint 1. Output shape (2, 8)."""
+    limit = inside_limit(rig, 1, upper)
+    t = ca.SX.sym("target", 5)
     axle, e_c, e_s = corner_circle(rig, t)
     s_yaw, c_yaw = ca.sin(t[3]), ca.cos(t[3])
     lg = rig.goose_neck
@@ -316,9 +339,5 @@ def slide_ends(rig: Rig, branch: Branch, upper: bool) -> Any:
     f = added(product(known, known), product(stretched, product(along, along)), -4)
     outputs = ca.cse([ca.vertcat(ca.horzcat(*[a for a, _ in f]), ca.horzcat(*[b for _, b in f]))])
     coefficients = ca.Function("slide", [t], outputs)
-    slope = sharper(yaw_chart(rig, branch), t, 2, limit)
-    sharp = [ca.vertcat(*polish((points[0, k], points[1, k]), slope)) for k in range(8)]
-    polished = ca.Function("polished", [t, points], [ca.cse(ca.horzcat(*sharp))])
     target = ca.MX.sym("target", 5)
-    found = polished(target, series_roots(4)(coefficients(target)))
-    return ca.Function("slide_ends", [target], [found], ["target"], ["points"])
+    return ca.Function("slide_points", [target], [series_roots(4)(coefficients(target))], ["target"], ["points"])

@@ -36,6 +36,7 @@ class RootSettings:
         cubic_steps, polish_steps, least_steps: Newton or Halley steps to the root of the pencil, to a root, and to the
             least point: what rounding leaves no more to do after.
         polish_reach: Of a step of the polish, rad.
+        reach: How far a root that is not polished may be from the one that it is polished to, rad.
         stages: Steps to all roots at once: after each stage but the last only those that still move by more than `near`
             go on.
         near: Relative.
@@ -47,6 +48,7 @@ class RootSettings:
     polish_steps: int = 3
     least_steps: int = 4
     polish_reach: float = 0.05
+    reach: float = 0.01
     stages: tuple[int, ...] = (6, 1, 1, 1, 1, 2, 4, 8, 16)
     near: float = 1e-5
 

@@ -1,15 +1,15 @@
 """Dask does the tasks: a cluster of this machine's cores, begun and ended here, or one that is given.
 
-Results come back to the driver, so no folder has to be seen by all machines.
+Results come back to the driver, so no folder has to be seen by all machines. The cluster that is begun here speaks TLS
+with a certificate that is made for it alone: no other user of the machine can send it work or read results.
 """
 
 from __future__ import annotations
 
 import logging
-import os
+import multiprocessing
 import queue
 import secrets
-import signal
 import sys
 import time
 from contextlib import ExitStack, suppress
@@ -35,12 +35,14 @@ class EngineSettings:
         chunk: Work that is sent at a time, s: Dask takes some ms for what it sends, so short tasks go together.
         patience: After so many s a scheduler that does not answer is gone.
         recount: s between two counts of the workers.
+        closing: At the end of a batch, s to wait at most for what was killed to be gone.
     """
 
     deaths: int = 3
     chunk: float = 0.05
     patience: float = 10.0
     recount: float = 2.0
+    closing: float = 0.7
 
 
 class Job(NamedTuple):
@@ -90,6 +92,8 @@ class Engine:
         self.settings = settings
         self._lost = (distributed.CancelledError, TimeoutError, self._dask.comm.CommClosedError)
         self._own: Any = None
+        self._client: Any = None
+        self._others = set(multiprocessing.active_children())
         self._rules = ExitStack()
         self._ended: queue.SimpleQueue[int] = queue.SimpleQueue()
         self._sent: dict[int, tuple[Any, list[Job]]] = {}
@@ -115,42 +119,65 @@ class Engine:
         """Begin workers on this machine."""
         import dask
 
-        rules = {
+        rules: dict[str, Any] = {
             "distributed.scheduler.allowed-failures": 0,
             "distributed.scheduler.worker-ttl": None,  # one call of CasADi may keep a worker silent for long
             "distributed.deploy.lost-worker-timeout": "1000 days",  # a worker that ended begins again, however late
+            "distributed.scheduler.http.routes": [],  # pages over HTTP ask nobody who he is
+            "distributed.worker.http.routes": [],
         }
         try:
+            security = self._dask.security.Security.temporary()
             self._rules.enter_context(dask.config.set(rules))
             self._own = self._dask.LocalCluster(
-                n_workers=self._workers,
+                n_workers=0,  # those that an interrupt finds half begun would be out of reach
                 threads_per_worker=1,
                 host="127.0.0.1",
                 memory_limit=0,
                 dashboard_address="127.0.0.1:0",
                 silence_logs=logging.CRITICAL,
+                security=security,
             )
+            self._own.scale(self._workers)
+            self._own.sync(lambda: self._own)  # awaits it, with its workers
+            if any(nanny.status != self._dask.Status.running for nanny in self._own.workers.values()):
+                raise RuntimeError("they ended at once")
+        except ImportError as error:
+            words = f"run_batch: {error}; pip install 'selfmotion[cluster]'"
+            raise ProblemError(words, name="workers", value=self._workers) from error
         except RuntimeError as error:
+            self.__exit__()
             words = f"workers: none can be started: {error}; what they wrote says more"
             raise ProblemError(words, name="workers", value=self._workers) from error
+        except BaseException:  # Ctrl-C
+            self.__exit__()
+            raise
         return self._own
 
     def __exit__(self, *_: object) -> None:
-        with suppress(Exception):  # the cluster may be gone, in whatever way
-            self._client.cancel([future for future, _ in self._sent.values()], force=True)
+        end = time.monotonic() + self.settings.closing
+        if self._own is not None:
+            self._kill_workers()
+        elif self._client is not None:
+            with suppress(Exception):  # the scheduler may be gone, in whatever way
+                self._client.cancel([future for future, _ in self._sent.values()], force=True)
         self._sent = {}
-        if self._own is not None:
-            for nanny in self._own.workers.values():  # at once, whatever they are at
-                nanny.auto_restart = False
-                with suppress(Exception):
-                    os.kill(nanny.pid, signal.SIGKILL)
-        if self._client is not self._cluster:
-            with suppress(Exception):
-                self._client.close(timeout=2.0)
-        if self._own is not None:
-            with suppress(Exception):
-                self._own.close(timeout=2.0)
+        for each in (self._client if self._client is not self._cluster else None, self._own):
+            if each is not None:
+                with suppress(Exception):  # what is late is left behind
+                    each.close(timeout=max(0.0, end - time.monotonic()))
+        if self._own is not None and self._own.status != self._dask.Status.closed:
+            self._own.loop.add_callback(self._own.loop.stop)
+            self._own.status = self._dask.Status.closed  # else Dask waits once more when Python ends
+            self._kill_workers()  # that were about to begin
         self._rules.close()
+
+    def _kill_workers(self) -> None:
+        """End the workers begun here at once, whatever they are at."""
+        for nanny in self._own.workers.values():
+            nanny.auto_restart = False
+        for process in set(multiprocessing.active_children()) - self._others:
+            process.kill()
 
     @property
     def is_idle(self) -> bool:

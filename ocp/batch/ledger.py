@@ -190,9 +190,10 @@ class Ledger:
         """
         place = self._place(record["key"])
         for link in (place.parent, place, *(file_at(place, i) for i in range(len(files)))):
-            if link.is_symlink():
+            if os.path.islink(link):
                 link.unlink()
-        place.parent.mkdir(parents=True, exist_ok=True)
+        if not os.path.isdir(place.parent):
+            place.parent.mkdir(parents=True, exist_ok=True)
         for i, file in enumerate(files):
             write_whole(file_at(place, i), lambda stream, file=file: stream.write(file), synced=False)  # type: ignore[misc]
         text = json.dumps(record, allow_nan=False).encode()
@@ -216,14 +217,17 @@ class Ledger:
 
     def recorded(self) -> Iterator[str]:
         """Keys of all records, in order."""
+        shards: list[str] = []
         with suppress(FileNotFoundError):
-            for shard in sorted(os.listdir(self.folder / "results")):
+            shards = sorted(os.listdir(self.folder / "results"))
+        for shard in shards:
+            with suppress(FileNotFoundError, NotADirectoryError):
                 for name in sorted(os.listdir(self.folder / "results" / shard)):
                     if name.endswith(".json"):
                         yield name.removesuffix(".json")
 
     def _place(self, key: str) -> Path:
-        return self.folder / "results" / key[:2] / f"{key}.json"
+        return Path(f"{self.folder}/results/{key[:2]}/{key}.json")
 
 
 def loaded(path: Path) -> Any:

@@ -104,7 +104,8 @@ def run_batch(
         return record["status"] == "done" or (same and record["status"] not in ends)
 
     def recorded(keys: Iterable[str]) -> dict[str, Result]:
-        records = [record for key in keys if (record := ledger.read(key)) is not None and counts(record)]
+        there = set(ledger.recorded())
+        records = [record for key in keys if key in there and (record := ledger.read(key)) and counts(record)]
         return {record["key"]: row_of(record, ledger) for record in records}
 
     results = recorded(texts)

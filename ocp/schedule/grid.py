@@ -262,7 +262,11 @@ def _in_time(cells: _Cells, length: float) -> Array:
         reached = min(max(steps * SETTINGS.growth / (SETTINGS.growth - 1), first), length / 2)
         count = max(int(np.ceil(np.log(reached / first) / np.log(SETTINGS.growth))), 1)
         near[end] = np.asarray(first * SETTINGS.growth ** np.arange(count + 1), dtype=float)
-        nodes = nodes[(away == 0) | (away >= near[end][-1] * (1 + (SETTINGS.growth - 1) / 2))]
+        # what resolves a limit more finely than these, as a bend near the end, stays beside them
+        gap = np.diff(nodes)
+        finest = np.minimum(np.append(gap, np.inf), np.insert(gap, 0, np.inf))
+        stays = finest < away * (1 - 1 / SETTINGS.growth)
+        nodes = nodes[(away == 0) | stays | (away >= near[end][-1] * (1 + (SETTINGS.growth - 1) / 2))]
     merged = np.unique(np.concatenate([nodes, near[0], length - near[1]]))
     return merged
 

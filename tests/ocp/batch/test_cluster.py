@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import socket
+import ssl
+import urllib.error
+import urllib.request
 from pathlib import Path
 from typing import Any
 
 import pytest
 from distributed import Client
+from distributed.security import Security
 
 from ocp import ProblemError
 from ocp.batch import run_batch
@@ -43,3 +48,37 @@ def test_a_cluster_does_what_processes_do_and_loses_nothing_when_it_is_killed(
     with pytest.raises(ProblemError, match="no scheduler answers") as caught:
         run_batch(functions.square, [{"x": 1.0}], tmp_path / "b", cluster=address)
     assert caught.value.name == "cluster"
+
+
+def said_to(stranger: ssl.SSLContext | None, address: str) -> bytes:
+    """What a server says first: one of Dask's greets whom it accepts."""
+    host, port = address.rpartition("/")[2].split(":")
+    with socket.create_connection((host, int(port))) as plain:
+        try:
+            if stranger is not None:
+                with stranger.wrap_socket(plain) as wrapped:
+                    return wrapped.recv(1)
+            plain.sendall(bytes(64))
+            return plain.recv(1)
+        except OSError:
+            return b""
+
+
+def test_no_other_user_of_the_machine_reaches_the_workers_of_a_batch() -> None:
+    """They have no certificate of this batch's, one of their own does not help, and no page answers without one."""
+    with Engine(functions.square, False, 1, None) as engine:
+        own = engine._own
+        (nanny,) = own.workers.values()
+        nobody = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+        foreign: Any = Security.temporary().get_connection_args("client")["ssl_context"]
+        friend: Any = own.security.get_connection_args("client")["ssl_context"]
+        for context in (nobody, foreign):
+            context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+        for address in (own.scheduler_address, nanny.address, nanny.worker_address):
+            assert address.startswith("tls://127.0.0.1:")
+            assert said_to(friend, address) != b""
+            assert [said_to(stranger, address) for stranger in (None, nobody, foreign)] == [b""] * 3
+        for page in ("json/index.html", "info/main/workers.html", "health", "metrics"):
+            with pytest.raises(urllib.error.HTTPError, match="404"):
+                urllib.request.urlopen(f"http://127.0.0.1:{own.scheduler.http_server.port}/{page}")
+        assert engine._client.submit(pow, 3, 2).result(timeout=60) == 9

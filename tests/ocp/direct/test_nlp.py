@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from ocp import Collocation, MultipleShooting, Problem, ProblemError, SolveError, prepare, solve
+from ocp.direct import nlp, prepared
 from ocp.status import SolverStatus
 from tests.ocp.problems import METHODS, SOLVERS, SWING, Method, energy, plant, relative, swing, van_der_pol
 
@@ -172,6 +173,41 @@ def test_an_infeasible_problem_does_not_blame_the_number_of_iterations(solver: s
     assert not solution.success
     assert solution.iterations < 200
     assert solution.status is not SolverStatus.ITERATION_LIMIT
+
+
+def no_least_cost() -> Problem:
+    """The more control the better, without an end."""
+    problem, x, u = plant("no least cost", initial=0.0)
+    problem.dynamics(x, u)
+    problem.minimize(running=-u)
+    return problem
+
+
+@pytest.mark.parametrize(
+    ("problem", "options", "word", "status"),
+    [
+        (van_der_pol(), {"max_iter": 2}, "iteration limit", SolverStatus.ITERATION_LIMIT),
+        (too_far(), {}, "deadpoint", SolverStatus.STEP_FAILED),
+        (no_least_cost(), {}, "unbounded", SolverStatus.DIVERGING),
+    ],
+    ids=["iteration limit", "deadpoint", "unbounded"],
+)
+def test_what_casadi_reports_of_sleqp_as_success_is_a_failure(
+    problem: Problem, options: dict[str, Any], word: str, status: SolverStatus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told = []
+
+    def call_solver(solver: Any, *arguments: Any) -> nlp.Outcome:
+        outcome = nlp.call_solver(solver, *arguments)
+        told.append((solver.stats()["return_status"], solver.stats()["success"]))
+        return outcome
+
+    monkeypatch.setattr(prepared, "call_solver", call_solver)
+    solution = solve(problem, MultipleShooting(4), solver="sleqp", options=options, check=False)
+    assert told[-1] == (word, True)
+    assert (solution.success, solution.status) == (False, status)
+    with pytest.raises(SolveError, match=str(status)):
+        solve(problem, MultipleShooting(4), solver="sleqp", options=options)
 
 
 def test_conflicting_constraints_are_named() -> None:

@@ -7,6 +7,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
+import hypothesis
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -182,6 +183,7 @@ def check_profile(plan: Schedule, asked: NDArray[np.float64], times: int = 20001
 
 @settings(max_examples=40)
 @given(seeds, st.integers(1, 9), st.sampled_from(["cubic", "quintic"]), st.booleans())
+@hypothesis.example(280, 6, "cubic", True)  # a near-cusp that the last ramp to rest reaches
 def test_random_paths_never_exceed_asked_speed_or_limits(seed: int, count: int, kind: Any, each: bool) -> None:
     rng = np.random.default_rng(seed)
     path = smooth(random_path(rng, count), 10 ** rng.uniform(-3, -0.5), kind=kind)
