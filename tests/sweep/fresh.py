@@ -23,8 +23,8 @@ from models import reference_rig, reference_tunnel
 from ocp import Audit, Plan, Solution, solve
 from scripts.papers.blend.results import compute
 from scripts.papers.cts.plan import METHOD, sweep_problem
+from scripts.papers.free_floating.formulations import null_space_problem, problem
 from scripts.papers.free_floating.optimality import agreement
-from scripts.papers.free_floating.results import problem
 from scripts.papers.standing.plans import PLANS, solved
 
 GALLERY = Path(__file__).parents[2] / "results" / "gallery"
@@ -47,7 +47,7 @@ def of_gallery(file: Path) -> dict[str, Any]:
 
 
 def free_floating() -> dict[str, Any]:
-    found = agreement(problem(), problem(formulation="null_space"))
+    found = agreement(problem(), null_space_problem())
     named = {"rates": found.rates, "null space": found.null_space}
     return {f"{form}, {name}": plan for form, plans in named.items() for name, plan in plans.items()}
 

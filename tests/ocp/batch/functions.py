@@ -114,6 +114,7 @@ def without_room(task: Any) -> float:
 
 def main() -> None:
     """A driver of its own: `python -m tests.ocp.batch.functions '{"folder": ..., "tasks": [...], "workers": 2}'`."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # shells start background jobs with Ctrl-C ignored
     asked = json.loads(sys.argv[1])
     done = run_batch(square, asked["tasks"], asked["folder"], workers=asked["workers"])
     print(done, flush=True)
