@@ -59,7 +59,7 @@ MADE_BY_THE_PACKAGE = {
     "Sensitivity",
 }
 """Results, protocols and constants: their methods are in the panels, but nobody makes them."""
-WITHOUT_ARGUMENTS = {"Anywhere", "paper_example", "reference_tunnel", "standing_example"}
+WITHOUT_ARGUMENTS = {"Anywhere", "SolverStatus", "paper_example", "reference_tunnel", "standing_example"}
 RAISED = {"DeadEnd", "Unreachable"}
 LOOKED_AT_IN_A_PROBLEM = {"Following", "Pinned"}
 """What a rule says of the zero moment point is looked at by standing_problem, which has them in its panel."""

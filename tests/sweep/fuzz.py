@@ -348,7 +348,8 @@ def dae() -> bytes:
     return f"""<?xml version="1.0"?><COLLADA><asset><unit meter="0.01"/></asset>
 <library_geometries><geometry id="g"><mesh>
 <source id="p"><float_array id="a" count="24">{places}</float_array><technique_common><accessor source="#a" count="8"
-stride="3"/></technique_common></source><vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
+stride="3"><param name="X" type="float"/><param name="Y" type="float"/><param name="Z" type="float"/></accessor>
+</technique_common></source><vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
 <triangles count="{len(FACES)}"><input semantic="VERTEX" source="#v" offset="0"/><p>{corners}</p></triangles></mesh>
 </geometry></library_geometries><library_visual_scenes><visual_scene id="s"><node id="n">
 <matrix>1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1</matrix><rotate>0 0 1 30</rotate><instance_geometry url="#g"/></node>

@@ -375,7 +375,7 @@ def test_rounding_of_numbers_passes(kind: str) -> None:
         field("cost", lambda c: c * (1 + 1e-9)),
         field("t", lambda t: np.append(t[:-1] * (1 + 1e-12), t[-1])),
         field("states", lambda d: {n: v.astype(np.float64) + 0.0 for n, v in d.items()}),
-        field("status", lambda w: w + "!"),
+        field("message", lambda words: words + "!"),
         field("iterations", lambda k: k + 1),
         field("name", lambda n: n),
     ):

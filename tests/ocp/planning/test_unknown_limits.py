@@ -89,7 +89,7 @@ REQUESTS: dict[str, tuple[Callable[[FixedBase], Any], set[str]]] = {
     "dynamics, own": (partial(moved, limits=Limits(velocity=5.0, torque=200.0)), set()),
     "pieces": (in_pieces, {"velocity"}),
     "inverse kinematics": (lambda machine: str(inverse_kinematics(machine, task(machine))), set()),
-    "least velocities": (least_velocities, set()),
+    "least velocities": (least_velocities, {"velocity"}),
 }
 """What is asked, and of which unknown limits there is a warning."""
 
