@@ -435,7 +435,7 @@ def _unlimited(rows: Sequence[Row]) -> tuple[str, ...]:
     for row in rows:
         what, _, name = row.name.partition(" of ")
         counts[what] = counts.get(what, 0) + 1
-        if row.verdict == "unlimited":
+        if row.verdict is RowVerdict.UNLIMITED:
             joints.setdefault(what, []).append(name)
     return tuple(
         f"{what} of {'every joint' if len(names) == counts[what] and len(names) > 1 else ', '.join(names)}"

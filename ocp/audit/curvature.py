@@ -21,8 +21,6 @@ from ocp.tolerances import FLAT_SHARE, IMPLIED_SHARE, ROUNDING_SHARE, SOLVER_SHA
 
 __all__ = ["Curvature", "curvature"]
 
-NEARLY = "constraints are nearly dependent"
-
 
 class Tied(NamedTuple):
     """Singular values of constraints, for rows of length 1, by the controls of a stage.
@@ -103,9 +101,9 @@ def curvature(accessory: AccessoryProblem) -> Curvature:
         inside = _sweep(accessory, stages, weak=True)
         if inside.least > FLAT_SHARE:
             why = "the cost curves upwards only because of limits that are touched without a push"
-            return Curvature(inside.least, inside.time, why, None, along.t, *inside[4:])
+            return Curvature(inside.least, inside.time, why, None, along.t, *inside[4:7])
         found = inside
-    if found.flat.startswith(NEARLY):
+    if found.dependent:
         # conditions that others imply are seen by controls up to the error of the plan alone: they are for the stages
         # before; and without what is left of them there is more to vary: upwards all the more
         for tied in (Tied(SOLVER_SHARE, SOLVER_SHARE), Tied(IMPLIED_SHARE, ROUNDING_SHARE)):
@@ -113,11 +111,14 @@ def curvature(accessory: AccessoryProblem) -> Curvature:
             if wider.least > FLAT_SHARE and not wider.flat:
                 found = wider
                 break
-    return Curvature(*found[:4], along.t, *found[4:])
+    return Curvature(*found[:4], along.t, *found[4:7])
 
 
 class _Swept(NamedTuple):
-    """Least curvature, its time, why it is not decided, a direction that lowers the cost; the rest of `Curvature`."""
+    """Least curvature, its time, why it is not decided, a direction that lowers the cost; the rest of `Curvature`.
+
+    ``dependent``: Whether it is not decided because constraints are nearly dependent.
+    """
 
     least: float
     time: float | None
@@ -126,6 +127,7 @@ class _Swept(NamedTuple):
     starts: tuple[np.ndarray, np.ndarray] | None = None
     won: np.ndarray | None = None
     pull: np.ndarray | None = None
+    dependent: bool = False
 
 
 def _sweep(accessory: AccessoryProblem, along: _Linearised, weak: bool, tied: Tied = INDEPENDENT) -> _Swept:
@@ -429,7 +431,7 @@ def _confirmed(least: float, at: float | None, found: _Variation, scale: float) 
     """
     if found.curvature < -FLAT_SHARE * scale and found.slip < SOLVER_SHARE:
         return _Swept(least, at, "", (found.controls, found.states))
-    return _Swept(least, at, f"{NEARLY} at {at or 0.0:.4g} s", None)
+    return _Swept(least, at, f"constraints are nearly dependent at {at or 0.0:.4g} s", None, dependent=True)
 
 
 def _singular(accessory: AccessoryProblem, k: int, controls: np.ndarray) -> str:
