@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from math import isfinite, isnan
-from numbers import Real
 from typing import Any, TypeAlias, TypeVar
 from warnings import warn
 
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 
 from models.errors import ModelError, ModelWarning
 from models.input_files import INPUT_LIMITS
+from models.real_numbers import NOT_NUMBERS, check_entries, floats
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -22,9 +22,6 @@ ROUNDING = 1e-9
 """Share of the largest of its kind, or m or rad, below which a difference is rounding, after many operations."""
 MAX_LISTED = 12
 """Entries of a vector, or names, that a message lists."""
-
-NOT_NUMBERS = (TypeError, ValueError, OverflowError, RuntimeError, NotImplementedError)
-"""What numpy and casadi raise of values that are no numbers."""
 
 _Choice = TypeVar("_Choice")
 _Kind = TypeVar("_Kind")
@@ -75,42 +72,6 @@ def checked_array(
         shown = f"{_shown(array, ~(array > 0), what)} {unit}".rstrip()
         raise ModelError(f"{owner}: {shown} is not positive", name=what, value=array, limit=0.0)
     return frozen(array)
-
-
-def check_entries(value: Any) -> None:
-    """Raise ValueError of too many entries: a view or a range may be larger than all memory.
-
-    Nothing is copied or gone through: the first entry of a list stands for all.
-    """
-    entries, part = 1, value
-    for _ in range(INPUT_LIMITS.nesting):  # as many dimensions as numpy's arrays have at most
-        if isinstance(part, np.ndarray):
-            entries *= part.size
-        if not isinstance(part, Sequence) or isinstance(part, str | bytes):
-            break
-        entries *= len(part)
-        if not 0 < entries <= INPUT_LIMITS.array_entries:
-            break
-        part = part[0]
-    if entries > INPUT_LIMITS.array_entries:
-        raise ValueError(f"{entries} entries, at most {INPUT_LIMITS.array_entries} are read")
-
-
-def floats(value: ArrayInput) -> Array:
-    """`value` as a new array of floats; one of NOT_NUMBERS where it is none.
-
-    That is also where they are too many, which are not copied, and where numpy would read a number all
-    the same: in a text, in True, in None and in a symbol (nan), in the real part of a complex number.
-    """
-    check_entries(value)
-    plain = np.asarray(value)
-    if plain.dtype.kind == "O":
-        fits = all(isinstance(entry, Real) and not isinstance(entry, bool | np.bool_) for entry in plain.flat)
-    else:
-        fits = plain.dtype.kind in "iuf"
-    if not fits:
-        raise TypeError(f"{plain.dtype} is no real number")
-    return np.array(plain, dtype=float)
 
 
 def _read(value: ArrayInput, owner: str, what: str) -> Array:

@@ -9,14 +9,15 @@ import pickle
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
-from numbers import Real
 from typing import Any, TypeVar
 
 import numpy as np
 
+from models.input_files import INPUT_LIMITS
+from models.real_numbers import NOT_NUMBERS, check_entries, floats
+
 __all__ = [
     "MOST",
-    "MOST_NUMBERS",
     "NOT_NUMBERS",
     "AuditError",
     "BoundWarning",
@@ -45,13 +46,8 @@ __all__ = [
     "unknown_name",
 ]
 
-NOT_NUMBERS = (TypeError, ValueError, OverflowError, RuntimeError, NotImplementedError)
-"""What numpy and casadi raise of values that are no numbers."""
 MOST = 1_000_000
 """Of what is counted: more than these take longer than anybody waits."""
-MOST_NUMBERS = 2**22
-"""Of one array that a user gives."""
-MOST_DIMENSIONS = 64  # of an array of numpy
 _Kind = TypeVar("_Kind")
 
 
@@ -138,42 +134,6 @@ def unknown_name(kind: str, name: object, known: Iterable[str]) -> ProblemError:
     return ProblemError(f"unknown {kind} {name!r}; {hint}", name=str(name) or kind, limit=tuple(names))
 
 
-def check_entries(value: Any) -> None:
-    """Raise ValueError of more than MOST_NUMBERS entries: a view or a range may be larger than all memory.
-
-    Nothing is copied or gone through: the first entry of a list stands for all.
-    """
-    entries, part = 1, value
-    for _ in range(MOST_DIMENSIONS):
-        if isinstance(part, np.ndarray):
-            entries *= part.size
-        if not isinstance(part, Sequence) or isinstance(part, str | bytes):
-            break
-        entries *= len(part)
-        if not 0 < entries <= MOST_NUMBERS:
-            break
-        part = part[0]
-    if entries > MOST_NUMBERS:
-        raise ValueError(f"{entries} entries, at most {MOST_NUMBERS} are read")
-
-
-def floats(value: Any) -> np.ndarray:
-    """``value`` as a new array of floats; one of NOT_NUMBERS where it is none.
-
-    That is also where they are more than MOST_NUMBERS, which are not copied, and where numpy would read a number all
-    the same: in a text, in True, in None and in a symbol (nan), in the real part of a complex number.
-    """
-    check_entries(value)
-    plain = np.asarray(value)
-    if plain.dtype.kind == "O":
-        fits = all(isinstance(entry, Real) and not isinstance(entry, bool | np.bool_) for entry in plain.flat)
-    else:
-        fits = plain.dtype.kind in "iuf"
-    if not fits:
-        raise TypeError(f"{plain.dtype} is no real number")
-    return np.array(plain, dtype=float)
-
-
 def real(value: Any) -> float:
     """A single real number, nan where it is none."""
     if isinstance(value, bool | np.bool_) or not isinstance(value, int | float | np.integer | np.floating):
@@ -232,13 +192,14 @@ def sample_times(what: str, period: Any, duration: float) -> np.ndarray:
     """Every `period` from 0 on, and the end of the duration, which comes as early as that says; s.
 
     Raises:
-        ProblemError: A period that is not positive, or so short that there were more than MOST_NUMBERS.
+        ProblemError: A period that is not positive, or so short that there were more than `INPUT_LIMITS.array_entries`.
     """
     step = checked_positive(what, period)
     count = np.ceil(duration / step * (1 - 1e-12))  # but for rounding
-    if not count < MOST_NUMBERS:
-        words = f"{what} {step:g} s asks for {count:g} samples of {duration:g} s, more than {MOST_NUMBERS}"
-        raise ProblemError(words, name=_last(what), value=period, limit=duration / MOST_NUMBERS)
+    most = INPUT_LIMITS.array_entries
+    if not count < most:
+        words = f"{what} {step:g} s asks for {count:g} samples of {duration:g} s, more than {most}"
+        raise ProblemError(words, name=_last(what), value=period, limit=duration / most)
     return np.append(np.arange(int(count)) * step, duration)
 
 

@@ -23,7 +23,7 @@ Rule: TypeAlias = Callable[["House"], list[str]]
 FLOORS = {
     "models": [
         ["errors", "input_files"],
-        ["cache"],
+        ["cache", "real_numbers"],
         ["arrays"],
         ["spatial"],
         ["robot", "paths"],
@@ -56,7 +56,7 @@ LAZY = {
     ("ocp.planning.motion", "ocp.app.plots"),
 }
 """Imports that go up, when `Solution.audit`, `Solution.sensitivity`, or `plot` of a solution or a plan, is called."""
-SEEN_BY_ALL = {"models.cache", "models.input_files", "models.shapes.nearest"}
+SEEN_BY_ALL = {"models.cache", "models.input_files", "models.real_numbers", "models.shapes.nearest"}
 """What all of ocp may import of models: they know no machine."""
 FOREIGN = {"models": {"casadi", "collada", "numpy", "scipy"}}
 

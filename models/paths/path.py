@@ -9,19 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from models.arrays import (
-    NOT_NUMBERS,
-    ROUNDING,
-    Array,
-    ArrayInput,
-    check_entries,
-    checked_array,
-    checked_indices,
-    checked_numbers,
-)
+from models.arrays import ROUNDING, Array, ArrayInput, checked_array, checked_indices, checked_numbers
 from models.errors import ModelError
 from models.paths.orientation import product, rotation_matrix, rotation_vector, unit_quaternion
 from models.paths.segments import Arc, Helix, Line, Segment, screw
+from models.real_numbers import NOT_NUMBERS, check_entries
 
 __all__ = ["Path"]
 

@@ -15,8 +15,9 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
-from models.arrays import NOT_NUMBERS, Array, checked_instance
+from models.arrays import Array, checked_instance
 from models.errors import ModelError
+from models.real_numbers import NOT_NUMBERS
 from models.robot.parts import massless
 from models.robot.robot import Robot
 from models.spatial import Expression, Frame, cross, expression, rotation, skew

@@ -17,7 +17,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ocp.errors import MOST_NUMBERS, ProblemError
+from models.input_files import INPUT_LIMITS
+from ocp.errors import ProblemError
 from ocp.planning import Plan
 from ocp.solution import Solution
 from ocp.storage import open_unlinked
@@ -51,8 +52,8 @@ def plain(value: Any, where: str, keep: Callable[[Any, tuple[Any, ...]], bool] =
 
     def walk(value: Any, at: tuple[Any, ...]) -> Any:
         if isinstance(value, np.ndarray | np.generic):
-            if value.size > MOST_NUMBERS:
-                raise wrong(at, value, f"has {value.size} numbers, at most {MOST_NUMBERS} are read")
+            if value.size > INPUT_LIMITS.array_entries:
+                raise wrong(at, value, f"has {value.size} numbers, at most {INPUT_LIMITS.array_entries} are read")
             value = value.tolist()
         if value is None or isinstance(value, bool):
             return value
