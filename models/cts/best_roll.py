@@ -337,7 +337,7 @@ class Search:
         return ca.Function("slide", [x, before, best], [gates(x, before, found, best)])
 
     def _slack(self) -> tuple[float, float]:
-        """How much sin q4 and cos q2 can change within ROOTS.reach of a roll."""
+        """Return bounds of the changes of sin q4 and cos q2 within ROOTS.reach of a roll."""
         rig = self.rig
         sin4 = ROOTS.reach * rig.goose_neck / rig.pitch_link
         cos4 = float(np.sqrt(2 * sin4)) + sin4

@@ -29,7 +29,7 @@ from models.spatial import FULL_TURN, Expression
 
 @dataclass(frozen=True)
 class ClearanceSearch:
-    """How a roll that keeps clear is looked for.
+    """Settings of the search for a roll that keeps clear.
 
     Attributes:
         basins: Minima of the grid that are refined.

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import casadi as ca
+import numpy as np
 
 from models.spatial import Expression
 
@@ -22,12 +23,12 @@ Slope = Callable[[Expression, Expression], tuple[Expression, Expression]]
 """A function of a point of the circle that gives a value and its derivative by the angle."""
 
 SMALLEST_DIVISOR = 1e-300
-"""What divisors are raised by: it changes no number but zero."""
+"""Added to divisors that may be zero; it changes no other number."""
 
 
 @dataclass(frozen=True)
 class RootSettings:
-    """How roots are found in a bounded number of operations.
+    """Settings of the root finding, whose number of operations is bounded.
 
     Attributes:
         least_second: Second harmonic, relative, that the pencil of conics is given at least; the polish takes the
@@ -100,7 +101,8 @@ def roots(f: Harmonics, sharper: Slope | None = None, steps: int = ROOTS.polish_
     The unit circle is cut by the conic f = 0: turned so that the second harmonic is r (x^2 - y^2), the pencil
     f + l (x^2 + y^2 - 1) holds a pair of real lines for a root l in [-r, r] of a cubic that always has one there.
     The lines meet the circle in the roots, which Newton steps then polish. Roots are good to rounding where they are
-    simple, to its square root where they are double.
+    simple. Where they are double a step does no more than halve what the lines leave, mostly the square root of
+    rounding.
 
     Args:
         f: The polynomial.
@@ -137,7 +139,9 @@ def roots(f: Harmonics, sharper: Slope | None = None, steps: int = ROOTS.polish_
             points.append((x * turn_c - y * turn_s, x * turn_s + y * turn_c))
     slope = f.derivative()
     sharp = sharper or (lambda c, s: (f.value(c, s), slope.value(c, s)))
-    return [polish(point, sharp, steps) for point in points]
+    # f has size 1: of a slope below the square root of rounding nothing but rounding is left, as at a double root
+    floor = SMALLEST_DIVISOR if sharper else np.finfo(float).eps
+    return [polish(point, sharp, steps, floor=floor) for point in points]
 
 
 def _axes(f: Harmonics, shift: Expression) -> tuple[Expression, Expression, Expression, Expression, Expression]:
@@ -192,12 +196,21 @@ def least_point(f: Harmonics) -> Point:
     return x * turn_c - y * turn_s, x * turn_s + y * turn_c
 
 
-def polish(point: Point, function: Slope, steps: int = ROOTS.polish_steps, reach: float = ROOTS.polish_reach) -> Point:
-    """Newton steps of at most `reach` rad on the circle; `function` gives value and derivative by the angle."""
+def polish(
+    point: Point,
+    function: Slope,
+    steps: int = ROOTS.polish_steps,
+    reach: float = ROOTS.polish_reach,
+    floor: float = SMALLEST_DIVISOR,
+) -> Point:
+    """Newton steps of at most `reach` rad on the circle; `function` gives value and derivative by the angle.
+
+    Where the square of the derivative is below `floor` the steps vanish.
+    """
     c, s = point
     for _ in range(steps):
         value, slope = function(c, s)
-        step = -value * slope / (slope * slope + SMALLEST_DIVISOR)
+        step = -value * slope / (slope * slope + floor)
         step = ca.fmin(ca.fmax(step, -reach), reach)
         c, s = c - step * s, s + step * c
         shrink = 1.5 - 0.5 * (c * c + s * s)  # 1 / norm to first order

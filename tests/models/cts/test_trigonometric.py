@@ -74,6 +74,26 @@ def test_the_roots_of_a_product_of_two_lines_are_where_each_cuts_the_circle(
     assert (gaps * slopes).max() < 1e-12
 
 
+@settings(max_examples=60)
+@given(angle, angle, st.floats(-3.0, 3.0))
+def test_the_polish_throws_no_double_root_away(at: float, other: float, middle: float) -> None:
+    """(1 - cos(x - a)) (m + cos(x - b)) touches zero at a, where value and slope are rounding both."""
+    (a0, _), (a1, b1), (a2, b2) = product(
+        [(1.0, 0.0), (-np.cos(at), -np.sin(at))], [(middle, 0.0), (np.cos(other), np.sin(other))]
+    )
+    f = Harmonics(*(ca.DM(part) for part in (a0, a1, b1, a2, b2)))
+    off = [np.hypot(*(numbers(roots(f, steps=steps)) - [np.cos(at), np.sin(at)]).T).min() for steps in (0, 3)]
+    assert off[1] <= max(off[0], np.sqrt(np.finfo(float).eps))
+
+
+def test_a_double_root_is_good_to_the_square_root_of_rounding() -> None:
+    (a0, _), (a1, b1), (a2, b2) = product(
+        [(-np.cos(2.5), 0.0), (np.cos(1.5), np.sin(1.5))], [(-np.cos(1.0), 0.0), (1.0, 0.0)]
+    )
+    points = numbers(roots(Harmonics(*(ca.DM(part) for part in (a0, a1, b1, a2, b2)))))
+    assert np.hypot(points[:, 0] - np.cos(1.0), points[:, 1] + np.sin(1.0)).min() < np.sqrt(np.finfo(float).eps)
+
+
 @settings(max_examples=40)
 @given(five, angle)
 def test_the_least_point_turns_with_the_polynomial(one: Any, turn: float) -> None:
