@@ -16,7 +16,6 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import partial, wraps
 from typing import Any, ParamSpec, TypeVar
 
@@ -45,19 +44,8 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 
-@dataclass(frozen=True)
-class Patience:
-    """How long a call may go on after Ctrl-C to end by itself, with what it has found.
-
-    Attributes:
-        busy: s of the processor. waiting: s where others hold the processor, or nothing is at work.
-    """
-
-    busy: float = 0.5
-    waiting: float = 10.0
-
-
-PATIENCE = Patience()
+GRACE = 0.8
+"""s after Ctrl-C in which a call may end by itself, with what it has found; the caller has control within a second."""
 
 
 # ---- Ctrl-C ------------------------------------------------------------------------------------------------------
@@ -99,13 +87,9 @@ class _Call(threading.Thread):
     def end(self) -> None:
         """Ask it to end; if nothing listens, raise KeyboardInterrupt in it, at the next step that is Python's."""
         self.stop = True
-        began, worked = time.monotonic(), time.process_time()
+        began = time.monotonic()
         try:
-            while (
-                (self.listeners or self.heard)
-                and time.process_time() - worked < PATIENCE.busy
-                and time.monotonic() - began < PATIENCE.waiting
-            ):
+            while (self.listeners or self.heard) and time.monotonic() - began < GRACE:
                 if self.left.wait(0.02):
                     return
         finally:
@@ -115,7 +99,7 @@ class _Call(threading.Thread):
                         ctypes.c_ulong(self.ident), ctypes.py_object(KeyboardInterrupt)
                     )
         if self.ident is not None:
-            self.left.wait(max(0.02, began + PATIENCE.busy - time.monotonic()))
+            self.left.wait(max(0.02, began + GRACE - time.monotonic()))
 
 
 _CALL: contextvars.ContextVar[_Call | None] = contextvars.ContextVar("call", default=None)

@@ -22,8 +22,11 @@ from ocp.errors import ProblemError, SolveError
 
 __all__ = ["Engine", "EngineSettings", "Job", "Outcome", "checked_cluster"]
 
+INSTALL = 'pip install "selfmotion[cluster]", or from a clone pip install ".[cluster]"'
 SCHEMES = ("tcp", "tls", "ucx", "ws", "wss", "inproc")
 """Of a scheduler's address."""
+WORKER_NAME = "Dask Worker"
+"""With which Dask begins the names of the processes of its workers."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +88,7 @@ class Engine:
         try:
             import distributed
         except ImportError as error:
-            words = "run_batch: Dask is not installed; pip install 'selfmotion[cluster]'"
+            words = f"run_batch: Dask is not installed; {INSTALL}"
             raise ProblemError(words, name="cluster", value=cluster) from error
         self._dask: Any = distributed
         self._function, self._near, self._workers, self._cluster = function, near, workers, cluster
@@ -143,7 +146,7 @@ class Engine:
             if any(nanny.status != self._dask.Status.running for nanny in self._own.workers.values()):
                 raise RuntimeError("they ended at once")
         except ImportError as error:
-            words = f"run_batch: {error}; pip install 'selfmotion[cluster]'"
+            words = f"run_batch: {error}; {INSTALL}"
             raise ProblemError(words, name="workers", value=self._workers) from error
         except RuntimeError as error:
             self.__exit__()
@@ -177,7 +180,8 @@ class Engine:
         for nanny in self._own.workers.values():
             nanny.auto_restart = False
         for process in set(multiprocessing.active_children()) - self._others:
-            process.kill()
+            if process.name.startswith(WORKER_NAME):  # what else the caller has begun meanwhile is not ours
+                process.kill()
 
     @property
     def is_idle(self) -> bool:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import multiprocessing
+import signal
 import socket
 import ssl
 import urllib.error
@@ -82,3 +84,19 @@ def test_no_other_user_of_the_machine_reaches_the_workers_of_a_batch() -> None:
             with pytest.raises(urllib.error.HTTPError, match="404"):
                 urllib.request.urlopen(f"http://127.0.0.1:{own.scheduler.http_server.port}/{page}")
         assert engine._client.submit(pow, 3, 2).result(timeout=60) == 9
+
+
+def test_processes_that_the_caller_began_meanwhile_outlive_the_workers() -> None:
+    before = set(multiprocessing.active_children())
+    with Engine(functions.square, False, 1, None):
+        mine = multiprocessing.get_context("spawn").Process(target=signal.pause)
+        mine.start()
+        workers = set(multiprocessing.active_children()) - before - {mine}
+        assert workers
+    try:
+        for worker in workers:
+            worker.join()
+        assert mine.is_alive()
+    finally:
+        mine.kill()
+        mine.join()
