@@ -17,7 +17,7 @@ __all__ = ["INPUT_LIMITS", "InputLimits", "UnfitFile", "open_regular", "parse_xm
 
 @dataclass(frozen=True)
 class InputLimits:
-    """How much of what others give is read: the largest that is known, some times over, and what memory has room for.
+    """Limits of the input that is read: several times the largest that is known, and small enough for the memory.
 
     Attributes:
         count: Of what a user counts, nodes say: more take longer than anybody waits.

@@ -98,7 +98,7 @@ def distance_gradients(
 def _least(
     value: Expression, gradient: Expression, place: list[int], counts: list[int], softness: float
 ) -> tuple[Expression, Expression]:
-    """Of so many pairs in a row, which are at these places, the soft minimum; of one pair itself."""
+    """Return the soft minimum of consecutive pairs, or the one pair itself."""
     values, rows, order = [value], [gradient], []
     for begin, end in pairwise(accumulate(counts, initial=0)):
         at = place[begin:end]

@@ -2,7 +2,8 @@
 
 It is given a tree without entities, pictures, cameras and skins, opens no file, and never sees what it would read in
 part, as something else, or without end. <unit> is applied, so that lengths are in m, <up_axis> is not, see
-`models.shapes.mesh_files`. Of a material its diffuse colour is taken; where that is an image there is none.
+`models.shapes.mesh_files`. Positions have single precision, 6e-8 of their size. Of a material its diffuse colour is
+taken; where that is an image there is none.
 """
 
 from __future__ import annotations

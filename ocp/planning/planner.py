@@ -36,7 +36,7 @@ from ocp.planning.postures import Asked, SearchKind, check_clear_start, postures
 from ocp.planning.search import checked_bound
 from ocp.planning.seeds import plan_from_seeds
 from ocp.planning.standing import plan_to_stand
-from ocp.tasks.checks import checked_configuration, checked_horizon, checked_tasks, checked_weights, inside_limits
+from ocp.tasks.checks import checked_configuration, checked_tasks, checked_weights, horizon_of, inside_limits
 from ocp.tasks.equations import bind
 from ocp.tasks.limits import Limits
 from ocp.tasks.tip_task import TipTask
@@ -199,13 +199,7 @@ def checked_asked(
         if free:
             words = "a free horizon knows no limits of drives; give it in s, or limit the rates alone"
             raise ProblemError(words, name="horizon", value=horizon)
-    if horizon is None or free:
-        ends = [task.end for task in given if task.duration is not None]
-        if not ends:
-            words = "horizon is missing: no task says how long it lasts; give plan(..., horizon=...) in s"
-            raise ProblemError(words, name="horizon")
-        horizon = max(ends)
-    duration = checked_horizon(horizon)
+    duration = horizon_of(given, None if free else horizon)
     place = checked_configuration(machine, np.zeros(machine.joint_size), start_base)[1]
     joints = None if start is None else checked_configuration(machine, start, start_base)[0]
     stretches = stretches_of(machine, given, duration)

@@ -13,13 +13,13 @@ from models.arrays import Array
 from ocp.builders.clearance import Clear
 from ocp.builders.standing.plan import Asked, plan_standing
 from ocp.builders.standing.problem import Weights
-from ocp.errors import ProblemError, SolveError, checked_flag, checked_instance, checked_positive
+from ocp.errors import ProblemError, SolveError, checked_flag, checked_instance
 from ocp.local.inverse_kinematics import inverse_kinematics
 from ocp.planning.candidate import Candidate, Reason, Rejection, Stage
 from ocp.planning.candidate_queue import CandidateQueue, Solver
 from ocp.planning.motion import Part, Plan
 from ocp.planning.settings import PlannerSettings
-from ocp.tasks.checks import check_rest
+from ocp.tasks.checks import check_rest, horizon_of
 from ocp.tasks.equations import TaskEquations, bind
 from ocp.tasks.limits import Limits
 from ocp.tasks.tip_task import TipTask
@@ -63,11 +63,7 @@ def plan_to_stand(
     if weights is not None:
         checked_instance("weights", weights, Weights)
     given = [part.task for part in bind(machine, tasks).bound]
-    ends = [task.end for task in given if task.duration is not None]
-    if horizon is None and not ends:
-        words = "horizon is missing: no task says how long it lasts; give plan(..., horizon=...) in s"
-        raise ProblemError(words, name="horizon")
-    duration = checked_positive("horizon", max(ends) if horizon is None else horizon)
+    duration = horizon_of(given, horizon)
     for number, task in enumerate(given):
         if task.begin > 0 or task.end < duration * (1 - 1e-9):
             words = (

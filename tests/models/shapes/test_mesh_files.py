@@ -51,6 +51,7 @@ def dae(scene: str, *, faces: str = "", unit: str = "", count: int = 12) -> str:
     )
 
 
+SINGLE = 4 * float(np.finfo(np.float32).eps)  # of numbers of size 1 after some operations in single precision
 INPUT = "<input semantic='VERTEX' source='#v' offset='0'/>"
 ONE = "<node><instance_geometry url='#g'/></node>"
 
@@ -125,9 +126,9 @@ def test_a_collada_scene_places_its_meshes_and_knows_its_unit(tmp_path: Path) ->
         ("c.dae", f"<node>{matrix}<instance_node url='#lent'/></node><node><node id='lent'>{own}</node></node>"),
     ]:
         vertices, faces = read_mesh(written(tmp_path, name, dae(scene, unit="<unit meter='0.001'/>")))
-        np.testing.assert_allclose(vertices[faces[:4]], wanted[FACES], rtol=1e-6, atol=1e-9, err_msg=name)
+        np.testing.assert_allclose(vertices[faces[:4]], wanted[FACES], atol=SINGLE, err_msg=name)
     assert len(faces) == 8
-    np.testing.assert_allclose(vertices[faces[4:]], 1e-3 * CORNERS[FACES], rtol=1e-6)
+    np.testing.assert_allclose(vertices[faces[4:]], 1e-3 * CORNERS[FACES], atol=1e-3 * SINGLE)
 
 
 def test_parts_side_by_side_keep_their_triangles() -> None:

@@ -263,15 +263,13 @@ def test_the_middle_of_an_obstacle_is_as_bad_however_its_distance_is_written(
 # ---- how long it takes -----------------------------------------------------------------------------------------------
 
 
-def test_the_time_grows_with_the_intervals_and_not_with_their_square() -> None:
-    seconds = []
-    for intervals in (100, 400):
-        plan = solve(van_der_pol(), Collocation(intervals))
-        again(van_der_pol(), plan)
-        tries = []
-        for _ in range(3):
+def test_the_time_grows_no_faster_than_the_intervals() -> None:
+    """Time of the processor, the least of several tries of both in turn: others at work lengthen some of them."""
+    plans = [solve(van_der_pol(), Collocation(intervals)) for intervals in (100, 400)]
+    least = [np.inf, np.inf]
+    for _ in range(6):
+        for k, plan in enumerate(plans):
             began = process_time()
             again(van_der_pol(), plan)
-            tries.append(process_time() - began)
-        seconds.append(min(tries))
-    assert seconds[1] < 8 * seconds[0]
+            least[k] = min(least[k], process_time() - began)
+    assert least[1] < 1.2 * 4 * least[0]

@@ -116,6 +116,82 @@ def test_local_motions_that_lose_their_tasks_or_are_far_costlier_are_not_solved_
     assert (1, Stage.SEED) in known.done
 
 
+def stages_of(known: Known, number: int) -> set[Stage]:
+    return {stage for each, stage in known.done if each == number}
+
+
+@pytest.mark.parametrize("size", [1.0, 1e3])
+@pytest.mark.parametrize(("coarse", "solved"), [(1.59, True), (1.61, False)])
+def test_a_coarse_cost_prunes_beyond_twice_the_error_of_the_coarse_mesh(
+    size: float, coarse: float, solved: bool
+) -> None:
+    """The best has 1.0 on the coarse mesh and 1.2 on the fine one: twice its error is a third of its cost."""
+    known = Known([size, coarse * size], [1.2 * size, 5.0 * size], [True, True])
+    CandidateQueue(known, SETTINGS).run(seeds([0, 1]))
+    assert (Stage.COARSE in stages_of(known, 1)) == solved
+
+
+@pytest.mark.parametrize(("share", "refined"), [(0.75, False), (1.25, True)])
+def test_on_the_fine_mesh_a_motion_has_to_be_cheaper_by_more_than_counts_as_the_same(
+    share: float, refined: bool
+) -> None:
+    fine = 2.0 * (1 - share * SETTINGS.same_cost)
+    known = Known([1.0, 2.5], [2.0, fine], [True, True])  # the first has passed before the second is solved
+    queue = CandidateQueue(known, SETTINGS)
+    queue.run(seeds([0, 1]))
+    assert (Stage.FINE in stages_of(known, 1)) == refined
+    assert queue.cost == (fine if refined else 2.0)
+
+
+@pytest.mark.parametrize(("share", "kind"), [(0.75, Rejection.DUPLICATE), (1.25, Rejection.COSTLIER)])
+def test_where_all_are_wanted_one_that_costs_what_another_does_is_told_as_that(share: float, kind: Rejection) -> None:
+    known = Known([1.0, 1.5], [2.0, 2.0 * (1 + share * SETTINGS.same_cost)], [True, True])
+    queue = CandidateQueue(known, SETTINGS)
+    queue.run(seeds([0, 1]), every=True)
+    told: Any = queue.plan()
+    assert [one.reason and one.reason.kind for one in told] == [None, kind]
+    assert Stage.FINE in stages_of(known, 1)  # which may change what it costs
+    assert (Stage.REFINED in stages_of(known, 1)) == (kind is Rejection.COSTLIER)
+
+
+@pytest.mark.parametrize("size", [0.5, 1.0, 1e3])
+@pytest.mark.parametrize(("share", "once"), [(0.75, True), (1.25, False)])
+def test_motions_of_one_coarse_cost_are_one_in_whatever_unit(size: float, share: float, once: bool) -> None:
+    costs = [size, size * (1 + share * SETTINGS.same_cost)]
+    known = Known(costs, [2 * size, 1.5 * size], [True, True])
+    CandidateQueue(known, SETTINGS).run(seeds([0, 1]))
+    assert (Stage.COARSE not in stages_of(known, 1)) == once
+
+
+@pytest.mark.parametrize(("ratio", "wanted"), [(0.95, True), (1.05, False)])
+def test_where_all_are_wanted_those_are_that_cost_no_more_than_so_many_times_the_best(
+    ratio: float, wanted: bool
+) -> None:
+    dear = 2.0 * SETTINGS.max_cost_ratio * ratio
+    known = Known([2.0, dear], [2.0, dear], [True, True])
+    CandidateQueue(known, SETTINGS).run(seeds([0, 1]), every=True)
+    assert (Stage.REFINED in stages_of(known, 1)) == wanted
+
+
+def test_after_so_many_failures_what_collides_is_no_longer_repaired_and_what_is_clear_goes_on() -> None:
+    count = SETTINGS.max_failures
+    touching = Reason(Rejection.COLLISION, "a link and a box")
+
+    class Colliding(Known):
+        def collision(self, candidate: Candidate) -> Reason | None:
+            return touching if candidate.start[0] in (0, count) else None
+
+    costs = [1.0 + k / 10 for k in range(count + 2)]
+    known = Colliding(costs, costs, [False] * count + [True, True])
+    queue = CandidateQueue(known, SETTINGS)
+    queue.run(seeds(range(count + 2)))
+    assert Stage.REFINED in stages_of(known, 0)  # there were none yet
+    assert stages_of(known, count) == {Stage.SEED}
+    reasons = {int(one.start[0]): one.reason for one in queue.candidates}
+    assert reasons[count] == touching
+    assert reasons[count + 1] is None
+
+
 def test_a_reason_is_read_as_it_was_written_and_not_where_it_is_damaged() -> None:
     assert Reason.of_record(FAILS.record()) == FAILS
     assert str(FAILS) == "the audit fails: row 2"
