@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from scipy import spatial
 
 from models import ModelError, cache
 from models.arrays import Array
@@ -151,7 +152,8 @@ def test_the_overhang_is_the_farthest_point_from_the_hull() -> None:
         along = np.subtract(each.shape.end, each.shape.start)
         ends = np.where((around @ along > 0)[:, None], each.shape.end, each.shape.start)
         points = ends + each.shape.radius * around
-        outside = points[~hull.contains(points)]
+        equations = spatial.ConvexHull(hull.vertices).equations
+        outside = points[(points @ equations[:, :3].T + equations[:, 3]).max(axis=1) > 0]
         _, distances, _ = trimesh.proximity.closest_point_naive(hull, outside)  # type: ignore[no-untyped-call]
         assert each.overhang <= distances.max() + 0.02 * each.shape.radius
         assert each.overhang >= 0.9 * distances.max()
