@@ -44,8 +44,8 @@ benchmark: $(VENV)/peers.stamp $(VENV)/test.stamp ## time model functions, build
 
 site: $(VENV)/site.stamp ## build the documentation into build/site, its tutorials run, and look at every link
 	rm -rf build/site
-	$(BIN)/python -m sphinx -q -E -a -j $(WORKERS) --fail-on-warning --keep-going -d build/doctrees scripts/site build/site
-	$(BIN)/python -m scripts.site.links build/site
+	$(BIN)/python -m sphinx -q -E -a -j $(WORKERS) --fail-on-warning --keep-going -d build/doctrees docs build/site
+	$(BIN)/python -m docs.links build/site
 
 test: $(VENV)/test.stamp ## run the tests (ARGS="-k momentum -x" passes options on)
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup $(ARGS)

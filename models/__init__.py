@@ -4,16 +4,14 @@ from models.cts.best_roll import optimal_inverse
 from models.cts.rig import Rig, Tunnel
 from models.cts.table import solve_table
 from models.errors import ModelError, ModelWarning
-from models.machines.actuators import wheels_of, with_wheels
-from models.machines.footprint import Footprint, footprint
 from models.machines.free_floating import FreeFloating
-from models.machines.machine import FixedBase, Machine
+from models.machines.machine import FixedBase, Machine, wheels_of, with_wheels
 from models.machines.moving import Moving
 from models.machines.scara import Scara
 from models.machines.scara_path import scara_along
 from models.machines.stance import Foot, Foothold, Stance
 from models.machines.standing import Standing
-from models.machines.support import Support, rectangle
+from models.machines.support import Footprint, Support, footprint, rectangle
 from models.machines.surroundings import Surroundings
 from models.papers import STANDING_STARTS, paper_example, reference_rig, reference_tunnel, standing_example
 from models.paths import Arc, Helix, Line, Path, SmoothPath, smooth
@@ -22,16 +20,19 @@ from models.robot.example import example_robot
 from models.robot.kinematics import (
     center_of_mass,
     center_of_mass_jacobian,
+    center_of_mass_motion,
     centers_of_mass,
     frame_jacobian,
     link_frames,
     link_jacobians,
+    link_motions,
+    momentum,
     momentum_matrix,
+    momentum_rate,
     robot_inertia,
     tip_jacobian,
     tip_pose,
 )
-from models.robot.motion import center_of_mass_motion, link_motions, momentum, momentum_rate
 from models.robot.parts import CollisionShape, Joint, Link, Mimic, VisualShape
 from models.robot.rebuild import (
     attached,

@@ -19,9 +19,8 @@ from typing import Any, NamedTuple, TypeVar, cast
 import casadi as ca
 import numpy as np
 
-from models.arrays import Array
+from models.arrays import NOT_NUMBERS, Array, floats
 from models.errors import ModelError
-from models.real_numbers import NOT_NUMBERS, floats
 
 Expression = Any
 """A casadi SX, MX or DM, whatever numpy reads as an array of floats, or a (nested) list with casadi entries."""

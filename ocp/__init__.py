@@ -2,35 +2,30 @@
 
 from ocp.audit.audit import Audit, Finding
 from ocp.audit.certificate import Certificate
-from ocp.builders.capture import capture_problem, chained_capture, plan_capture
-from ocp.builders.clearance import Clear
-from ocp.builders.cts import roll_problem, spline_targets
-from ocp.builders.drives import Effort, JointFriction, joint_torques
-from ocp.builders.dynamics import dynamics_problem
-from ocp.builders.dynamics_plan import plan_dynamics
-from ocp.builders.grasping import Cone, Grasp
-from ocp.builders.joint_spline import joint_path
-from ocp.builders.legs import Leg, dynamics_phases
-from ocp.builders.minimum_velocity import minimum_velocity_problem
-from ocp.builders.standing.loads import StepsMotion, steps_motion
-from ocp.builders.standing.plan import plan_standing, plan_steps
-from ocp.builders.standing.postures import standing_posture
-from ocp.builders.standing.problem import FreeTime, Weights, standing_problem
-from ocp.builders.standing.resolved import resolve_steps
-from ocp.builders.standing.stances import StancePhase, Steps, walk
-from ocp.builders.standing.steps import StepWeights, steps_problem
-from ocp.builders.timing import minimum_time_problem, plan_minimum_time
-from ocp.confirmation import certificate
 from ocp.direct.collocation import Collocation
 from ocp.direct.shooting import MultipleShooting
 from ocp.errors import AuditError, BoundWarning, ProblemError, RefinementWarning, SolveError, StorageWarning
 from ocp.indirect.method import Indirect
-from ocp.local.accelerations import resolve_accelerations
-from ocp.local.inverse_kinematics import Unreachable, inverse_kinematics
-from ocp.local.laws import Layer, Stabiliser
-from ocp.local.rates import resolve
-from ocp.methods import prepare, solve
-from ocp.planning import (
+from ocp.methods import certificate, prepare, solve
+from ocp.motion.builders.clearance import Clear
+from ocp.motion.builders.cts import roll_problem, spline_targets
+from ocp.motion.builders.drives import Effort, JointFriction, joint_torques
+from ocp.motion.builders.dynamics import dynamics_problem
+from ocp.motion.builders.dynamics_plan import Leg, dynamics_phases, plan_dynamics
+from ocp.motion.builders.joint_spline import joint_path
+from ocp.motion.builders.minimum_velocity import minimum_velocity_problem
+from ocp.motion.builders.space.capture import capture_problem, chained_capture, plan_capture
+from ocp.motion.builders.space.grasping import Cone, Grasp
+from ocp.motion.builders.standing.plan import plan_standing, plan_steps
+from ocp.motion.builders.standing.problem import FreeTime, Weights, standing_problem
+from ocp.motion.builders.standing.resolved import StepsMotion, resolve_steps, steps_motion
+from ocp.motion.builders.standing.stances import StancePhase, Steps, standing_posture, walk
+from ocp.motion.builders.standing.steps import StepWeights, steps_problem
+from ocp.motion.builders.timing import minimum_time_problem, plan_minimum_time
+from ocp.motion.local.accelerations import Layer, Stabiliser, resolve_accelerations
+from ocp.motion.local.inverse_kinematics import Unreachable, inverse_kinematics
+from ocp.motion.local.rates import resolve
+from ocp.motion.plan import (
     Candidate,
     DeadEnd,
     Plan,
@@ -41,17 +36,23 @@ from ocp.planning import (
     plan_in_pieces,
     plan_waypoints,
 )
+from ocp.motion.tasks.limits import Limits
+from ocp.motion.tasks.tip_task import TipTask
+from ocp.motion.tasks.zmp_rules import Anywhere, Following, IndexAtLeast, InFoot, Pinned
 from ocp.problem.phases import Phases
 from ocp.problem.problem import Problem
 from ocp.refinement import refine
+from ocp.registry import register as _register
 from ocp.solution import Sensitivity, Solution
 from ocp.status import SolverStatus
-from ocp.tasks.limits import Limits
-from ocp.tasks.tip_task import TipTask
-from ocp.tasks.zmp_rules import Anywhere, Following, IndexAtLeast, InFoot, Pinned
 from ocp.tightening import tighten
 
 __version__ = "0.1.0"
+
+_register("audit", "ocp.audit.audit")
+_register("sensitivity", "ocp.direct.sensitivity")
+for _drawing in ("plot_solution", "html_of_solution", "plot_plan", "html_of_plan"):
+    _register(_drawing, "ocp.app.view.plots")
 
 __all__ = [
     "Anywhere",

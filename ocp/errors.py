@@ -13,8 +13,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from models.arrays import NOT_NUMBERS, check_entries, floats
 from models.input_files import INPUT_LIMITS
-from models.real_numbers import NOT_NUMBERS, check_entries, floats
 
 __all__ = [
     "MOST",

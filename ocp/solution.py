@@ -20,6 +20,7 @@ from ocp.problem.formulation import Formulation
 from ocp.problem.phases import own_of
 from ocp.problem.problem import Problem
 from ocp.problem.stored import DAMAGED, NUMBERS, packed, unpacked
+from ocp.registry import call_registered
 from ocp.solution_data import (
     AT_NODE,
     HEAD,
@@ -165,7 +166,7 @@ class Solution:
         return "solved" if self.success else self.message or str(self.status)
 
     def plot(self, against: Any = None, *, figure: Any = None) -> Any:
-        """States and controls over time, with their bounds; see :func:`ocp.app.plots.plot_solution`.
+        """States and controls over time, with their bounds; see :func:`ocp.app.view.plots.plot_solution`.
 
         The solution is blue; what it is compared with, another one of the same states and controls or what ``resolve``
         made of the same joints, or several by name, orange. A notebook shows the figure, ``.savefig("a.png")`` writes
@@ -174,14 +175,10 @@ class Solution:
         Raises:
             ProblemError: Nothing that can be compared, or of other states and controls.
         """
-        from ocp.app.plots import plot_solution
-
-        return plot_solution(self, against, figure)
+        return call_registered("plot_solution", self, against, figure)
 
     def _repr_html_(self) -> str:
-        from ocp.app.plots import html_of_solution
-
-        return html_of_solution(self)
+        return str(call_registered("html_of_solution", self))
 
     def table(self) -> dict[str, np.ndarray]:
         """Columns by name, a row for every reported time: what pandas.DataFrame, polars.DataFrame, pyarrow.table take.
@@ -209,9 +206,8 @@ class Solution:
             ProblemError: An unknown parameter; no optimum of a direct method under the bounds of its problem; or limits
                 that contradict each other when the parameter moves.
         """
-        from ocp.direct.sensitivity import sensitivity
-
-        return sensitivity(self, name)
+        computed: Sensitivity = call_registered("sensitivity", self, name)
+        return computed
 
     def cost_gradient(self, name: str) -> np.ndarray:
         """Derivative of the optimal cost in a parameter, from the multipliers. Shape (n,)."""
@@ -319,14 +315,12 @@ class Solution:
         Raises:
             AuditError: The solution comes without its problem, and none is given; says why.
         """
-        from ocp.audit.audit import audit
-
         known = problem if problem is not None else self.problem
         if known is None:
             why = f" ({self.problem_lost})" if self.problem_lost else ""
             words = f"plan {self.name!r} comes without its problem{why}; call audit(problem)"
             raise AuditError(words, name=self.name)
-        return audit(known, self, **settings)
+        return call_registered("audit", known, self, **settings)
 
     def with_problem(self, problem: Any) -> Solution:
         """The same solution tied to a problem, after :meth:`load`, or to None."""

@@ -1,4 +1,7 @@
-"""Files of named arrays: written whole or not at all, and looked at before anything of them is unpacked."""
+"""Files of named arrays: written whole or not at all, and looked at before anything of them is unpacked.
+
+Tables as CSV: names and texts in them mean nothing to a spreadsheet or a shell, and are read back.
+"""
 
 from __future__ import annotations
 
@@ -10,17 +13,28 @@ import secrets
 import stat
 import sys
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
+from urllib.parse import unquote
 
 import numpy as np
 
 from models.input_files import UnfitFile, open_regular
 from ocp.errors import ProblemError
 
-__all__ = ["MOST_BYTES", "read_arrays", "write_arrays", "write_text"]
+__all__ = [
+    "MOST_BYTES",
+    "cell",
+    "column_name",
+    "joint_name",
+    "read_arrays",
+    "table_head",
+    "table_joints",
+    "write_arrays",
+    "write_text",
+]
 
 MOST_BYTES = 2**28  # of all arrays of a file, unpacked: 30 million numbers
 MOST_ENTRIES = 2**20  # bytes of an archive's table of contents
@@ -219,3 +233,48 @@ def array_of(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
         raise ValueError(f"{member.filename!r} has {left} bytes for shape {shape} of {kind}")
     array = np.frombuffer(data, kind, count, stream.tell()).reshape(shape, order="F" if by_columns else "C")
     return array.astype(kind.newbyteorder("="), order="C")
+
+
+ENDS = ("", ".velocity", ".acceleration")
+STRANGE = re.compile(r"[^\w./: -]|^[^\w]| $")
+"""What is written as %XX: all but letters, digits and signs that mean nothing within a name.
+
+At the beginning `-` would begin a formula, `/` a command, and blanks at the ends would be lost.
+"""
+
+
+FORMULA = re.compile(r"^[=+\-@\t\r%]")
+"""What begins a formula in a spreadsheet, and the sign by which it is written in a cell."""
+
+
+def column_name(name: str) -> str:
+    """Return a joint's name as it stands in the head of a table, with strange characters as %XX of their UTF-8."""
+    return STRANGE.sub(_quoted, name)
+
+
+def cell(value: Any) -> Any:
+    """Return a value as it stands in a cell: a text that a spreadsheet would take for a formula begins with %XX."""
+    return FORMULA.sub(_quoted, value) if isinstance(value, str) else value
+
+
+def _quoted(sign: re.Match[str]) -> str:
+    return "".join(f"%{byte:02X}" for byte in sign[0].encode(errors="surrogatepass"))
+
+
+def joint_name(column: str) -> str:
+    """Return the name that :func:`column_name` wrote."""
+    return unquote(column, errors="surrogatepass")
+
+
+def table_head(names: Sequence[str]) -> list[str]:
+    """Return the head of the table of a plan: time, and positions, velocities and accelerations of joints."""
+    return ["time", *(column_name(name) + end for end in ENDS for name in names)]
+
+
+def table_joints(head: Sequence[str]) -> tuple[str, ...]:
+    """Return the joints of a head that :func:`table_head` made; none where another program or person wrote it."""
+    try:
+        names = tuple(map(joint_name, head[1 : 1 + len(head) // 3]))
+    except UnicodeDecodeError:
+        return ()
+    return names if list(head) == table_head(names) and len(set(names)) == len(names) else ()

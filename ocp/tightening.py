@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ocp.console import interruptible, limited, time_left
-from ocp.direct.fragment import Fragment
+from ocp.direct.assembly import Fragment
 from ocp.direct.mesh import check_meshed
 from ocp.direct.prepared import DirectMethod
 from ocp.errors import SolveError, checked_mapping, checked_time_limit

@@ -18,7 +18,7 @@ from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 from PIL import Image
 
-from ocp.app.colors import COMPARED, PLAN
+from ocp.app.view.appearance import COMPARED, PLAN
 from scripts.papers.run import write, written
 
 COLORS = {
@@ -34,7 +34,7 @@ COLORS = {
 """Okabe, Ito 2008: told apart with every kind of colour vision.
 
 Where a plan stands beside what it is compared with (pseudo-inverse, local law, the paper's method), the plan is blue
-and the other orange, as in `ocp.app.colors`.
+and the other orange, as in `ocp.app.view.appearance`.
 """
 
 DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (4, 1.2, 1, 1.2)), (0, (1, 1)))

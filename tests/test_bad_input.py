@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import models
 import ocp
-import ocp.batch
-import ocp.files
-import ocp.schedule
+import ocp.app.batch
+import ocp.app.files
+import ocp.motion.schedule
 from tests.models.cts.test_bad_rigs import CASES as RIGS
 from tests.models.machines.test_bad_machines import CASES as MACHINES
 from tests.models.paths.test_bad_paths import CASES as PATHS
 from tests.models.robot.test_bad_robots import CASES as ROBOTS
 from tests.models.robot.test_bad_urdf import OPTIONS, TEXTS
 from tests.models.shapes.test_bad_shapes import CASES as SHAPES
-from tests.ocp.batch.test_bad_batches import CASES as BATCHES
-from tests.ocp.builders.test_bad_tasks import CASES as TASKS
-from tests.ocp.files.test_bad_files import CASES as FILES
-from tests.ocp.planning.test_bad_plans import CASES as PLANS
+from tests.ocp.app.batch.test_bad_batches import CASES as BATCHES
+from tests.ocp.app.files.test_bad_files import CASES as FILES
+from tests.ocp.motion.builders.test_bad_tasks import CASES as TASKS
+from tests.ocp.motion.plan.test_bad_plans import CASES as PLANS
+from tests.ocp.motion.schedule.test_bad_schedules import CASES as SCHEDULES
 from tests.ocp.problem.test_bad_problems import CASES as PROBLEMS
-from tests.ocp.schedule.test_bad_schedules import CASES as SCHEDULES
 
 CASES = [*ROBOTS, OPTIONS, *MACHINES, *PATHS, *RIGS, *SHAPES, *PROBLEMS, *SCHEDULES, *TASKS, *FILES, *PLANS, *BATCHES]
 MADE_BY_THE_PACKAGE = {
@@ -67,7 +67,13 @@ LOOKED_AT_IN_A_PROBLEM = {"Following", "Pinned"}
 
 def test_everything_a_user_types_is_in_a_panel() -> None:
     asked = {case.what.partition(".")[0].partition(" ")[0] for case in CASES}
-    faces = {*models.__all__, *ocp.__all__, *ocp.batch.__all__, *ocp.files.__all__, *ocp.schedule.__all__}
+    faces = {
+        *models.__all__,
+        *ocp.__all__,
+        *ocp.app.batch.__all__,
+        *ocp.app.files.__all__,
+        *ocp.motion.schedule.__all__,
+    }
     errors = {name for name in faces if name.endswith(("Error", "Warning")) or name in RAISED}
     assert faces - asked - errors - MADE_BY_THE_PACKAGE - WITHOUT_ARGUMENTS - LOOKED_AT_IN_A_PROBLEM == set()
 

@@ -1,7 +1,7 @@
-"""The rules of the house: who may import whom, what a package's face shows, which rooms there are.
+"""Rules of the architecture: which package may import which, what a package's `__init__` shows, how large things are.
 
 The rules read the source and import nothing, so a lazy import and one for annotations count like any other. Each rule
-is tried on a small house in which it is broken, too.
+is also tried on a small tree of modules that breaks it.
 """
 
 from __future__ import annotations
@@ -18,13 +18,12 @@ from typing import TypeAlias
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-Rule: TypeAlias = Callable[["House"], list[str]]
+Rule: TypeAlias = Callable[["Architecture"], list[str]]
 
-FLOORS = {
+LAYERS = {
     "models": [
         ["errors", "input_files"],
-        ["cache", "real_numbers"],
-        ["arrays"],
+        ["cache", "arrays"],
         ["spatial"],
         ["robot", "paths"],
         ["shapes"],
@@ -32,33 +31,28 @@ FLOORS = {
         ["papers"],
     ],
     "ocp": [
-        ["errors", "curves", "status", "tolerances"],
+        ["errors", "curves", "status", "tolerances", "registry"],
         ["console"],
-        ["storage", "libraries", "tables", "solution_data"],
-        ["problem", "schedule", "tasks"],
+        ["storage", "libraries", "solution_data"],
+        ["problem"],
         ["solution"],
-        ["direct", "audit", "local"],
+        ["direct", "audit"],
         ["indirect"],
         ["methods"],
-        ["confirmation", "refinement", "switching", "tightening"],
-        ["builders"],
-        ["planning"],
-        ["batch", "files"],
+        ["refinement", "switching", "tightening"],
+        ["motion"],
         ["app"],
     ],
+    "ocp.motion": [["tasks"], ["local", "schedule"], ["builders"], ["search"], ["plan"]],
+    "ocp.app": [["progress"], ["files", "batch"], ["check"], ["view"], ["planned"], ["arguments"], ["command"]],
 }
-"""Rooms and single modules from the ground up; each may import what stands on lower floors."""
-SEES_MODELS = {"tasks", "local", "builders", "planning", "batch", "files", "app"}
-LAZY = {
-    ("ocp.solution", "ocp.audit.audit"),
-    ("ocp.solution", "ocp.direct.sensitivity"),
-    ("ocp.solution", "ocp.app.plots"),
-    ("ocp.planning.motion", "ocp.app.plots"),
-}
-"""Imports that go up, when `Solution.audit`, `Solution.sensitivity`, or `plot` of a solution or a plan, is called."""
-SEEN_BY_ALL = {"models.cache", "models.input_files", "models.real_numbers", "models.shapes.nearest"}
-"""What all of ocp may import of models: they know no machine."""
+"""Packages and single modules of each package, from the lowest layer up: each may import from lower layers only."""
+MACHINES = {"ocp.motion", "ocp.app"}
+"""What may import `models`: all else knows no machine, beyond the modules of MATHEMATICS."""
+MATHEMATICS = {"models.arrays", "models.cache", "models.errors", "models.input_files", "models.shapes.hull"}
 FOREIGN = {"models": {"casadi", "collada", "numpy", "scipy"}}
+LARGEST_PACKAGE = 14
+LARGEST_MODULE = 500
 
 
 @dataclass(frozen=True)
@@ -69,33 +63,36 @@ class Module:
     is_package: bool
     tree: ast.Module
     imports: frozenset[str]
+    lines: int
 
     @property
     def package(self) -> str:
         return self.name.partition(".")[0]
 
     @property
-    def room(self) -> str:
-        return self.name.partition(".")[2].partition(".")[0]
+    def part(self) -> str:
+        """The part of its top-level package that it belongs to, such as `ocp.motion`."""
+        return ".".join(self.name.split(".")[:2])
 
 
-class House:
+class Architecture:
     """All modules of the two packages below a folder."""
 
     def __init__(self, root: Path) -> None:
-        files = {name: file for package in FLOORS for name, file in _files(root, package)}
+        packages = [package for package in LAYERS if "." not in package]
+        files = {name: file for package in packages for name, file in _files(root, package)}
         self.modules = {
-            name: Module(name, file.name == "__init__.py", tree, _imports(tree, name, files))
+            name: Module(name, file.name == "__init__.py", tree, _imports(tree, name, files), text.count("\n"))
             for name, file in files.items()
-            for tree in [ast.parse(file.read_text(encoding="utf-8"))]
+            for text in [file.read_text(encoding="utf-8")]
+            for tree in [ast.parse(text)]
         }
 
     def arrows(self) -> Iterator[tuple[Module, str]]:
-        """A module and one that it imports, the lazy exceptions left out."""
+        """A module and one that it imports."""
         for module in self.modules.values():
             for other in sorted(module.imports):
-                if (module.name, other) not in LAZY:
-                    yield module, other
+                yield module, other
 
 
 def _files(root: Path, package: str) -> Iterator[tuple[str, Path]]:
@@ -106,21 +103,21 @@ def _files(root: Path, package: str) -> Iterator[tuple[str, Path]]:
 
 def _imports(tree: ast.Module, own: str, files: dict[str, Path]) -> frozenset[str]:
     """Whole names of what a module imports: our own modules as deep as they are named, of others the package."""
-    found = set()
+    wrong = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
+            wrong |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{own}: imports are absolute"
             for alias in node.names:
                 inner = f"{node.module}.{alias.name}"
-                found.add(inner if inner in files else str(node.module))
-    return frozenset(name if name in files else name.partition(".")[0] for name in found) - {own}
+                wrong.add(inner if inner in files else str(node.module))
+    return frozenset(name if name in files else name.partition(".")[0] for name in wrong) - {own}
 
 
-def circles(house: House) -> list[str]:
-    graph: dict[str, set[str]] = {name: set() for name in house.modules}
-    for module, other in house.arrows():
+def circles(code: Architecture) -> list[str]:
+    graph: dict[str, set[str]] = {name: set() for name in code.modules}
+    for module, other in code.arrows():
         if other in graph:
             graph[module.name].add(other)
     try:
@@ -130,74 +127,85 @@ def circles(house: House) -> list[str]:
     return []
 
 
-def upward_imports(house: House) -> list[str]:
-    found = []
-    for module, other in house.arrows():
-        package, _, rest = other.partition(".")
-        if package != module.package or package not in FLOORS or not module.room:
-            continue
-        floor = {name: number for number, names in enumerate(FLOORS[package]) for name in names}
-        room = rest.partition(".")[0]
-        if room == module.room:
-            continue
-        if not room or floor.get(module.room, -1) <= floor.get(room, len(floor)):
-            found.append(f"{module.name} imports {other}, which does not stand below it")
-    return found
+def upward_imports(code: Architecture) -> list[str]:
+    wrong = []
+    for module, other in code.arrows():
+        for package, layers in LAYERS.items():
+            if not (module.name.startswith(package + ".") and (other + ".").startswith(package + ".")):
+                continue
+            layer = {name: number for number, names in enumerate(layers) for name in names}
+            own, target = (name.removeprefix(package).strip(".").partition(".")[0] for name in (module.name, other))
+            if own != target and (not target or layer.get(own, -1) <= layer.get(target, len(layer))):
+                wrong.append(f"{module.name} imports {other}, which is not in a lower layer")
+    return wrong
 
 
-def forbidden_packages(house: House) -> list[str]:
-    found = []
-    for module, other in house.arrows():
+def forbidden_packages(code: Architecture) -> list[str]:
+    wrong = []
+    for module, other in code.arrows():
         package = other.partition(".")[0]
         allowed = FOREIGN.get(module.package)
         if allowed is not None and package not in {*allowed, module.package, *sys.stdlib_module_names}:
-            found.append(f"{module.name} imports {package}; {module.package} takes {', '.join(sorted(allowed))} only")
-        if other in SEEN_BY_ALL:
-            continue
-        if (module.package, package) == ("ocp", "models") and module.room not in SEES_MODELS | {""}:
-            found.append(f"{module.name} imports {other}; only {', '.join(sorted(SEES_MODELS))} may import models")
-    return found
+            wrong.append(f"{module.name} imports {package}; {module.package} takes {', '.join(sorted(allowed))} only")
+        knows_machines = module.name == "ocp" or module.part in MACHINES
+        if package == "models" != module.package and not knows_machines and other not in MATHEMATICS:
+            wrong.append(f"{module.name} imports {other}; only {', '.join(sorted(MACHINES))} may import models")
+    return wrong
 
 
-def shadowed_modules(house: House) -> list[str]:
+def sizes(code: Architecture) -> list[str]:
+    """A package holds few modules and subpackages, a module few lines."""
+    wrong = []
+    for module in code.modules.values():
+        inside = [name for name in code.modules if name.rpartition(".")[0] == module.name]
+        if module.is_package and "." in module.name and len(inside) > LARGEST_PACKAGE:
+            wrong.append(f"{module.name} holds {len(inside)} modules; at most {LARGEST_PACKAGE}")
+        if module.lines > LARGEST_MODULE:
+            wrong.append(f"{module.name} has {module.lines} lines; at most {LARGEST_MODULE}")
+    return wrong
+
+
+def shadowed_modules(code: Architecture) -> list[str]:
     """Names in a package's face that are not the submodule of that name."""
-    found = []
-    for module in house.modules.values():
-        inside = {name.rpartition(".")[2] for name in house.modules if name.rpartition(".")[0] == module.name}
+    wrong = []
+    for module in code.modules.values():
+        inside = {name.rpartition(".")[2] for name in code.modules if name.rpartition(".")[0] == module.name}
         for name, source in _bound(module.tree):
             if name in inside and source != module.name:
-                found.append(f"{module.name}: {name!r} hides the module {module.name}.{name}")
-    return found
+                wrong.append(f"{module.name}: {name!r} hides the module {module.name}.{name}")
+    return wrong
 
 
-def faces(house: House) -> list[str]:
+def faces(code: Architecture) -> list[str]:
     """A face lists in `__all__`, sorted, exactly what it imports; every `__all__` names what is there."""
-    found = []
-    for module in house.modules.values():
+    wrong = []
+    for module in code.modules.values():
         bound = {name for name, _ in _bound(module.tree)}
         listed = _listed(module.tree)
         public = {name for name in bound if not name.startswith("_")} - {"annotations"}
         if listed is None:
             if module.is_package and public:
-                found.append(f"{module.name}: no __all__ for {', '.join(sorted(public))}")
+                wrong.append(f"{module.name}: no __all__ for {', '.join(sorted(public))}")
             continue
         if sorted(set(listed)) != sorted(listed):
-            found.append(f"{module.name}: __all__ names something twice")
-        wrong = set(listed) ^ public if module.is_package else set(listed) - bound
-        if wrong:
-            found.append(f"{module.name}: __all__ and what is there differ in {', '.join(sorted(wrong))}")
-    return found
+            wrong.append(f"{module.name}: __all__ names something twice")
+        differing = set(listed) ^ public if module.is_package else set(listed) - bound
+        if differing:
+            wrong.append(f"{module.name}: __all__ and what is there differ in {', '.join(sorted(differing))}")
+    return wrong
 
 
-def rooms(house: House) -> list[str]:
-    found = []
-    for module in house.modules.values():
-        known = {name for floor in FLOORS[module.package] for name in floor}
-        if module.room and module.room not in known:
-            found.append(f"{module.name} lies outside the rooms of {module.package}")
+def places(code: Architecture) -> list[str]:
+    """Every module belongs to a layer and says what it is."""
+    wrong = []
+    for module in code.modules.values():
+        for package, layers in LAYERS.items():
+            own = module.name.removeprefix(package + ".").partition(".")[0]
+            if module.name.startswith(package + ".") and own not in {name for names in layers for name in names}:
+                wrong.append(f"{module.name} is in no layer of {package}")
         if not ast.get_docstring(module.tree):
-            found.append(f"{module.name} does not say what it is: no docstring")
-    return found
+            wrong.append(f"{module.name} does not say what it is: no docstring")
+    return wrong
 
 
 def _bound(tree: ast.Module) -> Iterator[tuple[str, str]]:
@@ -222,15 +230,15 @@ def _listed(tree: ast.Module) -> list[str] | None:
 
 
 @cache
-def built() -> House:
-    return House(ROOT)
+def built() -> Architecture:
+    return Architecture(ROOT)
 
 
-RULES: tuple[Rule, ...] = (circles, upward_imports, forbidden_packages, shadowed_modules, faces, rooms)
+RULES: tuple[Rule, ...] = (circles, upward_imports, forbidden_packages, shadowed_modules, faces, places, sizes)
 
 
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.__name__)
-def test_the_house_keeps_the_rule(rule: Rule) -> None:
+def test_the_code_keeps_the_rule(rule: Rule) -> None:
     broken = rule(built())
     assert not broken, "\n".join(broken)
 
@@ -244,32 +252,33 @@ SOUND = {
     "models/errors.py": '"""Errors."""\nclass ModelError(ValueError): ...\n',
     "ocp/__init__.py": '"""Face."""\nfrom ocp.methods import solve\n__all__ = ["solve"]\n',
     "ocp/methods.py": '"""Methods."""\nfrom ocp.direct.nlp import call\ndef solve(): ...\n',
-    "ocp/solution.py": '"""A solution."""\ndef audit():\n    from ocp.audit.audit import audit\n',
+    "ocp/solution.py": '"""A solution."""\n',
     "ocp/audit/__init__.py": '"""Audits."""\n',
-    "ocp/audit/audit.py": '"""The audit."""\nfrom ocp.solution import audit as again\n',
+    "ocp/audit/audit.py": '"""The audit."""\nimport ocp.solution\n',
     "ocp/direct/__init__.py": '"""Direct methods."""\n',
     "ocp/direct/nlp.py": '"""Programs."""\ndef call(): ...\n',
     "ocp/direct/guess.py": '"""Guesses."""\nfrom models import cache\n',
-    "ocp/tasks/__init__.py": '"""Tasks."""\n',
-    "ocp/tasks/tip_task.py": '"""Tip tasks."""\nfrom models import Robot\n',
-    "ocp/schedule/__init__.py": '"""Schedules."""\n',
-    "ocp/schedule/limits.py": '"""Limits."""\nimport ocp.errors\n',
+    "ocp/motion/__init__.py": '"""Motions."""\n',
+    "ocp/motion/tasks/__init__.py": '"""Tasks."""\n',
+    "ocp/motion/tasks/tip_task.py": '"""Tip tasks."""\nfrom models import Robot\n',
+    "ocp/motion/schedule/__init__.py": '"""Schedules."""\n',
+    "ocp/motion/schedule/limits.py": '"""Limits."""\nimport ocp.errors\n',
     "ocp/errors.py": '"""Errors."""\n',
     "ocp/curves.py": '"""Curves."""\n',
 }
 
 
-def house_of(folder: Path, files: dict[str, str]) -> House:
+def architecture_of(folder: Path, files: dict[str, str]) -> Architecture:
     for name, text in files.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(text, encoding="utf-8")
-    return House(folder)
+    return Architecture(folder)
 
 
-def test_a_sound_house_breaks_no_rule(tmp_path: Path) -> None:
-    house = house_of(tmp_path, SOUND)
-    assert len(house.modules) == len(SOUND)
-    assert [broken for rule in RULES for broken in rule(house)] == []
+def test_a_sound_architecture_breaks_no_rule(tmp_path: Path) -> None:
+    code = architecture_of(tmp_path, SOUND)
+    assert len(code.modules) == len(SOUND)
+    assert [broken for rule in RULES for broken in rule(code)] == []
 
 
 PLANTED: list[tuple[Rule, str, dict[str, str]]] = [
@@ -300,10 +309,22 @@ PLANTED: list[tuple[Rule, str, dict[str, str]]] = [
         "models.errors imports models.robot.tree",
         {"models/errors.py": "from models.robot.tree import x"},
     ),
-    (upward_imports, "ocp.schedule.limits imports ocp.tasks", {"ocp/schedule/limits.py": "import ocp.tasks"}),
+    (
+        upward_imports,
+        "ocp.motion.tasks.tip_task imports ocp.motion.schedule",
+        {"ocp/motion/tasks/tip_task.py": "import ocp.motion.schedule"},
+    ),
     (forbidden_packages, "models.robot.tree imports matplotlib", {"models/robot/tree.py": "import matplotlib.pyplot"}),
     (forbidden_packages, "models.robot.tree imports ocp", {"models/robot/tree.py": "from ocp.errors import x"}),
     (forbidden_packages, "ocp.direct.nlp imports models", {"ocp/direct/nlp.py": "from models import Robot"}),
+    (
+        upward_imports,
+        "ocp.motion.tasks.tip_task imports ocp.motion.plan",
+        {"ocp/motion/tasks/tip_task.py": "def f():\n    import ocp.motion.plan", "ocp/motion/plan/__init__.py": ""},
+    ),
+    (upward_imports, "ocp.solution imports ocp.audit.audit", {"ocp/solution.py": "import ocp.audit.audit"}),
+    (sizes, "ocp.direct.nlp has 501 lines", {"ocp/direct/nlp.py": "# a line\n" * 498}),
+    (sizes, "ocp.direct holds 15 modules", {f"ocp/direct/part_{number}.py": '"""A part."""' for number in range(13)}),
     (shadowed_modules, "'methods' hides", {"ocp/__init__.py": "from ocp.methods import solve as methods"}),
     (shadowed_modules, "'audit' hides", {"ocp/audit/__init__.py": "def audit(): ..."}),
     (faces, "differ in call", {"ocp/__init__.py": "from ocp.direct.nlp import call"}),
@@ -311,14 +332,14 @@ PLANTED: list[tuple[Rule, str, dict[str, str]]] = [
     (faces, "differ in Link", {"models/__init__.py": "__all__ = ['Link', 'Robot']"}),
     (faces, "no __all__ for call", {"ocp/direct/__init__.py": "from ocp.direct.nlp import call"}),
     (faces, "differ in gone", {"ocp/direct/nlp.py": "__all__ = ['gone']"}),
-    (rooms, "ocp.utils lies outside", {"ocp/utils.py": '"""Odds and ends."""'}),
-    (rooms, "ocp.extras.thing lies outside", {"ocp/extras/thing.py": '"""A thing."""'}),
-    (rooms, "ocp.direct.bare does not say", {"ocp/direct/bare.py": "x = 1"}),
+    (places, "ocp.utils is in no layer of ocp", {"ocp/utils.py": '"""Odds and ends."""'}),
+    (places, "ocp.extras.thing is in no layer of ocp", {"ocp/extras/thing.py": '"""A thing."""'}),
+    (places, "ocp.direct.bare does not say", {"ocp/direct/bare.py": "x = 1"}),
 ]
 
 
 @pytest.mark.parametrize(("rule", "told", "lines"), PLANTED, ids=[f"{p[0].__name__}: {p[1]}" for p in PLANTED])
 def test_a_planted_violation_is_named(rule: Rule, told: str, lines: dict[str, str], tmp_path: Path) -> None:
     files = {file: SOUND.get(file, "") + line + "\n" for file, line in lines.items()}
-    broken = rule(house_of(tmp_path, {**SOUND, **files}))
+    broken = rule(architecture_of(tmp_path, {**SOUND, **files}))
     assert any(told in message for message in broken), broken

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from scripts.site.executed import blocks
+from docs.executed import blocks
 from tests.readme import steps
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -27,6 +27,8 @@ from models.arrays import checked_flag, checked_instance
 from models.cts.rig import HOME, Branch, Rig, RigPosture, Tunnel, checked_branch, joints_of, posture_at
 from models.cts.roll import (
     Candidate,
+    checked_gain,
+    convex_minima,
     index_harmonics,
     inside_limit,
     level_points,
@@ -35,12 +37,12 @@ from models.cts.roll import (
     sharp_point,
     simple_ends,
     slide_points,
+    unrolled,
     verdict,
     why_no_roll,
     yaw_chart,
     yaw_levels,
 )
-from models.cts.roll_change import checked_gain, convex_minima, unrolled
 from models.cts.trigonometric import ROOTS, Harmonics, Point, least_point, polish, roots
 from models.errors import ModelError
 from models.spatial import Expression

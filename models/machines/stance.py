@@ -27,9 +27,8 @@ from models.arrays import (
     checked_rotation,
 )
 from models.errors import ModelError
-from models.machines.footprint import convex_hull, footprint
 from models.machines.machine import FixedBase
-from models.machines.support import Support
+from models.machines.support import Support, convex_hull, footprint
 from models.robot.dynamics import Wrench, base_reaction, inverse_dynamics
 from models.robot.kinematics import center_of_mass, checked_vector, frame_jacobian, link_frames
 from models.robot.parts import massless

@@ -23,10 +23,9 @@ from models.machines.moving import Moving
 from models.machines.pair_gradients import WORLD, Placed, distance_gradients
 from models.robot.kinematics import link_frames
 from models.robot.robot import Robot
-from models.shapes.bodies import Body, LinkMesh, MissingRule, bodies_of
+from models.shapes.bodies import Body, LinkMesh, MissingRule, RigidParts, arms, bodies_of
 from models.shapes.distance import COLUMNS, column, distance, pair_function, soft_minimum
 from models.shapes.pairs import ASSUMED, COVERED, SRDF, STILL, TOLD, Reason, checked_pairs
-from models.shapes.rigid_parts import RigidParts, arms
 from models.shapes.shapes import KINDS, Box, Shape, checked_shape
 from models.spatial import Expression, Frame, expression
 

@@ -2,8 +2,7 @@
 
 from models.paths.blends import end_curvature, gamma, middle_curvature, peak_curvature, rest_to_rest
 from models.paths.functions import gauss_newton, march, path_function, predictor_corrector, turn_function
-from models.paths.path import Path
-from models.paths.reversals import chains
+from models.paths.path import Path, chains
 from models.paths.rounding import smooth
 from models.paths.segments import Arc, Helix, Line, Segment
 from models.paths.smooth_path import Blend, Place, SmoothPath, Turn

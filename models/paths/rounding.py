@@ -12,10 +12,18 @@ from numpy.typing import NDArray
 from models.arrays import Array, ArrayInput, checked_choice, checked_instance, one_for_each
 from models.errors import ModelError, ModelWarning
 from models.paths.arc_length import cells
-from models.paths.blends import PAPER_SHAPE, BlendKind, checked_shape, cubic, polynomial, quintic
+from models.paths.blends import (
+    PAPER_SHAPE,
+    BlendKind,
+    best_shape,
+    checked_shape,
+    corner_shape,
+    cubic,
+    polynomial,
+    quintic,
+)
 from models.paths.path import Path
 from models.paths.segments import screw
-from models.paths.shape_factor import best_shape, corner_shape
 from models.paths.smooth_path import SmoothPath
 from models.spatial import FULL_TURN
 
@@ -345,7 +353,7 @@ def smooth(
             between lines only, and only at shape 3.
         shape: End tangents over the remaining distance, lambda of eq. (9), one for all or one for each vertex. If
             None, the paper's 3 for a cubic, and for a quintic that of least peak curvature at each vertex, which is
-            run fastest: see models.paths.shape_factor.
+            run fastest: see models.paths.blends.
         overlap: What happens to blends that would overlap on a segment: "shrink" makes both smaller, "refuse" raises.
 
     Raises:

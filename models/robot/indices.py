@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import casadi as ca
 import numpy as np
 
+from models.arrays import NOT_NUMBERS, check_entries, floats
 from models.errors import ModelError
-from models.real_numbers import NOT_NUMBERS, check_entries, floats
 from models.robot.kinematics import joint_vector
 from models.robot.robot import Robot
 from models.spatial import Expression, determinant, expression, on_scalars

@@ -24,10 +24,9 @@ from models.arrays import (
     checked_text,
 )
 from models.errors import ModelError
-from models.robot.mimicry import cut, held
 from models.robot.parts import Joint, Link
 from models.robot.robot import Robot
-from models.robot.tree import reroot
+from models.robot.tree import cut, held, reroot
 
 
 def locked(robot: Robot, positions: Mapping[str, float]) -> Robot:
@@ -202,7 +201,7 @@ def pruned(robot: Robot, keep: Iterable[str] = ()) -> Robot:
     """The links on the way from the root to the tip, and to the links of `keep`; other branches, mass and all, go.
 
     To keep what the other branches weigh, lock their joints instead, and simplify. Joints that follow one that goes
-    are tied to each other as they were by it: see `models.robot.mimicry.cut`.
+    are tied to each other as they were by it: see `models.robot.tree.cut`.
 
     Raises:
         ModelError: No tip and nothing to keep.

@@ -28,9 +28,19 @@ from models.arrays import (
     warn_of_millimetres,
 )
 from models.errors import ModelError, ModelWarning
-from models.robot.mimicry import Drive, drives, held, joint_limits, ties_to_leaders
 from models.robot.parts import Joint, Link
-from models.robot.tree import absent, find_root, require_unique, reroot, tree_order
+from models.robot.tree import (
+    Drive,
+    absent,
+    drives,
+    find_root,
+    held,
+    joint_limits,
+    require_unique,
+    reroot,
+    ties_to_leaders,
+    tree_order,
+)
 from models.robot.urdf import InertiaRule, Source, read_urdf, written_urdf
 
 MimicRule: TypeAlias = Literal["couple", "lock", "free"]

@@ -19,8 +19,7 @@ from scipy.optimize import minimize
 from models.arrays import Array, ArrayInput, checked_array, checked_indices
 from models.cache import keep, kept, key_of, version_of
 from models.errors import ModelError
-from models.shapes.hull import convex_hull
-from models.shapes.nearest import nearest_directions
+from models.shapes.hull import convex_hull, nearest_directions
 from models.shapes.shapes import Box, Capsule
 
 

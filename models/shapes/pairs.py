@@ -26,9 +26,8 @@ from models.cache import keep, kept, key_of, version_of
 from models.errors import ModelError, ModelWarning
 from models.robot.robot import Robot
 from models.robot.urdf import parsed, text_of
-from models.shapes.bodies import Body
-from models.shapes.nearest import gap_along, nearest_directions
-from models.shapes.rigid_parts import RigidParts, Step, arms
+from models.shapes.bodies import Body, RigidParts, Step, arms
+from models.shapes.hull import gap_along, nearest_directions
 from models.shapes.shapes import Box, Shape
 
 

@@ -3,7 +3,7 @@
 The only part of the packages that draws.
 """
 
+from ocp.app.check.verdict import Check, Fault, Row, check_trajectory
 from ocp.app.command import main
-from ocp.app.verdict import Check, Fault, Row, check_trajectory
 
 __all__ = ["Check", "Fault", "Row", "check_trajectory", "main"]

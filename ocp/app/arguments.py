@@ -14,15 +14,14 @@ import numpy as np
 from models import FixedBase, FreeFloating, Robot, cache, locked, rectangle, with_load
 from models.arrays import Array
 from models.spatial import rotation_from_rpy
+from ocp.app.check.verdict import bounds_of, check_trajectory
+from ocp.app.files import read_trajectory, read_waypoints
+from ocp.app.files.outputs import SUFFIXES, checked_output
+from ocp.app.files.task_file import read_obstacles, read_task
 from ocp.app.planned import EXPORTED, check_period, export, run_task
 from ocp.app.progress import Progress
-from ocp.app.verdict import bounds_of, check_trajectory
 from ocp.errors import ProblemError
-from ocp.files import read_trajectory, read_waypoints
-from ocp.files.obstacles import read_obstacles
-from ocp.files.outputs import SUFFIXES, checked_output
-from ocp.files.task_file import read_task
-from ocp.planning import Plan
+from ocp.motion.plan import Plan
 from ocp.storage import write_text
 from ocp.tolerances import LIMIT_SHARE, ORIENTATION_TOLERANCE_RAD
 
@@ -298,8 +297,8 @@ def run_check(options: argparse.Namespace, progress: Progress) -> tuple[int, str
     )
     if options.report is not None:
         progress("report")
-        from ocp.app.obstacles import of_shapes
-        from ocp.app.report import report_of_check  # draws, which takes a while to import
+        from ocp.app.view.pictures import of_shapes
+        from ocp.app.view.report import report_of_check  # draws, which takes a while to import
 
         machine = FreeFloating(robot) if options.floating else FixedBase(robot, place, turn)
         report = report_of_check(
@@ -327,7 +326,7 @@ def run_export(options: argparse.Namespace, progress: Progress) -> tuple[int, st
 
 def run_report(options: argparse.Namespace, progress: Progress) -> tuple[int, str, Any]:
     """The command `report`."""
-    from ocp.app.report import report_of_plan
+    from ocp.app.view.report import report_of_plan
 
     file = checked_output("report", options.file, force=options.force)
     made = Plan.load(options.plan)
@@ -341,8 +340,7 @@ def run_report(options: argparse.Namespace, progress: Progress) -> tuple[int, st
 
 def run_view(options: argparse.Namespace, progress: Progress) -> tuple[int, str, Any]:
     """The command `view`."""
-    from ocp.app.player import page
-    from ocp.app.serving import Served
+    from ocp.app.view.player import Served, page
 
     if options.page is not None:
         checked_output("report", options.page, force=options.force)
@@ -371,7 +369,7 @@ def run_view(options: argparse.Namespace, progress: Progress) -> tuple[int, str,
 
 def motions_of(options: argparse.Namespace) -> list[Any]:
     """What the files of `view` hold, the plan first."""
-    from ocp.app.shown import shown_plan, shown_solution, shown_trajectory
+    from ocp.app.view.shown import shown_plan, shown_solution, shown_trajectory
     from ocp.solution import Solution
 
     files = [options.plan, *options.beside]

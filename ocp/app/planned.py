@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from models import FixedBase
+from ocp.app.files import write_mcap
+from ocp.app.files.outputs import MARK, SUFFIXES, checked_output
+from ocp.app.files.task_file import Task
 from ocp.errors import MOST, ProblemError, checked_instance, checked_positive
-from ocp.files import write_mcap
-from ocp.files.outputs import MARK, SUFFIXES, checked_output
-from ocp.files.task_file import Task
-from ocp.planning import Plan, PlanInPieces, plan, plan_in_pieces
+from ocp.motion.plan import Plan, PlanInPieces, plan, plan_in_pieces
 from ocp.storage import write_text
 
 __all__ = ["EXPORTED", "check_period", "export", "run_task"]
@@ -161,7 +161,7 @@ def _yaml(made: Plan, file: Path, period: float) -> None:
 
 
 def _report(made: Plan, file: Path, period: float, title: str) -> None:
-    from ocp.app.report import report_of_plan  # draws, which takes a while to import
+    from ocp.app.view.report import report_of_plan  # draws, which takes a while to import
 
     write_text(file, report_of_plan(made, period, title).html())
 

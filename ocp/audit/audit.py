@@ -14,9 +14,8 @@ import numpy as np
 from ocp.audit.clearance import Clearance, clearance
 from ocp.audit.linearisation import Linearisation
 from ocp.audit.optimality import Optimality, optimality
-from ocp.audit.reintegration import Reintegration, reintegrate
+from ocp.audit.reintegration import Reintegration, Violation, reintegrate, violations
 from ocp.audit.sizes import Sizes, fine_grid, sizes_along
-from ocp.audit.violations import Violation, violations
 from ocp.console import check_time, interruptible
 from ocp.curves import PiecewisePolynomial
 from ocp.errors import ProblemError, checked_mapping, unknown_name

@@ -8,7 +8,7 @@ no more than the points' acceleration (:mod:`ocp.problem.separation`). Between t
 and the distance is no less than the gap. The direction is that in which the bodies are nearest in the middle. Of a pair
 that others cover the same is said of each of them, and the least of it is as good. Where the bound does not settle it,
 the time between is halved. The plan's own polynomials say how fast its states change. What moves by time alone is
-bounded over the interval itself, kinks and jumps included (:mod:`ocp.problem.prescribed`).
+bounded over the interval itself, kinks and jumps included (:mod:`ocp.problem.enclosures`).
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ import numpy as np
 
 from ocp.console import check_time
 from ocp.curves import PiecewisePolynomial
+from ocp.problem.enclosures import PrescribedMotion
 from ocp.problem.formulation import Formulation
 from ocp.problem.hulls import Frames, PairsOfBodies, frames_of
-from ocp.problem.prescribed import PrescribedMotion
 from ocp.problem.problem import Problem
 from ocp.problem.separation import Separation
 from ocp.solution import Solution, check_belongs, in_order_of

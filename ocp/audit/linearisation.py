@@ -16,7 +16,7 @@ import numpy as np
 
 from ocp.audit.sizes import Sizes, as_others, nearest_bound
 from ocp.problem.formulation import Bounds, Formulation
-from ocp.problem.sampling import Sampler
+from ocp.problem.values import Sampler
 from ocp.solution import Solution, stack
 from ocp.tolerances import NEAR_LIMIT_SHARE, RESOLVED_SHARE, SOLVER_SHARE, TIGHTENED_SHARE
 

@@ -5,27 +5,143 @@ factorization and a few back-substitutions, which are Newton's steps with its ma
 matrix is the Hessian with what misses the limits at a price (Hestenes 1969, Powell 1969, method of multipliers): it
 is a narrow band, limits that repeat each other are no matter, and where it is positive definite the cost curves upwards
 along all that the limits leave free, so what is found is a plan and no saddle.
+
+The conditions of first order at an optimum as a linear system: which limits push.
+
+Nocedal, Wright 2006, Numerical Optimization, chapters 12 and 16.
+
+Symmetric matrices that are a band but for a few variables, and whether they are positive definite.
+
+Stages couple only to their neighbours; what all of them share, such as a free horizon, and one end of what is tied at
+both ends, stand last, as a border.
 """
 
 from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 import scipy.sparse as sp
+from scipy.linalg import LinAlgError, cho_solve_banded, cholesky, cholesky_banded, solve_triangular
 
 from ocp.console import reason_to_stop
-from ocp.direct.assembly import Program
-from ocp.direct.banded import Bordered, Cholesky
-from ocp.direct.fragment import Fragment
-from ocp.direct.kkt import Sides, corrected
+from ocp.direct.assembly import Fragment, Program
 from ocp.direct.nlp import SOLVER_RESIDUAL, Outcome
 from ocp.direct.scaling import Scales
 from ocp.status import SolverStatus
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = ["Newton"]
+__all__ = [
+    "RESOLVED",
+    "Bordered",
+    "Cholesky",
+    "Conditions",
+    "Newton",
+    "Sides",
+    "conditions",
+    "corrected",
+    "held_by",
+    "scaled",
+]
+
+Sides: TypeAlias = dict[str, np.ndarray]
+"""On which side each variable (x) and row (g) is held: -1 below, 1 above, 0 at none."""
+RESOLVED = 10 * SOLVER_RESIDUAL
+"""In units of the solver: the largest slope along what no limit holds, a plan costs the square of it too much; the
+distance to a limit at which it is touched though it does not push; and what a linear system may be missed by."""
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """First and second derivatives of a program at a plan, in units of the solver.
+
+    Attributes:
+        hessian: Of the Lagrangian, both halves. Shape (n, n). jacobian: Of the rows. Shape (m, n).
+        of_bounds: Multipliers of the bounds of the variables (n,). of_rows: Of the rows (m,).
+        held, fixed: Which rows and which variables stand at a limit that pushes, or are given.
+    """
+
+    hessian: sp.csc_array
+    jacobian: sp.csr_array
+    of_bounds: np.ndarray
+    of_rows: np.ndarray
+    held: np.ndarray
+    fixed: np.ndarray
+
+
+def conditions(program: Program, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales) -> Conditions:
+    """The conditions at what a solver found under these arguments (p and bounds)."""
+    v, lam, p = outcome.variables, outcome.multipliers, arguments["p"]
+    a, b, c = scales.variables, scales.rows, scales.cost
+    slope, jacobian = program.numbers.first(v, p)
+    slope, jacobian = slope * a / c, scaled(jacobian, 1 / b, a)
+    half = scaled(program.numbers.second(v, p, 1.0, lam), a / c, a)
+    hessian = half + sp.triu(half, 1).T
+    of_rows = lam * b / c
+    of_bounds = -(slope + jacobian.T @ of_rows)
+    held = at_limit(outcome.rows / b, arguments["lbg"] / b, arguments["ubg"] / b, of_rows)
+    fixed = at_limit(v / a, arguments["lbx"] / a, arguments["ubx"] / a, of_bounds)
+    return Conditions(sp.csc_array(hessian), sp.csr_array(jacobian), of_bounds, of_rows, held, fixed)
+
+
+def pushes(program: Program, outcome: Outcome, p: np.ndarray, scales: Scales) -> tuple[np.ndarray, np.ndarray]:
+    """Multipliers of the bounds of the variables (n,) and of the rows (m,), in units of the solver."""
+    v, lam = outcome.variables, outcome.multipliers
+    slope, jacobian = program.numbers.first(v, p)
+    return -(slope + jacobian.T @ lam) * scales.variables / scales.cost, lam * scales.rows / scales.cost
+
+
+def held_by(program: Program, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales) -> Sides:
+    """On which side each variable (x) and row (g) stands at a limit that pushes: -1 below, 1 above, 0 at none."""
+    push = dict(zip("xg", pushes(program, outcome, arguments["p"], scales), strict=True))
+    values, units = {"x": outcome.variables, "g": outcome.rows}, {"x": scales.variables, "g": scales.rows}
+    sides = {}
+    for kind, unit in units.items():
+        low, high = arguments[f"lb{kind}"] / unit, arguments[f"ub{kind}"] / unit
+        held = at_limit(values[kind] / unit, low, high, push[kind])
+        sides[kind] = np.where(held & (low < high), np.sign(push[kind]), 0.0)
+    return sides
+
+
+def corrected(
+    program: Program, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales, sides: Sides, tolerance: float
+) -> Sides | None:
+    """Which limits to hold next, after some were held and the others let go: those that push, and those missed.
+
+    Where these are the same as before, what was found is right. None where the cost still falls along what is free,
+    as where rounding ended the solve too early. Hintermueller, Ito, Kunisch 2002, The primal-dual
+    active set strategy as a semismooth Newton method.
+    """
+    push = dict(zip("xg", pushes(program, outcome, arguments["p"], scales), strict=True))
+    values, units = {"x": outcome.variables, "g": outcome.rows}, {"x": scales.variables, "g": scales.rows}
+    free = (sides["x"] == 0) & (arguments["lbx"] < arguments["ubx"])
+    if not np.all(np.abs(push["x"][free]) <= RESOLVED):  # nor where it is no number
+        return None
+    found = {}
+    for kind, unit in units.items():
+        value, side = values[kind] / unit, sides[kind]
+        low, high = arguments[f"lb{kind}"] / unit, arguments[f"ub{kind}"] / unit
+        room = tolerance * np.maximum(1.0, np.abs(value))
+        kept = np.where(push[kind] * side > SOLVER_RESIDUAL, side, 0.0)  # the others pull, or more do their work
+        missed = np.where(low < high, 1.0 * (value > high + room) - (value < low - room), 0.0)
+        found[kind] = np.where(missed != 0, missed, kept)
+    return found
+
+
+def at_limit(value: np.ndarray, lower: np.ndarray, upper: np.ndarray, push: np.ndarray) -> np.ndarray:
+    """Which values are given, or held by a limit that pushes more than it is away."""
+    with np.errstate(invalid="ignore"):
+        below = (push < -SOLVER_RESIDUAL) & (value - lower < -push)
+        above = (push > SOLVER_RESIDUAL) & (upper - value < push)
+    return np.asarray((lower == upper) | below | above)
+
+
+def scaled(matrix: sp.csc_array, rows: np.ndarray, columns: np.ndarray) -> sp.csc_array:
+    """A matrix with its rows and its columns times factors."""
+    by = rows[matrix.indices] * np.repeat(columns, np.diff(matrix.indptr))
+    return sp.csc_array((matrix.data * by, matrix.indices, matrix.indptr), shape=matrix.shape)
 
 
 @dataclass(frozen=True)
@@ -256,3 +372,100 @@ def _held(sides: Sides, arguments: dict[str, np.ndarray]) -> tuple[np.ndarray, n
 def _same(sides: Sides, others: Sides) -> bool:
     """Whether the same limits are held."""
     return all(np.array_equal(side, others[kind]) for kind, side in sides.items())
+
+
+class Bordered:
+    """An order of variables in which entries lie near the diagonal, but for those of the last ones.
+
+    Attributes:
+        place: Where each variable stands. Shape (n,). inner: How many stand before the border.
+        width: Of the band below the diagonal.
+
+    Args:
+        row, column: Where entries may be, in the order in which variables are declared; both halves or one.
+        size: Number of variables n.
+    """
+
+    def __init__(self, row: np.ndarray, column: np.ndarray, size: int) -> None:
+        apart = np.abs(row - column)
+        last = _border(row, column, apart, size)
+        self.inner = size - len(last)
+        self.place = np.empty(size, dtype=np.int64)
+        self.place[np.concatenate([np.setdiff1d(np.arange(size), last), last])] = np.arange(size)
+        i, j = self.place[row], self.place[column]
+        self.width = int(np.abs(i - j)[np.maximum(i, j) < self.inner].max(initial=0))
+        self._size = size
+
+    def at(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        """Where :meth:`cholesky` asks for the entries at these places of the order, whose first is not before."""
+        band = second * self.width + first
+        below = (self.width + 1) * self.inner + (first - self.inner) * self._size + second
+        return np.asarray(np.where(first < self.inner, band, below))
+
+    @property
+    def length(self) -> int:
+        """Of the values that :meth:`cholesky` asks for."""
+        return (self.width + 1) * self.inner + (self._size - self.inner) * self._size
+
+    def cholesky(self, values: np.ndarray) -> Cholesky | None:
+        """The factors of a matrix; None where it is not positive definite, or no number.
+
+        Args:
+            values: Of its lower half, each where :meth:`at` says, and 0 elsewhere. Overwritten.
+        """
+        if not np.all(np.isfinite(values)):
+            return None
+        n, k = self.inner, self._size - self.inner
+        band = values[: (self.width + 1) * n].reshape(n, self.width + 1).T
+        below = values[(self.width + 1) * n :].reshape(k, self._size)
+        try:
+            lower = cholesky_banded(band, overwrite_ab=True, lower=True, check_finite=False) if n else band
+            solved = cho_solve_banded((lower, True), below[:, :n].T, check_finite=False) if n and k else below[:, :n].T
+            corner = cholesky(below[:, n:] - below[:, :n] @ solved, lower=True, check_finite=False) if k else below
+        except LinAlgError:
+            return None
+        return Cholesky(self.place, lower, below[:, :n], solved, corner)
+
+
+@dataclass(frozen=True)
+class Cholesky:
+    """Factors of a positive definite matrix: of its band, and of what its border (k) adds.
+
+    Attributes:
+        place: Where each variable stands. lower: Of the band, as LAPACK keeps it. below: Rows of the border (k, n).
+        solved: The band's solutions for them (n, k). corner: Lower factor of what is left of the border (k, k).
+    """
+
+    place: np.ndarray
+    lower: np.ndarray
+    below: np.ndarray
+    solved: np.ndarray
+    corner: np.ndarray
+
+    def solve(self, right: np.ndarray) -> np.ndarray:
+        """For a right side (n,), both in the order of :class:`Bordered`."""
+        n = self.below.shape[1]
+        found = cho_solve_banded((self.lower, True), right[:n], check_finite=False) if n else right[:n]
+        if not len(self.below):
+            return np.asarray(found)
+        half = solve_triangular(self.corner, right[n:] - self.below @ found, lower=True, check_finite=False)
+        last = solve_triangular(self.corner, half, trans=1, lower=True, check_finite=False)
+        return np.concatenate([found - self.solved @ last, last])
+
+
+def _border(row: np.ndarray, column: np.ndarray, apart: np.ndarray, size: int) -> np.ndarray:
+    """The variables that stand last: those with most entries of what reaches far, so many that the work is least."""
+    degree = np.bincount(row, minlength=size) + np.bincount(column, minlength=size)
+    out, chosen, least, count = np.zeros(size, dtype=bool), list[int](), np.inf, 0
+    for k in np.argsort(-apart, kind="stable"):
+        i, j = row[k], column[k]
+        if out[i] or out[j]:
+            continue
+        # the work is that of (width + 2 of the border)^2
+        if apart[k] + 2 * len(chosen) < least:
+            least, count = apart[k] + 2 * len(chosen), len(chosen)
+        if 2 * len(chosen) >= least:
+            break
+        chosen.append(int(i if degree[i] >= degree[j] else j))
+        out[chosen[-1]] = True
+    return np.sort(np.array(chosen[:count], dtype=np.int64))

@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 
 from ocp.curves import differentiation_matrix, lagrange, quadrature_weights
-from ocp.direct.fragment import Block, Fragment, Interpolants
+from ocp.direct.assembly import Block, Fragment, Interpolants
 from ocp.direct.prepared import DirectMethod
 from ocp.direct.transcription import FragmentBuilder
 from ocp.errors import checked_choice

@@ -16,8 +16,7 @@ import casadi as ca
 import numpy as np
 
 from ocp.console import Progress, listening, time_left
-from ocp.direct.assembly import Program, sparse
-from ocp.direct.fragment import Fragment
+from ocp.direct.assembly import Fragment, Program, sparse
 from ocp.direct.nlp import Outcome
 from ocp.direct.scaling import SCALING, Scales
 from ocp.errors import Interrupted, SolveError

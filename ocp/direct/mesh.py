@@ -8,7 +8,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from ocp.direct.fragment import Fragment
+from ocp.direct.assembly import Fragment
 from ocp.errors import NOT_NUMBERS, ProblemError, about, checked_count, checked_positive, floats
 from ocp.problem.formulation import Formulation
 from ocp.problem.values import numeric

@@ -15,19 +15,23 @@ from typing import Any
 import numpy as np
 
 from ocp.console import OutOfTime, check_time, interruptible, limited
-from ocp.direct.active_set import Newton
+from ocp.direct.active_set import Newton, held_by
 from ocp.direct.assembly import Program, assemble
-from ocp.direct.compiled import block_derivatives
-from ocp.direct.controller import write_controller
+from ocp.direct.controller import block_derivatives, write_controller
 from ocp.direct.diagnosis import Elastic, diagnosis, elastic_plan
-from ocp.direct.guess import initial_point, later, names_told
-from ocp.direct.kkt import held_by
-from ocp.direct.known import Known
+from ocp.direct.guess import ELASTIC, GUESS, STARTS, initial_point, later, names_told, other_starts
 from ocp.direct.mesh import MeshedMethod
-from ocp.direct.nlp import SOLVERS, Outcome, broken_down, build_solver, call_solver, largest_number_of_iterations
-from ocp.direct.results import horizon_of, solution_of
-from ocp.direct.scaling import Pattern, Scales, badness, fitting_scales, scaled_program, sizes_along, unscaled
-from ocp.direct.starts import ELASTIC, GUESS, STARTS, other_starts
+from ocp.direct.nlp import (
+    SOLVERS,
+    Outcome,
+    broken_down,
+    build_solver,
+    call_solver,
+    horizon_of,
+    largest_number_of_iterations,
+    solution_of,
+)
+from ocp.direct.scaling import Known, Pattern, Scales, badness, fitting_scales, scaled_program, sizes_along, unscaled
 from ocp.errors import (
     Interrupted,
     ProblemError,

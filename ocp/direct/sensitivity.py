@@ -14,13 +14,11 @@ import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg as sla
 
-from ocp.direct.assembly import Program, assemble
+from ocp.direct.active_set import RESOLVED, Conditions, conditions
+from ocp.direct.assembly import Fragment, Program, assemble
 from ocp.direct.collocation import Collocation
 from ocp.direct.diagnosis import variable_names
-from ocp.direct.fragment import Fragment
-from ocp.direct.kkt import RESOLVED, Conditions, conditions
-from ocp.direct.nlp import Outcome
-from ocp.direct.results import controls_at
+from ocp.direct.nlp import Outcome, controls_at
 from ocp.direct.scaling import Pattern, fitting_scales, sizes_along
 from ocp.direct.shooting import MultipleShooting
 from ocp.errors import ProblemError, unknown_name

@@ -12,8 +12,7 @@ import casadi as ca
 import numpy as np
 
 from ocp.curves import integrator, rk4_step
-from ocp.direct.assembly import SIZES
-from ocp.direct.fragment import Block, Fragment, Interpolants
+from ocp.direct.assembly import SIZES, Block, Fragment, Interpolants
 from ocp.direct.prepared import DirectMethod
 from ocp.direct.transcription import FragmentBuilder
 from ocp.errors import checked_choice

@@ -12,7 +12,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ocp.direct.fragment import Block, Fragment, Interpolants, Stages
+from ocp.direct.assembly import Block, Fragment, Interpolants, Stages
 from ocp.errors import ProblemError
 from ocp.problem.formulation import Formulation, Rows
 

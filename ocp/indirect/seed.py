@@ -14,7 +14,7 @@ import numpy as np
 from ocp.errors import ProblemError, SolveError
 from ocp.indirect.hamiltonian import Hamiltonian
 from ocp.problem.formulation import Bounds, Formulation
-from ocp.problem.sampling import at_samples
+from ocp.problem.values import at_samples
 from ocp.solution import Solution
 from ocp.tolerances import RESOLVED_SHARE, SOLVER_SHARE
 

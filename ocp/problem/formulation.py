@@ -17,8 +17,7 @@ import numpy as np
 from ocp.errors import ProblemError, about, unknown_name
 from ocp.problem.declarations import Constraint, Declarations, Signal, Variable
 from ocp.problem.problem import Problem, checked_problem
-from ocp.problem.sampling import Sampler
-from ocp.problem.values import check_finite, check_horizon, check_inside, check_order, constant, numeric
+from ocp.problem.values import Sampler, check_finite, check_horizon, check_inside, check_order, constant, numeric
 
 __all__ = ["BoundTable", "Bounds", "Formulation", "Rows"]
 

@@ -1,6 +1,6 @@
 """Bodies as convex hulls of points on frames, and how far pairs of them are apart, many at once.
 
-Whatever direction the search of nearest points ends with (:mod:`models.shapes.nearest`), the gap along it is a lower
+Whatever direction the search of nearest points ends with (:mod:`models.shapes.hull`), the gap along it is a lower
 bound of the distance, so that nobody need trust the search.
 """
 
@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from models.shapes.nearest import gap_along, is_box, nearest_directions
+from models.shapes.hull import gap_along, is_box, nearest_directions
 from ocp.errors import ProblemError
 from ocp.problem.values import check_finite, table
 

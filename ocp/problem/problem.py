@@ -17,9 +17,9 @@ import numpy as np
 
 from ocp.errors import ProblemError, about, checked_count, checked_text, unknown_name
 from ocp.problem.declarations import ENDS, Constraint, Declarations, Guess, Horizon, PhaseTimes, Signal, Variable
+from ocp.problem.enclosures import PrescribedMotion
 from ocp.problem.expressions import ExpressionReader, Value, check_guess, number_of_entries, read_scale, signal_function
 from ocp.problem.hulls import Hull
-from ocp.problem.prescribed import PrescribedMotion
 from ocp.problem.separation import Separation, index_rows, motion_by_pair
 from ocp.problem.stored import restored, stored
 from ocp.problem.values import check_inside, constant, identity

@@ -2,7 +2,7 @@
 
 A body is the convex hull of some points, its core, swelled by a radius; it rides on a frame whose placement is an
 expression of states and time. How near two bodies come is no constraint of a method: the audit proves it over all
-times, and who declares it adds the constraints that he wants held (:mod:`ocp.builders.clearance`).
+times, and who declares it adds the constraints that he wants held (:mod:`ocp.motion.builders.clearance`).
 
 To prove anything between two times it has to be known how the states move the bodies. Seen from a frame that is told,
 with x the states that move the two, a state of rate x_k' moves no point of them by more than lever_k |x_k'| and turns
@@ -13,7 +13,7 @@ none by more than turn_k |x_k'|. A point that is carried by many axes, each by t
 
 p being one body's point less the other's. (The factor 2 is that of Coriolis: an axis that comes later moves points no
 farther than by its lever, and is turned by all before it.) How frames move that time alone places is not told: it is
-bounded from their expressions (:mod:`ocp.problem.prescribed`).
+bounded from their expressions (:mod:`ocp.problem.enclosures`).
 """
 
 from __future__ import annotations

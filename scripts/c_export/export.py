@@ -8,7 +8,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # run as a file, from anywhere
 
 from models import reference_rig, reference_tunnel
-from models.cts.export import export, rig_functions
+from models.cts.table import export, rig_functions
 
 
 def main() -> None:

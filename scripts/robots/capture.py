@@ -18,8 +18,8 @@ from scipy.spatial.transform import Rotation
 from models import FreeFloating, Link, Robot, VisualShape, with_wheels
 from models.arrays import Array
 from ocp import Audit, Collocation, Cone, Effort, FreeTime, Grasp, Limits, Solution, dynamics_problem, plan_capture
-from ocp.app.frames import Frames, frames_along
-from ocp.builders.grasping import grasp_wrench, joined, motion_of, pair_momentum
+from ocp.app.view.appearance import Frames, frames_along
+from ocp.motion.builders.space.grasping import grasp_wrench, joined, motion_of, pair_momentum
 from scripts.drawing import COLORS, DASHES
 from scripts.robots import capture_family
 from scripts.robots.capture_family import SPINS, Member

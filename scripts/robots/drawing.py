@@ -2,7 +2,7 @@
 
 `Scene` is a motion to draw; `page` puts two of them, side by side and seen alike, above three diagrams; `draw_scene`
 puts one into axes of any figure, and `animate` makes an endless film of them. The meshes, tools and frames are those
-that the viewer shows (`ocp.app.appearance`, `ocp.app.frames`), drawn by `ocp.app.rendering`. One colour is the plan's,
+that the viewer shows (`view.appearance`), drawn by `view.rendering`. One colour is the plan's,
 "blue", and one that of what it is compared with, "orange".
 """
 
@@ -21,9 +21,8 @@ from matplotlib.figure import Figure
 
 from models import Robot
 from models.arrays import Array
-from ocp.app.appearance import SURFACE_STYLE, Appearance, Part, appearance_of, part_of, rod
-from ocp.app.frames import Frames
-from ocp.app.rendering import Camera, Floor, Layer, placed, render, tube
+from ocp.app.view.appearance import SURFACE_STYLE, Appearance, Frames, Part, appearance_of, part_of, rod
+from ocp.app.view.rendering import Camera, Floor, Layer, placed, render, tube
 from scripts.drawing import COLORS, DASHES, add_note, gif, sheet
 
 JOINT_COLORS = [COLORS[name] for name in ("blue", "orange", "green", "purple", "yellow", "sky", "black")]

@@ -11,7 +11,7 @@ import numpy as np
 
 from ocp import Audit, TipTask
 from ocp.audit.clearance import Nearest
-from ocp.tasks.equations import task_errors
+from ocp.motion.tasks.equations import task_errors
 from scripts.robots import standing
 from scripts.robots.drawing import animate
 from scripts.robots.results import joint_return, save_motion, save_plan

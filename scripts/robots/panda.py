@@ -11,7 +11,7 @@ import numpy as np
 from models import FixedBase
 from models.arrays import Array
 from ocp import Collocation, TipTask, inverse_kinematics, minimum_velocity_problem, resolve, solve
-from ocp.app.frames import frames_along
+from ocp.app.view.appearance import frames_along
 from scripts.drawing import COLORS
 from scripts.robots.drawing import Scene, animate, joint_curves, page
 from scripts.robots.results import Example

@@ -18,7 +18,7 @@ import numpy as np
 from models import FixedBase, Link, Robot, VisualShape, attached, with_load
 from models.arrays import Array
 from ocp import Audit, Collocation, Effort, Leg, Solution, TipTask, inverse_kinematics, joint_torques, plan_dynamics
-from ocp.app.frames import TIP, Frames, frames_along
+from ocp.app.view.appearance import TIP_FRAME, Frames, frames_along
 from scripts.drawing import COLORS
 from scripts.robots.drawing import Scene, animate, joint_curves, page
 from scripts.robots.panda import HOME
@@ -201,7 +201,7 @@ def scene_of(name: str, example: PickAndPlace) -> Scene:
     first, last = np.flatnonzero(motion.in_hand)[[0, -1]]
     number = np.clip(np.arange(len(motion.t)), first, last)
     frames.rotations["load"], frames.positions["load"] = (
-        part[TIP][number] for part in (frames.rotations, frames.positions)
+        part[TIP_FRAME][number] for part in (frames.rotations, frames.positions)
     )
     for what in (frames.rotations, frames.positions):
         what["stands"] = what[robot.root]

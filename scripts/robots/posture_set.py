@@ -21,12 +21,12 @@ from models.arrays import Array
 from models.paths import rest_to_rest
 from ocp import Limits, SolveError, TipTask, inverse_kinematics, resolve
 from ocp import plan as planned
-from ocp.app.frames import frames_along
-from ocp.planning.charts import Charts, Instant, SelfMotions
-from ocp.planning.joint_space import JointSpace
-from ocp.planning.search import Search
-from ocp.planning.steps import Squares
-from ocp.tasks.equations import bind
+from ocp.app.view.appearance import frames_along
+from ocp.motion.search.charts import Charts, Instant, SelfMotions
+from ocp.motion.search.joint_space import JointSpace
+from ocp.motion.search.search import Search
+from ocp.motion.search.steps import Squares
+from ocp.motion.tasks.equations import bind
 from scripts.drawing import COLORS, VIRIDIS, sheet
 from scripts.robots.results import FINE, Example
 from scripts.robots.robots import TOOL_ANGLE, UR5

@@ -18,7 +18,7 @@ import numpy as np
 from models import Footprint, Standing, Surroundings, Wrench, footprint, with_load
 from models.machines.standing import External
 from ocp import Clear, Collocation, Problem, TipTask, resolve_accelerations, solve
-from ocp.builders.standing import InFoot, Limits, standing_problem
+from ocp.motion.builders.standing import InFoot, Limits, standing_problem
 from scripts.robots import standing
 from scripts.robots.drawing import animate
 from scripts.robots.mobile_manipulator import StandingExample, save

@@ -24,14 +24,14 @@ from models import FixedBase, Surroundings
 from models.arrays import Array
 from models.paths import rest_to_rest
 from ocp import Audit, Limits, Plan, PlanInPieces, Reconfiguration, TipTask, inverse_kinematics, plan_in_pieces
-from ocp.app.frames import frames_along
-from ocp.app.rendering import tube
-from ocp.planning.charts import Charts, Instant, SelfMotions
-from ocp.planning.joint_space import JointSpace
-from ocp.planning.search import Search
-from ocp.planning.steps import Squares
-from ocp.planning.value import Graph
-from ocp.tasks.equations import bind, task_errors
+from ocp.app.view.appearance import frames_along
+from ocp.app.view.rendering import tube
+from ocp.motion.search.charts import Charts, Instant, SelfMotions
+from ocp.motion.search.joint_space import JointSpace
+from ocp.motion.search.search import Search
+from ocp.motion.search.steps import Squares
+from ocp.motion.search.value import Graph
+from ocp.motion.tasks.equations import bind, task_errors
 from scripts.drawing import COLORS, DASHES, sheet
 from scripts.robots.drawing import Scene, animate, draw_scene
 from scripts.robots.robots import PANDA

@@ -14,10 +14,10 @@ from models import FreeFloating, Machine
 from models.arrays import Array
 from ocp import Audit, Plan, Solution, TipTask
 from ocp.curves import differentiation_matrix
-from ocp.local.rates import LocalSolution
-from ocp.planning.motion import Part
+from ocp.motion.local.rates import LocalSolution
+from ocp.motion.plan.motion import Part
+from ocp.motion.tasks.equations import task_errors
 from ocp.storage import write_text
-from ocp.tasks.equations import task_errors
 from scripts.robots.robots import RobotFile
 
 FINE = 1001

@@ -10,8 +10,8 @@ import numpy as np
 from models import FreeFloating
 from models.spatial import rotation_from_rpy
 from ocp import Collocation, TipTask, minimum_velocity_problem, resolve, solve
-from ocp.app.frames import frames_along
-from ocp.tasks.tracks import pose_line
+from ocp.app.view.appearance import frames_along
+from ocp.motion.tasks.tracks import pose_line
 from scripts.drawing import COLORS, DASHES
 from scripts.robots.drawing import Scene, animate, joint_curves, page
 from scripts.robots.results import FINE, Example, turning_angle

@@ -18,13 +18,12 @@ import numpy as np
 
 from models import Footprint, Robot, Standing, Surroundings, Wrench, footprint, locked, with_load
 from models.arrays import Array
-from models.machines.standing import External
-from models.machines.standing_motion import StandingMotion, standing_motion
+from models.machines.standing import External, StandingMotion, standing_motion
 from models.paths import rest_to_rest
 from ocp import Clear, Collocation, Problem, Solution, TipTask, resolve_accelerations, solve
-from ocp.app.frames import frames_along
-from ocp.builders.standing import InFoot, Limits, Weights, standing_problem
-from ocp.tasks.tip_task import timed
+from ocp.app.view.appearance import frames_along
+from ocp.motion.builders.standing import InFoot, Limits, Weights, standing_problem
+from ocp.motion.tasks.tip_task import timed
 from scripts.drawing import COLORS, DASHES
 from scripts.robots.drawing import Scene, page
 

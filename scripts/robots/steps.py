@@ -19,8 +19,8 @@ from scipy.spatial.transform import Rotation
 from models import Foot, Foothold, FreeFloating, Joint, Link, Robot, VisualShape, rectangle
 from models.arrays import Array
 from ocp import Audit, Collocation, Limits, Solution
-from ocp.app.frames import frames_along
-from ocp.builders.standing import (
+from ocp.app.view.appearance import frames_along
+from ocp.motion.builders.standing import (
     StancePhase,
     Steps,
     StepsMotion,

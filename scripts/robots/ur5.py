@@ -13,9 +13,9 @@ from models import FixedBase, Machine
 from models.arrays import Array
 from models.paths import rest_to_rest
 from ocp import Collocation, Solution, SolveError, TipTask, inverse_kinematics, minimum_velocity_problem, resolve, solve
-from ocp.app.frames import TIP, Frames, frames_along
-from ocp.local.inverse_kinematics import Posture
-from ocp.local.rates import LocalSolution
+from ocp.app.view.appearance import TIP_FRAME, Frames, frames_along
+from ocp.motion.local.inverse_kinematics import Posture
+from ocp.motion.local.rates import LocalSolution
 from scripts.drawing import COLORS, DASHES
 from scripts.robots.drawing import Scene, animate, joint_curves, page
 from scripts.robots.results import FINE, Example
@@ -118,7 +118,7 @@ def _planned(machine: Machine, task: TipTask, start: Posture, method: Collocatio
 
 def roll(frames: Frames) -> Array:
     """Angle of the tool about its axis: of its x axis to the lanes' direction, seen along the tool. Shape (M,), rad."""
-    turn = frames.rotations[TIP]
+    turn = frames.rotations[TIP_FRAME]
     axis, lanes = turn[:, :, 2], np.array([0.0, 1.0, 0.0])
     first = lanes - axis * axis[:, 1:2]
     first /= np.linalg.norm(first, axis=1, keepdims=True)

@@ -18,7 +18,7 @@ import numpy as np
 from models import FixedBase, paths, smooth
 from models.arrays import Array
 from ocp import TipTask, Unreachable, inverse_kinematics, resolve
-from ocp.schedule import JointLimits, LineLimits, schedule
+from ocp.motion.schedule import JointLimits, LineLimits, schedule
 from scripts import drawing
 from scripts.papers.run import text_table
 from scripts.robots.panda import HOME, LAP, circling

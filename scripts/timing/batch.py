@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ocp.batch import Batch, run_batch
+from ocp.app.batch import Batch, run_batch
 from scripts import drawing
 from scripts.papers.run import progress, text_table
 from scripts.timing.measure import against, timed

@@ -19,7 +19,7 @@ from models.arrays import Array
 from models.paths import gauss_newton, march, path_function, predictor_corrector
 from models.paths.arc_length import arc_length, speed
 from ocp import plan_minimum_time
-from ocp.schedule import LineLimits, Schedule, peak_acceleration, schedule
+from ocp.motion.schedule import LineLimits, Schedule, peak_acceleration, schedule
 from scripts import drawing
 from scripts.papers.blend.example import (
     ARM,

@@ -16,8 +16,8 @@ from models.arrays import Array
 from models.shapes.shapes import Shape
 from ocp import Plan, plan
 from ocp.audit.clearance import Clearance
-from ocp.builders.clearance import clearance_of
-from ocp.local.touching import distances_along
+from ocp.motion.builders.clearance import clearance_of
+from ocp.motion.local.touching import distances_along
 from scripts import drawing
 from scripts.papers.run import progress, text_table
 from scripts.robots.robots import PANDA, UR5

@@ -1,4 +1,4 @@
-"""A peer of `ocp.planning.waypoints`: Descartes, the ladder graph over samples in the wheel `tesseract-robotics`.
+"""A peer of `ocp.motion.plan.waypoints`: Descartes, the ladder graph over samples in the wheel `tesseract-robotics`.
 
 The wheel lists postures in closed form for arms of two classes of six joints only; of others it has numerical inverse
 kinematics, one posture from one guess, the joints' zeros. So the joints nearest to the base are sampled as those of a

@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from models import Box, FixedBase, Robot, Surroundings
-from ocp.builders.clearance import ROUNDING
+from ocp.motion.builders.clearance import ROUNDING
 from scripts import drawing
 from scripts.papers.run import text_table
 from scripts.timing.robots import ROBOTS, urdf_file

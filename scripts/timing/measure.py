@@ -15,7 +15,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from models.arrays import Array
-from models.cts.export import export
+from models.cts.table import export
 
 FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fno-semantic-interposition", "-std=gnu89")
 """None of them lets the compiler assume numbers finite or reorder sums (no -ffast-math): nan must stay nan. The last

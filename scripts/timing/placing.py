@@ -6,7 +6,7 @@ from typing import Any
 
 from models import FixedBase, Path, Robot, smooth
 from ocp import Plan, TipTask, plan
-from ocp.batch import kept
+from ocp.app.batch import kept
 from scripts.robots.robots import UR5
 
 

@@ -20,8 +20,8 @@ import numpy as np
 from models import FixedBase, SmoothPath, paths, smooth
 from models.arrays import Array
 from ocp import joint_path, plan_minimum_time
-from ocp.builders.joint_spline import PlannedJoints
-from ocp.schedule import JointLimits, LineLimits, Schedule, joint_motion, schedule
+from ocp.motion.builders.joint_spline import PlannedJoints
+from ocp.motion.schedule import JointLimits, LineLimits, Schedule, joint_motion, schedule
 from scripts import drawing
 from scripts.papers.run import progress, text_table
 from scripts.robots.panda import HOME

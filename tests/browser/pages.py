@@ -14,11 +14,10 @@ from urllib.parse import unquote, urlparse
 import numpy as np
 
 from ocp import Plan
-from ocp.app.frames import TIP, frames_along
-from ocp.app.player import page
-from ocp.app.serving import Served
-from ocp.app.shown import Shown, shown_plan, shown_trajectory
-from ocp.files import read_trajectory
+from ocp.app.files import read_trajectory
+from ocp.app.view.appearance import TIP_FRAME, frames_along
+from ocp.app.view.player import Served, page
+from ocp.app.view.shown import Shown, shown_plan, shown_trajectory
 
 __all__ = ["Look", "failures"]
 
@@ -190,7 +189,7 @@ def player(look: Look, opened: Any, name: str, first: Shown, *, ends: bool) -> N
 def poses(look: Look, opened: Any, name: str, first: Shown) -> None:
     """What the page draws between its times, against the model."""
     robot = first.machine.robot
-    links = [robot.root, *(joint.child for joint in robot.joints if joint.moves), TIP]
+    links = [robot.root, *(joint.child for joint in robot.joints if joint.moves), TIP_FRAME]
     for time in np.random.default_rng(0).uniform(0.0, first.t[-1], 5):
         drawn = np.array(opened.evaluate("(time) => [...player.motions[0].at(time)]", time)).reshape(-1, 7)
         joints, base = (

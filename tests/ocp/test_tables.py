@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ocp.schedule import JointTrajectory
-from ocp.tables import cell, column_name, joint_name
+from ocp.motion.schedule import JointTrajectory
+from ocp.storage import cell, column_name, joint_name
 
 ROOT = Path(__file__).parents[2]
 SIGNS = "=+-@\t\r"
@@ -51,7 +51,7 @@ def test_every_writer_of_tables_names_its_columns_here() -> None:
         methods = {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
         if calls & {"writerow", "writerows", "DictWriter", "savetxt"} or "write_csv" in methods:
             taken = [
-                node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module == "ocp.tables"
+                node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module == "ocp.storage"
             ]
             assert {name.name for node in taken for name in node.names} & {"cell", "column_name", "table_head"}, file
             writers.append(file.name)

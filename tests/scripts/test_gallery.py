@@ -19,8 +19,8 @@ from models import FixedBase, FreeFloating, with_wheels
 from models.arrays import Array
 from models.paths import rest_to_rest
 from ocp import Plan, Solution, SolveError, resolve_accelerations
-from ocp.app.frames import TIP, Frames, frames_along
-from ocp.files import read_trajectory
+from ocp.app.files import read_trajectory
+from ocp.app.view.appearance import TIP_FRAME, Frames, frames_along
 from scripts import gallery
 from scripts.robots import (
     capture,
@@ -38,8 +38,8 @@ from scripts.robots import (
 from scripts.robots.drawing import Scene, animate
 from scripts.robots.examples import run
 from scripts.robots.results import turning_angle
-from tests.ocp.builders.captures import replayed_momentum
-from tests.ocp.builders.test_capture import gaps
+from tests.ocp.motion.builders.captures import replayed_momentum
+from tests.ocp.motion.builders.test_capture import gaps
 
 pytestmark = [pytest.mark.xdist_group("gallery"), pytest.mark.long]
 
@@ -317,9 +317,9 @@ def test_roll_is_the_angle_about_the_tools_own_axis() -> None:
     angle = 0.7
     cosine, sine = np.cos(angle), np.sin(angle)
     about_z = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
-    turned = pose.rotations[TIP].copy()
+    turned = pose.rotations[TIP_FRAME].copy()
     turned[1] = turned[1] @ about_z
-    found = ur5.roll(Frames({TIP: turned}, {}))
+    found = ur5.roll(Frames({TIP_FRAME: turned}, {}))
     assert found[1] - found[0] == pytest.approx(angle)
 
 

@@ -16,14 +16,14 @@ import numpy as np
 
 from models.arrays import Array
 from ocp import TipTask, inverse_kinematics
-from ocp.local.inverse_kinematics import Unreachable
-from ocp.planning.charts import Instant, SelfMotions
-from ocp.planning.joint_space import TURN, JointSpace
-from ocp.planning.search import Search
-from ocp.planning.steps import Length, Squares, StepCost
-from ocp.tasks.equations import bind
-from tests.ocp.planning.test_charts import planar
-from tests.ocp.planning.test_values import INSTANTS, SECONDS, reached
+from ocp.motion.local.inverse_kinematics import Unreachable
+from ocp.motion.search.charts import Instant, SelfMotions
+from ocp.motion.search.joint_space import TURN, JointSpace
+from ocp.motion.search.search import Search
+from ocp.motion.search.steps import Length, Squares, StepCost
+from ocp.motion.tasks.equations import bind
+from tests.ocp.motion.search.test_charts import planar
+from tests.ocp.motion.search.test_values import INSTANTS, SECONDS, reached
 from tests.sweep.results import Sweep, parser
 
 KINDS = dict.fromkeys(("plain", "cut", "slow", "turning", "two"), 200)

@@ -19,10 +19,10 @@ import numpy as np
 
 from models import Box, FixedBase, Surroundings
 from ocp import Plan, ProblemError, SolveError, TipTask, inverse_kinematics, plan
-from ocp.local.touching import distances_along
+from ocp.motion.local.touching import distances_along
 from tests.models.shapes.shape_oracles import in_coal
-from tests.ocp.planning.motions import pair
-from tests.ocp.tasks.space_tasks import panda, ur5
+from tests.ocp.motion.plan.motions import pair
+from tests.ocp.motion.tasks.space_tasks import panda, ur5
 from tests.sweep.results import Row, Sweep, parser
 
 SECONDS = 3.0

@@ -1,6 +1,6 @@
 """A batch of 500 whose workers and drivers are killed, on processes and on a cluster, and a disk that is full.
 
-`make faults`. The tests do the same with fewer (`tests/ocp/batch`).
+`make faults`. The tests do the same with fewer (`tests/ocp/app/batch`).
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from tests.ocp.batch.drivers import check_disturbed, check_full_disk, check_killed_cluster, cluster
+from tests.ocp.app.batch.drivers import check_disturbed, check_full_disk, check_killed_cluster, cluster
 
 NUMBER = 500
 

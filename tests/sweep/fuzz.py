@@ -41,11 +41,10 @@ from models import Box, FixedBase, ModelError, Moving, Robot, Sphere, planar_cha
 from models.shapes.mesh_files import read_mesh
 from models.shapes.pairs import checked_pairs
 from ocp import AuditError, Collocation, Plan, Problem, ProblemError, Solution, SolveError, TipTask, plan, solve
-from ocp.files import read_gcode, read_trajectory, read_waypoints
-from ocp.files.mcap import DEFINITIONS, STATE
-from ocp.files.obstacles import read_obstacles
-from ocp.files.task_file import read_task
-from ocp.schedule import JointTrajectory
+from ocp.app.files import read_gcode, read_trajectory, read_waypoints
+from ocp.app.files.mcap import DEFINITIONS, STATE
+from ocp.app.files.task_file import read_obstacles, read_task
+from ocp.motion.schedule import JointTrajectory
 from tests.ocp.app.motions import NAMES, URDF, smooth
 
 Random: TypeAlias = np.random.Generator

@@ -18,9 +18,9 @@ import numpy as np
 from models import FixedBase
 from models.arrays import Array
 from ocp import ProblemError, SolveError, TipTask, inverse_kinematics, plan
-from ocp.local.inverse_kinematics import Unreachable
-from tests.ocp.planning.test_charts import planar
-from tests.ocp.tasks.space_tasks import panda, ur5
+from ocp.motion.local.inverse_kinematics import Unreachable
+from tests.ocp.motion.search.test_charts import planar
+from tests.ocp.motion.tasks.space_tasks import panda, ur5
 from tests.sweep.results import Row, Sweep, parser
 
 SECONDS = 4.0

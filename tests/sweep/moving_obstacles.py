@@ -22,10 +22,10 @@ import numpy as np
 from models import Box, Capsule, FixedBase, Mesh, ModelError, Moving, Sphere, Surroundings
 from ocp import Collocation, Problem, ProblemError, Solution, solve
 from ocp.audit.clearance import Clearance, clearance
-from ocp.builders.clearance import CLEARANCE, Clear
+from ocp.motion.builders.clearance import CLEARANCE, Clear
 from ocp.problem.formulation import Formulation
 from tests.models.shapes.shape_oracles import in_coal
-from tests.ocp.tasks.space_tasks import panda, ur5
+from tests.ocp.motion.tasks.space_tasks import panda, ur5
 from tests.sweep.results import Row, Sweep, parser
 
 SECONDS = 4.0

@@ -18,7 +18,7 @@ import pinocchio as pin
 
 from models.arrays import Array
 from ocp import SolveError
-from ocp.planning.waypoints import WaypointPlan, plan_waypoints
+from ocp.motion.plan.waypoints import WaypointPlan, plan_waypoints
 from tests.models.machines.test_redundancy_benchmark import by_coal
 from tests.redundancy_benchmark import FOLDER, PROBLEMS, Benchmark, problem_of, tip_and_file
 from tests.sweep.results import Row, Sweep, parser

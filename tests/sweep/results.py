@@ -23,7 +23,7 @@ Case = tuple[str, int]
 Row = dict[str, Any]
 TABLE = "sweeps.csv"
 ROOT = Path(ocp.__file__).parents[1]
-ABOVE = ("ocp/app/", "ocp/batch/", "ocp/files/")
+ABOVE = ("ocp/app/", "ocp/app/batch/", "ocp/app/files/")
 """Rooms that no plan is made by."""
 MINUTE = 60.0
 """s."""

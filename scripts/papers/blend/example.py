@@ -7,7 +7,7 @@ import numpy as np
 from models import Arc, Line, Path, Scara, SmoothPath, smooth
 from models.machines.scara import Elbow
 from models.paths.blends import BlendKind
-from ocp.schedule import JointLimits
+from ocp.motion.schedule import JointLimits
 
 MM = 1e-3
 

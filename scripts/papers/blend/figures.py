@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from models import SmoothPath
 from models.arrays import Array
 from models.paths.blends import BlendKind, polynomial
-from ocp.schedule import joint_motion
+from ocp.motion.schedule import joint_motion
 from scripts.drawing import ASSUMING, COLORS, DASHES, add_note, caption, gif, legend_below, sheet
 from scripts.papers.blend.example import (
     ARM,

@@ -11,7 +11,7 @@ from models.arrays import Array
 from models.paths import Blend, gauss_newton, march, predictor_corrector
 from models.paths.arc_length import arc_length
 from models.paths.blends import BlendKind, polynomial
-from ocp.schedule import Schedule, SpeedProfile
+from ocp.motion.schedule import Schedule, SpeedProfile
 from scripts.papers.blend.example import MM, PERIOD, SHAPE, SPEED, corner
 from scripts.papers.run import Row
 

@@ -14,8 +14,8 @@ from models.machines.scara_path import ScaraPath
 from models.paths import gamma
 from models.paths.blends import BlendKind, polynomial
 from ocp import plan_minimum_time
-from ocp.builders.timing import Fastest
-from ocp.schedule import LineLimits, Schedule, peak_acceleration, schedule
+from ocp.motion.builders.timing import Fastest
+from ocp.motion.schedule import LineLimits, Schedule, peak_acceleration, schedule
 from scripts.papers.blend.example import (
     ARM,
     CENTRIPETAL,

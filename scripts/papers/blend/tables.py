@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ocp.schedule import joint_motion, joint_trajectory
+from ocp.motion.schedule import joint_motion, joint_trajectory
 from scripts.papers.blend.example import (
     CENTRIPETAL,
     JOINT_LIMITS,

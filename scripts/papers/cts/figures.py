@@ -15,8 +15,8 @@ from models import Rig
 from models.arrays import Array
 from models.cts.clearance import rig_capsules
 from models.cts.rig import INCH
-from ocp.app.appearance import Part, part_of, rod
-from ocp.app.rendering import Camera, Layer, render, tube
+from ocp.app.view.appearance import Part, part_of, rod
+from ocp.app.view.rendering import Camera, Layer, render, tube
 from scripts.drawing import ASSUMING, COLORS, DASHES, TIME_COLORS, add_note, gif, legend_below, posture, sheet
 from scripts.papers.cts.plan import draw_plan
 from scripts.papers.cts.results import GAINS, NOTE, SCALE, Results, corners, surroundings

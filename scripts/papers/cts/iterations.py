@@ -17,8 +17,7 @@ import numpy as np
 from models import ModelError, Rig, Tunnel
 from models.arrays import Array, ArrayInput, checked_array
 from models.cts.rig import HOME, INCH, Branch, forward, inverse, task_jacobian
-from models.cts.roll import index_harmonics
-from models.cts.roll_change import checked_gain
+from models.cts.roll import checked_gain, index_harmonics
 from models.cts.table import checked_targets
 from models.spatial import Expression, solve_spd
 

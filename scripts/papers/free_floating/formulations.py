@@ -14,8 +14,8 @@ import numpy as np
 from models import Machine, paper_example
 from ocp import Problem, TipTask, minimum_velocity_problem, resolve
 from ocp.direct.guess import Samples
-from ocp.local.rates import LocalSolution, least_rates
-from ocp.tasks.equations import bind
+from ocp.motion.local.rates import LocalSolution, least_rates
+from ocp.motion.tasks.equations import bind
 
 __all__ = ["HORIZON", "ROWS", "START_JOINTS", "TASK", "TIP_VELOCITY", "null_space_problem", "problem"]
 

@@ -13,7 +13,7 @@ from models import FreeFloating, centers_of_mass, link_frames
 from models.arrays import Array
 from ocp import Audit, Solution
 from ocp.curves import PiecewisePolynomial, differentiation_matrix
-from ocp.local.rates import LocalSolution, least_rates
+from ocp.motion.local.rates import LocalSolution, least_rates
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from models.machines.standing_motion import StandingMotion
+from models.machines.standing import StandingMotion
 from scripts.drawing import COLORS, add_note, gif, sheet
 from scripts.papers.run import progress
 from scripts.papers.standing.cases import ASSUMED, HORIZON, Local, machine

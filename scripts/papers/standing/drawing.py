@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 
 from models import link_frames
-from models.machines.standing_motion import StandingMotion
+from models.machines.standing import StandingMotion
 from scripts.drawing import COLORS, DASHES, TIME_COLORS, posture
 from scripts.papers.standing.cases import Array, Local, machine
 from scripts.papers.standing.plans import Plan

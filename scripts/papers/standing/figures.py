@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from models.machines.standing_motion import StandingMotion
+from models.machines.standing import StandingMotion
 from scripts.drawing import ASSUMING, COLORS, legend_below, sheet, time_bar
 from scripts.papers.run import Row
 from scripts.papers.standing.animation import draw_animations

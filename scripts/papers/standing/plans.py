@@ -10,9 +10,9 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from models import STANDING_STARTS
-from models.machines.standing_motion import StandingMotion, standing_motion
+from models.machines.standing import StandingMotion, standing_motion
 from ocp import Audit, Collocation, MultipleShooting, Problem, Solution, TipTask, solve, tighten
-from ocp.builders.standing import (
+from ocp.motion.builders.standing import (
     Anywhere,
     FreeTime,
     IndexAtLeast,
@@ -23,7 +23,7 @@ from ocp.builders.standing import (
     ZmpRule,
     standing_problem,
 )
-from ocp.tasks.equations import task_errors
+from ocp.motion.tasks.equations import task_errors
 from scripts.papers.run import Row, progress
 from scripts.papers.standing.cases import HORIZON, ROWS, Array, led, machine, spring, start_tip, table_task
 

@@ -1,6 +1,6 @@
 """The null-space law (22) of Yoo et al. 2004 with the sign of C as it is printed: a likely cause of its Figure 4.
 
-The corrected law is ocp.local.laws' "null_space". With -C the zero moment point is not held where it is asked
+The corrected law is local.accelerations' "null_space". With -C the zero moment point is not held where it is asked
 to be, and the machine does not fall.
 """
 
@@ -10,11 +10,11 @@ import casadi as ca
 import numpy as np
 
 from models import Standing
-from models.machines.standing_motion import StandingMotion, standing_motion
+from models.machines.standing import StandingMotion, standing_motion
 from ocp import TipTask
 from ocp.curves import rk4_step
-from ocp.local.rates import least_rates
-from ocp.tasks.equations import bind
+from ocp.motion.local.rates import least_rates
+from ocp.motion.tasks.equations import bind
 
 __all__ = ["printed_law"]
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from models.machines.standing_motion import StandingMotion
+from models.machines.standing import StandingMotion
 from scripts.papers.run import Content, Row, Table, compared, text_table
 from scripts.papers.standing.cases import ASSUMED, CHOSEN, GAINS
 from scripts.papers.standing.checks import ALLOWED

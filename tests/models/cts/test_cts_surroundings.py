@@ -14,8 +14,16 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from models import Box, Capsule, Link, ModelError, reference_rig
-from models.cts.clearance import Surroundings, clearances, rig_capsules
-from models.cts.gaps import LinkCapsule, box_distance, capsule_in_box, capsule_to_box, capsule_to_capsule
+from models.cts.clearance import (
+    LinkCapsule,
+    Surroundings,
+    box_distance,
+    capsule_in_box,
+    capsule_to_box,
+    capsule_to_capsule,
+    clearances,
+    rig_capsules,
+)
 from models.cts.rig import dh_frames
 from models.shapes.distance import soft_minimum
 from scripts.papers.cts.release import GRAVITY, Ejector, SlenderAir, Store, release, yaw_pitch

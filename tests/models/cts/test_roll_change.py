@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from models import ModelError, reference_rig, reference_tunnel
-from models.cts.roll_change import checked_gain, convex_minima, descend, roll_window, unrolled
+from models.cts.roll import checked_gain, convex_minima, descend, roll_window, unrolled
 from models.cts.trigonometric import Harmonics
 from tests.models.cts.cts_oracle import index_by_geometry, random_targets
 

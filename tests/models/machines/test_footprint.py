@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
 from models import ModelError, Robot, footprint, link_frames, simplified
-from models.machines.footprint import convex_hull
+from models.machines.support import convex_hull
 from tests.models.robot.pinocchio_robots import ROBOTS, urdf_file
 from tests.models.robot.trees import numeric
 

@@ -16,7 +16,7 @@ from models.arrays import Array
 from models.shapes.bodies import bodies_of
 from models.shapes.pairs import ALWAYS, NEIGHBOURS, NEVER, RIGID
 from ocp import TipTask, inverse_kinematics
-from ocp.local.touching import distances_along
+from ocp.motion.local.touching import distances_along
 from tests.models.shapes.shape_oracles import in_coal
 from tests.redundancy_benchmark import PROBLEMS, Benchmark, problem_of
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from models import Arc, Line, ModelError, Path, Scara, scara_along, smooth, tip_jacobian, tip_pose
 from models.machines.scara_path import ScaraPath
 from ocp import ProblemError
-from ocp.schedule import JointLimits, LineLimits, schedule
+from ocp.motion.schedule import JointLimits, LineLimits, schedule
 from tests.models.paths.task_paths import random_arm_path, seeds, turned
 
 pytestmark = pytest.mark.filterwarnings("ignore:overlap='shrink'")  # blends of random paths may overlap

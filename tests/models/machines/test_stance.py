@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from models import Foot, Foothold, ModelError, Stance, Standing, Support, Wrench, inverse_dynamics, rectangle, rerooted
 from models.robot.dynamics import base_reaction
-from models.robot.motion import link_motions
+from models.robot.kinematics import link_motions
 from scripts.robots.robots import TALOS
 from scripts.robots.steps import SIDES, planar_biped, planar_feet
 from scripts.robots.talos import HELD, talos_steps

@@ -25,8 +25,7 @@ from models import (
     rectangle,
     standing_example,
 )
-from models.machines.standing import center_of_pressure, tip_spring
-from models.machines.standing_motion import standing_motion
+from models.machines.standing import center_of_pressure, standing_motion, tip_spring
 from tests.models.machines.standing_machines import random_motion, random_standing, standing_arm
 from tests.models.robot.oracles import mujoco_dynamics, pinocchio_dynamics, with_masses
 from tests.models.robot.trees import Array, few, numeric, random_robot, random_rotation, seeds

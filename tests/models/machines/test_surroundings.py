@@ -31,8 +31,7 @@ from models import (
     link_frames,
 )
 from models.shapes.distance import distance
-from models.shapes.hull import convex_hull
-from models.shapes.nearest import gap_along, nearest_directions
+from models.shapes.hull import convex_hull, gap_along, nearest_directions
 from tests.models.machines.armoured import armoured_arm
 
 OBSTACLES = (

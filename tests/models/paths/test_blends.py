@@ -16,7 +16,7 @@ from scipy.optimize import minimize_scalar
 from scipy.spatial import cKDTree
 
 from models import Arc, Line, ModelError, ModelWarning, Path, SmoothPath, smooth
-from models.paths import end_curvature, gamma, middle_curvature, peak_curvature, rest_to_rest, rounding, shape_factor
+from models.paths import blends, end_curvature, gamma, middle_curvature, peak_curvature, rest_to_rest, rounding
 from models.paths.arc_length import arc_length
 from models.paths.blends import LARGEST_SHAPE, polynomial
 from tests.models.paths.task_paths import random_path, seeds
@@ -225,7 +225,7 @@ def test_corners_in_parts_are_rounded_as_all_at_once(monkeypatch: pytest.MonkeyP
     path = random_path(np.random.default_rng(11), 12, arcs=0.3, helices=0.4)
     whole = smooth(path, deviation=1e-3)
     monkeypatch.setattr(rounding, "SETTINGS", replace(rounding.SETTINGS, block=2))
-    monkeypatch.setattr(shape_factor, "SEARCH", replace(shape_factor.SEARCH, block=2))
+    monkeypatch.setattr(blends, "SEARCH", replace(blends.SEARCH, block=2))
     parts = smooth(path, deviation=1e-3)
     assert parts.remaining == pytest.approx(whole.remaining, rel=1e-9)
     assert parts.shape == pytest.approx(whole.shape, rel=1e-9)

@@ -12,8 +12,7 @@ from scipy.optimize import minimize_scalar
 
 from models import Arc, Helix, Line, Path, SmoothPath, smooth
 from models.paths import peak_curvature
-from models.paths.blends import polynomial
-from models.paths.shape_factor import corner_shape
+from models.paths.blends import corner_shape, polynomial
 from tests.models.paths.task_paths import random_path, seeds
 
 few = settings(max_examples=40)

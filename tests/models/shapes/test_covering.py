@@ -17,8 +17,8 @@ from models.shapes import covering
 from models.shapes.bodies import capsule_around
 from models.shapes.covering import Cover, cover, cut, fitted, inside
 from models.shapes.hull import convex_hull
+from models.shapes.mesh_files import Faces
 from models.shapes.shapes import Box, Capsule
-from models.shapes.triangles import Faces
 from tests.families import some
 
 pytestmark = pytest.mark.xdist_group("covers")  # one process, so that the plate is covered once

@@ -16,9 +16,8 @@ import trimesh
 from models import ModelError
 from models.arrays import Array
 from models.input_files import INPUT_LIMITS
-from models.shapes import collada, mesh_files, triangles
-from models.shapes.mesh_files import find_mesh, read_mesh, read_painted_mesh
-from models.shapes.triangles import Faces
+from models.shapes import mesh_files
+from models.shapes.mesh_files import Faces, find_mesh, read_mesh, read_painted_mesh
 from tests.models.robot.pinocchio_robots import collection
 
 CORNERS = np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0], [0.0, 0.2, 0.0], [0.1, 0.1, 0.5]])
@@ -134,8 +133,8 @@ def test_a_collada_scene_places_its_meshes_and_knows_its_unit(tmp_path: Path) ->
 def test_parts_side_by_side_keep_their_triangles() -> None:
     """Of different sizes, and one of none."""
     rng = np.random.default_rng(1)
-    parts = [triangles.bare(rng.normal(size=(n, 3)), rng.integers(0, max(n, 1), (n, 3))) for n in (3, 0, 5, 2)]
-    whole = triangles.together(parts)
+    parts = [mesh_files.bare(rng.normal(size=(n, 3)), rng.integers(0, max(n, 1), (n, 3))) for n in (3, 0, 5, 2)]
+    whole = mesh_files.together(parts)
     wanted = np.concatenate([part.vertices[part.faces].reshape(-1, 3) for part in parts])
     np.testing.assert_array_equal(whole.vertices[whole.faces].reshape(-1, 3), wanted)
     assert whole.faces.min() >= 0
@@ -234,8 +233,7 @@ def test_a_broken_file_is_named_with_the_place(tmp_path: Path, name: str, conten
 
 def test_a_large_file_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     limits = replace(INPUT_LIMITS, mesh_bytes=1000, mesh_text_bytes=100)
-    for module in (mesh_files, triangles):
-        monkeypatch.setattr(module, "INPUT_LIMITS", limits)
+    monkeypatch.setattr(mesh_files, "INPUT_LIMITS", limits)
     for name, contents in [("a.stl", b"solid" + b" " * 200), ("a.obj", b" " * 101), ("a.dae", b" " * 101)]:
         with pytest.raises(ModelError, match=r"bytes of text, limit 100|at most 100 are read"):
             read_mesh(written(tmp_path, name, contents))
@@ -246,8 +244,7 @@ def test_a_large_file_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 def test_too_many_triangles_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in (mesh_files, collada):
-        monkeypatch.setattr(module, "INPUT_LIMITS", replace(INPUT_LIMITS, mesh_triangles=3))
+    monkeypatch.setattr(mesh_files, "INPUT_LIMITS", replace(INPUT_LIMITS, mesh_triangles=3))
     corner = "vertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendfacet\n"
     broken: list[tuple[str, str | bytes]] = [
         ("a.stl", binary_stl(CORNERS, FACES)),

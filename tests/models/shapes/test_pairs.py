@@ -14,7 +14,7 @@ import pytest
 
 from models import CollisionShape, Frame, Joint, Link, Mimic, ModelError, ModelWarning, Robot, link_frames, renamed
 from models.arrays import Array
-from models.shapes.bodies import Body, LinkMesh, bodies_of
+from models.shapes.bodies import Body, LinkMesh, RigidParts, bodies_of
 from models.shapes.distance import distance
 from models.shapes.pairs import (
     ALWAYS,
@@ -30,7 +30,6 @@ from models.shapes.pairs import (
     _postures,
     checked_pairs,
 )
-from models.shapes.rigid_parts import RigidParts
 from models.shapes.shapes import Box, Capsule, Shape, Sphere
 from tests import redundancy_benchmark
 from tests.models.robot.pinocchio_robots import ROBOTS, urdf_file

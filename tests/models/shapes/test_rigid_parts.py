@@ -10,7 +10,7 @@ import pytest
 
 from models import Joint, Link, Mimic, Robot, link_frames
 from models.arrays import Array
-from models.shapes.rigid_parts import RigidParts, Step, arms
+from models.shapes.bodies import RigidParts, Step, arms
 from models.shapes.shapes import Box, Capsule, Shape, Sphere
 
 

@@ -12,9 +12,9 @@ import pytest
 from models import FixedBase, FreeFloating, Robot, Sphere, Standing, inverse_dynamics
 from ocp import Plan
 from ocp.app import Check, Fault, check_trajectory
-from ocp.app.verdict import BaseKind
+from ocp.app.check.verdict import BaseKind
+from ocp.app.files import read_trajectory, read_waypoints
 from ocp.errors import ProblemError
-from ocp.files import read_trajectory, read_waypoints
 from tests.ocp.app.motions import MIDDLE, NAMES, SWING, TURNS, URDF, smooth, write_table
 
 AT = 1.7

@@ -17,8 +17,8 @@ from toppra.algorithm import TOPPRA
 from toppra.constraint import JointAccelerationConstraint, JointVelocityConstraint
 
 from ocp.app import Check, check_trajectory
-from ocp.app.pieces import Motion
-from ocp.files import RawTrajectory
+from ocp.app.check.pieces import Motion
+from ocp.app.files import RawTrajectory
 from tests.ocp.app.test_check_toppra import arm
 
 FASTER = 1.1

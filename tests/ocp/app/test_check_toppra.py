@@ -17,7 +17,7 @@ from toppra.constraint import JointAccelerationConstraint, JointVelocityConstrai
 
 from models import Robot
 from ocp.app import check_trajectory
-from ocp.files import read_trajectory
+from ocp.app.files import read_trajectory
 from tests.ocp.app.motions import joint, link, write_table
 
 SEED, DOF, POSTURES = 9, 7, 5

@@ -22,8 +22,8 @@ import pytest
 from models import cache as kept
 from ocp import Plan, PlanInPieces, ProblemError, SolveError, plan_in_pieces
 from ocp.app import main
+from ocp.app.files.task_file import read_task
 from ocp.app.progress import Progress
-from ocp.files.task_file import read_task
 from tests.ocp.app.motions import smooth, write_robot, write_table
 
 TASK = """# a seam

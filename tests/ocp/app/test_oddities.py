@@ -13,14 +13,13 @@ import pytest
 from models import FixedBase, FreeFloating, Robot, Sphere, Standing, Surroundings, mass_matrix, rectangle
 from ocp import Plan
 from ocp.app import Check, check_trajectory
-from ocp.app.bases import floating_base
-from ocp.app.joint_limits import floating_torques
-from ocp.app.oddities import BASES
-from ocp.app.pieces import Motion, Pieces, highest
-from ocp.app.surroundings import proof, within_limits
+from ocp.app.check.joint_limits import floating_base, floating_torques
+from ocp.app.check.oddities import BASES
+from ocp.app.check.pieces import Motion, Pieces, highest
+from ocp.app.check.surroundings import proof, within_limits
+from ocp.app.files import read_trajectory
 from ocp.errors import ProblemError
-from ocp.files import read_trajectory
-from ocp.local.touching import distances_along
+from ocp.motion.local.touching import distances_along
 from tests.ocp.app.motions import MIDDLE, NAMES, SWING, URDF, joint, link, smooth, write_table
 
 GALLERY = Path(__file__).resolve().parents[3] / "results" / "gallery"

@@ -20,12 +20,12 @@ from hypothesis import strategies as st
 from models import Joint, Link, ModelError, Robot
 from ocp import Plan, ProblemError
 from ocp.app import main
-from ocp.app.report import POLICY
-from ocp.app.serving import Served
-from ocp.files import read_trajectory
-from ocp.files.outputs import SUFFIXES, checked_output
-from ocp.schedule import JointTrajectory
-from ocp.tables import column_name, joint_name, table_head, table_joints
+from ocp.app.files import read_trajectory
+from ocp.app.files.outputs import SUFFIXES, checked_output
+from ocp.app.view.player import Served
+from ocp.app.view.report import POLICY
+from ocp.motion.schedule import JointTrajectory
+from ocp.storage import column_name, joint_name, table_head, table_joints
 from tests.ocp.app.motions import smooth, write_robot, write_table
 from tests.ocp.app.test_command import TASK, planned, run
 

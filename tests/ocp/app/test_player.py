@@ -40,17 +40,15 @@ from models import (
 from models.arrays import Array
 from models.robot.kinematics import centers_of_mass
 from ocp import Clear, Collocation, Plan, ProblemError, Solution, TipTask, minimum_velocity_problem, solve
-from ocp.app import appearance, main, serving
-from ocp.app.appearance import appearance_of
-from ocp.app.frames import frames_along
-from ocp.app.player import page, unpacked
-from ocp.app.quantities import Curve, footing_of
-from ocp.app.serving import Served
-from ocp.app.shown import PAGE_SETTINGS, shown_plan, shown_solution, shown_trajectory
-from ocp.files import read_trajectory
-from ocp.local.touching import distances_along
-from ocp.planning.motion import Part
-from ocp.tasks.targets import targets_along
+from ocp.app import main
+from ocp.app.files import read_trajectory
+from ocp.app.view import appearance, player
+from ocp.app.view.appearance import appearance_of, frames_along
+from ocp.app.view.player import Served, page, unpacked
+from ocp.app.view.shown import PAGE_SETTINGS, Curve, footing_of, shown_plan, shown_solution, shown_trajectory
+from ocp.motion.local.touching import distances_along
+from ocp.motion.plan.motion import Part
+from ocp.motion.tasks.targets import targets_along
 from tests.models.machines.armoured import armoured_arm
 
 MACHINE = """<robot name="arm">
@@ -440,7 +438,7 @@ def test_a_page_is_whole_small_the_same_again_and_asks_nobody(plans: dict[str, P
 
 
 def test_a_page_that_is_too_large_is_not_written(plans: dict[str, Plan], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ocp.app.player.PAGE_SETTINGS", replace(PAGE_SETTINGS, most_bytes=10_000))
+    monkeypatch.setattr("ocp.app.view.player.PAGE_SETTINGS", replace(PAGE_SETTINGS, most_bytes=10_000))
     with pytest.raises(ProblemError, match="MB"):
         page([shown_plan(plans["fixed"])])
     with pytest.raises(ProblemError, match="at least one"):
@@ -487,7 +485,7 @@ def test_the_command_writes_a_page_or_serves_it(
     assert "grip" in capsys.readouterr().err
     loose = ["--tolerance", "rates=1e-30"]
     assert main(["view", words[0], "--page", str(target), "--quiet", *loose]) in (0, 1)
-    monkeypatch.setattr(serving.Served, "wait", lambda self: urllib.request.urlopen(self.address, timeout=20).close())
+    monkeypatch.setattr(player.Served, "wait", lambda self: urllib.request.urlopen(self.address, timeout=20).close())
     assert main(["view", words[0], "--port", "0"]) == 0
     shown = capsys.readouterr()
     assert "http://127.0.0.1:" in shown.err

@@ -30,9 +30,9 @@ from ocp import (
     resolve,
     solve,
 )
-from ocp.app.colors import COMPARED, LIMIT, PLAN
-from ocp.local.rates import LocalSolution
-from ocp.planning import Candidate, Reason, Rejection
+from ocp.app.view.appearance import COMPARED, LIMIT, PLAN
+from ocp.motion.local.rates import LocalSolution
+from ocp.motion.plan import Candidate, Reason, Rejection
 
 START = np.array([0.3, 0.7, 0.5])
 TASK = TipTask(rows=(3, 4), velocity=(-0.1, 0.05))

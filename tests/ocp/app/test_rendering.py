@@ -7,8 +7,8 @@ import pytest
 
 from models.arrays import Array
 from ocp import ProblemError
-from ocp.app.appearance import Part, part_of
-from ocp.app.rendering import PICTURE_STYLE, Camera, Floor, Layer, render, tube
+from ocp.app.view.appearance import Part, part_of
+from ocp.app.view.rendering import PICTURE_STYLE, Camera, Floor, Layer, render, tube
 
 RNG = np.random.default_rng(17)
 PURE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))

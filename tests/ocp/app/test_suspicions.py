@@ -13,10 +13,10 @@ import pytest
 
 from models import FixedBase, Robot
 from ocp.app import Check, check_trajectory, main
-from ocp.app.pieces import Motion
-from ocp.app.suspicions import exchanged_joints
+from ocp.app.check.pieces import Motion
+from ocp.app.check.suspicions import exchanged_joints
+from ocp.app.files import RawTrajectory
 from ocp.errors import ProblemError
-from ocp.files import RawTrajectory
 from tests.ocp.app.motions import write_table
 
 HOME = np.array([0.3, -1.2, 1.4, -1.7, -1.5, 0.4])

@@ -14,7 +14,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from models.shapes.nearest import gap_along, nearest_directions
+from models.shapes.hull import gap_along, nearest_directions
 from ocp import Collocation, MultipleShooting, Problem, ProblemError, Solution, solve
 from ocp.audit.clearance import Clearance, ProofSettings, Track, clearance_along, nearest_at
 from ocp.problem.hulls import Frames, Hull, frames_of

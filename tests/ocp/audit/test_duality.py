@@ -11,8 +11,8 @@ import pytest
 from ocp import Collocation, MultipleShooting, Problem, Solution, solve
 from ocp.audit.accessory import AccessoryProblem
 from ocp.audit.costates import adjoint
-from ocp.audit.duality import Fit, best_multipliers
 from ocp.audit.linearisation import Linearisation
+from ocp.audit.optimality import Fit, best_multipliers
 from ocp.audit.sizes import sizes
 from ocp.curves import PiecewisePolynomial
 from ocp.problem.formulation import Formulation

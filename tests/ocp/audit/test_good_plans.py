@@ -23,7 +23,7 @@ from ocp import (
 )
 from tests.ocp.audit.drawn import drawn, holds, is_no_minimum, of
 from tests.ocp.audit.test_unsound_motions import START, arm, circle
-from tests.ocp.builders.standing_tasks import table_plan
+from tests.ocp.motion.builders.standing_tasks import table_plan
 from tests.ocp.problems import double_integrator
 from tests.ocp.test_tightening import walled
 

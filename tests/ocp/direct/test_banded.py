@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ocp.direct.banded import Bordered
+from ocp.direct.active_set import Bordered
 
 
 def coupled(rng: np.random.Generator, size: int, reach: int, shared: int, tied: int) -> np.ndarray:

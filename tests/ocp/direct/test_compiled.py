@@ -22,7 +22,7 @@ import pytest
 from models import cache
 from ocp import Collocation, MultipleShooting, Problem, SolveError, libraries, prepare
 from ocp.console import OutOfTime, limited
-from ocp.direct import compiled
+from ocp.direct import controller
 from ocp.direct.assembly import Derivatives, derivatives
 from ocp.libraries import CompilerError, Library, built
 from ocp.problem.formulation import Formulation
@@ -97,7 +97,7 @@ def test_compiled_functions_are_the_interpreted_ones_to_the_last_bit(shared: Pat
     random = np.random.default_rng(0)
     seen = 0
     blocks = method.transcribe(form).blocks
-    for block, own in zip(blocks, compiled.block_derivatives(method.transcribe(form), True), strict=True):
+    for block, own in zip(blocks, controller.block_derivatives(method.transcribe(form), True), strict=True):
         for name, plain, other in zip(Derivatives._fields, derivatives(block.function), own, strict=True):
             seen += other.class_name() == "External"
             for _ in range(5):

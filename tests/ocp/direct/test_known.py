@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ocp import Collocation, MultipleShooting, Problem, SolveError, solve
-from ocp.direct.known import self_running
+from ocp.direct.scaling import self_running
 from ocp.problem.formulation import Formulation
 
 METHODS: dict[str, Any] = {

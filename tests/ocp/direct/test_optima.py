@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ocp import Collocation, MultipleShooting, Problem, SolveError, prepare, solve
-from ocp.direct.kkt import conditions
+from ocp.direct.active_set import conditions
 from ocp.direct.nlp import Outcome
 from ocp.direct.prepared import Prepared
 from ocp.direct.scaling import unscaled

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ocp import Collocation, MultipleShooting, Problem, Solution, SolveError, prepare, solve
-from ocp.direct.starts import roll_out
+from ocp.direct.guess import roll_out
 from tests.ocp.problems import EVERY_METHOD, double_integrator, plant, van_der_pol
 
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from ocp import Problem
 from ocp.indirect.hamiltonian import Hamiltonian
-from ocp.indirect.minimality import not_least, null_space
+from ocp.indirect.method import not_least, null_space
 from ocp.indirect.sensitivity import Extremal
 from ocp.problem.formulation import Formulation
 from tests.ocp.problems import Array

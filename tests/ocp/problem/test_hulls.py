@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.optimize import minimize
 
-from models.shapes.nearest import gap_along, is_box, nearest_directions
+from models.shapes.hull import gap_along, is_box, nearest_directions
 from ocp.problem.hulls import Frames, Hull, PairsOfBodies, frames_of, grouped
 
 CORNERS = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)]) / 2.0

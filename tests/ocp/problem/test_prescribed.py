@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from ocp import Problem, ProblemError
+from ocp.problem.enclosures import PrescribedMotion
 from ocp.problem.hulls import Hull
-from ocp.problem.prescribed import PrescribedMotion
 from ocp.problem.separation import Separation
 
 T = ca.SX.sym("t")

@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from ocp.problem.sampling import Sampler
+from ocp.problem.values import Sampler
 
 
 @pytest.mark.parametrize("symbols", [ca.SX, ca.MX])

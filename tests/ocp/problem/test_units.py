@@ -12,8 +12,8 @@ from models import FixedBase, FreeFloating, Joint, Link, Robot, planar_chain, re
 from ocp import Limits, Problem, ProblemError, TipTask, minimum_velocity_problem, roll_problem, standing_problem
 from ocp.problem.formulation import Formulation
 from tests.models.machines.standing_machines import standing_arm
-from tests.ocp.builders.standing_tasks import ARM_HORIZON, ARM_START, arm_task
-from tests.ocp.builders.test_cts import falling
+from tests.ocp.motion.builders.standing_tasks import ARM_HORIZON, ARM_START, arm_task
+from tests.ocp.motion.builders.test_cts import falling
 
 
 def cart(**end: Any) -> Problem:

@@ -8,7 +8,7 @@ from PIL import Image
 
 from models import Path as TaskPath
 from models import Scara, smooth
-from ocp.schedule import JointTrajectory, LineLimits, joint_motion, schedule
+from ocp.motion.schedule import JointTrajectory, LineLimits, joint_motion, schedule
 from scripts import blend
 from scripts.papers.blend.example import (
     ARM,

@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from models import ModelError, reference_rig, reference_tunnel
-from models.cts.export import export, rig_functions
+from models.cts.table import export, rig_functions
 from scripts import cts
 from scripts.papers.cts.results import Results
 from tests.models.cts.cts_oracle import random_targets

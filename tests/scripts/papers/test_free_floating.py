@@ -9,7 +9,7 @@ from PIL import Image
 
 from models import FreeFloating, paper_example
 from ocp import Collocation, TipTask, resolve, solve
-from ocp.local.rates import LocalSolution
+from ocp.motion.local.rates import LocalSolution
 from scripts import free_floating
 from scripts.papers.free_floating import extremals, false_optima
 from scripts.papers.free_floating import results as free_floating_results

@@ -12,9 +12,9 @@ import pytest
 from PIL import Image
 
 from models import STANDING_STARTS
-from models.machines.standing_motion import StandingMotion
+from models.machines.standing import StandingMotion
 from ocp import MultipleShooting, resolve_accelerations, solve
-from ocp.builders.standing import Anywhere, Following, IndexAtLeast, InFoot, Pinned, motion_cost
+from ocp.motion.builders.standing import Anywhere, Following, IndexAtLeast, InFoot, Pinned, motion_cost
 from scripts import standing
 from scripts.papers.standing import plans
 from scripts.papers.standing.cases import HORIZON, LOCAL, fails, machine, table_task

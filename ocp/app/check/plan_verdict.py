@@ -1,0 +1,70 @@
+"""The verdict on a plan: its audit, and its samples held against the limits of its own machine."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from models import FreeFloating, Machine
+from models.arrays import Array
+from ocp.app.check.verdict import Check, check_trajectory
+from ocp.app.files import RawTrajectory
+from ocp.audit.audit import Audit
+from ocp.motion.plan import Plan, PlanSample
+
+__all__ = ["PlanVerdict", "verdict_of"]
+
+
+@dataclass(frozen=True, eq=False)
+class PlanVerdict:
+    """What is said of a plan: a plan whose samples break a limit of the machine must not be run, whatever it was asked.
+
+    Attributes:
+        audit: Of the plan, against what it was asked.
+        check: Of its samples, against the machine's own limits of joints, velocities and torques.
+    """
+
+    audit: Audit
+    check: Check
+
+    @property
+    def passed(self) -> bool:
+        """Whether the plan is feasible, a local minimum, and within the limits of its machine."""
+        return self.audit.passed and self.check.passed
+
+    @property
+    def sentence(self) -> str:
+        """What follows for whoever would run the plan."""
+        if not self.audit.feasible or self.check.passed:
+            return self.audit.sentence
+        first, count = self.check.faults[0], len(self.check.faults)
+        more = f"; {count - 1} more" if count > 1 else ""
+        return f"must not be run: it breaks the limits of its machine, {first}{more}"
+
+
+def verdict_of(plan: Plan, sample: PlanSample, name: str, **settings: Any) -> PlanVerdict:
+    """Return the verdict on a plan.
+
+    Args:
+        sample: The plan at the times at which it is held against the limits of its machine.
+        name: What the plan is called.
+        settings: Of the audit.
+    """
+    machine, given = plan.machine, (sample.joints, sample.rates, sample.accelerations)
+    lines = np.arange(1, len(sample.t) + 1)
+    raw = RawTrajectory(plan.names, sample.t, *given, None, lines, True, (), name)
+    base: Any = "floating" if isinstance(machine, FreeFloating) else "fixed"
+    place: dict[str, Any] = {} if machine.base_size else _mount(machine)
+    place |= {"time_unit": "s", "names_confirmed": True}  # a plan leaves no doubt of either
+    check = check_trajectory(machine.robot, raw, base=base, clearance=None, **place)
+    return PlanVerdict(plan.audit(**settings), check)
+
+
+def _mount(machine: Machine) -> dict[str, Array]:
+    frame = machine.world_from_base(())
+    return {
+        "translation": np.array(frame.position, dtype=float).ravel(),
+        "rotation": np.array(frame.rotation, dtype=float),
+    }

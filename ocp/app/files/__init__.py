@@ -1,0 +1,25 @@
+"""Files: tool paths from waypoints and from G-code, anybody's trajectories, plans as logs and in Rerun."""
+
+from ocp.app.files.gcode import read_gcode
+from ocp.app.files.mcap import log_rerun, write_mcap
+from ocp.app.files.program import Cut, Note, Pause, Program, ProgramMotion, Rapid, Stretch, TimedProgram
+from ocp.app.files.trajectory import RawTrajectory, read_trajectory
+from ocp.app.files.waypoints import Waypoints, read_waypoints
+
+__all__ = [
+    "Cut",
+    "Note",
+    "Pause",
+    "Program",
+    "ProgramMotion",
+    "Rapid",
+    "RawTrajectory",
+    "Stretch",
+    "TimedProgram",
+    "Waypoints",
+    "log_rerun",
+    "read_gcode",
+    "read_trajectory",
+    "read_waypoints",
+    "write_mcap",
+]

@@ -1,0 +1,332 @@
+"""The words of G-code: those of a line, and what can be read of them.
+
+RS274/NGC as of the LinuxCNC manual, "G-Code Overview", "G-Codes" and "M-Codes": letters of either case, blanks
+anywhere, `( )` and `;` comments, block delete `/`, line numbers N, files between two lines of `%`. A program number
+`O1000` alone in its line is passed over; parameters, expressions and control words are refused, for what they come to
+depends on the machine. Codes are in tenths: 901 is G90.1; where another dialect uses a code otherwise, it is refused.
+
+Arcs and helices of G2 and G3, from a centre or a radius.
+
+Numbers of a program are rounded, so a centre is hardly ever as far from the end as from the start. It is moved, the
+least that is needed, onto the plane that halves the chord: then the arc meets both, and no gap is left to be closed.
+LinuxCNC runs a spiral instead, about the centre that is written; the two differ by less than the gap.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from models.arrays import Array
+from models.input_files import INPUT_LIMITS
+from models.paths import Arc, Helix
+from models.paths.segments import SHORTEST_SEGMENT
+from models.spatial import FULL_TURN
+from ocp.app.files.lines import FileName, wrong_line
+from ocp.tolerances import STANDSTILL
+
+__all__ = [
+    "GROUPS",
+    "KEPT",
+    "LETTERS",
+    "MACHINE",
+    "MOTIONS",
+    "M_WORDS",
+    "PLANES",
+    "POST",
+    "REFUSED",
+    "Block",
+    "Gap",
+    "about_center",
+    "blocks",
+    "center_of_radius",
+    "code_name",
+]
+
+PLANES = {170: (0, 1, 2), 180: (2, 0, 1), 190: (1, 2, 0)}
+"""First axis, second axis and normal of G17, G18, G19: right-handed, so that G3 turns about the normal."""
+RADIUS_SHARE = 1e-3
+"""Of the radius: by so much the distances from the centre may differ where numbers have few digits."""
+
+
+class Gap(Exception):
+    """Numbers that make no arc.
+
+    Attributes:
+        why: What is wrong.
+        size: Of the gap that would be left, m. limit: The largest that is closed, m.
+    """
+
+    def __init__(self, why: str, size: float, limit: float) -> None:
+        super().__init__(why)
+        self.why, self.size, self.limit = why, size, limit
+
+
+def center_of_radius(start: Array, end: Array, radius: float, clockwise: bool, gap: float) -> Array:
+    """Centre of an arc given by its radius, the longer way round if that is negative. In the plane, shape (2,), m.
+
+    Raises:
+        Gap: A radius less than half the chord by more than `gap`, or a chord that is none.
+    """
+    chord = end - start
+    length = float(np.hypot(*chord))
+    if length == 0:
+        raise Gap("an arc by its radius ends where it starts; give I, J, K for a full circle", 0.0, gap)
+    short = length / 2 - abs(radius)
+    if short > gap and short > RADIUS_SHARE * length / 2:
+        raise Gap(f"R is {short:.3g} m less than half the way from start to end", short, gap)
+    height = np.sqrt(max(radius**2 - length**2 / 4, 0.0))
+    left = np.array([-chord[1], chord[0]]) / length
+    return np.asarray((start + end) / 2 + (height if clockwise == (radius < 0) else -height) * left)
+
+
+def about_center(
+    start: Array, end: Array, center: Array, clockwise: bool, turns: int, plane: tuple[int, int, int], gap: float
+) -> list[Arc | Helix]:
+    """Arcs or helices from start to end: one, or two halves where one centre cannot be moved to serve both ends.
+
+    That is so where a circle nearly closes, but ends nearer to the centre than it starts.
+
+    Args:
+        start, end: Shape (3,), m.
+        center: In the plane. Shape (2,), m.
+        turns: Full turns begun: 1 for an arc up to a full circle.
+        plane: First axis, second axis, normal.
+        gap: Largest difference of the distances from the centre that counts as rounding, m.
+
+    Raises:
+        Gap: A centre that is not in the middle, by more than rounding.
+    """
+    inside, normal = list(plane[:2]), plane[2]
+    first, last = start[inside], end[inside]
+    radii = float(np.hypot(*(first - center))), float(np.hypot(*(last - center)))
+    if min(radii) <= SHORTEST_SEGMENT:
+        raise Gap("the centre is the start or the end of the arc", max(radii), gap)
+    off = abs(radii[0] - radii[1])
+    allowed = max(gap, min(RADIUS_SHARE * max(radii), 100 * gap))  # two digits fewer than usual, at most
+    if off > allowed:
+        what = f"start and end are {radii[0]:.6g} and {radii[1]:.6g} m from the centre, {off:.3g} m apart"
+        raise Gap(what, off, allowed)
+    sweep = _sweep(first - center, last - center, clockwise)
+    moved = _moved(center, first, last)
+    # what moving the centre does to the far side of the arc
+    if np.hypot(*(moved - center)) * (1 - np.cos(sweep / 2)) <= max(2 * off, gap):
+        if (first != last).any():
+            sweep = _sweep(first - moved, last - moved, clockwise)
+        return [_turned(start, end, moved, clockwise, sweep + FULL_TURN * (turns - 1), plane)]
+    half = (-sweep if clockwise else sweep) / 2
+    cosine, sine = np.cos(half), np.sin(half)
+    out = (first - center) * (radii[0] + radii[1]) / (2 * radii[0])
+    middle = start.copy()
+    middle[inside] = center + np.array([cosine * out[0] - sine * out[1], sine * out[0] + cosine * out[1]])
+    total = sweep + FULL_TURN * (turns - 1)
+    middle[normal] += (end[normal] - start[normal]) * sweep / 2 / total
+    made = []
+    for one, other, more in ((start, middle, 0.0), (middle, end, total - sweep)):
+        there = _moved(center, one[inside], other[inside])
+        turn = _sweep(one[inside] - there, other[inside] - there, clockwise)
+        made.append(_turned(one, other, there, clockwise, turn + more, plane))
+    return made
+
+
+def _moved(center: Array, first: Array, last: Array) -> Array:
+    """The point nearest to a centre that is as far from one point as from another. Shape (2,) each."""
+    chord = last - first
+    square = float(chord @ chord)
+    return center if square == 0 else np.asarray(center - ((center - (first + last) / 2) @ chord) / square * chord)
+
+
+def _turned(
+    start: Array, end: Array, center: Array, clockwise: bool, sweep: float, plane: tuple[int, int, int]
+) -> Arc | Helix:
+    axis, middle = np.zeros(3), start.copy()
+    axis[plane[2]] = -1.0 if clockwise else 1.0
+    middle[list(plane[:2])] = center
+    rise = float((end - start) @ axis)
+    if sweep <= FULL_TURN * (1 + 1e-12) and abs(rise) <= STANDSTILL:
+        return Arc(start, middle, axis, min(sweep, FULL_TURN))
+    return Helix(start, middle, axis, sweep, rise)
+
+
+def _sweep(first: Array, last: Array, clockwise: bool) -> float:
+    angle = float(np.arctan2(first[0] * last[1] - first[1] * last[0], first @ last))
+    angle = (-angle if clockwise else angle) % FULL_TURN
+    return angle if angle > 1e-6 else FULL_TURN  # no arc is meant to turn by less
+
+
+MOTIONS = (0, 10, 20, 30)
+"""G0, G1, G2, G3."""
+
+GROUPS: dict[int, str] = {
+    **dict.fromkeys((*MOTIONS, 330, 331, 382, 383, 384, 385, 730, 760, *range(810, 900, 10), 50, 51, 52, 53), "motion"),
+    **dict.fromkeys(PLANES, "plane"),
+    **dict.fromkeys((900, 910), "distances"),
+    **dict.fromkeys((901, 911), "centres"),
+    **dict.fromkeys((930, 940, 950), "feed mode"),
+    **dict.fromkeys((200, 210), "units"),
+    **dict.fromkeys((610, 611, 640), "path control"),
+    **dict.fromkeys((*range(540, 600, 10), 591, 592, 593), "coordinate system"),
+    **dict.fromkeys((400, 410, 411, 420, 421), "cutter compensation"),
+}
+"""Of G codes, in tenths, of which a line may have one."""
+
+POST = "post the program without it"
+REFUSED: dict[int, str] = {
+    **dict.fromkeys((50, 51, 52, 53, 60, 61, 62), f"splines are not read; {POST}, as G1, G2 and G3"),
+    **dict.fromkeys((70, 330, 331, 760, 700, 710, 711, 712, 720, 721, 722), f"lathe words are not read; {POST}"),
+    **dict.fromkeys((120, 130), f"pocket cycles are not read; {POST}"),
+    **dict.fromkeys((160, 161), f"polar coordinates are not read; {POST}"),
+    **dict.fromkeys((310, 382, 383, 384, 385), f"probing has no path that is known before; {POST}"),
+    **dict.fromkeys((410, 411, 420, 421), "cutter compensation is not read; let the CAM compensate, or write G40"),
+    **dict.fromkeys((650, 660, 670), f"macro calls are not run; {POST}"),
+    **dict.fromkeys((680, 510, 511), f"rotated and scaled coordinates are not read; {POST}"),
+    **dict.fromkeys((730, 740, *range(810, 900, 10)), f"canned cycles are not read; {POST}, as G0 and G1"),
+    100: f"offsets of the machine cannot be set here; {POST}",
+    520: "local offsets are not read; write G92, or post the program without it",
+    923: "offsets kept from another program are not known; write G92 with numbers",
+    950: "feed per revolution is not read; write G94 and units per minute",
+}
+KEPT: dict[int, str] = {
+    80: "diameters off: so it is",
+    150: "polar coordinates off: so it is",
+    400: "cutter compensation off: so it is",
+    800: "canned cycles off: so it is",
+    430: "tool length: the path is that of the tool's tip",
+    431: "tool length: the path is that of the tool's tip",
+    440: "tool length: the path is that of the tool's tip",
+    490: "tool length: the path is that of the tool's tip",
+    500: "scaling off: so it is",
+    690: "rotation off: so it is",
+    960: "spindle mode, passed over",
+    970: "spindle mode, passed over",
+    980: "return of canned cycles, passed over",
+    990: "return of canned cycles, passed over",
+}
+LETTERS: dict[str, str] = {
+    "S": "S: spindle speed, passed over",
+    "T": "T: tool, passed over",
+    "H": "H: tool length, passed over",
+    "D": "D: tool diameter, passed over",
+    "E": "E: extrusion, passed over",
+    "L": "L: passed over",
+    "Q": "Q: passed over",
+}
+M_WORDS = {
+    **dict.fromkeys((0, 10, 600), "stop"),
+    **dict.fromkeys((20, 300), "end"),
+    **dict.fromkeys((970, 980, 990), "call"),
+}
+"""What M words mean for a path; all others are passed over."""
+MACHINE = (280, 281, 300, 301, 530)
+"""G words that lead to, or store, positions which the machine knows."""
+
+WORD = re.compile(r"([A-Z])([+-]?(?:\d+\.?\d*|\.\d+))")
+COMMENT = re.compile(r"\([^()]*\)")
+DELETED = re.compile(r"^/\d*")
+CHECKSUM = re.compile(r"\*\d+$")
+EXPONENT = re.compile(r"[\d.]E[+-]?\d+(?![\d.])", re.IGNORECASE)
+CONTROL, PROGRAM_NUMBER = re.compile(r"(N\d+)?O[\d<]"), re.compile(r"(N\d+)?O\d+")
+NOT_RUN = "O-words (subroutines, loops, conditions) are not run; post the program without them"
+
+
+class Block(NamedTuple):
+    """The words of one line.
+
+    Attributes:
+        number: Of the line in the file, from 1.
+        text: The line as it stands.
+        codes: G and M words in tenths: ("G", 901) is G90.1.
+        words: All others by their letter.
+        skipped: Whether the line begins with `/`.
+    """
+
+    number: int
+    text: str
+    codes: tuple[tuple[str, int], ...]
+    words: dict[str, float]
+    skipped: bool
+
+
+def blocks(file: FileName, lines: Sequence[str]) -> Iterator[Block]:
+    """Blocks with words in them, up to the second `%`.
+
+    Raises:
+        ProblemError: By line: what is no word, a comment without an end, an expression, a word given twice.
+    """
+    inside = False
+    for number, text in enumerate(lines, 1):
+        line = text
+        if "(" in line or ")" in line or ";" in line:
+            line = _without_comments(file, number, text)
+        words = line.upper().split()
+        if not words:
+            continue
+        if words[0][0] == "%":
+            if inside:
+                return
+            inside = True
+            continue
+        inside = True  # a lone % after words ends the program, too
+        if ("E" in line or "e" in line) and (exponent := EXPONENT.search(line)):
+            raise wrong_line(file, number, text, f"{exponent[0]!r} is no number of G-code; write it without E")
+        line = "".join(words)
+        skipped = line[0] == "/"
+        line = DELETED.sub("", line) if skipped else line
+        if "*" in line:
+            line = CHECKSUM.sub("", line)
+        found_words = WORD.findall(line)
+        if sum(len(letter) + len(value) for letter, value in found_words) != len(line):
+            _refuse(file, number, text, line)
+        codes, values = [], {}
+        for letter, value in found_words:
+            if letter in "GM":
+                codes.append((letter, _tenths(file, number, text, letter, value)))
+            elif letter == "O":
+                if not PROGRAM_NUMBER.fullmatch(line):
+                    raise wrong_line(file, number, text, NOT_RUN)
+            elif letter != "N":
+                if letter in values:
+                    raise wrong_line(file, number, text, f"{letter} stands twice in one line; leave one")
+                if len(value) > INPUT_LIMITS.number_characters:
+                    why = f"{letter} has more than {INPUT_LIMITS.number_characters} digits"
+                    raise wrong_line(file, number, text, why)
+                values[letter] = float(value)
+        if codes or values:
+            yield Block(number, text, tuple(codes), values, skipped)
+
+
+def _without_comments(file: FileName, number: int, text: str) -> str:
+    line, semicolon, _ = text.partition(";") if "(" not in text.partition(";")[0] else (text, "", "")
+    if not semicolon:
+        line = COMMENT.sub(" ", text)
+        line = line.partition(";")[0] if "(" not in line.partition(";")[0] else line
+    if "(" in line or ")" in line:
+        raise wrong_line(file, number, text, "a comment is not closed, or stands in another; close it by one ')'")
+    return line
+
+
+def _tenths(file: FileName, number: int, text: str, letter: str, value: str) -> int:
+    exact = float(value) * 10 if len(value) < 9 else -1.0
+    if exact < 0 or abs(exact - round(exact)) > 1e-6:
+        raise wrong_line(file, number, text, f"{letter}{value} is no code; codes have one decimal at most")
+    return round(exact)
+
+
+def _refuse(file: FileName, number: int, text: str, line: str) -> None:
+    if CONTROL.match(line):
+        raise wrong_line(file, number, text, NOT_RUN)
+    if any(sign in line for sign in "#[]=<>"):
+        why = "parameters and expressions are not evaluated; post the program with plain numbers"
+        raise wrong_line(file, number, text, why)
+    rest = WORD.sub("", line)
+    message = f"{rest[:20]!r} is no word of G-code, a letter and a number; correct it or make it a comment"
+    raise wrong_line(file, number, text, message)
+
+
+def code_name(tenths: int) -> str:
+    """Of a G code as it is written."""
+    whole, rest = divmod(tenths, 10)
+    return f"G{whole}.{rest}" if rest else f"G{whole}"

@@ -1,0 +1,1 @@
+"""Problems of arms in space: the capture of a tumbling body."""

@@ -1,0 +1,23 @@
+"""The front door: a machine and its tasks in, the cheapest motion out that passes its audit."""
+
+from ocp.motion.plan.candidate import Candidate, Reason, Rejection
+from ocp.motion.plan.motion import Plan, PlanSample
+from ocp.motion.plan.piecewise import PlanInPieces, Reconfiguration, plan_in_pieces
+from ocp.motion.plan.planner import plan
+from ocp.motion.plan.waypoints import WaypointPlan, plan_waypoints
+from ocp.motion.search.dead_end import DeadEnd
+
+__all__ = [
+    "Candidate",
+    "DeadEnd",
+    "Plan",
+    "PlanInPieces",
+    "PlanSample",
+    "Reason",
+    "Reconfiguration",
+    "Rejection",
+    "WaypointPlan",
+    "plan",
+    "plan_in_pieces",
+    "plan_waypoints",
+]

@@ -1,0 +1,28 @@
+"""Time schedules: jerk-limited line speed along a path, at the asked speed wherever the limits allow it."""
+
+from ocp.motion.schedule.limits import JointLimits, JointPath, JointRates, LineLimits, PathLike, ToolLimits, TorqueRates
+from ocp.motion.schedule.planner import Dip, Schedule, schedule
+from ocp.motion.schedule.profile import LineMotion, SpeedProfile
+from ocp.motion.schedule.ramps import peak_acceleration, ramp_distance, ramp_time
+from ocp.motion.schedule.trajectory import JointTrajectory, joint_motion, joint_trajectory
+
+__all__ = [
+    "Dip",
+    "JointLimits",
+    "JointPath",
+    "JointRates",
+    "JointTrajectory",
+    "LineLimits",
+    "LineMotion",
+    "PathLike",
+    "Schedule",
+    "SpeedProfile",
+    "ToolLimits",
+    "TorqueRates",
+    "joint_motion",
+    "joint_trajectory",
+    "peak_acceleration",
+    "ramp_distance",
+    "ramp_time",
+    "schedule",
+]

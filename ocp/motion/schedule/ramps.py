@@ -1,0 +1,317 @@
+"""Jerk-limited changes of the line speed, and the profile that they make of limits that change along the path.
+
+A ramp changes the speed without acceleration at both its ends: its time and distance, its inverse (the speed within
+reach), and the fastest motion from one speed to another over a distance. A zone is a stretch of one limit each of
+speed, acceleration and jerk; `plan` finds the speeds at their bounds and joins the fastest motions between them.
+
+The fastest motion where speeds and accelerations bind alone: exact passes backward and forward in (s, v^2).
+
+With x = v^2 at the nodes and one acceleration u in each interval of width h, x grows by 2 h u, and each row is linear
+in (u, x). Backward, the squared speeds from which the end can be reached are an interval at each node: in the rows of
+an interval u is eliminated, which leaves bounds on x alone. Forward, the greatest u that stays among them is taken.
+(Pham and Pham, A New Approach to Time-Optimal Path Parameterization Based on Reachability Analysis, 2018; the rows
+hold at both ends of an interval.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import MutableMapping
+from math import cbrt, hypot, sqrt
+from typing import NamedTuple
+
+import numpy as np
+from ruckig import InputParameter, Result, Ruckig, RuckigError, Trajectory
+
+from ocp.errors import ProblemError, checked_nonnegative, checked_positive
+from ocp.motion.schedule.profile import Array, SpeedProfile, advanced
+from ocp.tolerances import ROUNDING_SHARE
+
+__all__ = [
+    "Memory",
+    "Phases",
+    "Zones",
+    "fastest",
+    "passes",
+    "peak_acceleration",
+    "plan",
+    "ramp_distance",
+    "ramp_time",
+    "reach",
+]
+
+Phases = tuple[tuple[float, float], ...]
+"""Durations (s) and jerks (m/s^3) of the parts of constant jerk, in order."""
+Memory = MutableMapping[tuple[float, ...], Phases]
+"""Motions already found, by their limits and ends."""
+
+REACH_MARGIN = 1e-6
+"""Share of a zone's length kept back when its ends' speeds are chosen, so that a motion surely exists."""
+
+
+class Zones(NamedTuple):
+    """Stretches of a path with limits of their own.
+
+    Attributes:
+        bounds: Distances at which the zones begin, and the end. Shape (Z + 1,), m.
+        speed, acceleration, jerk: Limits in each zone. Shape (Z,).
+    """
+
+    bounds: Array
+    speed: Array
+    acceleration: Array
+    jerk: Array
+
+
+def ramp_time(change: float, acceleration: float, jerk: float) -> float:
+    """Shortest time (s) of a speed change (m/s) that begins and ends without acceleration.
+
+    Raises:
+        ProblemError: A negative change, a limit that is not positive.
+    """
+    checked_nonnegative("ramp: change", change)
+    for name, value in (("acceleration", acceleration), ("jerk", jerk)):
+        checked_positive(f"ramp: {name}", value)
+    if change * jerk >= acceleration**2:
+        return change / acceleration + acceleration / jerk
+    return 2 * sqrt(change / jerk)
+
+
+def ramp_distance(first: float, last: float, acceleration: float, jerk: float) -> float:
+    """Distance (m) that the shortest change from one speed to the other takes; raises as ramp_time."""
+    for name, value in (("first", first), ("last", last)):
+        checked_nonnegative(f"ramp: {name}", value)
+    return (first + last) / 2 * ramp_time(abs(last - first), acceleration, jerk)
+
+
+def reach(speed: float, distance: float, acceleration: float, jerk: float) -> float:
+    """Greatest speed (m/s) to which the speed can change within a distance (m), without acceleration at both ends.
+
+    The inverse of ramp_distance: the same for slowing down from that speed.
+    """
+    # without constant acceleration x = sqrt((v - speed)/jerk) solves jerk x^3 + 2 speed x = distance: Cardano's
+    # difference of two roots, as the quotient that does not cancel
+    half, third = distance / (2 * jerk), 2 * speed / (3 * jerk)
+    root = cbrt(half + hypot(half, third**1.5))
+    x = 2 * half / (root * root + third + (third / root) ** 2)
+    if jerk * x <= acceleration:
+        return float(speed + jerk * x * x)
+    # with it: v^2 + v A^2/J = speed^2 - speed A^2/J + 2 A distance
+    b = acceleration**2 / jerk
+    root = sqrt(b * b + 4 * (speed * speed - speed * b + 2 * acceleration * distance))
+    return float(max(speed, (root - b) / 2))
+
+
+def peak_acceleration(mean: float, speed: float, jerk: float) -> float:
+    """Peak acceleration (m/s^2) whose ramp from rest to `speed` (m/s) has the mean acceleration `mean`.
+
+    v/A + A/J = v/mean, the smaller root.
+
+    Raises:
+        ProblemError: Values that are not positive; a jerk too low for that mean.
+    """
+    for name, value in (("mean", mean), ("speed", speed), ("jerk", jerk)):
+        checked_positive(f"peak_acceleration: {name}", value)
+    time = speed / mean
+    square = time * time - 4 * speed / jerk
+    if square < 0:
+        least = 4 * mean**2 / speed
+        message = f"mean acceleration {mean:g} m/s^2 up to {speed:g} m/s needs a jerk of {least:g} m/s^3 or more"
+        raise ProblemError(f"{message}, not {jerk:g}", name="jerk", value=jerk, limit=(least, np.inf))
+    return jerk * (time - sqrt(square)) / 2
+
+
+def fastest(distance: float, first: float, last: float, top: float, acceleration: float, jerk: float) -> Phases:
+    """Fastest motion over a distance (m) from one speed to another, without acceleration at both ends.
+
+    ruckig finds it, in units of the distance and of the time that the top speed takes for it. Where its answer does
+    not close, which happens for distances that are barely enough, the same profile is put together from two ramps.
+
+    Args:
+        distance: m; enough for the change of speed, see ramp_distance.
+        first, last: m/s, at most `top`.
+        top, acceleration, jerk: Limits, m/s, m/s^2, m/s^3.
+    """
+    unit = distance / top
+    asked = InputParameter(1)
+    asked.current_position, asked.target_position = [0.0], [1.0]
+    asked.current_velocity, asked.target_velocity = [first / top], [last / top]
+    asked.max_velocity = [1.0]
+    asked.max_acceleration = [acceleration * unit / top]
+    asked.max_jerk = [jerk * unit * unit / top]
+    trajectory = Trajectory(1)
+    try:
+        solved = Ruckig(1).calculate(asked, trajectory) == Result.Working
+    except RuckigError:  # its root finding gave up
+        solved = False
+    if solved:
+        found = trajectory.profiles[0][0]
+        scale = top / (unit * unit)
+        phases = tuple((t * unit, j * scale) for t, j in zip(found.t, found.j, strict=True) if t > 0)
+        if _closes(phases, distance, first, last, top):
+            return phases
+    return _two_ramps(distance, first, last, top, acceleration, jerk)
+
+
+def _closes(phases: Phases, distance: float, first: float, last: float, top: float) -> bool:
+    """Whether a motion ends at its distance and last speed, and stays between the speeds on the way."""
+    s, v, a = 0.0, first, 0.0
+    error = ROUNDING_SHARE * top
+    for t, j in phases:
+        way, v, a = advanced(v, a, j, t)
+        s += way
+        if not min(first, last) - error <= v <= top + error:
+            return False
+    return abs(s - distance) <= ROUNDING_SHARE * distance and abs(v - last) <= error
+
+
+def _two_ramps(distance: float, first: float, last: float, top: float, acceleration: float, jerk: float) -> Phases:
+    """A ramp up to the highest speed that leaves way enough, that speed, and a ramp down."""
+
+    def needed(peak: float) -> float:
+        return ramp_distance(first, peak, acceleration, jerk) + ramp_distance(peak, last, acceleration, jerk)
+
+    low, high = max(first, last), top
+    if needed(high) <= distance:
+        low = high
+    while low < (middle := (low + high) / 2) < high:
+        low, high = (middle, high) if needed(middle) <= distance else (low, middle)
+    rest = max(distance - needed(low), 0.0)
+    return (
+        *_ramp(low - first, acceleration, jerk),
+        *(((rest / low, 0.0),) if rest > 0 and low > 0 else ()),
+        *_ramp(last - low, acceleration, jerk),
+    )
+
+
+def _ramp(change: float, acceleration: float, jerk: float) -> Phases:
+    """The shortest change of the speed by `change` (m/s)."""
+    size, sign = abs(change), 1.0 if change > 0 else -1.0
+    if size == 0:
+        return ()
+    if size * jerk < acceleration**2:
+        t = sqrt(size / jerk)
+        return ((t, sign * jerk), (t, -sign * jerk))
+    t = acceleration / jerk
+    middle = size / acceleration - t
+    flat = ((middle, 0.0),) if middle > 0 else ()
+    return ((t, sign * jerk), *flat, (t, -sign * jerk))
+
+
+def plan(zones: Zones, memory: Memory) -> SpeedProfile:
+    """Line speed from rest to rest, as fast as the zones' limits allow with no acceleration at their bounds.
+
+    A backward and a forward pass find the speeds at the bounds, then each zone is the fastest motion between them.
+    One zone alone gives the time optimum; more do but for the acceleration that drops to zero at a bound.
+    """
+    lengths = np.diff(zones.bounds).tolist()
+    limits = list(zip(zones.speed.tolist(), zones.acceleration.tolist(), zones.jerk.tolist(), strict=True))
+    ends = [0.0, *np.minimum(zones.speed[:-1], zones.speed[1:]).tolist(), 0.0]
+    count = len(lengths)
+    for i in range(count):
+        if ends[i + 1] > ends[i]:
+            ends[i + 1] = _limited(ends[i + 1], ends[i], lengths[i], limits[i])
+    for i in reversed(range(count)):
+        if ends[i] > ends[i + 1]:
+            ends[i] = _limited(ends[i], ends[i + 1], lengths[i], limits[i])
+
+    motions: list[Phases] = []
+    for (top, most, jerk), length, first, last in zip(limits, lengths, ends[:-1], ends[1:], strict=True):
+        key = (length, first, last, top, most, jerk)
+        if first == last == top:
+            motions.append(((length / top, 0.0),))
+        else:
+            motions.append(memory[key] if key in memory else memory.setdefault(key, fastest(*key)))
+    return _profile(zones, np.array(ends), motions)
+
+
+def _profile(zones: Zones, ends: Array, motions: list[Phases]) -> SpeedProfile:
+    """Motions through the zones, one after the other, from the speeds at the zones' bounds. Shape (Z + 1,), m/s."""
+    counts = np.array([len(phases) for phases in motions])
+    durations, jerks = np.array([phase for phases in motions for phase in phases]).reshape(-1, 2).T
+    if not durations.size or not np.isfinite(durations).all():
+        message = f"no line-speed profile over {zones.bounds[-1]:g} m: durations {durations[:5].tolist()}"
+        raise ProblemError(message, name="durations", value=durations[:5].tolist())
+    starts = np.cumsum(counts) - counts
+    s, v, a = (np.zeros(len(durations) + 1) for _ in range(3))
+    place, speed, rate = zones.bounds[:-1].copy(), ends[:-1].copy(), np.zeros(len(motions))
+    for number in range(int(counts.max())):  # of the phase, in all motions that have so many
+        on = np.flatnonzero(counts > number)
+        at = starts[on] + number
+        s[at], v[at], a[at] = place[on], speed[on], rate[on]
+        way, faster, rising = advanced(speed[on], rate[on], jerks[at], durations[at])
+        place[on] += way
+        speed[on] = np.maximum(faster, 0.0)
+        rate[on] = np.where(np.abs(rising) > 1e-9 * zones.acceleration[on], rising, 0.0)
+    s[-1] = zones.bounds[-1]
+    return SpeedProfile(np.concatenate([[0.0], np.cumsum(durations)]), s, v, a, jerks)
+
+
+def _limited(speed: float, other: float, length: float, limits: tuple[float, float, float]) -> float:
+    """The greater speed at one end of a zone, lowered to what can be reached from that at the other."""
+    return min(speed, reach(other, length * (1 - REACH_MARGIN), *limits[1:]))
+
+
+def passes(distance: Array, most: Array, p: Array, q: Array, low: Array, high: Array) -> Array:
+    """Greatest squared speeds at nodes, from rest to rest.
+
+    Args:
+        distance: Of the nodes. Shape (N + 1,), m.
+        most: Greatest squared speed at each. Shape (N + 1,).
+        p, q, low, high: low <= p u + q x <= high in each interval, x being that at its first node. Shape (N, R).
+
+    Raises:
+        ProblemError: A node that no motion can pass, as its `time` (m).
+    """
+    h = np.diff(distance)
+    floor, ceiling = _alone(p, q, low, high, most[:-1])
+    least, top = np.zeros(len(distance)), np.zeros(len(distance))
+    # u between lines over x: those with p > 0 bound it from above by `high`, from below by `low`, the others mirrored
+    sign = np.sign(p)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        slope = np.where(sign == 0, 0.0, -q / p)
+        above = np.where(sign == 0, np.inf, np.where(sign > 0, high, low) / p)
+        below = np.where(sign == 0, -np.inf, np.where(sign > 0, low, high) / p)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for k in range(len(h) - 1, -1, -1):
+            # x + 2 h u: its least value must not be above the next interval's end, its greatest not below its start
+            bend = 1 + 2 * h[k] * slope[k]
+            ends = (top[k + 1] - 2 * h[k] * below[k]) / bend
+            starts = (least[k + 1] - 2 * h[k] * above[k]) / bend
+            up, down = bend > 0, bend < 0
+            high_x = min(ceiling[k], ends[up].min(initial=np.inf), starts[down].min(initial=np.inf))
+            low_x = max(floor[k], starts[up].max(initial=0.0), ends[down].max(initial=0.0))
+            if not low_x <= high_x * (1 + ROUNDING_SHARE) + 1e-300:
+                place = float(distance[k])
+                message = f"no motion keeps the limits of acceleration and torque at {place:g} m; raise them"
+                raise ProblemError(message, name="acceleration", value=low_x, limit=high_x, time=place)
+            least[k], top[k] = min(low_x, high_x), high_x
+    if least[0] > 0:
+        message = "no motion from rest keeps the limits of acceleration and torque at 0 m; raise them"
+        raise ProblemError(message, name="acceleration", value=float(least[0]), limit=0.0, time=0.0)
+    x = np.zeros(len(distance))
+    for k in range(len(h)):
+        u = min(float((above[k] + slope[k] * x[k]).min(initial=np.inf)), (top[k + 1] - x[k]) / (2 * h[k]))
+        x[k + 1] = min(max(x[k] + 2 * h[k] * u, least[k + 1]), top[k + 1])
+    return x
+
+
+def _alone(p: Array, q: Array, low: Array, high: Array, most: Array) -> tuple[Array, Array]:
+    """Squared speeds at which an interval's rows leave some acceleration: bounds of x. Shape (N,) each."""
+    floor, ceiling = np.zeros(len(p)), most.copy()
+    count = p.shape[1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for i in range(count):
+            for j in range(i, count):
+                # any two rows: u eliminated leaves a row of x between two bounds
+                weight = np.where(p[:, i] == 0, 1.0, p[:, j]), np.where(p[:, i] == 0, 0.0, -p[:, i])
+                if i == j:
+                    weight = np.where(p[:, i] == 0, 1.0, 0.0), np.zeros(len(p))
+                of_x = weight[0] * q[:, i] + weight[1] * q[:, j]
+                least = sum(np.minimum(w * low[:, r], w * high[:, r]) for w, r in zip(weight, (i, j), strict=True))
+                greatest = sum(np.maximum(w * low[:, r], w * high[:, r]) for w, r in zip(weight, (i, j), strict=True))
+                ends = least / of_x, greatest / of_x
+                some = of_x != 0
+                ceiling = np.where(some, np.minimum(ceiling, np.fmax(*ends)), ceiling)
+                floor = np.where(some, np.maximum(floor, np.fmin(*ends)), floor)
+                ceiling = np.where(~some & ((least > 0) | (greatest < 0)) & (np.abs(weight[0]) > 0), -1.0, ceiling)
+    return floor, ceiling

@@ -1,0 +1,163 @@
+"""Joint trajectories sampled from a schedule, and their exchange as CSV and as a ROS 2 JointTrajectory."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from os import PathLike as FilePath
+from typing import Any
+
+import numpy as np
+
+from models.input_files import read_regular
+from ocp.errors import NOT_NUMBERS, ProblemError, checked_each, checked_instance, floats
+from ocp.motion.schedule.limits import JointPath, check_joints, rates_along
+from ocp.motion.schedule.planner import Schedule
+from ocp.motion.schedule.profile import Array, LineMotion
+from ocp.storage import checked_path, column_name, joint_name, write_text
+
+__all__ = ["JointTrajectory", "joint_motion", "joint_trajectory"]
+
+LARGEST_FILE = 2**26
+"""Bytes."""
+KINDS = ("positions", "velocities", "accelerations")
+
+
+@dataclass(frozen=True, eq=False)
+class JointTrajectory:
+    """Sampled joints.
+
+    Attributes:
+        names: Of the n joints.
+        t: Time from the start, increasing. Shape (M,), s.
+        positions, velocities, accelerations: Shape (M, n), rad or m, and per s, s^2.
+
+    Raises:
+        ProblemError: Wrong shapes, nan, times that do not increase, names that repeat.
+    """
+
+    names: tuple[str, ...]
+    t: Array
+    positions: Array
+    velocities: Array
+    accelerations: Array
+
+    def __post_init__(self) -> None:
+        names = checked_each("trajectory: names", self.names, str)
+        if isinstance(self.names, str) or not names or len(set(names)) != len(names):
+            message = f"trajectory: joint names {list(names)} must be there and differ"
+            raise ProblemError(message, name="names", value=names)
+        object.__setattr__(self, "names", names)
+        t = _numbers("times", self.t)
+        if t.ndim != 1 or not t.size or not np.isfinite(t).all() or (np.diff(t) <= 0).any():
+            raise ProblemError("trajectory: times must be finite, increasing, and at least one", name="times", value=t)
+        object.__setattr__(self, "t", t)
+        for kind in KINDS:
+            values = _numbers(kind, getattr(self, kind))
+            if values.shape != (shape := (len(t), len(names))):
+                message = f"trajectory: {kind} have shape {values.shape}, expected {shape}"
+                raise ProblemError(message, name=kind, value=values.shape, limit=shape)
+            if not np.isfinite(values).all():
+                raise ProblemError(f"trajectory: {kind} are not all finite", name=kind, value=values)
+            object.__setattr__(self, kind, values)
+
+    def __repr__(self) -> str:
+        return f"<JointTrajectory of {', '.join(self.names)} at {len(self.t)} times, {self.t[0]:g} to {self.t[-1]:g} s>"
+
+    def write_csv(self, path: str | FilePath[str]) -> None:
+        """Write columns t and position, velocity, acceleration of each joint, in full precision."""
+        head = ["t", *(f"{column_name(name)}.{kind}" for kind in KINDS for name in self.names)]
+        rows = np.column_stack([self.t, self.positions, self.velocities, self.accelerations])
+        write_text(path, "\n".join([",".join(head), *(",".join(map(repr, row)) for row in rows.tolist()), ""]))
+
+    @classmethod
+    def read_csv(cls, path: str | FilePath[str]) -> JointTrajectory:
+        """Read what write_csv wrote, bit for bit; ProblemError for anything else."""
+        try:
+            text = read_regular(checked_path(path), LARGEST_FILE).decode()
+        except (OSError, ValueError) as error:
+            words = f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}"
+            raise ProblemError(words, name="path", value=path) from error
+        rows = [line.split(",") for line in text.splitlines()]
+        head = rows[0] if rows else []
+        count = (len(head) - 1) // 3
+        columns = [column.removesuffix(f".{KINDS[0]}") for column in head[1 : count + 1]]
+        if count < 1 or head != ["t", *(f"{name}.{kind}" for kind in KINDS for name in columns)]:
+            message = f"{path}: the head {head[:4]} is not that of a joint trajectory"
+            raise ProblemError(message, name=str(path), value=head)
+        try:
+            table = np.array([[float(cell) for cell in row] for row in rows[1:]]).reshape(-1, len(head))
+        except ValueError as error:
+            message = f"{path}: a cell is not a number, or a row is not complete: {error}"
+            raise ProblemError(message, name=str(path)) from error
+        return cls(tuple(map(joint_name, columns)), table[:, 0], *np.split(table[:, 1:], 3, axis=1))
+
+    def to_ros(self) -> dict[str, Any]:
+        """Plain dictionary of the fields of trajectory_msgs/msg/JointTrajectory. Times are whole nanoseconds there.
+
+        Raises:
+            ProblemError: Times less than a nanosecond apart.
+        """
+        nanoseconds = np.round(self.t * 1e9).astype(np.int64)
+        if (np.diff(nanoseconds) <= 0).any():
+            at = int((np.diff(nanoseconds) <= 0).argmax())
+            first, second = self.t[at : at + 2].tolist()
+            message = f"trajectory: times {first} and {second} s are the same nanosecond"
+            raise ProblemError(message, name="times", value=second, time=first)
+        values = {kind: getattr(self, kind).tolist() for kind in KINDS}
+        points = [
+            {kind: rows[k] for kind, rows in values.items()}
+            | {"effort": [], "time_from_start": {"sec": ns // 10**9, "nanosec": ns % 10**9}}
+            for k, ns in enumerate(nanoseconds.tolist())
+        ]
+        header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}
+        return {"header": header, "joint_names": list(self.names), "points": points}
+
+    @classmethod
+    def from_ros(cls, message: Mapping[str, Any]) -> JointTrajectory:
+        """Read what to_ros made: the same numbers, times to the nanosecond. ProblemError when a field is missing."""
+        try:
+            points = message["points"]
+            stamps = [p["time_from_start"] for p in points]
+            t = np.array([(stamp["sec"] * 10**9 + stamp["nanosec"]) / 1e9 for stamp in stamps])
+            values = [floats([p[kind] for p in points]) for kind in KINDS]
+            names = tuple(message["joint_names"])
+        except (KeyError, IndexError, TypeError, ValueError) as error:
+            text = f"this is no joint trajectory message: {error!r}"
+            raise ProblemError(text, name="message", value=message) from error
+        return cls(names, t, *values)
+
+
+def _numbers(what: str, value: Any) -> Array:
+    try:
+        return floats(value)
+    except NOT_NUMBERS as error:
+        raise ProblemError(f"trajectory: {what} are not numeric: {value!r}", name=what, value=value) from error
+
+
+def joint_motion(joints: JointPath, motion: LineMotion) -> tuple[Array, Array, Array, Array]:
+    """Joints, their velocities, accelerations and jerks during a motion along the path. Shape (M, n) each.
+
+    q' v, q'' v^2 + q' a, q''' v^3 + 3 q'' v a + q' j.
+    """
+    checked_instance("motion", motion, LineMotion)
+    along = rates_along(joints, motion.distance)
+    v, a, j = (value[:, None] for value in (motion.speed, motion.acceleration, motion.jerk))
+    velocity = along.first * v
+    acceleration = along.second * v**2 + along.first * a
+    return along.position, velocity, acceleration, along.third * v**3 + 3 * along.second * v * a + along.first * j
+
+
+def joint_trajectory(schedule: Schedule, joints: JointPath, period: float) -> JointTrajectory:
+    """Joints every `period` s from the start to the end of a schedule; ProblemError for a bad period.
+
+    Times are whole nanoseconds, those of the message, and the joints are those of these times; the last is the first
+    one at or after the end, at rest.
+    """
+    checked_instance("schedule", schedule, Schedule)
+    check_joints(joints)
+    whole = np.round(schedule.sample(period).t * 1e9)
+    whole[-1] = np.ceil(schedule.duration * 1e9)
+    t = np.unique(whole) / 1e9
+    motion = schedule.at(np.minimum(t, schedule.duration))
+    return JointTrajectory(tuple(joints.names), t, *joint_motion(joints, motion)[:3])

@@ -1,0 +1,174 @@
+"""Pages of the site: their Python names what there is, their formulas are MathML, and all of them are in the index."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import re
+import textwrap
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+from latex2mathml.converter import convert
+
+from docs.docstrings import prepared
+from docs.executed import blocks, executed
+from docs.numbers import MARK, listed
+from docs.players import command
+from ocp.app.command import parser
+from scripts.papers.reproduced import read
+
+SITE = Path(__file__).resolve().parents[3] / "scripts" / "site"
+PAGES = sorted(SITE.rglob("*.md"))
+FACE = re.compile(r"\.\. automodule:: ([\w.]+)")
+FORMULAS = re.compile(r"\$\$(.+?)\$\$|(?<![\w$])\$([^$\n]+?)\$(?![\w$])", re.DOTALL)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(SITE)))
+def test_what_a_page_imports_is_there(page: Path) -> None:
+    for line, _, source in blocks(page.read_text(encoding="utf-8")):
+        tree = ast.parse(textwrap.dedent(source), str(page))
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom) and str(node.module).partition(".")[0] in ("models", "ocp"):
+                module = importlib.import_module(str(node.module))
+                missing = [alias.name for alias in node.names if not hasattr(module, alias.name)]
+                assert not missing, f"{page}:{line} imports {missing} of {node.module}"
+
+
+def test_every_page_is_in_the_index() -> None:
+    index = (SITE / "index.md").read_text(encoding="utf-8")
+    listed = {
+        line.strip()
+        for tree in re.findall(r"```\{toctree\}\n(.*?)```", index, re.DOTALL)
+        for line in tree.splitlines()
+        if line.strip() and not line.startswith(":")
+    }
+    assert listed == {str(page.relative_to(SITE).with_suffix("")) for page in PAGES} - {"index"}
+
+
+def test_every_face_has_its_reference() -> None:
+    shown = {name for page in PAGES for name in FACE.findall(page.read_text(encoding="utf-8"))}
+    assert shown == {
+        "models",
+        "models.paths",
+        "ocp",
+        "ocp.app",
+        "ocp.app.batch",
+        "ocp.app.files",
+        "ocp.motion.schedule",
+    }
+    for name in shown:
+        assert importlib.import_module(name).__all__
+
+
+def test_every_formula_becomes_mathml() -> None:
+    count = 0
+    for page in PAGES:
+        text = re.sub(r"^```.*?^```$|`[^`\n]*`", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+        for block, inline in FORMULAS.findall(text):
+            made = convert((block or inline).strip())
+            root = ElementTree.fromstring(made)
+            assert root.tag.endswith("math")
+            assert "\\" not in "".join(root.itertext()), f"{page}: {block or inline}"
+            count += 1
+    assert count > 40
+
+
+def test_what_a_block_prints_and_shows_stands_below_it() -> None:
+    page = textwrap.dedent(
+        """
+        # A page
+        ```python
+        x = 20
+        print("printed", x)
+        ```
+        Words.
+        ```py
+        class Shown:
+            def _repr_svg_(self):
+                return "<svg></svg>"
+
+        x + 1
+        ```
+        ```py
+        Shown()
+        ```
+        ```
+        no Python
+        ```
+        """
+    )
+    told = executed(page, "page")
+    printed, shown, drawn = (told.rindex(word) for word in ("printed 20", "\n21\n", "<svg></svg>"))
+    assert told.index("Words.") > printed
+    assert told.index("Words.") < shown < drawn
+    assert told.count("```python\n") == 3
+    assert "no Python" in told
+
+
+def test_a_block_that_fails_ends_the_build_with_its_page_and_line() -> None:
+    with pytest.raises(RuntimeError, match=r"(?s)the/page.*line 3.*ZeroDivisionError"):
+        executed("# A page\n```python\n1 / 0\n```\n", "the/page")
+
+
+def test_docstrings_mean_nothing_but_what_they_say() -> None:
+    told = prepared(
+        [
+            "Half |v|^2, `a|b` and ``c*d``, x_ * y.",
+            "",
+            "    q = |a| * b",
+            "    + c*",
+            "",
+            "Args:",
+            "    n: |n| of `a_`.",
+        ]
+    )
+    assert told[0] == "Half \\|v\\|^2, `a|b` and ``c*d``, x\\_ \\* y."
+    assert told[2:6] == ["::", "", "    q = |a| * b", "    + c*"]
+    assert told[-1] == "    n: \\|n\\| of `a_`."
+
+
+def test_every_number_of_the_papers_stands_on_its_page_with_its_reason() -> None:
+    found, _ = read(SITE.parents[1] / "results")
+    told = listed(found)
+    assert f"**{sum(one.reproduced for one in found)} of {len(found)} numbers" in told
+    for paper, part in zip(dict.fromkeys(one.paper for one in found), told.split("### ")[1:], strict=True):
+        assert part.startswith(f"{paper}\n")
+        for one in (one for one in found if one.paper == paper):
+            (line,) = (line for line in part.splitlines() if f"| {one.place} | {one.quantity} |" in line)
+            if one.reproduced:
+                assert line.endswith("| yes |")
+            else:
+                number = int(line.partition("no (")[2].partition(")")[0])
+                assert f"\n{number}. {one.why}.\n" in part
+    assert sum(MARK in page.read_text(encoding="utf-8") for page in PAGES) == 1
+
+
+def test_blocks_that_stand_alone_are_told_from_those_that_go_on() -> None:
+    found = blocks("a\n```python\nx = 1\n```\nb\n```py\nx + 1\n```\n```python3\nno\n```\n")
+    assert [(line, alone) for line, alone, _ in found] == [(3, True), (7, False)]
+    assert [source for _, _, source in found] == ["x = 1\n", "x + 1\n"]
+
+
+def test_of_what_is_long_the_beginning_is_shown() -> None:
+    told = executed("```python\nfor k in range(61):\n    print('line', k)\n```\n", "page")
+    assert "line 59\n... and 1 lines more" in told
+    assert "line 60" not in told
+    told = executed("```python\nfor k in range(60):\n    print('line', k)\n```\n", "page")
+    assert "line 59" in told
+    assert "lines more" not in told
+
+
+def test_every_plan_of_the_gallery_is_played_beside_what_it_is_compared_with() -> None:
+    told = (SITE / "gallery.md").read_text(encoding="utf-8")
+    plans = sorted((SITE.parents[1] / "results" / "gallery").glob("*.npz"))
+    assert sorted(re.findall(r"```\{player\} (\w+)", told)) == [plan.stem for plan in plans]
+    for plan in plans:
+        words = command(plan, SITE / "out.html")[3:]
+        options = parser().parse_args(words)
+        assert options.plan == plan
+        assert options.page == SITE / "out.html"
+        beside = [file for file in [plan.with_name(f"{plan.stem}.local.csv")] if file.exists()]
+        assert options.beside == beside
+        assert len(options.name) == 1 + len(beside)

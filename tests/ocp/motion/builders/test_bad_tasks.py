@@ -1,0 +1,640 @@
+"""Whatever is wrong with a task, a start, limits or laws is refused by name, by builders and local laws alike."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from models import (
+    FixedBase,
+    Foot,
+    Foothold,
+    FreeFloating,
+    Link,
+    Standing,
+    planar_chain,
+    rectangle,
+    reference_rig,
+    reference_tunnel,
+)
+from ocp import (
+    Collocation,
+    Cone,
+    Effort,
+    Following,
+    FreeTime,
+    Grasp,
+    IndexAtLeast,
+    Indirect,
+    InFoot,
+    JointFriction,
+    Layer,
+    Leg,
+    Limits,
+    Pinned,
+    Stabiliser,
+    StancePhase,
+    Steps,
+    StepWeights,
+    TipTask,
+    Weights,
+    capture_problem,
+    chained_capture,
+    dynamics_phases,
+    dynamics_problem,
+    inverse_kinematics,
+    joint_torques,
+    minimum_velocity_problem,
+    plan_capture,
+    plan_dynamics,
+    plan_standing,
+    plan_steps,
+    resolve,
+    resolve_accelerations,
+    resolve_steps,
+    roll_problem,
+    solve,
+    spline_targets,
+    standing_posture,
+    standing_problem,
+    steps_motion,
+    steps_problem,
+    walk,
+)
+from ocp.motion.tasks.tracks import along, pose_line
+from tests.bad_values import (
+    CALLABLE,
+    CHOICE,
+    COUNT,
+    FINITE,
+    FLAG,
+    INF,
+    INSTANCE,
+    LIMIT,
+    MAPPING,
+    NAN,
+    NONNEGATIVE,
+    NOTHING,
+    POSITIVE,
+    SEQUENCE,
+    STRANGE,
+    TEXT,
+    UNKNOWN,
+    WHOLE,
+    Bad,
+    Case,
+    array,
+    assert_refused,
+    but,
+    good_calls,
+    panel,
+)
+from tests.ocp.motion.builders.captures import planar_capture
+
+START = [0.3, 0.6, 0.9]
+CHAIN = planar_chain([1.0, 0.8, 0.6], [1.0] * 3, base=Link("foot", 30.0, inertia=np.eye(3)))
+ARM = FixedBase(CHAIN)
+UPRIGHT = [(0, 0, 1), (1, 0, 0), (0, 1, 0)]
+STANDING = Standing(CHAIN, rotation=UPRIGHT, support=rectangle((-0.3, 0.3), (-0.3, 0.3)))
+FLOATING = FreeFloating(
+    planar_chain([0.5, 0.4, 0.3], [2.0, 1.5, 1.0], base=Link("hub", 9.0, (0, 0, 0), np.eye(3))), "planar"
+)
+CAPTURE = planar_capture() | {"approach": 5.0, "detumble": 5.0}
+UP = [1.4, 0.3, 0.3]
+REACHED = np.array(ca.DM(ARM.tip_pose((), START).position)).ravel()
+FORWARD = TipTask(velocity=[0.1, 0.0], rows=(3, 4))
+HELD = TipTask(position=REACHED, rows=(3, 4))
+STILL = TipTask(velocity=[0.0, 0.0], rows=(4, 5))
+TRACK: Bad = STRANGE | {
+    "short": [1.0],
+    "nan": [NAN, 0.0],
+    "symbol": ca.SX.sym("strange", 2),
+    "texts": ["1", "2"],
+    "truths": [True, False],
+    "function of a word": lambda t: "a",
+    "function of one": lambda t: [t],
+    "function of nothing": lambda: [0, 0],
+    "function of nan": lambda t: [NAN, 0],
+    "function that fails": lambda t: 1 / 0,
+    "function of none": lambda t: None,
+}
+PLACE: Bad = TRACK | {"inf": [INF, 0.0, 0.0]}
+ROWS: Bad = but(SEQUENCE, "numbers") | {
+    "empty": [],
+    "twice": [3, 3],
+    "high": [6],
+    "half": [3.5, 4],
+    "digits": ["3", "4"],
+    "truths": [True, False],
+}
+BASE: Bad = array(7)
+RATES: Bad = array(3) | {"zero": [0.0, 1.0, 1.0], "negative": [-1.0, 1.0, 1.0]}
+SYMBOLS = INSTANCE
+HORIZON: Bad = POSITIVE | NOTHING
+TASK: Bad = INSTANCE | {
+    "none in it": [None],
+    "empty": (),
+    "unknown link": TipTask(velocity=[0.0], rows=(3,), link="nobody"),
+}
+ASKED: dict[str, Bad] = {
+    "machine": INSTANCE | {"a robot": CHAIN},
+    "start_joints": array(3) | NOTHING,
+    "horizon": HORIZON,
+    "weights": RATES,
+    "start_base": but(BASE, "empty"),
+}
+GIVEN = {"machine": ARM, "tasks": FORWARD, "start_joints": START, "horizon": 1.0}
+STOOD = {"machine": STANDING, "tasks": STILL, "start_joints": UP, "horizon": 0.2}
+EACH: Bad = LIMIT | {"one of them zero": [1.0, 0.0, 1.0], "table of words": [["a"]]}
+
+TASKS = [
+    Case(
+        "TipTask",
+        TipTask,
+        {"velocity": [0.1, 0.0], "rows": (3, 4)},
+        {
+            "rows": ROWS | NOTHING,
+            "position": {"both": REACHED},
+            "axes": CHOICE,
+            "link": but(UNKNOWN, "None", "unknown"),
+            "relative_to": but(UNKNOWN, "None", "unknown"),
+            "gain": NONNEGATIVE | NOTHING,
+            "start_gap": NONNEGATIVE | NOTHING,
+            "tool_axis": array(3) | {"zero": (0, 0, 0)},
+            "point": array(3) | {"without a link": (1, 0, 0)},
+            "velocity": NOTHING,
+        },
+    ),
+    Case("along", along, {"path": None, "speed": 0.1}, {"path": INSTANCE, "speed": POSITIVE}),
+    Case(
+        "pose_line",
+        pose_line,
+        {"first": (np.eye(3), REACHED), "second": (np.eye(3), REACHED + 1), "duration": 1.0},
+        {
+            "first": INSTANCE
+            | {
+                "no turn": (np.zeros((3, 3)), REACHED),
+                "one": (np.eye(3),),
+                "nan": (np.eye(3), [NAN, 0, 0]),
+                "inf": (np.eye(3), [INF, 0, 0]),
+                "texts": (np.eye(3), ["1", "2", "3"]),
+            },
+            "second": {"half a turn": (np.diag([-1, -1, 1]), REACHED)},
+            "duration": HORIZON,
+            "pace": CHOICE,
+        },
+    ),
+    Case(
+        "Limits",
+        Limits,
+        {},
+        {
+            "velocity": EACH,
+            "acceleration": EACH,
+            "jerk": EACH,
+            "torque": EACH,
+            "power": EACH,
+            "joints": FLAG,
+            "vertical_force": POSITIVE,
+            "friction": LIMIT | NOTHING,
+        },
+    ),
+    Case(
+        "Weights",
+        Weights,
+        {},
+        dict.fromkeys(
+            ("acceleration", "velocity", "joint_limits", "manipulability", "jerk", "time"), NONNEGATIVE | NOTHING
+        ),
+    ),
+    Case(
+        "FreeTime",
+        FreeTime,
+        {"lower": 0.5, "upper": 2.0, "guess": 1.0},
+        {
+            "lower": POSITIVE | NOTHING | {"above": 1.5},
+            "upper": POSITIVE | NOTHING | {"below": 0.7},
+            "guess": POSITIVE | NOTHING,
+        },
+    ),
+    Case("InFoot", InFoot, {}, {"margin": NONNEGATIVE | NOTHING}),
+    Case("IndexAtLeast", IndexAtLeast, {"value": 0.5}, {"value": FINITE | NOTHING | {"one": 1.0}}),
+    Case(
+        "Layer",
+        Layer,
+        {"index": "joint_limits", "demand": -1.0},
+        {"index": CHOICE, "demand": FINITE | NOTHING, "form": CHOICE},
+    ),
+    Case(
+        "Stabiliser",
+        Stabiliser,
+        {},
+        {
+            "poles": array(3) | NOTHING | {"zero": (0, 1, 1)},
+            "damping": NONNEGATIVE | NOTHING,
+            "gradient": NONNEGATIVE | NOTHING,
+        },
+    ),
+]
+
+VELOCITIES = [
+    Case(
+        "inverse_kinematics",
+        inverse_kinematics,
+        {"machine": ARM, "task": HELD, "starts": 4, "near": START},
+        {
+            "machine": ASKED["machine"],
+            "task": TASK | {"velocity": FORWARD},
+            "time": FINITE | NOTHING,
+            "base": but(BASE, "empty"),
+            "starts": WHOLE | NOTHING,
+            "near": array(3),
+            "seed": WHOLE | NOTHING,
+            "limits": FLAG,
+            "tolerance": POSITIVE | NOTHING,
+            "apart": POSITIVE | NOTHING,
+            "iterations": COUNT | NOTHING,
+        },
+    ),
+    Case(
+        "resolve",
+        resolve,
+        {**GIVEN, "samples": 5},
+        {
+            **ASKED,
+            "tasks": TASK,
+            "damping": NONNEGATIVE | NOTHING,
+            "tolerance": POSITIVE | NOTHING,
+            "samples": COUNT
+            | NOTHING
+            | {"falling": [0, 0.5, 0.4, 1.0], "one": [0.0], "texts": ["0", "1"], "nan": [0, NAN, 1]},
+        },
+    ),
+    Case(
+        "resolve by rows",
+        resolve,
+        {
+            "machine": ARM,
+            "tasks": TipTask(rows=(3, 4), velocity=[0.1, 0.0]),
+            "start_joints": START,
+            "horizon": 1.0,
+            "samples": 5,
+        },
+        {"tasks": TASK, "start_joints": array(3), "horizon": HORIZON},
+    ),
+    Case(
+        "resolve a pose",
+        lambda position: resolve(
+            ARM, tasks=TipTask(position=position, rows=(3, 4)), start_joints=START, horizon=1.0, samples=3
+        ),
+        {"position": REACHED},
+        {"position": PLACE | {"elsewhere": [9.0, 9.0]}},
+    ),
+    Case(
+        "minimum_velocity_problem",
+        minimum_velocity_problem,
+        GIVEN,
+        {
+            **ASKED,
+            "tasks": TASK,
+            "cyclic": FLAG,
+            "limits": but(INSTANCE, "None"),
+            "guess_damping": POSITIVE | NOTHING,
+            "clear": but(INSTANCE, "None"),
+        },
+    ),
+]
+
+STANDINGS = [
+    Case(
+        "resolve_accelerations",
+        resolve_accelerations,
+        {**STOOD, "step": 0.05},
+        {
+            "machine": ASKED["machine"] | {"bolted": ARM},
+            "tasks": TASK,
+            "start_joints": array(3) | NOTHING,
+            "horizon": HORIZON,
+            "law": CHOICE,
+            "start_velocities": array(3),
+            "external": CALLABLE,
+            "layers": SEQUENCE,
+            "stabiliser": but(INSTANCE, "None"),
+            "null_damping": NONNEGATIVE | NOTHING,
+            "step": POSITIVE | NOTHING,
+            "integrator": CHOICE,
+            "tolerance": POSITIVE | NOTHING,
+            "stop_at_lift_off": FLAG,
+            "speed_limit": POSITIVE | NOTHING,
+        },
+    ),
+    Case(
+        "standing_problem",
+        standing_problem,
+        STOOD,
+        {
+            "machine": ASKED["machine"] | {"bolted": ARM},
+            "tasks": TASK,
+            "start_joints": array(3) | NOTHING,
+            "horizon": HORIZON,
+            "zmp": but(INSTANCE, "None")
+            | {
+                "wide": InFoot(9.0),
+                "far": Pinned((9.0, 9.0)),
+                "of words": Pinned("a"),
+                "no function": Following(3),  # type: ignore[arg-type]
+                "function of one": Following(lambda t: [t]),
+                "function of nan": Following(lambda t: [NAN, 0]),
+            },
+            "external": CALLABLE,
+            "weights": but(INSTANCE, "None"),
+            "limits": but(INSTANCE, "None") | {"of two": Limits(velocity=[1.0, 2.0])},
+            "control": CHOICE,
+            "along": CHOICE,
+            "tip_level": CHOICE,
+            "start": CHOICE,
+            "end": CHOICE,
+            "end_joints": but(array(3), "nan"),
+            "symbols": SYMBOLS,
+        },
+    ),
+    Case(
+        "plan_standing",
+        plan_standing,
+        STOOD,
+        {
+            "machine": ASKED["machine"] | {"bolted": ARM},
+            "tasks": TASK,
+            "start_joints": array(3) | NOTHING,
+            "horizon": HORIZON,
+            "method": but(INSTANCE, "None") | {"indirect": Indirect()},
+            "options": MAPPING,
+            "tolerances": MAPPING | {"unknown": {"nothing": 1.0}},
+        },
+    ),
+]
+
+RIG, TUNNEL = reference_rig(), reference_tunnel()
+
+
+def falling(time: Any) -> list[Any]:
+    return [2.54, 0.1524, -0.381 + 0.0762 * time, 0.0, 0.0]
+
+
+ROLLS = [
+    Case(
+        "spline_targets",
+        spline_targets,
+        {"times": [0.0, 1.0, 2.0, 3.0], "targets": np.ones((4, 5))},
+        {"times": array(4) | NOTHING | {"falling": [0.0, 2.0, 1.0, 3.0]}, "targets": array(4, 5) | NOTHING},
+    ),
+    Case(
+        "roll_problem",
+        roll_problem,
+        {"rig": RIG, "tunnel": TUNNEL, "targets": falling, "horizon": 10.0},
+        {
+            "rig": INSTANCE,
+            "tunnel": INSTANCE,
+            "targets": TRACK | NOTHING | {"unreachable": lambda t: [9.0, 9, 9, 0, 0]},
+            "horizon": HORIZON,
+            "branch": INSTANCE,
+            "rate_weight": NONNEGATIVE | NOTHING,
+            "acceleration_weight": NONNEGATIVE | NOTHING,
+            "rate_limit": but(LIMIT, "zero") | NOTHING,
+            "acceleration_limit": but(LIMIT, "zero") | NOTHING,
+            "start_roll": FINITE,
+            "start_rate": FINITE,
+            "surroundings": but(INSTANCE, "None"),
+            "clearance": but(FINITE, "minus inf") | NOTHING,
+            "clearance_weight": NONNEGATIVE | NOTHING,
+            "clearance_width": POSITIVE | NOTHING,
+            "softness": POSITIVE | NOTHING,
+            "radii": but(INSTANCE, "None"),
+            "symbols": SYMBOLS,
+        },
+    ),
+]
+FRICTION = {"negative": -1.0, "nan": NAN, "inf": INF, "text": "much", "empty": []}
+DYNAMICS = [
+    Case("JointFriction", JointFriction, {}, {"viscous": FRICTION, "coulomb": FRICTION, "slip": POSITIVE}),
+    Case(
+        "Effort",
+        Effort,
+        {"time": 1.0},
+        {
+            "torque": FRICTION,
+            "energy": NONNEGATIVE,
+            "acceleration": NONNEGATIVE,
+            "jerk": NONNEGATIVE,
+            "turning": NONNEGATIVE,
+            "time": NONNEGATIVE,
+        },
+    ),
+    Case(
+        "dynamics_problem",
+        dynamics_problem,
+        {"machine": ARM, "start_joints": [0.1, 0.2, 0.3], "horizon": 1.0, "end_joints": [0.3, 0.2, 0.1]},
+        {
+            "machine": INSTANCE | {"standing": STANDING},
+            "start_joints": but(array(3), "nan"),
+            "horizon": HORIZON,
+            "end_joints": but(array(3), "nan"),
+            "limits": but(INSTANCE, "None") | {"of two": Limits(torque=[1.0, 2.0]), "jerk": Limits(jerk=1.0)},
+            "effort": but(INSTANCE, "None") | {"of two": Effort(torque=[1.0, 2.0]), "jerk": Effort(jerk=1.0)},
+            "friction": but(INSTANCE, "None") | {"of two": JointFriction([1.0, 2.0])},
+            "control": CHOICE,
+            "start": CHOICE,
+            "end": CHOICE,
+            "clear": but(INSTANCE, "None"),
+            "symbols": SYMBOLS,
+        },
+    ),
+    Case(
+        "dynamics_problem of a floating machine",
+        dynamics_problem,
+        {"machine": FLOATING, "start_joints": [0.1, 0.2, 0.3], "horizon": 1.0},
+        {"start": but(array(3), "nan"), "end": but(array(3), "nan"), "end_base": but(array(3), "nan")},
+    ),
+    Case(
+        "dynamics_phases",
+        dynamics_phases,
+        {"machine": ARM, "start_joints": [0.1, 0.2, 0.3], "legs": [Leg([0.3, 0.2, 0.1], 1.0)]},
+        {
+            "machine": INSTANCE | {"standing": STANDING},
+            "legs": SEQUENCE | {"empty": [], "horizon": [Leg([0.3, 0.2, 0.1], -1.0)]},
+            "total": but(HORIZON, "None"),
+            "clear": but(INSTANCE, "None"),
+        },
+    ),
+    Case(
+        "Leg of dynamics_phases",
+        lambda **leg: dynamics_phases(ARM, [0.1, 0.2, 0.3], [Leg(**leg)]),
+        {"joints": [0.3, 0.2, 0.1], "horizon": 1.0},
+        {
+            "joints": but(array(3), "nan"),
+            "horizon": POSITIVE,
+            "end": CHOICE,
+            "machine": but(INSTANCE, "None"),
+            "tasks": but(INSTANCE, "list", "dictionary"),
+            "name": TEXT | {"with a dot": "leg.1"},
+        },
+    ),
+    Case(
+        "Cone",
+        Cone,
+        {"direction": (-1.0, 0.0, 0.0), "half_angle": 0.4, "length": 0.3},
+        {
+            "direction": array(3) | {"zero": np.zeros(3)},
+            "half_angle": POSITIVE | {"right": np.pi / 2},
+            "length": POSITIVE,
+            "depth": POSITIVE,
+        },
+    ),
+    Case("Grasp", Grasp, {}, {"force": but(POSITIVE, "inf"), "moment": but(POSITIVE, "inf")}),
+    Case(
+        "capture_problem",
+        capture_problem,
+        CAPTURE,
+        {
+            "chaser": INSTANCE | {"fixed": ARM},
+            "target": INSTANCE | {"with joints": FLOATING},
+            "start_joints": array(4),
+            "approach": HORIZON,
+            "detumble": HORIZON,
+            "start_base": but(array(3), "None"),
+            "target_base": but(array(3), "None"),
+            "cone": but(INSTANCE, "None"),
+            "grasp": but(INSTANCE, "None"),
+        },
+    ),
+    *(
+        Case(
+            name,
+            function,
+            CAPTURE | {"method": Collocation(5, 4, scheme="legendre")},
+            {"chaser": INSTANCE, "detumble": HORIZON, "method": but(INSTANCE, "None"), "options": MAPPING},
+        )
+        for name, function in (("plan_capture", plan_capture), ("chained_capture", chained_capture))
+    ),
+    Case(
+        "plan_dynamics",
+        plan_dynamics,
+        {"machine": ARM, "start_joints": [0.1, 0.2, 0.3], "horizon": 1.0, "end_joints": [0.3, 0.2, 0.1]},
+        {
+            "total": but(HORIZON, "None"),
+            "machine": INSTANCE | {"standing": STANDING},
+            "horizon": HORIZON,
+            "end_joints": but(array(3), "nan"),
+            "tasks": but(INSTANCE, "list", "dictionary"),
+            "method": but(INSTANCE, "None") | {"indirect": Indirect()},
+            "options": MAPPING,
+            "tolerances": MAPPING | {"unknown": {"nothing": 1.0}},
+        },
+    ),
+    Case(
+        "joint_torques",
+        lambda machine: joint_torques(machine, (), ca.SX.sym("q", 3), ca.SX.sym("v", 3), ca.SX.sym("a", 3)),
+        {"machine": ARM},
+        {"machine": INSTANCE | {"standing": STANDING}},
+    ),
+]
+FEET = {"base": Foot("base", rectangle((-1.0, 1.0), (-1.0, 1.0)))}
+HERE = {"base": Foothold((0.0, 0.0, 0.0))}
+ARM_ON_FOOT = planar_chain([0.4, 0.4, 0.3], [2.0, 1.5, 1.0])
+STEPPING = Steps(ARM_ON_FOOT, FEET, [StancePhase(HERE, 1.0)])
+STEPPED: dict[str, Any] = {"steps": STEPPING, "start_joints": [0.3, 0.4, 0.5]}
+STEP_OPTIONS: dict[str, Bad] = {
+    "steps": INSTANCE,
+    "start_joints": array(3) | NOTHING,
+    "balance": CHOICE,
+    "margin": NONNEGATIVE | NOTHING | {"wide": 9.0},
+    "clearance": NONNEGATIVE | NOTHING,
+    "weights": but(INSTANCE, "None"),
+    "limits": but(INSTANCE, "None") | {"jerk": Limits(jerk=1.0), "of two": Limits(velocity=[1.0, 2.0])},
+}
+STEPS = [
+    Case(
+        "StepWeights",
+        StepWeights,
+        {},
+        dict.fromkeys(("acceleration", "velocity", "torque", "joint_limits", "load", "time"), NONNEGATIVE | NOTHING),
+    ),
+    Case(
+        "StancePhase",
+        StancePhase,
+        {"footholds": HERE, "duration": 1.0},
+        {"footholds": MAPPING | NOTHING | {"none": {}, "of words": {"base": "here"}}, "duration": HORIZON},
+    ),
+    Case(
+        "Steps",
+        Steps,
+        {"robot": ARM_ON_FOOT, "feet": FEET, "phases": [StancePhase(HERE, 1.0)]},
+        {
+            "robot": INSTANCE,
+            "feet": MAPPING | NOTHING | {"none": {}, "of words": {"base": "base"}, "lost": {"base": Foot("nobody")}},
+            "phases": SEQUENCE | NOTHING | {"none": []},
+            "gravity": POSITIVE | NOTHING,
+        },
+    ),
+    Case(
+        "walk",
+        walk,
+        {"start": {**HERE, "hand": HERE["base"]}, "steps": [("hand", HERE["base"])], "shift": 1.0, "swing": 1.0},
+        {
+            "start": MAPPING | {"none": {}, "of words": {"base": "here"}},
+            "steps": SEQUENCE | NOTHING | {"unknown": [("foot", HERE["base"])], "of words": [("base", "here")]},
+            "shift": HORIZON,
+            "swing": HORIZON,
+        },
+    ),
+    Case("steps_problem", steps_problem, STEPPED, STEP_OPTIONS),
+    Case(
+        "plan_steps",
+        plan_steps,
+        STEPPED,
+        {
+            **STEP_OPTIONS,
+            "method": but(INSTANCE, "None") | {"indirect": Indirect()},
+            "options": MAPPING,
+            "tolerances": MAPPING | {"unknown": {"nothing": 1.0}},
+        },
+    ),
+    Case(
+        "standing_posture",
+        standing_posture,
+        {"stance": STEPPING.stances[0], "near": [0.3, 0.4, 0.5]},
+        {"stance": INSTANCE, "near": array(3) | NOTHING, "over": array(2)},
+    ),
+    Case(
+        "resolve_steps",
+        resolve_steps,
+        {"steps": STEPPING, "start_joints": STEPPED["start_joints"], "clearance": 0.02, "samples": 5},
+        {
+            "steps": INSTANCE,
+            "start_joints": array(3) | NOTHING,
+            "clearance": NONNEGATIVE | NOTHING,
+            "samples": COUNT | NOTHING | {"one": 1},
+        },
+    ),
+    Case(
+        "steps_motion",
+        steps_motion,
+        {"steps": STEPPING, "solution": solve(steps_problem(**STEPPED), Collocation(2)), "samples": 5},
+        {"steps": INSTANCE, "solution": INSTANCE, "samples": COUNT | NOTHING | {"one": 1}},
+    ),
+]
+CASES = [*TASKS, *VELOCITIES, *STANDINGS, *ROLLS, *DYNAMICS, *STEPS]
+LONG = ("along", "plan_standing", "plan_steps")
+
+
+@pytest.mark.parametrize("case", good_calls(case for case in CASES if case.what not in LONG))
+def test_what_is_good_is_taken(case: Case) -> None:
+    case.call(**case.good)
+
+
+@pytest.mark.parametrize(("case", "argument"), panel(CASES))
+def test_bad_input_is_refused_by_name(case: Case, argument: str) -> None:
+    assert_refused(case, argument)

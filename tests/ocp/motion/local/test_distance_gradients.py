@@ -1,0 +1,129 @@
+"""Distances and their gradients: those of all samples of a motion, and of finite differences, in threads, too."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from models import (
+    Box,
+    Capsule,
+    CollisionShape,
+    Cylinder,
+    FixedBase,
+    FreeFloating,
+    HalfSpace,
+    Machine,
+    Moving,
+    Sphere,
+    Surroundings,
+)
+from ocp.motion.local.touching import distances_along
+from tests.models.robot.trees import random_robot
+
+SIZES = {"sphere": (0.08,), "capsule": (0.05, 0.3), "box": (0.1, 0.2, 0.3), "cylinder": (0.06, 0.3)}
+
+
+def crowd(seed: int, floating: bool = False) -> Surroundings:
+    """A random tree of joints, slides and followers with bodies of all kinds, among obstacles of all kinds."""
+    rng = np.random.default_rng(seed)
+    robot = random_robot(rng, 5, followers=True)
+    kinds = [*SIZES, *rng.permutation(list(SIZES))]
+    links = [
+        replace(link, collisions=(CollisionShape(kinds[k % 8], SIZES[kinds[k % 8]], translation=rng.normal(size=3)),))
+        for k, link in enumerate(robot.links)
+    ]
+    robot = replace(robot, links=tuple(links))
+    machine: Machine = FreeFloating(robot) if floating else FixedBase(robot)
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    obstacles: list[Any] = [
+        Sphere(0.2, rng.normal(size=3)),
+        Capsule(0.1, rng.normal(size=3), rng.normal(size=3)),
+        Box((0.4, 0.3, 0.6), rng.normal(size=3), turn * np.linalg.det(turn)),
+        Cylinder(0.2, 0.5, rng.normal(size=3)),
+        HalfSpace((0, 0.6, 0.8), (0, 0, -1.0)),
+        Moving(Box((0.2, 0.3, 0.4)), lambda t: (ca.sin(t), 0.3 * t, 0.5)),
+    ]
+    return Surroundings(machine, obstacles, limits=False)
+
+
+def configurations(around: Surroundings, count: int, seed: int) -> Iterator[tuple[Any, Any, float]]:
+    rng, machine = np.random.default_rng(seed), around.machine
+    for _ in range(count):
+        base = rng.normal(size=machine.base_size)
+        if machine.base_size:
+            base[3:] /= np.linalg.norm(base[3:])
+        yield base, rng.uniform(-1.5, 1.5, machine.joint_size), float(rng.uniform(0, 2))
+
+
+@pytest.fixture(scope="module")
+def few() -> tuple[Surroundings, list[int], Any]:
+    """Some surroundings, pairs of them, and their distances with gradients."""
+    around = crowd(3)
+    simple = (Sphere, Capsule, Box, HalfSpace)
+    pairs = [
+        k for k, both in enumerate(around.pairs) if all(isinstance(around.bodies[b].shape, simple) for b in both[:2])
+    ]
+    return around, pairs, around.distance_gradients(pairs=pairs, rounding=0.02)
+
+
+def test_gradients_are_finite_differences_of_distances(few: tuple[Surroundings, list[int], Any]) -> None:
+    """Along random rates, but for kinks, which are rare: there the differences of two steps do not agree."""
+    around, _, function = few
+    rng, kept = np.random.default_rng(4), 0
+    for base, q, time in configurations(around, 10, 4):
+        rates = rng.normal(size=len(q))
+
+        def apart(step: float, *, base: Any = base, q: Any = q, time: float = time, rates: Any = rates) -> Any:
+            return np.array(function(base, q + step * rates, time)[0]).ravel()
+
+        rough, fine = ((apart(h) - apart(-h)) / (2 * h) for h in (2e-5, 1e-5))
+        sure = np.abs(rough - fine) < 1e-7
+        kept += sure.sum()
+        slopes = np.array(function(base, q, time)[1]) @ rates
+        np.testing.assert_allclose(slopes[sure], fine[sure], atol=1e-6)
+    assert kept > 8 * len(rough)
+
+
+def test_distances_along_a_motion_are_those_of_its_samples(few: tuple[Surroundings, list[int], Any]) -> None:
+    """However many there are: they are measured side by side, and what is left over one by one."""
+    around, pairs, _ = few
+    known = around.distance_gradients(pairs=pairs)
+    for count in (3, 64, 150):
+        samples = list(configurations(around, count, count))
+        base, joints, times = (np.array(part) for part in zip(*samples, strict=True))
+        found = distances_along(around, base, joints, times)
+        np.testing.assert_allclose(
+            found[:, pairs].T, np.hstack([np.array(known(*one)[0]) for one in samples]), atol=1e-9
+        )
+
+
+def test_what_is_no_number_stays_none(few: tuple[Surroundings, list[int], Any]) -> None:
+    around, pairs, function = few
+    q = np.zeros(around.machine.joint_size)
+    q[0] = np.nan
+    joints = ca.SX.sym("q", len(q))
+    distances = ca.Function("distances", [joints], [around.distances(ca.DM(0, 1), joints, pairs=pairs, rounding=0.02)])
+    values, slopes = (np.array(part) for part in function((), q, 0.0))
+    lost = np.isnan(np.array(distances(q))).ravel()
+    assert lost.any()
+    assert np.isnan(values.ravel()[lost]).all()
+    assert np.isnan(slopes[lost]).any(axis=1).all()
+
+
+def test_threads_may_call_it_at_once(few: tuple[Surroundings, list[int], Any]) -> None:
+    around, _, function = few
+    mapped = function.map(100)
+    lots = [list(configurations(around, 100, seed)) for seed in range(4)]
+    given = [[np.array(part).T.reshape(-1, 100) for part in zip(*lot, strict=True)] for lot in lots]
+    known = [mapped.call(each) for each in given]
+    with ThreadPoolExecutor(4) as pool:
+        for found, one in zip(pool.map(mapped.call, given * 5), known * 5, strict=True):
+            for part, other in zip(found, one, strict=True):
+                np.testing.assert_array_equal(np.array(part), np.array(other))

@@ -1,0 +1,166 @@
+"""Inverse kinematics: all postures of known arms, limits, the nearest miss, and what is refused."""
+
+from __future__ import annotations
+
+import pickle
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from models import FixedBase, Joint, Link, Machine, Robot, planar_chain
+from ocp import ProblemError, TipTask, Unreachable, inverse_kinematics
+from ocp.motion.local.inverse_kinematics import postures_of
+from ocp.motion.tasks.equations import bind
+from tests.models.robot.trees import seeds
+from tests.ocp.motion.tasks.space_tasks import (
+    BASE,
+    PANDA_START,
+    UR5_START,
+    floating_panda,
+    panda,
+    pose,
+    two_pandas,
+    ur5,
+)
+
+POINT = TipTask(position=(0.0, 0.0, 0.0))
+
+
+def assert_poses(machine: Machine, joints: Any, rotation: Any, position: Any, base: Any = ()) -> None:
+    """The tip is there; of the turn only the tool axis where `rotation` is one direction."""
+    turn, place = pose(machine, base, joints)
+    np.testing.assert_allclose(place, position, atol=1e-9)
+    np.testing.assert_allclose(turn if np.ndim(rotation) == 2 else turn[:, 2], rotation, atol=1e-9)
+
+
+def test_a_six_joint_arm_has_its_eight_postures() -> None:
+    rotation, position = pose(ur5(), (), UR5_START)
+    found = inverse_kinematics(ur5(), TipTask(position=position, orientation=rotation))
+    assert len(found) == 8
+    assert [posture.quality for posture in found] == sorted((p.quality for p in found), reverse=True)
+    for posture in found:
+        assert_poses(ur5(), posture.joints, rotation, position)
+    nearest = min(np.abs(np.sin((posture.joints - UR5_START) / 2)).max() for posture in found)
+    assert nearest < 1e-9
+
+
+@pytest.mark.parametrize("limits", [True, False])
+def test_from_equations_and_targets_the_same_postures_are_found(limits: bool) -> None:
+    """Again and again with one set of functions."""
+    rng, told = np.random.default_rng(3), dict[str, Any](starts=8, limits=limits)
+    equations = None
+    for seed in range(3):
+        rotation, position = pose(panda(), (), rng.uniform(panda().robot.lower, panda().robot.upper))
+        task = TipTask(position=position, orientation=rotation)
+        equations = equations or bind(panda(), task)
+        targets = np.concatenate([position, np.zeros(3), rotation.T.ravel(), np.zeros(3)])
+        found = postures_of(equations, targets, seed=seed, **told)
+        asked = inverse_kinematics(panda(), task, seed=seed, **told)
+        for one, other in zip(found, asked, strict=True):
+            np.testing.assert_allclose(one.joints, other.joints, atol=1e-8)
+            assert one.quality == pytest.approx(other.quality)
+    with pytest.raises(Unreachable):
+        postures_of(bind(panda(), task), targets + 5.0, seed=0, **told)
+
+
+def test_a_two_link_arm_has_two_elbows_in_closed_form() -> None:
+    machine = FixedBase(planar_chain([1.0, 0.7], [1.0, 1.0]))
+    found = inverse_kinematics(machine, TipTask(position=(0.9, 0.6, 0.0), rows=(3, 4)), starts=16)
+    elbow = np.arccos((0.9**2 + 0.6**2 - 1 - 0.49) / 1.4)
+    assert sorted(np.round([np.remainder(p.joints[1] + np.pi, 2 * np.pi) - np.pi for p in found], 8)) == pytest.approx(
+        [-elbow, elbow], abs=1e-7
+    )
+
+
+@settings(max_examples=5)
+@given(seeds, st.booleans())
+def test_what_an_arm_can_do_is_found_within_its_limits(seed: int, free_roll: bool) -> None:
+    rng = np.random.default_rng(seed)
+    robot = panda().robot
+    joints = rng.uniform(robot.lower, robot.upper)
+    rotation, position = pose(panda(), (), joints)
+    asked: dict[str, Any] = {"direction": rotation[:, 2]} if free_roll else {"orientation": rotation}
+    for posture in inverse_kinematics(panda(), TipTask(position=position, **asked)):
+        assert (posture.joints >= robot.lower).all()
+        assert (posture.joints <= robot.upper).all()
+        assert_poses(panda(), posture.joints, rotation[:, 2] if free_roll else rotation, position)
+
+
+def test_the_base_may_float_and_two_arms_may_hold_one_thing() -> None:
+    machine = floating_panda()
+    rotation, position = pose(machine, BASE, PANDA_START)
+    best = inverse_kinematics(machine, TipTask(position=position, orientation=rotation), base=BASE)[0]
+    np.testing.assert_allclose(pose(machine, BASE, best.joints)[1], position, atol=1e-9)
+    both = two_pandas()
+    tasks = [
+        TipTask(position=(0.9, 0.0, 0.5), direction=(0.0, -1.0, 0.0), link="left_panda_hand"),
+        TipTask(
+            position=(0.0, 0.0, 0.4), direction=(0.0, 0.0, -1.0), link="right_panda_hand", relative_to="left_panda_hand"
+        ),
+    ]
+    posture = inverse_kinematics(both, tasks)[0]
+    assert posture.misfit < 1e-10
+    assert posture.joints.shape == (14,)
+
+
+def test_a_start_that_is_near_is_kept_and_seeds_repeat() -> None:
+    rotation, position = pose(ur5(), (), UR5_START)
+    task = TipTask(position=position, orientation=rotation)
+    (only,) = inverse_kinematics(ur5(), task, starts=0, near=UR5_START + 0.05)
+    np.testing.assert_allclose(only.joints, UR5_START, atol=1e-8)
+    one, other = (inverse_kinematics(ur5(), task, seed=4, starts=8) for _ in range(2))
+    np.testing.assert_array_equal([p.joints for p in one], [p.joints for p in other])
+
+
+def test_the_nearest_miss_is_told_and_pickled() -> None:
+    machine = FixedBase(planar_chain([1.0, 0.7], [1.0, 1.0]))
+    with pytest.raises(Unreachable, match=r"nearest miss is 0\.3 ") as caught:
+        inverse_kinematics(machine, TipTask(position=(2.0, 0.0, 0.0), rows=(3, 4)))
+    assert caught.value.misfit == pytest.approx(0.3, abs=1e-6)
+    np.testing.assert_allclose(np.sin(caught.value.joints), 0.0, atol=1e-3)
+    again = pickle.loads(pickle.dumps(caught.value))
+    assert (type(again), str(again)) == (Unreachable, str(caught.value))
+    assert (again.name, again.value, again.misfit) == ("link2", caught.value.misfit, caught.value.misfit)
+    np.testing.assert_array_equal(again.joints, caught.value.joints)
+
+
+def test_limits_refuse_what_they_forbid_and_name_the_joint() -> None:
+    hinge = Joint("hinge", "revolute", "post", "door", lower=-0.5, upper=0.5)
+    machine = FixedBase(Robot((Link("post"), Link("door")), (hinge,), tip_translation=(1.0, 0.0, 0.0)))
+    task = TipTask(position=(np.cos(1.0), np.sin(1.0), 0.0), rows=(3, 4))
+    with pytest.raises(Unreachable, match=r"\['hinge'\] at their limits"):
+        inverse_kinematics(machine, task)
+    assert inverse_kinematics(machine, task, limits=False)[0].joints[0] == pytest.approx(1.0)
+
+
+def test_an_orientation_half_a_turn_away_is_no_solution() -> None:
+    """The axial part of the error vanishes there: sin(pi) = 0."""
+    pin = Joint("pin", "revolute", "post", "door", lower=-0.1, upper=0.1)
+    machine = FixedBase(Robot((Link("post"), Link("door")), (pin,)))
+    with pytest.raises(Unreachable) as caught:
+        inverse_kinematics(machine, TipTask(orientation=np.diag([-1.0, -1.0, 1.0])))
+    assert caught.value.misfit > 1.0
+
+
+@pytest.mark.parametrize(
+    ("task", "changes", "message"),
+    [
+        (TipTask(rows=(3,), velocity=(0.0,)), {}, "need a pose"),
+        (POINT, {"starts": -1}, "starts must be a whole number"),
+        (POINT, {"starts": 0}, "no start"),
+        (POINT, {"tolerance": 0.0}, "tolerance must be positive"),
+        (POINT, {"near": (0.0, 0.0)}, r"near has shape \(1, 2\)"),
+        (TipTask(position=(0.0, 0.0, np.nan)), {}, "position .* not finite"),
+        (TipTask(position=(0.0, 0.0)), {}, r"position has shape \(2, 1\)"),
+        (TipTask(position=(0.0, 0.0, 0.0), link="tool1"), {}, "tool1"),
+        ([], {}, "empty list"),
+        (["left"], {}, "must be a TipTask"),
+    ],
+)
+def test_requests_that_cannot_be_right_are_refused(task: Any, changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ProblemError, match=message) as caught:
+        inverse_kinematics(ur5(), task, **changes)
+    assert (caught.value.name or "unnamed") in str(caught.value)

@@ -1,0 +1,220 @@
+"""Distances at samples of a motion: those of the formulas, whatever balls are looked at first, and what touches."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+import coal
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from models import (
+    Box,
+    CollisionShape,
+    FixedBase,
+    FreeFloating,
+    HalfSpace,
+    Joint,
+    Link,
+    Machine,
+    Moving,
+    Robot,
+    Sphere,
+    Surroundings,
+)
+from models.arrays import Array
+from models.shapes.distance import COLUMNS
+from models.shapes.mesh_files import find_mesh, read_mesh
+from models.spatial import skew
+from ocp import ProblemError
+from ocp.motion.local.touching import checked_surroundings, distances_along, hulls_of, touches
+from tests.models.machines.armoured import armoured_arm
+from tests.models.machines.test_surroundings import OBSTACLES, machines, postures, turned
+from tests.ocp.motion.tasks.space_tasks import panda, ur5
+
+MOVING = Moving(OBSTACLES[1], lambda t: (0.3, 0.2 * t, 0.2), lambda t: turned(t))
+TIMES = np.linspace(0.0, 3.0, 30)
+
+
+def known(around: Surroundings, base: Array, joints: Array) -> Array:
+    """By the expression, one sample after the other. Shape (M, n)."""
+    machine = around.machine
+    b, q, t = ca.SX.sym("b", machine.base_size), ca.SX.sym("q", machine.joint_size), ca.SX.sym("t")
+    function = ca.Function("distances", [b, q, t], [around.distances(b, q, t)])
+    return np.array([np.array(function(*each)).ravel() for each in zip(base, joints, TIMES, strict=True)])
+
+
+def by_formula(around: Surroundings) -> Array:
+    """Whether a pair is of shapes whose distances are exact. Shape (n,)."""
+    return np.array([all(type(around.bodies[k].shape) in COLUMNS for k in pair[:2]) for pair in around.pairs])
+
+
+@pytest.mark.parametrize("name", machines())
+def test_distances_along_a_motion_are_those_of_the_expression(name: str) -> None:
+    """Of the kinds with a formula; beside the others, meshes and cylinders, no less than its bound from below."""
+    around = Surroundings(machines()[name], (*OBSTACLES, MOVING))
+    base, joints = postures(around.machine, len(TIMES), 3)
+    found, told, exact = distances_along(around, base, joints, TIMES), known(around, base, joints), by_formula(around)
+    assert_allclose(found[:, exact], told[:, exact], atol=1e-9)
+    assert (found >= told - 1e-9)[found > 0].all()
+    assert exact.sum() > 8
+
+
+def test_boxes_that_overlap_are_as_deep_as_the_formula_says() -> None:
+    """A box that tumbles about its diagonal where another one slides."""
+    axis = skew(ca.DM([1, 1, 1]) / np.sqrt(3))
+
+    def tumbling(t: Any) -> Any:
+        return ca.DM.eye(3) + ca.sin(t) * axis + (1 - ca.cos(t)) * ca.mtimes(axis, axis)
+
+    around = Surroundings(machines()["slider"], [Moving(Box((0.3, 0.2, 0.25)), lambda t: (0.1, 0.1, 0.25), tumbling)])
+    base, joints = postures(around.machine, len(TIMES), 7)
+    joints[:, 0] = np.linspace(-0.1, 0.3, len(TIMES))
+    found, told = distances_along(around, base, joints, TIMES), known(around, base, joints)
+    boxes = [all(isinstance(around.bodies[k].shape, Box) for k in pair[:2]) for pair in around.pairs]
+    assert (found[:, boxes] < -0.05).sum() > 10
+    assert_allclose(found[:, boxes], told[:, boxes], atol=1e-9)
+
+
+def test_long_boxes_that_cross_edge_by_edge_are_as_deep_as_the_formula_says() -> None:
+    """Square to each other, each turned about its length, and far from their middles."""
+    ends: dict[str, Any] = {"lower": -1.0, "upper": 1.0}
+    angles = [np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]]) for a in (0.5, 0.4)]
+    across = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    beam = CollisionShape("box", (2.0, 0.2, 0.3), rotation=angles[0])
+    slide = Joint("slide", "prismatic", "base", "beam", axis=(1, 0, 0), **ends)
+    machine = FixedBase(Robot((Link("base"), Link("beam", collisions=(beam,))), (slide,)))
+    around = Surroundings(machine, [Box((2.0, 0.3, 0.25), (0.1, 0.6, 0.33), across @ angles[1])])
+    joints = np.linspace(-0.8, 0.8, len(TIMES))[:, None]
+    found = distances_along(around, np.zeros(0), joints, TIMES)
+    assert_allclose(found, known(around, np.zeros((len(TIMES), 0)), joints), atol=1e-9)
+    assert -0.05 < found.min() < -0.01
+
+
+@pytest.mark.parametrize("near", [-0.2, 0.0, 0.1, 0.5])
+def test_what_is_not_near_is_told_by_a_number_between(near: float) -> None:
+    """From the least that is asked for up to the distance; what is nearer is exact."""
+    around = Surroundings(machines()["slider"], (*OBSTACLES, MOVING, HalfSpace((3, 0, 4), (0.2, 0.1, 0.3))))
+    base, joints = postures(around.machine, len(TIMES), 4)
+    exact = distances_along(around, base, joints, TIMES)
+    found = distances_along(around, base, joints, TIMES, near)
+    below = exact < near
+    assert_allclose(found[below], exact[below], atol=1e-12)
+    assert (found[~below] >= near).all()
+    assert (found <= exact + 1e-12).all()
+    assert near <= 0 or below.any()
+    assert (found < exact - 1e-3).any()  # and not all of them were worked out
+
+
+def test_each_pair_that_touches_is_named_where_it_is_nearest_the_deepest_first() -> None:
+    around = Surroundings(machines()["arm"], (*OBSTACLES, MOVING), clearance=0.05)
+    base, joints = postures(around.machine, len(TIMES), 5)
+    apart = distances_along(around, base, joints, TIMES)
+    found = touches(around, base, joints, TIMES)
+    assert [touch.pair for touch in found] == np.argsort(apart.min(axis=0))[: len(found)].tolist()
+    assert len(found) == (apart.min(axis=0) < 0.05).sum() > 2
+    for touch in found:
+        assert touch.bodies == around.labels[touch.pair]
+        assert touch.distance == pytest.approx(apart[:, touch.pair].min(), abs=1e-12)
+        assert touch.time == TIMES[apart[:, touch.pair].argmin()]
+        assert ("overlap by" if touch.distance < 0 else "apart") in str(touch)
+        assert f"{abs(touch.distance):.3g} m" in str(touch)
+
+
+def test_one_base_for_all_samples_is_that_base_at_each() -> None:
+    around = Surroundings(FreeFloating(armoured_arm(4)), OBSTACLES)
+    base, joints = postures(around.machine, len(TIMES), 6)
+    same = np.tile(base[0], (len(TIMES), 1))
+    each = distances_along(around, same, joints, TIMES)
+    assert_allclose(distances_along(around, base[0], joints, TIMES), each)
+    assert np.ptp(each, axis=0).max() > 0.1
+
+
+def test_no_pairs_have_no_distances_and_what_is_no_number_touches() -> None:
+    bare = Surroundings(FixedBase(armoured_arm(2)))
+    assert distances_along(bare, np.zeros(0), np.zeros((3, 2)), np.zeros(3)).shape == (3, 0)
+    assert touches(bare, np.zeros(0), np.zeros((3, 2)), np.zeros(3)) == []
+    arm = FixedBase(armoured_arm())
+    lost = Surroundings(arm, [Sphere(0.1, (0.5, 0, 0))])
+    assert touches(lost, np.zeros(0), np.full((1, 7), np.nan), np.zeros(1))[0].distance == -np.inf
+
+
+def test_the_hulls_are_the_bodies() -> None:
+    around = Surroundings(FixedBase(armoured_arm()), OBSTACLES)
+    hulls = hulls_of(around)
+    assert list(hulls) == [body.name for body in around.bodies]
+    for hull, body in zip(hulls.values(), around.bodies, strict=True):
+        assert (hull.frame, hull.radius) == (body.frame, body.shape.swelling)
+        assert_allclose(hull.core, body.shape.core)
+        assert hull.normal.size == (3 if isinstance(body.shape, HalfSpace) else 0)
+
+
+def test_surroundings_are_those_of_the_machine_with_its_limits() -> None:
+    machine: Machine = FixedBase(armoured_arm())
+    kept, free = Surroundings(machine, limits=True), Surroundings(machine, limits=False)
+    assert checked_surroundings(kept, machine) is kept
+    assert checked_surroundings(free, machine, limits=False) is free
+    bad: list[Any] = [(kept, FixedBase(armoured_arm()), True), (kept, machine, False)]
+    for around, owner, limits in bad:
+        with pytest.raises(ProblemError) as caught:
+            checked_surroundings(around, owner, limits)
+        assert caught.value.name == "surroundings"
+
+
+def triangles(machine: FixedBase, link: str) -> Any:
+    """The meshes of a link by coal, in its frame."""
+    model = coal.BVHModelOBBRSS()
+    model.beginModel(0, 0)
+    for shape in machine.robot.link(link).collisions:
+        path = find_mesh(shape.file, shape.folder or None, [])
+        assert path is not None
+        vertices, faces = read_mesh(path)
+        for corners in (vertices * shape.size @ np.array(shape.rotation).T + shape.translation)[faces]:
+            model.addTriangle(*corners)
+    model.endModel()
+    return model
+
+
+def test_meshes_are_no_nearer_than_their_hulls_and_covers_say() -> None:
+    """Beside their triangles by coal: both are bounds from below, the larger is told, and what is held is told."""
+    seen, hollow = np.sum([beside_triangles(machine) for machine in (ur5(), panda())], axis=0)
+    assert seen > 60
+    assert hollow > 5  # where covers are farther apart than hulls
+
+
+def beside_triangles(machine: FixedBase) -> tuple[int, int]:
+    """How many pairs of hulls in random postures are looked at, and how many of them are held as far as is told."""
+    around = Surroundings(machine)
+    assert around.covers
+    rng = np.random.default_rng(3)
+    low, high = np.maximum(machine.robot.lower, -np.pi), np.minimum(machine.robot.upper, np.pi)
+    joints = rng.uniform(low, high, (1000, machine.joint_size))
+    pairs = list(around.covers)
+    told = distances_along(around, np.zeros(0), joints, np.zeros(len(joints)))[:, pairs]
+    near = np.flatnonzero(((told > 0) & (told < 0.03)).any(axis=1))[:40]
+    joints, told = joints[near], told[near]
+    q = ca.SX.sym("q", machine.joint_size)
+    places = ca.Function("places", [q], [around.placements((), q)])
+    held = ca.Function("held", [q], [around.distances((), q, pairs=pairs)])
+    meshes = {name: triangles(machine, name.split(" hull ")[0]) for pair in pairs for name in around.labels[pair]}
+    request, result = coal.DistanceRequest(), coal.DistanceResult()
+    seen, hollow = 0, 0
+    for at, apart in zip(joints, told, strict=True):
+        frames = np.array(places(at)).reshape(-1, 4, 3)
+        least = np.array(held(at)).ravel()
+        assert (np.minimum(least, 0.0) <= apart + 1e-9).all()  # what is held apart is apart
+        for k, pair in enumerate(pairs):
+            if not 0 < apart[k] < 0.03:
+                continue
+            sides: list[Any] = []
+            for body in around.pairs[pair, :2]:
+                turn, shift = frames[around.bodies[body].frame, :3].T, frames[around.bodies[body].frame, 3]
+                sides += [meshes[around.bodies[body].name], coal.Transform3s(turn, shift)]
+            result.clear()
+            true = coal.distance(*sides, request, result)
+            assert apart[k] <= true + 1e-7
+            seen += 1
+            hollow += bool(least[k] > apart[k] - 1e-9)
+    return seen, hollow

@@ -1,0 +1,316 @@
+"""What cannot be planned is refused by name: bad values, tasks that do not fit, and where a path leaves the reach."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from models import FixedBase, Path, SmoothPath, Surroundings, planar_chain, smooth
+from ocp import Clear, Limits, ProblemError, SolveError, TipTask, Unreachable, inverse_kinematics
+from ocp.app.files import log_rerun, write_mcap
+from ocp.motion.plan import Plan, plan, plan_in_pieces, plan_waypoints
+from ocp.motion.schedule import LineLimits, schedule
+from ocp.motion.tasks.tracks import along
+from tests.bad_values import (
+    CHOICE,
+    FINITE,
+    FLAG,
+    INSTANCE,
+    MAPPING,
+    NAN,
+    NONNEGATIVE,
+    POSITIVE,
+    SEQUENCE,
+    TEXT,
+    WHOLE,
+    Case,
+    array,
+    assert_refused,
+    but,
+    good_calls,
+    method,
+    panel,
+)
+from tests.models.machines.armoured import armoured_arm
+from tests.models.robot.trees import Array, numeric
+from tests.ocp.app.files.recorder import recorder
+from tests.ocp.motion.plan.motions import DOWN, angled_ur5
+from tests.ocp.motion.tasks.space_tasks import panda, ur5
+
+CHAIN = planar_chain([1.0, 0.8, 0.6], [1.0] * 3)
+ARM = FixedBase(CHAIN)
+START = [0.3, 0.6, 0.9]
+REACHED = numeric(ARM.tip_pose((), START).position).ravel()
+LINE = smooth(Path.through([REACHED, REACHED + np.array([0.1, -0.2, 0.0])]), deviation=0.01)
+GOOD = TipTask.along(LINE, 0.2, rows=(3, 4))
+assert GOOD.duration is not None
+PLANNED: dict[str, Any] = {"machine": ARM, "tasks": GOOD, "start": START, "search": "start"}
+AROUND = Surroundings(FixedBase(armoured_arm()))
+POSES = ([[0.4, 0.0, 0.5], [0.4, 0.02, 0.5], [0.4, 0.04, 0.5]], [[0.0, 1.0, 0.0, 0.0]] * 3)
+WAYPOINTS: dict[str, Any] = {"machine": panda(), "positions": POSES[0], "quaternions": POSES[1], "clearance": None}
+ENDLESS = replace(GOOD, duration=None, breaks=())
+
+
+@cache
+def made() -> Plan:
+    return plan(**PLANNED)
+
+
+def logged(**given: Any) -> None:
+    with TemporaryDirectory() as folder:
+        write_mcap(**{"plan": made(), "file": f"{folder}/a.mcap", **given})
+
+
+CASES = [
+    Case(
+        "plan",
+        plan,
+        PLANNED,
+        {
+            "machine": INSTANCE | {"class": FixedBase, "robot": CHAIN},
+            "tasks": INSTANCE | SEQUENCE | {"class": TipTask, "function": lambda t: t},
+            "horizon": but(POSITIVE, "word") | {"word": "a", "free in words": "Free", "too short": 0.1},
+            "start": array(3) | {"matrix": np.zeros((2, 3)), "elsewhere": [0.0, 0.0, 0.0]},
+            "start_base": but(array(7), "empty") | {"of a floating base": [0, 0, 0, 1, 0, 0, 0]},
+            "cyclic": FLAG | {"though it ends elsewhere": True},
+            "weights": array(3) | {"zero": [1.0, 0.0, 1.0], "negative": [1.0, -1.0, 1.0]},
+            "limits": but(INSTANCE, "None")
+            | {"class": Limits, "torque of two": Limits(torque=[1.0, 2.0]), "too many": Limits(velocity=[1.0, 2.0])},
+            "search": CHOICE,
+            "seed": WHOLE,
+            "time_cost": POSITIVE,
+            "obstacles": SEQUENCE | {"array": np.ones(3)},
+            "clearance": but(NONNEGATIVE, "None"),
+            "ignored": SEQUENCE | {"unknown": [("link_1", "nobody")]},
+            "srdf": {"number": 3, "list": ["a"], "object": object(), "nowhere": "/nowhere/at/all.srdf"},
+        },
+    ),
+    Case(
+        "plan_in_pieces",
+        plan_in_pieces,
+        {"machine": ARM, "tasks": GOOD, "start": START, "clearance": None},
+        {
+            "machine": INSTANCE | {"class": FixedBase, "robot": CHAIN},
+            "tasks": INSTANCE | SEQUENCE | {"class": TipTask, "function": lambda t: t},
+            "horizon": but(POSITIVE, "word") | {"word": "a", "free": "free", "too short": 0.1},
+            "start": array(3) | {"matrix": np.zeros((2, 3)), "elsewhere": [0.0, 0.0, 0.0]},
+            "weights": array(3) | {"zero": [1.0, 0.0, 1.0], "negative": [1.0, -1.0, 1.0]},
+            "limits": but(INSTANCE, "None") | {"class": Limits, "too many": Limits(velocity=[1.0, 2.0])},
+            "seed": WHOLE,
+            "obstacles": SEQUENCE | {"array": np.ones(3)},
+            "clearance": but(NONNEGATIVE, "None"),
+            "ignored": SEQUENCE | {"unknown": [("link_1", "nobody")]},
+            "srdf": {"number": 3, "list": ["a"], "object": object(), "nowhere": "/nowhere/at/all.srdf"},
+        },
+    ),
+    Case(
+        "plan_waypoints",
+        plan_waypoints,
+        WAYPOINTS,
+        {
+            "machine": INSTANCE | {"class": FixedBase, "robot": CHAIN},
+            "positions": array(3, 3) | {"one": POSES[0][:1], "fewer": POSES[0][:2]},
+            "quaternions": array(3, 4) | {"zero": np.zeros((3, 4)), "fewer": POSES[1][:2]},
+            "cost": CHOICE,
+            "reconfigurations": CHOICE,
+            "step": but(array(7), "inf") | {"zero": 0.0, "negative": -1.0, "one zero": [1.0] * 6 + [0.0]},
+            "weights": array(7) | {"zero": np.zeros(7), "negative": [1.0] * 6 + [-1.0]},
+            "limits": but(INSTANCE, "None") | {"class": Limits, "velocity": Limits(velocity=1.0)},
+            "seed": WHOLE,
+            "obstacles": SEQUENCE | {"array": np.ones(3)},
+            "clearance": but(NONNEGATIVE, "None"),
+            "ignored": SEQUENCE | {"unknown": [("link_1", "nobody")]},
+            "srdf": {"number": 3, "list": ["a"], "object": object(), "nowhere": "/nowhere/at/all.srdf"},
+        },
+    ),
+    Case(
+        "Clear",
+        Clear,
+        {"surroundings": AROUND, "margins": {0: 0.01}},
+        {
+            "surroundings": INSTANCE,
+            "margins": MAPPING | {"unknown": {99: 0.01}, "negative": {0: -1.0}, "nan": {0: NAN}, "word": {"a": 0.1}},
+        },
+    ),
+    Case(
+        "inverse_kinematics around",
+        inverse_kinematics,
+        {"machine": AROUND.machine, "task": TipTask(position=(0.5, 0.2, 0.6)), "surroundings": AROUND},
+        {"surroundings": but(INSTANCE, "None") | {"another's": Surroundings(FixedBase(armoured_arm()))}},
+    ),
+    Case(
+        "TipTask.along",
+        TipTask.along,
+        {"path": LINE, "speed": 0.2, "direction": (1.0, 0.0, 0.0), "within": 0.2, "rows": (3, 4)},
+        {
+            "path": INSTANCE | {"class": SmoothPath, "not smooth": LINE.path, "points": [[0, 0, 0], [1, 0, 0]]},
+            "speed": POSITIVE,
+            "roll": CHOICE,
+            "tool_axis": array(3) | {"zero": [0.0, 0.0, 0.0]},
+            "within": but(POSITIVE, "None") | {"half a turn": np.pi, "200 degrees": np.radians(200.0)},
+            "begin": NONNEGATIVE,
+            "duration": POSITIVE,
+            "breaks": {"after the end": [99.0], "negative": [-1.0], "nan": [NAN], "word": "a", "matrix": [[0.1]]},
+        },
+    ),
+    Case("along", along, {"path": LINE, "speed": 0.2}, {"path": INSTANCE, "speed": POSITIVE}),
+    method(
+        made,
+        "at",
+        {"time": 0.1},
+        time=but(FINITE, "empty") | {"before": -1.0, "after": 99.0, "some after": [0.1, 99.0]},
+    ),
+    Case("write_mcap", logged, {"period": 0.1}, {"plan": INSTANCE, "period": POSITIVE, "frame": TEXT}),
+    Case(
+        "log_rerun",
+        lambda **given: log_rerun(**{"plan": made(), **given}),
+        {"rerun": recorder(), "period": 0.1},
+        {"plan": INSTANCE, "rerun": INSTANCE, "period": POSITIVE, "entity": TEXT, "timeline": TEXT},
+    ),
+    method(made, "sample", {"period": 0.1}, period=POSITIVE),
+    method(made, "table", {"period": 0.1}, period=POSITIVE),
+    method(made, "plot", {}, against=but(INSTANCE, "None"), figure=but(INSTANCE, "None")),
+    method(made, "to_ros", {"period": 0.1}, period=POSITIVE),
+]
+
+
+@pytest.mark.parametrize("case", good_calls(CASES))
+def test_good_calls_pass(case: Case) -> None:
+    case.call(**case.good)
+
+
+@pytest.mark.parametrize(("case", "argument"), panel(CASES))
+def test_bad_values_are_refused_by_name(case: Case, argument: str) -> None:
+    assert_refused(case, argument)
+
+
+# ---- what does not fit -----------------------------------------------------------------------------------------------
+
+TASKS: dict[str, tuple[Callable[[], Any], str]] = {
+    "no horizon": (lambda: {"tasks": ENDLESS}, "horizon"),
+    "no tasks": (lambda: {"tasks": []}, "task"),
+    "begins after the end": (lambda: {"tasks": replace(GOOD, begin=5.0), "horizon": 2.0}, "task 0"),
+    "ends after the end": (lambda: {"tasks": [GOOD, replace(GOOD, begin=1.0)], "horizon": 1.5}, "task 1"),
+    "of an unknown link": (lambda: {"tasks": replace(GOOD, link="nobody")}, "nobody"),
+    "relative to an unknown link": (lambda: {"tasks": replace(GOOD, relative_to="nobody")}, "nobody"),
+    "more rows than joints": (lambda: {"tasks": [GOOD, TipTask(velocity=[0.0, 0.0], rows=(2, 3))]}, "rows"),
+    "twice the same": (lambda: {"tasks": [TipTask(velocity=[0.1], rows=[3]), GOOD]}, "rows"),
+    "rows no joint moves": (lambda: {"tasks": replace(GOOD, rows=None)}, "rows"),
+    "nan on the way": (
+        lambda: {"tasks": TipTask(position=lambda t: ca.vertcat(REACHED[0], ca.sqrt(0.5 - t)), rows=(3, 4))},
+        "task",
+    ),
+    "another's start": (lambda: {"start": [0.4, 0.6, 0.9]}, "link3"),
+    "a start outside the limits": (lambda: {"machine": limited(0.5)}, CHAIN.joints[1].name),
+    "velocity alone from nowhere": (
+        lambda: {"tasks": TipTask(velocity=[0.1, 0.0], rows=(3, 4)), "horizon": 1.0, "start": None},
+        "start",
+    ),
+    "a jump between tasks": (lambda: {"tasks": [GOOD, replace(GOOD, begin=GOOD.end)], "start": None}, ""),
+}
+
+
+def limited(most: float) -> FixedBase:
+    """The arm with its second joint between -most and most."""
+    first, second, *others = CHAIN.joints
+    return FixedBase(replace(CHAIN, joints=(first, replace(second, lower=-most, upper=most), *others)))
+
+
+@pytest.mark.parametrize("what", TASKS)
+def test_tasks_that_do_not_fit_are_refused_by_name(what: str) -> None:
+    changes, name = TASKS[what]
+    given = {**PLANNED, "horizon": None, **changes()}
+    if what == "nan on the way":
+        given["horizon"] = 1.0
+    with pytest.raises((ProblemError, SolveError)) as caught:
+        plan(**given)
+    assert caught.value.name
+    if name:
+        assert caught.value.name == name
+
+
+def test_a_schedule_of_another_path_is_refused() -> None:
+    other = smooth(Path.through([(0, 0, 0), (1, 0, 0)]), deviation=0.01)
+    timing = schedule(other, LineLimits(speed=0.1, acceleration=0.2, jerk=2.0))
+    with pytest.raises(ProblemError, match="path of 1 m") as caught:
+        TipTask.along(LINE, timing)
+    assert (caught.value.name, caught.value.value) == ("speed", 1.0)
+
+
+def test_a_cone_needs_an_axis() -> None:
+    with pytest.raises(ProblemError, match="direction") as caught:
+        TipTask.along(LINE, 0.2, within=0.1)
+    assert caught.value.name == "within"
+
+
+# ---- out of reach ----------------------------------------------------------------------------------------------------
+
+
+def leads_to(points: Any, speed: float = 0.5, **given: Any) -> TipTask:
+    return TipTask.along(smooth(Path.through(points), deviation=0.01), speed, **given)
+
+
+def test_a_start_that_is_too_far_says_by_how_much() -> None:
+    """Three links of 2.4 m in all; 3 m are asked."""
+    with pytest.raises(Unreachable, match="at 0 s") as caught:
+        plan(ARM, leads_to([(3.0, 0, 0), (2.0, 0, 0)], rows=(3, 4)))
+    assert caught.value.misfit == pytest.approx(0.6, abs=1e-6)
+    assert caught.value.time == 0.0
+    np.testing.assert_allclose(np.sin(caught.value.joints[1:]), 0.0, atol=1e-3)
+
+
+LEAVING = smooth(Path.through([(1.0, -1.5, 0.0), (2.6, 0.0, 0.0), (1.0, 1.5, 0.0)]), deviation=0.01)
+
+
+@pytest.mark.parametrize("search", ["start", "postures"])
+def test_a_path_that_leaves_the_reach_on_its_way_says_when_and_where(search: Any) -> None:
+    """Out by 0.2 m in the middle of its 4 m, at 4 of 8 s, inside again at the end."""
+    task = TipTask.along(LEAVING, 0.5, rows=(3, 4))
+    with pytest.raises(Unreachable) as caught:
+        plan(ARM, task, search=search)
+    found = caught.value
+    assert found.time is not None
+    place = LEAVING.at(0.5 * found.time).position[0]
+    assert np.linalg.norm(place) > 2.4
+    assert found.misfit == pytest.approx(np.linalg.norm(place) - 2.4, abs=1e-4)
+    assert found.misfit > 0.05
+    assert str(np.round(place, 6).tolist()) in str(found)
+
+
+def test_a_path_beyond_the_joint_limits_says_so() -> None:
+    """The arm is long enough, and its second joint may not bend so far."""
+    near = leads_to([(1.6, 0.3, 0.0), (0.25, 0.3, 0.0)], rows=(3, 4))
+    assert plan(ARM, near).audit().feasible
+    first, second, third = CHAIN.joints
+    stiff = tuple(replace(joint, lower=-0.6, upper=0.6) for joint in (second, third))
+    with pytest.raises(Unreachable) as caught:
+        plan(FixedBase(replace(CHAIN, joints=(first, *stiff))), near)
+    assert caught.value.misfit > 0.1
+    assert caught.value.time is not None
+
+
+def test_a_later_task_out_of_reach_is_named_with_its_time() -> None:
+    first = leads_to([(1.5, 0.0, 0.0), (1.5, 0.5, 0.0)], rows=(3, 4))
+    second = leads_to([(2.9, 0.0, 0.0), (2.9, 0.5, 0.0)], rows=(3, 4), begin=3.0)
+    with pytest.raises(Unreachable, match="task 1") as caught:
+        plan(ARM, [first, second])
+    assert caught.value.time == pytest.approx(3.0)
+    assert caught.value.misfit == pytest.approx(0.5, abs=1e-6)
+
+
+def test_an_orientation_out_of_reach_says_so() -> None:
+    """A tool that has to look away from an arm stretched to its end."""
+    places: Array = np.array([(0.9, 0.0, 0.2), (0.9, 0.1, 0.2)])
+    task = TipTask.along(smooth(Path.through(places), deviation=0.01), 0.1, direction=(-1, 0, 0))
+    for machine in (ur5(), angled_ur5()):
+        with pytest.raises(Unreachable) as caught:
+            plan(machine, task)
+        assert caught.value.misfit > 0.01
+    assert DOWN[2] == -1

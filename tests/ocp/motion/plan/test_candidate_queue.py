@@ -1,0 +1,212 @@
+"""Best-first search over candidates whose costs are known: the cheapest is found, and no work is wasted."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ocp import SolveError
+from ocp.motion.plan.candidate import Candidate, Reason, Rejection, Seed, Stage
+from ocp.motion.plan.candidate_queue import CandidateQueue, Solver
+from ocp.motion.search.settings import PlannerSettings
+
+SETTINGS = PlannerSettings(max_failures=3)
+FAILS = Reason(Rejection.AUDIT, "row 2", "row", 2.0, 1.0, 0.5)
+
+
+class Known(Solver):
+    """Motion `number` has a coarse cost, a fine one, and passes or not; candidates of one number are one motion."""
+
+    def __init__(self, coarse: list[float], fine: list[float], passes: list[bool]) -> None:
+        self.coarse, self.fine, self.passes = coarse, fine, passes
+        self.done: list[tuple[int, Stage]] = []
+
+    def advance(self, candidate: Candidate) -> list[Candidate]:
+        number = int(candidate.start[0])
+        self.done.append((number, candidate.stage))
+        if candidate.stage is Stage.REFINED:
+            return [replace(candidate, stage=Stage.AUDITED) if self.passes[number] else candidate.rejected(FAILS)]
+        if candidate.stage is Stage.FINE:
+            return [replace(candidate, stage=Stage.REFINED)]
+        cost = (self.coarse if candidate.stage is Stage.SEED else self.fine)[number]
+        stage = Stage.COARSE if candidate.stage is Stage.SEED else Stage.FINE
+        solution: Any = SimpleNamespace(cost=cost, number=number)
+        return [replace(candidate, stage=stage, cost=cost, solution=solution)]
+
+    def same_path(self, one: Any, other: Any) -> bool:
+        return bool(one.number == other.number)
+
+    def plan(self, candidates: Any) -> Any:
+        return candidates
+
+
+def seeds(numbers: Any) -> list[Candidate]:
+    return [Candidate(np.array([number]), seed=Seed(cost=1.0)) for number in numbers]
+
+
+@st.composite
+def motions(draw: Any) -> Known:
+    count = draw(st.integers(1, 6))
+    coarse = [1 + k / 100 for k in draw(st.lists(st.integers(0, 100), min_size=count, max_size=count, unique=True))]
+    more = draw(st.lists(st.floats(0.0, 0.5), min_size=count, max_size=count))
+    passes = draw(st.lists(st.booleans(), min_size=count, max_size=count))
+    return Known(coarse, [cost + rise for cost, rise in zip(coarse, more, strict=True)], passes)
+
+
+@given(motions(), st.integers(1, 2))
+def test_the_plan_is_the_cheapest_of_all_that_pass_and_none_is_solved_that_cannot_be(known: Known, times: int) -> None:
+    queue = CandidateQueue(known, SETTINGS)
+    count = len(known.coarse)
+    queue.run(seeds([*range(count)] * times))
+    assert len(queue.candidates) == times * count
+    costs = [cost for cost, passes in zip(known.fine, known.passes, strict=True) if passes]
+    if not costs:
+        with pytest.raises(SolveError, match="postures: the audit fails: row 2"):
+            queue.plan()
+        return
+    best: Any = queue.plan()
+    assert best[0].reason is None
+    assert best[0].cost <= min(costs) * (1 + SETTINGS.same_cost)
+    assert all(one.reason is not None for one in best[1:])
+    audited = [number for number, stage in known.done if stage is Stage.REFINED]
+    assert all(known.fine[number] <= min(costs) * (1 + SETTINGS.same_cost) for number in audited)
+    assert len({*audited}) == len(audited) or not all(known.passes)
+
+
+def test_where_a_motion_is_rejected_the_next_of_those_that_are_one_goes_on_in_its_place_a_few_times() -> None:
+    known = Known([1.0], [1.1], [False])
+    queue = CandidateQueue(known, SETTINGS)
+    queue.run(seeds([0] * 10))
+    assert [stage for _, stage in known.done].count(Stage.REFINED) == SETTINGS.max_failures
+    kinds = [one.reason.kind for one in queue.candidates if one.reason is not None]
+    assert kinds.count(Rejection.AUDIT) == SETTINGS.max_failures
+    assert kinds.count(Rejection.DUPLICATE) == 10 - SETTINGS.max_failures
+    with pytest.raises(SolveError, match="7 of 10 postures: the same as another one"):
+        queue.plan()
+
+
+def test_of_every_motion_that_is_wanted_each_is_told_once_with_its_cost() -> None:
+    known = Known([1.0, 1.2, 1.4, 30.0], [1.1, 1.3, 1.5, 31.0], [True] * 4)
+    queue = CandidateQueue(known, PlannerSettings())
+    queue.run(seeds([3, 1, 2, 0, 1]), every=True)
+    told: Any = queue.plan()
+    assert [one.cost for one in told if one.stage is Stage.AUDITED] == [1.1, 1.3, 1.5]
+    kinds = [one.reason and one.reason.kind for one in told]
+    assert kinds.count(Rejection.DUPLICATE) == 1
+    assert kinds.count(Rejection.COSTLIER) == 3
+
+
+def test_local_motions_that_lose_their_tasks_or_are_far_costlier_are_not_solved_where_another_is() -> None:
+    known = Known([1.0, 1.0, 1.0], [1.0, 1.0, 1.0], [True] * 3)
+    first, lost, far = seeds(range(3))
+    lost = replace(lost, seed=Seed(cost=0.5, tracked=False))
+    far = replace(far, seed=Seed(cost=1.01 * SETTINGS.max_cost_ratio))
+    queue = CandidateQueue(known, SETTINGS)
+    queue.run([first, far, lost])
+    assert {number for number, _ in known.done} == {0}
+    kinds = {int(one.start[0]): one.reason and one.reason.kind for one in queue.candidates}
+    assert kinds == {0: None, 1: Rejection.UNTRACKED, 2: Rejection.COSTLIER}
+    CandidateQueue(known, SETTINGS).run([lost])
+    assert (1, Stage.SEED) in known.done
+
+
+def stages_of(known: Known, number: int) -> set[Stage]:
+    return {stage for each, stage in known.done if each == number}
+
+
+@pytest.mark.parametrize("size", [1.0, 1e3])
+@pytest.mark.parametrize(("coarse", "solved"), [(1.59, True), (1.61, False)])
+def test_a_coarse_cost_prunes_beyond_twice_the_error_of_the_coarse_mesh(
+    size: float, coarse: float, solved: bool
+) -> None:
+    """The best has 1.0 on the coarse mesh and 1.2 on the fine one: twice its error is a third of its cost."""
+    known = Known([size, coarse * size], [1.2 * size, 5.0 * size], [True, True])
+    CandidateQueue(known, SETTINGS).run(seeds([0, 1]))
+    assert (Stage.COARSE in stages_of(known, 1)) == solved
+
+
+@pytest.mark.parametrize(("share", "refined"), [(0.75, False), (1.25, True)])
+def test_on_the_fine_mesh_a_motion_has_to_be_cheaper_by_more_than_counts_as_the_same(
+    share: float, refined: bool
+) -> None:
+    fine = 2.0 * (1 - share * SETTINGS.same_cost)
+    known = Known([1.0, 2.5], [2.0, fine], [True, True])  # the first has passed before the second is solved
+    queue = CandidateQueue(known, SETTINGS)
+    queue.run(seeds([0, 1]))
+    assert (Stage.FINE in stages_of(known, 1)) == refined
+    assert queue.cost == (fine if refined else 2.0)
+
+
+@pytest.mark.parametrize(("share", "kind"), [(0.75, Rejection.DUPLICATE), (1.25, Rejection.COSTLIER)])
+def test_where_all_are_wanted_one_that_costs_what_another_does_is_told_as_that(share: float, kind: Rejection) -> None:
+    known = Known([1.0, 1.5], [2.0, 2.0 * (1 + share * SETTINGS.same_cost)], [True, True])
+    queue = CandidateQueue(known, SETTINGS)
+    queue.run(seeds([0, 1]), every=True)
+    told: Any = queue.plan()
+    assert [one.reason and one.reason.kind for one in told] == [None, kind]
+    assert Stage.FINE in stages_of(known, 1)  # which may change what it costs
+    assert (Stage.REFINED in stages_of(known, 1)) == (kind is Rejection.COSTLIER)
+
+
+@pytest.mark.parametrize("size", [0.5, 1.0, 1e3])
+@pytest.mark.parametrize(("share", "once"), [(0.75, True), (1.25, False)])
+def test_motions_of_one_coarse_cost_are_one_in_whatever_unit(size: float, share: float, once: bool) -> None:
+    costs = [size, size * (1 + share * SETTINGS.same_cost)]
+    known = Known(costs, [2 * size, 1.5 * size], [True, True])
+    CandidateQueue(known, SETTINGS).run(seeds([0, 1]))
+    assert (Stage.COARSE not in stages_of(known, 1)) == once
+
+
+@pytest.mark.parametrize(("ratio", "wanted"), [(0.95, True), (1.05, False)])
+def test_where_all_are_wanted_those_are_that_cost_no_more_than_so_many_times_the_best(
+    ratio: float, wanted: bool
+) -> None:
+    dear = 2.0 * SETTINGS.max_cost_ratio * ratio
+    known = Known([2.0, dear], [2.0, dear], [True, True])
+    CandidateQueue(known, SETTINGS).run(seeds([0, 1]), every=True)
+    assert (Stage.REFINED in stages_of(known, 1)) == wanted
+
+
+def test_after_so_many_failures_what_collides_is_no_longer_repaired_and_what_is_clear_goes_on() -> None:
+    count = SETTINGS.max_failures
+    touching = Reason(Rejection.COLLISION, "a link and a box")
+
+    class Colliding(Known):
+        def collision(self, candidate: Candidate) -> Reason | None:
+            return touching if candidate.start[0] in (0, count) else None
+
+    costs = [1.0 + k / 10 for k in range(count + 2)]
+    known = Colliding(costs, costs, [False] * count + [True, True])
+    queue = CandidateQueue(known, SETTINGS)
+    queue.run(seeds(range(count + 2)))
+    assert Stage.REFINED in stages_of(known, 0)  # there were none yet
+    assert stages_of(known, count) == {Stage.SEED}
+    reasons = {int(one.start[0]): one.reason for one in queue.candidates}
+    assert reasons[count] == touching
+    assert reasons[count + 1] is None
+
+
+def test_a_reason_is_read_as_it_was_written_and_not_where_it_is_damaged() -> None:
+    assert Reason.of_record(FAILS.record()) == FAILS
+    assert str(FAILS) == "the audit fails: row 2"
+    plain = Reason(Rejection.DUPLICATE)
+    assert Reason.of_record(plain.record()) == plain
+    damages: list[dict[str, Any]] = [
+        {"kind": "os.system"},
+        {"kind": 3},
+        {"value": "much"},
+        {"limit": [1]},
+        {"time": {}},
+    ]
+    for damage in damages:
+        with pytest.raises((KeyError, TypeError, ValueError)):
+            Reason.of_record({**FAILS.record(), **damage})
+    for name in FAILS.record():
+        with pytest.raises(KeyError):
+            Reason.of_record({key: value for key, value in FAILS.record().items() if key != name})

@@ -1,0 +1,137 @@
+"""A plan that somebody changed is judged by its machine and by what it was asked, not by what else its file says."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from models import Box, FixedBase, Moving, Sphere, planar_chain
+from ocp import Collocation, Limits, Plan, Problem, StorageWarning, TipTask, plan, solve
+from ocp.app.check.plan_verdict import verdict_of
+from ocp.app.command import main
+from ocp.app.view.report import report_of_plan
+from ocp.app.view.shown import shown_plan
+from ocp.motion.plan.motion import Part
+from tests.ocp.motion.plan.motions import planned
+
+pytestmark = pytest.mark.xdist_group("plan seam_ur5")
+
+
+def swing() -> Plan:
+    """A plan of a UR5 whose problem knows no limits: 9 rad in 0.1 s."""
+    machine, n = planned("seam_ur5").machine, 6
+    problem = Problem("fast")
+    joints = problem.state("joints", n, initial=np.zeros(n), terminal=np.full(n, 9.0), unit="rad")
+    rates = problem.control("rates", n, unit="rad/s")
+    problem.dynamics(joints, rates)
+    problem.horizon(0.1)
+    problem.minimize(running=rates.T @ rates)
+    solution = solve(problem, Collocation(4))
+    assert solution.audit().passed
+    return Plan(machine, solution, (Part(0.0, 0.1, ""),))
+
+
+def test_a_problem_without_limits_does_not_excuse_a_motion_beyond_those_of_its_machine(tmp_path: Path) -> None:
+    path, page = tmp_path / "fast.npz", tmp_path / "fast.html"
+    swing().save(path)
+    for fast in (swing(), Plan.load(path)):
+        audit, verdict = fast.audit(), verdict_of(fast, fast.sample(0.01), "fast")
+        assert not audit.feasible
+        assert {finding.name.split(" ")[0] for finding in audit.failures} == {"joints", "rates"}
+        assert audit["rates of the machine, 'shoulder_pan_joint'"].value == pytest.approx(90 - np.pi, rel=0.01)
+        assert not verdict.passed
+        assert verdict.sentence.startswith("must not be run")
+    shown = shown_plan(fast)
+    assert ("must not be run" in shown.verdict, shown.passed) == (True, False)
+    assert main(["report", str(path), str(page)]) == 1
+    assert main(["view", str(path), "--page", str(tmp_path / "view.html")]) in (0, 1)
+    assert "may be run" not in page.read_text()
+
+
+def test_limits_of_a_request_beyond_those_of_the_machine_are_no_licence(tmp_path: Path) -> None:
+    chain = planar_chain([0.5, 0.4], [1.0, 1.0])
+    slow = replace(chain, joints=tuple(replace(joint, velocity=0.2) for joint in chain.joints))
+    task = TipTask(rows=(3,), velocity=(-0.3,))
+    fast = plan(FixedBase(slow), task, 0.5, start=(0.6, 0.9), limits=Limits(velocity=50.0), search="start")
+    assert fast.audit().passed, "the limits that were asked are held"
+    fast.save(tmp_path / "fast.npz")
+    again = Plan.load(tmp_path / "fast.npz")
+    assert again.audit().passed
+    verdict = verdict_of(again, again.sample(0.01), "fast")
+    assert not verdict.passed
+    assert verdict.sentence.startswith("must not be run: it breaks the limits of its machine")
+    assert "may be run" not in report_of_plan(again, 0.01, "fast").html()
+
+
+def test_a_motion_that_was_changed_is_held_against_what_was_asked(tmp_path: Path) -> None:
+    path = tmp_path / "seam.npz"
+    planned("seam_ur5").save(path)
+    with np.load(path) as archive:
+        arrays = {name: archive[name] for name in archive.files}
+    edits: dict[str, Any] = {
+        "states": {name: arrays[name] + 0.01 for name in ("states/joints", "state_interpolant/values")},
+        "half a plan": {name: arrays[name] * 0.5 for name in ("states/joints", "state_interpolant/values")},
+        "controls": {name: arrays[name] * 1.02 for name in ("controls/rates", "control_interpolant/values")},
+    }
+    for what, changes in edits.items():
+        np.savez(tmp_path / "changed.npz", **{**arrays, **changes})
+        assert not Plan.load(tmp_path / "changed.npz").audit().passed, what
+
+
+def test_no_problem_of_the_file_takes_the_place_of_the_request(tmp_path: Path) -> None:
+    """A problem that is put into the file beside the request is not the one that is audited."""
+    planned("seam_ur5").save(tmp_path / "seam.npz")
+    planned("seam_ur5").solution.save(tmp_path / "solution.npz")
+    with np.load(tmp_path / "seam.npz") as seam, np.load(tmp_path / "solution.npz") as solution:
+        arrays = {**{name: seam[name] for name in seam.files}, **{k: solution[k] for k in solution.files}}
+    np.savez(tmp_path / "both.npz", **arrays)
+    both = Plan.load(tmp_path / "both.npz")
+    assert both.request is not None
+    assert both.solution.problem is not None
+    assert both.solution.problem.origin is both.request
+
+
+def test_obstacles_that_stand_or_move_and_the_bodies_of_meshes_are_rebuilt(tmp_path: Path) -> None:
+    """The audit of a loaded plan proves the same distances, and finds what was moved into the way."""
+    arm = FixedBase(planar_chain([0.5, 0.4, 0.3], [1.0] * 3))
+    balls = [
+        Moving(Sphere(0.05, (0, 0, 0)), lambda t: (2.0, 1.0 + 0.3 * t, 0.0)),
+        Box((0.1, 0.1, 0.1), position=(0, -2, 0)),
+    ]
+    task = TipTask(rows=(3, 4), velocity=(-0.05, 0.02))
+    found = plan(arm, task, 1.0, start=(0.3, 0.6, 0.5), obstacles=balls, search="start")
+    found.save(tmp_path / "plan.npz")
+    again = Plan.load(tmp_path / "plan.npz")
+    assert str(again.audit()) == str(found.audit())
+
+
+def test_a_request_that_calls_python_is_said_when_it_is_saved(tmp_path: Path) -> None:
+    import casadi as ca
+
+    class Own(ca.Callback):  # type: ignore[misc]
+        def __init__(self) -> None:
+            ca.Callback.__init__(self)
+            self.construct("own", {"enable_fd": True})
+
+        def eval(self, arguments: list[Any]) -> list[Any]:
+            return [arguments[0] * 0.01]
+
+    seam = planned("seam_ur5")
+    assert seam.request is not None
+    own = Own()
+    task = replace(seam.request.tasks[0], position=lambda time: ca.vertcat(own(time), 0, 0))
+    problem = seam.solution.problem
+    changed = replace(seam.request, arguments={**seam.request.arguments, "tasks": (task,)})
+    kept, problem.origin = problem.origin, changed
+    try:
+        with pytest.warns(StorageWarning, match=r"saved without what was asked, .*'own' of kind CallbackInternal"):
+            seam.save(tmp_path / "plan.npz")
+    finally:
+        problem.origin = kept
+    again = Plan.load(tmp_path / "plan.npz")
+    assert again.request is None
+    assert again.audit().passed, "its problem is in the file, and its machine's limits hold"

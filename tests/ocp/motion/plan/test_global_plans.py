@@ -1,0 +1,203 @@
+"""Plans by search over all motions: the cheapest, with a bound."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from models import FixedBase, planar_chain
+from ocp import BoundWarning, Candidate, Plan, ProblemError, TipTask, Unreachable, plan
+from ocp.motion.plan.candidate import Reason, Rejection
+from ocp.motion.plan.candidate_solver import CandidateSolver
+from ocp.motion.search.search import Search, checked_bound
+from ocp.motion.search.task_search import instants_of
+from tests.ocp.motion.search.test_charts import moved, planar
+from tests.ocp.motion.tasks.space_tasks import PANDA_START, UR5_START, panda, ur5
+
+
+@pytest.mark.parametrize(
+    ("machine", "start", "rows"), [(panda(), PANDA_START, "pose"), (ur5(), UR5_START, "axis")], ids=["panda", "ur5"]
+)
+def test_the_cheapest_of_all_motions_has_a_bound_near_its_cost(machine, start, rows, tmp_path) -> None:  # type: ignore[no-untyped-def]
+    task = moved(machine, start, rows)
+    found = plan(machine, task, search="global", clearance=None)
+    others = plan(machine, task, search="postures", clearance=None)
+    assert found.audit().passed
+    assert found.bound is not None
+    assert 0.98 * found.cost <= found.bound <= found.cost
+    assert found.cost <= others.cost * (1 + 1e-6)
+    assert found.bound <= others.cost
+    assert all(found.bound <= one.cost * (1 + 1e-4) for one in found.candidates if np.isfinite(one.cost))
+    assert f"at least {found.bound:.6g}" in str(found)
+    found.save(tmp_path / "plan.npz")
+    assert Plan.load(tmp_path / "plan.npz").bound == found.bound
+
+
+def test_from_a_given_start_the_bound_is_of_motions_from_there() -> None:
+    task = moved(panda(), PANDA_START, "pose")
+    found = plan(panda(), task, start=PANDA_START, search="global", clearance=None)
+    free = plan(panda(), task, search="global", clearance=None)
+    assert found.bound is not None
+    assert free.cost < found.bound <= found.cost <= found.bound / 0.98
+    assert found["joints"][0] == pytest.approx(PANDA_START, abs=1e-9)
+
+
+def test_the_bound_follows_weights_and_pace() -> None:
+    machine, start = planar(np.array([0.5, 0.4, 0.3])), np.array([0.5, 1.2, -1.4])
+    task = moved(machine, start, "place")
+    one = plan(machine, task, search="global", clearance=None)
+    heavy = plan(machine, task, search="global", clearance=None, weights=np.full(3, 5.0))
+    assert heavy.cost == pytest.approx(5 * one.cost, rel=1e-6)
+    assert one.bound is not None
+    assert heavy.bound == pytest.approx(5 * one.bound, rel=0.01)
+
+
+def test_where_the_classes_that_may_be_the_cheapest_fail_every_one_is_followed_up(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    machine, start = planar(np.array([0.5, 0.4, 0.3]), 2.5), np.array([0.5, 1.2, -1.4])
+    asked, failed = list[bool](), list[Candidate]()
+
+    def followed(search: Search, most: float, every: bool) -> list[np.ndarray]:
+        asked.append(every)
+        return motions(search, most, every)
+
+    def failing(solver: CandidateSolver, candidate: Candidate) -> list[Candidate]:
+        if asked[-1]:
+            return advance(solver, candidate)
+        failed.append(candidate)
+        return [candidate.rejected(Reason(Rejection.AUDIT, "fails"))]
+
+    motions, advance = Search.motions, CandidateSolver.advance
+    monkeypatch.setattr(Search, "motions", followed)
+    monkeypatch.setattr(CandidateSolver, "advance", failing)
+    found = plan(machine, moved(machine, start, "place"), search="global", clearance=None)
+    assert asked == [False, True]
+    assert failed
+    assert found.audit().passed
+    assert found.bound is not None
+    assert 0.98 * found.cost <= found.bound <= found.cost
+
+
+def winding(lengths: list[float], start: list[float], ways: list[list[float]], seconds: float) -> Any:
+    """A planar arm whose tip goes along a line, to one side of it and then to the other, and its task."""
+    machine = FixedBase(planar_chain(lengths, np.ones(len(lengths))))
+    first = np.array(ca.DM(machine.tip_pose((), np.array(start)).position)).ravel()[:2]
+
+    def place(t: Any) -> Any:
+        share = t / seconds
+        return ca.DM(first) + share * ca.DM(ways[0]) + ca.sin(2 * np.pi * share) * ca.DM(ways[1])
+
+    return machine, TipTask(position=place, rows=[3, 4], duration=seconds)
+
+
+def test_the_motion_that_the_search_found_is_solved_where_a_coarse_mesh_loses_it() -> None:
+    """Near its reach the arm whips round at last; with a free start a coarse mesh finds nothing but a dearer class."""
+    ways = [[-0.6585, 0.3798], [-0.3619, 0.0052]]
+    machine, task = winding([0.4428, 0.4788, 0.5695], [2.4578, -2.2448, 2.2583], ways, 3.4005)
+    found = plan(machine, task, search="global", clearance=None)
+    assert found.audit().passed
+    assert found.bound is not None
+    assert found.bound <= found.cost <= 1.05 * found.bound
+    held = plan(machine, task, start=found.at(0.0)["joints"], clearance=None)
+    assert found.cost <= held.cost * (1 + 1e-6)
+
+
+def test_a_bound_above_the_cost_of_a_motion_is_no_bound_and_warned_of(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In use a warning, in these tests, where warnings are errors, a failure."""
+
+    def best(search: Search, most: float) -> tuple[np.ndarray | None, float]:
+        path, bound = right(search, most)
+        return path, 2 * bound
+
+    right = Search.best
+    machine, start = planar(np.array([0.5, 0.4, 0.3]), 2.5), np.array([0.5, 1.2, -1.4])
+    task = moved(machine, start, "place")
+    cost = plan(machine, task, search="global", clearance=None).cost
+    monkeypatch.setattr(Search, "best", best)
+    with pytest.raises(BoundWarning):
+        plan(machine, task, search="global", clearance=None)
+    with pytest.warns(BoundWarning, match="less than the bound") as caught:
+        found = plan(machine, task, search="global", clearance=None)
+    assert found.cost == pytest.approx(cost)
+    assert found.bound is None
+    warning = caught[0].message
+    assert isinstance(warning, BoundWarning)
+    assert warning.value == found.cost < warning.limit
+    with pytest.warns(BoundWarning):
+        assert checked_bound(1.0, 0.9) is None
+    assert checked_bound(1.0, 1.0 - 1e-12) == 1.0
+
+
+def test_where_the_set_of_postures_is_of_points_branches_are_compared() -> None:
+    task = moved(ur5(), UR5_START, "pose")
+    found = plan(ur5(), task, search="global", clearance=None)
+    others = plan(ur5(), task, search="postures", clearance=None)
+    assert found.cost == pytest.approx(others.cost, rel=1e-6)
+    assert found.bound is not None
+    assert 0.98 * found.cost <= found.bound <= found.cost
+
+
+def test_what_cannot_be_searched_is_refused() -> None:
+    task = moved(panda(), PANDA_START, "pose")
+    loose = TipTask(position=[0.4, 0.0, 0.4], duration=1.0)
+    turning = TipTask(velocity=[0.01, 0.0, 0.0], rows=[3, 4, 5], duration=1.0)
+    for machine, asked, more, words in (
+        (panda(), loose, {}, "leave 4 directions free"),
+        (panda(), turning, {"start": PANDA_START}, "needs poses"),
+        (panda(), task, {"horizon": "free"}, "keeps the tasks' own time"),
+    ):
+        with pytest.raises(ProblemError, match=words):
+            plan(machine, asked, search="global", clearance=None, **more)
+    with pytest.raises(Unreachable):
+        plan(panda(), TipTask(position=[3.0, 0.0, 0.4], direction=[0, 0, -1], duration=1.0), search="global")
+
+
+def test_instants_are_left_out_until_steps_miss_a_share_of_the_cost() -> None:
+    t = np.linspace(0, 2, 81)
+    bent = np.column_stack([np.abs(t - 1), np.where(t < 1, 0.0, 2 * (t - 1))])
+    assert instants_of(t, bent, np.ones(2), 1e-9, 2) == pytest.approx([0, 1, 2])
+    round_way = np.column_stack([np.sin(3 * t), np.cos(3 * t)])
+    weights = np.array([1.0, 1.0])
+
+    def cost(times: np.ndarray) -> float:
+        at = np.column_stack([np.sin(3 * times), np.cos(3 * times)])
+        return float((weights * np.diff(at, axis=0) ** 2 / (2 * np.diff(times)[:, None])).sum())
+
+    for share in (0.1, 0.01):
+        kept = instants_of(t, round_way, weights, share, 2)
+        assert cost(kept) >= (1 - share) * cost(t)
+        assert len(kept) <= 2 * np.sqrt(3 * 3 * 4 / (24 * share)) + 3
+    assert len(instants_of(t, round_way, weights, 0.9, 10)) == 11
+
+
+def line(first: np.ndarray, way: tuple[float, float], seconds: float) -> Any:
+    return lambda t: ca.DM(first) + t / seconds * ca.DM(way)
+
+
+@pytest.mark.parametrize("case", ["gap", "longer than its task", "round", "cyclic"])
+def test_stretches_of_time_are_searched_together(case: str) -> None:
+    machine, start = planar(np.array([0.5, 0.4, 0.3])), np.array([0.5, 1.2, -1.4])
+    at = np.array(ca.DM(machine.tip_pose((), start).position)).ravel()[:2]
+    first = TipTask(position=line(at, (0.1, -0.2), 2.0), rows=[3, 4], duration=2.0)
+    later = TipTask(position=line(at - [0.2, 0.0], (0.0, 0.2), 2.0), rows=[3, 4], begin=3.0, duration=2.0)
+
+    def circle(t: Any) -> Any:
+        angle = 2 * np.pi * t / 4
+        return ca.DM(at) + 0.1 * ca.vertcat(ca.cos(angle) - 1, ca.sin(angle))
+
+    closed = TipTask(position=circle, rows=[3, 4], duration=4.0)
+    tasks, more = {
+        "gap": ([first, later], {}),
+        "longer than its task": ([first], {"horizon": 4.0}),
+        "round": ([closed], {}),
+        "cyclic": ([closed], {"cyclic": True}),
+    }[case]
+    found = plan(machine, tasks, search="global", clearance=None, **more)  # type: ignore[arg-type]
+    others = plan(machine, tasks, search="postures", clearance=None, **more)  # type: ignore[arg-type]
+    assert found.bound is not None
+    assert found.cost <= others.cost * (1 + 1e-6)
+    assert 0.97 * found.cost <= found.bound <= found.cost

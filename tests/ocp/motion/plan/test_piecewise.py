@@ -1,0 +1,174 @@
+"""Tasks in pieces: as few as closed forms and brute force say, joined at the tasks' times, each audited."""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from models import CollisionShape, FixedBase, Path, Sphere, smooth
+from models.arrays import Array
+from models.machines.moving import Moving
+from ocp import DeadEnd, ProblemError, TipTask, plan, plan_in_pieces
+from ocp.motion.plan.piecewise import _part
+from tests.ocp.motion.search.test_charts import planar
+from tests.ocp.motion.search.test_reconfigurations import limited
+
+UPPER, LOWER = 0.5, 0.4
+HIGH = np.array([0.9, 1.8])
+SECONDS = 2.0
+
+
+def arm() -> FixedBase:
+    """Two links, the shoulder limited: on either side the elbow has to be on the other one."""
+    return limited(planar(np.array([UPPER, LOWER]), speed=3.0), -HIGH, HIGH)
+
+
+def line(reach: float) -> TipTask:
+    """Across in front of the arm."""
+
+    def position(t: Any) -> Any:
+        return ca.vertcat(0.6, reach * (2 * t / SECONDS - 1))
+
+    return TipTask(position=position, rows=[3, 4], duration=SECONDS)
+
+
+def posture(time: Array, reach: float, elbow: int) -> Array:
+    """By the law of cosines. Shape (M, 2)."""
+    x, y = 0.6, reach * (2 * time / SECONDS - 1)
+    far = np.hypot(x, y)
+    bend = elbow * np.arccos((far**2 - UPPER**2 - LOWER**2) / (2 * UPPER * LOWER))
+    return np.column_stack(
+        [np.arctan2(y, x) - np.arctan2(LOWER * np.sin(bend), UPPER + LOWER * np.cos(bend)), bend + 0 * y]
+    )
+
+
+def cost(first: float, last: float, reach: float, elbow: int) -> float:
+    """Of the one motion that there is on a branch."""
+    times = np.linspace(first, last, 4001)
+    return float((np.diff(posture(times, reach, elbow), axis=0) ** 2).sum() / 2 / (times[1] - times[0]))
+
+
+def test_of_two_links_the_pieces_are_the_branches_and_meet_where_that_costs_least() -> None:
+    reach, machine = 0.45, arm()
+    made = plan_in_pieces(machine, line(reach), clearance=None)
+    assert made.fewest == len(made.reconfigurations) == 1
+    (where,) = made.reconfigurations
+    assert made.begins == (0.0, where.time)
+    assert made.pieces[0].horizon == where.time
+    assert made.horizon == pytest.approx(SECONDS)
+    spans = [(0.0, where.time, -1), (where.time, SECONDS, 1)]
+    for piece, (begin, end, elbow) in zip(made.pieces, spans, strict=True):
+        assert piece.audit().passed
+        expected = posture(begin + piece.t, reach, elbow)
+        assert (np.abs(expected) <= HIGH + 1e-6).all()
+        np.testing.assert_allclose(piece["joints"], expected, atol=1e-6)
+        assert piece.cost == pytest.approx(cost(begin, end, reach, elbow), rel=1e-5)
+        assert piece.bound is not None
+        assert piece.bound <= piece.cost
+    # of all times at which the elbow may change side, none is cheaper but for the instants that are looked at
+    inside = [t for t in np.linspace(0, SECONDS, 401) if all(
+        (np.abs(posture(np.array([t]), reach, elbow)) <= HIGH).all() for elbow in (-1, 1)
+    )]  # fmt: skip
+    best = min(cost(0, t, reach, -1) + cost(t, SECONDS, reach, 1) for t in inside)
+    assert best * (1 - 1e-5) <= made.cost <= best * 1.002
+    np.testing.assert_allclose(where.before, posture(np.array([where.time]), reach, -1)[0], atol=1e-6)
+    np.testing.assert_allclose(where.after, posture(np.array([where.time]), reach, 1)[0], atol=1e-6)
+    assert where.way is not None
+    assert where.duration == pytest.approx(np.abs(where.after - where.before).max() / 3.0)
+    assert made.duration == pytest.approx(SECONDS + where.duration)
+    np.testing.assert_allclose(where.way.at([0.0, where.duration])["joints"], [where.before, where.after], atol=1e-9)
+    assert "1 reconfiguration, none has fewer" in str(made)
+    assert f"at {where.time:.4g} s the arm reconfigures" in str(made)
+    with pytest.raises(DeadEnd, match="plan_in_pieces") as refused:
+        plan(machine, line(reach), search="global", clearance=None)
+    assert refused.value.pieces == pickle.loads(pickle.dumps(refused.value)).pieces == 2
+
+
+@pytest.mark.long
+def test_what_one_motion_does_is_one_piece_and_the_plan() -> None:
+    made = plan_in_pieces(arm(), line(0.1), clearance=None)
+    assert (len(made.pieces), made.reconfigurations, made.fewest) == (1, (), 0)
+    alone = plan(arm(), line(0.1), search="global", clearance=None)
+    assert made.cost == pytest.approx(alone.cost, rel=1e-9)
+    assert made.duration == made.horizon == SECONDS
+
+
+def with_bodies() -> FixedBase:
+    """The same arm, a capsule along each link."""
+    machine = arm()
+    along_x = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
+    links = []
+    for link in machine.robot.links:
+        long = {"link0": UPPER, "link1": LOWER}.get(link.name)
+        if long is not None:
+            tube = CollisionShape("capsule", (0.02, long - 0.1), translation=(long / 2, 0, 0), rotation=along_x)
+            link = replace(link, collisions=(tube,))
+        links.append(link)
+    return FixedBase(replace(machine.robot, links=tuple(links)))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("angle", [0.15, 0.2])
+def test_a_reconfiguration_goes_round_what_is_in_the_way(angle: float) -> None:
+    place = 0.85 * np.array([np.cos(angle), np.sin(angle)])
+    machine, ball = with_bodies(), Sphere(0.03, (*place, 0.0))
+    made = plan_in_pieces(machine, line(0.45), obstacles=[ball], clearance=0.01)
+    (where,) = made.reconfigurations
+    assert all(piece.audit().passed for piece in made.pieces)
+    assert where.way is not None, where.why
+    straight = np.abs(where.after - where.before).max() / 3.0
+    assert where.duration > straight
+    joints = where.way.at(np.linspace(0, where.duration, 2001))["joints"]
+    assert (np.abs(joints) <= HIGH + 1e-6).all()
+    assert (np.abs(np.diff(joints, axis=0)) <= 3.0 * where.duration / 2000 * (1 + 1e-5)).all()
+    # the ball from the axes of the capsules, by hand
+    first = UPPER * np.column_stack([np.cos(joints[:, 0]), np.sin(joints[:, 0])])
+    turn = joints.sum(axis=1)
+    last = first + LOWER * np.column_stack([np.cos(turn), np.sin(turn)])
+    for begin, end in ((0 * first, first), (first, last)):
+        far, way = place - begin, end - begin
+        short = 0.05 / np.linalg.norm(way[0])
+        share = np.clip((far * way).sum(axis=1) / (way**2).sum(axis=1), short, 1 - short)
+        assert np.linalg.norm(far - share[:, None] * way, axis=1).min() >= 0.03 + 0.02 + 0.01 - 1e-6
+
+
+def test_a_part_of_a_task_asks_for_the_same_at_its_times() -> None:
+    path = smooth(Path.through([[0.4, -0.3, 0.0], [0.6, 0.0, 0.0], [0.4, 0.3, 0.0]]), deviation=0.02)
+    task = TipTask.along(path, 0.4, rows=(3, 4), begin=0.5)
+    end = task.end
+    for first, last in ((0.0, 0.9), (0.9, 1.3), (1.3, end), (0.0, end)):
+        part = _part(task, first, last)
+        assert part is not None
+        begin = max(first, 0.5)
+        assert [part.begin, part.end] == pytest.approx([begin - first, last - first])
+        assert part.position is not None
+        assert task.position is not None
+        t = ca.MX.sym("t")
+        for asked, told in ((task.position, part.position), (task.position.rate, part.position.rate)):
+            one, other = (ca.Function("at", [t], [track(t)]).map(7) for track in (asked, told))
+            times = np.linspace(begin, last, 7)[None]
+            np.testing.assert_allclose(one(times - 0.5), other(times - begin), atol=1e-12)
+        inside = [t for t in task.begin + np.asarray(task.breaks) if begin < t < last]
+        np.testing.assert_allclose(first + part.begin + np.asarray(part.breaks), inside)
+    assert _part(task, 0.0, 0.5) is None
+    assert _part(task, end, end + 1.0) is None
+
+
+def test_a_horizon_of_which_the_task_is_no_part_is_refused() -> None:
+    for planner in (plan_in_pieces, partial(plan, search="global")):
+        with pytest.raises(ProblemError, match="no part") as refused:
+            planner(arm(), line(0.1), 1e12, start=posture(np.zeros(1), 0.1, 1)[0], clearance=None)
+        assert refused.value.name == "horizon"
+
+
+def test_obstacles_that_move_do_not_wait() -> None:
+    ball = Moving(Sphere(0.03, (0.85, 0.0, 0.0)), lambda t: ca.vertcat(0.1 * t, 0, 0))
+    with pytest.raises(ProblemError, match="wait") as refused:
+        plan_in_pieces(with_bodies(), line(0.45), obstacles=[ball])
+    assert refused.value.name == "obstacles"

@@ -1,0 +1,355 @@
+"""Plans outlive their process: files are read again as they were, or refused by name, and are written whole."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections.abc import Callable
+from dataclasses import fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from models import FixedBase, FreeFloating, Link, Machine, Mimic, Standing, planar_chain, rectangle
+from ocp import ProblemError, Solution
+from ocp.motion.plan import Candidate, Plan, Reason, Rejection
+from ocp.motion.plan.request import restored_request, stored_request
+from ocp.motion.schedule import JointTrajectory
+from ocp.problem.stored import packed, unpacked
+from tests.models.robot.trees import numeric
+from tests.ocp.motion.plan.motions import planned
+from tests.ocp.motion.tasks.space_tasks import floating_manipulator, floating_panda, panda, two_pandas
+from tests.ocp.test_faults import run
+
+pytestmark = pytest.mark.xdist_group("plan seam_ur5")  # one process, so that it is planned once
+
+Arrays = dict[str, np.ndarray]
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("plans") / "seam.npz"
+    planned("seam_ur5").save(path)
+    return path
+
+
+# ---- plans -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_saved_plan_is_audited_in_another_process(saved: Path) -> None:
+    found, audit = planned("seam_ur5"), planned("seam_ur5").audit()
+    done = run(f"""
+        from ocp.motion.plan import Plan
+        plan = Plan.load({str(saved)!r})
+        audit = plan.audit()
+        print(audit.passed, repr(plan.cost), plan.names, repr(plan.sample(0.5).tip.tolist()))
+    """)
+    assert done.stdout.strip() == (f"{audit.passed} {found.cost!r} {found.names} {found.sample(0.5).tip.tolist()!r}"), (
+        done.stderr
+    )
+
+
+def test_a_plan_is_read_as_it_was_written(saved: Path, tmp_path: Path) -> None:
+    found, again = planned("seam_ur5"), Plan.load(saved)
+    for name in ("joints", "rates"):
+        np.testing.assert_array_equal(again[name], found[name])
+    np.testing.assert_array_equal(again.t, found.t)
+    assert (again.horizon, again.bound, again.parts) == (found.horizon, found.bound, found.parts)
+    assert [told_of(each) for each in again.candidates] == [told_of(each) for each in found.candidates]
+    np.testing.assert_array_equal(again.candidates[0].start, found.candidates[0].start)
+    assert again.candidates[0].solution is again.solution
+    assert str(again) == str(found)
+    again.save(tmp_path / "again.npz")
+    assert Plan.load(tmp_path / "again.npz").cost == found.cost
+
+
+def told_of(candidate: Candidate) -> str:
+    return repr((candidate.cost, candidate.stage, candidate.reason))
+
+
+def edited(saved: Path, tmp_path: Path, edit: Callable[[Arrays], Arrays]) -> Path:
+    with np.load(saved) as stored:
+        arrays = {name: stored[name] for name in stored}
+    path = tmp_path / "edited.npz"
+    changed: dict[str, Any] = dict(edit(arrays))
+    np.savez_compressed(path, **changed)
+    return path
+
+
+def told(change: Callable[[dict[str, Any]], Any]) -> Callable[[Arrays], Arrays]:
+    """An edit of what is told of the plan."""
+
+    def edit(arrays: Arrays) -> Arrays:
+        record = json.loads(arrays["plan"].tobytes())
+        return {**arrays, "plan": np.frombuffer(json.dumps(change(record)).encode(), dtype=np.uint8)}
+
+    return edit
+
+
+def machine_in(record: dict[str, Any]) -> dict[str, Any]:
+    """The record of the machine in what is told of a plan."""
+    return dict(record["request"]["arguments"]["pool"])["machine"]  # type: ignore[no-any-return]
+
+
+def having(record: dict[str, Any], machine: Any) -> dict[str, Any]:
+    """What is told of a plan with another record of the machine."""
+    pool = [[name, machine if name == "machine" else value] for name, value in record["request"]["arguments"]["pool"]]
+    return {**record, "request": {**record["request"], "arguments": {"pool": pool}}}
+
+
+def recorded(machine: Machine) -> Any:
+    return machine_in({"request": packed(stored_request("", {"machine": machine}))[0]})
+
+
+def without(name: str) -> Callable[[dict[str, Any]], Any]:
+    return lambda record: {key: value for key, value in record.items() if key != name}
+
+
+def without_in_request(name: str) -> Callable[[dict[str, Any]], Any]:
+    return lambda record: {**record, "request": {k: v for k, v in record["request"].items() if k != name}}
+
+
+def with_machine(**changes: Any) -> Callable[[dict[str, Any]], Any]:
+    def change(record: dict[str, Any]) -> Any:
+        machine = machine_in(record)
+        return having(record, {**machine, "fields": {**machine["fields"], **changes}})
+
+    return change
+
+
+def with_links(change: Callable[[Any], Any]) -> Callable[[dict[str, Any]], Any]:
+    """An edit of the links of the robot."""
+
+    def edit(record: dict[str, Any]) -> Any:
+        robot = machine_in(record)["fields"]["robot"]
+        links = change(robot["fields"]["links"])
+        return with_machine(robot={**robot, "fields": {**robot["fields"], "links": links}})(record)
+
+    return edit
+
+
+DAMAGES: dict[str, Callable[[Arrays], Arrays]] = {
+    "no text": lambda arrays: {**arrays, "plan": np.array([255, 254], dtype=np.uint8)},
+    "no JSON": lambda arrays: {**arrays, "plan": np.frombuffer(b"{", dtype=np.uint8)},
+    "numbers": lambda arrays: {**arrays, "plan": np.array([1.0, 2.0])},
+    "a list": told(lambda record: [1, 2]),
+    "nothing": told(lambda record: None),
+    **{f"no {name}": told(without(name)) for name in ("request", "parts", "candidates", "bound", "targets")},
+    **{f"a request without {name}": told(without_in_request(name)) for name in ("builder", "arguments", "functions")},
+    "another builder": told(lambda record: {**record, "request": {**record["request"], "builder": "os.system"}}),
+    "no parts at all": told(lambda record: {**record, "parts": []}),
+    "a part too short": told(lambda record: {**record, "parts": [[0.0, 1.0]]}),
+    "a part of words": told(lambda record: {**record, "parts": [["a", "b", ""]]}),
+    "a part of another plan": told(lambda record: {**record, "parts": [[*record["parts"][0][:2], " 7"]]}),
+    "a part that ends before it begins": told(lambda record: {**record, "parts": [[5.0, 1.0, ""]]}),
+    "a part that never ends": told(lambda record: {**record, "parts": [[0.0, math.nan, ""]]}),
+    "parts apart": told(lambda record: {**record, "parts": [[0.0, 5.0, ""], [6.0, 7.0, ""]]}),
+    "another horizon": told(lambda record: {**record, "parts": [[0.0, 2 * record["parts"][0][1], ""]]}),
+    "a candidate of words": told(lambda record: {**record, "candidates": ["abcd"]}),
+    "a candidate of another stage": told(lambda record: {**record, "candidates": [[[0.0], 1.0, 99, None]]}),
+    "a candidate of an unknown reason": told(
+        lambda record: {
+            **record,
+            "candidates": [[[0.0], 1.0, 3, {**Reason(Rejection.AUDIT).record(), "kind": "os.system"}]],
+        }
+    ),
+    "a candidate of half a reason": told(lambda record: {**record, "candidates": [[[0.0], 1.0, 3, {"kind": "AUDIT"}]]}),
+    "a bound of words": told(lambda record: {**record, "bound": "low"}),
+    "a machine of words": told(lambda record: having(record, "UR5")),
+    "a machine of another kind": told(lambda record: having(record, {**machine_in(record), "kind": "Rig"})),
+    "a machine without a kind": told(lambda record: having(record, {"fields": {}})),
+    "a machine without fields": told(lambda record: having(record, {"kind": "FixedBase"})),
+    "a machine that is a robot": told(lambda record: having(record, machine_in(record)["fields"]["robot"])),
+    "a link less": told(with_links(lambda links: links[:-1])),
+    "a link twice": told(with_links(lambda links: [*links, links[0]])),
+    "a link of words": told(with_links(lambda links: ["hand", *links[1:]])),
+    "links of words": told(with_links(lambda links: "links")),
+    "links a number": told(with_links(lambda links: 3)),
+    "a machine with more": told(with_machine(wings=2)),
+    "a machine without a robot": told(with_machine(robot=None)),
+    "another robot": told(lambda record: having(record, recorded(panda()))),
+    "a machine out of shape": told(with_machine(rotation=[[2, 0, 0], [0, 1, 0], [0, 0, 1]])),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_plan_is_refused_by_name(damage: str, saved: Path, tmp_path: Path) -> None:
+    with pytest.raises(ProblemError) as caught:
+        Plan.load(edited(saved, tmp_path, DAMAGES[damage]))
+    assert caught.value.name
+
+
+def test_files_that_are_no_plans_are_refused_by_name(saved: Path, tmp_path: Path) -> None:
+    planned("seam_ur5").solution.save(tmp_path / "solution.npz")
+    with pytest.raises(ProblemError, match=r"a solution and no plan"):
+        Plan.load(tmp_path / "solution.npz")
+    (tmp_path / "words.npz").write_text("words")
+    (tmp_path / "short.npz").write_bytes(saved.read_bytes()[:1000])
+    np.savez(tmp_path / "numbers.npz", numbers=np.arange(3))
+    for name in ("words", "short", "numbers"):
+        with pytest.raises(ProblemError) as caught:
+            Plan.load(tmp_path / f"{name}.npz")
+        assert caught.value.name
+    with pytest.raises(FileNotFoundError):
+        Plan.load(tmp_path / "nobody.npz")
+    for nothing in (None, 3, object()):
+        with pytest.raises(ProblemError):
+            Plan.load(nothing)  # type: ignore[arg-type]
+
+
+def test_a_plan_file_is_a_solution_file_too(saved: Path) -> None:
+    assert Solution.load(saved).cost == planned("seam_ur5").cost
+
+
+def test_nothing_half_written_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = planned("seam_ur5")
+    path, table = tmp_path / "plan.npz", tmp_path / "plan.csv"
+    path.write_text("before")
+    table.write_text("before")
+
+    def fails(*_: Any) -> None:
+        raise OSError("disk full")
+
+    monkeypatch.setattr("os.fsync", fails)
+    with pytest.raises(OSError, match="disk full"):
+        found.save(path)
+    with pytest.raises(OSError, match="disk full"):
+        found.write_csv(table)
+    assert (path.read_text(), table.read_text()) == ("before", "before")
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["plan.csv", "plan.npz"]
+
+
+def test_a_plan_of_a_machine_of_ones_own_is_not_written(tmp_path: Path) -> None:
+    class Own(FixedBase):
+        """Not one of models'."""
+
+    found = planned("seam_ur5")
+    with pytest.raises(ProblemError, match="Own") as caught:
+        replace(found, machine=Own(found.machine.robot)).save(tmp_path / "own.npz")
+    assert caught.value.name == "machine"
+    assert not list(tmp_path.iterdir())
+
+
+# ---- tables and messages ---------------------------------------------------------------------------------------------
+
+
+def test_a_table_is_read_back_bit_for_bit(tmp_path: Path) -> None:
+    found, path = planned("seam_ur5"), tmp_path / "seam.csv"
+    found.write_csv(path, 0.25)
+    with path.open(newline="", encoding="utf-8") as stream:
+        head, *rows = csv.reader(stream)
+    names = found.names
+    assert head == ["time", *names, *(f"{n}.velocity" for n in names), *(f"{n}.acceleration" for n in names)]
+    sample = found.sample(0.25)
+    table = np.array([[float(cell) for cell in row] for row in rows])
+    told = np.column_stack([sample.t, sample.joints, sample.rates, sample.accelerations])
+    np.testing.assert_array_equal(table, told)
+    np.testing.assert_allclose(np.diff(sample.t)[:-1], 0.25)
+    assert sample.t[-1] == found.horizon
+
+
+def test_a_message_is_read_back() -> None:
+    found = planned("seam_ur5")
+    message = found.to_ros(0.5)
+    again, made = JointTrajectory.from_ros(json.loads(json.dumps(message))), found.trajectory(0.5)
+    assert again.names == made.names == found.names
+    np.testing.assert_allclose(again.t, made.t, atol=1e-9)
+    for kind in ("positions", "velocities", "accelerations"):
+        np.testing.assert_array_equal(getattr(again, kind), getattr(made, kind))
+
+
+@pytest.mark.parametrize("name", ["seam_ur5", "seam_space_arm"])
+def test_samples_are_derivatives_of_each_other_and_tips_those_of_the_machine(name: str) -> None:
+    found = planned(name)
+    breaks = found.solution.state_interpolant.breaks * found.horizon
+    times = (breaks[:-1] + breaks[1:]) / 2
+    step = 1e-5
+    before, at, after = (found.sampled(times + shift) for shift in (-step, 0.0, step))
+    np.testing.assert_allclose((after.joints - before.joints) / (2 * step), at.rates, atol=2e-6)
+    np.testing.assert_allclose((after.rates - before.rates) / (2 * step), at.accelerations, atol=1e-6)
+    base = found.at(times).get("base", np.zeros((len(times), 0)))
+    for row, place, joints in zip(at.tip, base, at.joints, strict=True):
+        pose = found.machine.tip_pose(place, joints)
+        np.testing.assert_allclose(row[:3], numeric(pose.position).ravel(), atol=1e-12)
+        assert np.linalg.norm(row[3:]) == pytest.approx(1)
+        turn = numeric(pose.rotation)
+        w, x = row[3], row[4:]
+        again = np.eye(3) * (w * w - x @ x) + 2 * np.outer(x, x) + 2 * w * numeric(ca.skew(ca.DM(x)))
+        np.testing.assert_allclose(again, turn, atol=1e-12)
+
+
+# ---- machines --------------------------------------------------------------------------------------------------------
+
+
+def follower() -> Machine:
+    """A chain whose last joint follows the first one."""
+    chain = planar_chain([0.5, 0.4, 0.3], [1.0, 2.0, 3.0])
+    last = replace(chain.joints[-1], mimic=Mimic(chain.joints[0].name, 0.5, 0.1))
+    return FixedBase(replace(chain, joints=(*chain.joints[:-1], last)), translation=(0.1, 0.2, 0.3))
+
+
+def standing() -> Machine:
+    chain = planar_chain([1.0, 0.8, 0.6], [1.0] * 3, base=Link("foot", 30.0, inertia=np.eye(3)))
+    upright = [(0, 0, 1), (1, 0, 0), (0, 1, 0)]
+    return Standing(chain, rotation=upright, support=rectangle((-0.3, 0.3), (-0.3, 0.3)))
+
+
+MACHINES: dict[str, Callable[[], Machine]] = {
+    "fixed": panda,
+    "floating": floating_manipulator,
+    "with momentum": lambda: floating_panda((0.5, -0.3, 0.4, 1.0, -2.0, 1.5)),
+    "two arms": two_pandas,
+    "planar": lambda: FreeFloating(planar_chain([1.0, 0.5], [1.0, 1.0], base=Link("base", 5.0, inertia=np.eye(3)))),
+    "standing": standing,
+    "follower": follower,
+}
+
+
+def alike(first: Any, second: Any) -> bool:
+    """Whether two machines are the same in every field."""
+    if is_dataclass(first):
+        if type(first) is not type(second):
+            return False
+        return all(alike(getattr(first, f.name), getattr(second, f.name)) for f in fields(first) if f.init)
+    if isinstance(first, tuple | list):
+        return len(first) == len(second) and all(map(alike, first, second))
+    if isinstance(first, np.ndarray):
+        return np.array_equal(first, second)
+    return bool(first == second)
+
+
+@pytest.mark.parametrize("kind", MACHINES)
+def test_a_machine_is_read_as_it_was_written(kind: str) -> None:
+    machine = MACHINES[kind]()
+    record, arrays = packed(stored_request("", {"machine": machine}))
+    again = restored_request(unpacked(json.loads(json.dumps(record)), arrays)).machine
+    assert alike(machine, again)
+    rng = np.random.default_rng(3)
+    q, qd = rng.normal(size=(2, machine.joint_size))
+    base = machine.base_home()
+    np.testing.assert_array_equal(
+        numeric(again.tip_pose(base, q).position), numeric(machine.tip_pose(base, q).position)
+    )
+    np.testing.assert_array_equal(numeric(again.base_rate(base, q, qd)), numeric(machine.base_rate(base, q, qd)))
+
+
+def test_what_is_no_machine_is_refused_by_name() -> None:
+    value: Any
+    for value in (
+        None,
+        3,
+        "UR5",
+        [],
+        {},
+        {"kind": "Robot"},
+        {"kind": "os"},
+        {"kind": []},
+        {"kind": "FixedBase", "fields": 3},
+    ):
+        with pytest.raises(ProblemError) as caught:
+            restored_request({"builder": "", "functions": [], "arguments": {"pool": [["machine", value]]}})
+        assert caught.value.name == "request"

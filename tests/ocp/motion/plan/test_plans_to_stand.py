@@ -1,0 +1,218 @@
+"""Standing machines through `plan`: the ground's reaction by Newton's law of rods, and laws of the cost."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from models import Standing, Support, rectangle
+from models.paths import rest_to_rest
+from ocp import Limits, ProblemError, TipTask
+from ocp.motion.builders.standing import Weights
+from ocp.motion.plan import Plan, plan
+from tests.models.machines.standing_machines import planar_machine
+from tests.models.robot.trees import Array
+from tests.ocp.motion.builders.standing_tasks import ROWS, led, planar_start, tip_at
+
+pytestmark = pytest.mark.xdist_group("plans to stand")  # one process, so that every motion is planned once
+
+SIZE, SECONDS = 5, 2.0
+LENGTHS = 1.9 * np.linspace(1.3, 0.7, SIZE) / SIZE
+MASSES = 50.0 * np.linspace(1.3, 0.7, SIZE) ** 2 / (np.linspace(1.3, 0.7, SIZE) ** 2).sum()
+GRAVITY = 9.81
+EDGES = (-0.12, 0.2)
+"""Of the foot, m."""
+EFFORT = Weights(acceleration=0.01, velocity=0.0, joint_limits=0.0, manipulability=0.0)
+SHIFT = np.array([0.2, -0.3])
+"""What the tip is moved by, ahead and up, m."""
+
+
+def machine(edges: tuple[float, float] = EDGES) -> Standing:
+    given = planar_machine(SIZE)
+    return replace(given, support=rectangle((-0.1, 0.1), edges), most_stable_point=None, half_widths=None)
+
+
+def first() -> Array:
+    return planar_start(SIZE)
+
+
+def moved(start: Any, by: Any, seconds: float = SECONDS) -> TipTask:
+    """The tip by so many m, ahead and up, from rest to rest."""
+    place, step = ca.DM(tip_at(planar_machine(SIZE), start)[1:]), ca.DM(by)
+    return led(lambda t: place + step * rest_to_rest(t / seconds), ROWS)
+
+
+@cache
+def reached(edges: tuple[float, float] = EDGES, seconds: float = SECONDS) -> Plan:
+    task = moved(first(), SHIFT, seconds)
+    return plan(machine(edges), task, seconds, start=first(), weights=EFFORT)
+
+
+def bodies(joints: Array) -> tuple[Array, Array, Array]:
+    """Centres of rods (M, n, 2) and their angles (M, n), and tips (M, 2), in y and z; from the joints (M, n)."""
+    angles = np.cumsum(joints, axis=1)
+    along = np.stack([np.cos(angles), np.sin(angles)], axis=2) * LENGTHS[:, None]
+    ends = np.cumsum(along, axis=1)
+    return ends - along / 2, angles, ends[:, -1]
+
+
+def zero_moment_points(found: Plan, times: Array, step: float = 1e-4) -> tuple[Array, Array]:
+    """Where the ground's reaction acts, m, and its vertical force, N, by differences of the rods' places."""
+    before, at, after = (bodies(found.at(times + shift)["joints"]) for shift in (-step, 0.0, step))
+    pull, turning = ((b - 2 * a + c) / step**2 for b, a, c in zip(before[:2], at[:2], after[:2], strict=True))
+    weight = MASSES * (pull[:, :, 1] + GRAVITY)
+    y, z = at[0][:, :, 0], at[0][:, :, 1]
+    moment = (y * weight - z * MASSES * pull[:, :, 0] + MASSES * LENGTHS**2 / 12 * turning).sum(axis=1)
+    force = weight.sum(axis=1)
+    return moment / force, force
+
+
+def inside(found: Plan, count: int = 301) -> Array:
+    """Times that are no nodes, s."""
+    return np.linspace(0.0, found.horizon, count + 2)[1:-1] + 1.3e-4
+
+
+def effort(found: Plan) -> float:
+    """The integral of the squared accelerations, from what the plan says of them."""
+    nodes, weights = np.polynomial.legendre.leggauss(8)
+    kinks = found.solution.state_interpolant.breaks * found.horizon
+    half = np.diff(kinks) / 2
+    times = (kinks[:-1] + half)[:, None] + half[:, None] * nodes
+    second = found.sampled(times.ravel()).accelerations.reshape(*times.shape, -1)
+    return float(np.einsum("k,g,kgn->", half, weights, second**2))
+
+
+def test_the_machine_stands_by_newtons_law_and_its_tip_is_where_it_should_be() -> None:
+    found = reached()
+    assert found.audit().passed
+    times = inside(found)
+    place, force = zero_moment_points(found, times)
+    assert (force > 0).all()
+    assert EDGES[0] - 1e-4 < place.min()
+    assert place.max() < EDGES[1] + 1e-4
+    tips = bodies(found.at(times)["joints"])[2]
+    share = np.array([float(rest_to_rest(t / SECONDS)) for t in times])
+    begin = tip_at(planar_machine(SIZE), first())[1:]
+    assert np.abs(tips - begin - share[:, None] * SHIFT).max() < 1e-5
+
+
+def test_it_begins_and_ends_at_rest_and_keeps_its_limits() -> None:
+    found, robot = reached(), machine().robot
+    assert np.abs(found.at([0.0, found.horizon])["rates"]).max() < 1e-6
+    at = found.at(inside(found))
+    assert (at["joints"] > robot.lower - 1e-6).all()
+    assert (at["joints"] < robot.upper + 1e-6).all()
+    assert (np.abs(at["rates"]) < robot.velocity + 1e-6).all()
+    np.testing.assert_allclose(found["joints"][0], first(), atol=1e-9)
+
+
+def test_the_cost_is_the_integral_of_squared_accelerations() -> None:
+    assert reached().cost == pytest.approx(EFFORT.acceleration * effort(reached()), rel=1e-6)
+
+
+def test_a_narrow_foot_is_used_to_its_edge_and_a_wider_one_is_never_dearer() -> None:
+    """Where no edge is reached its place does not matter."""
+    wide, wider = reached((-3.0, 3.0)), reached((-6.0, 6.0))
+    assert wider.cost == pytest.approx(wide.cost, rel=1e-6)
+    swing = zero_moment_points(wide, inside(wide))[0]
+    edges = float(swing.min()) + 0.01, 0.5
+    narrow = reached(edges)
+    assert narrow.audit().passed
+    assert narrow.cost > wide.cost * (1 + 1e-5)
+    place = zero_moment_points(narrow, inside(narrow))[0]
+    assert edges[0] - 1e-3 < place.min() < edges[0] + 1e-3
+
+
+def test_twice_the_time_costs_an_eighth_where_the_foot_is_wide() -> None:
+    """Accelerations fall with the square of the time: their squares' integral with its cube."""
+    wide, slow = reached((-3.0, 3.0)), reached((-3.0, 3.0), 2 * SECONDS)
+    assert slow.cost == pytest.approx(wide.cost / 8, rel=1e-6)
+    share = np.linspace(0.0, 1.0, 51)
+    ways = [one.at(share * one.horizon)["joints"] for one in (wide, slow)]
+    np.testing.assert_allclose(ways[1], ways[0], atol=1e-5)
+
+
+def test_the_way_back_costs_no_more_than_the_way_there() -> None:
+    """A film of it played backwards stands as well: reactions depend on accelerations and squares of rates."""
+    there = reached()
+    end = there["joints"][-1]
+    back = plan(machine(), moved(end, -SHIFT), SECONDS, start=end, weights=EFFORT)
+    assert back.audit().passed
+    assert back.cost <= there.cost * (1 + 1e-6)
+
+
+def test_a_machine_in_another_plane_and_place_moves_alike() -> None:
+    given, angle = machine(), np.radians(90.0)
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])
+    shift = np.array([0.4, -0.3, 0.0])
+    corners = given.support.vertices @ turn[:2, :2].T + shift[:2]
+    other = replace(given, rotation=turn @ np.asarray(given.rotation), translation=shift, support=Support(corners))
+    begin = ca.DM(tip_at(other, first())[[0, 2]])
+    by = ca.DM([-SHIFT[0], SHIFT[1]])
+    task = led(lambda t: begin + by * rest_to_rest(t / SECONDS), (3, 5))
+    found = plan(other, task, SECONDS, start=first(), weights=EFFORT)
+    assert found.cost == pytest.approx(reached().cost, rel=1e-5)
+    times = np.linspace(0.0, SECONDS, 51)
+    np.testing.assert_allclose(found.at(times)["joints"], reached().at(times)["joints"], atol=1e-4)
+
+
+def test_a_start_that_is_searched_stands_and_does_the_same() -> None:
+    found = plan(machine(), moved(first(), SHIFT), SECONDS, weights=EFFORT, search="start")
+    assert found.audit().passed
+    place = zero_moment_points(found, inside(found))[0]
+    assert EDGES[0] - 1e-4 < place.min()
+    assert place.max() < EDGES[1] + 1e-4
+    tips = bodies(found.at([0.0, SECONDS])["joints"])[2]
+    begin = tip_at(planar_machine(SIZE), first())[1:]
+    np.testing.assert_allclose(tips, [begin, begin + SHIFT], atol=1e-5)
+    assert found.candidates[0].reason is None
+
+
+def test_what_moves_at_its_ends_does_not_begin_at_rest() -> None:
+    """A tip at constant speed: joints are free to move at both ends."""
+    begin = ca.DM(tip_at(planar_machine(SIZE), first())[1:])
+    task = led(lambda t: begin + ca.DM(SHIFT) * t / SECONDS, ROWS)
+    found = plan(machine(), task, SECONDS, start=first(), weights=EFFORT)
+    assert found.audit().passed
+    assert np.abs(found.at([0.0, SECONDS])["rates"]).max(axis=1).min() > 0.05
+    tips = bodies(found.at([0.5, 1.5])["joints"])[2]
+    np.testing.assert_allclose(np.diff(tips, axis=0)[0], SHIFT / SECONDS, atol=2e-5)
+
+
+def test_a_saved_plan_is_the_same_motion(tmp_path: Path) -> None:
+    reached().save(tmp_path / "stands.npz")
+    again = Plan.load(tmp_path / "stands.npz")
+    assert again.audit().passed
+    times = inside(again)
+    np.testing.assert_array_equal(again.at(times)["joints"], reached().at(times)["joints"])
+
+
+def test_a_foot_beside_the_plane_in_which_all_moves_is_refused() -> None:
+    beside = replace(machine(), support=rectangle((0.05, 0.2), EDGES), most_stable_point=None, half_widths=None)
+    with pytest.raises(ProblemError, match="zero moment point"):
+        plan(beside, moved(first(), SHIFT), SECONDS, start=first(), weights=EFFORT)
+
+
+@pytest.mark.parametrize(
+    ("name", "changes"),
+    [
+        ("cyclic", {"cyclic": True}),
+        ("horizon", {"horizon": None}),
+        ("horizon", {"horizon": "free"}),
+        ("task 0", {"tasks": TipTask(position=[0.5, 1.0], rows=ROWS, begin=1.0)}),
+        ("weights", {"weights": np.ones(SIZE)}),
+        ("start", {"tasks": TipTask(velocity=[0.1, 0.0], rows=ROWS), "start": None}),
+        ("velocity", {"limits": Limits(velocity=[1.0, 2.0])}),
+    ],
+)
+def test_what_no_standing_plan_takes_is_refused_by_name(name: str, changes: dict[str, Any]) -> None:
+    given: dict[str, Any] = {"tasks": moved(first(), SHIFT), "horizon": SECONDS, "start": first(), "weights": EFFORT}
+    with pytest.raises(ProblemError) as caught:
+        plan(machine(), **{**given, **changes})
+    assert caught.value.name == name

@@ -1,0 +1,139 @@
+"""The shortest ways through waypoints: valid by other libraries, near their bounds, the same when turned round."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, get_args
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from models import Box, FixedBase, Surroundings
+from models.arrays import Array
+from models.robot.rebuild import locked
+from models.spatial import quaternion_from_rotation
+from ocp import DeadEnd, Limits, ProblemError, Unreachable, plan_waypoints
+from ocp.motion.local.touching import distances_along
+from ocp.motion.plan.waypoints import WayCost
+from tests.ocp.motion.search.test_charts import planar
+from tests.ocp.motion.tasks.space_tasks import PANDA_START, UR5_START, panda, ur5
+from tests.redundancy_benchmark import problem_of
+from tests.sweep.redundancy import faults, planned
+
+
+def poses(machine: FixedBase, joints: Array, count: int) -> tuple[Array, Array]:
+    """A bent way from a posture, the hand as it is there."""
+    pose = machine.tip_pose((), joints)
+    s = np.linspace(0, 1, count)[:, None]
+    way = s * (0.05, 0.1, -0.1) + 0.05 * np.sin(3 * s) * (0.0, 0.0, 1.0)
+    turn = quaternion_from_rotation(np.array(ca.DM(pose.rotation))[None])[0]
+    return np.array(ca.DM(pose.position)).ravel() + way, np.tile(turn, (count, 1))
+
+
+@pytest.mark.long
+def test_a_problem_of_the_benchmark_is_solved_by_its_rules_and_shorter_than_published() -> None:
+    problem = problem_of("panda__1cube")
+    found = planned(problem)
+    assert problem.torm_length_rad is not None
+    assert found.cost < problem.torm_length_rad
+    assert 0.97 * found.cost <= found.bound <= found.cost
+    assert found.cost == pytest.approx(np.abs(np.diff(found.joints, axis=0)).sum(), rel=1e-12)
+    assert faults("panda__1cube", found.joints) == []
+    assert faults("panda__1cube", found.joints + 1e-3)  # it finds some
+
+
+@pytest.mark.parametrize(("machine", "start"), [(panda(), PANDA_START), (ur5(), UR5_START)], ids=["panda", "ur5"])
+def test_the_way_back_is_as_long_and_weights_count(machine: FixedBase, start: Array) -> None:
+    places, turns = poses(machine, start, 21)
+    found = plan_waypoints(machine, places, turns, clearance=None)
+    back = plan_waypoints(machine, places[::-1], -2.0 * turns[::-1], clearance=None)
+    heavy = plan_waypoints(machine, places, turns, clearance=None, weights=np.full(machine.joint_size, 3.0))
+    assert back.cost == pytest.approx(found.cost, rel=1e-3)
+    assert heavy.cost == pytest.approx(3 * found.cost, rel=1e-3)
+    for one in (found, back, heavy):
+        assert 0.95 * one.cost <= one.bound <= one.cost
+    tips = [np.array(ca.DM(machine.tip_pose((), q).position)).ravel() for q in found.joints]
+    assert np.array(tips) == pytest.approx(places, abs=1e-8)
+    assert (found.steps == np.abs(np.diff(found.joints, axis=0)).max(axis=0)).all()
+    assert "at least" in str(found)
+
+
+@pytest.mark.long
+def test_with_a_joint_more_the_way_is_no_longer_than_with_that_joint_held() -> None:
+    problem, some = problem_of("fetch__square"), slice(0, 60, 2)
+    machine, told = problem.machine, (problem.positions[some], problem.quaternions[some])
+    name = machine.robot.joint_names[0]
+    middle = (machine.robot.lower[0] + machine.robot.upper[0]) / 2
+    found = plan_waypoints(machine, *told, clearance=None)
+    held = plan_waypoints(FixedBase(locked(machine.robot, {name: middle})), *told, clearance=None)
+    assert found.cost < held.cost
+    assert found.steps[0] > 0
+    tips = np.array([np.array(ca.DM(machine.tip_pose((), q).position)).ravel() for q in found.joints])
+    assert tips == pytest.approx(told[0], abs=1e-8)
+
+
+def test_the_largest_way_and_the_time_are_least_where_they_are_the_cost() -> None:
+    places, turns = poses(panda(), PANDA_START, 21)
+    velocity = panda().robot.velocity
+    free: dict[str, Any] = {"clearance": None}
+    kinds: tuple[WayCost, ...] = get_args(WayCost)
+    found = {cost: plan_waypoints(panda(), places, turns, cost=cost, **free) for cost in kinds}
+    measures: dict[WayCost, Callable[[Array], float]] = {
+        "length": lambda ways: ways.sum(),
+        "largest": lambda ways: ways.max(axis=1).sum(),
+        "time": lambda ways: (ways / velocity).max(axis=1).sum(),
+    }
+    for cost, measured in measures.items():
+        by_plan = {name: measured(np.abs(np.diff(one.joints, axis=0))) for name, one in found.items()}
+        assert found[cost].cost == pytest.approx(by_plan[cost], rel=1e-12)
+        assert by_plan[cost] == min(by_plan.values())
+        assert 0.9 * found[cost].cost <= found[cost].bound <= found[cost].cost
+    slow = plan_waypoints(panda(), places, turns, cost="time", limits=Limits(velocity=velocity / 4), **free)
+    assert slow.cost == pytest.approx(4 * found["time"].cost, rel=1e-3)
+
+
+@pytest.mark.long
+def test_what_stands_in_the_way_makes_it_longer_and_is_kept_clear_of() -> None:
+    places, turns = poses(panda(), PANDA_START, 21)
+    free = plan_waypoints(panda(), places, turns)
+    box = Box((0.1, 0.1, 0.1), (0.25, 0.1, 0.9))
+    boxed = plan_waypoints(panda(), places, turns, obstacles=[box])
+    assert boxed.cost >= free.bound
+    assert boxed.bound <= boxed.cost
+    # between the waypoints no sample is nearer than what is proven, and some is as near as what was found
+    around = Surroundings(panda(), [box])
+    numbers = np.linspace(0, 20, 2001)
+    joints = np.stack([np.interp(numbers, np.arange(21), column) for column in boxed.joints.T], axis=1)
+    apart = distances_along(around, np.zeros(0), joints, numbers).min()
+    assert boxed.between is not None
+    worst = boxed.between.worst
+    assert worst is not None
+    assert min(near.least for near in boxed.between.pairs) <= apart + 1e-9
+    assert apart == pytest.approx(worst.distance, abs=1e-3)
+    assert f"{worst.bodies[0]} and {worst.bodies[1]}, {worst.distance:.4g} m apart" in str(boxed)
+    assert plan_waypoints(panda(), places[:6], turns[:6], clearance=None).between is None
+
+
+def test_what_cannot_be_done_is_refused() -> None:
+    places, turns = poses(panda(), PANDA_START, 11)
+    for told, name in (
+        ((places[:1], turns[:1]), "positions"),
+        ((places[:, :2], turns), "positions"),
+        ((places * np.nan, turns), "positions"),
+        ((places, turns[:-1]), "quaternions"),
+        ((places, turns * 0), "quaternions"),
+    ):
+        with pytest.raises(ProblemError) as refused:
+            plan_waypoints(panda(), *told)
+        assert refused.value.name == name
+    for more in ({"step": 0.0}, {"weights": np.zeros(7)}, {"weights": np.ones(3)}):
+        with pytest.raises(ProblemError) as refused:
+            plan_waypoints(panda(), places, turns, **more)
+        assert refused.value.name in more
+    with pytest.raises(ProblemError, match="3 joints for the 6 rows"):
+        plan_waypoints(planar(np.array([0.5, 0.4, 0.3])), places, turns)
+    with pytest.raises(Unreachable, match="waypoint 0 at"):
+        plan_waypoints(panda(), places + 3.0, turns)
+    with pytest.raises(DeadEnd, match=r"none goes on to waypoint 1; .* in one step, 0.0001 at most"):
+        plan_waypoints(panda(), places, turns, step=1e-4, limits=Limits(), clearance=None)

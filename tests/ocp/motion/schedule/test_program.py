@@ -1,0 +1,180 @@
+"""The parts of a schedule's programs: rows and their sums, the jerk that a motion holds, demands between the nodes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ocp.motion.schedule import LineLimits, schedule
+from ocp.motion.schedule.grid import make_grid
+from ocp.motion.schedule.limits import rows_at
+from ocp.motion.schedule.profile import LineMotion, through
+from ocp.motion.schedule.program import INTERIOR, Program, Spline, SplineRows, _Rows, least_time
+from ocp.motion.schedule.settings import SETTINGS
+from ocp.motion.schedule.stretch import _jerk_of
+from ocp.motion.schedule.window import Stretch, Window, demanded, profile_of
+from scripts.timing.schedules import JOINTS, panda_path
+from tests.models.paths.task_paths import seeds
+
+
+def random_rows(seed: int, count: int) -> tuple[Program, _Rows, np.ndarray]:
+    """Rows at random places of so many intervals, and coefficients."""
+    rng = np.random.default_rng(seed)
+    size = int(rng.integers(1, 6 * count + 1))
+    interval, jerk = rng.integers(0, count, size), rng.uniform(size=size) < rng.uniform()
+    rows = SplineRows(
+        interval,
+        rng.uniform(size=size),
+        rng.uniform(size=size),
+        rng.normal(size=(size, 3)),
+        rng.uniform(1, 2, size),
+        jerk,
+    )
+    most = np.where(rng.uniform(size=count + 2) < 0.5, 5.0, np.inf)
+    spline = Spline(np.cumsum(rng.uniform(0.1, 1.0, count + 1)))
+    program = Program(spline, rows, most, (0.0, 0.0), np.arange(0))
+    return program, _Rows(program), rng.uniform(0.5, 2.0, count + 2)
+
+
+@settings(max_examples=40)
+@given(seeds, st.integers(1, 90))
+def test_rows_are_those_of_a_matrix(seed: int, count: int) -> None:
+    """What they miss and its tangents, sums of values times these, and the diagonals of the sum of their squares."""
+    program, every, b = random_rows(seed, count)
+    gap, _ = every.look(b)
+    matrix = np.array([every.of(column) for column in np.eye(len(b))]).T
+    values = np.random.default_rng(seed).uniform(0.1, 1.0, len(gap))
+    assert every.gathered(values) == pytest.approx(matrix.T @ values, abs=1e-9)
+    normal = matrix.T @ (values[:, None] * matrix)
+    for k, diagonal in enumerate(every.squares(values)):
+        assert diagonal == pytest.approx(np.diag(normal, k), abs=1e-9)
+    step = 1e-6 * np.random.default_rng(seed + 1).normal(size=len(b))
+    change = matrix @ step
+    assert (every.look(b + step)[0] - every.look(b - step)[0]) / 2 == pytest.approx(change, abs=1e-10)
+
+    rows, near = program.rows, np.stack([b[program.rows.interval + k] for k in range(3)])
+    x, slope, bend = (program.spline.basis(rows.interval, rows.fraction) * near).sum(axis=1)
+    root = (program.spline.basis(rows.interval, rows.root)[0] * near).sum(axis=0)
+    bound = rows.bound * np.where(rows.jerk, root**-0.5, 1.0)
+    missed = [(rows.of * np.stack([x, slope, bend], axis=1)).sum(axis=1) - bound, -b[1:-1], b - program.most]
+    every.look(b)
+    assert np.sort(gap) == pytest.approx(np.sort(np.concatenate([part[np.isfinite(part)] for part in missed])))
+
+
+@settings(max_examples=40)
+@given(seeds, st.integers(1, 90), st.floats(0.1, 1.0), st.floats(0.1, 1.0))
+def test_steps_keep_what_is_positive_so(seed: int, count: int, share: float, of_positive: float) -> None:
+    """At most so much of the way to zero, the coefficients less, and the worst of all just so; they change slowly."""
+    _, every, _ = random_rows(seed, count)
+    rates = np.random.default_rng(seed).normal(size=len(every.interval)) * 10.0 ** np.random.default_rng(seed).uniform(
+        -1, 1
+    )
+    steps = every.longest(rates, share, of_positive)
+    most = np.where(np.arange(len(rates)) < count, of_positive, share)
+    gone = -rates * steps[every.interval] / most
+    assert gone.max() <= 1 + 1e-12
+    assert steps.max() <= 1
+    assert steps.min() == pytest.approx(1 / max(1.0, float((-rates / most).max())))
+    assert np.abs(np.diff(steps)).max(initial=0.0) <= 1 / INTERIOR.block
+
+
+@settings(max_examples=40)
+@given(seeds)
+def test_a_spline_has_the_values_and_derivatives_of_its_basis(seed: int) -> None:
+    """And goes through what it is made of; its second derivative is that of the slopes."""
+    rng = np.random.default_rng(seed)
+    nodes = np.cumsum(rng.uniform(0.1, 1.0, 9))
+    spline = Spline(nodes)
+    b = rng.uniform(0.5, 2.0, len(nodes) + 1)
+    x, slope = spline.at_nodes(b)
+    assert spline.through(x, slope) == pytest.approx(b)
+    interval, fraction = rng.integers(0, 8, 30), rng.uniform(0, 1, 30)
+    near = np.stack([b[interval + k] for k in range(3)])
+    value, first, second = (spline.basis(interval, fraction) * near).sum(axis=1)
+    way = fraction * np.diff(nodes)[interval]
+    assert second == pytest.approx((np.diff(slope) / np.diff(nodes))[interval])
+    assert first == pytest.approx(slope[interval] + way * second)
+    assert value == pytest.approx(x[interval] + way * (slope[interval] + first) / 2)
+
+
+def from_rest_to_rest(seed: int, count: int) -> Program:
+    """Speeds, accelerations and jerks that vary along a path."""
+    rng = np.random.default_rng(seed)
+    spline = Spline(np.cumsum(rng.uniform(0.5, 1.5, count + 1)) / count)
+    wave = 1 + 0.5 * np.sin(np.arange(count) * rng.uniform(0.05, 0.3))
+    interval, sign = np.repeat(np.arange(count), 4), np.tile([1.0, -1.0, 0.0, 0.0], count)
+    bend = np.tile([0.0, 0.0, 1.0, -1.0], count)
+    rows = SplineRows(
+        interval,
+        np.full(4 * count, 0.5),
+        np.full(4 * count, 0.5),
+        np.stack([0 * sign, sign / 2, bend / 2], axis=1),
+        np.where(bend == 0, 2.0, 20.0) * wave[interval],
+        bend != 0,
+    )
+    most = np.concatenate([[np.inf], wave, [np.inf]])
+    width = float(spline.h[0])
+    return Program(spline, rows, most, (width, width), np.zeros(0, dtype=np.intp))
+
+
+@settings(max_examples=20)
+@given(seeds, st.integers(60, 200))
+def test_parts_of_the_fastest_motion_between_the_rest_of_it_are_the_fastest_themselves(seed: int, count: int) -> None:
+    program, rng = from_rest_to_rest(seed, count), np.random.default_rng(seed)
+    start = np.full(count + 2, 1e-2)
+    whole = least_time(program, start, accuracy=1e-10, center=1.0)
+    edges = np.sort(rng.permutation(count)[:6])
+    free = np.concatenate([np.arange(a, b) for a, b in edges.reshape(3, 2)])
+    part, at = program.part(free)
+    stays = part.fixed
+    assert part.spline.at_nodes(whole[at])[0][0] == pytest.approx(program.spline.at_nodes(whole)[0][at[0]])
+    moved = np.where(np.isin(np.arange(len(at)), stays), 1.0, 0.9) * whole[at]
+    found = least_time(part, moved, accuracy=1e-10, center=0.1)
+    assert found[stays] == pytest.approx(whole[at][stays], rel=1e-12)
+    assert found == pytest.approx(whole[at], rel=1e-4, abs=1e-6)
+
+
+@settings(max_examples=40)
+@given(st.floats(-1, 1), st.floats(-1, 1))
+def test_the_jerks_of_a_motion_are_those_at_a_sixth_of_an_interval(slope: float, bend: float) -> None:
+    """But for terms of second order: half the interval, a quarter of the error."""
+    errors = []
+    for h in (0.04, 0.02):
+        s = np.array([0.0, h])
+        x = 1 + slope * s + bend * s**2 / 2
+        jerk = through(s, np.sqrt(x), (slope + bend * s) / 2).jerk
+        places = h * np.array([_jerk_of(0.0), _jerk_of(1.0)])
+        errors.append(np.abs(jerk - bend / 2 * np.sqrt(1 + slope * places + bend * places**2 / 2)).max())
+    assert errors[1] <= errors[0] / 3.5 + 1e-11
+    assert errors[0] <= 1e-3
+
+
+def test_what_is_demanded_is_what_dense_samples_demand() -> None:
+    """In every interval, by every limit that comes near: no less; and next to no more where that would matter."""
+    path, joints = panda_path(4)
+    limits = LineLimits(0.5, 5.0, 200.0, 5.0, JOINTS)
+    grid = make_grid(path, limits, joints)
+    stretch, every = Stretch(grid, 0, len(grid.asked)), np.arange(len(grid.asked))
+    window = Window.of(stretch, 0, len(grid.asked), stretch.ends)
+    plan = schedule(path, limits, joints=joints)
+    motion = plan.profile.at_distance(grid.distance)
+    profile = profile_of(window, motion.speed**2, 2 * motion.acceleration)
+    used, values = demanded(window, profile, every)
+    some = np.sort(np.random.default_rng(0).permutation(every)[:50])
+    for whole, part in zip((used, values), demanded(window, profile, some), strict=True):
+        assert part[:, some] == pytest.approx(whole[:, some], abs=1e-12)
+        assert not np.delete(part, some, axis=1).any()
+    shares = np.linspace(1e-6, 1 - 1e-6, 201)
+    places = grid.distance[:-1, None] + shares * np.diff(grid.distance)[:, None]
+    dense = profile.at_distance(places.ravel())
+    rows = rows_at(path, limits, joints, places.ravel())
+    values = rows.demands(LineMotion(*dense)).reshape(*places.shape, -1)
+    for side, sign in zip(used, (1, -1), strict=True):
+        most = (sign * values).max(axis=1)
+        near = most > 0.9
+        assert near.sum() > 50
+        # a joint's jerk may turn between places that are looked at, by less than the room that is left for it
+        assert (side - most)[near].min() > -2 * SETTINGS.room
+        assert (side - most)[side > 1 - 2 * SETTINGS.room].max() < 2 * SETTINGS.room

@@ -1,0 +1,219 @@
+"""Ways in pieces: as few reconfigurations as brute force over all postures finds, and then as short."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation, Slerp
+
+from models import FixedBase
+from models.arrays import Array
+from models.robot.rebuild import locked
+from ocp import DeadEnd, ProblemError, TipTask, inverse_kinematics, plan_waypoints
+from ocp.motion.local.closed_forms import closed_forms
+from ocp.motion.search.charts import Instant, SelfMotions
+from ocp.motion.search.joint_space import JointSpace
+from ocp.motion.search.reconfigurations import farthest, fewest_pieces
+from ocp.motion.search.search import Search
+from ocp.motion.search.steps import Length
+from ocp.motion.tasks.equations import bind
+from tests.ocp.motion.search.test_charts import planar
+from tests.ocp.motion.search.test_values import reached
+from tests.ocp.motion.tasks.space_tasks import ur5
+from tests.redundancy_benchmark import problem_of
+
+COUNT = 9
+TURN = 2 * np.pi
+
+
+def fewest(nodes: list[Array], step: Any, gap: int = 1) -> tuple[int, float]:
+    """The fewest reconfigurations, and the least length with these, over all sequences of nodes, the first first.
+
+    They lead to the next instant, or, without a gap, to another posture of the same one.
+    """
+    best = [(0, 0.0)] * len(nodes[0])
+    for here, there in pairwise(nodes):
+        ways = np.abs(there[:, None] - here)
+        near, length = (ways <= step).all(axis=2), ways.sum(axis=2)
+        jump = (min(best)[0] + 1, min(best)[1])
+        if not gap:
+            best, jump = [min(one, jump) for one in best], (10**6, np.inf)
+        counts, lengths = (np.array(part) for part in zip(*best, strict=True))
+        after = []
+        for row, own in zip(near, length, strict=True):
+            some = np.flatnonzero(row)
+            order = np.lexsort(((lengths + own)[some], counts[some]))
+            first = [(int(counts[i]), float(lengths[i] + own[i])) for i in some[order[:1]]]
+            after.append(min([jump, *first]))
+        best = after
+    return min(best)
+
+
+def limited(machine: FixedBase, lower: Array, upper: Array) -> FixedBase:
+    """The machine with other limits of its joints."""
+    names = machine.robot.joint_names
+    joints = [
+        replace(joint, lower=lower[names.index(joint.name)], upper=upper[names.index(joint.name)])
+        if joint.name in names
+        else joint
+        for joint in machine.robot.joints
+    ]
+    return FixedBase(replace(machine.robot, joints=tuple(joints)))
+
+
+def of_six_joints(seed: int) -> tuple[FixedBase, Array, Array, float, list[Array]]:
+    """An arm with random limits, a straight way from one pose to another, a step, and all postures there."""
+    rng = np.random.default_rng(seed)
+    middle, half = rng.uniform(-1.5, 1.5, 6), rng.uniform(1.0, 2.2, 6)
+    machine = limited(ur5(), middle - half, middle + half)
+    ends = [machine.tip_pose((), rng.uniform(middle - 0.8 * half, middle + 0.8 * half)) for _ in range(2)]
+    first, last = (np.array(ca.DM(pose.position)).ravel() for pose in ends)
+    places = np.linspace(first, last, COUNT)
+    turns = Slerp([0, 1], Rotation.from_matrix([np.array(ca.DM(pose.rotation)) for pose in ends]))(
+        np.linspace(0, 1, COUNT)
+    )
+    (form,) = closed_forms(machine)
+    own, joints = form.postures(places, turns.as_matrix(), np.zeros((COUNT, 0)))
+    joints = middle + np.remainder(joints - middle + np.pi, TURN) - np.pi  # less than two turns within the limits
+    more = [joints]
+    for j in range(6):
+        more = [part + side * TURN * np.eye(6)[j] for part in more for side in (-1, 0, 1)]
+        more = [np.where((np.abs(part - middle) <= half + 1e-9)[:, [j]], part, np.nan) for part in more]
+    nodes = []
+    for k in range(COUNT):
+        here = np.concatenate([part[own == k] for part in more])
+        nodes.append(here[np.isfinite(here).all(axis=1)])
+    quaternions = turns.as_quat()[:, [3, 0, 1, 2]]
+    return machine, places, quaternions, float(rng.uniform(0.3, 0.9)), nodes
+
+
+@pytest.mark.parametrize(("seed", "count"), [(0, 1), (16, 4), (23, 0), (39, 2)])
+def test_of_six_joints_the_pieces_are_those_of_brute_force(seed: int, count: int) -> None:
+    machine, places, quaternions, step, nodes = of_six_joints(seed)
+    told: dict[str, Any] = {"step": step, "clearance": None}
+    found = plan_waypoints(machine, places, quaternions, **told, reconfigurations="counted")
+    expected = fewest(nodes, step)
+    after = found.reconfigurations
+    assert (len(after), expected[0]) == (count, count)
+    assert found.cost == pytest.approx(expected[1], rel=1e-6)
+    assert found.bound <= found.cost
+    steps = np.abs(np.diff(found.joints, axis=0))
+    assert (np.flatnonzero((steps > step + 1e-9).any(axis=1)) == after).all()
+    assert found.cost == pytest.approx(np.delete(steps, after, axis=0).sum(), rel=1e-9)
+    assert (found.steps <= step + 1e-9).all()
+    assert ("reconfigures" in str(found)) == bool(count)
+    if count == 1:
+        assert f"after waypoint {after[0]}" in str(found)
+        with pytest.raises(DeadEnd):
+            plan_waypoints(machine, places, quaternions, **told)
+
+
+def search_of(seed: int) -> tuple[Search, list[Array], Array]:
+    """A planar arm of three joints whose tip goes a bent way, and postures nearly everywhere."""
+    rng = np.random.default_rng(seed)
+    lengths, limit = rng.uniform(0.25, 0.6, 3), rng.uniform(0.9, 1.5)
+    machine = planar(lengths, limit)
+    poses = [machine.tip_pose((), rng.uniform(-limit, limit, 3)) for _ in range(2)]
+    ends = np.array([np.array(ca.DM(pose.position)).ravel() for pose in poses])
+    places = np.linspace(ends[0, :2], ends[1, :2], COUNT)
+    return searched(machine, places, 0.3), [reached(lengths, place, limit, 700) for place in places], np.full(3, 0.3)
+
+
+def searched(machine: FixedBase, places: Array, step: float) -> Search:
+    """Of ways of three joints through places in a plane."""
+    space = JointSpace(machine, machine.robot.lower, machine.robot.upper, np.ones(3))
+    sets = SelfMotions(
+        space,
+        bind(machine, TipTask(position=[*places[0]], rows=[3, 4])),
+        np.array([np.r_[place, 0.0, 0.0, 0.0, 0.0] for place in places]),
+    )
+
+    def seeds(k: int) -> Array:
+        task = TipTask(position=[*places[k]], rows=[3, 4])
+        return np.array([one.joints for one in inverse_kinematics(machine, task, starts=16, seed=k)])
+
+    far = np.full((len(places) - 1, 3), step)
+    instants, times = [Instant(sets, k) for k in range(len(places))], np.linspace(0, 1, len(places))
+    return Search(space, instants, times, Length(np.ones(3)), far, seeds=seeds)
+
+
+@pytest.mark.parametrize(("reach", "count"), [(0.45, 1), pytest.param(0.1, 0, marks=pytest.mark.long)])
+def test_where_the_way_waits_pieces_meet_at_an_instant_and_none_are_fewer_or_shorter(reach: float, count: int) -> None:
+    lengths, high, step = np.array([0.5, 0.3, 0.1]), np.array([0.9, 1.8, 0.3]), 0.4
+    machine = limited(planar(lengths), -high, high)
+    places = np.column_stack([np.full(COUNT, 0.6), np.linspace(-reach, reach, COUNT)])
+    nodes = [reached(lengths, place, 1.8, 900) for place in places]
+    nodes = [own[(np.abs(own) <= high).all(axis=1)] for own in nodes]
+    search = searched(machine, places, step)
+    found = fewest_pieces(search, 0)
+    assert found is not None
+    pieces, bound = found
+    expected = fewest(nodes, step, 0)
+    assert (len(pieces) - 1, expected[0]) == (count, count)
+    assert [piece.first for piece in pieces] == [0, *(piece.last for piece in pieces[:-1])]
+    assert pieces[-1].last == COUNT - 1
+    cost = sum(piece.cost for piece in pieces)
+    assert bound <= min(cost, expected[1] + 1e-9)
+    assert cost <= 1.002 * expected[1]
+    for gap in (0, 1):
+        assert len(farthest(search, gap, ruled_out=bool(gap))) == len(pieces)
+    first, last = pieces[0].first, pieces[0].last
+    again = fewest_pieces(search, 0, [(first, last)])  # what is barred is no piece, nor what holds it
+    assert again is None or not any(piece.first <= first and last <= piece.last for piece in again[0])
+
+
+@pytest.mark.parametrize(("seed", "count"), [(2, 1), (18, 1), (26, 8), (35, 1)])
+def test_with_a_free_direction_no_sequence_of_postures_has_fewer_pieces_or_is_shorter(seed: int, count: int) -> None:
+    search, nodes, step = search_of(seed)
+    found = fewest_pieces(search)
+    assert found is not None
+    pieces, bound = found
+    expected = fewest(nodes, step)
+    assert (len(pieces) - 1, expected[0]) == (count, count)
+    assert [piece.first for piece in pieces] == [0, *(piece.last + 1 for piece in pieces[:-1])]
+    assert pieces[-1].last == COUNT - 1
+    cost = sum(piece.cost for piece in pieces)
+    assert bound <= min(cost, expected[1] + 1e-9)
+    assert bound >= 0.97 * cost
+    assert cost <= 1.002 * expected[1]
+    for piece in pieces:
+        ways = np.abs(np.diff(piece.joints, axis=0))
+        assert (ways <= step + 1e-9).all()
+        assert piece.cost == pytest.approx(ways.sum(), rel=1e-9)
+
+
+def test_far_apart_parts_of_a_way_are_pieces_as_cheap_and_as_clear_as_by_themselves() -> None:
+    problem = problem_of("panda__1cube")
+    machine = FixedBase(locked(problem.machine.robot, {"panda_joint4": -1.8}))
+    rows, turns = [], []
+    for begin in ([0.4, 0.3, -0.2, 0.3, 1.4, 0.5], [-1.8, 0.5, 0.6, -0.4, 1.9, -0.6]):
+        for k in range(3):
+            pose = machine.tip_pose((), np.array(begin) + 0.05 * k)
+            rows.append(np.array(ca.DM(pose.position)).ravel())
+            turns.append(Rotation.from_matrix(np.array(ca.DM(pose.rotation))).as_quat()[[3, 0, 1, 2]])
+    told: dict[str, Any] = {"step": 0.12, "obstacles": problem.boxes, "ignored": problem.ignored}
+    alone = [plan_waypoints(machine, rows[k : k + 3], turns[k : k + 3], **told) for k in (0, 3)]
+    found = plan_waypoints(machine, rows, turns, **told, reconfigurations="counted")
+    assert found.reconfigurations == (2,)
+    assert found.cost == pytest.approx(sum(one.cost for one in alone), rel=1e-6)
+    assert found.between is not None
+    assert found.between.worst is not None
+    nearest = [one.between.worst.distance for one in alone if one.between and one.between.worst]
+    assert found.between.worst.distance == pytest.approx(min(nearest), abs=1e-6)
+    assert not 2 < found.between.worst.time < 3
+
+
+def test_pieces_are_counted_with_one_free_direction_at_most() -> None:
+    problem = problem_of("fetch__square")
+    told = (problem.positions[:3], problem.quaternions[:3])
+    with pytest.raises(ProblemError, match="at most") as refused:
+        plan_waypoints(problem.machine, *told, clearance=None, reconfigurations="counted")
+    assert refused.value.name == "reconfigurations"
+    with pytest.raises(ProblemError, match="reconfigurations") as refused:
+        plan_waypoints(problem.machine, *told, reconfigurations="few")  # type: ignore[arg-type]
+    assert refused.value.name == "reconfigurations"

@@ -1,0 +1,181 @@
+"""Ways with two free directions: no dearer than with a joint held, one cost however finely they are asked for."""
+
+from __future__ import annotations
+
+from functools import cache, partial
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from models import Box, FixedBase
+from models.arrays import Array
+from models.robot.rebuild import locked
+from ocp import DeadEnd, ProblemError, SolveError, Unreachable, WaypointPlan, plan_waypoints
+from ocp.motion.plan import waypoints
+from ocp.motion.plan.waypoints import WaypointSettings
+from ocp.motion.search.reconfigurations import SectionSettings, values_of
+from ocp.motion.search.search import SearchSettings
+from tests.redundancy_benchmark import problem_of
+
+STEP = 0.1
+"""rad and m, of 40 waypoints."""
+
+
+@given(st.booleans(), st.floats(-4, 4), st.floats(0, 8), st.floats(1e-3, 10))
+def test_values_are_no_farther_apart_than_a_step_and_reach_the_limits(
+    slides: bool, low: float, far: float, step: float
+) -> None:
+    values, most = values_of(slides, low, low + far, step), min(SectionSettings().apart[not slides], step)
+    ends = np.clip((low, low + far), -np.pi, np.pi)
+    gap = float(np.diff(values).max(initial=0.0))
+    assert gap <= most * (1 + 1e-9) or len(values) >= SectionSettings().values - 1
+    assert len(values) <= SectionSettings().values
+    assert values[0] == ends[0]
+    if slides or np.ptp(ends) < 2 * np.pi - 1e-6:
+        assert values[-1] == pytest.approx(ends[1])
+    else:  # the last is as far from the first, all round, as from the one before
+        assert values[0] + 2 * np.pi - values[-1] == pytest.approx(gap if len(values) > 1 else 2 * np.pi)
+
+
+@pytest.mark.parametrize("slides", [True, False])
+def test_a_joint_without_limits_is_held_all_round_or_about_where_it_is(slides: bool) -> None:
+    values = values_of(slides, -np.inf, np.inf, np.inf)
+    assert np.abs(values).max() <= np.pi
+    assert len(np.unique(np.round(np.remainder(values, 2 * np.pi), 9))) == len(values) - slides
+
+
+@cache
+def task(count: int) -> tuple[Array, Array]:
+    """An oval in front of the lifting arm, 0.4 m high, the hand level."""
+    problem, s = problem_of("fetch__square"), np.linspace(0, 2 * np.pi, count)[:, None]
+    place = np.array([0.75, 0.1, 0.9]) + s * 0
+    place += 0.05 * np.sin(s) * (0, 1, 0) + 0.2 * (1 - np.cos(s)) * (0, 0, 0.5)
+    return place, np.tile(problem.quaternions[0], (count, 1))
+
+
+@cache
+def planned(count: int, **told: Any) -> WaypointPlan:
+    machine = problem_of("fetch__square").machine
+    return plan_waypoints(machine, *task(count), clearance=None, step=STEP * 39 / (count - 1), **told)
+
+
+def limit_charts(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
+    """Memory for so many charts."""
+    own = WaypointSettings(search=SearchSettings(charts=count), sections=SectionSettings(charts=count))
+    monkeypatch.setattr(waypoints, "_Ways", partial(waypoints._Ways, settings=own))
+
+
+def test_a_way_keeps_its_poses_and_steps_and_is_no_dearer_than_with_the_lift_held() -> None:
+    machine, found = problem_of("fetch__square").machine, planned(40)
+    tips = [np.array(ca.DM(machine.tip_pose((), q).position)).ravel() for q in found.joints]
+    assert np.array(tips) == pytest.approx(task(40)[0], abs=1e-6)
+    assert (found.steps <= STEP + 1e-9).all()
+    assert found.bound == 0
+    assert np.ptp(found.joints[:, 0]) > 0.1  # from one value to another
+    for height in (0.0, 0.2, 0.38):
+        arm = FixedBase(locked(machine.robot, {machine.robot.joint_names[0]: height}))
+        held = plan_waypoints(arm, *task(40), clearance=None, step=STEP)
+        assert found.cost <= held.cost * (1 + 1e-6)
+
+
+def test_what_is_in_reach_at_no_one_height_of_the_lift_is_done_by_lifting() -> None:
+    machine, count = problem_of("fetch__square").machine, 40
+    places = np.column_stack([np.full(count, 0.75), np.zeros(count), np.linspace(0.2, 1.4, count)])
+    turns = np.tile((1.0, 0.0, 0.0, 0.0), (count, 1))
+    found = plan_waypoints(machine, places, turns, clearance=None, step=STEP)
+    assert found.joints[-1, 0] > found.joints[0, 0] + 0.1
+    for height in (0.0, 0.2, 0.38):
+        arm = FixedBase(locked(machine.robot, {machine.robot.joint_names[0]: height}))
+        with pytest.raises(Unreachable):
+            plan_waypoints(arm, places, turns, clearance=None, step=STEP)
+
+
+def test_back_it_is_as_long_and_heavy_it_is_dearer() -> None:
+    machine, found = problem_of("fetch__square").machine, planned(40)
+    places, turns = task(40)
+    back = plan_waypoints(machine, places[::-1], -turns[::-1], clearance=None, step=STEP)
+    assert back.cost == pytest.approx(found.cost, rel=0.03)
+    heavy = planned(40, weights=(100.0, *np.ones(7)))
+    assert np.abs(np.diff(heavy.joints[:, 0])).sum() < np.abs(np.diff(found.joints[:, 0])).sum()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("count", [20, 200, 1500])
+def test_more_waypoints_of_one_path_change_little(count: int) -> None:
+    assert planned(count).cost == pytest.approx(planned(40).cost, rel=0.03)
+
+
+def test_where_there_are_more_charts_than_memory_is_for_fewer_waypoints_are_searched(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    limit_charts(monkeypatch, 4000)
+    machine = problem_of("fetch__square").machine
+    found = plan_waypoints(machine, *task(40), clearance=None, step=STEP)
+    assert found.cost == pytest.approx(planned(40).cost, rel=0.1)
+    limit_charts(monkeypatch, 10)
+    with pytest.raises(ProblemError) as refused:
+        plan_waypoints(machine, *task(40), clearance=None, step=STEP)
+    assert refused.value.name == "postures"
+
+
+def test_what_is_in_the_way_is_named_with_the_waypoint() -> None:
+    machine = problem_of("fetch__square").machine
+    places, turns = task(40)
+    box = Box((0.1, 0.1, 0.1), tuple(places[20]))
+    with pytest.raises(DeadEnd, match="the search does not rule one out: from waypoint") as refused:
+        plan_waypoints(machine, places, turns, step=STEP, obstacles=[box], ignored=problem_of("fetch__square").ignored)
+    assert refused.value.time is not None
+    assert refused.value.time < 20 <= refused.value.until + 10
+    assert "obstacle 0" in str(refused.value)
+
+
+@pytest.mark.parametrize("count", [2, 5])
+def test_a_handful_of_waypoints_may_be_as_far_apart_as_one_likes(count: int) -> None:
+    places, turns = (rows[:count] for rows in task(40))
+    machine = problem_of("fetch__square").machine
+    found = plan_waypoints(machine, places, turns, clearance=None)
+    tips = [np.array(ca.DM(machine.tip_pose((), q).position)).ravel() for q in found.joints]
+    assert np.array(tips) == pytest.approx(places, abs=1e-6)
+    assert found.cost == pytest.approx(np.abs(np.diff(found.joints, axis=0)).sum(), rel=1e-12)
+
+
+def test_a_waypoint_out_of_reach_is_named_wherever_it_is_seen_first() -> None:
+    """Also among the few that short ways are looked for at, and not among the many."""
+    places, turns = task(40)
+    number = 13
+    away = places.copy()
+    away[number] += (0.0, 0.0, 3.0)
+    with pytest.raises(Unreachable, match=f"^waypoint {number} at") as refused:
+        plan_waypoints(problem_of("fetch__square").machine, away, turns, clearance=None, step=STEP)
+    assert refused.value.time == number
+
+
+def test_where_nothing_is_clear_at_the_first_waypoint_none_begins() -> None:
+    lifting, arm = problem_of("fetch__square"), problem_of("fetch_arm__s")
+    for problem in (lifting, arm):
+        places, turns = task(40)
+        box = Box((0.1, 0.1, 0.1), tuple(places[0]))
+        with pytest.raises(DeadEnd, match="none begins at waypoint 0"):
+            plan_waypoints(problem.machine, places, turns, step=STEP, obstacles=[box], ignored=problem.ignored)
+
+
+def test_where_the_joint_is_held_at_no_value_that_does_the_waypoint_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(waypoints, "values_of", lambda *_: np.array([10.0]))
+    machine = problem_of("fetch__square").machine
+    with pytest.raises(SolveError, match="none was found at waypoint 0 with 'torso_lift_joint'") as refused:
+        plan_waypoints(machine, *task(40), clearance=None, step=STEP)
+    assert (refused.value.name, refused.value.time) == ("torso_lift_joint", 0.0)
+
+
+def test_with_one_free_direction_fewer_waypoints_are_searched_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    machine = problem_of("fetch_arm__s").machine
+    told: dict[str, Any] = {"clearance": None, "step": STEP}
+    found = plan_waypoints(machine, *task(40), **told)
+    limit_charts(monkeypatch, 1000)  # there are some 300 at each of 9 waypoints
+    again = plan_waypoints(machine, *task(40), **told)
+    assert again.cost == pytest.approx(found.cost, rel=0.02)
+    assert again.bound <= again.cost
