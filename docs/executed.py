@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 __all__ = ["Block", "blocks", "executed", "main", "setup"]
 
 FENCE = re.compile(r"^```(python|py)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[1]
 LONGEST = 900  # s, of a page
 MOST_LINES = 60
 """Of what a block prints, that are shown."""

@@ -12,7 +12,7 @@ from scripts.papers.reproduced import Printed, read
 __all__ = ["MARK", "listed", "setup"]
 
 MARK = "<!-- numbers of the papers -->"
-RESULTS = Path(__file__).resolve().parents[2] / "results"
+RESULTS = Path(__file__).resolve().parents[1] / "results"
 
 
 def listed(found: Sequence[Printed]) -> str:

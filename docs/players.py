@@ -16,7 +16,7 @@ from docutils.parsers.rst import Directive
 
 __all__ = ["command", "setup"]
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[1]
 PLANS = ROOT / "results" / "gallery"
 FOLDER = "players"
 NOT_PASSED = 1

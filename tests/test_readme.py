@@ -21,7 +21,7 @@ from tests.readme import steps
 
 ROOT = Path(__file__).resolve().parent.parent
 README = ROOT / "README.md"
-SITE = ROOT / "scripts" / "site"
+SITE = ROOT / "docs"
 PAGES = (README, *sorted(SITE.rglob("*.md")))
 LINK = re.compile(r"\]\(([^)#\s]+)(?:#[^)]*)?\)")
 MAKE = re.compile(r"(?:`|^)make ([a-z]+)", re.MULTILINE)

@@ -19,7 +19,7 @@ from docs.players import command
 from ocp.app.command import parser
 from scripts.papers.reproduced import read
 
-SITE = Path(__file__).resolve().parents[3] / "scripts" / "site"
+SITE = Path(__file__).resolve().parents[2] / "docs"
 PAGES = sorted(SITE.rglob("*.md"))
 FACE = re.compile(r"\.\. automodule:: ([\w.]+)")
 FORMULAS = re.compile(r"\$\$(.+?)\$\$|(?<![\w$])\$([^$\n]+?)\$(?![\w$])", re.DOTALL)
@@ -130,7 +130,7 @@ def test_docstrings_mean_nothing_but_what_they_say() -> None:
 
 
 def test_every_number_of_the_papers_stands_on_its_page_with_its_reason() -> None:
-    found, _ = read(SITE.parents[1] / "results")
+    found, _ = read(SITE.parent / "results")
     told = listed(found)
     assert f"**{sum(one.reproduced for one in found)} of {len(found)} numbers" in told
     for paper, part in zip(dict.fromkeys(one.paper for one in found), told.split("### ")[1:], strict=True):
@@ -162,7 +162,7 @@ def test_of_what_is_long_the_beginning_is_shown() -> None:
 
 def test_every_plan_of_the_gallery_is_played_beside_what_it_is_compared_with() -> None:
     told = (SITE / "gallery.md").read_text(encoding="utf-8")
-    plans = sorted((SITE.parents[1] / "results" / "gallery").glob("*.npz"))
+    plans = sorted((SITE.parent / "results" / "gallery").glob("*.npz"))
     assert sorted(re.findall(r"```\{player\} (\w+)", told)) == [plan.stem for plan in plans]
     for plan in plans:
         words = command(plan, SITE / "out.html")[3:]

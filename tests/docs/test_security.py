@@ -10,7 +10,7 @@ from ocp import storage
 from ocp.motion.schedule import trajectory
 from ocp.problem import function_reader
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[2]
 MB = 2**20
 LIMITS = {
     "URDF, SRDF": INPUT_LIMITS.description_bytes / MB,

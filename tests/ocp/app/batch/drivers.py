@@ -24,7 +24,7 @@ from ocp import SolveError
 from ocp.app.batch import run_batch
 from tests.ocp.app.batch import functions
 
-ROOT = Path(__file__).resolve().parents[3]
+ROOT = Path(__file__).resolve().parents[4]
 
 
 def driver(folder: Path, tasks: list[Any], workers: int = 2, **options: Any) -> subprocess.Popen[str]:
