@@ -138,7 +138,7 @@ def unpacked(text: str) -> tuple[dict[str, Any], dict[int, NDArray[Any]]]:
 
 def _filled(title: str, first: Shown, data: str) -> str:
     """The page's text."""
-    source = files("ocp.app").joinpath("page")
+    source = files("ocp.app.view").joinpath("page")
     text = source.joinpath("page.html").read_text(encoding="utf-8")
     script = "\n".join(source.joinpath(name).read_text(encoding="utf-8") for name in SCRIPTS)
     style = source.joinpath("page.css").read_text(encoding="utf-8")
