@@ -4,15 +4,15 @@ from models.cts.best_roll import optimal_inverse
 from models.cts.rig import Rig, Tunnel
 from models.cts.table import solve_table
 from models.errors import ModelError, ModelWarning
+from models.machines.collision_scene import CollisionScene
 from models.machines.free_floating import FreeFloating
 from models.machines.machine import FixedBase, Machine, wheels_of, with_wheels
-from models.machines.moving import Moving
+from models.machines.moving_obstacle import MovingObstacle
 from models.machines.scara import Scara
 from models.machines.scara_path import scara_along
 from models.machines.stance import Foot, Foothold, Stance
 from models.machines.standing import Standing
 from models.machines.support import Footprint, Support, footprint, rectangle
-from models.machines.surroundings import Surroundings
 from models.papers import STANDING_STARTS, paper_example, reference_rig, reference_tunnel, standing_example
 from models.paths import Arc, Helix, Line, Path, SmoothPath, smooth
 from models.robot.dynamics import Wrench, base_reaction, inverse_dynamics, mass_matrix
@@ -55,6 +55,7 @@ __all__ = [
     "Arc",
     "Box",
     "Capsule",
+    "CollisionScene",
     "CollisionShape",
     "Cylinder",
     "FixedBase",
@@ -73,7 +74,7 @@ __all__ = [
     "Mimic",
     "ModelError",
     "ModelWarning",
-    "Moving",
+    "MovingObstacle",
     "Path",
     "Rig",
     "Robot",
@@ -83,7 +84,6 @@ __all__ = [
     "Stance",
     "Standing",
     "Support",
-    "Surroundings",
     "Tunnel",
     "VisualShape",
     "Wrench",

@@ -7,9 +7,9 @@ from ocp.direct.shooting import MultipleShooting
 from ocp.errors import AuditError, BoundWarning, ProblemError, RefinementWarning, SolveError, StorageWarning
 from ocp.indirect.method import Indirect
 from ocp.methods import certificate, prepare, solve
-from ocp.motion.builders.clearance import Clear
+from ocp.motion.builders.actuator_limits import Effort, JointFriction, joint_torques
+from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.cts import roll_problem, spline_targets
-from ocp.motion.builders.drives import Effort, JointFriction, joint_torques
 from ocp.motion.builders.dynamics import dynamics_problem
 from ocp.motion.builders.dynamics_plan import Leg, dynamics_phases, plan_dynamics
 from ocp.motion.builders.joint_spline import joint_path
@@ -19,7 +19,7 @@ from ocp.motion.builders.space.grasping import Cone, Grasp
 from ocp.motion.builders.standing.plan import plan_standing, plan_steps
 from ocp.motion.builders.standing.problem import FreeTime, Weights, standing_problem
 from ocp.motion.builders.standing.resolved import StepsMotion, resolve_steps, steps_motion
-from ocp.motion.builders.standing.stances import StancePhase, Steps, standing_posture, walk
+from ocp.motion.builders.standing.stances import StancePhase, Steps, standing_configuration, walk
 from ocp.motion.builders.standing.steps import StepWeights, steps_problem
 from ocp.motion.builders.timing import minimum_time_problem, plan_minimum_time
 from ocp.motion.local.accelerations import Layer, Stabiliser, resolve_accelerations
@@ -29,11 +29,11 @@ from ocp.motion.plan import (
     Candidate,
     DeadEnd,
     Plan,
-    PlanInPieces,
     Reconfiguration,
+    SegmentedPlan,
     WaypointPlan,
     plan,
-    plan_in_pieces,
+    plan_in_segments,
     plan_waypoints,
 )
 from ocp.motion.tasks.limits import Limits
@@ -61,7 +61,7 @@ __all__ = [
     "BoundWarning",
     "Candidate",
     "Certificate",
-    "Clear",
+    "ClearanceConstraints",
     "Collocation",
     "Cone",
     "DeadEnd",
@@ -81,11 +81,11 @@ __all__ = [
     "Phases",
     "Pinned",
     "Plan",
-    "PlanInPieces",
     "Problem",
     "ProblemError",
     "Reconfiguration",
     "RefinementWarning",
+    "SegmentedPlan",
     "Sensitivity",
     "Solution",
     "SolveError",
@@ -113,7 +113,7 @@ __all__ = [
     "plan",
     "plan_capture",
     "plan_dynamics",
-    "plan_in_pieces",
+    "plan_in_segments",
     "plan_minimum_time",
     "plan_standing",
     "plan_steps",
@@ -126,7 +126,7 @@ __all__ = [
     "roll_problem",
     "solve",
     "spline_targets",
-    "standing_posture",
+    "standing_configuration",
     "standing_problem",
     "steps_motion",
     "steps_problem",

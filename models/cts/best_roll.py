@@ -24,7 +24,7 @@ import casadi as ca
 import numpy as np
 
 from models.arrays import checked_flag, checked_instance
-from models.cts.rig import HOME, Branch, Rig, RigPosture, Tunnel, checked_branch, joints_of, posture_at
+from models.cts.rig import HOME, Branch, Rig, RigConfiguration, Tunnel, checked_branch, joints_of, posture_at
 from models.cts.roll import (
     Candidate,
     checked_gain,
@@ -415,7 +415,7 @@ class Search:
     def _index(self, target: Expression) -> Harmonics:
         return index_harmonics(self.rig, self.tunnel, target)
 
-    def _posture(self, target: Expression, c: Expression, s: Expression) -> RigPosture:
+    def _posture(self, target: Expression, c: Expression, s: Expression) -> RigConfiguration:
         return posture_at(self.rig, target, c, s, self.branch)
 
     # ---- answers ---------------------------------------------------------------------------------------------

@@ -160,7 +160,7 @@ class Radii:
 
 
 @dataclass(frozen=True)
-class Surroundings:
+class CollisionScene:
     """What the rig must not touch.
 
     Attributes:
@@ -175,9 +175,9 @@ class Surroundings:
 
     def __post_init__(self) -> None:
         if self.walls is not None:
-            checked_instance(self.walls, Box, "surroundings", "walls")
+            checked_instance(self.walls, Box, "scene", "walls")
         for what, kind in (("solids", Box), ("capsules", Capsule)):
-            object.__setattr__(self, what, checked_each(getattr(self, what), kind, "surroundings", what))
+            object.__setattr__(self, what, checked_each(getattr(self, what), kind, "scene", what))
 
 
 def rig_capsules(rig: Rig, q: Expression, radii: Radii | None = None) -> dict[str, LinkCapsule]:
@@ -200,25 +200,25 @@ def rig_capsules(rig: Rig, q: Expression, radii: Radii | None = None) -> dict[st
 
 
 def clearances(
-    rig: Rig, q: Expression, surroundings: Surroundings, radii: Radii | None = None
+    rig: Rig, q: Expression, scene: CollisionScene, radii: Radii | None = None
 ) -> dict[tuple[str, str], Expression]:
     """Distance of every link to everything around it, by (link, thing). Each of shape (1, 1), m.
 
     Raises:
         ModelError: Nothing around.
     """
-    checked_instance(surroundings, Surroundings, "clearances", "surroundings")
+    checked_instance(scene, CollisionScene, "clearances", "scene")
     found: dict[tuple[str, str], Expression] = {}
     for name, capsule in rig_capsules(rig, q, radii).items():
-        if surroundings.walls is not None:
-            found[name, "walls"] = capsule_in_box(capsule, surroundings.walls)
-        for k, box in enumerate(surroundings.solids):
+        if scene.walls is not None:
+            found[name, "walls"] = capsule_in_box(capsule, scene.walls)
+        for k, box in enumerate(scene.solids):
             found[name, f"solid {k}"] = capsule_to_box(capsule, box)
-        for k, other in enumerate(surroundings.capsules):
+        for k, other in enumerate(scene.capsules):
             found[name, f"capsule {k}"] = capsule_to_capsule(capsule, other)
     if not found:
         message = "clearances: the surroundings are empty; give walls, solids or capsules"
-        raise ModelError(message, name="surroundings", value=surroundings)
+        raise ModelError(message, name="scene", value=scene)
     return found
 
 
@@ -244,7 +244,7 @@ def checked_clearance(clearance: float) -> float:
 def clear_inverse(
     rig: Rig,
     tunnel: Tunnel,
-    surroundings: Surroundings,
+    scene: CollisionScene,
     branch: Branch = HOME,
     *,
     clearance: float = -np.inf,
@@ -284,7 +284,7 @@ def clear_inverse(
     posture = posture_at(rig, target, c, s, branch)
     roll = unrolled(rig, c, s, previous)
     joints = joints_of(rig, target, roll, posture)
-    gap = soft_minimum(list(clearances(rig, joints, surroundings, radii).values()), softness)
+    gap = soft_minimum(list(clearances(rig, joints, scene, radii).values()), softness)
     cost = index_harmonics(rig, tunnel, target).value(c, s) + gain * (roll - previous) ** 2
     cost += nearness(gap, weight, width)
     meets = verdict(rig, target, posture, c, s)

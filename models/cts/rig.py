@@ -148,7 +148,7 @@ def checked_branch(branch: Branch) -> Branch:
     return Branch(*checked_choice(branch, BRANCHES, "rig", "branch"))
 
 
-class RigPosture(NamedTuple):
+class RigConfiguration(NamedTuple):
     """What a target, a roll and a branch make of the rig; scalar expressions unless said otherwise.
 
     Attributes:
@@ -261,7 +261,7 @@ def corner_circle(rig: Rig, target: Expression) -> tuple[Expression, Expression,
     return axle, ca.vertcat(c_yaw * s_pitch, s_yaw * s_pitch, c_pitch), ca.vertcat(s_yaw, -c_yaw, zero)
 
 
-def posture_at(rig: Rig, target: Expression, c: Expression, s: Expression, branch: Branch) -> RigPosture:
+def posture_at(rig: Rig, target: Expression, c: Expression, s: Expression, branch: Branch) -> RigConfiguration:
     """Joint angles but for their arcs, for a roll given by its cosine and sine: (23), (25), (27)."""
     corner = corner_at(rig, target, c, s)
     c_yaw, s_yaw = ca.cos(target[3]), ca.sin(target[3])
@@ -271,7 +271,7 @@ def posture_at(rig: Rig, target: Expression, c: Expression, s: Expression, branc
     cos2 = (corner[1] - along * s_yaw - rig.yaw_offset * c_yaw) / rig.yaw_link_1
     sin2 = branch.yaw * ca.sqrt(ca.fmax((1 - cos2) * (1 + cos2), 1e-32))
     q1 = corner[0] - along * c_yaw + rig.yaw_offset * s_yaw + rig.yaw_link_1 * sin2
-    return RigPosture(corner, sin4, cos4, sin2, cos2, q1)
+    return RigConfiguration(corner, sin4, cos4, sin2, cos2, q1)
 
 
 def inverse(rig: Rig, target: Expression, roll: Expression, branch: Branch = HOME) -> tuple[Expression, Expression]:
@@ -292,12 +292,12 @@ def inverse(rig: Rig, target: Expression, roll: Expression, branch: Branch = HOM
     return joints_of(rig, target, roll, posture), reach_of(posture)
 
 
-def reach_of(posture: RigPosture) -> Expression:
+def reach_of(posture: RigConfiguration) -> Expression:
     """1 - |sin q4| and 1 - |cos q2|, negative out of reach. Shape (2, 1)."""
     return ca.vertcat(1 - ca.fabs(posture.sin4), 1 - ca.fabs(posture.cos2))
 
 
-def joints_of(rig: Rig, target: Expression, roll: Expression, posture: RigPosture) -> Expression:
+def joints_of(rig: Rig, target: Expression, roll: Expression, posture: RigConfiguration) -> Expression:
     """Joint positions of a posture, each in the turn nearest to the middle of its limits. Shape (6, 1)."""
     q2 = ca.atan2(posture.sin2, posture.cos2)
     q4 = ca.atan2(posture.sin4, posture.cos4)

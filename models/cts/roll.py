@@ -19,7 +19,16 @@ import casadi as ca
 import numpy as np
 
 from models.arrays import checked_nonnegative
-from models.cts.rig import Branch, Rig, RigPosture, Tunnel, corner_circle, in_nearest_turn, in_turn_after, posture_at
+from models.cts.rig import (
+    Branch,
+    Rig,
+    RigConfiguration,
+    Tunnel,
+    corner_circle,
+    in_nearest_turn,
+    in_turn_after,
+    posture_at,
+)
 from models.cts.trigonometric import (
     Harmonics,
     Point,
@@ -125,7 +134,7 @@ def index_harmonics(rig: Rig, tunnel: Tunnel, target: Expression) -> Harmonics:
     )
 
 
-def verdict(rig: Rig, target: Expression, posture: RigPosture, c: Expression, s: Expression) -> Verdict:
+def verdict(rig: Rig, target: Expression, posture: RigConfiguration, c: Expression, s: Expression) -> Verdict:
     """Whether a posture is within reach and limits. Angles are compared by their cosine from the middle."""
     p = posture
     pair3 = _difference(ca.sin(target[3]), -ca.cos(target[3]), p.sin2, p.cos2)  # yaw - pi/2 - q2

@@ -30,7 +30,7 @@ from models.arrays import (
     warn_of_degrees,
 )
 from models.cts.best_roll import optimal_inverse
-from models.cts.clearance import Surroundings, clear_inverse
+from models.cts.clearance import CollisionScene, clear_inverse
 from models.cts.rig import (
     BRANCHES,
     HOME,
@@ -84,7 +84,7 @@ def solve_table(
     previous: ArrayInput = 0.0,
     in_sequence: bool = False,
     rate_weight: float = 0.0,
-    surroundings: Surroundings | None = None,
+    scene: CollisionScene | None = None,
     clearance: float = -np.inf,
     clearance_weight: float = 0.0,
     clearance_width: float = 0.05,
@@ -99,7 +99,7 @@ def solve_table(
         in_sequence: Whether each row's roll is the previous one of the next, as in a motion; rows that are not ok are
             passed over.
         rate_weight: w4 of I2; 0 for I1.
-        surroundings: What to keep clear of, None for nothing, by at least `clearance`, m, or by a term
+        scene: What to keep clear of, None for nothing, by at least `clearance`, m, or by a term
             clearance_weight exp(-distance / clearance_width) of the index; see clear_inverse.
 
     Raises:
@@ -114,12 +114,12 @@ def solve_table(
         raise ModelError("branches is empty; give at least one, for example (HOME,)", name="branches", value=branches)
     count = len(rows)
     before = one_for_each(previous, count, "table", "previous", "targets")
-    if surroundings is None:
+    if scene is None:
         functions = [optimal_inverse(rig, tunnel, branch, rate_weight=rate_weight) for branch in chosen]
     else:
         asked: dict[str, Any] = {"clearance": clearance, "weight": clearance_weight, "width": clearance_width}
         asked["rate_weight"] = rate_weight
-        functions = [clear_inverse(rig, tunnel, surroundings, branch, **asked) for branch in chosen]
+        functions = [clear_inverse(rig, tunnel, scene, branch, **asked) for branch in chosen]
     if in_sequence:
         roll, steps = float(before[0]), []
         for row in rows:

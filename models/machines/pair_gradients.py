@@ -31,7 +31,7 @@ class Placed(NamedTuple):
     Attributes:
         name: Of its link, with a number where it has several; or of an obstacle.
         shape: In the frame that it rides on.
-        frame: Index of that frame among those of `Surroundings.placements`; -1: the world.
+        frame: Index of that frame among those of `CollisionScene.placements`; -1: the world.
     """
 
     name: str

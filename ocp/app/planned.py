@@ -13,7 +13,7 @@ from ocp.app.files import write_mcap
 from ocp.app.files.outputs import MARK, SUFFIXES, checked_output
 from ocp.app.files.task_file import Task
 from ocp.errors import MOST, ProblemError, checked_instance, checked_positive
-from ocp.motion.plan import Plan, PlanInPieces, plan, plan_in_pieces
+from ocp.motion.plan import Plan, SegmentedPlan, plan, plan_in_segments
 from ocp.storage import write_text
 
 __all__ = ["EXPORTED", "check_period", "export", "run_task"]
@@ -51,7 +51,7 @@ def run_task(
         for taken in (file, *numbered):
             checked(kind, taken)
     if task.in_pieces:
-        found = plan_in_pieces(checked_instance("machine", task.machine, FixedBase), task.task, **task.options)
+        found = plan_in_segments(checked_instance("machine", task.machine, FixedBase), task.task, **task.options)
         if found.reconfigurations:
             return _in_pieces(task, found, outputs, progress, write)
         made = found.pieces[0]
@@ -81,7 +81,7 @@ def run_task(
 
 def _in_pieces(
     task: Task,
-    found: PlanInPieces,
+    found: SegmentedPlan,
     outputs: dict[str, Path],
     progress: Callable[[str], None],
     write: Callable[[Plan, dict[str, Path]], None],

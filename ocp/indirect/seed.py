@@ -130,10 +130,10 @@ def signs(slope: np.ndarray) -> np.ndarray:
     """
     found = np.sign(slope)
     for j in range(slope.shape[1]):
-        clear = np.flatnonzero(np.abs(slope[:, j]) > SOLVER_SHARE * np.max(np.abs(slope[:, j])))
-        if clear.size:
-            nearest = np.clip(np.searchsorted(clear, np.arange(len(slope))), 0, len(clear) - 1)
-            found[:, j] = np.sign(slope[clear[nearest], j])
+        significant = np.flatnonzero(np.abs(slope[:, j]) > SOLVER_SHARE * np.max(np.abs(slope[:, j])))
+        if significant.size:
+            nearest = np.clip(np.searchsorted(significant, np.arange(len(slope))), 0, len(significant) - 1)
+            found[:, j] = np.sign(slope[significant[nearest], j])
     return np.asarray(found)
 
 

@@ -16,7 +16,7 @@ from matplotlib.colors import ListedColormap, Normalize
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from models import FixedBase, Robot, Surroundings
+from models import CollisionScene, FixedBase, Robot
 from models.arrays import Array
 from models.paths import rest_to_rest
 from ocp import Limits, SolveError, TipTask, inverse_kinematics, resolve
@@ -63,7 +63,7 @@ def plan(coarse: bool = False) -> Example:
     """The cheapest of all motions, the motion by the pseudo-inverse and the best plan from where that begins."""
     machine, task = FixedBase(UR5.read()), seam()
     best = planned(machine, task, search="global")
-    first = inverse_kinematics(machine, task, surroundings=Surroundings(machine))[0]
+    first = inverse_kinematics(machine, task, scene=CollisionScene(machine))[0]
     local = resolve(machine, tasks=task, start_joints=first.joints, horizon=DURATION, samples=FINE)
     try:
         near = planned(machine, task, search="start")
@@ -97,7 +97,7 @@ def landscape(machine: FixedBase, task: TipTask, count: int, known: float) -> tu
         return np.array([one.joints for one in found])
 
     limits = bounds.velocity * np.diff(times)[:, None]
-    told: dict[str, Any] = {"seeds": seeds, "surroundings": Surroundings(machine)}
+    told: dict[str, Any] = {"seeds": seeds, "scene": CollisionScene(machine)}
     instants = [Instant(sets, k) for k in range(count)]
     search = Search(space, instants, times, Squares(np.ones(robot.dof)), limits, **told)
     layers = search.layers

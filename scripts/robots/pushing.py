@@ -15,9 +15,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from models import Footprint, Standing, Surroundings, Wrench, footprint, with_load
+from models import CollisionScene, Footprint, Standing, Wrench, footprint, with_load
 from models.machines.standing import External
-from ocp import Clear, Collocation, Problem, TipTask, resolve_accelerations, solve
+from ocp import ClearanceConstraints, Collocation, Problem, TipTask, resolve_accelerations, solve
 from ocp.motion.builders.standing import InFoot, Limits, standing_problem
 from scripts.robots import standing
 from scripts.robots.drawing import animate
@@ -102,7 +102,7 @@ def plan(coarse: bool = False) -> StandingExample:
     local = resolve_accelerations(
         machine, task(machine), START, SECONDS, external=pressed, step=5e-3, stop_at_lift_off=False
     ).motion
-    solution = solve(problem(machine, clear=Clear(Surroundings(machine))), METHOD)
+    solution = solve(problem(machine, clearance_constraints=ClearanceConstraints(CollisionScene(machine))), METHOD)
     motion = standing.sampled(machine, solution, pressed)
     found = standing.Results(ANYMAL.path, machine, ground, solution, motion, local, pressed)
     return StandingExample(ANYMAL.name, found, task(machine), solution.audit())

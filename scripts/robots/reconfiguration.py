@@ -20,10 +20,10 @@ from matplotlib.colors import to_rgb
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from models import FixedBase, Surroundings
+from models import CollisionScene, FixedBase
 from models.arrays import Array
 from models.paths import rest_to_rest
-from ocp import Audit, Limits, Plan, PlanInPieces, Reconfiguration, TipTask, inverse_kinematics, plan_in_pieces
+from ocp import Audit, Limits, Plan, Reconfiguration, SegmentedPlan, TipTask, inverse_kinematics, plan_in_segments
 from ocp.app.view.appearance import frames_along
 from ocp.app.view.rendering import tube
 from ocp.motion.search.charts import Charts, Instant, SelfMotions
@@ -83,7 +83,7 @@ class InPieces:
 
     machine: FixedBase
     task: TipTask
-    made: PlanInPieces
+    made: SegmentedPlan
     reached: Reached
 
     @property
@@ -136,7 +136,7 @@ def ring() -> TipTask:
 def plan(coarse: bool = False) -> InPieces:
     """The task in the fewest pieces, and all postures that do it; `coarse` at fewer times."""
     machine, task = FixedBase(PANDA.read()), ring()
-    made = plan_in_pieces(machine, task)
+    made = plan_in_segments(machine, task)
     return InPieces(machine, task, made, postures(machine, task, COARSE if coarse else INSTANTS))
 
 
@@ -152,7 +152,7 @@ def postures(machine: FixedBase, task: TipTask, count: int) -> Reached:
         return np.array([one.joints for one in found])
 
     limits = bounds.velocity * np.diff(times)[:, None]
-    told: dict[str, Any] = {"seeds": seeds, "surroundings": Surroundings(machine)}
+    told: dict[str, Any] = {"seeds": seeds, "scene": CollisionScene(machine)}
     search = Search(space, [Instant(sets, k) for k in range(count)], times, Squares(np.ones(n)), limits, **told)
     layers = [search.allowed(search.halved(charts, k), k) for k, charts in enumerate(search.layers)]
     graph = search.graph(layers, np.full(count - 1, np.inf))
@@ -255,7 +255,7 @@ def _scene(example: InPieces, title: str, color: str, joints: Array, t: Array | 
     )
 
 
-def _motion(made: PlanInPieces) -> tuple[Array, Array]:
+def _motion(made: SegmentedPlan) -> tuple[Array, Array]:
     """All joints from the beginning to the end, the ways between the pieces too, and their times, s."""
     order: list[Plan | None] = [made.pieces[0]]
     for change, piece in zip(made.reconfigurations, made.pieces[1:], strict=True):

@@ -16,11 +16,11 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from models import Footprint, Robot, Standing, Surroundings, Wrench, footprint, locked, with_load
+from models import CollisionScene, Footprint, Robot, Standing, Wrench, footprint, locked, with_load
 from models.arrays import Array
 from models.machines.standing import External, StandingMotion, standing_motion
 from models.paths import rest_to_rest
-from ocp import Clear, Collocation, Problem, Solution, TipTask, resolve_accelerations, solve
+from ocp import ClearanceConstraints, Collocation, Problem, Solution, TipTask, resolve_accelerations, solve
 from ocp.app.view.appearance import frames_along
 from ocp.motion.builders.standing import InFoot, Limits, Weights, standing_problem
 from ocp.motion.tasks.tip_task import timed
@@ -124,7 +124,9 @@ def from_rest(task: TipTask, seconds: float = SECONDS) -> TipTask:
     return timed(task, lambda time: rest_to_rest(time / seconds))
 
 
-def problem(machine: Standing, *, along: Any = "time", clear: Clear | None = None) -> Problem:
+def problem(
+    machine: Standing, *, along: Any = "time", clearance_constraints: ClearanceConstraints | None = None
+) -> Problem:
     """The plan to be made: the circle at a given time law, or with the time law left to the plan ("parameter")."""
     robot, hand = machine.robot, circle(machine)
     return standing_problem(
@@ -138,7 +140,7 @@ def problem(machine: Standing, *, along: Any = "time", clear: Clear | None = Non
         limits=Limits(velocity=SHARE * robot.velocity, torque=SHARE * robot.effort, friction=0.6),
         along=along,
         tip_level="acceleration",
-        clear=clear,
+        clearance_constraints=clearance_constraints,
     )
 
 
@@ -157,7 +159,7 @@ def plan() -> Results:
     local = resolve_accelerations(
         machine, from_rest(circle(machine)), START, SECONDS, external=pulled, step=5e-3, stop_at_lift_off=False
     ).motion
-    solution = solve(problem(machine, clear=Clear(Surroundings(machine))), METHOD)
+    solution = solve(problem(machine, clearance_constraints=ClearanceConstraints(CollisionScene(machine))), METHOD)
     return Results(robot_file(), machine, ground, solution, sampled(machine, solution, pulled), local, pulled)
 
 

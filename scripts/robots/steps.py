@@ -26,7 +26,7 @@ from ocp.motion.builders.standing import (
     StepsMotion,
     plan_steps,
     resolve_steps,
-    standing_posture,
+    standing_configuration,
     steps_motion,
     walk,
 )
@@ -180,7 +180,7 @@ def bent(steps: Steps, knee: float = 0.8) -> Array:
     pitches = [i for i, joint in enumerate(steps.robot.moving_joints) if abs(joint.axis[1]) > 0.5]
     near[pitches] = np.tile([-knee / 2, knee, -knee / 2], 2)
     stance = steps.stances[0]
-    found = standing_posture(stance, near[steps.order(stance)], steps.balanced(0))
+    found = standing_configuration(stance, near[steps.order(stance)], steps.balanced(0))
     return np.asarray(steps.in_order(stance, found[None])[0])
 
 

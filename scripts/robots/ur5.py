@@ -14,7 +14,7 @@ from models.arrays import Array
 from models.paths import rest_to_rest
 from ocp import Collocation, Solution, SolveError, TipTask, inverse_kinematics, minimum_velocity_problem, resolve, solve
 from ocp.app.view.appearance import TIP_FRAME, Frames, frames_along
-from ocp.motion.local.inverse_kinematics import Posture
+from ocp.motion.local.inverse_kinematics import IkSolution
 from ocp.motion.local.rates import LocalSolution
 from scripts.drawing import COLORS, DASHES
 from scripts.robots.drawing import Scene, animate, joint_curves, page
@@ -98,16 +98,18 @@ def plan(coarse: bool = False) -> Example:
     return Example(UR5, machine, task, local, solution, solution.audit(), facts, {"motions": motions, "rolls": rolls})
 
 
-def starts(machine: Machine, task: TipTask) -> list[Posture]:
+def starts(machine: Machine, task: TipTask) -> list[IkSolution]:
     """Postures at the start of the task with elbow and wrist above the panel, the best conditioned first."""
     found = inverse_kinematics(machine, task)
     frames = frames_along(machine, [posture.joints for posture in found])
     height = np.min([frames.positions[link][:, 2] for link in OVERHEAD], axis=0)
-    clear = [posture for posture, low in zip(found, height, strict=True) if low > CENTER[1] + CLEARANCE]
-    return clear or found
+    clearance_constraints = [posture for posture, low in zip(found, height, strict=True) if low > CENTER[1] + CLEARANCE]
+    return clearance_constraints or found
 
 
-def _planned(machine: Machine, task: TipTask, start: Posture, method: Collocation, free_start: bool) -> Solution | None:
+def _planned(
+    machine: Machine, task: TipTask, start: IkSolution, method: Collocation, free_start: bool
+) -> Solution | None:
     begin: dict[str, Any] = {"near" if free_start else "start_joints": start.joints}
     try:
         found = solve(minimum_velocity_problem(machine, task, horizon=DURATION, **begin), method)

@@ -11,17 +11,17 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from models import Box, FixedBase, Robot, Sphere, Surroundings, link_frames
+from models import Box, CollisionScene, FixedBase, Robot, Sphere, link_frames
 from models.arrays import Array
 from models.shapes.shapes import Shape
 from ocp import Plan, plan
 from ocp.audit.clearance import Clearance
 from ocp.motion.builders.clearance import clearance_of
-from ocp.motion.local.touching import distances_along
+from ocp.motion.local.collisions import distances_along
 from scripts import drawing
 from scripts.papers.run import progress, text_table
 from scripts.robots.robots import PANDA, UR5
-from scripts.timing.distances import surroundings
+from scripts.timing.distances import scene
 from scripts.timing.planning import lanes
 
 SECONDS, PIECES, SEEDS = 10.0, 40, 6
@@ -47,7 +47,7 @@ def run(repeats: int = 5) -> dict[str, Any]:
 
 def proofs(repeats: int) -> list[dict[str, Any]]:
     """Of joints of a Panda that swing for ten seconds among ten boxes, each with two frequencies."""
-    around = surroundings()
+    around = scene()
     if around is None:
         return []
     rows = []
@@ -67,7 +67,7 @@ def swing(robot: Robot, seed: int) -> tuple[Array, Array, Array, Array]:
     return middle, sizes, rng.uniform(0.3, 1.5, (2, robot.dof)), rng.uniform(0.0, 2 * np.pi, (2, robot.dof))
 
 
-def proven(around: Surroundings, middle: Array, sizes: Array, speeds: Array, phases: Array) -> Clearance:
+def proven(around: CollisionScene, middle: Array, sizes: Array, speeds: Array, phases: Array) -> Clearance:
     """How near anything comes while joints swing."""
 
     def joints(at: Array) -> Array:
@@ -82,8 +82,8 @@ def plans(case: str, repeats: int) -> list[dict[str, Any]]:
     """From the start of a motion clear of itself: a plan that looks at nothing, one beside boxes, one beside a ball."""
     file, link, lean = CASES[case]
     machine, task = FixedBase(file.read()), lanes(2, 0.3, 0.05, within=lean)
-    clear = plan(machine, task, search="start", clearance=CLEARANCE)
-    planned = partial(plan, machine, task, start=clear.at(0.0)["joints"], search="start")
+    clearance_constraints = plan(machine, task, search="start", clearance=CLEARANCE)
+    planned = partial(plan, machine, task, start=clearance_constraints.at(0.0)["joints"], search="start")
     spent, plain = least(partial(planned, clearance=None), repeats)
     rows = [{"robot": case, "plan": "plain", "plan_s": spent, "ratio": 1.0, "cost": plain.cost, "held": 0}]
     around: dict[str, Sequence[Shape]] = {
@@ -110,7 +110,7 @@ def least(work: Callable[[], Any], repeats: int) -> tuple[float, Any]:
 
 def apart(result: Plan, obstacles: Sequence[Shape]) -> Array:
     """How near a motion comes to each of some obstacles at samples. Shape (SAMPLES, obstacles), m."""
-    around = Surroundings(result.machine, obstacles)
+    around = CollisionScene(result.machine, obstacles)
     times = np.linspace(0.0, result.horizon, SAMPLES)
     near = distances_along(around, np.zeros(0), result.at(times)["joints"], times)
     beside = np.array([other for _, other in around.labels])

@@ -72,7 +72,7 @@ def write_problem(name: str, resolution: float, folder: Path) -> None:
     """Write a problem of the benchmark as the peer reads it, joints sampled so finely (rad; m: a tenth of it)."""
     from scipy.spatial.transform import Rotation
 
-    from models import Surroundings
+    from models import CollisionScene
     from tests.redundancy_benchmark import FOLDER, problem_of, tip_and_file
 
     problem = problem_of(name)
@@ -116,7 +116,9 @@ def write_problem(name: str, resolution: float, folder: Path) -> None:
         joint = ET.SubElement(root, "joint", name=f"to obstacle {k}", type="fixed")
         ET.SubElement(joint, "parent", link=base)
         ET.SubElement(joint, "child", link=f"obstacle {k}")
-    looked = {frozenset(pair) for pair in Surroundings(problem.machine, problem.boxes, ignored=problem.ignored).labels}
+    looked = {
+        frozenset(pair) for pair in CollisionScene(problem.machine, problem.boxes, ignored=problem.ignored).labels
+    }
     bodies = [link.name for link in robot.links if link.collisions] + [
         f"obstacle {k}" for k in range(len(problem.boxes))
     ]

@@ -9,7 +9,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from models import Box, FixedBase, Robot, Surroundings
+from models import Box, CollisionScene, FixedBase, Robot
 from ocp.motion.builders.clearance import ROUNDING
 from scripts import drawing
 from scripts.papers.run import text_table
@@ -24,7 +24,7 @@ HAND = ("hand", "finger")
 """What the names of links of the hand hold."""
 
 
-def surroundings() -> Surroundings | None:
+def scene() -> CollisionScene | None:
     """The arm and the boxes, at random but for half a metre about its axis; None where its URDF is not installed."""
     package, ending, options = ROBOTS["Panda"]
     file = urdf_file(package, ending)
@@ -37,10 +37,10 @@ def surroundings() -> Surroundings | None:
         turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
         if np.hypot(*place[:2]) > 0.35:
             boxes.append(Box(rng.uniform(0.05, 0.3, size=3), place, turn * np.sign(np.linalg.det(turn))))
-    return Surroundings(FixedBase(Robot.from_urdf(file, **options)), boxes)
+    return CollisionScene(FixedBase(Robot.from_urdf(file, **options)), boxes)
 
 
-def functions(around: Surroundings, pairs: list[int]) -> dict[str, Any]:
+def functions(around: CollisionScene, pairs: list[int]) -> dict[str, Any]:
     """Functions of the joints, by what they tell and how."""
     q, base = ca.SX.sym("q", around.machine.joint_size), ca.DM(0, 1)
     apart = around.distances(base, q, pairs=pairs, rounding=ROUNDING)
@@ -55,7 +55,7 @@ def functions(around: Surroundings, pairs: list[int]) -> dict[str, Any]:
 
 def run(repeats: int = 5) -> dict[str, Any]:
     """Processor time of one call by each means, us: the least of several bursts."""
-    around = surroundings()
+    around = scene()
     rows: list[dict[str, Any]] = []
     if around is None:
         return {"rows": rows, "goal_us": GOAL}

@@ -12,7 +12,7 @@ import models
 from models import FixedBase, Machine, Robot, smooth
 from models.arrays import Array
 from ocp import Plan, TipTask, plan
-from ocp.motion.search.postures import SearchKind
+from ocp.motion.search.configurations import SearchKind
 from scripts import drawing
 from scripts.papers.run import progress, text_table
 from scripts.robots.robots import PANDA, SPACE_ARM, UR5

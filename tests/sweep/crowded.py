@@ -17,9 +17,9 @@ import casadi as ca
 import coal
 import numpy as np
 
-from models import Box, FixedBase, Surroundings
+from models import Box, CollisionScene, FixedBase
 from ocp import Plan, ProblemError, SolveError, TipTask, inverse_kinematics, plan
-from ocp.motion.local.touching import distances_along
+from ocp.motion.local.collisions import distances_along
 from tests.models.shapes.shape_oracles import in_coal
 from tests.ocp.motion.plan.motions import pair
 from tests.ocp.motion.tasks.space_tasks import panda, ur5
@@ -51,8 +51,8 @@ class Crowd:
 
 
 @cache
-def alone(robot: str) -> Surroundings:
-    return Surroundings(ROBOTS[robot]())
+def alone(robot: str) -> CollisionScene:
+    return CollisionScene(ROBOTS[robot]())
 
 
 def crowd(robot: str, seed: int) -> Crowd:
@@ -73,7 +73,7 @@ def crowd(robot: str, seed: int) -> Crowd:
             turn *= np.sign(np.linalg.det(turn))
             at = first + way * rng.uniform(-0.2, 1.2) + rng.normal(size=3) * 0.25
             boxes.append(Box(rng.uniform(0.05, 0.25, size=3), at, turn))
-        around = Surroundings(machine, boxes, CLEARANCE)
+        around = CollisionScene(machine, boxes, CLEARANCE)
         if distances_along(around, np.zeros(0), joints[None], np.zeros(1)).min() < CLEARANCE:
             continue
 
@@ -88,7 +88,7 @@ def crowd(robot: str, seed: int) -> Crowd:
 
 def least_by_coal(result: Plan, boxes: Sequence[Box]) -> float:
     """Least distance by coal of all pairs at 1000 times, and of those that come near at sixty times as many."""
-    around = Surroundings(result.machine, boxes, CLEARANCE)
+    around = CollisionScene(result.machine, boxes, CLEARANCE)
     pairs = np.arange(len(around.pairs))
     times = np.linspace(0.0, result.horizon, COARSE + 1)
     found = _by_coal(around, np.asarray(result.at(times)["joints"]), pairs)
@@ -102,7 +102,7 @@ def least_by_coal(result: Plan, boxes: Sequence[Box]) -> float:
     return least
 
 
-def _by_coal(around: Surroundings, joints: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+def _by_coal(around: CollisionScene, joints: np.ndarray, pairs: np.ndarray) -> np.ndarray:
     """Distances of some pairs at joints (M, n). Shape (M, all pairs), inf for those left out.
 
     Hulls of meshes are as far apart as they are, or as the nearest of their covers, whichever is farther.
@@ -148,8 +148,8 @@ def planned(given: Crowd, **options: Any) -> Plan | str:
 
 def by_postures(given: Crowd, count: int) -> Plan | None:
     """The first plan from one of so many postures that are clear at the start."""
-    around = Surroundings(given.machine, given.boxes, CLEARANCE)
-    found = inverse_kinematics(given.machine, given.tasks, surroundings=around, starts=4 * count, near=given.start)
+    around = CollisionScene(given.machine, given.boxes, CLEARANCE)
+    found = inverse_kinematics(given.machine, given.tasks, scene=around, starts=4 * count, near=given.start)
     for posture in found[:count]:
         result = planned(given, start=posture.joints, search="start")
         if isinstance(result, Plan):

@@ -37,7 +37,7 @@ import yaml
 from mcap.writer import CompressionType
 from mcap_ros2.writer import Writer
 
-from models import Box, FixedBase, ModelError, Moving, Robot, Sphere, planar_chain
+from models import Box, FixedBase, ModelError, MovingObstacle, Robot, Sphere, planar_chain
 from models.shapes.mesh_files import read_mesh
 from models.shapes.pairs import checked_pairs
 from ocp import AuditError, Collocation, Plan, Problem, ProblemError, Solution, SolveError, TipTask, plan, solve
@@ -416,7 +416,7 @@ def saved(thing: Plan | Solution) -> bytes:
 def plan_file() -> bytes:
     """A plan among obstacles that stand and move."""
     arm = FixedBase(planar_chain([0.5, 0.4, 0.3], [1.0] * 3))
-    ball = Moving(Sphere(0.05, (0, 0, 0)), lambda time: (2.0, 1.0 + 0.3 * time, 0.0))
+    ball = MovingObstacle(Sphere(0.05, (0, 0, 0)), lambda time: (2.0, 1.0 + 0.3 * time, 0.0))
     around = [ball, Box((0.1, 0.1, 0.1), position=(0, -2, 0))]
     task = TipTask(rows=(3, 4), velocity=(-0.05, 0.02))
     return saved(plan(arm, task, 1.0, start=(0.3, 0.6, 0.5), obstacles=around, search="start"))

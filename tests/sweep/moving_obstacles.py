@@ -19,10 +19,10 @@ import casadi as ca
 import coal
 import numpy as np
 
-from models import Box, Capsule, FixedBase, Mesh, ModelError, Moving, Sphere, Surroundings
+from models import Box, Capsule, CollisionScene, FixedBase, Mesh, ModelError, MovingObstacle, Sphere
 from ocp import Collocation, Problem, ProblemError, Solution, solve
 from ocp.audit.clearance import Clearance, clearance
-from ocp.motion.builders.clearance import CLEARANCE, Clear
+from ocp.motion.builders.clearance import CLEARANCE, ClearanceConstraints
 from ocp.problem.formulation import Formulation
 from tests.models.shapes.shape_oracles import in_coal
 from tests.ocp.motion.tasks.space_tasks import panda, ur5
@@ -46,7 +46,7 @@ Way = Callable[[Any], Any]
 class Obstacle:
     """An obstacle, the name of its motion, and times (s) at which something happens, each with a width about it."""
 
-    moving: Moving
+    moving: MovingObstacle
     motion: str
     events: list[tuple[float, float]]
 
@@ -79,7 +79,7 @@ def obstacle(robot: str, seed: int) -> Obstacle:
     aim = tip * rng.uniform(0.5, 1.1) + rng.normal(size=3) * 0.08
     far = aim + rng.normal(size=3) * rng.uniform(0.3, 1.0)
     position, rotation, events = MOTIONS[kind](rng, when, aim, far)
-    return Obstacle(Moving(_shape(rng, thin=kind == "spins"), position, rotation), kind, events)
+    return Obstacle(MovingObstacle(_shape(rng, thin=kind == "spins"), position, rotation), kind, events)
 
 
 def _shape(rng: np.random.Generator, thin: bool) -> Any:
@@ -166,18 +166,18 @@ MOTIONS: dict[str, Any] = {
 """Motions: of a generator, a time, where it goes then and where it comes from, to position, rotation and events."""
 
 
-def proven(robot: str, given: Obstacle) -> tuple[Surroundings, Clearance]:
+def proven(robot: str, given: Obstacle) -> tuple[CollisionScene, Clearance]:
     """What is proven of the motion beside an obstacle, of the pairs with it alone."""
     machine = ROBOTS[robot]()
-    around = Surroundings(machine, [given.moving])
+    around = CollisionScene(machine, [given.moving])
     problem, q = problem_of(machine, ENDS[robot])
-    Clear(around).declare(problem, machine.base_home(), q, horizon=SECONDS)
+    ClearanceConstraints(around).declare(problem, machine.base_home(), q, horizon=SECONDS)
     beside = [k for k, pair in enumerate(around.labels) if "obstacle 0" in pair]
     apart = problem.declared.apart[CLEARANCE].of(beside)
     return around, clearance(Formulation.of(problem), apart, motion(robot), np.zeros(0))
 
 
-def least_by_coal(robot: str, given: Obstacle, around: Surroundings) -> dict[tuple[str, str], float]:
+def least_by_coal(robot: str, given: Obstacle, around: CollisionScene) -> dict[tuple[str, str], float]:
     """Least distances of the obstacle from each body, m."""
     about = [np.linspace(at - width, at + width, CLOSE + 1) for at, width in given.events]
     times = np.unique(np.clip(np.concatenate([np.linspace(0, SECONDS, COARSE + 1), *about]), 0.0, SECONDS))
@@ -220,9 +220,9 @@ def result(robot: str, seed: int) -> Row:
     above = [near.bodies for near in found.pairs if not near.least <= max(known[near.bodies], 0.0) + EXACT]
     least = min(near.least for near in found.pairs)
     said = "proven" if not worst.missed else "in collision" if worst.distance < 0 else "not proven"
-    touches = said == "proven" and min(known.values()) < -EXACT
+    find_collisions = said == "proven" and min(known.values()) < -EXACT
     numbers = {"least": None if not np.isfinite(least) else least, "by_coal": min(known.values())}
-    wrong = [f"above the truth: {pair}" for pair in above] + ["touches"] * touches
+    wrong = [f"above the truth: {pair}" for pair in above] + ["touches"] * find_collisions
     return row | numbers | {"said": said, "why": found.reason, "wrong": wrong}
 
 

@@ -9,11 +9,12 @@ from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
-from models import FixedBase, FreeFloating, Machine, Robot, Standing, Support, Surroundings, footprint
+from models import CollisionScene, FixedBase, FreeFloating, Machine, Robot, Standing, Support, footprint
 from models.arrays import Array, ArrayInput
 from models.robot.dynamics import GRAVITY
 from models.shapes.mesh_files import find_mesh
 from models.shapes.shapes import Shape
+from ocp.app.check.collisions import clearance_rows, path_rows, within_limits
 from ocp.app.check.joint_limits import (
     Row,
     RowVerdict,
@@ -25,7 +26,6 @@ from ocp.app.check.joint_limits import (
 )
 from ocp.app.check.oddities import Fault, Readable, readable
 from ocp.app.check.pieces import Motion, Rule
-from ocp.app.check.surroundings import clearance_rows, path_rows, within_limits
 from ocp.app.check.suspicions import doubtful_times, exchanged_joints
 from ocp.app.files import RawTrajectory, Waypoints
 from ocp.app.files.trajectory import UNITS
@@ -369,7 +369,7 @@ def _look_around(
         lost = [name for name, shape in shapes if find_mesh(shape.file, shape.folder or None, asked.folders) is None]
         if lost:
             unseen.append(f"clearance of {', '.join(dict.fromkeys(lost))}, whose meshes are missing")
-    around = Surroundings(
+    around = CollisionScene(
         within_limits(machine, motion),
         asked.obstacles,
         asked.clearance,

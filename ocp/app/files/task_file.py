@@ -163,7 +163,7 @@ class Task:
 
     Attributes:
         machine: Read from the robot's file. task: Of its tip.
-        options: Keywords of `ocp.plan`; of `ocp.plan_in_pieces` where it is to be done `in_pieces`.
+        options: Keywords of `ocp.plan`; of `ocp.plan_in_segments` where it is to be done `in_pieces`.
         outputs: Files to write, by kind of OUTPUTS, all below the `output_folder`. period: Of samples in them, s.
         file, urdf: Names of the task's own file and of the robot's.
     """

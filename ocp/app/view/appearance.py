@@ -29,8 +29,8 @@ __all__ = [
     "FAULT",
     "LIMIT",
     "PLAN",
+    "SCENE",
     "SURFACE_STYLE",
-    "SURROUNDINGS",
     "TIP",
     "TIP_FRAME",
     "Appearance",
@@ -306,7 +306,7 @@ FAULT = "#CC79A7"
 """Of where it does."""
 TIP = "#009E73"
 """Of the tip's way."""
-SURROUNDINGS = "#6E6E6E"
+SCENE = "#6E6E6E"
 """Of what stands around."""
 
 

@@ -23,8 +23,8 @@ from ocp.app.view.appearance import (
     FAULT,
     LIMIT,
     PLAN,
+    SCENE,
     SURFACE_STYLE,
-    SURROUNDINGS,
     TIP,
     appearance_of,
     frames_along,
@@ -189,7 +189,7 @@ def scene(
         corners, faces = one.solid(before)
         if one.rotations is not None and one.positions is not None:
             corners = corners @ one.rotations[-1].T + one.positions[-1]
-        still.append(part_of("", corners, faces, (*to_rgb(SURROUNDINGS), 1.0)))
+        still.append(part_of("", corners, faces, (*to_rgb(SCENE), 1.0)))
         if one.normal is None:
             clouds.append(corners)
     if machine.robot.tip is not None:

@@ -16,12 +16,12 @@ from typing import Any, Protocol, Self, TypeVar
 import casadi as ca
 import numpy as np
 
-from models import ModelError, Surroundings
+from models import CollisionScene, ModelError
 from models.arrays import Array
 from ocp.audit.audit import Audit
 from ocp.audit.clearance import Clearance, Track, clearance_along
 from ocp.errors import ProblemError, SolveError, checked_instance, checked_mapping, checked_nonnegative
-from ocp.motion.local.touching import Touch, hulls_of, touches
+from ocp.motion.local.collisions import Collision, find_collisions, hulls_of
 from ocp.problem.declarations import Variable
 from ocp.problem.hulls import frames_of
 from ocp.problem.problem import Problem
@@ -30,8 +30,19 @@ from ocp.problem.values import Sampler, constant
 from ocp.solution import Solution
 
 __all__ = [
-    "APART", "CLEARANCE", "LOOKS", "MARGIN", "ROUNDING", "Clear", "Keeping", "Kept", "clearance_of", "keeping_clear",
-    "of_clearance", "touching_error", "widened",
+    "APART",
+    "CLEARANCE",
+    "LOOKS",
+    "MARGIN",
+    "ROUNDING",
+    "ClearanceConstraints",
+    "Keeping",
+    "Kept",
+    "clearance_of",
+    "collision_error",
+    "of_clearance",
+    "solve_with_clearance",
+    "widened",
 ]  # fmt: skip
 
 CLEARANCE, APART = "clearance", "apart"
@@ -45,39 +56,39 @@ MARGIN = 5e-5
 
 
 @dataclass(frozen=True, eq=False)
-class Clear:
+class ClearanceConstraints:
     """What a motion has to stay clear of, and by how much.
 
     Attributes:
-        surroundings: Of the machine, with the clearance of every pair.
+        scene: Of the machine, with the clearance of every pair.
         margins: Pairs that are held apart by constraints, by their places, and by how much more than that, m.
 
     Raises:
         ProblemError: No surroundings, a pair that there is none of, a margin that is no number.
     """
 
-    surroundings: Surroundings
+    scene: CollisionScene
     margins: Mapping[int, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        checked_instance("clear: surroundings", self.surroundings, Surroundings)
-        for pair, margin in checked_mapping("clear: margins", self.margins).items():
-            checked_nonnegative("clear: margins", margin)
+        checked_instance("clearance_constraints: scene", self.scene, CollisionScene)
+        for pair, margin in checked_mapping("clearance_constraints: margins", self.margins).items():
+            checked_nonnegative("clearance_constraints: margins", margin)
             if (
                 isinstance(pair, bool)
                 or not isinstance(pair, int | np.integer)
-                or not 0 <= pair < len(self.surroundings.pairs)
+                or not 0 <= pair < len(self.scene.pairs)
             ):
-                words = f"clear: there is no pair {pair!r}, only {len(self.surroundings.pairs)}"
-                raise ProblemError(words, name="margins", value=pair, limit=len(self.surroundings.pairs))
+                words = f"clearance_constraints: there is no pair {pair!r}, only {len(self.scene.pairs)}"
+                raise ProblemError(words, name="margins", value=pair, limit=len(self.scene.pairs))
 
-    def holding(self, pairs: Sequence[int]) -> Clear:
+    def holding(self, pairs: Sequence[int]) -> ClearanceConstraints:
         """The same with some pairs more held apart."""
         return replace(self, margins={**{int(pair): MARGIN for pair in pairs}, **self.margins})
 
-    def widened(self, proofs: Sequence[Clearance]) -> Clear:
+    def widened(self, proofs: Sequence[Clearance]) -> ClearanceConstraints:
         """The same with what came too near held apart, farther by what it missed."""
-        return replace(self, margins=widened(self.margins, self.surroundings.labels, proofs))
+        return replace(self, margins=widened(self.margins, self.scene.labels, proofs))
 
     def declare(
         self,
@@ -106,7 +117,7 @@ class Clear:
             ProblemError: A moving obstacle and a free horizon; obstacles whose motion is not
                 defined all the time, or made of operations without bounds.
         """
-        around, time = self.surroundings, begin + pace * problem.time
+        around, time = self.scene, begin + pace * problem.time
         _check_limits(around, problem.declared.states[joints_name])
         if horizon is not None:
             try:
@@ -137,9 +148,9 @@ class Clear:
             least = [around.clearance + self.margins[pair] for pair in pairs]
             problem.path(f"{APART}{suffix}", apart, lower=least, unit="m")
 
-    def touches(self, base: Array, joints: Array, times: Array) -> list[Touch]:
-        """The pairs that come nearer than they may at some samples of a motion, see `local.touching.touches`."""
-        return touches(self.surroundings, base, joints, times)
+    def find_collisions(self, base: Array, joints: Array, times: Array) -> list[Collision]:
+        """The pairs that come nearer than they may at some samples of a motion, see `local.collisions`."""
+        return find_collisions(self.scene, base, joints, times)
 
 
 class Keeping(Protocol):
@@ -164,7 +175,7 @@ def widened(
 
 
 def clearance_of(
-    around: Surroundings,
+    around: CollisionScene,
     joints: Callable[[Array], Array],
     breaks: Array,
     horizon: float,
@@ -201,7 +212,7 @@ def clearance_of(
     return clearance_along(apart, frames)
 
 
-def _check_limits(around: Surroundings, joints: Variable) -> None:
+def _check_limits(around: CollisionScene, joints: Variable) -> None:
     """Raise where joints may leave the limits by which pairs were left that never touch."""
     robot = around.machine.robot
     kept = (constant(joints.lower) >= robot.lower) & (constant(joints.upper) <= robot.upper)
@@ -217,11 +228,11 @@ Kept = TypeVar("Kept", bound=Keeping | None)
 """What a planner is told to keep apart, or None."""
 
 
-def keeping_clear(clear: Kept, run: Callable[[Kept], Solution]) -> Solution:
+def solve_with_clearance(clearance_constraints: Kept, run: Callable[[Kept], Solution]) -> Solution:
     """What ``run`` plans, with the bodies held apart that come too near in what it planned before.
 
     Args:
-        clear: What to stay clear of; None for nothing.
+        clearance_constraints: What to stay clear of; None for nothing.
         run: Solves and audits; raises SolveError that names the clearance where that alone is wrong with its solution.
 
     Raises:
@@ -230,16 +241,16 @@ def keeping_clear(clear: Kept, run: Callable[[Kept], Solution]) -> Solution:
     touching: SolveError | None = None
     for _ in range(LOOKS):
         try:
-            return run(clear)
+            return run(clearance_constraints)
         except SolveError as error:
-            if clear is None or error.solution is None or not of_clearance(error.name):
+            if clearance_constraints is None or error.solution is None or not of_clearance(error.name):
                 if touching is None:
                     raise
                 words = f"{touching}; held apart, no motion was found: {error}"
                 found = {"value": touching.value, "limit": touching.limit, "time": touching.time}
                 raise SolveError(words, error.solution, error.conflicts, name=touching.name, **found) from error
             touching = error
-            clear = clear.widened(list(error.solution.audit().clearances.values()))
+            clearance_constraints = clearance_constraints.widened(list(error.solution.audit().clearances.values()))
     assert touching is not None
     raise touching
 
@@ -249,7 +260,7 @@ def of_clearance(name: Any) -> bool:
     return str(name).rpartition(".")[2].startswith(CLEARANCE)
 
 
-def touching_error(audit: Audit, solution: Solution) -> SolveError | None:
+def collision_error(audit: Audit, solution: Solution) -> SolveError | None:
     """What says that bodies come too near in a solution that is sound otherwise; None where it is not that."""
     failures = audit.failures
     if not failures or any(finding.name not in audit.clearances for finding in failures):

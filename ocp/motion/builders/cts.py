@@ -22,7 +22,7 @@ import numpy as np
 from models import ModelError
 from models.arrays import Array
 from models.cts.best_roll import optimal_inverse
-from models.cts.clearance import Radii, Surroundings, checked_clearance, clearances, nearness
+from models.cts.clearance import CollisionScene, Radii, checked_clearance, clearances, nearness
 from models.cts.rig import HOME, Branch, Rig, Tunnel, checked_branch, joints_of, posture_at
 from models.cts.roll import index_harmonics
 from models.cts.table import checked_targets
@@ -109,7 +109,7 @@ def roll_problem(
     acceleration_limit: float = np.inf,
     start_roll: float | None = None,
     start_rate: float | None = None,
-    surroundings: Surroundings | None = None,
+    scene: CollisionScene | None = None,
     clearance: float = 0.0,
     clearance_weight: float = 0.0,
     clearance_width: float = 0.05,
@@ -129,7 +129,7 @@ def roll_problem(
         rate_weight, acceleration_weight: w in s^2 and v in s^4; v keeps the control smooth.
         rate_limit, acceleration_limit: rad/s and rad/s^2.
         start_roll, start_rate: At time 0; free where None.
-        surroundings: What to keep away from; None for nothing.
+        scene: What to keep away from; None for nothing.
         clearance: Least distance from it, m; -inf for no constraint.
         clearance_weight, clearance_width: Of the term weight exp(-distance / width) of the index; width in m.
         softness: Width of the smooth minimum of all distances, m, see soft_minimum.
@@ -178,8 +178,8 @@ def roll_problem(
     index = index_harmonics(rig, tunnel, x).value(c, s)
     near: Any = 0.0
     short = _beyond(reached, -LARGEST_SINE, LARGEST_SINE) + _beyond(limited, rig.lower[held], rig.upper[held])
-    if surroundings is not None:
-        gap = soft_minimum(list(clearances(rig, joints, surroundings, radii).values()), softness)
+    if scene is not None:
+        gap = soft_minimum(list(clearances(rig, joints, scene, radii).values()), softness)
         near = nearness(gap, clearance_weight, clearance_width)
         if np.isfinite(clearance):
             short += ca.fmax(clearance + SEARCH.margin * softness - gap, 0)
@@ -222,7 +222,7 @@ def roll_problem(
     if held:
         unit = ", ".join(dict.fromkeys("rad" if k else "m" for k in held))  # the first joint slides
         problem.path("limits", along("joints", limited), rig.lower[held], rig.upper[held], unit=unit)
-    if surroundings is not None and np.isfinite(clearance):
+    if scene is not None and np.isfinite(clearance):
         problem.path("clearance", along("gap", gap), clearance, unit="m")
     running = along("index", index + near)
     problem.minimize(running=running + rate_weight * rate**2 + acceleration_weight * pull**2)

@@ -28,8 +28,15 @@ from models.robot.dynamics import Wrench
 from models.spatial import quaternion_product
 from ocp.console import interruptible
 from ocp.errors import NOT_NUMBERS, ProblemError, checked_choice, checked_each, checked_instance, floats
-from ocp.motion.builders.clearance import Clear
-from ocp.motion.builders.drives import Effort, JointFriction, Motors, checked_motors, joint_torques, nonnegative_each
+from ocp.motion.builders.actuator_limits import (
+    Effort,
+    JointFriction,
+    Motors,
+    checked_motors,
+    joint_torques,
+    nonnegative_each,
+)
+from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.standing.problem import FreeTime
 from ocp.motion.tasks.checks import (
     check_length,
@@ -87,7 +94,7 @@ def dynamics_problem(
     start: Literal["rest", "free"] | Any = "rest",
     end: Literal["rest", "free"] | Any = "rest",
     end_base: Any = None,
-    clear: Clear | None = None,
+    clearance_constraints: ClearanceConstraints | None = None,
     symbols: Any = ca.SX,
 ) -> Problem:
     """A motion within the limits of the drives, at the least effort, energy or time.
@@ -113,7 +120,7 @@ def dynamics_problem(
             (n,): wheels that hold the momentum of a base at rest turn.
         end_base: Configuration of a floating base at the end, nan where free; a quaternion is given whole or not at
             all. Shape (base_size,).
-        clear: What the motion has to stay clear of, see `ocp.motion.builders.clearance`.
+        clearance_constraints: What the motion has to stay clear of, see `ocp.motion.builders.clearance`.
         symbols: casadi.SX, or casadi.MX when a task calls an interpolant.
 
     Raises:
@@ -154,10 +161,12 @@ def dynamics_problem(
     running = _declare_drives(problem, machine, motion, torques, bounds, effort)
     if equations is not None:
         _declare_tasks(problem, equations, ends, motion, duration)
-    if clear is not None:
-        clear = checked_instance("dynamics_problem: clear", clear, Clear)
+    if clearance_constraints is not None:
+        clearance_constraints = checked_instance("dynamics_problem: clear", clearance_constraints, ClearanceConstraints)
         name = "base" if machine.base_size else ""
-        clear.declare(problem, motion.base, motion.joints, base_name=name, horizon=None if free else duration)
+        clearance_constraints.declare(
+            problem, motion.base, motion.joints, base_name=name, horizon=None if free else duration
+        )
     problem.minimize(running=running, terminal=effort.time * final)
     return problem
 

@@ -40,8 +40,14 @@ from ocp.errors import (
     checked_text,
 )
 from ocp.methods import solve
-from ocp.motion.builders.clearance import Clear, Kept, keeping_clear, of_clearance, touching_error
-from ocp.motion.builders.drives import Motors, checked_motors
+from ocp.motion.builders.actuator_limits import Motors, checked_motors
+from ocp.motion.builders.clearance import (
+    ClearanceConstraints,
+    Kept,
+    collision_error,
+    of_clearance,
+    solve_with_clearance,
+)
 from ocp.motion.builders.dynamics import AskedOfDrives, dynamics_problem
 from ocp.motion.builders.standing.problem import FreeTime
 from ocp.motion.tasks.checks import checked_horizon
@@ -85,7 +91,7 @@ def dynamics_phases(
     legs: Sequence[Leg],
     *,
     total: float | None = None,
-    clear: Clear | None = None,
+    clearance_constraints: ClearanceConstraints | None = None,
     **asked: Unpack[AskedOfDrives],
 ) -> Phases:
     """Legs one after the other as one problem, at the least cost of all together.
@@ -95,7 +101,7 @@ def dynamics_phases(
         start_joints: Shape (n,), rad or m.
         legs: At least one; all have the joints of the machine.
         total: Time of all legs together, s, where theirs are free; None: as long as is best.
-        clear: What the motion has to stay clear of, on legs whose machine is that of its surroundings.
+        clearance_constraints: What the motion has to stay clear of, on legs whose machine is that of its surroundings.
         asked: Of all legs, as of `dynamics_problem`; `start` and `start_base` where the first begins, `end_base`
             where the last ends.
 
@@ -105,8 +111,8 @@ def dynamics_phases(
             that the legs cannot have, what a leg says itself.
     """
     given = checked_legs(legs)
-    if clear is not None:
-        checked_instance("dynamics_phases: clear", clear, Clear)
+    if clearance_constraints is not None:
+        checked_instance("dynamics_phases: clear", clearance_constraints, ClearanceConstraints)
     for what in ("end_joints", "tasks", "end"):
         if what in asked:
             raise ProblemError(f"{what}: legs say it themselves, Leg({what}=...)", name=what, value=asked.get(what))
@@ -127,11 +133,22 @@ def dynamics_phases(
         own["start_base"] = asked.get("start_base") if k == 0 else np.full(movers[k].base_size, np.nan)
         if k == len(given) - 1:
             own["end_base"] = asked.get("end_base")
-        kept = clear if clear is not None and clear.surroundings.machine is movers[k] else None
+        kept = (
+            clearance_constraints
+            if clearance_constraints is not None and clearance_constraints.scene.machine is movers[k]
+            else None
+        )
         problems[name] = dynamics_problem(
-            movers[k], begin, leg.horizon, end_joints=leg.joints, tasks=leg.tasks, end=leg.end, clear=kept,
-            **own, **options,
-        )  # fmt: skip
+            movers[k],
+            begin,
+            leg.horizon,
+            end_joints=leg.joints,
+            tasks=leg.tasks,
+            end=leg.end,
+            clearance_constraints=kept,
+            **own,
+            **options,
+        )
         begin = leg.joints
     phases = Phases("legs", problems)
     for k in range(1, len(given)):
@@ -231,7 +248,7 @@ def plan_dynamics(
     method: Collocation | None = None,
     options: Mapping[str, Any] | None = None,
     tolerances: Mapping[str, float] | None = None,
-    clear: Clear | None = None,
+    clearance_constraints: ClearanceConstraints | None = None,
     **asked: Unpack[AskedOfDrives],
 ) -> Solution:
     """Solve `dynamics_problem`, or the legs of `dynamics_phases`, and audit the plan.
@@ -244,7 +261,7 @@ def plan_dynamics(
     best: a small weight of accelerations or torques beside it says it.
 
     Args:
-        machine, start_joints, clear, asked: As for `dynamics_problem`.
+        machine, start_joints, clearance_constraints, asked: As for `dynamics_problem`.
         horizon: Final time, s, or FreeTime(...); or the legs of the motion, each with its own: the plan has a phase for
             each then, `plan.phase(name)`. total: Of legs, see `dynamics_phases`.
         method: The first mesh, controls at the points; 20 Legendre intervals of degree 5 if None, with nodes where
@@ -263,18 +280,22 @@ def plan_dynamics(
             mover = leg.machine or mover
             driven[leg.name or f"leg {k + 1}"] = mover, asked.get("limits")
 
-        def all_legs(clear: Clear | None) -> Problem:
-            return dynamics_phases(machine, start_joints, legs, total=total, clear=clear, **asked)
+        def all_legs(clearance_constraints: ClearanceConstraints | None) -> Problem:
+            return dynamics_phases(
+                machine, start_joints, legs, total=total, clearance_constraints=clearance_constraints, **asked
+            )
 
-        return within_limits(all_legs, clear, method, (), options, tolerances, driven)
+        return within_limits(all_legs, clearance_constraints, method, (), options, tolerances, driven)
     if total is not None:
         raise ProblemError("total: of legs alone; the horizon is the whole time", name="total", value=total)
 
-    def declare(clear: Clear | None) -> Problem:
-        return dynamics_problem(machine, start_joints, horizon, clear=clear, **asked)
+    def declare(clearance_constraints: ClearanceConstraints | None) -> Problem:
+        return dynamics_problem(machine, start_joints, horizon, clearance_constraints=clearance_constraints, **asked)
 
     at = () if isinstance(horizon, FreeTime) else breaks_of(asked.get("tasks", ()), checked_horizon(horizon))
-    return within_limits(declare, clear, method, at, options, tolerances, {"": (machine, asked.get("limits"))})
+    return within_limits(
+        declare, clearance_constraints, method, at, options, tolerances, {"": (machine, asked.get("limits"))}
+    )
 
 
 def breaks_of(tasks: TipTask | Sequence[TipTask], horizon: float) -> Sequence[float]:
@@ -286,7 +307,7 @@ def breaks_of(tasks: TipTask | Sequence[TipTask], horizon: float) -> Sequence[fl
 
 def within_limits(
     declare: Callable[[Kept], Problem],
-    clear: Kept,
+    clearance_constraints: Kept,
     method: Collocation | None,
     breaks: Sequence[float],
     options: Mapping[str, Any] | None,
@@ -316,11 +337,11 @@ def within_limits(
                 raise
         return planned(problem, None)
 
-    def run(clear: Kept) -> Solution:
-        return planned(declare(clear), touching)
+    def run(clearance_constraints: Kept) -> Solution:
+        return planned(declare(clearance_constraints), touching)
 
     try:
-        return keeping_clear(clear, run)
+        return solve_with_clearance(clearance_constraints, run)
     except SolveError as error:
         raise _by_joint(error, driven) from error
 
@@ -353,7 +374,7 @@ def _first_that_holds(
             audit = plan.audit(tolerances=tolerances)
             if audit.passed:
                 return plan
-            if touching := touching_error(audit, plan):
+            if touching := collision_error(audit, plan):
                 raise touching
             guess = last = plan
             feasible += [plan] if audit.feasible else []

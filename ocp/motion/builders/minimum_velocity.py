@@ -16,10 +16,10 @@ from models import Machine
 from models.arrays import Array
 from ocp.console import interruptible
 from ocp.errors import ProblemError, checked_each, checked_flag, checked_instance, checked_positive
-from ocp.motion.builders.clearance import Clear
+from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.tool_motion import ToolMotion, stretches_of, tool_motion_problem
 from ocp.motion.local.inverse_kinematics import inverse_kinematics
-from ocp.motion.local.rates import Followed, follow
+from ocp.motion.local.rates import LocalMotion, follow
 from ocp.motion.tasks.checks import checked_configuration, checked_tasks, checked_weights, horizon_of, inside_limits
 from ocp.motion.tasks.equations import bind
 from ocp.motion.tasks.limits import JointBounds, Limits
@@ -45,7 +45,7 @@ def minimum_velocity_problem(
     weights: Any = None,
     limits: Limits | None = None,
     guess_damping: float = 0.01,
-    clear: Clear | None = None,
+    clearance_constraints: ClearanceConstraints | None = None,
 ) -> Problem:
     """Do tasks while the integral of half the squared joint rates, 1/2 |x2'|^2, is least (27).
 
@@ -68,7 +68,7 @@ def minimum_velocity_problem(
         guess_damping: Damping of the local motion that is the guess, relative to the root mean square of the singular
             values of the tasks' Jacobian. Small values start near the pseudo-inverse; large ones avoid its singular
             passages and may lead to another extremal.
-        clear: What the motion has to stay clear of, see `ocp.motion.builders.clearance`.
+        clearance_constraints: What the motion has to stay clear of, see `ocp.motion.builders.clearance`.
 
     Returns:
         The problem, its guesses attached; nothing is solved but the local motion.
@@ -101,11 +101,11 @@ def minimum_velocity_problem(
             checked_tasks(stretch.equations, base, joints, duration, start=begins)
     bounds, names = limits.bounds(machine, ("velocity",)), machine.robot.joint_names
     joints = inside_limits("start_joints", names, joints, bounds.lower, bounds.upper, "start inside them")
-    if clear is not None:
-        checked_instance("clear", clear, Clear)
+    if clearance_constraints is not None:
+        checked_instance("clearance_constraints", clearance_constraints, ClearanceConstraints)
     motion = tool_motion_problem(
         machine, stretches, base=base, start=None if start_joints is None else joints, reference=joints,
-        cyclic=cyclic, weights=heavy, bounds=bounds, clear=clear,
+        cyclic=cyclic, weights=heavy, bounds=bounds, clearance_constraints=clearance_constraints,
     )  # fmt: skip
     _attach_guess(motion, base, joints, heavy, bounds, guess_damping)
     return motion.problem
@@ -115,13 +115,13 @@ def _attach_guess(
     motion: ToolMotion, base: Array, joints: Array, weights: Array, bounds: JointBounds, damping: float
 ) -> None:
     """Make the damped local motion through all stretches the guess of states and controls."""
-    followed: list[Followed] = []
+    followed: list[LocalMotion] = []
     place, at = base[None], joints[None]
     for stretch in motion.stretches:
         steps = max(int(np.ceil(STEPS_OF_GUESS * stretch.duration / motion.horizon)), 1)
         times = np.union1d(np.linspace(stretch.begin, stretch.end, steps + 1), stretch.breaks)
         if stretch.equations is None:
-            followed.append(Followed.resting(times, place, at))
+            followed.append(LocalMotion.resting(times, place, at))
         else:
             told: dict[str, Any] = {"weights": weights, "damping": damping}
             followed.append(follow(stretch.equations, at, place, times, lower=bounds.lower, upper=bounds.upper, **told))

@@ -21,9 +21,9 @@ from models import Machine
 from models.arrays import Array
 from ocp.direct.guess import Samples
 from ocp.errors import ProblemError
-from ocp.motion.builders.clearance import Clear
-from ocp.motion.builders.drives import checked_motors, joint_torques
-from ocp.motion.local.rates import Followed
+from ocp.motion.builders.actuator_limits import checked_motors, joint_torques
+from ocp.motion.builders.clearance import ClearanceConstraints
+from ocp.motion.local.rates import LocalMotion
 from ocp.motion.tasks.checks import check_closed, check_speed
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.geometry import is_holonomic
@@ -103,7 +103,7 @@ class ToolMotion:
     horizon: float
     breaks: Array
 
-    def guess(self, followed: Sequence[Followed], number: int) -> dict[str, Any]:
+    def guess(self, followed: Sequence[LocalMotion], number: int) -> dict[str, Any]:
         """The motion `number` of those that were followed through each stretch, as a guess for a solve."""
         given: dict[str, Any] = {}
         for stretch, part in zip(self.stretches, followed, strict=True):
@@ -165,7 +165,7 @@ def tool_motion_problem(
     bounds: JointBounds,
     time_cost: float | None = None,
     driven: bool = False,
-    clear: Clear | None = None,
+    clearance_constraints: ClearanceConstraints | None = None,
     held: Array | None = None,
 ) -> ToolMotion:
     """Do tasks while the integral of half the weighted squared joint rates is least.
@@ -201,7 +201,19 @@ def tool_motion_problem(
     problem.horizon(horizon)
     if held is not None:
         bounds = bounds._replace(velocity=np.where(held, 0.0, bounds.velocity))
-    motion = _Motion(problem, machine, tuple(stretches), bounds, base, start, reference, cyclic, weights, clear, driven)
+    motion = _Motion(
+        problem,
+        machine,
+        tuple(stretches),
+        bounds,
+        base,
+        start,
+        reference,
+        cyclic,
+        weights,
+        clearance_constraints,
+        driven,
+    )
     if time_cost is not None:
         return _in_free_time(motion, time_cost)
     for stretch in stretches:
@@ -238,7 +250,7 @@ class _Motion:
     reference: Array
     cyclic: bool
     weights: Array
-    clear: Clear | None
+    clearance_constraints: ClearanceConstraints | None
     driven: bool
 
     @property
@@ -270,9 +282,9 @@ class _Motion:
 
     def keep_clear(self, stretch: Stretch, base: Any, joints: Any, horizon: float | None) -> None:
         """Declare what the motion has to stay clear of; no horizon where the time is free."""
-        if self.clear is not None:
+        if self.clearance_constraints is not None:
             when = stretch.suffix
-            self.clear.declare(
+            self.clearance_constraints.declare(
                 self.problem, base, joints, base_name=f"base{when}" if self.machine.base_size else "",
                 joints_name=f"joints{when}", suffix=when, begin=stretch.begin,
                 pace=1.0 if horizon is None else self.pace(stretch), horizon=horizon,

@@ -14,17 +14,17 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from models import Machine, Surroundings
+from models import CollisionScene, Machine
 from models.arrays import Array
 from ocp.console import interruptible
 from ocp.errors import NOT_NUMBERS, ProblemError, checked_count, checked_flag, checked_positive, floats, real
-from ocp.motion.local.touching import Touch, checked_surroundings, slid, touches
+from ocp.motion.local.collisions import Collision, checked_collision_scene, find_collisions, slid
 from ocp.motion.tasks.checks import checked_configuration
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.geometry import pose_in_reference
 from ocp.motion.tasks.tip_task import ANGULAR, TipTask
 
-__all__ = ["Posture", "Unreachable", "inverse_kinematics", "postures_of"]
+__all__ = ["IkSolution", "Unreachable", "inverse_kinematics", "postures_of"]
 
 LARGEST_SEED = 2**64
 
@@ -68,7 +68,7 @@ INVERSE = InverseSettings()
 
 
 @dataclass(frozen=True)
-class Posture:
+class IkSolution:
     """Joint positions that put the tip where it is wanted.
 
     Attributes:
@@ -115,8 +115,8 @@ def inverse_kinematics(
     tolerance: float = INVERSE.tolerance,
     apart: float = INVERSE.apart,
     iterations: int = INVERSE.iterations,
-    surroundings: Surroundings | None = None,
-) -> list[Posture]:
+    scene: CollisionScene | None = None,
+) -> list[IkSolution]:
     """Different joint positions at which the machine is where its pose tasks want it, the best first.
 
     Where the joints are more than the rows, solutions form families, of which each start gives one member.
@@ -133,7 +133,7 @@ def inverse_kinematics(
         tolerance: Largest misfit of a solution, m and rad.
         apart: Least distance between two solutions, in the greatest joint, angles modulo full turns.
         iterations: Of each start, at most.
-        surroundings: Of the machine; postures in which its bodies come nearer to each other or to obstacles than the
+        scene: Of the machine; postures in which its bodies come nearer to each other or to obstacles than the
             clearance are left out. Where that leaves none, those that touch least are slid along their self-motions.
 
     Returns:
@@ -159,8 +159,8 @@ def inverse_kinematics(
         checked_positive(what, value)
     checked_count("seed", seed, 0, LARGEST_SEED)
     checked_flag("limits", limits)
-    if surroundings is not None:
-        checked_surroundings(surroundings, machine, limits)
+    if scene is not None:
+        checked_collision_scene(scene, machine, limits)
     if not np.isfinite(real(time)):
         raise ProblemError(f"time must be a finite number of seconds, not {time!r}", name="time", value=time)
     size = machine.joint_size
@@ -175,14 +175,14 @@ def inverse_kinematics(
 
     search = _Search(equations, place, targets, lower, upper, tolerance, apart, int(iterations))
     distinct = search.postures(first, int(starts))
-    if surroundings is None:
+    if scene is None:
         return distinct
-    nearest = _touching(distinct, surroundings, place, float(time))
+    nearest = _touching(distinct, scene, place, float(time))
     if all(nearest) and equations.size < size:
         order = sorted(range(len(distinct)), key=lambda k: -nearest[k].distance)  # type: ignore[union-attr]
         least = np.array([distinct[k].joints for k in order[: INVERSE.slid]])
         moved = slid(
-            surroundings,
+            scene,
             place,
             least,
             float(time),
@@ -192,11 +192,11 @@ def inverse_kinematics(
             upper=upper,
         )
         distinct += search.rated(*search.back(moved))
-        nearest = _touching(distinct, surroundings, place, float(time))
-    return _clear(distinct, nearest, surroundings, float(time))
+        nearest = _touching(distinct, scene, place, float(time))
+    return _clear(distinct, nearest, scene, float(time))
 
 
-def postures_of(equations: TaskEquations, targets: Array, *, starts: int, seed: int, limits: bool) -> list[Posture]:
+def postures_of(equations: TaskEquations, targets: Array, *, starts: int, seed: int, limits: bool) -> list[IkSolution]:
     """As `inverse_kinematics` on a fixed base, of poses whose targets are known; again and again at little cost.
 
     Raises:
@@ -221,7 +221,7 @@ class _Search:
     apart: float = INVERSE.apart
     iterations: int = INVERSE.iterations
 
-    def postures(self, first: Array, random: int) -> list[Posture]:
+    def postures(self, first: Array, random: int) -> list[IkSolution]:
         """Those that starts (K, n) lead to, the best first; of the last `random` ones angles without limits come round.
 
         Raises:
@@ -243,7 +243,7 @@ class _Search:
         function = self.equations.misfit_function
         return gauss_newton(function, joints, self.lower, self.upper, self.tolerance, self.iterations, told)
 
-    def rated(self, joints: Array, misfits: Array) -> list[Posture]:
+    def rated(self, joints: Array, misfits: Array) -> list[IkSolution]:
         """Those that do the task, the best first, each once."""
         good, lower, upper = np.flatnonzero(misfits <= self.tolerance), self.lower, self.upper
         if not good.size:
@@ -255,7 +255,7 @@ class _Search:
             share = np.minimum(joints - lower, upper - joints) / ((upper - lower) / 2)
         margin = np.min(share[:, np.isfinite(upper - lower) & (upper > lower)], axis=1, initial=1.0)
         quality = values.prod(axis=1) * np.maximum(margin, 0.0)
-        found = [Posture(*each) for each in zip(joints, quality.tolist(), misfits[good].tolist(), strict=True)]
+        found = [IkSolution(*each) for each in zip(joints, quality.tolist(), misfits[good].tolist(), strict=True)]
         return distinct(sorted(found, key=lambda posture: -posture.quality), self._turns, self.apart)
 
     @property
@@ -354,9 +354,9 @@ def gauss_newton(
     return q, np.abs(residual).max(axis=1)
 
 
-def distinct(found: list[Posture], turns: NDArray[np.bool_], apart: float = INVERSE.apart) -> list[Posture]:
+def distinct(found: list[IkSolution], turns: NDArray[np.bool_], apart: float = INVERSE.apart) -> list[IkSolution]:
     """Of those nearer than `apart`, full turns not counted, the best."""
-    kept: list[Posture] = []
+    kept: list[IkSolution] = []
     for posture in found:
         for other in kept:
             difference = posture.joints - other.joints
@@ -368,21 +368,23 @@ def distinct(found: list[Posture], turns: NDArray[np.bool_], apart: float = INVE
     return kept
 
 
-def _touching(found: list[Posture], surroundings: Surroundings, base: Array, time: float) -> list[Touch | None]:
+def _touching(found: list[IkSolution], scene: CollisionScene, base: Array, time: float) -> list[Collision | None]:
     """Of each posture the pair that is nearest, where it comes nearer than the clearance."""
-    touching = [touches(surroundings, base[None], posture.joints[None], np.array([time])) for posture in found]
+    touching = [find_collisions(scene, base[None], posture.joints[None], np.array([time])) for posture in found]
     return [each[0] if each else None for each in touching]
 
 
-def _clear(found: list[Posture], nearest: list[Touch | None], surroundings: Surroundings, time: float) -> list[Posture]:
+def _clear(
+    found: list[IkSolution], nearest: list[Collision | None], scene: CollisionScene, time: float
+) -> list[IkSolution]:
     """The postures in which nothing comes nearer than the clearance.
 
     Raises:
         Unreachable: There are none.
     """
-    clear = [posture for posture, touch in zip(found, nearest, strict=True) if touch is None]
-    if clear:
-        return clear
+    collision_free = [posture for posture, touch in zip(found, nearest, strict=True) if touch is None]
+    if collision_free:
+        return collision_free
     best = max(range(len(found)), key=lambda k: nearest[k].distance if nearest[k] else 0.0)  # type: ignore[union-attr]
     touch = nearest[best]
     assert touch is not None
@@ -392,7 +394,7 @@ def _clear(found: list[Posture], nearest: list[Touch | None], surroundings: Surr
         found[best].misfit,
         name=" and ".join(touch.bodies),
         value=touch.distance,
-        limit=surroundings.clearance,
+        limit=scene.clearance,
         time=time,
     )
 

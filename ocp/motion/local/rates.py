@@ -19,18 +19,18 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from models import Machine, Surroundings
+from models import CollisionScene, Machine
 from models.arrays import Array
 from models.spatial import solve_spd
 from ocp.console import interruptible
 from ocp.curves import integrator
 from ocp.errors import MOST, NOT_NUMBERS, ProblemError, checked_nonnegative, checked_positive, floats, real
-from ocp.motion.local.touching import checked_surroundings, distances_along
+from ocp.motion.local.collisions import checked_collision_scene, distances_along
 from ocp.motion.tasks.checks import checked_configuration, checked_tasks, checked_weights, dependent_rows, horizon_of
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.tip_task import TipTask
 
-__all__ = ["Followed", "LocalSolution", "follow", "least_rates", "resolve"]
+__all__ = ["LocalMotion", "LocalSolution", "follow", "least_rates", "resolve"]
 
 INTEGRATOR_STEPS = 20000
 """Between two samples, at most; a smooth motion takes some tens."""
@@ -106,7 +106,7 @@ def resolve(
     damping: float = 0.0,
     tolerance: float = 1e-10,
     samples: Any = 501,
-    surroundings: Surroundings | None = None,
+    scene: CollisionScene | None = None,
 ) -> LocalSolution:
     """Simulate x2' = G# v, equation (26) of the free-floating paper with u = 0, and the base that follows.
 
@@ -124,7 +124,7 @@ def resolve(
         tolerance: Absolute and relative tolerance of the integrator (cvodes, Adams).
         samples: How many equally spaced times to report, or the increasing times themselves from 0 to the
             horizon.
-        surroundings: Of the machine; how near its bodies come to each other and to obstacles is reported, at the
+        scene: Of the machine; how near its bodies come to each other and to obstacles is reported, at the
             samples, and changes nothing.
 
     Returns:
@@ -154,12 +154,12 @@ def resolve(
         model = _Model(equations, heavy, damping, ca.MX)
     states, costs, stopped = _integrate(model, np.concatenate([base, joints]), times, tolerance)
     report = _report(machine, model, times[: len(states)], states, costs, tolerance, stopped)
-    if surroundings is None:
+    if scene is None:
         return replace(report, clearance=np.full(len(report.t), np.nan))
-    apart = distances_along(checked_surroundings(surroundings, machine), report.base, report.joints, report.t)
+    apart = distances_along(checked_collision_scene(scene, machine), report.base, report.joints, report.t)
     if not apart.shape[1]:
         return replace(report, clearance=np.full(len(report.t), np.inf))
-    labels = surroundings.labels
+    labels = scene.labels
     near = tuple(labels[k] for k in apart.argmin(axis=1).tolist())
     return replace(report, clearance=apart.min(axis=1), nearest=near)
 
@@ -301,7 +301,7 @@ CORRECTIONS = 2
 
 
 @dataclass(frozen=True, eq=False)
-class Followed:
+class LocalMotion:
     """K local motions at M times.
 
     Attributes:
@@ -323,7 +323,7 @@ class Followed:
     lost_at: Array
 
     @classmethod
-    def resting(cls, times: Array, base: Array, joints: Array) -> Followed:
+    def resting(cls, times: Array, base: Array, joints: Array) -> LocalMotion:
         """Motions in which nothing moves.
 
         Args:
@@ -334,10 +334,10 @@ class Followed:
         places, angles = (np.repeat(each[:, None], many, axis=1) for each in (base, joints))
         return cls(times, places, angles, still, none, none, none)
 
-    def of(self, rows: Any) -> Followed:
+    def of(self, rows: Any) -> LocalMotion:
         """Some of the motions."""
         kept = (self.base, self.joints, self.rates, self.cost, self.misfit, self.lost_at)
-        return Followed(self.t, *(part[rows] for part in kept))
+        return LocalMotion(self.t, *(part[rows] for part in kept))
 
 
 def follow(
@@ -350,7 +350,7 @@ def follow(
     damping: float,
     lower: Array,
     upper: Array,
-) -> Followed:
+) -> LocalMotion:
     """Follow tasks from several postures.
 
     Args:
@@ -420,7 +420,7 @@ def follow(
     rates = np.diff(path, axis=1) / steps[:, None]
     off = np.stack(misfits, axis=1)
     worst = off.argmax(axis=1)
-    return Followed(
+    return LocalMotion(
         times,
         np.stack(bases, axis=1),
         path,

@@ -2,7 +2,7 @@
 
 from ocp.motion.plan.candidate import Candidate, Reason, Rejection
 from ocp.motion.plan.motion import Plan, PlanSample
-from ocp.motion.plan.piecewise import PlanInPieces, Reconfiguration, plan_in_pieces
+from ocp.motion.plan.piecewise import Reconfiguration, SegmentedPlan, plan_in_segments
 from ocp.motion.plan.planner import plan
 from ocp.motion.plan.waypoints import WaypointPlan, plan_waypoints
 from ocp.motion.search.dead_end import DeadEnd
@@ -11,13 +11,13 @@ __all__ = [
     "Candidate",
     "DeadEnd",
     "Plan",
-    "PlanInPieces",
     "PlanSample",
     "Reason",
     "Reconfiguration",
     "Rejection",
+    "SegmentedPlan",
     "WaypointPlan",
     "plan",
-    "plan_in_pieces",
+    "plan_in_segments",
     "plan_waypoints",
 ]

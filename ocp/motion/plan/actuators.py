@@ -13,13 +13,13 @@ import numpy as np
 from models.arrays import Array
 from ocp.direct.guess import Samples
 from ocp.errors import SolveError
-from ocp.motion.builders.clearance import Clear
-from ocp.motion.builders.drives import checked_motors, joint_torques
+from ocp.motion.builders.actuator_limits import checked_motors, joint_torques
+from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.dynamics_plan import within_limits
 from ocp.motion.builders.tool_motion import ToolMotion
 from ocp.motion.plan.motion import CHECKED_TIMES, Plan
 from ocp.motion.plan.request import declared_motion
-from ocp.motion.search.postures import Asked
+from ocp.motion.search.configurations import Asked
 from ocp.motion.tasks.limits import Limits
 from ocp.problem.problem import Problem
 from ocp.solution import Solution
@@ -106,13 +106,15 @@ def within_actuator_limits(request: Asked, start: Array, reference: Array, free:
         start = np.where(np.isclose(free.at(0.0)["joints"], start, rtol=0.0), start, np.nan)
 
     def planned(begin: Array) -> Solution:
-        def declare(clear: Clear | None) -> Problem:
-            motion = declared_motion(request, start=begin, reference=reference, clear=clear, limits=limits)
+        def declare(clearance_constraints: ClearanceConstraints | None) -> Problem:
+            motion = declared_motion(
+                request, start=begin, reference=reference, clearance_constraints=clearance_constraints, limits=limits
+            )
             _guess(motion, free)
             return motion.problem
 
         joints = {"": (request.machine, limits)}
-        return within_limits(declare, request.clear, None, _breaks(request), None, None, joints)
+        return within_limits(declare, request.clearance_constraints, None, _breaks(request), None, None, joints)
 
     try:
         solution = planned(start)

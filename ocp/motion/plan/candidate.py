@@ -11,9 +11,9 @@ import numpy as np
 
 from models.arrays import Array
 from ocp.audit.clearance import Nearest
-from ocp.motion.builders.clearance import Clear
-from ocp.motion.local.rates import Followed
-from ocp.motion.local.touching import Touch
+from ocp.motion.builders.clearance import ClearanceConstraints
+from ocp.motion.local.collisions import Collision
+from ocp.motion.local.rates import LocalMotion
 from ocp.solution import Solution
 
 __all__ = ["Candidate", "Reason", "Rejection", "Seed", "Stage", "collision"]
@@ -93,7 +93,7 @@ class Reason:
         return cls(kind, str(error).split("\n")[0], None if name is None else str(name), **given)
 
 
-def collision(near: Touch | Nearest, limit: float, then: str = "") -> Reason:
+def collision(near: Collision | Nearest, limit: float, then: str = "") -> Reason:
     """That two bodies come nearer than a limit, m."""
     return Reason(Rejection.COLLISION, str(near), " and ".join(near.bodies), near.distance, limit, near.time, then)
 
@@ -114,7 +114,7 @@ class Seed:
 
     guess: Any = None
     cost: float = np.inf
-    local: Sequence[Followed] = ()
+    local: Sequence[LocalMotion] = ()
     tracked: bool = True
     direct: bool = False
     fixed: bool = False
@@ -133,7 +133,7 @@ class Candidate:
         stage: How far it has come.
         solution: Of the last solve; of a candidate that has ended, where that was on the fine mesh.
         seed: What it began from.
-        clear: What it has to stay clear of, with the pairs that constraints separate.
+        clearance_constraints: What it has to stay clear of, with the pairs that constraints separate.
         separations: How often pairs were separated, or farther. separated: The reason of the last time.
     """
 
@@ -143,7 +143,7 @@ class Candidate:
     stage: Stage = Stage.SEED
     solution: Solution | None = None
     seed: Seed = field(default_factory=Seed, repr=False)
-    clear: Clear | None = field(default=None, repr=False)
+    clearance_constraints: ClearanceConstraints | None = field(default=None, repr=False)
     separations: int = field(default=0, repr=False)
     separated: Reason | None = field(default=None, repr=False)
 

@@ -23,14 +23,14 @@ from ocp.errors import RefinementWarning, SolveError
 from ocp.methods import solve
 from ocp.motion.builders.clearance import APART
 from ocp.motion.builders.tool_motion import CLOCK, ToolMotion
+from ocp.motion.local.collisions import Collision
 from ocp.motion.local.inverse_kinematics import Unreachable
-from ocp.motion.local.touching import Touch
 from ocp.motion.plan.actuators import within_actuator_limits
 from ocp.motion.plan.candidate import Candidate, Reason, Rejection, Seed, Stage, collision
 from ocp.motion.plan.candidate_queue import Solver
 from ocp.motion.plan.motion import Plan, parts_of
 from ocp.motion.plan.request import declared_motion
-from ocp.motion.search.postures import OUT_OF_REACH, Asked, clear_postures, others_told
+from ocp.motion.search.configurations import OUT_OF_REACH, Asked, clear_postures, others_told
 from ocp.problem.values import constant
 from ocp.refinement import refined, split
 from ocp.solution import Solution
@@ -53,11 +53,13 @@ class CandidateSolver(Solver):
             start, reference: As of `tool_motion_problem`.
         """
         self.request, self.settings, self.start, self.reference = request, request.settings, start, reference
-        self.motion = declared_motion(request, start=start, reference=reference, clear=request.clear)
+        self.motion = declared_motion(
+            request, start=start, reference=reference, clearance_constraints=request.clearance_constraints
+        )
         self.last = Stage.AUDITED if request.drives is None else Stage.ACTUATED
         self._clear: dict[float, int | Unreachable | None] = {}
         self._prepared: dict[Any, tuple[ToolMotion, Collocation, Prepared]] = {}
-        self._collisions: tuple[Solution | None, list[Touch]] = None, []
+        self._collisions: tuple[Solution | None, list[Collision]] = None, []
 
     def advance(self, candidate: Candidate) -> list[Candidate]:
         """The candidate one stage further, or rejected; and candidates that stem from it."""
@@ -93,8 +95,8 @@ class CandidateSolver(Solver):
         touching = self.collisions(candidate)
         if not touching:
             return self._solved(candidate, Stage.FINE, candidate.solution)
-        if isinstance(clear := self._clear_at(touching[0].time), Unreachable):
-            return candidate.rejected(self._collision(touching[0], f"at {touching[0].time:.4g} s {clear}"))
+        if isinstance(unreachable := self._clear_at(touching[0].time), Unreachable):
+            return candidate.rejected(self._collision(touching[0], f"at {touching[0].time:.4g} s {unreachable}"))
         return self._apart(candidate, Stage.SEPARATED, touching)
 
     def _refine(self, candidate: Candidate) -> Candidate:
@@ -117,11 +119,16 @@ class CandidateSolver(Solver):
         start fixed.
         """
         motion, mesh, _ = self.prepared(candidate, fine=True)
-        clear, first = candidate.clear, f"joints{motion.stretches[0].suffix}"
+        clearance_constraints, first = candidate.clearance_constraints, f"joints{motion.stretches[0].suffix}"
         assert candidate.solution is not None
         solution, audit = self._audited(motion, mesh, candidate.solution, check=not _is_separated(candidate))
         if np.isnan(self._start(candidate)).any() and audit.feasible and audit.optimal is None:
-            fixed = declared_motion(self.request, start=solution[first][0], reference=self.reference, clear=clear)
+            fixed = declared_motion(
+                self.request,
+                start=solution[first][0],
+                reference=self.reference,
+                clearance_constraints=clearance_constraints,
+            )
             same = _mesh_of(mesh, solution)
             again = solve(fixed.problem, same, guess=solution, options=self._options(fixed, same, solution.cost, {}))
             again = self._on_task(fixed, mesh, again, check=True)
@@ -132,8 +139,8 @@ class CandidateSolver(Solver):
         candidate = replace(candidate, cost=solution.cost, solution=solution)
         proofs = list(audit.clearances.values())
         near = max((pair for proof in proofs for pair in proof.pairs), key=attrgetter("missed"), default=None)
-        if clear is not None and near is not None and near.missed > 0:
-            wider = replace(candidate, clear=clear.widened(proofs))
+        if clearance_constraints is not None and near is not None and near.missed > 0:
+            wider = replace(candidate, clearance_constraints=clearance_constraints.widened(proofs))
             return self._again(wider, Stage.FINE, self._collision(near))
         if audit.passed:
             return replace(candidate, stage=Stage.AUDITED)
@@ -152,10 +159,18 @@ class CandidateSolver(Solver):
         """What passed with a fixed start, to be solved again with its start free."""
         if not (found.seed.fixed and found.passed and found.stage is Stage.AUDITED):
             return []
-        clear = self.request.clear
-        if clear is not None:
-            clear = clear.holding([touch.pair for touch in self.local_collisions(found.seed)])
-        return [Candidate(found.start, seed=Seed(found.solution, local=found.seed.local, direct=True), clear=clear)]
+        clearance_constraints = self.request.clearance_constraints
+        if clearance_constraints is not None:
+            clearance_constraints = clearance_constraints.holding(
+                [touch.pair for touch in self.local_collisions(found.seed)]
+            )
+        return [
+            Candidate(
+                found.start,
+                seed=Seed(found.solution, local=found.seed.local, direct=True),
+                clearance_constraints=clearance_constraints,
+            )
+        ]
 
     # ---- solves ----------------------------------------------------------------------------------------------------
 
@@ -167,11 +182,13 @@ class CandidateSolver(Solver):
         reason = Reason(Rejection.INFEASIBLE, str(solution.status))
         return replace(candidate, cost=np.nan, solution=None).rejected(reason)
 
-    def _apart(self, candidate: Candidate, stage: Stage, touching: list[Touch]) -> Candidate:
+    def _apart(self, candidate: Candidate, stage: Stage, touching: list[Collision]) -> Candidate:
         """Solve a candidate again with more bodies separated."""
-        assert candidate.clear is not None
-        clear = candidate.clear.holding([touch.pair for touch in touching])
-        return self._again(replace(candidate, clear=clear), stage, self._collision(touching[0]))
+        assert candidate.clearance_constraints is not None
+        clearance_constraints = candidate.clearance_constraints.holding([touch.pair for touch in touching])
+        return self._again(
+            replace(candidate, clearance_constraints=clearance_constraints), stage, self._collision(touching[0])
+        )
 
     def _again(self, candidate: Candidate, stage: Stage, reason: Reason) -> Candidate:
         count = candidate.separations + 1
@@ -184,13 +201,22 @@ class CandidateSolver(Solver):
     ) -> tuple[ToolMotion, Collocation, Prepared]:
         """The problem of a candidate, the first mesh for it, and both prepared for guesses of about a cost."""
         settings, apart = self.settings, _is_separated(candidate)
-        held = tuple(sorted(candidate.clear.margins.items())) if candidate.clear is not None and apart else ()
+        held = (
+            tuple(sorted(candidate.clearance_constraints.margins.items()))
+            if candidate.clearance_constraints is not None and apart
+            else ()
+        )
         key = held, fine, tuple(candidate.start) if candidate.seed.fixed else ()
         if key not in self._prepared:
             start, motion = self._start(candidate), self.motion
             if held or candidate.seed.fixed:
                 reference = candidate.start if candidate.seed.fixed else self.reference
-                motion = declared_motion(self.request, start=start, reference=reference, clear=candidate.clear)
+                motion = declared_motion(
+                    self.request,
+                    start=start,
+                    reference=reference,
+                    clearance_constraints=candidate.clearance_constraints,
+                )
             least = settings.separated_intervals if held and not fine else settings.min_intervals
             degree = settings.fine_degree if fine else settings.coarse_degree
             mesh = Collocation(least if len(motion.breaks) < least else 1, degree).with_nodes_at(motion.breaks)
@@ -203,10 +229,10 @@ class CandidateSolver(Solver):
         """Joints at the start, nan where they are free: what bodies that are separated ride on is not ignorable."""
         if candidate.seed.fixed:
             return candidate.start
-        clear = candidate.clear
-        if clear is None or not clear.margins or self.request.start is not None:
+        clearance_constraints = candidate.clearance_constraints
+        if clearance_constraints is None or not clearance_constraints.margins or self.request.start is not None:
             return self.start
-        moves = clear.surroundings.levers.joints[sorted(clear.margins)].any(axis=0)
+        moves = clearance_constraints.scene.levers.joints[sorted(clearance_constraints.margins)].any(axis=0)
         return np.where(moves & ~self.request.held, np.nan, self.start)
 
     def _options(self, motion: ToolMotion, mesh: Collocation, cost: float, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -302,10 +328,10 @@ class CandidateSolver(Solver):
 
     # ---- collisions ------------------------------------------------------------------------------------------------
 
-    def collisions(self, candidate: Candidate) -> list[Touch]:
+    def collisions(self, candidate: Candidate) -> list[Collision]:
         """The bodies that come too near in a candidate's motion and are not separated, the worst first."""
-        clear, solution = candidate.clear, candidate.solution
-        if clear is None or solution is None:
+        clearance_constraints, solution = candidate.clearance_constraints, candidate.solution
+        if clearance_constraints is None or solution is None:
             return []
         if self._collisions[0] is not solution:
             at = self._samples(solution)
@@ -313,30 +339,30 @@ class CandidateSolver(Solver):
             for stretch in self.motion.stretches:
                 base = sample[f"base{stretch.suffix}"] if self.request.machine.base_size else np.zeros((len(at), 0))
                 times = stretch.begin + at * stretch.duration
-                found += clear.touches(base, sample[f"joints{stretch.suffix}"], times)
-            worst: dict[int, Touch] = {}
+                found += clearance_constraints.find_collisions(base, sample[f"joints{stretch.suffix}"], times)
+            worst: dict[int, Collision] = {}
             for touch in sorted(found, key=lambda touch: touch.distance):
                 worst.setdefault(touch.pair, touch)
             self._collisions = solution, list(worst.values())
-        return [touch for touch in self._collisions[1] if touch.pair not in clear.margins]
+        return [touch for touch in self._collisions[1] if touch.pair not in clearance_constraints.margins]
 
     def collision(self, candidate: Candidate) -> Reason | None:
         """That bodies collide in its motion, the worst pair; None if none do."""
         touching = self.collisions(candidate)
         return self._collision(touching[0]) if touching else None
 
-    def local_collisions(self, seed: Seed) -> list[Touch]:
+    def local_collisions(self, seed: Seed) -> list[Collision]:
         """The bodies that come too near in a local motion, the worst first."""
-        clear, found = self.request.clear, list[Touch]()
-        for part in seed.local if clear is not None else ():
-            assert clear is not None
-            found += clear.touches(part.base[0], part.joints[0], part.t)
+        clearance_constraints, found = self.request.clearance_constraints, list[Collision]()
+        for part in seed.local if clearance_constraints is not None else ():
+            assert clearance_constraints is not None
+            found += clearance_constraints.find_collisions(part.base[0], part.joints[0], part.t)
         return sorted(found, key=lambda touch: touch.distance)
 
     @property
     def barred(self) -> bool:
         """Whether there was a time at which no posture that does the tasks is clear."""
-        return any(isinstance(clear, Unreachable) for clear in self._clear.values())
+        return any(isinstance(value, Unreachable) for value in self._clear.values())
 
     def _clear_at(self, time: float) -> int | Unreachable | None:
         """How many postures that do the tasks at a time are clear, or why none is; None where that is not known."""
@@ -344,9 +370,9 @@ class CandidateSolver(Solver):
             self._clear[time] = clear_postures(self.request, time)
         return self._clear[time]
 
-    def _collision(self, near: Touch | Nearest, then: str = "") -> Reason:
-        assert self.request.clear is not None
-        return collision(near, self.request.clear.surroundings.clearance, then)
+    def _collision(self, near: Collision | Nearest, then: str = "") -> Reason:
+        assert self.request.clearance_constraints is not None
+        return collision(near, self.request.clearance_constraints.scene.clearance, then)
 
     # ---- what comes of them ------------------------------------------------------------------------------------------
 
@@ -375,7 +401,7 @@ class CandidateSolver(Solver):
 
 
 def _is_separated(candidate: Candidate) -> bool:
-    return candidate.clear is not None and bool(candidate.clear.margins)
+    return candidate.clearance_constraints is not None and bool(candidate.clearance_constraints.margins)
 
 
 def _mesh_of(mesh: Collocation, solution: Solution) -> Collocation:

@@ -21,21 +21,21 @@ from ocp.direct.collocation import Collocation
 from ocp.direct.guess import Samples
 from ocp.errors import ProblemError, SolveError, checked_instance
 from ocp.methods import solve
-from ocp.motion.builders.clearance import Clear, keeping_clear, touching_error
+from ocp.motion.builders.clearance import ClearanceConstraints, collision_error, solve_with_clearance
 from ocp.motion.builders.tool_motion import stretches_of
+from ocp.motion.local.collisions import distances_along
 from ocp.motion.local.inverse_kinematics import Unreachable
-from ocp.motion.local.touching import distances_along
 from ocp.motion.plan.candidate import Candidate, Stage
 from ocp.motion.plan.motion import Part, Plan
 from ocp.motion.plan.planner import checked_asked, clear_of, planned
-from ocp.motion.search.postures import Asked, followed_from, postures_at_the_start, settled
+from ocp.motion.search.configurations import Asked, followed_from, postures_at_the_start, settled
 from ocp.motion.search.task_search import TaskSearch
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.tip_task import TipTask, timed
 from ocp.problem.problem import Problem
 from ocp.solution import Solution
 
-__all__ = ["PlanInPieces", "Reconfiguration", "plan_in_pieces"]
+__all__ = ["Reconfiguration", "SegmentedPlan", "plan_in_segments"]
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class Reconfiguration:
 
 
 @dataclass(frozen=True, eq=False)
-class PlanInPieces:
+class SegmentedPlan:
     """Motions that do the tasks one after the other.
 
     Attributes:
@@ -142,7 +142,7 @@ class PlanInPieces:
 
 
 @interruptible
-def plan_in_pieces(
+def plan_in_segments(
     machine: FixedBase,
     tasks: TipTask | Sequence[TipTask],
     horizon: float | None = None,
@@ -157,7 +157,7 @@ def plan_in_pieces(
     srdf: Any = None,
     folders: Any = (),
     missing: str = "raise",
-) -> PlanInPieces:
+) -> SegmentedPlan:
     """Plan tasks in the fewest motions, between which the arm reconfigures, and of these the cheapest.
 
     Where one motion does, it is one piece: the plan of `plan(..., search="global")`. Else the time of the tasks is cut,
@@ -178,11 +178,11 @@ def plan_in_pieces(
     """
     checked_instance("machine", machine, FixedBase)
     asked = checked_asked(machine, tasks, horizon, start, None, False, weights, limits, "global", seed, 1.0)
-    clear = clear_of(machine, obstacles, clearance, ignored, srdf, folders, missing, limits)
-    if clear is not None and clear.surroundings.moves_by_itself:
+    clearance_constraints = clear_of(machine, obstacles, clearance, ignored, srdf, folders, missing, limits)
+    if clearance_constraints is not None and clearance_constraints.scene.moves_by_itself:
         words = "obstacles that move do not wait while the arm reconfigures; give those that stand still"
         raise ProblemError(words, name="obstacles", value=obstacles)
-    asked = replace(asked, clear=clear)
+    asked = replace(asked, clearance_constraints=clearance_constraints)
     postures = postures_at_the_start(asked)
     if asked.start is None:
         postures = settled(asked, postures)[1]
@@ -214,7 +214,7 @@ def plan_in_pieces(
         ends = before.at(before.horizon)["joints"], after.at(0.0)["joints"]
         between.append(_reconfigured(asked, begin, *ends))
     begins = tuple(begin for begin, _ in spans)
-    return PlanInPieces(machine, tuple(pieces), begins, tuple(between), fewest - 1)
+    return SegmentedPlan(machine, tuple(pieces), begins, tuple(between), fewest - 1)
 
 
 def _piece(asked: Asked, begin: float, end: float) -> Plan:
@@ -247,10 +247,10 @@ def _reconfigured(asked: Asked, time: float, before: Array, after: Array) -> Rec
     straight = float((np.abs(after - before) / fastest).max())
     middle, why = (before + after) / 2, ""
     ways = [(middle, straight)]
-    if asked.clear is not None:
+    if asked.clearance_constraints is not None:
         ways += [
             (via, settings.slowness * straight)
-            for via in (middle, *_round(asked, asked.clear, before, after, settings))
+            for via in (middle, *_round(asked, asked.clearance_constraints, before, after, settings))
         ]
     for via, duration in ways:
         try:
@@ -267,13 +267,19 @@ def _reconfigured(asked: Asked, time: float, before: Array, after: Array) -> Rec
     return Reconfiguration(time, before, after, None, why)
 
 
-def _round(asked: Asked, clear: Clear, before: Array, after: Array, settings: ReconfigurationSettings) -> Array:
+def _round(
+    asked: Asked,
+    clearance_constraints: ClearanceConstraints,
+    before: Array,
+    after: Array,
+    settings: ReconfigurationSettings,
+) -> Array:
     """Postures that are clear, the nearest to the middle between two others. Shape (K, n)."""
-    bounds, least = asked.bounds, clear.surroundings.clearance
+    bounds, least = asked.bounds, clearance_constraints.scene.clearance
     low = np.maximum(np.minimum(before, after) - settings.reach, bounds.lower)
     high = np.minimum(np.maximum(before, after) + settings.reach, bounds.upper)
     some = low + (high - low) * np.random.default_rng(asked.seed).random((settings.sampled, len(before)))
-    apart = distances_along(clear.surroundings, np.zeros(0), some, np.zeros(settings.sampled), least)
+    apart = distances_along(clearance_constraints.scene, np.zeros(0), some, np.zeros(settings.sampled), least)
     free = some[(apart >= least).all(axis=1)]
     return np.asarray(free[np.argsort(((free - (before + after) / 2) ** 2).sum(axis=1))[: settings.detours]])
 
@@ -299,7 +305,7 @@ def _way(
     machine, n, bounds = asked.machine, asked.machine.joint_size, asked.bounds
     guess = {"joints": Samples(np.array([0.0, duration / 2, duration]), np.array([before, via, after]))}
 
-    def run(clear: Clear | None) -> Solution:
+    def run(clearance_constraints: ClearanceConstraints | None) -> Solution:
         problem = Problem("reconfiguration")
         problem.horizon(duration)
         told: dict[str, Any] = {"lower": bounds.lower, "upper": bounds.upper, "unit": machine.robot.unit()}
@@ -307,14 +313,14 @@ def _way(
         most = (1 + settings.rate_slack) * fastest
         rates = problem.control("rates", n, lower=-most, upper=most, unit=machine.robot.unit("/s"))
         problem.dynamics(joints, rates)
-        if clear is not None:
-            clear.declare(problem, machine.base_home(), joints, horizon=duration)
+        if clearance_constraints is not None:
+            clearance_constraints.declare(problem, machine.base_home(), joints, horizon=duration)
         problem.minimize(running=ca.dot(rates, ca.DM(asked.weights) * rates) / 2)
         solution = solve(problem, settings.mesh, guess=guess, options=settings.options)
         audit = solution.audit()
         if not audit.feasible:
             worst = audit.failures[0]
-            raise touching_error(audit, solution) or SolveError(str(worst), solution, name=worst.name)
+            raise collision_error(audit, solution) or SolveError(str(worst), solution, name=worst.name)
         return solution
 
-    return keeping_clear(asked.clear, run) if apart else run(asked.clear)
+    return solve_with_clearance(asked.clearance_constraints, run) if apart else run(asked.clearance_constraints)

@@ -18,7 +18,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from models import Machine, ModelError, Standing, Surroundings
+from models import CollisionScene, Machine, ModelError, Standing
 from models.arrays import Array
 from ocp.console import interruptible
 from ocp.errors import (
@@ -31,11 +31,11 @@ from ocp.errors import (
     checked_instance,
     checked_positive,
 )
-from ocp.motion.builders.clearance import Clear
-from ocp.motion.builders.drives import checked_motors
+from ocp.motion.builders.actuator_limits import checked_motors
+from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.tool_motion import stretches_of
 from ocp.motion.local.inverse_kinematics import LARGEST_SEED
-from ocp.motion.local.rates import Followed
+from ocp.motion.local.rates import LocalMotion
 from ocp.motion.plan.actuators import limits_actuators, without_actuators
 from ocp.motion.plan.candidate import Candidate, Reason, Rejection, Seed
 from ocp.motion.plan.candidate_queue import CandidateQueue
@@ -43,8 +43,7 @@ from ocp.motion.plan.candidate_solver import CandidateSolver
 from ocp.motion.plan.motion import Plan
 from ocp.motion.plan.standing import plan_to_stand
 from ocp.motion.search.cells import CellSearch, follows
-from ocp.motion.search.dead_end import DeadEnd
-from ocp.motion.search.postures import (
+from ocp.motion.search.configurations import (
     OUT_OF_REACH,
     Asked,
     SearchKind,
@@ -55,6 +54,7 @@ from ocp.motion.search.postures import (
     settled,
     touches_at_the_start,
 )
+from ocp.motion.search.dead_end import DeadEnd
 from ocp.motion.search.search import checked_bound
 from ocp.motion.search.task_search import TaskSearch
 from ocp.motion.tasks.checks import checked_configuration, checked_tasks, checked_weights, horizon_of, inside_limits
@@ -109,7 +109,9 @@ def plan_from_seeds(request: Asked, postures: Array, solver: CandidateSolver) ->
         raise
 
 
-def seeds_of(solver: CandidateSolver, followed: Sequence[Followed], postures: Array, **kind: bool) -> list[Candidate]:
+def seeds_of(
+    solver: CandidateSolver, followed: Sequence[LocalMotion], postures: Array, **kind: bool
+) -> list[Candidate]:
     """Candidates of local motions, those that do their tasks before others, then the cheapest first.
 
     Args:
@@ -124,7 +126,11 @@ def seeds_of(solver: CandidateSolver, followed: Sequence[Followed], postures: Ar
         local = [part.of(slice(number, number + 1)) for part in followed]
         guess = solver.motion.guess(local, 0)
         seed = Seed(guess, float(costs[number]), local, bool(tracked[number]), **kind)
-        seeds.append(Candidate(postures[number], seed.cost, seed=seed, clear=solver.request.clear))
+        seeds.append(
+            Candidate(
+                postures[number], seed.cost, seed=seed, clearance_constraints=solver.request.clearance_constraints
+            )
+        )
     return seeds
 
 
@@ -179,7 +185,7 @@ def _check_dead_end(searched: TaskSearch) -> None:
 
 
 def _through_cells(
-    queue: CandidateQueue, solver: CandidateSolver, followed: Sequence[Followed], postures: Array
+    queue: CandidateQueue, solver: CandidateSolver, followed: Sequence[LocalMotion], postures: Array
 ) -> None:
     """The motions of a floating machine that a search over exact states leads to, with those that local ones do.
 
@@ -228,10 +234,15 @@ def _alternatives(queue: CandidateQueue, solver: CandidateSolver, seeds: list[Ca
     for seed in seeds:
         end = ended[id(seed.seed)]
         colliding = solver.collisions(end)
-        if end.clear is not None and (colliding or end.clear.margins):
+        if end.clearance_constraints is not None and (colliding or end.clearance_constraints.margins):
             local = solver.local_collisions(seed.seed)
-            clear = end.clear.holding([touch.pair for touch in (*colliding, *local)])
-            ways.append((min((touch.distance for touch in local), default=np.inf), replace(seed, clear=clear)))
+            clearance_constraints = end.clearance_constraints.holding([touch.pair for touch in (*colliding, *local)])
+            ways.append(
+                (
+                    min((touch.distance for touch in local), default=np.inf),
+                    replace(seed, clearance_constraints=clearance_constraints),
+                )
+            )
     others = [seed for _, seed in sorted(ways, key=lambda way: -way[0])[:most]]
     if request.start is None:
         touching_starts = touches_at_the_start(request, np.array([seed.start for seed in seeds]))
@@ -291,9 +302,9 @@ def plan(
             On a floating one of all that a search over exact states finds, without a bound, see `search.cells`,
             which also goes on where local motions come to a singularity.
         seed: Of inverse kinematics.
-        obstacles: Shapes in world, or `Moving` ones, that the machine's bodies stay clear of.
+        obstacles: Shapes in world, or `MovingObstacle` ones, that the machine's bodies stay clear of.
         clearance: Least distance to obstacles and between the links, m; None: nothing is looked at.
-        ignored, srdf, folders, missing: As of `models.Surroundings`: pairs that are not looked at, and what becomes of
+        ignored, srdf, folders, missing: As of `models.CollisionScene`: pairs that are not checked, and what becomes of
             meshes that are not found.
         time_cost: Of each second where the horizon is free, in units of the cost, (rad/s)^2; the larger, the nearer the
             motion is to that of least time.
@@ -306,14 +317,14 @@ def plan(
             names the time and the place that is out of reach.
         SolveError: No motion passes its audit; says what became of each posture. DeadEnd, which is one: the search over
             all motions says from where on none goes on, what stops it, and how far the tasks would have to give way, or
-            in how few pieces they may be done (`plan_in_pieces`).
+            in how few pieces they may be done (`plan_in_segments`).
     """
     around = (machine, obstacles, clearance, ignored, srdf, folders, missing, limits)
     if isinstance(machine, Standing):
         given = {"start": start, "cyclic": cyclic, "weights": weights, "limits": limits, "search": search, "seed": seed}
-        return plan_to_stand(machine, tasks, horizon, clear=clear_of(*around), **given)
+        return plan_to_stand(machine, tasks, horizon, clearance_constraints=clear_of(*around), **given)
     asked = checked_asked(machine, tasks, horizon, start, start_base, cyclic, weights, limits, search, seed, time_cost)
-    return planned(replace(asked, clear=clear_of(*around)))
+    return planned(replace(asked, clearance_constraints=clear_of(*around)))
 
 
 def planned(asked: Asked) -> Plan:
@@ -341,7 +352,7 @@ def clear_of(
     folders: Any,
     missing: Any,
     limits: Limits | None,
-) -> Clear | None:
+) -> ClearanceConstraints | None:
     """What a motion has to stay clear of; None where there is nothing.
 
     Raises:
@@ -355,10 +366,10 @@ def clear_of(
         return None
     try:
         kept = not isinstance(limits, Limits) or limits.joints
-        around = Surroundings(machine, obstacles, clearance, ignored, srdf, folders, missing, kept)
+        around = CollisionScene(machine, obstacles, clearance, ignored, srdf, folders, missing, kept)
     except ModelError as error:
         raise ProblemError(str(error), **vars(error)) from error
-    return Clear(around) if len(around.pairs) else None
+    return ClearanceConstraints(around) if len(around.pairs) else None
 
 
 def _empty(value: Any) -> bool:

@@ -17,6 +17,7 @@ import numpy as np
 from models import (
     Box,
     Capsule,
+    CollisionScene,
     CollisionShape,
     Cylinder,
     FixedBase,
@@ -28,23 +29,22 @@ from models import (
     Mesh,
     Mimic,
     ModelError,
-    Moving,
+    MovingObstacle,
     Robot,
     Sphere,
     Standing,
     Support,
-    Surroundings,
     VisualShape,
 )
 from models.shapes.bodies import Body, LinkMesh
 from models.spatial import expression
 from ocp.errors import ProblemError
-from ocp.motion.builders.clearance import Clear
-from ocp.motion.builders.drives import Effort, JointFriction
+from ocp.motion.builders.actuator_limits import Effort, JointFriction
+from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.dynamics import dynamics_problem
 from ocp.motion.builders.standing.problem import FreeTime, Weights, standing_problem
 from ocp.motion.builders.tool_motion import ToolMotion, stretches_of, tool_motion_problem
-from ocp.motion.search.postures import Asked
+from ocp.motion.search.configurations import Asked
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.motion.tasks.tracks import rated
@@ -58,11 +58,11 @@ __all__ = ["MotionRequest", "declared_motion", "request_of", "restored_request",
 
 SHAPES = (Box, Capsule, Cylinder, HalfSpace, Mesh, Sphere)
 PARTS = (Robot, Link, Joint, Mimic, CollisionShape, VisualShape, Support)
-ASKED = (TipTask, Limits, Clear, Effort, JointFriction, Weights, FreeTime, InFoot, Pinned, IndexAtLeast)
+ASKED = (TipTask, Limits, ClearanceConstraints, Effort, JointFriction, Weights, FreeTime, InFoot, Pinned, IndexAtLeast)
 MACHINES = (FixedBase, FreeFloating, Standing)
-KINDS = {kind.__name__: kind for kind in (*MACHINES, *PARTS, *SHAPES, *ASKED, Moving, Body)}
+KINDS = {kind.__name__: kind for kind in (*MACHINES, *PARTS, *SHAPES, *ASKED, MovingObstacle, Body)}
 SYMBOLS = {"SX": ca.SX, "MX": ca.MX}
-TRACKS = {TipTask: ("velocity", "position", "orientation", "direction"), Moving: ("position", "rotation")}
+TRACKS = {TipTask: ("velocity", "position", "orientation", "direction"), MovingObstacle: ("position", "rotation")}
 """Fields that may be functions of time."""
 
 
@@ -105,7 +105,12 @@ class MotionRequest:
 
 
 def declared_motion(
-    asked: Asked, *, start: Any, reference: Any, clear: Clear | None, limits: Limits | None = None
+    asked: Asked,
+    *,
+    start: Any,
+    reference: Any,
+    clearance_constraints: ClearanceConstraints | None,
+    limits: Limits | None = None,
 ) -> ToolMotion:
     """Declare the problem of a motion, which remembers what it was declared from.
 
@@ -122,7 +127,7 @@ def declared_motion(
         "time_cost": asked.time_cost,
         "driven": limits is not None,
         "held": asked.held if limits is None else None,
-        "clear": clear,
+        "clearance_constraints": clearance_constraints,
     }
     bounds = (limits or asked.limits).bounds(asked.machine)
     motion = tool_motion_problem(asked.machine, asked.stretches, bounds=bounds, **own)
@@ -178,12 +183,12 @@ def stored_request(builder: str, arguments: Mapping[str, Any]) -> dict[str, Any]
         if isinstance(value, Mesh):  # its file stays where it is: the hull is what counts
             placed = {"vertices": value.hull.vertices, "position": value.position, "rotation": value.rotation}
             return {"kind": "Mesh", "fields": {name: put(part) for name, part in placed.items()}}
-        if isinstance(value, Surroundings) and value.machine is owner:
+        if isinstance(value, CollisionScene) and value.machine is owner:
             return {"kind": "Surroundings", "fields": {name: put(part) for name, part in _around(value).items()}}
         if is_dataclass(value) and KINDS.get(type(value).__name__) is type(value):
             parts = {one.name: getattr(value, one.name) for one in fields(value) if one.init}
             tracks = TRACKS.get(type(value), ())
-            if isinstance(value, Moving):  # as it takes them: its tables are polynomials already
+            if isinstance(value, MovingObstacle):  # as it takes them: its tables are polynomials already
                 parts |= {"position": lambda time: value.frame(time).position}
                 parts |= {"rotation": lambda time: value.frame(time).rotation}
             return {
@@ -208,7 +213,7 @@ def stored_request(builder: str, arguments: Mapping[str, Any]) -> dict[str, Any]
     return {"builder": builder, "arguments": {"pool": pool}, "functions": writer.records}
 
 
-def _around(around: Surroundings) -> dict[str, Any]:
+def _around(around: CollisionScene) -> dict[str, Any]:
     """What its machine keeps clear of, by the bodies that cover meshes in place of the files of these."""
     return {
         "obstacles": around.obstacles,
@@ -285,7 +290,7 @@ def _read(value: Any, functions: list[Any], machine: Machine | None) -> Any:
     own = {name: read(part) for name, part in value["fields"].items()}
     if value["kind"] == "Surroundings":
         around = {name: own[name] for name in ("obstacles", "clearance", "ignored", "limits")}
-        return Surroundings(machine, **around, covered=_covered(own["covered"]))  # type: ignore[arg-type]
+        return CollisionScene(machine, **around, covered=_covered(own["covered"]))  # type: ignore[arg-type]
     if own.get("file") is not None and value["kind"] == "Mesh":
         raise ValueError("a mesh names a file, which is not opened")
     return KINDS[value["kind"]](**own)

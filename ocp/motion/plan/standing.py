@@ -11,7 +11,7 @@ import casadi as ca
 from models import Standing
 from models.arrays import Array
 from ocp.errors import ProblemError, SolveError, checked_flag, checked_instance
-from ocp.motion.builders.clearance import Clear
+from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.standing.plan import Asked, plan_standing
 from ocp.motion.builders.standing.problem import Weights
 from ocp.motion.local.inverse_kinematics import inverse_kinematics
@@ -38,7 +38,7 @@ def plan_to_stand(
     limits: Limits | None,
     search: str,
     seed: int,
-    clear: Clear | None,
+    clearance_constraints: ClearanceConstraints | None,
 ) -> Plan:
     """Do the tasks with the zero moment point inside the foot, at the least cost of `plan_standing`.
 
@@ -74,7 +74,7 @@ def plan_to_stand(
     asked: Asked = {"weights": weights, "limits": limits, "symbols": ca.SX if _takes_scalars(equations) else ca.MX}
     asked["start"], asked["end"] = _rest(equations, 0.0), _rest(equations, duration)
     queue = CandidateQueue(
-        _StandingSolver(machine, given, duration, clear, asked, start is not None), PlannerSettings()
+        _StandingSolver(machine, given, duration, clearance_constraints, asked, start is not None), PlannerSettings()
     )
     seeds = [Candidate(joints) for joints in _postures(machine, given, start, limits, seed)]
     for batch in [[one] for one in seeds] if search == "start" else [seeds]:
@@ -91,7 +91,7 @@ class _StandingSolver(Solver):
     machine: Standing
     tasks: list[TipTask]
     duration: float
-    clear: Clear | None
+    clearance_constraints: ClearanceConstraints | None
     asked: Asked
     start_given: bool
 
@@ -103,7 +103,14 @@ class _StandingSolver(Solver):
         """
         try:
             start = candidate.start
-            solution = plan_standing(self.machine, self.tasks, start, self.duration, clear=self.clear, **self.asked)
+            solution = plan_standing(
+                self.machine,
+                self.tasks,
+                start,
+                self.duration,
+                clearance_constraints=self.clearance_constraints,
+                **self.asked,
+            )
         except (ProblemError, SolveError) as error:
             if self.start_given or isinstance(error.__cause__, KeyboardInterrupt):
                 raise

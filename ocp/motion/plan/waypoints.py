@@ -17,14 +17,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from models import FixedBase, Surroundings
+from models import CollisionScene, FixedBase
 from models.arrays import Array
 from ocp.audit.clearance import Clearance
 from ocp.console import interruptible
 from ocp.errors import NOT_NUMBERS, ProblemError, SolveError, checked_choice, checked_count, checked_instance, floats
 from ocp.motion.builders.clearance import clearance_of
+from ocp.motion.local.collisions import Collision, distances_along, find_collisions
 from ocp.motion.local.inverse_kinematics import LARGEST_SEED, Unreachable, at_rest
-from ocp.motion.local.touching import Touch, distances_along, touches
 from ocp.motion.plan.planner import clear_of
 from ocp.motion.plan.waypoint_plan import WaypointPlan
 from ocp.motion.search.charts import Instant, SelfMotions
@@ -156,8 +156,8 @@ def plan_waypoints(
         if not heavy.any():
             raise ProblemError("no joint has a velocity limit, by which the time is told", name="velocity")
     most = _step(step, n)
-    clear = clear_of(machine, obstacles, clearance, ignored, srdf, folders, missing, told)
-    around = None if clear is None else clear.surroundings
+    clearance_constraints = clear_of(machine, obstacles, clearance, ignored, srdf, folders, missing, told)
+    around = None if clearance_constraints is None else clearance_constraints.scene
     way = _Ways(machine, places, turns, most, (Length if cost == "length" else Largest)(heavy), told, around, int(seed))
     return way.plan(reconfigurations == "counted")
 
@@ -173,7 +173,7 @@ class _Ways:
         step: Array,
         cost: Homogeneous,
         limits: Limits,
-        around: Surroundings | None,
+        around: CollisionScene | None,
         seed: int,
         settings: WaypointSettings = WaypointSettings(),
     ) -> None:
@@ -324,7 +324,7 @@ class _Ways:
     def _search(self, chosen: NDArray[np.intp], coarse: bool = False) -> Search:
         """Of all postures at some waypoints; with two free directions of those on some curves."""
         sets, far = SelfMotions(self.space, self.sets.equations, self.sets.targets[chosen]), np.diff(chosen)[:, None]
-        told: dict[str, Any] = {"seeds": lambda k: self._seeds(int(chosen[k])), "surroundings": self.around}
+        told: dict[str, Any] = {"seeds": lambda k: self._seeds(int(chosen[k])), "scene": self.around}
         instants = [Instant(sets, k) for k in range(len(chosen))]
         held = self._held
         given = self.space, instants, chosen.astype(float), self.cost, far * self.step
@@ -444,7 +444,7 @@ class _Ways:
             k, j = np.unravel_index(int(steps.argmax()), steps.shape)
             words = f"joint {names[j]!r} moves {steps.max() + self.step[j]:.3g} from waypoint {k} to the next"
         elif self.around is not None and near.any():
-            worst: Touch = touches(self.around, np.zeros(0), joints, numbers.astype(float))[0]
+            worst: Collision = find_collisions(self.around, np.zeros(0), joints, numbers.astype(float))[0]
             words = f"touches: {worst.bodies[0]} and {worst.bodies[1]} at waypoint {worst.time:g}"
         return words, np.flatnonzero(wrong | near)
 

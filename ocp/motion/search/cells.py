@@ -24,11 +24,11 @@ from scipy.spatial import cKDTree
 
 from models import FreeFloating
 from models.arrays import Array
+from ocp.motion.local.collisions import distances_along
 from ocp.motion.local.inverse_kinematics import Unreachable
-from ocp.motion.local.rates import Followed
-from ocp.motion.local.touching import distances_along
+from ocp.motion.local.rates import LocalMotion
+from ocp.motion.search.configurations import OUT_OF_REACH, Asked, misfits_of, placed
 from ocp.motion.search.dead_end import DeadEnd
-from ocp.motion.search.postures import OUT_OF_REACH, Asked, misfits_of, placed
 from ocp.motion.search.reduced import ReducedKinematics, Side, Slopes, check_floating_reach, within
 
 __all__ = ["CellSearch", "follows"]
@@ -74,7 +74,7 @@ class CellSettings:
     classes: int = 48
 
 
-def follows(asked: Asked, followed: Sequence[Followed]) -> NDArray[np.bool_]:
+def follows(asked: Asked, followed: Sequence[LocalMotion]) -> NDArray[np.bool_]:
     """Which local motions meet their poses, and run most of the way that velocities ask for. Shape (K,)."""
     count = len(followed[0].cost)
     missed, way = np.zeros(count), np.zeros(count)
@@ -165,7 +165,7 @@ class CellSearch:
                 total += least / 2 * stretch.duration / count
         return total
 
-    def followed(self) -> list[list[Followed]]:
+    def followed(self) -> list[list[LocalMotion]]:
         """Of each search, the largest first, the cheapest motion of each class through all stretches.
 
         They are what a plan begins from.
@@ -311,8 +311,8 @@ class _Cells:
         if kinematics.equations is not None and len(times):
             over = kinematics.equations.overhangs(times, layer.base, layer.joints)
             good &= over.max(axis=1, initial=0.0) <= OUT_OF_REACH
-        if self.asked.clear is not None and good.any():
-            around, at = self.asked.clear.surroundings, np.flatnonzero(good)
+        if self.asked.clearance_constraints is not None and good.any():
+            around, at = self.asked.clearance_constraints.scene, np.flatnonzero(good)
             apart = distances_along(around, layer.base[at], layer.joints[at], times[at], around.clearance)
             good[at] = (apart >= around.clearance).all(axis=1)
         return np.asarray(good)
@@ -345,7 +345,7 @@ class _Cells:
 
     # ---- what was found --------------------------------------------------------------------------------------------
 
-    def followed(self) -> list[Followed]:
+    def followed(self) -> list[LocalMotion]:
         """The cheapest motion of each class through all stretches."""
         layers, asked = self.layers, self.asked
         final, rows = layers[-1], np.arange(len(layers[-1].cost))
@@ -371,7 +371,7 @@ class _Cells:
             found.append(self._told(layers[begin : last + 1], ways[begin : last + 1, chosen]))
         return found
 
-    def _told(self, layers: Sequence[_Layer], ways: Indices) -> Followed:
+    def _told(self, layers: Sequence[_Layer], ways: Indices) -> LocalMotion:
         """Ways through some layers."""
         times = np.array([layer.time for layer in layers])
         base = np.stack([layer.base[row] for layer, row in zip(layers, ways, strict=True)], axis=1)
@@ -381,4 +381,4 @@ class _Cells:
         cost = np.einsum("kmn,n,m->k", rates**2, self.asked.weights, np.diff(times)) / 2
         none = np.zeros(ways.shape[1])
         rates = np.concatenate([rates, rates[:, -1:]], axis=1)
-        return Followed(times, base, joints, rates, np.asarray(cost), none, none)
+        return LocalMotion(times, base, joints, rates, np.asarray(cost), none, none)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from models.arrays import Array
 from ocp.errors import SolveError
 from ocp.motion.builders.clearance import LOOKS, MARGIN, ROUNDING
-from ocp.motion.local.touching import distances_along, touches
+from ocp.motion.local.collisions import distances_along, find_collisions
 from ocp.motion.search.charts import Charts
 from ocp.motion.search.joint_space import TOLERANCE
 from ocp.motion.search.search import Search
@@ -118,7 +118,7 @@ class DeadEnd(SolveError):
             there in any attitude, of the joint whose limit stops most, where it is, and that limit, else "task".
         stops: What stops motions there, each where it does so by the least, the least first.
         gives: Motions that would do if the task gave way, the least that was found of each kind.
-        pieces: In how few pieces it may be done, see `plan_in_pieces`; None where that is not known.
+        pieces: In how few pieces it may be done, see `plan_in_segments`; None where that is not known.
     """
 
     until: float
@@ -192,7 +192,7 @@ class _Walk:
 
     def __init__(self, search: Search) -> None:
         self.search = search
-        self.asked = np.inf if search.surroundings is None else search.surroundings.clearance
+        self.asked = np.inf if search.scene is None else search.scene.clearance
         self.layers = _narrow(search)
         count, n = len(search.times), len(search.space.scale)
         self.at = [np.full((len(charts), n), np.nan) for charts in self.layers]
@@ -253,12 +253,12 @@ class _Walk:
             width = self.width[k - 1][parents]
             way = np.abs(joints - self.at[k - 1][parents])
             good &= (way <= search.limits[k - 1] + TOLERANCE).all(axis=1)
-        if search.surroundings is not None:
+        if search.scene is not None:
             wide = width > self.width[k][charts]
             good &= wide
             at = np.flatnonzero(good)
             times = np.full(len(at), search.times[k])
-            apart = distances_along(search.surroundings, np.zeros(0), joints[at], times, clearance).min(axis=1)
+            apart = distances_along(search.scene, np.zeros(0), joints[at], times, clearance).min(axis=1)
             width[at] = np.minimum(np.minimum(width[at], apart), clearance)
         good &= width > self.width[k][charts]
         own = charts[good]
@@ -280,7 +280,7 @@ def _narrow(search: Search) -> list[Charts]:
 
 def _stops(search: Search, front: _Walk) -> list[Stop]:
     """What stops motions at the last instant that is reached, the least first; of each kind and name the least."""
-    space, around, last = search.space, search.surroundings, front.last
+    space, around, last = search.space, search.scene, front.last
     names, n, there = search.instants[0].sets.equations.machine.robot.joint_names, len(space.scale), last + 1
     before, after, on = _onward(search, front)
     instant, clearance = search.instants[there], 0.0 if around is None else around.clearance
@@ -365,7 +365,7 @@ def _given(search: Search, path: Array, turning: bool, kind: GiveKind) -> Give |
     """
     if not any((sets.equations.turning == turning).any() for sets in {instant.sets for instant in search.instants}):
         return None
-    around, pairs = search.surroundings, list[int]()
+    around, pairs = search.scene, list[int]()
     for _ in range(LOOKS):
         program = _Giving(search, turning, pairs)
         rough = program.solved(path, None)  # row by row, which is smooth where nothing gives way
@@ -373,7 +373,9 @@ def _given(search: Search, path: Array, turning: bool, kind: GiveKind) -> Give |
             return None
         made = program.solved(rough, max(program.amount(rough), NEGLIGIBLE))
         path = rough if made is None else made
-        missing = [] if around is None else [touch.pair for touch in touches(around, np.zeros(0), path, search.times)]
+        missing = (
+            [] if around is None else [touch.pair for touch in find_collisions(around, np.zeros(0), path, search.times)]
+        )
         if not missing:
             return Give(kind, program.amount(path), search.times, path)
         if set(missing) <= set(pairs):
@@ -412,11 +414,11 @@ class _Giving:
         self._rest, self._rows, self._sizes = (ca.vertcat(ca.MX(0, 1), *part) for part in (rest, rows, sizes))
         self._size = ca.Function("size", [self.joints], [ca.mmax(self._sizes)])
         self._apart = ca.MX(0, 1)
-        if search.surroundings is not None and pairs:
+        if search.scene is not None and pairs:
             q, time = ca.SX.sym("q", n), ca.SX.sym("time")
-            apart = search.surroundings.distances(ca.SX(0, 1), q, time, pairs=pairs, rounding=ROUNDING)
+            apart = search.scene.distances(ca.SX(0, 1), q, time, pairs=pairs, rounding=ROUNDING)
             apart = ca.Function("apart", [q, time], [apart]).map(count)(self.joints, search.times[None, :])
-            self._apart = ca.vec(apart) - search.surroundings.clearance - MARGIN
+            self._apart = ca.vec(apart) - search.scene.clearance - MARGIN
 
     def amount(self, path: Array) -> float:
         """How far the tips of a motion (K, n) are off, m, or turned, rad."""

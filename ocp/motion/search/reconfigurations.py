@@ -36,7 +36,7 @@ Span = tuple[int, int]
 
 
 @dataclass(frozen=True)
-class PieceSettings:
+class SegmentSettings:
     """How long it is looked for the cheapest of the fewest pieces.
 
     Attributes:
@@ -64,7 +64,7 @@ class Piece(NamedTuple):
 
 
 def fewest_pieces(
-    search: Search, gap: int = 1, barred: Collection[Span] = (), settings: PieceSettings = PieceSettings()
+    search: Search, gap: int = 1, barred: Collection[Span] = (), settings: SegmentSettings = SegmentSettings()
 ) -> tuple[list[Piece], float] | None:
     """The cheapest of the fewest pieces through all instants, one after the other, and what none cost less than.
 

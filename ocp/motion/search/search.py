@@ -22,11 +22,11 @@ from warnings import warn
 import numpy as np
 from numpy.typing import NDArray
 
-from models import Surroundings
+from models import CollisionScene
 from models.arrays import Array
 from ocp.errors import BoundWarning
+from ocp.motion.local.collisions import distances_along
 from ocp.motion.local.inverse_kinematics import Unreachable
-from ocp.motion.local.touching import distances_along
 from ocp.motion.search.charts import Charts, Instant, Parts, point
 from ocp.motion.search.joint_space import FARTHEST, TOLERANCE, JointSpace
 from ocp.motion.search.steps import StepCost, Values
@@ -97,7 +97,7 @@ class Search:
         *,
         seeds: Callable[[int], Array],
         start: Array | None = None,
-        surroundings: Surroundings | None = None,
+        scene: CollisionScene | None = None,
         settings: SearchSettings = SearchSettings(),
     ) -> None:
         """
@@ -109,7 +109,7 @@ class Search:
             limits: How far the joints may go from each to the next. Shape (K - 1, n).
             seeds: Postures at an instant, of as many parts of the set as are found, shape (M, n); raises Unreachable.
             start: The posture of the first instant, where it is given. Shape (n,).
-            surroundings: What has to be clear.
+            scene: What has to be clear.
             settings: How far it goes.
 
         Raises:
@@ -117,7 +117,7 @@ class Search:
             ProblemError: More postures than memory is for.
         """
         self.space, self.instants, self.times, self.cost, self.limits = space, instants, times, cost, limits
-        self.start, self.surroundings, self.settings = start, surroundings, settings
+        self.start, self.scene, self.settings = start, scene, settings
         self._known: tuple[Graph, list[Values], list[Values] | None] | None = None
         self.covered = self._cover(seeds)
         self.layers = [self.allowed(charts, k) for k, charts in enumerate(self.covered)]
@@ -156,7 +156,7 @@ class Search:
         return charts.of(self._allowed(charts, k))
 
     def _allowed(self, charts: Charts, k: int) -> NDArray[np.bool_]:
-        around = self.surroundings
+        around = self.scene
         if around is None or not len(charts):
             return np.ones(len(charts), dtype=bool)
         times, none = np.full(len(charts), self.times[k]), np.zeros(0)
@@ -391,7 +391,7 @@ class Search:
 
     def _clear(self, joints: Array, k: int) -> NDArray[np.bool_]:
         """Whether postures (N, n) of an instant keep limits and clearance. Shape (N,)."""
-        good, around = self.space.within(joints), self.surroundings
+        good, around = self.space.within(joints), self.scene
         if around is not None:
             at = np.flatnonzero(good)
             times = np.full(len(at), self.times[k])
@@ -407,7 +407,7 @@ class Search:
             return None
         if self.start is None:
             width = max(float(charts.radii.max()) for charts in layers)
-            made = drawn_tight(path, self.instants, *steps, bounds, self.surroundings, (width / 2, width / 64))
+            made = drawn_tight(path, self.instants, *steps, bounds, self.scene, (width / 2, width / 64))
             path = made if all(self._on(k, joints) is not None for k, joints in enumerate(made)) else path
         return path if (np.abs(np.diff(path, axis=0)) <= self.limits + TOLERANCE).all() else None
 

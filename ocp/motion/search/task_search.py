@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from models.arrays import Array
 from ocp.errors import ProblemError
 from ocp.motion.local.inverse_kinematics import Unreachable
-from ocp.motion.local.rates import Followed
+from ocp.motion.local.rates import LocalMotion
 from ocp.motion.search.charts import Instant, SelfMotions
+from ocp.motion.search.configurations import OUT_OF_REACH, Asked, misfits_of, placed
 from ocp.motion.search.dead_end import DeadEnd, dead_end
 from ocp.motion.search.joint_space import Held, JointSpace
-from ocp.motion.search.postures import OUT_OF_REACH, Asked, misfits_of, placed
 from ocp.motion.search.reconfigurations import farthest, fewest_pieces
 from ocp.motion.search.search import FREE, Search
 from ocp.motion.search.steps import Squares
@@ -61,7 +61,9 @@ class TaskSearch:
         Unreachable: An instant at which no posture does the tasks.
     """
 
-    def __init__(self, asked: Asked, followed: list[Followed], settings: InstantSettings = InstantSettings()) -> None:
+    def __init__(
+        self, asked: Asked, followed: list[LocalMotion], settings: InstantSettings = InstantSettings()
+    ) -> None:
         """
         Args:
             asked: What is asked.
@@ -118,9 +120,9 @@ class TaskSearch:
             sets = self._sets(equations, own)
             instants += [Instant(sets, number) for number in range(len(own))]
         self._instants, self._parts, self.times = instants, times, np.concatenate(times)
-        clear = None if asked.clear is None else asked.clear.surroundings
+        clearance_constraints = None if asked.clearance_constraints is None else asked.clearance_constraints.scene
         limits = asked.bounds.velocity * np.diff(self.times)[:, None]
-        told: dict[str, Any] = {"seeds": self._seeds, "start": asked.start, "surroundings": clear}
+        told: dict[str, Any] = {"seeds": self._seeds, "start": asked.start, "scene": clearance_constraints}
         self._search = Search(self.space, instants, self.times, Squares(asked.weights), limits, **told)
 
     def _sets(self, equations: TaskEquations, times: Array) -> SelfMotions:
@@ -201,12 +203,12 @@ class TaskSearch:
         except Unreachable as error:
             raise placed(self.asked, error, float(self.times[k])) from error
 
-    def followed(self, every: bool = False) -> list[Followed]:
+    def followed(self, every: bool = False) -> list[LocalMotion]:
         """The cheapest motion of each class through all stretches, as what a plan begins from.
 
         Of the classes that may be the cheapest; of `every` one where these do not pass.
         """
-        asked, found = self.asked, list[Followed]()
+        asked, found = self.asked, list[LocalMotion]()
         ways = self._search.motions(self._known, every)
         if self._best is not None:
             ways.insert(0, self._best)
@@ -226,7 +228,7 @@ class TaskSearch:
             cost = np.einsum("kmn,n,m->k", rates**2, asked.weights, np.diff(times)) / 2
             base, none = np.zeros((count, len(times), 0)), np.zeros(count)
             rates = np.concatenate([rates, rates[:, -1:]], axis=1)
-            found.append(Followed(times, base, rows, rates, np.asarray(cost), none, none))
+            found.append(LocalMotion(times, base, rows, rates, np.asarray(cost), none, none))
         return found
 
 

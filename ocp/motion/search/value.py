@@ -28,9 +28,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from models import Surroundings
+from models import CollisionScene
 from models.arrays import Array
-from ocp.motion.local.touching import distances_along
+from ocp.motion.local.collisions import distances_along
 from ocp.motion.search.charts import Charts, Instant
 from ocp.motion.search.joint_space import FARTHEST, JointSpace
 from ocp.motion.search.steps import Sheets, StepCost, Steps, Values
@@ -375,7 +375,7 @@ def drawn_tight(
     times: Array,
     far: Array,
     bounds: tuple[Array, Array],
-    around: Surroundings | None,
+    around: CollisionScene | None,
     widths: tuple[float, float],
     settings: TightSettings = TightSettings(),
 ) -> Array:
@@ -431,7 +431,7 @@ def drawn_tight(
 
 
 def _passed(
-    beside: Array, times: Array, bounds: tuple[Array, Array], around: Surroundings | None, inside: float
+    beside: Array, times: Array, bounds: tuple[Array, Array], around: CollisionScene | None, inside: float
 ) -> Array:
     """By how much postures (K, s, n) about a way pass limits and clearance at times (K,), rad and m. Shape (K, s)."""
     over = np.maximum(np.maximum(beside - bounds[1], bounds[0] - beside), 0.0).sum(axis=2)

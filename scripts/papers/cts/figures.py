@@ -19,7 +19,7 @@ from ocp.app.view.appearance import Part, part_of, rod
 from ocp.app.view.rendering import Camera, Layer, render, tube
 from scripts.drawing import ASSUMING, COLORS, DASHES, TIME_COLORS, add_note, gif, legend_below, posture, sheet
 from scripts.papers.cts.plan import draw_plan
-from scripts.papers.cts.results import GAINS, NOTE, SCALE, Results, corners, surroundings
+from scripts.papers.cts.results import GAINS, NOTE, SCALE, Results, corners, scene
 
 UNITS = ("in", *["deg"] * 5)
 ITERATIONS = (("combined", 0.0, "combined"), *(("jacobian", gain, f"Jacobian, gain {gain:g}") for gain in GAINS))
@@ -182,7 +182,7 @@ class _Scene:
         axis = np.column_stack([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)])
         length = SCALE * 2.2 / INCH
         self.stores = np.stack([self.lines[:, -1] - 0.2 * length * axis, self.lines[:, -1] + 0.8 * length * axis], 1)
-        wing = surroundings().solids[0]
+        wing = scene().solids[0]
         center, half = wing.position / INCH, wing.size / (2 * INCH)
         corner = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * half + center
         quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])

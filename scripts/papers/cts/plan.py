@@ -11,7 +11,7 @@ import numpy as np
 
 from models import Box, Rig, Tunnel, optimal_inverse
 from models.arrays import Array
-from models.cts.clearance import Surroundings, clearances
+from models.cts.clearance import CollisionScene, clearances
 from models.cts.rig import INCH, inverse
 from models.cts.roll import index_harmonics
 from ocp import Collocation, Problem, roll_problem, solve
@@ -57,9 +57,9 @@ def targets(t: Any) -> list[Any]:
     return [100 * INCH, 6 * INCH, (-15 + 3 * t) * INCH, 0.0, 0.0]
 
 
-def obstacle() -> Surroundings:
+def obstacle() -> CollisionScene:
     """A block beside the path of the goose-neck; chosen."""
-    return Surroundings(solids=(Box(INCH * np.array([6.0, 4.0, 4.0]), INCH * np.array([80.0, -9.0, 3.0])),))
+    return CollisionScene(solids=(Box(INCH * np.array([6.0, 4.0, 4.0]), INCH * np.array([80.0, -9.0, 3.0])),))
 
 
 def sweep_problem(rig: Rig, tunnel: Tunnel) -> Problem:
@@ -73,7 +73,7 @@ def sweep_problem(rig: Rig, tunnel: Tunnel) -> Problem:
         acceleration_weight=ACCELERATION_WEIGHT,
         rate_limit=RATE_LIMIT,
         acceleration_limit=ACCELERATION_LIMIT,
-        surroundings=obstacle(),
+        scene=obstacle(),
         clearance=CLEARANCE,
         symbols=ca.SX,
     )

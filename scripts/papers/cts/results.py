@@ -12,7 +12,7 @@ import numpy as np
 
 from models import Box, Link, Rig, Tunnel, optimal_inverse, reference_rig, reference_tunnel, solve_table
 from models.arrays import Array
-from models.cts.clearance import Surroundings, clearances
+from models.cts.clearance import CollisionScene, clearances
 from models.cts.rig import HOME, INCH, forward, goose_neck_corner, inverse
 from models.cts.roll import index_harmonics
 from models.cts.table import Table
@@ -205,18 +205,18 @@ def store_release(rig: Rig, tunnel: Tunnel) -> Release:
     off = np.column_stack(
         [np.linalg.norm(poses[:, :3] - targets[:, :3], axis=1), np.abs(poses[:, 3:5] - targets[:, 3:]).max(axis=1)]
     )
-    gaps = clearances(rig, q, surroundings())
+    gaps = clearances(rig, q, scene())
     each = np.array(ca.Function("gaps", [q], [ca.vertcat(*gaps.values())]).map(len(t))(table.joints.T))
     least = np.nanmin(each, axis=0)
     link, thing = list(gaps)[int(np.nanargmin(np.where(np.isfinite(each), each, np.inf).min(axis=1)))]
     return Release(t, states, table, off, least, (link, "wing" if thing == "solid 0" else thing))
 
 
-def surroundings() -> Surroundings:
+def scene() -> CollisionScene:
     """Walls of the tunnel, open along x, and the parent's wing above the store; chosen."""
     walls = Box((np.inf, 1.8, 1.5))
     wing = Box(INCH * np.array([16.0, 40.0, 2.0]), INCH * np.array([102.0, 3.0, 19.0]))
-    return Surroundings(walls, (wing,))
+    return CollisionScene(walls, (wing,))
 
 
 def corners(results: Results, table: Table) -> Any:

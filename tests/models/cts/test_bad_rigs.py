@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from models import Box, Rig, Tunnel, optimal_inverse, reference_rig, reference_tunnel, solve_table
-from models.cts.clearance import Radii, Surroundings, clear_inverse, clearances
+from models.cts.clearance import CollisionScene, Radii, clear_inverse, clearances
 from models.cts.rig import INCH, Branch
 from models.cts.table import all_joint_sets, reachable_rolls
 from tests.bad_values import (
@@ -32,9 +32,9 @@ OPEN = but(array(6), "inf")
 RIG, TUNNEL = reference_rig(), reference_tunnel()
 TARGET = INCH * np.array([100.0, 6.0, -15.0, 0.0, 0.0])
 BRANCH: Bad = INSTANCE | {"no sign": Branch(2, 0), "text": ("a", "b")}
-WALLS = Surroundings(walls=Box((10, 10, 10)))
+WALLS = CollisionScene(walls=Box((10, 10, 10)))
 CLEAR: dict[str, Bad] = {
-    "surroundings": but(INSTANCE, "None") | {"empty": Surroundings()},
+    "scene": but(INSTANCE, "None") | {"empty": CollisionScene()},
     "clearance": but(FINITE, "minus inf") | NOTHING,
 }
 CASES = [
@@ -77,13 +77,13 @@ CASES = [
             "previous": FINITE | NOTHING | {"two": [0.0, 0.0]},
             "in_sequence": FLAG,
             "rate_weight": NONNEGATIVE | NOTHING,
-            "surroundings": but(INSTANCE, "None") | {"empty": Surroundings()},
+            "scene": but(INSTANCE, "None") | {"empty": CollisionScene()},
         },
     ),
     Case(
         "solve_table beside walls",
         solve_table,
-        {"rig": RIG, "tunnel": TUNNEL, "targets": [TARGET], "surroundings": WALLS},
+        {"rig": RIG, "tunnel": TUNNEL, "targets": [TARGET], "scene": WALLS},
         {
             "clearance": but(FINITE, "minus inf") | NOTHING,
             "clearance_weight": NONNEGATIVE | NOTHING,
@@ -93,7 +93,7 @@ CASES = [
     Case(
         "clear_inverse",
         clear_inverse,
-        {"rig": RIG, "tunnel": TUNNEL, "surroundings": WALLS},
+        {"rig": RIG, "tunnel": TUNNEL, "scene": WALLS},
         {
             "rig": INSTANCE,
             "tunnel": INSTANCE,
@@ -110,17 +110,17 @@ CASES = [
     Case(
         "clearances",
         clearances,
-        {"rig": RIG, "q": np.zeros(6), "surroundings": WALLS},
+        {"rig": RIG, "q": np.zeros(6), "scene": WALLS},
         {
             "rig": INSTANCE,
             "q": array(6),
-            "surroundings": INSTANCE | {"empty": Surroundings()},
+            "scene": INSTANCE | {"empty": CollisionScene()},
             "radii": but(INSTANCE, "None"),
         },
     ),
     Case(
         "Surroundings",
-        Surroundings,
+        CollisionScene,
         {"walls": Box((10, 10, 10))},
         {"walls": but(INSTANCE, "None"), "solids": SEQUENCE | {"alone": Box((1, 1, 1))}, "capsules": SEQUENCE},
     ),

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from models import Box, ModelError, optimal_inverse, reference_rig, reference_tunnel, solve_table
-from models.cts.clearance import Surroundings, clear_inverse, clearances
+from models.cts.clearance import CollisionScene, clear_inverse, clearances
 from models.cts.rig import HOME, INCH, inverse
 from models.cts.roll import ACTIVE, STATUS
 from models.shapes.distance import soft_minimum
 from tests.models.cts.cts_oracle import Array, index_by_geometry, joints_by_geometry
 
 RIG, TUNNEL = reference_rig(), reference_tunnel()
-AROUND = Surroundings(solids=(Box(INCH * np.array([6.0, 4.0, 6.0]), INCH * np.array([80.0, -9.0, 0.0])),))
+AROUND = CollisionScene(solids=(Box(INCH * np.array([6.0, 4.0, 6.0]), INCH * np.array([80.0, -9.0, 0.0])),))
 TARGETS = np.array([[100 * INCH, 6 * INCH, z * INCH, yaw, 0.1] for z, yaw in ((-12, 0), (-6, 0.1), (0, 0), (7, -0.1))])
 
 
@@ -59,7 +59,7 @@ def test_no_roll_of_a_dense_grid_is_clear_and_better(clearance: float, weight: f
 def test_the_best_roll_is_found_where_the_best_clear_roll_of_the_grid_is_elsewhere() -> None:
     """Between two boxes: the best roll is in another basin than the best roll of the grid that is clear."""
     boxes = (Box((0.054, 0.154, 0.19), (2.009, -0.165, 0.153)), Box((0.088, 0.168, 0.084), (1.919, -0.022, -0.091)))
-    function = clear_inverse(RIG, TUNNEL, Surroundings(solids=boxes), clearance=0.03)
+    function = clear_inverse(RIG, TUNNEL, CollisionScene(solids=boxes), clearance=0.03)
     for target, known in (
         ((2.598, 0.156, 0.078, 0.167, 0.076), 0.0172392516),
         ((2.585, 0.092, -0.055, 0.147, 0.053), 0.0468053923),
@@ -70,7 +70,7 @@ def test_the_best_roll_is_found_where_the_best_clear_roll_of_the_grid_is_elsewhe
 
 
 def test_the_constraint_that_holds_the_roll_is_named() -> None:
-    table = solve_table(RIG, TUNNEL, TARGETS, surroundings=AROUND, clearance=0.15)
+    table = solve_table(RIG, TUNNEL, TARGETS, scene=AROUND, clearance=0.15)
     free = solve_table(RIG, TUNNEL, TARGETS)
     assert table.status == ("ok",) * 4
     assert table.active[2] == "clearance"
@@ -78,7 +78,7 @@ def test_the_constraint_that_holds_the_roll_is_named() -> None:
 
 
 def test_far_from_everything_it_is_the_closed_form() -> None:
-    far = Surroundings(solids=(Box((2.0, 2, 2), (80.0, 0, 0)),))
+    far = CollisionScene(solids=(Box((2.0, 2, 2), (80.0, 0, 0)),))
     function, closed = clear_inverse(RIG, TUNNEL, far, clearance=0.1), optimal_inverse(RIG, TUNNEL)
     for row in TARGETS:
         np.testing.assert_allclose(np.array(function(row, 0.3)[0]), np.array(closed(row, 0.3)[0]), atol=1e-7)
@@ -86,9 +86,9 @@ def test_far_from_everything_it_is_the_closed_form() -> None:
 
 def test_a_target_that_is_never_clear_is_marked_and_leaves_the_others_alone() -> None:
     rows = np.vstack([TARGETS, [[np.nan] * 5], [[9.0, 9, 9, 0, 0]]])
-    shut = Surroundings(walls=Box((np.inf, 0.02, 0.02)))
-    assert solve_table(RIG, TUNNEL, TARGETS, surroundings=shut, clearance=0.0).status == ("clearance",) * 4
-    table = solve_table(RIG, TUNNEL, rows, surroundings=AROUND, clearance=0.1)
+    shut = CollisionScene(walls=Box((np.inf, 0.02, 0.02)))
+    assert solve_table(RIG, TUNNEL, TARGETS, scene=shut, clearance=0.0).status == ("clearance",) * 4
+    table = solve_table(RIG, TUNNEL, rows, scene=AROUND, clearance=0.1)
     assert table.status == ("ok",) * 4 + ("not a number", "pitch link out of reach")
     assert np.isnan(table.joints[4:]).all()
     assert STATUS[-1] == ACTIVE[-1] == "clearance"
@@ -109,4 +109,4 @@ def test_what_cannot_be_asked_is_named(options: dict[str, Any], reason: str) -> 
     with pytest.raises(ModelError, match=reason):
         clear_inverse(RIG, TUNNEL, AROUND, **options)
     with pytest.raises(ModelError, match="empty"):
-        clear_inverse(RIG, TUNNEL, Surroundings())
+        clear_inverse(RIG, TUNNEL, CollisionScene())

@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from models import Box, Capsule, Link, ModelError, reference_rig
 from models.cts.clearance import (
+    CollisionScene,
     LinkCapsule,
-    Surroundings,
     box_distance,
     capsule_in_box,
     capsule_to_box,
@@ -97,7 +97,7 @@ def test_yaw_and_pitch_are_those_of_the_rig() -> None:
         (lambda: release(Store(BODY), REST, [0, 1, 1]), "times"),
         (lambda: release(Store(BODY), np.zeros(13), [0, 1]), "quaternion"),
         (lambda: release(Store(BODY), np.full(13, np.nan), [0, 1]), "start"),
-        (lambda: clearances(reference_rig(), ca.DM.zeros(6), Surroundings()), "empty"),
+        (lambda: clearances(reference_rig(), ca.DM.zeros(6), CollisionScene()), "empty"),
         (lambda: Box((1, 0, 1)), "size .* m is not positive"),
         (lambda: Box((np.inf,) * 3), "no outside"),
         (lambda: soft_minimum([ca.DM(1)], 0.0), "width"),
@@ -193,7 +193,7 @@ def test_the_capsules_join_the_frames_of_the_rig() -> None:
 
 
 def test_every_link_is_held_against_everything_around() -> None:
-    around = Surroundings(Box((np.inf, 2, 2)), (Box((2, 2, 0.2), (2, 0, 1)),), (Capsule(0.2, (0, 0, 2), (3, 0, 2)),))
+    around = CollisionScene(Box((np.inf, 2, 2)), (Box((2, 2, 0.2), (2, 0, 1)),), (Capsule(0.2, (0, 0, 2), (3, 0, 2)),))
     found = clearances(reference_rig(), ca.DM([0.3, -1.8, 0.3, 0.2, 1.4, 0.9]), around)
     assert len(found) == 6 * 3
     assert all(np.isfinite(number(gap)) for gap in found.values())

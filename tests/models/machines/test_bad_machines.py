@@ -8,20 +8,20 @@ import numpy as np
 import pytest
 
 from models import (
+    CollisionScene,
     CollisionShape,
     FixedBase,
     Foot,
     Foothold,
     FreeFloating,
     Link,
-    Moving,
+    MovingObstacle,
     Path,
     Scara,
     Sphere,
     Stance,
     Standing,
     Support,
-    Surroundings,
     footprint,
     planar_chain,
     rectangle,
@@ -109,7 +109,7 @@ def arm() -> Scara:
 BOLTED_CASES = [
     Case(
         "Surroundings",
-        lambda **given: Surroundings(**given),
+        lambda **given: CollisionScene(**given),
         {"machine": ARMOURED, "obstacles": [Sphere(0.1, (2.0, 0.0, 0.0))], "clearance": 0.01},
         {
             "obstacles": SEQUENCE | {"array": np.ones(3), "two": [Sphere(0.1, (2.0, 0.0, 0.0)), 1.0]},
@@ -123,7 +123,7 @@ BOLTED_CASES = [
     ),
     Case(
         "Moving",
-        Moving,
+        MovingObstacle,
         {"shape": Sphere(0.1, (0.0, 0.0, 0.0)), "position": lambda time: (time, 0.0, 0.0)},
         {
             "shape": INSTANCE,

@@ -8,8 +8,8 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from models import ModelError, Moving, Sphere
-from models.machines.moving import without_tables
+from models import ModelError, MovingObstacle, Sphere
+from models.machines.moving_obstacle import without_tables
 
 BALL = Sphere(0.1, (0, 0, 0))
 
@@ -34,11 +34,11 @@ def test_a_table_inside_a_function_of_either_kind_of_symbols_is_found() -> None:
     table = ca.interpolant("table", "linear", [[0.0, 1.0, 2.0]], [0.0, 1.0, 0.0])
     t = ca.MX.sym("t")
     way = ca.Function("way", [t], [ca.vertcat(table(t), 2 * table(t + 1), 0)])
-    moving = Moving(BALL, lambda time: way(time))
+    moving = MovingObstacle(BALL, lambda time: way(time))
     np.testing.assert_allclose(np.array(moving.frame(0.5).position).ravel(), [0.5, 1.0, 0.0])
 
 
 def test_what_is_no_table_of_one_argument_is_named() -> None:
     plane: Any = ca.interpolant("plane", "linear", [[0.0, 1.0], [0.0, 1.0]], [0.0, 1.0, 2.0, 3.0])
     with pytest.raises(ModelError, match=r"'plane'.* is no table of one argument"):
-        Moving(BALL, lambda t: (plane(ca.vertcat(t, t)), 0, 0))
+        MovingObstacle(BALL, lambda t: (plane(ca.vertcat(t, t)), 0, 0))

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from models import Surroundings, link_frames
+from models import CollisionScene, link_frames
 from models.arrays import Array
 from models.shapes.bodies import bodies_of
 from models.shapes.pairs import ALWAYS, NEIGHBOURS, NEVER, RIGID
 from ocp import TipTask, inverse_kinematics
-from ocp.motion.local.touching import distances_along
+from ocp.motion.local.collisions import distances_along
 from tests.models.shapes.shape_oracles import in_coal
 from tests.redundancy_benchmark import PROBLEMS, Benchmark, problem_of
 
@@ -65,7 +65,7 @@ def by_coal(problem: Benchmark, joints: Array) -> dict[frozenset[str], Array]:
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_what_touches_is_what_coal_says(name: str) -> None:
     problem = problem_of(name)
-    around = Surroundings(problem.machine, problem.boxes, ignored=problem.ignored)
+    around = CollisionScene(problem.machine, problem.boxes, ignored=problem.ignored)
     joints = postures(problem)
     expected = by_coal(problem, joints)
     base, q = ca.SX(0, 1), ca.SX.sym("q", problem.machine.joint_size)

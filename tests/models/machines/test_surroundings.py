@@ -14,6 +14,7 @@ from numpy.testing import assert_allclose
 from models import (
     Box,
     Capsule,
+    CollisionScene,
     CollisionShape,
     Cylinder,
     FixedBase,
@@ -24,10 +25,9 @@ from models import (
     Mesh,
     Mimic,
     ModelError,
-    Moving,
+    MovingObstacle,
     Robot,
     Sphere,
-    Surroundings,
     link_frames,
 )
 from models.shapes.distance import distance
@@ -75,7 +75,7 @@ def postures(machine: Any, count: int, seed: int) -> tuple[Any, Any]:
     return base, rng.uniform(low, high, size=(count, machine.joint_size))
 
 
-def points_of(around: Surroundings, machine: Any) -> Any:
+def points_of(around: CollisionScene, machine: Any) -> Any:
     """Casadi Function (base, q, time) -> points of each pair, seen from where they are seen."""
     base, q, t = ca.SX.sym("base", machine.base_size), ca.SX.sym("q", machine.joint_size), ca.SX.sym("t")
     frames = ca.reshape(around.placements(base, q, t), 12, -1)
@@ -98,7 +98,7 @@ def points_of(around: Surroundings, machine: Any) -> Any:
 @pytest.mark.parametrize("name", machines())
 def test_distances_are_those_of_the_hulls(name: str) -> None:
     machine = machines()[name]
-    around = Surroundings(machine, OBSTACLES)
+    around = CollisionScene(machine, OBSTACLES)
     assert len(around.pairs) >= 8
     base, q, t = ca.SX.sym("base", machine.base_size), ca.SX.sym("q", machine.joint_size), ca.SX.sym("t")
     exact = ca.Function("exact", [base, q, t], [around.distances(base, q, t)])
@@ -125,7 +125,7 @@ def test_distances_are_those_of_the_hulls(name: str) -> None:
 @pytest.mark.parametrize("name", machines())
 def test_no_point_moves_or_bends_by_more_than_its_levers_say(name: str) -> None:
     machine = machines()[name]
-    around = Surroundings(machine, OBSTACLES[:2])
+    around = CollisionScene(machine, OBSTACLES[:2])
     levers = around.levers
     lever = np.hstack([levers.base, levers.joints])
     turn = np.hstack([levers.base_turns, levers.joint_turns])
@@ -160,15 +160,15 @@ def test_each_obstacle_that_moves_is_where_it_is_then() -> None:
     """Two of them, others between: beside each link as if it stood where it is at that time."""
     machine = machines()["arm"]
     ways: list[Any] = [lambda t: (0.5, 0.3 * t, 0.5), lambda t: (-0.4 * t, 0.2, 0.3 + t**2)]
-    moving = [Moving(OBSTACLES[1], ways[0], turned), Moving(OBSTACLES[2], ways[1])]
-    around = Surroundings(machine, (OBSTACLES[0], moving[0], OBSTACLES[3], moving[1]))
+    moving = [MovingObstacle(OBSTACLES[1], ways[0], turned), MovingObstacle(OBSTACLES[2], ways[1])]
+    around = CollisionScene(machine, (OBSTACLES[0], moving[0], OBSTACLES[3], moving[1]))
     q, t = ca.SX.sym("q", machine.joint_size), ca.SX.sym("t")
     found = ca.Function("found", [q, t], [around.distances((), q, t)])
     for j, at in zip(postures(machine, 5, 3)[1], (0.0, 0.3, 0.7, 1.0, 2.0), strict=True):
         placed = []
         for one, way, turn in zip(moving, ways, (np.array(ca.DM(turned(at))), np.eye(3)), strict=True):
             placed.append(one.shape.placed(turn, np.array(way(at))))
-        still = Surroundings(machine, (OBSTACLES[0], placed[0], OBSTACLES[3], placed[1]))
+        still = CollisionScene(machine, (OBSTACLES[0], placed[0], OBSTACLES[3], placed[1]))
         known = dict(zip(still.labels, np.array(ca.DM(still.distances((), ca.DM(j)))).ravel(), strict=True))
         told = dict(zip(around.labels, np.array(found(j, at)).ravel(), strict=True))
         assert {one for label in told for one in label if one.startswith("obstacle")} == {
@@ -179,7 +179,7 @@ def test_each_obstacle_that_moves_is_where_it_is_then() -> None:
 
 
 def test_scaled_machines_have_scaled_distances_and_levers() -> None:
-    plain, large = (Surroundings(FixedBase(armoured_arm(scale=k))) for k in (1.0, 3.0))
+    plain, large = (CollisionScene(FixedBase(armoured_arm(scale=k))) for k in (1.0, 3.0))
     q = np.linspace(-1, 1, 7)
     assert plain.labels == large.labels
     assert_allclose(np.array(large.distances((), q)), 3 * np.array(plain.distances((), q)), rtol=1e-9)
@@ -189,12 +189,12 @@ def test_scaled_machines_have_scaled_distances_and_levers() -> None:
 
 def test_which_pairs_are_left() -> None:
     machine = FixedBase(armoured_arm())
-    around = Surroundings(machine, OBSTACLES, ignored=[("link6", "obstacle 1"), ("link2", "link4")])
+    around = CollisionScene(machine, OBSTACLES, ignored=[("link6", "obstacle 1"), ("link2", "link4")])
     assert around.left["base", "obstacle 0"] == "neither moves"
     assert around.left["link6", "obstacle 1"] == "told"
     assert not {("link6", "obstacle 1"), ("link2", "link4"), ("base", "obstacle 3")} & set(around.labels)
     assert ("link6", "obstacle 0") in around.labels
-    moving = Surroundings(machine, [Moving(OBSTACLES[0], lambda t: (t, 0, 0))])
+    moving = CollisionScene(machine, [MovingObstacle(OBSTACLES[0], lambda t: (t, 0, 0))])
     assert ("base", "obstacle 0") in moving.labels
 
 
@@ -210,9 +210,11 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
 
 def test_a_pair_is_ignored_by_the_names_that_it_is_told_as() -> None:
     machine = FixedBase(armoured_arm())
-    around = Surroundings(machine, [Sphere(0.1, (0.3, 0, 0.3)), Moving(Sphere(0.1, (0, 0, 0)), lambda t: (t, 0, 0.3))])
+    around = CollisionScene(
+        machine, [Sphere(0.1, (0.3, 0, 0.3)), MovingObstacle(Sphere(0.1, (0, 0, 0)), lambda t: (t, 0, 0.3))]
+    )
     for pair in range(len(around.pairs)):
-        without = Surroundings(machine, around.obstacles, ignored=[around.told_as(pair)])
+        without = CollisionScene(machine, around.obstacles, ignored=[around.told_as(pair)])
         assert set(without.labels) < set(around.labels)
         assert around.labels[pair] not in without.labels
 
@@ -221,7 +223,7 @@ def test_a_pair_is_ignored_by_the_names_that_it_is_told_as() -> None:
 def test_what_is_refused(case: str) -> None:
     given, word = BAD[case]
     with pytest.raises(ModelError, match=word):
-        Surroundings(FixedBase(armoured_arm()), **given)
+        CollisionScene(FixedBase(armoured_arm()), **given)
 
 
 @pytest.mark.parametrize(
@@ -241,7 +243,7 @@ def test_what_is_refused(case: str) -> None:
 def test_what_does_not_move(given: dict[str, Any], word: str) -> None:
     good: dict[str, Any] = {"shape": Sphere(0.1, (0, 0, 0)), "position": lambda t: (t, 0, 0)}
     with pytest.raises(ModelError, match=word):
-        Moving(**{**good, **given})
+        MovingObstacle(**{**good, **given})
 
 
 @pytest.mark.parametrize(
@@ -253,8 +255,8 @@ def test_what_does_not_move(given: dict[str, Any], word: str) -> None:
     ],
 )
 def test_a_motion_that_is_none_at_some_time_is_told_with_the_time(given: dict[str, Any], word: str) -> None:
-    moving = Moving(**{"shape": Sphere(0.1, (0, 0, 0)), "position": lambda t: (t, 0, 0), **given})
-    around = Surroundings(FixedBase(armoured_arm()), [moving])
+    moving = MovingObstacle(**{"shape": Sphere(0.1, (0, 0, 0)), "position": lambda t: (t, 0, 0), **given})
+    around = CollisionScene(FixedBase(armoured_arm()), [moving])
     with pytest.raises(ModelError, match=word) as caught:
         around.check_motions(0.0, 1.0)
     assert caught.value.time is not None
@@ -268,13 +270,13 @@ def test_a_slide_without_limits() -> None:
     turned = [Joint("foot", "revolute", "ground", "base", axis=(0, 0, 1)), *free]
     long = Robot((Link("ground", 1.0), *robot.links), tuple(turned), tip="left")
     with pytest.raises(ModelError, match="rail"):
-        _ = Surroundings(FixedBase(long), OBSTACLES[:1]).levers
+        _ = CollisionScene(FixedBase(long), OBSTACLES[:1]).levers
 
 
 @pytest.mark.parametrize("wrong", [{}, (), None, "arm", 1.0, FixedBase, Robot((Link("alone"),))], ids=repr)
 def test_what_is_no_machine_has_no_surroundings(wrong: Any) -> None:
-    with pytest.raises(ModelError, match="surroundings: machine must be a FixedBase") as caught:
-        Surroundings(wrong)
+    with pytest.raises(ModelError, match="scene: machine must be a FixedBase") as caught:
+        CollisionScene(wrong)
     assert caught.value.name == "machine"
 
 
@@ -282,8 +284,8 @@ def test_what_is_no_machine_has_no_surroundings(wrong: Any) -> None:
 def test_gradients_of_distances_are_their_derivatives(name: str, rounding: float) -> None:
     """By joints, slides, followers, a base that floats, beside what stands and what turns; pairs in any order."""
     machine = machines()[name]
-    tumbling = Moving(Box((0.2, 0.3, 0.4)), lambda t: (0.5, 0.3 * t, 0.5), lambda t: turned(t))
-    around = Surroundings(machine, (*OBSTACLES, tumbling))
+    tumbling = MovingObstacle(Box((0.2, 0.3, 0.4)), lambda t: (0.5, 0.3 * t, 0.5), lambda t: turned(t))
+    around = CollisionScene(machine, (*OBSTACLES, tumbling))
     order = np.random.default_rng(6).permutation(len(around.pairs)).tolist()
     function = around.distance_gradients(pairs=order, rounding=rounding)
     base, q, t = ca.SX.sym("base", machine.base_size), ca.SX.sym("q", machine.joint_size), ca.SX.sym("t")
@@ -307,7 +309,7 @@ def turned(t: Any) -> Any:
 
 def test_gradients_of_no_pairs_have_no_rows() -> None:
     machine = machines()["arm"]
-    values, slopes = Surroundings(machine, OBSTACLES).distance_gradients(pairs=[])(
+    values, slopes = CollisionScene(machine, OBSTACLES).distance_gradients(pairs=[])(
         (), np.zeros(machine.joint_size), 0.0
     )
     assert values.shape == (0, 1)
@@ -333,7 +335,7 @@ def hooked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FixedBase:
 
 def test_meshes_up_to_three_joints_apart_are_looked_at_as_their_hulls(hooked: FixedBase, tmp_path: Path) -> None:
     """Their distances are those of their covers, from below; gradients by the soft minimum; others are covers alone."""
-    around = Surroundings(hooked, folders=[tmp_path])
+    around = CollisionScene(hooked, folders=[tmp_path])
     hulls = [isinstance(around.bodies[one].shape, Mesh) for one, _, _ in around.pairs]
     links = [tuple(int(name[4]) for name in label) for label in around.labels]
     assert {(i, j) for (i, j), hull in zip(links, hulls, strict=True) if hull} == {

@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from models import FixedBase, ModelError, Surroundings, example_robot, mass_matrix
+from models import CollisionScene, FixedBase, ModelError, example_robot, mass_matrix
 
 NAMES = {"six_axis": 6, "seven_axis": 7}
 
@@ -61,7 +61,7 @@ def test_bodies_are_homogeneous_and_apart_at_zero_and_every_joint_is_limited(nam
     data, found = model.createData(), pin.GeometryData(shapes)
     pin.computeDistances(model, data, shapes, found, np.zeros(model.nq))
     assert min(result.min_distance for result in found.distanceResults) > 0.005
-    around = Surroundings(FixedBase(robot))
+    around = CollisionScene(FixedBase(robot))
     assert np.array(around.distances(np.zeros(0), np.zeros(robot.dof))).min() > 0
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from models import CollisionShape, FixedBase, Joint, Link, ModelError, ModelWarning, Robot, Surroundings
+from models import CollisionScene, CollisionShape, FixedBase, Joint, Link, ModelError, ModelWarning, Robot
 from models.arrays import Array
 from models.shapes.bodies import Body, bodies_of, capsule_around
 from models.shapes.covering import inside
@@ -133,7 +133,7 @@ def test_meshes_in_a_plane_are_looked_at_as_plates_of_a_micrometre(tmp_path: Pat
     links = tuple(Link(f"link{k}", collisions=(CollisionShape("mesh", (1, 1, 1), "flat.obj"),)) for k in range(3))
     turn: dict[str, Any] = {"axis": (0, 1, 0), "translation": (0, 0, 0.2), "lower": -2, "upper": 2}
     joints = tuple(Joint(f"joint{k}", "revolute", f"link{k - 1}", f"link{k}", **turn) for k in (1, 2))
-    around = Surroundings(FixedBase(Robot(links, joints)), folders=[tmp_path])
+    around = CollisionScene(FixedBase(Robot(links, joints)), folders=[tmp_path])
     assert around.labels == (("link0 hull 1", "link2 hull 2"),)
     for body in around.bodies:
         if isinstance(body.shape, Mesh):

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from models import cache as kept
-from ocp import Plan, PlanInPieces, ProblemError, SolveError, plan_in_pieces
+from ocp import Plan, ProblemError, SegmentedPlan, SolveError, plan_in_segments
 from ocp.app import main
 from ocp.app.files.task_file import read_task
 from ocp.app.progress import Progress
@@ -245,10 +245,10 @@ LIFTED = """<robot name="lifted"><link name="ground"/><link name="column"/><link
 def test_what_no_one_motion_does_is_written_in_pieces_and_the_ways_between_them_and_fails_where_one_is_missing(
     tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made = list[PlanInPieces]()
+    made = list[SegmentedPlan]()
 
-    def kept_too(*given: Any, **options: Any) -> PlanInPieces:
-        made.append(plan_in_pieces(*given, **options))
+    def kept_too(*given: Any, **options: Any) -> SegmentedPlan:
+        made.append(plan_in_segments(*given, **options))
         return made[0]
 
     monkeypatch.setattr("ocp.app.planned.plan_in_pieces", kept_too)

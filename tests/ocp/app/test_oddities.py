@@ -10,16 +10,16 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from models import FixedBase, FreeFloating, Robot, Sphere, Standing, Surroundings, mass_matrix, rectangle
+from models import CollisionScene, FixedBase, FreeFloating, Robot, Sphere, Standing, mass_matrix, rectangle
 from ocp import Plan
 from ocp.app import Check, check_trajectory
+from ocp.app.check.collisions import proof, within_limits
 from ocp.app.check.joint_limits import floating_base, floating_torques
 from ocp.app.check.oddities import BASES
 from ocp.app.check.pieces import Motion, Pieces, highest
-from ocp.app.check.surroundings import proof, within_limits
 from ocp.app.files import read_trajectory
 from ocp.errors import ProblemError
-from ocp.motion.local.touching import distances_along
+from ocp.motion.local.collisions import distances_along
 from tests.ocp.app.motions import MIDDLE, NAMES, SWING, URDF, joint, link, smooth, write_table
 
 GALLERY = Path(__file__).resolve().parents[3] / "results" / "gallery"
@@ -97,7 +97,7 @@ def test_proven_distances_lie_below_a_fine_sampling_and_near_it(rates: int, coun
     motion = Motion(t, *values[:rates])
     arm = FixedBase(Robot.from_urdf(URDF, tip="finger"))
     ball = Sphere(radius=0.1, position=rng.uniform([0.3, -0.2, 0.3], [0.9, 0.6, 0.6]))
-    around = Surroundings(within_limits(arm, motion), [ball], 0.05)
+    around = CollisionScene(within_limits(arm, motion), [ball], 0.05)
     found = proof(around, motion)
     assert found.settled
     fine = np.unique(np.concatenate([a + (b - a) * np.linspace(0.0, 1.0, 21) for a, b in pairwise(t)]))

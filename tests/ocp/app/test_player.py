@@ -17,6 +17,7 @@ import pytest
 
 from models import (
     Box,
+    CollisionScene,
     CollisionShape,
     FixedBase,
     FreeFloating,
@@ -24,11 +25,10 @@ from models import (
     Joint,
     Link,
     Machine,
-    Moving,
+    MovingObstacle,
     Robot,
     Sphere,
     Standing,
-    Surroundings,
     VisualShape,
     link_frames,
     locked,
@@ -39,14 +39,23 @@ from models import (
 )
 from models.arrays import Array
 from models.robot.kinematics import centers_of_mass
-from ocp import Clear, Collocation, Plan, ProblemError, Solution, TipTask, minimum_velocity_problem, solve
+from ocp import (
+    ClearanceConstraints,
+    Collocation,
+    Plan,
+    ProblemError,
+    Solution,
+    TipTask,
+    minimum_velocity_problem,
+    solve,
+)
 from ocp.app import main
 from ocp.app.files import read_trajectory
 from ocp.app.view import appearance, player
 from ocp.app.view.appearance import appearance_of, frames_along
 from ocp.app.view.player import Served, page, unpacked
 from ocp.app.view.shown import PAGE_SETTINGS, Curve, footing_of, shown_plan, shown_solution, shown_trajectory
-from ocp.motion.local.touching import distances_along
+from ocp.motion.local.collisions import distances_along
 from ocp.motion.plan.motion import Part
 from ocp.motion.tasks.targets import targets_along
 from tests.models.machines.armoured import armoured_arm
@@ -314,18 +323,22 @@ def test_the_momentum_of_the_whole_is_that_of_a_floating_plan(plans: dict[str, P
 def test_the_nearest_bodies_are_those_of_the_plan_at_every_time(tmp_path: Path) -> None:
     machine = FixedBase(armoured_arm())
     start = np.array([0.1, 0.6, 0.1, 1.0, 0.1, 0.8, 0.0])
-    clear = Clear(Surroundings(machine, [Sphere(0.05, (0.9, 0.4, 0.2))]))
+    clearance_constraints = ClearanceConstraints(CollisionScene(machine, [Sphere(0.05, (0.9, 0.4, 0.2))]))
     problem = minimum_velocity_problem(
-        machine, TipTask(rows=(3, 4, 5), velocity=(0.0, 0.1, 0.0)), start, 1.0, clear=clear
+        machine,
+        TipTask(rows=(3, 4, 5), velocity=(0.0, 0.1, 0.0)),
+        start,
+        1.0,
+        clearance_constraints=clearance_constraints,
     )
     plan = Plan(machine, solve(problem, Collocation(intervals=6, degree=3)), (Part(0.0, 1.0, ""),))
     near = shown_plan(plan).near
     assert near is not None
     joints = plan.at(near.t)["joints"]
-    apart = distances_along(clear.surroundings, np.zeros((len(near.t), 0)), joints, near.t)
+    apart = distances_along(clearance_constraints.scene, np.zeros((len(near.t), 0)), joints, near.t)
     np.testing.assert_allclose(near.distances, apart.min(axis=1), atol=1e-9)
     best = apart.argmin(axis=1)
-    labels = clear.surroundings.labels
+    labels = clearance_constraints.scene.labels
     assert [tuple(labels[k]) for k in best] == [tuple(pair) for pair in near.bodies]
     told, arrays = unpacked(page([shown_plan(plan)]).text)
     assert len(told["motions"][0]["around"]) == 1  # the ball
@@ -345,12 +358,16 @@ def test_obstacles_that_move_are_shown_where_they_are_at_every_time_and_half_spa
         return ca.blockcat([[ca.cos(time), -ca.sin(time), 0], [ca.sin(time), ca.cos(time), 0], [0, 0, 1]])
 
     around: list[Any] = [
-        Moving(Box((0.1, 0.2, 0.05), (0.02, 0, 0)), way, turn),
+        MovingObstacle(Box((0.1, 0.2, 0.05), (0.02, 0, 0)), way, turn),
         HalfSpace((0.6, 0.0, 0.8), (0.0, 0.0, -1.5)),
     ]
-    clear = Clear(Surroundings(machine, around))
+    clearance_constraints = ClearanceConstraints(CollisionScene(machine, around))
     problem = minimum_velocity_problem(
-        machine, TipTask(rows=(3, 4, 5), velocity=(0.0, 0.1, 0.0)), start, 1.0, clear=clear
+        machine,
+        TipTask(rows=(3, 4, 5), velocity=(0.0, 0.1, 0.0)),
+        start,
+        1.0,
+        clearance_constraints=clearance_constraints,
     )
     plan = Plan(machine, solve(problem, Collocation(intervals=6, degree=3)), (Part(0.0, 1.0, ""),))
     shown = shown_plan(plan)

@@ -360,10 +360,10 @@ def test_what_slides_on_what_turns_bends_by_coriolis(low: float) -> None:
     assert found is not None
     assert found.missed > 0
     assert found.least <= 1.0 <= found.distance + 1e-15
-    clear = swinging(low, asked=-1e-2)
-    assert clear.settled
-    assert clear.worst is not None
-    assert clear.worst.missed == 0
+    clearance_constraints = swinging(low, asked=-1e-2)
+    assert clearance_constraints.settled
+    assert clearance_constraints.worst is not None
+    assert clearance_constraints.worst.missed == 0
 
 
 @pytest.mark.parametrize("smooth", [True, False])

@@ -29,8 +29,8 @@ from models.arrays import Array
 from ocp.console import interruptible
 from ocp.direct.collocation import Collocation
 from ocp.errors import ProblemError, checked_instance
-from ocp.motion.builders.clearance import Clear
-from ocp.motion.builders.drives import Effort, JointFriction
+from ocp.motion.builders.actuator_limits import Effort, JointFriction
+from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.dynamics import dynamics_problem, rates_at
 from ocp.motion.builders.dynamics_plan import within_limits
 from ocp.motion.builders.space.grasping import Cone, Grasp, checked_pair, grasp_wrench, motion_of, pair_momentum
@@ -67,7 +67,7 @@ class AskedOfCapture(TypedDict, total=False):
     friction: JointFriction | None
     cone: Cone | None
     grasp: Grasp | None
-    clear: Clear | None
+    clearance_constraints: ClearanceConstraints | None
     end_joints: Any
     rest: bool
 
@@ -99,7 +99,7 @@ def capture_problem(
             limits, effort, friction: As of `dynamics_problem`, of both phases.
             cone: Of the approach. The tip begins at a distance of twice its length or more, or within it.
             grasp: What the hand bears while detumbling.
-            clear: What the chaser stays clear of while approaching, as of `dynamics_problem`; not the target.
+            clearance_constraints: Of the chaser while approaching, as of `dynamics_problem`; not the target.
             end_joints: At the end of the detumbling. Shape (n,), nan where free, as those of wheels.
             rest: Whether joints (but for wheels) and base turn no more at the end; True if not given.
 
@@ -154,13 +154,13 @@ def plan_capture(
         SolveError: As of `plan_dynamics`.
     """
 
-    def declare(clear: Clear | None) -> Problem:
-        kept: AskedOfCapture = {**asked, "clear": clear}
+    def declare(clearance_constraints: ClearanceConstraints | None) -> Problem:
+        kept: AskedOfCapture = {**asked, "clearance_constraints": clearance_constraints}
         return capture_problem(chaser, target, start_joints, approach, detumble, **kept)
 
     mesh = POINTS if method is None else method
     driven = {phase: (chaser, asked.get("limits")) for phase in (APPROACH, DETUMBLE)}
-    return within_limits(declare, asked.get("clear"), mesh, (), options, tolerances, driven)
+    return within_limits(declare, asked.get("clearance_constraints"), mesh, (), options, tolerances, driven)
 
 
 @interruptible
@@ -188,18 +188,20 @@ def chained_capture(
     given = _Capture.of(chaser, target, start_joints, (approach, detumble), asked)
     given.detumbling(detumble, None)  # refused before the approach is solved
 
-    def first(clear: Clear | None) -> Problem:
-        problem = replace(given, asked={**asked, "clear": clear}).approach(approach)
+    def first(clearance_constraints: ClearanceConstraints | None) -> Problem:
+        problem = replace(given, asked={**asked, "clearance_constraints": clearance_constraints}).approach(approach)
         given.grasp(problem, *motion_of(problem), problem.declared.states["target"].symbol)
         given.guess_approach(problem)
         return problem
 
-    one = within_limits(first, asked.get("clear"), mesh, (), options, tolerances, {"": (chaser, limits)})
+    one = within_limits(
+        first, asked.get("clearance_constraints"), mesh, (), options, tolerances, {"": (chaser, limits)}
+    )
     end = dict(one.at_fraction(1.0))
     end["joints"] = given.arm * end["joints"]
     end["base"] = np.array(ca.DM(_of_unit_length(chaser, end["base"]))).ravel()
 
-    def second(_: Clear | None) -> Problem:
+    def second(_: ClearanceConstraints | None) -> Problem:
         problem = given.detumbling(detumble, end)
         guess_braking(problem, given.pair, end["joints"], end["velocities"], end["base"])
         return problem
@@ -271,9 +273,15 @@ class _Capture:
         """The first phase: the target's motion, and the grasp at the end."""
         chaser, target, asked = self.chaser, self.target, self.asked
         problem = dynamics_problem(
-            chaser, self.joints, duration, start_base=self.base, end="free", clear=asked.get("clear"),
-            start=self.start.velocities, **self.shared,
-        )  # fmt: skip
+            chaser,
+            self.joints,
+            duration,
+            start_base=self.base,
+            end="free",
+            clearance_constraints=asked.get("clearance_constraints"),
+            start=self.start.velocities,
+            **self.shared,
+        )
         earliest = duration.lower if isinstance(duration, FreeTime) else duration
         require_reach(chaser, target, self.start, earliest)
         base, joints, _ = motion_of(problem)

@@ -3,7 +3,7 @@
 from ocp.motion.builders.standing.plan import plan_standing, plan_steps
 from ocp.motion.builders.standing.problem import FreeTime, Weights, motion_cost, standing_problem
 from ocp.motion.builders.standing.resolved import StepsMotion, resolve_steps, steps_motion
-from ocp.motion.builders.standing.stances import StancePhase, Steps, standing_posture, walk
+from ocp.motion.builders.standing.stances import StancePhase, Steps, standing_configuration, walk
 from ocp.motion.builders.standing.steps import StepWeights, steps_problem
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.zmp_rules import Anywhere, Following, IndexAtLeast, InFoot, Pinned, ZmpRule
@@ -26,7 +26,7 @@ __all__ = [
     "plan_standing",
     "plan_steps",
     "resolve_steps",
-    "standing_posture",
+    "standing_configuration",
     "standing_problem",
     "steps_motion",
     "steps_problem",

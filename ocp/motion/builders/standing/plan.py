@@ -26,7 +26,7 @@ from ocp.direct.collocation import Collocation
 from ocp.direct.shooting import MultipleShooting
 from ocp.errors import ProblemError, SolveError, checked_instance, checked_mapping, checked_time_limit
 from ocp.methods import solve
-from ocp.motion.builders.clearance import Clear, keeping_clear, touching_error
+from ocp.motion.builders.clearance import ClearanceConstraints, collision_error, solve_with_clearance
 from ocp.motion.builders.standing.problem import FreeTime, Weights, standing_problem
 from ocp.motion.builders.standing.stances import Steps
 from ocp.motion.builders.standing.steps import StepWeights, steps_problem
@@ -267,7 +267,7 @@ def plan_standing(
     method: Collocation | None = None,
     options: Mapping[str, Any] | None = None,
     tolerances: Mapping[str, float] | None = None,
-    clear: Clear | None = None,
+    clearance_constraints: ClearanceConstraints | None = None,
     **asked: Unpack[Asked],
 ) -> Solution:
     """Solve `standing_problem` and audit the plan, by the formulation that works for it.
@@ -282,7 +282,7 @@ def plan_standing(
         method: The first mesh, and by its `control` the only formulation that is tried.
         options: Of IPOPT.
         tolerances: Of the audit, by name, see `ocp.audit.audit.audit`.
-        clear: What the motion has to stay clear of; bodies that touch are held apart, and it is planned anew.
+        clearance_constraints: Colliding bodies are held apart, and the motion is planned anew.
 
     Raises:
         SolveError: No attempt leads to a plan that passes; says what became of each, and carries what the last one
@@ -301,14 +301,22 @@ def plan_standing(
         for level, mesh in _formulations(asked.get("control", "acceleration"), isinstance(horizon, FreeTime), method)
     ]
 
-    def run(clear: Clear | None) -> Solution:
+    def run(clearance_constraints: ClearanceConstraints | None) -> Solution:
         def declare(level: Level | None) -> Problem:
             held = level or "position"
-            return standing_problem(machine, tasks, start_joints, horizon, tip_level=held, clear=clear, **asked)
+            return standing_problem(
+                machine,
+                tasks,
+                start_joints,
+                horizon,
+                tip_level=held,
+                clearance_constraints=clearance_constraints,
+                **asked,
+            )
 
         return _first_that_holds(declare, trials, settings, judge)
 
-    return keeping_clear(clear, run)
+    return solve_with_clearance(clearance_constraints, run)
 
 
 @interruptible
@@ -470,7 +478,7 @@ class _Judge:
             exceeded = all(_is_inequality(problem, finding.name) for finding in audit.failures)
             details = {"value": worst.value, "limit": worst.limit, "time": worst.time}
             failure = SolveError(f"the audit fails, {worst.name} {worst.value:.2g}", name=worst.name, **details)
-            return Attempt(name, solution, failure, exceeded, touching_error(audit, solution))
+            return Attempt(name, solution, failure, exceeded, collision_error(audit, solution))
         return Attempt(name, solution, self.stray(audit))
 
 

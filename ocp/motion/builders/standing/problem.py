@@ -42,7 +42,7 @@ from models.robot.indices import joint_limit_index
 from models.robot.robot import Robot
 from ocp.console import interruptible
 from ocp.errors import ProblemError, checked_choice, checked_instance, checked_nonnegative
-from ocp.motion.builders.clearance import Clear
+from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.standing.start import (
     check_freedom,
     check_loads,
@@ -134,7 +134,7 @@ def standing_problem(
     start: Literal["rest", "free"] = "rest",
     end: Literal["rest", "free"] = "rest",
     end_joints: Any = None,
-    clear: Clear | None = None,
+    clearance_constraints: ClearanceConstraints | None = None,
     symbols: Any = ca.SX,
 ) -> Problem:
     """Do the tasks while the machine stands, at the least cost.
@@ -162,7 +162,7 @@ def standing_problem(
             gap at the start can be closed; what is left of it at the end still moves the joints.
         start, end: Whether the joints are at rest there, or free to move.
         end_joints: Joint positions at the end, nan where free; all free if None. Shape (n,).
-        clear: What the motion has to stay clear of, see `ocp.motion.builders.clearance`.
+        clearance_constraints: What the motion has to stay clear of, see `ocp.motion.builders.clearance`.
         symbols: casadi.SX, or casadi.MX when a task, external or a reference calls an interpolant.
 
     Returns:
@@ -237,9 +237,11 @@ def standing_problem(
         problem.path("torques", torques, lower=-effort[limited], upper=effort[limited], unit=machine.robot.effort_unit)
 
     none = ca.DM(0, 1)
-    if clear is not None:
+    if clearance_constraints is not None:
         known = None if isinstance(horizon, FreeTime) else duration
-        checked_instance("standing_problem: clear", clear, Clear).declare(problem, none, joints, horizon=known)
+        checked_instance("standing_problem: clear", clearance_constraints, ClearanceConstraints).declare(
+            problem, none, joints, horizon=known
+        )
     running = weights.acceleration * ca.sumsqr(accelerations) + weights.velocity * ca.sumsqr(velocities)
     if weights.joint_limits:
         running += weights.joint_limits * joint_limit_index(machine.robot, joints)

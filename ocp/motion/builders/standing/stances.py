@@ -36,7 +36,7 @@ __all__ = [
     "first_guess",
     "foot_task",
     "hold",
-    "standing_posture",
+    "standing_configuration",
     "walk",
 ]
 
@@ -222,7 +222,7 @@ IPOPT = {"print_level": 0, "sb": "yes", "max_iter": 200, "tol": 1e-10}
 
 
 @dataclass(frozen=True)
-class PostureSettings:
+class ConfigurationSettings:
     """How a standing posture near another is looked for.
 
     Attributes:
@@ -238,7 +238,7 @@ class PostureSettings:
     steps: int = 40
 
 
-POSTURES = PostureSettings()
+POSTURES = ConfigurationSettings()
 
 
 def hold(stance: Stance, places: dict[str, Foothold]) -> TaskEquations:
@@ -262,7 +262,7 @@ def foot_task(stance: Stance, name: str, position: Any, rotation: Any, **asked: 
     )
 
 
-def standing_posture(stance: Stance, near: Any, over: Any = None) -> Array:
+def standing_configuration(stance: Stance, near: Any, over: Any = None) -> Array:
     """The posture nearest to another that has all feet on their footholds and the center of mass where it is wanted.
 
     Args:
@@ -341,7 +341,7 @@ def first_guess(steps: Steps, start: Array, lift: float) -> list[dict[str, Any]]
 def _keyed(steps: Steps, stance: Stance, near: Array, over: Array) -> Array:
     """A posture in the robot's order."""
     order = steps.order(stance)
-    return np.asarray(steps.in_order(stance, standing_posture(stance, near[order], over)[None])[0])
+    return np.asarray(steps.in_order(stance, standing_configuration(stance, near[order], over)[None])[0])
 
 
 def _raised(swings: tuple[Swing, ...], lift: float) -> dict[str, Foothold]:

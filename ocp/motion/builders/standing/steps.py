@@ -99,7 +99,7 @@ def steps_problem(
 
     Args:
         steps: The robot and its stances.
-        start_joints: In the robot's order, with the feet on their footholds; `standing_posture` finds some. (n,).
+        start_joints: In the robot's order, with the feet on their footholds; `standing_configuration` finds some. (n,).
         balance: "static" asks for "balance" all the way; not in stances with a grip.
         margin: By which centers of pressure, and the center of mass where it is asked, stay inside, m. It has to cover
             by how much the machine leans out where ground and joints give, which are rigid here; most where it stays

@@ -264,7 +264,7 @@ def test_records_that_nobody_wrote_are_none_and_values_that_do_not_fit_are_named
 def test_a_result_is_read_by_load_alone_and_a_pickle_in_its_place_runs_nothing(tmp_path: Path, here: Any) -> None:
     import numpy as np
 
-    class Touch:
+    class Collision:
         def __reduce__(self) -> Any:
             return os.mkdir, (str(tmp_path / "run"),)
 
@@ -272,7 +272,7 @@ def test_a_result_is_read_by_load_alone_and_a_pickle_in_its_place_runs_nothing(t
     run_batch(functions.spring, [task], folder, cluster=here)
     place = record_of(folder)
     file = place.with_suffix(".0.npz")
-    np.savez(file, head=np.array([Touch()], dtype=object), allow_pickle=True)
+    np.savez(file, head=np.array([Collision()], dtype=object), allow_pickle=True)
     record = json.loads(place.read_text())
     record["files"][0]["bytes"] = file.stat().st_size
     place.write_text(json.dumps(record))

@@ -14,27 +14,27 @@ from numpy.testing import assert_allclose
 from models import (
     Box,
     Capsule,
+    CollisionScene,
     CollisionShape,
     FixedBase,
     HalfSpace,
     Joint,
     Link,
     Mimic,
-    Moving,
+    MovingObstacle,
     Robot,
     Sphere,
-    Surroundings,
 )
-from ocp import Clear, Collocation, Problem, ProblemError, SolveError, solve
+from ocp import ClearanceConstraints, Collocation, Problem, ProblemError, SolveError, solve
 from ocp.audit.audit import Finding
 from ocp.audit.clearance import Clearance, Nearest
-from ocp.motion.builders.clearance import LOOKS, MARGIN, ROUNDING, clearance_of, keeping_clear, touching_error
-from ocp.motion.local.touching import distances_along
+from ocp.motion.builders.clearance import LOOKS, MARGIN, ROUNDING, clearance_of, collision_error, solve_with_clearance
+from ocp.motion.local.collisions import distances_along
 from ocp.problem.values import constant
 from tests.models.machines.armoured import armoured_arm
 
 ARM = FixedBase(armoured_arm(4))
-BALL = Moving(Sphere(0.1, (0, 0, 0)), lambda t: (0.5, 0.3 * t, 0.5 - 0.2 * t**2))
+BALL = MovingObstacle(Sphere(0.1, (0, 0, 0)), lambda t: (0.5, 0.3 * t, 0.5 - 0.2 * t**2))
 
 
 def crane() -> FixedBase:
@@ -44,32 +44,32 @@ def crane() -> FixedBase:
     return FixedBase(Robot((Link("foot"), Link("boom", collisions=(ball,))), (turn,)))
 
 
-def nearest(around: Surroundings, pair: int, least: float, asked: float = 0.02) -> Nearest:
+def nearest(around: CollisionScene, pair: int, least: float, asked: float = 0.02) -> Nearest:
     return Nearest(around.labels[pair], least, least, 0.5, np.zeros((2, 3)), asked)
 
 
 def test_what_came_too_near_is_held_and_what_is_held_farther_by_what_it_missed() -> None:
-    around = Surroundings(ARM, [Sphere(0.1, (0.5, 0, 0.5)), Sphere(0.1, (0, 0.5, 0.5))], clearance=0.02)
+    around = CollisionScene(ARM, [Sphere(0.1, (0.5, 0, 0.5)), Sphere(0.1, (0, 0.5, 0.5))], clearance=0.02)
     assert 0 < MARGIN < 1e-4  # m: what is held apart is not visibly farther than it has to be
-    clear = Clear(around).holding([0, 1])
-    assert clear.margins == {0: MARGIN, 1: MARGIN}
-    assert Clear(around, {0: 0.5}).holding([0, 1]).margins == {0: 0.5, 1: MARGIN}
+    clearance_constraints = ClearanceConstraints(around).holding([0, 1])
+    assert clearance_constraints.margins == {0: MARGIN, 1: MARGIN}
+    assert ClearanceConstraints(around, {0: 0.5}).holding([0, 1]).margins == {0: 0.5, 1: MARGIN}
     near = [nearest(around, pair, least) for pair, least in ((0, 0.012), (1, 0.02), (2, 0.019), (3, 0.5))]
-    wider = clear.widened([Clearance("clearance", tuple(near), True, 4)])
+    wider = clearance_constraints.widened([Clearance("clearance", tuple(near), True, 4)])
     assert wider.margins == pytest.approx({0: MARGIN + 1.5 * 0.008 + MARGIN, 1: MARGIN, 2: MARGIN})
-    assert clear.margins == {0: MARGIN, 1: MARGIN}
+    assert clearance_constraints.margins == {0: MARGIN, 1: MARGIN}
 
 
 @pytest.mark.parametrize("symbols", [ca.SX, ca.MX])
 def test_what_is_declared_is_the_rounded_distance_at_the_time_of_the_surroundings(symbols: Any) -> None:
-    around = Surroundings(ARM, [BALL], clearance=0.02)
+    around = CollisionScene(ARM, [BALL], clearance=0.02)
     pairs = [2, 0]
-    clear = Clear(around, {2: 0.1, 0: 0.3})
+    clearance_constraints = ClearanceConstraints(around, {2: 0.1, 0: 0.3})
     problem = Problem("still", symbols=symbols)
     q = problem.state("joints", 4, lower=ARM.robot.lower, upper=ARM.robot.upper)
     problem.dynamics(q, problem.control("u", 4))
     problem.horizon(2.0)
-    clear.declare(problem, ARM.base_home(), q, begin=3.0, pace=0.5, horizon=2.0, suffix=" b")
+    clearance_constraints.declare(problem, ARM.base_home(), q, begin=3.0, pace=0.5, horizon=2.0, suffix=" b")
     held, apart = problem.declared.path["apart b"], problem.declared.apart["clearance b"]
     assert_allclose(constant(held.lower), [0.02 + 0.3, 0.02 + 0.1])
     function = ca.Function("held", [q, problem.time], [held.expression, apart.placements])
@@ -90,12 +90,12 @@ def test_what_is_declared_is_the_rounded_distance_at_the_time_of_the_surrounding
 
 
 def test_what_moves_by_itself_needs_a_horizon_and_joints_their_limits() -> None:
-    around = Surroundings(ARM, [BALL])
+    around = CollisionScene(ARM, [BALL])
     for limit, horizon, name in ((2.9, None, "obstacles"), (3.0, 1.0, "joint1")):
         problem = Problem("free")
         q = problem.state("joints", 4, lower=-limit, upper=limit)
         with pytest.raises(ProblemError) as caught:
-            Clear(around).declare(problem, ARM.base_home(), q, horizon=horizon)
+            ClearanceConstraints(around).declare(problem, ARM.base_home(), q, horizon=horizon)
         assert caught.value.name == name
 
 
@@ -106,7 +106,7 @@ def swung(at: Any, end: float) -> Any:
 
 def test_a_ball_that_swings_past_a_post_is_as_near_as_a_chord() -> None:
     """The post stands in the way at an angle of 0.4 rad; the swing ends before, at 0.3: 2 sin(0.05) between centres."""
-    around = Surroundings(crane(), [Sphere(0.005, (np.cos(0.4), np.sin(0.4), 0.0))])
+    around = CollisionScene(crane(), [Sphere(0.005, (np.cos(0.4), np.sin(0.4), 0.0))])
     breaks = np.linspace(0, 1, 5)
     rates, seconds = np.full((4, 1), 1.3 / 2.0), np.zeros((4, 1))
     for end, least in ((0.3, 2 * np.sin(0.05) - 0.105), (0.7, -0.105)):
@@ -133,7 +133,7 @@ def test_no_proof_claims_more_than_a_fine_sampling_shows(seed: int) -> None:
         HalfSpace(7 * rng.normal(size=3), 2 * size * rng.normal(size=3)),
         Capsule(1e-4 * size, rng.normal(size=3) * size, rng.normal(size=3) * size),
     ]
-    around = Surroundings(FixedBase(robot), obstacles)
+    around = CollisionScene(FixedBase(robot), obstacles)
     factors = rng.normal(size=(4, robot.dof)) * (robot.upper - robot.lower) / 8
 
     def joints(at: Any, order: int = 0) -> Any:
@@ -181,43 +181,43 @@ def random_robot(rng: np.random.Generator, size: float) -> Robot:
     return Robot(tuple(links), tuple(joints))
 
 
-def touching(around: Surroundings, pair: int = 0, least: float = 0.0, name: str = "clearance") -> SolveError:
+def touching(around: CollisionScene, pair: int = 0, least: float = 0.0, name: str = "clearance") -> SolveError:
     """As of a solution that is sound but for the clearance of a pair."""
     proof = Clearance(name, (nearest(around, pair, least),), True, 1)
     audit = SimpleNamespace(clearances={name: proof}, failures=[Finding(name, 0.02 - least, 0.0, 0.5)])
     solution: Any = SimpleNamespace(audit=lambda: audit)
-    found = touching_error(solution.audit(), solution)
+    found = collision_error(solution.audit(), solution)
     assert found is not None
     return found
 
 
 def test_it_is_planned_anew_until_it_is_clear() -> None:
-    around = Surroundings(ARM, [Sphere(0.1, (0.5, 0, 0.5))], clearance=0.02)
+    around = CollisionScene(ARM, [Sphere(0.1, (0.5, 0, 0.5))], clearance=0.02)
     seen: list[dict[int, float]] = []
 
-    def run(clear: Clear | None) -> Any:
-        assert clear is not None
-        seen.append(dict(clear.margins))
+    def run(clearance_constraints: ClearanceConstraints | None) -> Any:
+        assert clearance_constraints is not None
+        seen.append(dict(clearance_constraints.margins))
         if len(seen) < LOOKS:
             raise touching(around, pair=0, least=0.01)
         return "clear"
 
-    found: Any = keeping_clear(Clear(around), run)
+    found: Any = solve_with_clearance(ClearanceConstraints(around), run)
     assert found == "clear"
     margins = [MARGIN + k * (1.5 * 0.01 + MARGIN) for k in range(LOOKS - 1)]
     assert seen == [{}, *({0: pytest.approx(margin)} for margin in margins)]
 
 
 def test_what_cannot_be_kept_clear_names_who_touches_first() -> None:
-    around = Surroundings(ARM, [Sphere(0.1, (0.5, 0, 0.5))], clearance=0.02)
+    around = CollisionScene(ARM, [Sphere(0.1, (0.5, 0, 0.5))], clearance=0.02)
     looks: list[int] = []
 
-    def never(clear: Clear | None) -> Any:
+    def never(clearance_constraints: ClearanceConstraints | None) -> Any:
         looks.append(1)
         raise touching(around, least=-0.01)
 
     with pytest.raises(SolveError, match=r"overlap by 0\.01 m at 0\.5 s") as caught:
-        keeping_clear(Clear(around), never)
+        solve_with_clearance(ClearanceConstraints(around), never)
     assert len(looks) == LOOKS
     assert (caught.value.name, caught.value.value, caught.value.limit, caught.value.time) == (
         "clearance",
@@ -226,53 +226,53 @@ def test_what_cannot_be_kept_clear_names_who_touches_first() -> None:
         0.5,
     )
 
-    def stuck(clear: Clear | None) -> Any:
-        if clear is not None and clear.margins:
+    def stuck(clearance_constraints: ClearanceConstraints | None) -> Any:
+        if clearance_constraints is not None and clearance_constraints.margins:
             raise SolveError("no way", name="solver")
         raise touching(around, least=-0.01)
 
     with pytest.raises(SolveError, match=r"bodies touch.*held apart, no motion was found: no way") as caught:
-        keeping_clear(Clear(around), stuck)
+        solve_with_clearance(ClearanceConstraints(around), stuck)
     assert (caught.value.name, caught.value.time) == ("clearance", 0.5)
 
-    def other(clear: Clear | None) -> Any:
+    def other(clearance_constraints: ClearanceConstraints | None) -> Any:
         raise SolveError("no way", name="solver")
 
-    for clear in (None, Clear(around)):
+    for clearance_constraints in (None, ClearanceConstraints(around)):
         with pytest.raises(SolveError, match=r"^no way$"):
-            keeping_clear(clear, other)
+            solve_with_clearance(clearance_constraints, other)
 
-    def loose(clear: Clear | None) -> Any:
+    def loose(clearance_constraints: ClearanceConstraints | None) -> Any:
         raise touching(around)
 
     with pytest.raises(SolveError, match="bodies touch"):
-        keeping_clear(None, loose)
+        solve_with_clearance(None, loose)
 
 
 def test_bodies_touch_where_nothing_else_is_wrong() -> None:
-    around = Surroundings(ARM, [Sphere(0.1, (0.5, 0, 0.5))], clearance=0.02)
+    around = CollisionScene(ARM, [Sphere(0.1, (0.5, 0, 0.5))], clearance=0.02)
     found = touching(around, least=0.01, name="clearance b")
     assert (found.name, found.value, found.limit, found.time) == ("clearance b", 0.01, 0.0, 0.5)
     sound: Any = SimpleNamespace(clearances={}, failures=[])
-    assert touching_error(sound, sound) is None
+    assert collision_error(sound, sound) is None
     also: Any = SimpleNamespace(
         clearances={"clearance": Clearance("clearance", (), True, 0)},
         failures=[Finding("clearance", 1.0), Finding("dynamics", 1.0)],
     )
-    assert touching_error(also, also) is None
+    assert collision_error(also, also) is None
 
 
 def test_a_held_pair_of_a_solved_motion_keeps_its_margin_at_its_points() -> None:
     """A ball on a boom that has to pass a post in its way, above which it may not: it stops short by the margin."""
     crane_ = crane()
-    around = Surroundings(crane_, [Sphere(0.05, (np.cos(0.5), np.sin(0.5), 0.0))], clearance=0.01)
+    around = CollisionScene(crane_, [Sphere(0.05, (np.cos(0.5), np.sin(0.5), 0.0))], clearance=0.01)
     problem = Problem("swing")
     q = problem.state("joints", 1, initial=-0.5, lower=-3.0, upper=3.0)
     u = problem.control("u", 1)
     problem.dynamics(q, u)
     problem.horizon(1.0)
     problem.minimize(u**2 / 100, -(q**1))
-    Clear(around, {0: 2e-3}).declare(problem, crane_.base_home(), q, horizon=1.0)
+    ClearanceConstraints(around, {0: 2e-3}).declare(problem, crane_.base_home(), q, horizon=1.0)
     solution = solve(problem, Collocation(6, 2))
     apart = 2 * np.sin((0.5 - float(solution.at(1.0)["joints"][0])) / 2) - 0.15
     assert apart == pytest.approx(0.012, abs=1e-6)

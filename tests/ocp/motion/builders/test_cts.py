@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from models import Box, Rig, optimal_inverse, reference_rig, reference_tunnel
-from models.cts.clearance import Surroundings, clearances
+from models.cts.clearance import CollisionScene, clearances
 from models.cts.rig import HOME, INCH, inverse
 from ocp import Collocation, ProblemError, Solution, roll_problem, solve, spline_targets
 from ocp.motion.builders.cts import least_course
@@ -38,7 +38,7 @@ def joints_along(rig: Rig, found: Solution, t: Any) -> Any:
     return np.array(joints(targets_at(t), np.asarray(found.at(t)["roll"]).reshape(1, -1)))
 
 
-def least_gaps(around: Surroundings, joints: Any) -> Any:
+def least_gaps(around: CollisionScene, joints: Any) -> Any:
     """Distance of the rig from its surroundings for joints of shape (6, samples)."""
     q = ca.SX.sym("q", 6)
     gaps = ca.Function("gaps", [q], [ca.mmin(ca.vertcat(*clearances(RIG, q, around).values()))])
@@ -80,10 +80,10 @@ def test_planning_ahead_beats_the_roll_that_looks_back() -> None:
 
 
 def test_the_plan_goes_round_an_obstacle_on_the_way_of_the_free_roll() -> None:
-    around = Surroundings(solids=(Box(INCH * np.array([6.0, 4.0, 6.0]), INCH * np.array([80.0, -4.0, 0.0])),))
+    around = CollisionScene(solids=(Box(INCH * np.array([6.0, 4.0, 6.0]), INCH * np.array([80.0, -4.0, 0.0])),))
     free = optimal_inverse(RIG, TUNNEL).map(101)(targets_at(np.linspace(0, HORIZON, 101)), np.zeros((1, 101)))[0]
     assert least_gaps(around, free).min() < -0.02  # in its midst
-    problem = roll_problem(RIG, TUNNEL, falling, HORIZON, symbols=ca.SX, surroundings=around, clearance=0.01)
+    problem = roll_problem(RIG, TUNNEL, falling, HORIZON, symbols=ca.SX, scene=around, clearance=0.01)
     found = solve(problem, SMOOTH)
     assert least_gaps(around, joints_along(RIG, found, found.t)).min() >= 0.01 - 1e-6
     assert found.cost <= solve(problem, SMOOTH, guess={"roll": [-1.0]}).cost * (1 + 1e-6)  # the other way round
@@ -118,10 +118,10 @@ def test_a_course_goes_through_the_gap_that_costs_least_and_starts_where_it_must
 
 
 def test_clearance_in_the_index_keeps_away_without_a_constraint() -> None:
-    around = Surroundings(solids=(Box(INCH * np.array([6.0, 4.0, 4.0]), INCH * np.array([80.0, -9.0, 3.0])),))
+    around = CollisionScene(solids=(Box(INCH * np.array([6.0, 4.0, 4.0]), INCH * np.array([80.0, -9.0, 3.0])),))
 
     def mean(weight: float) -> float:
-        found = plan(surroundings=around, clearance=-np.inf, clearance_weight=weight, acceleration_weight=0.02)
+        found = plan(scene=around, clearance=-np.inf, clearance_weight=weight, acceleration_weight=0.02)
         return float(least_gaps(around, joints_along(RIG, found, np.linspace(0, HORIZON, 101))).mean())
 
     assert mean(0.02) > mean(0.0) + 5e-3

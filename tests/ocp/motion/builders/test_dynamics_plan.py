@@ -14,12 +14,12 @@ from toppra.algorithm import TOPPRA
 from toppra.constraint import JointTorqueConstraint
 
 from models import (
+    CollisionScene,
     CollisionShape,
     FixedBase,
     FreeFloating,
     Link,
     Sphere,
-    Surroundings,
     center_of_mass,
     planar_chain,
     with_load,
@@ -37,7 +37,7 @@ from ocp import (
     dynamics_phases,
     plan_dynamics,
 )
-from ocp.motion.builders.clearance import Clear
+from ocp.motion.builders.clearance import ClearanceConstraints
 from tests.ocp.motion.builders.test_dynamics import MASS, WAY, slider, torques_along
 
 MACHINE = FixedBase(planar_chain([0.5, 0.4], [2.0, 1.5]))
@@ -231,9 +231,15 @@ def test_what_touches_on_a_leg_is_held_apart_there() -> None:
     machine = FixedBase(replace(chain, links=tuple(links)))
     legs = [Leg([0.6, 0.3], 1.0, end="free"), Leg(START, 1.0)]
 
-    def way(clear: Clear | None) -> Array:
+    def way(clearance_constraints: ClearanceConstraints | None) -> Array:
         """Of the tip, there and back. Shape (402, 3)."""
-        plan = plan_dynamics(machine, START, legs, clear=clear, method=Collocation(6, 4, scheme="legendre"))
+        plan = plan_dynamics(
+            machine,
+            START,
+            legs,
+            clearance_constraints=clearance_constraints,
+            method=Collocation(6, 4, scheme="legendre"),
+        )
         assert plan.audit().passed
         both = [plan.phase(name).at_fraction(np.linspace(0, 1, 201))["joints"] for name in ("leg 1", "leg 2")]
         return np.array([np.array(ca.DM(machine.tip_pose(ca.DM(0, 1), q).position)).ravel() for q in np.vstack(both)])
@@ -241,5 +247,5 @@ def test_what_touches_on_a_leg_is_held_apart_there() -> None:
     free = way(None)
     place = free[100] * (1 + 0.08 / np.linalg.norm(free[100]))
     assert np.linalg.norm(free - place, axis=1).min() < sizes - 0.01
-    held = way(Clear(Surroundings(machine, [Sphere(ball, place)])))
+    held = way(ClearanceConstraints(CollisionScene(machine, [Sphere(ball, place)])))
     assert np.linalg.norm(held - place, axis=1).min() >= sizes - 1e-9

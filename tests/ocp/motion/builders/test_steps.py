@@ -22,7 +22,7 @@ from ocp.motion.builders.standing import (
     StepWeights,
     plan_steps,
     resolve_steps,
-    standing_posture,
+    standing_configuration,
     steps_motion,
     steps_problem,
     walk,
@@ -247,7 +247,7 @@ def test_a_sole_may_rest_where_it_lifts_and_lands_on_other_ground(height: float)
     phases = walk(feet, [("right", Foothold.level(0.2, 0, height=height))], shift=0.5, swing=0.8)
     steps = Steps(planar_biped(), planar_feet(), phases)
     form = Formulation.of(steps_problem(steps, bent(steps), clearance=0.02))
-    lands = standing_posture(steps.standing(2), bent(steps)[steps.order(steps.stances[1])])
+    lands = standing_configuration(steps.standing(2), bent(steps)[steps.order(steps.stances[1])])
     states, controls = np.zeros((3, form.nx)), np.zeros((3, form.nu))
     states[:, form.states["2 left.joints"]] = bent(steps)[steps.order(steps.stances[1])]
     states[2, form.states["2 left.joints"]] = lands
@@ -263,7 +263,7 @@ def on_the_corner_of_a_sole(steps: Steps, margin: float, seconds: float) -> Step
     stance = steps.stances[1]
     assert stance.support is not None
     over = np.asarray(stance.support.vertices).min(axis=0) + margin
-    posture = standing_posture(stance, bent(steps)[steps.order(stance)], over)[None].repeat(2, axis=0)
+    posture = standing_configuration(stance, bent(steps)[steps.order(stance)], over)[None].repeat(2, axis=0)
     still = np.zeros_like(posture)
     one = Steps(steps.robot, steps.feet, [StancePhase(steps.phases[1].footholds, seconds)])
     found = sampled(one, one.stances[0], (posture, still, still), {})

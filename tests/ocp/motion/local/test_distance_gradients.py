@@ -14,23 +14,23 @@ import pytest
 from models import (
     Box,
     Capsule,
+    CollisionScene,
     CollisionShape,
     Cylinder,
     FixedBase,
     FreeFloating,
     HalfSpace,
     Machine,
-    Moving,
+    MovingObstacle,
     Sphere,
-    Surroundings,
 )
-from ocp.motion.local.touching import distances_along
+from ocp.motion.local.collisions import distances_along
 from tests.models.robot.trees import random_robot
 
 SIZES = {"sphere": (0.08,), "capsule": (0.05, 0.3), "box": (0.1, 0.2, 0.3), "cylinder": (0.06, 0.3)}
 
 
-def crowd(seed: int, floating: bool = False) -> Surroundings:
+def crowd(seed: int, floating: bool = False) -> CollisionScene:
     """A random tree of joints, slides and followers with bodies of all kinds, among obstacles of all kinds."""
     rng = np.random.default_rng(seed)
     robot = random_robot(rng, 5, followers=True)
@@ -48,12 +48,12 @@ def crowd(seed: int, floating: bool = False) -> Surroundings:
         Box((0.4, 0.3, 0.6), rng.normal(size=3), turn * np.linalg.det(turn)),
         Cylinder(0.2, 0.5, rng.normal(size=3)),
         HalfSpace((0, 0.6, 0.8), (0, 0, -1.0)),
-        Moving(Box((0.2, 0.3, 0.4)), lambda t: (ca.sin(t), 0.3 * t, 0.5)),
+        MovingObstacle(Box((0.2, 0.3, 0.4)), lambda t: (ca.sin(t), 0.3 * t, 0.5)),
     ]
-    return Surroundings(machine, obstacles, limits=False)
+    return CollisionScene(machine, obstacles, limits=False)
 
 
-def configurations(around: Surroundings, count: int, seed: int) -> Iterator[tuple[Any, Any, float]]:
+def configurations(around: CollisionScene, count: int, seed: int) -> Iterator[tuple[Any, Any, float]]:
     rng, machine = np.random.default_rng(seed), around.machine
     for _ in range(count):
         base = rng.normal(size=machine.base_size)
@@ -63,7 +63,7 @@ def configurations(around: Surroundings, count: int, seed: int) -> Iterator[tupl
 
 
 @pytest.fixture(scope="module")
-def few() -> tuple[Surroundings, list[int], Any]:
+def few() -> tuple[CollisionScene, list[int], Any]:
     """Some surroundings, pairs of them, and their distances with gradients."""
     around = crowd(3)
     simple = (Sphere, Capsule, Box, HalfSpace)
@@ -73,7 +73,7 @@ def few() -> tuple[Surroundings, list[int], Any]:
     return around, pairs, around.distance_gradients(pairs=pairs, rounding=0.02)
 
 
-def test_gradients_are_finite_differences_of_distances(few: tuple[Surroundings, list[int], Any]) -> None:
+def test_gradients_are_finite_differences_of_distances(few: tuple[CollisionScene, list[int], Any]) -> None:
     """Along random rates, but for kinks, which are rare: there the differences of two steps do not agree."""
     around, _, function = few
     rng, kept = np.random.default_rng(4), 0
@@ -91,7 +91,7 @@ def test_gradients_are_finite_differences_of_distances(few: tuple[Surroundings, 
     assert kept > 8 * len(rough)
 
 
-def test_distances_along_a_motion_are_those_of_its_samples(few: tuple[Surroundings, list[int], Any]) -> None:
+def test_distances_along_a_motion_are_those_of_its_samples(few: tuple[CollisionScene, list[int], Any]) -> None:
     """However many there are: they are measured side by side, and what is left over one by one."""
     around, pairs, _ = few
     known = around.distance_gradients(pairs=pairs)
@@ -104,7 +104,7 @@ def test_distances_along_a_motion_are_those_of_its_samples(few: tuple[Surroundin
         )
 
 
-def test_what_is_no_number_stays_none(few: tuple[Surroundings, list[int], Any]) -> None:
+def test_what_is_no_number_stays_none(few: tuple[CollisionScene, list[int], Any]) -> None:
     around, pairs, function = few
     q = np.zeros(around.machine.joint_size)
     q[0] = np.nan
@@ -117,7 +117,7 @@ def test_what_is_no_number_stays_none(few: tuple[Surroundings, list[int], Any]) 
     assert np.isnan(slopes[lost]).any(axis=1).all()
 
 
-def test_threads_may_call_it_at_once(few: tuple[Surroundings, list[int], Any]) -> None:
+def test_threads_may_call_it_at_once(few: tuple[CollisionScene, list[int], Any]) -> None:
     around, _, function = few
     mapped = function.map(100)
     lots = [list(configurations(around, 100, seed)) for seed in range(4)]

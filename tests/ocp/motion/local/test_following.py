@@ -10,7 +10,7 @@ import pytest
 
 from models import FixedBase, Machine, Path, planar_chain, smooth
 from ocp import TipTask, inverse_kinematics, resolve
-from ocp.motion.local.rates import Followed, follow
+from ocp.motion.local.rates import LocalMotion, follow
 from ocp.motion.tasks.equations import bind
 from tests.models.robot.trees import Array, numeric
 from tests.ocp.motion.tasks.space_tasks import PANDA_START, floating_panda, panda, pose, ur5
@@ -25,7 +25,7 @@ def task(**given: Any) -> TipTask:
 
 def followed(
     machine: Machine, asked: TipTask, joints: Array, *, base: Any = None, steps: int = 64, **given: Any
-) -> Followed:
+) -> LocalMotion:
     robot = machine.robot
     options = {"weights": np.ones(machine.joint_size), "damping": 1e-6, "lower": robot.lower, "upper": robot.upper}
     home = machine.base_home() if base is None else base

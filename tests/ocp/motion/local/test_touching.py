@@ -12,6 +12,7 @@ from numpy.testing import assert_allclose
 
 from models import (
     Box,
+    CollisionScene,
     CollisionShape,
     FixedBase,
     FreeFloating,
@@ -19,26 +20,25 @@ from models import (
     Joint,
     Link,
     Machine,
-    Moving,
+    MovingObstacle,
     Robot,
     Sphere,
-    Surroundings,
 )
 from models.arrays import Array
 from models.shapes.distance import COLUMNS
 from models.shapes.mesh_files import find_mesh, read_mesh
 from models.spatial import skew
 from ocp import ProblemError
-from ocp.motion.local.touching import checked_surroundings, distances_along, hulls_of, touches
+from ocp.motion.local.collisions import checked_collision_scene, distances_along, find_collisions, hulls_of
 from tests.models.machines.armoured import armoured_arm
 from tests.models.machines.test_surroundings import OBSTACLES, machines, postures, turned
 from tests.ocp.motion.tasks.space_tasks import panda, ur5
 
-MOVING = Moving(OBSTACLES[1], lambda t: (0.3, 0.2 * t, 0.2), lambda t: turned(t))
+MOVING = MovingObstacle(OBSTACLES[1], lambda t: (0.3, 0.2 * t, 0.2), lambda t: turned(t))
 TIMES = np.linspace(0.0, 3.0, 30)
 
 
-def known(around: Surroundings, base: Array, joints: Array) -> Array:
+def known(around: CollisionScene, base: Array, joints: Array) -> Array:
     """By the expression, one sample after the other. Shape (M, n)."""
     machine = around.machine
     b, q, t = ca.SX.sym("b", machine.base_size), ca.SX.sym("q", machine.joint_size), ca.SX.sym("t")
@@ -46,7 +46,7 @@ def known(around: Surroundings, base: Array, joints: Array) -> Array:
     return np.array([np.array(function(*each)).ravel() for each in zip(base, joints, TIMES, strict=True)])
 
 
-def by_formula(around: Surroundings) -> Array:
+def by_formula(around: CollisionScene) -> Array:
     """Whether a pair is of shapes whose distances are exact. Shape (n,)."""
     return np.array([all(type(around.bodies[k].shape) in COLUMNS for k in pair[:2]) for pair in around.pairs])
 
@@ -54,7 +54,7 @@ def by_formula(around: Surroundings) -> Array:
 @pytest.mark.parametrize("name", machines())
 def test_distances_along_a_motion_are_those_of_the_expression(name: str) -> None:
     """Of the kinds with a formula; beside the others, meshes and cylinders, no less than its bound from below."""
-    around = Surroundings(machines()[name], (*OBSTACLES, MOVING))
+    around = CollisionScene(machines()[name], (*OBSTACLES, MOVING))
     base, joints = postures(around.machine, len(TIMES), 3)
     found, told, exact = distances_along(around, base, joints, TIMES), known(around, base, joints), by_formula(around)
     assert_allclose(found[:, exact], told[:, exact], atol=1e-9)
@@ -69,7 +69,9 @@ def test_boxes_that_overlap_are_as_deep_as_the_formula_says() -> None:
     def tumbling(t: Any) -> Any:
         return ca.DM.eye(3) + ca.sin(t) * axis + (1 - ca.cos(t)) * ca.mtimes(axis, axis)
 
-    around = Surroundings(machines()["slider"], [Moving(Box((0.3, 0.2, 0.25)), lambda t: (0.1, 0.1, 0.25), tumbling)])
+    around = CollisionScene(
+        machines()["slider"], [MovingObstacle(Box((0.3, 0.2, 0.25)), lambda t: (0.1, 0.1, 0.25), tumbling)]
+    )
     base, joints = postures(around.machine, len(TIMES), 7)
     joints[:, 0] = np.linspace(-0.1, 0.3, len(TIMES))
     found, told = distances_along(around, base, joints, TIMES), known(around, base, joints)
@@ -86,7 +88,7 @@ def test_long_boxes_that_cross_edge_by_edge_are_as_deep_as_the_formula_says() ->
     beam = CollisionShape("box", (2.0, 0.2, 0.3), rotation=angles[0])
     slide = Joint("slide", "prismatic", "base", "beam", axis=(1, 0, 0), **ends)
     machine = FixedBase(Robot((Link("base"), Link("beam", collisions=(beam,))), (slide,)))
-    around = Surroundings(machine, [Box((2.0, 0.3, 0.25), (0.1, 0.6, 0.33), across @ angles[1])])
+    around = CollisionScene(machine, [Box((2.0, 0.3, 0.25), (0.1, 0.6, 0.33), across @ angles[1])])
     joints = np.linspace(-0.8, 0.8, len(TIMES))[:, None]
     found = distances_along(around, np.zeros(0), joints, TIMES)
     assert_allclose(found, known(around, np.zeros((len(TIMES), 0)), joints), atol=1e-9)
@@ -96,7 +98,7 @@ def test_long_boxes_that_cross_edge_by_edge_are_as_deep_as_the_formula_says() ->
 @pytest.mark.parametrize("near", [-0.2, 0.0, 0.1, 0.5])
 def test_what_is_not_near_is_told_by_a_number_between(near: float) -> None:
     """From the least that is asked for up to the distance; what is nearer is exact."""
-    around = Surroundings(machines()["slider"], (*OBSTACLES, MOVING, HalfSpace((3, 0, 4), (0.2, 0.1, 0.3))))
+    around = CollisionScene(machines()["slider"], (*OBSTACLES, MOVING, HalfSpace((3, 0, 4), (0.2, 0.1, 0.3))))
     base, joints = postures(around.machine, len(TIMES), 4)
     exact = distances_along(around, base, joints, TIMES)
     found = distances_along(around, base, joints, TIMES, near)
@@ -109,10 +111,10 @@ def test_what_is_not_near_is_told_by_a_number_between(near: float) -> None:
 
 
 def test_each_pair_that_touches_is_named_where_it_is_nearest_the_deepest_first() -> None:
-    around = Surroundings(machines()["arm"], (*OBSTACLES, MOVING), clearance=0.05)
+    around = CollisionScene(machines()["arm"], (*OBSTACLES, MOVING), clearance=0.05)
     base, joints = postures(around.machine, len(TIMES), 5)
     apart = distances_along(around, base, joints, TIMES)
-    found = touches(around, base, joints, TIMES)
+    found = find_collisions(around, base, joints, TIMES)
     assert [touch.pair for touch in found] == np.argsort(apart.min(axis=0))[: len(found)].tolist()
     assert len(found) == (apart.min(axis=0) < 0.05).sum() > 2
     for touch in found:
@@ -124,7 +126,7 @@ def test_each_pair_that_touches_is_named_where_it_is_nearest_the_deepest_first()
 
 
 def test_one_base_for_all_samples_is_that_base_at_each() -> None:
-    around = Surroundings(FreeFloating(armoured_arm(4)), OBSTACLES)
+    around = CollisionScene(FreeFloating(armoured_arm(4)), OBSTACLES)
     base, joints = postures(around.machine, len(TIMES), 6)
     same = np.tile(base[0], (len(TIMES), 1))
     each = distances_along(around, same, joints, TIMES)
@@ -133,16 +135,16 @@ def test_one_base_for_all_samples_is_that_base_at_each() -> None:
 
 
 def test_no_pairs_have_no_distances_and_what_is_no_number_touches() -> None:
-    bare = Surroundings(FixedBase(armoured_arm(2)))
+    bare = CollisionScene(FixedBase(armoured_arm(2)))
     assert distances_along(bare, np.zeros(0), np.zeros((3, 2)), np.zeros(3)).shape == (3, 0)
-    assert touches(bare, np.zeros(0), np.zeros((3, 2)), np.zeros(3)) == []
+    assert find_collisions(bare, np.zeros(0), np.zeros((3, 2)), np.zeros(3)) == []
     arm = FixedBase(armoured_arm())
-    lost = Surroundings(arm, [Sphere(0.1, (0.5, 0, 0))])
-    assert touches(lost, np.zeros(0), np.full((1, 7), np.nan), np.zeros(1))[0].distance == -np.inf
+    lost = CollisionScene(arm, [Sphere(0.1, (0.5, 0, 0))])
+    assert find_collisions(lost, np.zeros(0), np.full((1, 7), np.nan), np.zeros(1))[0].distance == -np.inf
 
 
 def test_the_hulls_are_the_bodies() -> None:
-    around = Surroundings(FixedBase(armoured_arm()), OBSTACLES)
+    around = CollisionScene(FixedBase(armoured_arm()), OBSTACLES)
     hulls = hulls_of(around)
     assert list(hulls) == [body.name for body in around.bodies]
     for hull, body in zip(hulls.values(), around.bodies, strict=True):
@@ -153,14 +155,14 @@ def test_the_hulls_are_the_bodies() -> None:
 
 def test_surroundings_are_those_of_the_machine_with_its_limits() -> None:
     machine: Machine = FixedBase(armoured_arm())
-    kept, free = Surroundings(machine, limits=True), Surroundings(machine, limits=False)
-    assert checked_surroundings(kept, machine) is kept
-    assert checked_surroundings(free, machine, limits=False) is free
+    kept, free = CollisionScene(machine, limits=True), CollisionScene(machine, limits=False)
+    assert checked_collision_scene(kept, machine) is kept
+    assert checked_collision_scene(free, machine, limits=False) is free
     bad: list[Any] = [(kept, FixedBase(armoured_arm()), True), (kept, machine, False)]
     for around, owner, limits in bad:
         with pytest.raises(ProblemError) as caught:
-            checked_surroundings(around, owner, limits)
-        assert caught.value.name == "surroundings"
+            checked_collision_scene(around, owner, limits)
+        assert caught.value.name == "scene"
 
 
 def triangles(machine: FixedBase, link: str) -> Any:
@@ -186,7 +188,7 @@ def test_meshes_are_no_nearer_than_their_hulls_and_covers_say() -> None:
 
 def beside_triangles(machine: FixedBase) -> tuple[int, int]:
     """How many pairs of hulls in random postures are looked at, and how many of them are held as far as is told."""
-    around = Surroundings(machine)
+    around = CollisionScene(machine)
     assert around.covers
     rng = np.random.default_rng(3)
     low, high = np.maximum(machine.robot.lower, -np.pi), np.minimum(machine.robot.upper, np.pi)

@@ -12,10 +12,10 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from models import FixedBase, Path, SmoothPath, Surroundings, planar_chain, smooth
-from ocp import Clear, Limits, ProblemError, SolveError, TipTask, Unreachable, inverse_kinematics
+from models import CollisionScene, FixedBase, Path, SmoothPath, planar_chain, smooth
+from ocp import ClearanceConstraints, Limits, ProblemError, SolveError, TipTask, Unreachable, inverse_kinematics
 from ocp.app.files import log_rerun, write_mcap
-from ocp.motion.plan import Plan, plan, plan_in_pieces, plan_waypoints
+from ocp.motion.plan import Plan, plan, plan_in_segments, plan_waypoints
 from ocp.motion.schedule import LineLimits, schedule
 from ocp.motion.tasks.tracks import along
 from tests.bad_values import (
@@ -52,7 +52,7 @@ LINE = smooth(Path.through([REACHED, REACHED + np.array([0.1, -0.2, 0.0])]), dev
 GOOD = TipTask.along(LINE, 0.2, rows=(3, 4))
 assert GOOD.duration is not None
 PLANNED: dict[str, Any] = {"machine": ARM, "tasks": GOOD, "start": START, "search": "start"}
-AROUND = Surroundings(FixedBase(armoured_arm()))
+AROUND = CollisionScene(FixedBase(armoured_arm()))
 POSES = ([[0.4, 0.0, 0.5], [0.4, 0.02, 0.5], [0.4, 0.04, 0.5]], [[0.0, 1.0, 0.0, 0.0]] * 3)
 WAYPOINTS: dict[str, Any] = {"machine": panda(), "positions": POSES[0], "quaternions": POSES[1], "clearance": None}
 ENDLESS = replace(GOOD, duration=None, breaks=())
@@ -94,7 +94,7 @@ CASES = [
     ),
     Case(
         "plan_in_pieces",
-        plan_in_pieces,
+        plan_in_segments,
         {"machine": ARM, "tasks": GOOD, "start": START, "clearance": None},
         {
             "machine": INSTANCE | {"class": FixedBase, "robot": CHAIN},
@@ -132,18 +132,18 @@ CASES = [
     ),
     Case(
         "Clear",
-        Clear,
-        {"surroundings": AROUND, "margins": {0: 0.01}},
+        ClearanceConstraints,
+        {"scene": AROUND, "margins": {0: 0.01}},
         {
-            "surroundings": INSTANCE,
+            "scene": INSTANCE,
             "margins": MAPPING | {"unknown": {99: 0.01}, "negative": {0: -1.0}, "nan": {0: NAN}, "word": {"a": 0.1}},
         },
     ),
     Case(
         "inverse_kinematics around",
         inverse_kinematics,
-        {"machine": AROUND.machine, "task": TipTask(position=(0.5, 0.2, 0.6)), "surroundings": AROUND},
-        {"surroundings": but(INSTANCE, "None") | {"another's": Surroundings(FixedBase(armoured_arm()))}},
+        {"machine": AROUND.machine, "task": TipTask(position=(0.5, 0.2, 0.6)), "scene": AROUND},
+        {"scene": but(INSTANCE, "None") | {"another's": CollisionScene(FixedBase(armoured_arm()))}},
     ),
     Case(
         "TipTask.along",

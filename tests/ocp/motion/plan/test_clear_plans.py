@@ -15,19 +15,19 @@ from numpy.testing import assert_allclose
 
 from models import (
     Box,
+    CollisionScene,
     CollisionShape,
     FixedBase,
     FreeFloating,
     Joint,
     Link,
-    Moving,
+    MovingObstacle,
     Robot,
     Sphere,
-    Surroundings,
     link_frames,
 )
 from ocp import (
-    Clear,
+    ClearanceConstraints,
     Collocation,
     Limits,
     Plan,
@@ -41,7 +41,7 @@ from ocp import (
     resolve,
     solve,
 )
-from ocp.motion.local.touching import distances_along
+from ocp.motion.local.collisions import distances_along
 from ocp.motion.plan import planner
 from ocp.motion.plan.candidate import Candidate, Rejection
 from ocp.motion.plan.candidate_solver import CandidateSolver
@@ -85,7 +85,7 @@ def planned(*obstacles: Any, clearance: float | None = 0.0) -> Plan:
 
 def least_apart(result: Plan, obstacles: Any, samples: int = 4001) -> float:
     at = result.sample(result.horizon / (samples - 1))
-    around = Surroundings(result.machine, obstacles)
+    around = CollisionScene(result.machine, obstacles)
     base = np.array([result.at(t)["base"] for t in at.t]) if result.machine.base_size else np.zeros(0)
     return float(distances_along(around, base, at.joints, at.t).min())
 
@@ -128,7 +128,7 @@ def test_mirrored_and_larger_it_is_the_same_motion() -> None:
 
 
 def test_a_moving_obstacle_is_avoided() -> None:
-    ball = Moving(Sphere(0.05, (0, 0, 0)), lambda t: ca.DM(FIRST) + ca.vertcat(0, 0.25, 0.15 + 0.4 * (1.0 - t)))
+    ball = MovingObstacle(Sphere(0.05, (0, 0, 0)), lambda t: ca.DM(FIRST) + ca.vertcat(0, 0.25, 0.15 + 0.4 * (1.0 - t)))
     plain = planned(clearance=None)
     assert least_apart(plain, [ball]) < 0
     result = plan(ARM, line(), start=START, search="start", obstacles=[ball], clearance=0.01)
@@ -173,23 +173,23 @@ def test_what_no_task_moves_begins_out_of_the_way_of_what_it_would_hinder() -> N
     )
     robot = Robot((*links, Link("pole", 0.5, collisions=(pole,))), (*arm.joints, flag), tip="tip")
     task = TipTask(position=lambda t: [0.6 - 0.2 * t, 0.25], rows=[3, 4], duration=1.0)
-    bare, clear = (plan(FixedBase(robot), task, clearance=each) for each in (None, 0.01))
+    bare, clearance_constraints = (plan(FixedBase(robot), task, clearance=each) for each in (None, 0.01))
     place = robot.joint_names.index("flag")
     assert bare.at(0.0)["joints"][place] == 0
     assert least_apart(bare, ()) < 0
-    assert least_apart(clear, ()) >= 0.01 - 1e-6
-    assert abs(clear.at(0.0)["joints"][place]) > 0.2
-    assert_allclose(clear.cost, bare.cost, rtol=1e-4)
+    assert least_apart(clearance_constraints, ()) >= 0.01 - 1e-6
+    assert abs(clearance_constraints.at(0.0)["joints"][place]) > 0.2
+    assert_allclose(clearance_constraints.cost, bare.cost, rtol=1e-4)
 
 
 def test_held_apart_the_barrier_begins_worth_no_more_than_the_motion() -> None:
     """As many limits as the program has, each with the barrier that it begins with, cost what the motion costs."""
-    around = Surroundings(ARM, [POST])
+    around = CollisionScene(ARM, [POST])
     asked = checked_asked(ARM, line(), None, START, None, False, None, None, "start", 0, 1.0)
-    solver = CandidateSolver(replace(asked, clear=Clear(around)), START, START)
+    solver = CandidateSolver(replace(asked, clearance_constraints=ClearanceConstraints(around)), START, START)
     pair = around.labels.index(("link6", "obstacle 0"))
     cost = 0.25
-    separated = Candidate(START, clear=Clear(around).holding([pair]))
+    separated = Candidate(START, clearance_constraints=ClearanceConstraints(around).holding([pair]))
     prepared = solver.prepared(separated, fine=False, cost=cost)[2]
     bounds = prepared.formulation.bound_values(np.zeros(0))
     places = [getattr(prepared.fragment, f"{of}_bounds") for of in ("variable", "row")]
@@ -243,7 +243,7 @@ def test_a_plan_that_was_saved_is_proven_again(tmp_path: File) -> None:
 def test_tasks_one_after_the_other_are_proven_stretch_by_stretch() -> None:
     first = TipTask(position=lambda t: ca.DM(FIRST) + smooth_step(t) * ca.DM(WAY), duration=SECONDS)
     back = TipTask(position=lambda t: ca.DM(FIRST + WAY) - smooth_step(t) * ca.DM(WAY), begin=3.0, duration=SECONDS)
-    ball = Moving(Sphere(0.05, (0, 0, 0)), lambda t: ca.DM(FIRST) + ca.vertcat(0, 0.25, 0.15 + 0.4 * (4.0 - t)))
+    ball = MovingObstacle(Sphere(0.05, (0, 0, 0)), lambda t: ca.DM(FIRST) + ca.vertcat(0, 0.25, 0.15 + 0.4 * (4.0 - t)))
     result = plan(ARM, [first, back], start=START, search="start", obstacles=[ball], clearance=0.01)
     assert result.audit().passed
     assert len(result.audit().clearances) == 3
@@ -268,7 +268,7 @@ def rotation_about_y(angle: float) -> np.ndarray:
 
 def test_every_motion_along_a_seam_is_clear_or_says_what_touches() -> None:
     machine = torch_ur5()
-    around = Surroundings(machine)
+    around = CollisionScene(machine)
     assert any("tool0" in pair[1] and "upper_arm" in pair[0] for pair in around.labels)
     result = plan(machine, TipTask.along(bent_seam(), 0.03, direction=DOWN))
     assert result.audit().passed
@@ -297,18 +297,18 @@ def test_every_motion_along_a_seam_is_clear_or_says_what_touches() -> None:
 def test_what_never_touches_within_limits_is_looked_at_without_them() -> None:
     robot = armoured_arm()
     narrow = replace(robot, joints=tuple(replace(joint, lower=-0.3, upper=0.3) for joint in robot.joints))
-    within, beyond = (Surroundings(FixedBase(narrow), limits=limits) for limits in (True, False))
+    within, beyond = (CollisionScene(FixedBase(narrow), limits=limits) for limits in (True, False))
     assert within.left["link2", "link6"] == "never touch"
     assert ("link2", "link6") in beyond.labels
     free_of_limits = Limits(joints=False)
     asked: dict[str, Any] = {"tasks": line(), "start_joints": START, "horizon": SECONDS, "limits": free_of_limits}
-    around = Surroundings(ARM)
+    around = CollisionScene(ARM)
     with pytest.raises(ProblemError, match="limits=False"):
-        minimum_velocity_problem(ARM, **asked, clear=Clear(around))
+        minimum_velocity_problem(ARM, **asked, clearance_constraints=ClearanceConstraints(around))
     with pytest.raises(ProblemError, match="limits=False"):
-        inverse_kinematics(ARM, TipTask(position=FIRST), limits=False, surroundings=around)
-    free = Surroundings(ARM, limits=False)
-    assert minimum_velocity_problem(ARM, **asked, clear=Clear(free)).declared.apart
+        inverse_kinematics(ARM, TipTask(position=FIRST), limits=False, scene=around)
+    free = CollisionScene(ARM, limits=False)
+    assert minimum_velocity_problem(ARM, **asked, clearance_constraints=ClearanceConstraints(free)).declared.apart
     wide = plan(ARM, line(), start=START, search="start", limits=Limits(joints=False))
     assert wide.audit().passed
 
@@ -345,18 +345,18 @@ def test_where_no_posture_is_clear_no_alternatives_are_searched(monkeypatch: pyt
 def test_postures_that_touch_are_left_out_or_named() -> None:
     at = TipTask(position=FIRST)
     obstacle = Sphere(0.08, FIRST + np.array([-0.25, 0, 0.15]))
-    around = Surroundings(ARM, [obstacle], 0.01)
-    every, clear = inverse_kinematics(ARM, at), inverse_kinematics(ARM, at, surroundings=around)
+    around = CollisionScene(ARM, [obstacle], 0.01)
+    every, clearance_constraints = inverse_kinematics(ARM, at), inverse_kinematics(ARM, at, scene=around)
     apart = [distances_along(around, np.zeros(0), posture.joints[None], np.zeros(1)).min() for posture in every]
-    assert len(clear) == sum(each >= 0.01 for each in apart) < len(every)
+    assert len(clearance_constraints) == sum(each >= 0.01 for each in apart) < len(every)
     with pytest.raises(Unreachable, match=r"touches.*link6 and obstacle 0 overlap") as caught:
-        inverse_kinematics(ARM, at, surroundings=Surroundings(ARM, [Sphere(0.2, FIRST)]))
+        inverse_kinematics(ARM, at, scene=CollisionScene(ARM, [Sphere(0.2, FIRST)]))
     assert caught.value.name == "link6 and obstacle 0"
 
 
 def test_a_local_motion_tells_how_near_it_comes() -> None:
-    around = Surroundings(ARM, [POST])
-    local = resolve(ARM, tasks=line(), start_joints=START, horizon=SECONDS, samples=101, surroundings=around)
+    around = CollisionScene(ARM, [POST])
+    local = resolve(ARM, tasks=line(), start_joints=START, horizon=SECONDS, samples=101, scene=around)
     told = distances_along(around, np.zeros(0), local.joints, local.t)
     assert_allclose(local.clearance, told.min(axis=1))
     worst = int(local.clearance.argmin())
@@ -367,8 +367,8 @@ def test_a_local_motion_tells_how_near_it_comes() -> None:
 
 @pytest.mark.long
 def test_builders_take_what_to_stay_clear_of() -> None:
-    around = Surroundings(ARM, [POST])
-    problem = minimum_velocity_problem(ARM, line(), START, SECONDS, clear=Clear(around))
+    around = CollisionScene(ARM, [POST])
+    problem = minimum_velocity_problem(ARM, line(), START, SECONDS, clearance_constraints=ClearanceConstraints(around))
     touching = solve(problem, Collocation(16, 4)).audit()
     assert not touching["clearance"].passed
     assert not touching.feasible
@@ -385,7 +385,7 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     "what becomes of missing meshes": ({"missing": "perhaps", "clearance": 0.0}, "missing"),
     "an SRDF file that is none": ({"srdf": "/nowhere/at/all.srdf", "clearance": 0.0}, "srdf"),
     "an obstacle that moves while time is free": (
-        {"obstacles": [Moving(POST, lambda t: (t, 0, 0))], "horizon": "free"},
+        {"obstacles": [MovingObstacle(POST, lambda t: (t, 0, 0))], "horizon": "free"},
         "obstacle",
     ),
 }
@@ -406,11 +406,11 @@ def test_an_obstacle_without_a_place() -> None:
 def test_a_posture_that_touches_slides_along_its_self_motion_until_it_is_clear() -> None:
     """From it alone; the tip stays where it is. What is around the tip's own place leaves none."""
     elbow = np.array(ca.DM(link_frames(ARM.robot, START)["link4"].position)).ravel()
-    around = Surroundings(ARM, [Sphere(0.1, elbow)], 0.01)
+    around = CollisionScene(ARM, [Sphere(0.1, elbow)], 0.01)
     assert distances_along(around, np.zeros(0), START[None], np.zeros(1)).min() < -0.05
-    found = inverse_kinematics(ARM, line(), starts=0, near=START, surroundings=around)
+    found = inverse_kinematics(ARM, line(), starts=0, near=START, scene=around)
     assert_allclose(tip_at(ARM, found[0].joints), FIRST, atol=1e-9)
     assert distances_along(around, np.zeros(0), found[0].joints[None], np.zeros(1)).min() >= 0.01
-    buried = Surroundings(ARM, [Sphere(0.1, FIRST)])
+    buried = CollisionScene(ARM, [Sphere(0.1, FIRST)])
     with pytest.raises(Unreachable, match="touches"):
-        inverse_kinematics(ARM, line(), starts=0, near=START, surroundings=buried)
+        inverse_kinematics(ARM, line(), starts=0, near=START, scene=buried)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from models import Box, FixedBase, Moving, Sphere, planar_chain
+from models import Box, FixedBase, MovingObstacle, Sphere, planar_chain
 from ocp import Collocation, Limits, Plan, Problem, StorageWarning, TipTask, plan, solve
 from ocp.app.check.plan_verdict import verdict_of
 from ocp.app.command import main
@@ -99,7 +99,7 @@ def test_obstacles_that_stand_or_move_and_the_bodies_of_meshes_are_rebuilt(tmp_p
     """The audit of a loaded plan proves the same distances, and finds what was moved into the way."""
     arm = FixedBase(planar_chain([0.5, 0.4, 0.3], [1.0] * 3))
     balls = [
-        Moving(Sphere(0.05, (0, 0, 0)), lambda t: (2.0, 1.0 + 0.3 * t, 0.0)),
+        MovingObstacle(Sphere(0.05, (0, 0, 0)), lambda t: (2.0, 1.0 + 0.3 * t, 0.0)),
         Box((0.1, 0.1, 0.1), position=(0, -2, 0)),
     ]
     task = TipTask(rows=(3, 4), velocity=(-0.05, 0.02))

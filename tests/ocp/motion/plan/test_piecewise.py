@@ -13,8 +13,8 @@ import pytest
 
 from models import CollisionShape, FixedBase, Path, Sphere, smooth
 from models.arrays import Array
-from models.machines.moving import Moving
-from ocp import DeadEnd, ProblemError, TipTask, plan, plan_in_pieces
+from models.machines.moving_obstacle import MovingObstacle
+from ocp import DeadEnd, ProblemError, TipTask, plan, plan_in_segments
 from ocp.motion.plan.piecewise import _part
 from tests.ocp.motion.search.test_charts import planar
 from tests.ocp.motion.search.test_reconfigurations import limited
@@ -56,7 +56,7 @@ def cost(first: float, last: float, reach: float, elbow: int) -> float:
 
 def test_of_two_links_the_pieces_are_the_branches_and_meet_where_that_costs_least() -> None:
     reach, machine = 0.45, arm()
-    made = plan_in_pieces(machine, line(reach), clearance=None)
+    made = plan_in_segments(machine, line(reach), clearance=None)
     assert made.fewest == len(made.reconfigurations) == 1
     (where,) = made.reconfigurations
     assert made.begins == (0.0, where.time)
@@ -92,7 +92,7 @@ def test_of_two_links_the_pieces_are_the_branches_and_meet_where_that_costs_leas
 
 @pytest.mark.long
 def test_what_one_motion_does_is_one_piece_and_the_plan() -> None:
-    made = plan_in_pieces(arm(), line(0.1), clearance=None)
+    made = plan_in_segments(arm(), line(0.1), clearance=None)
     assert (len(made.pieces), made.reconfigurations, made.fewest) == (1, (), 0)
     alone = plan(arm(), line(0.1), search="global", clearance=None)
     assert made.cost == pytest.approx(alone.cost, rel=1e-9)
@@ -118,7 +118,7 @@ def with_bodies() -> FixedBase:
 def test_a_reconfiguration_goes_round_what_is_in_the_way(angle: float) -> None:
     place = 0.85 * np.array([np.cos(angle), np.sin(angle)])
     machine, ball = with_bodies(), Sphere(0.03, (*place, 0.0))
-    made = plan_in_pieces(machine, line(0.45), obstacles=[ball], clearance=0.01)
+    made = plan_in_segments(machine, line(0.45), obstacles=[ball], clearance=0.01)
     (where,) = made.reconfigurations
     assert all(piece.audit().passed for piece in made.pieces)
     assert where.way is not None, where.why
@@ -161,14 +161,14 @@ def test_a_part_of_a_task_asks_for_the_same_at_its_times() -> None:
 
 
 def test_a_horizon_of_which_the_task_is_no_part_is_refused() -> None:
-    for planner in (plan_in_pieces, partial(plan, search="global")):
+    for planner in (plan_in_segments, partial(plan, search="global")):
         with pytest.raises(ProblemError, match="no part") as refused:
             planner(arm(), line(0.1), 1e12, start=posture(np.zeros(1), 0.1, 1)[0], clearance=None)
         assert refused.value.name == "horizon"
 
 
 def test_obstacles_that_move_do_not_wait() -> None:
-    ball = Moving(Sphere(0.03, (0.85, 0.0, 0.0)), lambda t: ca.vertcat(0.1 * t, 0, 0))
+    ball = MovingObstacle(Sphere(0.03, (0.85, 0.0, 0.0)), lambda t: ca.vertcat(0.1 * t, 0, 0))
     with pytest.raises(ProblemError, match="wait") as refused:
-        plan_in_pieces(with_bodies(), line(0.45), obstacles=[ball])
+        plan_in_segments(with_bodies(), line(0.45), obstacles=[ball])
     assert refused.value.name == "obstacles"

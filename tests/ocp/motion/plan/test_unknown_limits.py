@@ -27,7 +27,7 @@ from ocp import (
     plan_waypoints,
     solve,
 )
-from ocp.motion.plan import plan_in_pieces
+from ocp.motion.plan import plan_in_segments
 from tests.ocp.motion.tasks.space_tasks import UR5_START, ur5
 
 START = np.array([0.4, 0.9, -0.6])
@@ -60,7 +60,7 @@ def planned(machine: FixedBase, **options: Any) -> Any:
 
 
 def in_pieces(machine: FixedBase) -> Any:
-    return [piece.cost for piece in plan_in_pieces(machine, task(machine)).pieces]
+    return [piece.cost for piece in plan_in_segments(machine, task(machine)).pieces]
 
 
 def least_velocities(machine: FixedBase) -> Any:

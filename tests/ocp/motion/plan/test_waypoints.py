@@ -9,12 +9,12 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from models import Box, FixedBase, Surroundings
+from models import Box, CollisionScene, FixedBase
 from models.arrays import Array
 from models.robot.rebuild import locked
 from models.spatial import quaternion_from_rotation
 from ocp import DeadEnd, Limits, ProblemError, Unreachable, plan_waypoints
-from ocp.motion.local.touching import distances_along
+from ocp.motion.local.collisions import distances_along
 from ocp.motion.plan.waypoints import WayCost
 from tests.ocp.motion.search.test_charts import planar
 from tests.ocp.motion.tasks.space_tasks import PANDA_START, UR5_START, panda, ur5
@@ -102,7 +102,7 @@ def test_what_stands_in_the_way_makes_it_longer_and_is_kept_clear_of() -> None:
     assert boxed.cost >= free.bound
     assert boxed.bound <= boxed.cost
     # between the waypoints no sample is nearer than what is proven, and some is as near as what was found
-    around = Surroundings(panda(), [box])
+    around = CollisionScene(panda(), [box])
     numbers = np.linspace(0, 20, 2001)
     joints = np.stack([np.interp(numbers, np.arange(21), column) for column in boxed.joints.T], axis=1)
     apart = distances_along(around, np.zeros(0), joints, numbers).min()

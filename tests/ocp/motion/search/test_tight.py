@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from models import CollisionShape, FixedBase, Moving, Sphere, Surroundings
+from models import CollisionScene, CollisionShape, FixedBase, MovingObstacle, Sphere
 from models.arrays import Array
-from ocp.motion.local.touching import distances_along
+from ocp.motion.local.collisions import distances_along
 from ocp.motion.search.charts import Instant
 from ocp.motion.search.steps import Length, Squares
 from ocp.motion.search.value import drawn_tight
@@ -61,7 +61,7 @@ def followed(start: Array = START) -> Array:
 def tight(obstacle: Any = None, later: float = 0.0) -> Array:
     """The way drawn tight, so much later than its task."""
     robot = MACHINE.robot
-    around = None if obstacle is None else Surroundings(MACHINE, [obstacle], clearance=CLEARANCE)
+    around = None if obstacle is None else CollisionScene(MACHINE, [obstacle], clearance=CLEARANCE)
     far, bounds = np.full((len(TIMES) - 1, robot.dof), 1.0), (robot.lower, robot.upper)
     cost = Length(np.ones(robot.dof))
     return drawn_tight(followed(), INSTANTS, cost, TIMES + later, far, bounds, around, (0.1, 1e-3))
@@ -137,12 +137,12 @@ def test_what_moves_is_in_the_way_where_it_is_then(later: float) -> None:
     half = tight()[len(TIMES) // 2]
     beside, away = np.append(middle_of_the_last_link(half), 0.04), np.array([0.0, 0.0, 9.0])
     before, after = (beside, away) if later else (away, beside)
-    moving = Moving(Sphere(0.05, (0, 0, 0)), lambda t: ca.if_else(t < 10.0, ca.DM(before), ca.DM(after)))
+    moving = MovingObstacle(Sphere(0.05, (0, 0, 0)), lambda t: ca.if_else(t < 10.0, ca.DM(before), ca.DM(after)))
     passed = tight(moving, later)
     assert_allclose(passed, tight(Sphere(0.05, away)), atol=1e-12)
-    around = Surroundings(MACHINE, [moving], clearance=CLEARANCE)
+    around = CollisionScene(MACHINE, [moving], clearance=CLEARANCE)
     assert distances_along(around, np.zeros(0), passed, TIMES + later).min() > CLEARANCE
-    there = Surroundings(MACHINE, [Sphere(0.05, beside)], clearance=CLEARANCE)
+    there = CollisionScene(MACHINE, [Sphere(0.05, beside)], clearance=CLEARANCE)
     assert distances_along(there, np.zeros(0), passed, TIMES).min() < 0.0
     past = tight(Sphere(0.05, beside))
     assert distances_along(there, np.zeros(0), past, TIMES).min() > CLEARANCE

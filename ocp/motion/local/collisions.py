@@ -18,20 +18,20 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from models import Machine, Surroundings
+from models import CollisionScene, Machine
 from models.arrays import Array
 from ocp.errors import ProblemError, checked_instance
 from ocp.problem.hulls import Hull, PairsOfBodies, frames_of
 from ocp.problem.values import Sampler
 
-__all__ = ["Touch", "checked_surroundings", "distances_along", "hulls_of", "slid", "touches"]
+__all__ = ["Collision", "checked_collision_scene", "distances_along", "find_collisions", "hulls_of", "slid"]
 
 
-class Touch(NamedTuple):
+class Collision(NamedTuple):
     """Two bodies that come too near.
 
     Attributes:
-        pair: Its place in `Surroundings.pairs`. bodies: Their names.
+        pair: Its place in `CollisionScene.pairs`. bodies: Their names.
         distance: m, negative where they overlap. time: s.
     """
 
@@ -45,73 +45,71 @@ class Touch(NamedTuple):
         return f"{self.bodies[0]} and {self.bodies[1]} {how} at {self.time:.4g} s"
 
 
-def hulls_of(surroundings: Surroundings) -> dict[str, Hull]:
+def hulls_of(scene: CollisionScene) -> dict[str, Hull]:
     """The bodies and obstacles, by name."""
     return {
         body.name: Hull(body.frame, body.shape.core, body.shape.swelling, getattr(body.shape, "normal", np.zeros(0)))
-        for body in surroundings.bodies
+        for body in scene.bodies
     }
 
 
-def distances_along(
-    surroundings: Surroundings, base: Array, joints: Array, times: Array, near: float = np.inf
-) -> Array:
+def distances_along(scene: CollisionScene, base: Array, joints: Array, times: Array, near: float = np.inf) -> Array:
     """Distances of all pairs at samples of a motion; how deep those with a mesh or a cylinder overlap is told about.
 
     Shape (M, n), m.
 
     Args:
-        surroundings: Of the machine that moves.
+        scene: Of the machine that moves.
         base: Its base, shape (M, base_size) or (base_size,). joints: Shape (M, joint_size). times: s. Shape (M,).
         near: Of pairs that are no nearer than this, m, some number is told that is no less, and no more than they are.
     """
     count = len(joints)
-    if not len(surroundings.pairs):
+    if not len(scene.pairs):
         return np.zeros((count, 0))
-    placements, bodies = _prepared(surroundings)
-    places = np.broadcast_to(base, (count, surroundings.machine.base_size))
+    placements, bodies = _prepared(scene)
+    places = np.broadcast_to(base, (count, scene.machine.base_size))
     return bodies.distances(frames_of(placements(places, joints, np.reshape(times, (-1, 1)))[0]), near)
 
 
-def touches(surroundings: Surroundings, base: Array, joints: Array, times: Array) -> list[Touch]:
+def find_collisions(scene: CollisionScene, base: Array, joints: Array, times: Array) -> list[Collision]:
     """The pairs that come nearer than the clearance at some samples, each where it is nearest, the worst first.
 
     Args: As of `distances_along`.
     """
-    apart = distances_along(surroundings, base, joints, times, surroundings.clearance)
+    apart = distances_along(scene, base, joints, times, scene.clearance)
     if not apart.size:
         return []
-    where, labels = apart.argmin(axis=0), surroundings.labels
+    where, labels = apart.argmin(axis=0), scene.labels
     found = [
-        Touch(pair, labels[pair], float(apart[where[pair], pair]), float(np.ravel(times)[where[pair]]))
-        for pair in np.flatnonzero(apart.min(axis=0) < surroundings.clearance).tolist()
+        Collision(pair, labels[pair], float(apart[where[pair], pair]), float(np.ravel(times)[where[pair]]))
+        for pair in np.flatnonzero(apart.min(axis=0) < scene.clearance).tolist()
     ]
     return sorted(found, key=lambda touch: touch.distance)
 
 
-def _prepared(surroundings: Surroundings) -> tuple[Sampler, PairsOfBodies]:
+def _prepared(scene: CollisionScene) -> tuple[Sampler, PairsOfBodies]:
     """Of base, joints and time the placements, and all pairs; kept with the surroundings."""
-    kept: tuple[Sampler, PairsOfBodies] | None = surroundings.__dict__.get("_prepared")
+    kept: tuple[Sampler, PairsOfBodies] | None = scene.__dict__.get("_prepared")
     if kept is None:
-        machine = surroundings.machine
+        machine = scene.machine
         base, joints = ca.SX.sym("base", machine.base_size), ca.SX.sym("q", machine.joint_size)
         time = ca.SX.sym("time")
-        placements = Sampler([base, joints, time], [ca.SX(surroundings.placements(base, joints, time))])
-        hulls = tuple(hulls_of(surroundings).values())
-        kept = placements, PairsOfBodies(hulls, surroundings.pairs, surroundings.covers)
-        surroundings.__dict__["_prepared"] = kept
+        placements = Sampler([base, joints, time], [ca.SX(scene.placements(base, joints, time))])
+        hulls = tuple(hulls_of(scene).values())
+        kept = placements, PairsOfBodies(hulls, scene.pairs, scene.covers)
+        scene.__dict__["_prepared"] = kept
     return kept
 
 
-def checked_surroundings(value: Any, machine: Machine, limits: bool = True) -> Surroundings:
+def checked_collision_scene(value: Any, machine: Machine, limits: bool = True) -> CollisionScene:
     """Surroundings of a machine whose joints keep their limits, or do not, or ProblemError unless they are."""
-    if checked_instance("surroundings", value, Surroundings).machine is not machine:
+    if checked_instance("scene", value, CollisionScene).machine is not machine:
         words = "surroundings are those of another machine; make them of this one: Surroundings(machine, ...)"
-        raise ProblemError(words, name="surroundings", value=value)
+        raise ProblemError(words, name="scene", value=value)
     if value.limits and not limits:
         words = "surroundings keep the joints within their limits; make them without: Surroundings(..., limits=False)"
-        raise ProblemError(words, name="surroundings", value=value)
-    found: Surroundings = value
+        raise ProblemError(words, name="scene", value=value)
+    found: CollisionScene = value
     return found
 
 
@@ -135,7 +133,7 @@ class SlidingSettings:
 
 
 def slid(
-    surroundings: Surroundings,
+    scene: CollisionScene,
     base: Array,
     joints: Array,
     time: float,
@@ -149,7 +147,7 @@ def slid(
     """Postures moved off what they touch, as far as that goes.
 
     Args:
-        surroundings: Of the machine. base: Its base. Shape (base_size,). time: s.
+        scene: Of the machine. base: Its base. Shape (base_size,). time: s.
         joints: Postures that do the task. Shape (K, n).
         jacobian: Of the task at a posture (n,). Shape (m, n).
         back: Postures (K, n) -> postures nearby that do the task again.
@@ -160,11 +158,11 @@ def slid(
         Of each posture the one on its way whose least distance is largest. Shape (K, n).
     """
     count, n = joints.shape
-    wanted = surroundings.clearance + settings.spare
+    wanted = scene.clearance + settings.spare
 
     def measured(postures: Array) -> Array:
         """Of all pairs, those farther than is wanted not told how far. Shape (K, P)."""
-        return distances_along(surroundings, base, postures, np.full(len(postures), time), near=wanted)
+        return distances_along(scene, base, postures, np.full(len(postures), time), near=wanted)
 
     best, at, depth = joints.copy(), joints.copy(), np.full(count, -np.inf)
     for _ in range(settings.steps):
@@ -173,7 +171,7 @@ def slid(
         least = gaps.min(axis=1)
         better = least > depth
         best[better], depth[better] = at[better], least[better]
-        if (depth >= surroundings.clearance).any():
+        if (depth >= scene.clearance).any():
             break
         slopes = (measured(moved).reshape(count, n, -1) - gaps[:, None]) / settings.difference
         step = np.array([_step(*each, wanted, settings) for each in zip(map(jacobian, at), gaps, slopes, strict=True)])

@@ -19,7 +19,7 @@ from models.arrays import Array, checked_flag, checked_indices, checked_nonnegat
 from models.errors import ModelError
 from models.input_files import INPUT_LIMITS
 from models.machines.machine import Machine
-from models.machines.moving import Moving
+from models.machines.moving_obstacle import MovingObstacle
 from models.machines.pair_gradients import WORLD, Placed, distance_gradients
 from models.robot.kinematics import link_frames
 from models.robot.robot import Robot
@@ -50,7 +50,7 @@ class Levers(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Surroundings:
+class CollisionScene:
     """The bodies of a machine and the obstacles around it, and which of them are looked at, pair by pair.
 
     Attributes:
@@ -77,7 +77,7 @@ class Surroundings:
     """
 
     machine: Machine
-    obstacles: Sequence[Shape | Moving] = ()
+    obstacles: Sequence[Shape | MovingObstacle] = ()
     clearance: float = 0.0
     ignored: Sequence[tuple[str, str]] = ()
     srdf: str | Path | None = None
@@ -94,25 +94,27 @@ class Surroundings:
     _held: dict[int, tuple[tuple[int, int], ...]] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        given = (self.obstacles,) if isinstance(self.obstacles, (*KINDS, Moving)) else self.obstacles
+        given = (self.obstacles,) if isinstance(self.obstacles, (*KINDS, MovingObstacle)) else self.obstacles
         found = _listed(given, "obstacles")
         for number, one in enumerate(found):
-            shape = one.shape if isinstance(one, Moving) else checked_shape(one, "surroundings", f"obstacles[{number}]")
+            shape = (
+                one.shape if isinstance(one, MovingObstacle) else checked_shape(one, "scene", f"obstacles[{number}]")
+            )
             if isinstance(shape, Box) and not np.isfinite(shape.size).all():
-                message = f"surroundings: obstacles[{number}] is a box without ends; give a HalfSpace or its size"
+                message = f"scene: obstacles[{number}] is a box without ends; give a HalfSpace or its size"
                 raise ModelError(message, name=f"obstacles[{number}]", value=shape.size)
         object.__setattr__(self, "obstacles", found)
-        near = checked_nonnegative(self.clearance, "surroundings", "clearance", "m")
+        near = checked_nonnegative(self.clearance, "scene", "clearance", "m")
         object.__setattr__(self, "clearance", near)
         robot = getattr(self.machine, "robot", None)
         if not isinstance(robot, Robot):
-            message = f"surroundings: machine must be a FixedBase(robot) or another machine, not {self.machine!r}"
+            message = f"scene: machine must be a FixedBase(robot) or another machine, not {self.machine!r}"
             raise ModelError(message, name="machine", value=self.machine)
         own = bodies_of(robot, folders=_listed(self.folders, "folders"), missing=self.missing, covered=self.covered)
         object.__setattr__(self, "covered", _by_mesh(robot, own))
         links, around = self._told()
         reach: dict[str, Any] = (
-            {} if checked_flag(self.limits, "surroundings", "limits") else {"lower": -np.inf, "upper": np.inf}
+            {} if checked_flag(self.limits, "scene", "limits") else {"lower": -np.inf, "upper": np.inf}
         )
         known = checked_pairs(robot, own, ignored=links, srdf=self.srdf, clearance=near, **reach)
         object.__setattr__(self, "_parts", RigidParts.of(robot))
@@ -140,7 +142,7 @@ class Surroundings:
             for i, body in enumerate(own):
                 if {(body.link, name), (name, body.link)} & told:
                     left[body.link, name] = TOLD
-                elif not self._moves(body.link) and not isinstance(one, Moving):
+                elif not self._moves(body.link) and not isinstance(one, MovingObstacle):
                     left[body.link, name] = STILL
                 else:
                     pairs.append((i, number))
@@ -157,7 +159,7 @@ class Surroundings:
         bodies = [Placed(name, body.shape, places[body.link]) for name, body in zip(_named(own), own, strict=True)]
         moving = 0
         for number, one in enumerate(self.obstacles):
-            if isinstance(one, Moving):
+            if isinstance(one, MovingObstacle):
                 bodies.append(Placed(f"obstacle {number}", one.shape, len(places) + moving))
                 moving += 1
             else:
@@ -218,7 +220,7 @@ class Surroundings:
     @property
     def moves_by_itself(self) -> bool:
         """Whether an obstacle moves."""
-        return any(isinstance(one, Moving) for one in self.obstacles)
+        return any(isinstance(one, MovingObstacle) for one in self.obstacles)
 
     def placements(self, base: Expression, q: Expression, time: Expression = 0.0) -> Expression:
         """Frames of bodies: rotation column by column, then position, one below the other. Shape (12 F, 1)."""
@@ -286,7 +288,7 @@ class Surroundings:
 
     def _asked(self, pairs: Sequence[int] | None, rounding: float) -> tuple[list[int], float]:
         """Pairs by their places, and a rounding, checked."""
-        every, owner = np.arange(len(self.pairs)), "surroundings"
+        every, owner = np.arange(len(self.pairs)), "scene"
         given = every if pairs is None else every[:0] if isinstance(pairs, list | tuple) and not pairs else pairs
         chosen = checked_indices(given, len(every), owner, "pairs").ravel().tolist()
         return chosen, checked_nonnegative(rounding, owner, "rounding", "m")
@@ -315,7 +317,7 @@ class Surroundings:
     def check_motions(self, begin: float, end: float) -> None:
         """Raise ModelError where the motion of an obstacle is not defined at a time between two, s."""
         for one in self.obstacles:
-            if isinstance(one, Moving):
+            if isinstance(one, MovingObstacle):
                 one.check(begin, end)
 
     # ---- inside ------------------------------------------------------------------------------------------------
@@ -327,7 +329,7 @@ class Surroundings:
 
     def _moving(self, time: Expression) -> list[Frame]:
         """Frames of the obstacles that move."""
-        return [one.frame(time) for one in self.obstacles if isinstance(one, Moving)]
+        return [one.frame(time) for one in self.obstacles if isinstance(one, MovingObstacle)]
 
     def _close_meshes(
         self, own: Sequence[Body], checked: Sequence[tuple[int, int]]
@@ -370,7 +372,7 @@ class Surroundings:
             turns[column] += 0.0 if slides else abs(ratio)
         if not np.isfinite(joints).all() or not np.isfinite(reach):
             name = next(joint.name for joint, *_ in way if joint.kind == "prismatic")
-            message = f"surroundings: joint {name!r} slides without limits; give it some"
+            message = f"scene: joint {name!r} slides without limits; give it some"
             raise ModelError(message, name=name, value=np.inf)
         if seen == WORLD and size:
             planar = size == 3
@@ -402,7 +404,7 @@ def _by_mesh(robot: Robot, bodies: Sequence[Body]) -> dict[tuple[str, int], tupl
 
 def _listed(values: Any, what: str) -> tuple[Any, ...]:
     if not isinstance(values, list | tuple) or len(values) > INPUT_LIMITS.count:
-        message = f"surroundings: {what} must be a list of at most {INPUT_LIMITS.count}, not {repr(values)[:80]}"
+        message = f"scene: {what} must be a list of at most {INPUT_LIMITS.count}, not {repr(values)[:80]}"
         raise ModelError(message, name=what, value=values, limit=INPUT_LIMITS.count)
     return tuple(values)
 
@@ -410,5 +412,5 @@ def _listed(values: Any, what: str) -> tuple[Any, ...]:
 def _pair(value: Any, number: int) -> tuple[str, str]:
     if isinstance(value, tuple | list) and len(value) == 2 and all(isinstance(name, str) for name in value):
         return value[0], value[1]
-    message = f"surroundings: ignored[{number}] must be two names, not {value!r}"
+    message = f"scene: ignored[{number}] must be two names, not {value!r}"
     raise ModelError(message, name="ignored", value=value)

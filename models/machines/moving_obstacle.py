@@ -23,7 +23,7 @@ NUMBERS = re.compile(r"static const casadi_(?:real|int) (\w+)\[\d+\] =\s*\{([^}]
 
 
 @dataclass(frozen=True, eq=False)
-class Moving:
+class MovingObstacle:
     """An obstacle that moves: a part on a conveyor, a target that tumbles.
 
     Attributes:

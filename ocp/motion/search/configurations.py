@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from models import Machine
 from models.arrays import Array
 from ocp.errors import ProblemError
-from ocp.motion.builders.clearance import Clear
+from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.tool_motion import Stretch
+from ocp.motion.local.collisions import Collision, distances_along
 from ocp.motion.local.inverse_kinematics import Unreachable, at_rest, distinct, inverse_kinematics, starts_of
-from ocp.motion.local.rates import Followed, follow
-from ocp.motion.local.touching import Touch, distances_along
+from ocp.motion.local.rates import LocalMotion, follow
 from ocp.motion.search.settings import PlannerSettings
 from ocp.motion.tasks.checks import ignorable_joints
 from ocp.motion.tasks.equations import bind
@@ -44,7 +44,7 @@ class Asked:
         limits: Of the joints.
         search: How the start is searched.
         drives: Limits with those of actuators, or None where these are not limited.
-        clear: What the motion has to stay clear of, or None.
+        clearance_constraints: What the motion has to stay clear of, or None.
         settings: Of the planner.
     """
 
@@ -61,7 +61,7 @@ class Asked:
     time_cost: float | None
     search: SearchKind = "postures"
     drives: Limits | None = None
-    clear: Clear | None = None
+    clearance_constraints: ClearanceConstraints | None = None
     settings: PlannerSettings = SETTINGS
 
     @cached_property
@@ -111,22 +111,22 @@ def postures_at_the_start(asked: Asked) -> Array:
     return joints[np.argsort(touching, kind="stable")]
 
 
-def touches_at_the_start(asked: Asked, postures: Array) -> list[Touch | None]:
+def touches_at_the_start(asked: Asked, postures: Array) -> list[Collision | None]:
     """Of each posture (K, n) the pair of bodies that comes nearest, where it comes too near."""
-    if asked.clear is None:
+    if asked.clearance_constraints is None:
         return [None] * len(postures)
-    around = asked.clear.surroundings
+    around = asked.clearance_constraints.scene
     apart = distances_along(around, asked.base, postures, np.zeros(len(postures)))
     nearest, labels = apart.argmin(axis=1).tolist(), around.labels
-    found = [Touch(pair, labels[pair], float(row[pair]), 0.0) for row, pair in zip(apart, nearest, strict=True)]
+    found = [Collision(pair, labels[pair], float(row[pair]), 0.0) for row, pair in zip(apart, nearest, strict=True)]
     return [touch if touch.distance < around.clearance else None for touch in found]
 
 
 def check_clear_start(asked: Asked, postures: Array) -> None:
     """Raise ProblemError where bodies come too near at the start that is given."""
     if (touch := touches_at_the_start(asked, postures)[0]) is not None:
-        assert asked.clear is not None
-        around, name = asked.clear.surroundings, " and ".join(touch.bodies)
+        assert asked.clearance_constraints is not None
+        around, name = asked.clearance_constraints.scene, " and ".join(touch.bodies)
         ignored = [around.told_as(touch.pair)]
         words = f"start: {touch}; start clear of everything, or name what may touch: {ignored=}"
         words = "; ".join([words, *others_told(clear_postures(asked, touch.time))])
@@ -139,22 +139,22 @@ def clear_postures(asked: Asked, time: float) -> int | Unreachable | None:
     None where that says nothing: no pose is asked for then, or the base may come from elsewhere.
     """
     tasks = [task for task in asked.tasks if task.is_pose and task.begin <= time <= task.end]
-    if asked.clear is None or not tasks or asked.machine.base_size:
+    if asked.clearance_constraints is None or not tasks or asked.machine.base_size:
         return None
-    around: dict[str, Any] = {"surroundings": asked.clear.surroundings, "limits": asked.limits.joints}
+    around: dict[str, Any] = {"scene": asked.clearance_constraints.scene, "limits": asked.limits.joints}
     try:
         return len(inverse_kinematics(asked.machine, tasks, time=time, seed=asked.seed, **around))
     except Unreachable as error:
         return error
 
 
-def others_told(clear: int | Unreachable | None) -> list[str]:
+def others_told(others: int | Unreachable | None) -> list[str]:
     """Whether another posture is clear, in words; nothing where that is not known."""
-    if clear is None:
+    if others is None:
         return []
-    if isinstance(clear, Unreachable):
-        return [f"no other posture is clear then: {clear}"]
-    return [f"clear then, and not on a motion that was found: {clear} other posture{'s' if clear > 1 else ''}"]
+    if isinstance(others, Unreachable):
+        return [f"no other posture is clear then: {others}"]
+    return [f"clear then, and not on a motion that was found: {others} other posture{'s' if others > 1 else ''}"]
 
 
 def settled(asked: Asked, postures: Array) -> tuple[Array, Array]:
@@ -174,25 +174,25 @@ def settled(asked: Asked, postures: Array) -> tuple[Array, Array]:
     ended = np.isfinite(bounds.upper - bounds.lower)
     start[ignorable] = np.where(ended, at_rest(bounds.lower, bounds.upper), postures[0])[ignorable]
 
-    def clear(values: Array) -> int:
+    def collision_count(values: Array) -> int:
         return touches_at_the_start(asked, np.where(ignorable, values, postures)).count(None)
 
-    if ignorable.any() and not clear(start):
+    if ignorable.any() and not collision_count(start):
         others = starts_of(asked.machine, bounds.lower, bounds.upper, asked.settings.ik_starts, None, asked.seed)
-        start[ignorable] = max((start, *postures, *others), key=clear)[ignorable]
+        start[ignorable] = max((start, *postures, *others), key=collision_count)[ignorable]
     return start, np.where(ignorable, start, postures)
 
 
-def followed_from(asked: Asked, postures: Array) -> list[Followed]:
+def followed_from(asked: Asked, postures: Array) -> list[LocalMotion]:
     """The local motions from all postures through all stretches, with the least damping that lets one of them follow.
 
     Raises:
         Unreachable: A place on the way that no posture reaches.
     """
     bounds, settings = asked.bounds, asked.settings
-    best: list[Followed] = []
+    best: list[LocalMotion] = []
     for damping in settings.dampings:
-        found: list[Followed] = []
+        found: list[LocalMotion] = []
         base, joints = np.tile(asked.base, (len(postures), 1)), postures
         for stretch in asked.stretches:
             if stretch.begin > 0:
@@ -204,7 +204,7 @@ def followed_from(asked: Asked, postures: Array) -> list[Followed]:
             times = np.union1d(np.linspace(stretch.begin, stretch.end, share + 1), stretch.breaks)
             equations = stretch.equations
             if equations is None:
-                found.append(Followed.resting(times, base, joints))
+                found.append(LocalMotion.resting(times, base, joints))
             else:
                 soft: dict[str, Any] = {"weights": asked.weights, "damping": damping}
                 found.append(follow(equations, joints, base, times, lower=bounds.lower, upper=bounds.upper, **soft))
@@ -243,7 +243,7 @@ def _begun(asked: Asked, stretch: Stretch, base: Array, joints: Array) -> Array:
     return np.asarray(ways[far.argmin(axis=1)])
 
 
-def _straight(part: Followed, joints: Array) -> Followed:
+def _straight(part: LocalMotion, joints: Array) -> LocalMotion:
     """A motion without a task that leads straight to joints (K, n)."""
     share = ((part.t - part.t[0]) / (part.t[-1] - part.t[0]))[:, None]
     way = (joints - part.joints[:, 0])[:, None]
@@ -251,12 +251,12 @@ def _straight(part: Followed, joints: Array) -> Followed:
     return replace(part, joints=part.joints[:, :1] + share * way, rates=rates)
 
 
-def misfits_of(followed: list[Followed]) -> list[float]:
+def misfits_of(followed: list[LocalMotion]) -> list[float]:
     """Of each posture the largest pose error on its way."""
     return np.max([part.misfit for part in followed], axis=0).tolist()  # type: ignore[no-any-return]
 
 
-def _check_reach(asked: Asked, followed: list[Followed]) -> None:
+def _check_reach(asked: Asked, followed: list[LocalMotion]) -> None:
     """Raise where no posture follows the tasks and no joints reach them, seen from a fixed base."""
     if asked.machine.base_size:
         return

@@ -7,7 +7,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 
-from models import Machine, Surroundings
+from models import CollisionScene, Machine
 from models.arrays import Array
 from ocp.app.check.joint_limits import Row, RowVerdict
 from ocp.app.check.oddities import Fault
@@ -15,7 +15,7 @@ from ocp.app.check.pieces import Motion
 from ocp.app.files import Waypoints
 from ocp.audit.clearance import Clearance
 from ocp.motion.builders.clearance import clearance_of
-from ocp.motion.local.touching import distances_along
+from ocp.motion.local.collisions import distances_along
 from ocp.problem.values import Sampler
 from ocp.tolerances import CLEARANCE_TOLERANCE_M
 
@@ -46,7 +46,7 @@ def within_limits(machine: Machine, motion: Motion) -> Machine:
     return made
 
 
-def proof(around: Surroundings, motion: Motion) -> Clearance:
+def proof(around: CollisionScene, motion: Motion) -> Clearance:
     """How near each pair comes at any time of a motion, within the limits, of a machine whose base stands still."""
     start, horizon = float(motion.t[0]), float(motion.t[-1] - motion.t[0])
     rates = motion.velocity.greatest
@@ -57,7 +57,7 @@ def proof(around: Surroundings, motion: Motion) -> Clearance:
     )
 
 
-def clearance_rows(around: Surroundings, motion: Motion, bases: Array | None) -> tuple[list[Row], list[Fault]]:
+def clearance_rows(around: CollisionScene, motion: Motion, bases: Array | None) -> tuple[list[Row], list[Fault]]:
     """Rows and faults of what comes too near.
 
     Where the base moves, `bases` (M, base_size) at the samples, pairs are looked at there and at the middles between
@@ -97,14 +97,14 @@ def clearance_rows(around: Surroundings, motion: Motion, bases: Array | None) ->
     faults = _with_beginnings(around, motion, faults)
     for near in found.pairs:
         name = f"clearance of {near.bodies[0]} and {near.bodies[1]}"
-        touches = near.distance < near.asked - CLEARANCE_TOLERANCE_M
-        if near.missed > CLEARANCE_TOLERANCE_M and not touches and name not in shown:
+        find_collisions = near.distance < near.asked - CLEARANCE_TOLERANCE_M
+        if near.missed > CLEARANCE_TOLERANCE_M and not find_collisions and name not in shown:
             note = f"at least {near.least:.4g} m is proven"
             rows.append(Row(name, near.distance, near.asked, "m", start + near.time, RowVerdict.UNDECIDED, note))
     return [*rows, *told], faults
 
 
-def _with_beginnings(around: Surroundings, motion: Motion, faults: list[Fault]) -> list[Fault]:
+def _with_beginnings(around: CollisionScene, motion: Motion, faults: list[Fault]) -> list[Fault]:
     """The same faults, each with the first of the samples, or of those that are looked at, where it is one already."""
     if not faults:
         return []
@@ -121,7 +121,7 @@ def _with_beginnings(around: Surroundings, motion: Motion, faults: list[Fault]) 
     return found
 
 
-def _sampled(around: Surroundings, motion: Motion, bases: Array) -> tuple[list[Row], list[Fault]]:
+def _sampled(around: CollisionScene, motion: Motion, bases: Array) -> tuple[list[Row], list[Fault]]:
     middles = (motion.t[1:] + motion.t[:-1]) / 2
     times = np.concatenate([motion.t, middles])
     joints = motion.position.at(times)
