@@ -184,7 +184,7 @@ def stored_request(builder: str, arguments: Mapping[str, Any]) -> dict[str, Any]
             placed = {"vertices": value.hull.vertices, "position": value.position, "rotation": value.rotation}
             return {"kind": "Mesh", "fields": {name: put(part) for name, part in placed.items()}}
         if isinstance(value, CollisionScene) and value.machine is owner:
-            return {"kind": "Surroundings", "fields": {name: put(part) for name, part in _around(value).items()}}
+            return {"kind": "CollisionScene", "fields": {name: put(part) for name, part in _around(value).items()}}
         if is_dataclass(value) and KINDS.get(type(value).__name__) is type(value):
             parts = {one.name: getattr(value, one.name) for one in fields(value) if one.init}
             tracks = TRACKS.get(type(value), ())
@@ -288,7 +288,7 @@ def _read(value: Any, functions: list[Any], machine: Machine | None) -> Any:
         at = _of_time(functions[value["track"]])
         return at if "rate" not in value else rated(at, _of_time(functions[value["rate"]]))
     own = {name: read(part) for name, part in value["fields"].items()}
-    if value["kind"] == "Surroundings":
+    if value["kind"] == "CollisionScene":
         around = {name: own[name] for name in ("obstacles", "clearance", "ignored", "limits")}
         return CollisionScene(machine, **around, covered=_covered(own["covered"]))  # type: ignore[arg-type]
     if own.get("file") is not None and value["kind"] == "Mesh":
