@@ -27,7 +27,7 @@ import scipy.sparse as sp
 from scipy.linalg import LinAlgError, cho_solve_banded, cholesky, cholesky_banded, solve_triangular
 
 from ocp.console import reason_to_stop
-from ocp.direct.assembly import Fragment, Program
+from ocp.direct.assembly import Program, Transcription
 from ocp.direct.nlp import SOLVER_RESIDUAL, Outcome
 from ocp.direct.scaling import Scales
 from ocp.status import SolverStatus
@@ -40,9 +40,9 @@ __all__ = [
     "Conditions",
     "Newton",
     "Sides",
+    "active_sides",
     "conditions",
     "corrected",
-    "held_by",
     "scaled",
 ]
 
@@ -93,7 +93,7 @@ def pushes(program: Program, outcome: Outcome, p: np.ndarray, scales: Scales) ->
     return -(slope + jacobian.T @ lam) * scales.variables / scales.cost, lam * scales.rows / scales.cost
 
 
-def held_by(program: Program, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales) -> Sides:
+def active_sides(program: Program, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales) -> Sides:
     """On which side each variable (x) and row (g) stands at a limit that pushes: -1 below, 1 above, 0 at none."""
     push = dict(zip("xg", pushes(program, outcome, arguments["p"], scales), strict=True))
     values, units = {"x": outcome.variables, "g": outcome.rows}, {"x": scales.variables, "g": scales.rows}
@@ -172,12 +172,14 @@ class Newton:
     """Newton's method for one program, its matrix in an order in which it is a band.
 
     Args:
-        program, fragment: What is solved.
+        program, transcription: What is solved.
     """
 
-    def __init__(self, program: Program, fragment: Fragment, settings: NewtonSettings = NewtonSettings()) -> None:
+    def __init__(
+        self, program: Program, transcription: Transcription, settings: NewtonSettings = NewtonSettings()
+    ) -> None:
         self._program, self._settings = program, settings
-        n, m = fragment.size, fragment.n_rows
+        n, m = transcription.size, transcription.n_rows
         row, column = (np.array(part, dtype=np.int64) for part in program.jacobian.sparsity_out(1).get_triplet())
         first, second = (np.array(part, dtype=np.int64) for part in program.hessian.sparsity_out(0).get_triplet())
         self._row, self._column, self._first, self._second = row, column, first, second

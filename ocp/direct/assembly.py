@@ -20,7 +20,17 @@ from ocp.console import check_time
 from ocp.curves import PiecewisePolynomial
 from ocp.problem.values import symbols_of
 
-__all__ = ["SIZES", "Block", "Derivatives", "Fragment", "Interpolants", "Program", "Stages", "assemble", "derivatives"]
+__all__ = [
+    "SIZES",
+    "Block",
+    "Derivatives",
+    "Interpolants",
+    "Program",
+    "Stages",
+    "Transcription",
+    "assemble",
+    "derivatives",
+]
 
 
 @dataclass(frozen=True)
@@ -95,7 +105,7 @@ class Interpolants:
 
 
 @dataclass(frozen=True)
-class Fragment:
+class Transcription:
     """The nonlinear program of a problem.
 
     Attributes:
@@ -206,9 +216,9 @@ class Program:
     parametric: Any
 
     @cached_property
-    def numbers(self) -> Numbers:
+    def numbers(self) -> NumericDerivatives:
         """The derivatives as arrays."""
-        return Numbers(self)
+        return NumericDerivatives(self)
 
     @cached_property
     def jacobian_entries(self) -> tuple[np.ndarray, np.ndarray]:
@@ -217,7 +227,7 @@ class Program:
         return np.array(row, dtype=np.int32), np.array(column, dtype=np.int32)
 
 
-class Numbers:
+class NumericDerivatives:
     """Values and derivatives of a program as arrays of numpy and scipy; those at the last point are kept.
 
     CasADi hands its matrices to Python number by number, which takes longer than computing them: here functions write
@@ -226,7 +236,7 @@ class Numbers:
 
     def __init__(self, program: Program) -> None:
         functions = program.gradient, program.jacobian, program.hessian, program.inside, program.parametric
-        self._gradient, self._jacobian, self._hessian, self._inside, self._parametric = map(Written, functions)
+        self._gradient, self._jacobian, self._hessian, self._inside, self._parametric = map(ArrayFunction, functions)
         self._at: tuple[np.ndarray, np.ndarray] | None = None
         self._found: tuple[Any, ...] = ()
 
@@ -267,7 +277,7 @@ class Numbers:
         return np.asarray(self._parametric(x, p, lam)[0])
 
 
-class Written:
+class ArrayFunction:
     """A casadi Function of dense vectors that writes its outputs into arrays of their nonzeros."""
 
     def __init__(self, function: Any) -> None:
@@ -325,16 +335,16 @@ class Derivatives(NamedTuple):
     slope: Any
 
 
-def assemble(fragment: Fragment, parameters: int, functions: Sequence[Derivatives] | None = None) -> Program:
+def assemble(transcription: Transcription, parameters: int, functions: Sequence[Derivatives] | None = None) -> Program:
     """The program of a fragment, from the derivatives of its blocks, which are made where they are not given.
 
     Raises:
         OutOfTime: The time limit is over.
     """
-    blocks = fragment.blocks
+    blocks = transcription.blocks
     if functions is None:
         functions = [derivatives(block.function) for block in blocks]
-    n, m = fragment.size, fragment.n_rows
+    n, m = transcription.size, transcription.n_rows
     x, p = ca.MX.sym("x", n), ca.MX.sym("p", parameters)
     sigma, lam = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", m)
     calls = [(block, each, [*inputs(block, x), p]) for block, each in zip(blocks, functions, strict=True)]
@@ -342,7 +352,7 @@ def assemble(fragment: Fragment, parameters: int, functions: Sequence[Derivative
     outputs = [mapped(each.value, block, call) for block, each, call in calls]
     f = sum((ca.sum2(out[0]) for out in outputs), ca.MX(0))
     nonlinear = scatter([block.rows.ravel(order="F") for block in blocks], [ca.densify(out[1]) for out in outputs], m)
-    g = nonlinear + ca.mtimes(sparse(*fragment.linear, (m, n)), x)
+    g = nonlinear + ca.mtimes(sparse(*transcription.linear, (m, n)), x)
 
     pieces = [mapped(each.gradient, block, call)[0] for block, each, call in calls]
     places = [gradient_at(each.gradient.sparsity_out(0), block) for block, each, _ in calls]
@@ -352,7 +362,7 @@ def assemble(fragment: Fragment, parameters: int, functions: Sequence[Derivative
 
     pieces = [mapped(each.jacobian, block, call)[0] for block, each, call in calls]
     spots = [jacobian_at(each.jacobian.sparsity_out(0), block) for block, each, _ in calls]
-    jac = scatter_matrix(spots, pieces, fragment.linear, (m, n))
+    jac = scatter_matrix(spots, pieces, transcription.linear, (m, n))
 
     pieces = [
         mapped(each.hessian, block, [*call, repeat(sigma, block), gather(lam, block.rows)])[0]
@@ -390,11 +400,11 @@ def derivatives(function: Any) -> Derivatives:
     hessian = ca.triu(ca.hessian(sigma * cost + ca.dot(lam, g), v)[0])
     slope = ca.densify(ca.gradient(cost + ca.dot(lam, g), p))
     return Derivatives(
-        without_repeats("value", [v, d, p], [cost, g]),
-        without_repeats("gradient", [v, d, p], [ca.jacobian(cost, v)]),
-        without_repeats("jacobian", [v, d, p], [ca.jacobian(g, v)]),
-        without_repeats("hessian", [v, d, p, sigma, lam], [hessian]),
-        without_repeats("slope", [v, d, p, lam], [slope]),
+        build_function("value", [v, d, p], [cost, g]),
+        build_function("gradient", [v, d, p], [ca.jacobian(cost, v)]),
+        build_function("jacobian", [v, d, p], [ca.jacobian(g, v)]),
+        build_function("hessian", [v, d, p, sigma, lam], [hessian]),
+        build_function("slope", [v, d, p, lam], [slope]),
     )
 
 
@@ -426,7 +436,7 @@ def places_of(pattern: Any) -> tuple[np.ndarray, np.ndarray]:
     return np.array(row, dtype=int), np.array(column, dtype=int)
 
 
-def without_repeats(name: str, given: list[Any], outputs: list[Any]) -> Any:
+def build_function(name: str, given: list[Any], outputs: list[Any]) -> Any:
     """A casadi Function in which nothing is computed twice, unless it is large."""
     large = ca.Function(name, given, outputs).n_instructions() > SIZES.compared
     return ca.Function(name, given, outputs, {"cse": not large})

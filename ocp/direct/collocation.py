@@ -13,9 +13,9 @@ import casadi as ca
 import numpy as np
 
 from ocp.curves import differentiation_matrix, lagrange, quadrature_weights
-from ocp.direct.assembly import Block, Fragment, Interpolants
+from ocp.direct.assembly import Block, Interpolants, Transcription
 from ocp.direct.prepared import DirectMethod
-from ocp.direct.transcription import FragmentBuilder
+from ocp.direct.transcription import TranscriptionBuilder
 from ocp.errors import checked_choice
 from ocp.problem.formulation import Formulation
 
@@ -57,11 +57,11 @@ class Collocation(DirectMethod):
     def control_order(self) -> int:
         return 1 if self.control == "held" else self.degree
 
-    def transcribe(self, form: Formulation, *, staged: bool = False) -> Fragment:
+    def transcribe(self, form: Formulation, *, staged: bool = False) -> Transcription:
         return transcribe(self, form, staged)
 
 
-def transcribe(method: Collocation, form: Formulation, staged: bool) -> Fragment:
+def transcribe(method: Collocation, form: Formulation, staged: bool) -> Transcription:
     d, nx, nu = method.degree, form.nx, form.nu
     radau, held = method.scheme == "radau", method.control == "held"
     mesh = method.fractions
@@ -73,7 +73,7 @@ def transcribe(method: Collocation, form: Formulation, staged: bool) -> Fragment
     weights = quadrature_weights(points)
     inner = d - 1 if radau else d  # Radau's last point is the end of the interval
 
-    build = FragmentBuilder(form, mesh, 0, inner * nx + len(samples) * nu, staged)
+    build = TranscriptionBuilder(form, mesh, 0, inner * nx + len(samples) * nu, staged)
     lay = build.layout
     point_at = mesh[:-1, None] + width[:, None] * points  # fractions of the points, (n, d)
     control_at = mesh[:-1, None] + width[:, None] * samples

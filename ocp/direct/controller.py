@@ -30,7 +30,7 @@ import casadi as ca
 import numpy as np
 
 from ocp.direct import assembly
-from ocp.direct.assembly import SIZES, Derivatives, Fragment, assemble, derivatives, gather
+from ocp.direct.assembly import SIZES, Derivatives, Transcription, assemble, derivatives, gather
 from ocp.errors import ProblemError
 from ocp.libraries import SERIALISED, CompilerError, Library, built, code, generated, notice, serialised
 from ocp.problem.formulation import Formulation
@@ -39,22 +39,22 @@ from ocp.storage import write_text
 __all__ = ["block_derivatives", "controller_functions", "write_controller"]
 
 
-def controller_functions(form: Formulation, fragment: Fragment, guess: np.ndarray) -> list[Any]:
+def controller_functions(form: Formulation, transcription: Transcription, guess: np.ndarray) -> list[Any]:
     """The functions that are written, in the units of the problem.
 
     Args:
         guess: Values of the variables that `plan_guess` moves inside the bounds at its parameters. Shape (size,).
     """
-    program = assemble(fragment, form.np)
-    x, p = ca.MX.sym("x", fragment.size), ca.MX.sym("p", form.np)
-    sigma, lam = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", fragment.n_rows)
+    program = assemble(transcription, form.np)
+    x, p = ca.MX.sym("x", transcription.size), ca.MX.sym("p", form.np)
+    sigma, lam = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", transcription.n_rows)
     lower, upper = form.bounds.function(p)
-    at_x, at_g = fragment.variable_bounds.tolist(), fragment.row_bounds.tolist()
+    at_x, at_g = transcription.variable_bounds.tolist(), transcription.row_bounds.tolist()
     bounds = [ca.densify(ca.vec(side)[at]) for at in (at_x, at_g) for side in (lower, upper)]
     start = ca.fmin(ca.fmax(ca.DM(guess), bounds[0]), bounds[1])
 
-    curves = fragment.interpolants
-    horizon = ca.MX(form.horizon_at(p)) if fragment.horizon is None else x[fragment.horizon]
+    curves = transcription.interpolants
+    horizon = ca.MX(form.horizon_at(p)) if transcription.horizon is None else x[transcription.horizon]
     states = gather(x, curves.variables)
     if curves.values is not None:
         states = curves.mapped(states, ca.DM(curves.data), horizon, p)
@@ -74,7 +74,7 @@ def controller_functions(form: Formulation, fragment: Fragment, guess: np.ndarra
     ]
 
 
-def write_controller(form: Formulation, fragment: Fragment, guess: np.ndarray, folder: Path) -> Path:
+def write_controller(form: Formulation, transcription: Transcription, guess: np.ndarray, folder: Path) -> Path:
     """Write the folder that the head of this module tells of; each file whole or not at all.
 
     Raises:
@@ -82,28 +82,33 @@ def write_controller(form: Formulation, fragment: Fragment, guess: np.ndarray, f
         OSError: The folder cannot be written.
     """
     try:
-        plan = generated(controller_functions(form, fragment, guess), "plan")
+        plan = generated(controller_functions(form, transcription, guess), "plan")
     except CompilerError as error:
         raise ProblemError(f"problem {form.name!r} has no C: {error}", name="method", value=form.name) from error
     texts = dict(zip(("plan.c", "plan.h"), plan, strict=True))
-    texts |= {"problem.h": problem_header(form, fragment), "curves.h": CURVES, "main.c": MAIN, "Makefile": MAKEFILE}
+    texts |= {
+        "problem.h": problem_header(form, transcription),
+        "curves.h": CURVES,
+        "main.c": MAIN,
+        "Makefile": MAKEFILE,
+    }
     folder.mkdir(parents=True, exist_ok=True)
     for name, text in texts.items():
         write_text(folder / name, text)
     return folder
 
 
-def problem_header(form: Formulation, fragment: Fragment) -> str:
+def problem_header(form: Formulation, transcription: Transcription) -> str:
     """Sizes, names, and breaks and nodes of the curves."""
-    curves = fragment.interpolants
+    curves = transcription.interpolants
     labels = [
         f"{name}[{i}]" if s.stop - s.start > 1 else name
         for name, s in form.parameters.items()
         for i in range(s.stop - s.start)
     ]
     sizes = {
-        "VARIABLES": fragment.size,
-        "ROWS": fragment.n_rows,
+        "VARIABLES": transcription.size,
+        "ROWS": transcription.n_rows,
         "PARAMETERS": form.np,
         "STATES": form.nx,
         "CONTROLS": form.nu,
@@ -262,19 +267,19 @@ RECIPE = hashlib.sha256(Path(assembly.__file__).read_bytes()).hexdigest()
 """What tells how derivatives are made of a block: the text that does it."""
 
 
-def block_derivatives(fragment: Fragment, compiled: bool) -> list[Derivatives]:
+def block_derivatives(transcription: Transcription, compiled: bool) -> list[Derivatives]:
     """Return the derivatives of each block of a fragment; blocks of one function share theirs.
 
     Args:
-        fragment: Whose blocks.
+        transcription: Whose blocks.
         compiled: Whether they are compiled. What cannot be is interpreted, and a warning says once why.
 
     Raises:
         OutOfTime: The time limit is over.
     """
-    texts = [serialised(block.function) for block in fragment.blocks]
+    texts = [serialised(block.function) for block in transcription.blocks]
     found: dict[str, Derivatives] = {}
-    for text, block in zip(texts, fragment.blocks, strict=True):
+    for text, block in zip(texts, transcription.blocks, strict=True):
         if text not in found:
             is_compiled = compiled and _is_worth_it(block.function, text)
             found[text] = _compiled(block.function, text) if is_compiled else derivatives(block.function)

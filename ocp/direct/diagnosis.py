@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 
 from ocp.console import Progress, listening, time_left
-from ocp.direct.assembly import Fragment, Program, sparse
+from ocp.direct.assembly import Program, Transcription, sparse
 from ocp.direct.nlp import Outcome
 from ocp.direct.scaling import SCALING, Scales
 from ocp.errors import Interrupted, SolveError
@@ -54,7 +54,7 @@ class Built(Protocol):
 
     problem: Problem
     formulation: Formulation
-    fragment: Fragment
+    transcription: Transcription
     program: Program
 
     @property
@@ -122,11 +122,11 @@ def diagnosis(
 
 def at_bounds(built: Built, values: np.ndarray, arguments: dict[str, np.ndarray], horizon: float) -> list[str]:
     """Which states and controls sit at their bounds, and for how much of the plan."""
-    form, fragment = built.formulation, built.fragment
+    form, transcription = built.formulation, built.transcription
     lines = []
     for role, labels in (("state", form.state_labels), ("control", form.control_labels)):
         for i, label in enumerate(labels):
-            mine = (fragment.variable_role == role) & (fragment.variable_entry == i)
+            mine = (transcription.variable_role == role) & (transcription.variable_entry == i)
             mine &= arguments["lbx"] < arguments["ubx"]  # not what is given
             for side, key in (("lower", "lbx"), ("upper", "ubx")):
                 bound = arguments[key][mine]
@@ -134,7 +134,7 @@ def at_bounds(built: Built, values: np.ndarray, arguments: dict[str, np.ndarray]
                     at = np.abs(values[mine] - bound) <= 1e-6 * np.maximum(1.0, np.abs(bound))
                 at &= np.isfinite(bound)
                 if np.any(at):
-                    where = fragment.variable_fraction[mine][at]
+                    where = transcription.variable_fraction[mine][at]
                     lines.append(
                         f"  {role} {label} is at its {side} bound {bound[at][0]:.4g} at {np.mean(at):.0%} of its "
                         f"points, from {where.min() * horizon:.4g} to {where.max() * horizon:.4g} s"
@@ -146,15 +146,15 @@ def residuals(
     built: Built, v: np.ndarray, arguments: dict[str, np.ndarray]
 ) -> tuple[list[str], np.ndarray, np.ndarray, np.ndarray]:
     """Label, fraction, value and miss of every row and of the bounds of every variable, evaluated anew."""
-    form, fragment = built.formulation, built.fragment
+    form, transcription = built.formulation, built.transcription
     try:
         g = np.asarray(built.program.values(v, arguments["p"])[1].full()).reshape(-1)
     except RuntimeError:  # an integrator breaks down
-        g = np.full(fragment.n_rows, np.nan)
+        g = np.full(transcription.n_rows, np.nan)
     value = np.concatenate([g, v])
     lower, upper = both_bounds(arguments)
-    at = np.concatenate([fragment.row_fractions, fragment.variable_fraction])
-    labels = [*fragment.row_labels, *(f"bound of {name}" for name in variable_names(form, fragment))]
+    at = np.concatenate([transcription.row_fractions, transcription.variable_fraction])
+    labels = [*transcription.row_labels, *(f"bound of {name}" for name in variable_names(form, transcription))]
     return labels, at, value, np.maximum(lower - value, value - upper)
 
 
@@ -164,20 +164,20 @@ def both_bounds(arguments: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarra
     return low, high
 
 
-def variable_labels(form: Formulation, fragment: Fragment) -> list[str]:
+def variable_labels(form: Formulation, transcription: Transcription) -> list[str]:
     """Name of the state, control or horizon that each variable is; "" of a copy that a stage carries."""
     names = {"state": form.state_labels, "control": form.control_labels, "horizon": ("horizon",)}
     return [
         names[role][entry] if role else ""
-        for role, entry in zip(fragment.variable_role, fragment.variable_entry, strict=True)
+        for role, entry in zip(transcription.variable_role, transcription.variable_entry, strict=True)
     ]
 
 
-def variable_names(form: Formulation, fragment: Fragment) -> list[str]:
+def variable_names(form: Formulation, transcription: Transcription) -> list[str]:
     """The same with what it is before it, "state q[2]"; "a stage variable" of a copy that a stage carries."""
     return [
         f"{'' if role == 'horizon' else role + ' '}{name}" if role else "a stage variable"
-        for role, name in zip(fragment.variable_role, variable_labels(form, fragment), strict=True)
+        for role, name in zip(transcription.variable_role, variable_labels(form, transcription), strict=True)
     ]
 
 
@@ -236,10 +236,10 @@ def elastic_plan(
     _, _, value, miss = residuals(built, outcome.variables, arguments)
     if time_left() <= 0 or not (np.all(np.isfinite(value)) and np.any(miss > SOLVER_SHARE)):
         return None
-    form, fragment, program = built.formulation, built.fragment, built.scaled
+    form, transcription, program = built.formulation, built.transcription, built.scaled
     own = scales.inside(arguments)
-    soft = _Soft(form, fragment, own)
-    n, m, k = fragment.size, fragment.n_rows, len(soft.labels)
+    soft = _Soft(form, transcription, own)
+    n, m, k = transcription.size, transcription.n_rows, len(soft.labels)
     x, p = ca.MX.sym("x", n + k), program.nlp["p"]
     v, slack = x[:n], x[n:]
     rows, columns = soft.picks(n, m, k)
@@ -291,7 +291,7 @@ def elastic_plan(
     plan = np.asarray(result["x"].full()).ravel()[:n]
     found = np.asarray(program.values(plan, own["p"])[1].full()).ravel()
     plan_of_problem = plan * scales.variables
-    end = horizon if fragment.horizon is None else float(plan_of_problem[fragment.horizon])
+    end = horizon if transcription.horizon is None else float(plan_of_problem[transcription.horizon])
     units = np.concatenate([scales.rows, scales.variables])
     return Elastic(plan_of_problem, tuple(soft.read(np.concatenate([found, plan]), own, end, units)))
 
@@ -302,15 +302,15 @@ class _Soft:
     Rows are numbered before variables. Those of one label share a slack.
     """
 
-    def __init__(self, form: Formulation, fragment: Fragment, arguments: dict[str, np.ndarray]) -> None:
+    def __init__(self, form: Formulation, transcription: Transcription, arguments: dict[str, np.ndarray]) -> None:
         places = form.bounds.places
-        owner = np.array([*fragment.row_labels, *variable_labels(form, fragment)])
+        owner = np.array([*transcription.row_labels, *variable_labels(form, transcription)])
         low, high = both_bounds(arguments)
         declared = np.concatenate([places[kind] for kind in ("path", "start", "end")])
-        is_soft = np.concatenate([np.isin(fragment.row_bounds, declared), arguments["lbx"] < arguments["ubx"]])
+        is_soft = np.concatenate([np.isin(transcription.row_bounds, declared), arguments["lbx"] < arguments["ubx"]])
         self.lower = np.flatnonzero(is_soft & np.isfinite(low) & (owner != "horizon"))
         self.upper = np.flatnonzero(is_soft & np.isfinite(high))
-        self.hard = np.flatnonzero(~is_soft[: fragment.n_rows])
+        self.hard = np.flatnonzero(~is_soft[: transcription.n_rows])
         self.labels, index = np.unique(owner[np.concatenate([self.lower, self.upper])], return_inverse=True)
         self.slack_of_lower, self.slack_of_upper = index[: len(self.lower)], index[len(self.lower) :]
         with np.errstate(invalid="ignore"):
@@ -321,11 +321,11 @@ class _Soft:
         np.minimum.at(self.sizes, index, size[np.concatenate([self.lower, self.upper])])
         self.prices = 1 / self.sizes
         self.prices[index[(low == high)[np.concatenate([self.lower, self.upper])]]] *= SETTINGS.equality
-        relaxed = is_soft[fragment.n_rows :]
-        horizon = fragment.variable_role == "horizon"
+        relaxed = is_soft[transcription.n_rows :]
+        horizon = transcription.variable_role == "horizon"
         self.low = np.where(relaxed & ~horizon, -np.inf, arguments["lbx"])
         self.high = np.where(relaxed, np.inf, arguments["ubx"])
-        self.fractions = np.concatenate([fragment.row_fractions, fragment.variable_fraction])
+        self.fractions = np.concatenate([transcription.row_fractions, transcription.variable_fraction])
 
     def picks(self, n: int, m: int, k: int) -> tuple[Any, Any]:
         """Constant matrices R, C: the elastic rows are R g(v) + C (v, slack)."""

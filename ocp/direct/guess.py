@@ -13,19 +13,19 @@ import casadi as ca
 import numpy as np
 
 from ocp.curves import rk4_step
-from ocp.direct.assembly import Fragment
+from ocp.direct.assembly import Transcription
 from ocp.errors import ProblemError, about, unknown_name
 from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.values import numeric, table
 from ocp.solution import Guess, Solution
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = ["ELASTIC", "GUESS", "STARTS", "Samples", "initial_point", "later", "names_told", "other_starts"]
+__all__ = ["ELASTIC", "GUESS", "STARTS", "Samples", "alternative_starts", "guessed_names", "initial_point", "later"]
 
 Trajectory = Callable[[np.ndarray], np.ndarray]  # fractions of the horizon (M,) -> values (M, n)
 
 
-def initial_point(form: Formulation, fragment: Fragment, guess: Guess, bounds: Bounds) -> np.ndarray:
+def initial_point(form: Formulation, transcription: Transcription, guess: Guess, bounds: Bounds) -> np.ndarray:
     """Values of all variables to start from. Shape (size,).
 
     What ``guess`` says comes first, then the guess declared with the variable, then a straight line between the given
@@ -59,11 +59,11 @@ def initial_point(form: Formulation, fragment: Fragment, guess: Guess, bounds: B
     entries.update(given)
     times = None if guess is None or isinstance(guess, Solution) else guess.get("t")
 
-    point = np.zeros(fragment.size)
-    point[fragment.variable_role == "horizon"] = horizon
+    point = np.zeros(transcription.size)
+    point[transcription.variable_role == "horizon"] = horizon
     for role, pool in (("state", form.states), ("control", form.controls)):
-        mine = fragment.variable_role == role
-        where, slot = np.unique(fragment.variable_fraction[mine], return_inverse=True)
+        mine = transcription.variable_role == role
+        where, slot = np.unique(transcription.variable_fraction[mine], return_inverse=True)
         size = max((place.stop for place in pool.values()), default=0)
         table = np.zeros((len(where), size))
         for name, place in pool.items():
@@ -80,11 +80,11 @@ def initial_point(form: Formulation, fragment: Fragment, guess: Guess, bounds: B
             for i in np.flatnonzero(~np.isfinite(table[:, place]).all(axis=1)):
                 words = f"guess of {name!r} is not finite at {where[i] * horizon:g} s: {table[i, place]}"
                 raise ProblemError(words, name=name, value=table[i, place], time=float(where[i] * horizon))
-        point[mine] = table[slot, fragment.variable_entry[mine]]
+        point[mine] = table[slot, transcription.variable_entry[mine]]
     return point
 
 
-def names_told(form: Formulation, guess: Guess) -> set[str]:
+def guessed_names(form: Formulation, guess: Guess) -> set[str]:
     """Names of states, controls and ``horizon`` of which a guess, or the problem's own, says something."""
     told = {name for name, value in form.guesses.items() if value is not None}
     if form.horizon_guess is not None:
@@ -94,15 +94,20 @@ def names_told(form: Formulation, guess: Guess) -> set[str]:
     return told | {*(guess or {})}
 
 
-def later(fragment: Fragment, intervals: int) -> tuple[np.ndarray, np.ndarray]:
+def later(transcription: Transcription, intervals: int) -> tuple[np.ndarray, np.ndarray]:
     """For each variable and each row of a program, the one of the same meaning so many equal intervals later.
 
     Itself where the horizon ends before.
     """
-    step = intervals / (len(fragment.mesh) - 1)
-    meanings = [f"{role} {entry}" for role, entry in zip(fragment.variable_role, fragment.variable_entry, strict=True)]
+    step = intervals / (len(transcription.mesh) - 1)
+    meanings = [
+        f"{role} {entry}" for role, entry in zip(transcription.variable_role, transcription.variable_entry, strict=True)
+    ]
     found = []
-    for words, fractions in ((meanings, fragment.variable_fraction), (fragment.row_labels, fragment.row_fractions)):
+    for words, fractions in (
+        (meanings, transcription.variable_fraction),
+        (transcription.row_labels, transcription.row_fractions),
+    ):
         _, label = np.unique(words, return_inverse=True)
         order = np.lexsort((fractions, label))
         at = label[order] + fractions[order] / 2  # one meaning after the other, in time
@@ -241,34 +246,38 @@ class StartSettings:
 STARTS = StartSettings()
 
 
-def other_starts(
-    form: Formulation, fragment: Fragment, point: np.ndarray, p: np.ndarray, bounds: tuple[np.ndarray, np.ndarray]
+def alternative_starts(
+    form: Formulation,
+    transcription: Transcription,
+    point: np.ndarray,
+    p: np.ndarray,
+    bounds: tuple[np.ndarray, np.ndarray],
 ) -> Iterator[tuple[str, np.ndarray]]:
     """Name and values of all variables of each start after the guess ``point``, made when it is asked for.
 
     Args:
         bounds: Of the variables, which the starts are moved into.
     """
-    zeros = np.where(fragment.variable_role == "horizon", STARTS.horizon * point, 0.0)
+    zeros = np.where(transcription.variable_role == "horizon", STARTS.horizon * point, 0.0)
     yield "zeros", np.clip(zeros, *bounds)
-    yield "roll-out", np.clip(roll_out(form, fragment, point, p), *bounds)
+    yield "roll-out", np.clip(roll_out(form, transcription, point, p), *bounds)
 
 
-def roll_out(form: Formulation, fragment: Fragment, point: np.ndarray, p: np.ndarray) -> np.ndarray:
+def roll_out(form: Formulation, transcription: Transcription, point: np.ndarray, p: np.ndarray) -> np.ndarray:
     """The controls of a start with the states that they lead to from its initial state. Shape (size,).
 
     Classical Runge-Kutta from each fraction at which a state stands to the next; from where the states are no longer
     finite they stand still.
     """
-    state, control = (fragment.variable_role == role for role in ("state", "control"))
-    where, slot = np.unique(fragment.variable_fraction[state], return_inverse=True)
-    horizon = float(form.horizon_at(p) if fragment.horizon is None else point[fragment.horizon])
+    state, control = (transcription.variable_role == role for role in ("state", "control"))
+    where, slot = np.unique(transcription.variable_fraction[state], return_inverse=True)
+    horizon = float(form.horizon_at(p) if transcription.horizon is None else point[transcription.horizon])
     # controls at the beginning, middle and end of every step
     places = np.concatenate([where[:-1], (where[:-1] + where[1:]) / 2, where[1:]])
     values = np.zeros((form.nu, len(places)))
     for i in range(form.nu):
-        mine = np.flatnonzero(control & (fragment.variable_entry == i))
-        at, first = np.unique(fragment.variable_fraction[mine], return_index=True)
+        mine = np.flatnonzero(control & (transcription.variable_entry == i))
+        at, first = np.unique(transcription.variable_fraction[mine], return_index=True)
         values[i] = np.interp(places, at, point[mine][first])
     steps = len(where) - 1
     inputs = np.vstack([*np.split(values, 3, axis=1), where[:-1] * horizon, np.diff(where) * horizon])
@@ -281,12 +290,12 @@ def roll_out(form: Formulation, fragment: Fragment, point: np.ndarray, p: np.nda
         return rate(here, d[third : third + form.nu], d[-2] + place * d[-1], horizon, p)
 
     step = ca.Function("step", [x, d], [rk4_step(slope, x, d[-1])])
-    start = point[fragment.start]
+    start = point[transcription.start]
     found = np.asarray(step.mapaccum("roll_out", steps)(start, inputs).full()) if steps else np.zeros((form.nx, 0))
     states = np.column_stack([start, found])
     broken = ~np.isfinite(states).all(axis=0)
     if broken.any():
         states[:, np.argmax(broken) :] = states[:, [np.argmax(broken) - 1]]
     rolled = point.copy()
-    rolled[state] = states[fragment.variable_entry[state], slot]
+    rolled[state] = states[transcription.variable_entry[state], slot]
     return rolled

@@ -8,7 +8,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from ocp.direct.assembly import Fragment
+from ocp.direct.assembly import Transcription
 from ocp.errors import NOT_NUMBERS, ProblemError, about, checked_count, checked_positive, floats
 from ocp.problem.formulation import Formulation
 from ocp.problem.values import numeric
@@ -41,7 +41,7 @@ class MeshedMethod(ABC):
         """Power of the width with which a smooth control is missed between its points."""
 
     @abstractmethod
-    def transcribe(self, form: Formulation, *, staged: bool = False) -> Fragment:
+    def transcribe(self, form: Formulation, *, staged: bool = False) -> Transcription:
         """The nonlinear program of a problem. ``staged`` lays it out for a structure-exploiting solver."""
 
     @property

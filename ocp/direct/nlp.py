@@ -16,7 +16,7 @@ import numpy as np
 
 from ocp.console import LOG, Progress, Watch, listening, quiet
 from ocp.curves import PiecewisePolynomial
-from ocp.direct.assembly import Fragment, Program, Stages
+from ocp.direct.assembly import Program, Stages, Transcription
 from ocp.errors import ProblemError, SolveError
 from ocp.problem.formulation import Formulation
 from ocp.solution import Solution
@@ -307,13 +307,13 @@ def last_line(error: BaseException) -> str:
     return str(error).strip().splitlines()[-1]
 
 
-def horizon_of(form: Formulation, fragment: Fragment, outcome: Outcome, p: np.ndarray) -> float:
+def horizon_of(form: Formulation, transcription: Transcription, outcome: Outcome, p: np.ndarray) -> float:
     """The final time of an outcome, s."""
-    return float(form.horizon_at(p) if fragment.horizon is None else outcome.variables[fragment.horizon])
+    return float(form.horizon_at(p) if transcription.horizon is None else outcome.variables[transcription.horizon])
 
 
 def solution_of(
-    form: Formulation, fragment: Fragment, program: Program, outcome: Outcome, p: np.ndarray, **told: Any
+    form: Formulation, transcription: Transcription, program: Program, outcome: Outcome, p: np.ndarray, **told: Any
 ) -> Solution:
     """The solution that an outcome is.
 
@@ -321,15 +321,15 @@ def solution_of(
         told: What else a solution says of itself: method, start, seconds.
     """
     v = outcome.variables
-    horizon = horizon_of(form, fragment, outcome, p)
-    states, controls = fragment.interpolants(v, p, horizon)
-    piece, place = fragment.report
-    mesh = fragment.mesh
+    horizon = horizon_of(form, transcription, outcome, p)
+    states, controls = transcription.interpolants(v, p, horizon)
+    piece, place = transcription.report
+    mesh = transcription.mesh
     at = mesh[piece] + np.diff(mesh)[piece] * place
     at[-1] = 1.0
-    costates = costates_of(program, fragment, outcome, p)
-    by_parameter = cost_gradient(form, program, fragment, outcome, p) if form.np else np.zeros(0)
-    x, u = v[fragment.report_states], controls_at(controls, fragment, piece, place)
+    costates = costates_of(program, transcription, outcome, p)
+    by_parameter = cost_gradient(form, program, transcription, outcome, p) if form.np else np.zeros(0)
+    x, u = v[transcription.report_states], controls_at(controls, transcription, piece, place)
     return Solution(
         name=form.name,
         solver=outcome.solver,
@@ -347,7 +347,7 @@ def solution_of(
         cost_gradients={name: by_parameter[s] for name, s in form.parameters.items()},
         state_interpolant=states,
         control_interpolant=controls,
-        costate_interpolant=costate_interpolant(fragment, costates),
+        costate_interpolant=costate_interpolant(transcription, costates),
         variables=v,
         multipliers=outcome.multipliers,
         problem=form.problem,
@@ -356,35 +356,35 @@ def solution_of(
     )
 
 
-def costates_of(program: Program, fragment: Fragment, outcome: Outcome, p: np.ndarray) -> np.ndarray:
+def costates_of(program: Program, transcription: Transcription, outcome: Outcome, p: np.ndarray) -> np.ndarray:
     """Costates at the reported points, from the multipliers.
 
     At a node: the derivative, with respect to its state, of what the intervals behind it add to the Lagrangian;
     at the end: minus what the intervals before it say.
     """
-    costates = outcome.multipliers[fragment.costate_rows] * fragment.costate_scale[:, None]
-    inner = np.where(fragment.row_stages < 0, 0.0, outcome.multipliers)
+    costates = outcome.multipliers[transcription.costate_rows] * transcription.costate_scale[:, None]
+    inner = np.where(transcription.row_stages < 0, 0.0, outcome.multipliers)
     numbers = program.numbers
     _, jacobian = numbers.first(outcome.variables, p)
-    rows, columns = jacobian.indices, np.repeat(np.arange(fragment.size), np.diff(jacobian.indptr))
+    rows, columns = jacobian.indices, np.repeat(np.arange(transcription.size), np.diff(jacobian.indptr))
     with np.errstate(invalid="ignore"):  # the iterate of a solver that failed may be anywhere
         terms = jacobian.data * inner[rows]
     running = numbers.inside(outcome.variables, p)
 
-    node_of = np.full(fragment.size, -2)
-    node_of[fragment.nodes] = np.arange(len(fragment.mesh))
-    own = fragment.row_stages[rows] == node_of[columns]
-    behind = np.bincount(columns[own], weights=terms[own], minlength=fragment.size)
-    behind[fragment.start] += running[fragment.start]
-    before = np.bincount(columns, weights=terms, minlength=fragment.size) + running
-    behind[fragment.end] = -before[fragment.end]
-    at_node = fragment.costate_rows < 0
-    costates[at_node] = behind[fragment.nodes.T[fragment.costate_nodes]][at_node]
+    node_of = np.full(transcription.size, -2)
+    node_of[transcription.nodes] = np.arange(len(transcription.mesh))
+    own = transcription.row_stages[rows] == node_of[columns]
+    behind = np.bincount(columns[own], weights=terms[own], minlength=transcription.size)
+    behind[transcription.start] += running[transcription.start]
+    before = np.bincount(columns, weights=terms, minlength=transcription.size) + running
+    behind[transcription.end] = -before[transcription.end]
+    at_node = transcription.costate_rows < 0
+    costates[at_node] = behind[transcription.nodes.T[transcription.costate_nodes]][at_node]
     return np.asarray(costates)
 
 
 def cost_gradient(
-    form: Formulation, program: Program, fragment: Fragment, outcome: Outcome, p: np.ndarray
+    form: Formulation, program: Program, transcription: Transcription, outcome: Outcome, p: np.ndarray
 ) -> np.ndarray:
     """Derivative of the optimal cost in the parameters: of the Lagrangian, and through every active bound."""
     v, lam = outcome.variables, outcome.multipliers
@@ -392,26 +392,26 @@ def cost_gradient(
     slope, jacobian = program.numbers.first(v, p)
     lam_x = -(slope + jacobian.T @ lam)
     push = np.zeros((2, sum(len(place) for place in form.bounds.places.values())))
-    for index, force in ((fragment.variable_bounds, lam_x), (fragment.row_bounds, lam)):
+    for index, force in ((transcription.variable_bounds, lam_x), (transcription.row_bounds, lam)):
         np.add.at(push[0], index, np.minimum(force, 0.0))  # at a lower bound
         np.add.at(push[1], index, np.maximum(force, 0.0))
     return np.asarray(direct - form.bounds.pull(p, push))
 
 
-def costate_interpolant(fragment: Fragment, costates: np.ndarray) -> PiecewisePolynomial:
+def costate_interpolant(transcription: Transcription, costates: np.ndarray) -> PiecewisePolynomial:
     """The polynomials through the reported costates of every interval, both its ends included."""
-    piece, place = fragment.report
-    n = len(fragment.mesh) - 1
+    piece, place = transcription.report
+    n = len(transcription.mesh) - 1
     starts = np.searchsorted(piece + (place == 1.0), np.arange(n))
     width = starts[1] - starts[0] if n > 1 else len(piece) - 1
     index = starts[:, None] + np.arange(width + 1)
     nodes = np.append(place[(piece + (place == 1.0)) == 0], 1.0)
-    return PiecewisePolynomial(fragment.mesh, nodes, costates[index])
+    return PiecewisePolynomial(transcription.mesh, nodes, costates[index])
 
 
-def controls_at(controls: Any, fragment: Fragment, piece: np.ndarray, place: np.ndarray) -> np.ndarray:
+def controls_at(controls: Any, transcription: Transcription, piece: np.ndarray, place: np.ndarray) -> np.ndarray:
     """Controls at reported points, from the side of the interval that reports them."""
-    if len(controls.breaks) == len(fragment.mesh):
+    if len(controls.breaks) == len(transcription.mesh):
         return np.asarray(controls.within(piece, place))
-    mesh = fragment.mesh
+    mesh = transcription.mesh
     return np.asarray(controls(mesh[piece] + np.diff(mesh)[piece] * place))

@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 
 from ocp.console import OutOfTime, check_time, interruptible, limited
-from ocp.direct.active_set import Newton, held_by
+from ocp.direct.active_set import Newton, active_sides
 from ocp.direct.assembly import Program, assemble
 from ocp.direct.controller import block_derivatives, write_controller
 from ocp.direct.diagnosis import Elastic, diagnosis, elastic_plan
-from ocp.direct.guess import ELASTIC, GUESS, STARTS, initial_point, later, names_told, other_starts
+from ocp.direct.guess import ELASTIC, GUESS, STARTS, alternative_starts, guessed_names, initial_point, later
 from ocp.direct.mesh import MeshedMethod
 from ocp.direct.nlp import (
     SOLVERS,
@@ -31,7 +31,16 @@ from ocp.direct.nlp import (
     largest_number_of_iterations,
     solution_of,
 )
-from ocp.direct.scaling import Known, Pattern, Scales, badness, fitting_scales, scaled_program, sizes_along, unscaled
+from ocp.direct.scaling import (
+    Pattern,
+    Predetermined,
+    Scales,
+    compute_scales,
+    scaled_program,
+    scaling_fault,
+    sizes_along,
+    unit_scales,
+)
 from ocp.errors import (
     Interrupted,
     ProblemError,
@@ -80,7 +89,7 @@ class Prepared:
     """A problem built once for a method and a solver, to be solved many times, by one thread at a time.
 
     Attributes:
-        formulation, fragment, program: What was built.
+        formulation, transcription, program: What was built.
         solver_name: The solver.
         seconds: Wall time of the build.
     """
@@ -101,15 +110,15 @@ class Prepared:
         own = checked_mapping("options", options)
         self._own_options, self._scaling = own, scaling
         self.solver_name = solver
-        self.fragment = method.transcribe(self.formulation, staged=solver == "fatrop")
+        self.transcription = method.transcribe(self.formulation, staged=solver == "fatrop")
         # sleqp asks for products with the Hessian, which compiled functions do not have
-        blocks = block_derivatives(self.fragment, compiled and solver != "sleqp")
-        self.program = assemble(self.fragment, self.formulation.np, blocks)
+        blocks = block_derivatives(self.transcription, compiled and solver != "sleqp")
+        self.program = assemble(self.transcription, self.formulation.np, blocks)
         check_time()
         self._solver, self._progress = self._built_solver(own)
         check_time()
-        self._pattern = Pattern(self.formulation, self.fragment, self.program)
-        self._known = Known(self.formulation, self.fragment, self.program)
+        self._pattern = Pattern(self.formulation, self.transcription, self.program)
+        self._known = Predetermined(self.formulation, self.transcription, self.program)
         self._most = largest_number_of_iterations(self.solver_name, own)
         self._made_of = problem, method, solver, options, compiled, scaling
         self._lock = threading.RLock()  # casadi's functions take one caller at a time
@@ -122,7 +131,7 @@ class Prepared:
 
     def _built_solver(self, options: dict[str, Any]) -> tuple[Any, Any]:
         """The solver with some options, and what ends it where it must end."""
-        return build_solver(self.scaled, self.solver_name, options, self.fragment.stages, self.problem.name)
+        return build_solver(self.scaled, self.solver_name, options, self.transcription.stages, self.problem.name)
 
     def __reduce__(self) -> Any:
         """Pickled and copied as what it was prepared of, to be prepared again."""
@@ -175,32 +184,32 @@ class Prepared:
             ProblemError: Wrong arguments, or something of the problem has no C, such as cvodes.
             OSError: The folder cannot be written.
         """
-        form, fragment = self.formulation, self.fragment
+        form, transcription = self.formulation, self.transcription
         place = Path(checked_path(folder))
         bounds = form.bound_values(form.parameter_vector(checked_mapping("parameters", parameters)))
         with self._lock:
-            point = initial_point(form, fragment, guess, bounds)
+            point = initial_point(form, transcription, guess, bounds)
             if isinstance(guess, Solution) and guess.method == self.method.settings:
                 # of this very grid; a layout in stages has more variables than one without
                 point = guess.variables if guess.variables.size == point.size else point
-            return write_controller(form, fragment, point, place)
+            return write_controller(form, transcription, point, place)
 
     def _solve(
         self, parameters: ByName, guess: Guess, check: bool, tighter: Mapping[str, np.ndarray] | None, ahead: int
     ) -> Solution:
-        form, fragment = self.formulation, self.fragment
+        form, transcription = self.formulation, self.transcription
         p = form.parameter_vector(checked_mapping("parameters", parameters))
         bounds = form.bound_values(p)
-        arguments = fragment.arguments(p, bounds_to_solve(form, p))
+        arguments = transcription.arguments(p, bounds_to_solve(form, p))
         if tighter is not None:
             draw_in(arguments, tighter)
         again = self._again(guess, arguments, bounds, ahead)
         if again is not None:
             return again
-        point = initial_point(form, fragment, guess, bounds)
+        point = initial_point(form, transcription, guess, bounds)
         if ahead and isinstance(guess, Solution):
-            point = guess.variables[later(fragment, ahead)[0]]
-        told = names_told(form, guess)
+            point = guess.variables[later(transcription, ahead)[0]]
+        told = guessed_names(form, guess)
         first = self._attempt(GUESS, point, told, arguments, bounds)
         if first.solution is not None and (first.outcome.success or not check):
             return first.solution
@@ -219,7 +228,7 @@ class Prepared:
             self,
             told_of.outcome,
             told_of.arguments,
-            horizon_of(form, fragment, told_of.outcome, p),
+            horizon_of(form, transcription, told_of.outcome, p),
             told_of.solution,
             elastic,
             [str(attempt) for attempt in attempts],
@@ -235,7 +244,9 @@ class Prepared:
         attempts, left, x0 = list[Attempt](), self._most, first.arguments["x0"]
         if first.is_final:
             return attempts
-        starts = other_starts(self.formulation, self.fragment, x0, arguments["p"], (arguments["lbx"], arguments["ubx"]))
+        starts = alternative_starts(
+            self.formulation, self.transcription, x0, arguments["p"], (arguments["lbx"], arguments["ubx"])
+        )
         for start, point in starts:
             if left <= 0 or np.array_equal(point, x0):
                 continue
@@ -248,7 +259,7 @@ class Prepared:
 
     def _elastic(self, first: Attempt) -> Elastic | None:
         """The plan that misses the constraints least; Ctrl-C carries the last iterate of the first attempt."""
-        horizon = horizon_of(self.formulation, self.fragment, first.outcome, first.arguments["p"])
+        horizon = horizon_of(self.formulation, self.transcription, first.outcome, first.arguments["p"])
         try:
             return elastic_plan(self, first.outcome, first.arguments, first.scales, horizon)
         except Interrupted as error:
@@ -259,7 +270,7 @@ class Prepared:
         if not isinstance(guess, Solution) or guess.method != self.method.settings:
             return False
         sizes = guess.variables.shape, guess.multipliers.shape, set(guess.parameters)
-        return sizes == ((self.fragment.size,), (self.fragment.n_rows,), set(self.formulation.parameters))
+        return sizes == ((self.transcription.size,), (self.transcription.n_rows,), set(self.formulation.parameters))
 
     def _again(self, guess: Guess, arguments: dict[str, np.ndarray], bounds: Bounds, ahead: int) -> Solution | None:
         """The plan beside the guess, moved on by ``ahead`` intervals; None where it is not found near it."""
@@ -270,14 +281,14 @@ class Prepared:
             return None
         try:
             p = form.parameter_vector(guess.parameters)
-            before = self._known.relaxed(self.fragment.arguments(p, bounds_to_solve(form, p)))
+            before = self._known.relaxed(self.transcription.arguments(p, bounds_to_solve(form, p)))
             v, lam = guess.variables, guess.multipliers
             scales = self._scales(v, self._all_names, bounds, arguments["p"])
             cost, rows = self.program.numbers.values(v, p)
             start = Outcome(v, cost, rows, lam, guess.status, "", 0, 0.0)
-            sides = held_by(self.program, start, before, scales)
+            sides = active_sides(self.program, start, before, scales)
             if ahead:
-                of_x, of_g = later(self.fragment, ahead)
+                of_x, of_g = later(self.transcription, ahead)
                 start = dataclasses.replace(start, variables=v[of_x], multipliers=lam[of_g])
                 sides = {"x": sides["x"][of_x], "g": sides["g"][of_g]}
             outcome = self._newton.beside(start, sides, self._known.relaxed(arguments), scales)
@@ -292,7 +303,7 @@ class Prepared:
     @cached_property
     def _newton(self) -> Newton:
         """What solves beside a plan."""
-        return Newton(self.program, self.fragment)
+        return Newton(self.program, self.transcription)
 
     @cached_property
     def _solver_of_other_starts(self) -> tuple[Any, Any]:
@@ -338,8 +349,8 @@ class Prepared:
     def _scales(self, point: np.ndarray, told: set[str], bounds: Bounds, p: np.ndarray) -> Scales:
         """What fits the sizes along a start; see :func:`sizes_along` for ``told``."""
         if not self._scaling:
-            return unscaled(self.fragment)
-        scales = fitting_scales(self._pattern, sizes_along(self._pattern, point, told, bounds, p), point, p)
+            return unit_scales(self.transcription)
+        scales = compute_scales(self._pattern, sizes_along(self._pattern, point, told, bounds, p), point, p)
         if getattr(self.method, "integrator", "") == "cvodes":
             # its tolerances are absolute: what it integrates backwards is not made larger
             return dataclasses.replace(scales, cost=max(scales.cost, 1.0))
@@ -349,7 +360,7 @@ class Prepared:
         """What was badly scaled to the solver, in words; "" where nothing was."""
         x0, p = attempt.arguments["x0"], attempt.arguments["p"]
         sizes = sizes_along(self._pattern, x0, attempt.told, bounds, p)
-        return badness(self._pattern, x0, p, attempt.scales, sizes)
+        return scaling_fault(self._pattern, x0, p, attempt.scales, sizes)
 
     @property
     def _all_names(self) -> set[str]:
@@ -360,7 +371,7 @@ class Prepared:
         seconds = {"build": self.seconds, "solve": outcome.seconds}
         return solution_of(
             self.formulation,
-            self.fragment,
+            self.transcription,
             self.program,
             outcome,
             p,

@@ -24,22 +24,22 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ocp.direct.assembly import Fragment, Program
+from ocp.direct.assembly import Program, Transcription
 from ocp.direct.nlp import SOLVER_RESIDUAL, Outcome
 from ocp.problem.formulation import Bounds, Formulation
 from ocp.status import SolverStatus
 
 __all__ = [
     "SCALING",
-    "Known",
     "Pattern",
+    "Predetermined",
     "Scales",
     "Sizes",
-    "badness",
-    "fitting_scales",
+    "compute_scales",
     "scaled_program",
+    "scaling_fault",
     "sizes_along",
-    "unscaled",
+    "unit_scales",
 ]
 
 SIDES = ("lbx", "ubx", "lbg", "ubg")
@@ -102,12 +102,12 @@ class Sizes:
     controls: np.ndarray
     horizon: float
 
-    def of_variables(self, fragment: Fragment) -> np.ndarray:
+    def of_variables(self, transcription: Transcription) -> np.ndarray:
         """The size of each variable of a program; 1 of a copy that a stage carries of nothing declared."""
-        found = np.ones(fragment.size)
+        found = np.ones(transcription.size)
         for role, sizes in (("state", self.states), ("control", self.controls), ("horizon", np.array([self.horizon]))):
-            mine = fragment.variable_role == role
-            found[mine] = sizes[fragment.variable_entry[mine]]
+            mine = transcription.variable_role == role
+            found[mine] = sizes[transcription.variable_entry[mine]]
         return found
 
 
@@ -120,24 +120,24 @@ class Pattern:
         width: Of the interval of each row, as a fraction. label: A number for the label of each.
     """
 
-    def __init__(self, form: Formulation, fragment: Fragment, program: Program) -> None:
-        self.form, self.fragment, self.program = form, fragment, program
+    def __init__(self, form: Formulation, transcription: Transcription, program: Program) -> None:
+        self.form, self.transcription, self.program = form, transcription, program
         self.rows, self.columns = rows, columns = program.jacobian_entries
         kinds = ("dynamics", "continuity")
         states = {f"{kind} of {label}": i for kind in kinds for i, label in enumerate(form.state_labels)}
-        owner = np.array([states.get(label, -1) for label in fragment.row_labels], dtype=np.int32)
-        to = np.where(fragment.row_bounds == form.bounds.places["zero"][0], owner, -1)[rows]
-        role = fragment.variable_role[columns]
-        source = fragment.variable_entry[columns] + np.where(role == "control", form.nx, 0)
+        owner = np.array([states.get(label, -1) for label in transcription.row_labels], dtype=np.int32)
+        to = np.where(transcription.row_bounds == form.bounds.places["zero"][0], owner, -1)[rows]
+        role = transcription.variable_role[columns]
+        source = transcription.variable_entry[columns] + np.where(role == "control", form.nx, 0)
         inner = (to >= 0) & ((role == "state") | (role == "control")) & (to != source)
         self.to, self.source = (np.where(inner, each, -1).astype(np.int32) for each in (to, source))
-        self.width = np.diff(fragment.mesh)[np.clip(fragment.row_stages, 0, len(fragment.mesh) - 2)]
-        _, self.label = np.unique(fragment.row_labels, return_inverse=True)
+        self.width = np.diff(transcription.mesh)[np.clip(transcription.row_stages, 0, len(transcription.mesh) - 2)]
+        _, self.label = np.unique(transcription.row_labels, return_inverse=True)
 
 
-def unscaled(fragment: Fragment) -> Scales:
+def unit_scales(transcription: Transcription) -> Scales:
     """Scales of one: the program as it is."""
-    return Scales(np.ones(fragment.size), np.ones(fragment.n_rows), 1.0)
+    return Scales(np.ones(transcription.size), np.ones(transcription.n_rows), 1.0)
 
 
 def scaled_program(program: Program) -> Program:
@@ -182,21 +182,21 @@ def sizes_along(pattern: Pattern, point: np.ndarray, given: Collection[str], bou
             anyhow.
         bounds, p: At the parameters.
     """
-    form, fragment = pattern.form, pattern.fragment
+    form, transcription = pattern.form, pattern.transcription
     nx, nu, places = form.nx, form.nu, form.bounds.places
     low, high = bounds
     seen = np.zeros(nx + nu + 1)
     for role, offset, pool in (("state", 0, form.states), ("control", nx, form.controls)):
-        mine = fragment.variable_role == role
-        np.maximum.at(seen, offset + fragment.variable_entry[mine], np.abs(point[mine]))
+        mine = transcription.variable_role == role
+        np.maximum.at(seen, offset + transcription.variable_entry[mine], np.abs(point[mine]))
         for name, place in pool.items():
             if name not in given:
                 seen[offset + place.start : offset + place.stop] = 0.0
     for end in ("initial", "terminal"):
         index = places[end]
         seen[:nx] = np.maximum(seen[:nx], np.where(low[index] == high[index], np.abs(low[index]), 0.0))
-    horizon = float(form.horizon_at(p) if fragment.horizon is None else point[fragment.horizon])
-    if fragment.horizon is None or "horizon" in given:
+    horizon = float(form.horizon_at(p) if transcription.horizon is None else point[transcription.horizon])
+    if transcription.horizon is None or "horizon" in given:
         seen[-1] = horizon
     index = np.concatenate([places["state"], places["control"], places["horizon"]])
     ends = np.abs([low[index], high[index]])
@@ -238,12 +238,12 @@ def couplings(pattern: Pattern, point: np.ndarray, p: np.ndarray) -> np.ndarray:
     return found
 
 
-def fitting_scales(pattern: Pattern, sizes: Sizes, point: np.ndarray, p: np.ndarray) -> Scales:
+def compute_scales(pattern: Pattern, sizes: Sizes, point: np.ndarray, p: np.ndarray) -> Scales:
     """Scales of a program for variables of these sizes; rows and cost by how far they move from a start."""
-    program, by = pattern.program, sizes.of_variables(pattern.fragment)
+    program, by = pattern.program, sizes.of_variables(pattern.transcription)
     # below, squares are no numbers any more, so that a cost has no size to fit
     by = np.where(by > np.sqrt(np.finfo(float).tiny), by, 1.0)
-    largest = np.zeros(pattern.fragment.n_rows)  # of all rows of a label, the same at all times
+    largest = np.zeros(pattern.transcription.n_rows)  # of all rows of a label, the same at all times
     slopes = _slopes(program, point, p)
     if slopes is not None:
         with np.errstate(invalid="ignore"):
@@ -263,21 +263,21 @@ def fitting_scales(pattern: Pattern, sizes: Sizes, point: np.ndarray, p: np.ndar
     return Scales(_told(pattern, _powers(by)), _powers(largest[pattern.label]), float(2.0 ** np.round(np.log2(cost))))
 
 
-def badness(pattern: Pattern, point: np.ndarray, p: np.ndarray, scales: Scales, sizes: Sizes) -> str:
+def scaling_fault(pattern: Pattern, point: np.ndarray, p: np.ndarray, scales: Scales, sizes: Sizes) -> str:
     """What makes a program badly scaled as it was solved, in words; "" where nothing does."""
-    form, fragment = pattern.form, pattern.fragment
-    by = sizes.of_variables(fragment) / scales.variables
+    form, transcription = pattern.form, pattern.transcription
+    by = sizes.of_variables(transcription) / scales.variables
     off = np.abs(np.log(by))
     if by.size and off.max() > np.log(SCALING.bad):
         k = int(np.argmax(off))
-        role, entry = str(fragment.variable_role[k]), int(fragment.variable_entry[k])
+        role, entry = str(transcription.variable_role[k]), int(transcription.variable_entry[k])
         label = {"state": form.state_labels, "control": form.control_labels}.get(role, ("",))[entry]
         return f"{role} {label}".strip() + f" is of size {by[k]:.1g} to the solver, not near 1"
     pull = couplings(pattern, point, p)
     inner = np.concatenate([sizes.states, sizes.controls])
     drive = (pull * inner / sizes.states[:, None]).max(axis=1, initial=0.0)
     if form.horizon_is_free:
-        drive *= sizes.horizon / point[fragment.horizon]
+        drive *= sizes.horizon / point[transcription.horizon]
     off = np.abs(np.log(np.where(drive > 0, drive, 1.0)))
     if off.max(initial=0.0) > np.log(SCALING.bad):
         i = int(np.argmax(off))
@@ -288,8 +288,8 @@ def badness(pattern: Pattern, point: np.ndarray, p: np.ndarray, scales: Scales, 
 def _told(pattern: Pattern, found: np.ndarray) -> np.ndarray:
     """The sizes of variables with those, as powers of two, that the problem tells."""
     form = pattern.form
-    told = Sizes(form.scales[: form.nx], form.scales[form.nx :], 1.0).of_variables(pattern.fragment)
-    told[~np.isin(pattern.fragment.variable_role, ("state", "control"))] = np.nan
+    told = Sizes(form.scales[: form.nx], form.scales[form.nx :], 1.0).of_variables(pattern.transcription)
+    told[~np.isin(pattern.transcription.variable_role, ("state", "control"))] = np.nan
     return np.where(np.isnan(told), found, np.exp2(np.round(np.log2(told))))
 
 
@@ -315,25 +315,25 @@ def _slopes(program: Program, point: np.ndarray, p: np.ndarray) -> Any:
         return None
 
 
-class Known:
+class Predetermined:
     """Which variables of a program are known in advance, and which rows only look at such.
 
     What is joined to a given variable, as the end of the last interval is to a given end, is known too.
     """
 
-    def __init__(self, form: Formulation, fragment: Fragment, program: Program) -> None:
-        state = fragment.variable_role == "state"
-        alone = self_running(form)
-        self.variables = np.zeros(fragment.size, dtype=bool)
-        self.variables[state] = alone[fragment.variable_entry[state]]
-        self.later = self.variables & (fragment.variable_fraction > 0)
+    def __init__(self, form: Formulation, transcription: Transcription, program: Program) -> None:
+        state = transcription.variable_role == "state"
+        alone = uncontrolled_states(form)
+        self.variables = np.zeros(transcription.size, dtype=bool)
+        self.variables[state] = alone[transcription.variable_entry[state]]
+        self.later = self.variables & (transcription.variable_fraction > 0)
         self.declared = np.isin(
-            fragment.row_bounds, np.concatenate([form.bounds.places[kind] for kind in ("path", "start", "end")])
+            transcription.row_bounds, np.concatenate([form.bounds.places[kind] for kind in ("path", "start", "end")])
         )
         self.rows, self.columns = program.jacobian_entries
         # rows of two variables, linear, as those that join the end of an interval to the next node
-        linear, column, _ = fragment.linear
-        alike = [np.bincount(index, minlength=fragment.n_rows)[linear] == 2 for index in (linear, self.rows)]
+        linear, column, _ = transcription.linear
+        alike = [np.bincount(index, minlength=transcription.n_rows)[linear] == 2 for index in (linear, self.rows)]
         both = np.flatnonzero(alike[0] & alike[1])
         pairs = both[np.argsort(linear[both], kind="stable")].reshape(-1, 2)
         self.joins, self.joined = linear[pairs[:, 0]], column[pairs]
@@ -367,7 +367,7 @@ class Known:
         return replace(outcome, status=SolverStatus.INFEASIBLE, message=SolverStatus.INFEASIBLE.message)
 
 
-def self_running(form: Formulation) -> np.ndarray:
+def uncontrolled_states(form: Formulation) -> np.ndarray:
     """Which states follow from the start and the time alone, whatever the controls do. Shape (nx,), bool."""
     if form.horizon_is_free:
         return np.zeros(form.nx, dtype=bool)

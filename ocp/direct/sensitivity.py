@@ -15,11 +15,11 @@ import scipy.sparse as sp
 import scipy.sparse.linalg as sla
 
 from ocp.direct.active_set import RESOLVED, Conditions, conditions
-from ocp.direct.assembly import Fragment, Program, assemble
+from ocp.direct.assembly import Program, Transcription, assemble
 from ocp.direct.collocation import Collocation
 from ocp.direct.diagnosis import variable_names
 from ocp.direct.nlp import Outcome, controls_at
-from ocp.direct.scaling import Pattern, fitting_scales, sizes_along
+from ocp.direct.scaling import Pattern, compute_scales, sizes_along
 from ocp.direct.shooting import MultipleShooting
 from ocp.errors import ProblemError, unknown_name
 from ocp.problem.formulation import Formulation
@@ -50,7 +50,7 @@ class Built:
     """The program that a plan is a solution of, and what is known there."""
 
     form: Formulation
-    fragment: Fragment
+    transcription: Transcription
     program: Program
     v: np.ndarray
     p: np.ndarray
@@ -66,29 +66,29 @@ def sensitivity(solution: Solution, name: str) -> Sensitivity:
             no optimum; or limits that contradict each other when the parameter moves.
     """
     built = program_of(solution)
-    form, fragment, p = built.form, built.fragment, built.p
+    form, transcription, p = built.form, built.transcription, built.p
     if not isinstance(name, str) or name not in form.parameters:
         raise unknown_name("parameter", name, form.parameters)
     place = form.parameters[name]
     columns = list(range(place.start, place.stop))
     v, lam = built.v, solution.multipliers
     bounds = built.lower, built.upper
-    arguments = fragment.arguments(p, bounds)
-    pattern = Pattern(form, fragment, built.program)
+    arguments = transcription.arguments(p, bounds)
+    pattern = Pattern(form, transcription, built.program)
     told = {*form.states, *form.controls, "horizon"}
-    scales = fitting_scales(pattern, sizes_along(pattern, v, told, bounds, p), v, p)
+    scales = compute_scales(pattern, sizes_along(pattern, v, told, bounds, p), v, p)
     a, b, c = scales.variables, scales.rows, scales.cost
     rows = np.asarray(built.program.values(v, p)[1].full()).ravel()
     outcome = Outcome(v, solution.cost, rows, lam, solution.status, solution.message, 0, 0.0)
     at = conditions(built.program, outcome, arguments, scales)
 
-    slope, change = by_parameters(fragment, v, p, lam, columns)
+    slope, change = by_parameters(transcription, v, p, lam, columns)
     slope, change = slope * a[:, None] / c, change / b[:, None]
     q = ca.MX.sym("p", len(p))
     moves = ca.Function("moves", [q], [ca.jacobian(side, q)[:, columns] for side in form.bounds.function(q)])(p)
     low, high = (np.asarray(move.full()) for move in moves)
-    low_x, high_x = (side[fragment.variable_bounds] / a[:, None] for side in (low, high))
-    low_g, high_g = (side[fragment.row_bounds] / b[:, None] for side in (low, high))
+    low_x, high_x = (side[transcription.variable_bounds] / a[:, None] for side in (low, high))
+    low_g, high_g = (side[transcription.row_bounds] / b[:, None] for side in (low, high))
     at_x = np.where((at.of_bounds > 0)[:, None], high_x, low_x)
     at_g = np.where((at.of_rows > 0)[:, None], high_g, low_g)
     dv, of_rows, of_bounds = moved(at, slope, change, at_x, at_g)
@@ -102,7 +102,7 @@ def sensitivity(solution: Solution, name: str) -> Sensitivity:
     held = np.concatenate([at.fixed, at.held])
     push, push_rates = np.concatenate([at.of_bounds, at.of_rows]), np.vstack([of_bounds, of_rows])
     given = sides[0] == sides[1]
-    names = [*variable_names(form, fragment), *fragment.row_labels]
+    names = [*variable_names(form, transcription), *transcription.row_labels]
     now = p[place]
     ends = np.tile([[-np.inf], [np.inf]], (1, len(columns)))
     words = [["", ""] for _ in columns]
@@ -127,13 +127,13 @@ def sensitivity(solution: Solution, name: str) -> Sensitivity:
                     ends[side, k] = sign * reach[first]
                     words[k][side] = names[some[nearer[first]]]
 
-    index = fragment.horizon
+    index = transcription.horizon
     by_time = high[form.bounds.places["horizon"][0]] if index is None else dv[index] * a[index]
     return Sensitivity(
         name=name,
         value=now,
         t=solution.t,
-        states=split(form.states, (a[:, None] * dv)[fragment.report_states]),
+        states=split(form.states, (a[:, None] * dv)[transcription.report_states]),
         controls=split(form.controls, control_rates(built, solution, a[:, None] * dv)),
         horizon=np.asarray(by_time, dtype=float),
         cost=solution.cost_gradients[name],
@@ -159,23 +159,23 @@ def program_of(solution: Solution) -> Built:
     form = Formulation.of(solution.problem)
     method = METHODS[kind](**settings)
     for staged in (False, True):
-        fragment = method.transcribe(form, staged=staged)
-        if (fragment.size, fragment.n_rows) == (len(solution.variables), len(solution.multipliers)):
+        transcription = method.transcribe(form, staged=staged)
+        if (transcription.size, transcription.n_rows) == (len(solution.variables), len(solution.multipliers)):
             break
     else:
         words = f"{what}: it is no solution of its problem by its method"
-        raise ProblemError(words, name="variables", value=len(solution.variables), limit=fragment.size)
+        raise ProblemError(words, name="variables", value=len(solution.variables), limit=transcription.size)
     p = form.parameter_vector(solution.parameters)
-    program = assemble(fragment, form.np)
-    return Built(form, fragment, program, solution.variables, p, *bounds_to_solve(form, p))
+    program = assemble(transcription, form.np)
+    return Built(form, transcription, program, solution.variables, p, *bounds_to_solve(form, p))
 
 
 def by_parameters(
-    fragment: Fragment, v: np.ndarray, p: np.ndarray, lam: np.ndarray, columns: list[int]
+    transcription: Transcription, v: np.ndarray, p: np.ndarray, lam: np.ndarray, columns: list[int]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Derivatives in some parameters of the slope of the Lagrangian (n, k) and of the rows (m, k)."""
-    slope, change = np.zeros((fragment.size, len(columns))), np.zeros((fragment.n_rows, len(columns)))
-    for block in fragment.blocks:
+    slope, change = np.zeros((transcription.size, len(columns))), np.zeros((transcription.n_rows, len(columns)))
+    for block in transcription.blocks:
         function = block.function
         symbol = symbols_of(function).sym
         inner, d, q = (symbol(name, function.numel_in(i)) for i, name in enumerate(("v", "d", "p")))
@@ -239,15 +239,15 @@ def moved(
 
 def control_rates(built: Built, solution: Solution, dv: np.ndarray) -> np.ndarray:
     """Derivatives of the controls at the reported times (M, nu, k): controls are linear in their variables."""
-    piece, place = built.fragment.report
+    piece, place = built.transcription.report
     columns = []
     for direction in dv.T:
         step = max(1.0, float(np.abs(built.v).max())) / max(float(np.abs(direction).max()), 1e-300)
         curves = [
-            built.fragment.interpolants(built.v + sign * step * direction, built.p, solution.horizon)[1]
+            built.transcription.interpolants(built.v + sign * step * direction, built.p, solution.horizon)[1]
             for sign in (1.0, -1.0)
         ]
-        up, down = (controls_at(curve, built.fragment, piece, place) for curve in curves)
+        up, down = (controls_at(curve, built.transcription, piece, place) for curve in curves)
         columns.append((up - down) / (2 * step))
     return np.stack(columns, axis=-1)
 

@@ -12,9 +12,9 @@ import casadi as ca
 import numpy as np
 
 from ocp.curves import integrator, rk4_step
-from ocp.direct.assembly import SIZES, Block, Fragment, Interpolants
+from ocp.direct.assembly import SIZES, Block, Interpolants, Transcription
 from ocp.direct.prepared import DirectMethod
-from ocp.direct.transcription import FragmentBuilder
+from ocp.direct.transcription import TranscriptionBuilder
 from ocp.errors import checked_choice
 from ocp.problem.formulation import Formulation
 from ocp.problem.values import symbols_of
@@ -59,17 +59,17 @@ class MultipleShooting(DirectMethod):
     def control_order(self) -> int:
         return 1 if self.control == "held" else 2
 
-    def transcribe(self, form: Formulation, *, staged: bool = False) -> Fragment:
+    def transcribe(self, form: Formulation, *, staged: bool = False) -> Transcription:
         return transcribe(self, form, staged)
 
 
-def transcribe(method: MultipleShooting, form: Formulation, staged: bool) -> Fragment:
+def transcribe(method: MultipleShooting, form: Formulation, staged: bool) -> Transcription:
     nx, nu = form.nx, form.nu
     mesh = method.fractions
     n, width = len(mesh) - 1, np.diff(mesh)
     stages = np.arange(n)
     linear = method.control == "linear"
-    build = FragmentBuilder(form, mesh, nu if linear else 0, 0 if linear else nu, staged)
+    build = TranscriptionBuilder(form, mesh, nu if linear else 0, 0 if linear else nu, staged)
     lay = build.layout
     first, last = lay.node[:nx, :-1], lay.node_end[:nx]
     if linear:

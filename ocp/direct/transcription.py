@@ -1,6 +1,6 @@
 """What every transcription shares: the nonlinear program of one phase, collected piece by piece.
 
-:class:`Layout` says where the variables of a phase stand in the vector of the program; :class:`FragmentBuilder`
+:class:`Layout` says where the variables of a phase stand in the vector of the program; :class:`TranscriptionBuilder`
 collects variables, rows and blocks, imposes what is asked at nodes and at both ends, and numbers the rows.
 """
 
@@ -12,11 +12,11 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ocp.direct.assembly import Block, Fragment, Interpolants, Stages
+from ocp.direct.assembly import Block, Interpolants, Stages, Transcription
 from ocp.errors import ProblemError
 from ocp.problem.formulation import Formulation, Rows
 
-__all__ = ["FragmentBuilder", "Layout"]
+__all__ = ["Layout", "TranscriptionBuilder"]
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ def staged_layout(intervals: int, node_size: int, interval_size: int, free_horiz
 
 
 @dataclass
-class FragmentBuilder:
+class TranscriptionBuilder:
     """Collects variables, rows and blocks of one phase; :meth:`finish` numbers the rows stage by stage.
 
     Args:
@@ -289,7 +289,7 @@ class FragmentBuilder:
         costate_nodes: np.ndarray,
         costate_scale: np.ndarray,
         interpolants: Interpolants,
-    ) -> Fragment:
+    ) -> Transcription:
         """Number the rows stage by stage and return the fragment."""
         order = np.concatenate(self._order)
         sequence = np.argsort(order, kind="stable")
@@ -303,7 +303,7 @@ class FragmentBuilder:
             carried, n = len(lay.joins[0]), self.intervals
             counts = np.bincount(order[order % 2 == 1] // 2, minlength=n + 1)
             stages = Stages((carried,) * (n + 1), (lay.stage_controls,) * n + (0,), tuple(counts.tolist()))
-        return Fragment(
+        return Transcription(
             mesh=self.mesh,
             size=lay.size,
             variable_bounds=self.variable_bounds,
