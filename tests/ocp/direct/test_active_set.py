@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ocp import Collocation, MultipleShooting, Problem, ProblemError, prepare
-from ocp.direct.guess import later
+from ocp.direct.guess import shifted_indices
 from ocp.direct.prepared import Prepared
 from tests.ocp.problems import FINE, MOVED, SOLVERS, Method, moved, relative, van_der_pol
 
@@ -225,7 +225,7 @@ def test_a_horizon_that_recedes_goes_on_from_the_plan_moved_on(method: Method) -
 def test_what_is_later_stands_for_the_same_so_many_intervals_later(method: str, solver: str) -> None:
     transcription = ready(van_der_pol(), FINE[method], solver).transcription
     n = len(transcription.mesh) - 1
-    of_x, of_g = later(transcription, 3)
+    of_x, of_g = shifted_indices(transcription, 3)
     labels = np.array(transcription.row_labels)
     for index, fractions, meanings in (
         (of_x, transcription.variable_fraction, (transcription.variable_role, transcription.variable_entry)),
