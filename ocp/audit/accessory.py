@@ -52,8 +52,8 @@ class AccessoryProblem:
         self.along, self.adjoint = along, adjoint
         form = along.form
         self.nx, self.nu = form.nx, form.nu
-        self.free, self.refers_to_start = form.horizon_is_free, form.ties_ends
-        self.nz = self.nx * (1 + self.refers_to_start) + self.free
+        self.free, self.with_start = form.horizon_is_free, form.ties_ends
+        self.nz = self.nx * (1 + self.with_start) + self.free
         self.obstacle = str(form.kept("obstacle", lambda: obstacle(form)))
         self._second_order()
         self._constraints()
@@ -80,7 +80,7 @@ class AccessoryProblem:
         self.range = np.where(curves, np.sqrt(largest / np.where(curves, curvature, 1.0)), sizes.control)
         state = self.along.state_size.copy()
         adopt_unit_sizes(state, self.along.form.states, self.along.form.problem.declared.states, LIMIT_SHARE)
-        self.unit = np.concatenate([state, horizon, *([state] if self.refers_to_start else []), self.range])
+        self.unit = np.concatenate([state, horizon, *([state] if self.with_start else []), self.range])
 
     def _into_z(self) -> tuple[list[int], list[int]]:
         """Return the entries of y = (x, T, u) in use, and the index of each in (z, u)."""
@@ -136,7 +136,7 @@ class AccessoryProblem:
     def start_slope(self) -> np.ndarray:
         """Slope of the cost in start and horizon, in scaled z. Shape (nz,)."""
         gradient, nx = self.adjoint.ends.slope, self.nx
-        slope = np.concatenate([gradient[:nx], gradient[nx:] if self.free else [], np.zeros(nx * self.refers_to_start)])
+        slope = np.concatenate([gradient[:nx], gradient[nx:] if self.free else [], np.zeros(nx * self.with_start)])
         return np.asarray(slope * self.unit[: self.nz])
 
     @property
@@ -192,14 +192,8 @@ class AccessoryProblem:
         n, q = along.shape
         self.normals, self.strong, self.weak = normals, strong, is_active & ~strong
         # on an arc the constraints at the points alone would let the ends of the intervals oscillate
-        state_multipliers = (state_strong | along.state_limits.equal).reshape(n, q, -1)
-        on_arc = np.concatenate(
-            [
-                state_multipliers[:1, 0],
-                state_multipliers[:-1, -1] & state_multipliers[1:, 0],
-                state_multipliers[-1:, -1],
-            ]
-        )
+        at_limit = (state_strong | along.state_limits.equal).reshape(n, q, -1)
+        on_arc = np.concatenate([at_limit[:1, 0], at_limit[:-1, -1] & at_limit[1:, 0], at_limit[-1:, -1]])
         node = np.zeros((n + 1, len(along.state_limits.equal), self.nz))
         node[:, :, : self.nx] = along.node_limits_x[:, :, :-1]
         if self.free:
@@ -279,11 +273,7 @@ def end_conditions(accessory: AccessoryProblem) -> tuple[np.ndarray, np.ndarray,
         held[k] = held[k] | (x <= low[places[k]] + slack) | (x >= high[places[k]] - slack)
 
     # select the entries of (x, T, x0) in z; at the start, x0 of the conditions is x
-    z = [
-        *range(nx),
-        *([nx] if accessory.free else []),
-        *(range(nx + 1, 2 * nx + 1) if accessory.refers_to_start else []),
-    ]
+    z = [*range(nx), *([nx] if accessory.free else []), *(range(nx + 1, 2 * nx + 1) if accessory.with_start else [])]
     z_unit = accessory.unit[: accessory.nz]
     eye = np.eye(accessory.nz)
     end_hessian, end_rows = end_curved[np.ix_(z, z)], np.vstack([psi_y[at_end][:, z], eye[:nx][held["terminal"]]])
@@ -292,7 +282,7 @@ def end_conditions(accessory: AccessoryProblem) -> tuple[np.ndarray, np.ndarray,
     start_hessian[: len(begin_of), : len(begin_of)] = start_curved[np.ix_(begin_of, begin_of)]
     start_rows[:, : len(begin_of)] = psi0_y[at_start][:, begin_of]
     extra = [eye[:nx][held["initial"]]]
-    if accessory.refers_to_start:
+    if accessory.with_start:
         extra.append(eye[:nx] - eye[accessory.nz - nx :])
     if accessory.free:
         least, most = (float(side[places["horizon"][0]]) for side in (low, high))

@@ -86,12 +86,11 @@ class Certificate:
         failed = [c.name for c in self.comparisons if not c.passed]
         if self.passed:
             return f"{len(self.comparisons)} solutions agree to {self.tolerance:g}, and each passed its audit"
-        parts = (
-            [f"{', '.join(different)} differ from {self.reference} by more than {self.tolerance:g}"]
-            if different
-            else []
-        )
-        parts += [f"the audit of {', '.join(failed)} failed"] if failed else []
+        parts = []
+        if different:
+            parts.append(f"{', '.join(different)} differ from {self.reference} by more than {self.tolerance:g}")
+        if failed:
+            parts.append(f"the audit of {', '.join(failed)} failed")
         return "; ".join(parts)
 
     def __repr__(self) -> str:

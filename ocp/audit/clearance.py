@@ -33,16 +33,14 @@ from ocp.solution import Solution, check_belongs, in_order_of
 __all__ = [
     "Clearance",
     "ClosestPair",
-    "ProofSettings",
     "Track",
     "clearance",
     "clearance_along",
-    "closest_pair_at",
     "closest_pairs_along",
     "separation_frames",
 ]
 
-MAX_ASSUMPTIONS_PRINTED = 4
+MAX_PRINTED = 4
 """Number of pairs left out by assumption that a line of text names; `Clearance.assumed` holds all."""
 
 
@@ -156,13 +154,9 @@ class Clearance:
 
     @property
     def _assumptions(self) -> list[str]:
-        """Return a text that names the pairs left out by assumption, in a list; empty if there are none."""
-        first = [f"{pair} ({why})" for pair, why in list(self.assumed.items())[:MAX_ASSUMPTIONS_PRINTED]]
-        more = (
-            [f"{len(self.assumed) - MAX_ASSUMPTIONS_PRINTED} more"]
-            if len(self.assumed) > MAX_ASSUMPTIONS_PRINTED
-            else []
-        )
+        """Return a text on the pairs left out by assumption, in a list; empty if there are none."""
+        first = [f"{pair} ({why})" for pair, why in list(self.assumed.items())[:MAX_PRINTED]]
+        more = [f"{len(self.assumed) - MAX_PRINTED} more"] if len(self.assumed) > MAX_PRINTED else []
         return [f"left out by assumption: {', '.join([*first, *more])}"] if first else []
 
 
@@ -185,20 +179,10 @@ def clearance_along(apart: Separation, track: Track | None, settings: ProofSetti
     return _Search(apart, track, settings).run()
 
 
-def closest_pair_at(problem: Problem, solution: Solution, time: float) -> ClosestPair | None:
-    """Return the closest pair of bodies of a plan at a time (s); None if the problem separates no bodies.
-
-    Raises:
-        ProblemError: The plan does not belong to the problem.
-    """
-    found = closest_pairs_along(problem, solution, [time])
-    return found[0] if found else None
-
-
 def closest_pairs_along(
     problem: Problem, solution: Solution, times: Iterable[float], suffix: str = ""
 ) -> list[ClosestPair]:
-    """Return the closest pair of bodies of a plan at each time (s); empty if the problem separates no bodies.
+    """Return the closest pair of bodies of a plan at each of the times (s); empty if the problem separates no bodies.
 
     Args:
         suffix: Suffix of the names of the states that move the bodies: selects one part of a plan whose parts are

@@ -94,11 +94,9 @@ def corrected_motion(along: Linearisation, grid: FineGrid) -> IntegratedMotion |
     if continuous is None:
         return None
     by_interval = newton.converged(False, continuous.rate)
-    return (
-        None
-        if by_interval is None
-        else IntegratedMotion(by_interval.x[:, ::2], continuous.x[:, ::2], by_interval.cost, continuous.cost)
-    )
+    if by_interval is None:
+        return None
+    return IntegratedMotion(by_interval.x[:, ::2], continuous.x[:, ::2], by_interval.cost, continuous.cost)
 
 
 class _Converged(NamedTuple):

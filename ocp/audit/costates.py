@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ocp.audit.linearisation import Limits, Linearisation
-from ocp.audit.principle import find_control_multipliers, nonnegative_least_squares, pseudo_inverse_of
+from ocp.audit.principle import find_control_multipliers, nnls, pseudo_inverse_of
 from ocp.curves import lagrange
 from ocp.solution import stack
 from ocp.tolerances import COSTATE_SHARE, ROUNDING_SHARE
@@ -113,10 +113,7 @@ def adjoint(
         if not (limited.size or along.mixed.size) or (before == (control_multipliers != 0)).all():
             break
     size = along.state_size
-    share, state_charge = (
-        along.share.reshape(n, q, 1),
-        along.state_limits.charge(inside.reshape(n * q, m)).reshape(n, q, m),
-    )
+    share, charge = along.share.reshape(n, q, 1), along.state_limits.charge(inside.reshape(n * q, m)).reshape(n, q, m)
     node = along.node_limits
     atom_charges = [node.at(k).charge(atoms[:, e]).sum(axis=1) for e, k in ((0, slice(0, n)), (1, slice(1, n + 1)))]
     state_multipliers = inside / share
@@ -135,15 +132,13 @@ def adjoint(
         np.abs(first - start) @ size,
         total,
         np.maximum(_between(along, costate, last) - force.sum(axis=1), 0.0),
-        state_charge.sum(axis=(1, 2)) + atom_charges[0] + atom_charges[1],
+        charge.sum(axis=(1, 2)) + atom_charges[0] + atom_charges[1],
         _node_shifts(along, control_multipliers, inside, atoms if node_shifts is None else None),
         _ends(along, costate, control_multipliers, inside, atoms, cost, last[-1]),
     )
 
 
-def _node_shifts(
-    along: Linearisation, control_multipliers: np.ndarray, inside: np.ndarray, atoms: np.ndarray | None
-) -> np.ndarray:
+def _node_shifts(along: Linearisation, holding: np.ndarray, inside: np.ndarray, atoms: np.ndarray | None) -> np.ndarray:
     """Return the part of all forces near a node that lies before it, see `Adjoint`: weighted by the hat function of the
     node.
 
@@ -157,7 +152,7 @@ def _node_shifts(
         shifts[:-1] += np.einsum("km,kmi->ki", atoms[:, 0], along.node_limits_x[:-1, :, :nx]) / 2
     slopes = along.state_limits_x[:, :, :nx].reshape(n, q, inside.shape[2], nx)
     shifts[1:] += np.einsum("j,kjm,kjmi->ki", along.places, inside, slopes)
-    multipliers = control_multipliers[:, nu : nu + along.mixed.size]
+    multipliers = holding[:, nu : nu + along.mixed.size]
     rising = (along.share.reshape(n, q) * along.places).ravel()
     force = np.einsum("k,km,kmi->ki", rising, multipliers, along.row_y[:, along.mixed, :nx])
     shifts[1:] += force.reshape(n, q, nx).sum(axis=1)
@@ -292,7 +287,7 @@ def _state_forces(
     slopes_c = np.einsum("j,juv,cjv->cju", weight, projectors, unit * np.einsum("jiu,cji->cju", rate_u, responses))
     target = np.concatenate([(first - start0) * size, -slope0.ravel()]) / cost
     matrix = np.hstack([start * size, slopes_c.reshape(len(columns), q * len(unit))]).T
-    values = nonnegative_least_squares(matrix, target, COSTATE_SHARE * np.array(charges), np.array(free, bool)) * cost
+    values = nnls(matrix, target, COSTATE_SHARE * np.array(charges), np.array(free, bool)) * cost
     for (kind, j, i, scale), value in zip(sources, values, strict=True):
         (inside if kind == 0 else atoms)[j, i] += scale * value
     return inside, atoms
@@ -349,7 +344,7 @@ def _ends(
     free[-1] = form.horizon_is_free
     matrix = (limits.slope * (limits.sign / effect)[:, None] * unit).T[free]
     prices = COSTATE_SHARE * limits.gap / effect
-    values = nonnegative_least_squares(matrix, (target * unit)[free] / cost, prices, limits.equal) * cost
+    values = nnls(matrix, (target * unit)[free] / cost, prices, limits.equal) * cost
     residual = np.zeros(2 * nx + 1)
     residual[free] = (target * unit)[free] - matrix @ values
     charge = float(limits.gap / effect @ values)

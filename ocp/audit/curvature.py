@@ -133,7 +133,7 @@ class _Swept(NamedTuple):
 
 
 def _sweep(
-    accessory: AccessoryProblem, along: _Linearised, weak: bool, tolerances: RankTolerances = FULL_RANK
+    accessory: AccessoryProblem, stages: _Linearised, weak: bool, tolerances: RankTolerances = FULL_RANK
 ) -> _Swept:
     """Sweep backwards over all stages: by linear solves if every stage curves upwards, else by eigenvectors.
 
@@ -141,12 +141,12 @@ def _sweep(
         weak: Whether active limits without multipliers are held too.
         tolerances: Which constraints count as dependent.
     """
-    stages = _reduced_stages(accessory, along, weak, tolerances)
+    reduced = _reduced(accessory, stages, weak, tolerances)
     if not accessory.linear_controls.any():
-        found = _swept(accessory, along, stages, tolerances, upwards=True)
+        found = _swept(accessory, stages, reduced, tolerances, upwards=True)
         if found is not None:
             return found
-    found = _swept(accessory, along, stages, tolerances, upwards=False)
+    found = _swept(accessory, stages, reduced, tolerances, upwards=False)
     assert found is not None
     return found
 
@@ -257,13 +257,11 @@ class _Linearised(NamedTuple):
         (n, q), h = along.shape, along.width
         # variations at the Gauss points from those at the start of the interval and those of the controls
         rate = accessory.rate.reshape(n, q, nz, nz + nu)
-        feedback = (
-            h[:, None, None, None, None] * along.matrix[:, None, :, None] * rate[:, None].transpose(0, 1, 3, 2, 4)
-        )
-        system = np.eye(q * nz) - feedback[..., :nz].reshape(n, q * nz, q * nz)
+        fed = h[:, None, None, None, None] * along.matrix[:, None, :, None] * rate[:, None].transpose(0, 1, 3, 2, 4)
+        system = np.eye(q * nz) - fed[..., :nz].reshape(n, q * nz, q * nz)
         inputs = np.zeros((n, q * nz, nz + q * nu))
         inputs[:, :, :nz] = np.tile(np.eye(nz), (q, 1))
-        inputs[:, :, nz:] = feedback[..., nz:].reshape(n, q * nz, q * nu)
+        inputs[:, :, nz:] = fed[..., nz:].reshape(n, q * nz, q * nu)
         # scale controls so that the length of a variation is the L2 norm of a function of time
         metric = np.sqrt(np.outer(h, along.weight))
         whole = np.zeros((n, q, nz + nu, nz + q * nu))
@@ -308,9 +306,7 @@ class _Stage(NamedTuple):
     rows: np.ndarray
 
 
-def _reduced_stages(
-    accessory: AccessoryProblem, sweep: _Linearised, weak: bool, tolerances: RankTolerances
-) -> list[_Stage]:
+def _reduced(accessory: AccessoryProblem, sweep: _Linearised, weak: bool, tolerances: RankTolerances) -> list[_Stage]:
     """Reduce each stage by its own constraints; stages with the same constraints are treated together."""
     n, q = accessory.along.shape
     nz, nu = accessory.nz, accessory.nu

@@ -20,7 +20,7 @@ from ocp.problem.values import Sampler
 from ocp.solution import Solution, stack
 from ocp.tolerances import NEAR_LIMIT_SHARE, RESOLVED_SHARE, SOLVER_SHARE, TIGHTENED_SHARE
 
-__all__ = ["Limits", "Linearisation", "gauss", "quadrature"]
+__all__ = ["Limits", "Linearisation", "quadrature"]
 
 MIN_POINTS, MAX_POINTS, ENOUGH_POINTS = 3, 5, 150
 """Smallest and largest number of Gauss points in an interval; number in a plan at which the smallest suffices."""
@@ -71,12 +71,8 @@ class Limits:
         m = len(self.below)
         self.equal = np.append(self.equal, np.ones(count, bool))
         zeros = np.zeros((m, count))
-        self.below, self.above, self.gap = (
-            np.hstack([distance, zeros]) for distance in (self.below, self.above, self.gap)
-        )
-        self.lower, self.upper = (
-            np.hstack([distance, np.ones((m, count), bool)]) for distance in (self.lower, self.upper)
-        )
+        self.below, self.above, self.gap = (np.hstack([part, zeros]) for part in (self.below, self.above, self.gap))
+        self.lower, self.upper = (np.hstack([part, np.ones((m, count), bool)]) for part in (self.lower, self.upper))
 
     @property
     def near(self) -> np.ndarray:
@@ -253,17 +249,17 @@ class Linearisation:
         equal = np.concatenate([np.zeros(nx + nu, bool), form.path.equality])
         equal |= low == high
         size = np.concatenate([sizes.state, self.control_size, sizes.path])
-        of_controls = np.concatenate([np.arange(nx, nx + nu), nx + nu + self.mixed])
-        of_states = np.concatenate([np.arange(nx), nx + nu + self.still])
+        controls = np.concatenate([np.arange(nx, nx + nu), nx + nu + self.mixed])
+        states = np.concatenate([np.arange(nx), nx + nu + self.still])
         value = np.hstack([self.x, self.u, self.row])
         by_point = np.repeat(tightening, q, axis=1)
         self.control_limits, self.state_limits = (
-            Limits(value[:, k], low[k], high[k], equal[k], size[k], by_point[:, :, k]) for k in (of_controls, of_states)
+            Limits(value[:, k], low[k], high[k], equal[k], size[k], by_point[:, :, k]) for k in (controls, states)
         )
         self.low, self.high = (np.tile(side[nx : nx + nu], (n * q, 1)) for side in (low, high))
         eye = np.broadcast_to(np.eye(nu), (n * q, nu, nu))
         self.control_limits_u = np.concatenate([eye, self.row_y[:, self.mixed, nx + 1 :]], axis=1)
-        self.state_limits_x = np.zeros((n * q, len(of_states), nx + 1))
+        self.state_limits_x = np.zeros((n * q, len(states), nx + 1))
         self.state_limits_x[:, :nx, :nx] = np.eye(nx)
         self.state_limits_x[:, nx:] = self.row_y[:, self.still, : nx + 1]
 
@@ -277,11 +273,9 @@ class Linearisation:
         point = x, u, at * horizon, horizon, self.p, (self.fraction, at[:, None])
         row, row_y = form.sampled(still, *point, kept="rows of the states")
         before, after = np.maximum(np.arange(n + 1) - 1, 0), np.minimum(np.arange(n + 1), n - 1)
-        at_nodes = np.maximum(tightening[:, before], tightening[:, after])[:, :, of_states]
-        self.node_limits = Limits(
-            np.hstack([x, row]), low[of_states], high[of_states], equal[of_states], size[of_states], at_nodes
-        )
-        self.node_limits_x = np.zeros((n + 1, len(of_states), nx + 1))
+        at_nodes = np.maximum(tightening[:, before], tightening[:, after])[:, :, states]
+        self.node_limits = Limits(np.hstack([x, row]), low[states], high[states], equal[states], size[states], at_nodes)
+        self.node_limits_x = np.zeros((n + 1, len(states), nx + 1))
         self.node_limits_x[:, :nx, :nx] = np.eye(nx)
         self.node_limits_x[:, nx:] = row_y.reshape(n + 1, nx + 1, len(self.still)).transpose(0, 2, 1)
 
@@ -316,12 +310,10 @@ def arcs_of(form: Formulation, rows: np.ndarray) -> list[tuple[np.ndarray, Sampl
         by_signals = [ca.mtimes(ca.jacobian(at, w), rate) for w, rate in pairwise([form.w, *rates])]
         at = ca.mtimes(ca.jacobian(at, form.x), form.f) + ca.jacobian(at, form.t) + sum(by_signals)
         in_control = ca.jacobian(at, form.u)
-        has_control = np.array(ca.DM(in_control.sparsity(), 1).full().any(axis=1), bool)
-        if has_control.any():
-            arcs.append(
-                (remaining[has_control], form.sampler([in_control[np.flatnonzero(has_control).tolist(), :]], *rates))
-            )
-            at, remaining = at[np.flatnonzero(~has_control).tolist()], remaining[~has_control]
+        seen = np.array(ca.DM(in_control.sparsity(), 1).full().any(axis=1), bool)
+        if seen.any():
+            arcs.append((remaining[seen], form.sampler([in_control[np.flatnonzero(seen).tolist(), :]], *rates)))
+            at, remaining = at[np.flatnonzero(~seen).tolist()], remaining[~seen]
     return arcs
 
 

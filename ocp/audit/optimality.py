@@ -26,7 +26,7 @@ from ocp.problem.formulation import Bounds, Formulation
 from ocp.solution import Solution
 from ocp.tolerances import FLAT_SHARE, LIMIT_SHARE, RESOLVED_SHARE
 
-__all__ = ["Fit", "Optimality", "best_multipliers", "optimality"]
+__all__ = ["Optimality", "optimality"]
 
 PROXIMITY_WEIGHT = 1e-5
 """Weight of the relative mean square distance from the reported costates: selects among equally good multipliers."""
@@ -204,23 +204,18 @@ class _Dual:
 
     def _costate_equation(self) -> None:
         """Add lambda' = -dH/dx over every interval, backwards from behind its last node to behind its first."""
-        along, program, controls, states, nodes = (
-            self.along,
-            self.program,
-            self.control_limits,
-            self.state_limits,
-            self.node,
-        )
+        along, program, node = self.along, self.program, self.node
+        controls, states = self.control_limits, self.state_limits
         (n, q), nx, size = along.shape, along.form.nx, along.state_size
         feedback = (along.rate_y[:, :, :nx] * size / size[:, None]).transpose(0, 2, 1)
         source = (along.cost_y[:, :nx] * size / self.cost).reshape(n, q, nx)
-        previous = nodes.point - 1  # the multiplier of a node also acts on the interval before it
+        previous = node.point - 1  # the multiplier of a node also acts on the interval before it
         steps = [(self.costate.reshape(n, q, nx)[:, i], along.weight - along.matrix[i]) for i in range(q)]
         for start, weight in [*steps, (self.nodes[:-1], along.weight)]:
             rows = program.equations(along.width[:, None] * np.einsum("j,kja->ka", weight, source))
             program.add(rows, start, 1.0)
             program.add(rows, self.nodes[1:], -1.0)
-            program.add(rows[previous], nodes.index[:, None], -nodes.slope[:, :nx] * size)
+            program.add(rows[previous], node.index[:, None], -node.slope[:, :nx] * size)
             densities, atoms = np.outer(along.width, weight).ravel(), np.tile(weight / along.weight, n)
             rows_of_point = rows[self.interval]
             program.add(rows_of_point[:, :, None], self.costate[:, None, :], -densities[:, None, None] * feedback)
@@ -276,13 +271,10 @@ class _Dual:
         program.add(rows[self.free], self.end_index[:, None], -slope[:, self.free])
         if form.horizon_is_free:
             program.add(rows[-1], self.costate, -horizon * share[:, None] * along.rate_y[:, :, nx] / along.state_size)
-            program.add(
-                rows[-1],
-                self.control_limits.index,
-                -horizon * share[self.control_limits.point] * self.path_slope[:, nx],
-            )
-            for pushes in (self.state_limits, self.node):
-                program.add(rows[-1], pushes.index, -horizon * pushes.slope[:, nx])
+            force = horizon * share[self.control_limits.point] * self.path_slope[:, nx]
+            program.add(rows[-1], self.control_limits.index, -force)
+            for limits in (self.state_limits, self.node):
+                program.add(rows[-1], limits.index, -horizon * limits.slope[:, nx])
         self.end_residual = []
         for sign in (-1.0, 1.0):
             self.end_residual.append(program.variables(int(self.free.sum()), 0.0, self.end_price))
@@ -295,12 +287,9 @@ class _Dual:
         for part in self.residual:
             paid = self.price * x[part] + self.weight * x[part] ** 2 / (2 * self.cost)
             np.add.at(lost, self.interval, paid.sum(axis=1))
-        for pushes, place in (
-            (self.control_limits, self.interval),
-            (self.state_limits, self.interval),
-            (self.node, np.arange(-1, n)),
-        ):
-            np.add.at(lost, place[pushes.point], pushes.price * x[pushes.index])
+        for limits in (self.control_limits, self.state_limits):
+            np.add.at(lost, self.interval[limits.point], limits.price * x[limits.index])
+        np.add.at(lost, self.node.point - 1, self.node.price * x[self.node.index])
         state_multipliers = self.state_limits.table(x, along.state_limits.lower.shape) / along.share[:, None]
         at_nodes = self.node.table(x, along.node_limits.lower.shape)
         state_multipliers.reshape(n, q, -1)[:, -1] += at_nodes[1:] / along.share.reshape(n, q)[:, -1:]
@@ -436,12 +425,8 @@ def _total_loss(by_interval: np.ndarray, multipliers: Adjoint) -> float:
 def _misfit(along: Linearisation, found: Adjoint, curved: np.ndarray | None) -> float:
     """Return the loss and the costate errors of a plan with these multipliers, in units of cost."""
     assert curved is not None
-    by_gaps = (
-        control_loss(along, found.costate, found.control_multipliers, curved).sum()
-        + found.charge.sum()
-        + found.ends.charge
-    )
-    return float(by_gaps + found.total + found.ends.transversality)
+    loss = control_loss(along, found.costate, found.control_multipliers, curved).sum()
+    return float(loss + found.charge.sum() + found.ends.charge + found.total + found.ends.transversality)
 
 
 def _control_curvature(along: Linearisation) -> np.ndarray | None:

@@ -20,14 +20,12 @@ from ocp.tolerances import FLAT_SHARE, MACHINE_SHARE, ROUNDING_SHARE, SOLVER_SHA
 
 __all__ = [
     "Hamiltonian",
-    "balance",
     "control_loss",
     "find_control_multipliers",
     "groups",
     "hamiltonian",
-    "nonnegative_least_squares",
+    "nnls",
     "pseudo_inverse_of",
-    "pseudo_inverses",
     "reduced_slope",
     "slope",
     "switching_loss",
@@ -108,9 +106,7 @@ def find_control_multipliers(
         which, sign, gap, free = (np.array(part) for part in zip(*sides, strict=True))
         rows = directions[k, which] * sign[:, None]
         size = np.abs(rows).max(axis=1)
-        magnitudes = nonnegative_least_squares(
-            (rows / size[:, None] @ root).T, -gradient[k] @ root, gap / size, free.astype(bool)
-        )
+        magnitudes = nnls((rows / size[:, None] @ root).T, -gradient[k] @ root, gap / size, free.astype(bool))
         multipliers[k] = 0.0
         np.add.at(multipliers[k], which, sign * magnitudes / size)
         across[k] = True
@@ -160,9 +156,7 @@ def balance(
     for k in np.flatnonzero(wrong_sign.any(axis=1)):  # solve again with the sign constraints
         index = np.flatnonzero(active[k])
         columns = (directions[k, index] * sign[k, index, None]).T
-        multipliers[k, index] = sign[k, index] * nonnegative_least_squares(
-            columns, -gradient[k], np.zeros(len(index)), free[k, index]
-        )
+        multipliers[k, index] = sign[k, index] * nnls(columns, -gradient[k], np.zeros(len(index)), free[k, index])
     return np.asarray(multipliers)
 
 
@@ -182,9 +176,7 @@ def reduced_slope(along: Linearisation, costate: np.ndarray, multipliers: np.nda
     return np.asarray(np.abs(residual).max(axis=1, initial=0.0) / size)
 
 
-def nonnegative_least_squares(
-    matrix: np.ndarray, target: np.ndarray, price: np.ndarray, free: np.ndarray
-) -> np.ndarray:
+def nnls(matrix: np.ndarray, target: np.ndarray, price: np.ndarray, free: np.ndarray) -> np.ndarray:
     """Return the y (m,) that minimises |matrix y - target|^2 / 2 + price . y, at least zero unless ``free`` (m,), bool.
 
     Active-set method (Lawson, Hanson 1974, chapter 23). Free entries have minimal norm.
@@ -195,7 +187,7 @@ def nonnegative_least_squares(
         inverse = np.linalg.pinv(matrix[:, free], rcond=ROUNDING_SHARE)
         rest = matrix[:, bound] - matrix[:, free] @ (inverse @ matrix[:, bound])
         rest_of_target = target - matrix[:, free] @ (inverse @ target)
-        y[bound] = nonnegative_least_squares(rest, rest_of_target, price[bound], np.zeros(int(bound.sum()), bool))
+        y[bound] = nnls(rest, rest_of_target, price[bound], np.zeros(int(bound.sum()), bool))
         y[free] = inverse @ (target - matrix[:, bound] @ y[bound])
         return y
     normal, right = matrix.T @ matrix, matrix.T @ target - price

@@ -27,7 +27,7 @@ from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.values import in_blocks
 from ocp.tolerances import LIMIT_SHARE, SOLVER_SHARE
 
-__all__ = ["Reintegration", "Violation", "integrated_motion", "reintegrate", "violations"]
+__all__ = ["Reintegration", "Violation", "reintegrate", "violations"]
 
 
 @dataclass(frozen=True)
@@ -157,7 +157,7 @@ class Flow:
 
     def __init__(self, along: Linearisation) -> None:
         form, solution, sizes = along.form, along.solution, along.sizes
-        curve, self._fixed_inputs = solution.control_interpolant, np.append(along.p, solution.horizon)
+        curve, self._inputs = solution.control_interpolant, np.append(along.p, solution.horizon)
         differences = newton_coefficients(curve.nodes, curve.values).reshape(len(curve.values), -1)
         self._columns = np.column_stack([differences, curve.breaks[:-1], np.diff(curve.breaks)])
         self._tolerance = SETTINGS.tolerance * np.append(sizes.state, sizes.cost)
@@ -189,9 +189,8 @@ class Flow:
             allowed = self._tolerance + SETTINGS.rounding * np.maximum(np.abs(before), np.abs(after))
             accurate = (error <= allowed).all(axis=1)  # False for nan
             failures = np.cumsum(~accurate)
-            valid = (
-                failures == (failures - ~accurate)[first][np.cumsum(first) - 1]
-            )  # no inaccurate step before it in its chain
+            # no inaccurate step before it in its chain
+            valid = failures == (failures - ~accurate)[first][np.cumsum(first) - 1]
             values[cell[valid & last]] = after[valid & last]
             current[own[valid]] = after[valid]  # of each chain the last value remains
             accepted.append(Steps(cell[valid], place[valid], width[valid]))
@@ -216,10 +215,8 @@ class Flow:
         count, size = len(first), starts.shape[1]
         padded = -(-count // SETTINGS.block) * SETTINGS.block
         data = np.zeros((padded, self._step.size1_in(1)))  # the last block is filled with steps of zero width
-        data[:, -len(self._fixed_inputs) :] = self._fixed_inputs
-        data[:count, : -len(self._fixed_inputs)] = np.column_stack(
-            [first, starts, place, width, self._columns[interval]]
-        )
+        data[:, -len(self._inputs) :] = self._inputs
+        data[:count, : -len(self._inputs)] = np.column_stack([first, starts, place, width, self._columns[interval]])
         state, after, errors = starts[0].copy(), np.empty((padded, size)), np.empty((padded, size))
         for at in range(0, padded, SETTINGS.blocks * SETTINGS.block):
             check_time()
@@ -330,21 +327,20 @@ def violations(
         excess = excess_over(_integrated(form, kind, g, t), lower[rows.bounds], upper[rows.bounds])
         limited = np.isfinite(rows.tolerance)
         if kind in sampled and limited.any():
-            values_reported = form.sampled(outputs, reported, *here[1:], kept="rows along a plan")[kind == "watch"]
-            excess_reported = excess_over(
-                _integrated(form, kind, values_reported, t), lower[rows.bounds], upper[rows.bounds]
+            g_reported = form.sampled(outputs, reported, *here[1:], kept="rows along a plan")[kind == "watch"]
+            reported_excess = excess_over(
+                _integrated(form, kind, g_reported, t), lower[rows.bounds], upper[rows.bounds]
             )
-            excess = np.where(limited, np.maximum(excess, excess_reported), excess)
+            excess = np.where(limited, np.maximum(excess, reported_excess), excess)
         size = np.tile(size, (len(t), 1))
-        largest = np.argmax(excess, axis=0), np.arange(len(rows))
-        if kind != "watch" and np.any(
-            excess[largest] > SOLVER_SHARE * size[largest]
-        ):  # judged by its local rate of change
+        at_worst = np.argmax(excess, axis=0), np.arange(len(rows))
+        # judge a violation by its local rate of change
+        if kind != "watch" and np.any(excess[at_worst] > SOLVER_SHARE * size[at_worst]):
             change = row_changes(
-                form, kind, (x[largest[0]], u[largest[0]], t[largest[0]]), initial, horizon, p, entries
+                form, kind, (x[at_worst[0]], u[at_worst[0]], t[at_worst[0]]), initial, horizon, p, entries
             )[1]
-            local_size = change.sum(axis=0)[largest[1], largest[1]] / LIMIT_SHARE
-            size[largest] = np.clip(local_size, SOLVER_SHARE * size[largest], size[largest])
+            local_size = change.sum(axis=0)[at_worst[1], at_worst[1]] / LIMIT_SHARE
+            size[at_worst] = np.clip(local_size, SOLVER_SHARE * size[at_worst], size[at_worst])
         with np.errstate(divide="ignore"):
             size = np.minimum(size, rows.tolerance / share)
         for name in rows.names:

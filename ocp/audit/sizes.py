@@ -91,10 +91,8 @@ def plan_at(solution: Solution, places: np.ndarray) -> tuple[np.ndarray, np.ndar
         basis[np.arange(m), segment] = lagrange(curve.nodes, np.clip(places * segments - segment, 0.0, 1.0))
         states = basis.reshape(m, -1) @ curve.values.reshape(n, segments * d, -1)
         return states.reshape(n * m, curve.values.shape[2]), controls, fractions.ravel() * solution.horizon
-    inside_fractions = mesh[:-1, None] + width[:, None] * inside
-    segment = np.clip(
-        np.searchsorted(curve.breaks, inside_fractions.ravel(), side="right") - 1, 0, len(curve.breaks) - 2
-    )
+    inner = mesh[:-1, None] + width[:, None] * inside
+    segment = np.clip(np.searchsorted(curve.breaks, inner.ravel(), side="right") - 1, 0, len(curve.breaks) - 2)
     start, end = curve.breaks[segment], curve.breaks[segment + 1]
     states = curve.within(segment, np.clip((fractions.ravel() - start) / (end - start), 0.0, 1.0))
     return states, controls, fractions.ravel() * solution.horizon
@@ -248,13 +246,11 @@ def _rows_of(
         return np.zeros(0)
     chosen = spaced(grid)
     samples = chosen[:1] if kind == "start" else chosen[-1:] if kind == "end" else chosen
-    by_variables, moves, spread, largest = _change_by_variables(form, kind, grid, samples, horizon, p, entries)
+    change, moves, spread, largest = _change_by_variables(form, kind, grid, samples, horizon, p, entries)
     if values is not None:
         spread, largest = _spread(values)
-    by_variables = np.where(
-        moves | (largest <= STANDSTILL), by_variables, 0.0
-    )  # a constant value has a size of its own
-    size = np.maximum(np.maximum(spread, by_variables), SOLVER_SHARE * largest)
+    change = np.where(moves | (largest <= STANDSTILL), change, 0.0)  # a constant value has a size of its own
+    size = np.maximum(np.maximum(spread, change), SOLVER_SHARE * largest)
     nearest = np.minimum(1.0, nearest_bound(_select(bounds, rows.bounds)))
     threshold, is_constant = np.where(moves, 0.0, STANDSTILL), ~moves & (largest > STANDSTILL)
     for name in rows.names:
@@ -338,10 +334,8 @@ def row_changes(
     size, count = form.nx + form.nu, len(t)
     expression = getattr(form, kind) if kind in COSTS else getattr(form, kind).expression
     uses_start = form.kept((kind, "tied"), lambda: ca.depends_on(expression, ca.vertcat(form.x0, form.u0)))
-    entries = 2 * size if uses_start else size
-    steps = np.vstack(
-        [np.zeros(2 * size), *(s * np.diag(np.concatenate([moves, moves]))[:entries] for s in (1.0, -1.0))]
-    )
+    used = 2 * size if uses_start else size
+    steps = np.vstack([np.zeros(2 * size), *(s * np.diag(np.concatenate([moves, moves]))[:used] for s in (1.0, -1.0))])
     sample = np.tile(np.arange(count), len(steps))
     first = np.broadcast_to(np.concatenate(begin), (len(sample), size))
     columns = np.hstack([x[sample], u[sample], first]) + np.repeat(steps, count, axis=0)
@@ -350,4 +344,4 @@ def row_changes(
     values = form.sampled([expression], x, u, t[sample], horizon, p, *starts, kept=(kind, "from the start"))[0]
     g = values.reshape(len(steps), count, -1)
     change = np.abs(np.where(np.isfinite(g[1:] - g[0]), g[1:] - g[0], 0.0))
-    return g[0], change.reshape(2, entries, count, -1).max(axis=0)
+    return g[0], change.reshape(2, used, count, -1).max(axis=0)

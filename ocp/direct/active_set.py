@@ -29,18 +29,7 @@ from ocp.direct.scaling import Scales
 from ocp.status import SolverStatus
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = [
-    "RESOLVED",
-    "Bordered",
-    "Cholesky",
-    "Conditions",
-    "Newton",
-    "Sides",
-    "active_sides",
-    "conditions",
-    "next_active_set",
-    "scaled",
-]
+__all__ = ["RESOLVED", "Conditions", "Newton", "active_sides", "conditions"]
 
 Sides: TypeAlias = dict[str, np.ndarray]
 """Active side of each variable (x) and row (g): -1 lower limit, 1 upper limit, 0 none."""
@@ -122,9 +111,8 @@ def next_active_set(
         value, side = values[kind] / unit, sides[kind]
         low, high = arguments[f"lb{kind}"] / unit, arguments[f"ub{kind}"] / unit
         slack = tolerance * np.maximum(1.0, np.abs(value))
-        remaining = np.where(
-            multipliers[kind] * side > SOLVER_RESIDUAL, side, 0.0
-        )  # others have the wrong sign or are redundant
+        # others have the wrong sign or are redundant
+        remaining = np.where(multipliers[kind] * side > SOLVER_RESIDUAL, side, 0.0)
         violated = np.where(low < high, 1.0 * (value > high + slack) - (value < low - slack), 0.0)
         result[kind] = np.where(violated != 0, violated, remaining)
     return result
@@ -296,15 +284,13 @@ class Newton:
             return None
         size = np.sqrt(np.bincount(self._row, slopes**2, minlength=len(b)))
         n, m = len(a), len(b)
-        largest_of_variable, largest_of_row = np.zeros(n), np.zeros(m)
+        of_variable, of_row = np.zeros(n), np.zeros(m)
         for index in (self._first, self._second):
-            np.maximum.at(largest_of_variable, index, np.abs(curvature))
-        largest = float(largest_of_variable.max(initial=0.0)) or 1.0
+            np.maximum.at(of_variable, index, np.abs(curvature))
+        largest = float(of_variable.max(initial=0.0)) or 1.0
         if local:
-            np.maximum.at(largest_of_row, self._row, np.where(slopes != 0, largest_of_variable[self._column], 0.0))
-        weight = np.divide(
-            np.sqrt(np.where(largest_of_row > 0, largest_of_row / largest, 1.0)), size, out=np.zeros(m), where=size > 0
-        )
+            np.maximum.at(of_row, self._row, np.where(slopes != 0, of_variable[self._column], 0.0))
+        weight = np.divide(np.sqrt(np.where(of_row > 0, of_row / largest, 1.0)), size, out=np.zeros(m), where=size > 0)
         slopes *= weight[self._row]
         penalty = self._settings.price * largest
         by_row = sp.csr_array((slopes[self._by_row], self._within[0], self._starts[0]), shape=(m, n))

@@ -35,7 +35,7 @@ from ocp.libraries import SERIALISED, CompilerError, Library, built, code, gener
 from ocp.problem.formulation import Formulation
 from ocp.storage import write_text
 
-__all__ = ["block_derivatives", "controller_functions", "write_controller"]
+__all__ = ["block_derivatives", "write_controller"]
 
 
 def controller_functions(form: Formulation, transcription: Transcription, guess: np.ndarray) -> list[Any]:

@@ -22,7 +22,6 @@ from ocp.solution import Solution
 from ocp.status import SolverStatus
 
 __all__ = [
-    "DEFAULTS",
     "SOLVERS",
     "SOLVER_RESIDUAL",
     "Outcome",

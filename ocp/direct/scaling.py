@@ -17,7 +17,7 @@ and checked afterwards.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -34,7 +34,6 @@ __all__ = [
     "Pattern",
     "Predetermined",
     "Scales",
-    "Sizes",
     "compute_scales",
     "scaled_program",
     "scaling_fault",
@@ -234,7 +233,7 @@ def couplings(pattern: Pattern, point: np.ndarray, p: np.ndarray) -> np.ndarray:
     + nu).
     """
     result = np.zeros((pattern.form.nx, pattern.form.nx + pattern.form.nu))
-    slopes = _slopes(pattern.program, point, p)
+    slopes = _evaluate(pattern.program.numbers.first, point, p)
     if slopes is not None:
         entries = np.abs(slopes[1].data)
         used = (pattern.to >= 0) & np.isfinite(entries) & (entries > 0)
@@ -250,14 +249,14 @@ def compute_scales(pattern: Pattern, sizes: Sizes, point: np.ndarray, p: np.ndar
     # squares of smaller sizes underflow
     size_of_variable = np.where(size_of_variable > np.sqrt(np.finfo(float).tiny), size_of_variable, 1.0)
     largest = np.zeros(pattern.transcription.n_rows)  # of all rows with one label, so that scales are constant in time
-    slopes = _slopes(program, point, p)
+    slopes = _evaluate(program.numbers.first, point, p)
     if slopes is not None:
         with np.errstate(invalid="ignore"):
             entries = np.abs(slopes[1].data) * size_of_variable[pattern.columns]
         np.maximum.at(largest, pattern.label[pattern.rows], np.where(np.isfinite(entries), entries, 0.0))
     changes = []
     for place in (point, point + size_of_variable):  # also beside a start at the minimum of the cost
-        slope = _slope(program, place, p)
+        slope = _evaluate(program.numbers.gradient, place, p)
         if slope is not None:
             with np.errstate(invalid="ignore"):
                 changes.append(float(np.abs(slope * size_of_variable).sum()))
@@ -309,18 +308,10 @@ def _powers(sizes: np.ndarray) -> np.ndarray:
     return np.where(unusual, np.exp2(np.round(np.log2(np.where(unusual, sizes, 1.0)))), 1.0)
 
 
-def _slope(program: Program, point: np.ndarray, p: np.ndarray) -> Any:
-    """Return the gradient of the program; None if an integrator fails."""
+def _evaluate(function: Callable[..., Any], point: np.ndarray, p: np.ndarray) -> Any:
+    """Return the values of a function of the program; None if an integrator fails."""
     try:
-        return program.numbers.gradient(point, p)
-    except RuntimeError:
-        return None
-
-
-def _slopes(program: Program, point: np.ndarray, p: np.ndarray) -> Any:
-    """Return the gradient and the Jacobian of the program; None if an integrator fails."""
-    try:
-        return program.numbers.first(point, p)
+        return function(point, p)
     except RuntimeError:
         return None
 

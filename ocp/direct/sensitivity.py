@@ -45,19 +45,6 @@ class SystemSettings:
     refinements: int = 4
 
 
-@dataclass(frozen=True)
-class Built:
-    """The program of a plan, with its variables, parameters and bounds."""
-
-    form: Formulation
-    transcription: Transcription
-    program: Program
-    v: np.ndarray
-    p: np.ndarray
-    lower: np.ndarray
-    upper: np.ndarray
-
-
 def sensitivity(solution: Solution, name: str) -> Sensitivity:
     """Return the derivatives of a plan of a direct method in the parameter ``name``; see
     :meth:`ocp.solution.Solution.sensitivity`.
@@ -66,22 +53,21 @@ def sensitivity(solution: Solution, name: str) -> Sensitivity:
         ProblemError: An unknown parameter; a plan that is not an optimum of a direct method under the bounds of its
             problem; or active limits that contradict each other when the parameter changes.
     """
-    built = program_of(solution)
-    form, transcription, p = built.form, built.transcription, built.p
+    form, transcription, program = program_of(solution)
     if not isinstance(name, str) or name not in form.parameters:
         raise unknown_name("parameter", name, form.parameters)
     place = form.parameters[name]
     columns = list(range(place.start, place.stop))
-    v, lam = built.v, solution.multipliers
-    bounds = built.lower, built.upper
+    v, lam, p = solution.variables, solution.multipliers, form.parameter_vector(solution.parameters)
+    bounds = bounds_to_solve(form, p)
     arguments = transcription.arguments(p, bounds)
-    pattern = Pattern(form, transcription, built.program)
+    pattern = Pattern(form, transcription, program)
     names = {*form.states, *form.controls, "horizon"}
     scales = compute_scales(pattern, sizes_along(pattern, v, names, bounds, p), v, p)
     a, b, c = scales.variables, scales.rows, scales.cost
-    rows = np.asarray(built.program.values(v, p)[1].full()).ravel()
+    rows = np.asarray(program.values(v, p)[1].full()).ravel()
     outcome = Outcome(v, solution.cost, rows, lam, solution.status, solution.message, 0, 0.0)
-    at = conditions(built.program, outcome, arguments, scales)
+    at = conditions(program, outcome, arguments, scales)
 
     slope, change = by_parameters(transcription, v, p, lam, columns)
     slope, change = slope * a[:, None] / c, change / b[:, None]
@@ -138,7 +124,7 @@ def sensitivity(solution: Solution, name: str) -> Sensitivity:
         value=value,
         t=solution.t,
         states=split(form.states, (a[:, None] * dv)[transcription.report_states]),
-        controls=split(form.controls, control_rates(built, solution, a[:, None] * dv)),
+        controls=split(form.controls, control_rates(transcription, solution, p, a[:, None] * dv)),
         horizon=np.asarray(by_time, dtype=float),
         cost=solution.cost_gradients[name],
         lower=value + ends[0],
@@ -147,7 +133,7 @@ def sensitivity(solution: Solution, name: str) -> Sensitivity:
     )
 
 
-def program_of(solution: Solution) -> Built:
+def program_of(solution: Solution) -> tuple[Formulation, Transcription, Program]:
     """Return the program that a plan is a solution of."""
     plan = f"plan {solution.name!r}"
     settings = dict(solution.method)
@@ -167,9 +153,7 @@ def program_of(solution: Solution) -> Built:
     else:
         text = f"{plan}: it is not a solution of its problem by its method"
         raise ProblemError(text, name="variables", value=len(solution.variables), limit=transcription.size)
-    p = form.parameter_vector(solution.parameters)
-    program = assemble(transcription, form.np)
-    return Built(form, transcription, program, solution.variables, p, *bounds_to_solve(form, p))
+    return form, transcription, assemble(transcription, form.np)
 
 
 def by_parameters(
@@ -241,17 +225,16 @@ def solve_system(
     return dv, of_rows, of_bounds
 
 
-def control_rates(built: Built, solution: Solution, dv: np.ndarray) -> np.ndarray:
+def control_rates(transcription: Transcription, solution: Solution, p: np.ndarray, dv: np.ndarray) -> np.ndarray:
     """Return derivatives of the controls at the reported times (M, nu, k); controls are linear in their variables."""
-    piece, place = built.transcription.report
-    columns = []
+    interval, place = transcription.report
+    v, columns = solution.variables, []
     for direction in dv.T:
-        step = max(1.0, float(np.abs(built.v).max())) / max(float(np.abs(direction).max()), 1e-300)
+        step = max(1.0, float(np.abs(v).max())) / max(float(np.abs(direction).max()), 1e-300)
         curves = [
-            built.transcription.interpolants(built.v + sign * step * direction, built.p, solution.horizon)[1]
-            for sign in (1.0, -1.0)
+            transcription.interpolants(v + sign * step * direction, p, solution.horizon)[1] for sign in (1.0, -1.0)
         ]
-        up, down = (controls_at(curve, built.transcription, piece, place) for curve in curves)
+        up, down = (controls_at(curve, transcription, interval, place) for curve in curves)
         columns.append((up - down) / (2 * step))
     return np.stack(columns, axis=-1)
 

@@ -16,7 +16,7 @@ from ocp.direct.assembly import Block, Interpolants, Stages, Transcription
 from ocp.errors import ProblemError
 from ocp.problem.formulation import Formulation, Rows
 
-__all__ = ["Layout", "TranscriptionBuilder"]
+__all__ = ["TranscriptionBuilder"]
 
 
 @dataclass(frozen=True)

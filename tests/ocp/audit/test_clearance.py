@@ -16,7 +16,7 @@ from numpy.testing import assert_allclose
 
 from models.shapes.hull import gap_along, nearest_directions
 from ocp import Collocation, MultipleShooting, Problem, ProblemError, Solution, solve
-from ocp.audit.clearance import Clearance, ProofSettings, Track, clearance_along, closest_pair_at
+from ocp.audit.clearance import Clearance, ProofSettings, Track, clearance_along, closest_pairs_along
 from ocp.problem.hulls import Frames, Hull, frames_of
 from ocp.problem.separation import Separation
 
@@ -78,7 +78,7 @@ def test_the_nearest_two_at_a_time() -> None:
     problem = flight([0, 0, 0], [1, 0, 0], {"ball": BALL, **posts}, [[0, 1, -1], [2, 0, 0]], 0.1)
     solution = solve(problem, Collocation(6, 3))  # the second pair is seen from the ball
     for time in (0.0, 0.3, 0.7, 1.0):
-        found, x = closest_pair_at(problem, solution, time), float(solution.at(time)["q"][0])
+        (found,), x = closest_pairs_along(problem, solution, [time]), float(solution.at(time)["q"][0])
         assert found is not None
         assert set(found.bodies) == {"ball", "post 0" if time < 0.5 else "post 1"}
         assert_allclose(found.distance, np.hypot(x - (0.2 if time < 0.5 else 0.8), 0.3) - 0.15, atol=1e-9)
@@ -89,7 +89,7 @@ def test_the_nearest_two_at_a_time() -> None:
     free.dynamics(q, free.control("u"))
     free.horizon(1.0)
     free.minimize(q**2)
-    assert closest_pair_at(free, solve(free, Collocation(3, 2)), 0.5) is None
+    assert closest_pairs_along(free, solve(free, Collocation(3, 2)), [0.5]) == []
 
 
 def test_the_pair_that_misses_most_of_what_is_asked_of_it_is_the_worst() -> None:
