@@ -179,20 +179,18 @@ class AccessoryProblem:
         def classify(limits: Limits, multipliers: np.ndarray, first: int, size: np.ndarray) -> list[np.ndarray]:
             count = multipliers.shape[1]
             multiplier_effect = np.abs(multipliers) * reach[:, first : first + count]
-            is_active = (limits.gap[:, :count] <= RESOLVED_SHARE * size) | limits.equal[:count]
-            return [multiplier_effect > FLAT_SHARE * (multiplier_effect.max(initial=0.0) or 1.0), is_active]
+            near = (limits.gap[:, :count] <= RESOLVED_SHARE * size) | limits.equal[:count]
+            return [multiplier_effect > FLAT_SHARE * (multiplier_effect.max(initial=0.0) or 1.0), near]
 
-        strong, is_active = classify(along.control_limits, self.adjoint.control_multipliers[:, :nh], 0, control_sizes)
-        self.fixed = strong[:, :nu] & is_active[:, :nu]
-        state_strong, state_active = classify(along.state_limits, self.adjoint.state_multipliers, nh, state_sizes)
-        strong = np.hstack(
-            [strong & is_active | along.control_limits.equal[:nh], state_strong | along.state_limits.equal]
-        )
-        is_active = np.hstack([is_active, state_active])
+        strong, near = classify(along.control_limits, self.adjoint.control_multipliers[:, :nh], 0, control_sizes)
+        self.fixed = strong[:, :nu] & near[:, :nu]
+        pushed, state_active = classify(along.state_limits, self.adjoint.state_multipliers, nh, state_sizes)
+        strong = np.hstack([strong & near | along.control_limits.equal[:nh], pushed | along.state_limits.equal])
+        near = np.hstack([near, state_active])
         n, q = along.shape
-        self.normals, self.strong, self.weak = normals, strong, is_active & ~strong
+        self.normals, self.strong, self.weak = normals, strong, near & ~strong
         # on an arc the constraints at the points alone would let the ends of the intervals oscillate
-        at_limit = (state_strong | along.state_limits.equal).reshape(n, q, -1)
+        at_limit = (pushed | along.state_limits.equal).reshape(n, q, -1)
         on_arc = np.concatenate([at_limit[:1, 0], at_limit[:-1, -1] & at_limit[1:, 0], at_limit[-1:, -1]])
         node = np.zeros((n + 1, len(along.state_limits.equal), self.nz))
         node[:, :, : self.nx] = along.node_limits_x[:, :, :-1]
@@ -201,9 +199,7 @@ class AccessoryProblem:
         self.node_normals, self.node_strong = node * self.unit[: self.nz], on_arc & along.node_limits.near
 
     def _switches(self) -> None:
-        """Find the controls that switch between their limits within an interval, and the second variation of the
-        switching time.
-        """
+        """Find the controls that switch within an interval, and the second variation of the switching time."""
         along, nu = self.along, self.nu
         n, q = along.shape
         self.moved, self.switching = np.zeros((n, nu), bool), np.zeros((n, nu))
@@ -235,8 +231,7 @@ def obstacle(form: Formulation) -> str:
 
 
 def curved_ends(form: Formulation) -> Any:
-    """Return a Function of the second derivatives of the end and start rows, each weighted by its multiplier, in (x, T,
-    x0).
+    """Return a Function of the second derivatives in (x, T, x0) of end and start rows times their multipliers.
 
     Its arguments are (x, x0, T, p, multipliers of the end rows, multipliers of the start rows).
     """

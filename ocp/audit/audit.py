@@ -291,9 +291,8 @@ def horizon_finding(form: Formulation, solution: Solution, bounds: Bounds) -> Fi
     low, high = (float(side[form.bounds.places["horizon"][0]]) for side in bounds)
     miss = max(low - solution.horizon, solution.horizon - high, abs(float(solution.t[-1]) - solution.horizon))
     declared = f"{low:.6g} s" if low == high else f"{low:.6g} to {high:.6g} s"
-    return Finding(
-        "horizon", miss, SOLVER_SHARE * solution.horizon, None, f"{solution.horizon:.6g} s, declared {declared}"
-    )
+    note = f"{solution.horizon:.6g} s, declared {declared}"
+    return Finding("horizon", miss, SOLVER_SHARE * solution.horizon, None, note)
 
 
 def optimality_findings(
@@ -315,14 +314,11 @@ def optimality_findings(
     share = float(optimum.lost.sum()) / cost + excess
     if costates is None:
         costates = max(COSTATE_SHARE, optimum.costate_accuracy)
+    best_costates = UNFIT_COSTATE_SHARE if optimum.has_linear_control else costates
     rows = [
         Finding("cost lost, relative", share, lost, None, f"{optimum.lost.sum():.3g} of the cost"),
         Finding("costate equation, relative", optimum.adjoint.total / errors, costates),
-        Finding(
-            "costates beside the best, relative",
-            optimum.costate_error,
-            UNFIT_COSTATE_SHARE if optimum.has_linear_control else costates,
-        ),
+        Finding("costates beside the best, relative", optimum.costate_error, best_costates),
         worst(
             "costates between the nodes, relative", optimum.adjoint.between / errors, optimum.adjoint.t[:-1], costates
         ),
@@ -361,9 +357,7 @@ def integration_finding(motion: Reintegration, limit: float, is_unstable: bool) 
 
 
 def violation_finding(violation: Violation, constraints: float, tolerance: float | None) -> Finding:
-    """Return the largest violation of a bound or constraint: relative to its size, or in its own unit for a given
-    tolerance.
-    """
+    """Return the largest violation, relative to the size or, with a given tolerance, in its own unit."""
     if tolerance is not None:
         return worst(violation.label, violation.missed, violation.t, tolerance)
     k = int(np.argmax(violation.shares))

@@ -145,11 +145,10 @@ def certificate(
     for name in order:
         solution = named[name]
         reported = solution.t[:-1] / solution.horizon  # costates are best where they are reported
-        (values, _, _), (reference_values, hamiltonian_size, running_size) = (
-            sample(form, plan, p, fractions, reported) for plan in (solution, first)
-        )
-        differences = [difference(a, b) for a, b in zip(values[:3], reference_values[:3], strict=True)]
-        differences.append(np.abs(values[3] - reference_values[3]) / (hamiltonian_size or 1.0))
+        values, _, _ = sample(form, solution, p, fractions, reported)
+        expected, hamiltonian_size, running_size = sample(form, first, p, fractions, reported)
+        differences = [difference(a, b) for a, b in zip(values[:3], expected[:3], strict=True)]
+        differences.append(np.abs(values[3] - expected[3]) / (hamiltonian_size or 1.0))
         size = max(abs(first.cost), running_size * first.horizon) or 1.0
         comparisons.append(
             Comparison(

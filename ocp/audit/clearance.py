@@ -219,11 +219,8 @@ def _tracks(problem: Problem, solution: Solution, suffix: str) -> list[tuple[Sep
     form = Formulation.of(problem)
     check_belongs(form, solution)
     solution, p = in_order_of(form, solution), form.parameter_vector(solution.parameters)
-    return [
-        (apart, _track_of(form, apart, solution, p))
-        for apart in problem.declared.apart.values()
-        if len(apart) and all(name.endswith(suffix) for name in apart.movers)
-    ]
+    moving = [each for each in problem.declared.apart.values() if all(name.endswith(suffix) for name in each.movers)]
+    return [(each, _track_of(form, each, solution, p)) for each in moving if len(each)]
 
 
 def _track_of(form: Formulation, apart: Separation, solution: Solution, p: np.ndarray) -> Track:
@@ -429,9 +426,8 @@ def _rate_bounds(curve: PiecewisePolynomial, columns: list[int], horizon: float)
     bounds = []
     for rate in (first, first.derivative()):
         degree = len(rate.nodes) - 1
-        basis = np.array(
-            [comb(degree, i) * rate.nodes**i * (1 - rate.nodes) ** (degree - i) for i in range(degree + 1)]
-        )
+        s, indices = rate.nodes, range(degree + 1)
+        basis = np.array([comb(degree, i) * s**i * (1 - s) ** (degree - i) for i in indices])
         coefficients = np.einsum("ij,kjn->kin", np.linalg.inv(basis.T), rate.values[:, :, columns])
         bounds.append(np.abs(coefficients).max(axis=1))
     return bounds[0] / horizon, bounds[1] / horizon**2

@@ -78,36 +78,33 @@ class Adjoint:
     ends: Ends
 
 
-def adjoint(
-    along: Linearisation, curved: np.ndarray | None, cost: float, node_shifts: np.ndarray | None = None
-) -> Adjoint:
+def adjoint(along: Linearisation, curved: np.ndarray | None, cost: float, shifts: np.ndarray | None = None) -> Adjoint:
     """Integrate the costates of a plan backwards, compute the multipliers, and check the conditions at the ends.
 
     Args:
         along: Linearisation of the plan.
         curved: T H_uu at the points, (M, nu, nu), or None if no path inequality has a control.
         cost: Size of the cost, by which errors are weighted.
-        node_shifts: Of an earlier call. They are subtracted from the reported costates at the nodes, so that the atoms
+        shifts: Of an earlier call. They are subtracted from the reported costates at the nodes, so that the atoms
             are distributed.
     """
     (n, q), m = along.shape, along.state_limits.lower.shape[1]
     first, last = interval_end_costates(along)
     # atoms at the start of the second interval explain a jump between two intervals
     first = np.vstack([first[:1], last[:-1]])
-    if node_shifts is not None:
-        first, last = first - node_shifts[:-1], last - node_shifts[1:]
+    if shifts is not None:
+        first, last = first - shifts[:-1], last - shifts[1:]
     costate, inside, atoms = along.costate, np.zeros((n, q, m)), np.zeros((n, 2, m))
     near, at_node = (
         np.asarray(part.any(axis=1)) for part in (along.state_limits.near.reshape(n, q * m), along.node_limits.near)
     )
     limited = np.flatnonzero(near | at_node[:-1] | at_node[1:])
     control_multipliers, across = find_control_multipliers(along, costate, curved)
-    for _ in range(3):
-        # alternate between the multipliers of the controls and those of the states
+    for _ in range(3):  # alternate between the multipliers of the controls and of the states
         before = control_multipliers != 0
         back = Backwards(along, control_multipliers, across)
         for k in limited.tolist():
-            inside[k], atoms[k] = _state_forces(back, k, first[k], last[k], cost)
+            inside[k], atoms[k] = _forces(back, k, first[k], last[k], cost)
         costate, start = back.integrate(last, inside, atoms)
         control_multipliers, across = find_control_multipliers(along, costate, curved)
         if not (limited.size or along.mixed.size) or (before == (control_multipliers != 0)).all():
@@ -133,14 +130,13 @@ def adjoint(
         total,
         np.maximum(_between(along, costate, last) - force.sum(axis=1), 0.0),
         charge.sum(axis=(1, 2)) + atom_charges[0] + atom_charges[1],
-        _node_shifts(along, control_multipliers, inside, atoms if node_shifts is None else None),
+        _node_shifts(along, control_multipliers, inside, atoms if shifts is None else None),
         _ends(along, costate, control_multipliers, inside, atoms, cost, last[-1]),
     )
 
 
 def _node_shifts(along: Linearisation, holding: np.ndarray, inside: np.ndarray, atoms: np.ndarray | None) -> np.ndarray:
-    """Return the part of all forces near a node that lies before it, see `Adjoint`: weighted by the hat function of the
-    node.
+    """Return the part of all forces near a node that lies before it, by the hat function of the node, see `Adjoint`.
 
     Half of the ``atoms`` at the starts of the intervals, if these are not distributed yet.
     """
@@ -172,14 +168,14 @@ def interval_end_costates(along: Linearisation) -> tuple[np.ndarray, np.ndarray]
 class Backwards:
     """The costate equation over every interval, backwards, with the multipliers of the controls as feedback."""
 
-    def __init__(self, along: Linearisation, control_multipliers: np.ndarray, across: np.ndarray) -> None:
+    def __init__(self, along: Linearisation, multipliers: np.ndarray, across: np.ndarray) -> None:
         self.along = along
         n, q = along.shape
         nx, nu = along.form.nx, along.form.nu
         rate_x, rate_u = along.rate_y[:, :, :nx], along.rate_y[:, :, nx + 1 :]
         feed, source = rate_x.transpose(0, 2, 1).copy(), along.cost_y[:, :nx].copy()
         unit, mixed = along.control_size, slice(nu, nu + along.mixed.size)
-        is_active = control_multipliers != 0
+        is_active = multipliers != 0
         self.projector = np.broadcast_to(np.eye(nu), (n * q, nu, nu)).copy()
         active = np.flatnonzero(is_active.any(axis=1))
         if active.size:
@@ -187,9 +183,8 @@ class Backwards:
             inverse = pseudo_inverse_of(along, is_active)[active].transpose(0, 2, 1)
             self.projector[active] -= rows.transpose(0, 2, 1) @ inverse
             if along.mixed.size:
-                source += np.einsum(
-                    "km,kmi->ki", control_multipliers[:, mixed] * across[:, None], along.row_y[:, along.mixed, :nx]
-                )
+                across_gaps = multipliers[:, mixed] * across[:, None]
+                source += np.einsum("km,kmi->ki", across_gaps, along.row_y[:, along.mixed, :nx])
                 active, inverse = active[~across[active]], inverse[~across[active]]
                 # multipliers = - inverse (unit slope): a linear feedback of the costate
                 slopes = along.row_y[active][:, along.mixed, :nx]
@@ -237,9 +232,7 @@ class Backwards:
         return np.where(np.isfinite(total), total, np.inf)
 
 
-def _state_forces(
-    back: Backwards, k: int, first: np.ndarray, last: np.ndarray, cost: float
-) -> tuple[np.ndarray, np.ndarray]:
+def _forces(back: Backwards, k: int, first: np.ndarray, last: np.ndarray, cost: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the multipliers of the state limits in interval k that fit its costates best: (q, m), atoms (2, m)."""
     along = back.along
     q, nx, m = along.shape[1], along.form.nx, along.state_limits.lower.shape[1]
@@ -402,13 +395,11 @@ def end_limits(along: Linearisation) -> EndLimits:
     sides: list[tuple[np.ndarray, ...]] = []
     for limits, slope, row in parts:
         has_slope = np.abs(slope).max(axis=1, initial=0.0) > 0
-        for may_be_active, gap, sign in (
+        for active, gap, sign in (
             (limits.upper[0], limits.above[0], 1.0),
             (limits.lower[0] & ~limits.equal, limits.below[0], -1.0),
         ):
-            chosen = may_be_active & has_slope
-            sides.append(
-                (slope[chosen], np.full(int(chosen.sum()), sign), gap[chosen], limits.equal[chosen], row[chosen])
-            )
+            near = active & has_slope
+            sides.append((slope[near], np.full(int(near.sum()), sign), gap[near], limits.equal[near], row[near]))
     slopes, signs, gaps, equals, rows = (np.concatenate(part) for part in zip(*sides, strict=True))
     return EndLimits(slopes, signs, gaps, equals, rows, (len(form.end), len(form.start)))

@@ -228,8 +228,7 @@ def _swept(
 
 
 class _Linearised(NamedTuple):
-    """The accessory problem of all stages: variations at the points as linear functions of those at the start and of
-    the controls.
+    """The accessory problem of all stages: variations at the points from those at the start and of the controls.
 
     Attributes:
         whole: Variations of (z, u) at the points. Shape (N, q, nz + nu, nz + q nu).
@@ -358,21 +357,19 @@ def _eliminated(
     results = []
     for (rank, visible), members in by_rank.items():
         at = np.array(members)
-        left_vectors, of_states = np.swapaxes(left[at], 1, 2), rows[at][:, :, :nz]
+        turned, of_states = np.swapaxes(left[at], 1, 2), rows[at][:, :, :nz]
         lift = np.zeros((len(at), size, size - rank))
         lift[:, :nz, :nz] = np.eye(nz)
         lift[:, nz:, :nz] = -np.swapaxes(right[at, :rank], 1, 2) @ (
-            left_vectors[:, :rank] @ of_states / sizes[at, :rank, None]
+            turned[:, :rank] @ of_states / sizes[at, :rank, None]
         )
         lift[:, nz:, nz:] = np.swapaxes(right[at, rank:], 1, 2)
-        results.append((at, lift, left_vectors[:, max(rank, visible) :] @ of_states))
+        results.append((at, lift, turned[:, max(rank, visible) :] @ of_states))
     return results
 
 
 class _Gain(NamedTuple):
-    """Feedback of a stage: its controls as a function of (z, 1) and the free variations, and minus the response of
-    these.
-    """
+    """Feedback of a stage: its controls from (z, 1) and the free variations, and minus the response of these."""
 
     lift: np.ndarray
     response: np.ndarray
@@ -417,9 +414,7 @@ def _variation(
     gains: list[_Gain],
     start: np.ndarray | None = None,
 ) -> _Variation:
-    """Return the variation that begins with these controls in an interval, or at the start, and follows the optimal
-    feedback.
-    """
+    """Return the variation that begins with these controls, or at the start, and follows the optimal feedback."""
     along, nz, nu = accessory.along, accessory.nz, accessory.nu
     n, q = along.shape
     without_one = np.delete(np.arange(nz + 1 + q * nu), nz)
@@ -458,8 +453,8 @@ def _confirmed(least: float, at: float | None, variation: _Variation, scale: flo
 
 
 def _singular(accessory: AccessoryProblem, k: int, controls: np.ndarray) -> str:
-    """Return why the curvature along the controls of a stage is inconclusive: the Hamiltonian itself does not curve
-    along them.
+    """Return why the curvature along the controls of a stage is inconclusive: the Hamiltonian does not curve along
+    them.
 
     For a control that enters linearly the remaining curvature is of the order of the interval's width. A minimum on a
     singular arc is decided by the generalised Legendre-Clebsch condition, which is not checked here.

@@ -29,8 +29,7 @@ MAX_DERIVATIVES = 3
 
 
 class Limits:
-    """Limits that may be active at some points of a plan: lower and upper limits of some quantities, and the distances
-    to them.
+    """Limits that may be active at some points of a plan: lower and upper limits of quantities, and distances to them.
 
     A limit that was slightly tightened when the plan was solved may be active where the plan rests on it. The price of
     its multiplier is the distance to the declared limit. Multiplier times distance is the excess cost of the plan to

@@ -136,8 +136,7 @@ class _Multipliers:
     @classmethod
     def of(cls, program: _Program, limits: Limits, chosen: np.ndarray, slopes: np.ndarray, size: np.ndarray,
            share: Any = 1.0) -> _Multipliers:  # fmt: skip
-        """Add both sides of ``chosen`` limits (M, m), bool, with their derivatives (M, m, n) in variables of these
-        sizes (n,).
+        """Add both sides of ``chosen`` limits (M, m), bool, with derivatives (M, m, n) in variables of sizes (n,).
 
         A multiplier per unit of s costs its gap times the ``share`` (M,) of its point.
         """
@@ -160,9 +159,7 @@ class _Multipliers:
 
 
 class _Dual:
-    """The dual program for the multipliers of a plan. Costates are scaled by the sizes of their states, to units of
-    cost.
-    """
+    """The dual program for the multipliers of a plan, with costates times the sizes of their states in units of cost."""
 
     def __init__(self, along: Linearisation, curved: np.ndarray, cost: float) -> None:
         self.along, self.cost, self.program = along, cost, _Program()
@@ -246,9 +243,7 @@ class _Dual:
             self.residual.append(part)
 
     def _ends(self) -> None:
-        """Add the conditions at the ends. Their residual is priced by the distance that the controls could drive the
-        states.
-        """
+        """Add the conditions at the ends; a residual is priced by the distance that controls could drive the states."""
         along, program, nx = self.along, self.program, self.along.form.nx
         form, (low, high), horizon = along.form, along.bounds, along.solution.horizon
         places, share = form.bounds.places, along.share

@@ -120,8 +120,7 @@ def slope(along: Linearisation, costate: np.ndarray) -> np.ndarray:
 
 
 def pseudo_inverse_of(along: Linearisation, active: np.ndarray) -> np.ndarray:
-    """Return the pseudo-inverse of the derivatives of the active limits (M, m), bool, with controls in units of their
-    sizes.
+    """Return the pseudo-inverse of the derivatives of ``active`` limits (M, m), bool, with controls in units of size.
 
     Shape (M, nu, m). It is cached with the plan, since it does not depend on the costates.
     """
@@ -161,17 +160,14 @@ def balance(
 
 
 def reduced_slope(along: Linearisation, costate: np.ndarray, multipliers: np.ndarray) -> np.ndarray:
-    """Return the largest entry of the slope of T H that remains with the multipliers, relative to its parts. Shape
-    (M,).
-    """
+    """Return the largest entry of the remaining slope of T H, relative to its parts. Shape (M,)."""
     form = along.form
     if not form.nu:
         return np.zeros(len(along.s))
     unit, first = along.control_size, form.nx + 1
     residual = (slope(along, costate) + np.einsum("kmu,km->ku", along.control_limits_u, multipliers)) * unit
-    parts = np.abs(along.cost_y[:, first:]) + np.einsum(
-        "kiu,ki->ku", np.abs(along.rate_y[:, :, first:]), np.abs(costate)
-    )
+    rates = np.abs(along.rate_y[:, :, first:])
+    parts = np.abs(along.cost_y[:, first:]) + np.einsum("kiu,ki->ku", rates, np.abs(costate))
     size = float((parts * unit).max(initial=0.0)) or 1.0
     return np.asarray(np.abs(residual).max(axis=1, initial=0.0) / size)
 
@@ -250,10 +246,9 @@ def control_loss(along: Linearisation, costate: np.ndarray, multipliers: np.ndar
     low, high = np.minimum(low, 0.0), np.maximum(high, 0.0)
     scale = float(np.abs(curved).max(initial=0.0)) or 1.0
     size = np.abs(along.control_limits_u * unit).max(axis=2)
-    has_multiplier = (
-        np.abs(multipliers) * size > FLAT_SHARE * np.abs(multipliers * size).max(initial=0.0)
-    ) | along.control_limits.equal
-    active = has_multiplier | (along.control_limits.lower & along.control_limits.upper & (size > 0))
+    force = np.abs(multipliers) * size
+    active = (force > FLAT_SHARE * np.abs(multipliers * size).max(initial=0.0)) | along.control_limits.equal
+    active = active | (along.control_limits.lower & along.control_limits.upper & (size > 0))
     gain = np.zeros(len(by_gaps))
     while True:  # fix controls at limits that the step would violate: at most nu rounds
         blocked, inverse = active.copy(), pseudo_inverse_of(along, active)
@@ -271,9 +266,8 @@ def control_loss(along: Linearisation, costate: np.ndarray, multipliers: np.ndar
         if (blocked == active).all():
             break
         active = blocked
-    return np.asarray(
-        ((by_gaps + gain) * along.share).reshape(n, -1).sum(axis=1) + switching_loss(along, costate, curved_u)
-    )
+    by_interval = ((by_gaps + gain) * along.share).reshape(n, -1).sum(axis=1)
+    return np.asarray(by_interval + switching_loss(along, costate, curved_u))
 
 
 def switching_loss(along: Linearisation, costate: np.ndarray, curved: np.ndarray) -> np.ndarray:
@@ -309,7 +303,7 @@ def switching_loss(along: Linearisation, costate: np.ndarray, curved: np.ndarray
 
 
 def _step(gradient: np.ndarray, curved: np.ndarray, projector: np.ndarray, scale: float) -> np.ndarray:
-    """Return the minimiser d of gradient . d + d curved d / 2 over projected d at each point; |d| is about 1 along no
+    """Return the minimiser d of gradient . d + d curved d / 2 over projected d at each point; |d| is about 1 without
     curvature.
 
     Shapes (k, nu), (k, nu, nu), (k, nu, nu). ``scale`` is the largest curvature.

@@ -101,9 +101,7 @@ def reintegrate(along: Linearisation, grid: FineGrid) -> Reintegration:
 
 
 def integrated_motion(along: Linearisation, grid: FineGrid) -> IntegratedMotion:
-    """Integrate step by step: the result of :func:`ocp.audit.correction.corrected_motion`, using only the starts of the
-    intervals.
-    """
+    """Integrate step by step: as :func:`ocp.audit.correction.corrected_motion`, from the starts of the intervals."""
     n, cells = int(grid.interval[-1]) + 1, grid.samples - 1
     flow = Flow(along)
     starts = grid.states.reshape(n, cells + 1, -1)[:, 0]
@@ -226,8 +224,7 @@ class Flow:
 
 
 def step_function(form: Formulation, nodes: np.ndarray) -> Any:
-    """Return one Dormand-Prince step, a Function (x, data) -> (x after the step, its error); x holds the states, then
-    the cost.
+    """Return one Dormand-Prince step, a Function (x, data) -> (x after the step, its error); x is states and cost.
 
     The data are: whether to restart, the start state, place and width of the step in its interval, the divided
     differences of the control at ``nodes`` of the interval, start and width of the interval as fractions of the
@@ -328,19 +325,18 @@ def violations(
         limited = np.isfinite(rows.tolerance)
         if kind in sampled and limited.any():
             g_reported = form.sampled(outputs, reported, *here[1:], kept="rows along a plan")[kind == "watch"]
-            reported_excess = excess_over(
-                _integrated(form, kind, g_reported, t), lower[rows.bounds], upper[rows.bounds]
-            )
+            g_reported = _integrated(form, kind, g_reported, t)
+            reported_excess = excess_over(g_reported, lower[rows.bounds], upper[rows.bounds])
             excess = np.where(limited, np.maximum(excess, reported_excess), excess)
         size = np.tile(size, (len(t), 1))
-        at_worst = np.argmax(excess, axis=0), np.arange(len(rows))
+        at_max = np.argmax(excess, axis=0), np.arange(len(rows))
         # judge a violation by its local rate of change
-        if kind != "watch" and np.any(excess[at_worst] > SOLVER_SHARE * size[at_worst]):
-            change = row_changes(
-                form, kind, (x[at_worst[0]], u[at_worst[0]], t[at_worst[0]]), initial, horizon, p, entries
-            )[1]
-            local_size = change.sum(axis=0)[at_worst[1], at_worst[1]] / LIMIT_SHARE
-            size[at_worst] = np.clip(local_size, SOLVER_SHARE * size[at_worst], size[at_worst])
+        if kind != "watch" and np.any(excess[at_max] > SOLVER_SHARE * size[at_max]):
+            change = row_changes(form, kind, (x[at_max[0]], u[at_max[0]], t[at_max[0]]), initial, horizon, p, entries)[
+                1
+            ]
+            local_size = change.sum(axis=0)[at_max[1], at_max[1]] / LIMIT_SHARE
+            size[at_max] = np.clip(local_size, SOLVER_SHARE * size[at_max], size[at_max])
         with np.errstate(divide="ignore"):
             size = np.minimum(size, rows.tolerance / share)
         for name in rows.names:

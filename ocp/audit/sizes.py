@@ -71,7 +71,7 @@ def fine_grid(solution: Solution) -> FineGrid:
 
 @np.errstate(invalid="ignore")  # nan is reported later, with its name
 def plan_at(solution: Solution, places: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return states (N m, nx), controls (N m, nu) and times (N m,) at the positions ``places`` (m,), 0..1, of all
+    """Return states (N m, nx), controls (N m, nu) and times (N m,) at positions ``places`` (m,), 0..1, of all
     intervals.
 
     At a break each value comes from the side of its interval.
@@ -131,19 +131,16 @@ def sizes(form: Formulation, solution: Solution, p: np.ndarray, bounds: Bounds) 
 def sizes_along(form: Formulation, grid: FineGrid, horizon: float, p: np.ndarray, bounds: Bounds) -> Sizes:
     """Return the sizes as `sizes` does, for a plan on its fine grid."""
     places = form.bounds.places
-    ends = [
-        np.where(low == high, low, np.nan)
-        for low, high in (_select(bounds, places[k]) for k in ("initial", "terminal"))
-    ]
+    fixed = (_select(bounds, places[kind]) for kind in ("initial", "terminal"))
+    ends = [np.where(low == high, low, np.nan) for low, high in fixed]
     declared = _select(bounds, places["state"])
     state, state_moves = _sizes_of(np.vstack([grid.states, *ends]), declared, ends, form.free_parameters)
     declared = _select(bounds, places["control"])
     control, control_moves = _sizes_of(grid.controls, declared, [], np.zeros(form.nu, dtype=bool))
     entries = np.concatenate([state, control]), np.concatenate([state_moves, control_moves])
     point = grid.states, grid.controls, grid.t, horizon, p, (form.x0, grid.states[0]), (form.u0, grid.controls[0])
-    running, rows, path_lengths = form.sampled(
-        [form.running, form.path.expression, form.watch_way], *point, kept="along a plan"
-    )
+    outputs = [form.running, form.path.expression, form.watch_way]
+    running, rows, path_lengths = form.sampled(outputs, *point, kept="along a plan")
     path = _rows_of(form, "path", grid, horizon, p, bounds, entries, rows)
     start, end, watch = (_rows_of(form, k, grid, horizon, p, bounds, entries) for k in ("start", "end", "watch"))
     absolute = np.where(np.isfinite(running), np.abs(running), 0.0)[:, 0]
@@ -260,8 +257,7 @@ def _rows_of(
 
 
 def _watched(form: Formulation, by_variables: np.ndarray, horizon: float, path_lengths: np.ndarray) -> np.ndarray:
-    """Return the sizes of the watched rows: the longest path length among rows of one name, or the change with the
-    variables.
+    """Return the sizes of watched rows: the longest path length among rows of one name, or the change with variables.
 
     Args:
         by_variables: Change with the variables. Shape (rows,).
@@ -277,9 +273,7 @@ def _watched(form: Formulation, by_variables: np.ndarray, horizon: float, path_l
 
 
 def integral(rates: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """Return the integral of columns (M, n) over times (M,), from the first to each, by the trapezoidal rule. Shape (M,
-    n).
-    """
+    """Return the integral of columns (M, n) over times (M,), from the first to each, by the trapezoidal rule."""
     steps = np.diff(t)[:, None] * (rates[1:] + rates[:-1]) / 2
     return np.vstack([np.zeros((1, rates.shape[1])), np.cumsum(steps, axis=0)])
 
@@ -318,8 +312,7 @@ def row_changes(
     p: np.ndarray,
     moves: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rows of one kind at K samples, and the change of each when a single entry of states or controls
-    changes.
+    """Return the rows of one kind at K samples, and their changes when a single entry of states or controls changes.
 
     Args:
         kind: ``path``, ``start``, ``end`` or ``watch``; or ``running`` or ``terminal`` for the cost.

@@ -15,7 +15,7 @@ border.
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -72,9 +72,7 @@ def conditions(program: Program, outcome: Outcome, arguments: dict[str, np.ndarr
     return Conditions(sp.csc_array(hessian), sp.csr_array(jacobian), of_bounds, of_rows, held, fixed)
 
 
-def scaled_multipliers(
-    program: Program, outcome: Outcome, p: np.ndarray, scales: Scales
-) -> tuple[np.ndarray, np.ndarray]:
+def multipliers_of(program: Program, outcome: Outcome, p: np.ndarray, scales: Scales) -> tuple[np.ndarray, np.ndarray]:
     """Return the multipliers of the variable bounds (n,) and of the rows (m,), in units of the solver."""
     v, lam = outcome.variables, outcome.multipliers
     slope, jacobian = program.numbers.first(v, p)
@@ -83,7 +81,7 @@ def scaled_multipliers(
 
 def active_sides(program: Program, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales) -> Sides:
     """Return the active side of each variable (x) and row (g): -1 lower limit, 1 upper limit, 0 none."""
-    multipliers = dict(zip("xg", scaled_multipliers(program, outcome, arguments["p"], scales), strict=True))
+    multipliers = dict(zip("xg", multipliers_of(program, outcome, arguments["p"], scales), strict=True))
     values, units = {"x": outcome.variables, "g": outcome.rows}, {"x": scales.variables, "g": scales.rows}
     sides = {}
     for kind, unit in units.items():
@@ -101,7 +99,7 @@ def next_active_set(
     The active set is right if it does not change. None if the cost still falls along free directions, as when rounding
     ended the solve too early. Primal-dual active set strategy (Hintermueller, Ito, Kunisch 2002).
     """
-    multipliers = dict(zip("xg", scaled_multipliers(program, outcome, arguments["p"], scales), strict=True))
+    multipliers = dict(zip("xg", multipliers_of(program, outcome, arguments["p"], scales), strict=True))
     values, units = {"x": outcome.variables, "g": outcome.rows}, {"x": scales.variables, "g": scales.rows}
     free = (sides["x"] == 0) & (arguments["lbx"] < arguments["ubx"])
     if not np.all(np.abs(multipliers["x"][free]) <= RESOLVED):  # also for nan
@@ -204,26 +202,21 @@ class Newton:
             root = self._root(start, sides, arguments, scales, self._settings.steps - steps)
             if root is None:
                 return None
-            steps += root.steps
-            start = Outcome(root.v, 0.0, root.rows, root.lam, SolverStatus.SOLVED, "", steps, 0.0, False, "newton")
-            next_sides = next_active_set(self._program, start, arguments, scales, sides, ROUNDING_SHARE)
+            steps, start = steps + root.iterations, root
+            next_sides = next_active_set(self._program, root, arguments, scales, sides, ROUNDING_SHARE)
             if next_sides is None:
                 return None
             if _same(next_sides, sides):
-                cost, _ = self._program.numbers.values(root.v, arguments["p"])
-                held = _held(sides, arguments)
-                if self._matrix(root.v, arguments["p"], root.lam, held, scales, local=True) is None:  # a saddle point
+                v, lam, p = root.variables, root.multipliers, arguments["p"]
+                if self._matrix(v, p, lam, _held(sides, arguments), scales, local=True) is None:  # a saddle point
                     return None
-                seconds = time.monotonic() - began
-                return Outcome(
-                    root.v, cost, root.rows, root.lam, start.status, str(start.status), steps, seconds, False, "newton"
-                )
+                return replace(root, iterations=steps, seconds=time.monotonic() - began)
             sides = next_sides
         return None
 
     def _root(
         self, start: Outcome, sides: Sides, arguments: dict[str, np.ndarray], scales: Scales, most: int
-    ) -> _Root | None:
+    ) -> Outcome | None:
         """Take at most ``most`` Newton steps with a fixed active set; None if they do not converge."""
         a, b, c, p, settings = scales.variables, scales.rows, scales.cost, arguments["p"], self._settings
         fixed, held = _held(sides, arguments)
@@ -245,7 +238,8 @@ class Newton:
             )
             stalls = is_new and settings.gain * before < error <= SOLVER_RESIDUAL  # limited by rounding
             if error <= settings.tolerance or stalls:
-                return _Root(step, v, rows, lam)
+                status = SolverStatus.SOLVED
+                return Outcome(v, cost, rows, lam, status, str(status), step, 0.0, False, "newton")
             if step == most or not error < np.inf or (is_new and error > before and step > 1) or reason_to_stop():
                 return None
             is_new = matrix is None or error > settings.gain * before
@@ -326,9 +320,7 @@ class _Matrix:
     settings: NewtonSettings
 
     def step(self, gradient: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return Newton's step of variables and multipliers, scaled; each pass of the method of multipliers reduces the
-        residual.
-        """
+        """Return Newton's step of variables and multipliers, scaled, by passes of the method of multipliers."""
         place, residual = self.factors.place, self.weight * residual
         side = np.empty_like(gradient)
         side[place] = gradient
@@ -343,16 +335,6 @@ class _Matrix:
                 break
             last = largest
         return move[place], self.weight * multipliers
-
-
-@dataclass(frozen=True)
-class _Root:
-    """Result of the Newton steps: their number, and variables, rows and multipliers at the root."""
-
-    steps: int
-    v: np.ndarray
-    rows: np.ndarray
-    lam: np.ndarray
 
 
 def _held(sides: Sides, arguments: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -390,9 +372,7 @@ class Bordered:
         self._size = size
 
     def at(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        """Return the index, for :meth:`cholesky`, of the entries at these positions; ``first`` is not before
-        ``second``.
-        """
+        """Return the index for :meth:`cholesky` of entries at these positions; ``first`` is not before ``second``."""
         band = second * self.width + first
         below = (self.width + 1) * self.inner + (first - self.inner) * self._size + second
         return np.asarray(np.where(first < self.inner, band, below))

@@ -361,26 +361,27 @@ def assemble(transcription: Transcription, parameters: int, functions: Sequence[
     g = nonlinear + ca.mtimes(sparse(*transcription.linear, (m, n)), x)
 
     parts = [mapped(function.gradient, block, call)[0] for block, function, call in calls]
-    places = [gradient_at(function.gradient.sparsity_out(0), block) for block, function, _ in calls]
+    entries = [places_of(function.gradient.sparsity_out(0)) for _, function, _ in calls]
+    places = [block.variables[column].ravel(order="F") for block, (_, column) in zip(blocks, entries, strict=True)]
     gradient = scatter(places, parts, n)
     inner = [i for i, block in enumerate(blocks) if not block.ends]
     inside = scatter([places[i] for i in inner], [parts[i] for i in inner], n)
 
     parts = [mapped(function.jacobian, block, call)[0] for block, function, call in calls]
-    entries = [jacobian_at(function.jacobian.sparsity_out(0), block) for block, function, _ in calls]
+    entries = [places_of(function.jacobian.sparsity_out(0)) for _, function, _ in calls]
+    entries = [
+        (block.rows[row].ravel(order="F"), block.variables[column].ravel(order="F"))
+        for block, (row, column) in zip(blocks, entries, strict=True)
+    ]
     jac = scatter_matrix(entries, parts, transcription.linear, (m, n))
 
-    parts = [
-        mapped(
-            function.hessian, block, [*call, ca.repmat(sigma, 1, block.variables.shape[1]), gather(lam, block.rows)]
-        )[0]
-        for block, function, call in calls
-    ]
+    parts = []
+    for block, function, call in calls:
+        weights = ca.repmat(sigma, 1, block.variables.shape[1]), gather(lam, block.rows)
+        parts += mapped(function.hessian, block, [*call, *weights])
     no_constants = (np.zeros(0, int), np.zeros(0, int), np.zeros(0))
-    hessian_entries = [hessian_at(function.hessian.sparsity_out(0), block) for block, function, _ in calls]
-    hess = scatter_matrix(
-        [at for at, _ in hessian_entries], parts, no_constants, (n, n), [factors for _, factors in hessian_entries]
-    )
+    upper = [hessian_at(function.hessian.sparsity_out(0), block) for block, function, _ in calls]
+    hess = scatter_matrix([at for at, _ in upper], parts, no_constants, (n, n), [factors for _, factors in upper])
 
     slope = ca.MX.zeros(parameters)
     if parameters:
@@ -418,21 +419,8 @@ def derivatives(function: Any) -> Derivatives:
     )
 
 
-def gradient_at(pattern: Any, block: Block) -> np.ndarray:
-    """Return the program variable of each nonzero of a block gradient, application by application."""
-    return np.asarray(block.variables[places_of(pattern)[1]].ravel(order="F"))
-
-
-def jacobian_at(pattern: Any, block: Block) -> tuple[np.ndarray, np.ndarray]:
-    """Return the program row and column of each nonzero of a block Jacobian, application by application."""
-    row, column = places_of(pattern)
-    return block.rows[row].ravel(order="F"), block.variables[column].ravel(order="F")
-
-
 def hessian_at(pattern: Any, block: Block) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
-    """Return the row and column in the upper triangle of the program, and the factor, of each nonzero of a block
-    Hessian.
-    """
+    """Return row and column in the upper triangle of the program, and factor, of each nonzero of a block Hessian."""
     first, second = places_of(pattern)
     where = block.variables
     upper = np.minimum(where[first], where[second]).ravel(order="F")

@@ -85,12 +85,8 @@ def write_controller(form: Formulation, transcription: Transcription, guess: np.
     except CompilerError as error:
         raise ProblemError(f"problem {form.name!r} has no C: {error}", name="method", value=form.name) from error
     texts = dict(zip(("plan.c", "plan.h"), plan, strict=True))
-    texts |= {
-        "problem.h": problem_header(form, transcription),
-        "curves.h": CURVES,
-        "main.c": MAIN,
-        "Makefile": MAKEFILE,
-    }
+    texts |= {"curves.h": CURVES, "main.c": MAIN, "Makefile": MAKEFILE}
+    texts["problem.h"] = problem_header(form, transcription)
     folder.mkdir(parents=True, exist_ok=True)
     for name, text in texts.items():
         write_text(folder / name, text)

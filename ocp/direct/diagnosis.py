@@ -376,7 +376,5 @@ class _Soft:
                         str(self.labels[j]), float(violation[i]), float(bound[i]), side, fraction, horizon
                     )
         order = sorted(by_slack, key=lambda j: -by_slack[j].amount / self.sizes[j])
-        return [
-            replace(by_slack[j], amount=by_slack[j].amount * unit_of[j], bound=by_slack[j].bound * unit_of[j])
-            for j in order
-        ]
+        conflicts = [(by_slack[j], unit_of[j]) for j in order]
+        return [replace(each, amount=each.amount * unit, bound=each.bound * unit) for each, unit in conflicts]

@@ -129,9 +129,8 @@ def build_solver(
     elif solver == "sleqp":
         # like fatrop's, its interface looks up given derivatives in its cache
         settings["cache"] = {"nlp_grad_f": program.gradient, "nlp_jac_g": program.jacobian}
-        settings |= {
-            key: solver_options.pop(key) for key in SLEQP if key in solver_options
-        }  # options of the interface, not of the solver
+        # options of the interface, not of the solver
+        settings |= {key: solver_options.pop(key) for key in SLEQP if key in solver_options}
     else:
         assert stages is not None
         nlp = {**nlp, "f": finite(nlp["f"]), "g": finite(nlp["g"])}

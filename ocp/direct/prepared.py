@@ -149,8 +149,7 @@ class Prepared:
         *,
         shift: int = 0,
     ) -> Solution:
-        """Solve with these parameters from this guess; see :func:`ocp.methods.solve`. Wait for a solve in another
-        thread.
+        """Solve with these parameters from this guess, after solves in other threads; see :func:`ocp.methods.solve`.
 
         If the guess is a plan of this problem, method and mesh, its active limits are held first, and a few Newton
         steps determine the solution (:mod:`ocp.direct.active_set`; ``Solution.solver`` is ``newton``). If they do not
@@ -210,7 +209,7 @@ class Prepared:
         arguments = transcription.arguments(p, bounds_to_solve(form, p))
         if tighter is not None:
             tighten_bounds(arguments, tighter)
-        nearby = self._solve_near(guess, arguments, bounds, shift)
+        nearby = self._nearby(guess, arguments, bounds, shift)
         if nearby is not None:
             return nearby
         point = initial_point(form, transcription, guess, bounds)
@@ -226,8 +225,8 @@ class Prepared:
         elastic = None if attempts[-1].is_final else self._elastic(first)
         remaining = self._max_iterations - sum(attempt.outcome.iterations for attempt in attempts[1:])
         if elastic is not None and check and remaining > 0:
-            solver = self._short_solver
-            attempts.append(self._attempt(ELASTIC, elastic.plan, self._all_names, arguments, bounds, solver))
+            everything = self._all_names
+            attempts.append(self._attempt(ELASTIC, elastic.plan, everything, arguments, bounds, self._short_solver))
             if attempts[-1].plan is not None:
                 return attempts[-1].plan
         decisive = attempts[-1] if attempts[-1].is_final else first
@@ -251,14 +250,11 @@ class Prepared:
         attempts, remaining, x0 = list[Attempt](), self._max_iterations, first.arguments["x0"]
         if first.is_final:
             return attempts
-        starts = alternative_starts(
-            self.formulation, self.transcription, x0, arguments["p"], (arguments["lbx"], arguments["ubx"])
-        )
-        for start, point in starts:
+        limits = arguments["lbx"], arguments["ubx"]
+        for start, point in alternative_starts(self.formulation, self.transcription, x0, arguments["p"], limits):
             if remaining <= 0 or np.array_equal(point, x0):
                 continue
-            solver = self._short_solver
-            attempts.append(self._attempt(start, point, first.names, arguments, bounds, solver))
+            attempts.append(self._attempt(start, point, first.names, arguments, bounds, self._short_solver))
             if attempts[-1].is_final or all(attempt.is_broken for attempt in (first, *attempts)):
                 break
             remaining -= attempts[-1].outcome.iterations
@@ -279,9 +275,7 @@ class Prepared:
         sizes = guess.variables.shape, guess.multipliers.shape, set(guess.parameters)
         return sizes == ((self.transcription.size,), (self.transcription.n_rows,), set(self.formulation.parameters))
 
-    def _solve_near(
-        self, guess: Guess, arguments: dict[str, np.ndarray], bounds: Bounds, shift: int
-    ) -> Solution | None:
+    def _nearby(self, guess: Guess, arguments: dict[str, np.ndarray], bounds: Bounds, shift: int) -> Solution | None:
         """Return the plan near the guess, shifted by ``shift`` intervals; None if there is none."""
         form = self.formulation
         if not isinstance(guess, Solution) or not self._is_own_plan(guess) or self.solver_name != "ipopt":
@@ -328,9 +322,7 @@ class Prepared:
         bounds: Bounds,
         solver: tuple[Any, Any] | None = None,
     ) -> Attempt:
-        """Run a solver, by default the own one, once from a start, scaled by the sizes along it; for ``names`` see
-        :func:`sizes_along`.
-        """
+        """Run a solver, by default the own one, from a start, scaled by the sizes along it; see :func:`sizes_along`."""
         arguments = {**limits, "x0": np.clip(point, limits["lbx"], limits["ubx"])}
         p, x0 = arguments["p"], arguments["x0"]
         scales = self._scales(x0, names, bounds, p)

@@ -229,9 +229,7 @@ def sizes_along(pattern: Pattern, point: np.ndarray, intended: Collection[str], 
 
 
 def couplings(pattern: Pattern, point: np.ndarray, p: np.ndarray) -> np.ndarray:
-    """Return the horizon times the largest derivative of each state rate in each other state and control. Shape (nx, nx
-    + nu).
-    """
+    """Return the horizon times the largest derivatives of state rates in other states and controls. (nx, nx + nu)."""
     result = np.zeros((pattern.form.nx, pattern.form.nx + pattern.form.nu))
     slopes = _evaluate(pattern.program.numbers.first, point, p)
     if slopes is not None:
@@ -265,11 +263,8 @@ def compute_scales(pattern: Pattern, sizes: Sizes, point: np.ndarray, p: np.ndar
     # a slope that is large at the start may be small at the optimum: scale it only to the edge of the usual range
     cost = cost / SCALING.usual if cost > SCALING.usual else cost if cost < 1 / SCALING.usual else 1.0
     largest = np.where(largest > SCALING.rounding * largest.max(initial=0.0), largest, 1.0)
-    return Scales(
-        _with_declared_sizes(pattern, _powers(size_of_variable)),
-        _powers(largest[pattern.label]),
-        float(2.0 ** np.round(np.log2(cost))),
-    )
+    variables = _with_declared_sizes(pattern, _powers(size_of_variable))
+    return Scales(variables, _powers(largest[pattern.label]), float(2.0 ** np.round(np.log2(cost))))
 
 
 def scaling_fault(pattern: Pattern, point: np.ndarray, p: np.ndarray, scales: Scales, sizes: Sizes) -> str:

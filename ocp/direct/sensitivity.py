@@ -46,8 +46,7 @@ class SystemSettings:
 
 
 def sensitivity(solution: Solution, name: str) -> Sensitivity:
-    """Return the derivatives of a plan of a direct method in the parameter ``name``; see
-    :meth:`ocp.solution.Solution.sensitivity`.
+    """Return the derivatives of a plan in the parameter ``name``; see :meth:`ocp.solution.Solution.sensitivity`.
 
     Raises:
         ProblemError: An unknown parameter; a plan that is not an optimum of a direct method under the bounds of its
@@ -117,14 +116,16 @@ def sensitivity(solution: Solution, name: str) -> Sensitivity:
                     ends[side, k] = sign * steps[first]
                     limit_names[k][side] = labels[finite[approaching[first]]]
 
+    state_rates = (a[:, None] * dv)[transcription.report_states]
+    input_rates = control_rates(transcription, solution, p, a[:, None] * dv)
     index = transcription.horizon
     by_time = high[form.bounds.places["horizon"][0]] if index is None else dv[index] * a[index]
     return Sensitivity(
         name=name,
         value=value,
         t=solution.t,
-        states=split(form.states, (a[:, None] * dv)[transcription.report_states]),
-        controls=split(form.controls, control_rates(transcription, solution, p, a[:, None] * dv)),
+        states={name: state_rates[:, place] for name, place in form.states.items()},
+        controls={name: input_rates[:, place] for name, place in form.controls.items()},
         horizon=np.asarray(by_time, dtype=float),
         cost=solution.cost_gradients[name],
         lower=value + ends[0],
@@ -202,11 +203,9 @@ def solve_system(
     active_rows = sp.diags_array(weight) @ active_rows
     sides = np.vstack([-(slope + hessian @ dv)[free], weight[:, None] * (at_g - change - at.jacobian @ dv)[held]])
     n, m = len(free), len(held)
-    system = (
-        sp.block_array([[hessian[free][:, free], active_rows.T], [active_rows, None]], format="csc")
-        if m
-        else hessian[free][:, free]
-    )
+    system = hessian[free][:, free]
+    if m:
+        system = sp.block_array([[system, active_rows.T], [active_rows, None]], format="csc")
     softened = system - sp.diags_array(np.concatenate([np.zeros(n), np.full(m, settings.softening * largest)]))
     solve = sla.splu(sp.csc_array(softened))
     solution = solve.solve(sides)
@@ -237,8 +236,3 @@ def control_rates(transcription: Transcription, solution: Solution, p: np.ndarra
         up, down = (controls_at(curve, transcription, interval, place) for curve in curves)
         columns.append((up - down) / (2 * step))
     return np.stack(columns, axis=-1)
-
-
-def split(places: dict[str, slice], values: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the columns of each name."""
-    return {name: values[:, place] for name, place in places.items()}

@@ -183,9 +183,7 @@ def cvodes(form: Formulation, method: MultipleShooting, places: list[float]) -> 
 
 
 def dense_function(form: Formulation, method: MultipleShooting) -> Any:
-    """Return ([x; w], d, T, p) -> values at THIRDS of the cubic Hermite curve through each step of an interval, (nx,
-    .).
-    """
+    """Return ([x; w], d, T, p) -> values at THIRDS of the cubic Hermite curve through each step of an interval."""
     v, d = ca.MX.sym("v", form.nx + n_controls_of(form, method)), ca.MX.sym("d", 2)
     x, w = v[: form.nx], v[form.nx :]
     horizon, p = ca.MX.sym("T"), ca.MX.sym("p", form.np)
