@@ -20,7 +20,7 @@ import numpy as np
 from ocp.audit.costates import Adjoint
 from ocp.audit.linearisation import Limits, Linearisation
 from ocp.audit.principle import slope
-from ocp.audit.sizes import adopt_unit_sizes
+from ocp.audit.sizes import share_sizes
 from ocp.problem.formulation import Formulation
 from ocp.tolerances import FLAT_SHARE, LIMIT_SHARE, MACHINE_SHARE, RESOLVED_SHARE, SOLVER_SHARE
 
@@ -79,7 +79,7 @@ class AccessoryProblem:
         )
         self.range = np.where(curves, np.sqrt(largest / np.where(curves, curvature, 1.0)), sizes.control)
         state = self.along.state_size.copy()
-        adopt_unit_sizes(state, self.along.form.states, self.along.form.problem.declared.states, LIMIT_SHARE)
+        share_sizes(state, self.along.form.states, self.along.form.problem.declared.states, LIMIT_SHARE)
         self.unit = np.concatenate([state, horizon, *([state] if self.with_start else []), self.range])
 
     def _into_z(self) -> tuple[list[int], list[int]]:

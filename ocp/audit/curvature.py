@@ -339,11 +339,9 @@ def _eliminated(
     """Eliminate constraint rows (K, r, nz + m) on nz states and m controls at K stages.
 
     Returns:
-        For each group of L stages with equal ranks: their indices, (L,); states and controls as functions of the states
-            and the
+        For each group of L stages with equal ranks: their indices, (L,); states and controls from the states and the
         free controls, (L, nz + m, nz + f); and the rows (L, r', nz) of the states that contain no control. Control
-        parts below
-        the tolerances are dropped, or the row counts as free of controls.
+        parts below the tolerances are dropped, or the row counts as free of controls.
     """
     size = rows.shape[2]
     lengths = np.linalg.norm(rows, axis=2, keepdims=True)
@@ -360,9 +358,8 @@ def _eliminated(
         turned, of_states = np.swapaxes(left[at], 1, 2), rows[at][:, :, :nz]
         lift = np.zeros((len(at), size, size - rank))
         lift[:, :nz, :nz] = np.eye(nz)
-        lift[:, nz:, :nz] = -np.swapaxes(right[at, :rank], 1, 2) @ (
-            turned[:, :rank] @ of_states / sizes[at, :rank, None]
-        )
+        solved = turned[:, :rank] @ of_states / sizes[at, :rank, None]
+        lift[:, nz:, :nz] = -np.swapaxes(right[at, :rank], 1, 2) @ solved
         lift[:, nz:, nz:] = np.swapaxes(right[at, rank:], 1, 2)
         results.append((at, lift, turned[:, max(rank, visible) :] @ of_states))
     return results

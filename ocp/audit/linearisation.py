@@ -14,7 +14,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ocp.audit.sizes import Sizes, adopt_unit_sizes, nearest_bound
+from ocp.audit.sizes import Sizes, nearest_bound, share_sizes
 from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.values import Sampler
 from ocp.solution import Solution, stack
@@ -228,7 +228,7 @@ class Linearisation:
         form, own = self.form, self.sizes.control
         low, high = (side[form.bounds.places["control"]] for side in self.bounds)
         by_unit = own.copy()
-        adopt_unit_sizes(by_unit, form.controls, form.problem.declared.controls, RESOLVED_SHARE)
+        share_sizes(by_unit, form.controls, form.problem.declared.controls, RESOLVED_SHARE)
         bound = np.minimum(1.0, nearest_bound((low, high)))
         full = np.where(by_unit <= RESOLVED_SHARE * bound, bound, by_unit)
         distance = np.minimum(np.abs(self.u - low), np.abs(self.u - high)).max(axis=0, initial=0.0)

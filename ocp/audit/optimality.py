@@ -159,7 +159,7 @@ class _Multipliers:
 
 
 class _Dual:
-    """The dual program for the multipliers of a plan, with costates times the sizes of their states in units of cost."""
+    """The dual program for the multipliers of a plan; costates times the sizes of their states, in units of cost."""
 
     def __init__(self, along: Linearisation, curved: np.ndarray, cost: float) -> None:
         self.along, self.cost, self.program = along, cost, _Program()
@@ -442,36 +442,13 @@ def _control_curvature(along: Linearisation) -> np.ndarray | None:
 
 def undefined(along: Linearisation, values: Hamiltonian) -> Optimality:
     """Return the result for a plan along which the problem is not finite: it passes no check."""
-    (n, _), m = along.shape, len(along.s)
-    infinite, form = np.full(n, np.inf), along.form
-    ends = Ends(
-        np.inf, np.inf, np.full(form.nx + 1, np.nan), np.inf, np.zeros(len(form.end)), np.zeros(len(form.start))
-    )
-    t = along.mesh * along.solution.horizon
-    shapes = form.nx, along.control_limits_u.shape[1], along.state_limits_x.shape[1]
-    costate, control_multipliers, state_multipliers = (np.full((m, k), np.nan) for k in shapes)
+    (n, _), m, form = along.shape, len(along.s), along.form
+    infinite, t = np.full(n, np.inf), along.mesh * along.solution.horizon
+    rows = np.zeros(len(form.end)), np.zeros(len(form.start))
+    ends = Ends(np.inf, np.inf, np.full(form.nx + 1, np.nan), np.inf, *rows)
+    counts = form.nx, along.control_limits_u.shape[1], along.state_limits_x.shape[1]
+    costate, of_controls, of_states = (np.full((m, count), np.nan) for count in counts)
+    shifts = np.zeros((n + 1, form.nx))
+    known = Adjoint(t, costate, of_controls, of_states, infinite, np.inf, infinite, infinite, shifts, ends)
     curved = Curvature(np.nan, None, "the problem is not a number along the plan", None, along.t)
-    return Optimality(
-        infinite,
-        1.0,
-        1.0,
-        along.t,
-        np.full(m, np.inf),
-        Adjoint(
-            t,
-            costate,
-            control_multipliers,
-            state_multipliers,
-            infinite,
-            np.inf,
-            infinite,
-            infinite,
-            np.zeros((n + 1, form.nx)),
-            ends,
-        ),
-        values,
-        curved,
-        0.0,
-        0.0,
-        False,
-    )
+    return Optimality(infinite, 1.0, 1.0, along.t, np.full(m, np.inf), known, values, curved, 0.0, 0.0, False)

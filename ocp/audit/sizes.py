@@ -24,11 +24,11 @@ from ocp.tolerances import HELD_SHARE, MACHINE_SHARE, ROUNDING_SHARE, SOLVER_SHA
 __all__ = [
     "FineGrid",
     "Sizes",
-    "adopt_unit_sizes",
     "fine_grid",
     "integral",
     "plan_at",
     "row_changes",
+    "share_sizes",
     "sizes",
     "sizes_along",
 ]
@@ -160,9 +160,7 @@ def spaced(grid: FineGrid) -> np.ndarray:
     return np.linspace(0, last, min(N_SAMPLES, last + 1)).astype(int)
 
 
-def adopt_unit_sizes(
-    size: np.ndarray, places: Mapping[str, slice], declared: Mapping[str, Variable], below: float
-) -> None:
+def share_sizes(size: np.ndarray, places: Mapping[str, slice], declared: Mapping[str, Variable], below: float) -> None:
     """Replace sizes that are small beside others of the same unit by the largest of these, in place.
 
     Args:

@@ -72,22 +72,28 @@ def conditions(program: Program, outcome: Outcome, arguments: dict[str, np.ndarr
     return Conditions(sp.csc_array(hessian), sp.csr_array(jacobian), of_bounds, of_rows, held, fixed)
 
 
-def multipliers_of(program: Program, outcome: Outcome, p: np.ndarray, scales: Scales) -> tuple[np.ndarray, np.ndarray]:
-    """Return the multipliers of the variable bounds (n,) and of the rows (m,), in units of the solver."""
-    v, lam = outcome.variables, outcome.multipliers
+def scaled_values(
+    program: Program, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales
+) -> dict[str, tuple[np.ndarray, ...]]:
+    """Return value, lower limit, upper limit and multiplier of variables (x) and rows (g), in units of the solver."""
+    v, lam, p = outcome.variables, outcome.multipliers, arguments["p"]
+    result: dict[str, tuple[np.ndarray, ...]] = {}
     slope, jacobian = program.numbers.first(v, p)
-    return -(slope + jacobian.T @ lam) * scales.variables / scales.cost, lam * scales.rows / scales.cost
+    of_bounds, of_rows = -(slope + jacobian.T @ lam) * scales.variables / scales.cost, lam * scales.rows / scales.cost
+    for kind, value, unit, multiplier in (
+        ("x", v, scales.variables, of_bounds),
+        ("g", outcome.rows, scales.rows, of_rows),
+    ):
+        result[kind] = value / unit, arguments[f"lb{kind}"] / unit, arguments[f"ub{kind}"] / unit, multiplier
+    return result
 
 
 def active_sides(program: Program, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales) -> Sides:
     """Return the active side of each variable (x) and row (g): -1 lower limit, 1 upper limit, 0 none."""
-    multipliers = dict(zip("xg", multipliers_of(program, outcome, arguments["p"], scales), strict=True))
-    values, units = {"x": outcome.variables, "g": outcome.rows}, {"x": scales.variables, "g": scales.rows}
     sides = {}
-    for kind, unit in units.items():
-        low, high = arguments[f"lb{kind}"] / unit, arguments[f"ub{kind}"] / unit
-        active = at_limit(values[kind] / unit, low, high, multipliers[kind])
-        sides[kind] = np.where(active & (low < high), np.sign(multipliers[kind]), 0.0)
+    for kind, (value, low, high, multiplier) in scaled_values(program, outcome, arguments, scales).items():
+        active = at_limit(value, low, high, multiplier)
+        sides[kind] = np.where(active & (low < high), np.sign(multiplier), 0.0)
     return sides
 
 
@@ -99,18 +105,15 @@ def next_active_set(
     The active set is right if it does not change. None if the cost still falls along free directions, as when rounding
     ended the solve too early. Primal-dual active set strategy (Hintermueller, Ito, Kunisch 2002).
     """
-    multipliers = dict(zip("xg", multipliers_of(program, outcome, arguments["p"], scales), strict=True))
-    values, units = {"x": outcome.variables, "g": outcome.rows}, {"x": scales.variables, "g": scales.rows}
+    values = scaled_values(program, outcome, arguments, scales)
     free = (sides["x"] == 0) & (arguments["lbx"] < arguments["ubx"])
-    if not np.all(np.abs(multipliers["x"][free]) <= RESOLVED):  # also for nan
+    if not np.all(np.abs(values["x"][3][free]) <= RESOLVED):  # also for nan
         return None
     result = {}
-    for kind, unit in units.items():
-        value, side = values[kind] / unit, sides[kind]
-        low, high = arguments[f"lb{kind}"] / unit, arguments[f"ub{kind}"] / unit
+    for kind, (value, low, high, multiplier) in values.items():
         slack = tolerance * np.maximum(1.0, np.abs(value))
         # others have the wrong sign or are redundant
-        remaining = np.where(multipliers[kind] * side > SOLVER_RESIDUAL, side, 0.0)
+        remaining = np.where(multiplier * sides[kind] > SOLVER_RESIDUAL, sides[kind], 0.0)
         violated = np.where(low < high, 1.0 * (value > high + slack) - (value < low - slack), 0.0)
         result[kind] = np.where(violated != 0, violated, remaining)
     return result

@@ -21,16 +21,7 @@ from ocp.problem.values import numeric, table
 from ocp.solution import Guess, Solution
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = [
-    "ELASTIC",
-    "GUESS",
-    "STARTS",
-    "Samples",
-    "alternative_starts",
-    "guessed_names",
-    "initial_point",
-    "shifted_indices",
-]
+__all__ = ["STARTS", "Samples", "alternative_starts", "guessed_names", "initial_point", "shifted_indices"]
 
 Trajectory = Callable[[np.ndarray], np.ndarray]  # fractions of the horizon (M,) -> values (M, n)
 
@@ -237,9 +228,6 @@ def default(form: Formulation, role: str, place: slice, bounds: Bounds) -> Traje
     start = np.where(first_fixed, first, np.where(last_fixed, last, centre))
     end = np.where(last_fixed, last, start)
     return lambda s: np.outer(1.0 - s, start) + np.outer(s, end)
-
-
-GUESS, ELASTIC = "guess", "elastic plan"
 
 
 @dataclass(frozen=True)

@@ -183,23 +183,14 @@ def fatrop_functions(program: Program, watch: Watch) -> dict[str, Any]:
     watched = ca.MX(jacobian.sparsity(), jacobian.nz[:] * watch(x))
     lagrangian = sigma * gradient + ca.mtimes(jacobian.T, lam)
     hessian = ca.triu2symm(finite(program.hessian(x, p, sigma, lam)))
+    symbols, names = [x, p, sigma, lam], ["x", "p", "lam_f", "lam_g"]
+    outputs = ["f", "g", "grad_gamma_x", "grad_gamma_p"]
+    values = [*program.values(x, p), lagrangian, ca.MX(n_p, 1)]
     functions = (
         ca.Function("nlp_grad_f", [x, p], [gradient], ["x", "p"], ["grad_f_x"]),
         ca.Function("nlp_jac_g", [x, p], [rows, watched], ["x", "p"], ["g", "jac_g_x"]),
-        ca.Function(
-            "nlp_hess_l",
-            [x, p, sigma, lam],
-            [lagrangian, hessian],
-            ["x", "p", "lam_f", "lam_g"],
-            ["grad_gamma_x", "hess_gamma_x_x"],
-        ),
-        ca.Function(
-            "nlp_grad",  # only its gradient in x is used
-            [x, p, sigma, lam],
-            [*program.values(x, p), lagrangian, ca.MX(n_p, 1)],
-            ["x", "p", "lam_f", "lam_g"],
-            ["f", "g", "grad_gamma_x", "grad_gamma_p"],
-        ),
+        ca.Function("nlp_hess_l", symbols, [lagrangian, hessian], names, ["grad_gamma_x", "hess_gamma_x_x"]),
+        ca.Function("nlp_grad", symbols, values, names, outputs),  # only its gradient in x is used
     )
     return {function.name(): function for function in functions}
 

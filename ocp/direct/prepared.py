@@ -19,7 +19,7 @@ from ocp.direct.active_set import Newton, active_sides
 from ocp.direct.assembly import Program, assemble
 from ocp.direct.controller import block_derivatives, write_controller
 from ocp.direct.diagnosis import Elastic, diagnosis, elastic_plan
-from ocp.direct.guess import ELASTIC, GUESS, STARTS, alternative_starts, guessed_names, initial_point, shifted_indices
+from ocp.direct.guess import STARTS, alternative_starts, guessed_names, initial_point, shifted_indices
 from ocp.direct.mesh import MeshedMethod
 from ocp.direct.nlp import (
     SOLVERS,
@@ -216,7 +216,7 @@ class Prepared:
         if shift and isinstance(guess, Solution):
             point = guess.variables[shifted_indices(transcription, shift)[0]]
         names = guessed_names(form, guess)
-        first = self._attempt(GUESS, point, names, arguments, bounds)
+        first = self._attempt("guess", point, names, arguments, bounds)
         if first.solution is not None and (first.outcome.success or not check):
             return first.solution
         attempts: list[Attempt] = [first, *(self._alternative_attempts(first, arguments, bounds) if check else ())]
@@ -226,7 +226,9 @@ class Prepared:
         remaining = self._max_iterations - sum(attempt.outcome.iterations for attempt in attempts[1:])
         if elastic is not None and check and remaining > 0:
             everything = self._all_names
-            attempts.append(self._attempt(ELASTIC, elastic.plan, everything, arguments, bounds, self._short_solver))
+            attempts.append(
+                self._attempt("elastic plan", elastic.plan, everything, arguments, bounds, self._short_solver)
+            )
             if attempts[-1].plan is not None:
                 return attempts[-1].plan
         decisive = attempts[-1] if attempts[-1].is_final else first
@@ -299,7 +301,7 @@ class Prepared:
                 outcome = self._known.checked(outcome, arguments, scales)
             if outcome is None or not outcome.success:
                 return None
-            return self._solution(outcome, arguments["p"], GUESS)
+            return self._solution(outcome, arguments["p"], "guess")
         except (ProblemError, RuntimeError):  # parameters that this problem rejects; an integrator that fails
             return None
 
@@ -370,16 +372,8 @@ class Prepared:
     def _solution(self, outcome: Outcome, p: np.ndarray, start: str) -> Solution:
         """Return the solution that belongs to an outcome."""
         seconds = {"build": self.seconds, "solve": outcome.seconds}
-        return solution_of(
-            self.formulation,
-            self.transcription,
-            self.program,
-            outcome,
-            p,
-            method=self.method.settings,
-            seconds=seconds,
-            start=start,
-        )
+        fields = {"method": self.method.settings, "seconds": seconds, "start": start}
+        return solution_of(self.formulation, self.transcription, self.program, outcome, p, **fields)
 
 
 @dataclass(frozen=True)

@@ -154,5 +154,5 @@ def test_what_cannot_tell_how_it_moves_is_refused() -> None:
     with pytest.raises(ProblemError, match="sensitivities need a plan of Collocation"):
         solve(energy(), Indirect()).sensitivity("x")
     stopped = solve(van_der_pol(), Collocation(4), options={"max_iter": 1}, check=False)
-    with pytest.raises(ProblemError, match="it is no optimum"):
+    with pytest.raises(ProblemError, match="it is not an optimum"):
         stopped.sensitivity("x")
