@@ -74,9 +74,8 @@ class AccessoryProblem:
         weight = curvature * size**2
         largest = float(weight.max(initial=0.0))
         negligible = size <= RESOLVED_SHARE * size.max(initial=0.0)  # whose size is not meaningful
-        curves = (weight > MACHINE_SHARE * largest) | (
-            negligible & (curvature > MACHINE_SHARE * curvature.max(initial=0.0))
-        )
+        is_curved = curvature > MACHINE_SHARE * curvature.max(initial=0.0)
+        curves = (weight > MACHINE_SHARE * largest) | (negligible & is_curved)
         self.range = np.where(curves, np.sqrt(largest / np.where(curves, curvature, 1.0)), sizes.control)
         state = self.along.state_size.copy()
         share_sizes(state, self.along.form.states, self.along.form.problem.declared.states, LIMIT_SHARE)
@@ -127,9 +126,8 @@ class AccessoryProblem:
     def residual_slope(self) -> np.ndarray:
         """Remaining slope of T H along the controls that curve it, in scaled controls. Shape (M, nu)."""
         along = self.along
-        gradient = slope(along, self.adjoint.costate) + np.einsum(
-            "kmu,km->ku", along.control_limits_u, self.adjoint.control_multipliers
-        )
+        multipliers = self.adjoint.control_multipliers
+        gradient = slope(along, self.adjoint.costate) + np.einsum("kmu,km->ku", along.control_limits_u, multipliers)
         return np.asarray(np.where(self.linear_controls, 0.0, gradient * self.range))
 
     @property

@@ -178,15 +178,12 @@ class _Dual:
         reachable = np.einsum("k,kij,j->i", along.share, np.abs(along.rate_y[:, :, nx + 1 :]), self.step)
         self.end_price = max(1.0, float((reachable / along.state_size).max(initial=0.0)))
         # arcs of the states are among the state limits
-        chosen = along.control_limits.near & (np.arange(along.control_limits_u.shape[1]) < nu + len(along.mixed))
+        controls, states, slopes = along.control_limits, along.state_limits, along.control_limits_u
+        chosen = controls.near & (np.arange(slopes.shape[1]) < nu + len(along.mixed))
         chosen[:, :nu] = True
-        self.control_limits = _Multipliers.of(
-            self.program, along.control_limits, chosen, along.control_limits_u, self.step, along.share
-        )
+        self.control_limits = _Multipliers.of(self.program, controls, chosen, slopes, self.step, along.share)
         scales = np.append(along.state_size, 0.0)
-        self.state_limits = _Multipliers.of(
-            self.program, along.state_limits, along.state_limits.near, along.state_limits_x, scales
-        )
+        self.state_limits = _Multipliers.of(self.program, states, states.near, along.state_limits_x, scales)
         interior = along.node_limits.near & (along.nodal | ~along.node_limits.equal)
         interior[[0, -1]] = False  # the conditions at the ends are separate
         self.node = _Multipliers.of(self.program, along.node_limits, interior, along.node_limits_x, scales)

@@ -332,9 +332,8 @@ def violations(
         at_max = np.argmax(excess, axis=0), np.arange(len(rows))
         # judge a violation by its local rate of change
         if kind != "watch" and np.any(excess[at_max] > SOLVER_SHARE * size[at_max]):
-            change = row_changes(form, kind, (x[at_max[0]], u[at_max[0]], t[at_max[0]]), initial, horizon, p, entries)[
-                1
-            ]
+            samples = x[at_max[0]], u[at_max[0]], t[at_max[0]]
+            _, change = row_changes(form, kind, samples, initial, horizon, p, entries)
             local_size = change.sum(axis=0)[at_max[1], at_max[1]] / LIMIT_SHARE
             size[at_max] = np.clip(local_size, SOLVER_SHARE * size[at_max], size[at_max])
         with np.errstate(divide="ignore"):

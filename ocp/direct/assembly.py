@@ -20,17 +20,7 @@ from ocp.console import check_time
 from ocp.curves import PiecewisePolynomial
 from ocp.problem.values import symbols_of
 
-__all__ = [
-    "SIZES",
-    "Block",
-    "Derivatives",
-    "Interpolants",
-    "Program",
-    "Stages",
-    "Transcription",
-    "assemble",
-    "derivatives",
-]
+__all__ = ["Block", "Derivatives", "Interpolants", "Program", "Stages", "Transcription", "assemble", "derivatives"]
 
 
 @dataclass(frozen=True)

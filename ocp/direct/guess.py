@@ -102,14 +102,12 @@ def shifted_indices(transcription: Transcription, intervals: int) -> tuple[np.nd
     The index itself where the horizon ends earlier.
     """
     step = intervals / (len(transcription.mesh) - 1)
-    meanings = [
-        f"{role} {entry}" for role, entry in zip(transcription.variable_role, transcription.variable_entry, strict=True)
-    ]
+    roles, entries = transcription.variable_role, transcription.variable_entry
+    meanings = [f"{role} {entry}" for role, entry in zip(roles, entries, strict=True)]
+    variables = meanings, transcription.variable_fraction
+    rows = transcription.row_labels, transcription.row_fractions
     indices = []
-    for kinds, fractions in (
-        (meanings, transcription.variable_fraction),
-        (transcription.row_labels, transcription.row_fractions),
-    ):
+    for kinds, fractions in (variables, rows):
         _, label = np.unique(kinds, return_inverse=True)
         order = np.lexsort((fractions, label))
         key = label[order] + fractions[order] / 2  # sorted by meaning, then by time

@@ -225,10 +225,8 @@ class Prepared:
         elastic = None if attempts[-1].is_final else self._elastic(first)
         remaining = self._max_iterations - sum(attempt.outcome.iterations for attempt in attempts[1:])
         if elastic is not None and check and remaining > 0:
-            everything = self._all_names
-            attempts.append(
-                self._attempt("elastic plan", elastic.plan, everything, arguments, bounds, self._short_solver)
-            )
+            start = "elastic plan", elastic.plan, self._all_names
+            attempts.append(self._attempt(*start, arguments, bounds, self._short_solver))
             if attempts[-1].plan is not None:
                 return attempts[-1].plan
         decisive = attempts[-1] if attempts[-1].is_final else first
