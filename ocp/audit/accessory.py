@@ -89,6 +89,7 @@ class AccessoryProblem:
         return [*keep, *inputs], [*range(len(keep)), *range(self.nz, self.nz + self.nu)]
 
     def _second_order(self) -> None:
+        """Set the derivatives of dynamics and Hamiltonian, in scaled variations."""
         along, form, m = self.along, self.along.form, len(self.along.s)
         lam, mu = form.sym("lam", form.nx), form.sym("mu", len(form.path))
         multipliers = np.zeros((m, len(form.path)))
@@ -145,7 +146,9 @@ class AccessoryProblem:
 
     @property
     def cost_scale(self) -> float:
-        """The same, for the states by the running cost alone: multipliers do not belong to the size of the cost."""
+        """Curvature over the sizes by the running cost alone for the states: multipliers do not belong to a size of the
+        cost.
+        """
         sizes, curvature = self.along.sizes, np.abs(self._curves[:, self.nx + 1 :])
         total = self.along.share @ (np.abs(self._cost_curves) @ sizes.state**2 + curvature @ sizes.control**2)
         return float(total) / 2

@@ -140,6 +140,7 @@ class Linearisation:
         self._arcs()
 
     def _differentiate(self) -> None:
+        """Set the derivatives of running cost, dynamics and path rows."""
         form, m = self.form, len(self.s)
         self.y = ca.vertcat(form.x, form.T, form.u)
         self.fraction, *self.scaled = form.kept("over the fraction of the horizon", lambda: over_fraction(form))
@@ -182,6 +183,7 @@ class Linearisation:
         return np.asarray((self.width[:, None] * self.weight).ravel())
 
     def _at_ends(self) -> None:
+        """Set the rows at the ends and the derivatives of these and of the terminal cost."""
         form, solution = self.form, self.solution
         x0, x1 = (solution.state_interpolant(np.array([end]))[0] for end in (0.0, 1.0))
         u0, u1 = stack(solution.controls, 2)[[0, -1]]
@@ -235,6 +237,7 @@ class Linearisation:
         return np.asarray(np.where(distance <= RESOLVED_SHARE * full, full, own))
 
     def _limits(self) -> None:
+        """Set the limits of controls and states at the points and at the ends of the intervals."""
         form, sizes, (n, q) = self.form, self.sizes, self.shape
         nx, nu = form.nx, form.nu
         self.mixed = np.flatnonzero(form.path.uses_control)

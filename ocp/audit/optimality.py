@@ -346,6 +346,7 @@ def optimality(
     solution: Solution,
     p: np.ndarray,
     bounds: Bounds,
+    *,
     along: Linearisation | None = None,
     allowed: float = LIMIT_SHARE,
 ) -> Optimality:
@@ -367,10 +368,10 @@ def optimality(
         candidate, loss = first, _misfit(along, first, curved)
         for _ in range(4):  # each pass resolves atoms at single nodes better by the width of an interval
             candidate = adjoint(along, curved, cost, candidate.node_shifts)
-            loss_found = _misfit(along, candidate, curved)
-            if loss_found >= loss:
+            new_loss = _misfit(along, candidate, curved)
+            if new_loss >= loss:
                 break
-            first, loss = candidate, loss_found
+            first, loss = candidate, new_loss
     accessory = AccessoryProblem(along, first)
     spread = accessory.hamiltonian_scale
     cost = max(abs(solution.cost), LIMIT_SHARE * accessory.cost_scale, LIMIT_SHARE**2 * along.slope_size)
@@ -414,11 +415,13 @@ def _total_loss(by_interval: np.ndarray, multipliers: Adjoint) -> float:
     return float(by_interval.sum() + multipliers.ends.charge)
 
 
-def _misfit(along: Linearisation, found: Adjoint, curved: np.ndarray | None) -> float:
+def _misfit(along: Linearisation, multipliers: Adjoint, curved: np.ndarray | None) -> float:
     """Return the loss and the costate errors of a plan with these multipliers, in units of cost."""
     assert curved is not None
-    loss = control_loss(along, found.costate, found.control_multipliers, curved).sum()
-    return float(loss + found.charge.sum() + found.ends.charge + found.total + found.ends.transversality)
+    loss = control_loss(along, multipliers.costate, multipliers.control_multipliers, curved).sum()
+    return float(
+        loss + multipliers.charge.sum() + multipliers.ends.charge + multipliers.total + multipliers.ends.transversality
+    )
 
 
 def _control_curvature(along: Linearisation) -> np.ndarray | None:

@@ -219,16 +219,16 @@ class Newton:
         return None
 
     def _root(
-        self, start: Outcome, sides: Sides, arguments: dict[str, np.ndarray], scales: Scales, most: int
+        self, start: Outcome, sides: Sides, arguments: dict[str, np.ndarray], scales: Scales, max_steps: int
     ) -> Outcome | None:
-        """Take at most ``most`` Newton steps with a fixed active set; None if they do not converge."""
+        """Take at most ``max_steps`` Newton steps with a fixed active set; None if they do not converge."""
         a, b, c, p = scales.variables, scales.rows, scales.cost, arguments["p"]
         fixed, held = _held(sides, arguments)
         target = np.where(sides["x"] > 0, arguments["ubx"], arguments["lbx"])
         row_target = np.where(sides["g"] > 0, arguments["ubg"], arguments["lbg"])
         v, lam = np.where(fixed, target, start.variables), np.where(held, start.multipliers, 0.0)
         before, is_new, matrix = np.inf, False, None
-        for step in range(most + 1):
+        for step in range(max_steps + 1):
             slope, jacobian = self._program.numbers.first(v, p)
             cost, rows = self._program.numbers.values(v, p)
             along = np.bincount(self._column, jacobian.data * lam[self._row], minlength=len(v))
@@ -244,7 +244,7 @@ class Newton:
             if error <= SETTINGS.tolerance or stalls:
                 status = SolverStatus.SOLVED
                 return Outcome(v, cost, rows, lam, status, str(status), step, 0.0, False, "newton")
-            if step == most or not error < np.inf or (is_new and error > before and step > 1) or reason_to_stop():
+            if step == max_steps or not error < np.inf or (is_new and error > before and step > 1) or reason_to_stop():
                 return None
             is_new = matrix is None or error > SETTINGS.gain * before
             if is_new:
@@ -346,9 +346,9 @@ def _held(sides: Sides, arguments: dict[str, np.ndarray]) -> tuple[np.ndarray, n
     return fixed, held
 
 
-def _same(sides: Sides, others: Sides) -> bool:
+def _same(sides: Sides, other_sides: Sides) -> bool:
     """Return whether two active sets are the same."""
-    return all(np.array_equal(side, others[kind]) for kind, side in sides.items())
+    return all(np.array_equal(side, other_sides[kind]) for kind, side in sides.items())
 
 
 class Bordered:

@@ -144,6 +144,7 @@ class Transcription:
 
     @property
     def n_rows(self) -> int:
+        """Number of rows."""
         return len(self.row_labels)
 
     @property

@@ -285,9 +285,9 @@ def roll_out(form: Formulation, transcription: Transcription, point: np.ndarray,
     rate = form.function("rate", [form.f], ["f"])
     x, d = ca.MX.sym("x", form.nx), ca.MX.sym("d", 3 * form.nu + 2)
 
-    def slope(place: float, state_here: ca.MX) -> ca.MX:
+    def slope(place: float, state_at: ca.MX) -> ca.MX:
         offset = round(2 * place) * form.nu
-        return rate(state_here, d[offset : offset + form.nu], d[-2] + place * d[-1], horizon, p)
+        return rate(state_at, d[offset : offset + form.nu], d[-2] + place * d[-1], horizon, p)
 
     step = ca.Function("step", [x, d], [rk4_step(slope, x, d[-1])])
     start = point[transcription.start]

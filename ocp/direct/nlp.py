@@ -154,8 +154,8 @@ def build_solver(
 
 def iteration_limit(solver: str, options: dict[str, Any]) -> int:
     """Return the iteration limit in a solver's options; 0 if they are invalid."""
-    most = {"max_iter": IPOPT["max_iter"], **DEFAULTS[solver], **options}["max_iter"]
-    return int(most) if isinstance(most, int | float | np.number) else 0
+    limit = {"max_iter": IPOPT["max_iter"], **DEFAULTS[solver], **options}["max_iter"]
+    return int(limit) if isinstance(limit, int | float | np.number) else 0
 
 
 def check_loaded(solver: str) -> None:
