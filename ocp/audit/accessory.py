@@ -40,8 +40,8 @@ class AccessoryProblem:
         normals: Gradients of all limits at the points. Shape (M, l, nz + nu).
         strong: Which of them are equalities or have a multiplier. Shape (M, l), bool.
         weak: Which of them are active without a multiplier. Shape (M, l), bool.
-        node_normals, node_strong: The same for the states at the ends of the intervals. Shapes (N + 1, l', nz), (N + 1,
-            l').
+        node_normals, node_strong: The same for the states at the ends of the intervals.
+            Shapes (N + 1, l', nz), (N + 1, l').
         moved: Whether a control switches in an interval. Shape (N, nu), bool.
         switching: Second variation of shifting that switch, per squared area, unscaled. Shape (N, nu).
         unit: Scales of (z, u) with which the sweep is well conditioned. Shape (nz + nu,).

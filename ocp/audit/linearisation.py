@@ -101,13 +101,13 @@ class Linearisation:
         state_size: Sizes of the states by which costates are judged. Shape (nx,).
         control_size: Sizes of the controls by which distances to their limits are judged. Shape (nu,).
         end_row, end_y: End rows, then start rows, and their derivatives in (x, x0, T). Shapes (m,), (m, 2 nx + 1).
-        final_y, final_yy: First and second derivatives of the terminal cost in these. Shapes (2 nx + 1,), (2 nx + 1, 2
-            nx + 1).
+        final_y, final_yy: First and second derivatives of the terminal cost in these.
+            Shapes (2 nx + 1,), (2 nx + 1, 2 nx + 1).
         control_limits: Limits of the controls, of path rows with a control (``mixed``) and of arcs along state
             equalities, in this order. Shape (M, nu + r + a).
         control_limits_u: Their derivatives in the controls. Shape (M, nu + r + a, nu).
-        state_limits: Limits of the states and of path rows without a control (``still``), in this order. Shape (M, nx +
-            r').
+        state_limits: Limits of the states and of path rows without a control (``still``), in this order.
+            Shape (M, nx + r').
         state_limits_x: Their derivatives in (x, T). Shape (M, nx + r', nx + 1).
         node_limits, node_limits_x: The same at the N + 1 ends of the intervals.
         low, high: Bounds of the controls at the points. Shape (M, nu).

@@ -317,8 +317,8 @@ class Optimality:
             control changes that are resolved.
         error_size: Reference of the costate errors, in units of cost. The cost is quadratic in these errors.
         t: Times of the Gauss points, s. Shape (N q,).
-        stationarity: Largest remaining slope of the Hamiltonian at these, relative to the sizes of its parts. Shape (N
-            q,).
+        stationarity: Largest remaining slope of the Hamiltonian at these, relative to the sizes of its parts.
+            Shape (N q,).
         adjoint: Costates and multipliers.
         hamiltonian: The Hamiltonian along the plan.
         curvature: The second variation.

@@ -1,5 +1,4 @@
-"""Initial points of a solver: guesses of every kind evaluated at the variables of a transcription, and alternative
-starts.
+"""Initial points of a solver: guesses evaluated at the variables of a transcription, and alternative starts.
 
 If the solver fails from the guess, it may start from zeros or from a roll-out of the dynamics.
 """

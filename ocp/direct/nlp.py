@@ -1,5 +1,6 @@
-"""Solver calls: options, progress, interruption and status; and the solution from a solver's result, with costates and
-cost gradients.
+"""Solver calls, and the solution from the result of a solver.
+
+A call handles options, progress, interruption and status. The solution adds curves, costates and cost gradients.
 """
 
 from __future__ import annotations
