@@ -93,8 +93,8 @@ def reintegrate(along: Linearisation, grid: FineGrid) -> Reintegration:
         grid.states,
         cost,
         local_cost,
-        _relative(states - grid.states, sizes.state),
-        _relative(local - grid.states, sizes.state),
+        _worst(np.abs(states - grid.states) / sizes.state),
+        _worst(np.abs(local - grid.states) / sizes.state),
         np.concatenate([[0.0], np.cumsum(_worst(defects))]),
         float(grid.t[np.argmax(failed)]) if failed.any() else None,
     )
@@ -112,11 +112,6 @@ def integrated_motion(along: Linearisation, grid: FineGrid) -> IntegratedMotion:
     motions = (starts, by_interval), (chained, continuous)
     local, states = (np.concatenate([start[:, None], values[:, :, :-1]], axis=1) for start, values in motions)
     return IntegratedMotion(local, states, float(by_interval[:, -1, -1].sum()), float(continuous[-1, -1, -1]))
-
-
-def _relative(difference: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """Return the largest difference of each row (M, n), relative to the sizes (n,). Shape (M,)."""
-    return _worst(np.abs(difference) / sizes)
 
 
 def _worst(values: np.ndarray) -> np.ndarray:

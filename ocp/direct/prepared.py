@@ -230,6 +230,8 @@ class Prepared:
             if attempts[-1].plan is not None:
                 return attempts[-1].plan
         decisive = attempts[-1] if attempts[-1].is_final else first
+        point = decisive.arguments["x0"]
+        sizes = sizes_along(self._pattern, point, decisive.names, bounds, p)
         raise diagnosis(
             self,
             decisive.outcome,
@@ -238,7 +240,7 @@ class Prepared:
             decisive.solution,
             elastic,
             [str(attempt) for attempt in attempts],
-            self._scaling_fault(decisive, bounds),
+            scaling_fault(self._pattern, point, p, decisive.scales, sizes),
         ) from decisive.error
 
     def _alternative_attempts(self, first: Attempt, arguments: dict[str, np.ndarray], bounds: Bounds) -> list[Attempt]:
@@ -355,12 +357,6 @@ class Prepared:
             # its tolerances are absolute: do not enlarge the adjoint variables
             return dataclasses.replace(scales, cost=max(scales.cost, 1.0))
         return scales
-
-    def _scaling_fault(self, attempt: Attempt, bounds: Bounds) -> str:
-        """Return a description of bad scaling for the solver, or ""."""
-        x0, p = attempt.arguments["x0"], attempt.arguments["p"]
-        sizes = sizes_along(self._pattern, x0, attempt.names, bounds, p)
-        return scaling_fault(self._pattern, x0, p, attempt.scales, sizes)
 
     @property
     def _all_names(self) -> set[str]:
