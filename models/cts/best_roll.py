@@ -24,12 +24,14 @@ import casadi as ca
 import numpy as np
 
 from models.arrays import checked_flag, checked_instance
-from models.cts.rig import HOME, Branch, Rig, RigConfiguration, Tunnel, checked_branch, joints_of, posture_at
+from models.cts.rig import HOME, Branch, Rig, RigConfiguration, Tunnel, checked_branch, configuration_at, joints_of
 from models.cts.roll import (
     Candidate,
+    check_constraints,
     checked_gain,
     convex_minima,
     index_harmonics,
+    infeasibility_code,
     inside_limit,
     level_points,
     limit_code,
@@ -37,9 +39,7 @@ from models.cts.roll import (
     sharp_point,
     simple_ends,
     slide_points,
-    unrolled,
-    verdict,
-    why_no_roll,
+    unwrap_roll,
     yaw_chart,
     yaw_levels,
 )
@@ -205,7 +205,7 @@ class Search:
         target, previous = _given(ca.SX)
         f = self._index(target)
         c, s = least_point(f)
-        meets = verdict(self.rig, target, self._posture(target, c, s), c, s)
+        meets = check_constraints(self.rig, target, self._posture(target, c, s), c, s)
         best, seen, _ = self._compare(target, previous, [Candidate(c, s, 0)], NOTHING)
         status = ca.if_else(ca.logic_and(meets.slide(), meets.angles()), 0, 4)
         status = ca.if_else(meets.pitch, ca.if_else(meets.yaw, status, 3), 2)
@@ -397,9 +397,9 @@ class Search:
         for point in points:
             value = f.value(point.c, point.s)
             if self.gain:
-                value += self.gain * (unrolled(self.rig, point.c, point.s, previous) - previous) ** 2
+                value += self.gain * (unwrap_roll(self.rig, point.c, point.s, previous) - previous) ** 2
             posture = self._posture(target, point.c, point.s)
-            meets = verdict(self.rig, target, posture, point.c, point.s)
+            meets = check_constraints(self.rig, target, posture, point.c, point.s)
             relaxed = meets.relaxed()
             better = ca.logic_and(ca.logic_and(relaxed, meets.slide()), value < cost)
             least = ca.fmin(least, value)
@@ -416,7 +416,7 @@ class Search:
         return index_harmonics(self.rig, self.tunnel, target)
 
     def _posture(self, target: Expression, c: Expression, s: Expression) -> RigConfiguration:
-        return posture_at(self.rig, target, c, s, self.branch)
+        return configuration_at(self.rig, target, c, s, self.branch)
 
     # ---- answers ---------------------------------------------------------------------------------------------
 
@@ -430,12 +430,12 @@ class Search:
     def _nowhere(self) -> Any:
         """Function (target) -> answer where no roll will do: without joints, with the status that tells why."""
         target = ca.SX.sym("target", 5)
-        result = Answer(ca.DM.ones(6) * np.nan, np.nan, 0, why_no_roll(self.rig, target, self.branch))
+        result = Answer(ca.DM.ones(6) * np.nan, np.nan, 0, infeasibility_code(self.rig, target, self.branch))
         return ca.Function("nowhere", [target], ca.cse([ca.vertcat(*result)]))
 
     def _answer(self, target: Expression, previous: Expression, best: Best, status: Expression) -> Expression:
         """The Answer with the best roll. Shape (9, 1)."""
-        roll = unrolled(self.rig, best.c, best.s, previous)
+        roll = unwrap_roll(self.rig, best.c, best.s, previous)
         joints = joints_of(self.rig, target, roll, self._posture(target, best.c, best.s))
         spoilt = ca.if_else(ca.SX(status) == 0, 0, np.nan)
         return ca.vertcat(*Answer(joints + spoilt, best.cost + spoilt, best.code, status))

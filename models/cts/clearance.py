@@ -22,8 +22,8 @@ import numpy as np
 
 from models.arrays import checked_count, checked_each, checked_instance, checked_nonnegative, checked_number
 from models.cts.best_roll import optimal_inverse
-from models.cts.rig import HOME, INCH, Branch, Rig, Tunnel, checked_branch, dh_frames, joints_of, posture_at
-from models.cts.roll import ACTIVE, STATUS, checked_gain, index_harmonics, unrolled, verdict
+from models.cts.rig import HOME, INCH, Branch, Rig, Tunnel, checked_branch, configuration_at, dh_frames, joints_of
+from models.cts.roll import ACTIVE, STATUS, check_constraints, checked_gain, index_harmonics, unwrap_roll
 from models.errors import ModelError
 from models.robot.kinematics import checked_vector
 from models.shapes.distance import soft_minimum
@@ -222,7 +222,7 @@ def clearances(
     return found
 
 
-def nearness(gap: Expression, weight: float, width: float) -> Expression:
+def proximity_cost(gap: Expression, weight: float, width: float) -> Expression:
     """Term of the index that grows as the rig comes near: weight exp(-gap / width), gap and width in m.
 
     Raises:
@@ -241,7 +241,7 @@ def checked_clearance(clearance: float) -> float:
     return clearance
 
 
-def clear_inverse(
+def collision_free_inverse(
     rig: Rig,
     tunnel: Tunnel,
     scene: CollisionScene,
@@ -281,13 +281,13 @@ def clear_inverse(
     checked_count(samples, "rig", "samples", 8)
     target, previous, angle = ca.SX.sym("target", 5), ca.SX.sym("previous"), ca.SX.sym("angle")
     c, s = ca.cos(angle), ca.sin(angle)
-    posture = posture_at(rig, target, c, s, branch)
-    roll = unrolled(rig, c, s, previous)
+    posture = configuration_at(rig, target, c, s, branch)
+    roll = unwrap_roll(rig, c, s, previous)
     joints = joints_of(rig, target, roll, posture)
     gap = soft_minimum(list(clearances(rig, joints, scene, radii).values()), softness)
     cost = index_harmonics(rig, tunnel, target).value(c, s) + gain * (roll - previous) ** 2
-    cost += nearness(gap, weight, width)
-    meets = verdict(rig, target, posture, c, s)
+    cost += proximity_cost(gap, weight, width)
+    meets = check_constraints(rig, target, posture, c, s)
     held = ca.logic_and(meets.relaxed(), meets.slide())
     fine = ca.logic_and(held, gap >= clearance)
     given = [target, previous, angle]
@@ -314,7 +314,7 @@ def clear_inverse(
     active = ca.if_else(distance - clearance < SEARCH.at_limit, ACTIVE.index("clearance"), active)
     outputs = [q + spoilt, least + spoilt, active, status, distance + spoilt]
     labels = ["target", "previous"], ["joints", "cost", "active", "status", "gap"]
-    return ca.Function("clear_inverse", [x, before], outputs, *labels)
+    return ca.Function("collision_free_inverse", [x, before], outputs, *labels)
 
 
 def _starts(samples: int) -> tuple[list[Any], list[Any]]:

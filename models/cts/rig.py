@@ -261,7 +261,7 @@ def corner_circle(rig: Rig, target: Expression) -> tuple[Expression, Expression,
     return axle, ca.vertcat(c_yaw * s_pitch, s_yaw * s_pitch, c_pitch), ca.vertcat(s_yaw, -c_yaw, zero)
 
 
-def posture_at(rig: Rig, target: Expression, c: Expression, s: Expression, branch: Branch) -> RigConfiguration:
+def configuration_at(rig: Rig, target: Expression, c: Expression, s: Expression, branch: Branch) -> RigConfiguration:
     """Joint angles but for their arcs, for a roll given by its cosine and sine: (23), (25), (27)."""
     corner = corner_at(rig, target, c, s)
     c_yaw, s_yaw = ca.cos(target[3]), ca.sin(target[3])
@@ -288,7 +288,7 @@ def inverse(rig: Rig, target: Expression, roll: Expression, branch: Branch = HOM
         q3, q5 make up the yaw and pitch of the target, unless limits ask for another turn.
     """
     target, roll = expression(target), expression(roll)
-    posture = posture_at(rig, target, ca.cos(roll), ca.sin(roll), branch)
+    posture = configuration_at(rig, target, ca.cos(roll), ca.sin(roll), branch)
     return joints_of(rig, target, roll, posture), reach_of(posture)
 
 

@@ -24,10 +24,10 @@ from models.cts.rig import (
     Rig,
     RigConfiguration,
     Tunnel,
+    configuration_at,
     corner_circle,
     in_nearest_turn,
     in_turn_after,
-    posture_at,
 )
 from models.cts.trigonometric import (
     Harmonics,
@@ -134,7 +134,7 @@ def index_harmonics(rig: Rig, tunnel: Tunnel, target: Expression) -> Harmonics:
     )
 
 
-def verdict(rig: Rig, target: Expression, posture: RigConfiguration, c: Expression, s: Expression) -> Verdict:
+def check_constraints(rig: Rig, target: Expression, posture: RigConfiguration, c: Expression, s: Expression) -> Verdict:
     """Whether a posture is within reach and limits. Angles are compared by their cosine from the middle."""
     p = posture
     pair3 = _difference(ca.sin(target[3]), -ca.cos(target[3]), p.sin2, p.cos2)  # yaw - pi/2 - q2
@@ -150,7 +150,7 @@ def verdict(rig: Rig, target: Expression, posture: RigConfiguration, c: Expressi
     return Verdict(ca.fabs(p.sin4) <= 1, ca.fabs(p.cos2) <= 1, angles[True], angles[False], *slide)
 
 
-def why_no_roll(rig: Rig, target: Expression, branch: Branch) -> Expression:
+def infeasibility_code(rig: Rig, target: Expression, branch: Branch) -> Expression:
     """Code in STATUS of a target that no roll holds: which link does not reach, or else that limits are in the way."""
     rig = rig.unlimited()
     axle, e_c, _ = corner_circle(rig, target)
@@ -159,7 +159,9 @@ def why_no_roll(rig: Rig, target: Expression, branch: Branch) -> Expression:
     points += [(end.c, end.s) for end in angle_ends(rig, target, branch)]
     yaw: Expression = 0
     for c, s in points:
-        yaw = ca.logic_or(yaw, verdict(rig, target, posture_at(rig, target, c, s, branch), c, s).relaxed())
+        yaw = ca.logic_or(
+            yaw, check_constraints(rig, target, configuration_at(rig, target, c, s, branch), c, s).relaxed()
+        )
     return ca.if_else(pitch, ca.if_else(yaw, 4, 3), 2)
 
 
@@ -279,7 +281,7 @@ def _allows(rig: Rig, joint: int, angle: float) -> bool:
 def yaw_chart(rig: Rig, branch: Branch) -> Any:
     """Function (target, cosine, sine of roll) -> cos q2, its derivative by roll, q1, its derivative, cos q4."""
     t, c, s = ca.SX.sym("target", 5), ca.SX.sym("c"), ca.SX.sym("s")
-    posture = posture_at(rig, t, c, s, branch)
+    posture = configuration_at(rig, t, c, s, branch)
     values = ca.vertcat(posture.cos2, posture.q1)
     slope = ca.jacobian(values, c) * -s + ca.jacobian(values, s) * c
     return ca.Function("chart", [t, c, s], [values[0], slope[0], values[1], slope[1], posture.cos4])
@@ -364,7 +366,7 @@ def checked_gain(rate_weight: float) -> float:
     return checked_nonnegative(rate_weight, "rig", "rate_weight") / FULL_TURN
 
 
-def unrolled(rig: Rig, c: Expression, s: Expression, previous: Expression) -> Expression:
+def unwrap_roll(rig: Rig, c: Expression, s: Expression, previous: Expression) -> Expression:
     """Roll of a point of the circle in the turn that is nearest to the previous roll, or in that of the limits."""
     angle = ca.atan2(s, c)
     if rig.limited(6):

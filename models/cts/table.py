@@ -30,7 +30,7 @@ from models.arrays import (
     warn_of_degrees,
 )
 from models.cts.best_roll import optimal_inverse
-from models.cts.clearance import CollisionScene, clear_inverse
+from models.cts.clearance import CollisionScene, collision_free_inverse
 from models.cts.rig import (
     BRANCHES,
     HOME,
@@ -38,12 +38,12 @@ from models.cts.rig import (
     Rig,
     Tunnel,
     checked_branch,
+    configuration_at,
     forward,
     goose_neck_corner,
     inverse,
-    posture_at,
 )
-from models.cts.roll import ACTIVE, STATUS, angle_ends, limit_code, slide_ends, verdict
+from models.cts.roll import ACTIVE, STATUS, angle_ends, check_constraints, limit_code, slide_ends
 from models.errors import ModelError
 from models.spatial import FULL_TURN
 
@@ -119,7 +119,7 @@ def solve_table(
     else:
         asked: dict[str, Any] = {"clearance": clearance, "weight": clearance_weight, "width": clearance_width}
         asked["rate_weight"] = rate_weight
-        functions = [clear_inverse(rig, tunnel, scene, branch, **asked) for branch in chosen]
+        functions = [collision_free_inverse(rig, tunnel, scene, branch, **asked) for branch in chosen]
     if in_sequence:
         roll, steps = float(before[0]), []
         for row in rows:
@@ -215,7 +215,7 @@ def roll_interval_functions(rig: Rig, branch: Branch = HOME) -> tuple[Any, Any]:
             parts.append(ca.vertcat(found, ca.DM.ones(1, 8) * limit_code(1, upper)))
     ends = ca.Function("arc_ends", [x], [ca.horzcat(*parts)], ["target"], ["points"])
     c, s = ca.cos(roll), ca.sin(roll)
-    meets = verdict(rig, target, posture_at(rig, target, c, s, branch), c, s)
+    meets = check_constraints(rig, target, configuration_at(rig, target, c, s, branch), c, s)
     inside = ca.logic_and(meets.relaxed(), meets.slide())
     return ends, ca.Function("feasible", [target, roll], [inside], ["target", "roll"], ["feasible"])
 

@@ -35,11 +35,11 @@ __all__ = [
     "PAPER_SHAPE",
     "BlendKind",
     "best_shape",
-    "by_arc_length",
     "checked_shape",
     "corner_shape",
     "cubic",
     "curvature",
+    "derivatives_by_arc_length",
     "end_curvature",
     "gamma",
     "middle_curvature",
@@ -205,7 +205,7 @@ def curvature(coefficients: Array, u: Array) -> Array:
     return np.asarray(bend / np.linalg.norm(first, axis=-1) ** 3)
 
 
-def by_arc_length(coefficients: Array, u: Array) -> tuple[Array, Array, Array, Array]:
+def derivatives_by_arc_length(coefficients: Array, u: Array) -> tuple[Array, Array, Array, Array]:
     """Position and derivatives by the distance from derivatives by u: the chain rule with d/ds = (1/|F'|) d/du."""
     position, first, second, third = (polynomial(coefficients, u, order) for order in range(4))
     rate = np.linalg.norm(first, axis=-1, keepdims=True)

@@ -31,7 +31,7 @@ from models.errors import ModelError
 from models.paths.orientation import product, rotation_matrix, rotation_vector, unit_quaternion
 from models.paths.segments import Arc, Helix, Line, Segment, screw
 
-__all__ = ["Path", "Reversal", "chains"]
+__all__ = ["Path", "Reversal", "split_at_reversals"]
 
 SMALLEST_ANGLE = 1e-6
 """Interior angle (rad) below which a corner counts as a reversal: its blend would bend with 4e12 / remaining."""
@@ -229,7 +229,9 @@ Reversal: TypeAlias = Literal["split"] | float
 """What becomes of a reversal: the path ends there, or turns round in a bulb of some width, m."""
 
 
-def chains(segments: Sequence[Segment], reversal: Reversal = "split") -> tuple[tuple[Path, NDArray[np.intp]], ...]:
+def split_at_reversals(
+    segments: Sequence[Segment], reversal: Reversal = "split"
+) -> tuple[tuple[Path, NDArray[np.intp]], ...]:
     """Paths of segments that follow each other, which may turn back.
 
     Args:

@@ -13,17 +13,17 @@ from numpy.typing import NDArray
 from models.arrays import Array, ArrayInput, checked_array, checked_count, one_for_each
 from models.errors import ModelError
 from models.paths.arc_length import Cells, parameter
-from models.paths.blends import BlendKind, by_arc_length, curvature, quintic
+from models.paths.blends import BlendKind, curvature, derivatives_by_arc_length, quintic
 from models.paths.orientation import along_piece
 from models.paths.path import Path
 
-__all__ = ["Blend", "Place", "SmoothPath", "Turn"]
+__all__ = ["Blend", "PathPoint", "SmoothPath", "Turn"]
 
 SAMPLES_AT_ONCE = 50_000
 """Samples handled at once, so that memory does not grow with them."""
 
 
-class Place(NamedTuple):
+class PathPoint(NamedTuple):
     """Where a path is at M distances, and its derivatives by the distance.
 
     Attributes:
@@ -146,13 +146,13 @@ class SmoothPath:
             self.coefficients[vertex],
         )
 
-    def at(self, distance: ArrayInput) -> Place:
+    def at(self, distance: ArrayInput) -> PathPoint:
         """Position, tangent, curvature and its derivative at distances from the start. Shape (M,), m.
 
         Raises:
             ModelError: nan, or a distance off the path by more than rounding.
         """
-        return Place(*_in_parts(self._at, self.checked_distance(distance), (3, 3, 3, 3)))
+        return PathPoint(*_in_parts(self._at, self.checked_distance(distance), (3, 3, 3, 3)))
 
     def curvature(self, distance: ArrayInput) -> Array:
         """Curvature at distances from the start. Shape (M,), 1/m."""
@@ -176,7 +176,7 @@ class SmoothPath:
         u[curved] = _in_parts(lambda at: (self._parameter(at)[1][:, None],), s[curved], (1,))[0][:, 0]
         return u
 
-    def dense(self, per_cell: int = 16, per_segment: int = 2) -> Array:
+    def sample_distances(self, per_cell: int = 16, per_segment: int = 2) -> Array:
         """Distances that resolve every piece: evenly in each cell of a blend and in each part of a segment.
 
         Shape (M,), m.
@@ -245,7 +245,7 @@ class SmoothPath:
         curved = np.flatnonzero(self.piece_blend[piece] >= 0)
         if curved.size:
             curve, u = self._parameter(s[curved])
-            for result, value in zip(results, by_arc_length(self.coefficients[curve], u), strict=True):
+            for result, value in zip(results, derivatives_by_arc_length(self.coefficients[curve], u), strict=True):
                 result[curved] = value
         return results
 
@@ -273,7 +273,7 @@ class SmoothPath:
         parts = np.flatnonzero(self.piece_segment >= 0)
         result[parts] = self._on_segment(self.piece_segment[parts], u * self.piece_lengths[parts])[2]
         blends = np.flatnonzero(self.piece_blend >= 0)
-        result[blends] = by_arc_length(self.coefficients, np.full(len(blends), u))[2]
+        result[blends] = derivatives_by_arc_length(self.coefficients, np.full(len(blends), u))[2]
         return result
 
     @cached_property

@@ -80,7 +80,7 @@ class Body:
         object.__setattr__(self, "overhang", checked_nonnegative(self.overhang, owner, "overhang", "m"))
 
 
-def bodies_of(
+def collision_bodies(
     robot: Robot,
     *,
     folders: Folders = (),
@@ -106,10 +106,10 @@ def bodies_of(
     Warns:
         ModelWarning: Meshes that are skipped, each with its link and why.
     """
-    checked_instance(robot, Robot, "bodies_of", "robot")
-    checked_choice(missing, get_args(MissingRule), "bodies_of", "missing")
+    checked_instance(robot, Robot, "collision_bodies", "robot")
+    checked_choice(missing, get_args(MissingRule), "collision_bodies", "missing")
     if isinstance(folders, str | os.PathLike) or not isinstance(folders, Sequence):
-        message = f"bodies_of: folders must be a list of paths, not {folders!r}"
+        message = f"collision_bodies: folders must be a list of paths, not {folders!r}"
         raise ModelError(message, name="folders", value=folders)
     find_mesh("", None, folders)  # says which of them is no path
     found: list[Body] = []
@@ -252,7 +252,7 @@ class RigidParts:
             up, down = up[:-1], down[:-1]
         return up, down[::-1]
 
-    def meeting(self, one: str, other: str) -> str:
+    def common_part(self, one: str, other: str) -> str:
         """The last part that carries both."""
         up = self.path(one, other)[0]
         return up[-1].above if up else one
@@ -265,7 +265,7 @@ class RigidParts:
             part = found[-1].above
         return found
 
-    def close(self, bodied: set[str]) -> set[frozenset[str]]:
+    def adjacent(self, bodied: set[str]) -> set[frozenset[str]]:
         """Parts with bodies that a joint connects, or a chain of joints with no body in between."""
         next_to: dict[str, set[str]] = defaultdict(set)
         for part, step in self.step.items():
@@ -286,7 +286,7 @@ class RigidParts:
         return found
 
 
-def arms(
+def lever_arms(
     robot: Robot, chain: Sequence[tuple[Step, bool]], end: Shape, low: Array, high: Array
 ) -> tuple[list[float], float]:
     """How far points of a body at the end of a chain are from each joint's axis at most, and from where it begins.
@@ -309,8 +309,8 @@ def arms(
         if k == len(chain) - 1:
             along = (end.core - origin) @ axis
             squares = ((end.core - origin) ** 2).sum(axis=1)
-            found.append(float(np.sqrt(np.maximum(squares - along**2, 0)).max()) + end.swelling)
-            reach = float(np.sqrt(squares).max()) + end.swelling
+            found.append(float(np.sqrt(np.maximum(squares - along**2, 0)).max()) + end.swept_radius)
+            reach = float(np.sqrt(squares).max()) + end.swept_radius
         else:
             following, going_down = chain[k + 1]
             hop = (following.shift if going_down else np.zeros(3)) - origin

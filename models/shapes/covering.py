@@ -101,12 +101,12 @@ def cover(vertices: ArrayInput, faces: ArrayInput) -> tuple[Cover, ...]:
     key = key_of(version_of(__name__), "cover", triangles)
     known = _read(kept(key), triangles.reshape(-1, 3))
     if known is None:
-        known = fitted(triangles)
+        known = fit_cover(triangles)
         keep(key, [_written(each) for each in known])
     return known
 
 
-def fitted(triangles: Array) -> tuple[Cover, ...]:
+def fit_cover(triangles: Array) -> tuple[Cover, ...]:
     """The cover of triangles, shape (m, 3, 3), m, whether it is kept or not."""
     middle, size = _middle(triangles.reshape(-1, 3))
     unit = (triangles - middle) / size
@@ -127,7 +127,7 @@ def fitted(triangles: Array) -> tuple[Cover, ...]:
             break
         others = [capsules[:k] + capsules[k + 1 :] for k in range(len(parts))]
         found = [_best_cut(part, others[k], capsules[k], grid) for k, part in enumerate(parts)]
-        least, k = min((cut[0], k) for k, cut in enumerate(found))
+        least, k = min((split_triangles[0], k) for k, split_triangles in enumerate(found))
         if not np.isfinite(least):
             break
         _, parts[k : k + 1], capsules[k : k + 1] = found[k]
@@ -138,7 +138,7 @@ def fitted(triangles: Array) -> tuple[Cover, ...]:
     return tuple(Cover(_scaled(each, middle, size), size * _overhang(each, hull)) for each in shapes)
 
 
-def inside(shape: Covering, points: Array) -> Array:
+def exceedance(shape: Covering, points: Array) -> Array:
     """By how much points lie outside of a capsule or box: zero or below for those inside. Shape (n,), m."""
     if isinstance(shape, Capsule):
         return np.asarray(_to_segment(points, np.asarray(shape.start), np.asarray(shape.end)) - shape.radius)
@@ -266,13 +266,13 @@ def _best_cut(
         axes.append(along)
     bases = _bases(np.concatenate([frame.T, _sphere(SETTINGS.directions // 2, half=True) @ frame.T]))
     sifted = _sifted(part, frame)
-    free = grid[np.min([inside(each, grid) for each in others], axis=0) > 0] if others else grid
+    free = grid[np.min([exceedance(each, grid) for each in others], axis=0) > 0] if others else grid
 
     def covered(fits: list[Capsule]) -> float:
         return 1 - (1 - _covered(fits, free)) * len(free) / len(grid)
 
     def tried(k: int, level: float) -> float:
-        sides = [_points(side) for side in cut(sifted, axes[k], level) if len(side)]
+        sides = [_points(side) for side in split_triangles(sifted, axes[k], level) if len(side)]
         if len(sides) < 2:
             return np.inf
         return covered([_quick_capsule(side[_farthest(side, frame)], bases) for side in sides])
@@ -283,7 +283,7 @@ def _best_cut(
     for share in (SETTINGS.cuts[0] / 2, SETTINGS.cuts[0] / 4):
         step = share * spans[k][1]
         _, level = min((tried(k, each), each) for each in (level - step, level, level + step))
-    sides = [side for side in cut(part, axes[k], level) if len(side)]
+    sides = [side for side in split_triangles(part, axes[k], level) if len(side)]
     if len(sides) < 2:
         return np.inf, [part], [capsule]
     fits = [_capsule(_points(side)) for side in sides]
@@ -308,7 +308,7 @@ def _covered(shapes: Sequence[Covering], grid: Array) -> float:
     """Share of the points of a grid that some shape holds."""
     if not len(grid):
         return 0.0
-    return float((np.min([inside(each, grid) for each in shapes], axis=0) <= 0).sum() / len(grid))
+    return float((np.min([exceedance(each, grid) for each in shapes], axis=0) <= 0).sum() / len(grid))
 
 
 def _sifted(triangles: Array, frame: Array) -> Array:
@@ -321,7 +321,7 @@ def _sifted(triangles: Array, frame: Array) -> Array:
     return np.concatenate([largest, np.repeat(points[_farthest(points, frame)][:, None], 3, axis=1)])
 
 
-def cut(triangles: Array, axis: Array, level: float) -> tuple[Array, Array]:
+def split_triangles(triangles: Array, axis: Array, level: float) -> tuple[Array, Array]:
     """Triangles cut by the plane axis x = level: what lies below and what above. Shapes (m, 3, 3)."""
     heights = triangles @ axis - level
     below = heights <= 0
@@ -382,7 +382,7 @@ def _box(points: Array, outermost: Array) -> Box:
 def _grown_box(box: Box, points: Array) -> Box:
     """The box with edges that every point is proven to lie in, and a little more."""
     return Box(
-        box.size + 2 * max(0.0, float(inside(box, points).max())) + 2 * SETTINGS.growth, box.position, box.rotation
+        box.size + 2 * max(0.0, float(exceedance(box, points).max())) + 2 * SETTINGS.growth, box.position, box.rotation
     )
 
 
@@ -486,5 +486,5 @@ def _read(value: Any, points: Array) -> tuple[Cover, ...] | None:
             found.append(Cover(Capsule(**own) if "radius" in own else Box(**own), float(each["overhang"])))
     except (AttributeError, KeyError, TypeError, ValueError):  # a ModelError is a ValueError
         return None
-    held = np.min([inside(each.shape, points) for each in found], axis=0) <= 0
+    held = np.min([exceedance(each.shape, points) for each in found], axis=0) <= 0
     return tuple(found) if held.all() else None

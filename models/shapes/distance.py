@@ -268,7 +268,7 @@ def _checked_simple(kind: Any, what: str) -> None:
 def _of_columns(kinds: tuple[Any, Any], entries: Sequence[Sequence[Expression]], rounding: float, hold: Hold) -> Any:
     """Signed distance of two shapes of these kinds, written as columns, entry by entry."""
     one, other = map(_core_of, kinds, entries)
-    swelling = sum(own[-1] for kind, own in zip(kinds, entries, strict=True) if kind in (Sphere, Capsule))
+    swept_radius = sum(own[-1] for kind, own in zip(kinds, entries, strict=True) if kind in (Sphere, Capsule))
     if isinstance(one, Plane):
         gap = _lowest(other, one.normal, one.point, rounding)
     elif isinstance(other, Plane):
@@ -280,7 +280,7 @@ def _of_columns(kinds: tuple[Any, Any], entries: Sequence[Sequence[Expression]],
         assert isinstance(core, Rod | Block)
         assert isinstance(block, Block)
         gap = beside_block(core, block, rounding, hold)
-    return gap - swelling
+    return gap - swept_radius
 
 
 @on_scalars
@@ -293,7 +293,7 @@ def _with_hulls(*places: Expression, one: Shape, other: Shape, rounding: float) 
         gap = _lowest(first, second.normal, second.point, rounding)
     else:
         gap = highest([*_gaps(first, second, rounding), *_gaps(second, first, rounding)], rounding, free)
-    return gap - (one.swelling + other.swelling)
+    return gap - (one.swept_radius + other.swept_radius)
 
 
 def _core(shape: Shape, turn: Expression, place: Expression) -> Core:

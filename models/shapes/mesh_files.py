@@ -54,15 +54,15 @@ class Triangles(NamedTuple):
     colors: Array
 
 
-def bare(vertices: Array, faces: Faces) -> Triangles:
+def without_colors(vertices: Array, faces: Faces) -> Triangles:
     """Triangles without colours."""
     return Triangles(vertices, faces, np.full((len(faces), 4), np.nan))
 
 
-def together(parts: Sequence[Triangles]) -> Triangles:
+def join_meshes(parts: Sequence[Triangles]) -> Triangles:
     """All parts as one mesh."""
     if not parts:
-        return bare(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.intp))
+        return without_colors(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.intp))
     offsets = np.cumsum([0, *(len(part.vertices) for part in parts)])
     faces = [part.faces + offset for part, offset in zip(parts, offsets, strict=False)]
     colors = [part.colors for part in parts]
@@ -259,7 +259,7 @@ def _read_stl_text(file: Path, data: bytes) -> Triangles:
 def _joined(corners: Array) -> Triangles:
     """Corners of triangles, three rows each, with those at the same place made one."""
     vertices, faces = np.unique(corners, axis=0, return_inverse=True)
-    return bare(vertices, faces.reshape(-1, 3).astype(np.intp))
+    return without_colors(vertices, faces.reshape(-1, 3).astype(np.intp))
 
 
 # ------------------------------------------------------------------------------------------------------------- OBJ
@@ -379,7 +379,7 @@ def read_collada(file: Path, data: bytes) -> Triangles:
         raise
     except Exception as error:  # whatever pycollada stumbles over
         raise wrong(file, f"it is no Collada that can be read: {error}", type(error).__name__) from error
-    return together(parts)
+    return join_meshes(parts)
 
 
 def _plain(file: Path, data: bytes) -> tuple[ElementTree.Element, float]:

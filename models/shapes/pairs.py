@@ -26,7 +26,7 @@ from models.cache import keep, kept, key_of, version_of
 from models.errors import ModelError, ModelWarning
 from models.robot.robot import Robot
 from models.robot.urdf import parsed, text_of
-from models.shapes.bodies import Body, RigidParts, Step, arms
+from models.shapes.bodies import Body, RigidParts, Step, lever_arms
 from models.shapes.hull import gap_along, nearest_directions
 from models.shapes.shapes import Box, Shape
 
@@ -34,18 +34,18 @@ from models.shapes.shapes import Box, Shape
 class Reason(StrEnum):
     """Why a pair of bodies is not checked."""
 
-    NEIGHBOURS = "neighbours"
-    RIGID = "one rigid part"
-    ALWAYS = "always touch"
-    COVERED = "always touch, perhaps only in their covers"
+    NEIGHBOURS = "adjacent links"
+    RIGID = "same rigid part"
+    ALWAYS = "always in collision"
+    COVERED = "always in collision, perhaps only in their covers"
     """In some posture bodies overlap by no more than their covers stand out of what they cover: this may be apart."""
-    NEVER = "never touch"
+    NEVER = "never in collision"
     SRDF = "the SRDF file"
-    TOLD = "told"
-    STILL = "neither moves"
+    IGNORED = "ignored by request"
+    IMMOBILE = "neither moves"
 
 
-NEIGHBOURS, RIGID, ALWAYS, COVERED, NEVER, SRDF, TOLD, STILL = Reason
+NEIGHBOURS, RIGID, ALWAYS, COVERED, NEVER, SRDF, IGNORED, IMMOBILE = Reason
 ASSUMED = (ALWAYS, COVERED)
 """Reasons that no proof stands behind: bodies touch in each of many configurations."""
 SURE = 1e-6
@@ -109,7 +109,7 @@ def checked_pairs(
     is checked.
 
     Args:
-        bodies: As `bodies_of` makes them.
+        bodies: As `collision_bodies` makes them.
         ignored: Pairs of links that are not checked.
         srdf: An SRDF file, as path or text, whose <disable_collisions> are not checked.
         lower, upper: Limits of the joint vector, rad or m; a number or shape (dof,); the robot's own if None.
@@ -139,13 +139,13 @@ def checked_pairs(
     near = checked_nonnegative(clearance, owner, "clearance", "m") + SURE
     rng = np.random.default_rng(checked_count(seed, owner, "seed", least=0, most=2**63))
     named = dict.fromkeys([] if srdf is None else _disabled(robot, srdf), SRDF)
-    named |= dict.fromkeys(map(frozenset, _named(robot, ignored)), TOLD)
+    named |= dict.fromkeys(map(frozenset, _named(robot, ignored)), IGNORED)
 
     key = _key(robot, bodies, low, high, named, near, count, seed)
     if (known := _read(kept(key), bodies)) is not None:
         return known
     parts = RigidParts.of(robot)
-    close = parts.close({parts.of_link[body.link] for body in bodies})
+    close = parts.adjacent({parts.of_link[body.link] for body in bodies})
     motions = _Motions(robot, parts, low, high, _postures(robot, low, high, count, rng), near)
     checked: list[tuple[int, int]] = []
     left: dict[tuple[str, str], Reason] = {}
@@ -189,7 +189,7 @@ def _key(
         words.append(f"{body.link} {type(body.shape).__name__}")
         parts += [
             body.shape.core,
-            body.shape.swelling,
+            body.shape.swept_radius,
             body.overhang,
             np.zeros(0) if body.mesh is None else body.mesh.points,
         ]
@@ -366,7 +366,7 @@ class _Between:
         core, points = (np.repeat(p, 2, axis=0) if len(p) == 1 else p for p in (self.one.core, self.other.core))
         here, there = np.broadcast_to(core, (len(turn), *core.shape)), points @ turn.transpose(0, 2, 1) + shift[:, None]
         along = nearest_directions(here, there, (isinstance(self.one, Box), isinstance(self.other, Box)))[0]
-        return gap_along(along, here, there) - (self.one.swelling + self.other.swelling)
+        return gap_along(along, here, there) - (self.one.swept_radius + self.other.swept_radius)
 
     def _relative(self, q: Array) -> tuple[Array, Array]:
         """Frame of the other's rigid part in the one's. Shapes (k, 3, 3) and (k, 3)."""
@@ -430,9 +430,9 @@ class _Between:
     def _levers(self, low: Array, high: Array) -> list[_Lever]:
         """Of the joints between the bodies, in order, each the shorter of the arms of the two sides."""
         chain = [*((step, False) for step in self.up), *((step, True) for step in self.down)]
-        ahead, _ = arms(self.robot, chain, self.other, low, high)
+        ahead, _ = lever_arms(self.robot, chain, self.other, low, high)
         back = [(step, not down) for step, down in chain[::-1]]
-        behind = arms(self.robot, back, self.one, low, high)[0][::-1]
+        behind = lever_arms(self.robot, back, self.one, low, high)[0][::-1]
         found = []
         for (step, _), one, other in zip(chain, ahead, behind, strict=True):
             column, ratio, _ = self.robot.drives[step.joint.name]

@@ -60,7 +60,7 @@ class Sphere:
         return np.array([self.position])
 
     @property
-    def swelling(self) -> float:
+    def swept_radius(self) -> float:
         """How far the shape goes beyond its core, m."""
         return self.radius
 
@@ -103,7 +103,7 @@ class Capsule:
         return np.array([self.start, self.end])
 
     @property
-    def swelling(self) -> float:
+    def swept_radius(self) -> float:
         """How far the shape goes beyond its core, m."""
         return self.radius
 
@@ -160,7 +160,7 @@ class Cylinder:
         return convex_hull(np.vstack([np.hstack([around, -half]), np.hstack([around, half])]))
 
     @property
-    def swelling(self) -> float:
+    def swept_radius(self) -> float:
         """How far the shape goes beyond its core: nowhere."""
         return 0.0
 
@@ -211,7 +211,7 @@ class Box:
         return np.asarray(self.position + (CORNERS * size / 2) @ self.rotation.T)
 
     @property
-    def swelling(self) -> float:
+    def swept_radius(self) -> float:
         """How far the shape goes beyond its core: nowhere."""
         return 0.0
 
@@ -254,7 +254,7 @@ class HalfSpace:
         return np.array([self.point])
 
     @property
-    def swelling(self) -> float:
+    def swept_radius(self) -> float:
         """Zero: what is solid is said by the normal."""
         return 0.0
 
@@ -341,7 +341,7 @@ class Mesh:
         return np.asarray(self.position + self.hull.vertices @ self.rotation.T)
 
     @property
-    def swelling(self) -> float:
+    def swept_radius(self) -> float:
         """How far the shape goes beyond its core: nowhere."""
         return 0.0
 
@@ -385,4 +385,4 @@ def _motion(rotation: ArrayInput, translation: ArrayInput) -> tuple[Array, Array
 
 def _reach(shape: Sphere | Capsule | Cylinder | Box | Mesh, point: ArrayInput) -> float:
     centre = checked_array(point, (3,), "shape", "point")
-    return float(np.linalg.norm(shape.core - centre, axis=1).max()) + shape.swelling
+    return float(np.linalg.norm(shape.core - centre, axis=1).max()) + shape.swept_radius

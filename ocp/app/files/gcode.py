@@ -16,7 +16,7 @@ import numpy as np
 
 from models import Line, ModelError, ModelWarning
 from models.arrays import Array, ArrayInput, checked_array
-from models.paths import Segment, chains
+from models.paths import Segment, split_at_reversals
 from models.paths.path import Reversal
 from models.paths.segments import SHORTEST_SEGMENT
 from ocp.app.files.lines import FileName, read_lines, wrong_line
@@ -416,6 +416,6 @@ class _Reader:
         self.moved = True
         segments, feeds, tolerances, lines = zip(*self.moves, strict=True)
         self.moves = []
-        for path, index in chains(segments, self.reversal):
+        for path, index in split_at_reversals(segments, self.reversal):
             made = Cut(path, np.array(feeds)[index], np.array(tolerances)[index], np.array(lines)[index])
             self.stretches.append(made)

@@ -111,7 +111,7 @@ def test_distances_are_those_of_the_hulls(name: str) -> None:
         for i, (one, other, _) in enumerate(around.pairs):
             a, c = sides[2 * i][None], sides[2 * i + 1][None]
             shapes = around.bodies[one].shape, around.bodies[other].shape
-            radii = shapes[0].swelling + shapes[1].swelling
+            radii = shapes[0].swept_radius + shapes[1].swept_radius
             way = -shapes[1].normal[None] if isinstance(shapes[1], HalfSpace) else nearest_directions(a, c)[0]
             gap = gap_along(way, a, c)[0]
             if any(isinstance(shape, Cylinder) for shape in shapes):  # of which the distance is a bound from below
@@ -191,7 +191,7 @@ def test_which_pairs_are_left() -> None:
     machine = FixedBase(armoured_arm())
     around = CollisionScene(machine, OBSTACLES, ignored=[("link6", "obstacle 1"), ("link2", "link4")])
     assert around.left["base", "obstacle 0"] == "neither moves"
-    assert around.left["link6", "obstacle 1"] == "told"
+    assert around.left["link6", "obstacle 1"] == "ignored by request"
     assert not {("link6", "obstacle 1"), ("link2", "link4"), ("base", "obstacle 3")} & set(around.labels)
     assert ("link6", "obstacle 0") in around.labels
     moving = CollisionScene(machine, [MovingObstacle(OBSTACLES[0], lambda t: (t, 0, 0))])

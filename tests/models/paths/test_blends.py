@@ -107,7 +107,7 @@ def test_a_step_towards_an_arc_length_cubes_the_error(
     path, found = corner(degrees, 0.3, kind, shape), list[Any]()
     for steps in (0, 1, 4):
         monkeypatch.setattr("models.paths.arc_length.MOST_STEPS", steps)
-        found.append(path.parameter(path.dense(40)))
+        found.append(path.parameter(path.sample_distances(40)))
     before, after = (np.nanmax(np.abs(each - found[2])) for each in found[:2])
     assert 1e-4 < before < 1e-2
     assert after < before**2.5
@@ -121,7 +121,7 @@ few = settings(max_examples=40)
 def test_the_curvature_is_that_of_the_place(seed: int) -> None:
     rng = np.random.default_rng(seed)
     path = smooth(random_path(rng, 5, arcs=0.3, helices=0.3), 0.02)
-    s = np.concatenate([path.dense(), path.bounds])
+    s = np.concatenate([path.sample_distances(), path.bounds])
     np.testing.assert_allclose(path.curvature(s), np.linalg.norm(path.at(s).curvature, axis=1), rtol=1e-12, atol=1e-9)
 
 
@@ -166,7 +166,7 @@ def test_random_paths_are_continuous_as_promised(seed: int, count: int, kind: An
     at = smoothed.bounds[1:-1]
     step = 1e-12 * smoothed.length
     before, after = smoothed.at(at - step), smoothed.at(at + step)
-    bend = smoothed.curvature(smoothed.dense()).max()
+    bend = smoothed.curvature(smoothed.sample_distances()).max()
     assert np.abs(after.position - before.position).max() < 4 * step
     assert np.abs(after.tangent - before.tangent).max() < 1e-12 + 4 * step * bend
     if kind == "quintic":
@@ -234,7 +234,7 @@ def test_corners_in_parts_are_rounded_as_all_at_once(monkeypatch: pytest.MonkeyP
 def test_a_vertex_without_a_corner_stays_straight() -> None:
     smoothed = smooth(Path.through([(0, 0, 0), (1, 0, 0), (3, 0, 0)]), deviation=1e-3)
     assert smoothed.length == pytest.approx(3, abs=1e-14)
-    assert smoothed.curvature(smoothed.dense()).max() < 1e-12
+    assert smoothed.curvature(smoothed.sample_distances()).max() < 1e-12
 
 
 CORNER = Path.through([(0, 0, 0), (1, 0, 0), (1, 1, 0)])

@@ -133,8 +133,10 @@ def test_a_collada_scene_places_its_meshes_and_knows_its_unit(tmp_path: Path) ->
 def test_parts_side_by_side_keep_their_triangles() -> None:
     """Of different sizes, and one of none."""
     rng = np.random.default_rng(1)
-    parts = [mesh_files.bare(rng.normal(size=(n, 3)), rng.integers(0, max(n, 1), (n, 3))) for n in (3, 0, 5, 2)]
-    whole = mesh_files.together(parts)
+    parts = [
+        mesh_files.without_colors(rng.normal(size=(n, 3)), rng.integers(0, max(n, 1), (n, 3))) for n in (3, 0, 5, 2)
+    ]
+    whole = mesh_files.join_meshes(parts)
     wanted = np.concatenate([part.vertices[part.faces].reshape(-1, 3) for part in parts])
     np.testing.assert_array_equal(whole.vertices[whole.faces].reshape(-1, 3), wanted)
     assert whole.faces.min() >= 0

@@ -14,17 +14,17 @@ import pytest
 
 from models import CollisionShape, Frame, Joint, Link, Mimic, ModelError, ModelWarning, Robot, link_frames, renamed
 from models.arrays import Array
-from models.shapes.bodies import Body, LinkMesh, RigidParts, bodies_of
+from models.shapes.bodies import Body, LinkMesh, RigidParts, collision_bodies
 from models.shapes.distance import distance
 from models.shapes.pairs import (
     ALWAYS,
     ASSUMED,
     COVERED,
+    IGNORED,
     NEIGHBOURS,
     NEVER,
     RIGID,
     SRDF,
-    TOLD,
     Pairs,
     _Between,
     _postures,
@@ -344,7 +344,7 @@ def test_an_srdf_file_and_the_user_leave_pairs_out(tmp_path: Path) -> None:
             pairs = checked_pairs(robot, bodies, srdf=source, ignored=[("link3", "link0")])
         assert pairs.checked == ((1, 3),)
         assert pairs.left["link0", "link2"] == SRDF
-        assert pairs.left["link0", "link3"] == TOLD
+        assert pairs.left["link0", "link3"] == IGNORED
 
 
 def test_names_and_the_order_of_declaration_do_not_matter() -> None:
@@ -377,7 +377,7 @@ def test_a_follower_counts_as_it_moves() -> None:
 def test_the_benchmark_of_redundant_arms(name: str) -> None:
     """Capsules and pairs as given: distances at random postures as an own formula and coal have them."""
     robot, ignored = redundancy_benchmark.robot_of(name), redundancy_benchmark.ignored_pairs(name)
-    bodies = bodies_of(robot)
+    bodies = collision_bodies(robot)
     pairs = checked_pairs(robot, bodies, ignored=ignored)
     for pair in ignored:
         assert frozenset(pair) not in by_links(bodies, pairs)
@@ -454,7 +454,7 @@ def test_arms_are_free_at_home(name: str) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ModelWarning)
         robot = Robot.from_urdf(urdf_file(package, ending), **options)
-    bodies = bodies_of(robot)
+    bodies = collision_bodies(robot)
     pairs = checked_pairs(robot, bodies)
     assert not {ALWAYS, COVERED} & set(pairs.left.values())
     frames = link_frames(robot, [HOME[name].get(joint, 0.0) for joint in robot.joint_names])
@@ -503,7 +503,7 @@ def test_collision_shapes_become_checked_bodies() -> None:
         Joint(f"joint{k}", "revolute", f"link{k - 1}", f"link{k}", (0.12, 0, 0), lower=-3, upper=3) for k in (1, 2)
     )
     robot = Robot(links, joints)
-    assert checked_pairs(robot, bodies_of(robot)).checked == ((0, 2),)
+    assert checked_pairs(robot, collision_bodies(robot)).checked == ((0, 2),)
 
 
 def far_meshes(gap: float) -> tuple[Robot, tuple[Body, ...]]:
