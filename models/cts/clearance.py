@@ -281,14 +281,14 @@ def collision_free_inverse(
     checked_count(samples, "rig", "samples", 8)
     target, previous, angle = ca.SX.sym("target", 5), ca.SX.sym("previous"), ca.SX.sym("angle")
     c, s = ca.cos(angle), ca.sin(angle)
-    posture = configuration_at(rig, target, c, s, branch)
+    configuration = configuration_at(rig, target, c, s, branch)
     roll = unwrap_roll(rig, c, s, previous)
-    joints = joints_of(rig, target, roll, posture)
+    joints = joints_of(rig, target, roll, configuration)
     gap = soft_minimum(list(clearances(rig, joints, scene, radii).values()), softness)
     cost = index_harmonics(rig, tunnel, target).value(c, s) + gain * (roll - previous) ** 2
     cost += proximity_cost(gap, weight, width)
-    meets = check_constraints(rig, target, posture, c, s)
-    held = ca.logic_and(meets.relaxed(), meets.slide())
+    meets = check_constraints(rig, target, configuration, c, s)
+    held = ca.logic_and(meets.all_but_slide(), meets.slide())
     fine = ca.logic_and(held, gap >= clearance)
     given = [target, previous, angle]
     value = ca.Function("value", given, ca.cse([ca.if_else(fine, cost, ca.inf)]))

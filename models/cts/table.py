@@ -43,7 +43,7 @@ from models.cts.rig import (
     goose_neck_corner,
     inverse,
 )
-from models.cts.roll import ACTIVE, STATUS, angle_ends, check_constraints, limit_code, slide_ends
+from models.cts.roll import ACTIVE, STATUS, arc_ends, check_constraints, limit_code, slide_ends
 from models.errors import ModelError
 from models.spatial import FULL_TURN
 
@@ -206,7 +206,7 @@ def reachable_rolls(rig: Rig, target: ArrayInput, branch: Branch = HOME) -> list
 def roll_interval_functions(rig: Rig, branch: Branch = HOME) -> tuple[Any, Any]:
     """Functions (target) -> points that hold all ends of arcs, rows cosine, sine, code; (target, roll) -> 1 or 0."""
     target, roll = ca.SX.sym("target", 5), ca.SX.sym("roll")
-    angle = ca.horzcat(*[ca.vertcat(*candidate) for candidate in angle_ends(rig, target, branch)])
+    angle = ca.horzcat(*[ca.vertcat(*candidate) for candidate in arc_ends(rig, target, branch)])
     x = ca.MX.sym("target", 5)
     parts = [ca.Function("angle_ends", [target], [angle])(x)]
     for upper in (False, True):
@@ -216,7 +216,7 @@ def roll_interval_functions(rig: Rig, branch: Branch = HOME) -> tuple[Any, Any]:
     ends = ca.Function("arc_ends", [x], [ca.horzcat(*parts)], ["target"], ["points"])
     c, s = ca.cos(roll), ca.sin(roll)
     meets = check_constraints(rig, target, configuration_at(rig, target, c, s, branch), c, s)
-    inside = ca.logic_and(meets.relaxed(), meets.slide())
+    inside = ca.logic_and(meets.all_but_slide(), meets.slide())
     return ends, ca.Function("feasible", [target, roll], [inside], ["target", "roll"], ["feasible"])
 
 

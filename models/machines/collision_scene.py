@@ -367,7 +367,7 @@ class CollisionScene:
         endless = np.full(robot.dof, np.inf)
         low, high = (robot.lower, robot.upper) if self.limits else (-endless, endless)
         own, reach = lever_arms(
-            robot, [(step, True) for step in way], placed.shape.placed(*parts.place[link]), low, high
+            robot, [(step, True) for step in way], placed.shape.placed(*parts.pose[link]), low, high
         )
         for (joint, *_), arm in zip(way, own, strict=True):
             column, ratio, _ = robot.drives[joint.name]

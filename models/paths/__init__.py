@@ -1,4 +1,4 @@
-"""Task paths: lines, arcs and helices with tool orientation, rounded at their corners, as functions of the distance."""
+"""Task paths of lines, arcs and helices with tool orientation and rounded corners, as functions of the distance."""
 
 from models.paths.blends import end_curvature, gamma, middle_curvature, peak_curvature, rest_to_rest
 from models.paths.functions import gauss_newton, march, path_function, predictor_corrector, turn_function

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from models import ModelError, reference_rig, reference_tunnel
-from models.cts.roll import checked_gain, convex_minima, descend, roll_window, unwrap_roll
+from models.cts.roll import checked_gain, convex_minima, minimize_convex, roll_window, unwrap_roll
 from models.cts.trigonometric import Harmonics
 from tests.models.cts.cts_oracle import index_by_geometry, random_targets
 
@@ -63,7 +63,7 @@ def test_the_window_is_a_turn_within_the_limits(previous: float) -> None:
 def test_descent_ends_where_the_slope_vanishes(gain: float) -> None:
     """Of cos(x) + gain (x - 1)^2, convex for gain > 1 / 2."""
     f = Harmonics(0.0, 1.0, 0.0, 0.0, 0.0)
-    x = float(ca.DM(descend(f, gain, ca.DM(1.0), ca.DM(-3.0), ca.DM(5.0), ca.DM(1.0), 20)))
+    x = float(ca.DM(minimize_convex(f, gain, ca.DM(1.0), ca.DM(-3.0), ca.DM(5.0), ca.DM(1.0), 20)))
     assert -np.sin(x) + 2 * gain * (x - 1) == pytest.approx(0, abs=1e-12)
 
 

@@ -106,7 +106,7 @@ def test_a_step_towards_an_arc_length_cubes_the_error(
 ) -> None:
     path, found = corner(degrees, 0.3, kind, shape), list[Any]()
     for steps in (0, 1, 4):
-        monkeypatch.setattr("models.paths.arc_length.MOST_STEPS", steps)
+        monkeypatch.setattr("models.paths.arc_length.MAX_STEPS", steps)
         found.append(path.parameter(path.sample_distances(40)))
     before, after = (np.nanmax(np.abs(each - found[2])) for each in found[:2])
     assert 1e-4 < before < 1e-2
@@ -202,7 +202,7 @@ def test_blends_that_overlap_are_shrunk_to_meet_or_refused() -> None:
     points = [(0, 0, 0), (1, 0, 0), (1, 0.3, 0), (2, 0.3, 0)]
     smoothed = smooth(Path.through(points), 0.2)
     assert smoothed.remaining == pytest.approx([0.15, 0.15], rel=1e-15)
-    with pytest.warns(ModelWarning, match=r"smaller than asked at vertices 1, 2; at vertex 1 0\.15 of 0\.2 m") as said:
+    with pytest.warns(ModelWarning, match=r"than requested at vertices 1, 2; at vertex 1 0\.15 of 0\.2 m") as said:
         smooth(Path.through(points), 0.2)
     assert [(each.message.name, each.message.value) for each in said] == [("vertex 1", (1, 2))]  # type: ignore[union-attr]
     with pytest.warns(ModelWarning, match=r"at vertices 3, 4; at vertex 3 0.025 of 0.03 m") as said:
@@ -275,7 +275,7 @@ def test_distances_off_the_path_are_a_named_error() -> None:
     smoothed = smooth(Path((Line((0, 0, 0), (1, 0, 0)), Arc.through((1, 0, 0), (1, 1, 0), (0, 2, 0)))), 0.1)
     for wrong in (-0.1, smoothed.length + 0.1, float("nan")):
         for ask in (smoothed.at, smoothed.turn, smoothed.parameter, smoothed.curvature):
-            with pytest.raises(ModelError, match="off the path"):
+            with pytest.raises(ModelError, match="outside the path"):
                 ask(wrong)
     with pytest.raises(ModelError, match="vertex 1"):
         smoothed.blend(1)

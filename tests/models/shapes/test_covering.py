@@ -204,7 +204,7 @@ def test_large_meshes_are_covered_too() -> None:
 
 
 def same(one: tuple[Cover, ...], other: tuple[Cover, ...]) -> bool:
-    return [covering._written(each) for each in one] == [covering._written(each) for each in other]
+    return [covering._to_json(each) for each in one] == [covering._to_json(each) for each in other]
 
 
 def test_what_is_kept_is_what_was_fitted(own_cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -212,7 +212,7 @@ def test_what_is_kept_is_what_was_fitted(own_cache: Path, monkeypatch: pytest.Mo
     first = cover(vertices, faces)
     assert len(list(own_cache.iterdir())) == 1
     assert same(first, fit_cover(vertices[faces]))
-    monkeypatch.setattr(covering, "fitted", lambda triangles: pytest.fail("fitted again"))
+    monkeypatch.setattr(covering, "fit_cover", lambda triangles: pytest.fail("fitted again"))
     assert same(cover(vertices, faces), first)
     assert same(cover(vertices.tolist(), faces.tolist()), first)
 
@@ -228,7 +228,7 @@ def covers_of_plate() -> tuple[Cover, ...]:
 )
 def test_a_broken_cache_is_no_error(own_cache: Path, contents: str, monkeypatch: pytest.MonkeyPatch) -> None:
     vertices, faces = plate()
-    monkeypatch.setattr(covering, "fitted", lambda triangles: covers_of_plate())
+    monkeypatch.setattr(covering, "fit_cover", lambda triangles: covers_of_plate())
     first = cover(vertices, faces)
     (file,) = own_cache.iterdir()
     file.write_text(contents, encoding="utf-8")

@@ -169,9 +169,9 @@ DOUBLING = (
     + "<node id='n40'><instance_geometry url='#g'/></node>"
 )
 BROKEN: list[tuple[str, str | bytes, str]] = [
-    ("a.stl", b"", "cut off"),
+    ("a.stl", b"", "complete binary"),
     ("a.stl", b"\0" * 84, "no triangle"),
-    ("a.stl", binary_stl(CORNERS, FACES)[:-1], "cut off"),
+    ("a.stl", binary_stl(CORNERS, FACES)[:-1], "complete binary"),
     ("a.stl", b" " * 80 + struct.pack("<I", 2**32 - 1), "4294967295"),
     ("a.stl", binary_stl(np.full((4, 3), np.nan), FACES), "not finite"),
     ("a.stl", "solid\nendsolid\n", "no triangle"),
@@ -214,8 +214,8 @@ BROKEN: list[tuple[str, str | bytes, str]] = [
     ("a.dae", dae(ONE).replace("stride='3'", "stride='3' offset='1'"), "offset 1"),
     ("a.dae", dae(ONE).replace("0.3", "nan"), "not finite"),
     ("a.dae", dae("<node><rotate>0 0 0 90</rotate></node>"), "no direction"),
-    ("a.dae", dae(ONE, faces=f"<triangles>{INPUT}<p>0 1 2</p><p>1 2 3</p></triangles>"), "not read"),
-    ("a.dae", dae(ONE, faces=f"<polygons>{INPUT}<ph><p>0 1 2</p></ph></polygons>"), "not read"),
+    ("a.dae", dae(ONE, faces=f"<triangles>{INPUT}<p>0 1 2</p><p>1 2 3</p></triangles>"), "not supported"),
+    ("a.dae", dae(ONE, faces=f"<polygons>{INPUT}<ph><p>0 1 2</p></ph></polygons>"), "not supported"),
     ("a.dae", dae(ONE, faces=f"<polylist>{INPUT}<vcount>2000000000</vcount><p>0 1 2</p></polylist>"), "<vcount>"),
     ("a.dae", dae("<node><instance_controller url='#g'/></node>"), "#g not found"),
     ("a.dae", b"PK\3\4" + bytes(30), "well-formed"),

@@ -26,8 +26,8 @@ from models.shapes.pairs import (
     RIGID,
     SRDF,
     Pairs,
-    _Between,
-    _postures,
+    _BodyPair,
+    _random_configurations,
     checked_pairs,
 )
 from models.shapes.shapes import Box, Capsule, Shape, Sphere
@@ -146,10 +146,10 @@ def test_bodies_are_where_the_kinematics_have_them(seed: int) -> None:
     known = gaps(robot, bodies, every, 10)
     for (i, j), row in zip(every, known, strict=True):
         one, other = bodies[i].shape, bodies[j].shape
-        between = _Between(robot, one, other, *parts.path(bodies[i].link, bodies[j].link))
+        between = _BodyPair(robot, one, other, *parts.path(bodies[i].link, bodies[j].link))
         turn, shift = between._relative(postures)
         np.testing.assert_allclose(exact_distances(one, other, turn, shift), row, atol=1e-9)
-        assert (between.gaps(postures)[0] <= row + 1e-9).all()
+        assert (between.bounds(postures)[0] <= row + 1e-9).all()
 
 
 def test_of_several_bodies_the_reason_that_matters_most_is_told() -> None:
@@ -227,7 +227,7 @@ def test_a_mesh_on_a_link_that_is_fixed_lies_where_it_is_fixed(shift: tuple[floa
 
 def bound(one: Shape, other: Shape, turn: Array, shift: Array) -> Array:
     """Distances as the proof has them."""
-    return _Between(chain(0.1)[0], one, other, [], []).below(turn, shift)
+    return _BodyPair(chain(0.1)[0], one, other, [], []).distance_bounds(turn, shift)
 
 
 def exact_distances(one: Shape, other: Shape, turn: Array, shift: Array) -> Array:
@@ -280,7 +280,7 @@ def test_random_postures_fill_the_limits_or_a_turn_or_a_metre_either_way() -> No
         joints.append(Joint(f"joint{k}", kind, f"link{k}", f"link{k + 1}"))
         links.append(Link(f"link{k + 1}"))
     low, high = np.tile(np.array(ends).T, 2)
-    found = _postures(Robot(tuple(links), tuple(joints)), low, high, 4000, np.random.default_rng(1))
+    found = _random_configurations(Robot(tuple(links), tuple(joints)), low, high, 4000, np.random.default_rng(1))
     for first, room in ((0, np.pi), (4, 1.0)):
         spans = [(-0.3, 0.4), (1.0, 1.0 + 2 * room), (1.0 - 2 * room, 1.0), (-room, room)]
         for k, (least, most) in enumerate(spans):

@@ -131,7 +131,7 @@ CASES = [
     method(waypoints, "path", {}, reversal=WIDTH),
     method(waypoints, "smooth", {}, tolerance=POSITIVE | NOTHING, reversal=WIDTH, kind=CHOICE),
     Case(
-        "chains",
+        "split_at_reversals",
         split_at_reversals,
         {"segments": path().segments},
         {"segments": SEQUENCE | {"none": ()}, "reversal": WIDTH | NOTHING},
