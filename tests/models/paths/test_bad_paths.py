@@ -139,7 +139,7 @@ CASES = [
     ),
     *[method(rounded, name, {"distance": 0.1}, distance=DISTANCE) for name in ("at", "curvature", "turn", "parameter")],
     method(rounded, "blend", {"vertex": 0}, vertex=WHOLE | NOTHING | {"high": 9}),
-    method(rounded, "dense", {"per_cell": 4}, per_cell=COUNT | NOTHING, per_segment=COUNT | NOTHING),
+    method(rounded, "sample_distances", {"per_cell": 4}, per_cell=COUNT | NOTHING, per_segment=COUNT | NOTHING),
     method(
         rounded, "by_piece", {"of_segments": 1.0}, of_segments=but(FINITE, "inf", "minus inf") | {"three": [1, 2, 3]}
     ),
