@@ -241,7 +241,7 @@ def all_joint_sets(rig: Rig, target: ArrayInput, roll: float) -> list[tuple[Bran
 
 
 def checked_targets(targets: ArrayInput, finite: bool = True) -> Array:
-    """Return at least one target (x, y, z, yaw, pitch), shape (samples, 5); raise a ModelError for the first wrong row."""
+    """Return targets (x, y, z, yaw, pitch), shape (samples, 5); raise a ModelError for the first wrong row."""
     rows = checked_array(targets, ("samples", 5), "table", "targets", finite=finite, nan=not finite)
     warn_of_degrees(rows[:, 3:], "table", "targets", "yaw or pitch")
     return rows
