@@ -95,7 +95,7 @@ class Evaluation(NamedTuple):
 
 
 class LevelBound(NamedTuple):
-    """An `ArcEndLevel` with a lower bound of the cost of rolls on it; `side` as in ApproximateRoll."""
+    """An `ArcEndLevel` with a lower bound of the cost of rolls on it; `side` as in RoughRoll."""
 
     bound: Expression
     cosine: Expression
@@ -186,7 +186,7 @@ def _build_inverse(rig: Rig, tunnel: Tunnel, branch: Branch, gain: float, limits
 class Search:
     """The steps of the search as casadi Functions.
 
-    Their argument `best` is an Incumbent, `seen` a row of EvaluatedRoll, `rough` a row of ApproximateRoll.
+    Their argument `best` is an Incumbent, `seen` a row of Evaluation, `rough` a row of RoughRoll.
 
     Attributes:
         gain: w4 / (2 pi) of I2; 0 for I1.
@@ -243,7 +243,7 @@ class Search:
         chart = yaw_chart(self.rig, self.branch)
         if not self.gain:
             rough = self._rough_stationary()(target)
-            best = self._sharpen_in_turn(self._sharpen_point(self._stationary), 4)(target, previous, rough, best)
+            best = self._improve(self._stationary, 4)(target, previous, rough, best)
             points = [Evaluation(point.bound, point.value) for point in unstack(RoughRoll, rough)]
             known.append(stack(Evaluation, points))
         seen = ca.horzcat(*known)
@@ -290,21 +290,19 @@ class Search:
         searched if one violates a limit of joint 1 alone, since its arc may end before that limit is satisfied.
         """
         target, _ = _inputs(ca.SX)
-        rolls, suspect = (
-            ca.SX.sym("seen", len(Evaluation._fields), count),
-            ca.SX.sym("suspect", len(LevelBound._fields)),
-        )
-        suspects, (_, slack) = [], self._slack()
+        rolls = ca.SX.sym("seen", len(Evaluation._fields), count)
+        levels, (_, slack) = [], self._slack()
         for level in yaw_levels(self.rig, target, self.branch):
             bound = ca.SX(ca.inf)
             for roll in unstack(Evaluation, rolls):
                 over = roll.cos2 - level.cosine if level.above else level.cosine - roll.cos2
                 bound = ca.fmin(bound, ca.if_else(over < slack, roll.cost, ca.inf))
             bound = ca.if_else(level.relevant, bound, ca.inf)
-            suspects.append(LevelBound(bound, level.cosine, level.code, level.relevant, 1 if level.above else -1))
-        needed = ca.Function("levels", [target, rolls], ca.cse([stack(LevelBound, suspects)]))
+            levels.append(LevelBound(bound, level.cosine, level.code, level.relevant, 1 if level.above else -1))
+        needed = ca.Function("levels", [target, rolls], ca.cse([stack(LevelBound, levels)]))
 
-        (_, cosine, code, _, side), rough = _record(LevelBound, suspect), self._approximation(target)
+        suspect, rough = ca.SX.sym("suspect", len(LevelBound._fields)), self._approximation(target)
+        _, cosine, code, _, side = _record(LevelBound, suspect)
         ends = level_points(self.rig, target, cosine)
         points = [rough(c, s, cosine, code, side, about=(cosine, slack)) for c, s in ends]
         near_level = ca.Function("rough", [target, suspect], ca.cse([stack(RoughRoll, points)]))
@@ -314,22 +312,18 @@ class Search:
 
         x, before = _inputs(ca.MX)
         first, column = ca.MX.sym("best", INCUMBENT_SIZE), ca.MX.sym("suspect", len(LevelBound._fields))
-        answer = self._sharpen_in_turn(self._sharpen_point(polished), len(points))(
-            x, before, near_level(x, column), first
-        )
+        answer = self._improve(polished, len(points))(x, before, near_level(x, column), first)
         search_level = evaluate_unless(ca.Function("level", [x, before, column, first], [answer]))
         seen = ca.MX.sym("seen", *rolls.shape)
         best = first
         for level in ca.horzsplit(needed(x, seen)):
-            best = search_level(
-                _record(LevelBound, level).bound >= _record(Incumbent, best).cost, best, x, before, level, best
-            )
+            settled = _record(LevelBound, level).bound >= _record(Incumbent, best).cost
+            best = search_level(settled, best, x, before, level, best)
         if np.isfinite([self.rig.limit(1, False), self.rig.limit(1, True)]).any():
             for level in ca.horzsplit(needed(x, seen)):
                 incumbent, relevant = _record(Incumbent, best), _record(LevelBound, level).relevant
-                settled = ca.logic_or(
-                    ca.fmin(incumbent.below, incumbent.above) >= incumbent.cost, ca.logic_not(relevant)
-                )
+                cannot_improve = ca.fmin(incumbent.below, incumbent.above) >= incumbent.cost
+                settled = ca.logic_or(cannot_improve, ca.logic_not(relevant))
                 best = search_level(settled, best, x, before, level, best)
         return ca.Function("levels", [x, before, seen, first], [best])
 
@@ -346,9 +340,8 @@ class Search:
 
         x, before = _inputs(ca.MX)
         best = ca.MX.sym("best", INCUMBENT_SIZE)
-        points_on_limit = near_limit(x, slide_points(self.rig, upper)(x))
-        gates = self._sharpen_in_turn(self._sharpen_point(polished), len(ends))
-        return ca.Function("slide", [x, before, best], [gates(x, before, points_on_limit, best)])
+        answer = self._improve(polished, len(ends))(x, before, near_limit(x, slide_points(self.rig, upper)(x)), best)
+        return ca.Function("slide", [x, before, best], [answer])
 
     def _slack(self) -> tuple[float, float]:
         """Return bounds of the changes of sin q4 and cos q2 within ROOTS.root_tolerance of a roll."""
@@ -358,7 +351,7 @@ class Search:
         return sin4, (ROOTS.root_tolerance * rig.goose_neck + rig.pitch_link * cos4) / rig.yaw_link_1
 
     def _approximation(self, target: Expression) -> Callable[..., RoughRoll]:
-        """Return a function that makes an ApproximateRoll; cos q2 must be within about = (middle, half) if given."""
+        """Return a function that makes a RoughRoll; cos q2 must be within about = (middle, half width)."""
         f, (slack4, _) = self._index(target), self._slack()
         slack = ROOTS.root_tolerance * (ca.fabs(f.a1) + ca.fabs(f.b1) + 2 * (ca.fabs(f.a2) + ca.fabs(f.b2)))
 
@@ -374,24 +367,25 @@ class Search:
 
         return rough
 
-    def _sharpen_in_turn(self, sharpen: Any, count: int) -> Any:
-        """Return the Function (target, previous, rough, best) -> best: polishes points that may improve it."""
-        target, previous = _inputs(ca.MX)
-        first, rough = ca.MX.sym("best", INCUMBENT_SIZE), ca.MX.sym("rough", len(RoughRoll._fields), count)
-        gate, best = evaluate_unless(sharpen), first
-        for point in ca.horzsplit(rough):
-            settled = _record(RoughRoll, point).bound >= _record(Incumbent, best).cost
-            best = gate(settled, best, target, previous, point, best)
-        return ca.Function("gates", [target, previous, rough, first], [best])
+    def _improve(self, polished: Callable[[Expression, RoughRoll], Point], count: int) -> Any:
+        """Return the Function (target, previous, rough, best) -> best: polishes and compares `count` points in turn.
 
-    def _sharpen_point(self, polished: Callable[[Expression, RoughRoll], Point]) -> Any:
-        """Return the Function (target, previous, rough, best) -> best: one point is polished and compared."""
+        Points whose bound is not below the cost of the incumbent are skipped.
+        """
         target, previous = _inputs(ca.SX)
         rough, first = ca.SX.sym("rough", len(RoughRoll._fields)), ca.SX.sym("best", INCUMBENT_SIZE)
         point = _record(RoughRoll, rough)
-        sharp = Candidate(*polished(target, point), point.code)
-        best, _, _ = self._compare(target, previous, [sharp], _record(Incumbent, first))
-        return ca.Function("sharpen", [target, previous, rough, first], ca.cse([ca.vertcat(*best)]))
+        candidate = Candidate(*polished(target, point), point.code)
+        best, _, _ = self._compare(target, previous, [candidate], _record(Incumbent, first))
+        sharpen = ca.Function("sharpen", [target, previous, rough, first], ca.cse([ca.vertcat(*best)]))
+
+        target, previous = _inputs(ca.MX)
+        first, rough = ca.MX.sym("best", INCUMBENT_SIZE), ca.MX.sym("rough", len(RoughRoll._fields), count)
+        gate, column = evaluate_unless(sharpen), first
+        for point in ca.horzsplit(rough):
+            settled = _record(RoughRoll, point).bound >= _record(Incumbent, column).cost
+            column = gate(settled, column, target, previous, point, column)
+        return ca.Function("gates", [target, previous, rough, first], [column])
 
     def _stationary(self, target: Expression, rough: RoughRoll) -> Point:
         """Return the stationary point of I1 near a point."""

@@ -193,25 +193,13 @@ def dh_frames(rig: Rig, q: Expression) -> list[Frame]:
     return [*frames, Frame(tool, frames[-1].position)]
 
 
-def tool_frame(rig: Rig, q: Expression) -> Frame:
-    """Return the tool frame in world by the closed expressions (6)-(14), (19)-(21)."""
-    q = expression(q)
-    (c23, s23), (c45, s45), (c6, s6) = _cosines_and_sines(q)
-    turn = ca.vertcat(
-        ca.horzcat(-s23 * s45, c45 * s23 * s6 - c23 * c6, c23 * s6 + c45 * s23 * c6),
-        ca.horzcat(c23 * s45, -s23 * c6 - c23 * c45 * s6, s23 * s6 - c23 * c45 * c6),
-        ca.horzcat(c45, s45 * s6, s45 * c6),
-    )
-    return Frame(turn, forward(rig, q)[:3])
-
-
 def forward(rig: Rig, q: Expression) -> Expression:
     """Return the pose (x, y, z, yaw, pitch, roll) of the tool in world, (16)-(22). Shape (6, 1), m and rad.
 
     Yaw and pitch are the sums of the joint angles, not reduced to one turn.
     """
     q = expression(q)
-    (c23, s23), (c45, s45), (c6, s6) = _cosines_and_sines(q)
+    (c23, s23), (c45, s45), (c6, s6) = ((ca.cos(x), ca.sin(x)) for x in (q[1] + q[2], q[3] + q[4], q[5]))
     along = rig.yaw_link_2 + rig.pitch_link * ca.cos(q[3]) + rig.sting * s45 + rig.goose_neck * c45 * c6
     sideways = rig.yaw_offset + rig.goose_neck * s6
     return ca.vertcat(
@@ -222,11 +210,6 @@ def forward(rig: Rig, q: Expression) -> Expression:
         q[3] + q[4] - np.pi / 2,
         q[5],
     )
-
-
-def _cosines_and_sines(q: Expression) -> list[tuple[Expression, Expression]]:
-    """Return cosine and sine of q2 + q3, of q4 + q5 and of q6."""
-    return [(ca.cos(angle), ca.sin(angle)) for angle in (q[1] + q[2], q[3] + q[4], q[5])]
 
 
 def task_jacobian(rig: Rig, q: Expression) -> Expression:

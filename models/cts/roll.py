@@ -337,8 +337,8 @@ def slide_ends(rig: Rig, branch: Branch, upper: bool) -> Any:
     sharp = [ca.vertcat(*polish((points[0, k], points[1, k]), slope)) for k in range(8)]
     polished = ca.Function("polished", [t, points], [ca.horzcat(*sharp)])
     target = ca.MX.sym("target", 5)
-    found = polished(target, slide_points(rig, upper)(target))
-    return ca.Function("slide_ends", [target], [found], ["target"], ["points"])
+    ends = polished(target, slide_points(rig, upper)(target))
+    return ca.Function("slide_ends", [target], [ends], ["target"], ["points"])
 
 
 def slide_points(rig: Rig, upper: bool) -> Any:

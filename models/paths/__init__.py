@@ -1,6 +1,6 @@
 """Task paths of lines, arcs and helices with tool orientation and rounded corners, as functions of the distance."""
 
-from models.paths.blends import end_curvature, gamma, middle_curvature, peak_curvature, rest_to_rest
+from models.paths.blends import gamma, rest_to_rest
 from models.paths.functions import gauss_newton, march, path_function, predictor_corrector, turn_function
 from models.paths.path import Path, split_at_reversals
 from models.paths.rounding import smooth
@@ -17,13 +17,10 @@ __all__ = [
     "Segment",
     "SmoothPath",
     "Turn",
-    "end_curvature",
     "gamma",
     "gauss_newton",
     "march",
-    "middle_curvature",
     "path_function",
-    "peak_curvature",
     "predictor_corrector",
     "rest_to_rest",
     "smooth",

@@ -40,10 +40,7 @@ __all__ = [
     "cubic",
     "curvature",
     "derivatives_by_arc_length",
-    "end_curvature",
     "gamma",
-    "middle_curvature",
-    "peak_curvature",
     "polynomial",
     "quintic",
     "rest_to_rest",
@@ -55,12 +52,8 @@ PAPER_SHAPE = 3.0
 """Shape factor of the cubic in the paper, for continuous curvature between lines."""
 LARGEST_SHAPE: dict[str, float] = {"cubic": 6.0, "quintic": 30 / 7}
 """Shape factors at which the curve between two lines has a cusp in its middle."""
-MIDDLE: dict[str, tuple[float, float, float, float]] = {
-    "cubic": (1 / 8, 3 / 2, 1 / 4, 1.0),
-    "quintic": (5 / 32, 15 / 8, 7 / 16, 3 / 2),
-}
-"""Coefficients (a, b, c, d) of the blend at u = 1/2 between two lines, with the remaining distance L:
-F = L (n2 - n1) (1/2 - a shape), F' = L (n1 + n2) (b - c shape), F'' = L (n2 - n1) d shape."""
+MIDDLE_FACTORS: dict[str, float] = {"cubic": 1 / 4, "quintic": 5 / 16}
+"""Factors of the shape in the distance from the vertex at u = 1/2, (8)."""
 
 
 def checked_shape(shape: ArrayInput, kind: str, count: int = 1) -> Array:
@@ -135,68 +128,18 @@ def _falling_factorials(order: int) -> list[float]:
     return [float(np.prod(np.arange(k - order + 1, k + 1))) if k >= order else 0.0 for k in range(6)]
 
 
-def _check_corner(shape: float, angle: float, remaining: float = 1.0) -> None:
-    for name, value in (("shape factor", shape), ("angle", angle), ("remaining distance", remaining)):
-        checked_number(value, "corner", name, positive=True)
-    if angle > np.pi:
-        raise ModelError(f"corner: angle {angle:g} rad is above pi", name="angle", value=angle, limit=np.pi)
-
-
-def _middle(kind: str) -> tuple[float, float, float, float]:
-    return MIDDLE[checked_choice(kind, get_args(BlendKind), "blend", "kind")]
-
-
 def gamma(shape: float, angle: float, kind: str = "cubic") -> float:
     """Return the distance of the blend from the vertex over the remaining distance, eq. (8), between two lines.
 
     |1 - shape/4| cos(angle/2) for the cubic, |1 - 5 shape/16| cos(angle/2) for the quintic: the distance at u = 1/2,
     which is the closest point for shapes up to 4 (cubic) and 3.2 (quintic).
     """
-    _check_corner(shape, angle)
-    a = _middle(kind)[0]
-    return float(abs(1 - 2 * a * shape) * np.cos(angle / 2))
-
-
-def end_curvature(shape: float, angle: float, remaining: float) -> float:
-    """Return the curvature (1/m) of the cubic at a line: |6 - 2 shape| sin(angle) / (shape^2 remaining)."""
-    _check_corner(shape, angle, remaining)
-    return float(abs(6 - 2 * shape) * np.sin(angle) / (shape**2 * remaining))
-
-
-def middle_curvature(shape: float, angle: float, remaining: float, kind: str = "cubic") -> float:
-    """Return the curvature (1/m) at u = 1/2 between two lines.
-
-    For the cubic, shape cos(angle/2) / [2 (1.5 - shape/4)^2 sin^2(angle/2) remaining]. It is the largest curvature for
-    shapes near 3; smaller shapes have it near the ends, see `peak_curvature`.
-    """
-    _check_corner(shape, angle, remaining)
-    _, b, c, d = _middle(kind)
-    half = angle / 2
-    return float(d * shape * np.cos(half) / (2 * (b - c * shape) ** 2 * np.sin(half) ** 2 * remaining))
-
-
-def peak_curvature(shape: float, angle: float, remaining: float, kind: str = "cubic") -> float:
-    """Return the largest curvature (1/m) of the blend between two lines.
-
-    It is evaluated on a grid that is refined about its maximum, to 1e-8 relative.
-    """
-    _check_corner(shape, angle, remaining)
-    checked_shape(shape, kind)
-    n1, n2 = np.array([1.0, 0.0, 0.0]), np.array([-np.cos(angle), np.sin(angle), 0.0])
-    rate, zero = shape * remaining, np.zeros(3)
-    start, end = -remaining * n1, remaining * n2
-    if kind == "cubic":
-        curve = cubic(start, rate * n1, end, rate * n2)
-    else:
-        curve = quintic(start, rate * n1, zero, end, rate * n2, zero)
-    low, high, best = 0.0, 1.0, 0.0
-    for _ in range(5):
-        u = np.linspace(low, high, 2001)
-        bend = curvature(curve, u)
-        at = int(bend.argmax())
-        best = float(bend[at])
-        low, high = u[max(at - 2, 0)], u[min(at + 2, len(u) - 1)]
-    return best
+    for name, value in (("shape factor", shape), ("angle", angle)):
+        checked_number(value, "corner", name, positive=True)
+    if angle > np.pi:
+        raise ModelError(f"corner: angle {angle:g} rad is above pi", name="angle", value=angle, limit=np.pi)
+    factor = MIDDLE_FACTORS[checked_choice(kind, get_args(BlendKind), "blend", "kind")]
+    return float(abs(1 - factor * shape) * np.cos(angle / 2))
 
 
 def curvature(coefficients: Array, u: Array) -> Array:

@@ -386,11 +386,19 @@ def smooth(
     lengths, segment, blend = np.empty(2 * count - 1), np.full(2 * count - 1, -1), np.full(2 * count - 1, -1)
     lengths[::2], lengths[1::2] = rests, blend_lengths
     segment[::2], blend[1::2] = np.arange(count), np.arange(count - 1)
-    kept = np.ones(2 * count - 1, dtype=bool)
-    kept[::2] = rests > SETTINGS.shortest * path.lengths
-    bounds = np.concatenate([[0.0], np.cumsum(lengths[kept])])
+    long_enough = np.ones(2 * count - 1, dtype=bool)
+    long_enough[::2] = rests > SETTINGS.shortest * path.lengths
+    bounds = np.concatenate([[0.0], np.cumsum(lengths[long_enough])])
     smoothed = SmoothPath(
-        path, kind, distances, corners.shape, coefficients, bounds, segment[kept], blend[kept], curve_cells
+        path,
+        kind,
+        distances,
+        corners.shape,
+        coefficients,
+        bounds,
+        segment[long_enough],
+        blend[long_enough],
+        curve_cells,
     )
     if path.turns:
         _check_turns(smoothed)

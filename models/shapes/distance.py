@@ -221,7 +221,7 @@ class StoppedGradients:
         """Return a symbol that stands for a value, which may contain other symbols."""
         if not isinstance(value, ca.MX) or value.is_constant():
             return value
-        self._symbols.append(ca.MX.sym("held", value.shape))
+        self._symbols.append(ca.MX.sym("stopped", value.shape))
         self._values.append(value)
         return self._symbols[-1]
 

@@ -147,9 +147,9 @@ def checked_pairs(
     margin = checked_nonnegative(clearance, owner, "clearance", "m") + MARGIN_M
     rng = np.random.default_rng(checked_count(seed, owner, "seed", least=0, most=2**63))
     named = dict.fromkeys([] if srdf is None else _disabled(robot, srdf), SRDF)
-    named |= dict.fromkeys(map(frozenset, _named(robot, ignored)), IGNORED)
+    named |= dict.fromkeys(_ignored_pairs(robot, ignored), IGNORED)
 
-    key = _key(robot, bodies, low, high, named, margin, count, seed)
+    key = _key(robot, bodies, named, low, high, margin, count, seed)
     if (known := _read(kept(key), bodies)) is not None:
         return known
     parts = RigidParts.of(robot)
@@ -170,37 +170,23 @@ def checked_pairs(
         elif left.get(links) not in ASSUMED or reason == COVERED:
             left[links] = reason
     open_links = {(bodies[i].link, bodies[j].link) for i, j in checked}
-    pairs = Pairs(
-        tuple(checked), {k: why for k, why in left.items() if k[0] != k[1] and (k not in open_links or why in ASSUMED)}
-    )
+    left = {k: why for k, why in left.items() if k[0] != k[1] and (k not in open_links or why in ASSUMED)}
+    pairs = Pairs(tuple(checked), left)
     keep(key, {"checked": pairs.checked, "left": [[*pair, why.value] for pair, why in pairs.left.items()]})
     return pairs
 
 
-def _key(
-    robot: Robot,
-    bodies: Sequence[Body],
-    low: Array,
-    high: Array,
-    named: Mapping[frozenset[str], Reason],
-    margin: float,
-    count: int,
-    seed: int,
-) -> str:
+def _key(robot: Robot, bodies: Sequence[Body], named: Mapping[frozenset[str], Reason], *numbers: Any) -> str:
     """Return the cache key of all that the pairs depend on."""
-    parts: list[Any] = [low, high, margin, count, seed]
+    parts = list(numbers)
     words = ["pairs", *(f"{sorted(pair)} {why}" for pair, why in named.items())]
     for joint in robot.joints:
         words.append(f"{joint.name} {joint.kind} {joint.parent} {joint.child} {robot.drives.get(joint.name)}")
         parts += [joint.axis, joint.translation, joint.rotation]
     for body in bodies:
-        words.append(f"{body.link} {type(body.shape).__name__}")
-        parts += [
-            body.shape.core,
-            body.shape.swept_radius,
-            body.overhang,
-            np.zeros(0) if body.mesh is None else body.mesh.points,
-        ]
+        shape, points = body.shape, np.zeros(0) if body.mesh is None else body.mesh.points
+        words.append(f"{body.link} {type(shape).__name__}")
+        parts += [shape.core, shape.swept_radius, body.overhang, points]
     return key_of(version_of(__name__), "\n".join(words), *parts)
 
 
@@ -214,23 +200,21 @@ def _read(value: Any, bodies: Sequence[Body]) -> Pairs | None:
     return Pairs(checked, left) if all(0 <= i < j < len(bodies) for i, j in checked) else None
 
 
-def _named(robot: Robot, pairs: Any) -> list[tuple[str, str]]:
+def _ignored_pairs(robot: Robot, pairs: Any) -> list[frozenset[str]]:
     names = []
-    for pair in checked_each(pairs, tuple, "checked_pairs", "ignored") if not isinstance(pairs, str) else [pairs]:
+    for pair in [pairs] if isinstance(pairs, str) else checked_each(pairs, tuple, "checked_pairs", "ignored"):
         if not isinstance(pair, tuple) or len(pair) != 2:
             message = f"checked_pairs: ignored must be pairs of links, not {pair!r}"
             raise ModelError(message, name="ignored", value=pair, limit=2)
-        names.append((robot.link(pair[0]).name, robot.link(pair[1]).name))
+        names.append(frozenset(robot.link(name).name for name in pair))
     return names
 
 
 def _disabled(robot: Robot, source: str | os.PathLike[str]) -> list[frozenset[str]]:
     """Return the pairs of <disable_collisions> whose links exist."""
     known = {link.name for link in robot.links}
-    pairs = [
-        frozenset(text_of(each, key, "SRDF") for key in ("link1", "link2"))
-        for each in parsed(source).findall("disable_collisions")
-    ]
+    elements = parsed(source).findall("disable_collisions")
+    pairs = [frozenset(text_of(each, key, "SRDF") for key in ("link1", "link2")) for each in elements]
     if unknown := sorted({name for pair in pairs for name in pair if name not in known}):
         message = f"the SRDF file names links that {robot.name!r} does not have: {', '.join(map(repr, unknown))}"
         warn(ModelWarning(message, name="srdf", value=tuple(unknown)), stacklevel=3)
@@ -295,11 +279,10 @@ class _PairClassifier:
         key = id(first.mesh), id(second.mesh)
         if key not in self._by_hulls:
             hulls = self._pair(first.link, first.mesh.hull, second.link, second.mesh.hull)
-            self._by_hulls[key] = (
-                hulls.check_on_grid(self.low, self.high)
-                if two_joints
-                else hulls.overlap_everywhere(self.configurations)
-            )
+            if two_joints:
+                self._by_hulls[key] = hulls.check_on_grid(self.low, self.high)
+            else:
+                self._by_hulls[key] = hulls.overlap_everywhere(self.configurations)
         if (hull_reason := self._by_hulls[key]) is not None:
             return hull_reason, False
         if reason == COVERED:

@@ -8,11 +8,11 @@ frame.
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from math import cos, pi
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, Self, TypeAlias, cast
 
 import numpy as np
 
@@ -53,6 +53,18 @@ class _SweptCore:
         """Return the largest distance of the shape's points from a point. Shape (3,), m; inf if it is unbounded."""
         centre = checked_array(point, (3,), "shape", "point")
         return float(np.linalg.norm(self.core - centre, axis=1).max()) + self.swept_radius
+
+
+class _Posed(_SweptCore):
+    """A shape with a pose of its own."""
+
+    def placed(self, rotation: ArrayInput, translation: ArrayInput) -> Self:
+        """Return the shape in another frame, in which its own has this rotation (3, 3) and position (3,), m."""
+        turn, shift = _motion(rotation, translation)
+        own: Any = copy(self)  # shares the hull, which is costly to compute
+        object.__setattr__(own, "position", frozen(turn @ own.position + shift))
+        object.__setattr__(own, "rotation", frozen(turn @ own.rotation))
+        return cast(Self, own)
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +143,7 @@ class Capsule(_SweptCore):
 
 
 @dataclass(frozen=True, eq=False)
-class Cylinder(_SweptCore):
+class Cylinder(_Posed):
     """A solid cylinder about its own z axis.
 
     Distances use the circumscribed regular prism of SIDES sides. The edges of the prism exceed the cylinder by
@@ -173,14 +185,9 @@ class Cylinder(_SweptCore):
         half = np.full((SIDES, 1), self.length / 2)
         return convex_hull(np.vstack([np.hstack([around, -half]), np.hstack([around, half])]))
 
-    def placed(self, rotation: ArrayInput, translation: ArrayInput) -> Cylinder:
-        """Return the cylinder in another frame, in which its own has this rotation (3, 3) and position (3,), m."""
-        turn, shift = _motion(rotation, translation)
-        return replace(self, position=turn @ self.position + shift, rotation=turn @ self.rotation)
-
 
 @dataclass(frozen=True, eq=False)
-class Box(_SweptCore):
+class Box(_Posed):
     """A solid box.
 
     Attributes:
@@ -215,11 +222,6 @@ class Box(_SweptCore):
         """
         size = checked_array(self.size, (3,), "box", "size", unit="m")
         return np.asarray(self.position + (CORNERS * size / 2) @ self.rotation.T)
-
-    def placed(self, rotation: ArrayInput, translation: ArrayInput) -> Box:
-        """Return the box in another frame, in which its own has this rotation (3, 3) and position (3,), m."""
-        turn, shift = _motion(rotation, translation)
-        return replace(self, position=turn @ self.position + shift, rotation=turn @ self.rotation)
 
     def reach(self, point: ArrayInput) -> float:
         """Return the largest distance of the box's points from a point. Shape (3,), m; inf for an infinite box."""
@@ -266,7 +268,7 @@ class HalfSpace(_SweptCore):
 
 
 @dataclass(frozen=True, eq=False)
-class Mesh(_SweptCore):
+class Mesh(_Posed):
     """The convex hull of a triangle mesh; cavities and holes are filled.
 
     Attributes:
@@ -337,14 +339,6 @@ class Mesh(_SweptCore):
     def core(self) -> Array:
         """Vertices of the hull. Shape (m, 3), m."""
         return np.asarray(self.position + self.hull.vertices @ self.rotation.T)
-
-    def placed(self, rotation: ArrayInput, translation: ArrayInput) -> Mesh:
-        """Return the mesh in another frame, in which its own has this rotation (3, 3) and position (3,), m."""
-        turn, shift = _motion(rotation, translation)
-        mesh = copy(self)  # shares the hull, which is costly to compute
-        object.__setattr__(mesh, "position", frozen(turn @ self.position + shift))
-        object.__setattr__(mesh, "rotation", frozen(turn @ self.rotation))
-        return mesh
 
 
 Shape: TypeAlias = Sphere | Capsule | Cylinder | Box | HalfSpace | Mesh

@@ -217,7 +217,7 @@ def check_line(path: PathLike, limits: LineLimits, joints: JointPath | None) -> 
     Raises:
         ProblemError: No path, no limits, no joints along a path, or joint limits without joints.
     """
-    what = ("length", "bounds", "by_piece", "curvature", "dense")
+    what = ("length", "bounds", "by_piece", "curvature", "sample_distances")
     missing = [name for name in what if isinstance(path, type) or not hasattr(path, name)]
     if missing:
         hint = "give a SmoothPath, as models.smooth makes it"

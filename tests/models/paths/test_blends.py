@@ -16,10 +16,10 @@ from scipy.optimize import minimize_scalar
 from scipy.spatial import cKDTree
 
 from models import Arc, Line, ModelError, ModelWarning, Path, SmoothPath, smooth
-from models.paths import blends, end_curvature, gamma, middle_curvature, peak_curvature, rest_to_rest, rounding
+from models.paths import blends, gamma, rest_to_rest, rounding
 from models.paths.arc_length import arc_length
 from models.paths.blends import LARGEST_SHAPE, polynomial
-from tests.models.paths.task_paths import random_path, seeds
+from tests.models.paths.task_paths import peak_curvature, random_path, seeds
 
 pytestmark = pytest.mark.filterwarnings("ignore:overlap='shrink'")  # blends of random paths may overlap
 
@@ -46,12 +46,6 @@ def test_the_closed_forms_are_those_of_the_curve(degrees: float, kind: str, shap
         lambda u: np.linalg.norm(polynomial(curve, np.asarray(u))), bounds=(0.3, 0.7), options={"xatol": 1e-12}
     )
     assert gamma(shape, angle, kind) == pytest.approx(nearest.fun / remaining, rel=1e-9, abs=1e-12)
-    assert middle_curvature(shape, angle, remaining, kind) == pytest.approx(curvature_at(curve, 0.5), rel=1e-10)
-    sampled = curvature_at(curve, np.linspace(0, 1, 4001)).max()
-    assert peak_curvature(shape, angle, remaining, kind) == pytest.approx(sampled, rel=1e-4)
-    if kind == "cubic":
-        for u in (0.0, 1.0):
-            assert end_curvature(shape, angle, remaining) == pytest.approx(curvature_at(curve, u), rel=1e-9, abs=1e-11)
 
 
 @pytest.mark.parametrize(
@@ -264,11 +258,10 @@ def test_a_blend_that_cannot_be_is_a_named_error(asked: dict[str, Any], message:
         smooth(CORNER, **asked)
 
 
-@pytest.mark.parametrize("bad", [(0.0, 1.0, 1.0), (3.0, 0.0, 1.0), (3.0, 4.0, 1.0), (3.0, 1.0, float("nan"))])
-def test_closed_forms_refuse_what_is_no_corner(bad: tuple[float, float, float]) -> None:
-    for form in (end_curvature, middle_curvature, peak_curvature):
-        with pytest.raises(ModelError, match=r"corner: .* is (not positive|not finite|above pi)"):
-            form(*bad)
+@pytest.mark.parametrize("bad", [(0.0, 1.0), (3.0, 0.0), (3.0, 4.0), (3.0, float("nan"))])
+def test_closed_forms_refuse_what_is_no_corner(bad: tuple[float, float]) -> None:
+    with pytest.raises(ModelError, match=r"corner: .* is (not positive|not finite|above pi)"):
+        gamma(*bad)
 
 
 def test_distances_off_the_path_are_a_named_error() -> None:
