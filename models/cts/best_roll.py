@@ -173,10 +173,10 @@ def _build_inverse(rig: Rig, tunnel: Tunnel, branch: Branch, gain: float, limits
     search = Search(rig, tunnel, branch, gain)
     target, previous = _inputs(ca.MX)
     direct = search.direct()
-    result, done, best, seen = direct(target, previous)
+    result, done, best, evaluations = direct(target, previous)
     if limits:
         search_ends = search.search_ends(direct.size2_out(3))
-        result = evaluate_unless(search_ends, (SOLUTION_SIZE, 1))(done, result, target, previous, best, seen)
+        result = evaluate_unless(search_ends, (SOLUTION_SIZE, 1))(done, result, target, previous, best, evaluations)
     name = f"optimal_inverse_{'i2' if gain else 'i1'}{'' if limits else '_free'}"
     outputs = RigSolution(*ca.vertsplit(result, [0, 6, 7, 8, 9]))
     return ca.Function(name, [target, previous], list(outputs), ["target", "previous"], list(RigSolution._fields))
@@ -186,7 +186,7 @@ def _build_inverse(rig: Rig, tunnel: Tunnel, branch: Branch, gain: float, limits
 class Search:
     """The steps of the search as casadi Functions.
 
-    Their argument `best` is an Incumbent, `seen` a row of Evaluation, `rough` a row of RoughRoll.
+    Their argument `best` is an Incumbent, `evaluations` a row of Evaluation, `rough` columns of RoughRoll.
 
     Attributes:
         gain: w4 / (2 pi) of I2; 0 for I1.
@@ -198,7 +198,7 @@ class Search:
     gain: float
 
     def direct(self) -> Any:
-        """Return the Function (target, previous) -> (answer, done, best, seen): the stationary point of least index.
+        """Return the Function (target, previous) -> (answer, done, best, evaluations) of the best stationary point.
 
         `done` says that the answer is final: it is within reach and limits, or the input is not finite.
         """
@@ -207,13 +207,13 @@ class Search:
         target, previous = _inputs(ca.SX)
         f = self._index(target)
         c, s = least_point(f)
-        meets = check_constraints(self.rig, target, self._configuration(target, c, s), c, s)
-        best, seen, _ = self._compare(target, previous, [Candidate(c, s, 0)], NO_INCUMBENT)
-        status = ca.if_else(ca.logic_and(meets.slide(), meets.angles()), 0, 4)
-        status = ca.if_else(meets.pitch, ca.if_else(meets.yaw, status, 3), 2)
+        check = check_constraints(self.rig, target, self._configuration(target, c, s), c, s)
+        best, evaluations, _ = self._compare(target, previous, [Candidate(c, s, 0)], NO_INCUMBENT)
+        status = ca.if_else(ca.logic_and(check.slide(), check.angles()), 0, 4)
+        status = ca.if_else(check.pitch, ca.if_else(check.yaw, status, 3), 2)
         status = ca.if_else(_is_finite(target, previous), status, 1)
         result = self._solution(target, previous, NO_INCUMBENT._replace(cost=f.value(c, s), c=c, s=s), status)
-        outputs = [result, status <= 1, ca.vertcat(*best), stack(Evaluation, seen)]
+        outputs = [result, status <= 1, ca.vertcat(*best), stack(Evaluation, evaluations)]
         return ca.Function("direct", [target, previous], ca.cse(outputs))
 
     def _direct_by_descent(self) -> Any:
@@ -224,30 +224,30 @@ class Search:
             for upper in (False, True):
                 angle = inside_limit(self.rig, 6, upper)
                 points.append(Candidate(np.cos(angle), np.sin(angle), limit_code(6, upper)))
-        best, seen, least = self._compare(target, previous, points, NO_INCUMBENT)
+        best, evaluations, least = self._compare(target, previous, points, NO_INCUMBENT)
         number = _is_finite(target, previous)
         result = self._solution(target, previous, best, ca.if_else(number, 0, 1))
         done = ca.logic_or(ca.logic_and(least >= best.cost, best.cost < ca.inf), ca.logic_not(number))
-        outputs = [result, done, ca.vertcat(*best), stack(Evaluation, seen)]
+        outputs = [result, done, ca.vertcat(*best), stack(Evaluation, evaluations)]
         settle = ca.Function("settle", [target, previous, rolls], ca.cse(outputs))
         x, before = _inputs(ca.MX)
         settled = settle(x, before, convex_minima(self.rig, self.tunnel, self.gain)(x, before))
         return ca.Function("direct", [x, before], list(settled))
 
     def search_ends(self, count: int) -> Any:
-        """Return the Function (target, previous, best, seen) -> answer from the arc ends, after `count` evaluations."""
+        """Return the Function (target, previous, best, `count` evaluations) -> answer from the arc ends."""
         target, previous = _inputs(ca.MX)
-        first, seen = ca.MX.sym("best", INCUMBENT_SIZE), ca.MX.sym("seen", len(Evaluation._fields), count)
+        first, evaluations = ca.MX.sym("best", INCUMBENT_SIZE), ca.MX.sym("seen", len(Evaluation._fields), count)
         best, more = self._cheap_ends()(target, previous, first)
-        known = [seen, more]
+        columns = [evaluations, more]
         chart = yaw_chart(self.rig, self.branch)
         if not self.gain:
             rough = self._rough_stationary()(target)
             best = self._improve(self._stationary, 4)(target, previous, rough, best)
             points = [Evaluation(point.bound, point.value) for point in unstack(RoughRoll, rough)]
-            known.append(stack(Evaluation, points))
-        seen = ca.horzcat(*known)
-        best = self._yaw_level_ends(chart, seen.shape[1])(target, previous, seen, best)
+            columns.append(stack(Evaluation, points))
+        evaluations = ca.horzcat(*columns)
+        best = self._yaw_level_ends(chart, evaluations.shape[1])(target, previous, evaluations, best)
         for upper in (False, True):
             if np.isfinite(self.rig.limit(1, upper)):
                 incumbent = _record(Incumbent, best)
@@ -255,17 +255,19 @@ class Search:
                 best = evaluate_unless(self._slide_ends(chart, upper))(settled, best, target, previous, best)
         answer, solved = self._finish()(target, previous, best), _record(Incumbent, best).cost < ca.inf
         result = evaluate_unless(self._infeasible(), (SOLUTION_SIZE, 1))(solved, answer, target)
-        return ca.Function("thorough", [target, previous, first, known[0]], [result])
+        return ca.Function("thorough", [target, previous, first, columns[0]], [result])
 
     # ---- candidates ------------------------------------------------------------------------------------------
 
     def _cheap_ends(self) -> Any:
-        """Return the Function (target, previous, best) -> (best, seen), with the ends known to rounding."""
+        """Return the Function (target, previous, best) -> (best, evaluations), with the ends known to rounding."""
         target, previous = _inputs(ca.SX)
         first = ca.SX.sym("best", INCUMBENT_SIZE)
         ends = closed_form_ends(self.rig, target, self.branch)
-        best, seen, _ = self._compare(target, previous, ends, _record(Incumbent, first))
-        return ca.Function("simple", [target, previous, first], ca.cse([ca.vertcat(*best), stack(Evaluation, seen)]))
+        best, evaluations, _ = self._compare(target, previous, ends, _record(Incumbent, first))
+        return ca.Function(
+            "simple", [target, previous, first], ca.cse([ca.vertcat(*best), stack(Evaluation, evaluations)])
+        )
 
     def _rough_stationary(self) -> Any:
         """Return the Function (target) -> points near the minima of I1; NO_ROLL if it certainly has only one minimum.
@@ -284,7 +286,7 @@ class Search:
         return ca.Function("rough_stationary", [x], [answer])
 
     def _yaw_level_ends(self, chart: Any, count: int) -> Any:
-        """Return the Function (target, previous, seen, best) -> best, from the ends by joints 2, 3 and yaw reach.
+        """Return the Function (target, previous, evaluations, best) -> best, by the levels of cos q2.
 
         A level is searched if an evaluated roll better than the incumbent is on its infeasible side. All levels are
         searched if one violates a limit of joint 1 alone, since its arc may end before that limit is satisfied.
@@ -314,18 +316,18 @@ class Search:
         first, column = ca.MX.sym("best", INCUMBENT_SIZE), ca.MX.sym("suspect", len(LevelBound._fields))
         answer = self._improve(polished, len(points))(x, before, near_level(x, column), first)
         search_level = evaluate_unless(ca.Function("level", [x, before, column, first], [answer]))
-        seen = ca.MX.sym("seen", *rolls.shape)
+        evaluations = ca.MX.sym("seen", *rolls.shape)
         best = first
-        for level in ca.horzsplit(needed(x, seen)):
+        for level in ca.horzsplit(needed(x, evaluations)):
             settled = _record(LevelBound, level).bound >= _record(Incumbent, best).cost
             best = search_level(settled, best, x, before, level, best)
         if np.isfinite([self.rig.limit(1, False), self.rig.limit(1, True)]).any():
-            for level in ca.horzsplit(needed(x, seen)):
+            for level in ca.horzsplit(needed(x, evaluations)):
                 incumbent, relevant = _record(Incumbent, best), _record(LevelBound, level).relevant
                 cannot_improve = ca.fmin(incumbent.below, incumbent.above) >= incumbent.cost
                 settled = ca.logic_or(cannot_improve, ca.logic_not(relevant))
                 best = search_level(settled, best, x, before, level, best)
-        return ca.Function("levels", [x, before, seen, first], [best])
+        return ca.Function("levels", [x, before, evaluations, first], [best])
 
     def _slide_ends(self, chart: Any, upper: bool) -> Any:
         """Return the Function (target, previous, best) -> best, with the ends by one limit of joint 1."""
@@ -359,10 +361,10 @@ class Search:
             c: Expression, s: Expression, value: Expression = None, code: Any = 0, side: Any = 0, about: Any = None
         ) -> RoughRoll:
             configuration = self._configuration(target, c, s)
-            near = ca.fabs(configuration.sin4) < 1 + slack4
+            is_near = ca.fabs(configuration.sin4) < 1 + slack4
             if about is not None:
-                near = ca.logic_and(near, ca.fabs(configuration.cos2 - about[0]) < about[1])
-            bound = ca.if_else(near, f.value(c, s) - slack, ca.inf)
+                is_near = ca.logic_and(is_near, ca.fabs(configuration.cos2 - about[0]) < about[1])
+            bound = ca.if_else(is_near, f.value(c, s) - slack, ca.inf)
             return RoughRoll(bound, c, s, configuration.cos2 if value is None else value, code, side)
 
         return rough
@@ -399,24 +401,24 @@ class Search:
         """Return the incumbent after comparing more rolls, these rolls, and the least cost of any, feasible or not."""
         f = self._index(target)
         cost, c, s, code, below, above = best
-        least, seen = ca.SX(ca.inf), []
+        least, evaluations = ca.SX(ca.inf), []
         for point in points:
             value = f.value(point.c, point.s)
             if self.gain:
                 value += self.gain * (unwrap_roll(self.rig, point.c, point.s, previous) - previous) ** 2
             configuration = self._configuration(target, point.c, point.s)
-            meets = check_constraints(self.rig, target, configuration, point.c, point.s)
-            all_but_slide = meets.all_but_slide()
-            better = ca.logic_and(ca.logic_and(all_but_slide, meets.slide()), value < cost)
+            check = check_constraints(self.rig, target, configuration, point.c, point.s)
+            all_but_slide = check.all_but_slide()
+            better = ca.logic_and(ca.logic_and(all_but_slide, check.slide()), value < cost)
             least = ca.fmin(least, value)
-            seen.append(Evaluation(ca.if_else(meets.pitch_joints(), value, ca.inf), configuration.cos2))
+            evaluations.append(Evaluation(ca.if_else(check.pitch_joints(), value, ca.inf), configuration.cos2))
             over = ca.if_else(all_but_slide, value, ca.inf)
-            below = ca.fmin(below, ca.if_else(meets.slide_lower, ca.inf, over))
-            above = ca.fmin(above, ca.if_else(meets.slide_upper, ca.inf, over))
+            below = ca.fmin(below, ca.if_else(check.slide_lower, ca.inf, over))
+            above = ca.fmin(above, ca.if_else(check.slide_upper, ca.inf, over))
             cost = ca.if_else(better, value, cost)
             c, s = ca.if_else(better, point.c, c), ca.if_else(better, point.s, s)
             code = ca.if_else(better, point.code, code)
-        return Incumbent(cost, c, s, code, below, above), seen, least
+        return Incumbent(cost, c, s, code, below, above), evaluations, least
 
     def _index(self, target: Expression) -> Harmonics:
         return index_harmonics(self.rig, self.tunnel, target)

@@ -108,8 +108,8 @@ def capsule_to_capsule(first: LinkCapsule | Capsule, second: LinkCapsule | Capsu
     s = _clip(ca.if_else(slack > 1e-12 * a * e, (b * f - c * e) / (slack + 1e-300), 0.0))
     t = _clip((b * s + f) / e)
     s = _clip((b * t - c) / a)
-    apart = gap + s * u - t * v
-    return _length(apart) - first.radius - second.radius
+    difference = gap + s * u - t * v
+    return _length(difference) - first.radius - second.radius
 
 
 def _length(vector: Expression) -> Expression:

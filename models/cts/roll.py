@@ -400,8 +400,8 @@ def convex_minima(rig: Rig, tunnel: Tunnel, gain: float) -> Any:
     start, end = roll_window(rig, previous)
     start, end = start + 2 * ANGLE_INSET, end - 2 * ANGLE_INSET
     first = ca.fmin(ca.fmax(previous, start), end)
-    whole = minimize_convex(f, gain, previous, start, end, first, 12)  # Newton steps to rounding from a good start
-    convex = ca.Function("convex", [target, previous], [ca.repmat(whole, 5, 1)])
+    minimum = minimize_convex(f, gain, previous, start, end, first, 12)  # Newton steps to rounding from a good start
+    convex = ca.Function("convex", [target, previous], [ca.repmat(minimum, 5, 1)])
     bounds = [start, *_sort_four(_inflections(f, gain, start, end)), end]
     minima = [minimize_convex(f, gain, previous, a, b, (a + b) / 2, 20) for a, b in pairwise(bounds)]
     by_intervals = ca.Function("pieces", [target, previous], [ca.vertcat(*minima)])

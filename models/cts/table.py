@@ -144,9 +144,11 @@ def _best_branch(results: list[Any]) -> Array:
         if best is None:
             best = rows
             continue
-        solved, known = rows[:, 9] == 0, best[:, 9] == 0
-        better = solved & (~known | (rows[:, 6] < best[:, 6] - 1e-12))
-        further = ~solved & ~known & (rows[:, 9] > best[:, 9])  # the branch that satisfies most tests names the reason
+        solved, best_solved = rows[:, 9] == 0, best[:, 9] == 0
+        better = solved & (~best_solved | (rows[:, 6] < best[:, 6] - 1e-12))
+        further = (
+            ~solved & ~best_solved & (rows[:, 9] > best[:, 9])
+        )  # the branch that satisfies most tests names the reason
         best = np.where((better | further)[:, None], rows, best)
     assert best is not None
     return best

@@ -177,10 +177,10 @@ def predictor_corrector(degree: int = 3, corrections: int = 3) -> Any:
 def _predictor_corrector(degree: int, corrections: int) -> Any:
     state, coefficients, steps, rate = _symbols(degree)
     u, step = state[1], steps[1]
-    here = rate(u)
-    guess = _predicted(state, steps, here)
+    start_rate = rate(u)
+    guess = _predicted(state, steps, start_rate)
     for _ in range(corrections):
-        guess = u + 2 * step / (here + rate(guess))
+        guess = u + 2 * step / (start_rate + rate(guess))
     return ca.Function("predictor_corrector", [state, coefficients, steps], [ca.cse(ca.vertcat(u, guess))])
 
 

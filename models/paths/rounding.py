@@ -217,12 +217,12 @@ def _solve_distances(corners: _Corners, tolerance: Array, longest: Array) -> Arr
         fits = ratio <= 1
         low[todo] = np.where(fits, trial[todo], low[todo])
         high[todo] = np.where(fits, high[todo], trial[todo])
-        open_ones = (~fits | (ratio < 1 - SETTINGS.reserve)) & (trial[todo] < longest[todo]) | ~fits
+        unsettled = (~fits | (ratio < 1 - SETTINGS.reserve)) & (trial[todo] < longest[todo]) | ~fits
         # the deviation is nearly proportional; bisect if that leaves the bracket, and in every fourth iteration
         aim = trial[todo] * (1 - SETTINGS.reserve / 2) / np.maximum(ratio, 1e-12)
         inside = (aim > low[todo]) & (aim < high[todo]) & (number % 4 != 3)
         trial[todo] = np.where(inside, aim, (low[todo] + high[todo]) / 2)
-        todo = todo[open_ones]
+        todo = todo[unsettled]
         if not todo.size:
             break
     if (low <= 0).any():
@@ -244,7 +244,7 @@ def _deviations(corners: _Corners, remaining: Array) -> tuple[Array, Array]:
     points = polynomial(curves[:, None], u[None, :])
     tip = path.start[vertices + 1][:, None]
     corner = np.linalg.norm(points - tip, axis=-1)
-    near = _blend_to_task(path, vertices, points, remaining)
+    to_task = _blend_to_task(path, vertices, points, remaining)
 
     def about(extreme: NDArray[np.intp]) -> Array:
         offsets = np.linspace(-1, 1, SETTINGS.samples) / (SETTINGS.samples - 1)
@@ -252,8 +252,8 @@ def _deviations(corners: _Corners, remaining: Array) -> tuple[Array, Array]:
 
     closest = np.linalg.norm(about(corner.argmin(axis=1)) - tip, axis=-1)
     # the distance to the task has a kink where the closer segment changes
-    farthest = _blend_to_task(path, vertices, about(near.argmax(axis=1)), remaining)
-    return (np.minimum(corner.min(axis=1), closest.min(axis=1)), np.maximum(near.max(axis=1), farthest.max(axis=1)))
+    farthest = _blend_to_task(path, vertices, about(to_task.argmax(axis=1)), remaining)
+    return (np.minimum(corner.min(axis=1), closest.min(axis=1)), np.maximum(to_task.max(axis=1), farthest.max(axis=1)))
 
 
 def _task_to_blend(corners: _Corners, remaining: Array) -> Array:
@@ -274,8 +274,8 @@ def _task_to_blend(corners: _Corners, remaining: Array) -> Array:
         nearest = np.clip(square.argmin(axis=2), 1, len(u) - 2)
         row = np.arange(len(index))[:, None]
         distance = np.full(nearest.shape, np.inf)
-        for one, other in ((-1, 0), (0, 1)):
-            start, end = points[row, nearest + one], points[row, nearest + other]
+        for i, j in ((-1, 0), (0, 1)):
+            start, end = points[row, nearest + i], points[row, nearest + j]
             chord, offset = end - start, task - start
             part_of = np.clip((offset * chord).sum(axis=-1) / (chord**2).sum(axis=-1), 0, 1)
             distance = np.minimum(distance, np.linalg.norm(offset - part_of[..., None] * chord, axis=-1))
@@ -328,8 +328,8 @@ def _distance_to_helix(path: Path, index: NDArray[np.intp], points: Array, first
     turns = float((np.hypot(*bends)[:, 0] * (last - first)).max()) / FULL_TURN
     share = np.linspace(0, 1, int(SETTINGS.samples * (1 + turns)))
     places = first[:, None] + (last - first)[:, None] * share
-    there = screw(*frame, *bends, places)[0] - frame[0]
-    square = (there**2).sum(axis=-1)[:, None] - 2 * (points - frame[0]) @ there.transpose(0, 2, 1)
+    curve_points = screw(*frame, *bends, places)[0] - frame[0]
+    square = (curve_points**2).sum(axis=-1)[:, None] - 2 * (points - frame[0]) @ curve_points.transpose(0, 2, 1)
     s = np.take_along_axis(places, square.argmin(axis=2), axis=1)
     for _ in range(SETTINGS.newton_iterations):
         at, tangent, bend, _ = screw(*frame, *bends, s)

@@ -130,8 +130,8 @@ def distance_of_segments(
         return _root(dot(gap, gap))
     u = subtract(first.points[1], p)
     if len(second.points) == 1:
-        apart = along(gap, stop_gradient(_clip(-dot(u, gap) / (dot(u, u) + KINK**2))), u)
-        return _root(dot(apart, apart))
+        difference = along(gap, stop_gradient(_clip(-dot(u, gap) / (dot(u, u) + KINK**2))), u)
+        return _root(dot(difference, difference))
     weight = rounding**2
     return _root(_segments_square(gap, u, subtract(second.points[1], q), weight, stop_gradient), weight / 2)
 
@@ -149,8 +149,8 @@ def _segments_square(gap: Triple, u: Triple, v: Triple, weight: float, stop_grad
     t = _clip((b * s + f) / e)
     s = _clip((b * t - c) / a)
     s, t = stop_gradient(s), stop_gradient(t)
-    apart = along(along(gap, s, u), -t, v)
-    square = dot(apart, apart)
+    difference = along(along(gap, s, u), -t, v)
+    square = dot(difference, difference)
     return square + weight * ((s - 0.5) ** 2 + (t - 0.5) ** 2) if weight else square
 
 
@@ -256,16 +256,16 @@ def _segment_box_square(
     """
     sizes, squares = triple(ca.fabs(part) + KINK for part in u), triple(part * part for part in u)
     s, pull, rise = 0.0, 0.0, weight + KINK**2
-    left: Sequence[Expression] = (1.0, 1.0, 1.0)
+    remaining: Sequence[Expression] = (1.0, 1.0, 1.0)
     for step in range(3):
         x = along(middle, s, u)
         nearest = triple(_clip(part, -h, h) for part, h in zip(x, half, strict=True))
-        over = triple(keep * (part - near) for keep, part, near in zip(left, x, nearest, strict=True))
+        over = triple(keep * (part - clipped) for keep, part, clipped in zip(remaining, x, nearest, strict=True))
         added = _largest_indicator(over, sizes) if step < 2 else (1.0, 1.0, 1.0)
         for k in range(3):
             taken = added[k] * (over[k] != 0) if step else added[k]
             pull, rise = pull + taken * (u[k] * (middle[k] - nearest[k])), rise + taken * squares[k]
-        left = [keep * (1 - taken) for keep, taken in zip(left, added, strict=True)]
+        remaining = [keep * (1 - taken) for keep, taken in zip(remaining, added, strict=True)]
         s = _clip(-pull / rise, -0.5, 0.5)
         s = _without_derivative(s) if step < 2 else stop_gradient(s)
     square = _point_box_square(along(middle, s, u), half, stop_gradient)

@@ -364,11 +364,11 @@ def _face_gaps(first: Core, second: Core, rounding: float) -> list[Expression]:
         return [_least_height(second, normal, first.centre, rounding) - h for normal, h in normals]
     if not isinstance(first, HullCore):
         return []
-    seen = _in_frame(second, first.centre, first.axes)
+    local = _in_frame(second, first.centre, first.axes)
     directions = np.vstack([first.hull.normals, _edge_directions(first.hull)])
     offsets = (directions @ first.hull.vertices.T).max(axis=1)
     pairs = zip(directions, offsets, strict=True)
-    return [_least_height(seen, _scalars(along), (0.0, 0.0, 0.0), rounding) - float(offset) for along, offset in pairs]
+    return [_least_height(local, _scalars(along), (0.0, 0.0, 0.0), rounding) - float(offset) for along, offset in pairs]
 
 
 def _edge_directions(hull: Hull) -> Array:

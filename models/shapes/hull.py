@@ -167,10 +167,10 @@ def nearest_directions(
         on_first, on_second, difference = _between_hulls(first, second)
     length = np.linalg.norm(difference, axis=1)
     size = np.abs(first).max(initial=0.0) + np.abs(second).max(initial=0.0)
-    apart = length > GAP_TOLERANCE * size
-    direction = np.where(apart[:, None], difference / np.where(apart, length, 1.0)[:, None], 0.0)
-    if not apart.all():
-        direction[~apart] = _least_overlap(first[~apart], second[~apart], boxes)
+    separated = length > GAP_TOLERANCE * size
+    direction = np.where(separated[:, None], difference / np.where(separated, length, 1.0)[:, None], 0.0)
+    if not separated.all():
+        direction[~separated] = _least_overlap(first[~separated], second[~separated], boxes)
     return direction, on_first, on_second
 
 
@@ -237,10 +237,12 @@ def _between_hulls(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, n
         support_first = p[rows, (p @ v[:, :, None])[:, :, 0].argmax(axis=1)]
         support_second = q[rows, (q @ v[:, :, None])[:, :, 0].argmin(axis=1)]
         square = (v * v).sum(axis=1)
-        left = (square - (v * (support_second - support_first)).sum(axis=1) > GAP_TOLERANCE * square) & (square > 0)
-        if not left.all():
-            active, a, b, v, square = (part[left] for part in (active, a, b, v, square))
-            support_first, support_second = support_first[left], support_second[left]
+        unconverged = (square - (v * (support_second - support_first)).sum(axis=1) > GAP_TOLERANCE * square) & (
+            square > 0
+        )
+        if not unconverged.all():
+            active, a, b, v, square = (part[unconverged] for part in (active, a, b, v, square))
+            support_first, support_second = support_first[unconverged], support_second[unconverged]
             if not active.size:
                 break
         # the last vertex has no weight in any simplex that is not full: replace it by the new one
@@ -313,9 +315,9 @@ def _least_overlap(first: np.ndarray, second: np.ndarray, boxes: tuple[bool, boo
     i, j = np.triu_indices(edges.shape[1], 1)
     middles = (second.mean(axis=1) - first.mean(axis=1))[:, None]
     axes = np.broadcast_to(np.eye(3), (len(first), 3, 3))
-    tried = np.concatenate([middles, edges, _cross(edges[:, i], edges[:, j]), axes], axis=1)
-    lengths = np.linalg.norm(tried, axis=2, keepdims=True)
-    units = np.where(lengths > 0, tried / np.where(lengths > 0, lengths, 1.0), axes[:, :1])
+    candidates = np.concatenate([middles, edges, _cross(edges[:, i], edges[:, j]), axes], axis=1)
+    lengths = np.linalg.norm(candidates, axis=2, keepdims=True)
+    units = np.where(lengths > 0, candidates / np.where(lengths > 0, lengths, 1.0), axes[:, :1])
     units = np.concatenate([units, -units], axis=1)
     on_second, on_first = units @ np.swapaxes(second, 1, 2), units @ np.swapaxes(first, 1, 2)
     return np.asarray(units[np.arange(len(first)), (on_second.min(axis=2) - on_first.max(axis=2)).argmax(axis=1)])
