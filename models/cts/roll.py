@@ -161,9 +161,8 @@ def infeasibility_code(rig: Rig, target: Expression, branch: Branch) -> Expressi
     points += [(end.c, end.s) for end in arc_ends(rig, target, branch)]
     yaw: Expression = 0
     for c, s in points:
-        yaw = ca.logic_or(
-            yaw, check_constraints(rig, target, configuration_at(rig, target, c, s, branch), c, s).all_but_slide()
-        )
+        configuration = configuration_at(rig, target, c, s, branch)
+        yaw = ca.logic_or(yaw, check_constraints(rig, target, configuration, c, s).all_but_slide())
     return ca.if_else(pitch, ca.if_else(yaw, 4, 3), 2)
 
 
@@ -232,9 +231,8 @@ def level_points(rig: Rig, target: Expression, cosine: Expression) -> list[Point
     axle, e_c, e_s = corner_circle(rig, target)
     lg, lp = rig.goose_neck, rig.pitch_link
     s_yaw, c_yaw = ca.sin(target[3]), ca.cos(target[3])
-    stretched = subtract_harmonics(
-        Harmonics(lp**2, 0, 0, 0, 0), square_of_first_harmonic(axle[2], lg * e_c[2], lg * e_s[2])
-    )
+    height = square_of_first_harmonic(axle[2], lg * e_c[2], lg * e_s[2])
+    stretched = subtract_harmonics(Harmonics(lp**2, 0, 0, 0, 0), height)
     level = axle[1] - rig.yaw_link_2 * s_yaw - rig.yaw_offset * c_yaw
     square = square_of_first_harmonic(level - rig.yaw_link_1 * cosine, lg * e_c[1], lg * e_s[1])
     f = subtract_harmonics(square, scale_harmonics(stretched, s_yaw * s_yaw))
@@ -400,10 +398,10 @@ def convex_minima(rig: Rig, tunnel: Tunnel, gain: float) -> Any:
     start, end = roll_window(rig, previous)
     start, end = start + 2 * ANGLE_INSET, end - 2 * ANGLE_INSET
     first = ca.fmin(ca.fmax(previous, start), end)
-    minimum = minimize_convex(f, gain, previous, start, end, first, 12)  # Newton steps to rounding from a good start
+    minimum = minimize_convex(f, gain, previous, (start, end), start=first, steps=12)  # from a good start
     convex = ca.Function("convex", [target, previous], [ca.repmat(minimum, 5, 1)])
     bounds = [start, *_sort_four(_inflections(f, gain, start, end)), end]
-    minima = [minimize_convex(f, gain, previous, a, b, (a + b) / 2, 20) for a, b in pairwise(bounds)]
+    minima = [minimize_convex(f, gain, previous, (a, b), start=(a + b) / 2, steps=20) for a, b in pairwise(bounds)]
     by_intervals = ca.Function("pieces", [target, previous], [ca.vertcat(*minima)])
     is_convex = ca.Function("is_convex", [target], [2 * gain >= f.slope_bound()])
     x, before = ca.MX.sym("target", 5), ca.MX.sym("previous")
@@ -412,9 +410,10 @@ def convex_minima(rig: Rig, tunnel: Tunnel, gain: float) -> Any:
 
 
 def minimize_convex(
-    f: Harmonics, gain: float, previous: Expression, a: Expression, b: Expression, start: Expression, steps: int
+    f: Harmonics, gain: float, previous: Expression, bracket: Point, *, start: Expression, steps: int
 ) -> Expression:
-    """Return the minimum of I2 on an interval [a, b] of convexity, by Newton steps within a shrinking bracket."""
+    """Return the minimum of I2 on an interval of convexity, by Newton steps within a shrinking bracket."""
+    a, b = bracket
     slope, bend = f.derivative(), f.derivative().derivative()
     x = start
     for _ in range(steps):

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 
@@ -36,6 +36,7 @@ class Line:
         start_orientation, end_orientation: Tool orientation in world at both ends, unit quaternion [w, x, y, z]. Shape
             (4,). Between them the tool turns about a fixed axis, by the shorter way, in proportion to the distance. A
             start of None continues the segment before (the first one: no rotation); an end of None equals the start.
+        curvature, torsion: Zero, 1/m.
 
     Raises:
         ModelError: An entry is not finite, the length is zero, or a quaternion is not normalised.
@@ -45,6 +46,8 @@ class Line:
     end: ArrayInput
     start_orientation: ArrayInput | None = None
     end_orientation: ArrayInput | None = None
+    curvature: ClassVar[float] = 0.0
+    torsion: ClassVar[float] = 0.0
 
     def __post_init__(self) -> None:
         for name in ("start", "end"):
@@ -71,16 +74,6 @@ class Line:
     def normal(self) -> Array:
         """Zero, since a line has no normal. Shape (3,)."""
         return np.zeros(3)
-
-    @property
-    def curvature(self) -> float:
-        """Zero, 1/m."""
-        return 0.0
-
-    @property
-    def torsion(self) -> float:
-        """Zero, 1/m."""
-        return 0.0
 
 
 class _Circular:
@@ -116,6 +109,7 @@ class Arc(_Circular):
         axis: Unit vector about which the arc turns, right-handed. Shape (3,).
         sweep: Angle of rotation, rad, in (0, 2 pi].
         start_orientation, end_orientation: As for a Line.
+        torsion: Zero, 1/m.
 
     Raises:
         ModelError: An entry is not finite, the radius is zero, the axis is zero or not perpendicular to the radius, or
@@ -128,6 +122,7 @@ class Arc(_Circular):
     sweep: float
     start_orientation: ArrayInput | None = None
     end_orientation: ArrayInput | None = None
+    torsion: ClassVar[float] = 0.0
 
     def __post_init__(self) -> None:
         radius = _set_circle(self, "arc")
@@ -201,11 +196,6 @@ class Arc(_Circular):
     def curvature(self) -> float:
         """Curvature, 1/m."""
         return 1 / self.radius
-
-    @property
-    def torsion(self) -> float:
-        """Zero, 1/m."""
-        return 0.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -295,7 +295,14 @@ class Mesh(_Posed):
 
     def __post_init__(self) -> None:
         if self.file is not None:
-            self._read()
+            if self.vertices is not None or self.faces is not None:
+                raise ModelError("mesh: give vertices or a file, not both", name="file", value=self.file)
+            if not isinstance(self.file, str | Path) or not str(self.file):
+                raise ModelError(f"mesh: file {self.file!r} is not a path", name="file", value=self.file)
+            from models.shapes.mesh_files import read_mesh
+
+            for name, value in zip(("vertices", "faces"), read_mesh(self.file), strict=True):
+                object.__setattr__(self, name, value)
         elif self.vertices is None:
             raise ModelError("mesh: vertices are missing; give vertices or a file", name="vertices", value=None)
         vertices = checked_array(self.vertices, ("vertices", 3), "mesh", "vertices", least=4)
@@ -324,16 +331,6 @@ class Mesh(_Posed):
         for name, value in {**fields, "file": None, "scale": np.ones(3), "hull": hull}.items():
             object.__setattr__(mesh, name, value)
         return mesh
-
-    def _read(self) -> None:
-        if self.vertices is not None or self.faces is not None:
-            raise ModelError("mesh: give vertices or a file, not both", name="file", value=self.file)
-        if not isinstance(self.file, str | Path) or not str(self.file):
-            raise ModelError(f"mesh: file {self.file!r} is not a path", name="file", value=self.file)
-        from models.shapes.mesh_files import read_mesh
-
-        for name, value in zip(("vertices", "faces"), read_mesh(self.file), strict=True):
-            object.__setattr__(self, name, value)
 
     @property
     def core(self) -> Array:

@@ -63,7 +63,7 @@ def test_the_window_is_a_turn_within_the_limits(previous: float) -> None:
 def test_descent_ends_where_the_slope_vanishes(gain: float) -> None:
     """Of cos(x) + gain (x - 1)^2, convex for gain > 1 / 2."""
     f = Harmonics(0.0, 1.0, 0.0, 0.0, 0.0)
-    x = float(ca.DM(minimize_convex(f, gain, ca.DM(1.0), ca.DM(-3.0), ca.DM(5.0), ca.DM(1.0), 20)))
+    x = float(ca.DM(minimize_convex(f, gain, ca.DM(1.0), (ca.DM(-3.0), ca.DM(5.0)), start=ca.DM(1.0), steps=20)))
     assert -np.sin(x) + 2 * gain * (x - 1) == pytest.approx(0, abs=1e-12)
 
 
