@@ -148,7 +148,7 @@ def test_no_point_moves_or_bends_by_more_than_its_levers_say(name: str) -> None:
         speeds, bends = np.array(found[: len(parts)]), np.array(found[len(parts) :])
         slow = lever @ np.abs(rate)
         most = lever @ np.abs(push) + 2 * (turn @ np.abs(rate)) * slow
-        # of a swelling nothing is seen here; the core's points move less than it says
+        # the swept radius has no influence here; the core's points move less than it says
         assert np.all(speeds.reshape(-1, 2).sum(axis=1) <= slow + 1e-9)
         assert np.all(bends.reshape(-1, 2).sum(axis=1) <= most + 1e-9)
         moving = slow > 0

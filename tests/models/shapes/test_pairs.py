@@ -1,4 +1,4 @@
-"""Which pairs of bodies are checked: by laws of the tree, by proof, as told; against a benchmark and coal."""
+"""Which pairs of bodies are checked: by laws of the tree, by proof, by request; against a benchmark and coal."""
 
 from __future__ import annotations
 
