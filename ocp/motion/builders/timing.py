@@ -213,7 +213,7 @@ def minimum_time_problem(
     if guess is not None and abs(guess.path.length - path.length) > 1e-9 * path.length:
         message = f"the guess is for a path of {guess.path.length:g} m, this one has {path.length:g} m"
         raise ProblemError(message, name="guess", value=guess.path.length, limit=path.length)
-    path_columns(path, limits, limited, path.dense())  # refuses what is not finite
+    path_columns(path, limits, limited, path.sample_distances())  # refuses what is not finite
     reference = reference_motion(path, limits, limited) if guess is None else guess.profile
     if guess is not None and limited is not None:
         check_smooth(path, limits, limited)  # refuses what no motion keeps, as a schedule does

@@ -48,7 +48,9 @@ class Collision(NamedTuple):
 def hulls_of(scene: CollisionScene) -> dict[str, Hull]:
     """The bodies and obstacles, by name."""
     return {
-        body.name: Hull(body.frame, body.shape.core, body.shape.swelling, getattr(body.shape, "normal", np.zeros(0)))
+        body.name: Hull(
+            body.frame, body.shape.core, body.shape.swept_radius, getattr(body.shape, "normal", np.zeros(0))
+        )
         for body in scene.bodies
     }
 

@@ -97,7 +97,9 @@ def make_grid(path: PathLike, limits: LineLimits, joints: JointPath | None) -> G
     some = np.concatenate([[True], np.diff(bounds)[:-1] > SETTINGS.shortest * path.length, [True]])
     some[-2] &= len(bounds) == 2 or bounds[-1] - bounds[-2] > SETTINGS.shortest * path.length
     nodes = bounds[some]
-    first = _apart(np.concatenate([path.dense(SETTINGS.cells, max(1, SETTINGS.segments // len(bounds))), nodes]), nodes)
+    first = _apart(
+        np.concatenate([path.sample_distances(SETTINGS.cells, max(1, SETTINGS.segments // len(bounds))), nodes]), nodes
+    )
     parts = [
         _halved(path, limits, joints, first[begin : begin + SETTINGS.block + 1], (bounds, asked))
         for begin in range(0, len(first) - 1, SETTINGS.block)
@@ -145,7 +147,7 @@ def _halved(
 def nodes_only(path: PathLike, limits: LineLimits) -> Grid:
     """The first nodes of a path, no interval halved: enough to say where the line binds."""
     bounds = np.asarray(path.bounds, dtype=float)
-    s = np.unique(np.concatenate([path.dense(SETTINGS.cells, 1), bounds]))
+    s = np.unique(np.concatenate([path.sample_distances(SETTINGS.cells, 1), bounds]))
     asked = np.asarray(path.by_piece(limits.speed)[piece_of(bounds, (s[:-1] + s[1:]) / 2)])
     return Grid(path, limits, None, s, asked, np.zeros(0, dtype=np.intp), np.zeros(0))
 

@@ -56,7 +56,7 @@ class PathLike(Protocol):
     def by_piece(self, of_segments: ArrayLike) -> Array: ...
     def curvature(self, distance: ArrayLike) -> Array: ...
     def curvature_jumps(self) -> Array: ...
-    def dense(self, per_cell: int = ..., per_segment: int = ...) -> Array: ...
+    def sample_distances(self, per_cell: int = ..., per_segment: int = ...) -> Array: ...
 
 
 class JointRates(Protocol):
@@ -217,7 +217,7 @@ def check_line(path: PathLike, limits: LineLimits, joints: JointPath | None) -> 
     Raises:
         ProblemError: No path, no limits, no joints along a path, or joint limits without joints.
     """
-    what = ("length", "bounds", "by_piece", "curvature", "dense")
+    what = ("length", "bounds", "by_piece", "curvature", "sample_distances")
     missing = [name for name in what if isinstance(path, type) or not hasattr(path, name)]
     if missing:
         hint = "give a SmoothPath, as models.smooth makes it"

@@ -49,7 +49,7 @@ def ramps_below_the_curve(path: PathLike, limits: LineLimits) -> SpeedProfile:
 def _curve(path: PathLike, limits: LineLimits) -> tuple[Array, Array, Array]:
     """Distances, the speed permitted at them (G,), and the asked one in each interval (G - 1,)."""
     of_pieces, bounds = path.by_piece(limits.speed), np.asarray(path.bounds, dtype=float)
-    first = np.unique(np.concatenate([path.dense(8, 2), bounds]))
+    first = np.unique(np.concatenate([path.sample_distances(8, 2), bounds]))
     parts = []
     for begin in range(0, len(of_pieces), SETTINGS.block):
         ends = bounds[begin : begin + SETTINGS.block + 1]

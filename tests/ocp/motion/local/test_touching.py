@@ -148,7 +148,7 @@ def test_the_hulls_are_the_bodies() -> None:
     hulls = hulls_of(around)
     assert list(hulls) == [body.name for body in around.bodies]
     for hull, body in zip(hulls.values(), around.bodies, strict=True):
-        assert (hull.frame, hull.radius) == (body.frame, body.shape.swelling)
+        assert (hull.frame, hull.radius) == (body.frame, body.shape.swept_radius)
         assert_allclose(hull.core, body.shape.core)
         assert hull.normal.size == (3 if isinstance(body.shape, HalfSpace) else 0)
 

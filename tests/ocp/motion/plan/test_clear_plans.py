@@ -298,7 +298,7 @@ def test_what_never_touches_within_limits_is_looked_at_without_them() -> None:
     robot = armoured_arm()
     narrow = replace(robot, joints=tuple(replace(joint, lower=-0.3, upper=0.3) for joint in robot.joints))
     within, beyond = (CollisionScene(FixedBase(narrow), limits=limits) for limits in (True, False))
-    assert within.left["link2", "link6"] == "never touch"
+    assert within.left["link2", "link6"] == "never in collision"
     assert ("link2", "link6") in beyond.labels
     free_of_limits = Limits(joints=False)
     asked: dict[str, Any] = {"tasks": line(), "start_joints": START, "horizon": SECONDS, "limits": free_of_limits}

@@ -243,7 +243,7 @@ def test_centripetal_acceleration_slows_the_blends_only() -> None:
 
 def test_a_slower_asked_speed_needs_no_dip() -> None:
     path = example("quintic")
-    peak = path.curvature(path.dense(200)).max()
+    peak = path.curvature(path.sample_distances(200)).max()
     plan = schedule(path, LineLimits(0.999 * np.sqrt(5.0 / peak), 5.0, 200.0, centripetal=5.0), strict=True)
     assert not plan.dips
 
