@@ -34,7 +34,7 @@ from ocp.motion.tasks.checks import check_length, checked_configuration, checked
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.motion.tasks.tracks import on_symbols
-from ocp.motion.tasks.zmp_rules import checked_place, is_finite
+from ocp.motion.tasks.zmp_rules import checked_point, is_finite
 
 __all__ = [
     "AccelerationSolution",
@@ -402,8 +402,8 @@ def resolve_accelerations(
 
 def _target(zmp: Callable[[Any], Any] | Any) -> Callable[[Any], Any]:
     if callable(zmp):
-        return lambda time: checked_place(zmp(time), "zmp")
-    point = checked_place(zmp, "zmp")
+        return lambda time: checked_point(zmp(time), "zmp")
+    point = checked_point(zmp, "zmp")
     return lambda time: point
 
 

@@ -12,11 +12,11 @@ from scipy.spatial.transform import Rotation
 
 from models.arrays import Array
 from ocp.motion.local.closed_forms import ClosedForm, closed_forms
-from ocp.motion.local.inverse_kinematics import at_rest
+from ocp.motion.local.inverse_kinematics import idle_positions
 from ocp.motion.tasks.equations import TaskEquations
 from ocp.motion.tasks.tip_task import ANGULAR, LINEAR
 
-__all__ = ["Branches", "branches_of"]
+__all__ = ["IkBranches", "ik_branches"]
 
 SLIDE = 1.0
 """m on either side of 0: where joints that slide without end are sampled."""
@@ -25,7 +25,7 @@ STEPS = np.sqrt([2.0, 3.0, 5.0, 7.0]) % 1
 TURN = 2 * np.pi
 
 
-class Branches:
+class IkBranches:
     """The postures of one pose task, of whose free directions samples are taken. Make it with `branches_of`."""
 
     def __init__(self, equations: TaskEquations, forms: tuple[ClosedForm, ...], lower: Array, upper: Array) -> None:
@@ -52,7 +52,7 @@ class Branches:
             low, high = np.where(np.isfinite(low), low, -span), np.where(np.isfinite(high), high, span)
             found.append(form.postures(places, rotations, low + shares[:, : len(form.held)] * (high - low))[1])
         joints = np.concatenate(found)
-        joints[:, self._idle] = at_rest(self.lower, self.upper)[self._idle]
+        joints[:, self._idle] = idle_positions(self.lower, self.upper)[self._idle]
         return self._within(joints)
 
     def _poses(self, form: ClosedForm, targets: Array, shares: Array) -> tuple[Array, Array]:
@@ -83,7 +83,7 @@ class Branches:
         return joints[((joints >= self.lower - 1e-9) & (joints <= self.upper + 1e-9)).all(axis=1)]
 
 
-def branches_of(equations: TaskEquations, lower: Array, upper: Array) -> Branches | None:
+def ik_branches(equations: TaskEquations, lower: Array, upper: Array) -> IkBranches | None:
     """The branches of a task on an arm that has closed forms; None of other tasks and machines.
 
     Args:
@@ -100,4 +100,4 @@ def branches_of(equations: TaskEquations, lower: Array, upper: Array) -> Branche
     forms = closed_forms(tip)
     if task.direction is None and not set(task.chosen) >= set(ANGULAR):
         forms = tuple(form for form in forms if form.kind == "scara")
-    return Branches(equations, forms, lower, upper) if forms else None
+    return IkBranches(equations, forms, lower, upper) if forms else None

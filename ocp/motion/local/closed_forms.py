@@ -62,7 +62,7 @@ class Motion(NamedTuple):
     turn: Array
     shift: Array
 
-    def of(self, chosen: NDArray[np.intp]) -> Motion:
+    def take(self, chosen: NDArray[np.intp]) -> Motion:
         return Motion(self.turn[chosen], self.shift[chosen])
 
     def after(self, other: Motion) -> Motion:
@@ -86,7 +86,7 @@ class Axis(NamedTuple):
     way: Array
     point: Array
 
-    def of(self, chosen: NDArray[np.intp]) -> Axis:
+    def take(self, chosen: NDArray[np.intp]) -> Axis:
         return Axis(self.way[chosen], self.point[chosen])
 
     def moved(self, motion: Motion) -> Axis:
@@ -290,8 +290,8 @@ def _of_six(axes: list[Axis], goal: Motion, form: ClosedForm) -> tuple[NDArray[n
     a_, b_ = (np.stack([np.stack(part[1:], axis=1) for part in side], axis=1) for side in (left, right))
     c_ = np.stack([r + part[0] - other[0] for r, part, other in zip(rest, right, left, strict=True)], axis=1)
     own, first, third = _pairs(a_, -b_, c_)
-    x, y, z, a, b, c = (axis.of(own) for axis in (x, y, z, a, b, c))
-    goal = goal.of(own)
+    x, y, z, a, b, c = (axis.take(own) for axis in (x, y, z, a, b, c))
+    goal = goal.take(own)
     if kind == "meeting":
         start, end = z.by(third).at(point[own]) - y.point, x.by(first).back.at(goal.at(point[own])) - y.point
     else:
@@ -372,7 +372,7 @@ def _wrist(axes: list[Axis], wanted: Motion) -> tuple[NDArray[np.intp], Array]:
     with np.errstate(divide="ignore", invalid="ignore"):
         share = np.clip(np.nan_to_num(value / np.hypot(cosine, sine)), -1.0, 1.0)
     own, second = _both(np.arctan2(sine, cosine), np.arccos(share))
-    return own, _ends([axis.of(own) for axis in axes], wanted.of(own), second, None)
+    return own, _ends([axis.take(own) for axis in axes], wanted.take(own), second, None)
 
 
 def _planar(axes: list[Axis], wanted: Motion) -> tuple[NDArray[np.intp], Array]:
@@ -388,7 +388,7 @@ def _planar(axes: list[Axis], wanted: Motion) -> tuple[NDArray[np.intp], Array]:
     with np.errstate(divide="ignore", invalid="ignore"):
         share = np.clip(np.nan_to_num(value / np.hypot(cosine, sine)), -1.0, 1.0)
     own, second = _both(np.arctan2(sine, cosine), np.arccos(share))
-    return own, _ends([axis.of(own) for axis in axes], wanted.of(own), second, place[own])
+    return own, _ends([axis.take(own) for axis in axes], wanted.take(own), second, place[own])
 
 
 def _ends(axes: list[Axis], wanted: Motion, second: Array, place: Array | None) -> Array:
@@ -424,14 +424,14 @@ def _corrected(
         at = own[busy]
         moved, columns = Motion(np.broadcast_to(np.eye(3), (len(at), 3, 3)), np.zeros((len(at), 3))), []
         for k, axis in enumerate(axes):
-            line = axis.of(at)
+            line = axis.take(at)
             now = line.moved(moved)
             if turns[k]:
                 columns.append(np.concatenate([now.way, np.cross(now.way, tip[at] - now.point) / size], axis=1))
             else:
                 columns.append(np.concatenate([np.zeros_like(now.way), now.way / size], axis=1))
             moved = moved.after(line.by(found[busy, k], bool(turns[k])))
-        left = goal.of(at).after(moved.back)
+        left = goal.take(at).after(moved.back)
         turn = left.turn
         spin = np.stack(
             [turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], 1

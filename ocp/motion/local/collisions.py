@@ -24,7 +24,7 @@ from ocp.errors import ProblemError, checked_instance
 from ocp.problem.hulls import Hull, PairsOfBodies, frames_of
 from ocp.problem.values import Sampler
 
-__all__ = ["Collision", "checked_collision_scene", "distances_along", "find_collisions", "hulls_of", "slid"]
+__all__ = ["Collision", "checked_collision_scene", "distances_along", "find_collisions", "scene_hulls", "slide_apart"]
 
 
 class Collision(NamedTuple):
@@ -45,7 +45,7 @@ class Collision(NamedTuple):
         return f"{self.bodies[0]} and {self.bodies[1]} {how} at {self.time:.4g} s"
 
 
-def hulls_of(scene: CollisionScene) -> dict[str, Hull]:
+def scene_hulls(scene: CollisionScene) -> dict[str, Hull]:
     """The bodies and obstacles, by name."""
     return {
         body.name: Hull(body.frame, body.shape.core, body.shape.swelling, getattr(body.shape, "normal", np.zeros(0)))
@@ -95,7 +95,7 @@ def _prepared(scene: CollisionScene) -> tuple[Sampler, PairsOfBodies]:
         base, joints = ca.SX.sym("base", machine.base_size), ca.SX.sym("q", machine.joint_size)
         time = ca.SX.sym("time")
         placements = Sampler([base, joints, time], [ca.SX(scene.placements(base, joints, time))])
-        hulls = tuple(hulls_of(scene).values())
+        hulls = tuple(scene_hulls(scene).values())
         kept = placements, PairsOfBodies(hulls, scene.pairs, scene.covers)
         scene.__dict__["_prepared"] = kept
     return kept
@@ -132,7 +132,7 @@ class SlidingSettings:
     spare: float = 2e-3
 
 
-def slid(
+def slide_apart(
     scene: CollisionScene,
     base: Array,
     joints: Array,

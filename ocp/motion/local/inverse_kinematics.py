@@ -18,13 +18,13 @@ from models import CollisionScene, Machine
 from models.arrays import Array
 from ocp.console import interruptible
 from ocp.errors import NOT_NUMBERS, ProblemError, checked_count, checked_flag, checked_positive, floats, real
-from ocp.motion.local.collisions import Collision, checked_collision_scene, find_collisions, slid
+from ocp.motion.local.collisions import Collision, checked_collision_scene, find_collisions, slide_apart
 from ocp.motion.tasks.checks import checked_configuration
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.geometry import pose_in_reference
 from ocp.motion.tasks.tip_task import ANGULAR, TipTask
 
-__all__ = ["IkSolution", "Unreachable", "inverse_kinematics", "postures_of"]
+__all__ = ["IkSolution", "Unreachable", "inverse_kinematics", "inverse_kinematics_at"]
 
 LARGEST_SEED = 2**64
 
@@ -58,7 +58,7 @@ class InverseSettings:
     growth: float = 4.0
     shrinkage: float = 0.25
     reach_tolerance: float = 1e-4
-    slid: int = 8
+    slide_count: int = 8
     simpson_steps: int = 400
 
 
@@ -75,12 +75,12 @@ class IkSolution:
         joints: Shape (joint_size,), rad or m.
         quality: Manipulability of the task times the least distance of a joint from its limits, the latter as a share
             of half its range: 0 at a limit or where the task is singular.
-        misfit: Distance that is left, m or rad, the greatest of all tasks.
+        pose_error: Distance that is left, m or rad, the greatest of all tasks.
     """
 
     joints: Array
     quality: float
-    misfit: float
+    pose_error: float
 
 
 class Unreachable(ProblemError):
@@ -88,17 +88,17 @@ class Unreachable(ProblemError):
 
     Attributes:
         joints: The nearest miss. Shape (joint_size,).
-        misfit: How far it is off, m or rad (2 sin(angle / 2)).
+        pose_error: How far it is off, m or rad (2 sin(angle / 2)).
     """
 
     def __init__(self, message: str, joints: Array, misfit: float, **details: Any) -> None:
         super().__init__(message, **details)
         self.joints = joints
-        self.misfit = misfit
+        self.pose_error = misfit
 
     def __reduce__(self) -> Any:
         """Pickled with what it is made from, and with its fields."""
-        return type(self), (*self.args, self.joints, self.misfit), self.__dict__
+        return type(self), (*self.args, self.joints, self.pose_error), self.__dict__
 
 
 @interruptible
@@ -167,21 +167,21 @@ def inverse_kinematics(
     place = checked_configuration(machine, np.zeros(size), base)[1]
     unbounded = np.full(size, np.inf)
     lower, upper = (machine.robot.lower, machine.robot.upper) if limits else (-unbounded, unbounded)
-    first = starts_of(machine, lower, upper, int(starts), near, seed)
+    first = start_configurations(machine, lower, upper, int(starts), near, seed)
     targets = np.array(equations.target_function()(float(time))).ravel()
     if not np.isfinite(targets).all():
         words = f"the task's targets are not finite at {time:g} s"
         raise ProblemError(words, name="task", value=targets, time=float(time))
 
     search = _Search(equations, place, targets, lower, upper, tolerance, apart, int(iterations))
-    distinct = search.postures(first, int(starts))
+    distinct_solutions = search.postures(first, int(starts))
     if scene is None:
-        return distinct
-    nearest = _touching(distinct, scene, place, float(time))
+        return distinct_solutions
+    nearest = _touching(distinct_solutions, scene, place, float(time))
     if all(nearest) and equations.size < size:
-        order = sorted(range(len(distinct)), key=lambda k: -nearest[k].distance)  # type: ignore[union-attr]
-        least = np.array([distinct[k].joints for k in order[: INVERSE.slid]])
-        moved = slid(
+        order = sorted(range(len(distinct_solutions)), key=lambda k: -nearest[k].distance)  # type: ignore[union-attr]
+        least = np.array([distinct_solutions[k].joints for k in order[: INVERSE.slide_count]])
+        moved = slide_apart(
             scene,
             place,
             least,
@@ -191,12 +191,14 @@ def inverse_kinematics(
             lower=lower,
             upper=upper,
         )
-        distinct += search.rated(*search.back(moved))
-        nearest = _touching(distinct, scene, place, float(time))
-    return _clear(distinct, nearest, scene, float(time))
+        distinct_solutions += search.rated(*search.back(moved))
+        nearest = _touching(distinct_solutions, scene, place, float(time))
+    return _clear(distinct_solutions, nearest, scene, float(time))
 
 
-def postures_of(equations: TaskEquations, targets: Array, *, starts: int, seed: int, limits: bool) -> list[IkSolution]:
+def inverse_kinematics_at(
+    equations: TaskEquations, targets: Array, *, starts: int, seed: int, limits: bool
+) -> list[IkSolution]:
     """As `inverse_kinematics` on a fixed base, of poses whose targets are known; again and again at little cost.
 
     Raises:
@@ -204,7 +206,7 @@ def postures_of(equations: TaskEquations, targets: Array, *, starts: int, seed: 
     """
     machine, unbounded = equations.machine, np.full(equations.machine.joint_size, np.inf)
     lower, upper = (machine.robot.lower, machine.robot.upper) if limits else (-unbounded, unbounded)
-    first = starts_of(machine, lower, upper, starts, None, seed)
+    first = start_configurations(machine, lower, upper, starts, None, seed)
     return _Search(equations, np.zeros(0), targets, lower, upper).postures(first, starts)
 
 
@@ -234,13 +236,15 @@ class _Search:
         q[last, wrap] = np.remainder(q[last, wrap] + np.pi, 2 * np.pi) - np.pi
         if not (misfit <= self.tolerance).any():
             nearest = int(misfit.argmin())
-            raise unreachable(self.equations.machine, self.equations, q[nearest], float(misfit[nearest]), lower, upper)
+            raise unreachable_error(
+                self.equations.machine, self.equations, q[nearest], float(misfit[nearest]), lower, upper
+            )
         return self.rated(q, misfit)
 
     def back(self, joints: Array) -> tuple[Array, Array]:
         """Joints (K, n) and greatest misfits (K,) that others lead to."""
         told = ca.DM(self.base), ca.DM(self.targets)
-        function = self.equations.misfit_function
+        function = self.equations.pose_residual_function
         return gauss_newton(function, joints, self.lower, self.upper, self.tolerance, self.iterations, told)
 
     def rated(self, joints: Array, misfits: Array) -> list[IkSolution]:
@@ -256,7 +260,7 @@ class _Search:
         margin = np.min(share[:, np.isfinite(upper - lower) & (upper > lower)], axis=1, initial=1.0)
         quality = values.prod(axis=1) * np.maximum(margin, 0.0)
         found = [IkSolution(*each) for each in zip(joints, quality.tolist(), misfits[good].tolist(), strict=True)]
-        return distinct(sorted(found, key=lambda posture: -posture.quality), self._turns, self.apart)
+        return distinct_solutions(sorted(found, key=lambda posture: -posture.quality), self._turns, self.apart)
 
     @property
     def _turns(self) -> NDArray[np.bool_]:
@@ -264,7 +268,7 @@ class _Search:
         return np.array([joint.kind != "prismatic" for joint in self.equations.machine.robot.moving_joints])
 
 
-def as_pose(machine: Machine, task: TipTask, start: Array, time: float, base: Any = ()) -> TipTask | None:
+def equivalent_pose(machine: Machine, task: TipTask, start: Array, time: float, base: Any = ()) -> TipTask | None:
     """The pose that a task has come to at a time; None where that depends on the way, or has a gap to close.
 
     Args:
@@ -288,7 +292,7 @@ def as_pose(machine: Machine, task: TipTask, start: Array, time: float, base: An
     return replace(task, velocity=None, rows=rows, position=np.array(ca.DM(first)).ravel() + moved)
 
 
-def starts_of(machine: Machine, lower: Array, upper: Array, count: int, near: Any, seed: int) -> Array:
+def start_configurations(machine: Machine, lower: Array, upper: Array, count: int, near: Any, seed: int) -> Array:
     size, rng = machine.joint_size, np.random.default_rng(seed)
     slides = np.array([joint.kind == "prismatic" for joint in machine.robot.moving_joints])
     span = np.where(slides, INVERSE.slide_spread, np.pi)
@@ -307,7 +311,7 @@ def starts_of(machine: Machine, lower: Array, upper: Array, count: int, near: An
     return np.asarray(np.clip(both, lower, upper))
 
 
-def at_rest(lower: Array, upper: Array) -> Array:
+def idle_positions(lower: Array, upper: Array) -> Array:
     """Where joints stand of which nothing is asked: in the middle of their limits, else within them next to 0."""
     with np.errstate(invalid="ignore"):
         middle = (lower + upper) / 2
@@ -354,7 +358,9 @@ def gauss_newton(
     return q, np.abs(residual).max(axis=1)
 
 
-def distinct(found: list[IkSolution], turns: NDArray[np.bool_], apart: float = INVERSE.apart) -> list[IkSolution]:
+def distinct_solutions(
+    found: list[IkSolution], turns: NDArray[np.bool_], apart: float = INVERSE.apart
+) -> list[IkSolution]:
     """Of those nearer than `apart`, full turns not counted, the best."""
     kept: list[IkSolution] = []
     for posture in found:
@@ -391,7 +397,7 @@ def _clear(
     raise Unreachable(
         f"each of the {len(found)} postures found touches; the one that does least: {touch}",
         found[best].joints,
-        found[best].misfit,
+        found[best].pose_error,
         name=" and ".join(touch.bodies),
         value=touch.distance,
         limit=scene.clearance,
@@ -399,7 +405,7 @@ def _clear(
     )
 
 
-def unreachable(
+def unreachable_error(
     machine: Machine, equations: TaskEquations, joints: Array, misfit: float, lower: Array, upper: Array
 ) -> Unreachable:
     names = [part.task.link or part.tip.robot.tip_link for part in equations.bound]

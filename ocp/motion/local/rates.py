@@ -30,7 +30,7 @@ from ocp.motion.tasks.checks import checked_configuration, checked_tasks, checke
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.tip_task import TipTask
 
-__all__ = ["LocalMotion", "LocalSolution", "follow", "least_rates", "resolve"]
+__all__ = ["LocalMotion", "LocalSolution", "least_rates", "resolve", "track_tasks"]
 
 INTEGRATOR_STEPS = 20000
 """Between two samples, at most; a smooth motion takes some tens."""
@@ -310,8 +310,8 @@ class LocalMotion:
         joints: Shape (K, M, joint_size), within the limits.
         rates: Mean joint rates from each time to the next, and the last ones again. Shape (K, M, joint_size).
         cost: Integral of half the weighted squared joint rates. Shape (K,).
-        misfit: Largest pose error anywhere, m and rad; infinite where a motion ran away. Shape (K,).
-        lost_at: When the pose error is largest, s. Shape (K,).
+        pose_error: Largest pose error anywhere, m and rad; infinite where a motion ran away. Shape (K,).
+        worst_time: When the pose error is largest, s. Shape (K,).
     """
 
     t: Array
@@ -319,11 +319,11 @@ class LocalMotion:
     joints: Array
     rates: Array
     cost: Array
-    misfit: Array
-    lost_at: Array
+    pose_error: Array
+    worst_time: Array
 
     @classmethod
-    def resting(cls, times: Array, base: Array, joints: Array) -> LocalMotion:
+    def stationary(cls, times: Array, base: Array, joints: Array) -> LocalMotion:
         """Motions in which nothing moves.
 
         Args:
@@ -334,13 +334,13 @@ class LocalMotion:
         places, angles = (np.repeat(each[:, None], many, axis=1) for each in (base, joints))
         return cls(times, places, angles, still, none, none, none)
 
-    def of(self, rows: Any) -> LocalMotion:
+    def take(self, rows: Any) -> LocalMotion:
         """Some of the motions."""
-        kept = (self.base, self.joints, self.rates, self.cost, self.misfit, self.lost_at)
+        kept = (self.base, self.joints, self.rates, self.cost, self.pose_error, self.worst_time)
         return LocalMotion(self.t, *(part[rows] for part in kept))
 
 
-def follow(
+def track_tasks(
     equations: TaskEquations,
     joints: Array,
     base: Array,
@@ -367,7 +367,7 @@ def follow(
     task = equations.function().map(count)
     b, q, u = ca.SX.sym("b", machine.base_size), ca.SX.sym("q", machine.joint_size), ca.SX.sym("u", machine.joint_size)
     moves = ca.Function("moves", [b, q, u], [machine.base_rate(b, q, u)]).map(count) if machine.base_size else None
-    posed, most = equations.posed, np.cos(equations.most_lean)
+    posed, most = equations.pose_rows, np.cos(equations.cone_angles)
     leaning = _leaning(equations).map(count) if most.size else None
     place, at = np.array(base, dtype=float), np.clip(joints, lower, upper)
     bases, postures, misfits = [place], [at], list[Array]()
@@ -436,7 +436,7 @@ def _leaning(equations: TaskEquations) -> Any:
     machine = equations.machine
     b, q, u = (ca.SX.sym("v", size) for size in (machine.base_size, machine.joint_size, machine.joint_size))
     targets = ca.SX.sym("targets", equations.target_function().numel_out())
-    cosines = equations.leans(b, q, targets)
+    cosines = equations.cone_cosines(b, q, targets)
     slopes = ca.jacobian(cosines, q)
     if machine.base_size:
         slopes = slopes + ca.mtimes(ca.jacobian(cosines, b), ca.jacobian(machine.base_rate(b, q, u), u))

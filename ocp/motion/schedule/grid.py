@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ocp.errors import ProblemError
-from ocp.motion.schedule.limits import JointPath, LineLimits, PathLike, Rows, causes, check_smooth, rows_at
-from ocp.motion.schedule.profile import Array, piece_of
+from ocp.motion.schedule.limits import JointPath, LineLimits, PathLike, Rows, check_smooth, limit_names, limit_rows
+from ocp.motion.schedule.profile import Array, segment_index
 from ocp.motion.schedule.settings import SETTINGS
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = ["Grid", "make_grid", "nodes_only", "reach"]
+__all__ = ["Grid", "coarse_grid", "make_grid", "reachable_bounds"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +30,7 @@ class Grid:
     Attributes:
         path, limits, joints: Of the schedule.
         distance: Of the nodes, from 0 to the path's length. Shape (N + 1,), m.
-        asked: Speed in each interval. Shape (N,), m/s.
+        requested: Requested speed in each interval. Shape (N,), m/s.
         jumps: Nodes where the path's pieces meet. Shape (B,).
         before: Distances just before these. Shape (B,), m.
         sharp: Whether jerks are limited anywhere.
@@ -40,7 +40,7 @@ class Grid:
     limits: LineLimits
     joints: JointPath | None
     distance: Array
-    asked: Array
+    requested: Array
     jumps: NDArray[np.intp]
     before: Array
     sharp: bool = True
@@ -52,15 +52,15 @@ class Grid:
         """
         at = np.flatnonzero((self.jumps > first) & (self.jumps <= last))
         places = np.concatenate([self.distance[first : last + 1], self.before[at]])
-        rows = rows_at(self.path, self.limits, self.joints, places)
+        rows = limit_rows(self.path, self.limits, self.joints, places)
         count = last - first
         right = np.arange(1, count + 1)
         right[self.jumps[at] - first - 1] = count + 1 + np.arange(len(at))
-        return rows.of(slice(count)), rows.of(right)
+        return rows.take(slice(count)), rows.take(right)
 
     def parts(self) -> list[tuple[int, int]]:
         """First and last nodes of parts of bounded length."""
-        ends = [*range(0, len(self.asked), SETTINGS.block), len(self.asked)]
+        ends = [*range(0, len(self.requested), SETTINGS.block), len(self.requested)]
         return list(pairwise(ends))
 
 
@@ -106,7 +106,7 @@ def make_grid(path: PathLike, limits: LineLimits, joints: JointPath | None) -> G
     s = _apart(np.concatenate([_in_time(cells, path.length), nodes]), nodes)
     inner = nodes[1:-1]
     before = inner - np.minimum(ROUNDING_SHARE * path.length, np.diff(nodes)[:-1] / 2)
-    of_interval = np.asarray(asked[piece_of(bounds, (s[:-1] + s[1:]) / 2)])
+    of_interval = np.asarray(asked[segment_index(bounds, (s[:-1] + s[1:]) / 2)])
     sharp = bool(np.isfinite(cells.sharp).any())
     return Grid(path, limits, joints, s, of_interval, np.searchsorted(s, inner), before, sharp)
 
@@ -121,13 +121,13 @@ def _halved(
         s: Places. Shape (M + 1,), m.
         asked: Bounds of the path's pieces, and the speed in each.
     """
-    rows = rows_at(path, limits, joints, s)
-    _check_rest(rows, s, causes(limits, joints))
+    rows = limit_rows(path, limits, joints, s)
+    _check_rest(rows, s, limit_names(limits, joints))
     new = np.arange(len(s) - 1)
     for _ in range(SETTINGS.halvings):
         middle = (s[new] + s[new + 1]) / 2
-        between = rows_at(path, limits, joints, middle)
-        wide = _uneven(rows.of(new), between, rows.of(new + 1), _top(rows, s, *asked)[new])
+        between = limit_rows(path, limits, joints, middle)
+        wide = _uneven(rows.take(new), between, rows.take(new + 1), _top(rows, s, *asked)[new])
         wide &= s[new + 1] - s[new] > SETTINGS.shortest * path.length
         if not wide.any():
             break
@@ -135,18 +135,18 @@ def _halved(
         s = np.insert(s, cut + 1, middle[wide])
         rows = Rows(*(np.insert(a, cut + 1, b[wide], axis=0) for a, b in zip(rows, between, strict=True)))
         new = np.sort(np.concatenate([cut + np.arange(len(cut)), cut + np.arange(len(cut)) + 1]))
-    top, left, right = _top(rows, s, *asked), rows.of(slice(-1)), rows.of(slice(1, None))
+    top, left, right = _top(rows, s, *asked), rows.take(slice(-1)), rows.take(slice(1, None))
     with np.errstate(divide="ignore"):
         sharp = 1 / np.maximum(np.abs(left.jerk[:, :, 0]), np.abs(right.jerk[:, :, 0])).max(axis=1, initial=0.0)
     most = 1 / np.maximum(np.abs(left.acceleration[:, :, 0]), np.abs(right.acceleration[:, :, 0])).max(axis=1)
     return _Cells(s[:-1], top, _rates(left, right, top**2, top**2), most, sharp)
 
 
-def nodes_only(path: PathLike, limits: LineLimits) -> Grid:
+def coarse_grid(path: PathLike, limits: LineLimits) -> Grid:
     """The first nodes of a path, no interval halved: enough to say where the line binds."""
     bounds = np.asarray(path.bounds, dtype=float)
     s = np.unique(np.concatenate([path.dense(SETTINGS.cells, 1), bounds]))
-    asked = np.asarray(path.by_piece(limits.speed)[piece_of(bounds, (s[:-1] + s[1:]) / 2)])
+    asked = np.asarray(path.by_piece(limits.speed)[segment_index(bounds, (s[:-1] + s[1:]) / 2)])
     return Grid(path, limits, None, s, asked, np.zeros(0, dtype=np.intp), np.zeros(0))
 
 
@@ -178,7 +178,9 @@ def _apart(places: Array, nodes: Array) -> Array:
 def _top(rows: Rows, s: Array, bounds: Array, asked: Array) -> Array:
     """Fastest steady speed in each interval, m/s."""
     steady = rows.steady()[0]
-    return np.asarray(np.minimum(np.minimum(steady[:-1], steady[1:]), asked[piece_of(bounds, (s[:-1] + s[1:]) / 2)]))
+    return np.asarray(
+        np.minimum(np.minimum(steady[:-1], steady[1:]), asked[segment_index(bounds, (s[:-1] + s[1:]) / 2)])
+    )
 
 
 def _uneven(left: Rows, middle: Rows, right: Rows, top: Array) -> NDArray[np.bool_]:
@@ -197,7 +199,9 @@ def _uneven(left: Rows, middle: Rows, right: Rows, top: Array) -> NDArray[np.boo
     return wide
 
 
-def reach(distance: Array, caps: Array, left: Rows, right: Rows, at_rest: tuple[bool, bool]) -> tuple[Array, Array]:
+def reachable_bounds(
+    distance: Array, caps: Array, left: Rows, right: Rows, at_rest: tuple[bool, bool]
+) -> tuple[Array, Array]:
     """Squared speeds that no motion exceeds, and accelerations of the line that none exceeds.
 
     Args:

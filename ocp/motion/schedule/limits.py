@@ -33,13 +33,13 @@ __all__ = [
     "Rows",
     "ToolLimits",
     "TorqueRates",
-    "causes",
     "check_joints",
     "check_line",
     "check_smooth",
     "curvature_along",
+    "limit_names",
+    "limit_rows",
     "rates_along",
-    "rows_at",
     "tool_along",
     "torque_rows",
     "torques_along",
@@ -343,7 +343,7 @@ class Rows(NamedTuple):
     acceleration: Array
     jerk: Array
 
-    def of(self, places: NDArray[np.intp] | slice) -> Rows:
+    def take(self, places: NDArray[np.intp] | slice) -> Rows:
         """Those at some of the places."""
         return Rows(self.speed[places], self.acceleration[places], self.jerk[places])
 
@@ -383,7 +383,7 @@ class Rows(NamedTuple):
         )
 
 
-def causes(limits: LineLimits, joints: JointPath | None) -> tuple[str, ...]:
+def limit_names(limits: LineLimits, joints: JointPath | None) -> tuple[str, ...]:
     """What each row limits, in the order of `Rows.demands`."""
     return tuple(name for kind in _kinds(limits, joints) for name in kind)
 
@@ -413,7 +413,7 @@ def torque_rows(limits: LineLimits, joints: JointPath | None) -> int:
     return len(joints.names)
 
 
-def rows_at(
+def limit_rows(
     path: PathLike, limits: LineLimits, joints: JointPath | None, distance: Array, *, torques: bool = True
 ) -> Rows:
     """Rows of all limits at distances (S,) of a path, those of `causes`; zeros for torques that are not asked for.

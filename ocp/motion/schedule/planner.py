@@ -18,19 +18,19 @@ from numpy.typing import ArrayLike, NDArray
 
 from ocp.console import interruptible
 from ocp.errors import ProblemError, checked_flag, sample_times
-from ocp.motion.schedule.grid import Grid, make_grid, nodes_only
-from ocp.motion.schedule.limits import JointPath, LineLimits, PathLike, causes, check_line, curvature_along
-from ocp.motion.schedule.profile import Array, LineMotion, SpeedProfile, joined, piece_of
-from ocp.motion.schedule.ramps import Zones, plan, ramp_distance
+from ocp.motion.schedule.grid import Grid, coarse_grid, make_grid
+from ocp.motion.schedule.limits import JointPath, LineLimits, PathLike, check_line, curvature_along, limit_names
+from ocp.motion.schedule.profile import Array, LineMotion, SpeedProfile, join_profiles, segment_index
+from ocp.motion.schedule.ramps import Zones, plan_zones, ramp_distance
 from ocp.motion.schedule.settings import SETTINGS
-from ocp.motion.schedule.stretch import fastest_over
+from ocp.motion.schedule.stretch import fastest_profile
 from ocp.motion.schedule.window import Stretch
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = ["Dip", "Schedule", "ramps_below_the_curve", "schedule"]
+__all__ = ["Dip", "Schedule", "plan_below_velocity_curve", "schedule"]
 
 
-def ramps_below_the_curve(path: PathLike, limits: LineLimits) -> SpeedProfile:
+def plan_below_velocity_curve(path: PathLike, limits: LineLimits) -> SpeedProfile:
     """The motion from rest to rest that keeps the limits of the line and of centripetal acceleration.
 
     Raises:
@@ -39,7 +39,7 @@ def ramps_below_the_curve(path: PathLike, limits: LineLimits) -> SpeedProfile:
     s, permitted, asked = _curve(path, limits)
     speed, memory = asked.copy(), dict[tuple[float, ...], tuple[tuple[float, float], ...]]()
     for number in range(SETTINGS.zone_rounds):
-        profile = plan(_zones(s, speed, limits), memory)
+        profile = plan_zones(_zones(s, speed, limits), memory)
         if not _lowered(s, permitted, speed, profile, number >= SETTINGS.thorough_from):
             return profile
     message = f"no plan below the speed that centripetal acceleration permits, after {SETTINGS.zone_rounds} rounds"
@@ -78,13 +78,13 @@ def _refined(
     at = np.searchsorted(s, inner)
     permitted[at] = np.minimum(most(before), permitted[at])
     for _ in range(SETTINGS.curve_halvings):
-        asked = of_pieces[piece_of(bounds, (s[:-1] + s[1:]) / 2)]
+        asked = of_pieces[segment_index(bounds, (s[:-1] + s[1:]) / 2)]
         cut = np.flatnonzero(_coarse(path.length, s, permitted, asked, limits.acceleration))
         if not cut.size:
             break
         middle = (s[cut] + s[cut + 1]) / 2
         s, permitted = np.insert(s, cut + 1, middle), np.insert(permitted, cut + 1, most(middle))
-    return s, permitted, np.asarray(of_pieces[piece_of(bounds, (s[:-1] + s[1:]) / 2)])
+    return s, permitted, np.asarray(of_pieces[segment_index(bounds, (s[:-1] + s[1:]) / 2)])
 
 
 def _coarse(length: float, s: Array, permitted: Array, asked: Array, acceleration: float) -> NDArray[np.bool_]:
@@ -119,7 +119,7 @@ def _lowered(s: Array, permitted: Array, speed: Array, profile: SpeedProfile, th
     here = np.concatenate([profile.at_distance(part).speed for part in np.array_split(s, len(s) // SETTINGS.block + 1)])
     top = np.maximum(here[:-1], here[1:])
     peaks = profile.peaks()
-    np.maximum.at(top, piece_of(s, peaks.distance), peaks.speed)
+    np.maximum.at(top, segment_index(s, peaks.distance), peaks.speed)
     most = np.minimum(permitted[:-1], permitted[1:])
     fast = np.minimum(top, speed) > most * (1 + ROUNDING_SHARE)
     if thoroughly:
@@ -148,7 +148,7 @@ class Dip:
     Attributes:
         start, end: Distances along the path, m.
         cause: The limit that binds, for example "centripetal acceleration" or "joint 'elbow' velocity".
-        asked, permitted: Asked line speed and the lowest steady one that the limits permit there, m/s: the same where
+        requested, permitted: Line speed and the lowest steady one that the limits permit there, m/s: the same where
             the limit binds on a ramp alone.
         speed: Lowest line speed of the schedule there, m/s.
         acceleration, jerk: Of the line speed, largest there, m/s^2 and m/s^3.
@@ -157,15 +157,15 @@ class Dip:
     start: float
     end: float
     cause: str
-    asked: float
+    requested: float
     permitted: float
     speed: float
     acceleration: float
     jerk: float
 
     def __str__(self) -> str:
-        slow = self.permitted < self.asked
-        amount = f"permits {self.permitted:.4g} of {self.asked:.4g} m/s" if slow else "binds on a ramp"
+        slow = self.permitted < self.requested
+        amount = f"permits {self.permitted:.4g} of {self.requested:.4g} m/s" if slow else "binds on a ramp"
         return (
             f"{self.start:.6g} to {self.end:.6g} m: {self.cause} {amount}, "
             f"line acceleration {self.acceleration:.4g} m/s^2, jerk {self.jerk:.4g} m/s^3"
@@ -246,17 +246,17 @@ def schedule(path: PathLike, limits: LineLimits, *, joints: JointPath | None = N
     if base is not None and not more:
         return Schedule(path, limits, base, (), joints)
     if base is not None and limited is None and limits.tool is None and len(path.bounds) > SETTINGS.long_path:
-        profile = ramps_below_the_curve(path, limits)
-        grid = nodes_only(path, limits)
+        profile = plan_below_velocity_curve(path, limits)
+        grid = coarse_grid(path, limits)
     else:
         grid = make_grid(path, limits, limited)
         profile = _planned(grid, base)
-    dips = () if profile is base else _dips(grid, profile, causes(limits, limited))
+    dips = () if profile is base else _dips(grid, profile, limit_names(limits, limited))
     if strict and dips:
         listed = "\n  ".join(str(dip) for dip in dips[:10])
         hint, one = "ask for less, larger blends, or strict=False", dips[0]
         message = f"the asked speed breaks limits in {len(dips)} place(s); {hint}:\n  {listed}"
-        raise ProblemError(message, name=one.cause, value=one.asked, limit=one.permitted, time=one.start)
+        raise ProblemError(message, name=one.cause, value=one.requested, limit=one.permitted, time=one.start)
     return Schedule(path, limits, profile, dips, joints)
 
 
@@ -266,14 +266,14 @@ def _by_ramps(path: PathLike, limits: LineLimits) -> SpeedProfile:
     first = np.concatenate([[0], 1 + np.flatnonzero(np.diff(asked))])
     same = np.ones(len(first))
     zones = Zones(bounds[np.append(first, len(asked))], asked[first], limits.acceleration * same, limits.jerk * same)
-    return plan(zones, {})
+    return plan_zones(zones, {})
 
 
 def _planned(grid: Grid, base: SpeedProfile | None) -> SpeedProfile:
     """The base motion where it keeps all limits, the fastest motion elsewhere."""
-    count = len(grid.asked)
+    count = len(grid.requested)
     if base is None:
-        return fastest_over(Stretch(grid, 0, count))
+        return fastest_profile(Stretch(grid, 0, count))
     broken = _broken(grid, base)
     if not broken.any():
         return base
@@ -282,9 +282,9 @@ def _planned(grid: Grid, base: SpeedProfile | None) -> SpeedProfile:
         stretches = _stretches(grid, base, broken, reach)
         found = []
         for first, last in stretches:
-            ends = [(0.0 if k in (0, count) else float(grid.asked[k]) ** 2, 0.0) for k in (first, last)]
+            ends = [(0.0 if k in (0, count) else float(grid.requested[k]) ** 2, 0.0) for k in (first, last)]
             try:
-                motion = fastest_over(Stretch(grid, first, last, (ends[0], ends[1])))
+                motion = fastest_profile(Stretch(grid, first, last, (ends[0], ends[1])))
             except ProblemError:
                 if (first, last) == (0, count):
                     raise
@@ -304,22 +304,22 @@ def _planned(grid: Grid, base: SpeedProfile | None) -> SpeedProfile:
         passed = float(s[last])
     if passed < s[-1]:
         parts.append(_cut(base, passed, float(s[-1])))
-    return joined(parts)
+    return join_profiles(parts)
 
 
 def _broken(grid: Grid, base: SpeedProfile) -> NDArray[np.bool_]:
     """Intervals of the grid in which a motion breaks a limit. Shape (N,)."""
-    over = np.zeros(len(grid.asked), dtype=bool)
+    over = np.zeros(len(grid.requested), dtype=bool)
     # inside an interval the jerk may change, and the speed be larger
     turns = base.at(np.concatenate([base.t, np.maximum(base.t[1:] - 1e-12 * base.duration, 0.0), base.peaks().t]))
-    at = piece_of(grid.distance, turns.distance)
+    at = segment_index(grid.distance, turns.distance)
     for first, last in grid.parts():
         here, inside = base.at_distance(grid.distance[first : last + 1]), (at >= first) & (at < last)
         turn = LineMotion(*(value[inside] for value in turns))
         for rows, ends in zip(grid.ends(first, last), (slice(-1), slice(1, None)), strict=True):
             motion = LineMotion(*(value[ends] for value in here))
             over[first:last] |= (np.abs(rows.demands(motion)) > 1 + ROUNDING_SHARE).any(axis=1)
-            passed = (np.abs(rows.of(at[inside] - first).demands(turn)) > 1 + ROUNDING_SHARE).any(axis=1)
+            passed = (np.abs(rows.take(at[inside] - first).demands(turn)) > 1 + ROUNDING_SHARE).any(axis=1)
             np.logical_or.at(over, at[inside], passed)
     return over
 
@@ -332,14 +332,14 @@ def _stretches(grid: Grid, base: SpeedProfile, broken: NDArray[np.bool_], reach:
     count, s, limits = len(broken), grid.distance, grid.limits
     here = base.at_distance(s)
     steady = (np.abs(here.acceleration) <= ROUNDING_SHARE * limits.acceleration) & (here.jerk == 0)
-    asked = np.minimum(np.append(grid.asked, np.inf), np.insert(grid.asked, 0, np.inf))
+    asked = np.minimum(np.append(grid.requested, np.inf), np.insert(grid.requested, 0, np.inf))
     steady &= np.abs(here.speed - asked) <= ROUNDING_SHARE * asked
     steady[[0, -1]] = True
     seats = np.flatnonzero(steady)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], broken.astype(np.int8), [0]]))).reshape(-1, 2)
     found: list[tuple[int, int]] = []
     for first, last in edges.tolist():
-        ramp = reach * ramp_distance(0.0, float(grid.asked[first:last].max()), limits.acceleration, limits.jerk)
+        ramp = reach * ramp_distance(0.0, float(grid.requested[first:last].max()), limits.acceleration, limits.jerk)
         low = int(np.searchsorted(s, s[first] - ramp, side="right")) - 1
         high = int(np.searchsorted(s, s[last] + ramp))
         begin = int(seats[np.searchsorted(seats, max(low, 0), side="right") - 1])
@@ -355,10 +355,10 @@ def _long_enough(grid: Grid, motion: SpeedProfile, first: int, last: int) -> boo
     """Whether a motion has not left the asked speed near those ends of its stretch that are none of the path."""
     length = motion.distance[-1] - motion.distance[0]
     for node, inside in ((first, first), (last, last - 1)):
-        if node in (0, len(grid.asked)):
+        if node in (0, len(grid.requested)):
             continue
         near = np.abs(motion.distance - grid.distance[node]) < 0.02 * length
-        if (motion.speed[near] < grid.asked[inside] * (1 - SETTINGS.leaving)).any():
+        if (motion.speed[near] < grid.requested[inside] * (1 - SETTINGS.leaving)).any():
             return False
     return True
 
@@ -374,15 +374,15 @@ def _cut(profile: SpeedProfile, begin: float, end: float) -> SpeedProfile:
     s[0], s[-1] = begin, end
     if end == profile.distance[-1]:
         v[-1], a[-1] = profile.speed[-1], profile.acceleration[-1]
-    return SpeedProfile(t - t[0], s, v, a, profile.jerk[piece_of(profile.t, (t[:-1] + t[1:]) / 2)])
+    return SpeedProfile(t - t[0], s, v, a, profile.jerk[segment_index(profile.t, (t[:-1] + t[1:]) / 2)])
 
 
 def _dips(grid: Grid, profile: SpeedProfile, names: tuple[str, ...]) -> tuple[Dip, ...]:
     """Where another limit than those of the line binds, while the motion stays below the asked speed."""
     middle = profile.at_distance((grid.distance[:-1] + grid.distance[1:]) / 2)
     of_line = [k for k, name in enumerate(names) if name.startswith("line ")]
-    cause, steady = np.zeros(len(grid.asked), dtype=np.intp), np.zeros(len(grid.asked))
-    binding = middle.speed < grid.asked * (1 - SETTINGS.reached)
+    cause, steady = np.zeros(len(grid.requested), dtype=np.intp), np.zeros(len(grid.requested))
+    binding = middle.speed < grid.requested * (1 - SETTINGS.reached)
     for first, last in grid.parts():
         part, sides = slice(first, last), grid.ends(first, last)
         here = LineMotion(*(value[part] for value in middle))
@@ -392,16 +392,16 @@ def _dips(grid: Grid, profile: SpeedProfile, names: tuple[str, ...]) -> tuple[Di
         cause[part], most = demand.argmax(axis=1), demand.max(axis=1)
         binding[part] &= (most > SETTINGS.binding) & (most >= line - (1 - SETTINGS.binding))
         steady[part] = np.minimum(*(rows.steady()[0] for rows in sides))
-    permitted = np.minimum(steady, grid.asked)
-    changes = (np.diff(binding) != 0) | (np.diff(cause) != 0) | (np.diff(grid.asked) != 0)
+    permitted = np.minimum(steady, grid.requested)
+    changes = (np.diff(binding) != 0) | (np.diff(cause) != 0) | (np.diff(grid.requested) != 0)
     edges = np.concatenate([[0], 1 + np.flatnonzero(changes), [len(binding)]])
     runs = np.stack([edges[:-1], edges[1:]], axis=1)[binding[edges[:-1]]]
     if not runs.size:
         return ()
     # runs of one cause are one dip, unless the asked speed is reached between them: the count of such intervals grows
-    reached = np.concatenate([[0], np.cumsum(middle.speed >= grid.asked * (1 - SETTINGS.reached))])
+    reached = np.concatenate([[0], np.cumsum(middle.speed >= grid.requested * (1 - SETTINGS.reached))])
     begin, end = runs[1:, 0], runs[:-1, 1]
-    apart = (cause[begin] != cause[end - 1]) | (grid.asked[begin] != grid.asked[end - 1])
+    apart = (cause[begin] != cause[end - 1]) | (grid.requested[begin] != grid.requested[end - 1])
     groups = np.concatenate([[0], 1 + np.flatnonzero(apart | (reached[begin] != reached[end]))])
 
     def extreme(of: np.ufunc, values: Array) -> Array:
@@ -413,7 +413,7 @@ def _dips(grid: Grid, profile: SpeedProfile, names: tuple[str, ...]) -> tuple[Di
         grid.distance[begin],
         grid.distance[end],
         [names[k] for k in cause[begin].tolist()],
-        grid.asked[begin],
+        grid.requested[begin],
         extreme(np.minimum, permitted),
         extreme(np.minimum, middle.speed),
         extreme(np.maximum, np.abs(middle.acceleration)),

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ocp.errors import NOT_NUMBERS, ProblemError, floats
 
-__all__ = ["Array", "LineMotion", "SpeedProfile", "advanced", "joined", "piece_of", "through"]
+__all__ = ["Array", "LineMotion", "SpeedProfile", "integrate_jerk", "join_profiles", "profile_through", "segment_index"]
 
 Array = NDArray[np.float64]
 
@@ -33,13 +33,13 @@ class LineMotion(NamedTuple):
     jerk: Array
 
 
-def advanced(speed: Any, acceleration: Any, jerk: Any, time: Any) -> tuple[Any, Any, Any]:
+def integrate_jerk(speed: Any, acceleration: Any, jerk: Any, time: Any) -> tuple[Any, Any, Any]:
     """Way covered in a time under constant jerk, and the speed and acceleration then; numbers, arrays or casadi."""
     s = time * (speed + time * (acceleration / 2 + time * jerk / 6))
     return s, speed + time * (acceleration + time * jerk / 2), acceleration + time * jerk
 
 
-def piece_of(bounds: ArrayLike, places: ArrayLike, side: Literal["left", "right"] = "right") -> NDArray[np.intp]:
+def segment_index(bounds: ArrayLike, places: ArrayLike, side: Literal["left", "right"] = "right") -> NDArray[np.intp]:
     """Index of the piece between increasing bounds (K + 1,) that holds each place; at a bound the right or left one.
 
     What lies beyond the ends counts for the first and the last piece.
@@ -113,7 +113,7 @@ class SpeedProfile:
             ProblemError: nan, or a time outside by more than rounding.
         """
         t = _inside(time, self.duration, "time", f"s is outside the schedule, 0 to {self.duration:g} s")
-        piece = piece_of(self.t, t)
+        piece = segment_index(self.t, t)
         motion = self._motion(piece, t - self.t[piece])
         # the end is known, but for rounding the pieces lead to it
         for values, last in zip(motion[:4], (self.t, self.distance, self.speed, self.acceleration), strict=True):
@@ -128,7 +128,7 @@ class SpeedProfile:
         """
         length = float(self.distance[-1])
         s = _inside(distance, length, "distance", f"m is off the path, which is {length:g} m long")
-        piece = piece_of(self.distance, s, side="left")
+        piece = segment_index(self.distance, s, side="left")
         inside = self._time_inside(piece, s - self.distance[piece])
         # at rest the time is the cube root of a rounding error: the end is known exactly
         return self._motion(piece, np.where(s == length, np.diff(self.t)[-1], inside))
@@ -152,14 +152,14 @@ class SpeedProfile:
         row = ca.MX(ca.DM(table))[:, piece]
         start, s, v, a, j = ca.vertsplit(row)
         t = inside - start
-        way, speed, acceleration = advanced(v, a, j, t)
+        way, speed, acceleration = integrate_jerk(v, a, j, t)
         outputs = [s + way, speed, acceleration, j]
         return ca.Function("profile", [time], outputs, ["time"], ["distance", "speed", "acceleration", "jerk"])
 
     def _motion(self, piece: NDArray[np.intp], t: Array) -> LineMotion:
         """At times (M,) after the start of pieces (M,)."""
         s, v, a, j = self.distance[piece], self.speed[piece], self.acceleration[piece], self.jerk[piece]
-        way, speed, acceleration = advanced(v, a, j, t)
+        way, speed, acceleration = integrate_jerk(v, a, j, t)
         return LineMotion(self.t[piece] + t, s + way, np.maximum(speed, 0.0), acceleration, j)  # no rounding below rest
 
     def _time_inside(self, piece: NDArray[np.intp], distance: Array) -> Array:
@@ -171,14 +171,14 @@ class SpeedProfile:
         todo = np.flatnonzero(~even)
         # Newton inside a bracket, for those that still move: the distance grows with the time
         high = high[todo]
-        whole = advanced(v[todo], a[todo], j[todo], high)[0]
+        whole = integrate_jerk(v[todo], a[todo], j[todo], high)[0]
         t[todo] = high * np.clip(distance[todo] / np.maximum(whole, 1e-300), 0.0, 1.0) ** np.where(a[todo] == 0, 0.5, 1)
         low = np.zeros_like(high)
         for _ in range(60):  # more than halving a bracket to the last digit takes
             if not todo.size:
                 break
             x = t[todo]
-            covered, speed, _ = advanced(v[todo], a[todo], j[todo], x)
+            covered, speed, _ = integrate_jerk(v[todo], a[todo], j[todo], x)
             error = covered - distance[todo]
             low, high = np.where(error <= 0, x, low), np.where(error >= 0, x, high)
             with np.errstate(divide="ignore", invalid="ignore"):
@@ -190,7 +190,7 @@ class SpeedProfile:
         return np.asarray(t)
 
 
-def through(distance: Array, speed: Array, acceleration: Array) -> SpeedProfile:
+def profile_through(distance: Array, speed: Array, acceleration: Array) -> SpeedProfile:
     """Pieces of constant jerk through given motions: two of one duration between neighbours, rest at an end with one.
 
     Over a way h, T follows from h = (v0 + v1)/2 T - (a1 - a0)/12 T^2, which two jerks of T/2 each satisfy.
@@ -205,8 +205,8 @@ def through(distance: Array, speed: Array, acceleration: Array) -> SpeedProfile:
     half = time / 2
     first = (np.diff(speed) - acceleration[:-1] * time) / half**2 - 0.5 * change / half
     second = change / half - first
-    _, middle, rate = advanced(speed[:-1], acceleration[:-1], first, half)
-    way = advanced(speed[:-1], acceleration[:-1], first, half)[0]
+    _, middle, rate = integrate_jerk(speed[:-1], acceleration[:-1], first, half)
+    way = integrate_jerk(speed[:-1], acceleration[:-1], first, half)[0]
     t = np.concatenate([[0.0], np.cumsum(np.repeat(half, 2))])
 
     def both(nodes: Array, between: Array) -> Array:
@@ -217,7 +217,7 @@ def through(distance: Array, speed: Array, acceleration: Array) -> SpeedProfile:
     return SpeedProfile(t, places, both(speed, np.maximum(middle, 0.0)), both(acceleration, rate), jerk)
 
 
-def joined(parts: Sequence[SpeedProfile]) -> SpeedProfile:
+def join_profiles(parts: Sequence[SpeedProfile]) -> SpeedProfile:
     """Profiles one after the other; each begins where the one before ends."""
     if len(parts) == 1:
         return parts[0]

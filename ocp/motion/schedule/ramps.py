@@ -23,20 +23,20 @@ import numpy as np
 from ruckig import InputParameter, Result, Ruckig, RuckigError, Trajectory
 
 from ocp.errors import ProblemError, checked_nonnegative, checked_positive
-from ocp.motion.schedule.profile import Array, SpeedProfile, advanced
+from ocp.motion.schedule.profile import Array, SpeedProfile, integrate_jerk
 from ocp.tolerances import ROUNDING_SHARE
 
 __all__ = [
     "Memory",
     "Phases",
     "Zones",
-    "fastest",
-    "passes",
+    "fastest_motion",
     "peak_acceleration",
-    "plan",
+    "plan_zones",
     "ramp_distance",
     "ramp_time",
-    "reach",
+    "reachability_passes",
+    "reachable_speed",
 ]
 
 Phases = tuple[tuple[float, float], ...]
@@ -83,7 +83,7 @@ def ramp_distance(first: float, last: float, acceleration: float, jerk: float) -
     return (first + last) / 2 * ramp_time(abs(last - first), acceleration, jerk)
 
 
-def reach(speed: float, distance: float, acceleration: float, jerk: float) -> float:
+def reachable_speed(speed: float, distance: float, acceleration: float, jerk: float) -> float:
     """Greatest speed (m/s) to which the speed can change within a distance (m), without acceleration at both ends.
 
     The inverse of ramp_distance: the same for slowing down from that speed.
@@ -120,7 +120,7 @@ def peak_acceleration(mean: float, speed: float, jerk: float) -> float:
     return jerk * (time - sqrt(square)) / 2
 
 
-def fastest(distance: float, first: float, last: float, top: float, acceleration: float, jerk: float) -> Phases:
+def fastest_motion(distance: float, first: float, last: float, top: float, acceleration: float, jerk: float) -> Phases:
     """Fastest motion over a distance (m) from one speed to another, without acceleration at both ends.
 
     ruckig finds it, in units of the distance and of the time that the top speed takes for it. Where its answer does
@@ -157,7 +157,7 @@ def _closes(phases: Phases, distance: float, first: float, last: float, top: flo
     s, v, a = 0.0, first, 0.0
     error = ROUNDING_SHARE * top
     for t, j in phases:
-        way, v, a = advanced(v, a, j, t)
+        way, v, a = integrate_jerk(v, a, j, t)
         s += way
         if not min(first, last) - error <= v <= top + error:
             return False
@@ -197,7 +197,7 @@ def _ramp(change: float, acceleration: float, jerk: float) -> Phases:
     return ((t, sign * jerk), *flat, (t, -sign * jerk))
 
 
-def plan(zones: Zones, memory: Memory) -> SpeedProfile:
+def plan_zones(zones: Zones, memory: Memory) -> SpeedProfile:
     """Line speed from rest to rest, as fast as the zones' limits allow with no acceleration at their bounds.
 
     A backward and a forward pass find the speeds at the bounds, then each zone is the fastest motion between them.
@@ -220,7 +220,7 @@ def plan(zones: Zones, memory: Memory) -> SpeedProfile:
         if first == last == top:
             motions.append(((length / top, 0.0),))
         else:
-            motions.append(memory[key] if key in memory else memory.setdefault(key, fastest(*key)))
+            motions.append(memory[key] if key in memory else memory.setdefault(key, fastest_motion(*key)))
     return _profile(zones, np.array(ends), motions)
 
 
@@ -238,7 +238,7 @@ def _profile(zones: Zones, ends: Array, motions: list[Phases]) -> SpeedProfile:
         on = np.flatnonzero(counts > number)
         at = starts[on] + number
         s[at], v[at], a[at] = place[on], speed[on], rate[on]
-        way, faster, rising = advanced(speed[on], rate[on], jerks[at], durations[at])
+        way, faster, rising = integrate_jerk(speed[on], rate[on], jerks[at], durations[at])
         place[on] += way
         speed[on] = np.maximum(faster, 0.0)
         rate[on] = np.where(np.abs(rising) > 1e-9 * zones.acceleration[on], rising, 0.0)
@@ -248,10 +248,10 @@ def _profile(zones: Zones, ends: Array, motions: list[Phases]) -> SpeedProfile:
 
 def _limited(speed: float, other: float, length: float, limits: tuple[float, float, float]) -> float:
     """The greater speed at one end of a zone, lowered to what can be reached from that at the other."""
-    return min(speed, reach(other, length * (1 - REACH_MARGIN), *limits[1:]))
+    return min(speed, reachable_speed(other, length * (1 - REACH_MARGIN), *limits[1:]))
 
 
-def passes(distance: Array, most: Array, p: Array, q: Array, low: Array, high: Array) -> Array:
+def reachability_passes(distance: Array, most: Array, p: Array, q: Array, low: Array, high: Array) -> Array:
     """Greatest squared speeds at nodes, from rest to rest.
 
     Args:

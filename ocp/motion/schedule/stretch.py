@@ -18,16 +18,16 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 
 from ocp.errors import ProblemError, SolveError
-from ocp.motion.schedule.grid import reach
+from ocp.motion.schedule.grid import reachable_bounds
 from ocp.motion.schedule.limits import Rows
-from ocp.motion.schedule.profile import Array, SpeedProfile, joined
+from ocp.motion.schedule.profile import Array, SpeedProfile, join_profiles
 from ocp.motion.schedule.program import Program, Spline, SplineRows, least_time
-from ocp.motion.schedule.ramps import passes
+from ocp.motion.schedule.ramps import reachability_passes
 from ocp.motion.schedule.settings import SETTINGS
-from ocp.motion.schedule.window import HELD, INSIDE, Ends, Motion, Stretch, Window, demanded, profile_of
+from ocp.motion.schedule.window import HELD, INSIDE, Ends, Motion, Stretch, Window, limit_usage, motion_profile
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = ["fastest_over"]
+__all__ = ["fastest_profile"]
 
 
 class _Margins(NamedTuple):
@@ -46,7 +46,7 @@ class _Margins(NamedTuple):
         shapes = (count,), (count, rows.acceleration.shape[1]), (count, rows.jerk.shape[1])
         return cls(*(np.full(shape, value) for shape in shapes))
 
-    def of(self, part: slice) -> _Margins:
+    def take(self, part: slice) -> _Margins:
         """Those of some intervals, which change with these."""
         return _Margins(*(margin[part] for margin in self))
 
@@ -84,7 +84,7 @@ class _Tight:
     def part(self, first: int, last: int) -> _Tight:
         """That of some intervals, which changes with it."""
         part = slice(first, last)
-        return _Tight(self.margins.of(part), self.times.of(part), self.held[:, :, part], self.speeds[:, part])
+        return _Tight(self.margins.take(part), self.times.take(part), self.held[:, :, part], self.speeds[:, part])
 
     def hold_near(self, used: Array, values: Array, jerks: Array) -> None:
         """Hold rows that come near their bounds, there and in the intervals beside, and some row of jerk in each.
@@ -146,14 +146,14 @@ class _Tight:
                 self.held[:, :, at[0][inherited], a + at[1][inherited]] = True
 
 
-def fastest_over(stretch: Stretch) -> SpeedProfile:
+def fastest_profile(stretch: Stretch) -> SpeedProfile:
     """The fastest motion over a stretch, its distance that along the path.
 
     Raises:
         ProblemError: Limits that no motion keeps, by place.
     """
     if not stretch.grid.sharp:
-        return _settled(Window.of(stretch, stretch.first, stretch.last, stretch.ends), stretch.last, None)[0]
+        return _settled(Window.build(stretch, stretch.first, stretch.last, stretch.ends), stretch.last, None)[0]
     parts: list[SpeedProfile] = []
     begin, state, behind = stretch.first, stretch.ends[0], None
     while True:
@@ -161,11 +161,11 @@ def fastest_over(stretch: Stretch) -> SpeedProfile:
         last = end == stretch.last
         seam = end if last else end - SETTINGS.overlap
         goal = stretch.ends[1] if last else (0.0, 0.0)
-        window = Window.of(stretch, begin, end, (state, goal))
+        window = Window.build(stretch, begin, end, (state, goal))
         part, state, behind = _settled(window, seam, behind)
         parts.append(part)
         if last:
-            return joined(parts)
+            return join_profiles(parts)
         begin = seam
 
 
@@ -190,7 +190,7 @@ def _settled(window: Window, seam: int, before: _Tight | None) -> tuple[SpeedPro
     kept, seen = seam - window.first, min(seam + SETTINGS.overlap // 2, window.last) - window.first
     x, slope = _tightened(window, tight, seam, seen)
     state = float(x[kept]), 0.0 if slope is None else float(slope[kept])
-    return profile_of(window, x[: kept + 1], slope), state, tight.part(kept, window.last - window.first)
+    return motion_profile(window, x[: kept + 1], slope), state, tight.part(kept, window.last - window.first)
 
 
 def _tightened(window: Window, tight: _Tight, seam: int, seen: int) -> tuple[Array, Array | None]:
@@ -216,7 +216,7 @@ def _tightened(window: Window, tight: _Tight, seam: int, seen: int) -> tuple[Arr
                 raise
             free = every  # too short to change the motion in
             continue
-        used, values = demanded(window, profile_of(window, x, slope), free, start is not None or not sharp)
+        used, values = limit_usage(window, motion_profile(window, x, slope), free, start is not None or not sharp)
         used /= _room(window, seam)[:, None]
         if start is None and slope is not None:
             tight.hold_near(used, values, window.rows[1].jerk[:, :, 0])
@@ -258,13 +258,13 @@ def _without_jerk(window: Window, margins: _Margins) -> Array:
     grid = window.grid
     left, right = window.rows[0], window.rows[-1]
     h = np.diff(window.nodes)[:, None]
-    caps = np.minimum(_beside(grid.asked) ** 2, _by_rows(window) * _beside(margins.speed) ** 2)
+    caps = np.minimum(_beside(grid.requested) ** 2, _by_rows(window) * _beside(margins.speed) ** 2)
     of = left.acceleration, right.acceleration
     p = np.concatenate([of[0][:, :, 0], of[1][:, :, 0] + 2 * h * of[1][:, :, 1]], axis=1)
     q, rest = (np.concatenate([side[:, :, seat] for side in of], axis=1) for seat in (1, 2))
     bound = np.concatenate([margins.acceleration] * 2, axis=1)
     caps[[0, -1]] = 0.0
-    return passes(window.nodes, caps, p, q, -bound - rest, bound - rest)
+    return reachability_passes(window.nodes, caps, p, q, -bound - rest, bound - rest)
 
 
 def _by_rows(window: Window) -> Array:
@@ -288,9 +288,9 @@ def _with_jerk(
     at_rest = ends[0][0] == 0, ends[1][0] == 0
     room = _room(window, seam)
     shares = tight.margins.times(room)
-    asked = grid.asked[begin:end] ** 2 * room**2
+    asked = grid.requested[begin:end] ** 2 * room**2
     caps = np.minimum(_beside(asked), _by_rows(window) * _beside(shares.speed) ** 2)
-    up, rates = reach(nodes, caps, left, right, at_rest)
+    up, rates = reachable_bounds(nodes, caps, left, right, at_rest)
     # from rest: the first interval, of constant jerk, is no part of the program
     low, high = int(at_rest[0]), len(nodes) - int(at_rest[1])
     rest = [0.0, 0.0]
@@ -326,9 +326,9 @@ def _with_jerk(
             b[outermost], b[next_to] = x_end, x_end + way * slope_end / 2
             most[[outermost, next_to]] = np.inf
             fixed += [outermost, next_to]
-    own_shares = shares.of(cells)
+    own_shares = shares.take(cells)
     moving = (not at_rest[0], not at_rest[1])
-    places = tuple(rows.of(cells) for rows in window.rows)
+    places = tuple(rows.take(cells) for rows in window.rows)
     with np.errstate(invalid="ignore"):
         implied = (1 - spline.share) * most[:-1] + spline.share * most[1:]
     rows = _rows(places, held[:, :, cells], caps[inner], implied, own_shares, tight.speeds[:, cells], moving)

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ocp.motion.schedule.grid import Grid
-from ocp.motion.schedule.limits import Rows, rows_at, torque_rows
-from ocp.motion.schedule.profile import Array, LineMotion, SpeedProfile, through
+from ocp.motion.schedule.limits import Rows, limit_rows, torque_rows
+from ocp.motion.schedule.profile import Array, LineMotion, SpeedProfile, profile_through
 from ocp.motion.schedule.settings import SETTINGS
 
-__all__ = ["HELD", "INSIDE", "Ends", "Motion", "Stretch", "Window", "demanded", "profile_of"]
+__all__ = ["HELD", "INSIDE", "Ends", "Motion", "Stretch", "Window", "limit_usage", "motion_profile"]
 
 INSIDE = (0.25, 0.5, 0.75)
 """Where each interval is looked at between its ends, as shares of its length."""
@@ -59,14 +59,14 @@ class Window(Stretch):
     close: dict[tuple[int, bool], Rows] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, stretch: Stretch, first: int, last: int, ends: Ends) -> Window:
+    def build(cls, stretch: Stretch, first: int, last: int, ends: Ends) -> Window:
         """Part of a stretch between two nodes."""
         grid = stretch.grid
         begin, h = grid.distance[first:last], np.diff(grid.distance[first : last + 1])
         left, right = grid.ends(first, last)
         places = np.concatenate([begin + share * h for share in INSIDE])
-        rows = rows_at(grid.path, grid.limits, grid.joints, places)
-        inside = [rows.of(slice(k * len(h), (k + 1) * len(h))) for k in range(len(INSIDE))]
+        rows = limit_rows(grid.path, grid.limits, grid.joints, places)
+        inside = [rows.take(slice(k * len(h), (k + 1) * len(h))) for k in range(len(INSIDE))]
         all_of_them = (left, *inside, right)
         bends = _bends([each.acceleration for each in all_of_them]), _bends([each.jerk for each in all_of_them])
         return cls(grid, first, last, ends, all_of_them, bends)
@@ -81,9 +81,9 @@ class Window(Stretch):
         if new:
             grid, begin, h = self.grid, self.nodes[new], np.diff(self.nodes)[new]
             places = begin[:, None] + np.arange(1, parts) / parts * h[:, None]
-            rows = rows_at(grid.path, grid.limits, grid.joints, places.ravel(), torques=torques)
+            rows = limit_rows(grid.path, grid.limits, grid.joints, places.ravel(), torques=torques)
             for k, at in enumerate(new):
-                self.close[self.first + at, torques] = rows.of(
+                self.close[self.first + at, torques] = rows.take(
                     slice(k * (SETTINGS.fine - 1), (k + 1) * (SETTINGS.fine - 1))
                 )
         found = [self.close[self.first + at, torques] for at in intervals.tolist()]
@@ -102,17 +102,17 @@ class Window(Stretch):
         return self.grid.distance[self.first : self.last + 1]
 
 
-def profile_of(stretch: Stretch, x: Array, slope: Array | None) -> SpeedProfile:
+def motion_profile(stretch: Stretch, x: Array, slope: Array | None) -> SpeedProfile:
     """The motion with squared speeds, and their slopes where jerks are limited, at the first nodes of a stretch."""
     s = stretch.grid.distance[stretch.first : stretch.first + len(x)]
     v = np.sqrt(x)
     if slope is not None:
-        return through(s, v, slope[: len(x)] / 2)
+        return profile_through(s, v, slope[: len(x)] / 2)
     t = np.concatenate([[0.0], np.cumsum(2 * np.diff(s) / (v[:-1] + v[1:]))])
     return SpeedProfile(t, s, v, np.append(np.diff(x) / (2 * np.diff(s)), 0.0), np.zeros(len(s) - 1))
 
 
-def demanded(
+def limit_usage(
     window: Window, profile: SpeedProfile, which: NDArray[np.intp], closely: bool = True
 ) -> tuple[Array, Array]:
     """Demands over their limits in some intervals (B,): the largest, upwards and downwards, and those at `HELD` places.
@@ -124,7 +124,7 @@ def demanded(
     """
     count, h = len(which), np.diff(window.nodes)[which]
     every, left = count == window.last - window.first, window.nodes[which]
-    begin, before, here, after, end = window.rows if every else (rows.of(which) for rows in window.rows)
+    begin, before, here, after, end = window.rows if every else (rows.take(which) for rows in window.rows)
     each = len(profile.jerk) // (window.last - window.first)
     # the halves meet where the jerk changes, near the middle: rows there are those of a parabola as well
     at = profile.distance[1::2][which] if each == 2 else left + h / 2

@@ -14,7 +14,7 @@ from models import Joint, Machine
 from models.arrays import Array, warn_of_degrees
 from ocp.errors import NOT_NUMBERS, ProblemError, floats, real, told_apart
 from ocp.motion.tasks.equations import TaskEquations
-from ocp.motion.tasks.geometry import Bound, is_holonomic, target_size
+from ocp.motion.tasks.geometry import BoundTask, is_holonomic, target_size
 from ocp.motion.tasks.tip_task import ANGULAR, TipTask
 
 __all__ = [
@@ -27,10 +27,10 @@ __all__ = [
     "checked_numbers",
     "checked_tasks",
     "checked_weights",
+    "clip_to_limits",
     "dependent_rows",
     "horizon_of",
     "ignorable_joints",
-    "inside_limits",
     "rates_at_rest",
 ]
 
@@ -109,7 +109,7 @@ def checked_configuration(machine: Machine, joints: Any, base: Any) -> tuple[Arr
     return angles, place
 
 
-def inside_limits(what: str, names: Sequence[str], joints: Array, lower: Array, upper: Array, hint: str) -> Array:
+def clip_to_limits(what: str, names: Sequence[str], joints: Array, lower: Array, upper: Array, hint: str) -> Array:
     """Joints at an end, nan where they are free, moved onto the limits that rounding has them beyond. Shape (n,).
 
     Raises:
@@ -187,7 +187,7 @@ def checked_tasks(equations: TaskEquations, base: Array, joints: Array, horizon:
             if not part.task.is_pose:
                 continue
             alone = TaskEquations(equations.machine, (part,))
-            misfit = np.array(alone.misfit(base, joints, alone.target_function()(0.0)))
+            misfit = np.array(alone.pose_residual(base, joints, alone.target_function()(0.0)))
             gap = float(np.abs(misfit).max())
             if gap > part.task.start_gap:
                 words = (
@@ -216,7 +216,7 @@ def ignorable_joints(equations: TaskEquations, base: Array) -> NDArray[np.bool_]
     b, q, u = (ca.SX.sym("v", size) for size in (machine.base_size, n, n))
     targets = ca.SX.sym("targets", sum(target_size(part.task) for part in equations.bound))
     parts = [equations.jacobian(b, q), equations.right(b, q, targets)]
-    parts += [machine.base_rate(b, q, u), equations.leans(b, q, targets)]
+    parts += [machine.base_rate(b, q, u), equations.cone_cosines(b, q, targets)]
     function = ca.Function("asked", [b, q, u, targets], parts, {"cse": True})
     at_zero = np.array(equations.target_function()(0.0)).ravel()
     found = np.ones(n, dtype=bool)
@@ -241,7 +241,7 @@ def _rows_by_name(equations: TaskEquations) -> list[int]:
     return list(range(equations.size))
 
 
-def _frame(part: Bound) -> str:
+def _frame(part: BoundTask) -> str:
     """The name of the link that a task moves."""
     return part.task.link or part.tip.robot.tip_link
 
@@ -252,7 +252,7 @@ def _sampled(equations: TaskEquations, horizon: float, count: int) -> tuple[Arra
     return times, np.array(equations.target_function().map(count)(times[None, :]))
 
 
-def _parts(equations: TaskEquations, values: Array) -> list[tuple[Bound, Array]]:
+def _parts(equations: TaskEquations, values: Array) -> list[tuple[BoundTask, Array]]:
     """Each task with its rows of the targets."""
     ends = np.cumsum([target_size(part.task) for part in equations.bound])
     return list(zip(equations.bound, np.split(values, ends[:-1]), strict=True))

@@ -23,24 +23,24 @@ from models.robot.indices import manipulability_of
 from models.spatial import on_scalars
 from ocp.errors import ProblemError, checked_each
 from ocp.motion.tasks.geometry import (
-    Bound,
+    BoundTask,
     angular_velocity,
     closing_combinations,
     cross_product,
     derivative,
-    held_task,
-    holding_rows,
     is_holonomic,
+    movable_angular_rows,
     pose_error,
+    pose_error_rows,
+    pose_holding_task,
     pose_in_reference,
     reference_pose,
     relative_twist,
     rotation_of,
-    rows_of,
     split_targets,
     target_size,
-    turning_rows,
-    wanted_twist,
+    target_twist,
+    task_rows,
 )
 from ocp.motion.tasks.tip_task import ANGULAR, TipTask
 from ocp.motion.tasks.tracks import on_symbols, track_expression
@@ -59,14 +59,14 @@ class TaskEquations:
     """
 
     machine: Machine
-    bound: tuple[Bound, ...]
+    bound: tuple[BoundTask, ...]
 
     @property
     def size(self) -> int:
         return sum(part.task.size for part in self.bound)
 
     @property
-    def posed(self) -> NDArray[np.bool_]:
+    def pose_rows(self) -> NDArray[np.bool_]:
         """Which rows are of poses. Shape (size,), bool."""
         return np.repeat([part.task.is_pose for part in self.bound], [part.task.size for part in self.bound])
 
@@ -144,7 +144,7 @@ class TaskEquations:
         rows = []
         for part in self.bound:
             relative = relative_twist(part, base, joints, part.tip.tip_jacobian(base, joints), None)
-            rows.append(rows_of(part, base, joints, relative))
+            rows.append(task_rows(part, base, joints, relative))
         return ca.densify(ca.cse(ca.vertcat(*rows)) if _is_symbolic(base, joints) else ca.vertcat(*rows))
 
     @on_scalars
@@ -159,9 +159,9 @@ class TaskEquations:
         for part, wanted in self._with_targets(targets):
             twist = relative_twist(part, base, joints, part.tip.tip_twist(base, joints, rates), rates)
             if part.task.velocity is not None:
-                rows.append(rows_of(part, base, joints, twist) - wanted)
+                rows.append(task_rows(part, base, joints, twist) - wanted)
             else:
-                rows.append(rows_of(part, base, joints, twist - wanted_twist(part, base, joints, wanted)))
+                rows.append(task_rows(part, base, joints, twist - target_twist(part, base, joints, wanted)))
         return ca.densify(ca.vertcat(*rows))
 
     @on_scalars
@@ -170,10 +170,10 @@ class TaskEquations:
         rows = []
         for part in self.bound:
             moving = relative_twist(part, base, joints, part.tip.tip_twist(base, joints, rates), rates)
-            rows.append(rows_of(part, base, joints, moving))
+            rows.append(task_rows(part, base, joints, moving))
         return ca.densify(ca.vertcat(*rows))
 
-    def strays(self, base: Any, joints: Any, rates: Any, targets: Any) -> dict[str, dict[str, Any]]:
+    def deviations(self, base: Any, joints: Any, rates: Any, targets: Any) -> dict[str, dict[str, Any]]:
         """How far the tips stray from their tasks, to be watched: arguments of `Problem.watch` by name.
 
         Errors of poses, "task position" and "task orientation"; of velocities the integral of what they are missed by,
@@ -192,7 +192,7 @@ class TaskEquations:
             (False, False, "task way", "m"),
             (False, True, "task turn", "rad"),
         ):
-            rows = np.flatnonzero((self.posed == posed) & (self.turning == turning)).tolist()
+            rows = np.flatnonzero((self.pose_rows == posed) & (self.turning == turning)).tolist()
             if rows:
                 what = (error if posed else missed)[rows]
                 off = gaps[rows] if posed else 0.0
@@ -250,16 +250,16 @@ class TaskEquations:
             if part.task.velocity is not None:
                 rows.append(ca.DM(part.task.size, 1))
             else:
-                rows.append(rows_of(part, base, joints, pose_error(part, base, joints, wanted)))
+                rows.append(task_rows(part, base, joints, pose_error(part, base, joints, wanted)))
         return ca.densify(ca.vertcat(*rows))
 
     def gap(self, base: Any, joints: Any, rates: Any, targets: Any) -> Any:
         """Pose found less pose wanted in the rows of poses, `residual` in those of velocities. Shape (size, 1)."""
         error, residual = self.error(base, joints, targets), self.residual(base, joints, rates, targets)
-        return ca.vertcat(*((-error if posed else residual)[i] for i, posed in enumerate(self.posed)))
+        return ca.vertcat(*((-error if posed else residual)[i] for i, posed in enumerate(self.pose_rows)))
 
     @on_scalars
-    def misfit(self, base: Any, joints: Any, targets: Any) -> Any:
+    def pose_residual(self, base: Any, joints: Any, targets: Any) -> Any:
         """Distance from the poses, one column, without the zeros that `error` has half a turn away.
 
         m, and chords of the unit circle (2 sin(angle / 2), near zero the angle in rad): for all turning of a frame the
@@ -280,21 +280,21 @@ class TaskEquations:
                     rows.append(ca.fmax(float(np.cos(task.within)) - self._cosine(part, base, joints, wanted), 0))
                 elif task.direction is not None:
                     rows.append(goal - ca.mtimes(turn, ca.DM(task.tool_axis)))
-                elif set(task.chosen) >= set(ANGULAR) or set(task.chosen) >= set(turning_rows(part)):
+                elif set(task.chosen) >= set(ANGULAR) or set(task.chosen) >= set(movable_angular_rows(part)):
                     rows.append(ca.vec(goal - turn) / np.sqrt(2))
                 else:
                     cosine = (ca.trace(ca.mtimes(goal, turn.T)) - 1) / 2
                     half = error[0:3] * ca.sqrt(2 / (1 + ca.fmax(cosine, -1 + 1e-9)))
                     angular = [i for i, row in enumerate(task.chosen) if row in ANGULAR]
-                    rows.append(rows_of(part, base, joints, ca.vertcat(half, ca.DM(3, 1)))[angular])
+                    rows.append(task_rows(part, base, joints, ca.vertcat(half, ca.DM(3, 1)))[angular])
             if place is not None:
                 tilt = 2 if task.tilts else 0
                 linear = [tilt + i for i, row in enumerate(task.chosen) if row not in ANGULAR]
-                rows.append(rows_of(part, base, joints, ca.vertcat(ca.DM(3, 1), error[3:6]))[linear])
+                rows.append(task_rows(part, base, joints, ca.vertcat(ca.DM(3, 1), error[3:6]))[linear])
         return ca.densify(ca.vertcat(*rows))
 
     @on_scalars
-    def leans(self, base: Any, joints: Any, targets: Any) -> Any:
+    def cone_cosines(self, base: Any, joints: Any, targets: Any) -> Any:
         """Cosines of the angles by which tool axes lean from their directions, of the tasks that let them.
 
         Shape (number of tasks with `within`, 1).
@@ -306,11 +306,11 @@ class TaskEquations:
         return ca.densify(ca.vertcat(*rows))
 
     @property
-    def most_lean(self) -> Array:
+    def cone_angles(self) -> Array:
         """Angles that the tool axes of `leans` may lean, rad. Shape as of `leans`, (k,)."""
         return np.array([part.task.within for part in self.bound if part.task.within is not None], dtype=float)
 
-    def _cosine(self, part: Bound, base: Any, joints: Any, wanted: Any) -> Any:
+    def _cosine(self, part: BoundTask, base: Any, joints: Any, wanted: Any) -> Any:
         """Of the angle between a task's tool axis and its direction."""
         _, turning = split_targets(part.task, wanted)
         reference = reference_pose(part, base, joints)
@@ -326,12 +326,12 @@ class TaskEquations:
         for part in self.bound:
             if part.task.velocity is not None:
                 position, turn = (ca.DM(value) for value in pose_in_reference(part, at_base, at_joints))
-                held = part._replace(task=held_task(part.task))
+                held = part._replace(task=pose_holding_task(part.task))
                 targets = ca.vertcat(position, ca.DM(3, 1), ca.vec(turn), ca.DM(3, 1))
-                rows.append(holding_rows(held, base, joints, targets))
+                rows.append(pose_error_rows(held, base, joints, targets))
         return ca.vertcat(*rows)
 
-    def _with_targets(self, targets: Any) -> Iterator[tuple[Bound, Any]]:
+    def _with_targets(self, targets: Any) -> Iterator[tuple[BoundTask, Any]]:
         at = 0
         for part in self.bound:
             size = target_size(part.task)
@@ -350,18 +350,18 @@ class TaskEquations:
         place = np.zeros((len(times), 0)) if base is None else np.atleast_2d(np.asarray(base, dtype=float))
         return place, angles, self.target_function().map(len(times))(times[None, :])
 
-    def overhangs(self, t: Any, base: Any, joints: Any) -> Array:
+    def cone_violations(self, t: Any, base: Any, joints: Any) -> Array:
         """Angles by which tool axes lean further than they may, rad, arguments as of `errors`. Shape (M, k)."""
         place, angles, targets = self._along(t, base, joints)
-        if not self.most_lean.size:
+        if not self.cone_angles.size:
             return np.zeros((len(angles), 0))
         cosines = np.array(self._lean_function.map(len(angles))(place.T, angles.T, targets)).T
-        return np.asarray(np.maximum(np.arccos(np.clip(cosines, -1.0, 1.0)) - self.most_lean, 0.0))
+        return np.asarray(np.maximum(np.arccos(np.clip(cosines, -1.0, 1.0)) - self.cone_angles, 0.0))
 
     @cached_property
     def _lean_function(self) -> Any:
         base, joints, targets = self._symbols
-        return ca.Function("leans", [base, joints, targets], [self.leans(base, joints, targets)], {"cse": True})
+        return ca.Function("leans", [base, joints, targets], [self.cone_cosines(base, joints, targets)], {"cse": True})
 
     def function(self) -> Any:
         """Casadi Function (base, joints, targets) -> (J, b, error, misfit)."""
@@ -371,14 +371,14 @@ class TaskEquations:
     def _function(self) -> Any:
         base, joints, targets = self._symbols
         parts = [self.jacobian(base, joints)]
-        parts += [what(base, joints, targets) for what in (self.right, self.error, self.misfit)]
+        parts += [what(base, joints, targets) for what in (self.right, self.error, self.pose_residual)]
         return ca.Function("task", [base, joints, targets], parts, {"cse": True})
 
     @cached_property
-    def misfit_function(self) -> Any:
+    def pose_residual_function(self) -> Any:
         """Casadi Function (joints, base, targets) -> (misfit, its Jacobian by the joints)."""
         base, joints, targets = self._symbols
-        misfit = self.misfit(base, joints, targets)
+        misfit = self.pose_residual(base, joints, targets)
         slopes = ca.densify(ca.jacobian(misfit, joints))
         return ca.Function("misfit", [joints, base, targets], [misfit, slopes], {"cse": True})
 
@@ -459,7 +459,7 @@ def bind(machine: Machine, tasks: TipTask | Sequence[TipTask]) -> TaskEquations:
             reference = None if task.relative_to is None else with_tip(machine, task.relative_to)
         except ModelError as error:
             raise ProblemError(str(error), **vars(error)) from error
-        bound.append(Bound(task, tip, reference))
+        bound.append(BoundTask(task, tip, reference))
     return TaskEquations(bound[0].tip if machine.robot.tip is None else machine, tuple(bound))
 
 

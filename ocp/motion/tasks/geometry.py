@@ -17,7 +17,7 @@ from ocp.errors import ProblemError
 from ocp.motion.tasks.tip_task import ANGULAR, TipTask
 
 
-class Bound(NamedTuple):
+class BoundTask(NamedTuple):
     """A task, and the machine with the tip in the task's frame and in its reference (None: the world)."""
 
     task: TipTask
@@ -44,11 +44,11 @@ def split_targets(task: TipTask, wanted: Any) -> tuple[Any, Any]:
     return place, None
 
 
-def reference_pose(part: Bound, base: Any, joints: Any) -> Frame | None:
+def reference_pose(part: BoundTask, base: Any, joints: Any) -> Frame | None:
     return None if part.reference is None else part.reference.tip_pose(base, joints)
 
 
-def relative_twist(part: Bound, base: Any, joints: Any, twist: Any, rates: Any) -> Any:
+def relative_twist(part: BoundTask, base: Any, joints: Any, twist: Any, rates: Any) -> Any:
     """Twist, or columns of twists, less that of the reference, of whose turning the frame takes part."""
     if part.reference is None:
         return twist
@@ -62,7 +62,7 @@ def relative_twist(part: Bound, base: Any, joints: Any, twist: Any, rates: Any) 
     return twist - ca.vertcat(other[0:3, :], other[3:6, :] - ca.mtimes(skew(arm), other[0:3, :]))
 
 
-def rows_of(part: Bound, base: Any, joints: Any, twist: Any) -> Any:
+def task_rows(part: BoundTask, base: Any, joints: Any, twist: Any) -> Any:
     """The task's rows of a twist in world axes, or of several as columns."""
     task = part.task
     angular, linear = twist[0:3, :], twist[3:6, :]
@@ -90,7 +90,7 @@ def _across(task: TipTask) -> Any:
     return ca.sparsify(ca.DM(right[1:].T))
 
 
-def pose_error(part: Bound, base: Any, joints: Any, wanted: Any) -> Any:
+def pose_error(part: BoundTask, base: Any, joints: Any, wanted: Any) -> Any:
     """Error of the pose as a twist in world axes: (sine of the angle about its axis, displacement)."""
     place, turning = split_targets(part.task, wanted)
     pose, reference = part.tip.tip_pose(base, joints), reference_pose(part, base, joints)
@@ -106,7 +106,7 @@ def pose_error(part: Bound, base: Any, joints: Any, wanted: Any) -> Any:
     return ca.vertcat(angular, linear)
 
 
-def wanted_twist(part: Bound, base: Any, joints: Any, wanted: Any) -> Any:
+def target_twist(part: BoundTask, base: Any, joints: Any, wanted: Any) -> Any:
     """Twist of the target relative to the reference and the feedback, world axes. Shape (6, 1)."""
     place, turning = split_targets(part.task, wanted)
     reference = reference_pose(part, base, joints)
@@ -117,7 +117,7 @@ def wanted_twist(part: Bound, base: Any, joints: Any, wanted: Any) -> Any:
     return ca.vertcat(angular, linear) + part.task.gain * pose_error(part, base, joints, wanted)
 
 
-def pose_in_reference(part: Bound, base: Any, joints: Any) -> tuple[Any, Any]:
+def pose_in_reference(part: BoundTask, base: Any, joints: Any) -> tuple[Any, Any]:
     """Position and rotation in the reference."""
     pose, reference = part.tip.tip_pose(base, joints), reference_pose(part, base, joints)
     if reference is None:
@@ -126,26 +126,26 @@ def pose_in_reference(part: Bound, base: Any, joints: Any) -> tuple[Any, Any]:
     return ca.mtimes(turn.T, pose.position - reference.position), ca.mtimes(turn.T, pose.rotation)
 
 
-def held_task(task: TipTask) -> TipTask:
+def pose_holding_task(task: TipTask) -> TipTask:
     return replace(task, velocity=None, position=np.zeros(3), orientation=np.eye(3))
 
 
 @on_scalars
-def holding_rows(part: Bound, base: Any, joints: Any, targets: Any) -> Any:
-    return rows_of(part, base, joints, pose_error(part, base, joints, targets))
+def pose_error_rows(part: BoundTask, base: Any, joints: Any, targets: Any) -> Any:
+    return task_rows(part, base, joints, pose_error(part, base, joints, targets))
 
 
-def is_holonomic(part: Bound) -> Array:
+def is_holonomic(part: BoundTask) -> Array:
     """Which rows of a task have an integral that does not depend on the way."""
     task = part.task
     if task.is_pose:
         return np.ones(task.size, dtype=bool)
-    whole = set(turning_rows(part)) <= set(task.chosen)  # all turning that there is
+    whole = set(movable_angular_rows(part)) <= set(task.chosen)  # all turning that there is
     fixed_axes = task.axes in ("world", "reference")
     return np.array([whole and fixed_axes if row in ANGULAR else fixed_axes for row in task.chosen], dtype=bool)
 
 
-def turning_rows(part: Bound) -> list[int]:
+def movable_angular_rows(part: BoundTask) -> list[int]:
     """Angular rows in world axes that some joint moves."""
     base, joints = ca.SX.sym("base", part.tip.base_size), ca.SX.sym("joints", part.tip.joint_size)
     jacobian = part.tip.tip_jacobian(base, joints)
@@ -173,7 +173,7 @@ def angular_velocity(turn: Any, rate: Any) -> Any:
 
 
 def closing_combinations(
-    machine: FreeFloating, bound: Sequence[Bound], chosen: NDArray[np.bool_], base: Array, joints: Array
+    machine: FreeFloating, bound: Sequence[BoundTask], chosen: NDArray[np.bool_], base: Array, joints: Array
 ) -> Array:
     """Combinations of the chosen rows that do not depend on the base's pose, the centre of mass staying. Shape (m, k).
 
@@ -183,7 +183,7 @@ def closing_combinations(
     rows = []
     for part in bound:
         by_base = relative_twist(part, base, joints, part.tip.jacobians(base, joints)[0], "base")  # type: ignore[attr-defined]
-        rows.append(np.array(ca.DM(rows_of(part, ca.DM(base), ca.DM(joints), by_base))))
+        rows.append(np.array(ca.DM(task_rows(part, ca.DM(base), ca.DM(joints), by_base))))
     frame = machine.world_from_base(base)
     lever = center_of_mass(machine.robot, joints, frame) - frame.position
     center = np.array(ca.DM(ca.horzcat(-skew(lever), ca.DM.eye(3))))[:, machine.twist_rows]

@@ -18,7 +18,7 @@ from models.arrays import Array, ArrayInput, checked_array
 from models.robot.indices import checked_rows
 from models.spatial import expression
 from ocp.errors import ProblemError, checked_choice, checked_nonnegative, checked_positive, checked_text
-from ocp.motion.tasks.tracks import Track, along, run_by
+from ocp.motion.tasks.tracks import Track, path_tracks, reparametrized
 from ocp.tolerances import ORIENTATION_TOLERANCE_RAD, POSITION_TOLERANCE_M
 
 __all__ = ["Axes", "Roll", "TipTask", "Velocity", "timed"]
@@ -159,7 +159,7 @@ class TipTask:
             ProblemError: No path, a speed that is none, or what the attributes say.
         """
         checked_choice("roll", roll, get_args(Roll))
-        tracks = along(path, speed)
+        tracks = path_tracks(path, speed)
         given: dict[str, Any] = {"position": tracks.position, "duration": tracks.duration, "breaks": tracks.breaks}
         if path.path.oriented and not {"direction", "orientation"} & set(others):
             axis = checked_array(tool_axis, (3,), "tip task", "tool_axis")
@@ -241,7 +241,7 @@ def timed(task: TipTask, clock: Callable[[Any], Any]) -> TipTask:
         return ca.jacobian(at, time) * expression(given)
 
     changed: dict[str, Any] = {
-        name: run_by(getattr(task, name), clock) for name in ("position", "orientation", "direction")
+        name: reparametrized(getattr(task, name), clock) for name in ("position", "orientation", "direction")
     }
     if task.velocity is not None:
         changed["velocity"] = velocity

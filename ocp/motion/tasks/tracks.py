@@ -21,7 +21,17 @@ from models.paths.smooth_path import SmoothPath
 from models.spatial import expression, rotation_from_quaternion
 from ocp.errors import NOT_NUMBERS, ProblemError, checked_choice, floats, real
 
-__all__ = ["PathTracks", "PoseLine", "Track", "along", "on_symbols", "pose_line", "rated", "run_by", "track_expression"]
+__all__ = [
+    "PathTracks",
+    "PoseLine",
+    "Track",
+    "on_symbols",
+    "path_tracks",
+    "pose_line",
+    "reparametrized",
+    "track_expression",
+    "track_with_rate",
+]
 
 Track: TypeAlias = Any
 """A constant, or a function: casadi time (s) -> casadi vector or matrix, or a list of expressions."""
@@ -103,7 +113,7 @@ class _Rated:
         return self._rate(time)
 
 
-def rated(track: Callable[[Any], Any], rate: Callable[[Any], Any]) -> Track:
+def track_with_rate(track: Callable[[Any], Any], rate: Callable[[Any], Any]) -> Track:
     """Return a track that knows its rate: of a position or direction the velocity, of an orientation the angular one.
 
     Args:
@@ -136,7 +146,7 @@ class PathTracks(NamedTuple):
         return _Rated(at, lambda time: ca.cross(spin(time), at(time)))
 
 
-def along(path: SmoothPath, speed: Any) -> PathTracks:
+def path_tracks(path: SmoothPath, speed: Any) -> PathTracks:
     """Tracks that run along a path.
 
     They need symbols=casadi.MX in builders. A mesh with nodes at `breaks` keeps its full order.
@@ -187,7 +197,7 @@ def along(path: SmoothPath, speed: Any) -> PathTracks:
     return PathTracks(position, orientation, duration, np.asarray(breaks, dtype=float))
 
 
-def run_by(track: Track, clock: Callable[[Any], Any]) -> Track:
+def reparametrized(track: Track, clock: Callable[[Any], Any]) -> Track:
     """A track over a parameter, run through by a clock: casadi time (s) -> parameter. Constants stay what they are."""
     if not callable(track):
         return track

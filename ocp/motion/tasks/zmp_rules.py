@@ -22,7 +22,7 @@ __all__ = [
     "Pinned",
     "ZmpRule",
     "check_rule",
-    "checked_place",
+    "checked_point",
     "foot_edges",
     "foot_rows",
     "index_rows",
@@ -91,7 +91,7 @@ class Pinned:
     def place(self, machine: Standing, time: Any) -> Any:
         """Shape (2, 1), m."""
         given = machine.most_stable_point if self.point is None else self.point
-        return checked_place(given, "Pinned: point")
+        return checked_point(given, "Pinned: point")
 
 
 @dataclass(frozen=True)
@@ -108,10 +108,10 @@ class Following:
         if not callable(self.reference):
             words = f"Following: a function of time is expected, not {self.reference!r}"
             raise ProblemError(words, name="Following", value=self.reference)
-        return checked_place(self.reference(time), "Following: the reference")
+        return checked_point(self.reference(time), "Following: the reference")
 
 
-def checked_place(given: Any, what: str) -> Any:
+def checked_point(given: Any, what: str) -> Any:
     """(x, y) as a casadi column, m; ProblemError unless it is two numbers or expressions."""
     try:
         point = expression(given)

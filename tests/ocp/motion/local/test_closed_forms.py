@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from models import FixedBase, Joint, Link, Mimic, Robot
 from models.arrays import Array
 from ocp import TipTask, inverse_kinematics
-from ocp.motion.local.branches import branches_of
+from ocp.motion.local.branches import ik_branches
 from ocp.motion.local.closed_forms import ClosedForm, closed_forms
 from ocp.motion.tasks.equations import bind
 from tests.ocp.motion.tasks.space_tasks import panda, ur5
@@ -186,7 +186,7 @@ def test_branches_keep_limits_are_turned_in_all_ways_and_do_the_task() -> None:
     at, turn = poses(machine, np.array([[3.4, 0.4, 0.9, -3.3, 0.7, 0.3]]))
     for rolls, told in ((1, {"orientation": turn[0]}), (12, {"direction": 2.0 * turn[0, :, 2]})):
         equations = bind(machine, TipTask(position=at[0], **told))
-        branches = branches_of(equations, machine.robot.lower, machine.robot.upper)
+        branches = ik_branches(equations, machine.robot.lower, machine.robot.upper)
         assert branches is not None
         target = np.array(equations.target_function()(0.0)).ravel()
         found = branches.postures(target, rolls)
@@ -208,7 +208,7 @@ def test_branches_of_a_scara_and_none_of_what_is_not_one_pose() -> None:
     for rows, orientation in (((3, 4, 5), None), ((2, 3, 4, 5), [np.cos(0.3), 0, 0, np.sin(0.3)])):
         task = TipTask(position=(0.35, 0.1, 0.05), orientation=orientation, rows=rows)
         equations = bind(machine, task)
-        branches = branches_of(equations, *told)
+        branches = ik_branches(equations, *told)
         assert branches is not None
         found = branches.postures(np.array(equations.target_function()(0.0)).ravel(), 16)
         assert len(found) == (2 if orientation else len(found))
@@ -222,4 +222,4 @@ def test_branches_of_a_scara_and_none_of_what_is_not_one_pose() -> None:
         TipTask(orientation=np.eye(3)),
         TipTask(position=place, orientation=np.eye(3), rows=[0, 1, 2, 3, 4]),
     ):
-        assert branches_of(bind(arm_of_six, other), arm_of_six.robot.lower, arm_of_six.robot.upper) is None
+        assert ik_branches(bind(arm_of_six, other), arm_of_six.robot.lower, arm_of_six.robot.upper) is None

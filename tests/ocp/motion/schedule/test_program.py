@@ -9,12 +9,12 @@ from hypothesis import strategies as st
 
 from ocp.motion.schedule import LineLimits, schedule
 from ocp.motion.schedule.grid import make_grid
-from ocp.motion.schedule.limits import rows_at
-from ocp.motion.schedule.profile import LineMotion, through
+from ocp.motion.schedule.limits import limit_rows
+from ocp.motion.schedule.profile import LineMotion, profile_through
 from ocp.motion.schedule.program import INTERIOR, Program, Spline, SplineRows, _Rows, least_time
 from ocp.motion.schedule.settings import SETTINGS
 from ocp.motion.schedule.stretch import _jerk_of
-from ocp.motion.schedule.window import Stretch, Window, demanded, profile_of
+from ocp.motion.schedule.window import Stretch, Window, limit_usage, motion_profile
 from scripts.timing.schedules import JOINTS, panda_path
 from tests.models.paths.task_paths import seeds
 
@@ -144,7 +144,7 @@ def test_the_jerks_of_a_motion_are_those_at_a_sixth_of_an_interval(slope: float,
     for h in (0.04, 0.02):
         s = np.array([0.0, h])
         x = 1 + slope * s + bend * s**2 / 2
-        jerk = through(s, np.sqrt(x), (slope + bend * s) / 2).jerk
+        jerk = profile_through(s, np.sqrt(x), (slope + bend * s) / 2).jerk
         places = h * np.array([_jerk_of(0.0), _jerk_of(1.0)])
         errors.append(np.abs(jerk - bend / 2 * np.sqrt(1 + slope * places + bend * places**2 / 2)).max())
     assert errors[1] <= errors[0] / 3.5 + 1e-11
@@ -156,20 +156,20 @@ def test_what_is_demanded_is_what_dense_samples_demand() -> None:
     path, joints = panda_path(4)
     limits = LineLimits(0.5, 5.0, 200.0, 5.0, JOINTS)
     grid = make_grid(path, limits, joints)
-    stretch, every = Stretch(grid, 0, len(grid.asked)), np.arange(len(grid.asked))
-    window = Window.of(stretch, 0, len(grid.asked), stretch.ends)
+    stretch, every = Stretch(grid, 0, len(grid.requested)), np.arange(len(grid.requested))
+    window = Window.build(stretch, 0, len(grid.requested), stretch.ends)
     plan = schedule(path, limits, joints=joints)
     motion = plan.profile.at_distance(grid.distance)
-    profile = profile_of(window, motion.speed**2, 2 * motion.acceleration)
-    used, values = demanded(window, profile, every)
+    profile = motion_profile(window, motion.speed**2, 2 * motion.acceleration)
+    used, values = limit_usage(window, profile, every)
     some = np.sort(np.random.default_rng(0).permutation(every)[:50])
-    for whole, part in zip((used, values), demanded(window, profile, some), strict=True):
+    for whole, part in zip((used, values), limit_usage(window, profile, some), strict=True):
         assert part[:, some] == pytest.approx(whole[:, some], abs=1e-12)
         assert not np.delete(part, some, axis=1).any()
     shares = np.linspace(1e-6, 1 - 1e-6, 201)
     places = grid.distance[:-1, None] + shares * np.diff(grid.distance)[:, None]
     dense = profile.at_distance(places.ravel())
-    rows = rows_at(path, limits, joints, places.ravel())
+    rows = limit_rows(path, limits, joints, places.ravel())
     values = rows.demands(LineMotion(*dense)).reshape(*places.shape, -1)
     for side, sign in zip(used, (1, -1), strict=True):
         most = (sign * values).max(axis=1)

@@ -27,7 +27,7 @@ from ocp.motion.schedule import (
     schedule,
 )
 from ocp.motion.schedule.grid import make_grid
-from ocp.motion.schedule.limits import causes, rows_at
+from ocp.motion.schedule.limits import limit_names, limit_rows
 from tests.models.paths.task_paths import random_arm_path, seeds
 from tests.models.paths.test_paths import example
 from tests.ocp.motion.schedule.check import largest
@@ -141,16 +141,16 @@ def test_where_the_curvature_jumps_both_sides_are_kept() -> None:
     limits = LineLimits(9.0, 5.0, 200.0, 2.0, JointLimits(2.0))
     grid, bounds = make_grid(arm.path, limits, arm), arm.path.bounds[1:-1]
     assert grid.distance[grid.jumps] == pytest.approx(bounds, abs=1e-15)
-    left, right = grid.ends(0, len(grid.asked))
+    left, right = grid.ends(0, len(grid.requested))
     step = 1e-10 * arm.path.length
-    for rows, sides in ((left.of(grid.jumps), bounds + step), (right.of(grid.jumps - 1), bounds - step)):
-        expected = rows_at(arm.path, limits, arm, sides)
+    for rows, sides in ((left.take(grid.jumps), bounds + step), (right.take(grid.jumps - 1), bounds - step)):
+        expected = limit_rows(arm.path, limits, arm, sides)
         for kind, value in zip(rows, expected, strict=True):
             assert kind == pytest.approx(value, rel=1e-5, abs=1e-6)
-    assert (np.abs(left.of(grid.jumps).speed - right.of(grid.jumps - 1).speed).max(axis=0) > 0.01).any()
+    assert (np.abs(left.take(grid.jumps).speed - right.take(grid.jumps - 1).speed).max(axis=0) > 0.01).any()
     plan = schedule(arm.path, limits, joints=arm)
     assert largest(plan, arm).max() <= 1.001
-    assert {dip.cause for dip in plan.dips} <= set(causes(limits, arm))
+    assert {dip.cause for dip in plan.dips} <= set(limit_names(limits, arm))
 
 
 class BrokenJoints:
