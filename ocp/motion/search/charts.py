@@ -198,7 +198,7 @@ class SelfMotions:
         """
         listed, count = np.zeros((0, len(self.space.scale))), self.settings.listed
         if self._branches is not None:
-            found = self._branches.postures(self.targets[number], count, count * number)
+            found = self._branches.solutions(self.targets[number], count, count * number)
             on, good = self.corrected(np.full(len(found), number), found)
             listed = on[good & self.space.within(on)]
         told: dict[str, Any] = {"limits": limits, "seed": seed, "starts": self.settings.starts}

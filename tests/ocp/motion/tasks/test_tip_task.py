@@ -264,7 +264,7 @@ def test_tasks_that_are_none_are_refused(fields: dict[str, Any], message: str) -
     [
         (TipTask(rows=(3, 4), velocity=(0.0,)), r"velocity has shape \(1, 1\)"),
         (TipTask(position=lambda t: [t, ca.SX.sym("wind"), 0]), r"position depends on \['wind'\]"),
-        (TipTask(orientation=lambda t: 2 * ca.DM.eye(3)), "orientation is no rotation"),
+        (TipTask(orientation=lambda t: 2 * ca.DM.eye(3)), "orientation is not a rotation"),
         ([TipTask(rows=(3, 4), velocity=(0, 0))] * 2, "linearly dependent in every configuration"),
         ([TipTask(rows=range(6), velocity=np.zeros(6)), TipTask(rows=(0, 1), velocity=(0, 0))], "fixes 8 rows"),
         (TipTask(rows=(3,), velocity=(0.0,), link="base_link"), "no joint moves the tip"),
