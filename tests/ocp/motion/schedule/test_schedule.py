@@ -352,5 +352,5 @@ def test_about_the_slowest_place_of_each_run_a_stretch_gets_its_speed(seed: int,
                     if most[at] > SETTINGS.spread * most[k]:
                         break
                     expected[at] = min(speed[at], most[k])
-    assert planner._lowered(s, permitted, speed, even, False) == fast.any()
+    assert planner._lower_speeds(s, permitted, speed, even, False) == fast.any()
     assert speed == pytest.approx(expected)

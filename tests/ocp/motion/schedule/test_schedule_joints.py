@@ -100,7 +100,7 @@ def test_a_joint_limit_slows_and_is_named_as_the_cause(limits: JointLimits, kind
     used = largest(plan, arm).max()
     assert 0.9 < used <= 1.001  # no slower than need be
     assert any(kind in dip.cause for dip in plan.dips)
-    with pytest.raises(ProblemError, match="breaks limits"):
+    with pytest.raises(ProblemError, match="violates limits"):
         schedule(arm.path, asked, joints=arm, strict=True)
 
 
@@ -208,7 +208,7 @@ def test_ramps_are_gentler_only_where_a_joint_binds(joints: JointLimits, cause: 
     assert plan.dips[0].start < 1e-3
     assert plan.dips[0].end < 0.1
     assert min(plan.dips[0].jerk / 200, plan.dips[0].acceleration / 5) < 0.99
-    assert "binds on a ramp" in str(plan.dips[0])
+    assert "is active on a ramp" in str(plan.dips[0])
     assert 0.9 < largest(plan, arm).max() <= 1.001
     before_end = np.linspace(0, plan.duration - plan.time_at(0.1)[0], 1000)
     mine, other = plan.at(plan.duration - before_end), free.at(free.duration - before_end)
