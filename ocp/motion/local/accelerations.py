@@ -37,15 +37,9 @@ from ocp.motion.tasks.tracks import on_symbols
 from ocp.motion.tasks.zmp_rules import checked_point, is_finite
 
 __all__ = [
-    "AccelerationSolution",
-    "Law",
-    "Layer",
-    "Stabiliser",
-    "Stop",
-    "accelerations",
-    "checked_law",
+    "AccelerationSolution", "Law", "Layer", "Stabiliser", "Stop", "accelerations", "checked_law",
     "resolve_accelerations",
-]
+]  # fmt: skip
 
 Law: TypeAlias = Literal["pseudo_inverse", "augmented", "null_space", "stabilised"]
 
@@ -191,7 +185,11 @@ def accelerations(
     for layer in layers:
         limits = layer.index == "joint_limits"
         index = joint_limit_index(machine.robot, q) if limits else manipulability_of(jacobian)
-        _apply_layer(layer, hierarchy, index, q, qd)
+        gradient = ca.jacobian(index, q)
+        if layer.form == "gradient":
+            hierarchy.add_free(layer.demand * gradient.T)
+        else:
+            hierarchy.add_task(gradient, layer.demand - ca.jtimes(ca.mtimes(gradient, qd), q, qd))
     if law == "stabilised":
         gains = stabiliser or Stabiliser()
         hierarchy.add_task(*_stabilising_task(machine, gains, q, qd, place, zmp_rows.right))
@@ -199,15 +197,6 @@ def accelerations(
     if null_damping:
         hierarchy.add_free(-null_damping * qd)
     return hierarchy.accelerations
-
-
-def _apply_layer(layer: Layer, hierarchy: _TaskHierarchy, index: Any, q: Any, qd: Any) -> None:
-    """Add a layer to the accelerations."""
-    gradient = ca.jacobian(index, q)
-    if layer.form == "gradient":
-        hierarchy.add_free(layer.demand * gradient.T)
-    else:
-        hierarchy.add_task(gradient, layer.demand - ca.jtimes(ca.mtimes(gradient, qd), q, qd))
 
 
 def _stabilising_task(machine: Standing, gains: Stabiliser, q: Any, qd: Any, place: Any, right: Any) -> tuple[Any, Any]:
@@ -424,13 +413,8 @@ class _Simulation:
         if integrator == "cvodes":
             fraction = ca.MX.sym("fraction")
             problem = {"t": fraction, "x": state, "p": time, "ode": step * rate(time + step * fraction, state)}
-            options = {
-                "abstol": tolerance,
-                "reltol": tolerance,
-                "max_num_steps": STEPPING.cvodes_steps,
-                "disable_internal_warnings": True,
-                "show_eval_warnings": False,
-            }
+            options = {"abstol": tolerance, "reltol": tolerance, "max_num_steps": STEPPING.cvodes_steps}
+            options |= {"disable_internal_warnings": True, "show_eval_warnings": False}
             solver = ca.integrator("motion", "cvodes", problem, 0.0, 1.0, options)
             after = solver(x0=state, p=time)["xf"]
         else:

@@ -44,17 +44,16 @@ class IkBranches:
         solutions = list[Array]()
         for form in self.forms:
             free = len(form.redundant) + self.roll_is_free
-            each = -(-count // len(self.forms)) if free else 1
-            shares = ((number + np.arange(each) + 0.5)[:, None] * STEPS[:free] + 0.5) % 1
+            n = -(-count // len(self.forms)) if free else 1
+            shares = ((number + np.arange(n) + 0.5)[:, None] * STEPS[:free] + 0.5) % 1
             positions, rotations = self._sample_poses(
-                form, targets, shares[:, -1] if self.roll_is_free else np.zeros(each)
+                form, targets, shares[:, -1] if self.roll_is_free else np.zeros(n)
             )
             low, high = (np.array(limit)[list(form.redundant)] for limit in (self.lower, self.upper))
             span = np.where(form.turns[list(form.redundant)], np.pi, SLIDE_RANGE_M)
             low, high = np.where(np.isfinite(low), low, -span), np.where(np.isfinite(high), high, span)
-            solutions.append(
-                form.solutions(positions, rotations, low + shares[:, : len(form.redundant)] * (high - low))[1]
-            )
+            redundant = low + shares[:, : len(form.redundant)] * (high - low)
+            solutions.append(form.solutions(positions, rotations, redundant)[1])
         joints = np.concatenate(solutions)
         joints[:, self._idle] = idle_positions(self.lower, self.upper)[self._idle]
         return self._within_limits(joints)
@@ -63,10 +62,8 @@ class IkBranches:
         """Return tip poses that do the task, the open angle at shares of a turn. Shapes (M, 3), (M, 3, 3)."""
         angles = TURN * shares[:, None]
         if self._task.direction is not None:
-            tool_axis, direction = np.array(self._task.tool_axis), targets[6:9] / np.linalg.norm(targets[6:9])
-            rotated = (
-                Rotation.from_rotvec(angles * direction) * Rotation.align_vectors(direction[None], tool_axis[None])[0]
-            )
+            tool, direction = np.array(self._task.tool_axis), targets[6:9] / np.linalg.norm(targets[6:9])
+            rotated = Rotation.from_rotvec(angles * direction) * Rotation.align_vectors(direction[None], tool[None])[0]
             rotations = rotated.as_matrix()
         elif self.roll_is_free:
             rotations = Rotation.from_rotvec(angles * form.axes[form.triple[0]]).as_matrix() @ form.rotation

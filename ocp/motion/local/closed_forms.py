@@ -371,10 +371,17 @@ def _meeting_points(*axes: Axis) -> Array:
     return np.asarray(np.linalg.solve(sum(projectors), np.asarray(projected)[:, :, None])[:, :, 0])
 
 
-def _plus_minus(middle: Array, half: Array) -> tuple[NDArray[np.intp], Array]:
-    """Return the indices and values of middle + half and middle - half."""
-    rows = np.arange(len(middle))
+def _middle_angles(value: Array, cosine: Array, sine: Array) -> tuple[NDArray[np.intp], Array]:
+    """Return indices and both angles with cosine cos + sine sin = value, the nearest where there are none."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = np.clip(np.nan_to_num(value / np.hypot(cosine, sine)), -1.0, 1.0)
+    middle, half, rows = np.arctan2(sine, cosine), np.arccos(share), np.arange(len(value))
     return np.concatenate([rows, rows]), np.concatenate([middle + half, middle - half])
+
+
+def _axial(turn: Array) -> Array:
+    """Return the axial vectors of rotations, 2 sin(angle) times their axes. Shapes (M, 3, 3) to (M, 3)."""
+    return np.stack([turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], 1)
 
 
 def _solve_wrist(axes: list[Axis], goal: Motion) -> tuple[NDArray[np.intp], Array]:
@@ -382,9 +389,7 @@ def _solve_wrist(axes: list[Axis], goal: Motion) -> tuple[NDArray[np.intp], Arra
     a, b, c = axes
     constant, cosine, sine = _rotation_terms(a.direction, b.direction, c.direction)
     value = np.einsum("mi,mij,mj->m", a.direction, goal.turn, c.direction) - constant
-    with np.errstate(divide="ignore", invalid="ignore"):
-        share = np.clip(np.nan_to_num(value / np.hypot(cosine, sine)), -1.0, 1.0)
-    pose, second = _plus_minus(np.arctan2(sine, cosine), np.arccos(share))
+    pose, second = _middle_angles(value, cosine, sine)
     return pose, _outer_angles([axis.take(pose) for axis in axes], goal.take(pose), second, None)
 
 
@@ -398,9 +403,7 @@ def _solve_planar(axes: list[Axis], goal: Motion) -> tuple[NDArray[np.intp], Arr
     parts = [part - _dot(part, along)[:, None] * along for part in (to_goal, arm, reach)]
     value = (_dot(parts[0], parts[0]) - _dot(parts[1], parts[1]) - _dot(parts[2], parts[2])) / 2
     cosine, sine = _dot(parts[1], parts[2]), _dot(parts[1], np.cross(b.direction, parts[2]))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        share = np.clip(np.nan_to_num(value / np.hypot(cosine, sine)), -1.0, 1.0)
-    pose, second = _plus_minus(np.arctan2(sine, cosine), np.arccos(share))
+    pose, second = _middle_angles(value, cosine, sine)
     return pose, _outer_angles([axis.take(pose) for axis in axes], goal.take(pose), second, goal_point[pose])
 
 
@@ -414,15 +417,7 @@ def _outer_angles(axes: list[Axis], goal: Motion, second: Array, goal_point: Arr
         start, end = motion.at(c.point) - a.point, goal_point - a.point
     first = a.angle(start, end)
     remaining = a.by(first).after(motion).inverse.after(goal).turn
-    axial = np.stack(
-        [
-            remaining[:, 2, 1] - remaining[:, 1, 2],
-            remaining[:, 0, 2] - remaining[:, 2, 0],
-            remaining[:, 1, 0] - remaining[:, 0, 1],
-        ],
-        1,
-    )
-    third = np.arctan2(_dot(c.direction, axial) / 2, (np.trace(remaining, axis1=1, axis2=2) - 1) / 2)
+    third = np.arctan2(_dot(c.direction, _axial(remaining)) / 2, (np.trace(remaining, axis1=1, axis2=2) - 1) / 2)
     return np.column_stack([first, second, third])
 
 
@@ -441,37 +436,27 @@ def _refine(
     for _ in range(FORMS.steps):
         if not active.size:
             break
-        poses = pose[active]
-        before, columns = Motion(np.broadcast_to(np.eye(3), (len(poses), 3, 3)), np.zeros((len(poses), 3))), []
+        at = pose[active]
+        before, columns = Motion(np.broadcast_to(np.eye(3), (len(at), 3, 3)), np.zeros((len(at), 3))), []
         for k, axis in enumerate(axes):
-            line = axis.take(poses)
+            line = axis.take(at)
             now = line.moved(before)
             if turns[k]:
                 columns.append(
-                    np.concatenate([now.direction, np.cross(now.direction, tip[poses] - now.point) / size], axis=1)
+                    np.concatenate([now.direction, np.cross(now.direction, tip[at] - now.point) / size], axis=1)
                 )
             else:
                 columns.append(np.concatenate([np.zeros_like(now.direction), now.direction / size], axis=1))
             before = before.after(line.by(angles[active, k], bool(turns[k])))
-        error = goal.take(poses).after(before.inverse)
+        error = goal.take(at).after(before.inverse)
         rotation = error.turn
-        axial = np.stack(
-            [
-                rotation[:, 2, 1] - rotation[:, 1, 2],
-                rotation[:, 0, 2] - rotation[:, 2, 0],
-                rotation[:, 1, 0] - rotation[:, 0, 1],
-            ],
-            1,
-        )
-        missed = np.concatenate([axial / 2, (tip[poses] - error.inverse.at(tip[poses])) / size], axis=1)
+        missed = np.concatenate([_axial(rotation) / 2, (tip[at] - error.inverse.at(tip[at])) / size], axis=1)
         beyond = np.trace(rotation, axis1=1, axis2=2) < 1
         worst = np.abs(missed).max(axis=1)
         good[active[(worst < FORMS.exact) & ~beyond]] = True
-        refinable = (worst >= FORMS.exact) & ~beyond & (worst < FORMS.rough)
-        step = np.einsum(
-            "kij,kj->ki", np.linalg.pinv(np.stack(columns, axis=2)[refinable], rcond=1e-8), missed[refinable]
-        )
-        active = active[refinable]
+        on = (worst >= FORMS.exact) & ~beyond & (worst < FORMS.rough)
+        step = np.einsum("kij,kj->ki", np.linalg.pinv(np.stack(columns, axis=2)[on], rcond=1e-8), missed[on])
+        active = active[on]
         angles[active] += np.clip(step, -1.0, 1.0)
     pose, angles = pose[good], angles[good]
     angles[:, turns] -= TURN * np.round(angles[:, turns] / TURN)

@@ -171,16 +171,14 @@ def slide_apart(
     best, current, clearance = joints.copy(), joints.copy(), np.full(count, -np.inf)
     for _ in range(SLIDING.steps):
         perturbed = (current[:, None] + SLIDING.difference * np.eye(n)).reshape(-1, n)
-        current_distances = distances(current)
-        minimum = current_distances.min(axis=1)
+        gaps = distances(current)
+        minimum = gaps.min(axis=1)
         better = minimum > clearance
         best[better], clearance[better] = current[better], minimum[better]
         if (clearance >= scene.clearance).any():
             break
-        gradients = (distances(perturbed).reshape(count, n, -1) - current_distances[:, None]) / SLIDING.difference
-        step = np.array(
-            [_step(*each, target) for each in zip(map(jacobian, current), current_distances, gradients, strict=True)]
-        )
+        gradients = (distances(perturbed).reshape(count, n, -1) - gaps[:, None]) / SLIDING.difference
+        step = np.array([_step(*each, target) for each in zip(map(jacobian, current), gaps, gradients, strict=True)])
         current = back(np.clip(current + step, lower, upper))
     return best
 

@@ -235,9 +235,7 @@ class _MultiStart:
         q[last, wrap] = np.remainder(q[last, wrap] + np.pi, 2 * np.pi) - np.pi
         if not (error <= self.tolerance).any():
             nearest = int(error.argmin())
-            raise unreachable_error(
-                self.equations.machine, self.equations, q[nearest], float(error[nearest]), lower, upper
-            )
+            raise unreachable_error(self.equations, q[nearest], float(error[nearest]), lower, upper)
         return self.rank(q, error)
 
     def iterate(self, joints: Array) -> tuple[Array, Array]:
@@ -393,8 +391,8 @@ def _closest_collisions(
     solutions: list[IkSolution], scene: CollisionScene, base: Array, time: float
 ) -> list[Collision | None]:
     """Return for each solution its closest pair below the clearance, or None."""
-    collisions = [find_collisions(scene, base[None], solution.joints[None], np.array([time])) for solution in solutions]
-    return [each[0] if each else None for each in collisions]
+    collisions = (find_collisions(scene, base[None], one.joints[None], np.array([time])) for one in solutions)
+    return [next(iter(each), None) for each in collisions]
 
 
 def _collision_free(
@@ -423,12 +421,12 @@ def _collision_free(
 
 
 def unreachable_error(
-    machine: Machine, equations: TaskEquations, joints: Array, pose_error: float, lower: Array, upper: Array
+    equations: TaskEquations, joints: Array, pose_error: float, lower: Array, upper: Array
 ) -> Unreachable:
     """Return the error for a pose without solution, with the nearest miss."""
     names = [part.task.link or part.tip.robot.tip_link for part in equations.bound]
     limited = np.flatnonzero((joints <= lower) | (joints >= upper))
-    at_limit = [machine.robot.joint_names[k] for k in limited]
+    at_limit = [equations.machine.robot.joint_names[k] for k in limited]
     where = f", with {at_limit} at their limits" if at_limit else ""
     return Unreachable(
         f"no joint positions put {names} where the task wants them: the nearest miss is {pose_error:.3g} (m or rad) at "

@@ -8,7 +8,7 @@ plans.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
@@ -26,6 +26,7 @@ from ocp.motion.local.collisions import checked_collision_scene, distances_along
 from ocp.motion.tasks.checks import checked_configuration, checked_tasks, checked_weights, dependent_rows, horizon_of
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.tip_task import TipTask
+from ocp.motion.tasks.tracks import on_symbols
 
 __all__ = ["LocalMotion", "LocalSolution", "least_rates", "resolve", "track_tasks"]
 
@@ -145,10 +146,7 @@ def resolve(
             "start elsewhere, fix fewer rows, or give a damping"
         )
         raise ProblemError(words, name=rows_dependent, value=joints, time=0.0)
-    try:
-        model = _Model(equations, rate_weights, damping, ca.SX)
-    except (RuntimeError, NotImplementedError):  # interpolants and external functions take MX only
-        model = _Model(equations, rate_weights, damping, ca.MX)
+    model = on_symbols(lambda symbols: _Model(equations, rate_weights, damping, symbols))
     states, costs, stopped = _integrate(model, np.concatenate([base, joints]), times, tolerance)
     solution = _report(machine, model, times[: len(states)], states, costs, tolerance, stopped)
     if scene is None:
@@ -217,25 +215,24 @@ class _Model:
         outputs = [machine.tip_pose(base, joints).position, jacobian, equations.error(base, joints, targets)]
         self.outputs = ca.Function("outputs", [self.time, self.state], outputs)
 
-    def integrator(self, start: float, times: Array, tolerance: float) -> Callable[..., Any]:
+    def integrator(self, start: float, times: Array, tolerance: float) -> Any:
         """Return the integrator of state and cost from `start` to the times."""
         problem = {"t": self.time, "x": self.state, "ode": self.ode, "quad": self.running}
-        return self._cvodes(problem, start, times, tolerance)
+        return _cvodes(problem, start, times, tolerance)
 
-    def one_interval(self, tolerance: float) -> Callable[..., Any]:
+    def one_interval(self, tolerance: float) -> Any:
         """Return an integrator from p[0] over p[1] seconds, for any interval between samples."""
         span, fraction = type(self.time).sym("span", 2), type(self.time).sym("fraction")
         rates = ca.Function("at", [self.time, self.state], [self.ode, self.running])
         ode, running = rates(span[0] + fraction * span[1], self.state)
         problem = {"t": fraction, "x": self.state, "p": span, "ode": span[1] * ode, "quad": span[1] * running}
-        return self._cvodes(problem, 0.0, np.array([1.0]), tolerance)
+        return _cvodes(problem, 0.0, np.array([1.0]), tolerance)
 
-    @staticmethod
-    def _cvodes(problem: dict[str, Any], start: float, times: Array, tolerance: float) -> Callable[..., Any]:
-        built: Callable[..., Any] = integrator(
-            "motion", problem, times.tolist(), tolerance=tolerance, max_steps=MAX_INTEGRATOR_STEPS, start=start
-        )
-        return built
+
+def _cvodes(problem: dict[str, Any], start: float, times: Array, tolerance: float) -> Any:
+    """Return the integrator of a problem from `start` to the times."""
+    options: dict[str, Any] = {"tolerance": tolerance, "max_steps": MAX_INTEGRATOR_STEPS, "start": start}
+    return integrator("motion", problem, times.tolist(), **options)
 
 
 def _integrate(model: _Model, first: Array, times: Array, tolerance: float) -> tuple[Array, Array, str | None]:
@@ -367,9 +364,7 @@ def track_tasks(
     targets = np.array(equations.target_function().map(len(times))(times[None, :]))
     task = equations.function.map(count)
     b, q, u = ca.SX.sym("b", machine.base_size), ca.SX.sym("q", machine.joint_size), ca.SX.sym("u", machine.joint_size)
-    base_motion = (
-        ca.Function("moves", [b, q, u], [machine.base_rate(b, q, u)]).map(count) if machine.base_size else None
-    )
+    motion = ca.Function("moves", [b, q, u], [machine.base_rate(b, q, u)]).map(count) if machine.base_size else None
     pose_rows, min_cosines = equations.pose_rows, np.cos(equations.cone_angles)
     cones = _cone_function(equations).map(count) if min_cosines.size else None
     base_now, joints_now = np.array(base, dtype=float), np.clip(joints, lower, upper)
@@ -395,12 +390,10 @@ def track_tasks(
 
     def move_base(step: Array, duration: float) -> Array:
         """Return the base (K, base_size) after joint steps and a duration of drift."""
-        if base_motion is None:
+        if motion is None:
             return base_now
-        drift = np.array(base_motion(base_now.T, joints_now.T, np.zeros_like(joints_now).T)).T
-        return np.asarray(
-            base_now + np.array(base_motion(base_now.T, joints_now.T, step.T)).T - drift + duration * drift
-        )
+        drift = np.array(motion(base_now.T, joints_now.T, np.zeros_like(joints_now).T)).T
+        return np.asarray(base_now + np.array(motion(base_now.T, joints_now.T, step.T)).T - drift + duration * drift)
 
     for k, h in enumerate([*steps, 0.0]):
         matrix, right, error, residual = linearise(k)

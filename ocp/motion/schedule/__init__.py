@@ -7,22 +7,7 @@ from ocp.motion.schedule.ramps import peak_acceleration, ramp_distance, ramp_tim
 from ocp.motion.schedule.trajectory import JointTrajectory, joint_motion, joint_trajectory
 
 __all__ = [
-    "Dip",
-    "JointLimits",
-    "JointPath",
-    "JointRates",
-    "JointTrajectory",
-    "LineLimits",
-    "LineMotion",
-    "PathLike",
-    "Schedule",
-    "SpeedProfile",
-    "ToolLimits",
-    "TorqueRates",
-    "joint_motion",
-    "joint_trajectory",
-    "peak_acceleration",
-    "ramp_distance",
-    "ramp_time",
-    "schedule",
-]
+    "Dip", "JointLimits", "JointPath", "JointRates", "JointTrajectory", "LineLimits", "LineMotion", "PathLike",
+    "Schedule", "SpeedProfile", "ToolLimits", "TorqueRates", "joint_motion", "joint_trajectory",
+    "peak_acceleration", "ramp_distance", "ramp_time", "schedule",
+]  # fmt: skip

@@ -97,11 +97,10 @@ def make_grid(path: PathLike, limits: LineLimits, joints: JointPath | None) -> G
     kept = np.concatenate([[True], np.diff(bounds)[:-1] > SETTINGS.shortest * path.length, [True]])
     kept[-2] &= len(bounds) == 2 or bounds[-1] - bounds[-2] > SETTINGS.shortest * path.length
     nodes = bounds[kept]
-    first = _separate(
-        np.concatenate([path.dense(SETTINGS.cells, max(1, SETTINGS.segments // len(bounds))), nodes]), nodes
-    )
+    dense = path.dense(SETTINGS.cells, max(1, SETTINGS.segments // len(bounds)))
+    first = _separate(np.concatenate([dense, nodes]), nodes)
     parts = [
-        _halved_intervals(path, limits, joints, first[begin : begin + SETTINGS.block + 1], (bounds, requested))
+        _halved(path, limits, joints, first[begin : begin + SETTINGS.block + 1], (bounds, requested))
         for begin in range(0, len(first) - 1, SETTINGS.block)
     ]
     cells = _Cells(*(np.concatenate(kind) for kind in zip(*parts, strict=True)))
@@ -113,7 +112,7 @@ def make_grid(path: PathLike, limits: LineLimits, joints: JointPath | None) -> G
     return Grid(path, limits, joints, s, of_interval, np.searchsorted(s, inner), before, sharp)
 
 
-def _halved_intervals(
+def _halved(
     path: PathLike, limits: LineLimits, joints: JointPath | None, s: Array, requested: tuple[Array, Array]
 ) -> _Cells:
     """Return the intervals between places, halved until their rows vary almost linearly.
@@ -180,9 +179,8 @@ def _separate(places: Array, nodes: Array) -> Array:
 def _steady_speeds(rows: Rows, s: Array, bounds: Array, requested: Array) -> Array:
     """Return the fastest steady speed in each interval, m/s."""
     steady = rows.steady()[0]
-    return np.asarray(
-        np.minimum(np.minimum(steady[:-1], steady[1:]), requested[segment_index(bounds, (s[:-1] + s[1:]) / 2)])
-    )
+    here = requested[segment_index(bounds, (s[:-1] + s[1:]) / 2)]
+    return np.asarray(np.minimum(np.minimum(steady[:-1], steady[1:]), here))
 
 
 def _uneven(left: Rows, middle: Rows, right: Rows, top: Array) -> NDArray[np.bool_]:

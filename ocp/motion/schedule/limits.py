@@ -23,25 +23,10 @@ from ocp.motion.schedule.profile import Array, LineMotion
 from ocp.motion.schedule.settings import SETTINGS
 
 __all__ = [
-    "JointLimits",
-    "JointPath",
-    "JointRates",
-    "LineLimits",
-    "PathLike",
-    "Rows",
-    "ToolLimits",
-    "TorqueRates",
-    "check_joints",
-    "check_line",
-    "check_smooth",
-    "curvature_along",
-    "limit_names",
-    "limit_rows",
-    "rates_along",
-    "tool_along",
-    "torque_rows",
-    "torques_along",
-]
+    "JointLimits", "JointPath", "JointRates", "LineLimits", "PathLike", "Rows", "ToolLimits", "TorqueRates",
+    "check_joints", "check_line", "check_smooth", "curvature_along", "limit_names", "limit_rows", "rates_along",
+    "tool_along", "torque_rows", "torques_along",
+]  # fmt: skip
 
 
 class PathLike(Protocol):

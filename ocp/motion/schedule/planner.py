@@ -54,9 +54,7 @@ def _velocity_curve(path: PathLike, limits: LineLimits) -> tuple[Array, Array, A
     for begin in range(0, len(of_pieces), SETTINGS.block):
         ends = bounds[begin : begin + SETTINGS.block + 1]
         low, high = np.searchsorted(first, ends[[0, -1]])
-        parts.append(
-            _refine_curve(path, limits, first[low : high + 1], ends, of_pieces[begin : begin + SETTINGS.block])
-        )
+        parts.append(_refined(path, limits, first[low : high + 1], ends, of_pieces[begin : begin + SETTINGS.block]))
     s = np.concatenate([part[0][:-1] for part in parts] + [first[-1:]])
     permitted = np.concatenate([part[1][:-1] for part in parts] + [parts[-1][1][-1:]])
     # where two parts meet, both sides count
@@ -65,7 +63,7 @@ def _velocity_curve(path: PathLike, limits: LineLimits) -> tuple[Array, Array, A
     return s, permitted * (1 - SETTINGS.speed_error), np.concatenate([part[2] for part in parts])
 
 
-def _refine_curve(
+def _refined(
     path: PathLike, limits: LineLimits, s: Array, bounds: Array, of_pieces: Array
 ) -> tuple[Array, Array, Array]:
     """Return the `_velocity_curve` over some segments, refined from these distances until they resolve it."""
@@ -125,10 +123,10 @@ def _lower_speeds(s: Array, permitted: Array, speed: Array, profile: SpeedProfil
     top = np.maximum(speeds[:-1], speeds[1:])
     peaks = profile.peaks()
     np.maximum.at(top, segment_index(s, peaks.distance), peaks.speed)
-    permitted_in = np.minimum(permitted[:-1], permitted[1:])
-    excess = np.minimum(top, speed) > permitted_in * (1 + ROUNDING_SHARE)
+    most = np.minimum(permitted[:-1], permitted[1:])
+    excess = np.minimum(top, speed) > most * (1 + ROUNDING_SHARE)
     if everywhere:
-        speed[excess] = permitted_in[excess]
+        speed[excess] = most[excess]
         return bool(excess.any())
     inside = np.flatnonzero(excess)
     if not inside.size:
@@ -136,10 +134,10 @@ def _lower_speeds(s: Array, permitted: Array, speed: Array, profile: SpeedProfil
     # one stretch around the slowest place of each run, as far as the permitted speed is similar
     starts = np.flatnonzero(np.diff(inside, prepend=-2) > 1)
     run = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(inside)))
-    speeds = permitted_in[inside]
+    speeds = most[inside]
     least = np.minimum.reduceat(speeds, starts)
-    slowest = np.minimum.reduceat(np.where(speeds == least[run], inside, len(permitted_in)), starts)
-    borders = np.concatenate([[-1], inside[speeds > SETTINGS.spread * least[run]], [len(permitted_in)]])
+    slowest = np.minimum.reduceat(np.where(speeds == least[run], inside, len(most)), starts)
+    borders = np.concatenate([[-1], inside[speeds > SETTINGS.spread * least[run]], [len(most)]])
     after = np.searchsorted(borders, slowest)
     lowered = (inside > borders[after - 1][run]) & (inside < borders[after][run])
     speed[inside[lowered]] = np.minimum(speed[inside[lowered]], least[run[lowered]])
@@ -246,7 +244,9 @@ def schedule(path: PathLike, limits: LineLimits, *, joints: JointPath | None = N
     """
     limited = check_line(path, limits, joints)
     checked_flag("strict", strict)
-    line_profile = _line_profile(path, limits) if np.isfinite(limits.jerk) else None
+    line_profile = None
+    if np.isfinite(limits.jerk):
+        line_profile = plan_zones(_constant_zones(np.asarray(path.bounds), path.by_piece(limits.speed), limits), {})
     further_limits = limited is not None or limits.tool is not None or np.isfinite(limits.centripetal)
     if line_profile is not None and not further_limits:
         return Schedule(path, limits, line_profile, (), joints)
@@ -265,15 +265,6 @@ def schedule(path: PathLike, limits: LineLimits, *, joints: JointPath | None = N
     return Schedule(path, limits, profile, dips, joints)
 
 
-def _line_profile(path: PathLike, limits: LineLimits) -> SpeedProfile:
-    """Return the motion that keeps speed, acceleration and jerk of the line."""
-    speeds, bounds = path.by_piece(limits.speed), np.asarray(path.bounds, dtype=float)
-    first = np.concatenate([[0], 1 + np.flatnonzero(np.diff(speeds))])
-    same = np.ones(len(first))
-    zones = Zones(bounds[np.append(first, len(speeds))], speeds[first], limits.acceleration * same, limits.jerk * same)
-    return plan_zones(zones, {})
-
-
 def _constrained_profile(grid: Grid, line_profile: SpeedProfile | None) -> SpeedProfile:
     """Return the line profile where it keeps all limits, and the fastest motion elsewhere."""
     count = len(grid.requested)
@@ -284,7 +275,7 @@ def _constrained_profile(grid: Grid, line_profile: SpeedProfile | None) -> Speed
         return line_profile
     s, extent = grid.distance, 1.0
     while True:
-        stretches = _affected_stretches(grid, line_profile, violated, extent)
+        stretches = _stretches(grid, line_profile, violated, extent)
         motions = []
         for first, last in stretches:
             ends = [(0.0 if k in (0, count) else float(grid.requested[k]) ** 2, 0.0) for k in (first, last)]
@@ -316,13 +307,13 @@ def _violated_intervals(grid: Grid, profile: SpeedProfile) -> NDArray[np.bool_]:
     """Return the intervals of the grid in which a motion violates a limit. Shape (N,)."""
     violated = np.zeros(len(grid.requested), dtype=bool)
     # inside an interval the jerk may change and the speed may have its maximum
-    extremes = profile.at(
+    peaks = profile.at(
         np.concatenate([profile.t, np.maximum(profile.t[1:] - 1e-12 * profile.duration, 0.0), profile.peaks().t])
     )
-    at = segment_index(grid.distance, extremes.distance)
+    at = segment_index(grid.distance, peaks.distance)
     for first, last in grid.parts():
         at_nodes, inside = profile.at_distance(grid.distance[first : last + 1]), (at >= first) & (at < last)
-        turn = LineMotion(*(value[inside] for value in extremes))
+        turn = LineMotion(*(value[inside] for value in peaks))
         for rows, ends in zip(grid.ends(first, last), (slice(-1), slice(1, None)), strict=True):
             motion = LineMotion(*(value[ends] for value in at_nodes))
             violated[first:last] |= (np.abs(rows.usage(motion)) > 1 + ROUNDING_SHARE).any(axis=1)
@@ -331,9 +322,7 @@ def _violated_intervals(grid: Grid, profile: SpeedProfile) -> NDArray[np.bool_]:
     return violated
 
 
-def _affected_stretches(
-    grid: Grid, profile: SpeedProfile, violated: NDArray[np.bool_], extent: float
-) -> list[tuple[int, int]]:
+def _stretches(grid: Grid, profile: SpeedProfile, violated: NDArray[np.bool_], extent: float) -> list[tuple[int, int]]:
     """Return first and last nodes of the stretches to plan again, between steady speeds or the ends of the path.
 
     They extend beyond the violated intervals by `extent` times the length of a ramp to rest.

@@ -9,16 +9,15 @@ With x = v^2 as a function of the distance s, a = x'/2 and j = v x''/2, so that
 
 are linear in (x, x', x'') except for x^(-1/2), which is convex: the time is a convex cost, and a row of jerk is linear
 <= convex, whose tangent is conservative (Debrouwere et al., Time-Optimal Path Following for Robots With Convex-Concave
-Constraints, 2013). Each step of the primal-dual interior point updates the tangents, so that the sequence of programs
-and the iterations of each are one.
+Constraints, 2013). Each step of the primal-dual interior point updates the tangents.
 
 x is a spline of degree 2 with a knot at every node: x'' is constant in an interval. Its B-spline coefficients are the
 unknowns; a row involves three of them and the normal equations have five diagonals, so a step costs time and memory in
 proportion to the nodes.
 
 Motions at distant places are almost independent. Therefore each interval has its own step length, which varies slowly
-along the path, instead of the one length that the worst row allows; the number of steps then hardly grows with the
-nodes. If such steps diverge from the bounds, all intervals use the shortest length from then on.
+along the path; the number of steps then hardly grows with the nodes. If such steps diverge from the bounds, all
+intervals use the shortest length from then on.
 """
 
 from __future__ import annotations
@@ -110,9 +109,8 @@ class Spline:
         """Return the spline of some coefficients as if they were neighbours."""
         part, last = copy(self), len(self.h)
         part.h = self.h[np.minimum(at[:-2], last - 1)]
-        part.nodes, part.width, part.share = (
-            kind[np.minimum(at[:-1], last)] for kind in (self.nodes, self.width, self.share)
-        )
+        nodes = np.minimum(at[:-1], last)
+        part.nodes, part.width, part.share = self.nodes[nodes], self.width[nodes], self.share[nodes]
         return part
 
     def at_nodes(self, b: Array) -> tuple[Array, Array]:
@@ -161,10 +159,8 @@ class Program(NamedTuple):
     def part(self, free: NDArray[np.intp]) -> tuple[Program, NDArray[np.intp]]:
         """Return the program of some intervals (B,) between fixed motions, and the indices of its coefficients in this
         one.
-
-        Its stretches are concatenated, with two intervals without rows between them.
         """
-        count = len(self.spline.h)
+        count = len(self.spline.h)  # stretches are concatenated, with two intervals without rows between them
         cuts = np.flatnonzero(np.diff(free) > 1)
         first, last = free[np.append(0, cuts + 1)], free[np.append(cuts, len(free) - 1)] + 1
         sizes = last - first + 2

@@ -26,17 +26,9 @@ from ocp.motion.schedule.profile import Array, SpeedProfile, integrate_jerk
 from ocp.tolerances import ROUNDING_SHARE
 
 __all__ = [
-    "Memory",
-    "Phases",
-    "Zones",
-    "fastest_motion",
-    "peak_acceleration",
-    "plan_zones",
-    "ramp_distance",
-    "ramp_time",
-    "reachability_passes",
-    "reachable_speed",
-]
+    "Memory", "Phases", "Zones", "fastest_motion", "peak_acceleration", "plan_zones", "ramp_distance", "ramp_time",
+    "reachability_passes", "reachable_speed",
+]  # fmt: skip
 
 Phases = tuple[tuple[float, float], ...]
 """Durations (s) and jerks (m/s^3) of consecutive phases of constant jerk."""

@@ -40,12 +40,6 @@ class _Margins(NamedTuple):
     acceleration: Array
     jerk: Array
 
-    @classmethod
-    def all_of(cls, value: float, count: int, rows: Rows) -> _Margins:
-        """Return equal margins for `count` intervals with rows like these."""
-        shapes = (count,), (count, rows.acceleration.shape[1]), (count, rows.jerk.shape[1])
-        return cls(*(np.full(shape, value) for shape in shapes))
-
     def take(self, part: slice) -> _Margins:
         """Return views of the margins of some intervals."""
         return _Margins(*(margin[part] for margin in self))
@@ -77,7 +71,8 @@ class _Enforced:
     def build(cls, window: Window) -> _Enforced:
         """Return the initial state of a window."""
         count, rows = window.last - window.first, window.rows[0]
-        margins, times = (_Margins.all_of(value, count, rows) for value in (1 - SETTINGS.room, 0.0))
+        shapes = (count,), (count, rows.acceleration.shape[1]), (count, rows.jerk.shape[1])
+        margins, times = (_Margins(*(np.full(shape, x) for shape in shapes)) for x in (1 - SETTINGS.room, 0.0))
         held = np.zeros((len(HELD), 2, count, rows.total), dtype=bool)
         return cls(margins, times, held, np.ones((len(HELD), count)))
 
@@ -213,7 +208,10 @@ def _tighten(window: Window, enforced: _Enforced, seam: int, checked: int) -> tu
     for number in range(SETTINGS.rounds):
         accuracy = accuracies[min(number, len(accuracies) - 1)]
         try:
-            x, slope = _solve_rows(window, enforced, seam, start, accuracy, free)
+            if sharp:
+                x, slope = _with_jerk(window, enforced, seam, start, accuracy, free)
+            else:
+                x, slope = _without_jerk(window, enforced.margins), None
         except ProblemError:
             if len(free) == len(every):
                 raise
@@ -231,9 +229,8 @@ def _tighten(window: Window, enforced: _Enforced, seam: int, checked: int) -> tu
             return x, slope
         if slope is not None and number == 1:
             enforced.release(values, window.rows[1].jerk[:, :, 0], seam - window.first)
-        enforced.lower(
-            used, violated if slope is None else enforced.hold(violated, values), window.rows[0], seam - window.first
-        )
+        held = violated if slope is None else enforced.hold(violated, values)
+        enforced.lower(used, held, window.rows[0], seam - window.first)
         if slope is None:
             continue
         start = x, slope
@@ -248,15 +245,6 @@ def _tighten(window: Window, enforced: _Enforced, seam: int, checked: int) -> tu
 def _seam_shares(window: Window, seam: int) -> Array:
     """Return the share of the limits that the intervals of a window may use. Shape (N,)."""
     return np.where(np.arange(window.first, window.last) < seam, 1.0, SETTINGS.seam)
-
-
-def _solve_rows(
-    window: Window, enforced: _Enforced, seam: int, start: Motion | None, accuracy: float, free: NDArray[np.intp]
-) -> tuple[Array, Array | None]:
-    """Return squared speeds at the nodes, and slopes with jerk limits; only free intervals change."""
-    if window.grid.sharp:
-        return _with_jerk(window, enforced, seam, start, accuracy, free)
-    return _without_jerk(window, enforced.margins), None
 
 
 def _without_jerk(window: Window, margins: _Margins) -> Array:
@@ -436,18 +424,14 @@ def _spline_rows(
         p, q, r = rows.acceleration[at, row].T
         direction, place = 1.0 - 2.0 * sign, np.full(len(at), inside)
         of = direction[:, None] * np.stack([q, p / 2, np.zeros(len(at))], axis=1)
-        parts.append(
-            SplineRows(
-                at, place, place, of, shares.acceleration[at, row] - direction * r, np.zeros(len(at), dtype=bool)
-            )
-        )
+        bound, is_jerk = shares.acceleration[at, row] - direction * r, np.zeros(len(at), dtype=bool)
+        parts.append(SplineRows(at, place, place, of, bound, is_jerk))
         sign, at, row = np.nonzero(which[:, :, second:])
         p, q, r = rows.jerk[at, row].T
         of = (1.0 - 2.0 * sign)[:, None] * np.stack([speed[at] * r, speed[at] * q / 2, p / 2], axis=1)
         root = np.full(len(at), _jerk_place(inside))
-        parts.append(
-            SplineRows(at, np.full(len(at), inside), root, of, shares.jerk[at, row], np.ones(len(at), dtype=bool))
-        )
+        place, is_jerk = np.full(len(at), inside), np.ones(len(at), dtype=bool)
+        parts.append(SplineRows(at, place, root, of, shares.jerk[at, row], is_jerk))
     return SplineRows(*(np.concatenate(kind) for kind in zip(*parts, strict=True)))
 
 

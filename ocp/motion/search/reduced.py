@@ -316,7 +316,7 @@ def check_floating_reach(
             known = found[good][:STARTS]
             return None
         best = int(off.argmin())
-        return unreachable_error(machine, equations, found[best, :n], float(off[best]), lower, upper)
+        return unreachable_error(equations, found[best, :n], float(off[best]), lower, upper)
 
     reached = begin
     for time in np.linspace(begin, end, looks).tolist():

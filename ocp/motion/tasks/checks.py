@@ -12,27 +12,16 @@ from numpy.typing import NDArray
 
 from models import Joint, Machine
 from models.arrays import Array, warn_of_degrees
-from ocp.errors import NOT_NUMBERS, ProblemError, floats, real, told_apart
+from ocp.errors import NOT_NUMBERS, ProblemError, checked_positive, floats, told_apart
 from ocp.motion.tasks.equations import TaskEquations
 from ocp.motion.tasks.geometry import BoundTask, is_holonomic, target_size
 from ocp.motion.tasks.tip_task import ANGULAR, TipTask
 
 __all__ = [
-    "check_closed",
-    "check_length",
-    "check_rest",
-    "check_speed",
-    "checked_configuration",
-    "checked_horizon",
-    "checked_numbers",
-    "checked_tasks",
-    "checked_weights",
-    "clip_to_limits",
-    "dependent_rows",
-    "horizon_of",
-    "ignorable_joints",
-    "rates_at_rest",
-]
+    "check_closed", "check_length", "check_rest", "check_speed", "checked_configuration", "checked_horizon",
+    "checked_numbers", "checked_tasks", "checked_weights", "clip_to_limits", "dependent_rows", "horizon_of",
+    "ignorable_joints", "rates_at_rest",
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -63,11 +52,7 @@ CHECKS = CheckSettings()
 
 def checked_horizon(horizon: Any) -> float:
     """Return the horizon; ProblemError unless it is a positive, finite number."""
-    duration = real(horizon)
-    if not 0 < duration < np.inf:
-        words = f"horizon must be a positive number of seconds, not {horizon!r}"
-        raise ProblemError(words, name="horizon", value=horizon, limit=0.0)
-    return duration
+    return float(checked_positive("horizon", horizon))
 
 
 def horizon_of(tasks: Sequence[TipTask], horizon: Any) -> float:
@@ -340,16 +325,14 @@ def check_length(equations: TaskEquations, base: Array, horizon: float) -> None:
         times, values = _sampled(TaskEquations(equations.machine, (part,)), horizon, CHECKS.track_samples)
         positions = values[task.linear].T
         shoulder, reach = _shoulder_and_reach(part.tip, base)
-        lengths = np.linalg.norm(positions - shoulder[task.linear], axis=1)
-        worst = int(lengths.argmax())
-        if lengths[worst] > reach:
+        far = np.linalg.norm(positions - shoulder[task.linear], axis=1)
+        worst = int(far.argmax())
+        if far[worst] > reach:
             words = (
-                f"the task of {_frame(part)!r} leads {lengths[worst]:.4g} m away from the first joint at "
+                f"the task of {_frame(part)!r} leads {far[worst]:.4g} m away from the first joint at "
                 f"{times[worst]:.4g}, to {positions[worst].tolist()} m, but the arm is at most {reach:.4g} m long"
             )
-            raise ProblemError(
-                words, name=_frame(part), value=float(lengths[worst]), limit=reach, time=float(times[worst])
-            )
+            raise ProblemError(words, name=_frame(part), value=float(far[worst]), limit=reach, time=float(times[worst]))
 
 
 def check_speed(equations: TaskEquations, rate_limits: Array, begin: float, end: float) -> None:

@@ -7,7 +7,7 @@ targets; everything else is a function of configuration and targets, written ele
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -31,7 +31,6 @@ from ocp.motion.tasks.geometry import (
     movable_angular_rows,
     pose_error,
     pose_error_rows,
-    pose_holding_task,
     pose_in_reference,
     reference_pose,
     relative_twist,
@@ -114,11 +113,9 @@ class TaskEquations:
             if task.velocity is not None:
                 parts.append(pace * track_expression(task.velocity, time, (task.size, 1), "velocity", task.begin))
             if task.position is not None:
-                value = _full_position(task, task.position, time, "position")
+                value = _position_of(task, task.position, time, "position")
                 rate = getattr(task.position, "rate", None)
-                velocity = (
-                    derivative(value, time) if rate is None else _full_position(task, rate, time, "position rate")
-                )
+                velocity = derivative(value, time) if rate is None else _position_of(task, rate, time, "position rate")
                 parts += [value, pace * velocity]
             if task.orientation is not None:
                 value = track_expression(task.orientation, time, ((4, 1), (3, 3)), "orientation", task.begin)
@@ -172,8 +169,8 @@ class TaskEquations:
         """Return the velocities of the tips in the rows of the tasks, rad/s and m/s. Shape (size, 1)."""
         rows = []
         for part in self.bound:
-            moving = relative_twist(part, base, joints, part.tip.tip_twist(base, joints, rates), rates)
-            rows.append(task_rows(part, base, joints, moving))
+            twist = relative_twist(part, base, joints, part.tip.tip_twist(base, joints, rates), rates)
+            rows.append(task_rows(part, base, joints, twist))
         return ca.densify(ca.vertcat(*rows))
 
     def deviations(self, base: Any, joints: Any, rates: Any, targets: Any) -> dict[str, dict[str, Any]]:
@@ -232,15 +229,13 @@ class TaskEquations:
             change: Rate of the pace, 1/s^2.
         """
         residual = self.residual(base, joints, rates, self.targets(time, pace))
-        symbols, derivatives = [joints, rates, time], [rates, second, 1]
+        symbols, rates_of = [joints, rates, time], [rates, second, 1]
         if self.machine.base_size:
-            symbols, derivatives = [base, *symbols], [self.machine.base_rate(base, joints, rates), *derivatives]
+            symbols, rates_of = [base, *symbols], [self.machine.base_rate(base, joints, rates), *rates_of]
         if isinstance(pace, ca.SX | ca.MX):
-            symbols, derivatives = [*symbols, pace], [*derivatives[:-1], pace, change]
+            symbols, rates_of = [*symbols, pace], [*rates_of[:-1], pace, change]
         gains = np.repeat([float(part.task.gain) for part in self.bound], [part.task.size for part in self.bound])
-        return (
-            ca.jtimes(residual, ca.vertcat(*symbols), ca.vertcat(*derivatives)) + ca.sparsify(ca.DM(gains)) * residual
-        )
+        return ca.jtimes(residual, ca.vertcat(*symbols), ca.vertcat(*rates_of)) + ca.sparsify(ca.DM(gains)) * residual
 
     @on_scalars
     def manipulability(self, base: Any, joints: Any) -> Any:
@@ -329,7 +324,9 @@ class TaskEquations:
         for part in self.bound:
             if part.task.velocity is not None:
                 position, rotation = (ca.DM(value) for value in pose_in_reference(part, at_base, at_joints))
-                bound = part._replace(task=pose_holding_task(part.task))
+                bound = part._replace(
+                    task=replace(part.task, velocity=None, position=np.zeros(3), orientation=np.eye(3))
+                )
                 targets = ca.vertcat(position, ca.DM(3, 1), ca.vec(rotation), ca.DM(3, 1))
                 rows.append(pose_error_rows(bound, base, joints, targets))
         return ca.vertcat(*rows)
@@ -364,18 +361,15 @@ class TaskEquations:
 
     @cached_property
     def _cone_function(self) -> Any:
-        base, joints, targets = self._symbols
-        return ca.Function(
-            "cone_cosines", [base, joints, targets], [self.cone_cosines(base, joints, targets)], {"cse": True}
-        )
+        symbols = self._symbols
+        return ca.Function("cone_cosines", symbols, [self.cone_cosines(*symbols)], {"cse": True})
 
     @cached_property
     def function(self) -> Any:
         """CasADi Function (base, joints, targets) -> (J, b, error, pose residual)."""
-        base, joints, targets = self._symbols
-        parts = [self.jacobian(base, joints)]
-        parts += [rows(base, joints, targets) for rows in (self.right, self.error, self.pose_residual)]
-        return ca.Function("task", [base, joints, targets], parts, {"cse": True})
+        symbols = self._symbols
+        rows = [of_targets(*symbols) for of_targets in (self.right, self.error, self.pose_residual)]
+        return ca.Function("task", symbols, [self.jacobian(*symbols[:2]), *rows], {"cse": True})
 
     @cached_property
     def pose_residual_function(self) -> Any:
@@ -392,10 +386,11 @@ class TaskEquations:
         return ca.Function("jacobian", [joints, base], [self.jacobian(base, joints)], {"cse": True})
 
     @property
-    def _symbols(self) -> tuple[Any, Any, Any]:
+    def _symbols(self) -> tuple[Any, ...]:
         """Symbols of base, joints and targets."""
-        base, joints = ca.SX.sym("base", self.machine.base_size), ca.SX.sym("joints", self.machine.joint_size)
-        return base, joints, ca.SX.sym("targets", sum(target_size(part.task) for part in self.bound))
+        targets = sum(target_size(part.task) for part in self.bound)
+        sizes = {"base": self.machine.base_size, "joints": self.machine.joint_size, "targets": targets}
+        return tuple(ca.SX.sym(name, size) for name, size in sizes.items())
 
     def target_function(self) -> Any:
         """Return the CasADi Function time -> targets, on MX symbols if a track needs them."""
@@ -417,17 +412,15 @@ class TaskEquations:
             ProblemError: The momentum moves the centre of mass, and the joints cannot return.
         """
         holonomic = np.concatenate([is_holonomic(part) for part in self.bound])
+        directions = np.eye(self.size)[:, holonomic]
         if self.machine.base_size == 0:
-            return np.eye(self.size)[:, holonomic]
-        directions = np.zeros((self.size, 0))
-        if isinstance(self.machine, FreeFloating):
-            combinations = closing_combinations(self.machine, self.bound, holonomic, base, joints)
-            directions = np.zeros((self.size, combinations.shape[1]))
-            directions[holonomic] = combinations
-        return directions
+            return directions
+        if not isinstance(self.machine, FreeFloating):
+            return np.zeros((self.size, 0))
+        return directions @ closing_combinations(self.machine, self.bound, holonomic, base, joints)
 
 
-def _full_position(task: TipTask, track: Any, time: Any, name: str) -> Any:
+def _position_of(task: TipTask, track: Any, time: Any, name: str) -> Any:
     """Return a position track with all three coordinates, zero where the task leaves them out. Shape (3, 1)."""
     short = task.along_reference and len(task.linear) < 3
     shapes = ((3, 1), (len(task.linear), 1)) if short else ((3, 1),)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -51,15 +50,11 @@ def reference_pose(part: BoundTask, base: Any, joints: Any) -> Frame | None:
 
 
 def relative_twist(part: BoundTask, base: Any, joints: Any, twist: Any, rates: Any) -> Any:
-    """Return a twist, or columns of twists, relative to the reference frame, in world axes.
-
-    The twist of the reference is taken at the tip of the task: a rotating reference also moves the point where the tip
-    is.
+    """Return a twist, or columns of twists, relative to the reference frame at the tip of the task, in world axes.
 
     Args:
         twist: Twist of the tip, (6, 1), or the columns of its Jacobian.
-        rates: Joint rates that go with a single twist; None for the joint Jacobian, "base" for the Jacobian by the base
-            twist.
+        rates: Joint rates of a single twist; None for the joint Jacobian, "base" for that by the base twist.
     """
     if part.reference is None:
         return twist
@@ -139,11 +134,6 @@ def pose_in_reference(part: BoundTask, base: Any, joints: Any) -> tuple[Any, Any
     return ca.mtimes(rotation.T, pose.position - reference.position), ca.mtimes(rotation.T, pose.rotation)
 
 
-def pose_holding_task(task: TipTask) -> TipTask:
-    """Return the pose task that keeps the pose in the rows of a velocity task."""
-    return replace(task, velocity=None, position=np.zeros(3), orientation=np.eye(3))
-
-
 @on_scalars
 def pose_error_rows(part: BoundTask, base: Any, joints: Any, targets: Any) -> Any:
     """Return the pose error in the rows of the task."""
@@ -151,10 +141,7 @@ def pose_error_rows(part: BoundTask, base: Any, joints: Any, targets: Any) -> An
 
 
 def is_holonomic(part: BoundTask) -> Array:
-    """Return which rows of a task have an integral that does not depend on the path. Shape (size,), bool.
-
-    Angular velocity has none unless the task prescribes every angular row that some joint moves.
-    """
+    """Return which rows of a task have an integral that does not depend on the path. Shape (size,), bool."""
     task = part.task
     if task.is_pose:
         return np.ones(task.size, dtype=bool)
@@ -197,9 +184,8 @@ def angular_velocity(rotation: Any, rate: Any) -> Any:
 def closing_combinations(
     machine: FreeFloating, bound_tasks: Sequence[BoundTask], selected: NDArray[np.bool_], base: Array, joints: Array
 ) -> Array:
-    """Return combinations of the selected rows that are independent of the base pose while the centre of mass stays.
-
-    Shape (m, k).
+    """Return combinations of the selected rows that no base motion changes while the centre of mass stays. Shape (m,
+    k).
 
     Raises:
         ProblemError: The momentum moves the centre of mass, and the joints cannot return.

@@ -7,6 +7,7 @@ derivative with respect to time would be wrong or undefined: at the bounds of th
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, TypeAlias, TypeVar
 
 import casadi as ca
@@ -19,19 +20,12 @@ from models.paths.functions import path_function, turn_function
 from models.paths.orientation import exponential
 from models.paths.smooth_path import SmoothPath
 from models.spatial import expression, rotation_from_quaternion
-from ocp.errors import NOT_NUMBERS, ProblemError, checked_choice, floats, real
+from ocp.errors import NOT_NUMBERS, ProblemError, checked_choice, checked_positive, floats, real
 
 __all__ = [
-    "PathTracks",
-    "PoseLine",
-    "Track",
-    "on_symbols",
-    "path_tracks",
-    "pose_line",
-    "reparametrized",
+    "PathTracks", "PoseLine", "Track", "TrackWithRate", "on_symbols", "path_tracks", "pose_line", "reparametrized",
     "track_expression",
-    "track_with_rate",
-]
+]  # fmt: skip
 
 Track: TypeAlias = Any
 """A constant, or a function: casadi time (s) -> casadi vector or matrix, or a list of expressions."""
@@ -69,15 +63,11 @@ def pose_line(
             that is not positive.
     """
     checked_choice("pace", pace, ("constant", "rest"))
-    if not 0 < real(duration) < np.inf:
-        words = f"duration must be a positive number of seconds, not {duration!r}"
-        raise ProblemError(words, name="duration", value=duration, limit=0.0)
+    checked_positive("duration", duration)
     (rotation, origin), (turned, end) = (_pose(pose, name) for pose, name in ((first, "first"), (second, "second")))
-    relative = rotation.T @ turned
-    axial = np.array(
-        [relative[2, 1] - relative[1, 2], relative[0, 2] - relative[2, 0], relative[1, 0] - relative[0, 1]]
-    )
-    sine, cosine = float(np.linalg.norm(axial)) / 2, (float(np.trace(relative)) - 1) / 2
+    change = rotation.T @ turned
+    axial = np.array([change[2, 1] - change[1, 2], change[0, 2] - change[2, 0], change[1, 0] - change[0, 1]])
+    sine, cosine = float(np.linalg.norm(axial)) / 2, (float(np.trace(change)) - 1) / 2
     angle = float(np.arctan2(sine, cosine))
     if angle > MAX_ROTATION_RAD:
         words = f"the poses are {np.degrees(angle):.4g} deg apart: the sense of the turn is ambiguous"
@@ -86,9 +76,7 @@ def pose_line(
 
     def fraction(time: Any) -> Any:
         s = time / duration
-        if pace == "constant":
-            return s
-        return rest_to_rest(ca.fmin(ca.fmax(s, 0), 1))
+        return s if pace == "constant" else rest_to_rest(ca.fmin(ca.fmax(s, 0), 1))
 
     def position(time: Any) -> Any:
         return ca.DM(origin) + fraction(time) * ca.DM(end - origin)
@@ -99,27 +87,19 @@ def pose_line(
     return PoseLine(position, orientation)
 
 
-class _TrackWithRate:
-    """A track with a rate of its own."""
+@dataclass(frozen=True, eq=False)
+class TrackWithRate:
+    """A track with a rate: velocity of a position or direction, angular velocity of an orientation, (3, 1), per s.
 
-    def __init__(self, at: Callable[[Any], Any], rate: Callable[[Any], Any]) -> None:
-        self._at, self._rate = at, rate
-
-    def __call__(self, time: Any) -> Any:
-        return self._at(time)
-
-    def rate(self, time: Any) -> Any:
-        """Return the velocity of a position or direction, or the angular velocity of an orientation. Shape (3, 1)."""
-        return self._rate(time)
-
-
-def track_with_rate(track: Callable[[Any], Any], rate: Callable[[Any], Any]) -> Track:
-    """Return a track with a given rate: velocity of a position or direction, angular velocity of an orientation.
-
-    Args:
+    Attributes:
         track, rate: Functions of CasADi time (s).
     """
-    return _TrackWithRate(track, rate)
+
+    track: Callable[[Any], Any]
+    rate: Callable[[Any], Any]
+
+    def __call__(self, time: Any) -> Any:
+        return self.track(time)
 
 
 class PathTracks(NamedTuple):
@@ -143,7 +123,7 @@ class PathTracks(NamedTuple):
         def direction(time: Any) -> Any:
             return ca.mtimes(rotation(time), ca.DM(tool_axis))
 
-        return _TrackWithRate(direction, lambda time: ca.cross(angular_velocity(time), direction(time)))
+        return TrackWithRate(direction, lambda time: ca.cross(angular_velocity(time), direction(time)))
 
 
 def path_tracks(path: SmoothPath, speed: Any) -> PathTracks:
@@ -192,8 +172,8 @@ def path_tracks(path: SmoothPath, speed: Any) -> PathTracks:
         distance, rate = pace(time)
         return rate * orientation_of(distance)[1]
 
-    position = _TrackWithRate(lambda time: position_of(pace(time)[0])[0], velocity)
-    orientation = _TrackWithRate(lambda time: rotation_from_quaternion(orientation_of(pace(time)[0])[0]), spin)
+    position = TrackWithRate(lambda time: position_of(pace(time)[0])[0], velocity)
+    orientation = TrackWithRate(lambda time: rotation_from_quaternion(orientation_of(pace(time)[0])[0]), spin)
     return PathTracks(position, orientation, duration, np.asarray(breaks, dtype=float))
 
 
@@ -210,7 +190,7 @@ def reparametrized(track: Track, clock: Callable[[Any], Any]) -> Track:
         return track(clock(time))
 
     rate = getattr(track, "rate", None)
-    return at if rate is None else _TrackWithRate(at, lambda time: ca.jacobian(clock(time), time) * rate(clock(time)))
+    return at if rate is None else TrackWithRate(at, lambda time: ca.jacobian(clock(time), time) * rate(clock(time)))
 
 
 def _pose(pose: tuple[ArrayInput, ArrayInput], name: str) -> tuple[Array, Array]:

@@ -15,19 +15,9 @@ from models.spatial import expression
 from ocp.errors import NOT_NUMBERS, ProblemError, real
 
 __all__ = [
-    "Anywhere",
-    "Following",
-    "InFoot",
-    "IndexAtLeast",
-    "Pinned",
-    "ZmpRule",
-    "check_rule",
-    "checked_point",
-    "foot_edges",
-    "foot_rows",
-    "index_rows",
-    "is_finite",
-]
+    "Anywhere", "Following", "InFoot", "IndexAtLeast", "Pinned", "ZmpRule", "check_rule", "checked_point",
+    "foot_edges", "foot_rows", "index_rows", "is_finite",
+]  # fmt: skip
 
 PARALLEL = 1e-12
 """Cosine below which an edge of the support is parallel to a direction."""
@@ -58,9 +48,7 @@ class InFoot:
         half_lengths = np.ptp(support.vertices @ directions.T, axis=0) / 2
         largest = support.inner_radius if len(directions) == 2 else float(half_lengths.min(initial=np.inf))
         if self.margin >= largest * (1 - 1e-9):
-            words = (
-                f"InFoot: margin {self.margin!r} m is too large for the support, whose largest margin is {largest:g} m"
-            )
+            words = f"InFoot: margin {self.margin!r} m is too large for the support, which allows {largest:g} m at most"
             raise ProblemError(words, name="margin", value=self.margin, limit=largest)
 
 

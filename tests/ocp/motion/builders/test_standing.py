@@ -480,7 +480,7 @@ def test_a_pushed_machine_is_asked_to_stand_where_a_time_dependent_force_lets_it
         ({"start_joints": np.deg2rad([20.0, 160, 240, 200, 50])}, "'joint1' starts at 0.349.*outside its limits"),
         ({"tasks": TipTask(velocity=(0.0, 0.0), rows=(1, 4))}, r"no joint moves the tip in rows \[1\]"),
         ({"tasks": TipTask(velocity=(0.1,), rows=(4,))}, "'link5' moves at .* 0 s, where the joints are to be at rest"),
-        ({"horizon": -1.0}, "horizon must be a positive number"),
+        ({"horizon": -1.0}, "horizon must be positive and finite"),
         ({"control": "force"}, "control must be 'acceleration' or 'jerk'"),
         ({"along": "arc"}, "along must be 'time' or 'parameter'"),
         ({"end": "soft"}, "end must be 'rest' or 'free'"),

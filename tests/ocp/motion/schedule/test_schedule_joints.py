@@ -278,7 +278,7 @@ def test_names_with_commas_come_back_from_csv(tmp_path: File) -> None:
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"names": ("a", "a")}, "differ"),
+        ({"names": ("a", "a")}, "distinct"),
         ({"t": np.array([0.0, 0.0])}, "increasing"),
         ({"t": np.array([0.0, np.nan])}, "finite"),
         ({"positions": np.zeros((2, 2))}, "shape"),
