@@ -430,14 +430,14 @@ class _Simulation:
         try:
             return np.array(self._many[count](state, times[None, :])).T
         except RuntimeError:  # the integrator fails at some step: integrate step by step
-            reached = np.full((count, 2 * self._n), np.nan)
+            states = np.full((count, 2 * self._n), np.nan)
             for i, at in enumerate(times):
                 try:
                     state = np.array(self._once(state, at)).ravel()
                 except RuntimeError:
                     break
-                reached[i] = state
-            return reached
+                states[i] = state
+            return states
 
 
 class _Recorder:

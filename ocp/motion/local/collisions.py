@@ -52,7 +52,7 @@ def scene_hulls(scene: CollisionScene) -> dict[str, Hull]:
     }
 
 
-def distances_along(scene: CollisionScene, base: Array, joints: Array, times: Array, near: float = np.inf) -> Array:
+def distances_along(scene: CollisionScene, base: Array, joints: Array, times: Array, cutoff: float = np.inf) -> Array:
     """Return the distances of all pairs at samples of a motion. Shape (M, n), m.
 
     The penetration depth of a pair with a mesh or a cylinder is an estimate.
@@ -62,14 +62,14 @@ def distances_along(scene: CollisionScene, base: Array, joints: Array, times: Ar
         base: Base configurations, shape (M, base_size) or (base_size,).
         joints: Joint positions. Shape (M, joint_size).
         times: Times, s. Shape (M,).
-        near: For pairs farther apart than this, m, a lower bound of the distance of at least `near` is enough.
+        cutoff: For pairs farther apart than this, m, a lower bound of at least `cutoff` may be returned.
     """
     count = len(joints)
     if not len(scene.pairs):
         return np.zeros((count, 0))
     placements, bodies = _prepare(scene)
     bases = np.broadcast_to(base, (count, scene.machine.base_size))
-    return bodies.distances(frames_of(placements(bases, joints, np.reshape(times, (-1, 1)))[0]), near)
+    return bodies.distances(frames_of(placements(bases, joints, np.reshape(times, (-1, 1)))[0]), cutoff)
 
 
 def find_collisions(scene: CollisionScene, base: Array, joints: Array, times: Array) -> list[Collision]:
@@ -166,7 +166,7 @@ def slide_apart(
 
     def distances(configurations: Array) -> Array:
         """Return the distances of all pairs; beyond the target a lower bound is enough. Shape (K, P)."""
-        return distances_along(scene, base, configurations, np.full(len(configurations), time), near=target)
+        return distances_along(scene, base, configurations, np.full(len(configurations), time), cutoff=target)
 
     best, current, clearance = joints.copy(), joints.copy(), np.full(count, -np.inf)
     for _ in range(SLIDING.steps):

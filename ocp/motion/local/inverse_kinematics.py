@@ -375,23 +375,23 @@ def distinct_solutions(
     solutions: list[IkSolution], revolute: NDArray[np.bool_], apart: float = IK_SETTINGS.apart
 ) -> list[IkSolution]:
     """Return the first of each group of solutions within `apart`, angles modulo full turns."""
-    kept: list[IkSolution] = []
+    distinct: list[IkSolution] = []
     for solution in solutions:
-        for previous in kept:
+        for previous in distinct:
             difference = solution.joints - previous.joints
             difference[revolute] = np.remainder(difference[revolute] + np.pi, 2 * np.pi) - np.pi
             if np.abs(difference).max() < apart:
                 break
         else:
-            kept.append(solution)
-    return kept
+            distinct.append(solution)
+    return distinct
 
 
 def _closest_collisions(
     solutions: list[IkSolution], scene: CollisionScene, base: Array, time: float
 ) -> list[Collision | None]:
     """Return for each solution its closest pair below the clearance, or None."""
-    collisions = (find_collisions(scene, base[None], one.joints[None], np.array([time])) for one in solutions)
+    collisions = (find_collisions(scene, base[None], solution.joints[None], np.array([time])) for solution in solutions)
     return [next(iter(each), None) for each in collisions]
 
 

@@ -246,24 +246,24 @@ def _integrate(model: _Model, first: Array, times: Array, tolerance: float) -> t
     except RuntimeError:
         pass  # integrate again from sample to sample to find how far it goes
     step = model.one_interval(tolerance)
-    reached, costs_so_far = [first], [0.0]
+    states_so_far, costs_so_far = [first], [0.0]
     for begin, end in pairwise(times):
         try:
-            result = step(x0=reached[-1], p=[begin, end - begin])
+            result = step(x0=states_so_far[-1], p=[begin, end - begin])
             state, cost = np.array(result["xf"]).ravel(), float(result["qf"])
             usable = np.isfinite([*state, cost]).all() and np.isfinite(np.array(model.rate(end, state))).all()
         except RuntimeError:
             usable = False
         if not usable:
-            manipulability = float(_manipulabilities(np.array(model.outputs(begin, reached[-1])[1])[None])[0])
+            manipulability = float(_manipulabilities(np.array(model.outputs(begin, states_so_far[-1])[1])[None])[0])
             reason = (
                 f"the integration fails between {begin:g} and {end:g} s, where the manipulability "
                 f"falls to {manipulability:.3g}: the task becomes singular; give a damping or another start"
             )
-            return np.array(reached), np.array(costs_so_far), reason
-        reached.append(state)
+            return np.array(states_so_far), np.array(costs_so_far), reason
+        states_so_far.append(state)
         costs_so_far.append(costs_so_far[-1] + cost)
-    return np.array(reached), np.array(costs_so_far), None
+    return np.array(states_so_far), np.array(costs_so_far), None
 
 
 def _report(

@@ -71,14 +71,14 @@ class _Cells(NamedTuple):
         begin: Beginnings of the intervals, m.
         top: Fastest steady speeds, m/s.
         rates: Upper bounds of the acceleration of any motion, m/s^2.
-        most, sharp: Largest line acceleration and jerk at rest, m/s^2 and m/s^3.
+        acceleration, jerk: Largest values of the line at rest, m/s^2 and m/s^3.
     """
 
     begin: Array
     top: Array
     rates: Array
-    most: Array
-    sharp: Array
+    acceleration: Array
+    jerk: Array
 
 
 def make_grid(path: PathLike, limits: LineLimits, joints: JointPath | None) -> Grid:
@@ -108,7 +108,7 @@ def make_grid(path: PathLike, limits: LineLimits, joints: JointPath | None) -> G
     inner = nodes[1:-1]
     before = inner - np.minimum(ROUNDING_SHARE * path.length, np.diff(nodes)[:-1] / 2)
     of_interval = np.asarray(requested[segment_index(bounds, (s[:-1] + s[1:]) / 2)])
-    sharp = bool(np.isfinite(cells.sharp).any())
+    sharp = bool(np.isfinite(cells.jerk).any())
     return Grid(path, limits, joints, s, of_interval, np.searchsorted(s, inner), before, sharp)
 
 
@@ -138,9 +138,9 @@ def _halved(
         new = np.sort(np.concatenate([cut + np.arange(len(cut)), cut + np.arange(len(cut)) + 1]))
     top, left, right = _steady_speeds(rows, s, *requested), rows.take(slice(-1)), rows.take(slice(1, None))
     with np.errstate(divide="ignore"):
-        sharp = 1 / np.maximum(np.abs(left.jerk[:, :, 0]), np.abs(right.jerk[:, :, 0])).max(axis=1, initial=0.0)
-    most = 1 / np.maximum(np.abs(left.acceleration[:, :, 0]), np.abs(right.acceleration[:, :, 0])).max(axis=1)
-    return _Cells(s[:-1], top, _acceleration_bounds(left, right, top**2, top**2), most, sharp)
+        jerk = 1 / np.maximum(np.abs(left.jerk[:, :, 0]), np.abs(right.jerk[:, :, 0])).max(axis=1, initial=0.0)
+    acceleration = 1 / np.maximum(np.abs(left.acceleration[:, :, 0]), np.abs(right.acceleration[:, :, 0])).max(axis=1)
+    return _Cells(s[:-1], top, _acceleration_bounds(left, right, top**2, top**2), acceleration, jerk)
 
 
 def coarse_grid(path: PathLike, limits: LineLimits) -> Grid:
@@ -237,13 +237,13 @@ def _reachable_squares(distance: Array, caps: Array, rates: Array, at_rest: tupl
 
 def _time_nodes(cells: _Cells, length: float) -> Array:
     """Return nodes that split intervals into ones that are short in time too and shrink towards both ends."""
-    _, top, rates, most, sharp = cells
+    _, top, rates, acceleration, jerk = cells
     s = np.append(cells.begin, length)
     caps = np.minimum(np.append(top, np.inf), np.insert(top, 0, np.inf)) ** 2
     squares = _reachable_squares(s, caps, rates, (True, True))
-    ramp = top / most
+    ramp = top / acceleration
     with np.errstate(invalid="ignore"):
-        build_up = np.minimum(most / sharp, np.sqrt(top / sharp))
+        build_up = np.minimum(acceleration / jerk, np.sqrt(top / jerk))
     duration = np.minimum(np.maximum(SETTINGS.build_up * build_up, SETTINGS.ramp * ramp), SETTINGS.turn * ramp)
     duration = np.maximum(duration, SETTINGS.least_build_up * build_up)
     speed = np.sqrt(np.maximum(np.maximum(squares[:-1], squares[1:]), 0.0))
@@ -256,11 +256,11 @@ def _time_nodes(cells: _Cells, length: float) -> Array:
         away = nodes if end == 0 else length - nodes
         build = max(float(build_up[end]), 1e-3 * float(ramp[end]))
         available = float(s[1] if end == 0 else length - s[-2])
-        first = min(float(most[end]) / build * (SETTINGS.first * build) ** 3 / 6, available / 4)
+        first = min(float(acceleration[end]) / build * (SETTINGS.first * build) ** 3 / 6, available / 4)
         # geometric intervals from rest, until they are as long as the others
         steps = np.diff(np.sort(away))[:3].max(initial=0.0)
-        reached = min(max(steps * SETTINGS.growth / (SETTINGS.growth - 1), first), length / 2)
-        count = max(int(np.ceil(np.log(reached / first) / np.log(SETTINGS.growth))), 1)
+        geometric_range = min(max(steps * SETTINGS.growth / (SETTINGS.growth - 1), first), length / 2)
+        count = max(int(np.ceil(np.log(geometric_range / first) / np.log(SETTINGS.growth))), 1)
         near[end] = np.asarray(first * SETTINGS.growth ** np.arange(count + 1), dtype=float)
         # finer nodes, which resolve a limit such as a bend near the end, are kept
         gap = np.diff(nodes)

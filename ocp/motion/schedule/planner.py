@@ -123,10 +123,10 @@ def _lower_speeds(s: Array, permitted: Array, speed: Array, profile: SpeedProfil
     top = np.maximum(speeds[:-1], speeds[1:])
     peaks = profile.peaks()
     np.maximum.at(top, segment_index(s, peaks.distance), peaks.speed)
-    most = np.minimum(permitted[:-1], permitted[1:])
-    excess = np.minimum(top, speed) > most * (1 + ROUNDING_SHARE)
+    allowed = np.minimum(permitted[:-1], permitted[1:])
+    excess = np.minimum(top, speed) > allowed * (1 + ROUNDING_SHARE)
     if everywhere:
-        speed[excess] = most[excess]
+        speed[excess] = allowed[excess]
         return bool(excess.any())
     inside = np.flatnonzero(excess)
     if not inside.size:
@@ -134,10 +134,10 @@ def _lower_speeds(s: Array, permitted: Array, speed: Array, profile: SpeedProfil
     # one stretch around the slowest place of each run, as far as the permitted speed is similar
     starts = np.flatnonzero(np.diff(inside, prepend=-2) > 1)
     run = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(inside)))
-    speeds = most[inside]
+    speeds = allowed[inside]
     least = np.minimum.reduceat(speeds, starts)
-    slowest = np.minimum.reduceat(np.where(speeds == least[run], inside, len(most)), starts)
-    borders = np.concatenate([[-1], inside[speeds > SETTINGS.spread * least[run]], [len(most)]])
+    slowest = np.minimum.reduceat(np.where(speeds == least[run], inside, len(allowed)), starts)
+    borders = np.concatenate([[-1], inside[speeds > SETTINGS.spread * least[run]], [len(allowed)]])
     after = np.searchsorted(borders, slowest)
     lowered = (inside > borders[after - 1][run]) & (inside < borders[after][run])
     speed[inside[lowered]] = np.minimum(speed[inside[lowered]], least[run[lowered]])

@@ -2,7 +2,7 @@
 
 With x = v^2 as a function of the distance s, a = x'/2 and j = v x''/2, so that
 
-    speed          x <= most
+    speed          x <= x_max
     acceleration   p x'/2 + q x + r between two bounds
     jerk           |p x''/2 + q x'/2 + r x| <= J x^(-1/2)
     time           integral of x^(-1/2) ds
@@ -144,7 +144,7 @@ class Program(NamedTuple):
     Attributes:
         spline: Squared speed.
         rows: Its constraints.
-        most: Upper bounds of its coefficients; infinite for none. Shape (N + 2,).
+        upper: Upper bounds of its coefficients; infinite for none. Shape (N + 2,).
         rest: Distances (m) from rest to its beginning and from its end to rest, with constant jerk and x ~ s^(4/3); 0
             where it does not begin or end at rest.
         fixed: Fixed coefficients: the outer two where it begins or ends in motion.
@@ -152,7 +152,7 @@ class Program(NamedTuple):
 
     spline: Spline
     rows: SplineRows
-    most: Array
+    upper: Array
     rest: tuple[float, float]
     fixed: NDArray[np.intp]
 
@@ -178,18 +178,18 @@ class Program(NamedTuple):
         interval, inside, curved = self.rows.interval, self.rows.fraction, self.rows.of[:, 2] != 0
         outer = (known[0, interval] & (inside == 0)) | (known[1, interval] & (inside == 1))
         rows = SplineRows(*(kind[(new_interval[interval] >= 0) & (curved | ~outer)] for kind in self.rows))
-        most = self.most[at]
-        most[inner] = np.inf
+        upper = self.upper[at]
+        upper[inner] = np.inf
         rest = 0.0 if left[0] else self.rest[0], 0.0 if right[-1] else self.rest[1]
         moved = rows._replace(interval=new_interval[rows.interval])
-        return Program(self.spline.part(at), moved, most, rest, np.flatnonzero(fixed)), at
+        return Program(self.spline.part(at), moved, upper, rest, np.flatnonzero(fixed)), at
 
 
 class _EndConditions:
     """Coefficients that are not free: fixed ones, and the outer one at rest, which follows from its neighbour."""
 
     def __init__(self, program: Program) -> None:
-        n, h, (first, last) = len(program.most), program.spline.h, program.rest
+        n, h, (first, last) = len(program.upper), program.spline.h, program.rest
         self.sides = [(0, 1, 1 / (1 + 2 * h[0] / (3 * first)))] if first else []
         self.sides += [(n - 1, n - 2, 1 / (1 + 2 * h[-1] / (3 * last)))] if last else []
         self.fixed = np.union1d(program.fixed, np.array([outer for outer, *_ in self.sides], dtype=np.intp))
@@ -268,14 +268,14 @@ class _Constraints:
     """
 
     def __init__(self, program: Program) -> None:
-        spline, rows, most, *_ = program
+        spline, rows, upper, *_ = program
         self.count = len(spline.h)
-        self.bounded = np.flatnonzero(np.isfinite(most))
+        self.bounded = np.flatnonzero(np.isfinite(upper))
         self.alone = self.count + len(self.bounded)
         order = np.lexsort((rows.interval, rows.jerk))
         self.row_interval = interval = rows.interval[order]
         self.interval = np.concatenate([np.arange(self.count), np.clip(self.bounded - 1, 0, self.count - 1), interval])
-        self.bound = np.concatenate([np.zeros(self.count), most[self.bounded], rows.bound[order]])
+        self.bound = np.concatenate([np.zeros(self.count), upper[self.bounded], rows.bound[order]])
         basis, of = spline.basis(interval, rows.fraction[order]), rows.of[order].T
         self.linear = of[0] * basis[0] + of[1] * basis[1] + of[2] * basis[2]
         self.gradients = self.linear.copy()

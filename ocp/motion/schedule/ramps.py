@@ -206,8 +206,8 @@ def plan_zones(zones: Zones, cache: Memory) -> SpeedProfile:
             ends[i] = _limited(ends[i], ends[i + 1], lengths[i], limits[i])
 
     motions: list[Phases] = []
-    for (top, most, jerk), length, first, last in zip(limits, lengths, ends[:-1], ends[1:], strict=True):
-        key = (length, first, last, top, most, jerk)
+    for (top, acceleration, jerk), length, first, last in zip(limits, lengths, ends[:-1], ends[1:], strict=True):
+        key = (length, first, last, top, acceleration, jerk)
         if first == last == top:
             motions.append(((length / top, 0.0),))
         else:
@@ -242,19 +242,19 @@ def _limited(speed: float, other_end: float, length: float, limits: tuple[float,
     return min(speed, reachable_speed(other_end, length * (1 - REACH_MARGIN), *limits[1:]))
 
 
-def reachability_passes(distance: Array, most: Array, p: Array, q: Array, low: Array, high: Array) -> Array:
+def reachability_passes(distance: Array, caps: Array, p: Array, q: Array, low: Array, high: Array) -> Array:
     """Return the greatest squared speeds at nodes, from rest to rest. Shape (N + 1,).
 
     Args:
         distance: Nodes. Shape (N + 1,), m.
-        most: Greatest squared speed at each. Shape (N + 1,).
+        caps: Greatest squared speed at each. Shape (N + 1,).
         p, q, low, high: low <= p u + q x <= high in each interval, x at its first node. Shape (N, R).
 
     Raises:
         ProblemError: No motion can pass a node, its distance (m) as `time`.
     """
     h = np.diff(distance)
-    floor, ceiling = _feasible_squares(p, q, low, high, most[:-1])
+    floor, ceiling = _feasible_squares(p, q, low, high, caps[:-1])
     least, top = np.zeros(len(distance)), np.zeros(len(distance))
     # bounds of u, linear in x: rows with p > 0 bound u from above by `high`, from below by `low`, others vice versa
     sign = np.sign(p)
@@ -286,9 +286,9 @@ def reachability_passes(distance: Array, most: Array, p: Array, q: Array, low: A
     return x
 
 
-def _feasible_squares(p: Array, q: Array, low: Array, high: Array, most: Array) -> tuple[Array, Array]:
+def _feasible_squares(p: Array, q: Array, low: Array, high: Array, caps: Array) -> tuple[Array, Array]:
     """Return bounds of the squared speeds at which the rows of an interval leave some acceleration. Shape (N,) each."""
-    floor, ceiling = np.zeros(len(p)), most.copy()
+    floor, ceiling = np.zeros(len(p)), caps.copy()
     count = p.shape[1]
     with np.errstate(divide="ignore", invalid="ignore"):
         for i in range(count):

@@ -129,10 +129,10 @@ class _Enforced:
             seam: Interval at which the next window begins.
         """
         ends = np.cumsum([0, *(kind.shape[1] for kind in rows)])
-        most = np.where(held, np.minimum(used, SETTINGS.lowered), 0.0).max(axis=0)
-        most[:, : ends[1]] = np.minimum(used[0, :, : ends[1]], SETTINGS.lowered)
+        largest = np.where(held, np.minimum(used, SETTINGS.lowered), 0.0).max(axis=0)
+        largest[:, : ends[1]] = np.minimum(used[0, :, : ends[1]], SETTINGS.lowered)
         for margin, times, (a, z) in zip(self.margins, self.times, pairwise(ends), strict=True):
-            ratio = most[:, a:z] if margin.ndim == 2 else most[:, a:z].max(axis=1, initial=0.0)
+            ratio = largest[:, a:z] if margin.ndim == 2 else largest[:, a:z].max(axis=1, initial=0.0)
             at = np.nonzero(ratio > 1)
             margin[at] /= np.minimum(1 + (ratio[at] - 1 + SETTINGS.room / 2) * 2.0 ** times[at], SETTINGS.lowered)
             times[at] += 1
@@ -237,9 +237,9 @@ def _tighten(window: Window, enforced: _Enforced, seam: int, checked: int) -> tu
         near = np.flatnonzero(maximum_filter1d(affected, 2 * SETTINGS.around + 1))
         free = near if accuracy == accuracies[-1] and len(near) < SETTINGS.few * len(every) else every
     worst = used[:, :checked].max(axis=(0, 2))
-    place, most = float(window.nodes[worst.argmax()]), float(worst.max())
-    message = f"the limits are violated by {most - 1:.2g} at {place:g} m, where the path or its joints bend sharply"
-    raise ProblemError(message, name="limits", value=most, limit=1.0, time=place)
+    place, largest = float(window.nodes[worst.argmax()]), float(worst.max())
+    message = f"the limits are violated by {largest - 1:.2g} at {place:g} m, where the path or its joints bend sharply"
+    raise ProblemError(message, name="limits", value=largest, limit=1.0, time=place)
 
 
 def _seam_shares(window: Window, seam: int) -> Array:
@@ -300,7 +300,7 @@ def _with_jerk(
     spline = Spline(nodes[inner])
     with np.errstate(divide="ignore"):
         between = (middle.speed.max(axis=1, initial=0.0) / shares.speed) ** -2.0
-    most = np.concatenate([caps[inner][:1], np.minimum(requested, between)[cells], caps[inner][-1:]])
+    upper = np.concatenate([caps[inner][:1], np.minimum(requested, between)[cells], caps[inner][-1:]])
     held = enforced.held
     if known is None:
         held = held.copy()
@@ -318,17 +318,17 @@ def _with_jerk(
     for (x_end, slope_end), resting, (outermost, next_to, signed_width) in zip(ends, at_rest, sides, strict=True):
         if not resting:
             b[outermost], b[next_to] = x_end, x_end + signed_width * slope_end / 2
-            most[[outermost, next_to]] = np.inf
+            upper[[outermost, next_to]] = np.inf
             fixed += [outermost, next_to]
     own_shares = shares.take(cells)
     in_motion = (not at_rest[0], not at_rest[1])
     places = tuple(rows.take(cells) for rows in window.rows)
     with np.errstate(invalid="ignore"):
-        implied = (1 - spline.share) * most[:-1] + spline.share * most[1:]
+        implied = (1 - spline.share) * upper[:-1] + spline.share * upper[1:]
     rows = _spline_rows(
         places, held[:, :, cells], caps[inner], implied, own_shares, enforced.speeds[:, cells], in_motion
     )
-    program = Program(spline, rows, most, (rest[0], rest[1]), np.array(fixed, dtype=np.intp))
+    program = Program(spline, rows, upper, (rest[0], rest[1]), np.array(fixed, dtype=np.intp))
     try:
         if known is None:
             b = least_time(program, b, accuracy=accuracy, center=SETTINGS.center)

@@ -106,9 +106,9 @@ def clip_to_limits(what: str, names: Sequence[str], joints: Array, lower: Array,
     """
     for name, value, low, high in zip(names, joints.tolist(), lower.tolist(), upper.tolist(), strict=True):
         if value < low - CHECKS.rounding * max(1.0, abs(low)) or value > high + CHECKS.rounding * max(1.0, abs(high)):
-            at, least, most = told_apart(value, low, high)
+            at, least, greatest = told_apart(value, low, high)
             verb = "ends" if what.startswith("end") else "starts"
-            words = f"{what}: {name!r} {verb} at {at}, outside its limits {least} .. {most}; {hint}"
+            words = f"{what}: {name!r} {verb} at {at}, outside its limits {least} .. {greatest}; {hint}"
             raise ProblemError(words, name=name, value=value, limit=(low, high))
     return np.clip(joints, lower, upper)
 

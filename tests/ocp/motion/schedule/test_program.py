@@ -58,7 +58,7 @@ def test_rows_are_those_of_a_matrix(seed: int, count: int) -> None:
     x, slope, bend = (program.spline.basis(rows.interval, rows.fraction) * near).sum(axis=1)
     root = (program.spline.basis(rows.interval, rows.root)[0] * near).sum(axis=0)
     bound = rows.bound * np.where(rows.jerk, root**-0.5, 1.0)
-    missed = [(rows.of * np.stack([x, slope, bend], axis=1)).sum(axis=1) - bound, -b[1:-1], b - program.most]
+    missed = [(rows.of * np.stack([x, slope, bend], axis=1)).sum(axis=1) - bound, -b[1:-1], b - program.upper]
     every.evaluate(b)
     assert np.sort(gap) == pytest.approx(np.sort(np.concatenate([part[np.isfinite(part)] for part in missed])))
 
