@@ -330,7 +330,7 @@ def test_a_target_inside_an_obstacle_names_the_pair_the_time_and_the_depth() -> 
     assert 1 <= caught.value.time <= SECONDS
     last = str(caught.value).split("\n")[-1]
     assert last.startswith("the cheapest that touches: link6 and obstacle 0 overlap")
-    assert re.search(r"; no other posture is clear then: each of the \d+ postures found touches", last)
+    assert re.search(r"; no other posture is clear then: each of the \d+ IK solutions is in collision", last)
 
 
 def test_where_no_posture_is_clear_no_alternatives_are_searched(monkeypatch: pytest.MonkeyPatch) -> None:
