@@ -195,7 +195,7 @@ class Program:
         nlp: The MX expressions x, p, f, g by name.
         gradient, jacobian, hessian: casadi Functions with the signatures of ``nlpsol``'s grad_f, jac_g and hess_lag.
         values: Function (x, p) -> (f, g).
-        inside: Function (x, p) -> gradient of the running cost, without the terminal cost.
+        running_gradient: Function (x, p) -> gradient of the running cost, without the terminal cost.
         parametric: Function (x, p, lam_g) -> gradient of f + lam_g . g in p.
     """
 
@@ -204,7 +204,7 @@ class Program:
     jacobian: Any
     hessian: Any
     values: Any
-    inside: Any
+    running_gradient: Any
     parametric: Any
 
     @cached_property
@@ -227,8 +227,8 @@ class NumericDerivatives:
     """
 
     def __init__(self, program: Program) -> None:
-        functions = program.gradient, program.jacobian, program.hessian, program.inside, program.parametric
-        self._gradient, self._jacobian, self._hessian, self._inside, self._parametric = map(ArrayFunction, functions)
+        functions = program.gradient, program.jacobian, program.hessian, program.running_gradient, program.parametric
+        self._gradient, self._jacobian, self._hessian, self._running, self._parametric = map(ArrayFunction, functions)
         self._at: tuple[np.ndarray, np.ndarray] | None = None
         self._cached: tuple[Any, ...] = ()
 
@@ -260,9 +260,9 @@ class NumericDerivatives:
         upper: sp.csc_array = self._hessian(x, p, np.array([sigma]), lam)[0]
         return upper
 
-    def inside(self, x: np.ndarray, p: np.ndarray) -> np.ndarray:
+    def running_gradient(self, x: np.ndarray, p: np.ndarray) -> np.ndarray:
         """Return the gradient of the running cost. Shape (n,)."""
-        return np.asarray(self._inside(x, p)[0])
+        return np.asarray(self._running(x, p)[0])
 
     def parametric(self, x: np.ndarray, p: np.ndarray, lam: np.ndarray) -> np.ndarray:
         """Return the gradient of f + lam . g in the parameters. Shape (n_p,)."""
@@ -385,7 +385,7 @@ def assemble(transcription: Transcription, parameters: int, functions: Sequence[
             "nlp_hess_l", [x, p, sigma, lam], [hess], ["x", "p", "lam_f", "lam_g"], ["triu_hess_gamma_x_x"]
         ),
         values=ca.Function("values", [x, p], [f, g]),
-        inside=ca.Function("inside", [x, p], [inside]),
+        running_gradient=ca.Function("inside", [x, p], [inside]),
         parametric=ca.Function("parametric", [x, p, lam], [slope]),
     )
 

@@ -241,7 +241,7 @@ def elastic_plan(
     if time_left() <= 0 or not (np.all(np.isfinite(value)) and np.any(violation > SOLVER_SHARE)):
         return None
     form, transcription, program = built.formulation, built.transcription, built.scaled
-    scaled = scales.inside(arguments)
+    scaled = scales.scale_arguments(arguments)
     soft = _Soft(form, transcription, scaled)
     n, m, k = transcription.size, transcription.n_rows, len(soft.labels)
     x, p = ca.MX.sym("x", n + k), program.nlp["p"]

@@ -360,7 +360,7 @@ def costates_of(program: Program, transcription: Transcription, outcome: Outcome
     rows, columns = jacobian.indices, np.repeat(np.arange(transcription.size), np.diff(jacobian.indptr))
     with np.errstate(invalid="ignore"):  # the iterate of a failed solver may be infinite
         terms = jacobian.data * inner[rows]
-    running = numbers.inside(outcome.variables, p)
+    running = numbers.running_gradient(outcome.variables, p)
 
     node_of = np.full(transcription.size, -2)
     node_of[transcription.nodes] = np.arange(len(transcription.mesh))

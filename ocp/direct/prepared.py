@@ -329,13 +329,13 @@ class Prepared:
         p, x0 = arguments["p"], arguments["x0"]
         scales = self._scales(x0, names, bounds, p)
         relaxed = self._known.relaxed(arguments)
-        scaled = scales.inside(relaxed)
+        scaled = scales.scale_arguments(relaxed)
         function, progress = solver or (self._solver, self._progress)
         try:
             outcome = call_solver(function, progress, scaled)
         except RuntimeError as error:
             outcome = broken_down(function, scaled, error)
-        outcome = scales.outside(outcome)
+        outcome = scales.unscale(outcome)
         outcome = self._known.checked(outcome, arguments, scales)
         try:
             solution = self._solution(outcome, p, start)

@@ -76,14 +76,14 @@ class Scales:
     rows: np.ndarray
     cost: float
 
-    def inside(self, arguments: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    def scale_arguments(self, arguments: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Return solver arguments (x0, p and bounds) for the scaled program."""
         units = {"x": self.variables, "g": self.rows}
         result = {key: arguments[key] / units[key[-1]] for key in SIDES}
         p = np.concatenate([arguments["p"], self.variables, self.rows, [self.cost]])
         return {**result, "x0": arguments["x0"] / self.variables, "p": p}
 
-    def outside(self, outcome: Outcome) -> Outcome:
+    def unscale(self, outcome: Outcome) -> Outcome:
         """Return the outcome of the scaled program in the units of the problem."""
         return replace(
             outcome,
