@@ -198,7 +198,7 @@ def checked_indices(value: Any, count: int, owner: str, what: str) -> NDArray[np
     return found.astype(np.intp)
 
 
-def one_for_each(
+def checked_broadcast(
     value: ArrayInput, count: int, owner: str, what: str, items: str, *, finite: bool = True, **checks: Any
 ) -> Array:
     """`value`, one number for all `items` or one for each of the `count`, as one for each. Shape (count,).

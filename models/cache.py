@@ -38,7 +38,7 @@ UNREADABLE = (OSError, ValueError, RuntimeError, RecursionError)
 """What a file raises that is broken or not there; RuntimeError where there is no home."""
 
 
-def key_of(version: str, *contents: Any) -> str:
+def cache_key(version: str, *contents: Any) -> str:
     """A name for arrays or texts and the version of what is done with them: hexadecimal digits of SHA-256.
 
     Args:
@@ -53,7 +53,7 @@ def key_of(version: str, *contents: Any) -> str:
 
 
 @functools.cache
-def version_of(module: str) -> str:
+def source_version(module: str) -> str:
     """Hexadecimal digits that tell the source of a module, and of what it imports of its package, from any other.
 
     So that no change of what a value was made by is forgotten. Imports are those written `from PACKAGE... import`.
@@ -70,14 +70,14 @@ def version_of(module: str) -> str:
     return hashlib.sha256(repr(sorted(sources.items())).encode()).hexdigest()
 
 
-def folder() -> Path:
+def cache_folder() -> Path:
     """Where the files lie; it need not exist."""
     given = os.environ.get("XDG_CACHE_HOME", "")
     place = Path(given) if given and Path(given).is_absolute() else Path("~/.cache").expanduser()
     return place / "selfmotion"
 
 
-def own_folder(make: bool = False) -> Path:
+def private_folder(make: bool = False) -> Path:
     """Return the folder; `make` it for this user alone where there is none.
 
     Raises:
@@ -85,7 +85,7 @@ def own_folder(make: bool = False) -> Path:
             belongs to somebody else, is a link or may be written by others, or a folder above may be.
         RuntimeError: There is no home.
     """
-    place = folder()
+    place = cache_folder()
     if make:
         place.mkdir(mode=0o700, parents=True, exist_ok=True)
     why = _unsafe(place)
@@ -120,7 +120,7 @@ def _notice(words: str) -> None:
 def files() -> list[Path]:
     """All that is kept, and parts that were left by who was killed."""
     try:
-        return sorted(file for file in own_folder().iterdir() if file.is_file() and file.suffix in KINDS)
+        return sorted(file for file in private_folder().iterdir() if file.is_file() and file.suffix in KINDS)
     except UNREADABLE:
         return []
 
@@ -128,16 +128,16 @@ def files() -> list[Path]:
 # ---- values ------------------------------------------------------------------------------------------------------
 
 
-def kept(key: str) -> Any:
+def load_value(key: str) -> Any:
     """What was kept under a key: lists, dictionaries, texts, numbers; None where there is nothing or nothing whole."""
     try:
-        digest, _, content = read_regular(own_folder() / f"{key}.json", MOST_BYTES, own=True).partition(b"\n")
+        digest, _, content = read_regular(private_folder() / f"{key}.json", MOST_BYTES, own=True).partition(b"\n")
         return json.loads(content) if digest == _digest(key, content) else None
     except UNREADABLE:
         return None
 
 
-def keep(key: str, value: Any) -> None:
+def store_value(key: str, value: Any) -> None:
     """Keep a value of JSON under a key; a file there is replaced as a whole."""
     with suppress(*UNREADABLE):
         content = json.dumps(value).encode()
@@ -151,13 +151,13 @@ def _digest(key: str, content: bytes) -> bytes:
 # ---- libraries ---------------------------------------------------------------------------------------------------
 
 
-def kept_library(key: str) -> Path | None:
+def load_library(key: str) -> Path | None:
     """The shared library that was kept under a key, now the most recently used; None where there is none.
 
     One that is damaged, or that somebody else owns or may write, is none; damaged ones are removed.
     """
     with suppress(*UNREADABLE):
-        place = own_folder()
+        place = private_folder()
         for name in os.listdir(place):
             if not (name.startswith(key) and name.endswith(".so")):
                 continue
@@ -171,7 +171,7 @@ def kept_library(key: str) -> Path | None:
     return None
 
 
-def keep_library(key: str, library: bytes) -> Path | None:
+def store_library(key: str, library: bytes) -> Path | None:
     """Keep a shared library under a key and say where it is; None where nothing can be written."""
     with suppress(*UNREADABLE):
         file = _write(_name(key, library), library)
@@ -181,14 +181,14 @@ def keep_library(key: str, library: bytes) -> Path | None:
 
 
 @contextmanager
-def alone(key: str, ask: Callable[[], Any] = lambda: None) -> Iterator[None]:
+def exclusive(key: str, ask: Callable[[], Any] = lambda: None) -> Iterator[None]:
     """Inside, no other process or thread is at work on a key; where the folder takes no locks, without.
 
     While another one is waited for, ``ask`` is called every 20 ms, to raise where there is no time for it.
     """
     lock = None
     with suppress(*UNREADABLE):
-        lock = _locked(own_folder(make=True) / f"{key}.lock", ask)
+        lock = _locked(private_folder(make=True) / f"{key}.lock", ask)
     try:
         yield
     finally:
@@ -245,7 +245,7 @@ def _make_room(newest: Path) -> None:
 
 def _write(name: str, content: bytes) -> Path:
     """Write a file of the folder whole or not at all."""
-    place = own_folder(make=True)
+    place = private_folder(make=True)
     part = None
     try:
         with NamedTemporaryFile("wb", dir=place, suffix=".part", delete=False) as file:

@@ -20,7 +20,7 @@ from models.errors import ModelError
 from models.input_files import INPUT_LIMITS
 from models.machines.machine import Machine
 from models.machines.moving_obstacle import MovingObstacle
-from models.machines.pair_gradients import WORLD, Placed, distance_gradients
+from models.machines.pair_gradients import WORLD, PlacedShape, distance_gradients
 from models.robot.kinematics import link_frames
 from models.robot.robot import Robot
 from models.shapes.bodies import Body, LinkMesh, MissingRule, RigidParts, arms, bodies_of
@@ -85,7 +85,7 @@ class CollisionScene:
     missing: MissingRule = "raise"
     limits: bool = True
     covered: Mapping[tuple[str, int], tuple[Body, ...]] | None = None
-    bodies: tuple[Placed, ...] = field(init=False, repr=False)
+    bodies: tuple[PlacedShape, ...] = field(init=False, repr=False)
     pairs: Array = field(init=False, repr=False)
     covers: dict[int, Array] = field(init=False, repr=False)
     left: dict[tuple[str, str], Reason] = field(init=False, repr=False)
@@ -156,14 +156,14 @@ class CollisionScene:
         covered = {pair for pairs in close.values() for pair in pairs}
         frames = dict.fromkeys([body.link for body in own] + [self._seen_from(own[i], own[j]) for i, j in checked])
         places = {link: k for k, link in enumerate(frames)}
-        bodies = [Placed(name, body.shape, places[body.link]) for name, body in zip(_named(own), own, strict=True)]
+        bodies = [PlacedShape(name, body.shape, places[body.link]) for name, body in zip(_named(own), own, strict=True)]
         moving = 0
         for number, one in enumerate(self.obstacles):
             if isinstance(one, MovingObstacle):
-                bodies.append(Placed(f"obstacle {number}", one.shape, len(places) + moving))
+                bodies.append(PlacedShape(f"obstacle {number}", one.shape, len(places) + moving))
                 moving += 1
             else:
-                bodies.append(Placed(f"obstacle {number}", one, WORLD))
+                bodies.append(PlacedShape(f"obstacle {number}", one, WORLD))
         pairs = [(i, j, places[self._seen_from(own[i], own[j])]) for i, j in checked if (i, j) not in covered]
         held: dict[int, tuple[tuple[int, int], ...]] = {}
         covers: dict[int, Array] = {}
@@ -173,7 +173,7 @@ class CollisionScene:
             for mesh, body in ((one_mesh, first), (other_mesh, second)):
                 if mesh not in hulls:
                     hulls[mesh] = len(bodies)
-                    bodies.append(Placed(f"{body.link} hull {len(hulls)}", mesh.hull, places[body.link]))
+                    bodies.append(PlacedShape(f"{body.link} hull {len(hulls)}", mesh.hull, places[body.link]))
             held[len(pairs)] = tuple(stand_ins)
             if self.left.get((first.link, second.link)) not in ASSUMED:
                 of = [[k for k, body in enumerate(own) if body.mesh is mesh] for mesh in (one_mesh, other_mesh)]
@@ -195,7 +195,7 @@ class CollisionScene:
         """Names of the two bodies of each pair."""
         return tuple((self.bodies[one].name, self.bodies[other].name) for one, other, _ in self.pairs)
 
-    def told_as(self, pair: int) -> tuple[str, str]:
+    def pair_names(self, pair: int) -> tuple[str, str]:
         """How a pair is named in `ignored`: by the links that its bodies belong to, or as an obstacle."""
         placed = [self.bodies[body] for body in self.pairs[pair, :2]]
         own = range(len(self._carriers))
@@ -210,7 +210,7 @@ class CollisionScene:
     @property
     def assumed(self) -> dict[str, str]:
         """Pairs of links that are left out by assumption, "one and other": no proof says that they always touch."""
-        looked_at = {frozenset(self.told_as(pair)) for pair in self._held}  # by their hulls
+        looked_at = {frozenset(self.pair_names(pair)) for pair in self._held}  # by their hulls
         return {
             " and ".join(pair): why.value
             for pair, why in self.left.items()
@@ -218,7 +218,7 @@ class CollisionScene:
         }
 
     @property
-    def moves_by_itself(self) -> bool:
+    def has_moving_obstacles(self) -> bool:
         """Whether an obstacle moves."""
         return any(isinstance(one, MovingObstacle) for one in self.obstacles)
 
@@ -353,7 +353,7 @@ class CollisionScene:
         """Whether a link ever moves in world."""
         return bool(self.machine.base_size) or any(joint.moves for joint in self.machine.robot.path_to(link))
 
-    def _levers_of(self, placed: Placed, seen: int) -> Levers:
+    def _levers_of(self, placed: PlacedShape, seen: int) -> Levers:
         """Of one body from where it is seen: a link's frame that it hangs on, or -1, the world."""
         robot, parts, size = self.machine.robot, self._parts, self.machine.base_size
         joints, turns, base, base_turns = np.zeros(robot.dof), np.zeros(robot.dof), np.zeros(size), np.zeros(size)
@@ -366,7 +366,7 @@ class CollisionScene:
         low, high = (robot.lower, robot.upper) if self.limits else (-endless, endless)
         own, reach = arms(robot, [(step, True) for step in way], placed.shape.placed(*parts.place[link]), low, high)
         for (joint, *_), arm in zip(way, own, strict=True):
-            column, ratio, _ = robot.drives[joint.name]
+            column, ratio, _ = robot.couplings[joint.name]
             slides = joint.kind == "prismatic"
             joints[column] += abs(ratio) * (1.0 if slides else arm)
             turns[column] += 0.0 if slides else abs(ratio)

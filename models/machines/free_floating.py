@@ -39,7 +39,7 @@ from models.robot.kinematics import (
     tip_frame,
 )
 from models.robot.kinematics import momentum_matrix as joint_momentum_matrix
-from models.robot.parts import massless
+from models.robot.parts import massless_error
 from models.robot.robot import Robot
 from models.spatial import (
     Expression,
@@ -390,7 +390,7 @@ def _require_inertia(robot: Robot, rows: list[int]) -> None:
     Whatever the units of mass and length: judged by the moments relative to each other.
     """
     if robot.total_mass == 0:
-        raise massless("without which no momentum tells how its base floats")
+        raise massless_error("without which no momentum tells how its base floats")
     # A stretched chain of point masses can lack inertia about one axis in one configuration: try others too.
     spread = np.linspace(0.3, 1.1, robot.dof)
     angular = [row for row in rows if row < 3]

@@ -22,10 +22,10 @@ from models.arrays import (
     Array,
     ArrayInput,
     checked_array,
+    checked_broadcast,
     checked_instance,
     checked_rotation,
     checked_text,
-    one_for_each,
 )
 from models.errors import ModelError
 from models.robot.indices import TWIST_SIZE, jacobian_manipulability
@@ -222,10 +222,10 @@ def with_wheels(
     count = len(along)
     checked_text(prefix, owner, "prefix")
     carrier = robot.root if link is None else robot.link(link).name
-    moments = one_for_each(inertia, count, owner, "inertia", "wheels", positive=True)
-    fastest = one_for_each(momentum, count, owner, "momentum", "wheels", finite=False, positive=True) / moments
-    most = one_for_each(torque, count, owner, "torque", "wheels", finite=False, positive=True)
-    masses = one_for_each(mass, count, owner, "mass", "wheels", least=0)
+    moments = checked_broadcast(inertia, count, owner, "inertia", "wheels", positive=True)
+    fastest = checked_broadcast(momentum, count, owner, "momentum", "wheels", finite=False, positive=True) / moments
+    most = checked_broadcast(torque, count, owner, "torque", "wheels", finite=False, positive=True)
+    masses = checked_broadcast(mass, count, owner, "mass", "wheels", least=0)
     places = np.zeros((count, 3)) if translations is None else translations
     places = checked_array(places, (count, 3), owner, "translations")
     links, joints = [*robot.links], [*robot.joints]
@@ -237,7 +237,7 @@ def with_wheels(
     return replace(robot, links=tuple(links), joints=tuple(joints))
 
 
-def wheels_of(robot: Robot) -> dict[str, float]:
+def find_wheels(robot: Robot) -> dict[str, float]:
     """Joints whose angle does not matter, and the inertia about each, kg m^2.
 
     Each turns without end one body alone, symmetric about its axis, on which its mass is; that carries neither the tip

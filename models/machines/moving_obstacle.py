@@ -56,7 +56,7 @@ class MovingObstacle:
                 message = f"moving: {what} must be a function of time, not {given!r}"
                 raise ModelError(message, name=what, value=given)
             try:
-                value = without_tables(ca.densify(ca.SX(expression(given(time)))))
+                value = expand_tables(ca.densify(ca.SX(expression(given(time)))))
             except Exception as error:  # of the function's own, too
                 message = f"moving: {what} is no function of a casadi symbol, the time: {error}"
                 raise ModelError(message, name=what, value=given) from error
@@ -95,7 +95,7 @@ class MovingObstacle:
                 raise ModelError(f"{error}, at {time:g} s", **{**vars(error), "time": time}) from error
 
 
-def without_tables(values: Any) -> Any:
+def expand_tables(values: Any) -> Any:
     """Return a matrix of SX with its look-up tables written out in elementary operations.
 
     Raises:

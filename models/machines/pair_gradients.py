@@ -25,7 +25,7 @@ WORLD = -1
 """In the place of a frame: the world."""
 
 
-class Placed(NamedTuple):
+class PlacedShape(NamedTuple):
     """A body that is looked at.
 
     Attributes:
@@ -41,7 +41,7 @@ class Placed(NamedTuple):
 
 def distance_gradients(
     machine: Machine,
-    bodies: Sequence[Placed],
+    bodies: Sequence[PlacedShape],
     carriers: Sequence[str],
     moving: Callable[[Expression], list[Frame]],
     groups: Sequence[Sequence[tuple[int, int]]],
@@ -114,7 +114,7 @@ def _least(
 
 
 def _moved(
-    machine: Machine, bodies: Sequence[Placed], carriers: Sequence[str], pairs: Array, joints: Sequence[str]
+    machine: Machine, bodies: Sequence[PlacedShape], carriers: Sequence[str], pairs: Array, joints: Sequence[str]
 ) -> Array:
     """1 where a coordinate of the base or a joint moves the first body of a pair alone, -1 the second, else 0."""
     size = machine.base_size
@@ -132,7 +132,7 @@ def _gathered(machine: Machine, joints: Sequence[str]) -> ca.DM | None:
     gathered = np.zeros((size + len(joints), size + robot.dof))
     gathered[:size, :size] = np.eye(size)
     for k, name in enumerate(joints):
-        column, ratio, _ = robot.drives[name]
+        column, ratio, _ = robot.couplings[name]
         gathered[size + k, size + column] = ratio
     return None if np.array_equal(gathered, np.eye(len(gathered))) else ca.DM(gathered)
 

@@ -31,10 +31,10 @@ from models.machines.machine import FixedBase
 from models.machines.support import Support, convex_hull, footprint
 from models.robot.dynamics import Wrench, base_reaction, inverse_dynamics
 from models.robot.kinematics import center_of_mass, checked_vector, frame_jacobian, link_frames
-from models.robot.parts import massless
-from models.robot.rebuild import rerooted, simplified, subtree
+from models.robot.parts import massless_error
+from models.robot.rebuild import reroot, simplify, subtree
 from models.robot.robot import Robot
-from models.robot.tree import absent
+from models.robot.tree import unknown_name
 from models.spatial import Expression, Frame, cross
 
 __all__ = ["Foot", "Foothold", "Stance"]
@@ -154,17 +154,17 @@ class Stance(FixedBase):
             raise ModelError(f"{owner}: no footholds are given; nothing stands on nothing", name="footholds")
         for name in footholds:
             if name not in feet:
-                raise absent("foot", name, feet)
+                raise unknown_name("foot", name, feet)
         links = [robot.link(foot.link).name for foot in feet.values()]
         if twice := [link for link in links if links.count(link) > 1]:
             raise ModelError(f"{owner}: link {twice[0]!r} is two feet; join their soles", name="feet", value=twice)
         if robot.total_mass == 0:
-            raise massless("nothing presses its feet on the ground")
+            raise massless_error("nothing presses its feet on the ground")
         first = next(iter(footholds))
         foot, place = feet[first], footholds[first]
         turn = np.asarray(place.rotation) @ np.asarray(foot.rotation).T
         return cls(
-            robot=rerooted(robot, foot.link),
+            robot=reroot(robot, foot.link),
             translation=place.position - turn @ foot.translation,
             rotation=turn,
             feet=dict(feet),
@@ -180,16 +180,16 @@ class Stance(FixedBase):
     @cached_property
     def bodies(self) -> Robot:
         """The robot with one link for each moving joint, and the feet: the same dynamics, sooner."""
-        return simplified(self.robot, {foot.link for foot in self.feet.values()})
+        return simplify(self.robot, {foot.link for foot in self.feet.values()})
 
     def foot(self, name: str) -> Foot:
         """A foot by its name; ModelError, which says what names come near, when there is none."""
         if not isinstance(name, str) or name not in self.feet:
-            raise absent("foot", name, self.feet)
+            raise unknown_name("foot", name, self.feet)
         return self.feet[name]
 
     @property
-    def others(self) -> tuple[str, ...]:
+    def other_feet(self) -> tuple[str, ...]:
         """Names of the feet that are held besides the first."""
         return tuple(self.footholds)[1:]
 
@@ -217,7 +217,7 @@ class Stance(FixedBase):
         first = next(iter(self.footholds))
         moment, force = given[:3], given[3:]
         left = ca.vertcat(moment - cross(ca.DM(self.footholds[first].position), force), force)
-        return {first: left, **{name: others[name] for name in self.others}}
+        return {first: left, **{name: others[name] for name in self.other_feet}}
 
     def joint_torques(
         self, q: Expression, qd: Expression, qdd: Expression, others: Mapping[str, Expression]
@@ -231,9 +231,9 @@ class Stance(FixedBase):
 
     def _wrenches(self, others: Mapping[str, Expression]) -> list[Wrench]:
         others = checked_mapping(others, "stance", "others")
-        if set(others) != set(self.others):
-            message = f"stance: loads of the feet {list(self.others)} are needed, not of {list(others)}"
-            raise ModelError(message, name="others", value=tuple(others), limit=self.others)
+        if set(others) != set(self.other_feet):
+            message = f"stance: loads of the feet {list(self.other_feet)} are needed, not of {list(others)}"
+            raise ModelError(message, name="others", value=tuple(others), limit=self.other_feet)
         found = []
         for name, load in others.items():
             load = checked_vector(load, 6, f"load of {name!r}", "moment about the sole's origin and force")
@@ -242,7 +242,7 @@ class Stance(FixedBase):
         return found
 
     @cached_property
-    def held_rows(self) -> dict[str, tuple[int, ...]]:
+    def load_rows(self) -> dict[str, tuple[int, ...]]:
         """Rows of the twist of each foot, world axes, that the joints move: all six, or three in a plane.
 
         For every foot but the first, in the air or held. Its load has these rows, too: the others nothing resists.
@@ -276,19 +276,19 @@ class Stance(FixedBase):
         return found
 
     def full_load(self, name: str, rows: Expression) -> Expression:
-        """A load of which only the `held_rows` are given. Shape (6, 1)."""
-        return ca.mtimes(ca.DM.eye(6)[:, list(self.held_rows[name])], rows)
+        """A load of which only the `load_rows` are given. Shape (6, 1)."""
+        return ca.mtimes(ca.DM.eye(6)[:, list(self.load_rows[name])], rows)
 
-    def in_sole(self, name: str, load: Expression) -> tuple[Expression, Expression]:
+    def load_in_sole(self, name: str, load: Expression) -> tuple[Expression, Expression]:
         """Moment and force of a load in the axes of the foothold. Shape (3, 1) each."""
         turn = ca.DM(np.asarray(self.footholds[name].rotation).T)
         return ca.mtimes(turn, load[:3]), ca.mtimes(turn, load[3:])
 
     def pressure(self, name: str, load: Expression) -> Expression:
         """Force that presses a sole on its foothold, positive where it holds. Shape (1, 1), N."""
-        return self.in_sole(name, load)[1][2]
+        return self.load_in_sole(name, load)[1][2]
 
-    def inside(self, name: str, load: Expression, margin: float = 0.0) -> Expression:
+    def edge_moments(self, name: str, load: Expression, margin: float = 0.0) -> Expression:
         """Moments of a load about the edges of its sole, drawn in by a margin: none negative where it does not tip.
 
         Distance of the center of pressure from the edge times the pressure, N m, for each edge that motion can bring
@@ -300,7 +300,7 @@ class Stance(FixedBase):
         sole = self.feet[name].sole
         if sole is None:
             return ca.DM(0, 1)
-        moment, force = self.in_sole(name, load)
+        moment, force = self.load_in_sole(name, load)
         offsets = (sole.normals * sole.vertices).sum(axis=1) + margin
         rows = (
             ca.mtimes(ca.sparsify(ca.DM(sole.normals)), ca.vertcat(-moment[1], moment[0])) - ca.DM(offsets) * force[2]
@@ -329,17 +329,17 @@ class Stance(FixedBase):
         found: dict[str, list[Array]] = {name: [] for name in self.footholds}
         for _ in range(SAMPLES):
             drawn = {}
-            for name in self.others:
-                part = rng.normal(size=len(self.held_rows[name]))
+            for name in self.other_feet:
+                part = rng.normal(size=len(self.load_rows[name]))
                 drawn[name] = ca.DM(self.full_load(name, part)) + ca.DM([0, 0, 0, 0, 0, 10])
             q, qd, qdd = rng.normal(size=(3, self.joint_size))
             values = self.loads(q, qd, qdd, drawn)
             for name, load in values.items():
-                moment, force = (np.array(ca.DM(part)).ravel() for part in self.in_sole(name, load))
+                moment, force = (np.array(ca.DM(part)).ravel() for part in self.load_in_sole(name, load))
                 found[name].append(np.array([-moment[1], moment[0]]) / force[2])
         return {name: np.array(points) for name, points in found.items()}
 
-    def grip(self, name: str, load: Expression, friction: float) -> Expression:
+    def friction_margin(self, name: str, load: Expression, friction: float) -> Expression:
         """What friction holds less what it gives, squares, N^2, not negative where the sole does not slip or turn.
 
         (mu f_z)^2 - f_x^2 - f_y^2 - (m_z / c)^2 with the moment m_z about the normal through the middle of the sole and
@@ -349,7 +349,7 @@ class Stance(FixedBase):
         sole = self.feet[name].sole
         if sole is None:
             return ca.DM(0, 1)
-        moment, force = self.in_sole(name, load)
+        moment, force = self.load_in_sole(name, load)
         x, y = sole.center
         turning = moment[2] - (x * force[1] - y * force[0])
         arm = 2 / 3 * sole.inner_radius  # of a disc evenly pressed: the moment that it bears over friction and load

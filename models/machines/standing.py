@@ -23,8 +23,8 @@ from models.machines.support import Support
 from models.robot.dynamics import Wrench, base_reaction, checked_wrenches, external_wrench, inverse_dynamics
 from models.robot.indices import joint_excess, joint_limit_index, manipulability_of
 from models.robot.kinematics import center_of_mass, checked_vector, joint_vector
-from models.robot.parts import massless
-from models.robot.rebuild import simplified
+from models.robot.parts import massless_error
+from models.robot.rebuild import simplify
 from models.robot.robot import Robot
 from models.spatial import Expression, expression
 
@@ -93,7 +93,7 @@ class Standing(FixedBase):
             message = f"{owner}: support must be a Support, as rectangle(...) gives, not {self.support!r}"
             raise ModelError(message, name="support", value=self.support)
         if self.robot.total_mass == 0:
-            raise massless("nothing presses its foot on the ground")
+            raise massless_error("nothing presses its foot on the ground")
         gravity = checked_number(self.gravity, owner, "gravity", positive=True, unit="m/s^2")
         object.__setattr__(self, "gravity", gravity)
         for what, default in (("most_stable_point", self.support.center), ("half_widths", self.support.half_widths)):
@@ -115,7 +115,7 @@ class Standing(FixedBase):
         """The robot with one link for each moving joint, and those on which wrenches act: the same dynamics, sooner."""
         keep = frozenset(self.robot.link(wrench.link).name for wrench in checked_wrenches(wrenches))
         if keep not in self._bodies:
-            self._bodies[keep] = simplified(self.robot, keep)
+            self._bodies[keep] = simplify(self.robot, keep)
         return self._bodies[keep]
 
     @cached_property
@@ -386,11 +386,11 @@ def standing_motion(
     given = {"joints": joints, "joint_velocities": joint_velocities, "joint_accelerations": joint_accelerations}
     shape = (len(times), machine.joint_size)
     parts = [checked_array(part, shape, "motion", name, finite=False) for name, part in given.items()]
-    found = evaluate(motion_function(machine, external, rows), times, *parts)
+    found = evaluate_motion(motion_function(machine, external, rows), times, *parts)
     return StandingMotion(times, *parts, **found)
 
 
-def evaluate(function: Any, t: Array, q: Array, qd: Array, qdd: Array) -> dict[str, Array]:
+def evaluate_motion(function: Any, t: Array, q: Array, qd: Array, qdd: Array) -> dict[str, Array]:
     """Outputs of a motion function at M times, by name: (M, k), or (M,) for what is a number at each time."""
     outputs = function.map(len(t))(t[None, :], q.T, qd.T, qdd.T)
     names = [function.name_out(i) for i in range(function.n_out())]

@@ -9,7 +9,7 @@ from warnings import warn
 import numpy as np
 from numpy.typing import NDArray
 
-from models.arrays import Array, ArrayInput, checked_choice, checked_instance, one_for_each
+from models.arrays import Array, ArrayInput, checked_broadcast, checked_choice, checked_instance
 from models.errors import ModelError, ModelWarning
 from models.paths.arc_length import cells
 from models.paths.blends import (
@@ -117,11 +117,11 @@ def _sized(
         raise ModelError(message, name="deviation", value=deviation)
     path, count = corners.path, len(corners.vertices)
     if remaining is not None:
-        wanted = one_for_each(remaining, count, "path", "remaining", "vertices", positive=True, unit="m")
+        wanted = checked_broadcast(remaining, count, "path", "remaining", "vertices", positive=True, unit="m")
         found = _without_overlap(path, wanted, overlap)
         _warn_of_smaller(path, wanted, found)
         return corners.shaped(found) if free else corners, found
-    tolerance = one_for_each(deviation, count, "path", "deviation", "vertices", positive=True, unit="m")
+    tolerance = checked_broadcast(deviation, count, "path", "deviation", "vertices", positive=True, unit="m")
     found = _within(corners, tolerance, overlap)
     if free and corners.bent.size:
         corners = corners.shaped(found)

@@ -29,7 +29,7 @@ from models.robot.kinematics import (
     subtree_moments,
 )
 from models.robot.parts import Link
-from models.robot.rebuild import simplified
+from models.robot.rebuild import simplify
 from models.robot.robot import Robot
 from models.spatial import Expression, Frame, cross, on_scalars, skew
 
@@ -190,7 +190,7 @@ def _efforts(
     """
     ground = checked_placement(world_from_base)
     frames = link_frames(robot, q, world_from_base) if links else {}
-    robot = simplified(robot, links)
+    robot = simplify(robot, links)
     joints = joint_frames(robot, q)
     needed: dict[str, tuple[Expression, Expression]] = {}
     motions = _motions_in_links(robot, joints, qd, qdd, gravity, ground, base_twist, base_acceleration)

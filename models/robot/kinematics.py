@@ -23,7 +23,7 @@ import numpy as np
 
 from models.arrays import NOT_NUMBERS, Array, checked_instance
 from models.errors import ModelError
-from models.robot.parts import Link, massless
+from models.robot.parts import Link, massless_error
 from models.robot.robot import Robot
 from models.spatial import Expression, Frame, cross, expression, on_scalars, rotation, skew
 
@@ -111,7 +111,7 @@ def each_joint(robot: Robot, vector: Expression, what: str = "q") -> dict[str, E
     its positions, followers' lack their offsets. ModelError as of joint_vector.
     """
     vector = joint_vector(robot, vector, what)
-    return {name: vector[k] if ratio == 1 else ratio * vector[k] for name, (k, ratio, _) in robot.drives.items()}
+    return {name: vector[k] if ratio == 1 else ratio * vector[k] for name, (k, ratio, _) in robot.couplings.items()}
 
 
 def by_joint_vector(robot: Robot, given: Mapping[str, Expression]) -> list[Expression]:
@@ -122,7 +122,7 @@ def by_joint_vector(robot: Robot, given: Mapping[str, Expression]) -> list[Expre
     found = [given[name] for name in robot.joint_names]
     for joint in robot.joints:
         if joint.mimic is not None:
-            column, multiplier, _ = robot.drives[joint.name]
+            column, multiplier, _ = robot.couplings[joint.name]
             found[column] = found[column] + multiplier * given[joint.name]
     return found
 
@@ -153,7 +153,7 @@ def center_of_mass(robot: Robot, q: Expression, world_from_base: Placement | Non
     """Centre of mass of the whole robot in the world. Shape (3, 1), m."""
     frames = link_frames(robot, q, world_from_base)
     if robot.total_mass == 0:
-        raise massless("hence no centre of mass")
+        raise massless_error("hence no centre of mass")
     moment = sum(link.mass * frames[link.name].point(link.center_of_mass) for link in robot.links if link.mass)
     return ca.densify(moment / robot.total_mass)
 
@@ -201,7 +201,7 @@ def center_of_mass_jacobian(robot: Robot, q: Expression, world_from_base: Placem
     """Jacobian of the whole robot's centre of mass. Shape (3, dof), world axes."""
     matrix = momentum_matrix(robot, q, world_from_base)
     if robot.total_mass == 0:
-        raise massless("hence no centre of mass")
+        raise massless_error("hence no centre of mass")
     return matrix[3:6, :] / robot.total_mass
 
 
@@ -273,7 +273,7 @@ def joint_frames(robot: Robot, q: Expression) -> dict[str, Frame]:
 def _positions(robot: Robot, q: Expression) -> dict[str, Expression]:
     """Positions of all joints that move, followers included, by name."""
     found = each_joint(robot, q)
-    for name, drive in robot.drives.items():
+    for name, drive in robot.couplings.items():
         if drive.offset:
             found[name] = found[name] + drive.offset
     return found
@@ -349,7 +349,7 @@ def link_motions(
 ) -> dict[str, LinkMotion]:
     """Motion of every link, by name, root first."""
     frames, axes = frames_and_axes(robot, q, world_from_base)
-    return motions_of(robot, frames, axes, qd, qdd)
+    return propagate_motions(robot, frames, axes, qd, qdd)
 
 
 def center_of_mass_motion(
@@ -357,7 +357,7 @@ def center_of_mass_motion(
 ) -> CenterOfMassMotion:
     """Position, velocity and acceleration of the centre of mass of the whole robot; ModelError if it has no mass."""
     if checked_instance(robot, Robot, "kinematics", "robot").total_mass == 0:
-        raise massless("hence no centre of mass")
+        raise massless_error("hence no centre of mass")
     return CenterOfMassMotion(*_center_of_mass_motion(robot, q, qd, qdd, world_from_base))
 
 
@@ -371,7 +371,7 @@ def momentum(
 ) -> Expression:
     """(Moment of momentum about a point of the world, linear momentum). Shape (6, 1), N m s and N s."""
     frames, axes = frames_and_axes(robot, q, world_from_base)
-    motions = motions_of(robot, frames, axes, qd, ca.DM(robot.dof, 1))
+    motions = propagate_motions(robot, frames, axes, qd, ca.DM(robot.dof, 1))
     place = checked_vector(about, 3, "about", "a point of the world")
     total: Expression = ca.DM(6, 1)
     for link in robot.links:
@@ -396,7 +396,7 @@ def momentum_rate(
     About a point that moves with the centre of mass it is the same, the velocity of that being along the momentum.
     """
     frames, axes = frames_and_axes(robot, q, world_from_base)
-    rates = momentum_rates(robot, frames, motions_of(robot, frames, axes, qd, qdd))
+    rates = momentum_rates(robot, frames, propagate_motions(robot, frames, axes, qd, qdd))
     place = checked_vector(about, 3, "about", "a point of the world")
     total: Expression = sum(rates.values(), start=ca.DM(6, 1))
     return ca.densify(ca.vertcat(total[0:3] - cross(place, total[3:6]), total[3:6]))
@@ -412,7 +412,7 @@ def _center_of_mass_motion(
     return tuple(ca.densify(part / robot.total_mass) for part in sums)
 
 
-def motions_of(
+def propagate_motions(
     robot: Robot,
     frames: dict[str, Frame],
     axes: dict[str, tuple[Expression, Expression]],

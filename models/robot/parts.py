@@ -299,7 +299,7 @@ class Joint:
         return Joint(self.name, "fixed", self.parent, self.child, shift, turn, self.axis)
 
 
-def massless(consequence: str) -> ModelError:
+def massless_error(consequence: str) -> ModelError:
     """The error that says a robot has no mass, what that makes impossible, and what URDF has for it."""
     message = f"the robot has no mass, {consequence}: give its links masses; in URDF none has an <inertial>"
     return ModelError(message, name="mass", value=0.0, limit=0.0)

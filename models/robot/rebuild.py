@@ -26,10 +26,10 @@ from models.arrays import (
 from models.errors import ModelError
 from models.robot.parts import Joint, Link
 from models.robot.robot import Robot
-from models.robot.tree import cut, held, reroot
+from models.robot.tree import lock_with_followers, prune_joints, reroot_tree
 
 
-def locked(robot: Robot, positions: Mapping[str, float]) -> Robot:
+def lock_joints(robot: Robot, positions: Mapping[str, float]) -> Robot:
     """The robot with some joints held fixed, and with each the joints that follow it, where that puts them.
 
     Args:
@@ -38,12 +38,12 @@ def locked(robot: Robot, positions: Mapping[str, float]) -> Robot:
     Raises:
         ModelError: A joint that is fixed already; a position that is not finite.
     """
-    given = checked_mapping(positions, "locked", "positions")
-    joints = held(_robot(robot).joints, {robot.joint(name).name: at for name, at in given.items()})
+    given = checked_mapping(positions, "lock_joints", "positions")
+    joints = lock_with_followers(_robot(robot).joints, {robot.joint(name).name: at for name, at in given.items()})
     return replace(robot, joints=joints)
 
 
-def retipped(
+def move_tip(
     robot: Robot, tip: str, translation: ArrayInput = (0.0, 0.0, 0.0), rotation: ArrayInput | None = None
 ) -> Robot:
     """The robot with its tip at a frame placed in the link `tip`."""
@@ -74,7 +74,7 @@ def with_load(
     return replace(robot, links=tuple(whole if each.name == link else each for each in robot.links))
 
 
-def attached(
+def attach_tool(
     robot: Robot,
     tool: Robot | Link,
     link: str | None = None,
@@ -97,7 +97,7 @@ def attached(
         prefix: Put before every name of the tool.
         keep_tip: The tip stays where it is; otherwise the tool's tip becomes that of the robot.
     """
-    added = renamed(
+    added = add_prefix(
         tool if isinstance(tool, Robot) else Robot((checked_instance(tool, Link, "attached", "tool"),)), prefix
     )
     robot = _robot(robot)
@@ -114,7 +114,7 @@ def attached(
     )
 
 
-def merged(
+def merge_robots(
     base: Robot | Link,
     arms: Mapping[str, Robot],
     *,
@@ -122,7 +122,7 @@ def merged(
     translations: Mapping[str, ArrayInput] | None = None,
     rotations: Mapping[str, ArrayInput] | None = None,
 ) -> Robot:
-    """Several robots on one base. The tip is that of the first arm; see retipped.
+    """Several robots on one base. The tip is that of the first arm; see move_tip.
 
     Args:
         base: What carries the arms: a link, or a robot.
@@ -149,17 +149,17 @@ def merged(
         carrier, shift, turn = (places.get(prefix) for places in given)
         shift = np.zeros(3) if shift is None else shift
         checked_instance(arm, Robot, f"{owner}: {prefix!r}", "arm")
-        whole = attached(
+        whole = attach_tool(
             whole, arm, root if carrier is None else carrier, shift, turn, prefix=prefix, keep_tip=not first
         )
         first = False
     return whole
 
 
-def renamed(robot: Robot, prefix: str) -> Robot:
+def add_prefix(robot: Robot, prefix: str) -> Robot:
     """The robot with a prefix before the names of all links and joints."""
     robot = _robot(robot)
-    if not checked_text(prefix, "renamed robot", "prefix"):
+    if not checked_text(prefix, "add_prefix", "prefix"):
         return robot
     links = tuple(replace(link, name=prefix + link.name) for link in robot.links)
     joints = []
@@ -171,12 +171,12 @@ def renamed(robot: Robot, prefix: str) -> Robot:
     return replace(robot, links=links, joints=tuple(joints), tip=tip, name=prefix + robot.name)
 
 
-def rerooted(robot: Robot, root: str) -> Robot:
+def reroot(robot: Robot, root: str) -> Robot:
     """The robot hung up at another link, its new base: same links, frames, joint names, limits and signs.
 
-    See `models.robot.tree.reroot` for the massless links that this takes.
+    See `models.robot.tree.reroot_tree` for the massless links that this takes.
     """
-    links, joints = reroot(_robot(robot).links, robot.joints, robot.root, root)
+    links, joints = reroot_tree(_robot(robot).links, robot.joints, robot.root, root)
     return replace(robot, links=links, joints=joints)
 
 
@@ -191,17 +191,17 @@ def subtree(robot: Robot, root: str, tip: str | None = None) -> Robot:
     for joint in robot.joints:
         if joint.parent in kept:
             kept.add(joint.child)
-    links, joints = tuple(link for link in robot.links if link.name in kept), cut(robot.joints, kept - {root})
+    links, joints = tuple(link for link in robot.links if link.name in kept), prune_joints(robot.joints, kept - {root})
     if tip is None and robot.tip in kept:
         return replace(robot, links=links, joints=joints)
     return Robot(links, joints, tip, name=robot.name)
 
 
-def pruned(robot: Robot, keep: Iterable[str] = ()) -> Robot:
+def prune(robot: Robot, keep: Iterable[str] = ()) -> Robot:
     """The links on the way from the root to the tip, and to the links of `keep`; other branches, mass and all, go.
 
     To keep what the other branches weigh, lock their joints instead, and simplify. Joints that follow one that goes
-    are tied to each other as they were by it: see `models.robot.tree.cut`.
+    are tied to each other as they were by it: see `models.robot.tree.prune_joints`.
 
     Raises:
         ModelError: No tip and nothing to keep.
@@ -210,10 +210,10 @@ def pruned(robot: Robot, keep: Iterable[str] = ()) -> Robot:
     ends = [*named] if robot.tip is None and named else [robot.tip_link, *named]
     stay = {robot.root, *(joint.child for name in ends for joint in robot.path_to(name))}
     links = tuple(link for link in robot.links if link.name in stay)
-    return replace(robot, links=links, joints=cut(robot.joints, stay))
+    return replace(robot, links=links, joints=prune_joints(robot.joints, stay))
 
 
-def simplified(robot: Robot, keep: Iterable[str] = ()) -> Robot:
+def simplify(robot: Robot, keep: Iterable[str] = ()) -> Robot:
     """The same motion and dynamics with fewer links: what hangs on a fixed joint becomes part of its carrier.
 
     The tip frame, the names and order of the moving joints and the frames of their links stay.

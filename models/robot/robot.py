@@ -30,18 +30,18 @@ from models.arrays import (
 from models.errors import ModelError, ModelWarning
 from models.robot.parts import Joint, Link
 from models.robot.tree import (
-    Drive,
-    absent,
-    drives,
+    JointCoupling,
     find_root,
-    held,
+    joint_couplings,
     joint_limits,
+    lock_with_followers,
     require_unique,
-    reroot,
+    reroot_tree,
     ties_to_leaders,
     tree_order,
+    unknown_name,
 )
-from models.robot.urdf import InertiaRule, Source, read_urdf, written_urdf
+from models.robot.urdf import InertiaRule, Source, read_urdf, urdf_text
 
 MimicRule: TypeAlias = Literal["couple", "lock", "free"]
 
@@ -82,7 +82,7 @@ class Robot:
             checked_name(self.name, "robot", "name")
         require_unique((link.name for link in links), "link")
         require_unique((joint.name for joint in joints), "joint")
-        joints = held(joints, {})
+        joints = lock_with_followers(joints, {})
         edges = [(joint.name, joint.parent, joint.child) for joint in joints]
         root = find_root([link.name for link in links], edges)
         object.__setattr__(self, "root", root)
@@ -98,7 +98,7 @@ class Robot:
     def _find_tip(self) -> str | None:
         names = [link.name for link in self.links]
         if self.tip is not None and (not isinstance(self.tip, str) or self.tip not in names):
-            raise absent("tip link", self.tip, names)
+            raise unknown_name("tip link", self.tip, names)
         leaves = self._leaves
         return self.tip if self.tip is not None else leaves[0] if len(leaves) == 1 else None
 
@@ -113,7 +113,7 @@ class Robot:
         if self.tip is None:
             message = (
                 f"{self.name!r} has no tip, which is needed here: its tree has the leaves {self._leaves}; say which "
-                "link carries it, tip=NAME where the robot is made or retipped(robot, NAME), or let tasks name links"
+                "link carries it, tip=NAME where the robot is made or move_tip(robot, NAME), or let tasks name links"
             )
             raise ModelError(message, name="tip", limit=tuple(self._leaves))
         return self.tip
@@ -137,7 +137,7 @@ class Robot:
             source: The text, recognised by its first character "<", or the path of a file.
             tip: Link that carries the tip; if None the one that the file names as to_urdf does, else the only leaf.
             root: Link to hang the tree up at, the base of the robot; the root of the file if None. Links keep their
-                frames, joints their names, limits and signs, see `models.robot.tree.reroot`.
+                frames, joints their names, limits and signs, see `models.robot.tree.reroot_tree`.
             tip_translation: As of Robot.
             tip_rotation: As of Robot; no turn if None.
             lock: Joints to hold fixed at given positions (rad or m), by name, and with them the joints that follow.
@@ -147,7 +147,7 @@ class Robot:
                 "as_given" without a word.
 
         Raises:
-            ModelError: What read_urdf, Robot and `models.robot.rebuild.locked` refuse.
+            ModelError: What read_urdf, Robot and `models.robot.rebuild.lock_joints` refuse.
 
         Warns:
             ModelWarning: Inertias that no body can have, attributes that mean nothing in URDF, joints whose followers'
@@ -160,14 +160,14 @@ class Robot:
         positions = {} if lock is None else checked_mapping(lock, "URDF", "lock")
         for name in positions:
             if name not in known:
-                raise absent("joint", name, known)
-        joints = held(joints, positions)
+                raise unknown_name("joint", name, known)
+        joints = lock_with_followers(joints, positions)
         if mimic == "lock":
-            joints = held(joints, {name: tie.offset for name, tie in ties_to_leaders(joints).items()})
+            joints = lock_with_followers(joints, {name: tie.offset for name, tie in ties_to_leaders(joints).items()})
         links = found.links
         if root is not None:
             whole = cls(links, joints, tip=links[0].name)  # says what is wrong with the tree before it is turned round
-            links, joints = reroot(links, joints, whole.root, root)
+            links, joints = reroot_tree(links, joints, whole.root, root)
         turn = np.eye(3) if tip_rotation is None else tip_rotation
         robot = cls(links, joints, found.tip if tip is None else tip, tip_translation, turn, found.name)
         room = zip(robot.moving_joints, robot.lower, robot.upper, strict=True)
@@ -178,10 +178,10 @@ class Robot:
     def to_urdf(self, file: str | os.PathLike[str] | None = None) -> str:
         """The robot as URDF text, of which from_urdf makes the same robot; written to a file too where one is given.
 
-        See `models.robot.urdf.written_urdf` for what other readers make of it. The file is replaced as a whole.
+        See `models.robot.urdf.urdf_text` for what other readers make of it. The file is replaced as a whole.
         """
         place = np.asarray(self.tip_translation), np.asarray(self.tip_rotation)
-        text = written_urdf(self.name, self.links, self.joints, self.tip, *place)
+        text = urdf_text(self.name, self.links, self.joints, self.tip, *place)
         if file is not None:
             if not isinstance(file, str | os.PathLike):
                 raise ModelError(f"to_urdf: file must be a path, not {file!r}", name="file", value=file)
@@ -197,9 +197,9 @@ class Robot:
         return tuple(joint for joint in self.joints if joint.moves and joint.mimic is None)
 
     @cached_property
-    def drives(self) -> dict[str, Drive]:
+    def couplings(self) -> dict[str, JointCoupling]:
         """What moves each joint that moves, followers included, by name."""
-        return drives(self.joints)
+        return joint_couplings(self.joints)
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -227,7 +227,7 @@ class Robot:
 
     @cached_property
     def _limits(self) -> dict[str, Array]:
-        return joint_limits(self.joints, self.drives)
+        return joint_limits(self.joints, self.couplings)
 
     @property
     def lower(self) -> Array:
@@ -264,13 +264,13 @@ class Robot:
     def link(self, name: str) -> Link:
         """The link of that name; ModelError, which says what names come near, when there is none."""
         if not isinstance(name, str) or name not in self._links_by_name:
-            raise absent("link", name, self._links_by_name)
+            raise unknown_name("link", name, self._links_by_name)
         return self._links_by_name[name]
 
     def joint(self, name: str) -> Joint:
         """The joint of that name, moving or fixed; ModelError, as for a link, when there is none."""
         if not isinstance(name, str) or name not in self._joints_by_name:
-            raise absent("joint", name, self._joints_by_name)
+            raise unknown_name("joint", name, self._joints_by_name)
         return self._joints_by_name[name]
 
     def path_to(self, name: str) -> tuple[Joint, ...]:

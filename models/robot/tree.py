@@ -22,7 +22,7 @@ from models.errors import ModelError
 from models.robot.parts import Joint, Link, Mimic
 
 
-def absent(what: str, name: object, known: Iterable[str]) -> ModelError:
+def unknown_name(what: str, name: object, known: Iterable[str]) -> ModelError:
     """The error that says a name does not exist and which ones come near it."""
     names = list(known)
     folded = {each.casefold(): each for each in reversed(names)}
@@ -58,7 +58,7 @@ def find_root(links: Sequence[str], edges: Sequence[tuple[str, str, str]]) -> st
     for joint, parent, child in edges:
         for role, link in (("parent", parent), ("child", child)):
             if link not in known:
-                raise absent(f"joint {joint!r}: {role} link", link, links)
+                raise unknown_name(f"joint {joint!r}: {role} link", link, links)
         if parent == child:
             raise ModelError(f"joint {joint!r} connects link {child!r} to itself: a loop", name=joint, value=child)
         if child in parent_joint:
@@ -103,7 +103,7 @@ def tree_order(root: str, edges: Sequence[tuple[str, str, str]]) -> list[int]:
     return order
 
 
-def reroot(
+def reroot_tree(
     links: Sequence[Link], joints: Sequence[Joint], old: str, new: str
 ) -> tuple[tuple[Link, ...], tuple[Joint, ...]]:
     """The tree of root `old` hung up at the link `new`.
@@ -117,7 +117,7 @@ def reroot(
     """
     names = [link.name for link in links]
     if not isinstance(new, str) or new not in names:
-        raise absent("root link", new, names)
+        raise unknown_name("root link", new, names)
     above = {joint.child: joint for joint in joints}
     turned: dict[str, list[Joint]] = {}
     frames: list[Link] = []
@@ -148,7 +148,7 @@ def reroot(
 LIMITS = ("lower", "upper", "velocity", "effort")
 
 
-class Drive(NamedTuple):
+class JointCoupling(NamedTuple):
     """What moves a joint: multiplier times an entry of the joint vector, plus an offset (rad or m)."""
 
     column: int
@@ -169,7 +169,7 @@ def ties_to_leaders(joints: Sequence[Joint]) -> dict[str, Mimic]:
         chain = [name]
         while True:
             if tie.joint not in names:
-                raise absent(f"joint {chain[-1]!r}: mimicked joint", tie.joint, names)
+                raise unknown_name(f"joint {chain[-1]!r}: mimicked joint", tie.joint, names)
             if tie.joint in chain:
                 message = f"joints {chain} mimic each other in a ring; let one of them mimic none"
                 raise ModelError(message, name="joints", value=tuple(chain))
@@ -183,7 +183,7 @@ def ties_to_leaders(joints: Sequence[Joint]) -> dict[str, Mimic]:
     return found
 
 
-def held(joints: Sequence[Joint], positions: Mapping[str, float]) -> tuple[Joint, ...]:
+def lock_with_followers(joints: Sequence[Joint], positions: Mapping[str, float]) -> tuple[Joint, ...]:
     """The joints, some of them locked at given positions (rad or m, by name), and with them what does not move then.
 
     Those are the followers of a locked or a fixed joint, which stands at 0, and a follower of multiplier 0. A follower
@@ -202,7 +202,7 @@ def held(joints: Sequence[Joint], positions: Mapping[str, float]) -> tuple[Joint
     return tuple(joint.locked(places[joint.name]) if joint.name in places else joint for joint in joints)
 
 
-def cut(joints: Sequence[Joint], kept: Container[str]) -> tuple[Joint, ...]:
+def prune_joints(joints: Sequence[Joint], kept: Container[str]) -> tuple[Joint, ...]:
     """The joints of the links that are kept, by the name of their child.
 
     Followers of a joint that goes follow on: its leader where that stays, else the first of them, which becomes a
@@ -225,15 +225,15 @@ def cut(joints: Sequence[Joint], kept: Container[str]) -> tuple[Joint, ...]:
     return tuple(result)
 
 
-def drives(joints: Sequence[Joint]) -> dict[str, Drive]:
+def joint_couplings(joints: Sequence[Joint]) -> dict[str, JointCoupling]:
     """What moves each joint that moves, by name: the leaders, in their order, are the entries of the joint vector."""
     leaders = [joint.name for joint in joints if joint.moves and joint.mimic is None]
     columns = {name: column for column, name in enumerate(leaders)}
     own = {joint.name: Mimic(joint.name) for joint in joints if joint.moves} | ties_to_leaders(joints)
-    return {name: Drive(columns[tie.joint], tie.multiplier, tie.offset) for name, tie in own.items()}
+    return {name: JointCoupling(columns[tie.joint], tie.multiplier, tie.offset) for name, tie in own.items()}
 
 
-def joint_limits(joints: Sequence[Joint], driven: Mapping[str, Drive]) -> dict[str, Array]:
+def joint_limits(joints: Sequence[Joint], driven: Mapping[str, JointCoupling]) -> dict[str, Array]:
     """Limits "lower", "upper", "velocity" and "effort" of the joint vector. Shape (dof,) each.
 
     No joint passes its limits, so that followers narrow the positions and slow the leaders that drive them. Effort is

@@ -90,7 +90,7 @@ def read_urdf(source: Source, *, inertia: InertiaRule = "warn") -> Description:
             root link that is left out.
     """
     checked_choice(inertia, get_args(InertiaRule), "URDF", "inertia")
-    tree = parsed(source)
+    tree = parse_urdf(source)
     own = isinstance(source, os.PathLike) or not source.lstrip(BLANK).startswith("<")
     folder = str(Path(source).resolve().parent) if own else ""
     if unread := [each for owner in (*tree.findall("link"), *tree.findall("joint")) for each in _unread(owner)]:
@@ -125,7 +125,7 @@ def _without_world(name: str, links: tuple[Link, ...], joints: list[tuple[str, s
     return tuple(link for link in links if link is not base)
 
 
-def written_urdf(
+def urdf_text(
     name: str, links: Sequence[Link], joints: Sequence[Joint], tip: str | None, translation: Array, rotation: Array
 ) -> str:
     """A robot as URDF text, of which `read_urdf` makes the same links, joints and tip, numbers to the last digit.
@@ -222,7 +222,7 @@ def _text(numbers: Any) -> str:
     return " ".join(repr(float(number)) for number in np.ravel(numbers))
 
 
-def parsed(source: Source) -> ElementTree.Element:
+def parse_urdf(source: Source) -> ElementTree.Element:
     """The <robot> element of a URDF text or file, namespaces removed; ModelError where there is none to read."""
     text, above = "", 0
     data: str | bytes = b""

@@ -317,7 +317,7 @@ def arms(
             found.append(float(np.linalg.norm(hop - (hop @ axis) * axis)) + beyond)
             reach = float(np.linalg.norm(hop)) + beyond
         if step.joint.kind == "prismatic":
-            column, ratio, offset = robot.drives[step.joint.name]
+            column, ratio, offset = robot.couplings[step.joint.name]
             ends = ratio * np.array([low[column], high[column]]) + offset
             reach += float(np.abs(ends).max())
         beyond = reach

@@ -16,16 +16,16 @@ from numpy.typing import NDArray
 from models.arrays import (
     Array,
     ArrayInput,
+    checked_broadcast,
     checked_count,
     checked_each,
     checked_instance,
     checked_nonnegative,
-    one_for_each,
 )
-from models.cache import keep, kept, key_of, version_of
+from models.cache import cache_key, load_value, source_version, store_value
 from models.errors import ModelError, ModelWarning
 from models.robot.robot import Robot
-from models.robot.urdf import parsed, text_of
+from models.robot.urdf import parse_urdf, text_of
 from models.shapes.bodies import Body, RigidParts, Step, arms
 from models.shapes.hull import gap_along, nearest_directions
 from models.shapes.shapes import Box, Shape
@@ -129,8 +129,8 @@ def checked_pairs(
     bodies = checked_each(bodies, Body, owner, "bodies")
     for body in bodies:
         robot.link(body.link)
-    low = robot.lower if lower is None else one_for_each(lower, robot.dof, owner, "lower", "joints", finite=False)
-    high = robot.upper if upper is None else one_for_each(upper, robot.dof, owner, "upper", "joints", finite=False)
+    low = robot.lower if lower is None else checked_broadcast(lower, robot.dof, owner, "lower", "joints", finite=False)
+    high = robot.upper if upper is None else checked_broadcast(upper, robot.dof, owner, "upper", "joints", finite=False)
     if (low > high).any():
         k = int(np.flatnonzero(low > high)[0])
         message = f"{owner}: lower {low[k]} of joint {robot.joint_names[k]!r} is above upper {high[k]}"
@@ -142,7 +142,7 @@ def checked_pairs(
     named |= dict.fromkeys(map(frozenset, _named(robot, ignored)), TOLD)
 
     key = _key(robot, bodies, low, high, named, near, count, seed)
-    if (known := _read(kept(key), bodies)) is not None:
+    if (known := _read(load_value(key), bodies)) is not None:
         return known
     parts = RigidParts.of(robot)
     close = parts.close({parts.of_link[body.link] for body in bodies})
@@ -165,7 +165,7 @@ def checked_pairs(
     found = Pairs(
         tuple(checked), {k: why for k, why in left.items() if k[0] != k[1] and (k not in open_links or why in ASSUMED)}
     )
-    keep(key, {"checked": found.checked, "left": [[*pair, why.value] for pair, why in found.left.items()]})
+    store_value(key, {"checked": found.checked, "left": [[*pair, why.value] for pair, why in found.left.items()]})
     return found
 
 
@@ -183,7 +183,7 @@ def _key(
     parts: list[Any] = [low, high, near, count, seed]
     words = ["pairs", *(f"{sorted(pair)} {why}" for pair, why in named.items())]
     for joint in robot.joints:
-        words.append(f"{joint.name} {joint.kind} {joint.parent} {joint.child} {robot.drives.get(joint.name)}")
+        words.append(f"{joint.name} {joint.kind} {joint.parent} {joint.child} {robot.couplings.get(joint.name)}")
         parts += [joint.axis, joint.translation, joint.rotation]
     for body in bodies:
         words.append(f"{body.link} {type(body.shape).__name__}")
@@ -193,7 +193,7 @@ def _key(
             body.overhang,
             np.zeros(0) if body.mesh is None else body.mesh.points,
         ]
-    return key_of(version_of(__name__), "\n".join(words), *parts)
+    return cache_key(source_version(__name__), "\n".join(words), *parts)
 
 
 def _read(value: Any, bodies: Sequence[Body]) -> Pairs | None:
@@ -222,7 +222,7 @@ def _disabled(robot: Robot, source: str | os.PathLike[str]) -> list[frozenset[st
     known = {link.name for link in robot.links}
     pairs = [
         frozenset(text_of(each, key, "SRDF") for key in ("link1", "link2"))
-        for each in parsed(source).findall("disable_collisions")
+        for each in parse_urdf(source).findall("disable_collisions")
     ]
     if unknown := sorted({name for pair in pairs for name in pair if name not in known}):
         message = f"the SRDF file names links that {robot.name!r} has not: {', '.join(map(repr, unknown))}"
@@ -324,7 +324,7 @@ class _Between:
 
         ALWAYS for those that overlap everywhere on it, else None.
         """
-        columns = sorted({self.robot.drives[step.joint.name].column for step in (*self.up, *self.down)})
+        columns = sorted({self.robot.couplings[step.joint.name].column for step in (*self.up, *self.down)})
         first = np.where(np.isfinite(low), low, -np.pi)[columns]
         last = np.minimum(np.where(np.isfinite(high), high, np.pi)[columns], first + 2 * np.pi)
         step = (last - first) / self.settings.grid
@@ -378,7 +378,7 @@ class _Between:
     def _chain(self, steps: Sequence[Step], q: Array) -> tuple[Array, Array]:
         turn, shift = np.tile(np.eye(3), (len(q), 1, 1)), np.zeros((len(q), 3))
         for step in steps:
-            column, ratio, offset = self.robot.drives[step.joint.name]
+            column, ratio, offset = self.robot.couplings[step.joint.name]
             at = ratio * q[:, column] + offset
             shift = shift + turn @ step.shift
             turn = turn @ step.turn
@@ -435,7 +435,7 @@ class _Between:
         behind = arms(self.robot, back, self.one, low, high)[0][::-1]
         found = []
         for (step, _), one, other in zip(chain, ahead, behind, strict=True):
-            column, ratio, _ = self.robot.drives[step.joint.name]
+            column, ratio, _ = self.robot.couplings[step.joint.name]
             found.append(_Lever(column, ratio, 0.0 if step.joint.kind == "prismatic" else max(min(one, other), 1e-300)))
         return found
 

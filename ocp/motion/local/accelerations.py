@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 
 from models.arrays import Array
-from models.machines.standing import External, Standing, StandingMotion, evaluate, motion_function, wrenches_at
+from models.machines.standing import External, Standing, StandingMotion, evaluate_motion, motion_function, wrenches_at
 from models.robot.indices import joint_limit_index, manipulability_of
 from models.robot.kinematics import center_of_mass_motion, momentum
 from ocp.console import interruptible
@@ -465,7 +465,7 @@ class _Watch:
         n = states.shape[1] // 2
         q, qd = states[:, :n], states[:, n:]
         qdd, gap = (np.array(part).T for part in self._law.map(len(times))(times[None, :], q.T, qd.T))
-        found = evaluate(self._motion, times, q, qd, qdd)
+        found = evaluate_motion(self._motion, times, q, qd, qdd)
         lost = ~np.isfinite(np.hstack([states, qdd, found["ground_force"]])).all(axis=1)
         vertical = found["ground_force"][:, 2]
         speed = np.abs(qd).max(axis=1)

@@ -76,7 +76,7 @@ class TaskEquations:
 
         None of a machine whose base floats or that has to keep its balance: there every joint counts.
         """
-        drives = self.machine.robot.drives
+        drives = self.machine.robot.couplings
         alone = isinstance(self.machine, FixedBase) and not isinstance(self.machine, Standing)
         idle = np.full(self.machine.joint_size, alone)
         for robot in (tip.robot for part in self.bound for tip in (part.tip, part.reference) if tip is not None):

@@ -22,12 +22,12 @@ from models import (
     Stance,
     Standing,
     Support,
+    find_wheels,
     footprint,
     planar_chain,
     rectangle,
     scara_along,
     smooth,
-    wheels_of,
     with_wheels,
 )
 from models.machines.machine import with_tip
@@ -194,7 +194,7 @@ ACTUATOR_CASES = [
             "prefix": but(NAME, "empty"),
         },
     ),
-    Case("wheels_of", wheels_of, {"robot": CHAIN}, {"robot": INSTANCE}),
+    Case("wheels_of", find_wheels, {"robot": CHAIN}, {"robot": INSTANCE}),
 ]
 STANDING_CASES = [
     Case(

@@ -208,13 +208,13 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
 }
 
 
-def test_a_pair_is_ignored_by_the_names_that_it_is_told_as() -> None:
+def test_a_pair_is_ignored_by_its_names() -> None:
     machine = FixedBase(armoured_arm())
     around = CollisionScene(
         machine, [Sphere(0.1, (0.3, 0, 0.3)), MovingObstacle(Sphere(0.1, (0, 0, 0)), lambda t: (t, 0, 0.3))]
     )
     for pair in range(len(around.pairs)):
-        without = CollisionScene(machine, around.obstacles, ignored=[around.told_as(pair)])
+        without = CollisionScene(machine, around.obstacles, ignored=[around.pair_names(pair)])
         assert set(without.labels) < set(around.labels)
         assert around.labels[pair] not in without.labels
 
