@@ -1,4 +1,4 @@
-"""What a machine is: symbolic kinematics, geometry and momentum. Knows nothing of problems or solvers."""
+"""Models of machines: symbolic kinematics, geometry and dynamics, independent of optimisation problems and solvers."""
 
 from models.cts.best_roll import optimal_inverse
 from models.cts.rig import Rig, Tunnel

@@ -17,7 +17,7 @@ KEY = cache.cache_key("1", "an input")
 @pytest.fixture
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    cache._notice.cache_clear()
+    cache._log_once.cache_clear()
     return tmp_path / "cache" / "selfmotion"
 
 

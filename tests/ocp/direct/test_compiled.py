@@ -319,10 +319,10 @@ def test_libraries_that_are_used_least_make_room(own: Path, monkeypatch: pytest.
     for age, file in enumerate(files):
         os.utime(file, (0, 1000 + age))
     assert built(number(10)) == files[0]  # used again
-    monkeypatch.setattr(cache, "MOST_KEPT", 3 * files[0].stat().st_size)
+    monkeypatch.setattr(cache, "MAX_LIBRARY_BYTES", 3 * files[0].stat().st_size)
     newest = built(number(13))
     assert {file for file in own.iterdir() if file.suffix == ".so"} == {files[0], files[2], newest}
-    monkeypatch.setattr(cache, "MOST_KEPT", 0)
+    monkeypatch.setattr(cache, "MAX_LIBRARY_BYTES", 0)
     assert built(number(14)).exists()  # what is needed now stays
     assert len(list(own.glob("*.so"))) == 1
 
