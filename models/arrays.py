@@ -83,7 +83,7 @@ def checked_array(
     value: ArrayInput,
     shape: tuple[int | str, ...],
     owner: str,
-    what: str,
+    argument: str,
     *,
     finite: bool = True,
     nan: bool = False,
@@ -97,7 +97,7 @@ def checked_array(
         value: Anything that NumPy reads as floats.
         shape: Expected shape. A string stands for a free dimension of size `least` or more: ("points", 3). A shape with
             one free dimension also accepts a scalar.
-        owner, what: The object and its argument, for messages.
+        owner, argument: The object and the name of its argument, for messages.
         finite: Refuse inf.
         nan: Accept nan.
         positive: Require all entries to be above zero.
@@ -105,29 +105,29 @@ def checked_array(
 
     Raises:
         ModelError: A value that is not numeric, has the wrong shape, or contains nan, inf or an entry that is not
-            positive. The error's `name` is `what`.
+            positive. The error's `name` is `argument`.
     """
-    array = _read(value, owner, what)
+    array = _read(value, owner, argument)
     if array.shape != shape:
-        array = _shaped(array, shape, owner, what, least)
+        array = _shaped(array, shape, owner, argument, least)
     if not np.isfinite(array).all():
         wrong = (np.isnan(array) & (not nan)) | (np.isinf(array) & finite)
         if wrong.any():
-            raise ModelError(f"{owner}: {_shown(array, wrong, what)} is not finite", name=what, value=array)
+            raise ModelError(f"{owner}: {_shown(array, wrong, argument)} is not finite", name=argument, value=array)
     if positive and not (array > 0).all():
-        shown = f"{_shown(array, ~(array > 0), what)} {unit}".rstrip()
-        raise ModelError(f"{owner}: {shown} is not positive", name=what, value=array, limit=0.0)
+        shown = f"{_shown(array, ~(array > 0), argument)} {unit}".rstrip()
+        raise ModelError(f"{owner}: {shown} is not positive", name=argument, value=array, limit=0.0)
     return frozen(array)
 
 
-def _read(value: ArrayInput, owner: str, what: str) -> Array:
+def _read(value: ArrayInput, owner: str, argument: str) -> Array:
     try:
         return floats(value)
     except NOT_NUMBERS as error:
-        raise ModelError(f"{owner}: {what} {value!r} is not numeric", name=what, value=value) from error
+        raise ModelError(f"{owner}: {argument} {value!r} is not numeric", name=argument, value=value) from error
 
 
-def _shaped(array: Array, shape: tuple[int | str, ...], owner: str, what: str, least: int) -> Array:
+def _shaped(array: Array, shape: tuple[int | str, ...], owner: str, argument: str, least: int) -> Array:
     """Return the array, a scalar as shape (1,), if it fits a shape with free dimensions; raise ModelError otherwise."""
     if array.ndim == 0 and len(shape) == 1 and isinstance(shape[0], str):
         array = array.reshape(1)
@@ -138,55 +138,55 @@ def _shaped(array: Array, shape: tuple[int | str, ...], owner: str, what: str, l
     if not fits:
         expected = str(shape).replace("'", "")
         hint = f", {least} at least" if any(isinstance(expected_size, str) for expected_size in shape) else ""
-        message = f"{owner}: {what} has shape {array.shape}, expected {expected}{hint}"
-        raise ModelError(message, name=what, value=array, limit=shape)
+        message = f"{owner}: {argument} has shape {array.shape}, expected {expected}{hint}"
+        raise ModelError(message, name=argument, value=array, limit=shape)
     return array
 
 
-def _shown(array: Array, wrong: Any, what: str) -> str:
+def _shown(array: Array, wrong: Any, argument: str) -> str:
     """Describe an invalid array: whole if it is a short vector, else by its first invalid entry or row."""
     if array.ndim < 2 and array.size <= MAX_LISTED:
-        return f"{what} {array.tolist()}"
+        return f"{argument} {array.tolist()}"
     if array.ndim == 1:
         entry = int(np.flatnonzero(wrong)[0])
-        return f"{what} (entry {entry}) {array[entry].item()}"
+        return f"{argument} (entry {entry}) {array[entry].item()}"
     row = int(np.flatnonzero(wrong.reshape(len(array), -1).any(axis=1))[0])
-    return f"{what} (row {row}) {array[row].tolist()}"
+    return f"{argument} (row {row}) {array[row].tolist()}"
 
 
-def checked_numbers(value: ArrayInput, owner: str, what: str) -> Array:
+def checked_numbers(value: ArrayInput, owner: str, argument: str) -> Array:
     """Return `value` as an array of finite floats of any shape; errors as in checked_array."""
-    array = _read(value, owner, what)
-    return checked_array(array, array.shape, owner, what)
+    array = _read(value, owner, argument)
+    return checked_array(array, array.shape, owner, argument)
 
 
 def checked_number(
-    value: ArrayInput, owner: str, what: str, *, finite: bool = True, positive: bool = False, unit: str = ""
+    value: ArrayInput, owner: str, argument: str, *, finite: bool = True, positive: bool = False, unit: str = ""
 ) -> float:
     """Return `value` as a float; arguments and errors as in checked_array."""
     if isinstance(value, float) and (isfinite(value) or not (finite or isnan(value))) and (value > 0 or not positive):
         return float(value)  # fast path: a robot has hundreds of numbers
-    return float(checked_array(value, (), owner, what, finite=finite, positive=positive, unit=unit))
+    return float(checked_array(value, (), owner, argument, finite=finite, positive=positive, unit=unit))
 
 
-def checked_nonnegative(value: ArrayInput, owner: str, what: str, unit: str = "") -> float:
+def checked_nonnegative(value: ArrayInput, owner: str, argument: str, unit: str = "") -> float:
     """Return `value` as a float; raise ModelError unless it is finite and not negative."""
-    number = checked_number(value, owner, what)
+    number = checked_number(value, owner, argument)
     if number < 0:
-        message = f"{owner}: {what} {number} {unit}".rstrip()
-        raise ModelError(f"{message} is negative", name=what, value=number, limit=0.0)
+        message = f"{owner}: {argument} {number} {unit}".rstrip()
+        raise ModelError(f"{message} is negative", name=argument, value=number, limit=0.0)
     return number
 
 
-def checked_count(value: Any, owner: str, what: str, least: int = 1, most: int = INPUT_LIMITS.count) -> int:
+def checked_count(value: Any, owner: str, argument: str, least: int = 1, most: int = INPUT_LIMITS.count) -> int:
     """Return `value` as an int; raise ModelError unless it is an integer from `least` to `most`."""
     if not isinstance(value, int | np.integer) or isinstance(value, bool) or not least <= value <= most:
-        message = f"{owner}: {what} must be a whole number, {least} to {most}, not {value!r}"
-        raise ModelError(message, name=what, value=value, limit=(least, most))
+        message = f"{owner}: {argument} must be a whole number, {least} to {most}, not {value!r}"
+        raise ModelError(message, name=argument, value=value, limit=(least, most))
     return int(value)
 
 
-def checked_indices(value: Any, count: int, owner: str, what: str) -> NDArray[np.intp]:
+def checked_indices(value: Any, count: int, owner: str, argument: str) -> NDArray[np.intp]:
     """Return `value` as an array of indices; raise ModelError unless all are integers in [0, count)."""
     try:
         check_entries(value)
@@ -194,13 +194,13 @@ def checked_indices(value: Any, count: int, owner: str, what: str) -> NDArray[np
     except NOT_NUMBERS:  # rejected below
         indices = np.array(np.nan)
     if indices.dtype.kind not in "iu" or ((indices < 0) | (indices >= count)).any():
-        message = f"{owner}: {what} must be whole numbers from 0, below {count}, not {value!r}"
-        raise ModelError(message, name=what, value=value, limit=(0, count))
+        message = f"{owner}: {argument} must be whole numbers from 0, below {count}, not {value!r}"
+        raise ModelError(message, name=argument, value=value, limit=(0, count))
     return indices.astype(np.intp)
 
 
 def checked_broadcast(
-    value: ArrayInput, count: int, owner: str, what: str, items: str, *, finite: bool = True, **checks: Any
+    value: ArrayInput, count: int, owner: str, argument: str, items: str, *, finite: bool = True, **checks: Any
 ) -> Array:
     """Return one float for each of `count` items, from one number or from an array of shape (count,).
 
@@ -211,15 +211,15 @@ def checked_broadcast(
     Raises:
         ModelError: As in checked_array.
     """
-    array = _read(value, owner, what)
+    array = _read(value, owner, argument)
     if array.ndim and array.shape != (count,):
-        message = f"{owner}: {what} has shape {array.shape}; give one number, or one for each of the {count} {items}"
-        raise ModelError(message, name=what, value=array, limit=(count,))
-    values = checked_array(array, array.shape, owner, what, finite=finite, **checks)
+        message = f"{owner}: {argument} has shape {array.shape}; give one number or one for each of the {count} {items}"
+        raise ModelError(message, name=argument, value=array, limit=(count,))
+    values = checked_array(array, array.shape, owner, argument, finite=finite, **checks)
     return frozen(np.array(np.broadcast_to(values, (count,))))
 
 
-def warn_of_degrees(angles: ArrayInput, owner: str, name: str, what: str) -> None:
+def warn_of_degrees(angles: ArrayInput, owner: str, name: str, argument: str) -> None:
     """Warn if an angle (rad) exceeds two turns and so looks like degrees. Values above 1e4 count as "no limit".
 
     Python shows the same message only once.
@@ -230,16 +230,16 @@ def warn_of_degrees(angles: ArrayInput, owner: str, name: str, what: str) -> Non
     limit = 4 * np.pi
     angle = _first_between(angles, limit, 1e4)  # larger values stand for no limit
     if angle is not None:
-        message = f"{owner}: {what} {angle:g} rad is more than two turns; angles are in rad, is it in degrees?"
+        message = f"{owner}: {argument} {angle:g} rad is more than two turns; angles are in rad, is it in degrees?"
         warn(ModelWarning(message, name=name, value=angle, limit=limit), stacklevel=1)
 
 
-def warn_of_millimetres(lengths: ArrayInput, owner: str, name: str, what: str) -> None:
+def warn_of_millimetres(lengths: ArrayInput, owner: str, name: str, argument: str) -> None:
     """Warn if a length (m) exceeds 50 m and so looks like millimetres, as warn_of_degrees does for angles."""
     limit = 50.0  # m: no part of an arm is longer
     length = _first_between(lengths, limit, np.inf)
     if length is not None:
-        message = f"{owner}: {what} {length:g} m is long for a robot; lengths are in m, is it in millimetres?"
+        message = f"{owner}: {argument} {length:g} m is long for a robot; lengths are in m, is it in millimetres?"
         warn(ModelWarning(message, name=name, value=length, limit=limit), stacklevel=1)
 
 
@@ -249,81 +249,81 @@ def _first_between(values: ArrayInput, low: float, high: float) -> float | None:
     return next((entry for entry in entries if low < abs(entry) < high), None)
 
 
-def checked_rotation(value: ArrayInput, owner: str, what: str) -> Array:
+def checked_rotation(value: ArrayInput, owner: str, argument: str) -> Array:
     """Return a read-only copy of a rotation matrix; raise ModelError if it is not one."""
-    matrix = checked_array(value, (3, 3), owner, what)
+    matrix = checked_array(value, (3, 3), owner, argument)
     error = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
     (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()  # np.linalg.det would double the cost
     if error > 1e-6 or a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) < 0:
-        message = f"{owner}: {what} {matrix.tolist()} is not a rotation matrix (orthonormal, determinant 1)"
-        raise ModelError(message, name=what, value=matrix)
+        message = f"{owner}: {argument} {matrix.tolist()} is not a rotation matrix (orthonormal, determinant 1)"
+        raise ModelError(message, name=argument, value=matrix)
     if error > 1e-12:  # printed with few digits: project onto the nearest rotation
         left, _, right = np.linalg.svd(matrix)
         matrix = frozen(left @ right)
     return matrix
 
 
-def checked_choice(value: _Choice, choices: Iterable[Any], owner: str, what: str) -> _Choice:
+def checked_choice(value: _Choice, choices: Iterable[Any], owner: str, argument: str) -> _Choice:
     """Return `value`; raise ModelError unless it is one of the choices."""
     allowed = tuple(choices)
     if not any(isinstance(value, type(choice)) and value == choice for choice in allowed):
-        message = f"{owner}: {what} {value!r} is unknown; use one of {list(allowed)}"
-        raise ModelError(message, name=what, value=value, limit=allowed)
+        message = f"{owner}: {argument} {value!r} is unknown; use one of {list(allowed)}"
+        raise ModelError(message, name=argument, value=value, limit=allowed)
     return value
 
 
-def checked_instance(value: Any, kind: type[_Kind], owner: str, what: str) -> _Kind:
+def checked_instance(value: Any, kind: type[_Kind], owner: str, argument: str) -> _Kind:
     """Return `value`; raise ModelError unless it is an instance of `kind`."""
     if not isinstance(value, kind):
-        message = f"{owner}: {what} must be a {kind.__name__}, not {value!r}"
-        raise ModelError(message, name=what, value=value, limit=kind.__name__)
+        message = f"{owner}: {argument} must be a {kind.__name__}, not {value!r}"
+        raise ModelError(message, name=argument, value=value, limit=kind.__name__)
     return value
 
 
-def checked_each(values: Any, kind: type[_Kind], owner: str, what: str) -> tuple[_Kind, ...]:
+def checked_each(values: Any, kind: type[_Kind], owner: str, argument: str) -> tuple[_Kind, ...]:
     """Return `values` as a tuple; raise ModelError unless all are instances of `kind`."""
     try:
         check_entries(values)
         items = tuple(values)
     except NOT_NUMBERS as error:
-        message = f"{owner}: {what} must be a list of {kind.__name__}, not {values!r}"
-        raise ModelError(message, name=what, value=values, limit=kind.__name__) from error
+        message = f"{owner}: {argument} must be a list of {kind.__name__}, not {values!r}"
+        raise ModelError(message, name=argument, value=values, limit=kind.__name__) from error
     for value in items:
-        checked_instance(value, kind, owner, what)
+        checked_instance(value, kind, owner, argument)
     return items
 
 
-def checked_name(value: Any, owner: str, what: str) -> str:
+def checked_name(value: Any, owner: str, argument: str) -> str:
     """Return `value`; raise ModelError unless it is a non-empty string of printable characters.
 
     Terminals, tables and shells act on control characters, so names must not contain any.
     """
     if not isinstance(value, str) or not value:
-        message = f"{owner}: {what} must be a name, a string that is not empty, not {value!r}"
-        raise ModelError(message, name=what, value=value)
+        message = f"{owner}: {argument} must be a name, a string that is not empty, not {value!r}"
+        raise ModelError(message, name=argument, value=value)
     limit = INPUT_LIMITS.name_characters
     if len(value) > limit or not value.isprintable():
-        message = f"{owner}: {what} must be at most {limit} printable characters, not {value[:limit]!r}"
-        raise ModelError(message, name=what, value=value, limit=limit)
+        message = f"{owner}: {argument} must be at most {limit} printable characters, not {value[:limit]!r}"
+        raise ModelError(message, name=argument, value=value, limit=limit)
     return value
 
 
-def checked_text(value: Any, owner: str, what: str) -> str:
+def checked_text(value: Any, owner: str, argument: str) -> str:
     """Return `value`; raise ModelError unless it is a string."""
-    return checked_instance(value, str, owner, what)
+    return checked_instance(value, str, owner, argument)
 
 
-def checked_flag(value: Any, owner: str, what: str) -> bool:
+def checked_flag(value: Any, owner: str, argument: str) -> bool:
     """Return `value` as a bool; raise ModelError unless it is True or False."""
     if not isinstance(value, bool | np.bool_):
-        message = f"{owner}: {what} must be True or False, not {value!r}"
-        raise ModelError(message, name=what, value=value, limit=(True, False))
+        message = f"{owner}: {argument} must be True or False, not {value!r}"
+        raise ModelError(message, name=argument, value=value, limit=(True, False))
     return bool(value)
 
 
-def checked_mapping(values: Any, owner: str, what: str) -> dict[str, Any]:
+def checked_mapping(values: Any, owner: str, argument: str) -> dict[str, Any]:
     """Return a copy of a dictionary with string keys; raise ModelError for anything else."""
     if not isinstance(values, Mapping) or not all(isinstance(name, str) for name in values):
-        message = f"{owner}: {what} must be a dictionary by name, not {values!r}"
-        raise ModelError(message, name=what, value=values)
+        message = f"{owner}: {argument} must be a dictionary by name, not {values!r}"
+        raise ModelError(message, name=argument, value=values)
     return dict(values)

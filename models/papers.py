@@ -33,7 +33,7 @@ STANDING_STARTS = {1: np.deg2rad([45.0, 160.0, 240.0, 200.0, 50.0]), 2: np.deg2r
 
 
 def standing_example() -> Standing:
-    """Return the five-link standing machine of Tables 1 and 2 of Yoo et al. 2004, which moves in the y-z plane of the world.
+    """Return the five-link standing machine of Tables 1 and 2 of Yoo et al. 2004, which moves in the world's y-z plane.
 
     Each joint angle is relative to the previous link, the first to +y, counter-clockwise seen from +x.
 

@@ -47,9 +47,10 @@ class Frame(NamedTuple):
 
 
 def expression(value: Expression) -> Expression:
-    """Return a value as a CasADi matrix: itself if it is one, else a DM without its exact zeros; vectors become columns.
+    """Return a value as a CasADi matrix.
 
-    Lists, tuples and arrays with CasADi entries are stacked vertically, inner lists horizontally.
+    A CasADi matrix is returned unchanged; numbers become a DM without its exact zeros, vectors become columns. Lists,
+    tuples and arrays with CasADi entries are stacked vertically, inner lists horizontally.
 
     Raises:
         ModelError: Text, booleans, ragged lists, arrays of more than two dimensions.
