@@ -106,7 +106,7 @@ def on_scalars(function: _Callable) -> _Callable:
         called = ca.Function(function.__name__.strip("_"), symbols, list(parts)).call(mx_arguments)
         if not isinstance(result, tuple):
             return called[0]
-        return Frame(*called) if isinstance(result, Frame) else tuple(called)
+        return type(result)(*called) if hasattr(result, "_fields") else tuple(called)  # a NamedTuple such as Frame
 
     return cast(_Callable, wrapper)
 

@@ -359,13 +359,17 @@ def link_motions(
     return propagate_motions(robot, frames, axes, qd, qdd)
 
 
+@on_scalars
 def center_of_mass_motion(
     robot: Robot, q: Expression, qd: Expression, qdd: Expression, world_from_base: Placement | None = None
 ) -> CenterOfMassMotion:
     """Return the motion of the centre of mass; raise ModelError if the robot has no mass."""
     if checked_instance(robot, Robot, "kinematics", "robot").total_mass == 0:
         raise massless_error("hence no centre of mass")
-    return CenterOfMassMotion(*_center_of_mass_motion(robot, q, qd, qdd, world_from_base))
+    motions = link_motions(robot, q, qd, qdd, world_from_base)
+    weighted = [[link.mass * part for part in motions[link.name][:3]] for link in robot.links]
+    sums = (sum(parts, start=ca.DM(3, 1)) for parts in zip(*weighted, strict=True))
+    return CenterOfMassMotion(*(ca.densify(part / robot.total_mass) for part in sums))
 
 
 @on_scalars
@@ -403,20 +407,16 @@ def momentum_rate(
     It is the same about a point that moves with the centre of mass, whose velocity is parallel to the momentum.
     """
     frames, axes = frames_and_axes(robot, q, world_from_base)
-    rates = momentum_rates(robot, frames, propagate_motions(robot, frames, axes, qd, qdd))
+    motions = propagate_motions(robot, frames, axes, qd, qdd)
     place = checked_vector(about, 3, "about", "a point of the world")
-    total: Expression = sum(rates.values(), start=ca.DM(6, 1))
+    total: Expression = ca.DM(6, 1)
+    for link in robot.links:
+        motion, inertia = motions[link.name], inertia_in_world(link, frames)
+        spin = motion.angular_velocity
+        force = link.mass * motion.acceleration
+        moment = ca.mtimes(inertia, motion.angular_acceleration) + cross(spin, ca.mtimes(inertia, spin))
+        total = total + ca.vertcat(moment + cross(motion.center, force), force)
     return ca.densify(ca.vertcat(total[0:3] - cross(place, total[3:6]), total[3:6]))
-
-
-@on_scalars
-def _center_of_mass_motion(
-    robot: Robot, q: Expression, qd: Expression, qdd: Expression, world_from_base: Placement | None
-) -> tuple[Expression, ...]:
-    motions = link_motions(robot, q, qd, qdd, world_from_base)
-    weighted = [[link.mass * part for part in motions[link.name][:3]] for link in robot.links]
-    sums = (sum(parts, start=ca.DM(3, 1)) for parts in zip(*weighted, strict=True))
-    return tuple(ca.densify(part / robot.total_mass) for part in sums)
 
 
 def propagate_motions(
@@ -460,15 +460,3 @@ def inertia_in_world(link: Link, frames: dict[str, Frame]) -> Expression:
     """Return the rotational inertia about the centre of mass, world axes. Shape (3, 3)."""
     turn = frames[link.name].rotation
     return ca.mtimes([turn, ca.sparsify(ca.DM(link.inertia)), turn.T])
-
-
-def momentum_rates(robot: Robot, frames: dict[str, Frame], motions: dict[str, LinkMotion]) -> dict[str, Expression]:
-    """Return d/dt of each link's momentum about the world's origin, by link name. Shape (6, 1) each."""
-    rates = {}
-    for link in robot.links:
-        motion, inertia = motions[link.name], inertia_in_world(link, frames)
-        spin = motion.angular_velocity
-        force = link.mass * motion.acceleration
-        moment = ca.mtimes(inertia, motion.angular_acceleration) + cross(spin, ca.mtimes(inertia, spin))
-        rates[link.name] = ca.vertcat(moment + cross(motion.center, force), force)
-    return rates

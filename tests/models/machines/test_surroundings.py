@@ -204,7 +204,7 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     "a pair of one": ({"ignored": ["link2"]}, "ignored"),
     "an unknown obstacle": ({"ignored": [("link2", "obstacle 7")]}, "obstacle 7"),
     "obstacles in a word": ({"obstacles": "box"}, "obstacles"),
-    "a box without ends": ({"obstacles": [Box((np.inf, 1, 1), (5, 5, 5))]}, r"obstacles\[0\] is a box without ends"),
+    "a box without ends": ({"obstacles": [Box((np.inf, 1, 1), (5, 5, 5))]}, r"obstacles\[0\] is an infinite box"),
 }
 
 
