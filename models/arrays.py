@@ -227,26 +227,23 @@ def warn_of_degrees(angles: ArrayInput, owner: str, name: str, argument: str) ->
     Warns:
         ModelWarning: With the `name` of a joint or argument, and the angle.
     """
-    limit = 4 * np.pi
-    angle = _first_between(angles, limit, 1e4)  # larger values stand for no limit
-    if angle is not None:
-        message = f"{owner}: {argument} {angle:g} rad is more than two turns; angles are in rad, is it in degrees?"
-        warn(ModelWarning(message, name=name, value=angle, limit=limit), stacklevel=1)
+    words = "rad is more than two turns; angles are in rad, is it in degrees?"
+    _warn_of_unit(angles, (4 * np.pi, 1e4), name, f"{owner}: {argument}", words)
 
 
 def warn_of_millimetres(lengths: ArrayInput, owner: str, name: str, argument: str) -> None:
     """Warn if a length (m) exceeds 50 m and so looks like millimetres, as warn_of_degrees does for angles."""
-    limit = 50.0  # m: no part of an arm is longer
-    length = _first_between(lengths, limit, np.inf)
-    if length is not None:
-        message = f"{owner}: {argument} {length:g} m is long for a robot; lengths are in m, is it in millimetres?"
-        warn(ModelWarning(message, name=name, value=length, limit=limit), stacklevel=1)
+    words = "m is long for a robot; lengths are in m, is it in millimetres?"
+    _warn_of_unit(lengths, (50.0, np.inf), name, f"{owner}: {argument}", words)
 
 
-def _first_between(values: ArrayInput, low: float, high: float) -> float | None:
-    """Return the first entry with low < |entry| < high, or None."""
-    entries = np.ravel(values).tolist()  # faster than NumPy for few entries
-    return next((entry for entry in entries if low < abs(entry) < high), None)
+def _warn_of_unit(values: ArrayInput, suspicious: tuple[float, float], name: str, owner: str, words: str) -> None:
+    """Warn of the first entry whose magnitude is between two bounds."""
+    low, high = suspicious
+    for value in np.ravel(values).tolist():  # faster than array operations on few entries
+        if low < abs(value) < high:
+            warn(ModelWarning(f"{owner} {value:g} {words}", name=name, value=value, limit=low), stacklevel=2)
+            return
 
 
 def checked_rotation(value: ArrayInput, owner: str, argument: str) -> Array:

@@ -279,9 +279,8 @@ def solve_spd(matrix: Expression, right: Expression) -> Expression:
     L D L' elimination without pivoting or square roots, meant for n <= 7; only the lower triangle is read.
     An indefinite matrix is not detected, and a singular one gives inf or nan.
 
-    Instructions of the SX function of a dense matrix with one right-hand side, against ca.solve: n = 2: 16
-    (20), 3: 38 (77), 4: 72 (200), 6: 184 (588), 7: 266 (896); with seven right-hand sides n = 6 takes 652
-    (1272).
+    Instructions of the SX function of a dense matrix with one right-hand side, against ca.solve: n = 2: 16 (20), 3: 38
+    (77), 4: 72 (200), 6: 184 (588), 7: 266 (896); with seven right-hand sides n = 6 takes 652 (1272).
     """
     matrix, right = expression(matrix), expression(right)
     size = matrix.shape[0]

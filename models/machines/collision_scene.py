@@ -92,7 +92,7 @@ class CollisionScene:
     left: dict[tuple[str, str], Reason] = field(init=False, repr=False)
     _parts: RigidParts = field(init=False, repr=False)
     _carriers: tuple[str, ...] = field(init=False, repr=False)
-    _held: dict[int, tuple[tuple[int, int], ...]] = field(init=False, repr=False)
+    _cover_pairs: dict[int, tuple[tuple[int, int], ...]] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         single = isinstance(self.obstacles, (*KINDS, MovingObstacle))
@@ -154,10 +154,13 @@ class CollisionScene:
         """Set the shapes of links, obstacles and hulls of meshes with their frames, and the checked pairs."""
         close = self._close_meshes(own, checked)
         covered = {pair for pairs in close.values() for pair in pairs}
-        frames = dict.fromkeys([body.link for body in own] + [self._reference_link(own[i], own[j]) for i, j in checked])
+        links = [body.link for body in own]
+        frames = dict.fromkeys(links + [self._reference_link(own[i], own[j]) for i, j in checked])
         indices = {link: k for k, link in enumerate(frames)}
-        named = zip(_body_names(own), own, strict=True)
-        bodies = [PlacedShape(name, body.shape, indices[body.link]) for name, body in named]
+        bodies = []
+        for k, (link, body) in enumerate(zip(links, own, strict=True)):
+            name = link if links.count(link) == 1 else f"{link}/{links[:k].count(link) + 1}"
+            bodies.append(PlacedShape(name, body.shape, indices[link]))
         moving = 0
         for number, obstacle in enumerate(self.obstacles):
             if isinstance(obstacle, MovingObstacle):
@@ -185,7 +188,7 @@ class CollisionScene:
         object.__setattr__(self, "bodies", tuple(bodies))
         object.__setattr__(self, "pairs", np.array(pairs, dtype=int).reshape(-1, 3))
         object.__setattr__(self, "covers", covers)
-        object.__setattr__(self, "_held", cover_pairs)
+        object.__setattr__(self, "_cover_pairs", cover_pairs)
 
     def _reference_link(self, first: Body, second: Body) -> str:
         """Return the last link that carries both bodies."""
@@ -211,7 +214,7 @@ class CollisionScene:
     @property
     def assumed(self) -> dict[str, str]:
         """Reason by pair of links, "A and B", for pairs that are excluded by assumption, without proof."""
-        checked_by_hull = {frozenset(self.pair_names(pair)) for pair in self._held}
+        checked_by_hull = {frozenset(self.pair_names(pair)) for pair in self._cover_pairs}
         return {
             " and ".join(pair): reason.value
             for pair, reason in self.left.items()
@@ -270,7 +273,7 @@ class CollisionScene:
 
         distances = []
         for pair in indices:
-            gaps = [pair_distance(*bodies) for bodies in self._held.get(pair, (self.pairs[pair, :2].tolist(),))]
+            gaps = [pair_distance(*bodies) for bodies in self._cover_pairs.get(pair, (self.pairs[pair, :2].tolist(),))]
             distances.append(gaps[0] if len(gaps) == 1 else soft_minimum(gaps, rounding / 4 + MIN_SOFTNESS_M))
         return ca.vertcat(*distances) if distances else expression(q)[:0]
 
@@ -285,7 +288,7 @@ class CollisionScene:
         Args, Raises: As in `distances`.
         """
         indices, rounding = self._checked_request(pairs, rounding)
-        groups = [self._held.get(pair, (tuple(self.pairs[pair, :2].tolist()),)) for pair in indices]
+        groups = [self._cover_pairs.get(pair, (tuple(self.pairs[pair, :2].tolist()),)) for pair in indices]
         softness = rounding / 4 + MIN_SOFTNESS_M
         return distance_gradients(self.machine, self.bodies, self._carriers, self._moving, groups, rounding, softness)
 
@@ -385,12 +388,6 @@ class CollisionScene:
         return levers
 
 
-def _body_names(bodies: Sequence[Body]) -> list[str]:
-    """Return the names of bodies: of their links, with a number if a link has several."""
-    links = [body.link for body in bodies]
-    return [link if links.count(link) == 1 else f"{link}/{links[:k].count(link) + 1}" for k, link in enumerate(links)]
-
-
 def _by_mesh(robot: Robot, bodies: Sequence[Body]) -> dict[tuple[str, int], tuple[Body, ...]]:
     """Return the bodies that cover each mesh, by its link and its index among the link's collision shapes."""
     covers: dict[tuple[str, int], tuple[Body, ...]] = {
@@ -405,10 +402,10 @@ def _by_mesh(robot: Robot, bodies: Sequence[Body]) -> dict[tuple[str, int], tupl
     return covers
 
 
-def _checked_list(values: Any, what: str) -> tuple[Any, ...]:
+def _checked_list(values: Any, argument: str) -> tuple[Any, ...]:
     if not isinstance(values, list | tuple) or len(values) > INPUT_LIMITS.count:
-        message = f"scene: {what} must be a list of at most {INPUT_LIMITS.count}, not {repr(values)[:80]}"
-        raise ModelError(message, name=what, value=values, limit=INPUT_LIMITS.count)
+        message = f"scene: {argument} must be a list of at most {INPUT_LIMITS.count}, not {repr(values)[:80]}"
+        raise ModelError(message, name=argument, value=values, limit=INPUT_LIMITS.count)
     return tuple(values)
 
 

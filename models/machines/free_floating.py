@@ -4,12 +4,11 @@ The base moves so that E1 x1' + E2 x2' = 0 (24), with x1' the base twist and x2'
 moves with F1 x1' + F2 x2' = G x2', G = F2 - F1 E1^-1 E2 being the generalized Jacobian (25). A non-zero momentum
 adds the twist of the whole machine as one rigid body: both become affine in the joint rates.
 
-The base motion is computed about the centre of mass of the machine, where linear and angular momentum decouple,
-and in the axes of the base, where nothing depends on the base's own pose. So only one rotational inertia, of size 3
-(1 if planar), is inverted instead of E1 of size 6 (3). Instructions of the SX function of G, against
-the same through solve_spd(E1, E2) and ca.solve(E1, E2): spatial base and seven joints 1721 (3451, 4191), the
-paper's planar example 177 (337, 389); of the base twist for given joint rates 1230 (2532, 3056) and 127 (240,
-292).
+The base motion is computed about the centre of mass of the machine, where linear and angular momentum decouple, and in
+the axes of the base, where nothing depends on the base's own pose. So only one rotational inertia, of size 3 (1 if
+planar), is inverted instead of E1 of size 6 (3). Instructions of the SX function of G, against the same through
+solve_spd(E1, E2) and ca.solve(E1, E2): spatial base and seven joints 1721 (3451, 4191), the paper's planar example 177
+(337, 389); of the base twist for given joint rates 1230 (2532, 3056) and 127 (240, 292).
 
 A machine in which some base motion carries no momentum is rejected.
 """
@@ -180,9 +179,8 @@ class FreeFloating:
         """Return E1 and E2 of (24): momentum = E1 base_twist + E2 joint_rates.
 
         Returns:
-            E1 of shape (6, 6), E2 of shape (6, joint_size), rows (moment of momentum about the world's
-            origin, linear momentum), world axes; (3, 3) and (3, joint_size) with the rows (Lz, Px, Py) for a
-            planar base.
+            E1 of shape (6, 6), E2 of shape (6, joint_size), rows (moment of momentum about the world's origin, linear
+            momentum), world axes; (3, 3) and (3, joint_size) with the rows (Lz, Px, Py) for a planar base.
         """
         to_world = force_transform(self.world_from_base(base))
         turn = motion_transform((self.world_from_base(base).rotation, ca.DM(3, 1)))

@@ -73,8 +73,8 @@ def distance_gradients(
     gaps = [distance(a.shape, b.shape, frames[a.frame], frames[b.frame], rounding=rounding) for a, b in general_pairs]
     general_gaps = ca.vertcat(ca.SX(0, 1), *gaps)
     sides = [
-        [ca.vertcat(*(column(bodies[body].shape, frames[bodies[body].frame]).T for body in some)) for some in own.T]
-        for own in (pairs[members] for members in batches.values())
+        [ca.vertcat(*(column(bodies[k].shape, frames[bodies[k].frame]).T for k in side)) for side in pairs[members].T]
+        for members in batches.values()
     ]
     general_gradients = ca.jacobian(general_gaps, ca.vertcat(base, q))
     parts = ca.cse([ca.SX(screws), general_gaps, general_gradients, *(side for both in sides for side in both)])

@@ -62,13 +62,13 @@ class Scara:
     names: tuple[str, str, str, str] = ("shoulder", "elbow", "quill", "wrist")
 
     def __post_init__(self) -> None:
-        for what in ("upper_arm", "forearm"):
-            length = checked_number(getattr(self, what), "scara", what, positive=True, unit="m")
-            object.__setattr__(self, what, length)
-            warn_of_millimetres(length, "scara", what, what)
+        for field in ("upper_arm", "forearm"):
+            length = checked_number(getattr(self, field), "scara", field, positive=True, unit="m")
+            object.__setattr__(self, field, length)
+            warn_of_millimetres(length, "scara", field, field)
         object.__setattr__(self, "mount", checked_array(self.mount, (3,), "scara", "mount"))
-        for what in ("lower", "upper"):
-            object.__setattr__(self, what, checked_array(getattr(self, what), (4,), "scara", what, finite=False))
+        for field in ("lower", "upper"):
+            object.__setattr__(self, field, checked_array(getattr(self, field), (4,), "scara", field, finite=False))
         names = () if isinstance(self.names, str) else checked_each(self.names, str, "scara", "names")
         if len(set(names) - {""}) != 4 or len(names) != 4:
             message = f"scara: joint names {list(self.names)} must be four that differ"
@@ -77,7 +77,6 @@ class Scara:
             if low > high or low == np.inf or high == -np.inf:
                 message = f"scara: joint {name!r} has limits {low:g} .. {high:g}, which leave it no position"
                 raise ModelError(message, name=name, value=low, limit=high)
-
         for joint, name in enumerate(self.names):
             if joint != QUILL:
                 warn_of_degrees((self.lower[joint], self.upper[joint]), "scara", name, f"limit of {name!r}")

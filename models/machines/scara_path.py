@@ -59,7 +59,11 @@ class ScaraPath:
         """Return the joints, with continuous angles, and their derivatives at arc lengths. Shape (M,), m."""
         s = self.path.checked_distance(distance)
         values = [np.array(v).T for v in self.rates.map(len(s))(*_poses(self.path, s))]
-        values[0] = _continuous(values[0], s, *self.table) + self.turns
+        table_s, table_q = self.table
+        for joint in ANGLES:  # make the angles continuous
+            reference = np.interp(s, table_s, table_q[:, joint])
+            values[0][:, joint] += FULL_TURN * np.round((reference - values[0][:, joint]) / FULL_TURN)
+        values[0] = values[0] + self.turns
         return JointsAlong(*values)
 
 
@@ -111,14 +115,6 @@ def _poses(path: SmoothPath, s: Array) -> list[Any]:
     yaw = 2 * np.arctan2(orientation.quaternion[:, 3], orientation.quaternion[:, 0])
     angular = (yaw, orientation.rate[:, 2], orientation.acceleration[:, 2], orientation.jerk[:, 2])
     return [ca.DM(np.column_stack([linear, angle]).T) for linear, angle in zip(position, angular, strict=True)]
-
-
-def _continuous(q: Array, s: Array, table_s: Array, table_q: Array) -> Array:
-    """Add whole turns to the angles so that they follow the table."""
-    for joint in ANGLES:
-        reference = np.interp(s, table_s, table_q[:, joint])
-        q[:, joint] += FULL_TURN * np.round((reference - q[:, joint]) / FULL_TURN)
-    return q
 
 
 def _turns(joints_along: ScaraPath) -> Array:

@@ -254,18 +254,14 @@ class Stance(FixedBase):
                 axes.
         """
         rng = np.random.default_rng(0)
-        first = next(iter(self.footholds))
         rows_of_feet = {}
         for name, foot in self.feet.items():
-            if name == first:
+            if name == next(iter(self.footholds)):
                 continue
             q = ca.SX.sym("q", self.joint_size)
-            jacobian = ca.Function(
-                "jacobian",
-                [q],
-                [frame_jacobian(self.bodies, q, foot.link, foot.translation, world_from_base=self.world_from_base())],
-            )
-            jacobians = [np.array(jacobian(rng.normal(size=self.joint_size))) for _ in range(SAMPLES)]
+            matrix = frame_jacobian(self.bodies, q, foot.link, foot.translation, self.world_from_base())
+            function = ca.Function("jacobian", [q], [matrix])
+            jacobians = [np.array(function(rng.normal(size=self.joint_size))) for _ in range(SAMPLES)]
             magnitudes = np.max([np.abs(sample).max(axis=1) for sample in jacobians], axis=0)
             rows = tuple(int(i) for i in np.flatnonzero(magnitudes > ROUNDING * magnitudes.max(initial=0.0)))
             ranks = [np.linalg.matrix_rank(sample[list(rows)], tol=ROUNDING * magnitudes.max()) for sample in jacobians]
@@ -378,8 +374,8 @@ class Stance(FixedBase):
         Shape (2, 1), m.
         """
         moment, force = ca.DM(3, 1), ca.DM(3, 1)
-        places = [np.asarray(self.footholds[name].position) for name in loads]
-        for place, load in zip(places, loads.values(), strict=True):
-            moment = moment + load[:3] + cross(ca.DM(place - [0.0, 0.0, places[0][2]]), load[3:])
+        positions = [np.asarray(self.footholds[name].position) for name in loads]
+        for position, load in zip(positions, loads.values(), strict=True):
+            moment = moment + load[:3] + cross(ca.DM(position - [0.0, 0.0, positions[0][2]]), load[3:])
             force = force + load[3:]
         return ca.vertcat(-moment[1], moment[0]) / force[2]

@@ -53,8 +53,8 @@ class MassMoments(NamedTuple):
 
     def momentum(self, angular: Expression, linear: Expression) -> tuple[Expression, Expression]:
         """Return (moment of momentum about the origin, linear momentum) for a common motion vector."""
-        turned = ca.mtimes(ca.tril2symm(self.second), angular)
-        return turned + cross(self.first, linear), self.mass * linear - cross(self.first, angular)
+        angular_momentum = ca.mtimes(ca.tril2symm(self.second), angular)
+        return angular_momentum + cross(self.first, linear), self.mass * linear - cross(self.first, angular)
 
     def spatial_inertia(self) -> Expression:
         """Return the spatial inertia about the origin. Shape (6, 6)."""

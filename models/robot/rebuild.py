@@ -135,14 +135,16 @@ def merge_robots(
     if not arms:
         raise ModelError(f"{owner}: no arms are given", name="arms", value=arms)
     mappings = {"links": links, "translations": translations, "rotations": rotations}
-    poses = [{} if places is None else checked_mapping(places, owner, what) for what, places in mappings.items()]
-    if unknown := [prefix for places in poses for prefix in places if prefix not in arms]:
+    poses = [
+        {} if mapping is None else checked_mapping(mapping, owner, argument) for argument, mapping in mappings.items()
+    ]
+    if unknown := [prefix for mapping in poses for prefix in mapping if prefix not in arms]:
         message = f"{owner}: {unknown} are no prefixes of the arms, which are {list(arms)}"
         raise ModelError(message, name=unknown[0], value=unknown, limit=tuple(arms))
     merged = base if isinstance(base, Robot) else Robot((checked_instance(base, Link, owner, "base"),), name=base.name)
     root, first = merged.root, next(iter(arms))
     for prefix, arm in arms.items():
-        carrier, shift, turn = (places.get(prefix) for places in poses)
+        carrier, shift, turn = (mapping.get(prefix) for mapping in poses)
         carrier, shift = root if carrier is None else carrier, np.zeros(3) if shift is None else shift
         checked_instance(arm, Robot, f"{owner}: {prefix!r}", "arm")
         merged = attach_tool(merged, arm, carrier, shift, turn, prefix=prefix, keep_tip=prefix != first)

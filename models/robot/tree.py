@@ -107,8 +107,7 @@ def reroot_tree(
     """Return the links and joints of the same tree with the link `new` as its root instead of `old`.
 
     Joints between the two are reversed. Every link keeps its frame, and every joint its name, its limits and the sign
-    of
-    its position: a moving joint J then carries a massless link "J_frame" at the joint's frame, to which the former
+    of its position: a moving joint J then carries a massless link "J_frame" at the joint's frame, to which the former
     parent is attached by a fixed joint "J_fixed". If parent and joint frame coincide, J carries the parent itself.
 
     Raises:

@@ -235,38 +235,38 @@ def parse_urdf(source: Source) -> ElementTree.Element:
             message = "source: an empty text cannot be read as URDF; give the XML or the path of a file"
             raise ModelError(message, name="source", value=source)
         if text.startswith("<"):
-            where = "the given text"
+            origin = "the given text"
         else:
             if not isinstance(source, str | os.PathLike):
                 message = f"a URDF source is a text or a path, not {type(source).__name__}"
                 raise ModelError(message, name="source", value=source)
-            where = f"file {os.fspath(source)!r}"
+            origin = f"file {os.fspath(source)!r}"
             data = read_regular(source, INPUT_LIMITS.description_bytes)
         tree = parse_xml(data)
     except ElementTree.ParseError as error:
         line, column = error.position
         reason = str(error).split(": line")[0]
         hint = f"; {XACRO}" if "unbound prefix" in reason and "xacro" in str(data) else ""
-        message = f"{where} is not well-formed XML: {reason}, line {line + lines_before}, column {column}{hint}"
-        raise ModelError(message, name=where, value=(line + lines_before, column)) from error
+        message = f"{origin} is not well-formed XML: {reason}, line {line + lines_before}, column {column}{hint}"
+        raise ModelError(message, name=origin, value=(line + lines_before, column)) from error
     except OSError as error:
-        message = f"{where} cannot be read: {error.strerror or error}; a URDF text begins with '<'"
-        raise ModelError(message, name=where, value=source) from error
+        message = f"{origin} cannot be read: {error.strerror or error}; a URDF text begins with '<'"
+        raise ModelError(message, name=origin, value=source) from error
     except ModelError:
         raise
     except (ValueError, LookupError) as error:
-        raise ModelError(f"{where} cannot be read: {error}", name=where, value=source) from error
+        raise ModelError(f"{origin} cannot be read: {error}", name=origin, value=source) from error
     namespace = tree.tag[: tree.tag.rfind("}") + 1]
     for element in tree.iter():
         if isinstance(element.tag, str):
             if "xacro" in element.tag:
                 tag = element.tag.rpartition("}")[2]
-                raise ModelError(f"{where} has the element <{tag}>: {XACRO}", name=tag, value=element.tag)
+                raise ModelError(f"{origin} has the element <{tag}>: {XACRO}", name=tag, value=element.tag)
             if namespace and element.tag.startswith(namespace):
                 element.tag = element.tag[len(namespace) :]
     if tree.tag != "robot":
-        message = f"{where} is not URDF: its root element is <{tree.tag}>, not <robot>"
-        raise ModelError(message, name=where, value=tree.tag, limit="robot")
+        message = f"{origin} is not URDF: its root element is <{tree.tag}>, not <robot>"
+        raise ModelError(message, name=origin, value=tree.tag, limit="robot")
     return tree
 
 
@@ -359,15 +359,14 @@ def _joint(element: ElementTree.Element) -> Joint:
         )
         raise ModelError(message, name="type", value=kind, limit=("fixed", *MOVING))
     parent, child = (text_of(child_of(element, role, owner), "link", owner) for role in ("parent", "child"))
-    shift, turn = origin_of(element, owner)
+    translation, rotation = origin_of(element, owner)
     if kind not in MOVING:
-        return Joint(name, "fixed", parent, child, shift, turn)
-    stated = _only(element, "axis", owner)
-    axis = np.array([1.0, 0.0, 0.0]) if stated is None else numbers_of(stated, "xyz", owner, 3)
+        return Joint(name, "fixed", parent, child, translation, rotation)
+    axis_element = _only(element, "axis", owner)
+    axis = np.array([1.0, 0.0, 0.0]) if axis_element is None else numbers_of(axis_element, "xyz", owner, 3)
     limits: dict[str, float] = {}
     if (limit := _only(element, "limit", owner)) is not None:
-        given = [key for key in ATTRIBUTES["limit"] if key in limit.attrib]
-        limits = {key: number_of(limit, key, owner) for key in given}
+        limits = {key: number_of(limit, key, owner) for key in ATTRIBUTES["limit"] if key in limit.attrib}
         if kind == "continuous":
             limits = {key: value for key, value in limits.items() if key in ("velocity", "effort")}
         elif "lower" in limits or "upper" in limits:
@@ -376,7 +375,7 @@ def _joint(element: ElementTree.Element) -> Joint:
     if (tie := _only(element, "mimic", owner)) is not None:
         numbers = {key: number_of(tie, key, owner) for key in ("multiplier", "offset") if key in tie.attrib}
         mimic = Mimic(text_of(tie, "joint", owner), **numbers)
-    return Joint(name, MOVING[kind], parent, child, shift, turn, axis, mimic=mimic, **limits)
+    return Joint(name, MOVING[kind], parent, child, translation, rotation, axis, mimic=mimic, **limits)
 
 
 def _unknown_attributes(owner: ElementTree.Element) -> list[str]:
@@ -388,18 +387,18 @@ def _unknown_attributes(owner: ElementTree.Element) -> list[str]:
         ModelError: An unknown attribute that resembles a missing one, or nearly equals a known one: a misspelling.
     """
     unknown = []
-    parts = [part for path in ("inertial", "collision", "collision/geometry") for part in owner.findall(path)]
-    for element in (each for part in (owner, *parts) for each in part):
+    parents = [part for path in ("inertial", "collision", "collision/geometry") for part in owner.findall(path)]
+    for element in (each for part in (owner, *parents) for each in part):
         known = ATTRIBUTES.get(element.tag, ())
         missing = [word for word in known if word not in element.attrib]
         for key in [key for key in element.attrib if known and key not in known and "}" not in key]:
-            where = f"{owner.tag} {name_of(owner)!r}: {key}={element.get(key)!r} of <{element.tag}>"
+            place = f"{owner.tag} {name_of(owner)!r}: {key}={element.get(key)!r} of <{element.tag}>"
             word = key.casefold()
             # stricter if the known attribute is present too: `iyx` besides `ixy` is no misspelling
             if similar := get_close_matches(word, missing, 1) or get_close_matches(word, known, 1, 0.8):
-                message = f"{where} is no attribute of URDF; did you mean {similar[0]!r}?"
+                message = f"{place} is no attribute of URDF; did you mean {similar[0]!r}?"
                 raise ModelError(message, name=key, value=element.get(key), limit=known)
-            unknown += [where] if missing else []
+            unknown += [place] if missing else []
     return unknown
 
 
@@ -422,11 +421,11 @@ def origin_of(element: ElementTree.Element, owner: str) -> tuple[Array, Array]:
 
 def _only(element: ElementTree.Element, tag: str, owner: str) -> ElementTree.Element | None:
     """Return the only child with a tag, or None; raise ModelError naming `owner` if there are several."""
-    found = element.findall(tag)
-    if len(found) > 1:
-        message = f"{owner} has {len(found)} <{tag}> elements in <{element.tag}>; it takes one at most"
-        raise ModelError(message, name=tag, value=len(found), limit=1)
-    return found[0] if found else None
+    children = element.findall(tag)
+    if len(children) > 1:
+        message = f"{owner} has {len(children)} <{tag}> elements in <{element.tag}>; it takes one at most"
+        raise ModelError(message, name=tag, value=len(children), limit=1)
+    return children[0] if children else None
 
 
 def name_of(element: ElementTree.Element) -> str:

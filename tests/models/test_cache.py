@@ -1,4 +1,4 @@
-"""The cache: what others own or may write is not used, and what is not whole or of another key is not believed."""
+"""The cache ignores files that others own or may write, and files that are damaged or of another key."""
 
 from __future__ import annotations
 

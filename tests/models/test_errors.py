@@ -1,4 +1,4 @@
-"""What the exceptions of the models carry, and what the checks of arguments say."""
+"""Fields of the models' exceptions, and messages of the argument checks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Standing machines, spatial ones among them, and random motions of them."""
+"""Standing machines, including spatial ones, and random motions of them."""
 
 from __future__ import annotations
 

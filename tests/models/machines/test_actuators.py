@@ -1,4 +1,4 @@
-"""Wheels: momentum and accelerations as MuJoCo has them."""
+"""Reaction wheels: momentum and accelerations against MuJoCo."""
 
 from __future__ import annotations
 

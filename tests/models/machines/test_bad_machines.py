@@ -1,4 +1,4 @@
-"""Whatever is wrong with a machine, or with what is asked of it, is refused by name."""
+"""Every invalid machine or argument is refused by name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The support of a robot, from the collision shapes of its description."""
+"""Support polygons computed from the collision shapes of robot descriptions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Stances: whatever link a robot is rooted at it moves the same, and its feet bear what Newton and Euler say."""
+"""Stances: motion does not depend on the root link, and the loads of the feet satisfy Newton-Euler."""
 
 from __future__ import annotations
 

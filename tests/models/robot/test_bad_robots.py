@@ -1,4 +1,4 @@
-"""Whatever is wrong with a robot, its parts or what is asked of it is refused by name."""
+"""Every invalid robot, part or argument is refused by name."""
 
 from __future__ import annotations
 

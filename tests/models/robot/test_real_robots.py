@@ -1,4 +1,4 @@
-"""Robots of other people's URDF files: what this library says of them is what Pinocchio says."""
+"""Robots of public URDF files agree with Pinocchio."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Joints that follow others: a robot with them is one without them, restricted to where the ties let it be."""
+"""Followers: a robot with mimic joints is the robot without them, restricted by the couplings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Obstacles that move: look-up tables are what casadi makes of them, and what is no table is named."""
+"""Moving obstacles: look-up tables agree with CasADi's, and other functions are refused by name."""
 
 from __future__ import annotations
 
