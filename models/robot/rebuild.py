@@ -55,6 +55,7 @@ def with_load(
     link: str,
     mass: float,
     center_of_mass: ArrayInput = (0.0, 0.0, 0.0),
+    *,
     inertia: ArrayInput | None = None,
 ) -> Robot:
     """Merge a rigid body into a link.
@@ -79,8 +80,8 @@ def attach_tool(
     tool: Robot | Link,
     link: str | None = None,
     translation: ArrayInput = (0.0, 0.0, 0.0),
-    rotation: ArrayInput | None = None,
     *,
+    rotation: ArrayInput | None = None,
     prefix: str = "",
     keep_tip: bool = False,
 ) -> Robot:
@@ -147,7 +148,7 @@ def merge_robots(
         carrier, shift, turn = (mapping.get(prefix) for mapping in poses)
         carrier, shift = root if carrier is None else carrier, np.zeros(3) if shift is None else shift
         checked_instance(arm, Robot, f"{owner}: {prefix!r}", "arm")
-        merged = attach_tool(merged, arm, carrier, shift, turn, prefix=prefix, keep_tip=prefix != first)
+        merged = attach_tool(merged, arm, carrier, shift, rotation=turn, prefix=prefix, keep_tip=prefix != first)
     return merged
 
 

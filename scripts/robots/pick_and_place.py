@@ -130,7 +130,7 @@ def carried() -> FixedBase:
     robot = arm().robot
     squares = np.square(SIZE)
     inertia = LOAD / 12 * np.diag(squares.sum() - squares)
-    return FixedBase(with_load(robot, robot.tip_link, LOAD, robot.tip_translation, inertia))
+    return FixedBase(with_load(robot, robot.tip_link, LOAD, robot.tip_translation, inertia=inertia))
 
 
 @cache

@@ -188,7 +188,7 @@ def test_an_attached_robot_moves_as_it_does_alone_on_a_moving_base(seed: int, si
     robot, tool = random_robot(rng, size, followers=True), random_robot(rng, more, followers=True)
     link = robot.links[int(rng.integers(len(robot.links)))].name
     turn, shift = random_frame(rng)
-    whole = attach_tool(robot, tool, link, shift, turn, prefix="tool_")
+    whole = attach_tool(robot, tool, link, shift, rotation=turn, prefix="tool_")
     q, own = rng.normal(size=robot.dof), rng.normal(size=tool.dof)
     together = np.concatenate([q, own])
     assert whole.joint_names == (*robot.joint_names, *(f"tool_{name}" for name in tool.joint_names))
@@ -201,7 +201,7 @@ def test_an_attached_robot_moves_as_it_does_alone_on_a_moving_base(seed: int, si
     np.testing.assert_allclose(matrix(tip_pose(whole, together)), matrix(tip), **NEAR)
     inertia = numeric(robot_inertia(robot, q)) + numeric(robot_inertia(tool, own, (carrier[:3, :3], carrier[:3, 3])))
     np.testing.assert_allclose(numeric(robot_inertia(whole, together)), inertia, **NEAR)
-    same = attach_tool(robot, tool, link, shift, turn, prefix="tool_", keep_tip=True)
+    same = attach_tool(robot, tool, link, shift, rotation=turn, prefix="tool_", keep_tip=True)
     np.testing.assert_allclose(matrix(tip_pose(same, together)), matrix(tip_pose(robot, q)), **NEAR)
 
 
@@ -224,7 +224,7 @@ def test_a_load_is_a_link_that_is_fixed(seed: int, size: int) -> None:
     robot = random_robot(rng, size, followers=True)
     link = robot.links[int(rng.integers(len(robot.links)))].name
     center, inertia = rng.normal(size=3), random_inertia(rng, 3.0)
-    loaded = with_load(robot, link, 3.0, center, inertia)
+    loaded = with_load(robot, link, 3.0, center, inertia=inertia)
     assert [each.name for each in loaded.links] == [each.name for each in robot.links]
     assert_same_dynamics(loaded, attach_tool(robot, Link("load", 3.0, center, inertia), link, keep_tip=True), seed)
 

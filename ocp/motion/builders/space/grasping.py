@@ -99,7 +99,7 @@ def joined(chaser: Robot, target: Robot) -> Robot:
     """
     turn = np.asarray(target.tip_rotation).T
     shift = -turn @ np.asarray(target.tip_translation)
-    return attach_tool(chaser, target, None, shift, turn, keep_tip=True)
+    return attach_tool(chaser, target, None, shift, rotation=turn, keep_tip=True)
 
 
 def checked_pair(chaser: Any, target: Any) -> Robot:
