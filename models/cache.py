@@ -102,16 +102,16 @@ def _unsafe(place: Path) -> str:
     """Return why other users could change files in a folder, or an empty string."""
     status, me = place.lstat(), os.geteuid()
     if not stat.S_ISDIR(status.st_mode):
-        return "it is a link or no folder; name another one, XDG_CACHE_HOME"
+        return "it is a link or not a folder; set XDG_CACHE_HOME to another folder"
     if status.st_uid != me:
-        return f"it belongs to the user {status.st_uid}; name a folder of your own, XDG_CACHE_HOME"
+        return f"it belongs to user {status.st_uid}; set XDG_CACHE_HOME to a folder of your own"
     if status.st_mode & 0o022:
-        return f"others may write it; empty it, then chmod 700 {place}"
+        return f"other users may write it; empty it, then chmod 700 {place}"
     for above in {*place.parents, *place.resolve().parents}:
         status = above.lstat()
         writable = status.st_mode & (stat.S_ISVTX | 0o002) == 0o002 and not stat.S_ISLNK(status.st_mode)
         if writable or status.st_uid not in (me, 0, os.stat("/").st_uid):
-            return f"others may change {above}; name a folder elsewhere, XDG_CACHE_HOME"
+            return f"other users may change {above}; set XDG_CACHE_HOME to a folder elsewhere"
     return ""
 
 

@@ -64,7 +64,7 @@ def test_a_folder_that_others_may_write_is_not_used(place: Path, mode: int, capl
             assert sorted(place.iterdir()) == sorted([value, library])
     assert cache.files() == []
     (record,) = caplog.records
-    assert "others may write it" in record.getMessage()
+    assert "other users may write it" in record.getMessage()
     assert str(place) in record.getMessage()
     place.chmod(0o700)
     assert cache.load_value(KEY) == [1.5]

@@ -194,7 +194,7 @@ ACTUATOR_CASES = [
             "prefix": but(NAME, "empty"),
         },
     ),
-    Case("wheels_of", find_wheels, {"robot": CHAIN}, {"robot": INSTANCE}),
+    Case("find_wheels", find_wheels, {"robot": CHAIN}, {"robot": INSTANCE}),
 ]
 STANDING_CASES = [
     Case(
