@@ -1,4 +1,4 @@
-"""What a machine is: symbolic kinematics, geometry and momentum. Knows nothing of problems or solvers."""
+"""Models of machines: symbolic kinematics, geometry and dynamics, independent of optimisation problems and solvers."""
 
 from models.cts.best_roll import optimal_inverse
 from models.cts.rig import Rig, Tunnel
@@ -6,7 +6,7 @@ from models.cts.table import solve_table
 from models.errors import ModelError, ModelWarning
 from models.machines.collision_scene import CollisionScene
 from models.machines.free_floating import FreeFloating
-from models.machines.machine import FixedBase, Machine, wheels_of, with_wheels
+from models.machines.machine import FixedBase, Machine, find_wheels, with_wheels
 from models.machines.moving_obstacle import MovingObstacle
 from models.machines.scara import Scara
 from models.machines.scara_path import scara_along
@@ -35,14 +35,14 @@ from models.robot.kinematics import (
 )
 from models.robot.parts import CollisionShape, Joint, Link, Mimic, VisualShape
 from models.robot.rebuild import (
-    attached,
-    locked,
-    merged,
-    pruned,
-    renamed,
-    rerooted,
-    retipped,
-    simplified,
+    add_prefix,
+    attach_tool,
+    lock_joints,
+    merge_robots,
+    move_tip,
+    prune,
+    reroot,
+    simplify,
     subtree,
     with_load,
 )
@@ -87,45 +87,45 @@ __all__ = [
     "Tunnel",
     "VisualShape",
     "Wrench",
-    "attached",
+    "add_prefix",
+    "attach_tool",
     "base_reaction",
     "center_of_mass",
     "center_of_mass_jacobian",
     "center_of_mass_motion",
     "centers_of_mass",
     "example_robot",
+    "find_wheels",
     "footprint",
     "frame_jacobian",
     "inverse_dynamics",
     "link_frames",
     "link_jacobians",
     "link_motions",
-    "locked",
+    "lock_joints",
     "mass_matrix",
-    "merged",
+    "merge_robots",
     "momentum",
     "momentum_matrix",
     "momentum_rate",
+    "move_tip",
     "optimal_inverse",
     "paper_example",
     "planar_chain",
-    "pruned",
+    "prune",
     "rectangle",
     "reference_rig",
     "reference_tunnel",
-    "renamed",
-    "rerooted",
-    "retipped",
+    "reroot",
     "robot_inertia",
     "scara_along",
-    "simplified",
+    "simplify",
     "smooth",
     "solve_table",
     "standing_example",
     "subtree",
     "tip_jacobian",
     "tip_pose",
-    "wheels_of",
     "with_load",
     "with_wheels",
 ]

@@ -1,11 +1,11 @@
-"""What is dear to compute and depends on nothing but its input, kept in files between runs.
+"""A disk cache of expensive results that depend on their input alone.
 
-The folder is $XDG_CACHE_HOME/selfmotion, else ~/.cache/selfmotion. Values lie there as KEY.json, behind a digest of the
-key, which names the code that made them, and of themselves; shared libraries as KEY.DIGEST.so. A file that cannot be
-read, is broken or cannot be written is no error: then the work is done again.
+The folder is $XDG_CACHE_HOME/selfmotion, else ~/.cache/selfmotion. A value is stored in KEY.json after a digest of the
+key and the value; the key includes the version of the code that computed it. A shared library is stored in
+KEY.DIGEST.so. Missing, damaged and unwritable files are not errors: the result is computed again.
 
-A digest says that a file is whole, not who wrote it. So nothing is kept in a folder, nor taken from a file, that
-somebody else owns or may write. What has been checked in such a folder cannot be changed before it is used.
+A digest proves that a file is complete, not who wrote it. So the cache uses only folders and files that this user owns
+and that nobody else may write.
 """
 
 from __future__ import annotations
@@ -31,32 +31,34 @@ import numpy as np
 
 from models.input_files import read_regular
 
-MOST_BYTES = 2**20  # of a value: ours have a few hundred
-MOST_KEPT = 2**28  # bytes of all libraries: the least recently used are removed
+MAX_VALUE_BYTES = 2**20
+MAX_LIBRARY_BYTES = 2**28
+"""Size of all libraries together, beyond which the least recently used are removed."""
 KINDS = (".json", ".so", ".lock", ".part")
 UNREADABLE = (OSError, ValueError, RuntimeError, RecursionError)
-"""What a file raises that is broken or not there; RuntimeError where there is no home."""
+"""Exceptions that a missing or damaged file raises; RuntimeError if the user has no home folder."""
 
 
-def key_of(version: str, *contents: Any) -> str:
-    """A name for arrays or texts and the version of what is done with them: hexadecimal digits of SHA-256.
+def cache_key(version: str, *contents: Any) -> str:
+    """Return a cache key for some contents, SHA-256 in hexadecimal digits.
 
     Args:
-        version: What is done with them; `version_of` the module that does it.
+        version: Version of the code that uses them, see `source_version`.
+        contents: Arrays or strings.
     """
     digest = hashlib.sha256(version.encode())
     for content in contents:
-        plain = np.frombuffer(content.encode(), np.uint8) if isinstance(content, str) else np.ascontiguousarray(content)
-        digest.update(f"|{plain.dtype.str}{plain.shape}|".encode())
-        digest.update(plain.tobytes())
+        data = np.frombuffer(content.encode(), np.uint8) if isinstance(content, str) else np.ascontiguousarray(content)
+        digest.update(f"|{data.dtype.str}{data.shape}|".encode())
+        digest.update(data.tobytes())
     return digest.hexdigest()
 
 
 @functools.cache
-def version_of(module: str) -> str:
-    """Hexadecimal digits that tell the source of a module, and of what it imports of its package, from any other.
+def source_version(module: str) -> str:
+    """Return a digest of a module's source and of all modules of its package that it imports, directly or not.
 
-    So that no change of what a value was made by is forgotten. Imports are those written `from PACKAGE... import`.
+    So any change of the code invalidates its cached values. Imports must be written `from PACKAGE... import`.
     """
     sources: dict[str, str] = {}
     waiting = [module]
@@ -70,75 +72,73 @@ def version_of(module: str) -> str:
     return hashlib.sha256(repr(sorted(sources.items())).encode()).hexdigest()
 
 
-def folder() -> Path:
-    """Where the files lie; it need not exist."""
-    given = os.environ.get("XDG_CACHE_HOME", "")
-    place = Path(given) if given and Path(given).is_absolute() else Path("~/.cache").expanduser()
-    return place / "selfmotion"
+def cache_folder() -> Path:
+    """Return the path of the cache folder; it need not exist."""
+    base = os.environ.get("XDG_CACHE_HOME", "")
+    return (Path(base) if Path(base).is_absolute() else Path("~/.cache").expanduser()) / "selfmotion"
 
 
-def own_folder(make: bool = False) -> Path:
-    """Return the folder; `make` it for this user alone where there is none.
+def private_folder(make: bool = False) -> Path:
+    """Return the cache folder after checking that only this user can change it.
+
+    Args:
+        make: Create the folder if it does not exist.
 
     Raises:
-        OSError: There is none, or others than this user and the system's owner may change what lies in it: the folder
-            belongs to somebody else, is a link or may be written by others, or a folder above may be.
-        RuntimeError: There is no home.
+        OSError: There is no folder, it is a link, or another user may change it or a folder above it.
+        RuntimeError: The user has no home folder.
     """
-    place = folder()
+    place = cache_folder()
     if make:
         place.mkdir(mode=0o700, parents=True, exist_ok=True)
-    why = _unsafe(place)
-    if why:
-        _notice(f"nothing is kept between runs in {place}: {why}")
-        raise PermissionError(errno.EPERM, why, str(place))
+    reason = _unsafe(place)
+    if reason:
+        _log_once(f"the cache in {place} is not used: {reason}")
+        raise PermissionError(errno.EPERM, reason, str(place))
     return place
 
 
 def _unsafe(place: Path) -> str:
-    """Why files in a folder may be changed by others; "" where they may not."""
+    """Return why other users could change files in a folder, or an empty string."""
     status, me = place.lstat(), os.geteuid()
     if not stat.S_ISDIR(status.st_mode):
-        return "it is a link or no folder; name another one, XDG_CACHE_HOME"
+        return "it is a link or not a folder; set XDG_CACHE_HOME to another folder"
     if status.st_uid != me:
-        return f"it belongs to the user {status.st_uid}; name a folder of your own, XDG_CACHE_HOME"
+        return f"it belongs to user {status.st_uid}; set XDG_CACHE_HOME to a folder of your own"
     if status.st_mode & 0o022:
-        return f"others may write it; empty it, then chmod 700 {place}"
+        return f"other users may write it; empty it, then chmod 700 {place}"
     for above in {*place.parents, *place.resolve().parents}:
         status = above.lstat()
         writable = status.st_mode & (stat.S_ISVTX | 0o002) == 0o002 and not stat.S_ISLNK(status.st_mode)
         if writable or status.st_uid not in (me, 0, os.stat("/").st_uid):
-            return f"others may change {above}; name a folder elsewhere, XDG_CACHE_HOME"
+            return f"other users may change {above}; set XDG_CACHE_HOME to a folder elsewhere"
     return ""
 
 
 @functools.cache
-def _notice(words: str) -> None:
-    logging.getLogger("models").warning(words)
+def _log_once(message: str) -> None:
+    logging.getLogger("models").warning(message)
 
 
 def files() -> list[Path]:
-    """All that is kept, and parts that were left by who was killed."""
+    """Return all cache files, including partial ones of interrupted writes."""
     try:
-        return sorted(file for file in own_folder().iterdir() if file.is_file() and file.suffix in KINDS)
+        return sorted(file for file in private_folder().iterdir() if file.is_file() and file.suffix in KINDS)
     except UNREADABLE:
         return []
 
 
-# ---- values ------------------------------------------------------------------------------------------------------
-
-
-def kept(key: str) -> Any:
-    """What was kept under a key: lists, dictionaries, texts, numbers; None where there is nothing or nothing whole."""
+def load_value(key: str) -> Any:
+    """Return the JSON value stored under a key, or None if there is none or it is damaged."""
     try:
-        digest, _, content = read_regular(own_folder() / f"{key}.json", MOST_BYTES, own=True).partition(b"\n")
+        digest, _, content = read_regular(private_folder() / f"{key}.json", MAX_VALUE_BYTES, own=True).partition(b"\n")
         return json.loads(content) if digest == _digest(key, content) else None
     except UNREADABLE:
         return None
 
 
-def keep(key: str, value: Any) -> None:
-    """Keep a value of JSON under a key; a file there is replaced as a whole."""
+def store_value(key: str, value: Any) -> None:
+    """Store a JSON value under a key, replacing the file atomically."""
     with suppress(*UNREADABLE):
         content = json.dumps(value).encode()
         _write(f"{key}.json", _digest(key, content) + b"\n" + content)
@@ -148,22 +148,19 @@ def _digest(key: str, content: bytes) -> bytes:
     return hashlib.sha256(key.encode() + b"\n" + content).hexdigest().encode()
 
 
-# ---- libraries ---------------------------------------------------------------------------------------------------
+def load_library(key: str) -> Path | None:
+    """Return the path of the shared library stored under a key and mark it as used, or None.
 
-
-def kept_library(key: str) -> Path | None:
-    """The shared library that was kept under a key, now the most recently used; None where there is none.
-
-    One that is damaged, or that somebody else owns or may write, is none; damaged ones are removed.
+    Damaged libraries are removed; those that another user owns or may write are ignored.
     """
     with suppress(*UNREADABLE):
-        place = own_folder()
+        place = private_folder()
         for name in os.listdir(place):
             if not (name.startswith(key) and name.endswith(".so")):
                 continue
             file = place / name
             with suppress(*UNREADABLE):
-                if file.name == _name(key, read_regular(file, MOST_KEPT, own=True)):
+                if file.name == _library_name(key, read_regular(file, MAX_LIBRARY_BYTES, own=True)):
                     with suppress(OSError):
                         os.utime(file)
                     return file
@@ -171,42 +168,43 @@ def kept_library(key: str) -> Path | None:
     return None
 
 
-def keep_library(key: str, library: bytes) -> Path | None:
-    """Keep a shared library under a key and say where it is; None where nothing can be written."""
+def store_library(key: str, library: bytes) -> Path | None:
+    """Store a shared library under a key and return its path, or None if it cannot be written."""
     with suppress(*UNREADABLE):
-        file = _write(_name(key, library), library)
-        _make_room(file)
+        file = _write(_library_name(key, library), library)
+        _evict(file)
         return file
     return None
 
 
 @contextmanager
-def alone(key: str, ask: Callable[[], Any] = lambda: None) -> Iterator[None]:
-    """Inside, no other process or thread is at work on a key; where the folder takes no locks, without.
+def exclusive(key: str, ask: Callable[[], Any] = lambda: None) -> Iterator[None]:
+    """Hold the lock of a key, so that no other process or thread works on it; do nothing if the folder has no locks.
 
-    While another one is waited for, ``ask`` is called every 20 ms, to raise where there is no time for it.
+    Args:
+        ask: Called every 20 ms while waiting. It may raise to stop waiting.
     """
     lock = None
     with suppress(*UNREADABLE):
-        lock = _locked(own_folder(make=True) / f"{key}.lock", ask)
+        lock = _open_locked(private_folder(make=True) / f"{key}.lock", ask)
     try:
         yield
     finally:
         if lock is not None:
             with lock, suppress(OSError):
                 os.unlink(lock.name)
-                fcntl.flock(lock, fcntl.LOCK_UN)  # or it would last as long as a process forked meanwhile
+                fcntl.flock(lock, fcntl.LOCK_UN)  # else a process forked meanwhile would keep the lock
 
 
-def _locked(file: Path, ask: Callable[[], Any]) -> IO[bytes]:
-    """A file that is made, if need be, and locked."""
+def _open_locked(file: Path, ask: Callable[[], Any]) -> IO[bytes]:
+    """Open a file, creating it if necessary, and lock it."""
     while True:
         stream = open(file, "ab")  # noqa: SIM115
         try:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if os.path.samestat(os.stat(file), os.fstat(stream.fileno())):
                 return stream
-        except (BlockingIOError, FileNotFoundError):  # another's, or removed by who had it
+        except (BlockingIOError, FileNotFoundError):  # locked by another process, or removed by its last owner
             pass
         except BaseException:
             stream.close()
@@ -216,27 +214,24 @@ def _locked(file: Path, ask: Callable[[], Any]) -> IO[bytes]:
         time.sleep(0.02)
 
 
-def _name(key: str, library: bytes) -> str:
+def _library_name(key: str, library: bytes) -> str:
     return f"{key}.{hashlib.sha256(library).hexdigest()[:16]}.so"
 
 
-def _make_room(newest: Path) -> None:
-    """Remove the libraries that were not used for longest, until the others and the newest are MOST_KEPT at most.
-
-    And the locks of processes that are no more.
-    """
+def _evict(newest: Path) -> None:
+    """Remove locks of dead processes, and the least recently used libraries until all fit MAX_LIBRARY_BYTES."""
     for lock in newest.parent.glob("*.lock"):
         with suppress(OSError), open(lock, "rb") as stream:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises while somebody has it
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises while the lock is in use
             lock.unlink()
-    found = []
+    libraries = []
     for file in newest.parent.glob("*.so"):
         with suppress(OSError):
             status = file.stat()
-            found.append((file == newest, status.st_mtime, status.st_size, file))
-    total = sum(size for _, _, size, _ in found)
-    for is_newest, _, size, file in sorted(found):
-        if total <= MOST_KEPT or is_newest:
+            libraries.append((file == newest, status.st_mtime, status.st_size, file))
+    total = sum(size for _, _, size, _ in libraries)
+    for is_newest, _, size, file in sorted(libraries):
+        if total <= MAX_LIBRARY_BYTES or is_newest:
             break
         with suppress(OSError):
             file.unlink()
@@ -244,8 +239,8 @@ def _make_room(newest: Path) -> None:
 
 
 def _write(name: str, content: bytes) -> Path:
-    """Write a file of the folder whole or not at all."""
-    place = own_folder(make=True)
+    """Write a file of the folder atomically."""
+    place = private_folder(make=True)
     part = None
     try:
         with NamedTemporaryFile("wb", dir=place, suffix=".part", delete=False) as file:

@@ -1,4 +1,4 @@
-"""The exception and the warning of the package, in a room of their own below all others, which all may raise them."""
+"""The exception and the warning that the whole package raises."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ from typing import Any
 
 
 class ModelError(ValueError):
-    """A machine that cannot exist or a request that does not fit it.
+    """An impossible machine, or an argument that does not fit it.
 
-    The message names the offending link, joint or argument, its value, and what to do about it.
+    The message names the offending link, joint or argument, its value, and the remedy.
 
     Attributes:
-        name: Of the link, joint or argument; None where the message names none.
-        value: What it was, or is by the model; None where the message says none.
-        limit: What the value breaks: a bound, a pair of bounds, a shape, the values to choose from.
-        time: When, s.
+        name: Name of the link, joint or argument, or None.
+        value: The offending value, or None.
+        limit: What the value violates: a bound, a pair of bounds, a shape or the allowed choices.
+        time: Time at which it does, s, or None.
     """
 
     def __init__(
@@ -25,10 +25,10 @@ class ModelError(ValueError):
 
 
 class ModelWarning(UserWarning):
-    """Something odd in what describes a machine, which can be worked with; the message names where it is.
+    """A suspicious but usable description of a machine; the message says where.
 
     Attributes:
-        name, value, limit: As of ModelError; each None where there is none, or where several are named.
+        name, value, limit: As in ModelError; each None if there is none, or if the warning concerns several.
     """
 
     def __init__(self, message: str = "", *, name: str | None = None, value: Any = None, limit: Any = None) -> None:

@@ -1,6 +1,6 @@
-"""Input files from anybody: regular files alone, none beyond a limit, and XML without entities.
+"""Safe reading of untrusted input files: regular files only, bounded size, XML without entities.
 
-A pipe would be waited for, a device read without end, and a file of another kind may do something when it is opened.
+Opening a pipe would block, a device can be read without end, and opening other special files may have side effects.
 """
 
 from __future__ import annotations
@@ -17,25 +17,26 @@ __all__ = ["INPUT_LIMITS", "InputLimits", "UnfitFile", "open_regular", "parse_xm
 
 @dataclass(frozen=True)
 class InputLimits:
-    """Limits of the input that is read: several times the largest that is known, and small enough for the memory.
+    """Limits on input: several times the largest known files, and small enough for the available memory.
 
     Attributes:
-        count: Of what a user counts, nodes say: more take longer than anybody waits.
-        array_entries: Of one array that a user gives.
-        name_characters: Of the name of a link or joint.
-        description_bytes: Of URDF and SRDF: the largest public ones have 1 MB.
-        xml_elements: Elements and attributes of a document: each takes some 200 bytes of memory.
-        mesh_bytes, mesh_text_bytes: Of a mesh; numbers in a text take several times their bytes while they are read.
-        mesh_triangles: After all instances in a scene are placed.
-        scene_nodes: Of a Collada scene, each counted as often as it is borrowed.
-        text_bytes, text_lines, line_characters: Of waypoints, trajectories and G-code: a path takes 1 or 2 kB a line.
-        number_characters: Of a number of G-code.
-        task_bytes: Of a task or obstacle file.
-        nesting: Containers within containers, nodes within nodes, parts of a name.
-        tree_values: Values and keys of a JSON or YAML file.
-        log_bytes: Of an MCAP file, and of all that it unpacks to.
-        log_record_bytes: Of a record or chunk of it, unpacked.
-        log_message_bytes: Of all its messages of joints, which take five times as much memory.
+        count: Any number that a user chooses, such as a number of nodes; larger values would run too long.
+        array_entries: Entries of one array.
+        name_characters: Characters of a link or joint name.
+        description_bytes: Bytes of a URDF or SRDF file. The largest public ones have 1 MB.
+        xml_elements: Elements plus attributes of an XML document. Each takes about 200 bytes of memory.
+        mesh_bytes, mesh_text_bytes: Bytes of a binary and a text mesh file. Parsing text takes several times its size.
+        mesh_triangles: Triangles of a scene after all instances are placed.
+        scene_nodes: Nodes of a Collada scene, counted once per instance.
+        text_bytes, text_lines, line_characters: Size of waypoint, trajectory and G-code files. A path takes 1 or 2 kB a
+            line.
+        number_characters: Characters of a G-code number.
+        task_bytes: Bytes of a task or obstacle file.
+        nesting: Depth of nested containers, nodes and dotted names.
+        tree_values: Values plus keys of a JSON or YAML file.
+        log_bytes: Bytes of an MCAP file, also after decompression.
+        log_record_bytes: Bytes of a decompressed MCAP record or chunk.
+        log_message_bytes: Bytes of all joint messages of a log, which take five times as much memory.
     """
 
     count: int = 100_000
@@ -63,10 +64,11 @@ INPUT_LIMITS = InputLimits()
 
 
 class UnfitFile(OSError):
-    """A file that is not read: it is not a regular file, is too large, or is not the user's own.
+    """A file that is not read: it is not a regular file, is too large, or is not owned by the user.
 
     Attributes:
-        value: The size in bytes of a file that is too large, else None. limit: The largest size that is read.
+        value: Size of a file that is too large, bytes; else None.
+        limit: Largest size that is read, bytes; else None.
     """
 
     value: int | None = None
@@ -76,16 +78,16 @@ class UnfitFile(OSError):
 def open_regular(path: str | os.PathLike[str], most: int, own: bool = False, links: bool = True) -> BufferedReader:
     """Open a regular file of at most `most` bytes for reading.
 
-    The file is looked at before it is opened, as opening a device may already do something. It is looked at again when
-    it is open, as it may have been replaced meanwhile, and opening waits for nothing.
+    The file is checked before opening, because opening a device may have side effects, and again afterwards, because it
+    may have been replaced meanwhile. Opening never blocks.
 
     Args:
-        own: Whether only a file is opened that belongs to this user, that nobody else may write, and that is no link.
-        links: Whether a link is followed.
+        own: Open only a file that belongs to this user, that nobody else may write, and that is not a link.
+        links: Follow symbolic links.
 
     Raises:
-        UnfitFile: It is a folder, a pipe, a socket or a device, is larger, or is not the user's own.
-        OSError, ValueError: It cannot be opened.
+        UnfitFile: A folder, pipe, socket or device, a file that is too large, or one that is not the user's own.
+        OSError, ValueError: The file cannot be opened.
     """
     name = os.fspath(path)
     follows = links and not own
@@ -103,12 +105,12 @@ def open_regular(path: str | os.PathLike[str], most: int, own: bool = False, lin
 def read_regular(path: str | os.PathLike[str], most: int, own: bool = False) -> bytes:
     """Return the contents of a regular file of at most `most` bytes; arguments and errors are those of `open_regular`.
 
-    A file that grows while it is read, or whose size the system does not know, is held to the same limit.
+    The limit also holds for a file that grows while it is read, and for one of unknown size.
     """
     with open_regular(path, most, own) as stream:
         data = stream.read(most + 1)
     if data is None:
-        raise UnfitFile(errno.EAGAIN, "it has nothing to be read yet", str(path))
+        raise UnfitFile(errno.EAGAIN, "it has no data yet", str(path))
     _check_size(len(data), str(path), most)
     return data
 
@@ -135,14 +137,15 @@ def parse_xml(data: str | bytes) -> ElementTree.Element:
     """Return the root element of an XML document.
 
     Raises:
-        ElementTree.ParseError: It is not well-formed.
-        ValueError, LookupError: It declares entities, has too many elements and attributes, or its
-            encoding is unknown.
+        ElementTree.ParseError: The document is not well-formed.
+        ValueError, LookupError: It declares entities, has too many elements and attributes, or its encoding is unknown.
     """
-    plain = data.encode(errors="surrogatepass") if isinstance(data, str) else data.replace(b"\0", b"")  # of UTF-16
-    if b"<!ENTITY" in plain:
+    content = (
+        data.encode(errors="surrogatepass") if isinstance(data, str) else data.replace(b"\0", b"")
+    )  # NUL bytes of UTF-16
+    if b"<!ENTITY" in content:
         raise ValueError("it declares entities, which are not read")
-    count = plain.count(b"<") - plain.count(b"</") + plain.count(b"=")
+    count = content.count(b"<") - content.count(b"</") + content.count(b"=")
     if count > INPUT_LIMITS.xml_elements:
         raise ValueError(f"it has {count} elements and attributes, at most {INPUT_LIMITS.xml_elements} are read")
     return ElementTree.fromstring(data)

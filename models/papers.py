@@ -1,4 +1,4 @@
-"""The machines of the four papers, and what had to be assumed because it is not printed."""
+"""Example machines of the four reproduced papers, with the assumptions for data that the papers do not print."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from models.robot.robot import planar_chain
 
 
 def paper_example() -> FreeFloating:
-    """The planar three-joint machine of Kim, Kim 2011, section 5.
+    """Return the planar three-joint free-floating machine of Kim, Kim 2011, section 5.
 
     Printed: base 100 kg and 66.67 kg m^2 (a plate of 2 m x 2 m), links of 2 kg and 0.7083 kg m^2 (plates of
-    2 m x 0.5 m). Not printed, identified from the pattern of Table 1 and therefore assumptions: links 2 m
-    long, arm mounted at (1, 0) m of the base, centres of mass at mid-link. The paper starts it from base pose
-    0 and joints at 45, 60, -60 deg, with the tip moving at (-1, -1) m/s and its orientation free.
+    2 m x 0.5 m). Assumed, identified from the pattern of Table 1: links 2 m long, arm mounted at (1, 0) m of the
+    base, centres of mass at mid-link. In the paper the base starts at pose 0 and the joints at 45, 60, -60 deg; the
+    tip moves at (-1, -1) m/s with free orientation.
     """
     base = Link("base", 100.0, inertia=np.diag([33.335, 33.335, 66.67]))
     robot = planar_chain([2.0] * 3, [2.0] * 3, [0.7083] * 3, mount=(1.0, 0.0), base=base)
@@ -29,17 +29,17 @@ def paper_example() -> FreeFloating:
 
 
 STANDING_STARTS = {1: np.deg2rad([45.0, 160.0, 240.0, 200.0, 50.0]), 2: np.deg2rad([60.0, 80.0, 295.0, 230.0, 100.0])}
-"""Joint angles at the start of the tasks of Tables 1 and 2, rad."""
+"""Start configurations of the tasks of Tables 1 and 2, rad."""
 
 
 def standing_example() -> Standing:
-    """The five-link machine of Tables 1 and 2, which moves in the y-z plane of the world.
+    """Return the five-link standing machine of Tables 1 and 2 of Yoo et al. 2004, which moves in the world's y-z plane.
 
-    Joint angles are relative to the link before, the first to +y, counter-clockwise seen from +x.
+    Each joint angle is relative to the previous link, the first to +y, counter-clockwise seen from +x.
 
-    Not printed and therefore assumed: centres of mass at mid-link, slender rods, a massless foot with the ankle at
-    the world's origin and 0.1 m wide in x (of no effect), the foot from y = -0.1 to 0.2 m (from the text) with an
-    index about y = 0 of half-width 0.1 m (from the tables), the joint limits.
+    Assumed, because not printed: centres of mass at mid-link; slender rods; a massless foot with the ankle at the
+    world's origin, 0.1 m wide in x (without effect), from y = -0.1 to 0.2 m (from the text), with a stability index
+    about y = 0 of half-width 0.1 m (from the tables); the joint limits.
     """
     robot = planar_chain((0.44, 0.44, 0.52, 0.26, 0.18), (6.02, 14.0, 35.0, 3.92, 2.38))
     limits = np.deg2rad([(30, 120), (0, 165), (190, 360), (135, 360), (0, 150)])
@@ -56,10 +56,10 @@ def standing_example() -> Standing:
 
 
 def reference_rig(**limits: Any) -> Rig:
-    """The rig of the reference numbers. The paper prints no lengths: these are chosen, 20, 20, 4, 30, 20, 10 in."""
+    """Return the rig of the reference numbers. Its lengths are assumed: 20, 20, 4, 30, 20, 10 in."""
     return Rig(*(INCH * length for length in (20.0, 20.0, 4.0, 30.0, 20.0, 10.0)), **limits)
 
 
 def reference_tunnel() -> Tunnel:
-    """The tunnel of the reference numbers, chosen: centre (80, 0, 0) in, ranges (60, 48, 40) in, weights 1."""
+    """Return the tunnel of the reference numbers. Assumed: centre (80, 0, 0) in, ranges (60, 48, 40) in, weights 1."""
     return Tunnel(INCH * np.array([80.0, 0.0, 0.0]), INCH * np.array([60.0, 48.0, 40.0]))

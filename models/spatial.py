@@ -2,11 +2,10 @@
 
 Spatial vectors are (angular, linear): a motion vector is (angular velocity, velocity of the point at the
 frame's origin), a force vector is (moment about the frame's origin, force), a momentum is (moment of momentum
-about the origin, linear momentum). Every function takes SX, MX, DM, numpy arrays or nested lists, and keeps
+about the origin, linear momentum). Every function takes SX, MX, DM, NumPy arrays or nested lists and keeps
 structural zeros, so that a planar machine written in three dimensions costs no more than one written in two.
 
-Systems of equations and determinants of small symbolic matrices are worked out element by element, which keeps the
-graphs of their expressions small.
+Linear systems and determinants of small matrices are expanded element by element, which keeps expression graphs small.
 """
 
 from __future__ import annotations
@@ -23,16 +22,16 @@ from models.arrays import NOT_NUMBERS, Array, floats
 from models.errors import ModelError
 
 Expression = Any
-"""A casadi SX, MX or DM, whatever numpy reads as an array of floats, or a (nested) list with casadi entries."""
+"""An SX, MX or DM, anything that NumPy reads as an array of floats, or a (nested) list with CasADi entries."""
 
 FULL_TURN = 2 * np.pi
-"""rad."""
+"""2 pi, rad."""
 
 _Callable = TypeVar("_Callable", bound=Callable[..., Any])
 
 
 class Frame(NamedTuple):
-    """Placement of a frame B in a frame A: x_in_a = rotation x_in_b + position.
+    """Pose of a frame B in a frame A: x_in_a = rotation x_in_b + position.
 
     Attributes:
         rotation: Axes of B as columns, in A. Shape (3, 3).
@@ -43,21 +42,22 @@ class Frame(NamedTuple):
     position: Expression
 
     def point(self, position: Expression) -> Expression:
-        """Coordinates in A of a point given in B. Shape (3, 1), m."""
+        """Return the coordinates in A of a point given in B. Shape (3, 1), m."""
         return self.position + ca.mtimes(self.rotation, expression(position))
 
 
 def expression(value: Expression) -> Expression:
-    """`value` itself if it is a casadi matrix, else a DM without its exact zeros; vectors become columns.
+    """Return a value as a CasADi matrix.
 
-    Lists, tuples and arrays with casadi entries are stacked: the entries below each other, inner lists side by side.
+    A CasADi matrix is returned unchanged; numbers become a DM without its exact zeros, vectors become columns. Lists,
+    tuples and arrays with CasADi entries are stacked vertically, inner lists horizontally.
 
     Raises:
-        ModelError: Texts, truths, ragged lists, arrays of more than two dimensions.
+        ModelError: Text, booleans, ragged lists, arrays of more than two dimensions.
     """
     if isinstance(value, ca.SX | ca.MX | ca.DM):
         return value
-    if has_expressions(value):  # numpy would read a symbol as nan
+    if has_expressions(value):  # NumPy would read a symbol as nan
         rows = [ca.horzcat(*map(expression, row)) if _is_sequence(row) else expression(row) for row in value]
         return ca.vertcat(*rows)
     try:
@@ -68,7 +68,7 @@ def expression(value: Expression) -> Expression:
 
 
 def has_expressions(value: Any) -> bool:
-    """Whether a list, tuple or array has a casadi matrix among its entries, at any depth."""
+    """Return whether a list, tuple or array contains a CasADi matrix at any depth."""
     if not _is_sequence(value):
         return False
     return any(isinstance(entry, ca.SX | ca.MX | ca.DM) or has_expressions(entry) for entry in value)
@@ -81,11 +81,11 @@ def _is_sequence(value: Any) -> bool:
 
 
 def on_scalars(function: _Callable) -> _Callable:
-    """Let a function written element by element take MX arguments through one call of its SX form.
+    """Evaluate a function written element by element on SX, also for MX arguments.
 
-    Element-wise MX graphs are slow to build and to run. When an argument is MX, the function is evaluated on
-    SX symbols of the same sparsity and the result is called; other arguments pass through untouched. A plain list of
-    scalars with MX entries counts as the MX column it stands for.
+    Element-wise MX graphs are slow to build and to run. If an argument is MX, the decorated function is evaluated once
+    with SX symbols of the same sparsity, and the resulting Function is called. Other arguments pass through unchanged.
+    A flat list of scalars with MX entries counts as an MX column.
     """
 
     def column(value: Any) -> Any:
@@ -94,41 +94,40 @@ def on_scalars(function: _Callable) -> _Callable:
     @wraps(function)
     def wrapper(*args: Any, **kwargs: Any) -> Any:
         args, kwargs = tuple(map(column, args)), {name: column(value) for name, value in kwargs.items()}
-        given = [value for value in (*args, *kwargs.values()) if isinstance(value, ca.MX)]
-        if not given:
+        mx_arguments = [value for value in (*args, *kwargs.values()) if isinstance(value, ca.MX)]
+        if not mx_arguments:
             return function(*args, **kwargs)
-        symbols = [ca.SX.sym(f"x{i}", value.sparsity()) for i, value in enumerate(given)]
-        supply = iter(symbols)
-        scalar_args = [next(supply) if isinstance(value, ca.MX) else value for value in args]
-        scalar_kwargs = {k: next(supply) if isinstance(v, ca.MX) else v for k, v in kwargs.items()}
+        symbols = [ca.SX.sym(f"x{i}", value.sparsity()) for i, value in enumerate(mx_arguments)]
+        next_symbol = iter(symbols)
+        scalar_args = [next(next_symbol) if isinstance(value, ca.MX) else value for value in args]
+        scalar_kwargs = {k: next(next_symbol) if isinstance(v, ca.MX) else v for k, v in kwargs.items()}
         result = function(*scalar_args, **scalar_kwargs)
         parts = result if isinstance(result, tuple) else (result,)
-        called = ca.Function(function.__name__.strip("_"), symbols, list(parts)).call(given)
+        called = ca.Function(function.__name__.strip("_"), symbols, list(parts)).call(mx_arguments)
         if not isinstance(result, tuple):
             return called[0]
-        return Frame(*called) if isinstance(result, Frame) else tuple(called)
+        return type(result)(*called) if hasattr(result, "_fields") else tuple(called)  # a NamedTuple such as Frame
 
     return cast(_Callable, wrapper)
 
 
 def skew(vector: Expression) -> Expression:
-    """Matrix [a x] with [a x] b = a x b. Shape (3, 3)."""
+    """Return the matrix [a x] with [a x] b = a x b. Shape (3, 3)."""
     a = expression(vector)
     zero = type(a)(1, 1)
     return ca.vertcat(ca.horzcat(zero, -a[2], a[1]), ca.horzcat(a[2], zero, -a[0]), ca.horzcat(-a[1], a[0], zero))
 
 
 def cross(a: Expression, b: Expression) -> Expression:
-    """Vector product, which unlike casadi's own keeps structural zeros. Shape (3, 1)."""
+    """Return the vector product; unlike CasADi's, it keeps structural zeros. Shape (3, 1)."""
     a, b = expression(a), expression(b)
     return ca.vertcat(a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
 def rotation(axis: Expression, angle: Expression) -> Expression:
-    """Rotation by `angle` (rad) about the unit vector `axis`. Shape (3, 3).
+    """Return the rotation by `angle` (rad) about the unit vector `axis`. Shape (3, 3).
 
-    Rodrigues' formula as a a' + cos (1 - a a') + sin [a x]: about a coordinate axis the zeros and the one are
-    exact.
+    Rodrigues' formula as a a' + cos (1 - a a') + sin [a x]: for a coordinate axis its zeros and its one are exact.
     """
     a, angle = expression(axis), expression(angle)
     along = ca.mtimes(a, a.T)
@@ -139,40 +138,34 @@ def rotation(axis: Expression, angle: Expression) -> Expression:
 
 
 def rotation_from_rpy(roll: Expression, pitch: Expression, yaw: Expression) -> Expression:
-    """Rotation about the fixed x, then y, then z axis (URDF): Rz(yaw) Ry(pitch) Rx(roll). Angles in rad.
-
-    Shape (3, 3).
-    """
+    """Return Rz(yaw) Ry(pitch) Rx(roll): rotations about the fixed x, y, z axes (URDF). Angles in rad. Shape (3, 3)."""
     return ca.mtimes([rotation((0, 0, 1), yaw), rotation((0, 1, 0), pitch), rotation((1, 0, 0), roll)])
 
 
 def quaternion_about(axis: Expression, angle: Expression) -> Expression:
-    """Unit quaternion [w, x, y, z] of the rotation by `angle` (rad) about the unit vector `axis`.
-
-    Shape (4, 1).
-    """
+    """Return the unit quaternion [w, x, y, z] of a rotation by `angle` (rad) about a unit vector. Shape (4, 1)."""
     half = expression(angle) / 2
     return ca.vertcat(ca.cos(half), ca.sin(half) * expression(axis))
 
 
 def quaternion_product(a: Expression, b: Expression) -> Expression:
-    """Hamilton product a b of quaternions [w, x, y, z]: first turn by b, then by a. Shape (4, 1)."""
+    """Return the Hamilton product a b of quaternions [w, x, y, z]: rotate by b, then by a. Shape (4, 1)."""
     a, b = expression(a), expression(b)
     scalar = a[0] * b[0] - ca.dot(a[1:4], b[1:4])
     return ca.vertcat(scalar, a[0] * b[1:4] + b[0] * a[1:4] + cross(a[1:4], b[1:4]))
 
 
 def quaternion_conjugate(quaternion: Expression) -> Expression:
-    """Conjugate [w, -x, -y, -z]: the inverse rotation of a unit quaternion. Shape (4, 1)."""
+    """Return the conjugate [w, -x, -y, -z], the inverse rotation of a unit quaternion. Shape (4, 1)."""
     quaternion = expression(quaternion)
     return ca.vertcat(quaternion[0], -quaternion[1:4])
 
 
 def rotation_from_quaternion(quaternion: Expression) -> Expression:
-    """Rotation matrix of a quaternion [w, x, y, z]. Shape (3, 3).
+    """Return the rotation matrix of a quaternion [w, x, y, z]. Shape (3, 3).
 
-    Divided by the squared norm, so that any non-zero quaternion gives a rotation: a state that has drifted
-    off the unit sphere by an integrator's error turns no shape into another.
+    Division by the squared norm makes the result a rotation for any non-zero quaternion, so that a state that has
+    drifted off the unit sphere by integration error does not distort shapes.
     """
     q = expression(quaternion)
     w, x, y, z = q[0], q[1], q[2], q[3]
@@ -188,45 +181,43 @@ def rotation_from_quaternion(quaternion: Expression) -> Expression:
 
 
 def quaternion_from_rotation(rotation: Array) -> Array:
-    """Unit quaternions [w, x, y, z], w not negative, of rotation matrices, as numbers (Shepperd 1978).
+    """Return unit quaternions [w, x, y, z] with w >= 0 of numeric rotation matrices (Shepperd 1978).
 
     Shape (M, 3, 3) to (M, 4).
     """
     r = np.asarray(rotation, dtype=float)
     trace = np.trace(r, axis1=1, axis2=2)
     squares = np.column_stack([trace, r[:, 0, 0], r[:, 1, 1], r[:, 2, 2]])
-    largest = squares.argmax(axis=1)  # so that nothing small is divided by
-    found = np.empty((len(r), 4))
+    largest = squares.argmax(axis=1)  # avoids division by a small number
+    quaternions = np.empty((len(r), 4))
     for k in range(4):
-        mine = largest == k
-        m = r[mine]
+        selected = largest == k
+        m = r[selected]
         spin = np.stack([m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]], axis=1)
         if k == 0:
-            found[mine] = np.column_stack([1 + trace[mine], spin])
+            quaternions[selected] = np.column_stack([1 + trace[selected], spin])
         else:
             i = k - 1
             row = m[:, i, :] + m[:, :, i]
-            row[:, i] = 1 + 2 * m[:, i, i] - trace[mine]
-            found[mine] = np.column_stack([spin[:, i], row])
-    found *= np.where(found[:, :1] < 0, -1.0, 1.0)
-    return np.asarray(found / np.linalg.norm(found, axis=1, keepdims=True))
+            row[:, i] = 1 + 2 * m[:, i, i] - trace[selected]
+            quaternions[selected] = np.column_stack([spin[:, i], row])
+    quaternions *= np.where(quaternions[:, :1] < 0, -1.0, 1.0)
+    return np.asarray(quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True))
 
 
 def quaternion_rate(quaternion: Expression, angular_velocity: Expression) -> Expression:
-    """Time derivative of the quaternion of a body that turns with `angular_velocity` (world axes, rad/s).
+    """Return the time derivative of a body's quaternion from its angular velocity (world axes, rad/s). Shape (4, 1).
 
-    Shape (4, 1).
-
-    (0, omega) q / 2, which is orthogonal to q: the norm is conserved.
+    (0, omega) q / 2, which is orthogonal to q, so that the norm is conserved.
     """
     omega = expression(angular_velocity)
     return quaternion_product(ca.vertcat(type(omega)(1, 1), omega), quaternion) / 2
 
 
 def angular_velocity_from_quaternion(quaternion: Expression, rate: Expression) -> Expression:
-    """Angular velocity (world axes, rad/s) of a quaternion that changes with `rate`. Shape (3, 1).
+    """Return the angular velocity (world axes, rad/s) from a quaternion and its time derivative. Shape (3, 1).
 
-    The inverse of quaternion_rate; the quaternion may have any norm but zero.
+    The inverse of quaternion_rate; the quaternion may have any non-zero norm.
     """
     quaternion = expression(quaternion)
     product = quaternion_product(rate, quaternion_conjugate(quaternion))
@@ -234,21 +225,16 @@ def angular_velocity_from_quaternion(quaternion: Expression, rate: Expression) -
 
 
 def motion_transform(frame: tuple[Expression, Expression]) -> Expression:
-    """Pluecker transform of motion vectors from frame B to A, `frame` being the placement of B in A.
-
-    Shape (6, 6).
-    """
+    """Return the Pluecker transform of motion vectors from frame B to A for the pose of B in A. Shape (6, 6)."""
     turn, position = expression(frame[0]), expression(frame[1])
     zero = type(turn)(3, 3)
     return ca.vertcat(ca.horzcat(turn, zero), ca.horzcat(ca.mtimes(skew(position), turn), turn))
 
 
 def force_transform(frame: tuple[Expression, Expression]) -> Expression:
-    """Pluecker transform of force vectors (and momenta) from frame B to A, `frame` placing B in A.
+    """Return the Pluecker transform of force vectors (and momenta) from frame B to A, `frame` being the pose of B in A.
 
-    Shape (6, 6).
-
-    The inverse transpose of motion_transform: power does not depend on the frame.
+    Shape (6, 6). The inverse transpose of motion_transform: power does not depend on the frame.
     """
     turn, position = expression(frame[0]), expression(frame[1])
     zero = type(turn)(3, 3)
@@ -256,7 +242,7 @@ def force_transform(frame: tuple[Expression, Expression]) -> Expression:
 
 
 def motion_cross(velocity: Expression) -> Expression:
-    """Operator v x on motion vectors: rate of change of a motion vector fixed in a body that moves with v.
+    """Return the operator v x on motion vectors: the rate of a motion vector fixed in a body that moves with v.
 
     Shape (6, 6).
     """
@@ -266,19 +252,20 @@ def motion_cross(velocity: Expression) -> Expression:
 
 
 def force_cross(velocity: Expression) -> Expression:
-    """Operator v x* on force vectors, minus the transpose of motion_cross. Shape (6, 6)."""
+    """Return the operator v x* on force vectors, minus the transpose of motion_cross. Shape (6, 6)."""
     return -motion_cross(velocity).T
 
 
 def spatial_inertia(mass: Expression, center_of_mass: Expression, inertia: Expression) -> Expression:
-    """Spatial inertia of a rigid body about its frame's origin: maps a motion vector to a momentum.
-
-    Shape (6, 6).
+    """Return the spatial inertia of a rigid body about its frame's origin, which maps a motion vector to a momentum.
 
     Args:
         mass: kg.
         center_of_mass: In the frame. Shape (3,), m.
         inertia: About the centre of mass, in the frame's axes. Shape (3, 3), kg m^2.
+
+    Returns:
+        Shape (6, 6).
     """
     arm = skew(center_of_mass)
     about_origin = expression(inertia) + mass * ca.mtimes(arm, arm.T)
@@ -287,16 +274,13 @@ def spatial_inertia(mass: Expression, center_of_mass: Expression, inertia: Expre
 
 @on_scalars
 def solve_spd(matrix: Expression, right: Expression) -> Expression:
-    """Solve matrix x = right for a small symmetric positive definite matrix.
-
-    Shape (n, m) for `right` of (n, m).
+    """Solve matrix x = right for a small symmetric positive definite matrix. Shape (n, m) for `right` of (n, m).
 
     L D L' elimination without pivoting or square roots, meant for n <= 7; only the lower triangle is read.
-    An indefinite matrix is not noticed, a singular one gives inf or nan.
+    An indefinite matrix is not detected, and a singular one gives inf or nan.
 
-    Instructions of the SX function of a dense matrix with one right-hand side, against ca.solve: n = 2: 16
-    (20), 3: 38 (77), 4: 72 (200), 6: 184 (588), 7: 266 (896); with seven right-hand sides n = 6 takes 652
-    (1272).
+    Instructions of the SX function of a dense matrix with one right-hand side, against ca.solve: n = 2: 16 (20), 3: 38
+    (77), 4: 72 (200), 6: 184 (588), 7: 266 (896); with seven right-hand sides n = 6 takes 652 (1272).
     """
     matrix, right = expression(matrix), expression(right)
     size = matrix.shape[0]
@@ -320,12 +304,10 @@ def solve_spd(matrix: Expression, right: Expression) -> Expression:
 
 @on_scalars
 def determinant(matrix: Expression) -> Expression:
-    """Determinant of a small square matrix (n <= 7), without divisions: exact zeros stay finite.
+    """Return the determinant of a small square matrix (n <= 7) without divisions, so that exact zeros stay finite.
 
-    Shape (1, 1).
-
-    Laplace expansion in which each minor of the first rows is written once: n 2^(n-1) products instead of the
-    n! of the plain expansion. Instructions against ca.det: n = 4: 56 (74), 6: 337 (1977).
+    Shape (1, 1). Laplace expansion that computes each minor of the first rows once: n 2^(n-1) products instead of n!.
+    Instructions against ca.det: n = 4: 56 (74), 6: 337 (1977).
     """
     matrix = expression(matrix)
     size = matrix.shape[0]

@@ -86,7 +86,7 @@ class Library:
             CompilerError: There is no compiler.
         """
         machine = (platform.machine(), sys.platform, ca.__version__, str(SIZES.optimized))
-        return cache.key_of(VERSION, *machine, *compiler(), *FLAGS, LINK, *self.contents)
+        return cache.cache_key(VERSION, *machine, *compiler(), *FLAGS, LINK, *self.contents)
 
 
 def code(functions: Iterable[Any]) -> str:
@@ -128,15 +128,15 @@ def built(library: Library) -> Path:
         OutOfTime: The time limit is over.
     """
     key = library.key
-    found = _OWN.get(key) or cache.kept_library(key)
+    found = _OWN.get(key) or cache.load_library(key)
     if found is not None:
         return found
-    with cache.alone(key, check_time):
-        found = _OWN.get(key) or cache.kept_library(key)  # another process may have made it meanwhile
+    with cache.exclusive(key, check_time):
+        found = _OWN.get(key) or cache.load_library(key)  # another process may have made it meanwhile
         if found is not None:
             return found
         content = _compiled(library)
-        found = cache.keep_library(key, content)
+        found = cache.store_library(key, content)
     if found is None:  # for this process only
         found = Path(_own_folder().name) / f"{key}.so"
         found.write_bytes(content)

@@ -21,11 +21,11 @@ from models.arrays import (
     Array,
     ArrayInput,
     checked_array,
+    checked_broadcast,
     checked_each,
     checked_flag,
     checked_instance,
     checked_number,
-    one_for_each,
     warn_of_degrees,
 )
 from models.cts.best_roll import optimal_inverse
@@ -112,7 +112,7 @@ def solve_table(
         message = "table: branches is empty; give at least one, for example (HOME,)"
         raise ModelError(message, name="branches", value=branches)
     count = len(rows)
-    before = one_for_each(previous, count, "table", "previous", "targets")
+    before = checked_broadcast(previous, count, "table", "previous", "targets")
     if scene is None:
         functions = [optimal_inverse(rig, tunnel, branch, rate_weight=rate_weight) for branch in branches]
     else:

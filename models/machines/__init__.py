@@ -1,1 +1,1 @@
-"""Machines: a robot on a fixed, floating or standing base, and the SCARA arm."""
+"""Machines: robots on a fixed, floating or standing base, SCARA arms, and their collision scenes."""

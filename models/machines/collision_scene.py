@@ -1,7 +1,7 @@
-"""What a machine may touch: its own links, and obstacles around it, at rest or moving; how its joints move the pairs.
+"""Collision scenes: the bodies of a machine, static and moving obstacles, and the pairs of them that may collide.
 
-A pair of bodies is seen from where both hang: the last link that carries them both, or the world. Only what lies
-between the two moves them towards each other.
+Each pair is considered in its reference frame, that of the last link that carries both bodies, or the world: only the
+joints between that link and the bodies move them relative to each other.
 """
 
 from __future__ import annotations
@@ -20,26 +20,27 @@ from models.errors import ModelError
 from models.input_files import INPUT_LIMITS
 from models.machines.machine import Machine
 from models.machines.moving_obstacle import MovingObstacle
-from models.machines.pair_gradients import WORLD, Placed, distance_gradients
+from models.machines.pair_gradients import WORLD, PlacedShape, distance_gradients
 from models.robot.kinematics import link_frames
 from models.robot.robot import Robot
-from models.shapes.bodies import Body, LinkMesh, MissingRule, RigidParts, collision_bodies, lever_arms
+from models.shapes.bodies import Body, LinkMesh, MissingRule, RigidParts, arms, bodies_of
 from models.shapes.distance import COLUMNS, column, distance, pair_function, soft_minimum
-from models.shapes.pairs import ASSUMED, COVERED, IGNORED, IMMOBILE, SRDF, Reason, checked_pairs
+from models.shapes.pairs import ASSUMED, COVERED, SRDF, STILL, TOLD, Reason, checked_pairs
 from models.shapes.shapes import KINDS, Box, Shape, checked_shape
 from models.spatial import Expression, Frame, expression
 
-FINEST = 1e-6
-"""m: of the least of several distances."""
+MIN_SOFTNESS_M = 1e-6
+"""Least smoothing of the minimum of several distances, m."""
 
 
 class Levers(NamedTuple):
-    """How the configuration moves each of n pairs, one body seen from the other.
+    """Bounds on the relative motion of the two bodies of each of n pairs per unit rate of the configuration.
 
-    A coordinate of rate r moves no point faster than its lever times |r|, and turns no faster than its turn times |r|.
+    A coordinate with rate r moves no point faster than its lever times |r|, and rotates the body no faster than its
+    turn times |r|.
 
     Attributes:
-        base, base_turns: Of the base's configuration. Shape (n, base_size).
+        base, base_turns: Of the base configuration. Shape (n, base_size).
         joints, joint_turns: Of the joints. Shape (n, joint_size).
     """
 
@@ -51,29 +52,29 @@ class Levers(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class CollisionScene:
-    """The bodies of a machine and the obstacles around it, and which of them are looked at, pair by pair.
+    """The bodies of a machine and the obstacles, with the pairs that are checked for collision.
 
     Attributes:
         machine: Any machine; the <collision> shapes of its robot are its bodies, see `models.shapes.bodies`.
-        obstacles: Shapes in world, and moving ones.
-        clearance: How far bodies and obstacles have to be apart, m.
-        ignored: Pairs of names of links that are not looked at, beside neighbours and what never or always touches; or
-            of a link and an obstacle, "obstacle 0".
-        srdf: File whose pairs are not looked at either, or None.
-        folders: Where meshes are looked for.
-        missing: "raise" where a mesh is missing; "skip" goes on without it, and warns.
-        limits: Whether the joints keep to the robot's position limits, by which pairs are left that never touch.
-        covered: Bodies that stand for the meshes of links, as of `models.shapes.bodies.collision_bodies`; from files of
-            the meshes if None, and in either case told afterwards.
-        bodies: All that is looked at: of the links, obstacles, hulls of meshes.
-        pairs: Of each pair the two bodies and the frame that they are seen from, -1 for the world. Shape (n, 3).
-        covers: Of pairs of hulls, by their places, all pairs of the bodies that cover the two meshes; hulls are as far
-            apart as they are, or as the nearest of these. Shape (m, 2) each. None where some of them always touch.
-        left: Pairs of names that are not looked at, and why.
+        obstacles: Shapes in world, and moving obstacles.
+        clearance: Required distance of all checked pairs, m.
+        ignored: Pairs of link names, or of a link and an obstacle ("obstacle 0"), that are not checked. Adjacent links
+            and pairs that never or always collide are excluded in any case.
+        srdf: SRDF file whose disabled pairs are not checked either, or None.
+        folders: Folders in which meshes are searched.
+        missing: "raise" an error for a missing mesh, or "skip" it with a warning.
+        limits: Assume that the joints keep the robot's position limits, so that pairs that never collide within them
+            are excluded.
+        covered: Bodies that replace the meshes of links, as in `models.shapes.bodies.bodies_of`; computed from the mesh
+            files if None. Holds the bodies in use after construction.
+        bodies: All shapes of the scene: of links, obstacles and hulls of meshes.
+        pairs: Two bodies and the reference frame of each pair, -1 for the world. Shape (n, 3).
+        covers: For pairs of hulls, by index, all pairs of bodies that cover the two meshes, shape (m, 2), or none if
+            some of them always collide. Hulls are at least as far apart as the nearest of these.
+        left: Reason why each pair of names is not checked.
 
     Raises:
-        ModelError: A clearance below zero, an obstacle that is no shape, a name that there is none of, a mesh that is
-            missing.
+        ModelError: A negative clearance, an invalid obstacle, an unknown name, a missing mesh.
     """
 
     machine: Machine
@@ -85,147 +86,148 @@ class CollisionScene:
     missing: MissingRule = "raise"
     limits: bool = True
     covered: Mapping[tuple[str, int], tuple[Body, ...]] | None = None
-    bodies: tuple[Placed, ...] = field(init=False, repr=False)
+    bodies: tuple[PlacedShape, ...] = field(init=False, repr=False)
     pairs: Array = field(init=False, repr=False)
     covers: dict[int, Array] = field(init=False, repr=False)
     left: dict[tuple[str, str], Reason] = field(init=False, repr=False)
     _parts: RigidParts = field(init=False, repr=False)
     _carriers: tuple[str, ...] = field(init=False, repr=False)
-    _held: dict[int, tuple[tuple[int, int], ...]] = field(init=False, repr=False)
+    _cover_pairs: dict[int, tuple[tuple[int, int], ...]] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        given = (self.obstacles,) if isinstance(self.obstacles, (*KINDS, MovingObstacle)) else self.obstacles
-        found = _listed(given, "obstacles")
-        for number, one in enumerate(found):
-            shape = (
-                one.shape if isinstance(one, MovingObstacle) else checked_shape(one, "scene", f"obstacles[{number}]")
-            )
+        single = isinstance(self.obstacles, (*KINDS, MovingObstacle))
+        obstacles = _checked_list((self.obstacles,) if single else self.obstacles, "obstacles")
+        for number, obstacle in enumerate(obstacles):
+            name = f"obstacles[{number}]"
+            shape = obstacle.shape if isinstance(obstacle, MovingObstacle) else checked_shape(obstacle, "scene", name)
             if isinstance(shape, Box) and not np.isfinite(shape.size).all():
-                message = f"scene: obstacles[{number}] is a box without ends; give a HalfSpace or its size"
-                raise ModelError(message, name=f"obstacles[{number}]", value=shape.size)
-        object.__setattr__(self, "obstacles", found)
-        near = checked_nonnegative(self.clearance, "scene", "clearance", "m")
-        object.__setattr__(self, "clearance", near)
+                message = f"scene: {name} is an infinite box; give its size, or a HalfSpace"
+                raise ModelError(message, name=name, value=shape.size)
+        object.__setattr__(self, "obstacles", obstacles)
+        clearance = checked_nonnegative(self.clearance, "scene", "clearance", "m")
+        object.__setattr__(self, "clearance", clearance)
         robot = getattr(self.machine, "robot", None)
         if not isinstance(robot, Robot):
             message = f"scene: machine must be a FixedBase(robot) or another machine, not {self.machine!r}"
             raise ModelError(message, name="machine", value=self.machine)
-        own = collision_bodies(
-            robot, folders=_listed(self.folders, "folders"), missing=self.missing, covered=self.covered
-        )
+        folders = _checked_list(self.folders, "folders")
+        own = bodies_of(robot, folders=folders, missing=self.missing, covered=self.covered)
         object.__setattr__(self, "covered", _by_mesh(robot, own))
-        links, around = self._told()
-        reach: dict[str, Any] = (
-            {} if checked_flag(self.limits, "scene", "limits") else {"lower": -np.inf, "upper": np.inf}
-        )
-        known = checked_pairs(robot, own, ignored=links, srdf=self.srdf, clearance=near, **reach)
+        link_pairs, obstacle_pairs = self._ignored_pairs()
+        unlimited: dict[str, Any] = {"lower": -np.inf, "upper": np.inf}
+        limits = {} if checked_flag(self.limits, "scene", "limits") else unlimited
+        known = checked_pairs(robot, own, ignored=link_pairs, srdf=self.srdf, clearance=clearance, **limits)
         object.__setattr__(self, "_parts", RigidParts.of(robot))
-        beside, still = self._beside_obstacles(own, around)
-        object.__setattr__(self, "left", {**known.left, **still})
-        self._place(own, known.checked, beside)
+        with_obstacles, excluded = self._pairs_with_obstacles(own, obstacle_pairs)
+        object.__setattr__(self, "left", {**known.left, **excluded})
+        self._place(own, known.checked, with_obstacles)
 
-    def _told(self) -> tuple[list[tuple[str, str]], set[tuple[str, str]]]:
-        """Pairs of links that are ignored, and those of a link and an obstacle."""
+    def _ignored_pairs(self) -> tuple[list[tuple[str, str]], set[tuple[str, str]]]:
+        """Return the ignored pairs of two links, and those of a link and an obstacle."""
         names = {f"obstacle {number}" for number in range(len(self.obstacles))}
-        ignored = [_pair(each, number) for number, each in enumerate(_listed(self.ignored, "ignored"))]
-        around = {pair for pair in ignored if names & set(pair)}
-        for pair in around:
+        ignored = [_pair(each, number) for number, each in enumerate(_checked_list(self.ignored, "ignored"))]
+        with_obstacle = {pair for pair in ignored if names & set(pair)}
+        for pair in with_obstacle:
             for name in set(pair) - names:
                 self.machine.robot.link(name)
-        return [pair for pair in ignored if pair not in around], around
+        return [pair for pair in ignored if pair not in with_obstacle], with_obstacle
 
-    def _beside_obstacles(
-        self, own: Sequence[Body], told: set[tuple[str, str]]
+    def _pairs_with_obstacles(
+        self, own: Sequence[Body], ignored: set[tuple[str, str]]
     ) -> tuple[list[tuple[int, int]], dict[tuple[str, str], Reason]]:
-        """Bodies and obstacles that may touch, by their numbers; and why others are left."""
-        pairs, left = [], dict[tuple[str, str], Reason]()
-        for number, one in enumerate(self.obstacles):
+        """Return indices of the bodies and obstacles that may collide, and why other pairs are excluded."""
+        pairs, excluded = [], dict[tuple[str, str], Reason]()
+        for number, obstacle in enumerate(self.obstacles):
             name = f"obstacle {number}"
             for i, body in enumerate(own):
-                if {(body.link, name), (name, body.link)} & told:
-                    left[body.link, name] = IGNORED
-                elif not self._moves(body.link) and not isinstance(one, MovingObstacle):
-                    left[body.link, name] = IMMOBILE
+                if {(body.link, name), (name, body.link)} & ignored:
+                    excluded[body.link, name] = TOLD
+                elif not self._moves(body.link) and not isinstance(obstacle, MovingObstacle):
+                    excluded[body.link, name] = STILL
                 else:
                     pairs.append((i, number))
-        return pairs, left
+        return pairs, excluded
 
     def _place(
-        self, own: Sequence[Body], checked: Sequence[tuple[int, int]], beside: Sequence[tuple[int, int]]
+        self, own: Sequence[Body], checked: Sequence[tuple[int, int]], with_obstacles: Sequence[tuple[int, int]]
     ) -> None:
-        """What is looked at: bodies of links, obstacles and hulls of meshes, each on its frame, and their pairs."""
+        """Set the shapes of links, obstacles and hulls of meshes with their frames, and the checked pairs."""
         close = self._close_meshes(own, checked)
         covered = {pair for pairs in close.values() for pair in pairs}
-        frames = dict.fromkeys([body.link for body in own] + [self._seen_from(own[i], own[j]) for i, j in checked])
-        places = {link: k for k, link in enumerate(frames)}
-        bodies = [Placed(name, body.shape, places[body.link]) for name, body in zip(_named(own), own, strict=True)]
+        links = [body.link for body in own]
+        frames = dict.fromkeys(links + [self._reference_link(own[i], own[j]) for i, j in checked])
+        indices = {link: k for k, link in enumerate(frames)}
+        bodies = []
+        for k, (link, body) in enumerate(zip(links, own, strict=True)):
+            name = link if links.count(link) == 1 else f"{link}/{links[:k].count(link) + 1}"
+            bodies.append(PlacedShape(name, body.shape, indices[link]))
         moving = 0
-        for number, one in enumerate(self.obstacles):
-            if isinstance(one, MovingObstacle):
-                bodies.append(Placed(f"obstacle {number}", one.shape, len(places) + moving))
+        for number, obstacle in enumerate(self.obstacles):
+            if isinstance(obstacle, MovingObstacle):
+                bodies.append(PlacedShape(f"obstacle {number}", obstacle.shape, len(indices) + moving))
                 moving += 1
             else:
-                bodies.append(Placed(f"obstacle {number}", one, WORLD))
-        pairs = [(i, j, places[self._seen_from(own[i], own[j])]) for i, j in checked if (i, j) not in covered]
-        held: dict[int, tuple[tuple[int, int], ...]] = {}
+                bodies.append(PlacedShape(f"obstacle {number}", obstacle, WORLD))
+        pairs = [(i, j, indices[self._reference_link(own[i], own[j])]) for i, j in checked if (i, j) not in covered]
+        cover_pairs: dict[int, tuple[tuple[int, int], ...]] = {}
         covers: dict[int, Array] = {}
         hulls: dict[LinkMesh, int] = {}
-        for (one_mesh, other_mesh), stand_ins in close.items():
-            first, second = (own[k] for k in stand_ins[0])
-            for mesh, body in ((one_mesh, first), (other_mesh, second)):
+        for (mesh_a, mesh_b), replaced_pairs in close.items():
+            first, second = (own[k] for k in replaced_pairs[0])
+            for mesh, body in ((mesh_a, first), (mesh_b, second)):
                 if mesh not in hulls:
                     hulls[mesh] = len(bodies)
-                    bodies.append(Placed(f"{body.link} hull {len(hulls)}", mesh.hull, places[body.link]))
-            held[len(pairs)] = tuple(stand_ins)
+                    bodies.append(PlacedShape(f"{body.link} hull {len(hulls)}", mesh.hull, indices[body.link]))
+            cover_pairs[len(pairs)] = tuple(replaced_pairs)
             if self.left.get((first.link, second.link)) not in ASSUMED:
-                of = [[k for k, body in enumerate(own) if body.mesh is mesh] for mesh in (one_mesh, other_mesh)]
-                covers[len(pairs)] = np.array([(i, j) for i in of[0] for j in of[1]])
-            pairs.append((hulls[one_mesh], hulls[other_mesh], places[self._seen_from(first, second)]))
-        pairs += [(i, len(own) + number, WORLD) for i, number in beside]
+                covering = [[k for k, body in enumerate(own) if body.mesh is mesh] for mesh in (mesh_a, mesh_b)]
+                covers[len(pairs)] = np.array([(i, j) for i in covering[0] for j in covering[1]])
+            pairs.append((hulls[mesh_a], hulls[mesh_b], indices[self._reference_link(first, second)]))
+        pairs += [(i, len(own) + number, WORLD) for i, number in with_obstacles]
         object.__setattr__(self, "_carriers", tuple(frames))
         object.__setattr__(self, "bodies", tuple(bodies))
         object.__setattr__(self, "pairs", np.array(pairs, dtype=int).reshape(-1, 3))
         object.__setattr__(self, "covers", covers)
-        object.__setattr__(self, "_held", held)
+        object.__setattr__(self, "_cover_pairs", cover_pairs)
 
-    def _seen_from(self, one: Body, other: Body) -> str:
-        """The link that two bodies are seen from: the last rigid part that carries both."""
-        return self._parts.common_part(*(self._parts.of_link[body.link] for body in (one, other)))
+    def _reference_link(self, first: Body, second: Body) -> str:
+        """Return the last link that carries both bodies."""
+        return self._parts.meeting(*(self._parts.of_link[body.link] for body in (first, second)))
 
     @property
     def labels(self) -> tuple[tuple[str, str], ...]:
         """Names of the two bodies of each pair."""
-        return tuple((self.bodies[one].name, self.bodies[other].name) for one, other, _ in self.pairs)
+        return tuple((self.bodies[i].name, self.bodies[j].name) for i, j, _ in self.pairs)
 
-    def told_as(self, pair: int) -> tuple[str, str]:
-        """How a pair is named in `ignored`: by the links that its bodies belong to, or as an obstacle."""
-        placed = [self.bodies[body] for body in self.pairs[pair, :2]]
+    def pair_names(self, pair: int) -> tuple[str, str]:
+        """Return the names of a pair as in `ignored`: those of its links, or of a link and an obstacle."""
+        bodies = [self.bodies[body] for body in self.pairs[pair, :2]]
         own = range(len(self._carriers))
-        one, other = (self._carriers[body.frame] if body.frame in own else body.name for body in placed)
-        return one, other
+        first, second = (self._carriers[body.frame] if body.frame in own else body.name for body in bodies)
+        return first, second
 
     @property
     def disabled(self) -> list[tuple[str, str]]:
-        """Pairs of links that the SRDF file names."""
-        return [pair for pair, why in self.left.items() if why == SRDF]
+        """Pairs of links that the SRDF file disables."""
+        return [pair for pair, reason in self.left.items() if reason == SRDF]
 
     @property
     def assumed(self) -> dict[str, str]:
-        """Pairs of links that are left out by assumption, "one and other": no proof says that they always touch."""
-        looked_at = {frozenset(self.told_as(pair)) for pair in self._held}  # by their hulls
+        """Reason by pair of links, "A and B", for pairs that are excluded by assumption, without proof."""
+        checked_by_hull = {frozenset(self.pair_names(pair)) for pair in self._cover_pairs}
         return {
-            " and ".join(pair): why.value
-            for pair, why in self.left.items()
-            if why in ASSUMED and frozenset(pair) not in looked_at
+            " and ".join(pair): reason.value
+            for pair, reason in self.left.items()
+            if reason in ASSUMED and frozenset(pair) not in checked_by_hull
         }
 
     @property
-    def moves_by_itself(self) -> bool:
+    def has_moving_obstacles(self) -> bool:
         """Whether an obstacle moves."""
-        return any(isinstance(one, MovingObstacle) for one in self.obstacles)
+        return any(isinstance(obstacle, MovingObstacle) for obstacle in self.obstacles)
 
     def placements(self, base: Expression, q: Expression, time: Expression = 0.0) -> Expression:
-        """Frames of bodies: rotation column by column, then position, one below the other. Shape (12 F, 1)."""
+        """Return the frames of the bodies, stacked: rotation column by column, then position. Shape (12 F, 1)."""
         frames = self._frames(base, q, time)
         columns = [part for frame in frames for part in (ca.vec(frame.rotation), frame.position)]
         return ca.densify(ca.vertcat(*columns)) if columns else expression(q)[:0]
@@ -239,90 +241,92 @@ class CollisionScene:
         pairs: Sequence[int] | None = None,
         rounding: float = 0.0,
     ) -> Expression:
-        """Signed distances of pairs, m, exact or from below; see `models.shapes.distance`. Shape (n, 1).
+        """Return the signed distances of pairs, m, exact or lower bounds, see `models.shapes.distance`. Shape (n, 1).
 
-        Of two hulls of meshes it is that of their covers: they are no nearer.
+        For two hulls of meshes it is the distance of their covers, a lower bound.
 
         Args:
-            base, q: Configuration of the machine. time: s.
-            pairs: Which; all if None. rounding: As of `distance`, m.
+            base, q: Configuration of the machine.
+            time: s.
+            pairs: Indices of the pairs; all if None.
+            rounding: As in `distance`, m.
 
         Raises:
-            ModelError: Pairs that there are none of, a rounding below zero.
+            ModelError: An unknown pair, a negative rounding.
         """
-        chosen, rounding = self._asked(pairs, rounding)
+        indices, rounding = self._checked_request(pairs, rounding)
         frames = [*self._frames(base, q, time), None]
         columns: dict[int, Expression] = {}
 
-        def side(body: int) -> Expression:
+        def column_of(body: int) -> Expression:
             if body not in columns:
                 placed = self.bodies[body]
                 columns[body] = column(placed.shape, frames[placed.frame])
             return columns[body]
 
-        def between(one: int, other: int) -> Expression:
-            a, b = self.bodies[one], self.bodies[other]
+        def pair_distance(i: int, j: int) -> Expression:
+            a, b = self.bodies[i], self.bodies[j]
             kinds = type(a.shape), type(b.shape)
             if set(kinds) <= COLUMNS.keys():
-                return pair_function(*kinds, rounding)(side(one), side(other))
+                return pair_function(*kinds, rounding)(column_of(i), column_of(j))
             return distance(a.shape, b.shape, frames[a.frame], frames[b.frame], rounding=rounding)
 
-        found = []
-        for pair in chosen:
-            each = [between(*both) for both in self._held.get(pair, (self.pairs[pair, :2].tolist(),))]
-            found.append(each[0] if len(each) == 1 else soft_minimum(each, rounding / 4 + FINEST))
-        return ca.vertcat(*found) if found else expression(q)[:0]
+        distances = []
+        for pair in indices:
+            gaps = [pair_distance(*bodies) for bodies in self._cover_pairs.get(pair, (self.pairs[pair, :2].tolist(),))]
+            distances.append(gaps[0] if len(gaps) == 1 else soft_minimum(gaps, rounding / 4 + MIN_SOFTNESS_M))
+        return ca.vertcat(*distances) if distances else expression(q)[:0]
 
     def distance_gradients(self, *, pairs: Sequence[int] | None = None, rounding: float = 0.0) -> Any:
-        """Function (base, q, time) -> signed distances of pairs and their gradients; see `distances`.
+        """Return a Function (base, q, time) -> signed distances of pairs and their gradients; see `distances`.
 
-        Distances have shape (n, 1), m, gradients by base and joints shape (n, base_size + joint_size). It takes all
-        pairs of two kinds of shapes at once, and no derivatives but those of frames: a distance of rigid bodies changes
-        with the twist of one seen from the other alone, by its wrench. That is some fifteen times faster than
-        `distances` and its Jacobian. Of a base with a quaternion, gradients hold along rates that keep it a unit.
+        Distances have shape (n, 1), m, gradients by base and joints shape (n, base_size + joint_size). All pairs of the
+        same two kinds of shapes are evaluated together, and only frames are differentiated: a distance of rigid bodies
+        changes only with their relative twist, through a wrench. That is about fifteen times faster than `distances`
+        and its Jacobian. For a base with a quaternion, gradients hold along rates that keep it a unit quaternion.
 
-        Args, Raises: As of `distances`.
+        Args, Raises: As in `distances`.
         """
-        chosen, rounding = self._asked(pairs, rounding)
-        groups = [self._held.get(pair, (tuple(self.pairs[pair, :2].tolist()),)) for pair in chosen]
-        softness = rounding / 4 + FINEST
+        indices, rounding = self._checked_request(pairs, rounding)
+        groups = [self._cover_pairs.get(pair, (tuple(self.pairs[pair, :2].tolist()),)) for pair in indices]
+        softness = rounding / 4 + MIN_SOFTNESS_M
         return distance_gradients(self.machine, self.bodies, self._carriers, self._moving, groups, rounding, softness)
 
-    def _asked(self, pairs: Sequence[int] | None, rounding: float) -> tuple[list[int], float]:
-        """Pairs by their places, and a rounding, checked."""
-        every, owner = np.arange(len(self.pairs)), "scene"
-        given = every if pairs is None else every[:0] if isinstance(pairs, list | tuple) and not pairs else pairs
-        chosen = checked_indices(given, len(every), owner, "pairs").ravel().tolist()
-        return chosen, checked_nonnegative(rounding, owner, "rounding", "m")
+    def _checked_request(self, pairs: Sequence[int] | None, rounding: float) -> tuple[list[int], float]:
+        """Return the indices of pairs, all if None, and a rounding, checked."""
+        indices = np.arange(len(self.pairs))
+        if isinstance(pairs, list | tuple) and not pairs:
+            indices = indices[:0]
+        elif pairs is not None:
+            indices = checked_indices(pairs, len(indices), "scene", "pairs").ravel()
+        return indices.tolist(), checked_nonnegative(rounding, "scene", "rounding", "m")
 
     @cached_property
     def levers(self) -> Levers:
-        """How the configuration moves each pair.
+        """Bounds on the relative motion of each pair.
 
         Raises:
-            ModelError: A slide without limits.
+            ModelError: A prismatic joint without limits.
         """
         n, dof, size = len(self.pairs), self.machine.robot.dof, self.machine.base_size
         joints, turns = np.zeros((n, dof)), np.zeros((n, dof))
         base, base_turns = np.zeros((n, size)), np.zeros((n, size))
         known: dict[tuple[int, int], Levers] = {}
-        for row, (one, other, seen) in enumerate(self.pairs.tolist()):
-            for pair in [(one, other), *self.covers.get(row, np.zeros((0, 2), dtype=int)).tolist()]:
+        for row, (first, second, reference) in enumerate(self.pairs.tolist()):
+            for pair in [(first, second), *self.covers.get(row, np.zeros((0, 2), dtype=int)).tolist()]:
                 for body in pair:
-                    if (body, seen) not in known:
-                        known[body, seen] = self._levers_of(self.bodies[body], seen)
-                both = [known[body, seen] for body in pair]
-                for most, *found in zip((base, base_turns, joints, turns), *both, strict=True):
-                    most[row] = np.maximum(most[row], sum(found))
+                    if (body, reference) not in known:
+                        known[body, reference] = self._levers_of(self.bodies[body], reference)
+                levers = [known[body, reference] for body in pair]
+                for largest, *values in zip((base, base_turns, joints, turns), *levers, strict=True):
+                    largest[row] = np.maximum(largest[row], sum(values))
         return Levers(base, base_turns, joints, turns)
 
     def check_motions(self, begin: float, end: float) -> None:
-        """Raise ModelError where the motion of an obstacle is not defined at a time between two, s."""
-        for one in self.obstacles:
-            if isinstance(one, MovingObstacle):
-                one.check(begin, end)
-
-    # ---- inside ------------------------------------------------------------------------------------------------
+        """Raise ModelError if the pose of a moving obstacle is invalid at a sampled time between two times, s."""
+        for obstacle in self.obstacles:
+            if isinstance(obstacle, MovingObstacle):
+                obstacle.check(begin, end)
 
     def _frames(self, base: Expression, q: Expression, time: Expression) -> list[Frame]:
         machine = self.machine
@@ -330,71 +334,63 @@ class CollisionScene:
         return [*(frames[link] for link in self._carriers), *self._moving(time)]
 
     def _moving(self, time: Expression) -> list[Frame]:
-        """Frames of the obstacles that move."""
-        return [one.frame(time) for one in self.obstacles if isinstance(one, MovingObstacle)]
+        """Return the frames of the moving obstacles."""
+        return [obstacle.frame(time) for obstacle in self.obstacles if isinstance(obstacle, MovingObstacle)]
 
     def _close_meshes(
         self, own: Sequence[Body], checked: Sequence[tuple[int, int]]
     ) -> dict[tuple[LinkMesh, LinkMesh], list[tuple[int, int]]]:
-        """Pairs of bodies, by the two meshes that they cover, of links two or three joints apart.
+        """Return pairs of bodies by the two meshes that they cover, for links with at most three joints between them.
 
-        These may be a few millimetres from each other by design, less than covers stand out: their hulls are looked at,
-        and those of meshes whose covers always touch.
+        Such meshes may be only millimetres apart by design, closer than their covers allow. So their hulls are checked,
+        as are those of meshes whose covers always collide.
         """
-        found: dict[tuple[LinkMesh, LinkMesh], list[tuple[int, int]]] = {}
+        pairs: dict[tuple[LinkMesh, LinkMesh], list[tuple[int, int]]] = {}
         for i, j in checked:
-            one, other = own[i], own[j]
-            up, down = self._parts.path(*(self._parts.of_link[body.link] for body in (one, other)))
-            # meshes of links with few joints between them are looked at as they are, not as their covers
-            near = len(up) + len(down) <= 3 or self.left.get((one.link, other.link)) == COVERED
-            if near and one.mesh is not None and other.mesh is not None:
-                found.setdefault((one.mesh, other.mesh), []).append((i, j))
-        return found
+            first, second = own[i], own[j]
+            up, down = self._parts.path(*(self._parts.of_link[body.link] for body in (first, second)))
+            is_close = len(up) + len(down) <= 3 or self.left.get((first.link, second.link)) == COVERED
+            if is_close and first.mesh is not None and second.mesh is not None:
+                pairs.setdefault((first.mesh, second.mesh), []).append((i, j))
+        return pairs
 
     def _moves(self, link: str) -> bool:
-        """Whether a link ever moves in world."""
+        """Return whether a link can move in world."""
         return bool(self.machine.base_size) or any(joint.moves for joint in self.machine.robot.path_to(link))
 
-    def _levers_of(self, placed: Placed, seen: int) -> Levers:
-        """Of one body from where it is seen: a link's frame that it hangs on, or -1, the world."""
+    def _levers_of(self, placed: PlacedShape, reference: int) -> Levers:
+        """Return the levers of one body in a reference frame: that of a link, or -1 for the world."""
         robot, parts, size = self.machine.robot, self._parts, self.machine.base_size
         joints, turns, base, base_turns = np.zeros(robot.dof), np.zeros(robot.dof), np.zeros(size), np.zeros(size)
-        found = Levers(base, base_turns, joints, turns)
+        levers = Levers(base, base_turns, joints, turns)
         if not 0 <= placed.frame < len(self._carriers):
-            return found  # an obstacle
-        link, above = self._carriers[placed.frame], robot.root if seen == WORLD else self._carriers[seen]
-        way = parts.path(parts.of_link[above], parts.of_link[link])[1]
-        endless = np.full(robot.dof, np.inf)
-        low, high = (robot.lower, robot.upper) if self.limits else (-endless, endless)
-        own, reach = lever_arms(
-            robot, [(step, True) for step in way], placed.shape.placed(*parts.pose[link]), low, high
-        )
-        for (joint, *_), arm in zip(way, own, strict=True):
-            column, ratio, _ = robot.drives[joint.name]
+            return levers  # an obstacle
+        link, base_link = self._carriers[placed.frame], robot.root if reference == WORLD else self._carriers[reference]
+        path = parts.path(parts.of_link[base_link], parts.of_link[link])[1]
+        infinite = np.full(robot.dof, np.inf)
+        low, high = (robot.lower, robot.upper) if self.limits else (-infinite, infinite)
+        shape = placed.shape.placed(*parts.place[link])
+        lengths, reach = arms(robot, [(step, True) for step in path], shape, low, high)
+        for (joint, *_), arm in zip(path, lengths, strict=True):
+            column, ratio, _ = robot.couplings[joint.name]
             slides = joint.kind == "prismatic"
             joints[column] += abs(ratio) * (1.0 if slides else arm)
             turns[column] += 0.0 if slides else abs(ratio)
         if not np.isfinite(joints).all() or not np.isfinite(reach):
-            name = next(joint.name for joint, *_ in way if joint.kind == "prismatic")
-            message = f"scene: joint {name!r} slides without limits; give it some"
+            name = next(joint.name for joint, *_ in path if joint.kind == "prismatic")
+            message = f"scene: joint {name!r} slides without limits; give it position limits"
             raise ModelError(message, name=name, value=np.inf)
-        if seen == WORLD and size:
+        if reference == WORLD and size:
             planar = size == 3
             # a unit quaternion that changes by dq turns by 2 |dq|
             base[:] = (1.0, 1.0, reach) if planar else [1.0] * 3 + [2.0 * reach] * 4
             base_turns[:] = (0.0, 0.0, 1.0) if planar else [0.0] * 3 + [2.0] * 4
-        return found
-
-
-def _named(bodies: Sequence[Body]) -> list[str]:
-    """Names of bodies: of their links, with a number where a link has several."""
-    links = [body.link for body in bodies]
-    return [link if links.count(link) == 1 else f"{link}/{links[:k].count(link) + 1}" for k, link in enumerate(links)]
+        return levers
 
 
 def _by_mesh(robot: Robot, bodies: Sequence[Body]) -> dict[tuple[str, int], tuple[Body, ...]]:
-    """The bodies that cover each mesh, by its link and its place among the collision shapes of the link."""
-    found: dict[tuple[str, int], tuple[Body, ...]] = {
+    """Return the bodies that cover each mesh, by its link and its index among the link's collision shapes."""
+    covers: dict[tuple[str, int], tuple[Body, ...]] = {
         (link.name, number): ()
         for link in robot.links
         for number, shape in enumerate(link.collisions)
@@ -402,14 +398,14 @@ def _by_mesh(robot: Robot, bodies: Sequence[Body]) -> dict[tuple[str, int], tupl
     }
     for body in bodies:
         if body.mesh is not None:
-            found[body.link, body.mesh.number] += (body,)
-    return found
+            covers[body.link, body.mesh.number] += (body,)
+    return covers
 
 
-def _listed(values: Any, what: str) -> tuple[Any, ...]:
+def _checked_list(values: Any, argument: str) -> tuple[Any, ...]:
     if not isinstance(values, list | tuple) or len(values) > INPUT_LIMITS.count:
-        message = f"scene: {what} must be a list of at most {INPUT_LIMITS.count}, not {repr(values)[:80]}"
-        raise ModelError(message, name=what, value=values, limit=INPUT_LIMITS.count)
+        message = f"scene: {argument} must be a list of at most {INPUT_LIMITS.count}, not {repr(values)[:80]}"
+        raise ModelError(message, name=argument, value=values, limit=INPUT_LIMITS.count)
     return tuple(values)
 
 

@@ -1,17 +1,16 @@
-"""Arms on an unactuated, freely floating base whose momentum is conserved, zero unless given (Kim, Kim 2011).
+"""Arms on an unactuated, freely floating base with conserved momentum, zero by default (Kim, Kim 2011).
 
 The base moves so that E1 x1' + E2 x2' = 0 (24), with x1' the base twist and x2' the joint rates; the tip
-moves with F1 x1' + F2 x2' = G x2', G = F2 - F1 E1^-1 E2 being the generalized Jacobian (25). A momentum that is
-not zero adds the twist of the whole machine as one rigid body: both become affine in the joint rates.
+moves with F1 x1' + F2 x2' = G x2', G = F2 - F1 E1^-1 E2 being the generalized Jacobian (25). A non-zero momentum
+adds the twist of the whole machine as one rigid body: both become affine in the joint rates.
 
-The reaction is computed about the centre of mass of the machine, where linear and angular momentum decouple,
-and in the axes of the base, where nothing depends on the base's own pose: one rotational inertia, of size 3
-(1 when planar), is left to invert instead of E1 of size 6 (3). Instructions of the SX function of G, against
-the same through solve_spd(E1, E2) and ca.solve(E1, E2): spatial base and seven joints 1721 (3451, 4191), the
-paper's planar example 177 (337, 389); of the base twist for given joint rates 1230 (2532, 3056) and 127 (240,
-292).
+The base motion is computed about the centre of mass of the machine, where linear and angular momentum decouple, and in
+the axes of the base, where nothing depends on the base's own pose. So only one rotational inertia, of size 3 (1 if
+planar), is inverted instead of E1 of size 6 (3). Instructions of the SX function of G, against the same through
+solve_spd(E1, E2) and ca.solve(E1, E2): spatial base and seven joints 1721 (3451, 4191), the paper's planar example 177
+(337, 389); of the base twist for given joint rates 1230 (2532, 3056) and 127 (240, 292).
 
-A machine in which some motion of the base carries no momentum has no such reaction and is refused.
+A machine in which some base motion carries no momentum is rejected.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ from models.robot.kinematics import (
     tip_frame,
 )
 from models.robot.kinematics import momentum_matrix as joint_momentum_matrix
-from models.robot.parts import massless
+from models.robot.parts import massless_error
 from models.robot.robot import Robot
 from models.spatial import (
     Expression,
@@ -59,15 +58,12 @@ from models.spatial import (
 BaseKind: TypeAlias = Literal["planar", "spatial"]
 
 PLANAR_ROWS = [2, 3, 4]
-"""Of a spatial vector, what a motion in the plane z = constant has:
-
-Rotation about z, translation along x and y.
-"""
+"""Rows of a spatial vector that planar motion (z = constant) has: rotation about z, translation along x and y."""
 
 
 @dataclass(frozen=True, eq=False)
 class FreeFloating:
-    """A robot whose root link floats freely, the total momentum being conserved.
+    """A robot whose root link floats freely with conserved total momentum.
 
     The configuration of the base is the pose of the root link's frame in an inertial world: (x, y, angle) for
     a planar base, (x, y, z, qw, qx, qy, qz) for a spatial one, with a unit quaternion. A base twist is
@@ -75,7 +71,7 @@ class FreeFloating:
     (angular velocity, vx, vy), shape (3, 1).
 
     Attributes:
-        robot: The kinematic tree; a single body without joints moves as its momentum makes it tumble.
+        robot: Kinematic tree; a single body without joints tumbles according to its momentum.
         base: "planar" or "spatial".
         conserved_momentum: (Angular about the centre of mass, N m s; linear, N s), world axes, shape (6,);
             (Lz, Px, Py), shape (3,), if planar. Zero if None.
@@ -96,13 +92,13 @@ class FreeFloating:
             _require_planar(self.robot)
         _require_inertia(self.robot, self.twist_rows)
         size = len(self.twist_rows)
-        given = np.zeros(size) if self.conserved_momentum is None else self.conserved_momentum
-        momentum = checked_array(given, (size,), f"{self.base} free-floating base", "conserved_momentum")
+        momentum = np.zeros(size) if self.conserved_momentum is None else self.conserved_momentum
+        momentum = checked_array(momentum, (size,), f"{self.base} free-floating base", "conserved_momentum")
         object.__setattr__(self, "conserved_momentum", momentum)
 
     @property
     def base_size(self) -> int:
-        """3 for a planar base, 7 for a spatial one."""
+        """Length of the base configuration: 3 for a planar base, 7 for a spatial one."""
         return 3 if self.base == "planar" else 7
 
     @property
@@ -112,18 +108,15 @@ class FreeFloating:
 
     @property
     def twist_rows(self) -> list[int]:
-        """Which rows of a spatial twist or momentum the base has:
-
-        (rotation z, x, y) if planar, else all six.
-        """
+        """Rows of a spatial twist or momentum that the base has: (rotation z, x, y) if planar, else all six."""
         return PLANAR_ROWS if self.base == "planar" else list(range(6))
 
     def base_home(self) -> Array:
-        """Base at the world's origin, axes parallel. Shape (base_size,)."""
+        """Return the base configuration at the world's origin, axes parallel. Shape (base_size,)."""
         return np.zeros(3) if self.base == "planar" else np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 
     def world_from_base(self, base: Expression) -> Frame:
-        """Placement of the root link's frame in the world."""
+        """Return the pose of the root link's frame in the world."""
         base = self._checked_base(base)
         if self.base == "planar":
             return Frame(rotation((0, 0, 1), base[2]), ca.vertcat(base[0:2], type(base)(1, 1)))
@@ -131,7 +124,7 @@ class FreeFloating:
 
     @on_scalars
     def tip_pose(self, base: Expression, q: Expression) -> Frame:
-        """Frame of the tip in the world."""
+        """Return the frame of the tip in the world."""
         world_from_base = self.world_from_base(base)
         tip = tip_frame(self.robot, frames_and_axes(self.robot, q)[0])
         turned = ca.mtimes(world_from_base.rotation, tip.rotation)
@@ -139,18 +132,18 @@ class FreeFloating:
 
     @on_scalars
     def tip_jacobian(self, base: Expression, q: Expression) -> Expression:
-        """Generalized Jacobian G (25), the linear part of the tip's twist. Shape (6, joint_size)."""
+        """Return the generalized Jacobian G (25), the linear part of the tip's twist. Shape (6, joint_size)."""
         return self._tip_motion(base, self._reaction(q, None, tip=True))
 
     @on_scalars
     def tip_twist(self, base: Expression, q: Expression, joint_rates: Expression) -> Expression:
-        """Twist of the tip, G joint_rates (25) and what the conserved momentum adds. Shape (6, 1)."""
+        """Return the twist of the tip: G joint_rates (25) plus the drift of the conserved momentum. Shape (6, 1)."""
         rates = joint_vector(self.robot, joint_rates, "joint_rates")
         return self._tip_motion(base, self._reaction(q, rates, base, tip=True))
 
     @on_scalars
     def base_twist(self, base: Expression, q: Expression, joint_rates: Expression) -> Expression:
-        """Twist of the base that has the momentum, E1^-1 (momentum - E2 joint_rates) (24).
+        """Return the twist of the base under the conserved momentum, E1^-1 (momentum - E2 joint_rates) (24).
 
         Shape (6, 1) or (3, 1).
         """
@@ -161,7 +154,7 @@ class FreeFloating:
 
     @on_scalars
     def base_rate(self, base: Expression, q: Expression, joint_rates: Expression) -> Expression:
-        """Time derivative of the base configuration that has the momentum. Shape (base_size, 1)."""
+        """Return the time derivative of the base configuration under the conserved momentum. Shape (base_size, 1)."""
         if self.base == "planar":
             twist = self.base_twist(base, q, joint_rates)
             return ca.vertcat(twist[1:3], twist[0])
@@ -169,12 +162,12 @@ class FreeFloating:
         reaction = self._reaction(q, joint_vector(self.robot, joint_rates, "joint_rates"), base)
         turn = self.world_from_base(base).rotation
         quaternion, spin = pose[3:7], reaction.base_angular
-        turning = quaternion_product(quaternion, ca.vertcat(type(spin)(1, 1), spin)) / 2  # in base axes: no rotation
+        turning = quaternion_product(quaternion, ca.vertcat(type(spin)(1, 1), spin)) / 2  # spin is in base axes
         return ca.densify(ca.vertcat(ca.mtimes(turn, reaction.base_linear), turning))
 
     @on_scalars
     def twist_of_rate(self, base: Expression, base_rate: Expression) -> Expression:
-        """Twist of a base whose configuration changes with `base_rate`. Shape (6, 1), or (3, 1) if planar."""
+        """Return the base twist for a rate of the base configuration. Shape (6, 1), or (3, 1) if planar."""
         rate = checked_vector(base_rate, self.base_size, "base_rate", "the derivative of the base configuration")
         base = self._checked_base(base)
         if self.base == "planar":
@@ -183,12 +176,11 @@ class FreeFloating:
 
     @on_scalars
     def momentum_matrices(self, base: Expression, q: Expression) -> tuple[Expression, Expression]:
-        """E1 and E2 of (24): momentum = E1 base_twist + E2 joint_rates.
+        """Return E1 and E2 of (24): momentum = E1 base_twist + E2 joint_rates.
 
         Returns:
-            E1 of shape (6, 6), E2 of shape (6, joint_size), rows (moment of momentum about the world's
-            origin, linear momentum), world axes; (3, 3) and (3, joint_size) with the rows (Lz, Px, Py) for a
-            planar base.
+            E1 of shape (6, 6), E2 of shape (6, joint_size), rows (moment of momentum about the world's origin, linear
+            momentum), world axes; (3, 3) and (3, joint_size) with the rows (Lz, Px, Py) for a planar base.
         """
         to_world = force_transform(self.world_from_base(base))
         turn = motion_transform((self.world_from_base(base).rotation, ca.DM(3, 1)))
@@ -199,7 +191,7 @@ class FreeFloating:
 
     @on_scalars
     def momentum(self, base: Expression, q: Expression, base_twist: Expression, joint_rates: Expression) -> Expression:
-        """Total (moment of momentum about the world's origin, linear momentum); (Lz, Px, Py) if planar.
+        """Return the total (moment of momentum about the world's origin, linear momentum); (Lz, Px, Py) if planar.
 
         Shape (6, 1) or (3, 1).
         """
@@ -211,55 +203,57 @@ class FreeFloating:
     def joint_torques(
         self, base: Expression, q: Expression, joint_rates: Expression, accelerations: Expression
     ) -> Expression:
-        """Torques (forces of prismatic joints) of a motion on which nothing acts from outside. Shape (n, 1), N m or N.
+        """Return the joint torques (forces of prismatic joints) of a motion without external wrenches.
 
-        Computed in the axes of the base. Its pose enters only through the carried momentum h, whose components change
-        as these axes turn with the angular velocity w: h' = -w x h.
+        They are computed in base axes. The pose of the base enters only through the conserved momentum h, whose
+        components change as these axes rotate with the angular velocity w: h' = -w x h.
 
         Args:
-            base, q, joint_rates: Symbols, for they are differentiated. Shape (base_size, 1), (n, 1) and (n, 1).
+            base, q, joint_rates: Symbols, because the base twist is differentiated by them. Shape (base_size, 1), (n,
+                1) and (n, 1).
             accelerations: Of the joints. Shape (n, 1).
+
+        Returns:
+            Shape (n, 1), N m or N.
         """
-        carried, plane = self._carried(), ca.DM.eye(TWIST_SIZE)[:, self.twist_rows]
+        carried, plane = self._spatial_momentum(), ca.DM.eye(TWIST_SIZE)[:, self.twist_rows]
         momentum = ca.SX.sym("momentum", 0 if carried is None else TWIST_SIZE)
-        held = None if carried is None else (momentum[:3], momentum[3:])
-        reaction = _reaction(self.robot, q, joint_rates, held, planar=self.base == "planar", tip=False)
+        in_base = None if carried is None else (momentum[:3], momentum[3:])
+        reaction = _reaction(self.robot, q, joint_rates, in_base, planar=self.base == "planar", tip=False)
         twist = ca.mtimes(plane, ca.vertcat(reaction.base_angular, reaction.base_linear)[self.twist_rows])
         spin = twist[0:3]
-        turning = ca.vertcat(ca.DM(0, 1), *(-cross(spin, part) for part in held or ()))
+        turning = ca.vertcat(ca.DM(0, 1), *(-cross(spin, part) for part in in_base or ()))
         along = ca.vertcat(turning, joint_rates, accelerations)
         second = ca.mtimes(plane.T, ca.jtimes(twist, ca.vertcat(momentum, q, joint_rates), along))
         second = ca.mtimes(plane, second) + ca.vertcat(ca.DM(3, 1), cross(spin, twist[3:6]))
-        found = inverse_dynamics(
+        torques = inverse_dynamics(
             self.robot, q, joint_rates, accelerations, gravity=(0.0, 0.0, 0.0), base_twist=twist,
             base_acceleration=second,
         )  # fmt: skip
         if carried is None:
-            return found
+            return torques
         turn = self.world_from_base(base).rotation.T
-        return ca.substitute(found, momentum, ca.densify(ca.SX(ca.vertcat(*(ca.mtimes(turn, h) for h in carried)))))
+        return ca.substitute(torques, momentum, ca.densify(ca.SX(ca.vertcat(*(ca.mtimes(turn, h) for h in carried)))))
 
     @on_scalars
     def momentum_residual(
         self, base: Expression, q: Expression, base_rate: Expression, joint_rates: Expression
     ) -> Expression:
-        """Momentum, as above, of a motion given by its configuration's derivatives, less the one that it has:
+        """Return the momentum of a motion, as by `momentum`, less the conserved one: zero if the motion is possible.
 
-        Zero if the motion is possible.
+        The motion is given by the rates of base configuration and joints.
         """
-        found = self.momentum(base, q, self.twist_of_rate(base, base_rate), joint_rates)
-        carried = self._carried()
+        momentum = self.momentum(base, q, self.twist_of_rate(base, base_rate), joint_rates)
+        carried = self._spatial_momentum()
         if carried is None:
-            return found
+            return momentum
         angular, linear = carried
         center = center_of_mass(self.robot, q, self.world_from_base(base))
-        return found - ca.densify(ca.vertcat(angular + cross(center, linear), linear))[self.twist_rows, :]
+        return momentum - ca.densify(ca.vertcat(angular + cross(center, linear), linear))[self.twist_rows, :]
 
     @on_scalars
     def jacobians(self, base: Expression, q: Expression) -> tuple[Expression, Expression]:
-        """F1 and F2 of (25).
-
-        Tip twist = F1 base_twist + F2 joint_rates, base and joints taken as independent.
+        """Return F1 and F2 of (25): tip twist = F1 base_twist + F2 joint_rates, with base and joints independent.
 
         Returns:
             F1 of shape (6, 6), (6, 3) for a planar base; F2 of shape (6, joint_size).
@@ -274,7 +268,7 @@ class FreeFloating:
         return ca.densify(lever)[:, self.twist_rows], ca.densify(ca.mtimes(both, joints))
 
     def manipulability(self, base: Expression, q: Expression, rows: Sequence[int] = range(TWIST_SIZE)) -> Expression:
-        """Of the generalized Jacobian, as jacobian_manipulability. Shape (1, 1)."""
+        """Return the manipulability of the generalized Jacobian, see jacobian_manipulability. Shape (1, 1)."""
         return jacobian_manipulability(self.tip_jacobian(base, q), rows)
 
     def _tip_motion(self, base: Expression, reaction: _Reaction) -> Expression:
@@ -283,12 +277,15 @@ class FreeFloating:
         return ca.densify(ca.vertcat(angular, linear))
 
     def _checked_base(self, base: Expression) -> Expression:
-        """Configuration of the base; ModelError for another size."""
+        """Return the base configuration as a column; raise ModelError for another size."""
         meaning = "(x, y, angle)" if self.base == "planar" else "(x, y, z, qw, qx, qy, qz)"
         return checked_vector(base, self.base_size, "base", meaning)
 
-    def _carried(self) -> tuple[Expression, Expression] | None:
-        """(Angular about the centre of mass, linear) momentum, world axes, shape (3, 1) each; None where it is zero."""
+    def _spatial_momentum(self) -> tuple[Expression, Expression] | None:
+        """Return the conserved momentum (angular about the centre of mass, linear) in world axes; None if it is zero.
+
+        Shape (3, 1) each.
+        """
         momentum = np.asarray(self.conserved_momentum)
         if not momentum.any():
             return None
@@ -299,18 +296,18 @@ class FreeFloating:
     def _reaction(
         self, q: Expression, joint_rates: Expression | None, base: Expression = None, tip: bool = False
     ) -> _Reaction:
-        """Of the robot, with the momentum in the base's axes where rates are given."""
+        """Return the base reaction, including the momentum if joint rates are given."""
         carried = None
-        if joint_rates is not None and (momentum := self._carried()) is not None:
+        if joint_rates is not None and (momentum := self._spatial_momentum()) is not None:
             turn = self.world_from_base(base).rotation
             carried = ca.mtimes(turn.T, momentum[0]), ca.mtimes(turn.T, momentum[1])
         return _reaction(self.robot, q, joint_rates, carried, planar=self.base == "planar", tip=tip)
 
 
 class _Reaction(NamedTuple):
-    """Motion of base and tip per unit joint rate, or for given joint rates; in base axes, one column each.
+    """Motion of base and tip in base axes: one column per joint for unit rates, or one column for given joint rates.
 
-    The latter with what the conserved momentum adds. That of the tip is None unless asked for.
+    The latter includes the effect of the conserved momentum. The motion of the tip is None unless requested.
     """
 
     base_angular: Expression
@@ -322,25 +319,25 @@ class _Reaction(NamedTuple):
 def _reaction(
     robot: Robot,
     q: Expression,
-    joint_rates: Expression | None = None,
-    carried: tuple[Expression, Expression] | None = None,
+    joint_rates: Expression | None,
+    carried: tuple[Expression, Expression] | None,
     *,
-    planar: bool = False,
-    tip: bool = True,
+    planar: bool,
+    tip: bool,
 ) -> _Reaction:
-    """_Reaction of a base that floats to unit rate of each joint (n columns), or to given joint rates (one column).
+    """Return the motion of a floating base for unit rates of each joint (n columns), or for given rates (one column).
 
     Args:
-        robot: The kinematic tree, its root link free.
+        robot: Kinematic tree with a free root link.
         q: Joint positions. Shape (dof, 1).
         joint_rates: Shape (dof, 1); None for unit rates.
-        carried: Momentum that the machine has, with given joint rates only: (angular about the centre of mass,
-            linear), axes of the base. Shape (3, 1) each; none if None.
-        planar: Whether the base moves in the plane z = constant only.
-        tip: Whether the motion of the tip is asked for.
+        carried: Conserved momentum, only with given joint rates: (angular about the centre of mass, linear), base axes.
+            Shape (3, 1) each; zero if None.
+        planar: Restrict the base to the plane z = constant.
+        tip: Also compute the motion of the tip.
 
     Raises:
-        ModelError: The tip is asked for of a robot that has none; wrong sizes.
+        ModelError: The tip is requested but the robot has none; wrong sizes.
     """
     frames, axes = frames_and_axes(robot, q)
     moments = subtree_moments(robot, frames)
@@ -359,7 +356,7 @@ def _reaction(
         turning = ca.vertcat(ca.DM(2, about_center.shape[1]), -about_center[2, :] / inertia[2, 2])
     else:
         turning = -solve_spd(inertia, about_center)
-    # The centre of mass moves with the carried momentum alone, which fixes the velocity of the base's origin.
+    # The velocity of the centre of mass follows from the conserved momentum alone and fixes that of the base's origin.
     linear = ca.mtimes(skew(center), turning) - momentum[3:6, :] / total.mass
     if not tip:
         return _Reaction(turning, linear)
@@ -385,13 +382,13 @@ def _require_planar(robot: Robot) -> None:
 
 
 def _require_inertia(robot: Robot, rows: list[int]) -> None:
-    """Raise ModelError where the momentum in these rows of it does not fix the motion of the base.
+    """Raise ModelError if the momentum in these rows does not determine the base motion.
 
-    Whatever the units of mass and length: judged by the moments relative to each other.
+    Only the ratios of the inertias matter, not the units of mass and length.
     """
     if robot.total_mass == 0:
-        raise massless("without which no momentum tells how its base floats")
-    # A stretched chain of point masses can lack inertia about one axis in one configuration: try others too.
+        raise massless_error("without which no momentum tells how its base floats")
+    # A stretched chain of point masses lacks inertia about one axis in a single configuration, so several are tried.
     spread = np.linspace(0.3, 1.1, robot.dof)
     angular = [row for row in rows if row < 3]
     for q in (np.zeros(robot.dof), spread, -2 * spread[::-1]):

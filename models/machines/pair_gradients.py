@@ -1,8 +1,8 @@
-"""Distances of many pairs of bodies with their gradients, by wrenches.
+"""Distances of many pairs of bodies with their gradients.
 
-A distance of rigid bodies changes with the twist of one seen from the other alone, by a wrench, and that twist is a sum
-of the screws of the joints between the two: no derivatives are taken but those of frames by the base. All pairs of two
-kinds of shapes are columns of numbers side by side.
+The distance of two rigid bodies changes only with their relative twist, through a wrench. That twist is a sum of the
+screws of the joints between them, so only the frames are differentiated, by the base. All pairs of the same two
+kinds of shapes are evaluated together as columns.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from models.shapes.shapes import Shape
 from models.spatial import Expression, Frame, cross
 
 WORLD = -1
-"""In the place of a frame: the world."""
+"""Index that stands for the world instead of a frame."""
 
 
-class Placed(NamedTuple):
-    """A body that is looked at.
+class PlacedShape(NamedTuple):
+    """A shape in a collision scene.
 
     Attributes:
-        name: Of its link, with a number where it has several; or of an obstacle.
-        shape: In the frame that it rides on.
-        frame: Index of that frame among those of `CollisionScene.placements`; -1: the world.
+        name: Name of its link, with a number if the link has several shapes, or of an obstacle.
+        shape: Shape in the frame that carries it.
+        frame: Index of that frame among those of `CollisionScene.placements`; -1 for the world.
     """
 
     name: str
@@ -41,20 +41,22 @@ class Placed(NamedTuple):
 
 def distance_gradients(
     machine: Machine,
-    bodies: Sequence[Placed],
+    bodies: Sequence[PlacedShape],
     carriers: Sequence[str],
     moving: Callable[[Expression], list[Frame]],
     groups: Sequence[Sequence[tuple[int, int]]],
     rounding: float,
     softness: float,
 ) -> Any:
-    """Function (base, q, time) -> distances, shape (n, 1), m, and gradients, shape (n, size of base and q).
+    """Return a Function (base, q, time) -> distances, shape (n, 1), m, and gradients, shape (n, size of base and q).
 
     Args:
-        machine: Whose bodies.
-        bodies: All. carriers: Links of their frames, in order. moving: Time (s) -> the frames behind these.
-        groups: Of each distance the pairs, numbers of two bodies, that it is the least of.
-        rounding, softness: Of a distance, and of the least of several, m.
+        machine: Machine that carries the bodies.
+        bodies: All shapes.
+        carriers: Links of the first frames, in order.
+        moving: Function from time (s) to the remaining frames.
+        groups: For each distance the pairs, indices of two bodies, of which it is the minimum.
+        rounding, softness: Smoothing of each distance, and of the minimum of several, m.
     """
     base, q, time = ca.SX.sym("base", machine.base_size), ca.SX.sym("q", machine.joint_size), ca.SX.sym("time")
     world_from_base = machine.world_from_base(base)
@@ -62,61 +64,61 @@ def distance_gradients(
     frames = [*(links[link] for link in carriers), *moving(time), None]
     screws = ca.horzcat(_base_twists(world_from_base, base), *(ca.vertcat(*axis) for axis in axes.values()))
     pairs = np.array([both for group in groups for both in group], dtype=int).reshape(-1, 2)
-    lots: dict[Any, list[int]] = {}
+    batches: dict[Any, list[int]] = {}
     for number, both in enumerate(pairs.tolist()):
         kinds = tuple(type(bodies[body].shape) for body in both)
-        lots.setdefault(kinds if set(kinds) <= COLUMNS.keys() else None, []).append(number)
-    others = lots.pop(None, [])
-    placed = [[bodies[body] for body in pairs[number]] for number in others]
-    apart = [distance(a.shape, b.shape, frames[a.frame], frames[b.frame], rounding=rounding) for a, b in placed]
-    rest = ca.vertcat(ca.SX(0, 1), *apart)
+        batches.setdefault(kinds if set(kinds) <= COLUMNS.keys() else None, []).append(number)
+    general = batches.pop(None, [])
+    general_pairs = [[bodies[body] for body in pairs[number]] for number in general]
+    gaps = [distance(a.shape, b.shape, frames[a.frame], frames[b.frame], rounding=rounding) for a, b in general_pairs]
+    general_gaps = ca.vertcat(ca.SX(0, 1), *gaps)
     sides = [
-        [ca.vertcat(*(column(bodies[body].shape, frames[bodies[body].frame]).T for body in some)) for some in own.T]
-        for own in (pairs[members] for members in lots.values())
+        [ca.vertcat(*(column(bodies[k].shape, frames[bodies[k].frame]).T for k in side)) for side in pairs[members].T]
+        for members in batches.values()
     ]
-    slopes = ca.jacobian(rest, ca.vertcat(base, q))
-    parts = ca.cse([ca.SX(screws), rest, slopes, *(side for both in sides for side in both)])
-    posed = ca.Function("posed", [base, q, time], list(map(ca.densify, parts)))
+    general_gradients = ca.jacobian(general_gaps, ca.vertcat(base, q))
+    parts = ca.cse([ca.SX(screws), general_gaps, general_gradients, *(side for both in sides for side in both)])
+    geometry = ca.Function("posed", [base, q, time], list(map(ca.densify, parts)))
 
     names = ["base", "q", "time"]
-    given = [ca.MX.sym(name, symbol.numel()) for name, symbol in zip(names, (base, q, time), strict=True)]
-    twists, value, gradient, *columns = posed.call(given)
-    moved, gathered = _moved(machine, bodies, carriers, pairs, list(axes)), _gathered(machine, list(axes))
-    values, rows, order = [value], [gradient], list(others)
-    for k, (kinds, members) in enumerate(lots.items()):
+    arguments = [ca.MX.sym(name, symbol.numel()) for name, symbol in zip(names, (base, q, time), strict=True)]
+    twist_columns, value, gradient, *columns = geometry.call(arguments)
+    signs, reduction = _motion_signs(machine, bodies, carriers, pairs, list(axes)), _leader_columns(machine, list(axes))
+    values, rows, order = [value], [gradient], list(general)
+    for k, (kinds, members) in enumerate(batches.items()):
         gap, wrench = pair_wrenches(kinds[0], kinds[1], rounding, len(members))(*columns[2 * k : 2 * k + 2])
-        by_screws = ca.mtimes(wrench, twists) * moved[members]
+        joint_gradient = ca.mtimes(wrench, twist_columns) * signs[members]
         values.append(gap)
-        rows.append(by_screws if gathered is None else ca.mtimes(by_screws, gathered))
+        rows.append(joint_gradient if reduction is None else ca.mtimes(joint_gradient, reduction))
         order += members
-    found = ca.vertcat(*values), ca.vertcat(*rows)
+    result = ca.vertcat(*values), ca.vertcat(*rows)
     if order:
-        found = _least(*found, np.argsort(order, kind="stable").tolist(), list(map(len, groups)), softness)
-    return ca.Function("distances", given, found, names, ["distances", "gradients"])
+        result = _reduce_groups(*result, np.argsort(order, kind="stable").tolist(), list(map(len, groups)), softness)
+    return ca.Function("distances", arguments, result, names, ["distances", "gradients"])
 
 
-def _least(
-    value: Expression, gradient: Expression, place: list[int], counts: list[int], softness: float
+def _reduce_groups(
+    value: Expression, gradient: Expression, positions: list[int], counts: list[int], softness: float
 ) -> tuple[Expression, Expression]:
-    """Return the soft minimum of consecutive pairs, or the one pair itself."""
+    """Return the soft minimum of each group of consecutive pairs, or the distance of a single pair, with gradients."""
     values, rows, order = [value], [gradient], []
     for begin, end in pairwise(accumulate(counts, initial=0)):
-        at = place[begin:end]
-        if len(at) == 1:
-            order += at
+        members = positions[begin:end]
+        if len(members) == 1:
+            order += members
             continue
-        own = value[at]
-        weights = ca.exp((ca.mmin(own) - own) / softness)
-        order.append(len(place) + len(values) - 1)
-        values.append(soft_minimum(ca.vertsplit(own), softness))
-        rows.append(ca.mtimes((weights / ca.sum1(weights)).T, gradient[at, :]))
+        group = value[members]
+        weights = ca.exp((ca.mmin(group) - group) / softness)
+        order.append(len(positions) + len(values) - 1)
+        values.append(soft_minimum(ca.vertsplit(group), softness))
+        rows.append(ca.mtimes((weights / ca.sum1(weights)).T, gradient[members, :]))
     return ca.vertcat(*values)[order], ca.vertcat(*rows)[order, :]
 
 
-def _moved(
-    machine: Machine, bodies: Sequence[Placed], carriers: Sequence[str], pairs: Array, joints: Sequence[str]
+def _motion_signs(
+    machine: Machine, bodies: Sequence[PlacedShape], carriers: Sequence[str], pairs: Array, joints: Sequence[str]
 ) -> Array:
-    """1 where a coordinate of the base or a joint moves the first body of a pair alone, -1 the second, else 0."""
+    """Return 1 where a base coordinate or joint moves only the first body of a pair, -1 only the second, else 0."""
     size = machine.base_size
     carried = np.zeros((len(bodies), size + len(joints)))
     for k, body in enumerate(bodies):
@@ -126,23 +128,26 @@ def _moved(
     return np.asarray(carried[pairs[:, 0]] - carried[pairs[:, 1]])
 
 
-def _gathered(machine: Machine, joints: Sequence[str]) -> ca.DM | None:
-    """Columns of base and joints, followers at the joints that they follow; None where each has its own."""
+def _leader_columns(machine: Machine, joints: Sequence[str]) -> ca.DM | None:
+    """Return the matrix that adds the columns of followers to those of their leaders, or None without followers."""
     robot, size = machine.robot, machine.base_size
-    gathered = np.zeros((size + len(joints), size + robot.dof))
-    gathered[:size, :size] = np.eye(size)
+    matrix = np.zeros((size + len(joints), size + robot.dof))
+    matrix[:size, :size] = np.eye(size)
     for k, name in enumerate(joints):
-        column, ratio, _ = robot.drives[name]
-        gathered[size + k, size + column] = ratio
-    return None if np.array_equal(gathered, np.eye(len(gathered))) else ca.DM(gathered)
+        column, ratio, _ = robot.couplings[name]
+        matrix[size + k, size + column] = ratio
+    return None if np.array_equal(matrix, np.eye(len(matrix))) else ca.DM(matrix)
 
 
 def _base_twists(world_from_base: Frame, base: Expression) -> Expression:
-    """Twists of a base by its coordinates, (angular, linear at the world's origin), world axes. Shape (6, size)."""
-    turn, place = (ca.SX(part) for part in world_from_base)
-    found = []
+    """Return the twists of a base per coordinate, (angular, linear at the world's origin), world axes.
+
+    Shape (6, size).
+    """
+    orientation, position = (ca.SX(part) for part in world_from_base)
+    twists = []
     for k in range(base.numel()):
-        spin = ca.mtimes(ca.reshape(ca.jacobian(ca.vec(turn), base[k]), 3, 3), turn.T)
+        spin = ca.mtimes(ca.reshape(ca.jacobian(ca.vec(orientation), base[k]), 3, 3), orientation.T)
         angular = ca.vertcat(spin[2, 1] - spin[1, 2], spin[0, 2] - spin[2, 0], spin[1, 0] - spin[0, 1]) / 2
-        found.append(ca.vertcat(angular, ca.jacobian(place, base[k]) + cross(place, angular)))
-    return ca.horzcat(ca.SX(6, 0), *found)
+        twists.append(ca.vertcat(angular, ca.jacobian(position, base[k]) + cross(position, angular)))
+    return ca.horzcat(ca.SX(6, 0), *twists)

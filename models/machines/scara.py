@@ -1,11 +1,11 @@
-"""SCARA arm: two parallel links in a horizontal plane, a quill and a wrist about the same vertical direction.
+"""SCARA arms: two parallel links in a horizontal plane, a quill and a wrist about the same vertical direction.
 
 Joint vector (shoulder, elbow, quill, wrist): rad, rad, m, rad. In the frame of the mount
 
     x = l1 cos q1 + l2 cos(q1 + q2),  y likewise,  z = q3,  yaw = q1 + q2 + q4.
 
-det of the planar Jacobian is l1 l2 sin q2: singular where the arm is stretched (reach l1 + l2) or folded
-(|l1 - l2|, the column about the shoulder axis when both links are equal).
+The determinant of the planar Jacobian is l1 l2 sin q2: the arm is singular when stretched (reach l1 + l2) or folded
+(|l1 - l2|, the shoulder axis if both links are equal).
 """
 
 from __future__ import annotations
@@ -45,12 +45,13 @@ class Scara:
 
     Attributes:
         upper_arm, forearm: Link lengths l1, l2, m.
-        mount: Point of the shoulder axis from which the quill is counted, in world. Shape (3,), m.
+        mount: Origin of the quill position on the shoulder axis, in world. Shape (3,), m.
         lower, upper: Joint limits. Shape (4,), rad and m.
-        names: Of the joints.
+        names: Names of the joints.
 
     Raises:
-        ModelError: A length that is not positive, limits that are nan or out of order, names that are not four.
+        ModelError: A length that is not positive, limits that are nan or out of order, names that are not four distinct
+            ones.
     """
 
     upper_arm: float
@@ -61,13 +62,13 @@ class Scara:
     names: tuple[str, str, str, str] = ("shoulder", "elbow", "quill", "wrist")
 
     def __post_init__(self) -> None:
-        for what in ("upper_arm", "forearm"):
-            length = checked_number(getattr(self, what), "scara", what, positive=True, unit="m")
-            object.__setattr__(self, what, length)
-            warn_of_millimetres(length, "scara", what, what)
+        for field in ("upper_arm", "forearm"):
+            length = checked_number(getattr(self, field), "scara", field, positive=True, unit="m")
+            object.__setattr__(self, field, length)
+            warn_of_millimetres(length, "scara", field, field)
         object.__setattr__(self, "mount", checked_array(self.mount, (3,), "scara", "mount"))
-        for what in ("lower", "upper"):
-            object.__setattr__(self, what, checked_array(getattr(self, what), (4,), "scara", what, finite=False))
+        for field in ("lower", "upper"):
+            object.__setattr__(self, field, checked_array(getattr(self, field), (4,), "scara", field, finite=False))
         names = () if isinstance(self.names, str) else checked_each(self.names, str, "scara", "names")
         if len(set(names) - {""}) != 4 or len(names) != 4:
             message = f"scara: joint names {list(self.names)} must be four that differ"
@@ -76,35 +77,34 @@ class Scara:
             if low > high or low == np.inf or high == -np.inf:
                 message = f"scara: joint {name!r} has limits {low:g} .. {high:g}, which leave it no position"
                 raise ModelError(message, name=name, value=low, limit=high)
-
         for joint, name in enumerate(self.names):
             if joint != QUILL:
                 warn_of_degrees((self.lower[joint], self.upper[joint]), "scara", name, f"limit of {name!r}")
 
     @property
     def outer(self) -> float:
-        """Greatest reach, m."""
+        """Largest reach, m."""
         return self.upper_arm + self.forearm
 
     @property
     def inner(self) -> float:
-        """Least reach, m."""
+        """Smallest reach, m."""
         return abs(self.upper_arm - self.forearm)
 
     @cached_property
     def robot(self) -> Robot:
-        """The arm as a kinematic tree, massless, for whatever takes a robot."""
+        """Kinematic tree of the arm, without mass."""
         links = tuple(Link(name) for name in ("base", "upper arm", "forearm", "quill", "tool"))
-        places = (tuple(self.mount), (self.upper_arm, 0.0, 0.0), (self.forearm, 0.0, 0.0), (0.0, 0.0, 0.0))
+        origins = (tuple(self.mount), (self.upper_arm, 0.0, 0.0), (self.forearm, 0.0, 0.0), (0.0, 0.0, 0.0))
         kinds: tuple[Any, ...] = ("revolute", "revolute", "prismatic", "revolute")
         joints = []
         for i, (name, kind) in enumerate(zip(self.names, kinds, strict=True)):
             ends = links[i].name, links[i + 1].name
-            joints.append(Joint(name, kind, *ends, places[i], lower=self.lower[i], upper=self.upper[i]))
+            joints.append(Joint(name, kind, *ends, origins[i], lower=self.lower[i], upper=self.upper[i]))
         return Robot(links, tuple(joints))
 
     def forward(self, joints: Expression) -> Frame:
-        """Frame of the tool in world. `joints` of shape (4,), casadi or numbers."""
+        """Return the frame of the tool in world. `joints` has shape (4,), CasADi or numbers."""
         q = checked_vector(joints, 4, "joints", f"one entry for each of {list(self.names)}")
         bend = q[0] + q[1]
         x = self.upper_arm * ca.cos(q[0]) + self.forearm * ca.cos(bend)
@@ -112,10 +112,11 @@ class Scara:
         return Frame(rotation((0, 0, 1), bend + q[3]), ca.DM(self.mount) + ca.vertcat(x, y, q[2]))
 
     def inverse(self, position: ArrayInput, yaw: float = 0.0, elbow: Elbow = "left") -> Array:
-        """Joints that put the tool at a point with a yaw. Shape (4,).
+        """Return the joints that put the tool at a point with a yaw. Shape (4,).
 
-        Shoulder and elbow are within (-pi, pi] and wrist = yaw - shoulder - elbow, but for whole turns where only they
-        keep a limit. At both ends of the reach the elbows agree; on the shoulder axis the shoulder is arbitrary.
+        Shoulder and elbow are within (-pi, pi] and wrist = yaw - shoulder - elbow; whole turns are added only where a
+        limit requires them. At both ends of the reach the two elbows agree; on the shoulder axis the shoulder is
+        arbitrary.
 
         Args:
             position: In world. Shape (3,), m.
@@ -123,7 +124,7 @@ class Scara:
             elbow: "left" bends the elbow counter-clockwise (q2 >= 0), "right" clockwise.
 
         Raises:
-            ModelError: nan, a point out of reach (the message says how far), joint limits.
+            ModelError: nan, a point out of reach (the message gives the distance), joint limits.
         """
         point = checked_array(position, (3,), "scara", "position")
         angle = checked_number(yaw, "scara", "yaw")
@@ -142,9 +143,9 @@ class Scara:
         return q
 
     def whole_turn(self, joint: int, least: float, most: float) -> float | None:
-        """Smallest multiple of 2 pi that brings a joint's range within its limits (to 1e-9), always 0 for the quill.
+        """Return the smallest multiple of 2 pi that moves a joint's range within its limits (to 1e-9), or None.
 
-        None if there is none.
+        It is always 0 for the quill.
 
         Args:
             joint: Index.
@@ -159,9 +160,9 @@ class Scara:
         return turn if low <= least + turn and most + turn <= high else None
 
     def inverse_expression(self, pose: Expression, elbow: Elbow = "left") -> Expression:
-        """Closed-form inverse kinematics of (x, y, z, yaw) in world, without any check. Shape (4, 1).
+        """Return the closed-form inverse kinematics of (x, y, z, yaw) in world, without checks. Shape (4, 1).
 
-        sin q2 from the product of the distances to both ends of the reach, which keeps its digits near them.
+        sin q2 is computed from the product of the distances to both ends of the reach, which is accurate near them.
         """
         checked_choice(elbow, get_args(Elbow), "scara", "elbow")
         p = checked_vector(pose, 4, "pose", "x, y, z and yaw")
@@ -169,7 +170,7 @@ class Scara:
         a, b = self.upper_arm, self.forearm
         square = x**2 + y**2
         cosine = (square - a**2 - b**2) / (2 * a * b)
-        # rounding may put a point of the boundary beyond it
+        # rounding may put a point of the boundary outside
         product = (self.outer**2 - square) * (square - self.inner**2)
         sine = ca.sqrt(ca.fmax(product, 0)) / (2 * a * b) * (1 if elbow == "left" else -1)
         along, across = a + b * cosine, b * sine
@@ -178,9 +179,9 @@ class Scara:
         return ca.vertcat(shoulder, bend, z, p[3] - shoulder - bend)
 
     def inverse_rates(self, elbow: Elbow = "left") -> Any:
-        """casadi Function of a pose (x, y, z, yaw) and its first three derivatives by any parameter, (4) each.
+        """Return the CasADi Function from a pose (x, y, z, yaw) and its first three derivatives to those of the joints.
 
-        Outputs: joints and their first three derivatives by the same parameter, (4) each.
+        All derivatives are by the same parameter; inputs and outputs have 4 entries each.
         """
         inputs = [ca.SX.sym(name, 4) for name in ("pose", "first", "second", "third")]
         at = ca.SX.sym("at")
@@ -193,7 +194,7 @@ class Scara:
         return ca.Function("inverse_rates", inputs, ca.cse([ca.densify(ca.simplify(value)) for value in here]))
 
     def check_reach(self, radius: float, what: str) -> None:
-        """ModelError naming `what` unless the arm reaches points at `radius` (m) from the shoulder axis."""
+        """Raise ModelError naming `what` unless the arm reaches points at `radius` (m) from the shoulder axis."""
         if not self.inner * (1 - 1e-12) <= radius <= self.outer * (1 + 1e-12):
             message = (
                 f"scara: {what} is {radius:g} m from the shoulder axis, unreachable: the arm reaches from "

@@ -1,9 +1,8 @@
-"""Arms that stand unfastened on level ground: zero moment point, ground reaction, stability (Yoo et al. 2004).
+"""Robots that stand unfixed on level ground: ground reaction, zero moment point, stability (Yoo et al. 2004).
 
-The ground is the plane z = 0 of the world, z upwards. As long as the foot stays flat on it the machine is one on a
-fixed base; whether it stays is read from the reaction that the ground would have to give.
-
-What a motion of a standing machine asks of the ground and of its joints, at sampled times.
+The ground is the plane z = 0 of the world, z upwards. While the foot stays flat on it, the machine is one on a fixed
+base; whether it stays is decided by the required ground reaction. A StandingMotion evaluates the ground reaction and
+the joint loads of a motion at sampled times.
 """
 
 from __future__ import annotations
@@ -23,17 +22,17 @@ from models.machines.support import Support
 from models.robot.dynamics import Wrench, base_reaction, checked_wrenches, external_wrench, inverse_dynamics
 from models.robot.indices import joint_excess, joint_limit_index, manipulability_of
 from models.robot.kinematics import center_of_mass, checked_vector, joint_vector
-from models.robot.parts import massless
-from models.robot.rebuild import simplified
+from models.robot.parts import massless_error
+from models.robot.rebuild import simplify
 from models.robot.robot import Robot
 from models.spatial import Expression, expression
 
 External: TypeAlias = Callable[[Expression, Expression], Sequence[Wrench]]
-"""Wrenches from outside as a function of time (s) and the tip's position in the world (3, 1)."""
+"""Function from time (s) and the tip's position in the world (3, 1) to external wrenches."""
 
 
 def wrenches_at(external: External | None, time: Expression, tip: Expression) -> tuple[Wrench, ...]:
-    """What `external` gives, () if None; ModelError unless it is a function that returns a list of wrenches."""
+    """Return the wrenches that `external` returns, () if None; raise ModelError for anything else."""
     if external is None:
         return ()
     if not callable(external):
@@ -43,9 +42,9 @@ def wrenches_at(external: External | None, time: Expression, tip: Expression) ->
 
 
 class ZmpRows(NamedTuple):
-    """The equation (18) that keeps the zero moment point at a given place: J_m q'' + q'^T H_m q' = C.
+    """Equation (18), which fixes the zero moment point at a given position: J_m q'' + q'^T H_m q' = C.
 
-    Row 0 says where its x is, row 1 where its y is; both are moments over the place, in N m.
+    Row 0 fixes its x, row 1 its y; both are moments about the position, in N m.
 
     Attributes:
         jacobian: J_m. Shape (2, n).
@@ -58,24 +57,24 @@ class ZmpRows(NamedTuple):
     right: Expression
 
     def needed(self, qd: Expression) -> Expression:
-        """C - q'^T H_m q': what J_m q'' has to be. Shape (2, 1), N m."""
+        """Return C - q'^T H_m q', the required value of J_m q''. Shape (2, 1), N m."""
         qd = expression(qd)
         return self.right - ca.vertcat(*(ca.mtimes([qd.T, plane, qd]) for plane in self.hessians))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Standing(FixedBase):
-    """A robot whose root link, the foot, stands on the ground and is not fastened to it.
+    """A robot whose root link, the foot, stands on the ground without being fixed to it.
 
-    Besides what a FixedBase has (`robot`, `translation`, `rotation` of the foot's frame in the world):
+    In addition to the attributes of FixedBase (`robot`, `translation`, `rotation` of the foot's frame in the world):
 
     Attributes:
         support: Region of the ground under the foot.
         gravity: m/s^2, downwards.
-        most_stable_point: (x, y) at which the stability index is 1; the middle of the support's bounding box if
-            None. Shape (2,), m.
-        half_widths: Distances in x and y at which the index falls to 0; those of the bounding box if None. Shape
-            (2,), m.
+        most_stable_point: (x, y) at which the stability index is 1; the centre of the support's bounding box if None.
+            Shape (2,), m.
+        half_widths: Distances in x and y at which the index falls to 0; those of the bounding box if None. Shape (2,),
+            m.
 
     Raises:
         ModelError: No moving joint, no mass, no Support, wrong sizes, a gravity or a half-width that is not positive.
@@ -93,29 +92,29 @@ class Standing(FixedBase):
             message = f"{owner}: support must be a Support, as rectangle(...) gives, not {self.support!r}"
             raise ModelError(message, name="support", value=self.support)
         if self.robot.total_mass == 0:
-            raise massless("nothing presses its foot on the ground")
+            raise massless_error("nothing presses its foot on the ground")
         gravity = checked_number(self.gravity, owner, "gravity", positive=True, unit="m/s^2")
         object.__setattr__(self, "gravity", gravity)
-        for what, default in (("most_stable_point", self.support.center), ("half_widths", self.support.half_widths)):
-            value = default if getattr(self, what) is None else getattr(self, what)
-            value = checked_array(value, (2,), owner, what, positive=what == "half_widths", unit="m")
-            object.__setattr__(self, what, value)
+        for name, default in (("most_stable_point", self.support.center), ("half_widths", self.support.half_widths)):
+            value = default if getattr(self, name) is None else getattr(self, name)
+            value = checked_array(value, (2,), owner, name, positive=name == "half_widths", unit="m")
+            object.__setattr__(self, name, value)
 
     @property
     def weight(self) -> float:
-        """N."""
+        """Weight, N."""
         return self.robot.total_mass * self.gravity
 
     @property
     def gravity_in_world(self) -> Array:
-        """Shape (3,), m/s^2."""
+        """Gravitational acceleration. Shape (3,), m/s^2."""
         return np.array([0.0, 0.0, -self.gravity])
 
     def bodies(self, wrenches: Sequence[Wrench] = ()) -> Robot:
-        """The robot with one link for each moving joint, and those on which wrenches act: the same dynamics, sooner."""
+        """Return the robot with links merged between moving joints and wrenches: the same dynamics, faster."""
         keep = frozenset(self.robot.link(wrench.link).name for wrench in checked_wrenches(wrenches))
         if keep not in self._bodies:
-            self._bodies[keep] = simplified(self.robot, keep)
+            self._bodies[keep] = simplify(self.robot, keep)
         return self._bodies[keep]
 
     @cached_property
@@ -125,55 +124,55 @@ class Standing(FixedBase):
     def ground_reaction(
         self, q: Expression, qd: Expression, qdd: Expression, wrenches: Sequence[Wrench] = ()
     ) -> Expression:
-        """What the ground does to the foot: (moment about the world's origin, force). Shape (6, 1), N m and N."""
+        """Return the ground's wrench on the foot: (moment about the world's origin, force). Shape (6, 1), N m, N."""
         robot = self.bodies(wrenches)
         return base_reaction(robot, q, qd, qdd, wrenches, self.gravity_in_world, self.world_from_base())
 
     def zero_moment_point(
         self, q: Expression, qd: Expression, qdd: Expression, wrenches: Sequence[Wrench] = ()
     ) -> Expression:
-        """Point (x, y) of the ground about which its reaction has no horizontal moment, (2)-(3), (35)-(36) corrected.
+        """Return the ground point about which the reaction has no horizontal moment, (2)-(3), (35)-(36) corrected.
 
-        Shape (2, 1), m. Of use only while the vertical force is positive.
+        Shape (2, 1), m. Meaningful only while the vertical force is positive.
         """
         return center_of_pressure(self.ground_reaction(q, qd, qdd, wrenches))
 
     def joint_torques(
         self, q: Expression, qd: Expression, qdd: Expression, wrenches: Sequence[Wrench] = ()
     ) -> Expression:
-        """Torques (forces) of the joints by inverse dynamics. Shape (n, 1), N m or N."""
+        """Return the torques (forces) of the joints by inverse dynamics. Shape (n, 1), N m or N."""
         robot = self.bodies(wrenches)
         return inverse_dynamics(robot, q, qd, qdd, wrenches, self.gravity_in_world, self.world_from_base())
 
     def stability_index(self, point: Expression) -> Expression:
-        """1 - ((point - most stable point) / half-width)^2 for x and y, (5)-(6). Shape (2, 1)."""
+        """Return 1 - ((point - most stable point) / half-width)^2 for x and y, (5)-(6). Shape (2, 1)."""
         offset = checked_vector(point, 2, "point", "x and y on the ground") - ca.DM(self.most_stable_point)
         return 1 - (offset / ca.DM(self.half_widths)) ** 2
 
     def zmp_rows(self, q: Expression, qd: Expression, point: Expression, wrenches: Sequence[Wrench] = ()) -> ZmpRows:
-        """The rows of (18) for the zero moment point at `point`, by differentiating its equation.
+        """Return the rows of (18) for the zero moment point at `point`, by differentiation of its equation.
 
         Args:
             q, qd: Shape (n, 1) each.
             point: (x, y) on the ground. Shape (2,), m.
-            wrenches: From outside; they enter C.
+            wrenches: External wrenches; they enter C.
         """
-        outside = external_wrench(self.robot, q, wrenches, self.world_from_base())
+        external = external_wrench(self.robot, q, wrenches, self.world_from_base())
         point = checked_vector(point, 2, "point", "x and y on the ground")
         q, qd = joint_vector(self.robot, q), joint_vector(self.robot, qd, "qd")
-        jacobian, first, second, right = self._zmp_rows(q, qd, point, outside)
+        jacobian, first, second, right = self._zmp_rows(q, qd, point, external)
         return ZmpRows(jacobian, (first, second), right)
 
     @cached_property
     def _zmp_rows(self) -> Any:
         n = self.joint_size
         q, qd, qdd = (ca.SX.sym(name, n) for name in ("q", "qd", "qdd"))
-        point, outside = ca.SX.sym("point", 2), ca.SX.sym("outside", 6)
+        point, external = ca.SX.sym("point", 2), ca.SX.sym("external", 6)
         x, y = ca.vertsplit(point)
 
         def moments(velocity: Expression, acceleration: Expression) -> Expression:
-            """Over the point, in the order and with the signs of (11)-(12). Shape (2, 1)."""
-            reaction = self.ground_reaction(q, velocity, acceleration) - outside
+            """Return the moments about the point, in the order and with the signs of (11)-(12). Shape (2, 1)."""
+            reaction = self.ground_reaction(q, velocity, acceleration) - external
             return ca.vertcat(-reaction[1] - x * reaction[5], reaction[0] - y * reaction[5])
 
         rest = ca.DM.zeros(n)
@@ -181,56 +180,56 @@ class Standing(FixedBase):
         moving, at_rest = moments(qd, rest), moments(rest, rest)
         planes = [ca.hessian(moving[i], qd)[0] / 2 for i in (0, 1)]
         outputs = [ca.densify(part) for part in (jacobian, *planes, -at_rest)]
-        return ca.Function("zmp_rows", [q, qd, point, outside], outputs, {"cse": True})
+        return ca.Function("zmp_rows", [q, qd, point, external], outputs, {"cse": True})
 
     @cached_property
-    def _reached(self) -> Array:
-        """Zero moment points of a few motions without wrenches. Shape (5, 2), m."""
+    def _sampled_points(self) -> Array:
+        """Zero moment points of random motions without wrenches. Shape (5, 2), m."""
         rng = np.random.default_rng(0)
         points = [ca.DM(self.zero_moment_point(*rng.normal(size=(3, self.joint_size)))) for _ in range(5)]
         return np.array([np.array(point).ravel() for point in points])
 
     @cached_property
     def moving_directions(self) -> Array:
-        """Directions on the ground in which motion can move the zero moment point, orthonormal. Shape (k, 2).
+        """Directions on the ground in which motion can shift the zero moment point, orthonormal. Shape (k, 2).
 
-        Both axes for k = 2; one direction for a machine that moves in a vertical plane, whichever plane that is.
+        Both axes if k = 2; one direction for a machine that moves in a vertical plane.
         """
-        _, sizes, directions = np.linalg.svd(self._reached - self._reached.mean(axis=0))
+        _, sizes, directions = np.linalg.svd(self._sampled_points - self._sampled_points.mean(axis=0))
         count = int((sizes > 1e-9 * max(1.0, sizes[0])).sum())
         if count == 2:
             return np.eye(2)
-        found = np.where(np.abs(directions[:count]) < 1e-9, 0.0, directions[:count])
-        return np.asarray(found * np.sign(found[np.arange(count), np.abs(found).argmax(axis=1)])[:, None])
+        axes = np.where(np.abs(directions[:count]) < 1e-9, 0.0, directions[:count])
+        return np.asarray(axes * np.sign(axes[np.arange(count), np.abs(axes).argmax(axis=1)])[:, None])
 
     @property
     def moving_axes(self) -> tuple[int, ...]:
-        """Which coordinates of the zero moment point motion can change: (0, 1), or one of them, or none."""
+        """Coordinates of the zero moment point that motion can change: (0, 1), one of them, or none."""
         return tuple(axis for axis in (0, 1) if self.moving_directions[:, axis].any())
 
     def nearest_reachable(self, point: ArrayInput) -> Array:
-        """The place nearest to `point` to which motion alone can move the zero moment point. Shape (2,), m."""
-        given = checked_array(point, (2,), "standing machine", "point")
-        along = self.moving_directions.T @ self.moving_directions
-        return np.asarray(along @ given + (np.eye(2) - along) @ self._reached.mean(axis=0))
+        """Return the point nearest to `point` to which motion can shift the zero moment point. Shape (2,), m."""
+        target = checked_array(point, (2,), "standing machine", "point")
+        projection = self.moving_directions.T @ self.moving_directions
+        return np.asarray(projection @ target + (np.eye(2) - projection) @ self._sampled_points.mean(axis=0))
 
     def tip_wrench(self, force: Expression, moment: Expression = (0.0, 0.0, 0.0)) -> Wrench:
-        """A force (N) and a moment (N m) in world axes at the tip. Shape (3,) each."""
+        """Return the wrench of a force (N) and a moment (N m) in world axes at the tip. Shape (3,) each."""
         return Wrench(self.robot.tip_link, force, moment, self.robot.tip_translation)
 
 
 def center_of_pressure(reaction: Expression) -> Expression:
-    """Zero moment point (x, y) of a ground reaction (moment about the world's origin, force). Shape (2, 1), m."""
+    """Return the zero moment point (x, y) of a reaction (moment about the world's origin, force). Shape (2, 1), m."""
     reaction = checked_vector(reaction, 6, "reaction", "moment about the world's origin and force")
     return ca.vertcat(-reaction[1], reaction[0]) / reaction[5]
 
 
 def tip_spring(machine: Standing, stiffness: ArrayInput, rest: ArrayInput) -> External:
-    """A spring at the tip: force -stiffness (tip - rest), axis by axis.
+    """Return the wrench function of a spring at the tip: force -stiffness (tip - rest), axis by axis.
 
     Args:
         stiffness: Along world x, y, z. Shape (3,), N/m.
-        rest: Position of the tip where the spring is relaxed. Shape (3,), m.
+        rest: Position of the tip at which the spring is relaxed. Shape (3,), m.
     """
     checked_instance(machine, Standing, "tip spring", "machine")
     k = checked_array(stiffness, (3,), "tip spring", "stiffness")
@@ -239,25 +238,25 @@ def tip_spring(machine: Standing, stiffness: ArrayInput, rest: ArrayInput) -> Ex
 
 
 Rows: TypeAlias = Sequence[int] | Callable[[Expression], Expression]
-"""Whose manipulability is reported: rows of the tip's twist, or any Jacobian as a function of q, (m, n)."""
+"""Task of the reported manipulability: rows of the tip's twist, or a Jacobian (m, n) as a function of q."""
 
 
 @dataclass(frozen=True)
 class StandingMotion:
-    """A motion of a standing machine at M times, and what it takes.
+    """A motion of a standing machine at M times, with the required torques and ground reaction.
 
     Attributes:
         t: Times. Shape (M,), s.
         joints, joint_velocities, joint_accelerations: Shape (M, n).
         joint_torques: By inverse dynamics. Shape (M, n), N m or N.
         tip_in_world: Shape (M, 3), m.
-        external_force: Sum of the forces from outside, wherever they act, world axes. Shape (M, 3), N.
+        external_force: Sum of the external forces, wherever they act, world axes. Shape (M, 3), N.
         center_of_mass: Shape (M, 3), m.
-        ground_force: What the ground does to the foot. Shape (M, 3), N.
+        ground_force: Force of the ground on the foot. Shape (M, 3), N.
         zero_moment_point: (x, y). Shape (M, 2), m.
         index: Stability index in x and y, (5)-(6). Shape (M, 2).
         foot_margin: Signed distance of the zero moment point from the edge of the support. Shape (M,), m.
-        joint_excess: Of the worst joint beyond its limits, negative inside. Shape (M,), rad or m.
+        joint_excess: Largest violation of a joint limit, negative inside. Shape (M,), rad or m.
         joint_limit_index: p1 (23). Shape (M,).
         manipulability: p2 (27) of the task's rows. Shape (M,).
     """
@@ -280,34 +279,34 @@ class StandingMotion:
 
     @property
     def friction(self) -> Array:
-        """Horizontal over vertical ground force: the coefficient of friction it takes. Shape (M,)."""
+        """Horizontal over vertical ground force: the required coefficient of friction. Shape (M,)."""
         vertical = self.ground_force[:, 2]
         with np.errstate(divide="ignore", invalid="ignore"):
-            needed = np.linalg.norm(self.ground_force[:, :2], axis=1) / vertical
-        return np.asarray(np.where(vertical > 0, needed, np.inf))
+            ratio = np.linalg.norm(self.ground_force[:, :2], axis=1) / vertical
+        return np.asarray(np.where(vertical > 0, ratio, np.inf))
 
     @property
     def stays_on_ground(self) -> bool:
-        """Whether the ground only ever pushes."""
+        """Whether the vertical ground force is always positive."""
         return bool((self.ground_force[:, 2] > 0).all())
 
     @property
     def stays_in_foot(self) -> bool:
-        """Whether the zero moment point never leaves the support."""
+        """Whether the zero moment point stays in the support."""
         return bool((self.foot_margin >= -ROUNDING).all())
 
     @property
     def stays_in_limits(self) -> bool:
-        """Whether every joint stays within its position limits."""
+        """Whether all joints keep their position limits."""
         return bool((self.joint_excess <= ROUNDING).all())
 
     @property
     def stands(self) -> bool:
-        """Whether the machine neither lifts off nor tips: an index of 1 alone does not say so."""
+        """Whether the machine neither lifts off nor tips, which a stability index of 1 does not imply."""
         return self.stays_on_ground and self.stays_in_foot
 
     def summary(self) -> dict[str, float | bool]:
-        """The extremes, by name."""
+        """Return the extreme values, by name."""
         zmp = self.zero_moment_point
         return {
             "stands": self.stands,
@@ -331,29 +330,29 @@ class StandingMotion:
 
     def __str__(self) -> str:
         lines = [f"Motion of {self.t[-1]:g} s: {'stands' if self.stands else 'DOES NOT STAND'}"]
-        for what, values, wrong in (
+        for quantity, values, violated in (
             ("vertical ground force, N", self.ground_force[:, 2], ~(self.ground_force[:, 2] > 0)),
             ("zero moment point inside the foot by, m", self.foot_margin, ~(self.foot_margin >= -ROUNDING)),
             ("stability index", self.index.min(axis=1), np.zeros(len(self.t), dtype=bool)),
-            ("room to the joint limits", -self.joint_excess, ~(self.joint_excess <= ROUNDING)),
+            ("distance to the joint limits", -self.joint_excess, ~(self.joint_excess <= ROUNDING)),
         ):
             k = int(np.argmin(values))
-            verdict = f", wrong from {self.t[wrong][0]:.4g} s on" if wrong.any() else ""
-            lines.append(f"  {what:<42} least {values[k]:>10.4g} at {self.t[k]:.4g} s{verdict}")
-        for what, values in (
+            violation = f", violated from {self.t[violated][0]:.4g} s on" if violated.any() else ""
+            lines.append(f"  {quantity:<42} least {values[k]:>10.4g} at {self.t[k]:.4g} s{violation}")
+        for quantity, values in (
             ("joint velocity", self.joint_velocities),
             ("joint acceleration", self.joint_accelerations),
             ("joint torque", self.joint_torques),
         ):
             k = int(np.abs(values).max(axis=1).argmax())
-            lines.append(f"  {what:<42} peak  {np.abs(values[k]).max():>10.4g} at {self.t[k]:.4g} s")
+            lines.append(f"  {quantity:<42} peak  {np.abs(values[k]).max():>10.4g} at {self.t[k]:.4g} s")
         return "\n".join(lines)
 
 
 def motion_function(machine: Standing, external: External | None = None, rows: Rows = (3, 4, 5)) -> Any:
-    """What a motion takes at one instant: (time, q, q', q'') -> the attributes of a StandingMotion after those.
+    """Return the CasADi Function (time, q, qd, qdd) -> attributes of a StandingMotion from `joint_torques` on.
 
-    A casadi Function of the names time, q, qd, qdd; of MX symbols where `external` needs them.
+    Its symbols are SX, or MX if `external` requires it.
     """
     try:
         return _motion_function(machine, external, rows, ca.SX)
@@ -370,33 +369,32 @@ def standing_motion(
     external: External | None = None,
     rows: Rows = (3, 4, 5),
 ) -> StandingMotion:
-    """Evaluate a motion.
+    """Evaluate a motion of a standing machine.
 
     Args:
-        machine: What moves.
+        machine: Standing machine.
         t: Times. Shape (M,), s.
         joints, joint_velocities, joint_accelerations: Shape (M, n).
-        external: Wrenches as a function of time and tip position.
-        rows: Whose manipulability is reported.
+        external: External wrenches as a function of time and tip position.
+        rows: Task of the reported manipulability.
 
     Raises:
         ModelError: No times, shapes that do not match, nan.
     """
     times = checked_array(t, ("times",), "motion", "t")
-    given = {"joints": joints, "joint_velocities": joint_velocities, "joint_accelerations": joint_accelerations}
+    arrays = {"joints": joints, "joint_velocities": joint_velocities, "joint_accelerations": joint_accelerations}
     shape = (len(times), machine.joint_size)
-    parts = [checked_array(part, shape, "motion", name, finite=False) for name, part in given.items()]
-    found = evaluate(motion_function(machine, external, rows), times, *parts)
-    return StandingMotion(times, *parts, **found)
+    parts = [checked_array(part, shape, "motion", name, finite=False) for name, part in arrays.items()]
+    return StandingMotion(times, *parts, **evaluate_motion(motion_function(machine, external, rows), times, *parts))
 
 
-def evaluate(function: Any, t: Array, q: Array, qd: Array, qdd: Array) -> dict[str, Array]:
-    """Outputs of a motion function at M times, by name: (M, k), or (M,) for what is a number at each time."""
+def evaluate_motion(function: Any, t: Array, q: Array, qd: Array, qdd: Array) -> dict[str, Array]:
+    """Return the outputs of a motion function at M times, by name: (M, k), or (M,) for scalars."""
     outputs = function.map(len(t))(t[None, :], q.T, qd.T, qdd.T)
     names = [function.name_out(i) for i in range(function.n_out())]
     values = {name: np.array(ca.DM(value)).T for name, value in zip(names, outputs, strict=True)}
-    numbers = ("foot_margin", "joint_excess", "joint_limit_index", "manipulability")
-    return {name: value[:, 0] if name in numbers else value for name, value in values.items()}
+    scalars = ("foot_margin", "joint_excess", "joint_limit_index", "manipulability")
+    return {name: value[:, 0] if name in scalars else value for name, value in values.items()}
 
 
 def _motion_function(machine: Standing, external: External | None, rows: Rows, symbols: Any) -> Any:
@@ -406,11 +404,11 @@ def _motion_function(machine: Standing, external: External | None, rows: Rows, s
     wrenches = wrenches_at(external, time, tip)
     reaction = machine.ground_reaction(q, qd, qdd, wrenches)
     point = center_of_pressure(reaction)
-    outside: Any = sum((ca.densify(wrench.force) for wrench in wrenches), start=ca.DM.zeros(3))
+    external_force: Any = sum((ca.densify(wrench.force) for wrench in wrenches), start=ca.DM.zeros(3))
     outputs = {
         "joint_torques": machine.joint_torques(q, qd, qdd, wrenches),
         "tip_in_world": tip,
-        "external_force": outside,
+        "external_force": external_force,
         "center_of_mass": center_of_mass(machine.bodies(), q, placement),
         "ground_force": reaction[3:6],
         "zero_moment_point": point,

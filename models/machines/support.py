@@ -1,7 +1,4 @@
-"""The region of the ground that a foot rests on: a convex polygon.
-
-Where a robot touches level ground: its support, from the collision shapes of its wheels and feet.
-"""
+"""Support polygons: the convex region of the ground that a foot rests on, and its computation from collision shapes."""
 
 from __future__ import annotations
 
@@ -35,11 +32,11 @@ from models.spatial import FULL_TURN, Expression, Frame
 
 @dataclass(frozen=True, eq=False)
 class Support:
-    """Convex polygon on the ground, in world axes.
+    """A convex polygon on the ground, in world axes.
 
     Attributes:
-        vertices: Corners in order, either way round; stored counter-clockwise, without those on a straight edge.
-            Shape (k, 2), m.
+        vertices: Corners in order, in either sense; stored counter-clockwise, without corners on a straight edge. Shape
+            (k, 2), m.
 
     Raises:
         ModelError: Fewer than three corners, a polygon without area, one that is not convex or crosses itself.
@@ -59,47 +56,47 @@ class Support:
         edges = np.roll(corners, -1, axis=0) - corners
         lengths = np.linalg.norm(edges, axis=1)
         if lengths.min() <= ROUNDING * size:
-            twice = corners[lengths.argmin()].tolist()
+            repeated = corners[lengths.argmin()].tolist()
             raise ModelError(
-                f"support: corner {twice} occurs twice in a row; give it once", name="vertices", value=twice
+                f"support: corner {repeated} occurs twice in a row; give it once", name="vertices", value=repeated
             )
-        ahead = np.roll(edges, -1, axis=0)
-        turns = np.arctan2(_cross(edges, ahead), (edges * ahead).sum(axis=1))
-        worst = int(turns.argmin())
-        if turns[worst] < -ROUNDING:
-            corner = np.roll(corners, -1, axis=0)[worst]
+        next_edges = np.roll(edges, -1, axis=0)
+        angles = np.arctan2(_cross(edges, next_edges), (edges * next_edges).sum(axis=1))
+        reflex = int(angles.argmin())
+        if angles[reflex] < -ROUNDING:
+            corner = np.roll(corners, -1, axis=0)[reflex]
             message = (
                 f"support: the polygon {corners.tolist()} is not convex at {corner.tolist()}; "
                 "the ground carries a foot on the convex hull of its contact points: give that"
             )
             raise ModelError(message, name="vertices", value=corner)
-        if turns.sum() > 3 * np.pi:
+        if angles.sum() > 3 * np.pi:
             message = f"support: the polygon {corners.tolist()} crosses itself; give its corners in order"
             raise ModelError(message, name="vertices", value=corners)
-        object.__setattr__(self, "vertices", frozen(corners[np.roll(turns, 1) > ROUNDING]))
+        object.__setattr__(self, "vertices", frozen(corners[np.roll(angles, 1) > ROUNDING]))
 
     @property
     def area(self) -> float:
-        """m^2."""
+        """Area, m^2."""
         return _area(self.vertices)
 
     @property
     def center(self) -> Array:
-        """Middle of the bounding box. Shape (2,), m."""
+        """Centre of the bounding box. Shape (2,), m."""
         return np.asarray(self.vertices.max(axis=0) + self.vertices.min(axis=0)) / 2
 
     @property
     def half_widths(self) -> Array:
-        """Half the sides of the bounding box. Shape (2,), m."""
+        """Half the side lengths of the bounding box. Shape (2,), m."""
         return np.asarray(np.ptp(self.vertices, axis=0)) / 2
 
     @cached_property
     def inner_radius(self) -> float:
-        """Radius of the largest circle inside, m: the largest margin that any point has."""
+        """Radius of the largest inscribed circle, m: the largest margin of any point."""
         offsets = (self.normals * self.vertices).sum(axis=1)
         best = 0.0
-        for chosen in combinations(range(len(offsets)), 3):  # it touches three edges (two parallel ones and another)
-            edges = list(chosen)
+        for indices in combinations(range(len(offsets)), 3):  # the circle touches three edges
+            edges = list(indices)
             system = np.column_stack([self.normals[edges], -np.ones(3)])
             if abs(np.linalg.det(system)) > ROUNDING:
                 *point, radius = np.linalg.solve(system, offsets[edges])
@@ -109,35 +106,36 @@ class Support:
 
     @cached_property
     def normals(self) -> Array:
-        """Inward unit normals of the edges, edge i from corner i to the next. Shape (k, 2)."""
+        """Inward unit normals of the edges; edge i runs from corner i to the next. Shape (k, 2)."""
         edges = np.roll(self.vertices, -1, axis=0) - self.vertices
         return np.asarray(np.column_stack([-edges[:, 1], edges[:, 0]]) / np.linalg.norm(edges, axis=1)[:, None])
 
     def distances(self, point: Expression) -> Expression:
-        """Signed distance of a point from every edge's line, positive inside. Shape (k, 1), m."""
+        """Return the signed distance of a point from each edge's line, positive inside. Shape (k, 1), m."""
         point = checked_vector(point, 2, "point", "x and y on the ground")
         offsets = (self.normals * self.vertices).sum(axis=1)
         return ca.mtimes(ca.sparsify(ca.DM(self.normals)), point) - ca.DM(offsets)
 
     def margin(self, point: Expression) -> Expression:
-        """Least of :meth:`distances`: how far a point may move before it leaves the polygon. Shape (1, 1), m.
+        """Return the least of :meth:`distances`: how far a point may move before it leaves the polygon.
 
-        Negative outside; there its size is the distance from the farthest line, at most that from the polygon.
+        Outside it is negative; its size is the distance from the farthest line, which is at most that from the polygon.
+        Shape (1, 1), m.
         """
         return ca.mmin(ca.densify(self.distances(point)))
 
 
 def rectangle(x: ArrayInput, y: ArrayInput) -> Support:
-    """Rectangular support from (least, greatest) x and y, m.
+    """Return a rectangular support from (lower, upper) bounds of x and y, m.
 
     Raises:
-        ModelError: Not two numbers each, a side without length.
+        ModelError: Not two numbers each, or a side without length.
     """
     x, y = checked_array(x, (2,), "rectangle", "x"), checked_array(y, (2,), "rectangle", "y")
-    for what, (least, greatest) in (("x", x), ("y", y)):
-        if not least < greatest:
-            message = f"rectangle: {what} from {least:g} to {greatest:g} m has no length; least first"
-            raise ModelError(message, name=what, value=(least, greatest))
+    for name, (lower, upper) in (("x", x), ("y", y)):
+        if not lower < upper:
+            message = f"rectangle: {name} from {lower:g} to {upper:g} m has no length; give the lower bound first"
+            raise ModelError(message, name=name, value=(lower, upper))
     return Support([(x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1])])
 
 
@@ -150,20 +148,20 @@ def _area(corners: Array) -> float:
 
 
 RIM = 32
-"""Points by which the rim of a cylinder is described: its contact is this polygon, inside the true one."""
+"""Number of vertices of the polygon, inscribed in the rim, that represents a cylinder's contact."""
 
 
 class Footprint(NamedTuple):
-    """What a robot stands on.
+    """Contact of a robot with the ground, and its pose on it.
 
-    With it the robot stands on z = 0 of the world: `Standing(robot, support=found.support,
-    translation=found.translation, rotation=found.rotation)`.
+    With this pose the robot stands on z = 0 of the world: `Standing(robot, support=result.support,
+    translation=result.translation, rotation=result.rotation)`.
 
     Attributes:
-        support: Convex hull of the lowest points, in axes x and y of the world through the root link's origin.
-        translation: The root link's origin in the world, above the ground. Shape (3,), m.
-        rotation: The root link's axes, as columns, in the world. Shape (3, 3).
-        links: Names of the links that touch the ground.
+        support: Convex hull of the lowest points, in world axes x and y through the root link's origin.
+        translation: Root link's origin in the world, above the ground. Shape (3,), m.
+        rotation: Root link's axes, as columns, in the world. Shape (3, 3).
+        links: Names of the links in contact with the ground.
     """
 
     support: Support
@@ -180,33 +178,33 @@ def footprint(
     links: Sequence[str] | None = None,
     depth: float = 0.005,
 ) -> Footprint:
-    """Support of a robot that stands on whatever of its collision shapes is lowest.
+    """Compute the support polygon of a robot from its lowest collision shapes.
 
-    Boxes, cylinders, capsules and spheres are looked at. Meshes are not read: where a foot is a mesh
-    give the support yourself; where a mesh might be lower than what is found name the `links` that touch the ground.
+    Boxes, cylinders, capsules and spheres are evaluated; meshes are not read. If a foot is a mesh, define the support
+    yourself; if a mesh might be lower than the other shapes, name the `links` in contact with the ground.
 
     Args:
-        robot: With the links whose shapes may touch the ground, or what carries them.
-        q: Joint positions in which it stands, zeros if None. Shape (dof,), rad or m.
-        rotation: The root link's axes, as columns, in the world, z upwards; those of the world if None. Shape (3, 3).
-        links: Links that may touch the ground; all if None.
-        depth: How far above the lowest point a point still counts as touching, m: wheels and casters give way.
+        robot: Robot with the links whose shapes may be in contact.
+        q: Joint positions, zeros if None. Shape (dof,), rad or m.
+        rotation: Root link's axes, as columns, in the world, z upwards; the identity if None. Shape (3, 3).
+        links: Links that may be in contact; all if None.
+        depth: Height above the lowest point up to which points count as in contact, m, since wheels and casters deform.
 
     Raises:
-        ModelError: Unknown links, no shape but meshes or the origin of a mesh below them, contact points in one line, a
-            negative depth, no rotation.
+        ModelError: Unknown links, only mesh shapes, a mesh whose origin is below all other shapes, collinear contact
+            points, a negative depth, an invalid rotation.
     """
     checked_instance(robot, Robot, "footprint", "robot")
     checked_nonnegative(depth, "footprint", "depth", "m")
     if links is not None:
         links = checked_each(links, str, "footprint", "links")
-    standing = robot.links if links is None else [robot.link(name) for name in links]
+    candidates = robot.links if links is None else [robot.link(name) for name in links]
     upright = checked_rotation(np.eye(3) if rotation is None else rotation, "footprint", "rotation")
     frames = link_frames(robot, np.zeros(robot.dof) if q is None else q, Frame(ca.DM(upright), ca.DM.zeros(3)))
     owners: list[str] = []
     points: list[Array] = []
     meshes: list[tuple[float, str]] = []  # height of the origin, link
-    for link in standing:
+    for link in candidates:
         turn, place = (np.array(ca.DM(part)) for part in frames[link.name])
         for shape in (each.placed(turn, place.ravel()) for each in link.collisions):
             if shape.kind == "mesh":
@@ -216,10 +214,10 @@ def footprint(
                 points.extend(corners)
                 owners.extend([link.name] * len(corners))
     if not points:
-        owning = sorted({name for _, name in meshes})
-        what = f"only meshes, in {owning}, which are not read" if meshes else "no collision shapes"
-        message = f"footprint: there are {what}; give the support yourself, for example models.rectangle(...)"
-        raise ModelError(message, name=owning[0] if owning else "shapes", value=tuple(owning))
+        mesh_links = sorted({name for _, name in meshes})
+        shapes = f"only meshes, in {mesh_links}, which are not read" if meshes else "no collision shapes"
+        message = f"footprint: there are {shapes}; give the support yourself, for example models.rectangle(...)"
+        raise ModelError(message, name=mesh_links[0] if mesh_links else "shapes", value=tuple(mesh_links))
     cloud = np.array(points)
     height = float(cloud[:, 2].min())
     if meshes and min(meshes)[0] < height:
@@ -229,9 +227,9 @@ def footprint(
             "give the support yourself, or name the links that touch the ground"
         )
         raise ModelError(message, name=name, value=low, limit=height)
-    touching = cloud[:, 2] <= height + depth
-    names = tuple(dict.fromkeys(name for name, low in zip(owners, touching, strict=True) if low))
-    hull = convex_hull(cloud[touching, :2])
+    in_contact = cloud[:, 2] <= height + depth
+    names = tuple(dict.fromkeys(name for name, low in zip(owners, in_contact, strict=True) if low))
+    hull = convex_hull(cloud[in_contact, :2])
     if len(hull) < 3:
         message = (
             f"footprint: the links {list(names)} touch the ground in one point or line, on which nothing stands; "
@@ -242,9 +240,9 @@ def footprint(
 
 
 def convex_hull(points: ArrayInput) -> Array:
-    """Corners of the convex hull of points in the plane, counter-clockwise, by qhull. Shape (k, 2).
+    """Return the corners of the convex hull of points in the plane, counter-clockwise, by Qhull. Shape (k, 2).
 
-    Fewer than three where all points lie in one line, as far as doubles tell.
+    Fewer than three corners if all points are collinear to rounding.
     """
     cloud = np.unique(np.asarray(points, dtype=float), axis=0)  # sorted by x, then y
     if np.linalg.matrix_rank(cloud - cloud[:1], tol=1e-12 * float(np.ptp(cloud, axis=0).max(initial=0.0))) < 2:
@@ -253,7 +251,7 @@ def convex_hull(points: ArrayInput) -> Array:
 
 
 def _corners(shape: CollisionShape) -> Array:
-    """Points of a shape in the world, no mesh, that may be its lowest. Shape (k, 3), m."""
+    """Return the points of a shape in the world, not a mesh, that may be its lowest. Shape (k, 3), m."""
     down = -np.asarray(shape.rotation)[2]  # in the shape's axes
     if shape.kind == "box":
         corners = np.array(np.meshgrid(*([-1, 1] for _ in range(3)))).reshape(3, -1).T * shape.size / 2
@@ -265,10 +263,10 @@ def _corners(shape: CollisionShape) -> Array:
         if shape.kind == "capsule":
             corners = ends + radius * down
         else:
-            lowest = np.arctan2(down[1], down[0])  # the rim's own lowest point is one of its corners
+            lowest = np.arctan2(down[1], down[0])  # a vertex at the rim's lowest point
             angles = lowest + FULL_TURN * np.arange(RIM) / RIM
             rim = radius * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(RIM)])
-            # level, but for a slope of a thousandth; a wheel stands on its lowest line alone
+            # the lowest part of the rim, to a slope of a thousandth: a wheel stands on its lowest line alone
             rim = rim[rim @ down >= (rim @ down).max() - 1e-3 * radius]
             corners = (ends[:, None] + rim[None]).reshape(-1, 3)
     return np.asarray(corners @ shape.rotation.T + shape.translation)

@@ -27,7 +27,7 @@ from typing import Literal, TypeAlias, get_args
 import casadi as ca
 import numpy as np
 
-from models.arrays import Array, ArrayInput, checked_choice, checked_number, checked_numbers, one_for_each
+from models.arrays import Array, ArrayInput, checked_broadcast, checked_choice, checked_number, checked_numbers
 from models.errors import ModelError
 from models.spatial import Expression
 
@@ -65,7 +65,7 @@ def checked_shape(shape: ArrayInput, kind: str, count: int = 1) -> Array:
     """
     checked_choice(kind, get_args(BlendKind), "blend", "kind")
     cusp = LARGEST_SHAPE[kind]
-    factors = one_for_each(shape, count, f"{kind} blend", "shape factor", "vertices", positive=True)
+    factors = checked_broadcast(shape, count, f"{kind} blend", "shape factor", "vertices", positive=True)
     if (factors >= cusp).any():
         largest = float(factors.max())
         message = f"shape factor {largest:g} of a {kind} blend must be below {cusp:.6g}, where the curve has a cusp"

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from models.arrays import Array, ArrayInput, checked_array, checked_count, one_for_each
+from models.arrays import Array, ArrayInput, checked_array, checked_broadcast, checked_count
 from models.errors import ModelError
 from models.paths.arc_length import Cells, parameter
 from models.paths.blends import BlendKind, curvature, derivatives_by_arc_length, quintic
@@ -206,7 +206,7 @@ class SmoothPath:
             ModelError: The number of values differs from the number of segments.
         """
         count = len(self.path.segments)
-        values = one_for_each(of_segments, count, "path", "speed", "segments", finite=False)
+        values = checked_broadcast(of_segments, count, "path", "speed", "segments", finite=False)
         blends = np.minimum(values[self.piece_blend], values[np.minimum(self.piece_blend + 1, count - 1)])
         return np.where(self.piece_blend >= 0, blends, values[self.piece_segment])
 

@@ -1,10 +1,10 @@
-"""What a motion takes: torques of the joints and the reaction of the ground, with forces from outside.
+"""Inverse dynamics of robots: joint torques, base reaction and mass matrix, with external wrenches.
 
-Recursive Newton-Euler (Luh, Walker, Paul 1980; Featherstone 2008, chapter 5), each link in its own axes, where its
-inertia is constant: that takes less than half of the operations of world axes, and its derivatives a quarter. The base
-stands still unless its motion is given; joint positions, velocities and accelerations are of shape (dof, 1) in the
-order of `robot.joint_names`, as SX, MX, DM or numbers. Any algebra of one kind: a wrench of SX entries goes with SX
-positions. All raise ModelError for wrong sizes, and for a wrench on a link that does not exist.
+Recursive Newton-Euler algorithm (Luh, Walker, Paul 1980; Featherstone 2008, chapter 5) in link axes, where the inertias
+are constant: less than half the operations of world axes, and a quarter for derivatives. The base is at rest unless its
+motion is given. Joint positions, velocities and accelerations have shape (dof, 1) in the order of `robot.joint_names`,
+as SX, MX, DM or numbers, all of one kind: wrenches with SX entries need SX positions. All functions raise ModelError
+for wrong sizes and for a wrench on an unknown link.
 """
 
 from __future__ import annotations
@@ -29,28 +29,28 @@ from models.robot.kinematics import (
     subtree_moments,
 )
 from models.robot.parts import Link
-from models.robot.rebuild import simplified
+from models.robot.rebuild import simplify
 from models.robot.robot import Robot
 from models.spatial import Expression, Frame, cross, on_scalars, skew
 
 GRAVITY = (0.0, 0.0, -9.81)
-"""Acceleration of free fall in the world, z upwards, m/s^2."""
+"""Gravitational acceleration in the world, z upwards, m/s^2."""
 
 
 @dataclass(frozen=True, eq=False)
 class Wrench:
-    """A force and a moment that act on a link from outside.
+    """An external force and moment on a link.
+
+    Each part is a CasADi vector, numbers, or a list of either; it is stored as a CasADi column.
 
     Attributes:
         link: Name of the link.
         force: In world axes. Shape (3,), N.
-        moment: In world axes, besides that of the force. Shape (3,), N m.
-        point: Where the force acts, in the link's frame. Shape (3,), m.
-
-    Each part is a casadi vector, numbers, or a list of either; stored as a casadi column.
+        moment: In world axes, in addition to that of the force. Shape (3,), N m.
+        point: Point of application of the force, in the link's frame. Shape (3,), m.
 
     Raises:
-        ModelError: A part that is not of three entries, or not finite.
+        ModelError: A part that does not have three entries, or is not finite.
     """
 
     link: str
@@ -60,10 +60,9 @@ class Wrench:
 
     def __post_init__(self) -> None:
         checked_name(self.link, "wrench", "link")
+        owner = f"wrench on link {self.link!r}"
         for part in ("force", "moment", "point"):
-            given = getattr(self, part)
-            owner = f"wrench on link {self.link!r}"
-            value = checked_vector(given, 3, f"{owner}: {part}", "x, y and z")
+            value = checked_vector(getattr(self, part), 3, f"{owner}: {part}", "x, y and z")
             if isinstance(value, ca.DM):
                 checked_array(np.array(value).ravel(), (3,), owner, part)
             object.__setattr__(self, part, value)
@@ -81,12 +80,15 @@ def inverse_dynamics(
     base_twist: Expression | None = None,
     base_acceleration: Expression | None = None,
 ) -> Expression:
-    """Torques (forces of prismatic joints) that the joints must give. Shape (dof, 1), N m or N.
+    """Return the joint torques (forces of prismatic joints) of a motion. Shape (dof, 1), N m or N.
 
-    A joint with followers gives what moves them too: its own torque and multiplier times those of each of them.
+    A leader also drives its followers: its entry is its own torque plus multiplier times those of its followers.
 
-    The base may move: `base_twist` and `base_acceleration` are (angular velocity, velocity of the origin of the root
-    link's frame) and their time derivatives, world axes, shape (6, 1).
+    Args:
+        wrenches: External wrenches.
+        gravity: In world axes. Shape (3,), m/s^2.
+        base_twist, base_acceleration: Motion of the base, zero if None: (angular velocity, velocity of the origin of
+            the root link's frame) and its time derivative, world axes. Shape (6, 1).
     """
     stacked, links = stacked_wrenches(robot, wrenches), tuple(wrench.link for wrench in wrenches)
     return _efforts(robot, q, qd, qdd, stacked, links, gravity, world_from_base, base_twist, base_acceleration)[0]
@@ -104,10 +106,11 @@ def base_reaction(
     base_twist: Expression | None = None,
     base_acceleration: Expression | None = None,
 ) -> Expression:
-    """What the ground must do to the root link: (moment about the world's origin, force). Shape (6, 1), N m and N.
+    """Return the wrench that the ground exerts on the root link: (moment about the world's origin, force).
 
-    The rate of momentum less the weight of all links, the root link included, and less the wrenches. Of a base that
-    moves, see inverse_dynamics, it is what drives it: zero where it floats freely.
+    It is the rate of momentum less the weight of all links, including the root link, and less the external wrenches.
+    For a moving base (arguments as in inverse_dynamics) it is the wrench that drives it, zero for a floating base.
+    Shape (6, 1), N m and N.
     """
     stacked, links = stacked_wrenches(robot, wrenches), tuple(wrench.link for wrench in wrenches)
     return _efforts(robot, q, qd, qdd, stacked, links, gravity, world_from_base, base_twist, base_acceleration)[1]
@@ -115,30 +118,30 @@ def base_reaction(
 
 @on_scalars
 def mass_matrix(robot: Robot, q: Expression) -> Expression:
-    """Joint-space inertia M of T = q'^T M q' / 2, the base standing still. Shape (dof, dof), kg m^2, kg m or kg.
+    """Return the joint-space inertia M of T = q'^T M q' / 2, the base at rest. Shape (dof, dof), kg m^2, kg m or kg.
 
-    Composite rigid bodies (Featherstone 2008, 6.2): the momentum of all that joint j carries, per rate of j, along the
-    axis of each joint i that carries j.
+    Composite rigid bodies (Featherstone 2008, 6.2): M_ij is the momentum of all that joint j carries, per rate of j,
+    along the axis of each joint i that carries j.
     """
     frames, axes = frames_and_axes(robot, q)
     moments = subtree_moments(robot, frames)
-    below: dict[tuple[str, str], Expression] = {}
+    matrix: dict[tuple[str, str], Expression] = {}
     for joint in robot.joints:
         if joint.moves:
             momentum = ca.vertcat(*moments[joint.child].momentum(*axes[joint.name]))
             for carrier in robot.path_to(joint.child):
                 if carrier.moves:
                     entry = ca.dot(ca.vertcat(*axes[carrier.name]), momentum)
-                    below[carrier.name, joint.name] = below[joint.name, carrier.name] = entry
-    rows = {one: {other: below.get((one, other), ca.DM(1, 1)) for other in axes} for one in axes}
-    columns = {one: ca.vertcat(ca.DM(0, 1), *by_joint_vector(robot, row)) for one, row in rows.items()}
+                    matrix[carrier.name, joint.name] = matrix[joint.name, carrier.name] = entry
+    rows = {i: {j: matrix.get((i, j), ca.DM(1, 1)) for j in axes} for i in axes}
+    columns = {i: ca.vertcat(ca.DM(0, 1), *by_joint_vector(robot, row)) for i, row in rows.items()}
     return ca.densify(ca.horzcat(ca.DM(robot.dof, 0), *by_joint_vector(robot, columns)))
 
 
 def external_wrench(
     robot: Robot, q: Expression, wrenches: Sequence[Wrench], world_from_base: Placement | None = None
 ) -> Expression:
-    """Sum of wrenches: (moment about the world's origin, force). Shape (6, 1)."""
+    """Return the sum of wrenches: (moment about the world's origin, force). Shape (6, 1)."""
     frames = link_frames(robot, q, world_from_base)
     total: Expression = ca.DM(6, 1)
     for column, wrench in enumerate(checked_wrenches(wrenches)):
@@ -148,12 +151,12 @@ def external_wrench(
 
 
 def checked_wrenches(wrenches: Sequence[Wrench]) -> tuple[Wrench, ...]:
-    """`wrenches` as a tuple; ModelError unless it is a list of them."""
+    """Return `wrenches` as a tuple; raise ModelError unless all are wrenches."""
     return checked_each(wrenches, Wrench, "dynamics", "wrenches")
 
 
 def stacked_wrenches(robot: Robot, wrenches: Sequence[Wrench]) -> Expression:
-    """Moment, force and point of every wrench in a column of its own. Shape (9, k)."""
+    """Return moment, force and point of every wrench, one column each. Shape (9, k)."""
     checked_instance(robot, Robot, "dynamics", "robot")
     columns = []
     for wrench in checked_wrenches(wrenches):
@@ -163,7 +166,7 @@ def stacked_wrenches(robot: Robot, wrenches: Sequence[Wrench]) -> Expression:
 
 
 def _parts(stacked: Expression, column: int) -> tuple[Expression, Expression, Expression]:
-    """Moment, force and point of a wrench."""
+    """Return moment, force and point of a wrench."""
     moment, force, point = (stacked[3 * i : 3 * i + 3, column] for i in range(3))
     return moment, force, point
 
@@ -181,40 +184,41 @@ def _efforts(
     base_twist: Expression | None,
     base_acceleration: Expression | None,
 ) -> tuple[Expression, Expression]:
-    """Torques of the joints and reaction of the base.
+    """Return the joint torques and the base reaction.
 
     A point x of a link accelerates by a + U x, with U = [alpha x] + [omega x]^2 of the link and a of its origin, less
-    free fall. So the link needs the force m a + U h and the moment h x a + sum of m x (x U x), which are twice the
-    entries of the antisymmetric part of U J; h and J are the sums of m x and of m x x' (Atkeson, An, Hollerbach 1986
-    have the same of the inertia).
+    gravity. So the link needs the force m a + U h and the moment cross(h, a) + sum of m cross(x, U x). The entries of
+    that sum are twice those of the antisymmetric part of U J; h and J are the sums of m x and of m x x' (Atkeson, An,
+    Hollerbach 1986 write the same with the inertia).
     """
     ground = checked_placement(world_from_base)
     frames = link_frames(robot, q, world_from_base) if links else {}
-    robot = simplified(robot, links)
+    robot = simplify(robot, links)
     joints = joint_frames(robot, q)
-    needed: dict[str, tuple[Expression, Expression]] = {}
+    loads: dict[str, tuple[Expression, Expression]] = {}
     motions = _motions_in_links(robot, joints, qd, qdd, gravity, ground, base_twist, base_acceleration)
     for link in robot.links:
-        push, field = motions[link.name]
-        first, second = _mass_sums(link)
-        turned = ca.mtimes(field, second)
+        acceleration, field = motions[link.name]
+        first_moment, second_moment = _mass_sums(link)
+        turned = ca.mtimes(field, second_moment)
         moment = ca.vertcat(turned[2, 1] - turned[1, 2], turned[0, 2] - turned[2, 0], turned[1, 0] - turned[0, 1])
-        needed[link.name] = moment + cross(first, push), link.mass * push + ca.mtimes(field, first)
+        force = link.mass * acceleration + ca.mtimes(field, first_moment)
+        loads[link.name] = moment + cross(first_moment, acceleration), force
     for column, name in enumerate(links):
         moment, force, point = _parts(stacked, column)
         moment, force = (ca.mtimes(frames[name].rotation.T, part) for part in (moment, force))
-        before = needed[name]
-        needed[name] = before[0] - moment - cross(point, force), before[1] - force
+        load = loads[name]
+        loads[name] = load[0] - moment - cross(point, force), load[1] - force
     torques: dict[str, Expression] = {}
     for joint in reversed(robot.joints):
-        moment, force = needed[joint.child]
+        moment, force = loads[joint.child]
         if joint.moves:
             torques[joint.name] = ca.dot(constant(joint.axis), force if joint.kind == "prismatic" else moment)
         turn, position = joints[joint.name]
         moment, force = (ca.mtimes(turn, part) for part in (moment, force))
-        before = needed[joint.parent]
-        needed[joint.parent] = before[0] + moment + cross(position, force), before[1] + force
-    moment, force = (ca.mtimes(ground.rotation, part) for part in needed[robot.root])
+        load = loads[joint.parent]
+        loads[joint.parent] = load[0] + moment + cross(position, force), load[1] + force
+    moment, force = (ca.mtimes(ground.rotation, part) for part in loads[robot.root])
     reaction = ca.vertcat(moment + cross(ground.position, force), force)
     return ca.densify(ca.vertcat(ca.DM(0, 1), *by_joint_vector(robot, torques))), reaction
 
@@ -229,24 +233,24 @@ def _motions_in_links(
     base_twist: Expression | None,
     base_acceleration: Expression | None,
 ) -> dict[str, tuple[Expression, Expression]]:
-    """Of each link a, less free fall, shape (3, 1), and U, shape (3, 3), in its own axes, by name; see _efforts."""
+    """Return a less gravity, shape (3, 1), and U, shape (3, 3), of each link in its own axes, by name; see _efforts."""
     rates, accelerations = each_joint(robot, qd, "qd"), each_joint(robot, qdd, "qdd")
-    fall = checked_vector(gravity, 3, "gravity", "x, y and z")
+    g = checked_vector(gravity, 3, "gravity", "x, y and z")
     meaning = "angular, then of the origin of the root link's frame"
     twist, push = (
-        ca.DM(6, 1) if given is None else checked_vector(given, 6, what, meaning)
-        for given, what in ((base_twist, "base_twist"), (base_acceleration, "base_acceleration"))
+        ca.DM(6, 1) if vector is None else checked_vector(vector, 6, name, meaning)
+        for vector, name in ((base_twist, "base_twist"), (base_acceleration, "base_acceleration"))
     )
-    # angular velocity and acceleration, acceleration of the origin
+    # angular velocity, angular acceleration, acceleration of the origin less gravity
     spin, turning, acceleration = (
-        ca.mtimes(ground.rotation.T, part) for part in (twist[0:3], push[0:3], push[3:6] - fall)
+        ca.mtimes(ground.rotation.T, part) for part in (twist[0:3], push[0:3], push[3:6] - g)
     )
     origin = {robot.root: (spin, turning, acceleration)}
-    found = {robot.root: (acceleration, _field(spin, turning))}
+    fields = {robot.root: (acceleration, _field(spin, turning))}
     for joint in robot.joints:
         turn, position = joints[joint.name]
         spin, turning, acceleration = origin[joint.parent]
-        acceleration = acceleration + ca.mtimes(found[joint.parent][1], position)
+        acceleration = acceleration + ca.mtimes(fields[joint.parent][1], position)
         spin, turning, acceleration = (ca.mtimes(turn.T, part) for part in (spin, turning, acceleration))
         if joint.moves:
             rate, push = (constant(joint.axis) * part[joint.name] for part in (rates, accelerations))
@@ -256,18 +260,18 @@ def _motions_in_links(
                 turning = turning + push + cross(spin, rate)
                 spin = spin + rate
         origin[joint.child] = (spin, turning, acceleration)
-        found[joint.child] = (acceleration, _field(spin, turning))
-    return found
+        fields[joint.child] = (acceleration, _field(spin, turning))
+    return fields
 
 
 def _mass_sums(link: Link) -> tuple[Expression, Expression]:
-    """Sums of m x and of m x x' over a link, in its frame. Shapes (3, 1), kg m, and (3, 3), kg m^2."""
+    """Return the sums of m x and of m x x' over a link, in its frame. Shapes (3, 1), kg m, and (3, 3), kg m^2."""
     center, inertia = link.center_of_mass, link.inertia
     about_center = np.trace(inertia) / 2 * np.eye(3) - inertia
     return constant(link.mass * center), constant(about_center + link.mass * np.outer(center, center))
 
 
 def _field(spin: Expression, turning: Expression) -> Expression:
-    """[alpha x] + [omega x]^2. Shape (3, 3)."""
+    """Return [alpha x] + [omega x]^2. Shape (3, 3)."""
     squares = ca.mtimes(spin, spin.T)
     return skew(turning) + squares - ca.trace(squares) * ca.DM.eye(3)

@@ -1,4 +1,4 @@
-"""Robots that come with the package, for first plans and for tests: arms of common dimensions, of plain shapes."""
+"""Example robots for first plans and for tests: arms with typical dimensions and simple shapes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["example_robot"]
 
 X, Y, Z = np.eye(3)
 ALONG = {id(X): ((0, 0, 1), (0, 1, 0), (-1, 0, 0)), id(Y): ((1, 0, 0), (0, 0, 1), (0, -1, 0)), id(Z): np.eye(3)}
-"""Rotations in which a cylinder lies along an axis."""
+"""Rotations that align a cylinder with an axis."""
 ROWS: dict[str, list[tuple[Any, ...]]] = {
     "six_axis": [
         ("shoulder", (0, 0, 0.09), Z, 3.14, 3.14, 150, Z, -0.05, 0.06, 0.06, 3.5),
@@ -34,24 +34,25 @@ ROWS: dict[str, list[tuple[Any, ...]]] = {
         ("link_7", (0, 0, 0.08), Z, 3.05, 3.1, 40, Z, 0.0, 0.045, 0.04, 0.3),
     ],
 }
-"""Of each link: name, place in the link before, joint axis, limits of position, velocity and effort (rad, rad/s, N m);
-and of its body, a homogeneous cylinder: axis, where it begins and ends along it, radius (m), mass (kg)."""
+"""Each link: name, position in the previous link, joint axis, limits of position, velocity, effort (rad, rad/s, N m);
+then its body, a homogeneous cylinder: axis, start and end along it, radius (m), mass (kg).
+"""
 
 
 def example_robot(name: str) -> Robot:
-    """Return a robot that comes with the package, its tip at the flange "tool0", whose z points out of the arm.
+    """Return an example robot with its tip at the flange "tool0", whose z axis points out of the arm.
 
     Args:
-        name: "six_axis", an arm with three parallel axes, or "seven_axis", an arm whose axes cross at shoulder and
-            wrist; each reaches about 0.9 m from its shoulder.
+        name: "six_axis", an arm with three parallel axes, or "seven_axis", an arm whose axes intersect at shoulder and
+            wrist. Each reaches about 0.9 m from its shoulder.
 
     Raises:
         ModelError: Another name.
     """
     rows = ROWS[checked_choice(name, ROWS, "example_robot", "name")]
     links, joints = [_cylinder("base", Z, 0.0, 0.12 if name == "seven_axis" else 0.03, 0.07, 4.0)], []
-    for k, (link, place, axis, most, velocity, effort, *body) in enumerate(rows, 1):
-        limits = {"lower": -most, "upper": most, "velocity": velocity, "effort": effort}
+    for k, (link, place, axis, limit, velocity, effort, *body) in enumerate(rows, 1):
+        limits = {"lower": -limit, "upper": limit, "velocity": velocity, "effort": effort}
         joints.append(Joint(f"joint_{k}", "revolute", links[-1].name, link, place, axis=axis, **limits))
         links.append(_cylinder(link, *body))
     *_, axis, _, end, _, _ = rows[-1]
@@ -60,7 +61,9 @@ def example_robot(name: str) -> Robot:
 
 
 def _cylinder(name: str, axis: Any, begin: float, end: float, radius: float, mass: float) -> Link:
-    across, long = mass * (3 * radius**2 + (end - begin) ** 2) / 12, mass * radius**2 / 2
+    transverse, axial = mass * (3 * radius**2 + (end - begin) ** 2) / 12, mass * radius**2 / 2
     middle = (begin + end) / 2 * axis
     shape = CollisionShape("cylinder", (radius, end - begin), translation=middle, rotation=ALONG[id(axis)])
-    return Link(name, mass, middle, across * np.eye(3) + (long - across) * np.outer(axis, axis), collisions=(shape,))
+    return Link(
+        name, mass, middle, transverse * np.eye(3) + (axial - transverse) * np.outer(axis, axis), collisions=(shape,)
+    )

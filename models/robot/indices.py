@@ -1,4 +1,4 @@
-"""How good a posture of the joints is: the indices that spare freedom is spent on."""
+"""Performance indices of a configuration: manipulability and distance from the joint limits."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ TWIST_SIZE = 6
 
 
 def joint_limit_index(robot: Robot, q: Expression) -> Expression:
-    """Sum of ((q - middle) / range)^2 over the joints with two limits, (23) of Yoo et al. 2004. Shape (1, 1).
+    """Return the sum of ((q - middle) / range)^2 over the joints with two limits, (23) of Yoo et al. 2004.
 
-    Each joint adds 0 at the middle of its range and 1/4 at a limit; a joint without limits adds nothing.
+    Each joint adds 0 at the middle of its range and 1/4 at a limit; a joint without limits adds nothing. Shape (1, 1).
     """
     q = joint_vector(robot, q)
     width = robot.upper - robot.lower
@@ -29,7 +29,7 @@ def joint_limit_index(robot: Robot, q: Expression) -> Expression:
 
 
 def joint_excess(robot: Robot, q: Expression) -> Expression:
-    """How far the worst joint is beyond its limits, negative inside; -inf without limits. Shape (1, 1), rad or m."""
+    """Return the largest violation of a position limit, negative inside, -inf without limits. Shape (1, 1)."""
     q = joint_vector(robot, q)
     lower, upper = np.flatnonzero(np.isfinite(robot.lower)).tolist(), np.flatnonzero(np.isfinite(robot.upper)).tolist()
     if not lower and not upper:
@@ -39,13 +39,14 @@ def joint_excess(robot: Robot, q: Expression) -> Expression:
 
 @on_scalars
 def jacobian_manipulability(jacobian: Expression, rows: Sequence[int] = range(TWIST_SIZE)) -> Expression:
-    """sqrt(det(G_r G_r')) of the rows r of a tip Jacobian G (Yoshikawa 1985). Shape (1, 1).
-
-    Zero where the task is singular.
+    """Return sqrt(det(G_r G_r')) of the rows r of a tip Jacobian G (Yoshikawa 1985), zero where the task is singular.
 
     Args:
         jacobian: Shape (6, n).
-        rows: Which rows of the twist the task fixes: angular 0..2, linear 3..5.
+        rows: Rows of the twist that the task fixes: angular 0..2, linear 3..5.
+
+    Returns:
+        Shape (1, 1).
 
     Raises:
         ModelError: Rows out of range, repeated, or none.
@@ -55,11 +56,11 @@ def jacobian_manipulability(jacobian: Expression, rows: Sequence[int] = range(TW
 
 @on_scalars
 def manipulability_of(task: Expression) -> Expression:
-    """sqrt(det(G G')) of the Jacobian G of any task, shape (m, n). Shape (1, 1)."""
+    """Return sqrt(det(G G')) of a task Jacobian G of shape (m, n). Shape (1, 1)."""
     square = ca.mtimes(task, task.T)
-    if square.shape[0] <= 7:  # a determinant without divisions
+    if square.shape[0] <= 7:  # division-free
         volume = determinant(square)
-    else:  # of two arms, say: an expansion would be long
+    else:  # several arms: the expansion would be long
         diagonal, _, _ = ca.ldl(ca.densify(square), False)
         volume = 1
         for entry in ca.vertsplit(ca.vec(diagonal)):
@@ -68,22 +69,22 @@ def manipulability_of(task: Expression) -> Expression:
 
 
 def checked_rows(rows: Sequence[int]) -> list[int]:
-    """`rows` as a list; ModelError unless they are different indices of a twist, 0..5, and at least one."""
+    """Return `rows` as a list; raise ModelError unless they are distinct indices 0..5 of a twist, and not empty."""
     try:
         check_entries(rows)
-        given = floats(list(rows))
+        numbers = floats(list(rows))
     except NOT_NUMBERS:
-        given = np.array([np.nan])
-    whole = given.ndim == 1 and bool((given == np.round(given)).all())
-    chosen = given.astype(int).tolist() if whole else []
-    if not whole:
+        numbers = np.array([np.nan])
+    integral = numbers.ndim == 1 and bool((numbers == np.round(numbers)).all())
+    indices = numbers.astype(int).tolist() if integral else []
+    if not integral:
         message = f"rows must be a list of the twist rows 0..5, not {rows!r}"
-    elif not chosen:
+    elif not indices:
         message = "rows is empty; a task fixes at least one of the twist rows 0..5"
-    elif len(set(chosen)) < len(chosen):
-        message = f"rows {chosen} name a twist row more than once"
-    elif not all(0 <= row < TWIST_SIZE for row in chosen):
-        message = f"rows {chosen} are not all among the twist rows 0..5 (angular 0..2, linear 3..5)"
+    elif len(set(indices)) < len(indices):
+        message = f"rows {indices} name a twist row more than once"
+    elif not all(0 <= row < TWIST_SIZE for row in indices):
+        message = f"rows {indices} are not all among the twist rows 0..5 (angular 0..2, linear 3..5)"
     else:
-        return chosen
+        return indices
     raise ModelError(message, name="rows", value=rows, limit=(0, TWIST_SIZE - 1))

@@ -1,16 +1,12 @@
-"""Where the links of a robot are and how they move: frames, Jacobians, centre of mass, momentum.
+"""Kinematics of robots: frames, Jacobians, motion of the links, centre of mass, momentum and its rate.
 
-Every function takes the joint positions q, shape (dof, 1) in the order of `robot.joint_names`, as SX, MX, DM or
-numbers, with which joints that follow others move too, and the placement of the root link in the world,
-`world_from_base` = (rotation, position), the world's own frame if None. Velocities and momenta are those of the
-joints alone: the base stands still unless said otherwise. All raise ModelError for a q of a wrong size, for a link that
-does not exist, and, where they divide by it, for no mass.
+Joint positions q, velocities qd and accelerations qdd have shape (dof, 1) in the order of `robot.joint_names`, as SX,
+MX, DM or numbers; followers move with their leaders. `world_from_base` = (rotation, position) is the pose of the root
+link in the world, the identity if None. The base is at rest unless stated otherwise, and moments are about points at
+rest in the world.
 
-How the links of a robot move: accelerations, the centre of mass, momentum and its rate.
-
-Written in world axes, so that what a planar machine does not do stays a structural zero. The base stands still; joint
-positions, velocities and accelerations are of shape (dof, 1) in the order of `robot.joint_names`, as SX, MX, DM or
-numbers; ModelError for one of a wrong size. Moments are about points at rest in the world.
+Everything is written in world axes, so that what a planar machine cannot do stays a structural zero. All functions
+raise ModelError for vectors of a wrong size and unknown links, and for a massless robot if they divide by its mass.
 """
 
 from __future__ import annotations
@@ -23,7 +19,7 @@ import numpy as np
 
 from models.arrays import NOT_NUMBERS, Array, checked_instance
 from models.errors import ModelError
-from models.robot.parts import Link, massless
+from models.robot.parts import Link, massless_error
 from models.robot.robot import Robot
 from models.spatial import Expression, Frame, cross, expression, on_scalars, rotation, skew
 
@@ -31,15 +27,15 @@ Placement = tuple[Expression, Expression]
 
 
 class _Turn(NamedTuple):
-    before: Expression  # rotation of the link before the first of the parallel axes
+    """Rotation about consecutive parallel axes: orientation before the first, common axis, sum of angles."""
+
+    before: Expression
     axis: Array
     angle: Expression
 
 
 class MassMoments(NamedTuple):
-    """Mass, first and second moments of a set of bodies about the world's origin.
-
-    Their spatial inertia in ten numbers.
+    """Mass, first and second moments of a set of bodies about the world's origin: their spatial inertia in ten numbers.
 
     Attributes:
         mass: kg.
@@ -52,28 +48,36 @@ class MassMoments(NamedTuple):
     second: Expression
 
     def plus(self, other: MassMoments) -> MassMoments:
-        """Moments of both sets of bodies together."""
+        """Return the moments of the union of two sets of bodies."""
         return MassMoments(self.mass + other.mass, self.first + other.first, self.second + other.second)
 
     def momentum(self, angular: Expression, linear: Expression) -> tuple[Expression, Expression]:
-        """(Moment of momentum about the origin, linear momentum) when all bodies share one motion vector."""
-        turned = ca.mtimes(ca.tril2symm(self.second), angular)
-        return turned + cross(self.first, linear), self.mass * linear - cross(self.first, angular)
+        """Return (moment of momentum about the origin, linear momentum) for a common motion vector."""
+        angular_momentum = ca.mtimes(ca.tril2symm(self.second), angular)
+        return angular_momentum + cross(self.first, linear), self.mass * linear - cross(self.first, angular)
 
     def spatial_inertia(self) -> Expression:
-        """Spatial inertia about the origin. Shape (6, 6)."""
+        """Return the spatial inertia about the origin. Shape (6, 6)."""
         arm = skew(self.first)
         return ca.vertcat(ca.horzcat(ca.tril2symm(self.second), arm), ca.horzcat(arm.T, self.mass * ca.DM.eye(3)))
 
 
-def joint_vector(robot: Robot, q: Expression, what: str = "q") -> Expression:
-    """`q` as a column; ModelError unless it has one entry for each moving joint."""
+def joint_vector(robot: Robot, q: Expression, name: str = "q") -> Expression:
+    """Return `q` as a column; raise ModelError unless it has one entry for each moving joint."""
     checked_instance(robot, Robot, "kinematics", "robot")
-    return checked_vector(q, robot.dof, what, f"one entry for each of the joints {list(robot.joint_names)}")
+    return checked_vector(q, robot.dof, name, f"one entry for each of the joints {list(robot.joint_names)}")
 
 
 def checked_vector(value: Expression, size: int, what: str, meaning: str) -> Expression:
-    """`value` as a column of `size`; ModelError naming `what`, an argument, and `meaning` otherwise."""
+    """Return `value` as a column of `size` entries.
+
+    Args:
+        what: Name of the argument, for messages, which may be preceded by its owner.
+        meaning: Meaning of the entries, for messages.
+
+    Raises:
+        ModelError: Another size, or a value that is not numeric or not finite.
+    """
     name, limit = what.rpartition(" ")[2], (size, 1)
     try:
         value = expression(value)
@@ -89,71 +93,74 @@ def checked_vector(value: Expression, size: int, what: str, meaning: str) -> Exp
 
 
 def checked_placement(placement: Placement | None) -> Frame:
-    """A placement of the root link as a frame, the world's own if None; ModelError for anything else."""
+    """Return the pose of the root link as a frame, the identity if None; raise ModelError if it is invalid."""
     if placement is None:
         return Frame(ca.DM.eye(3), ca.DM(3, 1))
     try:
-        turn, position = map(expression, placement)
+        orientation, position = map(expression, placement)
     except NOT_NUMBERS as error:
         message = f"world_from_base must be (rotation, position), not {placement!r}"
         raise ModelError(message, name="world_from_base", value=placement) from error
-    if turn.shape != (3, 3) or position.shape != (3, 1):
-        message = f"world_from_base has the shapes {turn.shape}, {position.shape}; (3, 3), (3, 1) expected"
-        raise ModelError(message, name="world_from_base", value=(turn.shape, position.shape), limit=((3, 3), (3, 1)))
-    if not all(part.is_regular() for part in (turn, position) if isinstance(part, ca.DM)):
+    if orientation.shape != (3, 3) or position.shape != (3, 1):
+        message = f"world_from_base has the shapes {orientation.shape}, {position.shape}; (3, 3), (3, 1) expected"
+        raise ModelError(
+            message, name="world_from_base", value=(orientation.shape, position.shape), limit=((3, 3), (3, 1))
+        )
+    if not all(part.is_regular() for part in (orientation, position) if isinstance(part, ca.DM)):
         message = f"world_from_base {placement!r} is not finite"
         raise ModelError(message, name="world_from_base", value=placement)
-    return Frame(turn, position)
+    return Frame(orientation, position)
 
 
 def each_joint(robot: Robot, vector: Expression, what: str = "q") -> dict[str, Expression]:
-    """Rates or accelerations of all joints that move, followers included, by name, from those of the joint vector; of
-    its positions, followers' lack their offsets. ModelError as of joint_vector.
+    """Expand a joint vector to all moving joints, followers included, by name.
+
+    Correct for rates and accelerations; for positions, the offsets of followers are not added.
     """
     vector = joint_vector(robot, vector, what)
-    return {name: vector[k] if ratio == 1 else ratio * vector[k] for name, (k, ratio, _) in robot.drives.items()}
+    return {name: vector[k] if ratio == 1 else ratio * vector[k] for name, (k, ratio, _) in robot.couplings.items()}
 
 
-def by_joint_vector(robot: Robot, given: Mapping[str, Expression]) -> list[Expression]:
-    """What belongs to each entry of the joint vector, given what belongs to each joint that moves, by name.
+def by_joint_vector(robot: Robot, by_joint: Mapping[str, Expression]) -> list[Expression]:
+    """Reduce quantities of all moving joints, such as Jacobian columns or forces, to the entries of the joint vector.
 
-    Columns of a Jacobian or forces: that of the joint, and multiplier times those of its followers.
+    Each entry is that of the leader plus multiplier times those of its followers.
     """
-    found = [given[name] for name in robot.joint_names]
+    entries = [by_joint[name] for name in robot.joint_names]
     for joint in robot.joints:
         if joint.mimic is not None:
-            column, multiplier, _ = robot.drives[joint.name]
-            found[column] = found[column] + multiplier * given[joint.name]
-    return found
+            column, multiplier, _ = robot.couplings[joint.name]
+            entries[column] = entries[column] + multiplier * by_joint[joint.name]
+    return entries
 
 
 def link_frames(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> dict[str, Frame]:
-    """Frames of all links in the world, by link name, root first."""
+    """Return the frames of all links in the world, by link name, root first."""
     return frames_and_axes(robot, q, world_from_base)[0]
 
 
 def tip_pose(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> Frame:
-    """Frame of the tip in the world."""
+    """Return the frame of the tip in the world."""
     return tip_frame(robot, link_frames(robot, q, world_from_base))
 
 
 def tip_frame(robot: Robot, frames: dict[str, Frame]) -> Frame:
-    """Frame of the tip in the world, given the frames of the links."""
+    """Return the frame of the tip in the world from the frames of the links."""
     link = frames[robot.tip_link]
     return Frame(ca.mtimes(link.rotation, constant(robot.tip_rotation)), link.point(robot.tip_translation))
 
 
 def centers_of_mass(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> dict[str, Expression]:
-    """Centre of mass of each link in the world, by link name. Shape (3, 1) each, m."""
+    """Return the centre of mass of each link in the world, by link name. Shape (3, 1) each, m."""
     frames = link_frames(robot, q, world_from_base)
     return {link.name: frames[link.name].point(link.center_of_mass) for link in robot.links}
 
 
 def center_of_mass(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> Expression:
-    """Centre of mass of the whole robot in the world. Shape (3, 1), m."""
+    """Return the centre of mass of the whole robot in the world. Shape (3, 1), m."""
     frames = link_frames(robot, q, world_from_base)
     if robot.total_mass == 0:
-        raise massless("hence no centre of mass")
+        raise massless_error("hence no centre of mass")
     moment = sum(link.mass * frames[link.name].point(link.center_of_mass) for link in robot.links if link.mass)
     return ca.densify(moment / robot.total_mass)
 
@@ -165,9 +172,9 @@ def frame_jacobian(
     point: Expression = (0.0, 0.0, 0.0),
     world_from_base: Placement | None = None,
 ) -> Expression:
-    """Geometric Jacobian of a point fixed in a link.
+    """Return the geometric Jacobian of a point fixed in a link.
 
-    Joint rates to (angular velocity, velocity of the point), world axes.
+    It maps joint rates to (angular velocity, velocity of the point) in world axes.
 
     Args:
         link: Name of the link.
@@ -183,32 +190,32 @@ def frame_jacobian(
 
 
 def link_jacobians(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> dict[str, Expression]:
-    """As frame_jacobian for the origins of all link frames, by link name. Shape (6, dof) each."""
+    """Return the Jacobians of the origins of all link frames, as frame_jacobian, by link name. Shape (6, dof) each."""
     frames, axes = frames_and_axes(robot, q, world_from_base)
     return {link: ca.densify(point_jacobian(robot, axes, link, frame.position)) for link, frame in frames.items()}
 
 
 def tip_jacobian(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> Expression:
-    """Geometric Jacobian of the tip: joint rates to (angular, linear) velocity of the tip frame, world axes.
+    """Return the geometric Jacobian of the tip frame.
 
-    Shape (6, dof).
+    It maps joint rates to (angular, linear) velocity in world axes. Shape (6, dof).
     """
     tip = checked_instance(robot, Robot, "kinematics", "robot").tip_link
     return frame_jacobian(robot, q, tip, robot.tip_translation, world_from_base)
 
 
 def center_of_mass_jacobian(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> Expression:
-    """Jacobian of the whole robot's centre of mass. Shape (3, dof), world axes."""
+    """Return the Jacobian of the whole robot's centre of mass, world axes. Shape (3, dof)."""
     matrix = momentum_matrix(robot, q, world_from_base)
     if robot.total_mass == 0:
-        raise massless("hence no centre of mass")
+        raise massless_error("hence no centre of mass")
     return matrix[3:6, :] / robot.total_mass
 
 
 def momentum_matrix(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> Expression:
-    """Joint rates to (moment of momentum about the world's origin, linear momentum), the base standing still.
+    """Return the map from joint rates to (moment of momentum about the world's origin, linear momentum).
 
-    Shape (6, dof).
+    The base is at rest. Shape (6, dof).
     """
     frames, axes = frames_and_axes(robot, q, world_from_base)
     moments = subtree_moments(robot, frames)
@@ -216,13 +223,13 @@ def momentum_matrix(robot: Robot, q: Expression, world_from_base: Placement | No
 
 
 def robot_inertia(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> Expression:
-    """Spatial inertia of the robot with locked joints about the world's origin, world axes. Shape (6, 6)."""
+    """Return the spatial inertia with locked joints about the world's origin, world axes. Shape (6, 6)."""
     frames = link_frames(robot, q, world_from_base)
     return ca.densify(subtree_moments(robot, frames)[robot.root].spatial_inertia())
 
 
 def subtree_moments(robot: Robot, frames: dict[str, Frame]) -> dict[str, MassMoments]:
-    """Moments of each link together with all links it carries, by link name, about the world's origin."""
+    """Return the moments of each link with all links that it carries, by link name, about the world's origin."""
     moments: dict[str, MassMoments] = {}
     for link in robot.links:
         turn, center = frames[link.name].rotation, frames[link.name].point(link.center_of_mass)
@@ -239,7 +246,7 @@ def subtree_moments(robot: Robot, frames: dict[str, Frame]) -> dict[str, MassMom
 def joint_momenta(
     robot: Robot, axes: dict[str, tuple[Expression, Expression]], moments: dict[str, MassMoments]
 ) -> Expression:
-    """As momentum_matrix, from the axes of frames_and_axes and the moments of subtree_moments."""
+    """Return momentum_matrix from the axes of frames_and_axes and the moments of subtree_moments."""
     children = {joint.name: moments[joint.child] for joint in robot.joints if joint.moves}
     momenta = {name: ca.vertcat(*children[name].momentum(*axis)) for name, axis in axes.items()}
     return ca.horzcat(ca.DM(6, 0), *by_joint_vector(robot, momenta))
@@ -248,7 +255,7 @@ def joint_momenta(
 def point_jacobian(
     robot: Robot, axes: dict[str, tuple[Expression, Expression]], link: str, point: Expression
 ) -> Expression:
-    """As frame_jacobian, from the axes of frames_and_axes and a point in the world. Shape (6, dof)."""
+    """Return the Jacobian of a point in the world from the axes of frames_and_axes. Shape (6, dof)."""
     carriers = {joint.name for joint in robot.path_to(link)}
     columns = {
         name: ca.vertcat(angular, linear + cross(angular, point)) if name in carriers else ca.DM(6, 1)
@@ -258,33 +265,33 @@ def point_jacobian(
 
 
 def joint_frames(robot: Robot, q: Expression) -> dict[str, Frame]:
-    """Frame of each joint's child in that of its parent, by the name of the joint."""
-    positions, found = _positions(robot, q), {}
+    """Return the frame of each joint's child link in its parent link, by joint name."""
+    positions, frames = _positions(robot, q), {}
     for joint in robot.joints:
-        turn, place = constant(joint.rotation), constant(joint.translation)
+        orientation, position = constant(joint.rotation), constant(joint.translation)
         if joint.kind == "prismatic":
-            place = place + ca.mtimes(turn, constant(joint.axis)) * positions[joint.name]
+            position = position + ca.mtimes(orientation, constant(joint.axis)) * positions[joint.name]
         elif joint.moves:
-            turn = ca.mtimes(turn, rotation(constant(joint.axis), positions[joint.name]))
-        found[joint.name] = Frame(turn, place)
-    return found
+            orientation = ca.mtimes(orientation, rotation(constant(joint.axis), positions[joint.name]))
+        frames[joint.name] = Frame(orientation, position)
+    return frames
 
 
 def _positions(robot: Robot, q: Expression) -> dict[str, Expression]:
-    """Positions of all joints that move, followers included, by name."""
-    found = each_joint(robot, q)
-    for name, drive in robot.drives.items():
-        if drive.offset:
-            found[name] = found[name] + drive.offset
-    return found
+    """Return the positions of all moving joints, followers included, by name."""
+    positions = each_joint(robot, q)
+    for name, coupling in robot.couplings.items():
+        if coupling.offset:
+            positions[name] = positions[name] + coupling.offset
+    return positions
 
 
 def frames_and_axes(
     robot: Robot, q: Expression, world_from_base: Placement | None = None
 ) -> tuple[dict[str, Frame], dict[str, tuple[Expression, Expression]]]:
-    """Frames of the links, and motion vectors of all joints that move, followers included, both by name.
+    """Return the frames of the links, and the motion vectors of all moving joints, followers included, both by name.
 
-    A motion vector is (angular velocity, velocity at the world's origin) per unit rate of that joint, world axes.
+    A motion vector is (angular velocity, velocity at the world's origin) per unit rate of the joint, world axes.
     """
     positions = _positions(robot, q)
     frames: dict[str, Frame] = {robot.root: checked_placement(world_from_base)}
@@ -300,7 +307,7 @@ def frames_and_axes(
             axes[joint.name] = (ca.DM(3, 1), axis)
             frame = Frame(frame.rotation, frame.position + positions[joint.name] * axis)
         elif joint.moves:
-            # Parallel axes in a row: the angles add up, which is cheaper than a product of rotations.
+            # Angles about consecutive parallel axes add up, which is cheaper than a product of rotations.
             if turn is not None and np.array_equal(turn.axis, joint.axis):
                 turn = turn._replace(angle=turn.angle + positions[joint.name])
             else:
@@ -316,7 +323,7 @@ def frames_and_axes(
 
 
 def constant(array: Array) -> Expression:
-    """An array without its zeros, and without what rounding leaves of cos(pi / 2), which would hide them."""
+    """Return an array as a DM without its zeros, including rounding residues such as cos(pi / 2)."""
     return ca.sparsify(ca.DM(array), 1e-15 * float(np.abs(array).max(initial=0.0)))
 
 
@@ -347,18 +354,22 @@ class CenterOfMassMotion(NamedTuple):
 def link_motions(
     robot: Robot, q: Expression, qd: Expression, qdd: Expression, world_from_base: Placement | None = None
 ) -> dict[str, LinkMotion]:
-    """Motion of every link, by name, root first."""
+    """Return the motion of every link, by name, root first."""
     frames, axes = frames_and_axes(robot, q, world_from_base)
-    return motions_of(robot, frames, axes, qd, qdd)
+    return propagate_motions(robot, frames, axes, qd, qdd)
 
 
+@on_scalars
 def center_of_mass_motion(
     robot: Robot, q: Expression, qd: Expression, qdd: Expression, world_from_base: Placement | None = None
 ) -> CenterOfMassMotion:
-    """Position, velocity and acceleration of the centre of mass of the whole robot; ModelError if it has no mass."""
+    """Return the motion of the centre of mass; raise ModelError if the robot has no mass."""
     if checked_instance(robot, Robot, "kinematics", "robot").total_mass == 0:
-        raise massless("hence no centre of mass")
-    return CenterOfMassMotion(*_center_of_mass_motion(robot, q, qd, qdd, world_from_base))
+        raise massless_error("hence no centre of mass")
+    motions = link_motions(robot, q, qd, qdd, world_from_base)
+    weighted = [[link.mass * part for part in motions[link.name][:3]] for link in robot.links]
+    sums = (sum(parts, start=ca.DM(3, 1)) for parts in zip(*weighted, strict=True))
+    return CenterOfMassMotion(*(ca.densify(part / robot.total_mass) for part in sums))
 
 
 @on_scalars
@@ -369,9 +380,9 @@ def momentum(
     about: Expression = (0.0, 0.0, 0.0),
     world_from_base: Placement | None = None,
 ) -> Expression:
-    """(Moment of momentum about a point of the world, linear momentum). Shape (6, 1), N m s and N s."""
+    """Return (moment of momentum about a point of the world, linear momentum). Shape (6, 1), N m s and N s."""
     frames, axes = frames_and_axes(robot, q, world_from_base)
-    motions = motions_of(robot, frames, axes, qd, ca.DM(robot.dof, 1))
+    motions = propagate_motions(robot, frames, axes, qd, ca.DM(robot.dof, 1))
     place = checked_vector(about, 3, "about", "a point of the world")
     total: Expression = ca.DM(6, 1)
     for link in robot.links:
@@ -391,37 +402,33 @@ def momentum_rate(
     about: Expression = (0.0, 0.0, 0.0),
     world_from_base: Placement | None = None,
 ) -> Expression:
-    """Time derivative of :func:`momentum` about a point at rest. Shape (6, 1), N m and N.
+    """Return the time derivative of :func:`momentum` about a point at rest. Shape (6, 1), N m and N.
 
-    About a point that moves with the centre of mass it is the same, the velocity of that being along the momentum.
+    It is the same about a point that moves with the centre of mass, whose velocity is parallel to the momentum.
     """
     frames, axes = frames_and_axes(robot, q, world_from_base)
-    rates = momentum_rates(robot, frames, motions_of(robot, frames, axes, qd, qdd))
+    motions = propagate_motions(robot, frames, axes, qd, qdd)
     place = checked_vector(about, 3, "about", "a point of the world")
-    total: Expression = sum(rates.values(), start=ca.DM(6, 1))
+    total: Expression = ca.DM(6, 1)
+    for link in robot.links:
+        motion, inertia = motions[link.name], inertia_in_world(link, frames)
+        spin = motion.angular_velocity
+        force = link.mass * motion.acceleration
+        moment = ca.mtimes(inertia, motion.angular_acceleration) + cross(spin, ca.mtimes(inertia, spin))
+        total = total + ca.vertcat(moment + cross(motion.center, force), force)
     return ca.densify(ca.vertcat(total[0:3] - cross(place, total[3:6]), total[3:6]))
 
 
-@on_scalars
-def _center_of_mass_motion(
-    robot: Robot, q: Expression, qd: Expression, qdd: Expression, world_from_base: Placement | None
-) -> tuple[Expression, ...]:
-    motions = link_motions(robot, q, qd, qdd, world_from_base)
-    weighted = [[link.mass * part for part in motions[link.name][:3]] for link in robot.links]
-    sums = (sum(parts, start=ca.DM(3, 1)) for parts in zip(*weighted, strict=True))
-    return tuple(ca.densify(part / robot.total_mass) for part in sums)
-
-
-def motions_of(
+def propagate_motions(
     robot: Robot,
     frames: dict[str, Frame],
     axes: dict[str, tuple[Expression, Expression]],
     qd: Expression,
     qdd: Expression,
 ) -> dict[str, LinkMotion]:
-    """Outward recursion over the origins of the link frames, then from these to the centres of mass."""
+    """Propagate the motion from the root outwards over the link frames, then to the centres of mass."""
     rates, accelerations = each_joint(robot, qd, "qd"), each_joint(robot, qdd, "qdd")
-    # of the frame's origin: velocity, acceleration, angular velocity, angular acceleration
+    # velocity and acceleration of the frame's origin, angular velocity, angular acceleration
     origin: dict[str, tuple[Expression, Expression, Expression, Expression]] = {robot.root: (ca.DM(3, 1),) * 4}
     for joint in robot.joints:
         velocity, acceleration, spin, turning = origin[joint.parent]
@@ -450,18 +457,6 @@ def motions_of(
 
 
 def inertia_in_world(link: Link, frames: dict[str, Frame]) -> Expression:
-    """Rotational inertia about the centre of mass, world axes. Shape (3, 3)."""
+    """Return the rotational inertia about the centre of mass, world axes. Shape (3, 3)."""
     turn = frames[link.name].rotation
     return ca.mtimes([turn, ca.sparsify(ca.DM(link.inertia)), turn.T])
-
-
-def momentum_rates(robot: Robot, frames: dict[str, Frame], motions: dict[str, LinkMotion]) -> dict[str, Expression]:
-    """d/dt of each link's momentum about the world's origin, by link name. Shape (6, 1) each."""
-    rates = {}
-    for link in robot.links:
-        motion, inertia = motions[link.name], inertia_in_world(link, frames)
-        spin = motion.angular_velocity
-        force = link.mass * motion.acceleration
-        moment = ca.mtimes(inertia, motion.angular_acceleration) + cross(spin, ca.mtimes(inertia, spin))
-        rates[link.name] = ca.vertcat(moment + cross(motion.center, force), force)
-    return rates

@@ -1,6 +1,6 @@
-"""Links, their shapes, and joints: the parts of a robot, checked when they are made.
+"""Parts of a robot: links, joints and shapes, validated on construction.
 
-Attributes that are arrays are given as anything numpy reads and stored as read-only float arrays.
+Array attributes accept anything that NumPy reads and are stored as read-only arrays of floats.
 """
 
 from __future__ import annotations
@@ -35,26 +35,26 @@ Kind: TypeAlias = Literal["fixed", "revolute", "continuous", "prismatic"]
 ShapeKind: TypeAlias = Literal["box", "sphere", "cylinder", "capsule", "mesh"]
 
 SHAPES = {"box": 3, "sphere": 1, "cylinder": 2, "capsule": 2, "mesh": 3}
-"""Kinds of collision shapes, and how many numbers their size is."""
+"""Kinds of collision shapes and the length of their size."""
 INERTIA_TOLERANCE = 1e-6
-"""Relative slack of the inertia checks: inertias printed to six digits still pass."""
+"""Relative tolerance of the inertia checks, so that inertias printed to six digits pass."""
 
 
 @dataclass(frozen=True, eq=False)
 class CollisionShape:
-    """A shape that stands for a link, or for a part of one, where it may touch something.
+    """A shape that represents a link, or part of one, in collision checks.
 
     Attributes:
-        kind: "box", "sphere", "cylinder", "capsule" or "mesh". Those with a length lie along z of the shape's frame.
-        size: Edges along x, y, z of a box; (radius,) of a sphere; (radius, length) of a cylinder, or of a capsule
-            without its caps; scale along x, y, z of a mesh, negative where it is mirrored. m, but for the scale.
-        file: Of a mesh, as it was given: nothing looks for it here.
-        translation: Origin of the shape's frame, the middle of all but a mesh, in the link frame. Shape (3,), m.
+        kind: "box", "sphere", "cylinder", "capsule" or "mesh". Cylinders and capsules lie along z of the shape's frame.
+        size: Edge lengths along x, y, z of a box; (radius,) of a sphere; (radius, length) of a cylinder, or of a
+            capsule without its caps; scale along x, y, z of a mesh, negative to mirror it. m, except for the scale.
+        file: File of a mesh as written in the description; it is not opened here.
+        translation: Origin of the shape's frame in the link frame; the centre of all shapes but meshes. Shape (3,), m.
         rotation: Axes of the shape's frame, as columns, in the link frame. Shape (3, 3).
-        folder: Of the description that names the file, where it is looked for first; "" where that is not known.
+        folder: Folder of the description that names the file, where the file is searched first; "" if unknown.
 
     Raises:
-        ModelError: Unknown kind, wrong sizes, a size that is not positive, a mesh without a file or scaled to nothing.
+        ModelError: Unknown kind, wrong sizes, a size that is not positive, a mesh without a file or with zero scale.
     """
 
     kind: ShapeKind
@@ -65,11 +65,11 @@ class CollisionShape:
     folder: str = ""
 
     def __post_init__(self) -> None:
-        numbers = SHAPES[checked_choice(self.kind, SHAPES, "collision shape", "kind")]
-        for what in ("file", "folder"):
-            checked_text(getattr(self, what), "collision shape", what)
+        size_length = SHAPES[checked_choice(self.kind, SHAPES, "collision shape", "kind")]
+        for argument in ("file", "folder"):
+            checked_text(getattr(self, argument), "collision shape", argument)
         owner, mesh = f"collision {self.kind}", self.kind == "mesh"
-        size = checked_array(self.size, (numbers,), owner, "size", positive=not mesh)
+        size = checked_array(self.size, (size_length,), owner, "size", positive=not mesh)
         if mesh and not self.file:
             raise ModelError(f"{owner}: a mesh needs the name of its file", name="file", value=self.file)
         if not size.all():
@@ -81,10 +81,11 @@ class CollisionShape:
         object.__setattr__(self, "rotation", checked_rotation(self.rotation, owner, "rotation"))
 
     def _check_size(self, size: Array, owner: str) -> None:
+        """Warn of sizes that look like millimetres."""
         warn_of_millimetres(size, owner, "size", "size")
 
     def placed(self, rotation: Array, translation: Array) -> Self:
-        """The same shape in a frame in which its link stands so. Shape (3, 3) and (3,)."""
+        """Return the same shape in a frame, given the pose of its link in it. Shape (3, 3) and (3,)."""
         turn = checked_rotation(rotation, "placed shape", "rotation")
         shift = checked_array(translation, (3,), "placed shape", "translation") + turn @ self.translation
         return replace(self, translation=shift, rotation=turn @ self.rotation)
@@ -92,14 +93,14 @@ class CollisionShape:
 
 @dataclass(frozen=True, eq=False)
 class VisualShape(CollisionShape):
-    """A shape that a link, or a part of one, looks like; nothing is computed with it.
+    """A shape for display only.
 
     Attributes:
-        kind, size, file, translation, rotation, folder: As of CollisionShape, whatever its size.
-        color: Red, green, blue and opacity, 0 to 1; None where nothing is said of it. Shape (4,).
+        kind, size, file, translation, rotation, folder: As in CollisionShape; any size is accepted.
+        color: Red, green, blue and opacity, 0 to 1; None if unspecified. Shape (4,).
 
     Raises:
-        ModelError: As of CollisionShape; a color that is none.
+        ModelError: As CollisionShape; an invalid color.
     """
 
     color: ArrayInput = None
@@ -115,7 +116,7 @@ class VisualShape(CollisionShape):
         object.__setattr__(self, "color", color)
 
     def _check_size(self, size: Array, owner: str) -> None:
-        """Whatever is seen."""
+        """Accept every size."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,9 +128,9 @@ class Link:
         mass: kg, not negative.
         center_of_mass: In the link frame. Shape (3,), m.
         inertia: About the centre of mass, in link axes. Shape (3, 3), kg m^2.
-        any_inertia: Take an inertia that no body has, as some robot descriptions give. It must still be symmetric.
-        collisions: Shapes that stand for the body where it may touch something.
-        visuals: Shapes that it looks like.
+        any_inertia: Accept a physically impossible inertia, as some robot descriptions contain. It must be symmetric.
+        collisions: Shapes that represent the link in collision checks.
+        visuals: Shapes for display.
 
     Raises:
         ModelError: Negative or non-finite mass, wrong sizes, an inertia that no mass distribution has (not
@@ -160,11 +161,11 @@ class Link:
 
 @dataclass(frozen=True)
 class Mimic:
-    """What ties a joint to another one that it follows: its position is multiplier times that one's, plus offset.
+    """The coupling of a follower to another joint: its position is multiplier times that joint's position, plus offset.
 
     Attributes:
         joint: Name of the joint that is followed, which may itself follow another.
-        multiplier: rad or m per rad or m of the joint that is followed.
+        multiplier: rad or m per rad or m of that joint.
         offset: rad or m.
 
     Raises:
@@ -177,17 +178,17 @@ class Mimic:
 
     def __post_init__(self) -> None:
         owner = f"mimic of joint {checked_name(self.joint, 'mimic', 'joint')!r}"
-        for what in ("multiplier", "offset"):
-            number = checked_number(getattr(self, what), owner, what)
-            object.__setattr__(self, what, number)
+        for argument in ("multiplier", "offset"):
+            number = checked_number(getattr(self, argument), owner, argument)
+            object.__setattr__(self, argument, number)
 
 
 @dataclass(frozen=True, eq=False)
 class Joint:
     """A connection of a child link to a parent link.
 
-    The joint frame stands in the parent link frame at `translation`, `rotation` (URDF convention). The child
-    link frame is the joint frame turned about `axis` (revolute, continuous) or shifted along it (prismatic).
+    The joint frame has the pose `translation`, `rotation` in the parent link frame (URDF convention). The child link
+    frame is the joint frame rotated about `axis` (revolute, continuous) or translated along it (prismatic).
 
     Attributes:
         name: Unique within the robot.
@@ -197,15 +198,15 @@ class Joint:
         translation: Joint frame's origin in the parent link frame. Shape (3,), m.
         rotation: Joint frame's axes, as columns, in the parent link frame. Shape (3, 3).
         axis: In the joint frame; stored with unit length. Shape (3,).
-        lower: Least position, rad or m.
-        upper: Greatest position, rad or m.
-        velocity: Greatest speed, rad/s or m/s; 0, as in many URDF files, where it is unknown and nothing limits it.
-        effort: Greatest torque or force, N m or N; 0 likewise.
-        mimic: Which joint it follows, and how; None for a joint of its own.
+        lower: Lower position limit, rad or m.
+        upper: Upper position limit, rad or m.
+        velocity: Speed limit, rad/s or m/s; 0, as in many URDF files, means unknown and hence no limit.
+        effort: Torque or force limit, N m or N; 0 likewise.
+        mimic: Coupling to the joint that it follows; None for an independent joint.
 
     Raises:
-        ModelError: Unknown kind, wrong sizes, zero axis, a rotation that is none, lower > upper, a negative
-            limit, position limits of a continuous joint, a fixed joint that follows another.
+        ModelError: Unknown kind, wrong sizes, zero axis, an invalid rotation, lower > upper, a negative limit, position
+            limits of a continuous joint, a fixed joint that follows another.
 
     Warns:
         ModelWarning: Limits that look like degrees, an origin that looks like millimetres.
@@ -238,48 +239,48 @@ class Joint:
         object.__setattr__(self, "axis", frozen(axis / length))
         object.__setattr__(self, "translation", checked_array(self.translation, (3,), owner, "translation"))
         object.__setattr__(self, "rotation", checked_rotation(self.rotation, owner, "rotation"))
-        for what in ("lower", "upper", "velocity", "effort"):
-            limit = checked_number(getattr(self, what), owner, what, finite=False)
-            object.__setattr__(self, what, limit)
-            if what in ("velocity", "effort") and limit < 0:
-                raise ModelError(f"{owner}: {what} limit {limit} is negative", name=what, value=limit, limit=0.0)
-        room = (self.lower, self.upper)
+        for name in ("lower", "upper", "velocity", "effort"):
+            limit = checked_number(getattr(self, name), owner, name, finite=False)
+            object.__setattr__(self, name, limit)
+            if name in ("velocity", "effort") and limit < 0:
+                raise ModelError(f"{owner}: {name} limit {limit} is negative", name=name, value=limit, limit=0.0)
+        limits = (self.lower, self.upper)
         if self.lower > self.upper:
             message = f"{owner}: lower limit {self.lower} is above upper limit {self.upper}"
             raise ModelError(message, name="lower", value=self.lower, limit=self.upper)
         if self.lower == np.inf or self.upper == -np.inf:
             message = f"{owner}: limits {self.lower} .. {self.upper} leave no position"
-            raise ModelError(message, name="limits", value=room)
-        if self.kind == "continuous" and np.isfinite(room).any():
+            raise ModelError(message, name="limits", value=limits)
+        if self.kind == "continuous" and np.isfinite(limits).any():
             message = (
                 f"{owner}: a continuous joint has no position limits, but {self.lower} .. {self.upper} is "
                 "given; make it revolute or leave them out"
             )
-            raise ModelError(message, name="limits", value=room, limit=(-np.inf, np.inf))
+            raise ModelError(message, name="limits", value=limits, limit=(-np.inf, np.inf))
         warn_of_millimetres(self.translation, owner, self.name, "translation")
         if self.kind == "revolute":
-            warn_of_degrees(room, owner, self.name, "limit")
+            warn_of_degrees(limits, owner, self.name, "limit")
         if self.mimic is not None and not self.moves:
             message = f"{owner} is fixed and cannot follow joint {self.mimic.joint!r}"
             raise ModelError(message, name=self.name, value=self.mimic.joint)
 
     @property
     def moves(self) -> bool:
-        """Whether the joint is not fixed; one that follows another moves with it."""
+        """Whether the joint is not fixed; followers move."""
         return self.kind != "fixed"
 
     @property
     def unit(self) -> str:
-        """Of its position: "m" of a prismatic joint, "rad" of any other."""
+        """Unit of the position: "m" of a prismatic joint, else "rad"."""
         return "m" if self.kind == "prismatic" else "rad"
 
     @property
     def effort_unit(self) -> str:
-        """Of what drives it: "N" of a prismatic joint, "N m" of any other."""
+        """Unit of the effort: "N" of a prismatic joint, else "N m"."""
         return "N" if self.kind == "prismatic" else "N m"
 
     def placed(self, position: float) -> tuple[Array, Array]:
-        """Placement of the child link in the parent link at a joint position (rad or m): rotation, translation."""
+        """Return the pose of the child link in the parent link at a position (rad or m): rotation, translation."""
         turn, shift = self.rotation, self.translation
         position = checked_number(position, f"joint {self.name!r}", "position")
         if self.kind == "prismatic":
@@ -287,10 +288,10 @@ class Joint:
         return (turn @ np.array(ca.DM(rotation(self.axis, position))) if self.moves else turn), shift
 
     def locked(self, position: float) -> Joint:
-        """The joint held fixed at a position (rad or m), which may lie outside its limits.
+        """Return a fixed joint at a given position (rad or m), which may violate the limits.
 
         Raises:
-            ModelError: The joint is fixed already, or the position is not finite.
+            ModelError: The joint is already fixed, or the position is not finite.
         """
         if not self.moves:
             message = f"joint {self.name!r} is fixed; only a joint that moves can be locked"
@@ -299,25 +300,25 @@ class Joint:
         return Joint(self.name, "fixed", self.parent, self.child, shift, turn, self.axis)
 
 
-def massless(consequence: str) -> ModelError:
-    """The error that says a robot has no mass, what that makes impossible, and what URDF has for it."""
+def massless_error(consequence: str) -> ModelError:
+    """Return the error for a robot without mass; `consequence` names what that makes impossible."""
     message = f"the robot has no mass, {consequence}: give its links masses; in URDF none has an <inertial>"
     return ModelError(message, name="mass", value=0.0, limit=0.0)
 
 
-def _check_inertia(inertia: Array, owner: str, lenient: bool) -> None:
+def _check_inertia(inertia: Array, owner: str, any_inertia: bool) -> None:
     slack = INERTIA_TOLERANCE * float(np.abs(inertia).max())
     if np.abs(inertia - inertia.T).max() > slack:
         raise ModelError(f"{owner}: inertia {inertia.tolist()} is not symmetric", name="inertia", value=inertia)
-    if lenient:
+    if any_inertia:
         return
-    least, middle, greatest = np.linalg.eigvalsh(inertia / 2 + inertia.T / 2)
-    if least < -slack:
-        message = f"{owner}: inertia has the negative principal moment {least:g} kg m^2"
-        raise ModelError(message, name="inertia", value=float(least), limit=0.0)
-    if greatest > least + middle + slack:
+    smallest, middle, largest = np.linalg.eigvalsh(inertia / 2 + inertia.T / 2)
+    if smallest < -slack:
+        message = f"{owner}: inertia has the negative principal moment {smallest:g} kg m^2"
+        raise ModelError(message, name="inertia", value=float(smallest), limit=0.0)
+    if largest > smallest + middle + slack:
         message = (
-            f"{owner}: inertia has principal moments {least:g}, {middle:g}, {greatest:g} kg m^2, which violate the "
+            f"{owner}: inertia has principal moments {smallest:g}, {middle:g}, {largest:g} kg m^2, which violate the "
             "triangle inequality: none may exceed the sum of the two others"
         )
-        raise ModelError(message, name="inertia", value=float(greatest), limit=float(least + middle))
+        raise ModelError(message, name="inertia", value=float(largest), limit=float(smallest + middle))

@@ -1,8 +1,8 @@
-"""Robots made from robots: joints locked, tools and loads attached, arms joined, branches cut, another root or tip.
+"""Changes of robots: lock joints, attach tools and loads, join arms, cut branches, change the root or the tip.
 
-Every function takes a robot, which it leaves as it is, and returns a new one. Placements are (3,) translations in m
-and (3, 3) rotations whose columns are axes, no turn if None. All raise ModelError, naming the near ones, for a name
-that does not exist, and for a name that would occur twice.
+Every function leaves its robot unchanged and returns a new one. Poses are translations of shape (3,), m, and rotations
+of shape (3, 3) whose columns are axes, the identity if None. All raise ModelError for an unknown name, with similar
+names, and for a name that would occur twice.
 """
 
 from __future__ import annotations
@@ -26,27 +26,27 @@ from models.arrays import (
 from models.errors import ModelError
 from models.robot.parts import Joint, Link
 from models.robot.robot import Robot
-from models.robot.tree import cut, held, reroot
+from models.robot.tree import lock_with_followers, prune_joints, reroot_tree
 
 
-def locked(robot: Robot, positions: Mapping[str, float]) -> Robot:
-    """The robot with some joints held fixed, and with each the joints that follow it, where that puts them.
+def lock_joints(robot: Robot, positions: Mapping[str, float]) -> Robot:
+    """Lock joints, and the joints that follow them, at given positions.
 
     Args:
         positions: Position of each joint to lock (rad or m), by name. Limits are not checked.
 
     Raises:
-        ModelError: A joint that is fixed already; a position that is not finite.
+        ModelError: A joint that is already fixed, or a position that is not finite.
     """
-    given = checked_mapping(positions, "locked", "positions")
-    joints = held(_robot(robot).joints, {robot.joint(name).name: at for name, at in given.items()})
+    positions = checked_mapping(positions, "lock_joints", "positions")
+    joints = lock_with_followers(_robot(robot).joints, {robot.joint(name).name: positions[name] for name in positions})
     return replace(robot, joints=joints)
 
 
-def retipped(
+def move_tip(
     robot: Robot, tip: str, translation: ArrayInput = (0.0, 0.0, 0.0), rotation: ArrayInput | None = None
 ) -> Robot:
-    """The robot with its tip at a frame placed in the link `tip`."""
+    """Place the tip at a frame fixed in the link `tip`."""
     return replace(robot, tip=_robot(robot).link(tip).name, tip_translation=translation, tip_rotation=_turn(rotation))
 
 
@@ -55,9 +55,10 @@ def with_load(
     link: str,
     mass: float,
     center_of_mass: ArrayInput = (0.0, 0.0, 0.0),
+    *,
     inertia: ArrayInput | None = None,
 ) -> Robot:
-    """The robot with a body welded to a link, whose inertia it joins.
+    """Merge a rigid body into a link.
 
     Args:
         link: Name of the link that carries the load.
@@ -70,51 +71,47 @@ def with_load(
     """
     carrier = _robot(robot).link(link)
     load = Link(f"load of {link}", mass, center_of_mass, np.zeros((3, 3)) if inertia is None else inertia)
-    whole = _welded(carrier, [(load, np.eye(3), np.zeros(3))])
-    return replace(robot, links=tuple(whole if each.name == link else each for each in robot.links))
+    loaded = _welded(carrier, [(load, np.eye(3), np.zeros(3))])
+    return replace(robot, links=tuple(loaded if each.name == link else each for each in robot.links))
 
 
-def attached(
+def attach_tool(
     robot: Robot,
     tool: Robot | Link,
     link: str | None = None,
     translation: ArrayInput = (0.0, 0.0, 0.0),
-    rotation: ArrayInput | None = None,
     *,
+    rotation: ArrayInput | None = None,
     prefix: str = "",
     keep_tip: bool = False,
 ) -> Robot:
-    """The robot with a tool, or any other robot, fixed to one of its links.
+    """Attach a tool, or any other robot, to a link by a fixed joint.
 
-    The fixed joint is called "NAME_mount", NAME being the tool's root link with the prefix. The joints of the tool
-    come last.
+    The joint is called "NAME_mount", NAME being the tool's root link with the prefix. The joints of the tool come last.
 
     Args:
-        tool: What is attached: a robot, or a single link.
-        link: Name of the link that carries it. The tool stands at its tip frame if None.
+        tool: A robot or a single link.
+        link: Name of the link that carries it; the tip frame if None.
         translation: Tool's root link in the carrying frame. Shape (3,), m.
         rotation: Tool's root link in the carrying frame. Shape (3, 3).
-        prefix: Put before every name of the tool.
-        keep_tip: The tip stays where it is; otherwise the tool's tip becomes that of the robot.
+        prefix: Prefix of all names of the tool.
+        keep_tip: Keep the robot's tip; otherwise the tool's tip becomes that of the robot.
     """
-    added = renamed(
-        tool if isinstance(tool, Robot) else Robot((checked_instance(tool, Link, "attached", "tool"),)), prefix
-    )
-    robot = _robot(robot)
-    checked_flag(keep_tip, "attached tool", "keep_tip")
-    shift = checked_array(translation, (3,), "attached tool", "translation")
-    turn = checked_rotation(_turn(rotation), "attached tool", "rotation")
+    owner = "attached tool"
+    added = tool if isinstance(tool, Robot) else Robot((checked_instance(tool, Link, owner, "tool"),))
+    added, robot = add_prefix(added, prefix), _robot(robot)
+    checked_flag(keep_tip, owner, "keep_tip")
+    shift = checked_array(translation, (3,), owner, "translation")
+    turn = checked_rotation(_turn(rotation), owner, "rotation")
     if link is None:
         link = robot.tip_link
         shift, turn = robot.tip_translation + robot.tip_rotation @ shift, robot.tip_rotation @ turn
     mount = Joint(f"{added.root}_mount", "fixed", robot.link(link).name, added.root, shift, turn)
-    owner = robot if keep_tip else added
-    return replace(
-        owner, links=(*robot.links, *added.links), joints=(*robot.joints, mount, *added.joints), name=robot.name
-    )
+    links, joints = (*robot.links, *added.links), (*robot.joints, mount, *added.joints)
+    return replace(robot if keep_tip else added, links=links, joints=joints, name=robot.name)
 
 
-def merged(
+def merge_robots(
     base: Robot | Link,
     arms: Mapping[str, Robot],
     *,
@@ -122,44 +119,43 @@ def merged(
     translations: Mapping[str, ArrayInput] | None = None,
     rotations: Mapping[str, ArrayInput] | None = None,
 ) -> Robot:
-    """Several robots on one base. The tip is that of the first arm; see retipped.
+    """Join several robots on one base; the tip is that of the first arm, see move_tip.
 
     Args:
-        base: What carries the arms: a link, or a robot.
-        arms: Robots by prefix, which is put before all their names: {"left_": arm, "right_": arm}.
-        links: Link of the base that carries each, by prefix; the root of the base where none is given.
-        translations: Each arm's root link in the carrying link, by prefix; zero where none is given. Shape (3,), m.
-        rotations: The same for the turn. Shape (3, 3).
+        base: A link or a robot that carries the arms.
+        arms: Robots by the prefix of all their names: {"left_": arm, "right_": arm}.
+        links: Link of the base that carries each arm, by prefix; the root of the base by default.
+        translations: Each arm's root link in the carrying link, by prefix; zero by default. Shape (3,), m.
+        rotations: The same for the rotation. Shape (3, 3).
 
     Raises:
-        ModelError: No arm; a placement of an arm that is not there.
+        ModelError: No arms, or a pose for an unknown prefix.
     """
     owner = "merged robots"
     arms = checked_mapping(arms, owner, "arms")
     if not arms:
         raise ModelError(f"{owner}: no arms are given", name="arms", value=arms)
-    placed = {"links": links, "translations": translations, "rotations": rotations}
-    given = [{} if places is None else checked_mapping(places, owner, what) for what, places in placed.items()]
-    if unknown := [prefix for places in given for prefix in places if prefix not in arms]:
-        message = f"merged robots: {unknown} are no prefixes of the arms, which are {list(arms)}"
+    mappings = {"links": links, "translations": translations, "rotations": rotations}
+    poses = [
+        {} if mapping is None else checked_mapping(mapping, owner, argument) for argument, mapping in mappings.items()
+    ]
+    if unknown := [prefix for mapping in poses for prefix in mapping if prefix not in arms]:
+        message = f"{owner}: {unknown} are no prefixes of the arms, which are {list(arms)}"
         raise ModelError(message, name=unknown[0], value=unknown, limit=tuple(arms))
-    whole = base if isinstance(base, Robot) else Robot((checked_instance(base, Link, owner, "base"),), name=base.name)
-    root, first = whole.root, True
+    merged = base if isinstance(base, Robot) else Robot((checked_instance(base, Link, owner, "base"),), name=base.name)
+    root, first = merged.root, next(iter(arms))
     for prefix, arm in arms.items():
-        carrier, shift, turn = (places.get(prefix) for places in given)
-        shift = np.zeros(3) if shift is None else shift
+        carrier, shift, turn = (mapping.get(prefix) for mapping in poses)
+        carrier, shift = root if carrier is None else carrier, np.zeros(3) if shift is None else shift
         checked_instance(arm, Robot, f"{owner}: {prefix!r}", "arm")
-        whole = attached(
-            whole, arm, root if carrier is None else carrier, shift, turn, prefix=prefix, keep_tip=not first
-        )
-        first = False
-    return whole
+        merged = attach_tool(merged, arm, carrier, shift, rotation=turn, prefix=prefix, keep_tip=prefix != first)
+    return merged
 
 
-def renamed(robot: Robot, prefix: str) -> Robot:
-    """The robot with a prefix before the names of all links and joints."""
+def add_prefix(robot: Robot, prefix: str) -> Robot:
+    """Put a prefix before the names of the robot and of all its links and joints."""
     robot = _robot(robot)
-    if not checked_text(prefix, "renamed robot", "prefix"):
+    if not checked_text(prefix, "add_prefix", "prefix"):
         return robot
     links = tuple(replace(link, name=prefix + link.name) for link in robot.links)
     joints = []
@@ -171,92 +167,95 @@ def renamed(robot: Robot, prefix: str) -> Robot:
     return replace(robot, links=links, joints=tuple(joints), tip=tip, name=prefix + robot.name)
 
 
-def rerooted(robot: Robot, root: str) -> Robot:
-    """The robot hung up at another link, its new base: same links, frames, joint names, limits and signs.
+def reroot(robot: Robot, root: str) -> Robot:
+    """Make another link the root of the tree; links keep their frames, joints their names, limits and signs.
 
-    See `models.robot.tree.reroot` for the massless links that this takes.
+    See `models.robot.tree.reroot_tree` for the massless links that this adds.
     """
-    links, joints = reroot(_robot(robot).links, robot.joints, robot.root, root)
+    links, joints = reroot_tree(_robot(robot).links, robot.joints, robot.root, root)
     return replace(robot, links=links, joints=joints)
 
 
 def subtree(robot: Robot, root: str, tip: str | None = None) -> Robot:
-    """A link with all that it carries, as a robot of its own; `pruned` says what becomes of joints that follow others.
+    """Return a link with all links that it carries as a robot of its own; followers are treated as by `prune`.
 
     Args:
         root: Name of the link.
-        tip: Link whose frame is the tip. If None the robot's tip where it is among them, else the only leaf if any.
+        tip: Link whose frame is the tip. If None, the robot's tip if it belongs to the subtree, else the only leaf if
+            any.
     """
     kept = {_robot(robot).link(root).name}
     for joint in robot.joints:
         if joint.parent in kept:
             kept.add(joint.child)
-    links, joints = tuple(link for link in robot.links if link.name in kept), cut(robot.joints, kept - {root})
+    links, joints = tuple(link for link in robot.links if link.name in kept), prune_joints(robot.joints, kept - {root})
     if tip is None and robot.tip in kept:
         return replace(robot, links=links, joints=joints)
     return Robot(links, joints, tip, name=robot.name)
 
 
-def pruned(robot: Robot, keep: Iterable[str] = ()) -> Robot:
-    """The links on the way from the root to the tip, and to the links of `keep`; other branches, mass and all, go.
+def prune(robot: Robot, keep: Iterable[str] = ()) -> Robot:
+    """Keep only the links on the paths from the root to the tip and to the links of `keep`.
 
-    To keep what the other branches weigh, lock their joints instead, and simplify. Joints that follow one that goes
-    are tied to each other as they were by it: see `models.robot.tree.cut`.
+    The other branches are removed with their mass. To keep the mass, lock their joints and call `simplify` instead.
+    Joints that follow a removed joint stay coupled to each other, see `models.robot.tree.prune_joints`.
 
     Raises:
-        ModelError: No tip and nothing to keep.
+        ModelError: The robot has no tip and `keep` is empty.
     """
-    robot, named = _robot(robot), _names(keep)
-    ends = [*named] if robot.tip is None and named else [robot.tip_link, *named]
-    stay = {robot.root, *(joint.child for name in ends for joint in robot.path_to(name))}
-    links = tuple(link for link in robot.links if link.name in stay)
-    return replace(robot, links=links, joints=cut(robot.joints, stay))
+    robot, names = _robot(robot), _names(keep)
+    ends = [*names] if robot.tip is None and names else [robot.tip_link, *names]
+    kept = {robot.root, *(joint.child for name in ends for joint in robot.path_to(name))}
+    links = tuple(link for link in robot.links if link.name in kept)
+    return replace(robot, links=links, joints=prune_joints(robot.joints, kept))
 
 
-def simplified(robot: Robot, keep: Iterable[str] = ()) -> Robot:
-    """The same motion and dynamics with fewer links: what hangs on a fixed joint becomes part of its carrier.
+def simplify(robot: Robot, keep: Iterable[str] = ()) -> Robot:
+    """Merge links on fixed joints into the links that carry them; motion and dynamics stay the same.
 
-    The tip frame, the names and order of the moving joints and the frames of their links stay.
+    The tip frame, the names and order of the moving joints and the frames of their links are unchanged.
 
     Args:
-        keep: Links on fixed joints whose frames are still wanted. They stay, without mass: that goes to the carrier.
+        keep: Links on fixed joints whose frames are needed. They stay, but their mass goes to the link that carries
+            them.
     """
     robot = _robot(robot)
-    stay = {robot.link(name).name for name in _names(keep)}
-    carrier = {robot.root: (robot.root, np.eye(3), np.zeros(3))}  # of the frame: placement in the link it is part of
-    body = dict(carrier)  # of the mass
+    kept = {robot.link(name).name for name in _names(keep)}
+    # by link: the link that carries its frame, or its mass, and the pose (rotation, translation) in it
+    frame_carrier = {robot.root: (robot.root, np.eye(3), np.zeros(3))}
+    mass_carrier = dict(frame_carrier)
     joints = []
     for joint in robot.joints:
-        host, turn, shift = carrier[joint.parent]
+        host, turn, shift = frame_carrier[joint.parent]
         turn, shift = turn @ joint.rotation, shift + turn @ joint.translation
-        stays = joint.moves or joint.child in stay
-        if stays:
+        is_kept = joint.moves or joint.child in kept
+        if is_kept:
             joints.append(replace(joint, parent=host, rotation=turn, translation=shift))
-        carrier[joint.child] = (joint.child, np.eye(3), np.zeros(3)) if stays else (host, turn, shift)
-        whole, turn, shift = body[joint.parent]
+        frame_carrier[joint.child] = (joint.child, np.eye(3), np.zeros(3)) if is_kept else (host, turn, shift)
+        mass_host, turn, shift = mass_carrier[joint.parent]
         turn, shift = turn @ joint.rotation, shift + turn @ joint.translation
-        body[joint.child] = (joint.child, np.eye(3), np.zeros(3)) if joint.moves else (whole, turn, shift)
+        mass_carrier[joint.child] = (joint.child, np.eye(3), np.zeros(3)) if joint.moves else (mass_host, turn, shift)
     parts: dict[str, list[tuple[Link, Array, Array]]] = {}
     for link in robot.links:
-        parts.setdefault(body[link.name][0], []).append((link, *body[link.name][1:]))
+        parts.setdefault(mass_carrier[link.name][0], []).append((link, *mass_carrier[link.name][1:]))
     links = []
     for link in robot.links:
-        if body[link.name][0] == link.name:
+        if mass_carrier[link.name][0] == link.name:
             links.append(_welded(link, [part for part in parts[link.name] if part[0] is not link]))
-        elif carrier[link.name][0] == link.name:
+        elif frame_carrier[link.name][0] == link.name:
             links.append(Link(link.name))
     if robot.tip is None:
         return replace(robot, links=tuple(links), joints=tuple(joints))
-    tip, turn, shift = carrier[robot.tip]
+    tip, turn, shift = frame_carrier[robot.tip]
     shift, turn = shift + turn @ robot.tip_translation, turn @ robot.tip_rotation
     return replace(robot, links=tuple(links), joints=tuple(joints), tip=tip, tip_translation=shift, tip_rotation=turn)
 
 
 def _welded(link: Link, others: Sequence[tuple[Link, Array, Array]]) -> Link:
-    """One link of several, shapes and all, the others placed in its frame by (rotation, translation); parallel axes."""
+    """Return a link merged with others, including shapes, given their poses (rotation, translation) in its frame."""
     shapes = (shape.placed(turn, shift) for part, turn, shift in others for shape in part.collisions)
-    seen = (shape.placed(turn, shift) for part, turn, shift in others for shape in part.visuals)
-    link = replace(link, collisions=(*link.collisions, *shapes), visuals=(*link.visuals, *seen))
+    visuals = (shape.placed(turn, shift) for part, turn, shift in others for shape in part.visuals)
+    link = replace(link, collisions=(*link.collisions, *shapes), visuals=(*link.visuals, *visuals))
     others = [part for part in others if part[0].mass or part[0].inertia.any()]
     if not others:
         return link
@@ -266,11 +265,11 @@ def _welded(link: Link, others: Sequence[tuple[Link, Array, Array]]) -> Link:
     mass = sum(masses)
     center = np.average(centers, axis=0, weights=masses) if mass else np.zeros(3)
     inertia = np.zeros((3, 3))
-    for (part, turn, _), own, place in zip(parts, masses, centers, strict=True):
-        arm = place - center
-        inertia += turn @ part.inertia @ turn.T + own * (arm @ arm * np.eye(3) - np.outer(arm, arm))
-    doubtful = any(part.any_inertia for part, _, _ in parts)
-    return replace(link, mass=mass, center_of_mass=center, inertia=inertia, any_inertia=doubtful)
+    for (part, turn, _), part_mass, mass_center in zip(parts, masses, centers, strict=True):
+        arm = mass_center - center
+        inertia += turn @ part.inertia @ turn.T + part_mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+    any_inertia = any(part.any_inertia for part, _, _ in parts)
+    return replace(link, mass=mass, center_of_mass=center, inertia=inertia, any_inertia=any_inertia)
 
 
 def _turn(rotation: ArrayInput | None) -> ArrayInput:

@@ -1,4 +1,4 @@
-"""A robot as a kinematic tree of links and joints, checked when it is made."""
+"""Robots: validated kinematic trees of links and joints."""
 
 from __future__ import annotations
 
@@ -30,39 +30,38 @@ from models.arrays import (
 from models.errors import ModelError, ModelWarning
 from models.robot.parts import Joint, Link
 from models.robot.tree import (
-    Drive,
-    absent,
-    drives,
+    JointCoupling,
     find_root,
-    held,
+    joint_couplings,
     joint_limits,
+    lock_with_followers,
     require_unique,
-    reroot,
+    reroot_tree,
     ties_to_leaders,
     tree_order,
+    unknown_name,
 )
-from models.robot.urdf import InertiaRule, Source, read_urdf, written_urdf
+from models.robot.urdf import InertiaRule, Source, read_urdf, urdf_text
 
 MimicRule: TypeAlias = Literal["couple", "lock", "free"]
 
 
 @dataclass(frozen=True, eq=False)
 class Robot:
-    """A kinematic tree of links, with one frame of interest, the tip.
+    """A kinematic tree of links with one frame of interest, the tip.
 
     Attributes:
-        links: Every link, in the order given.
-        joints: Every joint, parents first; the order given is kept wherever it already is such an order. Joints that
-            follow one that does not move are fixed.
-        tip: Name of the link that carries the tip; when not given the only leaf, None where there are several.
+        links: All links, in the given order.
+        joints: All joints, parents before children, otherwise in the given order. Followers of a fixed joint are fixed.
+        tip: Name of the link that carries the tip. If not given, the only leaf, or None if there are several.
         tip_translation: Tip frame's origin in the tip link's frame. Shape (3,), m.
         tip_rotation: Tip frame's axes, as columns, in the tip link's frame. Shape (3, 3).
-        name: What the robot is called in texts.
+        name: Name of the robot in texts.
         root: Name of the link without a parent, the base.
 
     Raises:
-        ModelError: Duplicate or unknown names, a loop, several roots, wrong sizes; joints that follow none that exists
-            or each other in a ring, or whose limits leave the joint that they follow no position.
+        ModelError: Duplicate or unknown names, a loop, several roots, wrong sizes, a joint that follows an unknown
+            joint or itself through others, followers whose limits leave their leader no position.
     """
 
     links: tuple[Link, ...]
@@ -74,31 +73,29 @@ class Robot:
     root: str = field(init=False)
 
     def __post_init__(self) -> None:
-        links, joints = (
-            checked_each(self.links, Link, "robot", "links"),
-            checked_each(self.joints, Joint, "robot", "joints"),
-        )
-        if not (isinstance(self.name, str) and self.name == ""):  # a description may leave it out
-            checked_name(self.name, "robot", "name")
+        owner = "robot"
+        links = checked_each(self.links, Link, owner, "links")
+        joints = checked_each(self.joints, Joint, owner, "joints")
+        if not (isinstance(self.name, str) and self.name == ""):  # descriptions may omit it
+            checked_name(self.name, owner, "name")
         require_unique((link.name for link in links), "link")
         require_unique((joint.name for joint in joints), "joint")
-        joints = held(joints, {})
+        joints = lock_with_followers(joints, {})
         edges = [(joint.name, joint.parent, joint.child) for joint in joints]
         root = find_root([link.name for link in links], edges)
         object.__setattr__(self, "root", root)
         object.__setattr__(self, "links", links)
         object.__setattr__(self, "joints", tuple(joints[i] for i in tree_order(root, edges)))
         object.__setattr__(self, "tip", self._find_tip())
-        owner = "robot"
         object.__setattr__(self, "tip_translation", checked_array(self.tip_translation, (3,), owner, "tip_translation"))
         object.__setattr__(self, "tip_rotation", checked_rotation(self.tip_rotation, owner, "tip_rotation"))
         warn_of_millimetres(self.tip_translation, owner, "tip_translation", "tip_translation")
-        _ = self._limits  # raises where followers leave a joint no position
+        _ = self._limits  # raises if followers leave a joint no position
 
     def _find_tip(self) -> str | None:
         names = [link.name for link in self.links]
         if self.tip is not None and (not isinstance(self.tip, str) or self.tip not in names):
-            raise absent("tip link", self.tip, names)
+            raise unknown_name("tip link", self.tip, names)
         leaves = self._leaves
         return self.tip if self.tip is not None else leaves[0] if len(leaves) == 1 else None
 
@@ -109,11 +106,11 @@ class Robot:
 
     @property
     def tip_link(self) -> str:
-        """Name of the link that carries the tip; ModelError, which says how to give it, where there is none."""
+        """Name of the link that carries the tip; raises ModelError if there is none."""
         if self.tip is None:
             message = (
                 f"{self.name!r} has no tip, which is needed here: its tree has the leaves {self._leaves}; say which "
-                "link carries it, tip=NAME where the robot is made or retipped(robot, NAME), or let tasks name links"
+                "link carries it, tip=NAME where the robot is made or move_tip(robot, NAME), or let tasks name links"
             )
             raise ModelError(message, name="tip", limit=tuple(self._leaves))
         return self.tip
@@ -131,75 +128,78 @@ class Robot:
         mimic: MimicRule = "couple",
         inertia: InertiaRule = "warn",
     ) -> Robot:
-        """The robot of a URDF description; `models.robot.urdf.read_urdf` says what is read, with which defaults.
+        """Read a robot from a URDF description; see `models.robot.urdf.read_urdf` for what is read and the defaults.
 
         Args:
             source: The text, recognised by its first character "<", or the path of a file.
-            tip: Link that carries the tip; if None the one that the file names as to_urdf does, else the only leaf.
-            root: Link to hang the tree up at, the base of the robot; the root of the file if None. Links keep their
-                frames, joints their names, limits and signs, see `models.robot.tree.reroot`.
-            tip_translation: As of Robot.
-            tip_rotation: As of Robot; no turn if None.
-            lock: Joints to hold fixed at given positions (rad or m), by name, and with them the joints that follow.
-            mimic: Joints that follow another one: move with it ("couple"), hold each where it is when the joint that
-                it follows is at 0 ("lock"), or take all, also those of locked joints, as independent ("free").
-            inertia: What to do about inertias that no body can have: "warn" that they are taken, or take them
-                "as_given" without a word.
+            tip: Link that carries the tip. If None, the one that the file names as to_urdf does, else the only leaf.
+            root: Link to become the root of the tree, the base; the root of the file if None. Links keep their frames,
+                joints their names, limits and signs, see `models.robot.tree.reroot_tree`.
+            tip_translation: As in Robot.
+            tip_rotation: As in Robot; the identity if None.
+            lock: Joints to lock together with their followers, with their positions (rad or m), by name.
+            mimic: Treatment of followers: couple them to their leaders ("couple"), lock each where it is when the joint
+                that it follows is at 0 ("lock"), or make them independent, including followers of locked joints
+                ("free").
+            inertia: Treatment of physically impossible inertias: accept them with a warning ("warn") or silently
+                ("as_given").
 
         Raises:
-            ModelError: What read_urdf, Robot and `models.robot.rebuild.locked` refuse.
+            ModelError: As read_urdf, Robot and `models.robot.rebuild.lock_joints`.
 
         Warns:
-            ModelWarning: Inertias that no body can have, attributes that mean nothing in URDF, joints whose followers'
-                limits leave them one position.
+            ModelWarning: Physically impossible inertias, attributes without meaning in URDF, joints whose followers'
+                limits leave them a single position.
         """
         checked_choice(mimic, get_args(MimicRule), "URDF", "mimic")
-        found = read_urdf(source, inertia=inertia)
-        joints = found.joints if mimic != "free" else tuple(replace(joint, mimic=None) for joint in found.joints)
-        known = {joint.name: None for joint in joints}
+        description = read_urdf(source, inertia=inertia)
+        joints = description.joints
+        if mimic == "free":
+            joints = tuple(replace(joint, mimic=None) for joint in joints)
+        names = {joint.name: None for joint in joints}
         positions = {} if lock is None else checked_mapping(lock, "URDF", "lock")
         for name in positions:
-            if name not in known:
-                raise absent("joint", name, known)
-        joints = held(joints, positions)
+            if name not in names:
+                raise unknown_name("joint", name, names)
+        joints = lock_with_followers(joints, positions)
         if mimic == "lock":
-            joints = held(joints, {name: tie.offset for name, tie in ties_to_leaders(joints).items()})
-        links = found.links
+            joints = lock_with_followers(joints, {name: tie.offset for name, tie in ties_to_leaders(joints).items()})
+        links = description.links
         if root is not None:
-            whole = cls(links, joints, tip=links[0].name)  # says what is wrong with the tree before it is turned round
-            links, joints = reroot(links, joints, whole.root, root)
+            original = cls(links, joints, tip=links[0].name)  # validates the tree before it is rerooted
+            links, joints = reroot_tree(links, joints, original.root, root)
         turn = np.eye(3) if tip_rotation is None else tip_rotation
-        robot = cls(links, joints, found.tip if tip is None else tip, tip_translation, turn, found.name)
-        room = zip(robot.moving_joints, robot.lower, robot.upper, strict=True)
-        if names := [joint.name for joint, lower, upper in room if lower == upper and joint.lower < joint.upper]:
-            warn(f"joints {names} cannot move: limits of joints that follow them leave one position", ModelWarning, 2)
+        robot = cls(links, joints, description.tip if tip is None else tip, tip_translation, turn, description.name)
+        ranges = zip(robot.moving_joints, robot.lower, robot.upper, strict=True)
+        if stuck := [joint.name for joint, lower, upper in ranges if lower == upper and joint.lower < joint.upper]:
+            warn(f"joints {stuck} cannot move: limits of joints that follow them leave one position", ModelWarning, 2)
         return robot
 
     def to_urdf(self, file: str | os.PathLike[str] | None = None) -> str:
-        """The robot as URDF text, of which from_urdf makes the same robot; written to a file too where one is given.
+        """Return the robot as URDF text, from which from_urdf recreates it; also write it to `file` if given.
 
-        See `models.robot.urdf.written_urdf` for what other readers make of it. The file is replaced as a whole.
+        See `models.robot.urdf.urdf_text` for how other readers interpret it. The file is replaced atomically.
         """
         place = np.asarray(self.tip_translation), np.asarray(self.tip_rotation)
-        text = written_urdf(self.name, self.links, self.joints, self.tip, *place)
+        text = urdf_text(self.name, self.links, self.joints, self.tip, *place)
         if file is not None:
             if not isinstance(file, str | os.PathLike):
                 raise ModelError(f"to_urdf: file must be a path, not {file!r}", name="file", value=file)
             part = Path(file).with_name(f"{Path(file).name}.{secrets.token_hex(4)}.part")
-            with part.open("x", encoding="utf-8") as stream:  # a new file, where a link may lie in wait
+            with part.open("x", encoding="utf-8") as stream:  # refuses to follow an existing link
                 stream.write(text)
             part.replace(file)
         return text
 
     @cached_property
     def moving_joints(self) -> tuple[Joint, ...]:
-        """Joints that move and follow no other, in tree order: the order of every joint vector."""
+        """Joints that move independently, in tree order: the order of every joint vector."""
         return tuple(joint for joint in self.joints if joint.moves and joint.mimic is None)
 
     @cached_property
-    def drives(self) -> dict[str, Drive]:
-        """What moves each joint that moves, followers included, by name."""
-        return drives(self.joints)
+    def couplings(self) -> dict[str, JointCoupling]:
+        """Coupling of each moving joint, followers included, to the joint vector, by name."""
+        return joint_couplings(self.joints)
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -207,12 +207,12 @@ class Robot:
         return tuple(joint.name for joint in self.moving_joints)
 
     def unit(self, per: str = "") -> str:
-        """Unit of the joint vector, or with `per` "/s" of its rates: "rad", "m", or both, "rad, m", in its order."""
+        """Return the unit of the joint vector, or of its rates with `per` "/s": "rad", "m" or "rad, m" in its order."""
         return ", ".join(dict.fromkeys(joint.unit + checked_text(per, "unit", "per") for joint in self.moving_joints))
 
     @property
     def effort_unit(self) -> str:
-        """Unit of the efforts of the joint vector, likewise: "N m", "N" or "N m, N"."""
+        """Unit of the efforts of the joint vector: "N m", "N" or "N m, N" in its order."""
         return ", ".join(dict.fromkeys(joint.effort_unit for joint in self.moving_joints))
 
     @property
@@ -222,31 +222,31 @@ class Robot:
 
     @property
     def total_mass(self) -> float:
-        """kg."""
+        """Mass of all links, kg."""
         return float(sum(link.mass for link in self.links))
 
     @cached_property
     def _limits(self) -> dict[str, Array]:
-        return joint_limits(self.joints, self.drives)
+        return joint_limits(self.joints, self.couplings)
 
     @property
     def lower(self) -> Array:
-        """Least positions of the joint vector, at which no follower passes its limits. Shape (dof,), rad or m."""
+        """Lower position limits of the joint vector, including those of followers. Shape (dof,), rad or m."""
         return self._limits["lower"].copy()
 
     @property
     def upper(self) -> Array:
-        """Greatest positions, likewise. Shape (dof,), rad or m."""
+        """Upper position limits, likewise. Shape (dof,), rad or m."""
         return self._limits["upper"].copy()
 
     @property
     def velocity(self) -> Array:
-        """Greatest speeds, likewise; infinite where a joint's is unknown. Shape (dof,), rad/s or m/s."""
+        """Speed limits, likewise; infinite if unknown. Shape (dof,), rad/s or m/s."""
         return self._limits["velocity"].copy()
 
     @property
     def effort(self) -> Array:
-        """Greatest torques or forces of the joints' own drives, likewise. Shape (dof,), N m or N."""
+        """Torque or force limits of the joints' own actuators; infinite if unknown. Shape (dof,), N m or N."""
         return self._limits["effort"].copy()
 
     @cached_property
@@ -262,19 +262,19 @@ class Robot:
         return {joint.child: joint for joint in self.joints}
 
     def link(self, name: str) -> Link:
-        """The link of that name; ModelError, which says what names come near, when there is none."""
+        """Return the link of that name; raise ModelError, with similar names, if there is none."""
         if not isinstance(name, str) or name not in self._links_by_name:
-            raise absent("link", name, self._links_by_name)
+            raise unknown_name("link", name, self._links_by_name)
         return self._links_by_name[name]
 
     def joint(self, name: str) -> Joint:
-        """The joint of that name, moving or fixed; ModelError, as for a link, when there is none."""
+        """Return the moving or fixed joint of that name; raise ModelError, with similar names, if there is none."""
         if not isinstance(name, str) or name not in self._joints_by_name:
-            raise absent("joint", name, self._joints_by_name)
+            raise unknown_name("joint", name, self._joints_by_name)
         return self._joints_by_name[name]
 
     def path_to(self, name: str) -> tuple[Joint, ...]:
-        """Joints from the root to a link, root first; ModelError when there is no such link."""
+        """Return the joints from the root to a link, root first; raise ModelError for an unknown link."""
         self.link(name)
         path: list[Joint] = []
         while name != self.root:
@@ -283,7 +283,7 @@ class Robot:
         return tuple(reversed(path))
 
     def print(self) -> None:
-        """Print the tree with masses and limits, which is also `str(robot)`. A limit that is not there is not shown."""
+        """Print `str(robot)`: the tree with masses and finite limits."""
         print(self)
 
     def __repr__(self) -> str:
@@ -295,19 +295,19 @@ class Robot:
             f"{self.total_mass:g} kg, {'no tip' if self.tip is None else f'tip on {self.tip}'}",
             f"{self.root}  {self.link(self.root).mass:g} kg",
         ]
-        below = defaultdict(list)
+        children = defaultdict(list)
         for joint in self.joints:
-            below[joint.parent].append(joint)
-        waiting = [(joint, "") for joint in reversed(below[self.root])]
+            children[joint.parent].append(joint)
+        waiting = [(joint, "") for joint in reversed(children[self.root])]
         while waiting:
             joint, indent = waiting.pop()
-            last = joint is below[joint.parent][-1]
+            last = joint is children[joint.parent][-1]
             lines.append(
                 f"{indent}{'└─' if last else '├─'} {joint.name} ({_limits(joint)}) -> {joint.child}  "
                 f"{self.link(joint.child).mass:g} kg"
             )
             indent += "   " if last else "│  "
-            waiting += [(each, indent) for each in reversed(below[joint.child])]
+            waiting += [(each, indent) for each in reversed(children[joint.child])]
         return "\n".join(lines)
 
 
@@ -332,15 +332,15 @@ def planar_chain(
     mount: ArrayInput = (0.0, 0.0),
     base: Link | None = None,
 ) -> Robot:
-    """Arm of revolute joints about z whose links lie along x at zero joint angles.
+    """Return an arm of revolute joints about z whose links lie along x at zero joint angles.
 
-    Centres of mass at mid-link.
+    Centres of mass are at mid-link.
 
     Args:
         lengths: Link lengths. Shape (n,), m.
         masses: Link masses. Shape (n,), kg.
-        inertias: Moments about z through the centres of mass. Shape (n,), kg m^2; slender rods, m l^2 / 12,
-            if None.
+        inertias: Moments about z through the centres of mass. Shape (n,), kg m^2; those of slender rods, m l^2 / 12, if
+            None.
         mount: First joint in the base link frame (x, y). Shape (2,), m.
         base: Root link; a massless "base" if None.
 
@@ -348,7 +348,7 @@ def planar_chain(
         Robot with links "link1".. on joints "joint1".. and the tip at the end of the last link.
 
     Raises:
-        ModelError: Sizes that differ, no link, a mass or an inertia that is impossible.
+        ModelError: Sizes that differ, no link, an impossible mass or inertia.
     """
     owner = "planar chain"
     lengths = checked_array(lengths, ("links",), owner, "lengths", positive=True, unit="m")
@@ -359,7 +359,7 @@ def planar_chain(
     root = Link("base") if base is None else checked_instance(base, Link, owner, "base")
     links, joints = [root], []
     for i in range(count):
-        # Only the moment about z matters to a planar machine; the others are those of a lamina.
+        # Only the moment about z affects a planar machine; the others are those of a lamina.
         inertia = np.diag([moments[i] / 2, moments[i] / 2, moments[i]])
         links.append(Link(f"link{i + 1}", masses[i], (lengths[i] / 2, 0.0, 0.0), inertia))
         place = (*mount, 0.0) if i == 0 else (lengths[i - 1], 0.0, 0.0)

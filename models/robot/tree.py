@@ -1,10 +1,8 @@
-"""Order of a kinematic tree: which link is the root, which joint comes first; and the same tree from another root.
+"""Kinematic trees: root and order of the joints, change of the root, and followers (joints with <mimic> in URDF).
 
-Joints that follow others: what drives each, which are held with a joint that is held, and what limits they set.
-
-The position of a follower is multiplier times that of the joint it follows, plus offset (<mimic> of URDF). Followers
-of followers make a chain; the joint at its end, which follows none, is the leader of them all, and it alone has an
-entry in the joint vector.
+The position of a follower is multiplier times that of the joint it follows, plus offset. Followers may follow each
+other in a chain. The joint at its end, which follows none, is the leader; only leaders have an entry in the joint
+vector.
 """
 
 from __future__ import annotations
@@ -22,34 +20,34 @@ from models.errors import ModelError
 from models.robot.parts import Joint, Link, Mimic
 
 
-def absent(what: str, name: object, known: Iterable[str]) -> ModelError:
-    """The error that says a name does not exist and which ones come near it."""
+def unknown_name(kind: str, name: object, known: Iterable[str]) -> ModelError:
+    """Return the error for a name that does not exist, with similar names as suggestions."""
     names = list(known)
-    folded = {each.casefold(): each for each in reversed(names)}
-    near = [folded[each] for each in get_close_matches(str(name).casefold(), folded, n=3, cutoff=0.5)]
-    hint = f"did you mean {' or '.join(repr(each) for each in near)}? " if near else ""
+    by_case = {each.casefold(): each for each in reversed(names)}
+    similar = [by_case[each] for each in get_close_matches(str(name).casefold(), by_case, n=3, cutoff=0.5)]
+    hint = f"did you mean {' or '.join(repr(each) for each in similar)}? " if similar else ""
     listed = f"{names[:MAX_LISTED]} and {len(names) - MAX_LISTED} more" if len(names) > MAX_LISTED else f"{names}"
-    message = f"{what} {name!r} does not exist; {hint}there are {listed if names else 'none'}"
-    return ModelError(message, name=str(name) or what, value=name, limit=tuple(names))
+    message = f"{kind} {name!r} does not exist; {hint}there are {listed if names else 'none'}"
+    return ModelError(message, name=str(name) or kind, value=name, limit=tuple(names))
 
 
-def require_unique(names: Iterable[str], what: str) -> None:
-    """Raise ModelError when a name occurs twice."""
+def require_unique(names: Iterable[str], kind: str) -> None:
+    """Raise ModelError if a name occurs twice."""
     for name, count in Counter(names).items():
         if count > 1:
-            message = f"{what} name {name!r} is used more than once; give every {what} its own name"
+            message = f"{kind} name {name!r} is used more than once; give every {kind} its own name"
             raise ModelError(message, name=name, value=count, limit=1)
 
 
 def find_root(links: Sequence[str], edges: Sequence[tuple[str, str, str]]) -> str:
-    """Name of the only link that is no joint's child.
+    """Return the name of the only link that is not the child of a joint.
 
     Args:
         links: Names of the links, unique.
         edges: (joint, parent link, child link) of every joint.
 
     Raises:
-        ModelError: Unknown link name, a link with two parents, no root (a loop), more than one root.
+        ModelError: Unknown link name, a link with two parents, no root (a loop), several roots.
     """
     if not links:
         raise ModelError("a robot needs at least one link", name="link", value=0, limit=1)
@@ -58,7 +56,7 @@ def find_root(links: Sequence[str], edges: Sequence[tuple[str, str, str]]) -> st
     for joint, parent, child in edges:
         for role, link in (("parent", parent), ("child", child)):
             if link not in known:
-                raise absent(f"joint {joint!r}: {role} link", link, links)
+                raise unknown_name(f"joint {joint!r}: {role} link", link, links)
         if parent == child:
             raise ModelError(f"joint {joint!r} connects link {child!r} to itself: a loop", name=joint, value=child)
         if child in parent_joint:
@@ -79,22 +77,22 @@ def find_root(links: Sequence[str], edges: Sequence[tuple[str, str, str]]) -> st
 
 
 def tree_order(root: str, edges: Sequence[tuple[str, str, str]]) -> list[int]:
-    """Indices of the joints such that every parent link is reached before its children.
+    """Return the indices of the joints in an order in which every joint comes before those of its descendants.
 
-    The order of declaration is kept wherever it already is such an order.
+    The order of declaration is kept where possible.
 
     Raises:
-        ModelError: Some links form a loop that the root does not reach.
+        ModelError: Some links form a loop that is not connected to the root.
     """
-    below = defaultdict(list)
+    children = defaultdict(list)
     for i, (_, parent, _) in enumerate(edges):
-        below[parent].append(i)
+        children[parent].append(i)
     order: list[int] = []
-    ready = below[root][::]
+    ready = children[root][::]
     while ready:
         first = min(ready)
         ready.remove(first)
-        ready += below[edges[first][2]]
+        ready += children[edges[first][2]]
         order.append(first)
     if len(order) < len(edges):
         names = [edges[i][0] for i in sorted(set(range(len(edges))) - set(order))]
@@ -103,43 +101,43 @@ def tree_order(root: str, edges: Sequence[tuple[str, str, str]]) -> list[int]:
     return order
 
 
-def reroot(
+def reroot_tree(
     links: Sequence[Link], joints: Sequence[Joint], old: str, new: str
 ) -> tuple[tuple[Link, ...], tuple[Joint, ...]]:
-    """The tree of root `old` hung up at the link `new`.
+    """Return the links and joints of the same tree with the link `new` as its root instead of `old`.
 
-    Joints between the two change direction. Every link keeps its frame, and every joint its name, limits and the sign
-    of its position: a moving joint J now carries a massless link "J_frame" at the joint's frame, on which the former
-    parent is fixed by a joint "J_fixed". (Where parent and joint frame coincide, J carries the parent itself.)
+    Joints between the two are reversed. Every link keeps its frame, and every joint its name, its limits and the sign
+    of its position: a moving joint J then carries a massless link "J_frame" at the joint's frame, to which the former
+    parent is attached by a fixed joint "J_fixed". If parent and joint frame coincide, J carries the parent itself.
 
     Raises:
-        ModelError: The new root is no link; a name that is needed is taken.
+        ModelError: The new root is not a link, or a required name is already used.
     """
     names = [link.name for link in links]
     if not isinstance(new, str) or new not in names:
-        raise absent("root link", new, names)
-    above = {joint.child: joint for joint in joints}
-    turned: dict[str, list[Joint]] = {}
+        raise unknown_name("root link", new, names)
+    parent_joint = {joint.child: joint for joint in joints}
+    reversed_joints: dict[str, list[Joint]] = {}
     frames: list[Link] = []
     while new != old:
-        joint = above[new]
+        joint = parent_joint[new]
         turn, shift = joint.rotation, joint.translation
-        back = {"rotation": turn.T, "translation": -turn.T @ shift}
-        together = not shift.any() and np.array_equal(turn, np.eye(3))
+        inverse = {"rotation": turn.T, "translation": -turn.T @ shift}
+        coincident = not shift.any() and np.array_equal(turn, np.eye(3))
         at_origin = {"rotation": np.eye(3), "translation": np.zeros(3), "axis": -joint.axis}
         if not joint.moves:
-            turned[joint.name] = [replace(joint, parent=joint.child, child=joint.parent, **back)]
-        elif together:
-            turned[joint.name] = [replace(joint, parent=joint.child, child=joint.parent, **at_origin)]
+            reversed_joints[joint.name] = [replace(joint, parent=joint.child, child=joint.parent, **inverse)]
+        elif coincident:
+            reversed_joints[joint.name] = [replace(joint, parent=joint.child, child=joint.parent, **at_origin)]
         else:
             frame = Link(f"{joint.name}_frame")
             frames.append(frame)
-            turned[joint.name] = [
+            reversed_joints[joint.name] = [
                 replace(joint, parent=joint.child, child=frame.name, **at_origin),
-                Joint(f"{joint.name}_fixed", "fixed", frame.name, joint.parent, **back),
+                Joint(f"{joint.name}_fixed", "fixed", frame.name, joint.parent, **inverse),
             ]
         new = joint.parent
-    result = [each for joint in joints for each in turned.get(joint.name, [joint])]
+    result = [each for joint in joints for each in reversed_joints.get(joint.name, [joint])]
     require_unique((*names, *(frame.name for frame in frames)), "link")
     require_unique((joint.name for joint in result), "joint")
     return (*links, *frames), tuple(result)
@@ -148,8 +146,14 @@ def reroot(
 LIMITS = ("lower", "upper", "velocity", "effort")
 
 
-class Drive(NamedTuple):
-    """What moves a joint: multiplier times an entry of the joint vector, plus an offset (rad or m)."""
+class JointCoupling(NamedTuple):
+    """Position of a moving joint: multiplier times an entry of the joint vector, plus an offset (rad or m).
+
+    Attributes:
+        column: Index of the entry, the leader's.
+        multiplier: rad or m per rad or m of the leader.
+        offset: rad or m.
+    """
 
     column: int
     multiplier: float
@@ -157,98 +161,98 @@ class Drive(NamedTuple):
 
 
 def ties_to_leaders(joints: Sequence[Joint]) -> dict[str, Mimic]:
-    """The tie of each follower to its leader, by the follower's name.
+    """Return the coupling of each follower to its leader, by the follower's name.
 
     Raises:
-        ModelError: A joint that follows one that does not exist, or itself by way of others.
+        ModelError: A joint that follows an unknown joint, or itself through others.
     """
     ties = {joint.name: joint.mimic for joint in joints if joint.mimic is not None}
     names = {joint.name: None for joint in joints}
-    found: dict[str, Mimic] = {}
+    resolved: dict[str, Mimic] = {}
     for name, tie in ties.items():
         chain = [name]
         while True:
             if tie.joint not in names:
-                raise absent(f"joint {chain[-1]!r}: mimicked joint", tie.joint, names)
+                raise unknown_name(f"joint {chain[-1]!r}: mimicked joint", tie.joint, names)
             if tie.joint in chain:
                 message = f"joints {chain} mimic each other in a ring; let one of them mimic none"
                 raise ModelError(message, name="joints", value=tuple(chain))
             if tie.joint not in ties:
                 break
             chain.append(tie.joint)
-            further = ties[tie.joint]
-            offset = tie.offset + tie.multiplier * further.offset
-            tie = Mimic(further.joint, tie.multiplier * further.multiplier, offset)
-        found[name] = tie
-    return found
+            next_tie = ties[tie.joint]
+            offset = tie.offset + tie.multiplier * next_tie.offset
+            tie = Mimic(next_tie.joint, tie.multiplier * next_tie.multiplier, offset)
+        resolved[name] = tie
+    return resolved
 
 
-def held(joints: Sequence[Joint], positions: Mapping[str, float]) -> tuple[Joint, ...]:
-    """The joints, some of them locked at given positions (rad or m, by name), and with them what does not move then.
+def lock_with_followers(joints: Sequence[Joint], positions: Mapping[str, float]) -> tuple[Joint, ...]:
+    """Return the joints with some locked at given positions (rad or m, by name), and their followers with them.
 
-    Those are the followers of a locked or a fixed joint, which stands at 0, and a follower of multiplier 0. A follower
-    that is locked itself follows no more.
+    Joints that cannot move are locked too: followers of a locked joint, followers of a fixed joint (which counts as
+    being at 0), and followers with multiplier 0. A follower that is locked itself follows no longer.
 
     Raises:
-        ModelError: What `ties_to_leaders` and `Joint.locked` refuse.
+        ModelError: As `ties_to_leaders` and `Joint.locked`.
     """
     joints = tuple(joint.locked(positions[joint.name]) if joint.name in positions else joint for joint in joints)
-    at = {joint.name: float(positions.get(joint.name, 0.0)) for joint in joints if not joint.moves}
-    places = {
-        name: tie.offset + tie.multiplier * at.get(tie.joint, 0.0)
+    locked_positions = {joint.name: float(positions.get(joint.name, 0.0)) for joint in joints if not joint.moves}
+    followers = {
+        name: tie.offset + tie.multiplier * locked_positions.get(tie.joint, 0.0)
         for name, tie in ties_to_leaders(joints).items()
-        if tie.joint in at or tie.multiplier == 0
+        if tie.joint in locked_positions or tie.multiplier == 0
     }
-    return tuple(joint.locked(places[joint.name]) if joint.name in places else joint for joint in joints)
+    return tuple(joint.locked(followers[joint.name]) if joint.name in followers else joint for joint in joints)
 
 
-def cut(joints: Sequence[Joint], kept: Container[str]) -> tuple[Joint, ...]:
-    """The joints of the links that are kept, by the name of their child.
+def prune_joints(joints: Sequence[Joint], kept: Container[str]) -> tuple[Joint, ...]:
+    """Return the joints whose child link is in `kept`.
 
-    Followers of a joint that goes follow on: its leader where that stays, else the first of them, which becomes a
-    leader. So what stays can stand as it could before; the limits of what goes are gone.
+    Followers of a removed joint stay coupled: to its leader if that is kept, else to the first of them, which becomes
+    their leader. So the remaining joints can reach the same positions as before; limits of removed joints are lost.
     """
     ties, result = ties_to_leaders(joints), []
-    staying = {joint.name for joint in joints if joint.child in kept}
-    heirs: dict[str, str] = {}
+    kept_joints = {joint.name for joint in joints if joint.child in kept}
+    new_leaders: dict[str, str] = {}
     for joint in joints:
-        if joint.name not in staying:
+        if joint.name not in kept_joints:
             continue
-        if joint.mimic is not None and joint.mimic.joint not in staying:
+        if joint.mimic is not None and joint.mimic.joint not in kept_joints:
             tie: Mimic | None = ties[joint.name]
-            if tie is not None and tie.joint not in staying:
-                heir = heirs.setdefault(tie.joint, joint.name)
-                ratio = tie.multiplier / ties[heir].multiplier
-                tie = None if heir == joint.name else Mimic(heir, ratio, tie.offset - ratio * ties[heir].offset)
+            if tie is not None and tie.joint not in kept_joints:
+                leader = new_leaders.setdefault(tie.joint, joint.name)
+                ratio = tie.multiplier / ties[leader].multiplier
+                tie = None if leader == joint.name else Mimic(leader, ratio, tie.offset - ratio * ties[leader].offset)
             joint = replace(joint, mimic=tie)
         result.append(joint)
     return tuple(result)
 
 
-def drives(joints: Sequence[Joint]) -> dict[str, Drive]:
-    """What moves each joint that moves, by name: the leaders, in their order, are the entries of the joint vector."""
+def joint_couplings(joints: Sequence[Joint]) -> dict[str, JointCoupling]:
+    """Return the coupling of each moving joint to the joint vector, whose entries are the leaders in order, by name."""
     leaders = [joint.name for joint in joints if joint.moves and joint.mimic is None]
     columns = {name: column for column, name in enumerate(leaders)}
-    own = {joint.name: Mimic(joint.name) for joint in joints if joint.moves} | ties_to_leaders(joints)
-    return {name: Drive(columns[tie.joint], tie.multiplier, tie.offset) for name, tie in own.items()}
+    couplings = {joint.name: Mimic(joint.name) for joint in joints if joint.moves} | ties_to_leaders(joints)
+    return {name: JointCoupling(columns[tie.joint], tie.multiplier, tie.offset) for name, tie in couplings.items()}
 
 
-def joint_limits(joints: Sequence[Joint], driven: Mapping[str, Drive]) -> dict[str, Array]:
-    """Limits "lower", "upper", "velocity" and "effort" of the joint vector. Shape (dof,) each.
+def joint_limits(joints: Sequence[Joint], couplings: Mapping[str, JointCoupling]) -> dict[str, Array]:
+    """Return the limits "lower", "upper", "velocity" and "effort" of the joint vector. Shape (dof,) each.
 
-    No joint passes its limits, so that followers narrow the positions and slow the leaders that drive them. Effort is
-    that of the leader's own drive, the one actuator of them all: what loads the followers loads it too. A velocity or
-    an effort of 0 says, as in many URDF files, that the limit is unknown: it is infinite here.
+    Followers must keep their own limits, so they narrow the positions and the speed of their leader. Effort is that of
+    the leader's actuator, which drives the followers too. A velocity or effort of 0 means, as in many URDF files, that
+    the limit is unknown; it becomes infinite.
 
     Raises:
-        ModelError: Followers that leave a leader no position.
+        ModelError: Followers that leave their leader no position.
     """
     moving = {joint.name: joint for joint in joints if joint.moves}
     leaders = [joint for joint in moving.values() if joint.mimic is None]
-    limits = {what: np.array([getattr(joint, what) for joint in leaders], dtype=float) for what in LIMITS}
-    for what in ("velocity", "effort"):
-        limits[what][limits[what] == 0] = np.inf
-    for name, (column, multiplier, offset) in driven.items():
+    limits = {kind: np.array([getattr(joint, kind) for joint in leaders], dtype=float) for kind in LIMITS}
+    for kind in ("velocity", "effort"):
+        limits[kind][limits[kind] == 0] = np.inf
+    for name, (column, multiplier, offset) in couplings.items():
         joint, leader = moving[name], leaders[column]
         if joint is leader:
             continue

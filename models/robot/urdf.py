@@ -1,10 +1,9 @@
-"""Robot descriptions in URDF, the XML format of ROS, read into links and joints, and written.
+"""Reading and writing of robot descriptions in URDF, the XML format of ROS.
 
-Kinematics, inertias, limits, mimicry, collision and visual shapes are read; <transmission>, <gazebo>,
-<safety_controller>, <dynamics> and unknown elements are passed over, and so is a <visual> that says nothing that can be
-shown: how a robot looks never keeps it from moving. Meshes are named, with the folder of the file that
-names them, and no file of theirs is looked for here (`models.shapes.bodies` does). The standard library's parser is
-enough: the libraries that read URDF bring mesh and XML packages along, which a core without meshes spares.
+Read are kinematics, inertias, limits, mimic joints, collision and visual shapes. <transmission>, <gazebo>,
+<safety_controller>, <dynamics>, unknown elements and invalid <visual> elements are skipped. Mesh files are recorded by
+name and folder but not opened here; `models.shapes.bodies` reads them. The standard library's XML parser suffices:
+packages that read URDF depend on mesh and XML packages, which the core does without.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ _Shape = TypeVar("_Shape", bound=CollisionShape)
 MOVING: dict[str, Kind] = {"revolute": "revolute", "continuous": "continuous", "prismatic": "prismatic"}
 XACRO = "this is xacro, the macro language that URDF files are made from; expand it first: xacro FILE > FILE.urdf"
 BLANK = "\ufeff \t\r\n"
-"""What may stand before a text's first character."""
+"""Characters that may precede the first character of a text."""
 MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 ATTRIBUTES: dict[str, tuple[str, ...]] = {
     "limit": ("lower", "upper", "velocity", "effort"),
@@ -49,17 +48,17 @@ ATTRIBUTES: dict[str, tuple[str, ...]] = {
     "capsule": ("radius", "length"),
     "mesh": ("filename", "scale"),
 }
-"""Elements in which a misspelt attribute would go unseen, and the attributes that they have."""
+"""Elements whose attributes are checked for misspelling, and their attributes."""
 
 
 @dataclass(frozen=True, eq=False)
 class Description:
-    """What a URDF file says of a robot.
+    """The content of a URDF file.
 
     Attributes:
-        name: Of the robot; "robot" where the file gives none.
+        name: Name of the robot; "robot" if the file has none.
         links, joints: In the order of the file.
-        tip: Link that carries the tip, where the file says so by <tip link="NAME"/>, which is no part of the format.
+        tip: Link that carries the tip, from the non-standard element <tip link="NAME"/>, or None.
     """
 
     name: str
@@ -71,42 +70,44 @@ class Description:
 def read_urdf(source: Source, *, inertia: InertiaRule = "warn") -> Description:
     """Read a URDF description.
 
-    What is left out has the meaning of the format: an origin of zeros, the axis x, no inertia. A revolute or
-    prismatic joint whose <limit> gives only one of lower and upper has 0 for the other; with neither, or without
-    <limit>, it has no position limits. Likewise for effort and velocity. A floating joint between a massless root and
-    its only child says that the robot floats: both are left out. A fixed joint follows none, whatever it mimics.
+    Missing data have the default values of the format: a zero origin, the axis x, no inertia. A revolute or prismatic
+    joint whose <limit> has only one of lower and upper has 0 for the other; with neither, or without <limit>, it has no
+    position limits. The same holds for effort and velocity. A floating joint between a massless root and its only child
+    means that the robot floats; both are omitted. A <mimic> of a fixed joint is ignored.
 
     Args:
         source: The text, recognised by its first character "<", or the path of a file.
-        inertia: What to say about an inertia that no body can have: "warn", or nothing and take it "as_given".
+        inertia: Treatment of physically impossible inertias: accept them with a warning ("warn") or silently
+            ("as_given").
 
     Raises:
-        ModelError: No such file, malformed XML, xacro, missing, misspelt or non-numeric attributes, elements given
-            twice, kinds of joints or shapes that are not supported, impossible masses, limits or shapes.
+        ModelError: No such file, malformed XML, xacro, missing, misspelt or non-numeric attributes, duplicate elements,
+            unsupported kinds of joints or shapes, impossible masses, limits or shapes.
 
     Warns:
-        ModelWarning: Inertias that no body can have; attributes that mean nothing in URDF; angles that look like
-            degrees, lengths that look like millimetres (see `models.arrays.warn_of_degrees`); collision shapes of a
-            root link that is left out.
+        ModelWarning: Physically impossible inertias; attributes without meaning in URDF; angles that look like degrees,
+            lengths that look like millimetres (see `models.arrays.warn_of_degrees`); collision shapes of an omitted
+            root link.
     """
     checked_choice(inertia, get_args(InertiaRule), "URDF", "inertia")
-    tree = parsed(source)
-    own = isinstance(source, os.PathLike) or not source.lstrip(BLANK).startswith("<")
-    folder = str(Path(source).resolve().parent) if own else ""
-    if unread := [each for owner in (*tree.findall("link"), *tree.findall("joint")) for each in _unread(owner)]:
-        warn(f"attributes that mean nothing in URDF are not read: {'; '.join(unread)}", ModelWarning, 3)
+    tree = parse_urdf(source)
+    is_file = isinstance(source, os.PathLike) or not source.lstrip(BLANK).startswith("<")
+    folder = str(Path(source).resolve().parent) if is_file else ""
+    parts = (*tree.findall("link"), *tree.findall("joint"))
+    if unknown := [attribute for part in parts for attribute in _unknown_attributes(part)]:
+        warn(f"attributes that mean nothing in URDF are not read: {'; '.join(unknown)}", ModelWarning, 3)
     links = _links(tree, inertia, folder)
     joints = [(name_of(each), each.get("type"), _joint(each)) for each in tree.findall("joint")]
     for name in [name for name, kind, _ in joints if kind == "floating"]:
         links = _without_world(name, links, joints)
         joints = [each for each in joints if each[0] != name]
     tip = _only(tree, "tip", "the robot")
-    named = None if tip is None else text_of(tip, "link", "the robot")
-    return Description(tree.get("name") or "robot", links, tuple(joint for *_, joint in joints), named)
+    tip_name = None if tip is None else text_of(tip, "link", "the robot")
+    return Description(tree.get("name") or "robot", links, tuple(joint for *_, joint in joints), tip_name)
 
 
 def _without_world(name: str, links: tuple[Link, ...], joints: list[tuple[str, str | None, Joint]]) -> tuple[Link, ...]:
-    """The links but for the massless root from which a floating joint lets the whole robot float."""
+    """Return the links without the massless root to which a floating joint connects the robot."""
     virtual = next(joint for each, _, joint in joints if each == name)
     base = next((link for link in links if link.name == virtual.parent), None)
     neighbours = [joint for *_, joint in joints if virtual.parent in (joint.parent, joint.child)]
@@ -125,15 +126,15 @@ def _without_world(name: str, links: tuple[Link, ...], joints: list[tuple[str, s
     return tuple(link for link in links if link is not base)
 
 
-def written_urdf(
+def urdf_text(
     name: str, links: Sequence[Link], joints: Sequence[Joint], tip: str | None, translation: Array, rotation: Array
 ) -> str:
-    """A robot as URDF text, of which `read_urdf` makes the same links, joints and tip, numbers to the last digit.
+    """Return a robot as URDF text, from which `read_urdf` recreates links, joints and tip with all digits.
 
-    A tip that does not stand in its link's own frame, (3,) and (3, 3) as of Robot, becomes a link "LINK_tip" on a fixed
-    joint. The tip is named by <tip link="NAME"/>, which is no part of the format and which other readers pass over. A
-    limit that there is not is left out, which urdfdom, and so ROS and Pinocchio, does not accept of revolute and
-    prismatic joints: give such a robot limits of effort and velocity, and of position on both sides or none, first.
+    A tip frame that differs from its link's frame, (3,) and (3, 3) as in Robot, becomes a link "LINK_tip" on a fixed
+    joint. The tip is named by <tip link="NAME"/>, a non-standard element that other readers skip. Infinite limits are
+    omitted, but urdfdom, and so ROS and Pinocchio, rejects revolute and prismatic joints without them: give such a
+    robot limits of effort and velocity, and of position on both sides or none, before writing.
     """
     robot = ElementTree.Element("robot", name=name)
     if tip is not None and (translation.any() or not np.array_equal(rotation, np.eye(3))):
@@ -161,13 +162,13 @@ def _write_link(robot: ElementTree.Element, link: Link) -> None:
         ElementTree.SubElement(body, "mass", value=_text(link.mass))
         moments = map(_text, link.inertia[np.triu_indices(3)])
         ElementTree.SubElement(body, "inertia", dict(zip(MOMENTS, moments, strict=True)))
-    for seen in link.visuals:
-        visual = _write_shape(element, "visual", seen)
-        if seen.color is not None:
-            material = ElementTree.SubElement(visual, "material", name="")
-            ElementTree.SubElement(material, "color", rgba=_text(seen.color))
-    for shape in link.collisions:
-        _write_shape(element, "collision", shape)
+    for visual in link.visuals:
+        shape = _write_shape(element, "visual", visual)
+        if visual.color is not None:
+            material = ElementTree.SubElement(shape, "material", name="")
+            ElementTree.SubElement(material, "color", rgba=_text(visual.color))
+    for collision in link.collisions:
+        _write_shape(element, "collision", collision)
 
 
 def _write_joint(robot: ElementTree.Element, joint: Joint) -> None:
@@ -178,10 +179,10 @@ def _write_joint(robot: ElementTree.Element, joint: Joint) -> None:
     if not joint.moves:
         return
     ElementTree.SubElement(element, "axis", xyz=_text(joint.axis))
-    given = [what for what in ("effort", "velocity") if np.isfinite(getattr(joint, what))]
-    given += ["lower", "upper"] if np.isfinite([joint.lower, joint.upper]).any() else []
-    if given:
-        ElementTree.SubElement(element, "limit", {what: _text(getattr(joint, what)) for what in given})
+    limits = [limit for limit in ("effort", "velocity") if np.isfinite(getattr(joint, limit))]
+    limits += ["lower", "upper"] if np.isfinite([joint.lower, joint.upper]).any() else []
+    if limits:
+        ElementTree.SubElement(element, "limit", {limit: _text(getattr(joint, limit)) for limit in limits})
     if (tie := joint.mimic) is not None:
         numbers = {"multiplier": _text(tie.multiplier), "offset": _text(tie.offset)}
         ElementTree.SubElement(element, "mimic", {"joint": tie.joint} | numbers)
@@ -201,20 +202,20 @@ def _write_shape(link: ElementTree.Element, tag: str, shape: CollisionShape) -> 
 
 
 def _write_origin(element: ElementTree.Element, translation: Array, rotation: Array) -> None:
-    """No rpy where nothing is turned, so that zeros stay exact."""
-    turned = {} if np.array_equal(rotation, np.eye(3)) else {"rpy": _text(_rpy(rotation))}
-    ElementTree.SubElement(element, "origin", {"xyz": _text(translation)} | turned)
+    """Write an <origin>; without rotation there is no rpy, so that zeros stay exact."""
+    rpy = {} if np.array_equal(rotation, np.eye(3)) else {"rpy": _text(_rpy(rotation))}
+    ElementTree.SubElement(element, "origin", {"xyz": _text(translation)} | rpy)
 
 
 def _rpy(rotation: Array) -> Array:
-    """Angles about the fixed x, y, z that make a rotation. Shape (3,), rad.
+    """Return the angles about the fixed x, y, z axes of a rotation matrix. Shape (3,), rad.
 
-    At pitch = +-pi/2 yaw is whatever rounding says, and roll, which is measured with this yaw taken back, makes up for
-    it: exact to rounding there too.
+    At pitch = +-pi/2 yaw is arbitrary; roll is computed relative to that yaw, so the rotation is exact to rounding
+    there too.
     """
     yaw = np.arctan2(rotation[1, 0], rotation[0, 0])
     pitch = np.arctan2(-rotation[2, 0], np.hypot(rotation[0, 0], rotation[1, 0]))
-    across = np.array([-np.sin(yaw), np.cos(yaw)]) @ rotation[:2]  # y of the frame that is turned by yaw alone
+    across = np.array([-np.sin(yaw), np.cos(yaw)]) @ rotation[:2]  # y axis of the frame rotated by yaw alone
     return np.array([np.arctan2(-across[2], across[1]), pitch, yaw])
 
 
@@ -222,67 +223,69 @@ def _text(numbers: Any) -> str:
     return " ".join(repr(float(number)) for number in np.ravel(numbers))
 
 
-def parsed(source: Source) -> ElementTree.Element:
-    """The <robot> element of a URDF text or file, namespaces removed; ModelError where there is none to read."""
-    text, above = "", 0
+def parse_urdf(source: Source) -> ElementTree.Element:
+    """Return the <robot> element of a URDF text or file, without namespaces; raise ModelError if it cannot be read."""
+    text, lines_before = "", 0
     data: str | bytes = b""
     if isinstance(source, str):
         data = text = source.lstrip(BLANK)
-        above = source[: len(source) - len(text)].count("\n")
+        lines_before = source[: len(source) - len(text)].count("\n")
     try:
         if isinstance(source, str) and not text:
             message = "source: an empty text cannot be read as URDF; give the XML or the path of a file"
             raise ModelError(message, name="source", value=source)
         if text.startswith("<"):
-            where = "the given text"
+            origin = "the given text"
         else:
-            where = f"file {os.fspath(source)!r}" if isinstance(source, str | os.PathLike) else repr(source)
             if not isinstance(source, str | os.PathLike):
                 message = f"a URDF source is a text or a path, not {type(source).__name__}"
                 raise ModelError(message, name="source", value=source)
+            origin = f"file {os.fspath(source)!r}"
             data = read_regular(source, INPUT_LIMITS.description_bytes)
         tree = parse_xml(data)
     except ElementTree.ParseError as error:
         line, column = error.position
         reason = str(error).split(": line")[0]
         hint = f"; {XACRO}" if "unbound prefix" in reason and "xacro" in str(data) else ""
-        message = f"{where} is not well-formed XML: {reason}, line {line + above}, column {column}{hint}"
-        raise ModelError(message, name=where, value=(line + above, column)) from error
+        message = f"{origin} is not well-formed XML: {reason}, line {line + lines_before}, column {column}{hint}"
+        raise ModelError(message, name=origin, value=(line + lines_before, column)) from error
     except OSError as error:
-        message = f"{where} cannot be read: {error.strerror or error}; a URDF text begins with '<'"
-        raise ModelError(message, name=where, value=source) from error
+        message = f"{origin} cannot be read: {error.strerror or error}; a URDF text begins with '<'"
+        raise ModelError(message, name=origin, value=source) from error
     except ModelError:
         raise
     except (ValueError, LookupError) as error:
-        raise ModelError(f"{where} cannot be read: {error}", name=where, value=source) from error
-    space = tree.tag[: tree.tag.rfind("}") + 1]
+        raise ModelError(f"{origin} cannot be read: {error}", name=origin, value=source) from error
+    namespace = tree.tag[: tree.tag.rfind("}") + 1]
     for element in tree.iter():
         if isinstance(element.tag, str):
             if "xacro" in element.tag:
                 tag = element.tag.rpartition("}")[2]
-                raise ModelError(f"{where} has the element <{tag}>: {XACRO}", name=tag, value=element.tag)
-            if space and element.tag.startswith(space):
-                element.tag = element.tag[len(space) :]
+                raise ModelError(f"{origin} has the element <{tag}>: {XACRO}", name=tag, value=element.tag)
+            if namespace and element.tag.startswith(namespace):
+                element.tag = element.tag[len(namespace) :]
     if tree.tag != "robot":
-        message = f"{where} is not URDF: its root element is <{tree.tag}>, not <robot>"
-        raise ModelError(message, name=where, value=tree.tag, limit="robot")
+        message = f"{origin} is not URDF: its root element is <{tree.tag}>, not <robot>"
+        raise ModelError(message, name=origin, value=tree.tag, limit="robot")
     return tree
 
 
 def _links(tree: ElementTree.Element, rule: InertiaRule, folder: str) -> tuple[Link, ...]:
-    links, refused = [], []
-    colors = {each.get("name"): color for each in tree.findall("material") if (color := _color(each)) is not None}
-    for said in (_said_of_link(each, folder, colors) for each in tree.findall("link")):
+    links, reasons = [], []
+    colors = {
+        element.get("name"): color for element in tree.findall("material") if (color := _color(element)) is not None
+    }
+    for arguments in (_link_arguments(element, folder, colors) for element in tree.findall("link")):
         try:
-            links.append(Link(**said))
+            links.append(Link(**arguments))
             continue
         except ModelError as error:
-            refused.append(str(error))
-        links.append(Link(**said, any_inertia=True))  # raises what is wrong beside the inertia
-    if refused and rule == "warn":
+            reasons.append(str(error))
+        links.append(Link(**arguments, any_inertia=True))  # raises for any error but the inertia
+    if reasons and rule == "warn":
         warn(
-            f"inertias that no body can have are taken as given: {'; '.join(refused)}. Correct the file, or have no "
-            "more said of it: from_urdf(..., inertia='as_given')",
+            f"inertias that no body can have are taken as given: {'; '.join(reasons)}. Correct the file, or silence "
+            "this warning: from_urdf(..., inertia='as_given')",
             ModelWarning,
             4,
         )
@@ -291,8 +294,8 @@ def _links(tree: ElementTree.Element, rule: InertiaRule, folder: str) -> tuple[L
     return tuple(links)
 
 
-def _said_of_link(element: ElementTree.Element, folder: str, colors: dict[str | None, Array]) -> dict[str, Any]:
-    """Attributes of Link, by name; `colors` are those of the robot's materials."""
+def _link_arguments(element: ElementTree.Element, folder: str, colors: dict[str | None, Array]) -> dict[str, Any]:
+    """Return the arguments of Link for an element; `colors` are those of the robot's materials."""
     name = name_of(element)
     owner = f"link {name!r}"
     shapes = tuple(_shape(each, owner, folder, CollisionShape) for each in element.findall("collision"))
@@ -307,17 +310,17 @@ def _said_of_link(element: ElementTree.Element, folder: str, colors: dict[str | 
     body = _only(element, "inertial", owner)
     if body is None:
         return {"name": name, "collisions": shapes, "visuals": tuple(visuals)}
-    center, turn = origin_of(body, owner)
+    center, orientation = origin_of(body, owner)
     mass = number_of(child_of(body, "mass", owner), "value", owner)
-    given = child_of(body, "inertia", owner)
-    xx, xy, xz, yy, yz, zz = (number_of(given, key, owner) for key in MOMENTS)
-    inertia = turn @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ turn.T
-    told = {"name": name, "mass": mass, "center_of_mass": center, "inertia": inertia}
-    return {**told, "collisions": shapes, "visuals": tuple(visuals)}
+    moments = child_of(body, "inertia", owner)
+    xx, xy, xz, yy, yz, zz = (number_of(moments, key, owner) for key in MOMENTS)
+    inertia = orientation @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ orientation.T
+    arguments = {"name": name, "mass": mass, "center_of_mass": center, "inertia": inertia}
+    return {**arguments, "collisions": shapes, "visuals": tuple(visuals)}
 
 
 def _color(material: ElementTree.Element) -> Array | None:
-    """Red, green, blue and opacity, each 0 to 1; None where the element does not say them."""
+    """Return red, green, blue and opacity, each 0 to 1, or None if the element has no valid color."""
     try:
         color = np.array((material.find("color").get("rgba") or "").split(), dtype=float)  # type: ignore[union-attr]
     except (AttributeError, ValueError):
@@ -325,12 +328,13 @@ def _color(material: ElementTree.Element) -> Array | None:
     return np.clip(color, 0.0, 1.0) if color.shape == (4,) and np.isfinite(color).all() else None
 
 
-def _shape(element: ElementTree.Element, owner: str, folder: str, kind_of: type[_Shape], **more: Any) -> _Shape:
-    found: list[Any] = list(child_of(element, "geometry", owner))
-    if len(found) != 1:
-        message = f"{owner}: <geometry> has {len(found)} shapes, not one"
-        raise ModelError(message, name="geometry", value=len(found), limit=1)
-    (shape,) = found
+def _shape(element: ElementTree.Element, owner: str, folder: str, shape_type: type[_Shape], **arguments: Any) -> _Shape:
+    """Return the collision or visual shape of an element."""
+    shapes: list[Any] = list(child_of(element, "geometry", owner))
+    if len(shapes) != 1:
+        message = f"{owner}: <geometry> has {len(shapes)} shapes, not one"
+        raise ModelError(message, name="geometry", value=len(shapes), limit=1)
+    (shape,) = shapes
     kind = checked_choice(shape.tag, SHAPES, owner, "shape")
     file = text_of(shape, "filename", owner) if kind == "mesh" else ""
     if kind in ("box", "mesh"):
@@ -339,7 +343,7 @@ def _shape(element: ElementTree.Element, owner: str, folder: str, kind_of: type[
     else:
         size = np.array([number_of(shape, key, owner) for key in ("radius", "length")[: SHAPES[kind]]])
     try:
-        return kind_of(kind, size, file, *origin_of(element, owner), folder if file else "", **more)
+        return shape_type(kind, size, file, *origin_of(element, owner), folder if file else "", **arguments)
     except ModelError as error:
         raise ModelError(f"{owner}: {error}", name=error.name, value=error.value, limit=error.limit) from None
 
@@ -355,15 +359,14 @@ def _joint(element: ElementTree.Element) -> Joint:
         )
         raise ModelError(message, name="type", value=kind, limit=("fixed", *MOVING))
     parent, child = (text_of(child_of(element, role, owner), "link", owner) for role in ("parent", "child"))
-    shift, turn = origin_of(element, owner)
+    translation, rotation = origin_of(element, owner)
     if kind not in MOVING:
-        return Joint(name, "fixed", parent, child, shift, turn)
-    stated = _only(element, "axis", owner)
-    axis = np.array([1.0, 0.0, 0.0]) if stated is None else numbers_of(stated, "xyz", owner, 3)
+        return Joint(name, "fixed", parent, child, translation, rotation)
+    axis_element = _only(element, "axis", owner)
+    axis = np.array([1.0, 0.0, 0.0]) if axis_element is None else numbers_of(axis_element, "xyz", owner, 3)
     limits: dict[str, float] = {}
     if (limit := _only(element, "limit", owner)) is not None:
-        given = [key for key in ATTRIBUTES["limit"] if key in limit.attrib]
-        limits = {key: number_of(limit, key, owner) for key in given}
+        limits = {key: number_of(limit, key, owner) for key in ATTRIBUTES["limit"] if key in limit.attrib}
         if kind == "continuous":
             limits = {key: value for key, value in limits.items() if key in ("velocity", "effort")}
         elif "lower" in limits or "upper" in limits:
@@ -372,33 +375,35 @@ def _joint(element: ElementTree.Element) -> Joint:
     if (tie := _only(element, "mimic", owner)) is not None:
         numbers = {key: number_of(tie, key, owner) for key in ("multiplier", "offset") if key in tie.attrib}
         mimic = Mimic(text_of(tie, "joint", owner), **numbers)
-    return Joint(name, MOVING[kind], parent, child, shift, turn, axis, mimic=mimic, **limits)
+    return Joint(name, MOVING[kind], parent, child, translation, rotation, axis, mimic=mimic, **limits)
 
 
-def _unread(owner: ElementTree.Element) -> list[str]:
-    """Attributes below a link or a joint that are none of URDF's, where one is lacking that they may stand for.
+def _unknown_attributes(owner: ElementTree.Element) -> list[str]:
+    """Return descriptions of unknown attributes of a link's or a joint's child elements that lack a known attribute.
 
-    Beside all of URDF's they are an extension, and passed over as unknown elements are. ModelError for an attribute
-    that looks like one that is lacking, or nearly is another one.
+    Unknown attributes in addition to all known ones are an extension and are skipped, like unknown elements.
+
+    Raises:
+        ModelError: An unknown attribute that resembles a missing one, or nearly equals a known one: a misspelling.
     """
-    found = []
-    parts = [part for path in ("inertial", "collision", "collision/geometry") for part in owner.findall(path)]
-    for element in (each for part in (owner, *parts) for each in part):
+    unknown = []
+    parents = [part for path in ("inertial", "collision", "collision/geometry") for part in owner.findall(path)]
+    for element in (each for part in (owner, *parents) for each in part):
         known = ATTRIBUTES.get(element.tag, ())
-        lacking = [word for word in known if word not in element.attrib]
+        missing = [word for word in known if word not in element.attrib]
         for key in [key for key in element.attrib if known and key not in known and "}" not in key]:
-            where = f"{owner.tag} {name_of(owner)!r}: {key}={element.get(key)!r} of <{element.tag}>"
+            place = f"{owner.tag} {name_of(owner)!r}: {key}={element.get(key)!r} of <{element.tag}>"
             word = key.casefold()
-            # so alike to one that is given too is misspelt, but not `iyx` beside `ixy`
-            if near := get_close_matches(word, lacking, 1) or get_close_matches(word, known, 1, 0.8):
-                message = f"{where} is no attribute of URDF; did you mean {near[0]!r}?"
+            # stricter if the known attribute is present too: `iyx` besides `ixy` is no misspelling
+            if similar := get_close_matches(word, missing, 1) or get_close_matches(word, known, 1, 0.8):
+                message = f"{place} is no attribute of URDF; did you mean {similar[0]!r}?"
                 raise ModelError(message, name=key, value=element.get(key), limit=known)
-            found += [where] if lacking else []
-    return found
+            unknown += [place] if missing else []
+    return unknown
 
 
 def origin_of(element: ElementTree.Element, owner: str) -> tuple[Array, Array]:
-    """Position (3,) and rotation (3, 3) of an <origin>; warns where its rpy look like degrees."""
+    """Return position (3,) and rotation (3, 3) of an <origin>; warn if its rpy looks like degrees."""
     origin = _only(element, "origin", owner)
     shift, angles = np.zeros(3), np.zeros(3)
     if origin is not None:
@@ -406,38 +411,38 @@ def origin_of(element: ElementTree.Element, owner: str) -> tuple[Array, Array]:
         angles = numbers_of(origin, "rpy", owner, 3) if "rpy" in origin.attrib else angles
     warn_of_degrees(angles, owner, owner.partition(" ")[2].strip("'"), "rpy")
     (cr, sr), (cp, sp), (cy, sy) = ((cos(angle), sin(angle)) for angle in angles.tolist())  # a file has hundreds
-    turn = [
+    rotation = [
         [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
         [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
         [-sp, cp * sr, cp * cr],
     ]
-    return shift, np.array(turn)
+    return shift, np.array(rotation)
 
 
 def _only(element: ElementTree.Element, tag: str, owner: str) -> ElementTree.Element | None:
-    """The child of that tag, None without; ModelError naming `owner` where there are several."""
-    found = element.findall(tag)
-    if len(found) > 1:
-        message = f"{owner} has {len(found)} <{tag}> elements in <{element.tag}>; it takes one at most"
-        raise ModelError(message, name=tag, value=len(found), limit=1)
-    return found[0] if found else None
+    """Return the only child with a tag, or None; raise ModelError naming `owner` if there are several."""
+    children = element.findall(tag)
+    if len(children) > 1:
+        message = f"{owner} has {len(children)} <{tag}> elements in <{element.tag}>; it takes one at most"
+        raise ModelError(message, name=tag, value=len(children), limit=1)
+    return children[0] if children else None
 
 
 def name_of(element: ElementTree.Element) -> str:
-    """Its attribute "name"; ModelError without."""
+    """Return the attribute "name"; raise ModelError if there is none."""
     return text_of(element, "name", f"a <{element.tag}> of children {[child.tag for child in element]}")
 
 
 def child_of(element: ElementTree.Element, tag: str, owner: str) -> ElementTree.Element:
-    """The one child of that tag; ModelError naming `owner` without, or with several."""
-    found = _only(element, tag, owner)
-    if found is None:
+    """Return the only child with a tag; raise ModelError naming `owner` if there is none, or several."""
+    child = _only(element, tag, owner)
+    if child is None:
         raise ModelError(f"{owner}: <{element.tag}> has no <{tag}>", name=tag, value=0, limit=1)
-    return found
+    return child
 
 
 def text_of(element: ElementTree.Element, key: str, owner: str) -> str:
-    """An attribute; ModelError naming `owner` without, or when it is empty."""
+    """Return an attribute; raise ModelError naming `owner` if it is missing or empty."""
     value = element.get(key)
     if not value:
         raise ModelError(f"{owner}: <{element.tag}> has no attribute {key!r}", name=key, value=value)
@@ -445,12 +450,12 @@ def text_of(element: ElementTree.Element, key: str, owner: str) -> str:
 
 
 def number_of(element: ElementTree.Element, key: str, owner: str) -> float:
-    """An attribute of one number, inf and nan among them; ModelError naming `owner` otherwise."""
+    """Return an attribute with one number, possibly inf or nan; raise ModelError naming `owner` otherwise."""
     return _numbers(element, key, owner, 1)[0]
 
 
 def numbers_of(element: ElementTree.Element, key: str, owner: str, count: int) -> Array:
-    """An attribute of `count` finite numbers, shape (count,); ModelError naming `owner` otherwise."""
+    """Return an attribute with `count` finite numbers, shape (count,); raise ModelError naming `owner` otherwise."""
     values = _numbers(element, key, owner, count)
     if not all(map(isfinite, values)):
         raise ModelError(f"{_where(element, key, owner)} is not finite", name=key, value=element.get(key))

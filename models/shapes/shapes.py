@@ -20,12 +20,12 @@ from models.arrays import (
     Array,
     ArrayInput,
     checked_array,
+    checked_broadcast,
     checked_indices,
     checked_nonnegative,
     checked_number,
     checked_rotation,
     frozen,
-    one_for_each,
 )
 from models.errors import ModelError
 from models.shapes.hull import Hull, convex_hull
@@ -313,7 +313,7 @@ class Mesh(_Posed):
                 message = f"mesh: faces have shape {faces.shape}, expected (m, 3)"
                 raise ModelError(message, name="faces", value=self.faces, limit=("m", 3))
             object.__setattr__(self, "faces", faces)
-        scale = one_for_each(self.scale, 3, "mesh", "scale", "axes")
+        scale = checked_broadcast(self.scale, 3, "mesh", "scale", "axes")
         if not scale.all():
             message = f"mesh: scale {scale.tolist()} has a zero; every axis needs a nonzero factor"
             raise ModelError(message, name="scale", value=scale, limit=0.0)

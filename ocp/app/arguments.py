@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from models import FixedBase, FreeFloating, Robot, cache, locked, rectangle, with_load
+from models import FixedBase, FreeFloating, Robot, cache, lock_joints, rectangle, with_load
 from models.arrays import Array
 from models.spatial import rotation_from_rpy
 from ocp.app.check.verdict import bounds_of, check_trajectory
@@ -406,14 +406,14 @@ def run_cache(options: argparse.Namespace, progress: Progress) -> tuple[int, str
             file.unlink(missing_ok=True)
     word = "cleared" if options.action == "clear" else "kept"
     told = {
-        "folder": str(cache.folder()),
+        "folder": str(cache.cache_folder()),
         "files": len(files),
         "libraries": sum(file.suffix == ".so" for file in files),
         "bytes": size,
         "cleared": options.action == "clear",
     }
     words = f"{len(files)} files, {told['libraries']} of them compiled functions, {size / 1e6:.3g} MB {word}"
-    return 0, f"{cache.folder()}: {words}", told
+    return 0, f"{cache.cache_folder()}: {words}", told
 
 
 def run_completion(options: argparse.Namespace, progress: Progress) -> tuple[int, str, Any]:
@@ -431,7 +431,7 @@ def read_robot(options: argparse.Namespace) -> Robot:
     """The robot as the options read it."""
     robot = Robot.from_urdf(options.robot, tip=options.tip)
     if options.lock:
-        robot = locked(robot, dict(options.lock))
+        robot = lock_joints(robot, dict(options.lock))
     if options.load is not None:
         robot = with_load(robot, robot.tip_link, options.load, robot.tip_translation)
     return robot

@@ -15,7 +15,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from models import FixedBase, Link, Robot, VisualShape, attached, with_load
+from models import FixedBase, Link, Robot, VisualShape, attach_tool, with_load
 from models.arrays import Array
 from ocp import Audit, Collocation, Effort, Leg, Solution, TipTask, inverse_kinematics, joint_torques, plan_dynamics
 from ocp.app.view.appearance import TIP_FRAME, Frames, frames_along
@@ -130,7 +130,7 @@ def carried() -> FixedBase:
     robot = arm().robot
     squares = np.square(SIZE)
     inertia = LOAD / 12 * np.diag(squares.sum() - squares)
-    return FixedBase(with_load(robot, robot.tip_link, LOAD, robot.tip_translation, inertia))
+    return FixedBase(with_load(robot, robot.tip_link, LOAD, robot.tip_translation, inertia=inertia))
 
 
 @cache
@@ -219,7 +219,7 @@ def furnished(robot: Robot) -> Robot:
     place = (far * np.cos(direction), far * np.sin(direction), tall / 2)
     shelf = Link("stands", visuals=(VisualShape("box", (0.2, 0.2, tall), translation=place, color=SHELF),))
     for each in (block, shelf):
-        robot = attached(robot, each, robot.root, keep_tip=True)
+        robot = attach_tool(robot, each, robot.root, keep_tip=True)
     return robot
 
 

@@ -16,7 +16,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from models import CollisionScene, Footprint, Robot, Standing, Wrench, footprint, locked, with_load
+from models import CollisionScene, Footprint, Robot, Standing, Wrench, footprint, lock_joints, with_load
 from models.arrays import Array
 from models.machines.standing import External, StandingMotion, standing_motion
 from models.paths import rest_to_rest
@@ -92,7 +92,7 @@ def tiago(load: float = LOAD) -> tuple[Standing, Footprint]:
     file = robot_file()
     whole = Robot.from_urdf(file, tip=HAND, inertia="as_given")  # some of the file's inertias are rounded
     ground = footprint(whole)
-    robot = locked(whole, {name: 0.0 for name in whole.joint_names if name not in JOINTS})
+    robot = lock_joints(whole, {name: 0.0 for name in whole.joint_names if name not in JOINTS})
     robot = with_load(robot, HAND, load) if load else robot
     return Standing(robot, support=ground.support, translation=ground.translation, rotation=ground.rotation), ground
 

@@ -22,7 +22,7 @@ from models import (
     inverse_dynamics,
     link_frames,
     link_jacobians,
-    simplified,
+    simplify,
     tip_jacobian,
 )
 from models.arrays import Array
@@ -116,7 +116,7 @@ def space_arm(repeats: int) -> list[dict[str, Any]]:
     if path is None:
         return []
     given = Robot.from_urdf(path)
-    robot = simplified(given)
+    robot = simplify(given)
     machine = FreeFloating(robot)
     rng = np.random.default_rng(SEED)
     base = np.column_stack([rng.normal(size=(COUNT, 3)), rng.normal(size=(COUNT, 4))])

@@ -1,4 +1,4 @@
-"""The cache: what others own or may write is not used, and what is not whole or of another key is not believed."""
+"""The cache ignores files that others own or may write, and files that are damaged or of another key."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ import pytest
 
 from models import cache
 
-KEY = cache.key_of("1", "an input")
+KEY = cache.cache_key("1", "an input")
 
 
 @pytest.fixture
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    cache._notice.cache_clear()
+    cache._log_once.cache_clear()
     return tmp_path / "cache" / "selfmotion"
 
 
 def filled(place: Path) -> tuple[Path, Path]:
     """Files of a value and a library, both of which are taken."""
-    cache.keep(KEY, [1.5])
-    library = cache.keep_library(KEY, b"compiled")
+    cache.store_value(KEY, [1.5])
+    library = cache.store_library(KEY, b"compiled")
     assert library is not None
-    assert (cache.kept(KEY), cache.kept_library(KEY)) == ([1.5], library)
+    assert (cache.load_value(KEY), cache.load_library(KEY)) == ([1.5], library)
     return place / f"{KEY}.json", library
 
 
@@ -39,7 +39,7 @@ def given_away(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_folder_is_made_for_its_owner_alone(place: Path) -> None:
-    assert cache.kept(KEY) is None
+    assert cache.load_value(KEY) is None
     assert cache.files() == []
     assert not place.exists()  # looking makes nothing
     place.parent.mkdir()
@@ -57,32 +57,32 @@ def test_a_folder_that_others_may_write_is_not_used(place: Path, mode: int, capl
     value, library = filled(place)
     place.chmod(mode)
     with caplog.at_level(logging.WARNING):
-        assert (cache.kept(KEY), cache.kept_library(KEY)) == (None, None)
-        cache.keep(KEY, [2.5])
-        assert cache.keep_library("b" * 64, b"compiled") is None
-        with cache.alone(KEY):
+        assert (cache.load_value(KEY), cache.load_library(KEY)) == (None, None)
+        cache.store_value(KEY, [2.5])
+        assert cache.store_library("b" * 64, b"compiled") is None
+        with cache.exclusive(KEY):
             assert sorted(place.iterdir()) == sorted([value, library])
     assert cache.files() == []
     (record,) = caplog.records
-    assert "others may write it" in record.getMessage()
+    assert "other users may write it" in record.getMessage()
     assert str(place) in record.getMessage()
     place.chmod(0o700)
-    assert cache.kept(KEY) == [1.5]
+    assert cache.load_value(KEY) == [1.5]
 
 
 @pytest.mark.parametrize("whose", ["folder", "above"])
 def test_a_folder_of_somebody_else_is_not_used(place: Path, whose: str, monkeypatch: pytest.MonkeyPatch) -> None:
     filled(place)
     given_away(place if whose == "folder" else place.parent, monkeypatch)
-    assert (cache.kept(KEY), cache.kept_library(KEY)) == (None, None)
+    assert (cache.load_value(KEY), cache.load_library(KEY)) == (None, None)
 
 
 def test_a_folder_that_others_may_rename_is_not_used(place: Path) -> None:
     filled(place)
     place.parent.chmod(0o777)
-    assert (cache.kept(KEY), cache.kept_library(KEY)) == (None, None)
+    assert (cache.load_value(KEY), cache.load_library(KEY)) == (None, None)
     place.parent.chmod(0o1777)  # as /tmp is: names in it belong to who made them
-    assert cache.kept(KEY) == [1.5]
+    assert cache.load_value(KEY) == [1.5]
 
 
 def test_a_link_is_not_followed(place: Path, tmp_path: Path) -> None:
@@ -90,7 +90,7 @@ def test_a_link_is_not_followed(place: Path, tmp_path: Path) -> None:
     for file in (value, library):
         file.rename(tmp_path / file.name)
         file.symlink_to(tmp_path / file.name)
-    assert (cache.kept(KEY), cache.kept_library(KEY)) == (None, None)
+    assert (cache.load_value(KEY), cache.load_library(KEY)) == (None, None)
     other = tmp_path / "other"
     place.rename(other)
     place.symlink_to(other)
@@ -107,7 +107,7 @@ def test_a_file_of_others_is_not_believed(place: Path, how: str, monkeypatch: py
             file.chmod(0o620)
         else:
             given_away(file, monkeypatch)
-    assert (cache.kept(KEY), cache.kept_library(KEY)) == (None, None)
+    assert (cache.load_value(KEY), cache.load_library(KEY)) == (None, None)
 
 
 def test_a_value_carries_a_digest_of_itself_and_of_its_key(place: Path) -> None:
@@ -116,9 +116,9 @@ def test_a_value_carries_a_digest_of_itself_and_of_its_key(place: Path) -> None:
     whole = value.read_bytes()
     for changed in (whole.replace(b"1.5", b"2.5"), whole[:-1], b"x" + whole[1:], json.dumps([1.5]).encode(), b""):
         value.write_bytes(changed)
-        assert cache.kept(KEY) is None
-    other = cache.key_of("2", "an input")
+        assert cache.load_value(KEY) is None
+    other = cache.cache_key("2", "an input")
     (place / f"{other}.json").write_bytes(whole)
-    assert cache.kept(other) is None
+    assert cache.load_value(other) is None
     value.write_bytes(whole)
-    assert cache.kept(KEY) == [1.5]
+    assert cache.load_value(KEY) == [1.5]

@@ -1,4 +1,4 @@
-"""What the exceptions of the models carry, and what the checks of arguments say."""
+"""Fields of the models' exceptions, and messages of the argument checks."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from models import ModelError
-from models.arrays import checked_array, checked_choice, checked_number, checked_rotation, one_for_each
+from models.arrays import checked_array, checked_broadcast, checked_choice, checked_number, checked_rotation
 
 
 def test_a_pickled_error_keeps_its_message_and_its_fields() -> None:
@@ -31,7 +31,7 @@ def test_arrays_are_read_only_copies_and_free_dimensions_take_any_length() -> No
         array[0, 0] = 2.0
     assert checked_array(2.0, ("times",), "motion", "t").tolist() == [2.0]
     assert np.isnan(checked_array([np.nan, 1], (2,), "a", "b", nan=True)[0])
-    assert one_for_each(0.5, 3, "path", "speed", "segments").tolist() == [0.5] * 3
+    assert checked_broadcast(0.5, 3, "path", "speed", "segments").tolist() == [0.5] * 3
     assert checked_number(1e-3, "rig", "length", positive=True, unit="m") == 1e-3
     assert checked_choice("left", ("left", "right"), "scara", "elbow") == "left"
 
@@ -46,7 +46,7 @@ def test_arrays_are_read_only_copies_and_free_dimensions_take_any_length() -> No
         (lambda: checked_array([1.0] * 30 + [-2], ("n",), "a", "b", positive=True), r"\(entry 30\) -2.0", "b", 0.0),
         (lambda: checked_array([1, np.nan], (2,), "a", "b", finite=False), "is not finite", "b", None),
         (lambda: checked_number(-1, "a", "b", positive=True, unit="m"), "a: b -1.0 m is not positive", "b", 0.0),
-        (lambda: one_for_each([1, 2], 3, "a", "b", "joints"), "or one for each of the 3 joints", "b", (3,)),
+        (lambda: checked_broadcast([1, 2], 3, "a", "b", "joints"), "or one for each of the 3 joints", "b", (3,)),
         (lambda: checked_rotation(2 * np.eye(3), "a", "b"), "is not a rotation matrix", "b", None),
         (lambda: checked_rotation(np.diag([1, 1, -1]), "a", "b"), "is not a rotation matrix", "b", None),
         (lambda: checked_rotation(np.eye(3)[[1, 0, 2]], "a", "b"), "is not a rotation matrix", "b", None),

@@ -1,4 +1,4 @@
-"""Quaternions of rotation matrices, as numbers."""
+"""Quaternions of numeric rotation matrices."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Angles that look like degrees and lengths that look like millimetres are warned of, by name; what is meant is not."""
+"""Warnings of angles that look like degrees and lengths that look like millimetres."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from models import Box, CollisionShape, FixedBase, ModelWarning, Robot, link_frames
 from models.arrays import Array
-from models.robot.rebuild import locked
+from models.robot.rebuild import lock_joints
 
 FOLDER = Path(__file__).resolve().parent
 ROBOTS = ("fetch", "fetch_arm", "panda")
@@ -59,7 +59,7 @@ def robot_of(name: str) -> Robot:
         warnings.simplefilter("ignore", ModelWarning)  # of the file's own attributes
         whole = Robot.from_urdf(FOLDER / given["urdf"], tip=given["tip"], root=given["base"])
     standing = {joint: 0.0 for joint in whole.joint_names if joint not in given["joints"]}
-    robot = locked(whole, standing | given.get("locked", {}))
+    robot = lock_joints(whole, standing | given.get("locked", {}))
     assert robot.joint_names == tuple(given["joints"])
     links = tuple(
         replace(link, collisions=(_capsule(given["capsules"][link.name]),)) if link.name in given["capsules"] else link

@@ -32,7 +32,7 @@ def within_limits(machine: Machine, motion: Motion) -> Machine:
     joints = []
     for joint in robot.joints:
         if joint.moves and joint.kind != "continuous":
-            column, ratio, offset = robot.drives[joint.name]
+            column, ratio, offset = robot.couplings[joint.name]
             ends = sorted((ratio * float(low[column]) + offset, ratio * float(high[column]) + offset))
             lower, upper = min(joint.lower, ends[0]), max(joint.upper, ends[1])
             if joint.kind == "prismatic":

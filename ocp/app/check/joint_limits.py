@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from models import FixedBase, FreeFloating, Robot, Standing, inverse_dynamics, momentum, robot_inertia, simplified
+from models import FixedBase, FreeFloating, Robot, Standing, inverse_dynamics, momentum, robot_inertia, simplify
 from models.arrays import Array
 from models.machines.standing import center_of_pressure
 from models.spatial import cross, rotation_from_quaternion
@@ -214,7 +214,7 @@ def torque_rows(
     if isinstance(machine, FreeFloating):
         torque = floating_torques(machine, q, v, a)
     else:
-        bodies = simplified(robot, frozenset())
+        bodies = simplify(robot, frozenset())
         torque = inverse_dynamics(bodies, q, v, a, (), gravity, machine.world_from_base())
     sampler = Sampler([q, v, a], [torque])
     times, *values = states_along(motion)

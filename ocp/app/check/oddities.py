@@ -465,7 +465,7 @@ def _followers(raw: RawTrajectory, robot: Robot, rows: Indices, faults: list[Fau
     for joint in robot.joints:
         if joint.mimic is None or not joint.moves or joint.name not in raw.names:
             continue
-        column, ratio, offset = robot.drives[joint.name]
+        column, ratio, offset = robot.couplings[joint.name]
         leader = robot.joint_names[column]
         if leader not in raw.names:
             continue

@@ -66,7 +66,7 @@ from models import (
     Sphere,
     Standing,
     footprint,
-    locked,
+    lock_joints,
     rectangle,
     smooth,
     with_load,
@@ -236,7 +236,7 @@ def _machine(entries: Entries, urdf: Path) -> Machine:
     held = entries.numbers_by_name("lock", "a table of joints and positions: lock = { finger = 0.02 }")
     if held:
         with _about(entries, "lock"):
-            robot = locked(robot, held)
+            robot = lock_joints(robot, held)
     load = entries.number("load", "a number above 0, kg", least=0.0)
     if load is not None:
         with _about(entries, "load"):

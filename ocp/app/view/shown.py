@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from models import FreeFloating, Machine, Standing, inverse_dynamics, simplified
+from models import FreeFloating, Machine, Standing, inverse_dynamics, simplify
 from models.arrays import Array
 from models.machines.standing import center_of_pressure
 from models.robot.dynamics import GRAVITY
@@ -116,7 +116,7 @@ def _torques(machine: Machine, joints: Array, rates: Array, accelerations: Array
     else:
         gravity = getattr(machine, "gravity_in_world", GRAVITY)
         frame = machine.world_from_base(())
-        torque = inverse_dynamics(simplified(robot), q, v, a, (), gravity, frame)
+        torque = inverse_dynamics(simplify(robot), q, v, a, (), gravity, frame)
     found: Array = Sampler([q, v, a], [torque])(joints, rates, accelerations)[0]
     return found
 

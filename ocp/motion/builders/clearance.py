@@ -124,7 +124,7 @@ class ClearanceConstraints:
                 around.check_motions(begin, begin + pace * horizon)
             except ModelError as error:
                 raise ProblemError(str(error), **vars(error)) from error
-        elif around.moves_by_itself:
+        elif around.has_moving_obstacles:
             words = "an obstacle that moves needs a time that is known; give a horizon in s, or let it stand"
             raise ProblemError(words, name="obstacles")
         levers = around.levers

@@ -22,7 +22,7 @@ from typing import Any, Literal, NamedTuple, TypedDict
 import casadi as ca
 import numpy as np
 
-from models import FreeFloating, Robot, wheels_of
+from models import FreeFloating, Robot, find_wheels
 from models.arrays import Array
 from models.robot.dynamics import Wrench
 from models.spatial import quaternion_product
@@ -335,7 +335,7 @@ def _wheel_sizes(robot: Robot, bounds: JointBounds, duration: float) -> Array:
     1 N m s and 1 N m make of them.
     """
     found = np.full((4, robot.dof), np.nan)
-    for name, inertia in wheels_of(robot).items():
+    for name, inertia in find_wheels(robot).items():
         k = robot.joint_names.index(name)
         speed, torque = bounds.velocity[k], bounds.torque[k]
         speed = speed / 4 if np.isfinite(speed) else 1 / inertia

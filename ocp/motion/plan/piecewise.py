@@ -179,7 +179,7 @@ def plan_in_segments(
     checked_instance("machine", machine, FixedBase)
     asked = checked_asked(machine, tasks, horizon, start, None, False, weights, limits, "global", seed, 1.0)
     clearance_constraints = clear_of(machine, obstacles, clearance, ignored, srdf, folders, missing, limits)
-    if clearance_constraints is not None and clearance_constraints.scene.moves_by_itself:
+    if clearance_constraints is not None and clearance_constraints.scene.has_moving_obstacles:
         words = "obstacles that move do not wait while the arm reconfigures; give those that stand still"
         raise ProblemError(words, name="obstacles", value=obstacles)
     asked = replace(asked, clearance_constraints=clearance_constraints)

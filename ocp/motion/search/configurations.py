@@ -133,7 +133,7 @@ def check_clear_start(asked: Asked, postures: Array) -> None:
     if (touch := touches_at_the_start(asked, postures)[0]) is not None:
         assert asked.clearance_constraints is not None
         around, name = asked.clearance_constraints.scene, " and ".join(touch.bodies)
-        ignored = [around.told_as(touch.pair)]
+        ignored = [around.pair_names(touch.pair)]
         words = f"start: {touch}; start clear of everything, or name what may touch: {ignored=}"
         words = "; ".join([words, *others_told(clear_postures(asked, touch.time))])
         raise ProblemError(words, name=name, value=touch.distance, limit=around.clearance, time=touch.time)

@@ -1,4 +1,4 @@
-"""Arms with bodies, for tests of what they may touch."""
+"""Arms with collision bodies for tests."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Standing machines, spatial ones among them, and random motions of them."""
+"""Standing machines, including spatial ones, and random motions of them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from models import Joint, Link, Robot, Standing, Support, merged, planar_chain, rectangle
+from models import Joint, Link, Robot, Standing, Support, merge_robots, planar_chain, rectangle
 from tests.models.robot.trees import Array, random_robot, random_rotation
 
 FOOT = Link("foot", 12.0, (0.0, 0.0, 0.05), np.diag([0.2, 0.1, 0.3]))
@@ -67,7 +67,7 @@ def two_armed() -> Standing:
     )
     arm = Robot((shoulder, beam("upper", 3.0, 0.3), beam("lower", 2.0, 0.3), beam("hand", 1.0, 0.15)), joints)
     sides = {"left_": (0.0, 0.2, 0.45), "right_": (0.0, -0.2, 0.45)}
-    robot = merged(body, dict.fromkeys(sides, arm), links=dict.fromkeys(sides, "body"), translations=sides)
+    robot = merge_robots(body, dict.fromkeys(sides, arm), links=dict.fromkeys(sides, "body"), translations=sides)
     return Standing(robot, support=rectangle((-0.12, 0.12), (-0.15, 0.15)))
 
 

@@ -1,4 +1,4 @@
-"""Wheels: momentum and accelerations as MuJoCo has them."""
+"""Reaction wheels: momentum and accelerations against MuJoCo."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from models import FreeFloating, Joint, Link, ModelError, Robot, Wrench, wheels_of, with_wheels
+from models import FreeFloating, Joint, Link, ModelError, Robot, Wrench, find_wheels, with_wheels
 from ocp import ProblemError, joint_torques
 from tests.models.robot.oracles import mujoco_model
 from tests.models.robot.trees import Array
@@ -51,18 +51,18 @@ def test_limits_of_a_wheel_are_those_of_its_joint() -> None:
 def test_wheels_are_known_by_their_symmetry() -> None:
     """What has a shape of its own, or carries the tip, or is not balanced, is none."""
     robot = wheeled()
-    assert wheels_of(robot) == pytest.approx({"wheel1": 0.02, "wheel2": 0.03, "wheel3": 0.02, "wheel4": 0.05})
+    assert find_wheels(robot) == pytest.approx({"wheel1": 0.02, "wheel2": 0.03, "wheel3": 0.02, "wheel4": 0.05})
     loose = Joint("loose", "continuous", "hub", "panel", axis=(0, 0, 1))
     for panel in (
         Link("panel", 1.0, (0.1, 0.0, 0.0), 0.1 * np.eye(3)),
         Link("panel", 1.0, (0.0, 0.0, 0.0), np.diag([0.1, 0.2, 0.2])),
     ):
         more = Robot((*robot.links, panel), (*robot.joints, loose), robot.tip)
-        assert "loose" not in wheels_of(more)
+        assert "loose" not in find_wheels(more)
     ring = Link("panel", 1.0, (0.0, 0.0, 0.3), np.diag([0.1, 0.1, 0.2]))
     more = Robot((*robot.links, ring), (*robot.joints, loose), robot.tip)
-    assert "loose" in wheels_of(more)
-    assert "loose" not in wheels_of(Robot(more.links, more.joints, "panel"))
+    assert "loose" in find_wheels(more)
+    assert "loose" not in find_wheels(Robot(more.links, more.joints, "panel"))
 
 
 @pytest.mark.parametrize("inertia", [1e-6, 0.02, 300.0])
@@ -72,9 +72,9 @@ def test_a_rotor_is_a_disc_and_its_symmetry_is_judged_by_its_size(inertia: float
     disc = inertia * np.diag([0.6, 0.6, 1.0])
     wheel = with_wheels(body, [[0, 0, 2.0]], inertia)
     np.testing.assert_allclose(np.asarray(wheel.links[-1].inertia), disc, rtol=1e-14, atol=0)
-    assert wheels_of(wheel) == pytest.approx({"wheel1": inertia})
+    assert find_wheels(wheel) == pytest.approx({"wheel1": inertia})
     uneven = replace(wheel.links[-1], inertia=disc + inertia * np.diag([1e-6, 0.0, 0.0]))
-    assert wheels_of(replace(wheel, links=(*wheel.links[:-1], uneven))) == {}
+    assert find_wheels(replace(wheel, links=(*wheel.links[:-1], uneven))) == {}
 
 
 def state(machine: FreeFloating, seed: int) -> tuple[Array, Array, Array, Array]:

@@ -1,4 +1,4 @@
-"""Whatever is wrong with a machine, or with what is asked of it, is refused by name."""
+"""Every invalid machine or argument is refused by name."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from models import (
     Stance,
     Standing,
     Support,
+    find_wheels,
     footprint,
     planar_chain,
     rectangle,
     scara_along,
     smooth,
-    wheels_of,
     with_wheels,
 )
 from models.machines.machine import with_tip
@@ -194,7 +194,7 @@ ACTUATOR_CASES = [
             "prefix": but(NAME, "empty"),
         },
     ),
-    Case("wheels_of", wheels_of, {"robot": CHAIN}, {"robot": INSTANCE}),
+    Case("find_wheels", find_wheels, {"robot": CHAIN}, {"robot": INSTANCE}),
 ]
 STANDING_CASES = [
     Case(

@@ -1,4 +1,4 @@
-"""The support of a robot, from the collision shapes of its description."""
+"""Support polygons computed from the collision shapes of robot descriptions."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
-from models import ModelError, Robot, footprint, link_frames, simplified
+from models import ModelError, Robot, footprint, link_frames, simplify
 from models.machines.support import convex_hull
 from tests.models.robot.pinocchio_robots import ROBOTS, urdf_file
 from tests.models.robot.trees import numeric
@@ -152,7 +152,7 @@ def test_a_root_link_that_is_not_upright_is_set_upright() -> None:
 
 def test_a_simplified_robot_stands_on_the_same_shapes() -> None:
     robot = Robot.from_urdf(wheels_and_ball())
-    found, whole = footprint(simplified(robot)), footprint(robot)
+    found, whole = footprint(simplify(robot)), footprint(robot)
     assert (found.links, whole.links) == (("base",), ("left", "right", "caster"))
     np.testing.assert_allclose(found.support.vertices, whole.support.vertices, atol=1e-15)
 

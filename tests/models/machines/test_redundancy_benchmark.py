@@ -1,4 +1,4 @@
-"""The problems of a public benchmark: what touches in them is what coal says, at random and along their paths."""
+"""Problems of a public benchmark: collisions agree with coal at random configurations and along the paths."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The SCARA arm against an independent model of the same arm, its inverse, limits and singular reach."""
+"""SCARA arms against an independent model: forward and inverse kinematics, limits and singularities."""
 
 from __future__ import annotations
 

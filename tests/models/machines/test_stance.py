@@ -1,4 +1,4 @@
-"""Stances: whatever link a robot is rooted at it moves the same, and its feet bear what Newton and Euler say."""
+"""Stances: motion does not depend on the root link, and the loads of the feet satisfy Newton-Euler."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from models import Foot, Foothold, ModelError, Stance, Standing, Support, Wrench, inverse_dynamics, rectangle, rerooted
+from models import Foot, Foothold, ModelError, Stance, Standing, Support, Wrench, inverse_dynamics, rectangle, reroot
 from models.robot.dynamics import base_reaction
 from models.robot.kinematics import link_motions
 from scripts.robots.robots import TALOS
@@ -30,7 +30,7 @@ def test_a_robot_bears_the_same_whatever_link_it_is_rooted_at(seed: int, size: i
     rng = np.random.default_rng(seed)
     robot = random_robot(rng, size)
     root = robot.links[int(rng.integers(len(robot.links)))].name
-    turned = rerooted(robot, root)
+    turned = reroot(robot, root)
     order = [robot.joint_names.index(name) for name in turned.joint_names]
     q, qd, qdd = rng.normal(size=(3, robot.dof))
     place = random_frame(rng)
@@ -57,7 +57,8 @@ def test_a_robot_bears_the_same_whatever_link_it_is_rooted_at(seed: int, size: i
 
 def random_loads(rng: np.random.Generator, stance: Stance) -> dict[str, Array]:
     return {
-        name: numeric(stance.full_load(name, rng.normal(size=len(stance.held_rows[name])))) for name in stance.others
+        name: numeric(stance.full_load(name, rng.normal(size=len(stance.load_rows[name]))))
+        for name in stance.other_feet
     }
 
 
@@ -120,7 +121,7 @@ def test_one_foot_is_a_standing_machine() -> None:
     torques = numeric(standing.joint_torques(q, qd, qdd))
     np.testing.assert_allclose(numeric(stance.joint_torques(q, qd, qdd, {})), torques, atol=1e-9)
     pressed = float(stance.pressure("left", loads["left"]))
-    rows = numeric(stance.inside("left", loads["left"])).ravel() / pressed
+    rows = numeric(stance.edge_moments("left", loads["left"])).ravel() / pressed
     assert len(rows) == 2  # no motion brings it nearer to the sides
     distances = numeric(sole.distances(standing.zero_moment_point(q, qd, qdd))).ravel()
     np.testing.assert_allclose(sorted(rows), sorted(distances[np.abs(sole.normals[:, 0]) > 0.5]), atol=1e-9)
@@ -138,9 +139,9 @@ def test_at_rest_the_center_of_pressure_is_under_the_center_of_mass() -> None:
             under = numeric(stance.center_of_mass(q)).ravel()[:2]
             np.testing.assert_allclose(numeric(stance.zero_moment_point(loads)).ravel(), under, rtol=0, atol=1e-9)
             assert stance.support is not None
-            inside = numeric(stance.inside(name, loads[name])).ravel() / stance.weight
+            inside = numeric(stance.edge_moments(name, loads[name])).ravel() / stance.weight
             np.testing.assert_allclose(inside.min(), float(stance.support.margin(under)), atol=1e-9)
-            assert float(stance.grip(name, loads[name], 0.5)) == pytest.approx((0.5 * stance.weight) ** 2)
+            assert float(stance.friction_margin(name, loads[name], 0.5)) == pytest.approx((0.5 * stance.weight) ** 2)
 
 
 def test_what_a_sole_bears_does_not_depend_on_where_and_how_it_lies() -> None:
@@ -152,7 +153,11 @@ def test_what_a_sole_bears_does_not_depend_on_where_and_how_it_lies() -> None:
     for turn, place in ((np.eye(3), np.zeros(3)), random_frame(rng)):
         stance = Stance.on(steps.robot, steps.feet, {"left": Foothold(place, turn)})
         load = ca.DM(np.concatenate([turn @ moment, turn @ force]))
-        parts = (stance.pressure("left", load), stance.inside("left", load, 0.01), stance.grip("left", load, 0.7))
+        parts = (
+            stance.pressure("left", load),
+            stance.edge_moments("left", load, 0.01),
+            stance.friction_margin("left", load, 0.7),
+        )
         found.append(np.concatenate([numeric(part).ravel() for part in parts]))
     np.testing.assert_allclose(found[1], found[0], rtol=0, atol=1e-9)
     assert len(found[0]) == 6  # a rectangle has four edges
@@ -175,7 +180,7 @@ def test_a_sole_slips_at_friction_times_load_and_turns_at_two_thirds_of_the_radi
         for factor, sign in ((1 - 1e-6, 1), (1 + 1e-6, -1)):
             side = force * [factor, factor, 1]
             load = np.concatenate([turn @ (factor * twist + np.cross(middle, side)), turn @ side])
-            assert sign * float(stance.grip("left", ca.DM(load), friction)) > 0
+            assert sign * float(stance.friction_margin("left", ca.DM(load), friction)) > 0
 
 
 @pytest.mark.parametrize("margin", [0.0, 0.02])
@@ -190,7 +195,7 @@ def test_a_sole_tips_about_the_edge_that_the_center_of_pressure_leaves(margin: f
     for x, y in ((0.02, -0.01), (right + 0.01, low), (left, high - 0.03)):
         force = np.array([30.0, -20.0, 400.0])
         load = np.concatenate([turn @ np.cross([x, y, 0.0], force), turn @ force])
-        rooms = np.sort(numeric(stance.inside("right", ca.DM(load), margin)).ravel())
+        rooms = np.sort(numeric(stance.edge_moments("right", ca.DM(load), margin)).ravel())
         expected = 400.0 * (np.array([x - left, right - x, y - low, high - y]) - margin)
         np.testing.assert_allclose(rooms, np.sort(expected), atol=1e-9)
 
@@ -207,7 +212,9 @@ def test_the_hull_of_the_soles_holds_exactly_what_they_can_share() -> None:
         shares = ca.SX.sym("shares", 2)  # load of the right foot: moment about y and force
         right = stance.full_load("right", ca.vertcat(shares[0], 0, shares[1]))
         left = ca.vertcat(0, -at, 0, 0, 0, 1) - ca.vertcat(0, shares[0] - 0.5 * shares[1], 0, 0, 0, shares[1])
-        rows = [part for name, load in (("left", left), ("right", right)) for part in (stance.inside(name, load),)]
+        rows = [
+            part for name, load in (("left", left), ("right", right)) for part in (stance.edge_moments(name, load),)
+        ]
         values = ca.vertcat(*rows, left[5], right[5])
         problem = {"h": ca.Sparsity(2, 2), "a": ca.jacobian(values, shares).sparsity()}
         solver = ca.conic("share", "highs", problem, {"error_on_fail": False, "highs": {"output_flag": False}})
@@ -230,8 +237,8 @@ def test_what_nothing_stands_on_is_refused_by_name() -> None:
     aside = {name: Foot(f"{name}_foot", rectangle((-0.1, 0.1), (0.1, 0.2)), (0, 0, -0.08)) for name in SIDES}
     stance = Stance.on(robot, aside, {"left": Foothold.level(0, 0)})
     with pytest.raises(ModelError, match="beyond an edge of the sole") as refusal:
-        stance.inside("left", ca.DM([0, 0, 0, 0, 0, 1]), 0.03)
+        stance.edge_moments("left", ca.DM([0, 0, 0, 0, 0, 1]), 0.03)
     assert refusal.value.value == pytest.approx(0.13)  # the edge is 0.1 m aside
     askew = Stance.on(robot, feet, {name: Foothold.level(0, 0, heading=0.5) for name in SIDES})
     with pytest.raises(ModelError, match="not along axes of the world"):
-        _ = askew.held_rows
+        _ = askew.load_rows

@@ -1,4 +1,4 @@
-"""A body that nothing acts on tumbles as Euler says: a machine that floats and has no joints."""
+"""A floating body without joints and external forces tumbles according to Euler's equations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Serial free-floating arms, and what their chains should give by automatic differentiation of link frames."""
+"""Serial free-floating arms and their virtual chains, by automatic differentiation of link frames."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The machines of this library as those of Pinocchio and MuJoCo, the root link on a free joint."""
+"""Machines of this library as models of Pinocchio and MuJoCo, with the root link on a free joint."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Robots that others described, as Pinocchio has them: what it says of a configuration, in the order of our joints."""
+"""Public robot descriptions in Pinocchio, evaluated in the order of this library's joints."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whatever is wrong with a robot, its parts or what is asked of it is refused by name."""
+"""Every invalid robot, part or argument is refused by name."""
 
 from __future__ import annotations
 
@@ -181,13 +181,13 @@ PARTS = [
 
 REBUILT = [
     of(
-        "locked",
+        "lock_joints",
         {"positions": {"joint1": 0.1}},
         positions=MAPPING
         | NOTHING
         | {"unknown": {"joint9": 0.0}, "nan": {"joint1": NAN}, "digits": {"joint1": "1"}, "number": {1: 0.0}},
     ),
-    of("retipped", {"tip": "link1"}, tip=UNKNOWN, translation=SPATIAL, rotation=rotation()),
+    of("move_tip", {"tip": "link1"}, tip=UNKNOWN, translation=SPATIAL, rotation=rotation()),
     of(
         "with_load",
         {"link": "link1", "mass": 1.0},
@@ -197,7 +197,7 @@ REBUILT = [
         inertia=array(3, 3),
     ),
     of(
-        "attached",
+        "attach_tool",
         {"tool": Link("tool")},
         tool=INSTANCE,
         link=but(UNKNOWN, "None"),
@@ -207,8 +207,8 @@ REBUILT = [
         keep_tip=FLAG,
     ),
     Case(
-        "merged",
-        models.merged,
+        "merge_robots",
+        models.merge_robots,
         {"base": HULL, "arms": {"left_": planar_chain([1.0], [1.0])}},
         {
             "base": INSTANCE,
@@ -218,11 +218,11 @@ REBUILT = [
             "rotations": MAPPING | {"zero": {"left_": np.zeros((3, 3))}},
         },
     ),
-    of("renamed", {"prefix": "a_"}, prefix=NOTHING | TEXT),
-    of("rerooted", {"root": "link2"}, root=UNKNOWN),
+    of("add_prefix", {"prefix": "a_"}, prefix=NOTHING | TEXT),
+    of("reroot", {"root": "link2"}, root=UNKNOWN),
     of("subtree", {"root": "link1"}, root=UNKNOWN, tip=but(UNKNOWN, "None")),
-    of("pruned", {}, keep=SEQUENCE | {"unknown": ["nobody"]}),
-    of("simplified", {}, keep=SEQUENCE | {"unknown": ["nobody"]}),
+    of("prune", {}, keep=SEQUENCE | {"unknown": ["nobody"]}),
+    of("simplify", {}, keep=SEQUENCE | {"unknown": ["nobody"]}),
 ]
 
 POSES = (

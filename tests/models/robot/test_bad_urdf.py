@@ -1,4 +1,4 @@
-"""Whatever is wrong with a URDF description, or with what is asked of it, is refused by name."""
+"""Every invalid URDF description or argument is refused by name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The robots that come with the package, beside Pinocchio and closed forms."""
+"""The example robots of the package against Pinocchio and closed forms."""
 
 from __future__ import annotations
 

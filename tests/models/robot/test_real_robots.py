@@ -1,4 +1,4 @@
-"""Robots of other people's URDF files: what this library says of them is what Pinocchio says."""
+"""Robots of public URDF files agree with Pinocchio."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from models import (
     link_frames,
     link_jacobians,
     momentum_matrix,
-    simplified,
+    simplify,
     tip_jacobian,
     tip_pose,
 )
@@ -214,7 +214,7 @@ def test_centre_of_mass_and_centroidal_momentum(case: Case) -> None:
 def test_generalized_jacobian_from_the_joint_space_inertia(case: Case, fewer: bool) -> None:
     """G = J_q - J_b M_bb^-1 M_bq, and the base's twist -M_bb^-1 M_bq q'."""
     robot, peer = case.robot, case.peer
-    machine = FreeFloating(simplified(robot) if fewer else robot)
+    machine = FreeFloating(simplify(robot) if fewer else robot)
     base, q, rates = ca.SX.sym("base", 7), ca.SX.sym("q", robot.dof), ca.SX.sym("rates", robot.dof)
     outputs = [machine.tip_jacobian(base, q), machine.base_twist(base, q, rates), machine.tip_twist(base, q, rates)]
     values = [[s.base, s.q, s.qd] for s in case.states]

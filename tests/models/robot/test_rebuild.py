@@ -14,20 +14,20 @@ from models import (
     Joint,
     Link,
     Robot,
-    attached,
+    add_prefix,
+    attach_tool,
     base_reaction,
     inverse_dynamics,
     link_frames,
-    locked,
-    merged,
+    lock_joints,
+    merge_robots,
     momentum_matrix,
+    move_tip,
     planar_chain,
-    pruned,
-    renamed,
-    rerooted,
-    retipped,
+    prune,
+    reroot,
     robot_inertia,
-    simplified,
+    simplify,
     subtree,
     tip_jacobian,
     tip_pose,
@@ -89,7 +89,7 @@ def test_locked_joints_stand_where_they_are_told_and_the_others_feel_no_differen
     held = rng.random(robot.dof) < 0.5
     qd[held] = qdd[held] = 0.0
     positions = {name: q[i] for i, name in enumerate(robot.joint_names) if held[i]}
-    fewer = locked(robot, positions)
+    fewer = lock_joints(robot, positions)
     assert fewer.joint_names == tuple(name for name in robot.joint_names if name not in positions)
     for name, pose in numeric_poses(robot, q).items():
         np.testing.assert_allclose(matrix(numeric_poses(fewer, q[~held])[name]), matrix(pose), **NEAR)
@@ -106,7 +106,7 @@ def test_a_reduced_robot_is_that_of_pinocchio() -> None:
     names = ["panda_joint3", "panda_finger_joint1", "panda_finger_joint2"]
     indices = [robot.joint_names.index(name) for name in names]
     reduced = pinocchio.buildReducedModel(whole, [whole.getJointId(name) for name in names], place)
-    fewer = locked(robot, {name: place[i] for name, i in zip(names, indices, strict=True)})
+    fewer = lock_joints(robot, {name: place[i] for name, i in zip(names, indices, strict=True)})
     assert list(fewer.joint_names) == list(reduced.names)[1:]
     for _ in range(20):
         q, qd, qdd = (rng.normal(size=fewer.dof) for _ in range(3))
@@ -121,7 +121,7 @@ def test_a_robot_hung_up_elsewhere_moves_the_same(seed: int, size: int) -> None:
     rng = np.random.default_rng(seed)
     robot = random_robot(rng, size, followers=True)
     root = robot.links[int(rng.integers(len(robot.links)))].name
-    turned = rerooted(robot, root)
+    turned = reroot(robot, root)
     assert turned.root == root
     assert turned.total_mass == pytest.approx(robot.total_mass)
     q, place = rng.normal(size=robot.dof), random_frame(rng)
@@ -144,10 +144,10 @@ def test_a_robot_hung_up_elsewhere_moves_the_same(seed: int, size: int) -> None:
 
 def test_rerooting_to_and_fro_adds_massless_frames_once_and_changes_no_motion() -> None:
     robot = real_robot("ur5")
-    there = rerooted(robot, "tool0")
+    there = reroot(robot, "tool0")
     assert {joint.name for joint in robot.moving_joints} == {joint.name for joint in there.moving_joints}
-    back = rerooted(there, robot.root)
-    again = rerooted(rerooted(back, "tool0"), robot.root)
+    back = reroot(there, robot.root)
+    again = reroot(reroot(back, "tool0"), robot.root)
     assert sorted(link.name for link in again.links) == sorted(link.name for link in there.links)
     q = np.linspace(-1, 1, 6)
     for each in (back, again):
@@ -160,12 +160,12 @@ def test_rerooting_to_and_fro_adds_massless_frames_once_and_changes_no_motion() 
 def test_a_simplified_robot_has_the_same_dynamics(seed: int, size: int) -> None:
     rng = np.random.default_rng(seed)
     robot = random_robot(rng, size, followers=True)
-    fewer = simplified(robot)
-    assert len(fewer.links) == len(robot.drives) + 1
+    fewer = simplify(robot)
+    assert len(fewer.links) == len(robot.couplings) + 1
     assert fewer.joint_names == robot.joint_names
     assert_same_dynamics(robot, fewer, seed)
     kept = robot.links[int(rng.integers(1, len(robot.links)))].name
-    named = simplified(robot, keep=[kept])
+    named = simplify(robot, keep=[kept])
     assert_same_dynamics(robot, named, seed)
     q = rng.normal(size=robot.dof)
     np.testing.assert_allclose(
@@ -176,7 +176,7 @@ def test_a_simplified_robot_has_the_same_dynamics(seed: int, size: int) -> None:
 @pytest.mark.parametrize("name", ROBOTS)
 def test_a_simplified_real_robot_has_the_same_dynamics(name: str) -> None:
     robot = real_robot(name)
-    fewer = simplified(robot)
+    fewer = simplify(robot)
     assert len(fewer.links) == robot.dof + 1
     assert_same_dynamics(robot, fewer, 5)
 
@@ -188,7 +188,7 @@ def test_an_attached_robot_moves_as_it_does_alone_on_a_moving_base(seed: int, si
     robot, tool = random_robot(rng, size, followers=True), random_robot(rng, more, followers=True)
     link = robot.links[int(rng.integers(len(robot.links)))].name
     turn, shift = random_frame(rng)
-    whole = attached(robot, tool, link, shift, turn, prefix="tool_")
+    whole = attach_tool(robot, tool, link, shift, rotation=turn, prefix="tool_")
     q, own = rng.normal(size=robot.dof), rng.normal(size=tool.dof)
     together = np.concatenate([q, own])
     assert whole.joint_names == (*robot.joint_names, *(f"tool_{name}" for name in tool.joint_names))
@@ -201,18 +201,18 @@ def test_an_attached_robot_moves_as_it_does_alone_on_a_moving_base(seed: int, si
     np.testing.assert_allclose(matrix(tip_pose(whole, together)), matrix(tip), **NEAR)
     inertia = numeric(robot_inertia(robot, q)) + numeric(robot_inertia(tool, own, (carrier[:3, :3], carrier[:3, 3])))
     np.testing.assert_allclose(numeric(robot_inertia(whole, together)), inertia, **NEAR)
-    same = attached(robot, tool, link, shift, turn, prefix="tool_", keep_tip=True)
+    same = attach_tool(robot, tool, link, shift, rotation=turn, prefix="tool_", keep_tip=True)
     np.testing.assert_allclose(matrix(tip_pose(same, together)), matrix(tip_pose(robot, q)), **NEAR)
 
 
 def test_a_tool_stands_at_the_tip_unless_a_link_is_named() -> None:
-    arm = retipped(
+    arm = move_tip(
         planar_chain([1.0, 1.0], [1.0, 1.0]),
         "link2",
         (1.0, 0.0, 0.5),
         Rotation.from_euler("z", 90, degrees=True).as_matrix(),
     )
-    whole = attached(arm, Link("gripper", 0.5), translation=(0.0, -0.25, 0.0))
+    whole = attach_tool(arm, Link("gripper", 0.5), translation=(0.0, -0.25, 0.0))
     assert (whole.tip, whole.joints[-1].name) == ("gripper", "gripper_mount")
     np.testing.assert_allclose(numeric(tip_pose(whole, [0.0, 0.0]).position).ravel(), [2.25, 0.0, 0.5], atol=1e-15)
 
@@ -224,9 +224,9 @@ def test_a_load_is_a_link_that_is_fixed(seed: int, size: int) -> None:
     robot = random_robot(rng, size, followers=True)
     link = robot.links[int(rng.integers(len(robot.links)))].name
     center, inertia = rng.normal(size=3), random_inertia(rng, 3.0)
-    loaded = with_load(robot, link, 3.0, center, inertia)
+    loaded = with_load(robot, link, 3.0, center, inertia=inertia)
     assert [each.name for each in loaded.links] == [each.name for each in robot.links]
-    assert_same_dynamics(loaded, attached(robot, Link("load", 3.0, center, inertia), link, keep_tip=True), seed)
+    assert_same_dynamics(loaded, attach_tool(robot, Link("load", 3.0, center, inertia), link, keep_tip=True), seed)
 
 
 def test_a_load_without_inertia_is_a_point() -> None:
@@ -243,7 +243,7 @@ def test_two_arms_on_one_base_move_as_each_does_alone() -> None:
         (Joint("yaw", "revolute", "satellite", "mast", (0, 0, 1)),),
     )
     turn, shift = random_rotation(rng), rng.normal(size=3)
-    pair = merged(
+    pair = merge_robots(
         body,
         {"left_": arm, "right_": other},
         links={"right_": "mast"},
@@ -265,9 +265,9 @@ def test_two_arms_on_one_base_move_as_each_does_alone() -> None:
         np.testing.assert_allclose(
             numeric(momentum_matrix(pair, q))[:, columns], numeric(momentum_matrix(robot, own, place)), **NEAR
         )
-    twins = merged(Link("base"), {"a_": arm, "b_": arm})
+    twins = merge_robots(Link("base"), {"a_": arm, "b_": arm})
     assert twins.name == "base"
-    assert FreeFloating(retipped(twins, "b_Link_7")).joint_size == 14
+    assert FreeFloating(move_tip(twins, "b_Link_7")).joint_size == 14
 
 
 @given(seeds, st.integers(2, 9))
@@ -278,7 +278,7 @@ def test_branches_are_cut_and_taken_out(seed: int, size: int) -> None:
     q = rng.normal(size=robot.dof)
     poses = numeric_poses(robot, q)
     other = robot.links[int(rng.integers(len(robot.links)))].name
-    cut = pruned(robot, other)
+    cut = prune(robot, other)
     ways = {robot.root, *(j.child for name in (robot.tip_link, other) for j in robot.path_to(name))}
     assert {link.name for link in cut.links} == ways
     chosen = q[[robot.joint_names.index(name) for name in cut.joint_names]]
@@ -292,7 +292,7 @@ def test_branches_are_cut_and_taken_out(seed: int, size: int) -> None:
 
 
 def test_names_are_prefixed_everywhere() -> None:
-    robot = renamed(planar_chain([1.0, 1.0], [1.0, 1.0]), "a_")
+    robot = add_prefix(planar_chain([1.0, 1.0], [1.0, 1.0]), "a_")
     assert [link.name for link in robot.links] == ["a_base", "a_link1", "a_link2"]
     assert (robot.joint_names, robot.tip, robot.root) == (("a_joint1", "a_joint2"), "a_link2", "a_base")
     assert list(link_frames(robot, [0.0, 0.0])) == ["a_base", "a_link1", "a_link2"]
@@ -300,8 +300,8 @@ def test_names_are_prefixed_everywhere() -> None:
 
 def test_an_impossible_inertia_stays_marked_where_it_is_merged() -> None:
     odd = Link("odd", 1.0, inertia=np.diag([1.0, 1.0, 9.0]), any_inertia=True)
-    robot = attached(planar_chain([1.0], [1.0]), odd)
-    assert [link.any_inertia for link in simplified(robot).links] == [False, True]
+    robot = attach_tool(planar_chain([1.0], [1.0]), odd)
+    assert [link.any_inertia for link in simplify(robot).links] == [False, True]
     with refused(r"inertia .* not symmetric"):
         Link("odd", 1.0, inertia=np.triu(np.ones((3, 3))), any_inertia=True)
 
@@ -313,28 +313,28 @@ PAIR: Any = {"joint1": [0.0, 1.0]}
 @pytest.mark.parametrize(
     ("build", "message"),
     [
-        (lambda: locked(ARM, {"joint3": 0.0}), "joint 'joint3' does not exist; did you mean"),
-        (lambda: locked(locked(ARM, {"joint1": 0.0}), {"joint1": 0.0}), "joint 'joint1' is fixed"),
-        (lambda: locked(ARM, {"joint1": np.inf}), "joint 'joint1': locked position inf is not finite"),
-        (lambda: locked(ARM, PAIR), "joint 'joint1': locked position has shape"),
-        (lambda: retipped(ARM, "link3"), "link 'link3' does not exist; did you mean"),
-        (lambda: retipped(ARM, "link2", (1.0, 0.0)), "tip_translation has shape"),
-        (lambda: rerooted(ARM, "Base"), "link 'Base' does not exist; did you mean 'base'"),
+        (lambda: lock_joints(ARM, {"joint3": 0.0}), "joint 'joint3' does not exist; did you mean"),
+        (lambda: lock_joints(lock_joints(ARM, {"joint1": 0.0}), {"joint1": 0.0}), "joint 'joint1' is fixed"),
+        (lambda: lock_joints(ARM, {"joint1": np.inf}), "joint 'joint1': locked position inf is not finite"),
+        (lambda: lock_joints(ARM, PAIR), "joint 'joint1': locked position has shape"),
+        (lambda: move_tip(ARM, "link3"), "link 'link3' does not exist; did you mean"),
+        (lambda: move_tip(ARM, "link2", (1.0, 0.0)), "tip_translation has shape"),
+        (lambda: reroot(ARM, "Base"), "link 'Base' does not exist; did you mean 'base'"),
         (lambda: with_load(ARM, "link3", 1.0), "link 'link3' does not exist"),
         (lambda: with_load(ARM, "link2", -1.0), "load of link2': mass -1.0 kg is negative"),
         (lambda: with_load(ARM, "link2", 1.0, inertia=np.diag([1, 1, 3])), "load of link2': .* triangle inequality"),
-        (lambda: attached(ARM, Link("tool"), "link3"), "link 'link3' does not exist"),
-        (lambda: attached(ARM, ARM), "link name 'base' is used more than once"),
-        (lambda: attached(ARM, Link("tool"), translation=(0, 0)), "attached tool: translation has shape"),
-        (lambda: attached(ARM, Link("tool"), rotation=np.ones((3, 3))), "attached tool: rotation .* not a rotation"),
-        (lambda: merged(Link("base"), {}), "no arms are given"),
-        (lambda: merged(Link("base"), {"": ARM}), "link name 'base' is used more than once"),
-        (lambda: merged(Link("b"), {"a_": ARM}, links={"a_": "c"}), "link 'c' does not exist"),
-        (lambda: merged(Link("b"), {"a_": ARM}, translations={"A_": (0, 0, 0)}), r"\['A_'\] are no prefixes"),
-        (lambda: pruned(ARM, ["link3"]), "link 'link3' does not exist"),
+        (lambda: attach_tool(ARM, Link("tool"), "link3"), "link 'link3' does not exist"),
+        (lambda: attach_tool(ARM, ARM), "link name 'base' is used more than once"),
+        (lambda: attach_tool(ARM, Link("tool"), translation=(0, 0)), "attached tool: translation has shape"),
+        (lambda: attach_tool(ARM, Link("tool"), rotation=np.ones((3, 3))), "attached tool: rotation .* not a rotation"),
+        (lambda: merge_robots(Link("base"), {}), "no arms are given"),
+        (lambda: merge_robots(Link("base"), {"": ARM}), "link name 'base' is used more than once"),
+        (lambda: merge_robots(Link("b"), {"a_": ARM}, links={"a_": "c"}), "link 'c' does not exist"),
+        (lambda: merge_robots(Link("b"), {"a_": ARM}, translations={"A_": (0, 0, 0)}), r"\['A_'\] are no prefixes"),
+        (lambda: prune(ARM, ["link3"]), "link 'link3' does not exist"),
         (lambda: subtree(ARM, "link3"), "link 'link3' does not exist"),
         (lambda: subtree(ARM, "link1", "base"), "tip link 'base' does not exist"),
-        (lambda: simplified(ARM, ["link3"]), "link 'link3' does not exist"),
+        (lambda: simplify(ARM, ["link3"]), "link 'link3' does not exist"),
     ],
 )
 def test_what_cannot_be_rebuilt_is_refused(build: Any, message: str) -> None:

@@ -17,12 +17,12 @@ from models import (
     Joint,
     Link,
     Robot,
-    attached,
-    locked,
+    add_prefix,
+    attach_tool,
+    lock_joints,
     planar_chain,
-    pruned,
-    renamed,
-    simplified,
+    prune,
+    simplify,
     tip_jacobian,
     tip_pose,
 )
@@ -82,9 +82,11 @@ def test_a_tree_of_several_leaves_has_no_tip_and_says_so_where_one_is_needed() -
     np.testing.assert_array_equal(
         numeric(machine.base_twist(base, q, rates)), numeric(with_tip_b.base_twist(base, q, rates))
     )
-    assert [each.tip for each in (renamed(robot, "x_"), simplified(robot), locked(robot, {"j": 0.0}))] == [None] * 3
-    assert pruned(robot, "c").tip == "c"
-    assert attached(robot, Link("tool"), "b").tip == "tool"
+    assert [each.tip for each in (add_prefix(robot, "x_"), simplify(robot), lock_joints(robot, {"j": 0.0}))] == [
+        None
+    ] * 3
+    assert prune(robot, "c").tip == "c"
+    assert attach_tool(robot, Link("tool"), "b").tip == "tool"
     assert str(robot).startswith("robot of 3 links, 2 degrees of freedom, 3 kg, no tip")
     needing: list[Callable[[], Any]] = [
         lambda: tip_pose(robot, q),
@@ -93,11 +95,11 @@ def test_a_tree_of_several_leaves_has_no_tip_and_says_so_where_one_is_needed() -
         lambda: machine.tip_pose(base, q),
         lambda: machine.tip_jacobian(base, q),
         lambda: machine.jacobians(base, q),
-        lambda: pruned(robot),
-        lambda: attached(robot, Link("tool")),
+        lambda: prune(robot),
+        lambda: attach_tool(robot, Link("tool")),
     ]
     for use in needing:
-        with refused(r"'robot' has no tip.*leaves \['b', 'c'\].*tip=NAME.*retipped"):
+        with refused(r"'robot' has no tip.*leaves \['b', 'c'\].*tip=NAME.*move_tip"):
             use()
 
 

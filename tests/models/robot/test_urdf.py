@@ -25,7 +25,7 @@ from models import (
     momentum_matrix,
     rectangle,
     robot_inertia,
-    simplified,
+    simplify,
     tip_pose,
 )
 from models.robot.parts import SHAPES
@@ -147,7 +147,7 @@ def test_a_rotation_is_written_exactly_to_rounding_at_the_gimbal_lock_too(
 
 
 def test_a_robot_is_written_to_a_file_as_a_whole_and_read_by_other_readers(tmp_path: Path) -> None:
-    robot = simplified(Robot.from_urdf(urdf_file(*ROBOTS["panda"][:2]), tip="panda_hand_tcp"))
+    robot = simplify(Robot.from_urdf(urdf_file(*ROBOTS["panda"][:2]), tip="panda_hand_tcp"))
     file = tmp_path / "arm.urdf"
     file.write_text("an older one", encoding="utf-8")
     assert robot.to_urdf(file) == file.read_text(encoding="utf-8")
@@ -294,7 +294,7 @@ def test_followers_are_coupled_held_or_free() -> None:
     robot = Robot.from_urdf(source)
     assert robot.joint_names == ("j1",)
     assert [robot.joint(name).mimic for name in ("j2", "j3")] == [Mimic("j1", 2, 0.5), Mimic("j2", 1, 1)]
-    assert [robot.drives[name] for name in ("j2", "j3")] == [(0, 2, 0.5), (0, 2, 1.5)]
+    assert [robot.couplings[name] for name in ("j2", "j3")] == [(0, 2, 0.5), (0, 2, 1.5)]
     assert Robot.from_urdf(source, mimic="free").joint_names == ("j1", "j2", "j3")
     assert Robot.from_urdf(source, mimic="free", lock={"j1": 0.25}).joint_names == ("j2", "j3")
     at_rest = Robot.from_urdf(source, mimic="lock")

@@ -12,7 +12,7 @@ import coal
 import numpy as np
 import pytest
 
-from models import CollisionShape, Frame, Joint, Link, Mimic, ModelError, ModelWarning, Robot, link_frames, renamed
+from models import CollisionShape, Frame, Joint, Link, Mimic, ModelError, ModelWarning, Robot, add_prefix, link_frames
 from models.arrays import Array
 from models.shapes.bodies import Body, LinkMesh, RigidParts, collision_bodies
 from models.shapes.distance import distance
@@ -354,7 +354,7 @@ def test_names_and_the_order_of_declaration_do_not_matter() -> None:
         wanted = by_links(bodies, pairs)
         turned = Robot(robot.links[::-1], robot.joints[::-1], tip=robot.tip)
         assert by_links(bodies[::-1], checked_pairs(turned, bodies[::-1])) == wanted
-        other = renamed(robot, "other ")
+        other = add_prefix(robot, "other ")
         moved = tuple(Body(f"other {body.link}", body.shape) for body in bodies)
         assert checked_pairs(other, moved).checked == pairs.checked
 

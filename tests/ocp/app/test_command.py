@@ -352,15 +352,15 @@ def test_the_cache_is_shown_and_cleared(tmp_path: Path, capsys: Any, monkeypatch
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     (tmp_path / "selfmotion").mkdir()
     (tmp_path / "selfmotion" / "mine.txt").write_text("not of the cache")
-    kept.keep("a" * 64, {"a": 1})
-    kept.keep_library("b" * 64, b"compiled")
+    kept.store_value("a" * 64, {"a": 1})
+    kept.store_library("b" * 64, b"compiled")
     told = json.loads(run(capsys, "cache", "--json")[1])
     assert (told["folder"], told["files"], told["cleared"]) == (str(tmp_path / "selfmotion"), 2, False)
     assert (told["libraries"], told["bytes"]) == (1, 64 + len('\n{"a": 1}') + len(b"compiled"))
-    assert kept.kept("a" * 64) == {"a": 1}
+    assert kept.load_value("a" * 64) == {"a": 1}
     assert run(capsys, "cache", "clear")[0] == 0
-    assert kept.kept("a" * 64) is None
-    assert kept.kept_library("b" * 64) is None
+    assert kept.load_value("a" * 64) is None
+    assert kept.load_library("b" * 64) is None
     assert [file.name for file in (tmp_path / "selfmotion").iterdir()] == ["mine.txt"]
 
 

@@ -31,10 +31,10 @@ from models import (
     Standing,
     VisualShape,
     link_frames,
-    locked,
+    lock_joints,
     mass_matrix,
     rectangle,
-    simplified,
+    simplify,
     with_load,
 )
 from models.arrays import Array
@@ -200,8 +200,8 @@ def _chain(names: tuple[str, ...]) -> Any:
 @pytest.mark.parametrize("change", ["simplified", "locked", "with_load"])
 def test_a_robot_that_was_changed_looks_the_same(folder: Path, robot: Robot, change: str) -> None:
     changed = {
-        "simplified": lambda: simplified(robot),
-        "locked": lambda: locked(robot, {"wrist": -0.6}),
+        "simplified": lambda: simplify(robot),
+        "locked": lambda: lock_joints(robot, {"wrist": -0.6}),
         "with_load": lambda: with_load(robot, "hand", 2.0),
     }[change]()
     clouds = []

@@ -221,7 +221,7 @@ def test_a_damaged_file_is_made_again(own: Path, damage: bytes | None) -> None:
     whole = library.read_bytes()
     library.unlink()  # Python has not loaded it
     library.write_bytes(whole[:-1] + b"x" if damage is None else damage)
-    assert cache.kept_library(number(4).key) is None
+    assert cache.load_library(number(4).key) is None
     assert told(built(number(4))) == 4
     assert [file.read_bytes() for file in own.iterdir()] == [whole]
 
@@ -305,13 +305,13 @@ def test_what_is_too_long_is_not_compiled(own: Path, monkeypatch: pytest.MonkeyP
 
 def test_a_library_of_somebody_else_is_not_run(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     key = number(9).key
-    assert cache.kept_library(key) is None
+    assert cache.load_library(key) is None
     library = built(number(9))
-    assert cache.kept_library(key) == library
+    assert cache.load_library(key) == library
     monkeypatch.setattr(os, "geteuid", lambda: os.getuid() + 1)
     if library.stat().st_uid == 0:
         os.chown(library, 12345, -1)
-    assert cache.kept_library(key) is None
+    assert cache.load_library(key) is None
 
 
 def test_libraries_that_are_used_least_make_room(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -319,10 +319,10 @@ def test_libraries_that_are_used_least_make_room(own: Path, monkeypatch: pytest.
     for age, file in enumerate(files):
         os.utime(file, (0, 1000 + age))
     assert built(number(10)) == files[0]  # used again
-    monkeypatch.setattr(cache, "MOST_KEPT", 3 * files[0].stat().st_size)
+    monkeypatch.setattr(cache, "MAX_LIBRARY_BYTES", 3 * files[0].stat().st_size)
     newest = built(number(13))
     assert {file for file in own.iterdir() if file.suffix == ".so"} == {files[0], files[2], newest}
-    monkeypatch.setattr(cache, "MOST_KEPT", 0)
+    monkeypatch.setattr(cache, "MAX_LIBRARY_BYTES", 0)
     assert built(number(14)).exists()  # what is needed now stays
     assert len(list(own.glob("*.so"))) == 1
 
@@ -333,7 +333,7 @@ def test_libraries_that_are_used_least_make_room(own: Path, monkeypatch: pytest.
 def test_locks_are_removed_unless_somebody_has_them(own: Path) -> None:
     built(number(21))
     (own / "left.lock").touch()
-    with cache.alone("taken"):
+    with cache.exclusive("taken"):
         built(number(22))
         assert {file.name for file in own.glob("*.lock")} == {"taken.lock"}
     assert not list(own.glob("*.lock"))
@@ -379,7 +379,7 @@ def test_a_process_that_ends_takes_its_compiler_along(
     process.communicate()
     assert is_gone(pid)
     assert is_empty(tmp_path / "temporary")
-    assert cache.kept_library(number(18).key) is None
+    assert cache.load_library(number(18).key) is None
 
 
 PATIENCE = 300.0

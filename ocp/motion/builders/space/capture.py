@@ -24,7 +24,7 @@ from typing import Any, TypedDict, Unpack
 import casadi as ca
 import numpy as np
 
-from models import FreeFloating, center_of_mass, wheels_of
+from models import FreeFloating, center_of_mass, find_wheels
 from models.arrays import Array
 from ocp.console import interruptible
 from ocp.direct.collocation import Collocation
@@ -252,7 +252,7 @@ class _Capture:
     @property
     def arm(self) -> Array:
         """1 of joints, 0 of wheels, whose angles do not matter: each phase counts them from zero. Shape (n,)."""
-        wheels = wheels_of(self.chaser.robot)
+        wheels = find_wheels(self.chaser.robot)
         return np.array([float(name not in wheels) for name in self.chaser.robot.joint_names])
 
     @property
@@ -313,7 +313,7 @@ class _Capture:
     def detumbling(self, duration: float | FreeTime, start: Mapping[str, Array] | None) -> Problem:
         """The second phase, from the end of an approach, or free to be joined to one."""
         pair, asked = self.pair, self.asked
-        wheels = wheels_of(pair.robot)
+        wheels = find_wheels(pair.robot)
         rest = asked.get("rest", True)
         still = np.array([np.nan if name in wheels else 0.0 for name in pair.robot.joint_names])
         ends: dict[str, Any] = {"end_joints": asked.get("end_joints"), "end": still if rest else "free"}

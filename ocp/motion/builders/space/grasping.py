@@ -14,7 +14,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from models import FreeFloating, ModelError, Robot, attached, center_of_mass
+from models import FreeFloating, ModelError, Robot, attach_tool, center_of_mass
 from models.machines.machine import with_tip
 from models.spatial import Expression, cross
 from ocp.errors import NOT_NUMBERS, ProblemError, checked_instance, checked_positive, floats, real
@@ -99,7 +99,7 @@ def joined(chaser: Robot, target: Robot) -> Robot:
     """
     turn = np.asarray(target.tip_rotation).T
     shift = -turn @ np.asarray(target.tip_translation)
-    return attached(chaser, target, None, shift, turn, keep_tip=True)
+    return attach_tool(chaser, target, None, shift, rotation=turn, keep_tip=True)
 
 
 def checked_pair(chaser: Any, target: Any) -> Robot:
@@ -111,7 +111,7 @@ def checked_pair(chaser: Any, target: Any) -> Robot:
         words = f"capture: the chaser floats on a {chaser.base} base, the target on a {target.base} one"
         raise ProblemError(words, name="target", value=target.base, limit=chaser.base)
     if target.joint_size or len(target.robot.links) != 1:
-        words = "capture: the target is one body: simplified(locked(robot, ...)) makes one of several"
+        words = "capture: the target is one body: simplify(lock_joints(robot, ...)) makes one of several"
         raise ProblemError(words, name="target", value=target)
     if not chaser.joint_size:
         raise ProblemError("capture: the chaser has no joints to reach with", name="chaser", value=chaser)

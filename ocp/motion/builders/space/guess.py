@@ -20,7 +20,7 @@ import casadi as ca
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from models import FreeFloating, Robot, center_of_mass, link_frames, wheels_of
+from models import FreeFloating, Robot, center_of_mass, find_wheels, link_frames
 from models.arrays import Array
 from ocp.errors import ProblemError
 from ocp.motion.builders.dynamics import QUINTIC
@@ -205,7 +205,7 @@ def guess_braking(problem: Problem, pair: FreeFloating, joints: Array, rates: Ar
     share = times[:, None] / duration
     slowing = 1 - 3 * share**2 + 2 * share**3
     way = (share - share**3 + share**4 / 2) * duration
-    names, wheels = robot.joint_names, wheels_of(robot)
+    names, wheels = robot.joint_names, find_wheels(robot)
     turning = [k for k, name in enumerate(names) if name in wheels]
     angular = [k for k, row in enumerate(pair.twist_rows) if row < 3]
     b, q, v = (ca.SX.sym("z", size) for size in (pair.base_size, len(joints), len(joints)))
@@ -304,7 +304,7 @@ def held_by_wheels(machine: FreeFloating, bounds: JointBounds, start: Start, dri
         spin[machine.twist_rows] = twist
     spin = np.array(ca.DM(machine.world_from_base(start.base).rotation)).T @ spin[:3]
     frames, free, sides = link_frames(robot, ca.DM(start.joints)), 0.0, [np.zeros(3)]
-    for name, inertia in wheels_of(robot).items():
+    for name, inertia in find_wheels(robot).items():
         wheel, k = robot.joint(name), robot.joint_names.index(name)
         size = inertia * bounds.velocity[k]
         if any(joint.moves for joint in robot.path_to(wheel.parent)):  # the arm turns it to any side

@@ -133,7 +133,7 @@ def steps_motion(steps: Steps, solution: Solution, samples: int = SAMPLES) -> St
     for k, name in enumerate(steps.names):
         stance = steps.stances[k]
         values = solution.phase(name).at_fraction(share)
-        others = {foot: values[f"{foot} load"] for foot in stance.others}
+        others = {foot: values[f"{foot} load"] for foot in stance.other_feet}
         motion = tuple(values[part] for part in ("joints", "velocities", "accelerations"))
         found = sampled(steps, stance, motion, others)
         begin, end = times[name]
@@ -179,7 +179,7 @@ def sampled(steps: Steps, stance: Stance, motion: tuple[Array, ...], others: Map
 def _function(steps: Steps, stance: Stance) -> tuple[Any, list[str]]:
     n = stance.joint_size
     q, qd, qdd = (ca.SX.sym(name, n) for name in ("q", "qd", "qdd"))
-    given = {name: ca.SX.sym("load", len(stance.held_rows[name])) for name in stance.others}
+    given = {name: ca.SX.sym("load", len(stance.load_rows[name])) for name in stance.other_feet}
     others = {name: stance.full_load(name, rows) for name, rows in given.items()}
     loads = stance.loads(q, qd, qdd, others)
     root = link_frames(stance.robot, q, stance.world_from_base())[steps.robot.root]
@@ -242,7 +242,7 @@ def _phase(steps: Steps, k: int, joints: Array, t: Array, clearance: float) -> t
     tasks = [
         foot_task(stance, name, place.position, place.rotation)
         for name, place in stance.footholds.items()
-        if name in stance.others
+        if name in stance.other_feet
     ]
     tasks += [_on_its_way(stance, swing, t[-1], clearance) for swing in swings]
     found = resolve(stance, tasks=tasks, start_joints=joints, horizon=t[-1], samples=t)
@@ -275,7 +275,7 @@ def _on_its_way(stance: Stance, swing: Swing, seconds: float, clearance: float) 
 
 def _shared(stance: Stance, motion: tuple[Array, Array, Array]) -> dict[str, Array]:
     """Loads of the feet besides the first, in the rows that are held, (M, k): the least squares of all of them."""
-    sizes = {name: len(stance.held_rows[name]) for name in stance.others}
+    sizes = {name: len(stance.load_rows[name]) for name in stance.other_feet}
     if not sizes:
         return {}
     q, qd, qdd = (ca.SX.sym(name, stance.joint_size) for name in ("q", "qd", "qdd"))

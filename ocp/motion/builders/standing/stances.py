@@ -253,7 +253,7 @@ def foot_task(stance: Stance, name: str, position: Any, rotation: Any, **asked: 
     back = np.asarray(foot.rotation).T
     turn = (lambda t: ca.mtimes(rotation(t), back)) if callable(rotation) else np.asarray(rotation) @ back
     return TipTask(
-        rows=stance.held_rows[name],
+        rows=stance.load_rows[name],
         position=position,
         orientation=turn,
         link=foot.link,
@@ -282,8 +282,8 @@ def standing_configuration(stance: Stance, near: Any, over: Any = None) -> Array
     begin = np.clip(begin, lower, upper)
     q, none = ca.SX.sym("q", stance.joint_size), ca.DM(0, 1)
     gap: Any = none
-    if stance.others:
-        equations = hold(stance, {name: stance.footholds[name] for name in stance.others})
+    if stance.other_feet:
+        equations = hold(stance, {name: stance.footholds[name] for name in stance.other_feet})
         gap = equations.error(none, q, ca.DM(equations.target_function()(0.0)))
     cost = POSTURES.near * ca.sumsqr(q - begin)
     if over is not None:
@@ -303,9 +303,9 @@ def standing_configuration(stance: Stance, near: Any, over: Any = None) -> Array
 
 def check_placed(stance: Stance, joints: Array) -> None:
     """Raise ProblemError where joints of a start, in the stance's order, have a foot off its foothold."""
-    if not stance.others:
+    if not stance.other_feet:
         return
-    equations = hold(stance, {name: stance.footholds[name] for name in stance.others})
+    equations = hold(stance, {name: stance.footholds[name] for name in stance.other_feet})
     found = np.array(ca.DM(equations.error(ca.DM(0, 1), joints, equations.target_function()(0.0))))
     gap = float(np.abs(found).max())
     if gap > PLACED:

@@ -92,7 +92,7 @@ def steps_problem(
 
     The phases bear the names of `Steps.names`; joint vectors in a phase are in its stance's order. States "joints",
     "velocities"; controls "accelerations", and "FOOT load" of every foot that is held besides the first, in the rows
-    `Stance.held_rows`. Path constraints "feet" (they do not move); "FOOT pressure", N; "FOOT center of pressure", its
+    `Stance.load_rows`. Path constraints "feet" (they do not move); "FOOT pressure", N; "FOOT center of pressure", its
     distance from the edges of the sole times its share of the weight, m; "FOOT friction", squares over the squared
     weight; "torques"; "FOOT clearance" of a foot in the air, m. At the end of a phase "FOOT landing", and at the end of
     all "balance", the center of mass over the support, m.
@@ -170,7 +170,7 @@ def _phase(steps: Steps, k: int, start: Array | None, guess: dict[str, Any], ask
     problem = Problem(steps.names[k])
     final = _horizon(problem, phase)
     none = ca.DM(0, 1)
-    equations = hold(stance, {name: phase.footholds[name] for name in stance.others}) if stance.others else None
+    equations = hold(stance, {name: phase.footholds[name] for name in stance.other_feet}) if stance.other_feet else None
 
     resting: Any = None
     if last:
@@ -203,7 +203,7 @@ def _phase(steps: Steps, k: int, start: Array | None, guess: dict[str, Any], ask
         elif last:
             problem.end("balance", over, lower=asked.margin, unit="m")
 
-    others = {name: _load(problem, stance, name) for name in stance.others}
+    others = {name: _load(problem, stance, name) for name in stance.other_feet}
     loads = stance.loads(joints, rates, second, others)
     for name, load in loads.items():
         _bear(problem, stance, name, load, asked)
@@ -241,7 +241,7 @@ def _horizon(problem: Problem, phase: StancePhase) -> Any:
 
 def _load(problem: Problem, stance: Stance, name: str) -> Any:
     """The load of a foot besides the first, a control in the rows that are resisted. Shape (6, 1)."""
-    rows = stance.held_rows[name]
+    rows = stance.load_rows[name]
     share = stance.weight / len(stance.footholds)
     guess = [share * (row == 5) for row in rows]
     unit = ", ".join(dict.fromkeys("N m" if row < 3 else "N" for row in rows))
@@ -254,11 +254,11 @@ def _bear(problem: Problem, stance: Stance, name: str, load: Any, asked: _Asked)
         return
     least = 0.0 if asked.limits.vertical_force is None else float(asked.limits.vertical_force)
     problem.path(f"{name} pressure", stance.pressure(name, load), lower=least, unit="N")
-    inside = stance.inside(name, load, asked.margin) / stance.weight
+    inside = stance.edge_moments(name, load, asked.margin) / stance.weight
     if inside.numel():
         problem.path(f"{name} center of pressure", inside, lower=0.0, unit="m")
     if np.isfinite(asked.limits.friction):
-        room = stance.grip(name, load, asked.limits.friction) / stance.weight**2
+        room = stance.friction_margin(name, load, asked.limits.friction) / stance.weight**2
         problem.path(f"{name} friction", room, lower=0.0)
 
 

@@ -14,7 +14,7 @@ import casadi as ca
 import mujoco
 import numpy as np
 
-from models import FixedBase, FreeFloating, simplified
+from models import FixedBase, FreeFloating, simplify
 from models.arrays import Array
 from ocp import Solution, joint_torques
 from ocp.curves import quadrature_weights
@@ -50,7 +50,7 @@ def replay(machine: FixedBase | FreeFloating, plan: Solution, steps: int = 80) -
         steps: Of Runge-Kutta in each interval.
     """
     fixed = isinstance(machine, FixedBase)
-    robot = simplified(machine.robot)
+    robot = simplify(machine.robot)
     model = mujoco_model(robot, fixed=fixed)
     model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
     if not fixed:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from models import Robot, Support, simplified
+from models import Robot, Support, simplify
 from ocp.motion.builders.standing.resolved import StepsMotion
 from tests.models.robot.trees import Array
 
@@ -46,7 +46,7 @@ def replay(motion: StepsMotion, friction: float, planar: bool = False) -> Replay
         planar: The root link moves in the plane y = 0 alone.
     """
     feet = motion.steps.feet
-    robot = simplified(motion.steps.robot, {foot.link for foot in feet.values()})
+    robot = simplify(motion.steps.robot, {foot.link for foot in feet.values()})
     soles = {foot.link: name for name, foot in feet.items()}
     model = mujoco.MjModel.from_xml_string(_model(robot, motion, soles, friction, planar))
     names = robot.joint_names

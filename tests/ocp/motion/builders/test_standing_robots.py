@@ -16,7 +16,7 @@ import numpy as np
 import pinocchio
 import pytest
 
-from models import ModelWarning, Robot, Standing, Wrench, rectangle, simplified, standing_example, with_load
+from models import ModelWarning, Robot, Standing, Wrench, rectangle, simplify, standing_example, with_load
 from models.machines.standing import StandingMotion
 from ocp import Collocation, ProblemError, Solution, resolve_accelerations, solve
 from ocp.motion.builders.standing import Anywhere, Limits, Pinned, standing_problem
@@ -181,7 +181,7 @@ def test_anymal_with_its_time_law_free_costs_less(anymal: Peered, anymal_solutio
 
 
 def test_a_simplified_robot_has_the_same_plan(anymal: Peered, anymal_solution: Solution) -> None:
-    machine = replace(anymal.machine, robot=simplified(anymal.machine.robot))
+    machine = replace(anymal.machine, robot=simplify(anymal.machine.robot))
     assert solve(pushing.problem(machine), pushing.METHOD).cost == pytest.approx(anymal_solution.cost, rel=1e-9)
 
 

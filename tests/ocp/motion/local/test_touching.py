@@ -31,7 +31,7 @@ from models.spatial import skew
 from ocp import ProblemError
 from ocp.motion.local.collisions import checked_collision_scene, distances_along, find_collisions, scene_hulls
 from tests.models.machines.armoured import armoured_arm
-from tests.models.machines.test_surroundings import OBSTACLES, machines, postures, turned
+from tests.models.machines.test_collision_scene import OBSTACLES, configurations, machines, turned
 from tests.ocp.motion.tasks.space_tasks import panda, ur5
 
 MOVING = MovingObstacle(OBSTACLES[1], lambda t: (0.3, 0.2 * t, 0.2), lambda t: turned(t))
@@ -55,7 +55,7 @@ def by_formula(around: CollisionScene) -> Array:
 def test_distances_along_a_motion_are_those_of_the_expression(name: str) -> None:
     """Of the kinds with a formula; beside the others, meshes and cylinders, no less than its bound from below."""
     around = CollisionScene(machines()[name], (*OBSTACLES, MOVING))
-    base, joints = postures(around.machine, len(TIMES), 3)
+    base, joints = configurations(around.machine, len(TIMES), 3)
     found, told, exact = distances_along(around, base, joints, TIMES), known(around, base, joints), by_formula(around)
     assert_allclose(found[:, exact], told[:, exact], atol=1e-9)
     assert (found >= told - 1e-9)[found > 0].all()
@@ -72,7 +72,7 @@ def test_boxes_that_overlap_are_as_deep_as_the_formula_says() -> None:
     around = CollisionScene(
         machines()["slider"], [MovingObstacle(Box((0.3, 0.2, 0.25)), lambda t: (0.1, 0.1, 0.25), tumbling)]
     )
-    base, joints = postures(around.machine, len(TIMES), 7)
+    base, joints = configurations(around.machine, len(TIMES), 7)
     joints[:, 0] = np.linspace(-0.1, 0.3, len(TIMES))
     found, told = distances_along(around, base, joints, TIMES), known(around, base, joints)
     boxes = [all(isinstance(around.bodies[k].shape, Box) for k in pair[:2]) for pair in around.pairs]
@@ -99,7 +99,7 @@ def test_long_boxes_that_cross_edge_by_edge_are_as_deep_as_the_formula_says() ->
 def test_what_is_not_near_is_told_by_a_number_between(near: float) -> None:
     """From the least that is asked for up to the distance; what is nearer is exact."""
     around = CollisionScene(machines()["slider"], (*OBSTACLES, MOVING, HalfSpace((3, 0, 4), (0.2, 0.1, 0.3))))
-    base, joints = postures(around.machine, len(TIMES), 4)
+    base, joints = configurations(around.machine, len(TIMES), 4)
     exact = distances_along(around, base, joints, TIMES)
     found = distances_along(around, base, joints, TIMES, near)
     below = exact < near
@@ -112,7 +112,7 @@ def test_what_is_not_near_is_told_by_a_number_between(near: float) -> None:
 
 def test_each_pair_that_touches_is_named_where_it_is_nearest_the_deepest_first() -> None:
     around = CollisionScene(machines()["arm"], (*OBSTACLES, MOVING), clearance=0.05)
-    base, joints = postures(around.machine, len(TIMES), 5)
+    base, joints = configurations(around.machine, len(TIMES), 5)
     apart = distances_along(around, base, joints, TIMES)
     found = find_collisions(around, base, joints, TIMES)
     assert [touch.pair for touch in found] == np.argsort(apart.min(axis=0))[: len(found)].tolist()
@@ -127,7 +127,7 @@ def test_each_pair_that_touches_is_named_where_it_is_nearest_the_deepest_first()
 
 def test_one_base_for_all_samples_is_that_base_at_each() -> None:
     around = CollisionScene(FreeFloating(armoured_arm(4)), OBSTACLES)
-    base, joints = postures(around.machine, len(TIMES), 6)
+    base, joints = configurations(around.machine, len(TIMES), 6)
     same = np.tile(base[0], (len(TIMES), 1))
     each = distances_along(around, same, joints, TIMES)
     assert_allclose(distances_along(around, base[0], joints, TIMES), each)

@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from models import Arc, FixedBase, Helix, Link, Machine, Path, SmoothPath, merged, smooth
+from models import Arc, FixedBase, Helix, Link, Machine, Path, SmoothPath, merge_robots, smooth
 from models.spatial import quaternion_product
 from ocp import TipTask
 from ocp.motion.plan import Plan, plan
@@ -128,7 +128,7 @@ def pair() -> FixedBase:
     """Two Pandas on a stand."""
     places = {"left_": (0.0, 0.3, 0.0), "right_": (0.0, -0.3, 0.0)}
     stand = Link("stand", 10.0, inertia=np.eye(3))
-    return FixedBase(merged(stand, {"left_": panda_arm(), "right_": panda_arm()}, translations=places))
+    return FixedBase(merge_robots(stand, {"left_": panda_arm(), "right_": panda_arm()}, translations=places))
 
 
 def space_tip() -> tuple[Array, Array]:

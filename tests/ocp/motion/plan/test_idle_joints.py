@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from models import FixedBase, FreeFloating, Link, Robot, Sphere, attached, merged, planar_chain
+from models import FixedBase, FreeFloating, Link, Robot, Sphere, attach_tool, merge_robots, planar_chain
 from models.robot.kinematics import link_frames
 from ocp import TipTask, plan, plan_waypoints
 from ocp.motion.local.branches import ik_branches
@@ -37,7 +37,7 @@ GRIPPER = """<robot name="gripper"><link name="palm"/>
 def handed(arm: Robot, hand: str | Robot) -> FixedBase:
     """An arm with a gripper on its tip, which stays the tip."""
     gripper = Robot.from_urdf(hand, tip="palm") if isinstance(hand, str) else hand
-    return FixedBase(attached(arm, gripper, arm.tip_link, arm.tip_translation, keep_tip=True))
+    return FixedBase(attach_tool(arm, gripper, arm.tip_link, arm.tip_translation, keep_tip=True))
 
 
 def straight(machine: FixedBase, joints: Array, way: tuple[float, float, float], **more: Any) -> TipTask:
@@ -73,7 +73,7 @@ def test_what_moves_a_frame_is_read_from_the_tree() -> None:
     assert names_of(hand, bind(hand, TipTask(relative_to="right", **place)).idle) == []
     assert names_of(hand, bind(hand, [TipTask(**place), TipTask(link="left", begin=1, **place)]).idle) == []
     arm = planar_chain([0.4, 0.3], [1.0] * 2)
-    two = merged(Link("body", 3.0), {"l_": arm, "r_": arm})
+    two = merge_robots(Link("body", 3.0), {"l_": arm, "r_": arm})
     for machine, idle in ((FixedBase(two), ["r_joint1", "r_joint2"]), (FreeFloating(two), [])):
         assert names_of(machine, bind(machine, TipTask(link="l_link2", **place)).idle) == idle
     equations = bind(hand, TipTask(**place))
@@ -136,7 +136,7 @@ def test_a_given_start_says_where_fingers_stand() -> None:
 
 def test_the_other_arm_stands_still_while_one_works() -> None:
     arm = planar_chain([0.4, 0.3, 0.2], [1.0] * 3)
-    two = FixedBase(merged(Link("body", 3.0), {"l_": arm, "r_": arm}, translations={"r_": (0.0, 2.0, 0.0)}))
+    two = FixedBase(merge_robots(Link("body", 3.0), {"l_": arm, "r_": arm}, translations={"r_": (0.0, 2.0, 0.0)}))
     start = np.array([0.4, 0.8, -0.5])
     task = straight(FixedBase(arm), start, (-0.1, 0.15, 0), rows=[3, 4])
     alone = plan(FixedBase(arm), task, search="global", clearance=None)

@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from models import FixedBase, Machine, Path, Robot, SmoothPath, locked, planar_chain, smooth
+from models import FixedBase, Machine, Path, Robot, SmoothPath, lock_joints, planar_chain, smooth
 from ocp import ProblemError, SolveError, TipTask
 from ocp.motion.plan import Plan
 from ocp.motion.tasks.equations import bind, task_errors
@@ -58,7 +58,7 @@ def slide() -> Asked:
 def kinova() -> Asked:
     package, ending, told = ROBOTS["anymal-kinova"]
     whole = Robot.from_urdf(urdf_file(package, ending), **told)
-    machine = FixedBase(locked(whole, {n: 0.0 for n in whole.joint_names if not n.startswith("j2s6")}))
+    machine = FixedBase(lock_joints(whole, {n: 0.0 for n in whole.joint_names if not n.startswith("j2s6")}))
     turn, at = pose(machine, (), [0.3, 2.5, 1.5, 0.4, 1.0, 0.2])
     corners = at, at + np.array([0.0, 0.1, 0.05]), at + np.array([0.05, 0.15, 0.0])
     return machine, TipTask.along(line(*corners), 0.05, direction=turn[:, 2]), {}

@@ -11,7 +11,7 @@ import pytest
 
 from models import Box, CollisionScene, FixedBase
 from models.arrays import Array
-from models.robot.rebuild import locked
+from models.robot.rebuild import lock_joints
 from models.spatial import quaternion_from_rotation
 from ocp import DeadEnd, Limits, ProblemError, Unreachable, plan_waypoints
 from ocp.motion.local.collisions import distances_along
@@ -66,7 +66,7 @@ def test_with_a_joint_more_the_way_is_no_longer_than_with_that_joint_held() -> N
     name = machine.robot.joint_names[0]
     middle = (machine.robot.lower[0] + machine.robot.upper[0]) / 2
     found = plan_waypoints(machine, *told, clearance=None)
-    held = plan_waypoints(FixedBase(locked(machine.robot, {name: middle})), *told, clearance=None)
+    held = plan_waypoints(FixedBase(lock_joints(machine.robot, {name: middle})), *told, clearance=None)
     assert found.cost < held.cost
     assert found.steps[0] > 0
     tips = np.array([np.array(ca.DM(machine.tip_pose((), q).position)).ravel() for q in found.joints])

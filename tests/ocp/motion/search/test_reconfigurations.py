@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from models import FixedBase
 from models.arrays import Array
-from models.robot.rebuild import locked
+from models.robot.rebuild import lock_joints
 from ocp import DeadEnd, ProblemError, TipTask, inverse_kinematics, plan_waypoints
 from ocp.motion.local.closed_forms import closed_forms
 from ocp.motion.search.charts import Instant, SelfMotions
@@ -189,7 +189,7 @@ def test_with_a_free_direction_no_sequence_of_postures_has_fewer_pieces_or_is_sh
 
 def test_far_apart_parts_of_a_way_are_pieces_as_cheap_and_as_clear_as_by_themselves() -> None:
     problem = problem_of("panda__1cube")
-    machine = FixedBase(locked(problem.machine.robot, {"panda_joint4": -1.8}))
+    machine = FixedBase(lock_joints(problem.machine.robot, {"panda_joint4": -1.8}))
     rows, turns = [], []
     for begin in ([0.4, 0.3, -0.2, 0.3, 1.4, 0.5], [-1.8, 0.5, 0.6, -0.4, 1.9, -0.6]):
         for k in range(3):

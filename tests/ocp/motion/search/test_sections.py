@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from models import Box, FixedBase
 from models.arrays import Array
-from models.robot.rebuild import locked
+from models.robot.rebuild import lock_joints
 from ocp import DeadEnd, ProblemError, SolveError, Unreachable, WaypointPlan, plan_waypoints
 from ocp.motion.plan import waypoints
 from ocp.motion.plan.waypoints import WaypointSettings
@@ -77,7 +77,7 @@ def test_a_way_keeps_its_poses_and_steps_and_is_no_dearer_than_with_the_lift_hel
     assert found.bound == 0
     assert np.ptp(found.joints[:, 0]) > 0.1  # from one value to another
     for height in (0.0, 0.2, 0.38):
-        arm = FixedBase(locked(machine.robot, {machine.robot.joint_names[0]: height}))
+        arm = FixedBase(lock_joints(machine.robot, {machine.robot.joint_names[0]: height}))
         held = plan_waypoints(arm, *task(40), clearance=None, step=STEP)
         assert found.cost <= held.cost * (1 + 1e-6)
 
@@ -89,7 +89,7 @@ def test_what_is_in_reach_at_no_one_height_of_the_lift_is_done_by_lifting() -> N
     found = plan_waypoints(machine, places, turns, clearance=None, step=STEP)
     assert found.joints[-1, 0] > found.joints[0, 0] + 0.1
     for height in (0.0, 0.2, 0.38):
-        arm = FixedBase(locked(machine.robot, {machine.robot.joint_names[0]: height}))
+        arm = FixedBase(lock_joints(machine.robot, {machine.robot.joint_names[0]: height}))
         with pytest.raises(Unreachable):
             plan_waypoints(arm, places, turns, clearance=None, step=STEP)
 

@@ -8,7 +8,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from models import FixedBase, FreeFloating, Link, Machine, Robot, merged
+from models import FixedBase, FreeFloating, Link, Machine, Robot, merge_robots
 from models.paths import rest_to_rest
 from ocp import Solution
 from ocp.motion.tasks.equations import task_errors
@@ -39,12 +39,12 @@ def ur5() -> FixedBase:
 
 
 def floating_panda(momentum: Any = None) -> FreeFloating:
-    robot = merged(SATELLITE, {"": panda_arm()}, translations={"": (0.3, 0.0, 0.2)})
+    robot = merge_robots(SATELLITE, {"": panda_arm()}, translations={"": (0.3, 0.0, 0.2)})
     return FreeFloating(robot, conserved_momentum=momentum)
 
 
 def two_pandas(momentum: Any = None) -> FreeFloating:
-    robot = merged(
+    robot = merge_robots(
         SATELLITE,
         {"left_": panda_arm(), "right_": panda_arm()},
         translations={"left_": (0.3, 0.3, 0.2), "right_": (0.3, -0.3, 0.2)},

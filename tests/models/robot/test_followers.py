@@ -1,4 +1,4 @@
-"""Joints that follow others: a robot with them is one without them, restricted to where the ties let it be."""
+"""Followers: a robot with mimic joints is the robot without them, restricted by the couplings."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from models import (
     center_of_mass_motion,
     frame_jacobian,
     inverse_dynamics,
-    locked,
+    lock_joints,
     mass_matrix,
     momentum,
     momentum_matrix,
     momentum_rate,
-    pruned,
+    prune,
     robot_inertia,
     subtree,
     tip_jacobian,
@@ -128,9 +128,9 @@ def test_followers_are_locked_where_the_joint_that_they_follow_is(seed: int, siz
     rng = np.random.default_rng(seed)
     robot = random_robot(rng, size, followers=True)
     q, held = rng.normal(size=robot.dof), rng.random(robot.dof) < 0.5
-    fewer = locked(robot, {name: q[i] for i, name in enumerate(robot.joint_names) if held[i]})
+    fewer = lock_joints(robot, {name: q[i] for i, name in enumerate(robot.joint_names) if held[i]})
     assert fewer.joint_names == tuple(name for i, name in enumerate(robot.joint_names) if not held[i])
-    assert fewer.drives.keys() == {name for name, drive in robot.drives.items() if not held[drive.column]}
+    assert fewer.couplings.keys() == {name for name, drive in robot.couplings.items() if not held[drive.column]}
     for name, pose in numeric_poses(robot, q).items():
         np.testing.assert_allclose(np.c_[numeric_poses(fewer, q[~held])[name]], np.c_[pose], **NEAR)
     np.testing.assert_allclose(numeric(mass_matrix(fewer, q[~held])), numeric(mass_matrix(robot, q))[~held][:, ~held])
@@ -144,10 +144,10 @@ def test_what_is_cut_off_leaves_the_others_tied_to_each_other(seed: int, size: i
     other = robot.links[int(rng.integers(len(robot.links)))].name
     q = rng.normal(size=robot.dof)
     at, poses = joint_positions(robot, q), numeric_poses(robot, q)
-    for part in (pruned(robot, other), subtree(robot, other)):
+    for part in (prune(robot, other), subtree(robot, other)):
         own = [at[name] for name in part.joint_names]
-        assert joint_positions(part, own) == pytest.approx({name: at[name] for name in part.drives})
-        leaders = {robot.drives[name].column for name in part.drives}
+        assert joint_positions(part, own) == pytest.approx({name: at[name] for name in part.couplings})
+        leaders = {robot.couplings[name].column for name in part.couplings}
         assert part.dof == len(leaders)
         for name, pose in numeric_poses(part, own, poses[part.root]).items():
             np.testing.assert_allclose(np.c_[pose], np.c_[poses[name]], **NEAR)
@@ -167,10 +167,10 @@ def gripper(*mimics: Mimic | None, kinds: str = "ppp", **limits: float) -> Robot
 def test_a_follower_that_is_locked_follows_no_more_and_one_of_a_fixed_joint_stands_at_its_offset() -> None:
     robot = gripper(None, Mimic("j0", 2.0, 0.5), Mimic("j1", 1.0, 1.0))
     assert robot.joint_names == ("j0",)
-    by_hand = locked(robot, {"j1": 3.0})
+    by_hand = lock_joints(robot, {"j1": 3.0})
     assert by_hand.joint_names == ("j0",)
     assert [by_hand.joint(name).translation[2] for name in ("j1", "j2")] == [3.0, 4.0]
-    assert locked(robot, {"j0": 0.25}).joint("j2").translation[2] == 2.0
+    assert lock_joints(robot, {"j0": 0.25}).joint("j2").translation[2] == 2.0
     still = gripper(None, Mimic("j0", 2.0, 0.5), Mimic("j1", 1.0, 1.0), kinds="fpp")
     assert still.dof == 0
     assert [joint.translation[2] for joint in still.joints] == [0.0, 0.5, 1.5]

@@ -1,4 +1,4 @@
-"""Obstacles that move: look-up tables are what casadi makes of them, and what is no table is named."""
+"""Moving obstacles: look-up tables agree with CasADi's, and other functions are refused by name."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from models import ModelError, MovingObstacle, Sphere
-from models.machines.moving_obstacle import without_tables
+from models.machines.moving_obstacle import expand_tables
 
 BALL = Sphere(0.1, (0, 0, 0))
 
@@ -23,7 +23,7 @@ def test_a_table_that_is_written_out_is_the_table(kind: str, count: int, entries
     knots = np.sort(rng.uniform(-3, 3, count))
     table = ca.interpolant("table", kind, [knots.tolist()], rng.normal(size=count * entries).tolist())
     t = ca.SX.sym("t")
-    found = ca.Function("found", [t], [without_tables(table(2 * t + 1))])
+    found = ca.Function("found", [t], [expand_tables(table(2 * t + 1))])
     assert ca.OP_CALL not in {found.instruction_id(k) for k in range(found.n_instructions())}
     times = np.concatenate([(knots[1:-1] - 1) / 2, rng.uniform(-2.5, 1.5, 500)])[None]
     known = np.array(table(2 * times + 1))
