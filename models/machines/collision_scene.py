@@ -23,9 +23,9 @@ from models.machines.moving_obstacle import MovingObstacle
 from models.machines.pair_gradients import WORLD, PlacedShape, distance_gradients
 from models.robot.kinematics import link_frames
 from models.robot.robot import Robot
-from models.shapes.bodies import Body, LinkMesh, MissingRule, RigidParts, arms, bodies_of
+from models.shapes.bodies import Body, LinkMesh, MissingRule, RigidParts, collision_bodies, lever_arms
 from models.shapes.distance import COLUMNS, column, distance, pair_function, soft_minimum
-from models.shapes.pairs import ASSUMED, COVERED, SRDF, STILL, TOLD, Reason, checked_pairs
+from models.shapes.pairs import ASSUMED, COVERED, IGNORED, IMMOBILE, SRDF, Reason, checked_pairs
 from models.shapes.shapes import KINDS, Box, Shape, checked_shape
 from models.spatial import Expression, Frame, expression
 
@@ -65,7 +65,7 @@ class CollisionScene:
         missing: "raise" an error for a missing mesh, or "skip" it with a warning.
         limits: Assume that the joints keep the robot's position limits, so that pairs that never collide within them
             are excluded.
-        covered: Bodies that replace the meshes of links, as in `models.shapes.bodies.bodies_of`; computed from the mesh
+        covered: Bodies that replace the meshes of links, as in `collision_bodies`; computed from the mesh
             files if None. Holds the bodies in use after construction.
         bodies: All shapes of the scene: of links, obstacles and hulls of meshes.
         pairs: Two bodies and the reference frame of each pair, -1 for the world. Shape (n, 3).
@@ -111,7 +111,7 @@ class CollisionScene:
             message = f"scene: machine must be a FixedBase(robot) or another machine, not {self.machine!r}"
             raise ModelError(message, name="machine", value=self.machine)
         folders = _checked_list(self.folders, "folders")
-        own = bodies_of(robot, folders=folders, missing=self.missing, covered=self.covered)
+        own = collision_bodies(robot, folders=folders, missing=self.missing, covered=self.covered)
         object.__setattr__(self, "covered", _by_mesh(robot, own))
         link_pairs, obstacle_pairs = self._ignored_pairs()
         unlimited: dict[str, Any] = {"lower": -np.inf, "upper": np.inf}
@@ -141,9 +141,9 @@ class CollisionScene:
             name = f"obstacle {number}"
             for i, body in enumerate(own):
                 if {(body.link, name), (name, body.link)} & ignored:
-                    excluded[body.link, name] = TOLD
+                    excluded[body.link, name] = IGNORED
                 elif not self._moves(body.link) and not isinstance(obstacle, MovingObstacle):
-                    excluded[body.link, name] = STILL
+                    excluded[body.link, name] = IMMOBILE
                 else:
                     pairs.append((i, number))
         return pairs, excluded
@@ -192,7 +192,7 @@ class CollisionScene:
 
     def _reference_link(self, first: Body, second: Body) -> str:
         """Return the last link that carries both bodies."""
-        return self._parts.meeting(*(self._parts.of_link[body.link] for body in (first, second)))
+        return self._parts.common_part(*(self._parts.of_link[body.link] for body in (first, second)))
 
     @property
     def labels(self) -> tuple[tuple[str, str], ...]:
@@ -369,8 +369,8 @@ class CollisionScene:
         path = parts.path(parts.of_link[base_link], parts.of_link[link])[1]
         infinite = np.full(robot.dof, np.inf)
         low, high = (robot.lower, robot.upper) if self.limits else (-infinite, infinite)
-        shape = placed.shape.placed(*parts.place[link])
-        lengths, reach = arms(robot, [(step, True) for step in path], shape, low, high)
+        shape = placed.shape.placed(*parts.pose[link])
+        lengths, reach = lever_arms(robot, [(step, True) for step in path], shape, low, high)
         for (joint, *_), arm in zip(path, lengths, strict=True):
             column, ratio, _ = robot.couplings[joint.name]
             slides = joint.kind == "prismatic"

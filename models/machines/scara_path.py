@@ -85,7 +85,7 @@ def scara_along(scara: Scara, path: SmoothPath, elbow: Elbow = "left", *, cleara
     checked_nonnegative(clearance, "scara", "clearance", "m")
     _check_reach(scara, path, clearance)
     rates = scara.inverse_rates(elbow)
-    s = path.dense(8, 16)
+    s = path.sample_distances(8, 16)
     turn = path.turn(s)
     tilt = np.abs(turn.quaternion[:, 1:3]).max(axis=1)
     if tilt.max() > 1e-9:
@@ -143,7 +143,7 @@ def _turns(joints_along: ScaraPath) -> Array:
 
 def _check_reach(scara: Scara, path: SmoothPath, clearance: float) -> None:
     """Raise ModelError for a path out of reach, or too close to a singularity."""
-    s = path.dense(8, 32)
+    s = path.sample_distances(8, 32)
 
     def radius(lengths: Array) -> Array:
         return np.asarray(np.linalg.norm((path.at(lengths).position - scara.mount)[:, :2], axis=1))

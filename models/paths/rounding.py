@@ -9,7 +9,7 @@ from warnings import warn
 import numpy as np
 from numpy.typing import NDArray
 
-from models.arrays import Array, ArrayInput, checked_choice, checked_instance, one_for_each
+from models.arrays import Array, ArrayInput, checked_broadcast, checked_choice, checked_instance
 from models.errors import ModelError, ModelWarning
 from models.paths.arc_length import cells
 from models.paths.blends import (
@@ -122,11 +122,11 @@ def _remaining_distances(
         raise ModelError(message, name="deviation", value=deviation)
     path, count = corners.path, len(corners.vertices)
     if remaining is not None:
-        requested = one_for_each(remaining, count, "path", "remaining", "vertices", positive=True, unit="m")
+        requested = checked_broadcast(remaining, count, "path", "remaining", "vertices", positive=True, unit="m")
         distances = _without_overlap(path, requested, overlap)
         _warn_if_smaller(path, requested, distances)
         return corners.with_best_shape(distances) if free else corners, distances
-    tolerance = one_for_each(deviation, count, "path", "deviation", "vertices", positive=True, unit="m")
+    tolerance = checked_broadcast(deviation, count, "path", "deviation", "vertices", positive=True, unit="m")
     distances = _within_tolerance(corners, tolerance, overlap)
     if free and corners.curved.size:
         corners = corners.with_best_shape(distances)

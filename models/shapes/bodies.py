@@ -324,7 +324,7 @@ def lever_arms(
             levers.append(float(np.linalg.norm(offset - (offset @ axis) * axis)) + reach)
             reach = float(np.linalg.norm(offset)) + reach
         if step.joint.kind == "prismatic":
-            column, ratio, zero = robot.drives[step.joint.name]
+            column, ratio, zero = robot.couplings[step.joint.name]
             ends = ratio * np.array([low[column], high[column]]) + zero
             reach += float(np.abs(ends).max())
     step, down = chain[0]

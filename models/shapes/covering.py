@@ -18,7 +18,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from models.arrays import Array, ArrayInput, checked_array, checked_indices
-from models.cache import keep, kept, key_of, version_of
+from models.cache import cache_key, load_value, source_version, store_value
 from models.errors import ModelError
 from models.shapes.hull import convex_hull, nearest_directions
 from models.shapes.shapes import Box, Capsule
@@ -101,11 +101,11 @@ def cover(vertices: ArrayInput, faces: ArrayInput) -> tuple[Cover, ...]:
         message = f"cover: faces have shape {corners.shape}, expected (m, 3)"
         raise ModelError(message, name="faces", value=faces, limit=("m", 3))
     triangles = points[corners]
-    key = key_of(version_of(__name__), "cover", triangles)
-    known = _from_json(kept(key), triangles.reshape(-1, 3))
+    key = cache_key(source_version(__name__), "cover", triangles)
+    known = _from_json(load_value(key), triangles.reshape(-1, 3))
     if known is None:
         known = fit_cover(triangles)
-        keep(key, [_to_json(each) for each in known])
+        store_value(key, [_to_json(each) for each in known])
     return known
 
 

@@ -16,16 +16,16 @@ from numpy.typing import NDArray
 from models.arrays import (
     Array,
     ArrayInput,
+    checked_broadcast,
     checked_count,
     checked_each,
     checked_instance,
     checked_nonnegative,
-    one_for_each,
 )
-from models.cache import keep, kept, key_of, version_of
+from models.cache import cache_key, load_value, source_version, store_value
 from models.errors import ModelError, ModelWarning
 from models.robot.robot import Robot
-from models.robot.urdf import parsed, text_of
+from models.robot.urdf import parse_urdf, text_of
 from models.shapes.bodies import Body, JointStep, RigidParts, lever_arms
 from models.shapes.hull import gap_along, nearest_directions
 from models.shapes.shapes import Box, Shape
@@ -137,8 +137,8 @@ def checked_pairs(
     bodies = checked_each(bodies, Body, owner, "bodies")
     for body in bodies:
         robot.link(body.link)
-    low = robot.lower if lower is None else one_for_each(lower, robot.dof, owner, "lower", "joints", finite=False)
-    high = robot.upper if upper is None else one_for_each(upper, robot.dof, owner, "upper", "joints", finite=False)
+    low = robot.lower if lower is None else checked_broadcast(lower, robot.dof, owner, "lower", "joints", finite=False)
+    high = robot.upper if upper is None else checked_broadcast(upper, robot.dof, owner, "upper", "joints", finite=False)
     if (low > high).any():
         k = int(np.flatnonzero(low > high)[0])
         message = f"{owner}: lower {low[k]} of joint {robot.joint_names[k]!r} is above upper {high[k]}"
@@ -150,7 +150,7 @@ def checked_pairs(
     named |= dict.fromkeys(_ignored_pairs(robot, ignored), IGNORED)
 
     key = _key(robot, bodies, named, low, high, margin, count, seed)
-    if (known := _read(kept(key), bodies)) is not None:
+    if (known := _read(load_value(key), bodies)) is not None:
         return known
     parts = RigidParts.of(robot)
     adjacent = parts.adjacent({parts.of_link[body.link] for body in bodies})
@@ -172,7 +172,7 @@ def checked_pairs(
     open_links = {(bodies[i].link, bodies[j].link) for i, j in checked}
     left = {k: why for k, why in left.items() if k[0] != k[1] and (k not in open_links or why in ASSUMED)}
     pairs = Pairs(tuple(checked), left)
-    keep(key, {"checked": pairs.checked, "left": [[*pair, why.value] for pair, why in pairs.left.items()]})
+    store_value(key, {"checked": pairs.checked, "left": [[*pair, why.value] for pair, why in pairs.left.items()]})
     return pairs
 
 
@@ -181,13 +181,13 @@ def _key(robot: Robot, bodies: Sequence[Body], named: Mapping[frozenset[str], Re
     parts = list(numbers)
     words = ["pairs", *(f"{sorted(pair)} {why}" for pair, why in named.items())]
     for joint in robot.joints:
-        words.append(f"{joint.name} {joint.kind} {joint.parent} {joint.child} {robot.drives.get(joint.name)}")
+        words.append(f"{joint.name} {joint.kind} {joint.parent} {joint.child} {robot.couplings.get(joint.name)}")
         parts += [joint.axis, joint.translation, joint.rotation]
     for body in bodies:
         shape, points = body.shape, np.zeros(0) if body.mesh is None else body.mesh.points
         words.append(f"{body.link} {type(shape).__name__}")
         parts += [shape.core, shape.swept_radius, body.overhang, points]
-    return key_of(version_of(__name__), "\n".join(words), *parts)
+    return cache_key(source_version(__name__), "\n".join(words), *parts)
 
 
 def _read(value: Any, bodies: Sequence[Body]) -> Pairs | None:
@@ -213,7 +213,7 @@ def _ignored_pairs(robot: Robot, pairs: Any) -> list[frozenset[str]]:
 def _disabled(robot: Robot, source: str | os.PathLike[str]) -> list[frozenset[str]]:
     """Return the pairs of <disable_collisions> whose links exist."""
     known = {link.name for link in robot.links}
-    elements = parsed(source).findall("disable_collisions")
+    elements = parse_urdf(source).findall("disable_collisions")
     pairs = [frozenset(text_of(each, key, "SRDF") for key in ("link1", "link2")) for each in elements]
     if unknown := sorted({name for pair in pairs for name in pair if name not in known}):
         message = f"the SRDF file names links that {robot.name!r} does not have: {', '.join(map(repr, unknown))}"
@@ -320,7 +320,7 @@ class _BodyPair:
 
         Returns ALWAYS for hulls that overlap on the whole first grid, else None.
         """
-        columns = sorted({self.robot.drives[step.joint.name].column for step in (*self.up, *self.down)})
+        columns = sorted({self.robot.couplings[step.joint.name].column for step in (*self.up, *self.down)})
         start = np.where(np.isfinite(low), low, -np.pi)[columns]
         end = np.minimum(np.where(np.isfinite(high), high, np.pi)[columns], start + 2 * np.pi)
         step = (end - start) / SETTINGS.grid
@@ -374,7 +374,7 @@ class _BodyPair:
     def _chain(self, steps: Sequence[JointStep], q: Array) -> tuple[Array, Array]:
         turn, shift = np.tile(np.eye(3), (len(q), 1, 1)), np.zeros((len(q), 3))
         for step in steps:
-            column, ratio, offset = self.robot.drives[step.joint.name]
+            column, ratio, offset = self.robot.couplings[step.joint.name]
             position = ratio * q[:, column] + offset
             shift = shift + turn @ step.translation
             turn = turn @ step.rotation
@@ -430,7 +430,7 @@ class _BodyPair:
         arms_first = lever_arms(self.robot, reverse, self.first, low, high)[0][::-1]
         levers = []
         for (step, _), *arms in zip(chain, arms_second, arms_first, strict=True):
-            column, ratio, _ = self.robot.drives[step.joint.name]
+            column, ratio, _ = self.robot.couplings[step.joint.name]
             levers.append(_Lever(column, ratio, 0.0 if step.joint.kind == "prismatic" else max(min(arms), 1e-300)))
         return levers
 

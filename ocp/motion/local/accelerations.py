@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 
 from models.arrays import Array
-from models.machines.standing import External, Standing, StandingMotion, evaluate, motion_function, wrenches_at
+from models.machines.standing import External, Standing, StandingMotion, evaluate_motion, motion_function, wrenches_at
 from models.robot.indices import joint_limit_index, manipulability_of
 from models.robot.kinematics import center_of_mass_motion, momentum
 from ocp.console import interruptible
@@ -454,7 +454,7 @@ class _Recorder:
         n = states.shape[1] // 2
         q, qd = states[:, :n], states[:, n:]
         qdd, gap = (np.array(part).T for part in self._law.map(len(times))(times[None, :], q.T, qd.T))
-        outputs = evaluate(self._motion, times, q, qd, qdd)
+        outputs = evaluate_motion(self._motion, times, q, qd, qdd)
         not_finite = ~np.isfinite(np.hstack([states, qdd, outputs["ground_force"]])).all(axis=1)
         vertical = outputs["ground_force"][:, 2]
         speed = np.abs(qd).max(axis=1)

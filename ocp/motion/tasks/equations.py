@@ -74,11 +74,11 @@ class TaskEquations:
 
         On a floating base or a standing machine no joint is idle: each one moves the base or the balance.
         """
-        drives = self.machine.robot.drives
+        couplings = self.machine.robot.couplings
         fixed_base = isinstance(self.machine, FixedBase) and not isinstance(self.machine, Standing)
         idle = np.full(self.machine.joint_size, fixed_base)
         for robot in (tip.robot for part in self.bound for tip in (part.tip, part.reference) if tip is not None):
-            idle[[drives[joint.name].column for joint in robot.path_to(robot.tip_link) if joint.moves]] = False
+            idle[[couplings[joint.name].column for joint in robot.path_to(robot.tip_link) if joint.moves]] = False
         return idle
 
     def unit(self, pose: str = "/s", velocity: str = "/s") -> str:

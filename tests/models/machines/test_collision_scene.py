@@ -111,7 +111,7 @@ def test_distances_are_those_of_the_hulls(name: str) -> None:
         for i, (one, other, _) in enumerate(scene.pairs):
             a, c = sides[2 * i][None], sides[2 * i + 1][None]
             shapes = scene.bodies[one].shape, scene.bodies[other].shape
-            radii = shapes[0].swelling + shapes[1].swelling
+            radii = shapes[0].swept_radius + shapes[1].swept_radius
             way = -shapes[1].normal[None] if isinstance(shapes[1], HalfSpace) else nearest_directions(a, c)[0]
             gap = gap_along(way, a, c)[0]
             if any(isinstance(shape, Cylinder) for shape in shapes):  # of which the distance is a bound from below
