@@ -18,16 +18,16 @@ from ocp.app.check.verdict import bounds_of, check_trajectory
 from ocp.app.files import read_trajectory, read_waypoints
 from ocp.app.files.outputs import SUFFIXES, checked_output
 from ocp.app.files.task_file import read_obstacles, read_task
-from ocp.app.planned import EXPORTED, check_period, export, run_task
 from ocp.app.progress import Progress
+from ocp.app.run_task import EXPORT_KINDS, check_period, export_plan, run_task
 from ocp.errors import ProblemError
 from ocp.motion.plan import Plan
 from ocp.storage import write_text
 from ocp.tolerances import LIMIT_SHARE, ORIENTATION_TOLERANCE_RAD
 
-__all__ = ["Words", "subcommands"]
+__all__ = ["CommandFunction", "subcommands"]
 
-Words: TypeAlias = Callable[[argparse.Namespace, Progress], tuple[int, str, Any]]
+CommandFunction: TypeAlias = Callable[[argparse.Namespace, Progress], tuple[int, str, Any]]
 """What a command does: options and progress to exit status, text and what JSON shows."""
 
 CHECK = """Check anybody's trajectory for a robot: limits, jumps, units, clearance proven between the samples.
@@ -48,7 +48,7 @@ CHECK_EXAMPLES = """examples:
 PLAN = """Plan the cheapest motion that a task file asks for, audit it, and write what the file says.
 
 The task file is TOML: [robot] urdf, tip; [path] file or points, speed; and if wanted [limits], [cost], [search],
-[surroundings], [[obstacle]], [output]. What is wrong in it is said with its line and what was expected."""
+[scene], [[obstacle]], [output]. What is wrong in it is said with its line and what was expected."""
 PLAN_EXAMPLES = """examples:
   selfmotion plan seam.toml -o seam.npz
   selfmotion plan seam.toml --json | jq .cost
@@ -123,7 +123,7 @@ def subcommands(parser: argparse.ArgumentParser) -> None:
     _force(check)
     plan = _command(commands, "plan", "plan what a task file asks for", PLAN, PLAN_EXAMPLES, run_plan)
     plan.set_defaults(
-        called={"missing='skip'": '[surroundings] meshes = "skip"', "folders=[": "[surroundings] folders = ["}
+        called={"missing='skip'": '[scene] meshes = "skip"', "folders=[": "[scene] folders = ["}
     )
     _file(plan, "task", "TOML file")
     _file(plan, "--output", "the plan (.npz), whatever the task file says", short="-o")
@@ -131,7 +131,7 @@ def subcommands(parser: argparse.ArgumentParser) -> None:
     _force(plan)
     other = _command(commands, "export", "write a plan in another format", EXPORT, EXPORT_EXAMPLES, run_export)
     _file(other, "plan", "file of a plan (.npz)")
-    _file(other, "file", f"to write: {', '.join(SUFFIXES[kind][0] for kind in EXPORTED)}")
+    _file(other, "file", f"to write: {', '.join(SUFFIXES[kind][0] for kind in EXPORT_KINDS)}")
     _force(other)
     other.add_argument("--period", type=float, default=0.01, metavar="S", help="of samples, s (default: 0.01)")
     report = _command(commands, "report", "one HTML file about a plan", REPORT, REPORT_EXAMPLES, run_report)
@@ -170,7 +170,9 @@ def subcommands(parser: argparse.ArgumentParser) -> None:
     shell.set_defaults(whole=parser, quiet=True)
 
 
-def _command(commands: Any, name: str, short: str, about: str, examples: str, run: Words) -> argparse.ArgumentParser:
+def _command(
+    commands: Any, name: str, short: str, about: str, examples: str, run: CommandFunction
+) -> argparse.ArgumentParser:
     made: argparse.ArgumentParser = commands.add_parser(
         name, help=short, description=about, epilog=examples, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -236,7 +238,7 @@ def check_options(parser: argparse.ArgumentParser) -> None:
     corners = ("X0", "X1", "Y0", "Y1")
     stands.add_argument("--foot", nargs=4, type=float, metavar=corners, help="what it stands on, m; else its shapes")
     stands.add_argument("--friction", type=float, default=np.inf, help="of the ground (default: no limit)")
-    around = parser.add_argument_group("surroundings")
+    around = parser.add_argument_group("scene")
     _file(around, "--obstacles", "TOML of [[obstacle]] tables: shape, size, position, ...")
     around.add_argument("--clearance", type=float, default=0.0, metavar="M", help="least distance, m (default: 0)")
     around.add_argument("--no-clearance", action="store_true", help="do not look at distances")
@@ -258,7 +260,7 @@ def run_check(options: argparse.Namespace, progress: Progress) -> tuple[int, str
         checked_output("report", options.report, force=options.force)
     progress("reading the robot")
     robot = read_robot(options)
-    place, turn = mount_of(options)
+    place, turn = base_pose(options)
     progress("reading the trajectory")
     moving = [joint.name for joint in robot.joints if joint.moves]
     columns = None if options.columns is None else [name.strip() for name in options.columns.split(",")]
@@ -293,16 +295,16 @@ def run_check(options: argparse.Namespace, progress: Progress) -> tuple[int, str
         time_unit=options.time_unit,
         unwrap=options.unwrap,
         names_confirmed=options.names_confirmed,
-        told=progress,
+        progress=progress,
     )
     if options.report is not None:
         progress("report")
-        from ocp.app.view.pictures import of_shapes
+        from ocp.app.view.pictures import obstacles_of_shapes
         from ocp.app.view.report import report_of_check  # draws, which takes a while to import
 
         machine = FreeFloating(robot) if options.floating else FixedBase(robot, place, turn)
         report = report_of_check(
-            found, machine, bounds_of(robot, **limits), of_shapes(obstacles), tuple(options.folder)
+            found, machine, bounds_of(robot, **limits), obstacles_of_shapes(obstacles), tuple(options.folder)
         )
         write_text(checked_output("report", options.report, force=options.force), report.html())
     return (0 if found.passed else 1), str(found), found.to_dict()
@@ -317,10 +319,10 @@ def run_plan(options: argparse.Namespace, progress: Progress) -> tuple[int, str,
 
 
 def run_export(options: argparse.Namespace, progress: Progress) -> tuple[int, str, Any]:
-    """The command `export`."""
+    """The command `export_plan`."""
     made = Plan.load(options.plan)
     progress("writing")
-    export(made, options.file, options.period, options.force)
+    export_plan(made, options.file, options.period, options.force)
     return 0, f"written: {options.file}", {"written": str(options.file)}
 
 
@@ -340,14 +342,14 @@ def run_report(options: argparse.Namespace, progress: Progress) -> tuple[int, st
 
 def run_view(options: argparse.Namespace, progress: Progress) -> tuple[int, str, Any]:
     """The command `view`."""
-    from ocp.app.view.player import Served, page
+    from ocp.app.view.player import PageServer, build_page
 
     if options.page is not None:
         checked_output("report", options.page, force=options.force)
     progress("reading the motions")
     shown = motions_of(options)
     progress("drawing")
-    text, missing = page(
+    text, missing = build_page(
         shown, title=options.title or options.plan.name, folders=options.folder, meshes=not options.no_meshes
     )
     for name, reason in missing.items():
@@ -359,7 +361,7 @@ def run_view(options: argparse.Namespace, progress: Progress) -> tuple[int, str,
         write_text(checked_output("report", options.page, force=options.force), text)
         told |= {"written": str(options.page), "bytes": len(text.encode())}
         return status, f"{first.verdict}\nwritten: {options.page}".strip(), told
-    with Served(text, options.port) as served:
+    with PageServer(text, options.port) as served:
         print(f"{options.plan.name} on {served.address}; Ctrl-C ends it", file=sys.stderr, flush=True)
         if options.open:
             webbrowser.open(served.address)
@@ -369,7 +371,7 @@ def run_view(options: argparse.Namespace, progress: Progress) -> tuple[int, str,
 
 def motions_of(options: argparse.Namespace) -> list[Any]:
     """What the files of `view` hold, the plan first."""
-    from ocp.app.view.shown import shown_plan, shown_solution, shown_trajectory
+    from ocp.app.view.animation import animate_plan, animate_solution, animate_trajectory
     from ocp.solution import Solution
 
     files = [options.plan, *options.beside]
@@ -380,20 +382,20 @@ def motions_of(options: argparse.Namespace) -> list[Any]:
     allowed: dict[str, Any] = {"tolerances": dict(options.tolerance)} if options.tolerance else {}
     if options.robot is not None:
         robot = read_robot(options)
-        machine = FreeFloating(robot) if options.floating else FixedBase(robot, *mount_of(options))
+        machine = FreeFloating(robot) if options.floating else FixedBase(robot, *base_pose(options))
         states = {"joints": options.joints, "base": options.base}
-        found = [shown_solution(Solution.load(options.plan), machine, names[0], **states, **allowed)]
+        found = [animate_solution(Solution.load(options.plan), machine, names[0], **states, **allowed)]
     else:
         made = Plan.load(options.plan)
-        machine, found = made.machine, [shown_plan(made, names[0], **allowed)]
+        machine, found = made.machine, [animate_plan(made, names[0], **allowed)]
     for file, name in zip(options.beside, names[1:], strict=True):
         if file.suffix.lower() != ".npz":
             moving = [joint.name for joint in machine.robot.joints if joint.moves]
-            found.append(shown_trajectory(read_trajectory(file, joints=moving), machine, name))
+            found.append(animate_trajectory(read_trajectory(file, joints=moving), machine, name))
         elif options.robot is not None:
-            found.append(shown_solution(Solution.load(file), machine, name, **states, **allowed))
+            found.append(animate_solution(Solution.load(file), machine, name, **states, **allowed))
         else:
-            found.append(shown_plan(Plan.load(file), name, **allowed))
+            found.append(animate_plan(Plan.load(file), name, **allowed))
     return found
 
 
@@ -437,7 +439,7 @@ def read_robot(options: argparse.Namespace) -> Robot:
     return robot
 
 
-def mount_of(options: argparse.Namespace) -> tuple[Array, Array]:
+def base_pose(options: argparse.Namespace) -> tuple[Array, Array]:
     """Translation (3,), m, and rotation (3, 3) of the base in world."""
     numbers = options.mount or [0.0] * 6
     return np.array(numbers[:3]), np.array(rotation_from_rpy(*numbers[3:]), dtype=float)

@@ -16,7 +16,7 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 from models import ModelError, ModelWarning
-from ocp.app.arguments import Words, subcommands
+from ocp.app.arguments import CommandFunction, subcommands
 from ocp.app.progress import Progress
 from ocp.errors import AuditError, ProblemError, SolveError, checked_each
 
@@ -71,7 +71,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
-    asked: Words = options.run
+    asked: CommandFunction = options.run
     try:
         with warnings.catch_warnings(), Progress(f"selfmotion {options.command}", options.quiet) as progress:
             warnings.simplefilter("default", ModelWarning)

@@ -32,7 +32,7 @@ from ocp.motion.plan import Plan
 from ocp.solution import Solution
 from ocp.storage import open_unlinked
 
-__all__ = ["Parcel", "digest_of", "key_of", "neighbours", "packed", "plain", "text_of", "unpacked"]
+__all__ = ["Payload", "as_data", "canonical_text", "digest_of", "key_of", "neighbours", "pack_result", "unpack_result"]
 
 DEEPEST = 64
 """Of data within data."""
@@ -41,14 +41,14 @@ KINDS: dict[str, type[Plan] | type[Solution]] = {"Plan": Plan, "Solution": Solut
 DATA = "numbers, texts, True, False, None, and lists and dictionaries by name of these"
 
 
-class Parcel(NamedTuple):
+class Payload(NamedTuple):
     """A result on its way: what its text says, and the bytes of its files."""
 
     record: dict[str, Any]
     files: tuple[bytes, ...] = ()
 
 
-def plain(value: Any, where: str, keep: Callable[[Any, tuple[Any, ...]], bool] = lambda value, at: False) -> Any:
+def as_data(value: Any, where: str, keep: Callable[[Any, tuple[Any, ...]], bool] = lambda value, at: False) -> Any:
     """A value as data of its own: arrays and tuples as lists, numbers of numpy as Python's.
 
     Args:
@@ -98,14 +98,14 @@ def plain(value: Any, where: str, keep: Callable[[Any, tuple[Any, ...]], bool] =
     return walk(value, ())
 
 
-def text_of(value: Any, where: str) -> str:
+def canonical_text(value: Any, where: str) -> str:
     """The one text of data: the order of names does not count, 1 and 1.0 are two, every digit of a float does.
 
     Raises:
-        ProblemError: As :func:`plain`.
+        ProblemError: As :func:`as_data`.
     """
     try:
-        return json.dumps(plain(value, where), sort_keys=True, separators=(",", ":"), allow_nan=False)
+        return json.dumps(as_data(value, where), sort_keys=True, separators=(",", ":"), allow_nan=False)
     except ProblemError:
         raise
     except ValueError as error:  # an integer of more digits than Python writes
@@ -117,7 +117,7 @@ def key_of(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
-def packed(value: Any) -> Parcel:
+def pack_result(value: Any) -> Payload:
     """What a function returned, with its cost and its verdict.
 
     Cost: of a plan or a solution its own, of a dictionary its ``"cost"`` or that of the only plan in it, and a single
@@ -130,12 +130,12 @@ def packed(value: Any) -> Parcel:
     found: list[tuple[Any, list[Any]]] = []
 
     def keep(part: Any, at: tuple[Any, ...]) -> bool:
-        kept = isinstance(part, Plan | Solution)
-        if kept:
+        cached = isinstance(part, Plan | Solution)
+        if cached:
             found.append((part, list(at)))
-        return kept
+        return cached
 
-    data = plain(value, "the result", keep)
+    data = as_data(value, "the result", keep)
     named = data if isinstance(data, dict) else {}
     only = found[0][0] if len(found) == 1 else None
     cost = named.get("cost", data if only is None else only.cost)
@@ -149,12 +149,12 @@ def packed(value: Any) -> Parcel:
         {"kind": "Plan" if isinstance(part, Plan) else "Solution", "at": at, "bytes": len(file)}
         for (part, at), file in zip(found, files, strict=True)
     ]
-    told = {"cost": None if cost is None else plain(float(cost), "the result's cost"), "verdict": verdict}
-    return Parcel({**told, "value": data, "files": kinds}, files)
+    told = {"cost": None if cost is None else as_data(float(cost), "the result's cost"), "verdict": verdict}
+    return Payload({**told, "value": data, "files": kinds}, files)
 
 
-def unpacked(parcel: Parcel) -> Any:
-    """What the function had returned, of what :func:`packed` made; tuples and arrays are lists.
+def unpack_result(parcel: Payload) -> Any:
+    """What the function had returned, of what :func:`pack_result` made; tuples and arrays are lists.
 
     Raises:
         ProblemError: A file is damaged.
@@ -207,7 +207,7 @@ def neighbours(tasks: Mapping[str, Any], names: Sequence[str]) -> dict[str, str 
         ProblemError: A task has no such numbers, or not as many as the others; names it.
     """
     order = sorted(tasks)
-    each = [place_of(tasks[key], names) for key in order]
+    each = [coordinates_of(tasks[key], names) for key in order]
     for key, place in zip(order, each, strict=True):
         if len(place) != len(each[0]):
             words = f"near: {len(place)} numbers in the task {tasks[key]!r}, {len(each[0])} in another"
@@ -228,7 +228,7 @@ def neighbours(tasks: Mapping[str, Any], names: Sequence[str]) -> dict[str, str 
     return found
 
 
-def place_of(task: Any, names: Sequence[str]) -> Array:
+def coordinates_of(task: Any, names: Sequence[str]) -> Array:
     """The numbers of a task by which it is near to others. Shape (n,)."""
     parts = []
     for name in names:

@@ -26,21 +26,21 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from models.errors import ModelError
-from ocp.app.batch.content import Parcel, digest_of, packed, text_of, unpacked
+from ocp.app.batch.content import Payload, canonical_text, digest_of, pack_result, unpack_result
 from ocp.errors import Detailed, ProblemError, SolveError
 
 __all__ = [
-    "Broken",
     "Engine",
     "EngineSettings",
     "Function",
     "Job",
     "Outcome",
+    "WorkerFailure",
     "attempt",
     "attempts",
+    "cached",
     "checked_cluster",
     "failed",
-    "kept",
 ]
 
 Function = Callable[..., Any]
@@ -49,7 +49,7 @@ FULL = {errno.ENOSPC, errno.EDQUOT, errno.EROFS}
 """What is wrong with a machine, and says nothing of the task that met it."""
 
 
-class Broken(OSError):
+class WorkerFailure(OSError):
     """A task came to no end for a reason that is not its own: a disk is full."""
 
 
@@ -59,9 +59,9 @@ _ONE = threading.RLock()
 """Threads of one worker, as Dask may have, take turns: casadi's expressions are not made by two at a time."""
 
 
-def attempts(function: Function, jobs: list[tuple[str, Parcel | None]], near: bool, most: float) -> list[Parcel]:
+def attempts(function: Function, jobs: list[tuple[str, Payload | None]], near: bool, most: float) -> list[Payload]:
     """:func:`attempt` of one task after the other, each with its neighbour's result; as many as begin in ``most`` s."""
-    began, found = time.perf_counter(), list[Parcel]()
+    began, found = time.perf_counter(), list[Payload]()
     for task, guess in jobs:
         found.append(attempt(function, task, near, guess))
         if time.perf_counter() - began > most:
@@ -69,39 +69,39 @@ def attempts(function: Function, jobs: list[tuple[str, Parcel | None]], near: bo
     return found
 
 
-def attempt(function: Function, task: str, near: bool, guess: Parcel | None) -> Parcel:
+def attempt(function: Function, task: str, near: bool, guess: Payload | None) -> Payload:
     """Call the function with a task, by its text, and with its neighbour's result where results are `near`.
 
     Returns:
         The result, or of whatever the function raises its name and its message.
 
     Raises:
-        Broken: There is no room on the disk.
+        WorkerFailure: There is no room on the disk.
     """
     with _ONE:
         began = time.perf_counter()
         _INPUTS.clear()
         try:
-            given = (json.loads(task), None if guess is None else unpacked(guess)) if near else (json.loads(task),)
+            given = (json.loads(task), None if guess is None else unpack_result(guess)) if near else (json.loads(task),)
             try:
-                found = packed(function(*given))
+                found = pack_result(function(*given))
             except BaseException as error:  # of any kind: the others go on
                 if isinstance(error, OSError) and error.errno in FULL:
                     raise
                 found = failed("failed", type(error).__name__, message_of(error))
             else:
-                found = Parcel({"status": "done", "error": "", "message": "", **found.record}, found.files)
+                found = Payload({"status": "done", "error": "", "message": "", **found.record}, found.files)
         except OSError as error:
-            raise Broken(error.errno, error.strerror or str(error), error.filename) from error
+            raise WorkerFailure(error.errno, error.strerror or str(error), error.filename) from error
         told = {"seconds": time.perf_counter() - began, "inputs": {"kept": dict(_INPUTS)}}
-        return Parcel({**found.record, **told}, found.files)
+        return Payload({**found.record, **told}, found.files)
 
 
-def failed(status: str, error: str, message: str) -> Parcel:
+def failed(status: str, error: str, message: str) -> Payload:
     """The record of a task without a result."""
     empty: dict[str, Any] = {"value": None, "files": [], "cost": None, "verdict": None, "seconds": 0.0}
     empty["inputs"] = {"kept": {}}
-    return Parcel({"status": status, "error": error, "message": message, **empty})
+    return Payload({"status": status, "error": error, "message": message, **empty})
 
 
 def message_of(error: BaseException) -> str:
@@ -121,7 +121,7 @@ _INPUTS: dict[str, str | None] = {}
 """Of the task that is at hand: what was kept for it is made of, texts that may name files with the files' digests."""
 
 
-def kept(make: Function, *arguments: Any) -> Any:
+def cached(make: Function, *arguments: Any) -> Any:
     """``make(*arguments)``, made once in each worker and kept: a prepared problem, a robot that is read from a file.
 
     The last eight are kept. Arguments are data as tasks are, and what is made is the same for the same content. Where
@@ -134,7 +134,7 @@ def kept(make: Function, *arguments: Any) -> Any:
         raise ProblemError(f"make must be a function, not {make!r}", name="make", value=make)
     code = getattr(make, "__code__", make)  # Dask brings a script's own function anew with each task
     own = make if getattr(make, "__closure__", None) or getattr(make, "__defaults__", None) else code
-    key = (getattr(make, "__qualname__", ""), own), text_of(list(arguments), "arguments")
+    key = (getattr(make, "__qualname__", ""), own), canonical_text(list(arguments), "arguments")
     with _ONE:
         if key not in _KEPT:
             inputs = {argument: digest_of(argument) for argument in arguments if isinstance(argument, str)}
@@ -145,7 +145,7 @@ def kept(make: Function, *arguments: Any) -> Any:
                 if isinstance(error, Detailed | ModelError) or getattr(error, "errno", None) in FULL:
                     raise
                 call = f"{key[0][0]}({', '.join(map(repr, arguments))})"
-                words = f"kept: {call} raised {type(error).__name__}: {message_of(error)}"
+                words = f"cached: {call} raised {type(error).__name__}: {message_of(error)}"
                 raise ProblemError(words, name="make", value=key[0][0]) from error
         _KEPT.move_to_end(key)
         while len(_KEPT) > MOST_KEPT:
@@ -186,7 +186,7 @@ class Job(NamedTuple):
 
     key: str
     task: str
-    guess: Parcel | None
+    guess: Payload | None
 
 
 class Outcome(NamedTuple):
@@ -196,7 +196,7 @@ class Outcome(NamedTuple):
     """
 
     key: str
-    parcel: Parcel | None
+    parcel: Payload | None
     deaths: int = 0
 
 
@@ -212,7 +212,7 @@ class Engine:
     Raises:
         ProblemError: Dask is not installed, no worker begins, or a worker cannot load the function.
         SolveError: The scheduler is gone.
-        Broken: A worker's disk is full.
+        WorkerFailure: A worker's disk is full.
     """
 
     def __init__(
@@ -368,8 +368,8 @@ class Engine:
 
     def _outcomes(self, future: Any, jobs: list[Job]) -> list[Outcome]:
         try:
-            parcels = [Parcel(*each) for each in future.result(timeout=self.settings.patience)]
-        except Broken:
+            parcels = [Payload(*each) for each in future.result(timeout=self.settings.patience)]
+        except WorkerFailure:
             raise
         except self._dask.KilledWorker as error:
             self._most = 1

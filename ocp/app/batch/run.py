@@ -16,9 +16,9 @@ from typing import Any, Literal
 
 from tqdm import tqdm
 
-from ocp.app.batch.content import Parcel, digest_of, key_of, neighbours, text_of
+from ocp.app.batch.content import Payload, canonical_text, digest_of, key_of, neighbours
 from ocp.app.batch.engine import Engine, Function, Job, checked_cluster, failed
-from ocp.app.batch.ledger import ENDS, Ledger
+from ocp.app.batch.result_store import ENDS, ResultStore
 from ocp.app.batch.table import Batch, Result, row_of
 from ocp.errors import MOST, NOT_NUMBERS, ProblemError, check_entries, checked_choice, checked_count, checked_text
 
@@ -63,7 +63,7 @@ def run_batch(
             for a warm start, or None (:mod:`ocp.app.batch.content`): the tasks alone decide of which.
         again: Ends that are tried again whatever has changed: ``"failed"``, ``"killed"``, or both. Without it a task
             that failed is tried again when the source of the function's module has changed, or a file that an argument
-            of :func:`kept` names.
+            of :func:`cached` names.
         failures: What becomes of a batch in which tasks failed: ``"raise"`` a BatchError, so that a script ends with a
             status other than 0, or ``"return"`` the results, for failures that are answers.
         version: Of the function, a text; another version's results are not mixed in, failures are no results. None: the
@@ -90,7 +90,7 @@ def run_batch(
         checked_choice("again", end, ENDS[1:])
     checked_choice("failures", failures, ("raise", "return"))
     told = source_version(function) if version is None else checked_text("version", version)
-    ledger = Ledger.of(folder, name, told, version is not None)
+    ledger = ResultStore.of(folder, name, told, version is not None)
     parents = neighbours(tasks_of(texts), names) if names else dict.fromkeys(texts)
     source, digests = source_version(sys.modules[function.__module__]), cache(digest_of)
 
@@ -111,7 +111,7 @@ def run_batch(
         try:
             with ledger.alone():
                 results |= recorded([key for key in texts if key not in results])  # of a driver that was waited for
-                missing = Missing(ledger, texts, parents, results, source)
+                missing = PendingTasks(ledger, texts, parents, results, source)
                 if len(results) < len(texts):
                     with Engine(function, bool(names), min(count, len(texts) - len(results)), cluster) as engine:
                         missing.do(engine)
@@ -128,12 +128,12 @@ def run_batch(
     return batch
 
 
-class Missing:
+class PendingTasks:
     """The tasks of a batch that have no result yet."""
 
     def __init__(
         self,
-        ledger: Ledger,
+        ledger: ResultStore,
         texts: dict[str, str],
         parents: dict[str, str | None],
         results: dict[str, Result],
@@ -195,7 +195,7 @@ class Missing:
                 break
             engine.submit([Job(key, self.texts[key], self._guess(key)) for key in keys])
 
-    def _guess(self, key: str) -> Parcel | None:
+    def _guess(self, key: str) -> Payload | None:
         """The result of the nearest neighbour that has one."""
         parent = self._neighbour(key)
         record = None if parent is None else self.ledger.read(parent)
@@ -207,7 +207,7 @@ class Missing:
             parent = self.parents[parent]
         return parent
 
-    def _end(self, key: str, parcel: Parcel) -> None:
+    def _end(self, key: str, parcel: Payload) -> None:
         """Keep what came of a task."""
         record = {"key": key, "task": json.loads(self.texts[key]), "neighbour": self._neighbour(key), **parcel.record}
         record["inputs"] = {"source": self.source, **record["inputs"]}
@@ -234,7 +234,7 @@ def texts_of(tasks: Any) -> dict[str, str]:
         for i, task in enumerate(tasks):
             if i >= MOST:
                 raise ProblemError(f"tasks: at most {MOST} at a time", name="tasks", limit=MOST)
-            text = text_of(task, f"tasks[{i}]")
+            text = canonical_text(task, f"tasks[{i}]")
             found[key_of(text)] = text
     except ProblemError:
         raise

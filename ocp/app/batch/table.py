@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from ocp.app.batch.ledger import Ledger
+from ocp.app.batch.result_store import ResultStore
 from ocp.errors import Detailed, ProblemError, SolveError, checked_each, checked_instance, unknown_name
 from ocp.storage import cell, checked_path, write_text, write_whole
 
@@ -57,7 +57,7 @@ class Result:
     message: str
     neighbour: str | None
     scalars: Mapping[str, Any] = field(repr=False)
-    _ledger: Ledger = field(repr=False, compare=False)
+    _ledger: ResultStore = field(repr=False, compare=False)
 
     @property
     def value(self) -> Any:
@@ -88,7 +88,7 @@ class Result:
         return told | {f"result.{name}": value for name, value in self.scalars.items()}
 
 
-def row_of(record: Mapping[str, Any], ledger: Ledger) -> Result:
+def row_of(record: Mapping[str, Any], ledger: ResultStore) -> Result:
     """A result of a record."""
     value = record["value"]
     named = value if isinstance(value, dict) else {}
@@ -104,8 +104,8 @@ class Batch:
         folder: Where they are kept. results: All of them.
     """
 
-    def __init__(self, ledger: Ledger, results: Sequence[Result]) -> None:
-        self.folder = checked_instance("Batch: ledger", ledger, Ledger).folder
+    def __init__(self, ledger: ResultStore, results: Sequence[Result]) -> None:
+        self.folder = checked_instance("Batch: ledger", ledger, ResultStore).folder
         self.results = checked_each("Batch: results", results, Result)
 
     def __len__(self) -> int:
@@ -221,7 +221,7 @@ def read_batch(folder: str | os.PathLike[str]) -> Batch:
     Raises:
         ProblemError: It is no folder of a batch.
     """
-    ledger = Ledger.at(folder)
+    ledger = ResultStore.at(folder)
     records = (ledger.read(key) for key in ledger.recorded())
     return Batch(ledger, tuple(row_of(record, ledger) for record in records if record is not None))
 

@@ -9,9 +9,9 @@ import numpy as np
 
 from models import CollisionScene, Machine
 from models.arrays import Array
+from ocp.app.check.data_checks import Fault
+from ocp.app.check.interpolation import Motion
 from ocp.app.check.joint_limits import Row, RowVerdict
-from ocp.app.check.oddities import Fault
-from ocp.app.check.pieces import Motion
 from ocp.app.files import Waypoints
 from ocp.audit.clearance import Clearance
 from ocp.motion.builders.clearance import clearance_of
@@ -19,13 +19,13 @@ from ocp.motion.local.collisions import distances_along
 from ocp.problem.values import Sampler
 from ocp.tolerances import CLEARANCE_TOLERANCE_M
 
-__all__ = ["clearance_rows", "path_rows", "proof", "within_limits"]
+__all__ = ["clearance_rows", "path_rows", "prove_clearance", "with_wide_limits"]
 
 SHOWN = 20
 """Pairs that are named."""
 
 
-def within_limits(machine: Machine, motion: Motion) -> Machine:
+def with_wide_limits(machine: Machine, motion: Motion) -> Machine:
     """The machine itself where the motion keeps its limits and its slides have some; else one with limits so wide."""
     robot = machine.robot
     low, high = (getattr(motion.position.coefficients, side)(axis=(0, 1)) for side in ("min", "max"))
@@ -46,7 +46,7 @@ def within_limits(machine: Machine, motion: Motion) -> Machine:
     return made
 
 
-def proof(around: CollisionScene, motion: Motion) -> Clearance:
+def prove_clearance(around: CollisionScene, motion: Motion) -> Clearance:
     """How near each pair comes at any time of a motion, within the limits, of a machine whose base stands still."""
     start, horizon = float(motion.t[0]), float(motion.t[-1] - motion.t[0])
     rates = motion.velocity.greatest
@@ -72,7 +72,7 @@ def clearance_rows(around: CollisionScene, motion: Motion, bases: Array | None) 
     if bases is not None:
         rows, faults = _sampled(around, motion, bases)
         return [*rows, *told], faults
-    found = proof(around, motion)
+    found = prove_clearance(around, motion)
     start = float(motion.t[0])
     rows, faults = [], []
     proven = min(near.least for near in found.pairs)

@@ -20,8 +20,8 @@ from models import FixedBase, FreeFloating, Robot, Standing, inverse_dynamics, m
 from models.arrays import Array
 from models.machines.standing import center_of_pressure
 from models.spatial import cross, rotation_from_quaternion
-from ocp.app.check.oddities import Fault
-from ocp.app.check.pieces import Along, Indices, Motion, highest
+from ocp.app.check.data_checks import Fault
+from ocp.app.check.interpolation import Indices, Motion, MotionQuantity, polynomial_maxima
 from ocp.audit.audit import Audit
 from ocp.motion.tasks.limits import JointBounds
 from ocp.problem.values import Sampler
@@ -31,14 +31,14 @@ __all__ = [
     "ORDERS",
     "Row",
     "RowVerdict",
-    "floating_base",
+    "audit_rows",
     "floating_torques",
+    "integrate_base",
     "limit_rows",
     "momentum_rows",
-    "rows_of",
     "standing_rows",
-    "states_along",
     "torque_rows",
+    "torque_samples",
 ]
 
 ORDERS = {"position": "", "velocity": "/s", "acceleration": "/s^2", "jerk": "/s^3"}
@@ -91,26 +91,26 @@ def limit_rows(
     """
     rows: list[Row] = []
     faults: list[Fault] = []
-    unseen = []
+    unchecked = []
     for what, per in ORDERS.items():
-        along = motion.along(what)
-        if along is None:
+        quantity = motion.quantity(what)
+        if quantity is None:
             if np.isfinite(getattr(bounds, what)[joints]).any():
-                unseen.append(f"{what}, of which so few samples say nothing")
+                unchecked.append(f"{what}, of which so few samples say nothing")
             continue
-        note = "" if along.closed else "of any motion through the samples, by divided differences"
+        note = "" if quantity.closed else "of any motion through the samples, by divided differences"
         most = None if what == "position" else getattr(bounds, what)
         for column, joint in enumerate(joints):
             name = robot.joint_names[joint]
             unit = robot.joint(name).unit + per
             low, high = (bounds.lower[joint], bounds.upper[joint]) if most is None else (-most[joint], most[joint])
-            row, slight, fault = _looked(along, column, what, name, unit, float(low), float(high), share)
+            row, slight, fault = _looked(quantity, column, what, name, unit, float(low), float(high), share)
             rows.append(Row(f"{what} of {name}", *row, "; ".join(filter(None, (slight, note)))))
             faults += fault
-    return rows, faults, unseen
+    return rows, faults, unchecked
 
 
-def rows_of(audit: Audit) -> list[Row]:
+def audit_rows(audit: Audit) -> list[Row]:
     """The findings of an audit as rows of a table."""
     verdicts = [RowVerdict.TOLD if f.limit is None else RowVerdict.of(not f.passed) for f in audit.findings]
     return [
@@ -134,16 +134,16 @@ class _Side(NamedTuple):
     eased: bool
 
     @classmethod
-    def of(cls, along: Along, column: int, sign: float, limit: float, room: float) -> _Side:
-        towards, t = sign * along.pieces.coefficients[:, :, column], along.pieces.t
-        most = np.broadcast_to(along.needed[0 if sign > 0 else 1], along.blur.shape)[:, column]
+    def of(cls, quantity: MotionQuantity, column: int, sign: float, limit: float, room: float) -> _Side:
+        towards, t = sign * quantity.pieces.coefficients[:, :, column], quantity.pieces.t
+        most = np.broadcast_to(quantity.needed[0 if sign > 0 else 1], quantity.blur.shape)[:, column]
         ends, enclosed = np.maximum(towards[:, 0], towards[:, -1]), towards.max(axis=1)
         # of a piece whose enclosure is above the greatest end, or beyond the limit, the greatest value is looked for
         above = np.minimum(enclosed, most) > np.minimum(ends, most).max()
         open_ = np.flatnonzero(above | ((enclosed > limit) & (ends <= limit)))
         values, place = ends.copy(), (towards[:, -1] > towards[:, 0]).astype(float)
         if open_.size and towards.shape[1] > 2:
-            values[open_], place[open_] = highest(towards[open_])
+            values[open_], place[open_] = polynomial_maxima(towards[open_])
         eased = bool((values > np.maximum(most, limit + room)).any())
         values = np.minimum(values, most)
         k = int(values.argmax())
@@ -161,12 +161,12 @@ class _Side(NamedTuple):
 
 
 def _looked(
-    along: Along, column: int, what: str, name: str, unit: str, low: float, high: float, share: float
+    quantity: MotionQuantity, column: int, what: str, name: str, unit: str, low: float, high: float, share: float
 ) -> tuple[tuple[float, float | None, str, float | None, RowVerdict], str, list[Fault]]:
     """Value, limit, unit, time and verdict of a row, that it is slightly beyond, and the fault it is."""
-    t, blur = along.pieces.t, np.asarray(along.blur)[:, column]
+    t, blur = quantity.pieces.t, np.asarray(quantity.blur)[:, column]
     room = share * max((abs(one) for one in (low, high) if np.isfinite(one)), default=0.0)
-    sides = [_Side.of(along, column, *one, room) for one in ((1.0, high), (-1.0, -low))]
+    sides = [_Side.of(quantity, column, *one, room) for one in ((1.0, high), (-1.0, -low))]
     if not np.isfinite([low, high]).any():
         worst = max(sides, key=lambda side: float(side.values.max()))
         return (worst.found, None, unit, worst.time, RowVerdict.UNLIMITED), "", []
@@ -187,7 +187,7 @@ def _looked(
         return row, slight if verdict is RowVerdict.OK else "", []
     starts = np.flatnonzero(over & ~np.concatenate([[False], over[:-1]]))
     first = float(t[starts[0]])
-    between = ", between two samples" if along.closed and time not in t else ""
+    between = ", between two samples" if quantity.closed and time not in t else ""
     stretches = f"; {len(starts)} times, first from {first:.6g} s" if len(starts) > 1 else ""
     share_over = abs(found) / abs(allowed) - 1 if allowed else np.inf
     much = f", {100 * share_over:.3g} % beyond" if 1e-4 < share_over < 10 else ""
@@ -217,14 +217,14 @@ def torque_rows(
         bodies = simplified(robot, frozenset())
         torque = inverse_dynamics(bodies, q, v, a, (), gravity, machine.world_from_base())
     sampler = Sampler([q, v, a], [torque])
-    times, *values = states_along(motion)
+    times, *values = torque_samples(motion)
     if not len(times):
         return [], []
     check()
     found = sampler(*values)[0]
     mean = motion.q.mean(axis=0)
     weight = np.abs(np.array(ca.Function("inertia", [q], [ca.jacobian(torque, a)])(mean)))  # torques are linear in them
-    blurred = motion.along("acceleration")
+    blurred = motion.quantity("acceleration")
     blur = weight @ (np.zeros(n) if blurred is None else np.median(np.asarray(blurred.blur), axis=0))
     rows, faults = [], []
     note = "at samples, by differences" if motion.rule == "linear" else "at five times of every piece"
@@ -266,7 +266,7 @@ def floating_torques(machine: FreeFloating, q: ca.SX, v: ca.SX, a: ca.SX) -> ca.
     return ca.substitute(torque, base, ca.SX(ca.DM(machine.base_home())))
 
 
-def states_along(motion: Motion) -> tuple[Array, Array, Array, Array]:
+def torque_samples(motion: Motion) -> tuple[Array, Array, Array, Array]:
     """Times, positions, velocities and accelerations where torques are looked at. Shape (K,), (K, n) each."""
     t, h = motion.t, np.diff(motion.t)
     if motion.acceleration is None:
@@ -292,7 +292,7 @@ def standing_rows(machine: Standing, motion: Motion, friction: float) -> tuple[l
     point = center_of_pressure(reaction)
     slip = ca.norm_2(reaction[3:5])
     sampler = Sampler([q, v, a], [machine.support.margin(point), reaction[5], slip, point])
-    times, *values = states_along(motion)
+    times, *values = torque_samples(motion)
     if not len(times):
         return [], []
     margin, push, slide, place = sampler(*values)
@@ -324,7 +324,7 @@ def standing_rows(machine: Standing, motion: Motion, friction: float) -> tuple[l
     return rows, faults
 
 
-def floating_base(machine: FreeFloating, motion: Motion) -> tuple[Array, list[Row]]:
+def integrate_base(machine: FreeFloating, motion: Motion) -> tuple[Array, list[Row]]:
     """Configurations of the base at the samples, from its home on, (M, base_size), and rows that tell its way.
 
     Integrated by the classical Runge-Kutta method, a step for each piece.

@@ -13,8 +13,8 @@ import numpy as np
 
 from models import FixedBase, Robot
 from models.arrays import Array
-from ocp.app.check.oddities import SMALL_UNITS, THRESHOLDS, Fault, likely_unit
-from ocp.app.check.pieces import Indices, Motion
+from ocp.app.check.data_checks import SMALL_UNITS, THRESHOLDS, Fault, likely_unit
+from ocp.app.check.interpolation import Indices, Motion
 from ocp.problem.values import Sampler
 
 __all__ = ["doubtful_times", "exchanged_joints"]

@@ -14,18 +14,18 @@ from models.arrays import Array, ArrayInput
 from models.robot.dynamics import GRAVITY
 from models.shapes.mesh_files import find_mesh
 from models.shapes.shapes import Shape
-from ocp.app.check.collisions import clearance_rows, path_rows, within_limits
+from ocp.app.check.collisions import clearance_rows, path_rows, with_wide_limits
+from ocp.app.check.data_checks import CleanedTrajectory, Fault, clean_trajectory
+from ocp.app.check.interpolation import Motion, Rule
 from ocp.app.check.joint_limits import (
     Row,
     RowVerdict,
-    floating_base,
+    integrate_base,
     limit_rows,
     momentum_rows,
     standing_rows,
     torque_rows,
 )
-from ocp.app.check.oddities import Fault, Readable, readable
-from ocp.app.check.pieces import Motion, Rule
 from ocp.app.check.suspicions import doubtful_times, exchanged_joints
 from ocp.app.files import RawTrajectory, Waypoints
 from ocp.app.files.trajectory import UNITS
@@ -74,9 +74,9 @@ class Check:
     faults: tuple[Fault, ...]
     suspicions: tuple[Fault, ...]
     unlimited: tuple[str, ...]
-    unseen: tuple[str, ...]
+    unchecked: tuple[str, ...]
     notes: tuple[str, ...]
-    readable: Readable
+    cleaned: CleanedTrajectory
 
     @property
     def passed(self) -> bool:
@@ -88,7 +88,7 @@ class Check:
         """The verdict."""
         open_ = [row.name for row in self.rows if row.verdict is RowVerdict.UNDECIDED]
         but = f"; not decided: {', '.join(open_[:3])}{' ...' if len(open_) > 3 else ''}" if open_ else ""
-        without = f"; not looked at: {'; '.join(self.unseen)}" if self.unseen else ""
+        without = f"; not looked at: {'; '.join(self.unchecked)}" if self.unchecked else ""
         if self.passed:
             return f"holds all that was looked at{but}{without}"
         if not self.faults:
@@ -122,21 +122,21 @@ class Check:
         if self.unlimited:
             lines.append("unlimited: " + "; ".join(self.unlimited))
         lines += map(str, self.suspicions)
-        lines += [f"not looked at: {one}" for one in self.unseen]
+        lines += [f"not looked at: {one}" for one in self.unchecked]
         lines += [f"note: {one}" for one in self.notes]
         return "\n".join([*lines, f"The trajectory {self.sentence}."])
 
     def to_dict(self) -> dict[str, Any]:
         """What JSON can hold: everything but the samples."""
-        told = {name: getattr(self, name) for name in ("file", "robot", "joints", "samples", "duration", "rule")}
-        told |= {"passed": self.passed, "verdict": self.sentence}
-        told |= {name: [asdict(one) for one in getattr(self, name)] for name in ("faults", "suspicions", "rows")}
-        told |= {name: list(getattr(self, name)) for name in ("unlimited", "unseen", "notes")}
-        return told
+        progress = {name: getattr(self, name) for name in ("file", "robot", "joints", "samples", "duration", "rule")}
+        progress |= {"passed": self.passed, "verdict": self.sentence}
+        progress |= {name: [asdict(one) for one in getattr(self, name)] for name in ("faults", "suspicions", "rows")}
+        progress |= {name: list(getattr(self, name)) for name in ("unlimited", "unchecked", "notes")}
+        return progress
 
 
 @dataclass(frozen=True, eq=False)
-class Asked:
+class CheckRequest:
     """What a check is asked for, arguments as of `check_trajectory`."""
 
     base: BaseKind
@@ -186,7 +186,7 @@ def check_trajectory(
     time_unit: str | float | None = None,
     unwrap: bool = False,
     names_confirmed: bool = False,
-    told: Callable[[str], None] = lambda what: None,
+    progress: Callable[[str], None] = lambda what: None,
 ) -> Check:
     """Check anybody's trajectory for a robot.
 
@@ -210,7 +210,7 @@ def check_trajectory(
             None: seconds, unless they look otherwise.
         unwrap: Take joints with limits whose values were wrapped by whole turns as turning on.
         names_confirmed: Do not suspect columns to be exchanged.
-        told: Is called with what comes next.
+        progress: Is called with what comes next.
 
     Raises:
         ProblemError, ModelError: What is given does not fit the robot, or no sample can be read.
@@ -227,34 +227,34 @@ def check_trajectory(
             raise ProblemError(f"{what} must be a number above 0, not {value!r}", name=what, value=value, limit=0.0)
     notes: list[str] = []
     bounds = bounds_of(robot, velocity, acceleration, jerk, torque, notes)
-    told("reading")
+    progress("reading")
     if time_unit is not None:
         units = ("s", "ms", "us", "ns")
         size = time_unit if not isinstance(time_unit, str) else UNITS[checked_choice("time_unit", time_unit, units)]
         checked_positive("time_unit", size)
         trajectory = replace(trajectory, t=trajectory.t * size)
-    found = readable(trajectory, robot, *bounds[:3], time_unit is not None, unwrap)
+    found = clean_trajectory(trajectory, robot, *bounds[:3], time_unit is not None, unwrap)
     if rule is not None:
         checked_choice("rule", rule, get_args(Rule))
         found = replace(found, motion=found.motion.by(rule))
     motion, whole = found.motion, len(found.joints) == robot.dof
     rows: list[Row] = []
-    faults, unseen = list(found.faults), []
+    faults, unchecked = list(found.faults), []
 
     def add(made: tuple[list[Row], list[Fault]]) -> None:
         rows.extend(made[0])
         faults.extend(made[1])
         check_time()
 
-    told("limits")
+    progress("limits")
     more, wrong, left = limit_rows(motion, robot, found.joints, bounds, share)
     add((more, wrong))
-    unseen += left
+    unchecked += left
     add(_efforts(found, robot, bounds, share))
     if not whole:
-        unseen.append("torques, clearance and the tip, as joints are missing")
+        unchecked.append("torques, clearance and the tip, as joints are missing")
     else:
-        asked = Asked(
+        asked = CheckRequest(
             base,
             np.asarray(translation, dtype=float),
             np.eye(3) if rotation is None else np.asarray(rotation, dtype=float),
@@ -272,7 +272,7 @@ def check_trajectory(
             path_angle,
             share,
         )
-        notes += _machine_rows(robot, found, bounds, asked, add, unseen, told)
+        notes += _machine_rows(robot, found, bounds, asked, add, unchecked, progress)
     suspicions: list[Fault] = []
     if time_unit is None and not any(fault.kind == "units" and fault.name == "time" for fault in faults):
         suspicions += doubtful_times(motion, bounds.velocity[found.joints])
@@ -294,7 +294,7 @@ def check_trajectory(
         tuple(faults),
         tuple(suspicions),
         unlimited,
-        tuple(unseen),
+        tuple(unchecked),
         (*found.notes, *notes),
         found,
     )
@@ -302,12 +302,12 @@ def check_trajectory(
 
 def _machine_rows(
     robot: Robot,
-    found: Readable,
+    found: CleanedTrajectory,
     bounds: JointBounds,
-    asked: Asked,
+    asked: CheckRequest,
     add: Callable[[tuple[list[Row], list[Fault]]], None],
-    unseen: list[str],
-    told: Callable[[str], None],
+    unchecked: list[str],
+    progress: Callable[[str], None],
 ) -> list[str]:
     """Everything that takes the whole robot; what was taken otherwise than told."""
     motion, notes = found.motion, []
@@ -316,12 +316,12 @@ def _machine_rows(
     if asked.base == "floating":
         planar = found.base is not None and found.base.shape[1] == 3
         machine = FreeFloating(robot, "planar" if planar else "spatial")
-        told("momentum")
+        progress("momentum")
         if found.base is not None:
             bases = found.base
             add(momentum_rows(machine, motion, bases))
         else:
-            bases, rows = floating_base(machine, motion)
+            bases, rows = integrate_base(machine, motion)
             add((rows, []))
     elif asked.base == "standing":
         foot, place = asked.foot, asked.translation
@@ -331,20 +331,20 @@ def _machine_rows(
             notes.append(f"it stands on {', '.join(under.links)}")
         down = -float(asked.gravity[2])
         machine = Standing(robot=robot, translation=place, rotation=asked.rotation, support=foot, gravity=down)
-        told("ground")
+        progress("ground")
         add(standing_rows(machine, motion, asked.friction))
     else:
         machine = FixedBase(robot, asked.translation, asked.rotation)
     if robot.total_mass == 0:
-        unseen.append("torques, as the robot has no masses")
+        unchecked.append("torques, as the robot has no masses")
     else:
-        told("torques")
+        progress("torques")
         add(torque_rows(motion, machine, bounds, asked.gravity, asked.share, check_time))
     if asked.path is not None:
-        told("path")
+        progress("path")
         add(path_rows(machine, motion, bases, asked.path, asked.path_tolerance, asked.path_angle))
-    told("clearance")
-    _look_around(machine, motion, bases, asked, add, unseen)
+    progress("clearance")
+    _look_around(machine, motion, bases, asked, add, unchecked)
     return notes
 
 
@@ -352,25 +352,25 @@ def _look_around(
     machine: Machine,
     motion: Motion,
     bases: Array | None,
-    asked: Asked,
+    asked: CheckRequest,
     add: Callable[[tuple[list[Row], list[Fault]]], None],
-    unseen: list[str],
+    unchecked: list[str],
 ) -> None:
     """What the machine may touch."""
     robot = machine.robot
     if asked.clearance is None:
-        unseen.append("clearance, as told")
+        unchecked.append("clearance, as told")
         return
     if not any(link.collisions for link in robot.links):
-        unseen.append("clearance, as the robot has no collision shapes")
+        unchecked.append("clearance, as the robot has no collision shapes")
         return
     if asked.missing == "skip":
         shapes = [(link.name, shape) for link in robot.links for shape in link.collisions if shape.kind == "mesh"]
         lost = [name for name, shape in shapes if find_mesh(shape.file, shape.folder or None, asked.folders) is None]
         if lost:
-            unseen.append(f"clearance of {', '.join(dict.fromkeys(lost))}, whose meshes are missing")
+            unchecked.append(f"clearance of {', '.join(dict.fromkeys(lost))}, whose meshes are missing")
     around = CollisionScene(
-        within_limits(machine, motion),
+        with_wide_limits(machine, motion),
         asked.obstacles,
         asked.clearance,
         asked.ignored,
@@ -392,7 +392,7 @@ def bounds_of(
     """Limits of the joint vector: what is told, else the robot's own; where that is 0 there is none, which is noted."""
     free = np.full(robot.dof, np.inf)
     given = {}
-    for what, own, told in (
+    for what, own, progress in (
         ("velocity", robot.velocity, velocity),
         ("acceleration", free, acceleration),
         ("jerk", free, jerk),
@@ -401,7 +401,7 @@ def bounds_of(
         limits = own.copy()
         if notes is not None and (names := unknown_limits(robot, what)):
             notes.append(f"the robot gives {', '.join(names)} a {what} limit of 0: taken as none")
-        by_name = told if isinstance(told, Mapping) else {} if told is None else {"": told}
+        by_name = progress if isinstance(progress, Mapping) else {} if progress is None else {"": progress}
         for name, value in checked_mapping(what, by_name).items():
             if not real(value) > 0:
                 words = f"{what} of {name or 'all joints'} must be a number above 0, not {value!r}"
@@ -414,7 +414,9 @@ def bounds_of(
     return JointBounds(robot.lower, robot.upper, power=free, **given)
 
 
-def _efforts(found: Readable, robot: Robot, bounds: JointBounds, share: float) -> tuple[list[Row], list[Fault]]:
+def _efforts(
+    found: CleanedTrajectory, robot: Robot, bounds: JointBounds, share: float
+) -> tuple[list[Row], list[Fault]]:
     """Torques that the file itself tells, at its samples."""
     rows: list[Row] = []
     faults: list[Fault] = []
@@ -427,8 +429,8 @@ def _efforts(found: Readable, robot: Robot, bounds: JointBounds, share: float) -
         value, time = float(found.efforts[k, column]), float(found.motion.t[k])
         failed = abs(value) > limit * (1 + share)
         verdict = RowVerdict.FAILED if failed else RowVerdict.OK if np.isfinite(limit) else RowVerdict.UNLIMITED
-        told = limit if np.isfinite(limit) else None
-        rows.append(Row(f"told torque of {name}", value, told, unit, time, verdict, "as the file has it"))
+        progress = limit if np.isfinite(limit) else None
+        rows.append(Row(f"told torque of {name}", value, progress, unit, time, verdict, "as the file has it"))
         if failed:
             text = f"the file has {value:.5g} {unit} at {time:.6g} s, limit {limit:.5g}"
             faults.append(Fault("torque", name, text, time, time, value, limit, unit))

@@ -19,25 +19,25 @@ from models.arrays import Array, ArrayInput, checked_array
 from models.paths import Segment, chains
 from models.paths.path import Reversal
 from models.paths.segments import SHORTEST_SEGMENT
-from ocp.app.files.lines import FileName, read_lines, wrong_line
-from ocp.app.files.program import Cut, Note, Pause, Program, Rapid, Stretch, checked_reversal
-from ocp.app.files.words import (
+from ocp.app.files.gcode_words import (
     GROUPS,
-    KEPT,
-    LETTERS,
+    IGNORED_CODES,
+    IGNORED_LETTERS,
     M_WORDS,
-    MACHINE,
+    MACHINE_CODES,
     MOTIONS,
     PLANES,
-    POST,
-    REFUSED,
+    REPOST,
+    UNSUPPORTED_CODES,
+    ArcError,
     Block,
-    Gap,
-    about_center,
-    blocks,
-    center_of_radius,
+    arcs_about_center,
+    center_from_radius,
     code_name,
+    read_blocks,
 )
+from ocp.app.files.program import Cut, Note, Pause, Program, Rapid, Section, checked_reversal
+from ocp.app.files.text_files import FileName, line_error, read_lines
 from ocp.errors import ProblemError, checked_choice, checked_flag, checked_positive
 
 __all__ = ["read_gcode"]
@@ -130,7 +130,7 @@ class _Reader:
         self.system: int | None = None
         self.exact, self.tolerance = False, np.nan
         self.moves: list[tuple[Segment, float, float, int]] = []
-        self.stretches: list[Stretch] = []
+        self.sections: list[Section] = []
         self.noted: dict[str, list[int]] = {}
         self.machine: Block | None = None  # a move to where nobody knows, after which nothing may move
         self.moved = False
@@ -138,7 +138,7 @@ class _Reader:
 
     def read(self, lines: Sequence[str]) -> Program:
         """All blocks, as a program."""
-        for block in blocks(self.file, lines):
+        for block in read_blocks(self.file, lines):
             self.block = block
             if block.skipped:
                 self._note("/: passed over, block_delete is on" if self.block_delete else "/: run, block_delete is off")
@@ -146,7 +146,7 @@ class _Reader:
                     continue
             try:
                 ended = self._run()
-            except Gap as wrong:
+            except ArcError as wrong:
                 hint = f", or read with gap={1.01 * wrong.size:.2g}" if wrong.size > 0 else ""
                 self._refuse(f"{wrong.why}; correct it{hint}", wrong.limit)
             except ModelError as error:
@@ -154,14 +154,14 @@ class _Reader:
             if ended:
                 break
         self._end_path()
-        if not self.stretches:
+        if not self.sections:
             message = f"{self.file}: no word of it moves anything; is it G-code?"
             raise ProblemError(message, name="file", value=str(self.file))
         notes = tuple(Note(text, tuple(numbers)) for text, numbers in self.noted.items())
-        return Program(tuple(self.stretches), self.start, notes)
+        return Program(tuple(self.sections), self.start, notes)
 
     def _refuse(self, why: str, limit: Any = None) -> NoReturn:
-        raise wrong_line(self.file, self.block.number, self.block.text, why, limit)
+        raise line_error(self.file, self.block.number, self.block.text, why, limit)
 
     def _note(self, text: str) -> None:
         lines = self.noted.setdefault(text, [])
@@ -179,7 +179,7 @@ class _Reader:
             self._set_feed(words.pop("F"))
             if self.unit != before:
                 self._note("F is in the units of its own line")
-        for letter, text in LETTERS.items():
+        for letter, text in IGNORED_LETTERS.items():
             if letter in words:
                 del words[letter]
                 self._note(text)
@@ -188,7 +188,7 @@ class _Reader:
                 self._refuse(f"{letter} moves an axis beside X, Y and Z, which is not read; post for three axes")
         if 40 in codes:
             self._dwell(words)
-        if machine := codes.intersection(MACHINE):
+        if machine := codes.intersection(MACHINE_CODES):
             self._to_machine_position(machine.pop(), words)
         elif codes & {920, 921, 922}:
             self._shift(codes, words)
@@ -199,19 +199,19 @@ class _Reader:
     def _check_groups(self, codes: set[int]) -> None:
         seen: dict[str, int] = {}
         for code in sorted(codes):
-            if code in REFUSED:
-                self._refuse(f"{code_name(code)}: {REFUSED[code]}")
+            if code in UNSUPPORTED_CODES:
+                self._refuse(f"{code_name(code)}: {UNSUPPORTED_CODES[code]}")
             group = GROUPS.get(code)
-            if group is None and code not in KEPT and code not in (40, 90, 920, 921, 922, *MACHINE):
-                self._refuse(f"{code_name(code)} is not known; {POST}")
+            if group is None and code not in IGNORED_CODES and code not in (40, 90, 920, 921, 922, *MACHINE_CODES):
+                self._refuse(f"{code_name(code)} is not known; {REPOST}")
             if group in seen:
                 self._refuse(
                     f"{code_name(seen[group])} and {code_name(code)} contradict each other in one line; leave one"
                 )
             if group is not None:
                 seen[group] = code
-            if code in KEPT:
-                self._note(f"{code_name(code)}: {KEPT[code]}")
+            if code in IGNORED_CODES:
+                self._note(f"{code_name(code)}: {IGNORED_CODES[code]}")
 
     def _set_modes(self, codes: set[int], words: dict[str, float]) -> None:
         for code in codes:
@@ -262,12 +262,12 @@ class _Reader:
         if duration < 0:
             self._refuse("the time P of G4 is below zero")
         self._end_path()
-        self.stretches.append(Pause(duration, self.block.number, "G4"))
+        self.sections.append(Pause(duration, self.block.number, "G4"))
         self._note("G4: P is read as seconds")
 
     def _to_machine_position(self, code: int, words: dict[str, float]) -> None:
         if code in (281, 301):
-            self._refuse(f"{code_name(code)} stores a position of the machine; {POST}")
+            self._refuse(f"{code_name(code)} stores a position of the machine; {REPOST}")
         named = [i for i, axis in enumerate(AXES) if axis in words]
         leaves_cut = self.moved or self.moves
         if code == 530:
@@ -345,7 +345,7 @@ class _Reader:
     def _rapid(self, target: Array) -> None:
         self._end_path()
         if np.linalg.norm(target - self.reached) > SHORTEST_SEGMENT:
-            self.stretches.append(Rapid(self.reached, target, self.block.number))
+            self.sections.append(Rapid(self.reached, target, self.block.number))
             self.reached = target
         self.position, self.moved = target, True
 
@@ -367,7 +367,7 @@ class _Reader:
         if radius is not None:
             if given:
                 self._refuse("an arc has a radius R and a centre; leave one of them out")
-            center = center_of_radius(start[inside], target[inside], radius * unit, clockwise, gap)
+            center = center_from_radius(start[inside], target[inside], radius * unit, clockwise, gap)
         else:
             if given.pop(plane[2], 0.0) != 0.0:
                 self._refuse(f"{OFFSETS[plane[2]]} does not lie in the plane of {code_name(self.plane)}; leave it out")
@@ -379,7 +379,7 @@ class _Reader:
                 whole[i] = value
             center = (whole + (self.offset if self.absolute_centers else self.position))[inside]
         self.position = target
-        self._add(about_center(start, target, center, clockwise, int(turns), plane, gap), target)
+        self._add(arcs_about_center(start, target, center, clockwise, int(turns), plane, gap), target)
 
     def _add(self, segments: Sequence[Segment], reached: Array) -> None:
         if not self.feed:
@@ -400,7 +400,7 @@ class _Reader:
                 self._refuse(f"{name}: subroutines are not run; post the program without them")
             if kind == "stop":
                 self._end_path()
-                self.stretches.append(Pause(0.0, self.block.number, name))
+                self.sections.append(Pause(0.0, self.block.number, name))
             ended |= kind == "end"
             if kind != "end":
                 self._note(f"{name}: {'a stop' if kind == 'stop' else 'passed over'}")
@@ -418,4 +418,4 @@ class _Reader:
         self.moves = []
         for path, index in chains(segments, self.reversal):
             made = Cut(path, np.array(feeds)[index], np.array(tolerances)[index], np.array(lines)[index])
-            self.stretches.append(made)
+            self.sections.append(made)

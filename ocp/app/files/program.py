@@ -16,20 +16,20 @@ from ocp.errors import NOT_NUMBERS, ProblemError, checked_choice, checked_instan
 from ocp.motion.schedule import LineLimits, Schedule, schedule
 
 __all__ = [
-    "TOLERANCE",
+    "DEFAULT_TOLERANCE",
     "Cut",
     "Note",
     "Pause",
     "Program",
     "ProgramMotion",
     "Rapid",
-    "Stretch",
+    "Section",
     "TimedProgram",
     "checked_reversal",
     "smoothed",
 ]
 
-TOLERANCE = 5e-5
+DEFAULT_TOLERANCE = 5e-5
 """m, where neither the file nor the caller says one: a usual contour tolerance of machine tools."""
 
 
@@ -76,7 +76,7 @@ class Cut:
         given = np.fmin(self.tolerances[:-1], self.tolerances[1:])
         if tolerance is not None:
             given = np.fmin(given, checked_positive("tolerance", tolerance))
-        return smoothed(self.path, np.where(np.isnan(given), TOLERANCE, given), options)
+        return smoothed(self.path, np.where(np.isnan(given), DEFAULT_TOLERANCE, given), options)
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +118,7 @@ class Pause:
         return f"pause {self.why}, line {self.line}"
 
 
-Stretch: TypeAlias = Cut | Rapid | Pause
+Section: TypeAlias = Cut | Rapid | Pause
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,19 +126,19 @@ class Program:
     """What a file asks for, in its order.
 
     Attributes:
-        stretches: Cuts, rapids and pauses; each starts where the one before ends.
+        sections: Cuts, rapids and pauses; each starts where the one before ends.
         start: Where the program begins. Shape (3,), m.
         notes: What was passed over, by line.
     """
 
-    stretches: tuple[Stretch, ...]
+    sections: tuple[Section, ...]
     start: Array
     notes: tuple[Note, ...] = ()
 
     @cached_property
     def cuts(self) -> tuple[Cut, ...]:
         """The paths that are run at a feed."""
-        return tuple(each for each in self.stretches if isinstance(each, Cut))
+        return tuple(each for each in self.sections if isinstance(each, Cut))
 
     @property
     def paths(self) -> tuple[Path, ...]:
@@ -153,7 +153,7 @@ class Program:
     @property
     def rapids(self) -> tuple[Rapid, ...]:
         """The ways between."""
-        return tuple(each for each in self.stretches if isinstance(each, Rapid))
+        return tuple(each for each in self.sections if isinstance(each, Rapid))
 
     @property
     def length(self) -> float:
@@ -174,8 +174,8 @@ class Program:
         ends = [self.start, *(end for each in self.rapids for end in (each.start, each.end))]
         moved = iter(_moved(np.array(ends), position, orientation))
         start = next(moved)
-        made: list[Stretch] = []
-        for each in self.stretches:
+        made: list[Section] = []
+        for each in self.sections:
             if isinstance(each, Cut):
                 made.append(replace(each, path=each.path.placed(position, orientation)))
             else:
@@ -216,12 +216,12 @@ class Program:
         fastest = float(np.asarray(limits.speed))
         across = fastest if rapid is None else checked_positive("rapid", rapid)
         timed: list[Schedule | None] = []
-        for each in self.stretches:
+        for each in self.sections:
             if isinstance(each, Cut):
                 path = each.smooth(tolerance, **options)
                 timed.append(schedule(path, replace(limits, speed=np.minimum(each.feeds, fastest))))
             elif isinstance(each, Rapid):
-                line = smooth(Path.through([each.start, each.end]), TOLERANCE)
+                line = smooth(Path.through([each.start, each.end]), DEFAULT_TOLERANCE)
                 timed.append(schedule(line, replace(limits, speed=across)))
             else:
                 timed.append(None)
@@ -264,7 +264,7 @@ class ProgramMotion(NamedTuple):
 
     Attributes:
         t: Time. Shape (M,), s.
-        stretch: Index in the program's stretches. Shape (M,).
+        section: Index in the program's stretches. Shape (M,).
         distance: Along the stretch. Shape (M,), m.
         position: Shape (M, 3), m.
         tangent: Unit; zero in a pause. Shape (M, 3).
@@ -272,7 +272,7 @@ class ProgramMotion(NamedTuple):
     """
 
     t: Array
-    stretch: NDArray[np.intp]
+    section: NDArray[np.intp]
     distance: Array
     position: Array
     tangent: Array
@@ -296,7 +296,7 @@ class TimedProgram:
     @cached_property
     def bounds(self) -> Array:
         """Times at which the stretches begin, and the end. Shape (K + 1,), s."""
-        pairs = zip(self.program.stretches, self.schedules, strict=True)
+        pairs = zip(self.program.sections, self.schedules, strict=True)
         durations = [each.duration if timed is None else timed.duration for each, timed in pairs]  # type: ignore[union-attr]
         return np.concatenate([[0.0], np.cumsum(durations)])
 
@@ -308,7 +308,7 @@ class TimedProgram:
     @property
     def names(self) -> tuple[str, ...]:
         """Of the stretches, with the lines they come from."""
-        return tuple(each.name for each in self.program.stretches)
+        return tuple(each.name for each in self.program.sections)
 
     def at(self, time: ArrayLike) -> ProgramMotion:
         """Motion at times of [0, duration]. Shape (M,), s. At a bound it is that of the stretch that begins.
@@ -345,7 +345,7 @@ class TimedProgram:
 
     def _rest(self, which: int) -> Array:
         """Where a pause stands: the end of what is before it."""
-        for each in reversed(self.program.stretches[:which]):
+        for each in reversed(self.program.sections[:which]):
             if isinstance(each, Rapid):
                 return each.end
             if isinstance(each, Cut):

@@ -23,7 +23,7 @@ weights = { elbow = 4 }             # of squared joint rates; 1 of all others
 [search]
 kind = "postures"                   # or "start", "global"; "pieces": the fewest motions, where one does not do
 # start = { elbow = 1.2 }           # joints at the start, all of them; cyclic = true; seed = 1; pace = "free"
-[surroundings]
+[scene]
 clearance = 0.01                    # m; ignored = [["link1", "link3"]]; srdf = "..."; folders = ["..."]
 [[obstacle]]
 shape = "box"                       # see ocp.app.files.task_file
@@ -75,16 +75,16 @@ from models import Path as ToolPath
 from models.arrays import Array
 from models.shapes.shapes import Shape
 from models.spatial import rotation_from_rpy
-from ocp.app.files.entries import REQUIRED, Entries, read_entries
-from ocp.app.files.lines import FileName
 from ocp.app.files.outputs import SUFFIXES, checked_output
+from ocp.app.files.text_files import FileName
+from ocp.app.files.toml_table import REQUIRED, TomlTable, read_toml
 from ocp.app.files.waypoints import read_waypoints
 from ocp.errors import NOT_NUMBERS, ProblemError, floats
 from ocp.motion.schedule import LineLimits, schedule
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.tip_task import TipTask
 
-__all__ = ["OUTPUTS", "Task", "obstacles_of", "read_obstacles", "read_task", "turn_of"]
+__all__ = ["OUTPUTS", "Task", "obstacles_of", "read_obstacles", "read_task", "rotation_of"]
 
 SHAPES = ("box", "sphere", "capsule", "cylinder", "halfspace", "mesh")
 
@@ -95,7 +95,7 @@ def read_obstacles(file: FileName) -> tuple[Shape, ...]:
     Raises:
         ProblemError: By line, what is wrong and what was expected.
     """
-    entries = read_entries(file)
+    entries = read_toml(file)
     found = obstacles_of(entries, Path(file).parent)
     entries.done()
     if not found:
@@ -103,7 +103,7 @@ def read_obstacles(file: FileName) -> tuple[Shape, ...]:
     return found
 
 
-def obstacles_of(entries: Entries, folder: Path) -> tuple[Shape, ...]:
+def obstacles_of(entries: TomlTable, folder: Path) -> tuple[Shape, ...]:
     """The shapes under [[obstacle]]; files of meshes are looked for from a folder."""
     found = []
     for one in entries.tables("obstacle"):
@@ -117,13 +117,13 @@ def obstacles_of(entries: Entries, folder: Path) -> tuple[Shape, ...]:
     return tuple(found)
 
 
-def turn_of(entries: Entries) -> Array:
+def rotation_of(entries: TomlTable) -> Array:
     """The rotation that `rpy` says, none where it is not there. Shape (3, 3)."""
     told = entries.vector("rpy", 3, "three angles, rad", (0.0, 0.0, 0.0))
     return np.array(rotation_from_rpy(*(float(angle) for angle in told)), dtype=float)
 
 
-def _shape(one: Entries, shape: str, folder: Path) -> Shape:
+def _shape(one: TomlTable, shape: str, folder: Path) -> Shape:
     def place(name: str = "position") -> Any:
         return one.vector(name, 3, "three numbers, m", REQUIRED)
 
@@ -131,23 +131,23 @@ def _shape(one: Entries, shape: str, folder: Path) -> Shape:
         return one.number(name, "a number above 0, m", REQUIRED, least=0.0)
 
     if shape == "box":
-        return Box(one.vector("size", 3, "three lengths, m", REQUIRED), place(), turn_of(one))
+        return Box(one.vector("size", 3, "three lengths, m", REQUIRED), place(), rotation_of(one))
     if shape == "sphere":
         return Sphere(length("radius"), place())
     if shape == "capsule":
         return Capsule(length("radius"), place("start"), place("end"))
     if shape == "cylinder":
-        return Cylinder(length("radius"), length("length"), place(), turn_of(one))
+        return Cylinder(length("radius"), length("length"), place(), rotation_of(one))
     if shape == "halfspace":
         return HalfSpace(one.vector("normal", 3, "three numbers: out of what is solid", REQUIRED), place("point"))
     name = one.text("file", "the name of an STL, OBJ or DAE file", REQUIRED)
     scale = one.number("scale", "a number above 0: m for each unit of the file", 1.0, least=0.0)
     position = one.vector("position", 3, "three numbers, m", (0.0, 0.0, 0.0))
-    return Mesh(file=folder / name, position=position, rotation=turn_of(one), scale=scale)
+    return Mesh(file=folder / name, position=position, rotation=rotation_of(one), scale=scale)
 
 
 OUTPUTS = tuple(SUFFIXES)
-LIMITED = {
+LIMIT_UNITS = {
     "velocity": "rad/s or m/s",
     "acceleration": "rad/s^2 or m/s^2",
     "jerk": "rad/s^3 or m/s^3",
@@ -163,7 +163,7 @@ class Task:
 
     Attributes:
         machine: Read from the robot's file. task: Of its tip.
-        options: Keywords of `ocp.plan`; of `ocp.plan_in_segments` where it is to be done `in_pieces`.
+        options: Keywords of `ocp.plan`; of `ocp.plan_in_segments` where it is to be done `in_segments`.
         outputs: Files to write, by kind of OUTPUTS, all below the `output_folder`. period: Of samples in them, s.
         file, urdf: Names of the task's own file and of the robot's.
     """
@@ -176,7 +176,7 @@ class Task:
     file: str
     urdf: Path
     output_folder: Path
-    in_pieces: bool = False
+    in_segments: bool = False
 
 
 def read_task(file: FileName, output_folder: FileName | None = None) -> Task:
@@ -188,8 +188,8 @@ def read_task(file: FileName, output_folder: FileName | None = None) -> Task:
     Raises:
         ProblemError: By line, what is wrong and what was expected.
     """
-    root = read_entries(file)
-    root.only("robot", "path", "limits", "cost", "search", "surroundings", "obstacle", "output")
+    root = read_toml(file)
+    root.only("robot", "path", "limits", "cost", "search", "scene", "obstacle", "output")
     folder = Path(file).parent
     robot = root.table("robot", "a table [robot] with urdf and tip", REQUIRED)
     assert robot is not None
@@ -202,19 +202,19 @@ def read_task(file: FileName, output_folder: FileName | None = None) -> Task:
     path.done()
     options: dict[str, Any] = {"obstacles": obstacles_of(root, folder)}
     names = machine.robot.joint_names
-    for name, read in (("limits", _limits), ("cost", _cost), ("search", _search), ("surroundings", _surroundings)):
+    for name, read in (("limits", _limits), ("cost", _cost), ("search", _search), ("scene", _scene)):
         if (table := root.table(name, f"a table [{name}]")) is not None:
             options |= read(table, names, folder)
             table.done()
     written = folder if output_folder is None else Path(output_folder)
     outputs, period = _outputs(root.table("output", "a table [output]"), written)
     root.done()
-    in_pieces = options.pop("in_pieces", False)
-    return Task(machine, task, options, outputs, period, str(file), urdf, written, in_pieces)
+    in_segments = options.pop("in_pieces", False)
+    return Task(machine, task, options, outputs, period, str(file), urdf, written, in_segments)
 
 
 @contextmanager
-def _about(entries: Entries, name: str | None) -> Iterator[None]:
+def _about(entries: TomlTable, name: str | None) -> Iterator[None]:
     """What is refused inside is wrong with an entry."""
     try:
         yield
@@ -224,7 +224,7 @@ def _about(entries: Entries, name: str | None) -> Iterator[None]:
         raise told from error
 
 
-def _machine(entries: Entries, urdf: Path) -> Machine:
+def _machine(entries: TomlTable, urdf: Path) -> Machine:
     tip = entries.text("tip", "the name of the link that carries the tip")
     if not urdf.is_file():
         raise entries.wrong("urdf", f"there is no file {urdf}; name the robot's URDF, from the task file's folder")
@@ -242,7 +242,7 @@ def _machine(entries: Entries, urdf: Path) -> Machine:
         with _about(entries, "load"):
             robot = with_load(robot, robot.tip_link, load, robot.tip_translation)
     base = entries.choice("base", ("fixed", "standing", "floating"), "fixed")
-    place, turn = entries.vector("position", 3, "three numbers, m", (0.0, 0.0, 0.0)), turn_of(entries)
+    place, turn = entries.vector("position", 3, "three numbers, m", (0.0, 0.0, 0.0)), rotation_of(entries)
     foot = entries.vector("foot", 4, "four numbers, m: least and greatest x, least and greatest y")
     with _about(entries, "base"):
         if base == "floating":
@@ -255,7 +255,7 @@ def _machine(entries: Entries, urdf: Path) -> Machine:
         return Standing(robot=robot, support=under.support, translation=under.translation, rotation=turn)
 
 
-def _task(entries: Entries, folder: Path) -> TipTask:
+def _task(entries: TomlTable, folder: Path) -> TipTask:
     path = _path(entries, folder)
     speed = _pace(entries, "speed", "m/s", REQUIRED)
     acceleration = _pace(entries, "acceleration", "m/s^2")
@@ -285,12 +285,12 @@ def _task(entries: Entries, folder: Path) -> TipTask:
         return replace(task, rows=(3, 4, 5), direction=None, orientation=None) if tool == "free" else task
 
 
-def _pace(entries: Entries, name: str, unit: str, default: Any = None) -> Any:
+def _pace(entries: TomlTable, name: str, unit: str, default: Any = None) -> Any:
     """What a schedule is asked for; what is beyond is no machine's."""
     return entries.number(name, f"a number above 0, {unit}, of 1e-6 to 1e6", default, least=0.999e-6, most=1e6)
 
 
-def _path(entries: Entries, folder: Path) -> SmoothPath:
+def _path(entries: TomlTable, folder: Path) -> SmoothPath:
     stray = entries.number("rounding", "a number above 0, m: how far rounded corners may stray", 1e-3, least=0.0)
     name = entries.text("file", "the name of a file of waypoints")
     points = entries.raw("points")
@@ -311,9 +311,9 @@ def _path(entries: Entries, folder: Path) -> SmoothPath:
         return smooth(ToolPath.through(corners), deviation=stray)
 
 
-def _limits(entries: Entries, names: tuple[str, ...], folder: Path) -> dict[str, Any]:
+def _limits(entries: TomlTable, names: tuple[str, ...], folder: Path) -> dict[str, Any]:
     given: dict[str, Any] = {}
-    for what, unit in LIMITED.items():
+    for what, unit in LIMIT_UNITS.items():
         expected = f"a number above 0, {unit}, or {{ joint = number }}"
         with _about(entries, what):
             given[what] = _each(entries, what, names, np.inf, expected)
@@ -321,11 +321,11 @@ def _limits(entries: Entries, names: tuple[str, ...], folder: Path) -> dict[str,
     return {"limits": Limits(**given, joints=entries.flag("positions", True))}
 
 
-def _cost(entries: Entries, names: tuple[str, ...], folder: Path) -> dict[str, Any]:
+def _cost(entries: TomlTable, names: tuple[str, ...], folder: Path) -> dict[str, Any]:
     return {"weights": _each(entries, "weights", names, 1.0, "numbers above 0 by joint: { elbow = 4 }")}
 
 
-def _each(entries: Entries, name: str, names: tuple[str, ...], other: float, expected: str) -> Any:
+def _each(entries: TomlTable, name: str, names: tuple[str, ...], other: float, expected: str) -> Any:
     """One number for all joints, or one for each; None where nothing is told."""
     if name not in entries:
         return None
@@ -336,7 +336,7 @@ def _each(entries: Entries, name: str, names: tuple[str, ...], other: float, exp
     return np.array([told.get(joint, other) for joint in names])
 
 
-def _check_joints(entries: Entries, name: str, told: dict[str, float], names: tuple[str, ...]) -> None:
+def _check_joints(entries: TomlTable, name: str, told: dict[str, float], names: tuple[str, ...]) -> None:
     for joint in told:
         if joint not in names:
             table = entries.table(name)
@@ -346,7 +346,7 @@ def _check_joints(entries: Entries, name: str, told: dict[str, float], names: tu
             )
 
 
-def _search(entries: Entries, names: tuple[str, ...], folder: Path) -> dict[str, Any]:
+def _search(entries: TomlTable, names: tuple[str, ...], folder: Path) -> dict[str, Any]:
     kind = entries.choice("kind", ("postures", "start", "global", "pieces"), "postures")
     cyclic, pace = entries.flag("cyclic"), entries.choice("pace", ("given", "free"), "given")
     found: dict[str, Any] = {"seed": entries.count("seed", "a whole number, 0 or more", 0)}
@@ -368,7 +368,7 @@ def _search(entries: Entries, names: tuple[str, ...], folder: Path) -> dict[str,
     return found
 
 
-def _surroundings(entries: Entries, names: tuple[str, ...], folder: Path) -> dict[str, Any]:
+def _scene(entries: TomlTable, names: tuple[str, ...], folder: Path) -> dict[str, Any]:
     look = entries.flag("look", True)
     clearance = entries.number("clearance", "a distance of 0 or more, m", 0.0, least=-1e-300)
     srdf = entries.text("srdf", "the name of an SRDF file")
@@ -382,7 +382,7 @@ def _surroundings(entries: Entries, names: tuple[str, ...], folder: Path) -> dic
     return found
 
 
-def _outputs(entries: Entries | None, folder: Path) -> tuple[dict[str, Path], float]:
+def _outputs(entries: TomlTable | None, folder: Path) -> tuple[dict[str, Path], float]:
     if entries is None:
         return {}, 0.01
     found = {}

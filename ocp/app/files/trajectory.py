@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.arrays import Array
-from ocp.app.files.lines import FileName, cells_of, is_number, parts_of, read_lines, read_tree, wrong_line
 from ocp.app.files.mcap import read_joint_messages
+from ocp.app.files.text_files import FileName, children_of, is_number, line_error, read_lines, read_tree, split_cells
 from ocp.errors import NOT_NUMBERS, ProblemError, checked_choice, checked_each, checked_positive, checked_text
 from ocp.storage import table_joints
 
@@ -68,7 +68,7 @@ class RawTrajectory:
         positions, velocities, accelerations, efforts: nan where there is none; None where the file has none of the
             kind. Shape (M, n), rad or m, N m or N.
         lines: Of the file, or numbers of points or messages, from 1. Shape (M,).
-        told: Whether the file says of every name that it is a joint's.
+        names_are_joints: Whether the file says of every name that it is a joint's.
         notes: What was passed over, or converted.
         file: Its name.
     """
@@ -80,7 +80,7 @@ class RawTrajectory:
     accelerations: Array | None
     efforts: Array | None
     lines: Indices
-    told: bool
+    names_are_joints: bool
     notes: tuple[str, ...]
     file: str
 
@@ -143,11 +143,11 @@ def _read_table(
     if not texts:
         raise ProblemError(f"{file}: the file is empty but for comments", name="file", value=str(file))
     delimiter = next((sign for sign in ";,\t" if sign in texts[0]), " ")
-    first = cells_of(texts[0], delimiter)
+    first = split_cells(texts[0], delimiter)
     if columns is None:
         if all(is_number(cell or "nan") for cell in first):
             why = "no head names the columns; name them: --columns time,NAME,... (columns=), in their order"
-            raise wrong_line(file, numbers[0], texts[0], why)
+            raise line_error(file, numbers[0], texts[0], why)
         head, rows, numbers = first, texts[1:], numbers[1:]
     else:
         told = not all(is_number(cell or "nan") for cell in first)
@@ -177,14 +177,14 @@ def _read_table(
 
 def _numbers(file: FileName, rows: list[str], numbers: list[int], delimiter: str, width: int) -> Array:
     """The table; nan where a cell is empty. Shape (M, width)."""
-    split = [cells_of(row, delimiter) for row in rows]
+    split = [split_cells(row, delimiter) for row in rows]
     for row, number, cells in zip(rows, numbers, split, strict=True):
         if len(cells) != width:
             while len(cells) > width and not cells[-1]:
                 cells.pop()
             if len(cells) != width:
                 why = f"{len(cells)} columns, the head has {width}; complete the row"
-                raise wrong_line(file, number, row, why, width)
+                raise line_error(file, number, row, why, width)
     try:
         return np.array(split, dtype=float)
     except ValueError:
@@ -192,7 +192,7 @@ def _numbers(file: FileName, rows: list[str], numbers: list[int], delimiter: str
     for row, number, cells in zip(rows, numbers, split, strict=True):
         for k, cell in enumerate(cells):
             if not is_number(cell or "nan"):
-                raise wrong_line(file, number, row, f"{cell!r} is no number; correct it")
+                raise line_error(file, number, row, f"{cell!r} is no number; correct it")
             cells[k] = cell or "nan"
     return np.array(split, dtype=float)
 
@@ -259,7 +259,7 @@ def _trajectory_in(tree: Any, depth: int = 6) -> Mapping[str, Any] | None:
         for one in level:
             if isinstance(one, Mapping) and "joint_names" in one and "points" in one:
                 return one
-            for part in parts_of(one)[:100]:
+            for part in children_of(one)[:100]:
                 if id(part) not in seen:
                     seen.add(id(part))
                     below.append(part)

@@ -30,8 +30,8 @@ from models.paths import Line, chains
 from models.paths.orientation import product, rotation_vector
 from models.paths.path import Reversal
 from models.paths.segments import SHORTEST_SEGMENT
-from ocp.app.files.lines import FileName, cells_of, is_number, read_lines, wrong_line
-from ocp.app.files.program import TOLERANCE, checked_reversal, smoothed
+from ocp.app.files.program import DEFAULT_TOLERANCE, checked_reversal, smoothed
+from ocp.app.files.text_files import FileName, is_number, line_error, read_lines, split_cells
 from ocp.errors import ProblemError, checked_choice, checked_each, checked_positive
 
 __all__ = ["Waypoints", "read_waypoints"]
@@ -112,7 +112,7 @@ class Waypoints:
                 lines.append(Line(self.positions[last], self.positions[i], *ends))
             except ModelError as error:
                 why = f"from line {self.lines[last]} to here {error}"
-                raise wrong_line(self.file, int(self.lines[i]), self._shown(i), why, error.limit) from error
+                raise line_error(self.file, int(self.lines[i]), self._shown(i), why, error.limit) from error
             last = i
         if not lines:
             message = f"{self.file}: all waypoints are at one place; a path needs two"
@@ -134,10 +134,12 @@ class Waypoints:
             end = np.asarray(found[0].segments[-1].end)
             i = int(np.linalg.norm(self.positions - end, axis=1).argmin())
             why = "the path turns back the way it came; take paths(), which ends there, or path(reversal=width in m)"
-            raise wrong_line(self.file, int(self.lines[i]), self._shown(i), why)
+            raise line_error(self.file, int(self.lines[i]), self._shown(i), why)
         return found[0]
 
-    def smooth(self, tolerance: float = TOLERANCE, *, reversal: Reversal | None = None, **options: Any) -> SmoothPath:
+    def smooth(
+        self, tolerance: float = DEFAULT_TOLERANCE, *, reversal: Reversal | None = None, **options: Any
+    ) -> SmoothPath:
         """The path with its corners rounded.
 
         Args:
@@ -158,7 +160,7 @@ class Waypoints:
             turn = float(np.linalg.norm(rotation_vector(self.orientations[last], self.orientations[i])))
         if turn > ROUNDING:
             why = f"the tool turns by {np.degrees(turn):.4g} deg in one place; turn it along a way, or drop the line"
-            raise wrong_line(self.file, int(self.lines[i]), self._shown(i), why, ROUNDING)
+            raise line_error(self.file, int(self.lines[i]), self._shown(i), why, ROUNDING)
 
     def _shown(self, i: int) -> str:
         return f"waypoint {i} at {self.positions[i].tolist()} m"
@@ -198,7 +200,7 @@ def read_waypoints(file: FileName, *, unit: str | None = None, columns: Sequence
     if times is not None and (np.diff(times) <= 0).any():
         i = int((np.diff(times) <= 0).argmax()) + 1
         why = f"the time {times[i]:g} s does not come after {times[i - 1]:g} s; sort the rows"
-        raise wrong_line(file, int(lines[i]), texts[i], why)
+        raise line_error(file, int(lines[i]), texts[i], why)
     positions = parts[POSITION]
     if unit is None and not any(_unit(cell) for cell, name in zip(head, names, strict=True) if name in POSITION):
         extent = np.ptp(positions, axis=0).max()
@@ -230,10 +232,10 @@ def _rows(file: FileName) -> list[tuple[int, str, list[str]]]:
             continue
         if delimiter is None:
             delimiter = next((sign for sign in ";,\t" if sign in line), " ")
-        rows.append((number, text, cells_of(line.strip(" "), delimiter)))
+        rows.append((number, text, split_cells(line.strip(" "), delimiter)))
     if not rows or delimiter is None:
         raise ProblemError(f"{file}: the file is empty but for comments", name="file", value=str(file))
-    named = cells_of(remark[1].strip(" "), delimiter)  # as numpy.savetxt writes a head
+    named = split_cells(remark[1].strip(" "), delimiter)  # as numpy.savetxt writes a head
     if len(named) == len(rows[0][2]) and set(POSITION) <= {_name(cell) for cell in named}:
         rows.insert(0, (*remark, named))
     return rows
@@ -266,7 +268,7 @@ def _head(
         why = (
             f"no head names the {len(cells)} columns; name them in the file, or read with columns=('x', 'y', 'z', ...)"
         )
-        raise wrong_line(file, rows[0][0], rows[0][1], why)
+        raise line_error(file, rows[0][0], rows[0][1], why)
     return list(POSITION), 0
 
 
@@ -319,17 +321,17 @@ def _table(file: FileName, rows: list[tuple[int, str, list[str]]], read: Sequenc
     table = np.zeros((len(rows), width))
     for i, (number, text, cells) in enumerate(rows):
         if len(cells) < width or any(cells[width:]):
-            raise wrong_line(file, number, text, f"{len(cells)} columns, expected {width}; complete the row", width)
+            raise line_error(file, number, text, f"{len(cells)} columns, expected {width}; complete the row", width)
         for k in range(width):
             if read[k]:
                 try:
                     table[i, k] = float(cells[k])
                 except ValueError:
-                    raise wrong_line(file, number, text, f"{cells[k]!r} is no number; correct it") from None
+                    raise line_error(file, number, text, f"{cells[k]!r} is no number; correct it") from None
     wrong = ~np.isfinite(table).all(axis=1)
     if wrong.any():
         number, text, _ = rows[int(wrong.argmax())]
-        raise wrong_line(file, number, text, "a number is not finite; correct it or drop the line")
+        raise line_error(file, number, text, "a number is not finite; correct it or drop the line")
     return table
 
 
@@ -340,7 +342,7 @@ def _quaternions(file: FileName, values: Array, lines: NDArray[np.intp], texts: 
     if wrong.any():
         i = int(wrong.argmax())
         why = f"the quaternion has the norm {norm[i]:.6g}; give a unit quaternion"
-        raise wrong_line(file, int(lines[i]), texts[i], why, most)
+        raise line_error(file, int(lines[i]), texts[i], why, most)
     return np.asarray(values / norm[:, None])
 
 
@@ -348,7 +350,7 @@ def _axes(file: FileName, values: Array, lines: NDArray[np.intp], texts: Sequenc
     norm = np.linalg.norm(values, axis=1)
     if not (norm > 0).all():
         i = int((norm > 0).argmin())
-        raise wrong_line(file, int(lines[i]), texts[i], "the tool's axis is zero; give a direction")
+        raise line_error(file, int(lines[i]), texts[i], "the tool's axis is zero; give a direction")
     return np.asarray(values / norm[:, None])
 
 
@@ -373,7 +375,7 @@ def _least_roll(file: FileName, axes: Array, lines: NDArray[np.intp], texts: Seq
     if opposite.any():
         i = int(opposite.argmax())
         why = f"the tool's axis turns round against line {lines[i - 1]}, and nothing says which way; put one between"
-        raise wrong_line(file, int(lines[i]), texts[i], why)
+        raise line_error(file, int(lines[i]), texts[i], why)
     steps = steps / np.linalg.norm(steps, axis=1)[:, None]
     found = np.empty_like(steps)
     current = np.array([1.0, 0.0, 0.0, 0.0])

@@ -17,7 +17,7 @@ from models import HalfSpace, Machine
 from models.arrays import Array
 from models.shapes.hull import convex_hull
 from models.shapes.shapes import Shape
-from ocp.app.check.pieces import Motion
+from ocp.app.check.interpolation import Motion
 from ocp.app.view.appearance import (
     COMPARED,
     FAULT,
@@ -30,7 +30,7 @@ from ocp.app.view.appearance import (
     frames_along,
     part_of,
 )
-from ocp.app.view.rendering import PICTURE_STYLE, Camera, Floor, Layer, placed, render, tube
+from ocp.app.view.rendering import PICTURE_STYLE, Camera, Floor, Layer, parts_in_world, render, tube
 from ocp.audit.clearance import placements_along
 from ocp.motion.plan import Plan
 from ocp.motion.tasks.limits import JointBounds
@@ -42,16 +42,16 @@ __all__ = [
     "STYLE",
     "Obstacle",
     "Solid",
-    "add_names",
+    "add_legend",
     "as_svg",
-    "curves",
+    "draw_curves",
     "draw_joints",
-    "look",
-    "looks_of",
+    "draw_limits",
+    "draw_scene",
+    "line_style",
     "obstacles_of",
-    "of_shapes",
-    "scene",
-    "show_limits",
+    "obstacles_of_shapes",
+    "times_by_part",
 ]
 
 Solid = tuple[Array, NDArray[np.intp]]
@@ -94,7 +94,7 @@ class Obstacle(NamedTuple):
         return middle + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) @ sides, np.array([[0, 1, 2], [0, 2, 3]])
 
 
-def of_shapes(shapes: Iterable[Shape]) -> list[Obstacle]:
+def obstacles_of_shapes(shapes: Iterable[Shape]) -> list[Obstacle]:
     """Shapes that stand still in world."""
     return [
         Obstacle(np.asarray(one.point, dtype=float)[None], 0.0, np.asarray(one.normal, dtype=float))
@@ -120,7 +120,7 @@ def obstacles_of(solution: Solution, parts: Sequence[tuple[str, Array]]) -> list
     still: dict[str, Obstacle] = {}
     moving: dict[str, list[tuple[Any, Array, Array]]] = {}
     for suffix, times in parts:
-        placed: list[tuple[Separation, Any]] | None = None
+        placements: list[tuple[Separation, Any]] | None = None
         for apart in problem.declared.apart.values():
             if not all(name.endswith(suffix) for name in apart.movers):
                 continue
@@ -129,9 +129,9 @@ def obstacles_of(solution: Solution, parts: Sequence[tuple[str, Array]]) -> list
                 if hull.frame < 0:
                     still[name] = Obstacle(hull.core, hull.radius, hull.normal if hull.normal.size else None)
                 elif hull.frame in riding:
-                    if placed is None:
-                        placed = placements_along(problem, solution, times, suffix)
-                    frames = next(frames for one, frames in placed if one is apart)
+                    if placements is None:
+                        placements = placements_along(problem, solution, times, suffix)
+                    frames = next(frames for one, frames in placements if one is apart)
                     at = frames.rotations[:, hull.frame], frames.positions[:, hull.frame]
                     moving.setdefault(name, []).append((hull, *at))
     found = list(still.values())
@@ -143,7 +143,7 @@ def obstacles_of(solution: Solution, parts: Sequence[tuple[str, Array]]) -> list
     return found
 
 
-def looks_of(plan: Plan, times: Array) -> list[tuple[str, Array]]:
+def times_by_part(plan: Plan, times: Array) -> list[tuple[str, Array]]:
     """Ascending times of a plan (M,), s, part by part: the suffix of its states, and the times in its solution."""
     begins = [part.begin for part in plan.parts]
     which = np.clip(np.searchsorted(begins, times, "right") - 1, 0, len(begins) - 1)
@@ -168,7 +168,7 @@ DASHES: tuple[Any, ...] = ((0, (1, 1)), (0, (5, 1.5)), (0, (4, 1.2, 1, 1.2)))
 """Of what a plan is compared with, so that nothing is known by its colour alone."""
 
 
-def scene(
+def draw_scene(
     machine: Machine, motion: Motion, bases: Array | None, around: Sequence[Obstacle], folders: Sequence[Any] = ()
 ) -> bytes:
     """The robot as it looks at several times, at the last one solid, its tip's way, and what is around; a PNG.
@@ -182,7 +182,10 @@ def scene(
     places = None if bases is None else np.column_stack([np.interp(times, motion.t, column) for column in bases.T])
     frames = frames_along(machine, motion.position.at(times), places)
     looks = appearance_of(machine.robot, folders)
-    shown = [placed(looks, frames, int(k)) for k in np.linspace(0, PICTURE_STYLE.curve_points - 1, PICTURE_STYLE.poses)]
+    shown = [
+        parts_in_world(looks, frames, int(k))
+        for k in np.linspace(0, PICTURE_STYLE.curve_points - 1, PICTURE_STYLE.poses)
+    ]
     clouds = [part.vertices for parts in shown for part in parts]
     before, still = np.vstack(clouds), []
     for one in around:
@@ -208,7 +211,7 @@ def scene(
     return stream.getvalue()
 
 
-def curves(
+def draw_curves(
     motion: Motion, names: Sequence[str], units: Sequence[str], bounds: JointBounds, faults: Sequence[Any]
 ) -> str:
     """Position, velocity and acceleration of every joint with its limits, and where faults are; an SVG."""
@@ -243,7 +246,7 @@ def draw_joints(
                 times = np.unique(
                     np.concatenate([np.linspace(motion.t[0], motion.t[-1], PICTURE_STYLE.curve_points), spread])
                 )
-                one = motion.along(kind)
+                one = motion.quantity(kind)
                 drawn.append((number, times, None if one is None else one.pieces.at(times)))
             most = getattr(bounds, kind, None)
             lower, upper = (bounds.lower, bounds.upper) if most is None else (-most, most)
@@ -255,8 +258,8 @@ def draw_joints(
                 ax = grid[row, column]
                 for number, times, values in drawn:
                     if values is not None:
-                        ax.plot(times, values[:, row], **look(number))
-                show_limits(ax, lower[row], upper[row], least)
+                        ax.plot(times, values[:, row], **line_style(number))
+                draw_limits(ax, lower[row], upper[row], least)
                 for fault in faults:
                     if fault.name == name and fault.kind == kind and fault.time is not None:
                         ax.axvline(fault.time, color=FAULT, lw=1.6)
@@ -265,10 +268,10 @@ def draw_joints(
         for ax in grid[-1]:
             ax.set_xlabel("time, s")
         if len(motions) > 1:
-            add_names(figure, list(motions))
+            add_legend(figure, list(motions))
 
 
-def show_limits(ax: Any, lower: float, upper: float, least: float) -> None:
+def draw_limits(ax: Any, lower: float, upper: float, least: float) -> None:
     """Limits of the curves in some axes: dashed where they are near, and said in words where they are far.
 
     Curves that change by less than `least` are drawn as ones that do not.
@@ -291,16 +294,16 @@ def show_limits(ax: Any, lower: float, upper: float, least: float) -> None:
     ax.set_ylim(low - room, high + room + (0.1 * span if far else 0.0))
 
 
-def look(number: int) -> dict[str, Any]:
+def line_style(number: int) -> dict[str, Any]:
     """How the curve of a plan, number 0, and those of what it is compared with are drawn."""
     return {"color": PLAN, "lw": 1.4} if number == 0 else {"color": COMPARED, "lw": 1.1, "ls": DASHES[number % 3]}
 
 
-def add_names(figure: Any, names: Sequence[str]) -> None:
+def add_legend(figure: Any, names: Sequence[str]) -> None:
     """A legend below a figure: the plan's name, and those of what it is compared with."""
     from matplotlib.lines import Line2D
 
-    lines = [Line2D([], [], **look(number)) for number in range(len(names))]
+    lines = [Line2D([], [], **line_style(number)) for number in range(len(names))]
     figure.legend(lines, names, loc="outside lower center", ncols=len(names), frameon=False, fontsize=8)
 
 

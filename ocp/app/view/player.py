@@ -32,11 +32,11 @@ from numpy.typing import NDArray
 from models import Robot
 from models.arrays import Array
 from models.spatial import quaternion_from_rotation
+from ocp.app.view.animation import PAGE_SETTINGS, Animation
 from ocp.app.view.appearance import TIP_FRAME, Appearance, Frames, appearance_of, frames_along
-from ocp.app.view.shown import PAGE_SETTINGS, Shown
 from ocp.errors import ProblemError
 
-__all__ = ["Buffers", "Page", "Served", "page", "unpacked"]
+__all__ = ["Buffers", "Page", "PageServer", "build_page", "unpack_page"]
 
 SCRIPTS = ("scene.js", "curves.js", "player.js")
 
@@ -71,7 +71,9 @@ class Page(NamedTuple):
     missing: dict[str, str]
 
 
-def page(shown: Sequence[Shown], *, title: str = "", folders: Sequence[Any] = (), meshes: bool = True) -> Page:
+def build_page(
+    shown: Sequence[Animation], *, title: str = "", folders: Sequence[Any] = (), meshes: bool = True
+) -> Page:
     """The page of one motion, or of several, the first held against the others.
 
     Args:
@@ -111,7 +113,7 @@ def page(shown: Sequence[Shown], *, title: str = "", folders: Sequence[Any] = ()
     return Page(text, missing)
 
 
-def unpacked(text: str) -> tuple[dict[str, Any], dict[int, NDArray[Any]]]:
+def unpack_page(text: str) -> tuple[dict[str, Any], dict[int, NDArray[Any]]]:
     """What a page holds: its description, and the arrays by their places."""
     mark = '<script id="data" type="text/plain">'
     begin = text.index(mark) + len(mark)
@@ -136,7 +138,7 @@ def unpacked(text: str) -> tuple[dict[str, Any], dict[int, NDArray[Any]]]:
     return told, arrays
 
 
-def _filled(title: str, first: Shown, data: str) -> str:
+def _filled(title: str, first: Animation, data: str) -> str:
     """The page's text."""
     source = files("ocp.app.view").joinpath("page")
     text = source.joinpath("page.html").read_text(encoding="utf-8")
@@ -221,7 +223,7 @@ def _poses(frames: Frames, names: Sequence[str]) -> Array:
     return np.stack(found, axis=1)
 
 
-def _motion(one: Shown, buffers: Buffers) -> dict[str, Any]:
+def _motion(one: Animation, buffers: Buffers) -> dict[str, Any]:
     rows = np.unique(np.linspace(0, len(one.t) - 1, min(len(one.t), PAGE_SETTINGS.poses)).round().astype(int))
     frames = frames_along(one.machine, one.joints[rows], one.base[rows])
     tip = one.machine.robot.tip is not None
@@ -307,7 +309,7 @@ TRIED = 20
 HOST = "127.0.0.1"
 
 
-class Served:
+class PageServer:
     """A page on a server, which runs as long as the block.
 
     Attributes:

@@ -14,8 +14,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from models.arrays import Array
-from ocp.app.check.pieces import Motion
-from ocp.app.view.pictures import STYLE, add_names, as_svg, draw_joints, look, show_limits
+from ocp.app.check.interpolation import Motion
+from ocp.app.view.pictures import STYLE, add_legend, as_svg, draw_joints, draw_limits, line_style
 from ocp.app.view.rendering import PICTURE_STYLE
 from ocp.errors import ProblemError, checked_instance
 from ocp.motion.local.accelerations import AccelerationSolution
@@ -153,9 +153,9 @@ def plot_solution(solution: Solution, against: Any = None, figure: Any = None) -
             for number, curve in reversed([*enumerate(curves)]):
                 if name in curve:
                     times, values = curve[name]
-                    ax.plot(times, values[:, k], **look(number))
+                    ax.plot(times, values[:, k], **line_style(number))
             lower, upper = bounds[name][:, k] if name in bounds else (-np.inf, np.inf)
-            show_limits(
+            draw_limits(
                 ax, lower, upper, PICTURE_STYLE.flat * max(np.abs(c[name][1]).max() for c in curves if name in c)
             )
             ax.set_title(name if shapes[name] == 1 else f"{name} [{k}]")
@@ -165,7 +165,7 @@ def plot_solution(solution: Solution, against: Any = None, figure: Any = None) -
             ax.set_xlabel("time, s")
             ax.tick_params(labelbottom=True)
         if others:
-            add_names(made, ["solution", *others])
+            add_legend(made, ["solution", *others])
     costs = "".join(f", that of {name} {np.ravel(other.cost)[-1]:.6g}" for name, other in others.items())
     rest = f"; {len(left_out)} entries are not drawn" if left_out else ""
     made.suptitle(f"{solution.name}: cost {solution.cost:.6g}{costs}{rest}", fontsize=9.5)

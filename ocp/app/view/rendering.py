@@ -18,7 +18,7 @@ from models.arrays import Array
 from ocp.app.view.appearance import Appearance, Frames, Part
 from ocp.errors import ProblemError
 
-__all__ = ["PICTURE_STYLE", "Camera", "Floor", "Layer", "PictureStyle", "placed", "render", "tube"]
+__all__ = ["PICTURE_STYLE", "Camera", "Floor", "Layer", "PictureStyle", "parts_in_world", "render", "tube"]
 
 
 @dataclass(frozen=True)
@@ -157,7 +157,7 @@ class Floor(NamedTuple):
     grid: float
 
 
-def placed(looks: Appearance, frames: Frames, k: int) -> list[Part]:
+def parts_in_world(looks: Appearance, frames: Frames, k: int) -> list[Part]:
     """What a robot looks like at sample k of a motion, in world."""
     found = []
     for part in looks.parts:

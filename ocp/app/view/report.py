@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 
 from models import Machine
-from ocp.app.check.joint_limits import Row, RowVerdict, rows_of
-from ocp.app.check.pieces import Motion
+from ocp.app.check.interpolation import Motion
+from ocp.app.check.joint_limits import Row, RowVerdict, audit_rows
 from ocp.app.check.plan_verdict import verdict_of
 from ocp.app.check.verdict import Check, bounds_of
-from ocp.app.view.pictures import Obstacle, curves, looks_of, obstacles_of, scene
+from ocp.app.view.pictures import Obstacle, draw_curves, draw_scene, obstacles_of, times_by_part
 from ocp.motion.plan import Plan
 from ocp.motion.tasks.limits import JointBounds
 
@@ -124,15 +124,15 @@ def report_of_check(
     check: Check, machine: Machine, bounds: JointBounds, around: Sequence[Obstacle] = (), folders: Sequence[Any] = ()
 ) -> Report:
     """Of a check. The limits are those that it held the motion against."""
-    motion, robot = check.readable.motion, machine.robot
+    motion, robot = check.cleaned.motion, machine.robot
     whole = len(check.joints) == robot.dof
-    bases = check.readable.base if machine.base_size else None
+    bases = check.cleaned.base if machine.base_size else None
     if machine.base_size and bases is None:
         bases = np.repeat(machine.base_home()[None], len(motion.t), axis=0)
-    columns = check.readable.joints
+    columns = check.cleaned.joints
     taken = JointBounds(*(one[columns] for one in bounds))
     units = [robot.joint(name).unit for name in check.joints]
-    picture = scene(machine, motion, bases, around, folders) if whole else b""
+    picture = draw_scene(machine, motion, bases, around, folders) if whole else b""
     shown = [row for row in check.rows if row.verdict is not RowVerdict.UNLIMITED]
     return Report(
         f"{check.file} for {robot.name}",
@@ -141,11 +141,11 @@ def report_of_check(
         (f"{check.samples} samples", f"{check.duration:.5g} s", f"{len(check.joints)} joints", f"{check.rule} between"),
         tuple(str(fault) for fault in check.faults),
         picture,
-        curves(motion, check.joints, units, taken, check.faults),
+        draw_curves(motion, check.joints, units, taken, check.faults),
         (("What was looked at", tuple(shown)),),
         (
             *(f"unlimited: {one}" for one in check.unlimited),
-            *(f"not looked at: {one}" for one in check.unseen),
+            *(f"not looked at: {one}" for one in check.unchecked),
             *check.notes,
         ),
     )
@@ -169,8 +169,8 @@ def report_of_plan(plan: Plan, period: float, title: str) -> Report:
         verdict.passed,
         (robot.name, f"{plan.horizon:.5g} s", f"{robot.dof} joints", cost, f"{len(plan.candidates)} motions found"),
         tuple(str(fault) for fault in check.faults),
-        scene(machine, motion, bases, obstacles_of(plan.solution, looks_of(plan, sample.t))),
-        curves(motion, plan.names, units, bounds, check.faults),
-        (("The audit", tuple(rows_of(audit))), (f"Samples of {period:g} s against the robot's limits", tuple(told))),
+        draw_scene(machine, motion, bases, obstacles_of(plan.solution, times_by_part(plan, sample.t))),
+        draw_curves(motion, plan.names, units, bounds, check.faults),
+        (("The audit", tuple(audit_rows(audit))), (f"Samples of {period:g} s against the robot's limits", tuple(told))),
         tuple(f"unlimited: {one}" for one in check.unlimited),
     )

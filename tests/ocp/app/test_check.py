@@ -142,7 +142,7 @@ def test_a_joint_that_is_missing_and_one_that_nobody_has(tmp_path: Path) -> None
         ("missing joint", "wrist"),
     }
     assert "is it wrist?" in the(found, "unknown joint", "wrst").text
-    assert any("clearance" in one for one in found.unseen)
+    assert any("clearance" in one for one in found.unchecked)
 
 
 def test_a_collision_between_two_samples(tmp_path: Path) -> None:

@@ -223,7 +223,7 @@ def test_a_place_out_of_reach_is_bad_input_and_no_motion_is_a_failure(
         raise SolveError("no motion passes its audit", name="plan")
 
     (tmp_path / "seam.toml").write_text(TASK)
-    monkeypatch.setattr("ocp.app.planned.plan", nothing)
+    monkeypatch.setattr("ocp.app.run_task.plan", nothing)
     status, out, err = run(capsys, "plan", tmp_path / "seam.toml", "--json")
     assert status == 1
     assert json.loads(out)["error"] == "no motion passes its audit"
@@ -251,12 +251,12 @@ def test_what_no_one_motion_does_is_written_in_pieces_and_the_ways_between_them_
         made.append(plan_in_segments(*given, **options))
         return made[0]
 
-    monkeypatch.setattr("ocp.app.planned.plan_in_pieces", kept_too)
+    monkeypatch.setattr("ocp.app.run_task.plan_in_pieces", kept_too)
     (tmp_path / "robot.urdf").write_text(LIFTED)
     (tmp_path / "line.toml").write_text(
         "[robot]\nurdf = 'robot.urdf'\ntip = 'tip'\n"
         "[path]\npoints = [[0.6, -0.45, 0], [0.6, 0.45, 0]]\nspeed = 0.45\ntool = 'free'\n"
-        "[search]\nkind = 'pieces'\n[surroundings]\nlook = false\n[output]\ncsv = 'line.csv'\n"
+        "[search]\nkind = 'pieces'\n[scene]\nlook = false\n[output]\ncsv = 'line.csv'\n"
     )
     status, out, err = run(capsys, "plan", tmp_path / "line.toml", "-o", tmp_path / "line.npz", "--json")
     assert status == 0, err
@@ -275,7 +275,7 @@ def test_what_no_one_motion_does_is_written_in_pieces_and_the_ways_between_them_
         Path(file).unlink()
     barred = [replace(one, way=None, why="the way is barred") for one in made[0].reconfigurations]
     monkeypatch.setattr(
-        "ocp.app.planned.plan_in_pieces", lambda *_, **__: replace(made[0], reconfigurations=tuple(barred))
+        "ocp.app.run_task.plan_in_pieces", lambda *_, **__: replace(made[0], reconfigurations=tuple(barred))
     )
     status, out, _ = run(capsys, "plan", tmp_path / "line.toml", "--json")
     assert status == 1  # the pieces are there, and pass

@@ -55,13 +55,13 @@ def test_a_cluster_does_what_processes_do_and_loses_nothing_when_it_is_killed(
 def said_to(stranger: ssl.SSLContext | None, address: str) -> bytes:
     """What a server says first: one of Dask's greets whom it accepts."""
     host, port = address.rpartition("/")[2].split(":")
-    with socket.create_connection((host, int(port))) as plain:
+    with socket.create_connection((host, int(port))) as as_data:
         try:
             if stranger is not None:
-                with stranger.wrap_socket(plain) as wrapped:
+                with stranger.wrap_socket(as_data) as wrapped:
                     return wrapped.recv(1)
-            plain.sendall(bytes(64))
-            return plain.recv(1)
+            as_data.sendall(bytes(64))
+            return as_data.recv(1)
         except OSError:
             return b""
 

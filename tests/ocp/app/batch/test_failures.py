@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from ocp.app.batch import Batch, BatchError, kept, read_batch, run_batch
+from ocp.app.batch import Batch, BatchError, cached, read_batch, run_batch
 from ocp.errors import ProblemError
 from tests.ocp.app.batch import functions
 from tests.ocp.app.batch.drivers import ROOT, stored
@@ -76,7 +76,7 @@ def test_failures_are_tried_again_when_a_file_has_changed_and_results_stay(tmp_p
     kept_results = {name: text for name, text in stored(tmp_path / "b").items() if b'"done"' in text[1]}
     message = read_batch(tmp_path / "b").results
     assert {result.error for result in message} == {"", "ProblemError"}
-    assert any("kept: read('" in result.message and "FileNotFoundError" in result.message for result in message)
+    assert any("cached: read('" in result.message and "FileNotFoundError" in result.message for result in message)
     before = stored(tmp_path / "b")
     assert counts() == {"done": 2, "failed": 2}
     assert stored(tmp_path / "b") == before, "nothing has changed"
@@ -139,8 +139,8 @@ def test_the_error_carries_the_results_and_can_be_had_later(tmp_path: Path, here
 
 
 def test_what_kept_raises_names_the_function_and_its_arguments(tmp_path: Path) -> None:
-    with pytest.raises(ProblemError, match=r"kept: read\('.*nothing'\) raised FileNotFoundError") as caught:
-        kept(functions.read, str(tmp_path / "nothing"))
+    with pytest.raises(ProblemError, match=r"cached: read\('.*nothing'\) raised FileNotFoundError") as caught:
+        cached(functions.read, str(tmp_path / "nothing"))
     assert caught.value.name == "make"
     assert isinstance(caught.value.__cause__, FileNotFoundError)
 

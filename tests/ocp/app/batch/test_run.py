@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from ocp import ProblemError, SolveError
-from ocp.app.batch import BatchError, kept, read_batch, run_batch
-from ocp.app.batch.ledger import Ledger
+from ocp.app.batch import BatchError, cached, read_batch, run_batch
+from ocp.app.batch.result_store import ResultStore
 from ocp.app.batch.run import source_version
 from tests.ocp.app.batch import functions
 from tests.ocp.app.batch.drivers import ROOT, count, driver, runs, stored, until, workers_of
@@ -236,7 +236,7 @@ def test_a_script_runs_its_own_function_under_its_guard(end: str, says: str, tmp
 
 
 def test_a_folder_of_another_function_or_version_or_of_something_else_is_refused(tmp_path: Path) -> None:
-    Ledger.of(tmp_path / "b", "tests.ocp.app.batch.functions:square", source_version(functions.square), False)
+    ResultStore.of(tmp_path / "b", "tests.ocp.app.batch.functions:square", source_version(functions.square), False)
     run_batch(functions.square, X[:1], tmp_path / "b")
     with pytest.raises(ProblemError, match=r"holds results of .*square, not of .*same") as caught:
         run_batch(functions.same, X, tmp_path / "b")
@@ -271,11 +271,11 @@ def test_what_is_kept_is_made_once_for_each_content_and_forgotten_in_turn() -> N
         made.append(value["a"])
         return value["a"]
 
-    assert [kept(make, {"a": value}) for value in (1.0, 1.0, 2.0, 1.0)] == [1.0, 1.0, 2.0, 1.0]
+    assert [cached(make, {"a": value}) for value in (1.0, 1.0, 2.0, 1.0)] == [1.0, 1.0, 2.0, 1.0]
     assert made == [1.0, 2.0]
     for value in range(3, 10):
-        kept(make, {"a": float(value)})
-    kept(make, {"a": 1.0})
-    kept(make, {"a": 2.0})
+        cached(make, {"a": float(value)})
+    cached(make, {"a": 1.0})
+    cached(make, {"a": 2.0})
     assert made[-1] == 2.0
     assert made.count(1.0) == 1 or made.count(1.0) == 2

@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 FOLDER = File(__file__).parent / "gcode"
 PROGRAMS = sorted(file for file in FOLDER.iterdir() if file.suffix != ".canon")
 GOOD = [file for file in PROGRAMS if not file.name.startswith("refused")]
-REFUSED = [file for file in PROGRAMS if file.name.startswith("refused")]
+UNSUPPORTED_CODES = [file for file in PROGRAMS if file.name.startswith("refused")]
 MM = 1e-3
 STEP = 1e-5  # m, of samples
 
@@ -58,7 +58,7 @@ def strayed(one: Path | SmoothPath, other: Path | SmoothPath) -> float:
 
 def test_there_are_many_programs_of_many_dialects() -> None:
     assert len(GOOD) >= 30
-    assert len(REFUSED) >= 30
+    assert len(UNSUPPORTED_CODES) >= 30
 
 
 @pytest.mark.parametrize("file", GOOD, ids=lambda file: file.stem)
@@ -74,7 +74,7 @@ def test_a_program_goes_through_and_its_path_stays_within_the_tolerance(file: Fi
         assert smooth.curvature_jumps().max(initial=0.0) < 1e-6 * (1 + smooth.curvature(smooth.dense()).max())
 
 
-@pytest.mark.parametrize("file", REFUSED, ids=lambda file: file.stem)
+@pytest.mark.parametrize("file", UNSUPPORTED_CODES, ids=lambda file: file.stem)
 def test_a_program_is_refused_by_line_with_what_to_do(file: File) -> None:
     head = file.read_text(encoding="utf-8").splitlines()[0]
     where, _, words = head.strip("()").removeprefix("refused: ").rpartition(": ")
@@ -172,12 +172,12 @@ def written(
 def shape_of(found: Program) -> list[tuple[float, ...]]:
     """Of each segment and rapid: ends and centre, sweep, length, feed."""
     rows = []
-    for stretch in found.stretches:
-        if not isinstance(stretch, Cut):
-            assert not isinstance(stretch, Pause)
-            rows.append((*stretch.end, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+    for section in found.sections:
+        if not isinstance(section, Cut):
+            assert not isinstance(section, Pause)
+            rows.append((*section.end, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
             continue
-        for segment, feed in zip(stretch.path.segments, stretch.feeds, strict=True):
+        for segment, feed in zip(section.path.segments, section.feeds, strict=True):
             center = segment.center if isinstance(segment, Arc | Helix) else np.zeros(3)
             sweep = segment.sweep if isinstance(segment, Arc | Helix) else 0.0
             rows.append((*segment.end, *center, sweep, segment.length, 0.01 * float(feed)))
@@ -397,7 +397,7 @@ def test_home_is_passed_over_at_the_ends_and_gone_to_where_it_is_known(program: 
     found = program(between, home=(0.0, 0.1, 0.2))
     assert [rapid.end.tolist() for rapid in found.rapids[1:]] == [[0.01, 0.0, 0.002], [0.01, 0.0, 0.2]]
     ends = program("G21 F100\nG91 G28 Z0\nG90 G0 X5\nG1 X10\nG53 G0 Z0\nG28\nM30\n")
-    assert len(ends.stretches) == 2
+    assert len(ends.sections) == 2
     assert [note.lines for note in ends.notes if "machine" in note.text] == [(2, 6), (5,)]
 
 

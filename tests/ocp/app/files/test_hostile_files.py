@@ -24,8 +24,8 @@ from models.shapes.mesh_files import read_mesh
 from models.shapes.pairs import checked_pairs
 from ocp import ProblemError, Solution
 from ocp.app.files import lines, read_gcode, read_trajectory, read_waypoints
-from ocp.app.files.lines import read_tree
 from ocp.app.files.task_file import read_obstacles, read_task
+from ocp.app.files.text_files import read_tree
 from ocp.motion.schedule import JointTrajectory
 
 READERS: dict[str, tuple[str, Callable[[Any], Any]]] = {

@@ -25,25 +25,25 @@ from models.input_files import INPUT_LIMITS
 from models.paths import Arc, Helix
 from models.paths.segments import SHORTEST_SEGMENT
 from models.spatial import FULL_TURN
-from ocp.app.files.lines import FileName, wrong_line
+from ocp.app.files.text_files import FileName, line_error
 from ocp.tolerances import STANDSTILL
 
 __all__ = [
     "GROUPS",
-    "KEPT",
-    "LETTERS",
-    "MACHINE",
+    "IGNORED_CODES",
+    "IGNORED_LETTERS",
+    "MACHINE_CODES",
     "MOTIONS",
     "M_WORDS",
     "PLANES",
-    "POST",
-    "REFUSED",
+    "REPOST",
+    "UNSUPPORTED_CODES",
+    "ArcError",
     "Block",
-    "Gap",
-    "about_center",
-    "blocks",
-    "center_of_radius",
+    "arcs_about_center",
+    "center_from_radius",
     "code_name",
+    "read_blocks",
 ]
 
 PLANES = {170: (0, 1, 2), 180: (2, 0, 1), 190: (1, 2, 0)}
@@ -52,7 +52,7 @@ RADIUS_SHARE = 1e-3
 """Of the radius: by so much the distances from the centre may differ where numbers have few digits."""
 
 
-class Gap(Exception):
+class ArcError(Exception):
     """Numbers that make no arc.
 
     Attributes:
@@ -65,25 +65,25 @@ class Gap(Exception):
         self.why, self.size, self.limit = why, size, limit
 
 
-def center_of_radius(start: Array, end: Array, radius: float, clockwise: bool, gap: float) -> Array:
+def center_from_radius(start: Array, end: Array, radius: float, clockwise: bool, gap: float) -> Array:
     """Centre of an arc given by its radius, the longer way round if that is negative. In the plane, shape (2,), m.
 
     Raises:
-        Gap: A radius less than half the chord by more than `gap`, or a chord that is none.
+        ArcError: A radius less than half the chord by more than `gap`, or a chord that is none.
     """
     chord = end - start
     length = float(np.hypot(*chord))
     if length == 0:
-        raise Gap("an arc by its radius ends where it starts; give I, J, K for a full circle", 0.0, gap)
+        raise ArcError("an arc by its radius ends where it starts; give I, J, K for a full circle", 0.0, gap)
     short = length / 2 - abs(radius)
     if short > gap and short > RADIUS_SHARE * length / 2:
-        raise Gap(f"R is {short:.3g} m less than half the way from start to end", short, gap)
+        raise ArcError(f"R is {short:.3g} m less than half the way from start to end", short, gap)
     height = np.sqrt(max(radius**2 - length**2 / 4, 0.0))
     left = np.array([-chord[1], chord[0]]) / length
     return np.asarray((start + end) / 2 + (height if clockwise == (radius < 0) else -height) * left)
 
 
-def about_center(
+def arcs_about_center(
     start: Array, end: Array, center: Array, clockwise: bool, turns: int, plane: tuple[int, int, int], gap: float
 ) -> list[Arc | Helix]:
     """Arcs or helices from start to end: one, or two halves where one centre cannot be moved to serve both ends.
@@ -98,18 +98,18 @@ def about_center(
         gap: Largest difference of the distances from the centre that counts as rounding, m.
 
     Raises:
-        Gap: A centre that is not in the middle, by more than rounding.
+        ArcError: A centre that is not in the middle, by more than rounding.
     """
     inside, normal = list(plane[:2]), plane[2]
     first, last = start[inside], end[inside]
     radii = float(np.hypot(*(first - center))), float(np.hypot(*(last - center)))
     if min(radii) <= SHORTEST_SEGMENT:
-        raise Gap("the centre is the start or the end of the arc", max(radii), gap)
+        raise ArcError("the centre is the start or the end of the arc", max(radii), gap)
     off = abs(radii[0] - radii[1])
     allowed = max(gap, min(RADIUS_SHARE * max(radii), 100 * gap))  # two digits fewer than usual, at most
     if off > allowed:
         what = f"start and end are {radii[0]:.6g} and {radii[1]:.6g} m from the centre, {off:.3g} m apart"
-        raise Gap(what, off, allowed)
+        raise ArcError(what, off, allowed)
     sweep = _sweep(first - center, last - center, clockwise)
     moved = _moved(center, first, last)
     # what moving the centre does to the far side of the arc
@@ -173,23 +173,23 @@ GROUPS: dict[int, str] = {
 }
 """Of G codes, in tenths, of which a line may have one."""
 
-POST = "post the program without it"
-REFUSED: dict[int, str] = {
-    **dict.fromkeys((50, 51, 52, 53, 60, 61, 62), f"splines are not read; {POST}, as G1, G2 and G3"),
-    **dict.fromkeys((70, 330, 331, 760, 700, 710, 711, 712, 720, 721, 722), f"lathe words are not read; {POST}"),
-    **dict.fromkeys((120, 130), f"pocket cycles are not read; {POST}"),
-    **dict.fromkeys((160, 161), f"polar coordinates are not read; {POST}"),
-    **dict.fromkeys((310, 382, 383, 384, 385), f"probing has no path that is known before; {POST}"),
+REPOST = "post the program without it"
+UNSUPPORTED_CODES: dict[int, str] = {
+    **dict.fromkeys((50, 51, 52, 53, 60, 61, 62), f"splines are not read; {REPOST}, as G1, G2 and G3"),
+    **dict.fromkeys((70, 330, 331, 760, 700, 710, 711, 712, 720, 721, 722), f"lathe words are not read; {REPOST}"),
+    **dict.fromkeys((120, 130), f"pocket cycles are not read; {REPOST}"),
+    **dict.fromkeys((160, 161), f"polar coordinates are not read; {REPOST}"),
+    **dict.fromkeys((310, 382, 383, 384, 385), f"probing has no path that is known before; {REPOST}"),
     **dict.fromkeys((410, 411, 420, 421), "cutter compensation is not read; let the CAM compensate, or write G40"),
-    **dict.fromkeys((650, 660, 670), f"macro calls are not run; {POST}"),
-    **dict.fromkeys((680, 510, 511), f"rotated and scaled coordinates are not read; {POST}"),
-    **dict.fromkeys((730, 740, *range(810, 900, 10)), f"canned cycles are not read; {POST}, as G0 and G1"),
-    100: f"offsets of the machine cannot be set here; {POST}",
+    **dict.fromkeys((650, 660, 670), f"macro calls are not run; {REPOST}"),
+    **dict.fromkeys((680, 510, 511), f"rotated and scaled coordinates are not read; {REPOST}"),
+    **dict.fromkeys((730, 740, *range(810, 900, 10)), f"canned cycles are not read; {REPOST}, as G0 and G1"),
+    100: f"offsets of the machine cannot be set here; {REPOST}",
     520: "local offsets are not read; write G92, or post the program without it",
     923: "offsets kept from another program are not known; write G92 with numbers",
     950: "feed per revolution is not read; write G94 and units per minute",
 }
-KEPT: dict[int, str] = {
+IGNORED_CODES: dict[int, str] = {
     80: "diameters off: so it is",
     150: "polar coordinates off: so it is",
     400: "cutter compensation off: so it is",
@@ -205,7 +205,7 @@ KEPT: dict[int, str] = {
     980: "return of canned cycles, passed over",
     990: "return of canned cycles, passed over",
 }
-LETTERS: dict[str, str] = {
+IGNORED_LETTERS: dict[str, str] = {
     "S": "S: spindle speed, passed over",
     "T": "T: tool, passed over",
     "H": "H: tool length, passed over",
@@ -220,7 +220,7 @@ M_WORDS = {
     **dict.fromkeys((970, 980, 990), "call"),
 }
 """What M words mean for a path; all others are passed over."""
-MACHINE = (280, 281, 300, 301, 530)
+MACHINE_CODES = (280, 281, 300, 301, 530)
 """G words that lead to, or store, positions which the machine knows."""
 
 WORD = re.compile(r"([A-Z])([+-]?(?:\d+\.?\d*|\.\d+))")
@@ -250,7 +250,7 @@ class Block(NamedTuple):
     skipped: bool
 
 
-def blocks(file: FileName, lines: Sequence[str]) -> Iterator[Block]:
+def read_blocks(file: FileName, lines: Sequence[str]) -> Iterator[Block]:
     """Blocks with words in them, up to the second `%`.
 
     Raises:
@@ -271,7 +271,7 @@ def blocks(file: FileName, lines: Sequence[str]) -> Iterator[Block]:
             continue
         inside = True  # a lone % after words ends the program, too
         if ("E" in line or "e" in line) and (exponent := EXPONENT.search(line)):
-            raise wrong_line(file, number, text, f"{exponent[0]!r} is no number of G-code; write it without E")
+            raise line_error(file, number, text, f"{exponent[0]!r} is no number of G-code; write it without E")
         line = "".join(words)
         skipped = line[0] == "/"
         line = DELETED.sub("", line) if skipped else line
@@ -286,13 +286,13 @@ def blocks(file: FileName, lines: Sequence[str]) -> Iterator[Block]:
                 codes.append((letter, _tenths(file, number, text, letter, value)))
             elif letter == "O":
                 if not PROGRAM_NUMBER.fullmatch(line):
-                    raise wrong_line(file, number, text, NOT_RUN)
+                    raise line_error(file, number, text, NOT_RUN)
             elif letter != "N":
                 if letter in values:
-                    raise wrong_line(file, number, text, f"{letter} stands twice in one line; leave one")
+                    raise line_error(file, number, text, f"{letter} stands twice in one line; leave one")
                 if len(value) > INPUT_LIMITS.number_characters:
                     why = f"{letter} has more than {INPUT_LIMITS.number_characters} digits"
-                    raise wrong_line(file, number, text, why)
+                    raise line_error(file, number, text, why)
                 values[letter] = float(value)
         if codes or values:
             yield Block(number, text, tuple(codes), values, skipped)
@@ -304,26 +304,26 @@ def _without_comments(file: FileName, number: int, text: str) -> str:
         line = COMMENT.sub(" ", text)
         line = line.partition(";")[0] if "(" not in line.partition(";")[0] else line
     if "(" in line or ")" in line:
-        raise wrong_line(file, number, text, "a comment is not closed, or stands in another; close it by one ')'")
+        raise line_error(file, number, text, "a comment is not closed, or stands in another; close it by one ')'")
     return line
 
 
 def _tenths(file: FileName, number: int, text: str, letter: str, value: str) -> int:
     exact = float(value) * 10 if len(value) < 9 else -1.0
     if exact < 0 or abs(exact - round(exact)) > 1e-6:
-        raise wrong_line(file, number, text, f"{letter}{value} is no code; codes have one decimal at most")
+        raise line_error(file, number, text, f"{letter}{value} is no code; codes have one decimal at most")
     return round(exact)
 
 
 def _refuse(file: FileName, number: int, text: str, line: str) -> None:
     if CONTROL.match(line):
-        raise wrong_line(file, number, text, NOT_RUN)
+        raise line_error(file, number, text, NOT_RUN)
     if any(sign in line for sign in "#[]=<>"):
         why = "parameters and expressions are not evaluated; post the program with plain numbers"
-        raise wrong_line(file, number, text, why)
+        raise line_error(file, number, text, why)
     rest = WORD.sub("", line)
     message = f"{rest[:20]!r} is no word of G-code, a letter and a number; correct it or make it a comment"
-    raise wrong_line(file, number, text, message)
+    raise line_error(file, number, text, message)
 
 
 def code_name(tenths: int) -> str:

@@ -16,7 +16,7 @@ from ocp.errors import MOST, ProblemError, checked_instance, checked_positive
 from ocp.motion.plan import Plan, SegmentedPlan, plan, plan_in_segments
 from ocp.storage import write_text
 
-__all__ = ["EXPORTED", "check_period", "export", "run_task"]
+__all__ = ["EXPORT_KINDS", "check_period", "export_plan", "run_task"]
 
 TOLD = ("name", "value", "limit", "unit", "time", "passed", "verdict", "note")
 """Of a finding of the audit."""
@@ -47,10 +47,10 @@ def run_task(
             WRITERS[kind](made, place, task.period, task.file)
 
     for kind, file in outputs.items():  # before anybody waits for the plan
-        numbered = file.parent.glob(f"{escape(file.stem)}-*{escape(file.suffix)}") if task.in_pieces else ()
+        numbered = file.parent.glob(f"{escape(file.stem)}-*{escape(file.suffix)}") if task.in_segments else ()
         for taken in (file, *numbered):
             checked(kind, taken)
-    if task.in_pieces:
+    if task.in_segments:
         found = plan_in_segments(checked_instance("machine", task.machine, FixedBase), task.task, **task.options)
         if found.reconfigurations:
             return _in_pieces(task, found, outputs, progress, write)
@@ -126,16 +126,16 @@ def _written(files: list[Path]) -> list[str]:
     return [f"written: {file}" for file in files] or [nothing]
 
 
-def export(made: Plan, file: Path, period: float, force: bool = False) -> None:
+def export_plan(made: Plan, file: Path, period: float, force: bool = False) -> None:
     """Write a plan by the end of the file's name.
 
     Raises:
         ProblemError: A name with another end, a period that is not positive, a file that selfmotion did not write,
             unless `force`.
     """
-    kind = next((kind for kind in EXPORTED if file.suffix.lower() in SUFFIXES[kind]), None)
+    kind = next((kind for kind in EXPORT_KINDS if file.suffix.lower() in SUFFIXES[kind]), None)
     if kind is None:
-        known = tuple(SUFFIXES[kind][0] for kind in EXPORTED)
+        known = tuple(SUFFIXES[kind][0] for kind in EXPORT_KINDS)
         words = f"{file}: a plan is written as {', '.join(known)}; end the name with one of these"
         raise ProblemError(words, name="file", value=str(file), limit=known)
     place = checked_output(kind, file, force=force)
@@ -176,4 +176,4 @@ WRITERS: dict[str, Callable[[Plan, Path, float, str], Any]] = {
     "report": _report,
 }
 """What writes each kind of output: a plan, a file, the period of samples in s, and a title."""
-EXPORTED = ("csv", "json", "yaml", "mcap", "urdf")
+EXPORT_KINDS = ("csv", "json", "yaml", "mcap", "urdf")

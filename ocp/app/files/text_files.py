@@ -17,7 +17,16 @@ from typing import Any
 from models.input_files import INPUT_LIMITS, UnfitFile, read_regular
 from ocp.errors import ProblemError
 
-__all__ = ["FileName", "cells_of", "checked_depth", "is_number", "parts_of", "read_lines", "read_tree", "wrong_line"]
+__all__ = [
+    "FileName",
+    "checked_depth",
+    "children_of",
+    "is_number",
+    "line_error",
+    "read_lines",
+    "read_tree",
+    "split_cells",
+]
 
 FileName = str | PathLike[str]
 BEFORE_UNIT = re.compile(r"(?<!\s)\s+(?=[\[(])")
@@ -56,20 +65,20 @@ def read_lines(
         raise ProblemError(message, name="file", value=len(lines), limit=INPUT_LIMITS.text_lines)
     if longest is not None and max(len(line) for line in lines) > longest:
         i = next(i for i, line in enumerate(lines) if len(line) > longest)
-        raise wrong_line(path, i + 1, lines[i], f"longer than {longest} characters; break it", longest)
+        raise line_error(path, i + 1, lines[i], f"longer than {longest} characters; break it", longest)
     if not text.strip():
         raise ProblemError(f"{path}: the file is empty", name="file", value=str(path))
     return lines
 
 
-def wrong_line(file: Any, number: int, text: str, why: str, limit: Any = None) -> ProblemError:
+def line_error(file: Any, number: int, text: str, why: str, limit: Any = None) -> ProblemError:
     """The error of a line, which is counted from 1: what it says, what is wrong and what to do."""
     shown = text.strip()
     shown = shown if len(shown) <= LONGEST_SHOWN else shown[:LONGEST_SHOWN] + " ..."
     return ProblemError(f"{file}, line {number}, {shown!r}: {why}", name=f"line {number}", value=shown, limit=limit)
 
 
-def cells_of(line: str, delimiter: str) -> list[str]:
+def split_cells(line: str, delimiter: str) -> list[str]:
     """Return the cells of a line of a table, without quotes; where semicolons divide them a comma is decimal."""
     if delimiter == " ":
         return [cell.strip("\"'") for cell in BEFORE_UNIT.sub("", line).split()]
@@ -213,12 +222,12 @@ def checked_depth(tree: Any) -> Any:
     """Return a tree; raise ValueError where its containers stand in each other more than INPUT_LIMITS.nesting deep."""
     level = [tree]
     for _ in range(INPUT_LIMITS.nesting + 1):
-        level = [part for one in level for part in parts_of(one)]
+        level = [part for one in level for part in children_of(one)]
     if level:
         raise ValueError(TOO_DEEP)
     return tree
 
 
-def parts_of(value: Any) -> list[Any]:
+def children_of(value: Any) -> list[Any]:
     """Return the values of a mapping or list; of anything else none."""
     return list(value.values()) if isinstance(value, Mapping) else value if isinstance(value, list) else []

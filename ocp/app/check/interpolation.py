@@ -26,14 +26,14 @@ from numpy.typing import NDArray
 from models.arrays import Array
 from ocp.errors import ProblemError
 
-__all__ = ["Along", "Indices", "Motion", "Pieces", "Rule", "half_digits", "highest"]
+__all__ = ["Indices", "Motion", "MotionQuantity", "PiecewisePolynomial", "Rule", "half_digits", "polynomial_maxima"]
 
 Indices: TypeAlias = NDArray[np.intp]
 Rule: TypeAlias = Literal["linear", "cubic", "quintic"]
 
 
 @dataclass(frozen=True, eq=False)
-class Pieces:
+class PiecewisePolynomial:
     """Polynomials one after the other.
 
     Attributes:
@@ -44,11 +44,11 @@ class Pieces:
     t: Array
     coefficients: Array
 
-    def derivative(self) -> Pieces:
+    def derivative(self) -> PiecewisePolynomial:
         """In time."""
         degree = self.coefficients.shape[1] - 1
         width = np.diff(self.t)[:, None, None]
-        return Pieces(self.t, degree * np.diff(self.coefficients, axis=1) / width)
+        return PiecewisePolynomial(self.t, degree * np.diff(self.coefficients, axis=1) / width)
 
     def at(self, times: Array) -> Array:
         """Values at times (M,), continuous from the right, clipped to the ends. Shape (M, n)."""
@@ -71,7 +71,7 @@ class Pieces:
         return np.asarray(np.abs(self.coefficients).max(axis=1))
 
 
-def highest(coefficients: Array) -> tuple[Array, Array]:
+def polynomial_maxima(coefficients: Array) -> tuple[Array, Array]:
     """Greatest values of polynomials by their Bernstein coefficients (K, d + 1), and where, 0 to 1. Shape (K,) each."""
     first, last = coefficients[:, 0], coefficients[:, -1]
     best, place = np.maximum(first, last), np.where(last > first, 1.0, 0.0)
@@ -105,7 +105,7 @@ def _halves(coefficients: Array) -> tuple[Array, Array]:
     return np.stack(left, axis=1), np.stack(right[::-1], axis=1)
 
 
-class Along(NamedTuple):
+class MotionQuantity(NamedTuple):
     """Something of every joint along a motion.
 
     Attributes:
@@ -116,7 +116,7 @@ class Along(NamedTuple):
             piece; infinite where the interpolant itself counts. Shape (N, n) each, or ().
     """
 
-    pieces: Pieces
+    pieces: PiecewisePolynomial
     blur: Array
     closed: bool
     needed: tuple[Any, Any] = (np.inf, np.inf)
@@ -160,7 +160,7 @@ class Motion:
         return Motion(self.t, self.q, v, a, stated=True)
 
     @cached_property
-    def position(self) -> Pieces:
+    def position(self) -> PiecewisePolynomial:
         """As polynomials."""
         h = np.diff(self.t)[:, None]
         q, v, a = self.q, self.v, self.a
@@ -175,15 +175,15 @@ class Motion:
                 q[1:] - 2 * h / 5 * v[1:] + h**2 / 20 * a[1:],
                 q[1:] - h / 5 * v[1:],
             ]
-        return Pieces(self.t, np.stack([q[:-1], *inner, q[1:]], axis=1))
+        return PiecewisePolynomial(self.t, np.stack([q[:-1], *inner, q[1:]], axis=1))
 
     @cached_property
-    def velocity(self) -> Pieces:
+    def velocity(self) -> PiecewisePolynomial:
         """As polynomials; steps where the file has positions alone."""
         return self.position.derivative()
 
     @cached_property
-    def acceleration(self) -> Pieces | None:
+    def acceleration(self) -> PiecewisePolynomial | None:
         """As polynomials; None where there is none, of straight lines."""
         return None if self.v is None else self.velocity.derivative()
 
@@ -193,31 +193,31 @@ class Motion:
         none = np.zeros(self.q.shape[1])
         return tuple(none if values is None else half_digits(values) for values in (self.q, self.v, self.a))  # type: ignore[return-value]
 
-    def along(self, what: str) -> Along | None:
+    def quantity(self, what: str) -> MotionQuantity | None:
         """Its "position", "velocity", "acceleration" or "jerk"; None where there are too few samples."""
         h = np.diff(self.t)[:, None]
         eq, ev, ea = self.digits
         smooth = {"linear": 0, "cubic": 1, "quintic": 2}[self.rule]
         if what == "position":
-            return Along(self.position, np.broadcast_to(eq, h.shape[:1] + eq.shape), True)
+            return MotionQuantity(self.position, np.broadcast_to(eq, h.shape[:1] + eq.shape), True)
         if what == "velocity":
             # of the Bernstein coefficients only the middle one has the difference of positions in it
             grows = {0: 2 * eq / h, 1: 3 * eq / h + ev, 2: 3.75 * eq / h + 2.5 * ev + 0.2 * h * ea}[smooth]
-            return Along(self.velocity, grows, True, self.needed(what))
+            return MotionQuantity(self.velocity, grows, True, self.needed(what))
         if what == "acceleration" and smooth:
             assert self.acceleration is not None
             grows = 12 * eq / h**2 + 6 * ev / h if smooth == 1 else 30 * eq / h**2 + 15 * ev / h + 3 * ea
-            return Along(self.acceleration, grows, True, self.needed(what))
+            return MotionQuantity(self.acceleration, grows, True, self.needed(what))
         if what == "jerk" and smooth == 2:
             assert self.acceleration is not None
             grows = 120 * eq / h**3 + 60 * ev / h**2 + 12 * ea / h
-            return Along(self.acceleration.derivative(), grows, True, self.needed(what))
+            return MotionQuantity(self.acceleration.derivative(), grows, True, self.needed(what))
         values, digits, order = (self.q, eq, 2 if what == "acceleration" else 3) if smooth == 0 else (self.v, ev, 2)
         assert values is not None
         return self._differences(values, digits, order)
 
     def needed(self, what: str) -> tuple[Any, Any]:
-        """What every motion through the samples needs in each piece, as `Along.needed`.
+        """What every motion through the samples needs in each piece, as `MotionQuantity.needed`.
 
         Acceleration: a motion between positions and velocities needs the least if it switches once from A to -A, where
         A = (2 |e| + sqrt(4 e^2 + h^2 d^2)) / h^2, d is the change of velocity, and e the way less h times the mean
@@ -252,7 +252,7 @@ class Motion:
 
         return peak(1.0), peak(-1.0)
 
-    def _differences(self, values: Array, digits: Array, order: int) -> Along | None:
+    def _differences(self, values: Array, digits: Array, order: int) -> MotionQuantity | None:
         """order! times divided differences, each between the times of all of its samples."""
         if len(self.t) <= order:
             return None
@@ -263,7 +263,7 @@ class Motion:
         begin, end = self.t[:-order], self.t[order:]
         middle = (begin + end) / 2
         edges = np.concatenate([[begin[0]], (middle[1:] + middle[:-1]) / 2, [end[-1]]])
-        return Along(Pieces(edges, table[:, None]), blur, False)
+        return MotionQuantity(PiecewisePolynomial(edges, table[:, None]), blur, False)
 
 
 def half_digits(values: Array) -> Array:

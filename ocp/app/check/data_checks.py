@@ -16,15 +16,23 @@ import numpy as np
 
 from models import Robot
 from models.arrays import Array
-from ocp.app.check.pieces import Indices, Motion, half_digits
+from ocp.app.check.interpolation import Indices, Motion, half_digits
 from ocp.app.files import RawTrajectory
 from ocp.errors import ProblemError
 
-__all__ = ["SMALL_UNITS", "THRESHOLDS", "Fault", "OddityThresholds", "Readable", "likely_unit", "readable"]
+__all__ = [
+    "SMALL_UNITS",
+    "THRESHOLDS",
+    "CleanedTrajectory",
+    "DataThresholds",
+    "Fault",
+    "clean_trajectory",
+    "likely_unit",
+]
 
 
 @dataclass(frozen=True)
-class OddityThresholds:
+class DataThresholds:
     """From where on a file is doubted.
 
     Attributes:
@@ -48,7 +56,7 @@ class OddityThresholds:
     even: float = 5e-4
 
 
-THRESHOLDS = OddityThresholds()
+THRESHOLDS = DataThresholds()
 SMALL_UNITS = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
 FACTORS = {
     180 / np.pi: "degrees per second",
@@ -90,7 +98,7 @@ class Fault:
 
 
 @dataclass(frozen=True, eq=False)
-class Readable:
+class CleanedTrajectory:
     """What is left of a trajectory.
 
     Attributes:
@@ -115,7 +123,7 @@ BASES = (("base.x", "base.y", "base.z", "base.qw", "base.qx", "base.qy", "base.q
 """Names of the columns of a floating base."""
 
 
-def readable(
+def clean_trajectory(
     raw: RawTrajectory,
     robot: Robot,
     lower: Array,
@@ -123,7 +131,7 @@ def readable(
     velocity: Array,
     stated: bool = False,
     unwrap: bool = False,
-) -> Readable:
+) -> CleanedTrajectory:
     """What is left of a file's trajectory for a robot.
 
     Args:
@@ -169,7 +177,7 @@ def readable(
     t = _time_by_velocities(t, q, v, names, faults)
     _jumps(t, q, names, kinds, velocity[joints], faults)
     _followers(raw, robot, rows, faults)
-    return Readable(joints, Motion(t, q, v, a), faults, notes, base, efforts, len(raw.t))
+    return CleanedTrajectory(joints, Motion(t, q, v, a), faults, notes, base, efforts, len(raw.t))
 
 
 def _columns(
@@ -190,7 +198,7 @@ def _columns(
             notes.append(f"{name} is fixed in the robot; its column is not read")
     for name in strange:
         near = get_close_matches(name, missing, n=1, cutoff=0.7)
-        if raw.told or near:
+        if raw.names_are_joints or near:
             hint = f"; is it {near[0]}?" if near else ""
             faults.append(Fault("unknown joint", name, f"the robot has no joint of that name{hint}"))
         else:

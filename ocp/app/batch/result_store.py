@@ -21,12 +21,12 @@ from math import isfinite
 from pathlib import Path
 from typing import Any
 
-from ocp.app.batch.content import Parcel, key_of, text_of, unpacked
+from ocp.app.batch.content import Payload, canonical_text, key_of, unpack_result
 from ocp.console import LOG
 from ocp.errors import ProblemError
 from ocp.storage import END, checked_path, open_unlinked, write_whole
 
-__all__ = ["ENDS", "Ledger"]
+__all__ = ["ENDS", "ResultStore"]
 
 FORMAT = 2
 HEAD = "batch.json"
@@ -50,7 +50,7 @@ PARTS = {
 """Of a record, with their kinds."""
 
 
-class Ledger:
+class ResultStore:
     """The records of a folder.
 
     Attributes:
@@ -61,7 +61,7 @@ class Ledger:
         self.folder, self.function, self.version = folder, function, version
 
     @classmethod
-    def at(cls, folder: Any) -> Ledger:
+    def at(cls, folder: Any) -> ResultStore:
         """The ledger that is there.
 
         Raises:
@@ -88,7 +88,7 @@ class Ledger:
         return found
 
     @classmethod
-    def of(cls, folder: Any, function: str, version: str, chosen: bool) -> Ledger:
+    def of(cls, folder: Any, function: str, version: str, chosen: bool) -> ResultStore:
         """The ledger of a function in a folder, begun where the folder is new or empty.
 
         Args:
@@ -167,7 +167,9 @@ class Ledger:
         try:
             place = self._place(key)
             record: Any = None if place.parent.is_symlink() else loaded(place)
-            sound = record.keys() == PARTS.keys() and record["key"] == key == key_of(text_of(record["task"], "task"))
+            sound = record.keys() == PARTS.keys() and record["key"] == key == key_of(
+                canonical_text(record["task"], "task")
+            )
             sound = sound and all(isinstance(record[name], kind) for name, kind in PARTS.items())
             if not sound or record["status"] not in ENDS:
                 return None
@@ -199,7 +201,7 @@ class Ledger:
         text = json.dumps(record, allow_nan=False).encode()
         write_whole(place, lambda stream: stream.write(text), synced=False)
 
-    def parcel(self, record: dict[str, Any]) -> Parcel:
+    def parcel(self, record: dict[str, Any]) -> Payload:
         """A record with its files.
 
         Raises:
@@ -209,11 +211,11 @@ class Ledger:
         for i in range(len(record["files"])):
             with open_unlinked(file_at(self._place(record["key"]), i)) as stream:
                 files.append(stream.read())
-        return Parcel(record, tuple(files))
+        return Payload(record, tuple(files))
 
     def value(self, record: dict[str, Any]) -> Any:
         """What the function had returned."""
-        return unpacked(self.parcel(record))
+        return unpack_result(self.parcel(record))
 
     def recorded(self) -> Iterator[str]:
         """Keys of all records, in order."""

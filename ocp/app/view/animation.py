@@ -19,12 +19,12 @@ from models import FreeFloating, Machine, Standing, inverse_dynamics, simplified
 from models.arrays import Array
 from models.machines.standing import center_of_pressure
 from models.robot.dynamics import GRAVITY
-from ocp.app.check.joint_limits import Row, floating_base, floating_torques, rows_of
-from ocp.app.check.oddities import readable
+from ocp.app.check.data_checks import clean_trajectory
+from ocp.app.check.joint_limits import Row, audit_rows, floating_torques, integrate_base
 from ocp.app.check.plan_verdict import PlanVerdict, verdict_of
 from ocp.app.check.verdict import bounds_of
 from ocp.app.files import RawTrajectory
-from ocp.app.view.pictures import Obstacle, looks_of, obstacles_of
+from ocp.app.view.pictures import Obstacle, obstacles_of, times_by_part
 from ocp.audit.audit import Audit
 from ocp.audit.clearance import nearest_along
 from ocp.errors import ProblemError, unknown_name
@@ -38,18 +38,18 @@ from ocp.solution import Solution, in_order_of
 
 __all__ = [
     "PAGE_SETTINGS",
+    "Animation",
+    "ClosestPairs",
     "Curve",
-    "Footing",
-    "Near",
+    "GroundContact",
     "PageSettings",
-    "Shown",
-    "footing_of",
+    "animate_plan",
+    "animate_solution",
+    "animate_trajectory",
+    "cumulative_integral",
+    "ground_contact",
     "joint_curves",
     "machine_curves",
-    "shown_plan",
-    "shown_solution",
-    "shown_trajectory",
-    "so_far",
 ]
 
 
@@ -72,7 +72,7 @@ class Curve:
 
 
 @dataclass(frozen=True, eq=False)
-class Footing:
+class GroundContact:
     """Where the ground pushes on a machine that stands.
 
     Attributes:
@@ -151,9 +151,9 @@ def machine_curves(machine: Machine, base: Array, joints: Array, rates: Array, b
     return found
 
 
-def footing_of(
+def ground_contact(
     machine: Standing, joints: Array, rates: Array, accelerations: Array, inside: Sequence[Curve] = ()
-) -> tuple[Footing, list[Curve]]:
+) -> tuple[GroundContact, list[Curve]]:
     """Where the ground pushes, and how far from the edge of the foot.
 
     Args:
@@ -172,15 +172,15 @@ def footing_of(
             points = np.ascontiguousarray(found[:2].T)
             distances = edges + points @ normals.T
             margin = Curve("Standing", "zero moment point from the edge of the foot", "m", distances.min(axis=1), 0.0)
-            return Footing(corners, points, True), [margin]
+            return GroundContact(corners, points, True), [margin]
     q, v, a = (ca.SX.sym(name, machine.joint_size) for name in ("q", "v", "a"))
     point = center_of_pressure(machine.ground_reaction(q, v, a))
     points, inner = Sampler([q, v, a], [point, machine.support.margin(point)])(joints, rates, accelerations)
     words = "zero moment point from the edge of the foot, no forces from outside"
-    return Footing(corners, points, False), [Curve("Standing", words, "m", inner[:, 0], 0.0)]
+    return GroundContact(corners, points, False), [Curve("Standing", words, "m", inner[:, 0], 0.0)]
 
 
-def so_far(t: Array, values: Array) -> Array:
+def cumulative_integral(t: Array, values: Array) -> Array:
     """The integral of samples (M,) up to each time, by trapezia. Shape (M,)."""
     return np.concatenate([[0.0], np.cumsum(np.diff(t) * (values[1:] + values[:-1]) / 2)])
 
@@ -213,7 +213,7 @@ class PageSettings:
 PAGE_SETTINGS = PageSettings()
 
 
-class Near(NamedTuple):
+class ClosestPairs(NamedTuple):
     """The two bodies that are nearest to each other, at K times.
 
     Attributes:
@@ -231,7 +231,7 @@ class Near(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
+class Animation:
     """A motion, sampled.
 
     Attributes:
@@ -256,8 +256,8 @@ class Shown:
     base: Array
     curves: tuple[Curve, ...]
     targets: tuple[Target, ...] = ()
-    footing: Footing | None = None
-    near: Near | None = None
+    footing: GroundContact | None = None
+    near: ClosestPairs | None = None
     around: tuple[Obstacle, ...] = ()
     verdict: str = ""
     passed: bool | None = None
@@ -265,7 +265,7 @@ class Shown:
     cost: float | None = None
 
 
-def shown_plan(plan: Plan, name: str = "plan", **settings: Any) -> Shown:
+def animate_plan(plan: Plan, name: str = "plan", **settings: Any) -> Animation:
     """A plan, with its audit, of which `settings` are."""
     times = _times(plan.horizon)
     sample = plan.sampled(times)
@@ -280,7 +280,7 @@ def shown_plan(plan: Plan, name: str = "plan", **settings: Any) -> Shown:
     given = sample.joints, sample.rates, sample.accelerations
     about: dict[str, Any] = {
         "near": near,
-        "around": tuple(obstacles_of(plan.solution, looks_of(plan, times))),
+        "around": tuple(obstacles_of(plan.solution, times_by_part(plan, times))),
         "cost": plan.cost,
         "targets": plan.targets,
     }
@@ -288,7 +288,7 @@ def shown_plan(plan: Plan, name: str = "plan", **settings: Any) -> Shown:
     return _shown(name, plan.machine, times, base, *given, _base_rates(times, base), told, **about)
 
 
-def shown_solution(
+def animate_solution(
     solution: Solution,
     machine: Machine,
     name: str = "solution",
@@ -296,7 +296,7 @@ def shown_solution(
     joints: str = "joints",
     base: str = "base",
     **settings: Any,
-) -> Shown:
+) -> Animation:
     """A solution of a problem of one's own.
 
     Args:
@@ -338,7 +338,7 @@ def shown_solution(
     return _shown(name, machine, times, place, q, v, a if smooth else None, moves, told, **about)
 
 
-def shown_trajectory(raw: RawTrajectory, machine: Machine, name: str = "") -> Shown:
+def animate_trajectory(raw: RawTrajectory, machine: Machine, name: str = "") -> Animation:
     """Anybody's trajectory, between its samples as a controller makes it.
 
     Raises:
@@ -346,7 +346,7 @@ def shown_trajectory(raw: RawTrajectory, machine: Machine, name: str = "") -> Sh
     """
     robot = machine.robot
     bounds = bounds_of(robot)
-    found = readable(raw, robot, bounds.lower, bounds.upper, bounds.velocity)
+    found = clean_trajectory(raw, robot, bounds.lower, bounds.upper, bounds.velocity)
     if len(found.joints) < robot.dof:
         lacking = [one for k, one in enumerate(robot.joint_names) if k not in found.joints]
         words = f"{raw.file} does not move {lacking}; hold them: --lock {lacking[0]}=VALUE"
@@ -361,7 +361,7 @@ def shown_trajectory(raw: RawTrajectory, machine: Machine, name: str = "") -> Sh
         told = found.base
         if told is None:
             assert isinstance(machine, FreeFloating)
-            told = floating_base(machine, motion)[0]  # moves as its momentum has it
+            told = integrate_base(machine, motion)[0]  # moves as its momentum has it
         else:
             moves = _between(begin + times, motion.t, np.gradient(told, motion.t, axis=0))
         base = _between(begin + times, motion.t, told)
@@ -384,9 +384,9 @@ def _shown(
     base_rates: Array | None,
     told: Sequence[Curve],
     **about: Any,
-) -> Shown:
+) -> Animation:
     """With what every motion tells."""
-    effort = so_far(t, (rates**2).sum(axis=1) / 2)
+    effort = cumulative_integral(t, (rates**2).sum(axis=1) / 2)
     curves = [Curve("Cost", "half the squared joint rates, so far", "", effort)]
     own = [one for one in told if one.group == "Cost"]
     curves += [
@@ -399,11 +399,13 @@ def _shown(
         curves.append(Curve("The motion", "nearest two bodies", "m", distances, float(near.asked.min())))
     footing = None
     if isinstance(machine, Standing) and accelerations is not None:
-        footing, more = footing_of(machine, joints, rates, accelerations, [one for one in told if one.group == FOOT])
+        footing, more = ground_contact(
+            machine, joints, rates, accelerations, [one for one in told if one.group == FOOT]
+        )
         curves += more
     curves += joint_curves(machine, bounds_of(machine.robot), joints, rates, accelerations)
     curves += _rooms([one for one in told if one.group != "Cost"])
-    return Shown(name, machine, t, joints, base, tuple(curves), footing=footing, **about)
+    return Animation(name, machine, t, joints, base, tuple(curves), footing=footing, **about)
 
 
 def _times(horizon: float) -> Array:
@@ -429,7 +431,7 @@ def _audited(solution: Solution, judge: Callable[[], Audit | PlanVerdict]) -> di
         return {"verdict": f"Its problem is not in the file, so that nothing is audited: {solution.problem_lost}."}
     verdict = judge()
     audit = verdict.audit if isinstance(verdict, PlanVerdict) else verdict
-    return {"verdict": f"The plan {verdict.sentence}.", "passed": verdict.passed, "rows": tuple(rows_of(audit))}
+    return {"verdict": f"The plan {verdict.sentence}.", "passed": verdict.passed, "rows": tuple(audit_rows(audit))}
 
 
 def _told(solution: Solution, fractions: Array, times: Array) -> list[Curve]:
@@ -445,7 +447,7 @@ def _told(solution: Solution, fractions: Array, times: Array) -> list[Curve]:
     p = form.parameter_vector(ordered.parameters)
     running, rows = form.sampled([form.running, form.path.expression], x, u, times, ordered.horizon, p)
     lower, upper = (side[form.path.bounds] for side in form.bound_values(p))
-    own = so_far(fractions * ordered.horizon, running[:, 0])
+    own = cumulative_integral(fractions * ordered.horizon, running[:, 0])
     return [Curve("Cost", "the problem's own, so far", "", own)] + [
         Curve(owner, label, form.units[owner], rows[:, k], float(lower[k]), float(upper[k]))
         for k, (owner, label) in enumerate(zip(form.path.owners, form.path.labels, strict=True))
@@ -467,21 +469,21 @@ def _rooms(rows: Sequence[Curve]) -> list[Curve]:
     return [one for one in found if np.isfinite(one.values).any()]
 
 
-def _near(plan: Plan) -> Near | None:
+def _near(plan: Plan) -> ClosestPairs | None:
     problem = plan.solution.problem
     if problem is None:
         return None
     looks = np.linspace(0.0, plan.horizon, PAGE_SETTINGS.near)
     found = []
-    for suffix, times in looks_of(plan, looks):
+    for suffix, times in times_by_part(plan, looks):
         found += nearest_along(problem, plan.solution, times, suffix)
     return _joined(looks, found)
 
 
-def _joined(t: Array, found: Sequence[Any]) -> Near | None:
+def _joined(t: Array, found: Sequence[Any]) -> ClosestPairs | None:
     if len(found) < len(t):
         return None
     points, distances, asked = (
         np.array([getattr(one, what) for one in found]) for what in ("points", "distance", "asked")
     )
-    return Near(t, points, distances, asked, tuple(one.bodies for one in found))
+    return ClosestPairs(t, points, distances, asked, tuple(one.bodies for one in found))

@@ -12,10 +12,10 @@ import numpy as np
 
 from models.arrays import Array
 from models.input_files import INPUT_LIMITS
-from ocp.app.files.lines import FileName, checked_depth, read_lines, wrong_line
+from ocp.app.files.text_files import FileName, checked_depth, line_error, read_lines
 from ocp.errors import NOT_NUMBERS, ProblemError, floats, real
 
-__all__ = ["Entries", "read_entries"]
+__all__ = ["TomlTable", "read_toml"]
 
 TABLE = re.compile(r"(\[\[?)([^\[\]#]+)\]\]?\s*(?:#.*)?$")
 KEY = re.compile(r"""((?:[\w-]+|"[^"]*"|'[^']*')(?:\s*\.\s*(?:[\w-]+|"[^"]*"|'[^']*'))*)\s*=""")
@@ -24,7 +24,7 @@ AT_LINE = re.compile(r"\(at line (\d+)")
 Place = tuple[Any, ...]
 
 
-class Entries:
+class TomlTable:
     """A table of a file: what was asked for is known, and `done` refuses what was not.
 
     Attributes:
@@ -45,7 +45,7 @@ class Entries:
         place = self.place if name is None else (*self.place, name)
         number = next((self._lines[place[:k]] for k in range(len(place), 0, -1) if place[:k] in self._lines), 1)
         text = self._texts[number - 1] if number <= len(self._texts) else ""
-        error = wrong_line(self.file, number, text, why)
+        error = line_error(self.file, number, text, why)
         error.name = name or ".".join(str(part) for part in place) or "file"
         return error
 
@@ -124,7 +124,7 @@ class Entries:
         found = self._taken(name, {}, expected, lambda value: isinstance(value, dict))
         for key, value in found.items():
             if not np.isfinite(real(value)):
-                raise Entries(self.file, self._texts, self._lines, (*self.place, name), found).wrong(
+                raise TomlTable(self.file, self._texts, self._lines, (*self.place, name), found).wrong(
                     key, f"{key} must be a number, not {value!r}"
                 )
         return {key: float(value) for key, value in found.items()}
@@ -150,12 +150,12 @@ class Entries:
         """Whatever stands there."""
         return self._taken(name, default, "", lambda value: True)
 
-    def table(self, name: str, expected: str = "a table", default: Any = None) -> Entries | None:
+    def table(self, name: str, expected: str = "a table", default: Any = None) -> TomlTable | None:
         """A table in this one; None where it is not there."""
         found = self._taken(name, default, expected, lambda value: isinstance(value, dict))
-        return None if found is None else Entries(self.file, self._texts, self._lines, (*self.place, name), found)
+        return None if found is None else TomlTable(self.file, self._texts, self._lines, (*self.place, name), found)
 
-    def tables(self, name: str) -> list[Entries]:
+    def tables(self, name: str) -> list[TomlTable]:
         """The tables that stand under [[name]]."""
         found = self._taken(
             name,
@@ -164,7 +164,7 @@ class Entries:
             lambda value: isinstance(value, list) and all(isinstance(one, dict) for one in value),
         )
         return [
-            Entries(self.file, self._texts, self._lines, (*self.place, name, k), one) for k, one in enumerate(found)
+            TomlTable(self.file, self._texts, self._lines, (*self.place, name, k), one) for k, one in enumerate(found)
         ]
 
     def only(self, *names: str) -> None:
@@ -197,7 +197,7 @@ def _array(value: Any) -> Array:
     return np.array(value, dtype=float)
 
 
-def read_entries(file: FileName) -> Entries:
+def read_toml(file: FileName) -> TomlTable:
     """The root table of a TOML file.
 
     Raises:
@@ -208,7 +208,7 @@ def read_entries(file: FileName) -> Entries:
         if any(
             part.count(".") > INPUT_LIMITS.nesting for part in BETWEEN.split(text)
         ):  # the parser's time grows by the square
-            raise wrong_line(
+            raise line_error(
                 file, number, text, f"a name has more than {INPUT_LIMITS.nesting} parts", INPUT_LIMITS.nesting
             )
     try:
@@ -217,10 +217,10 @@ def read_entries(file: FileName) -> Entries:
         told = AT_LINE.search(str(error))
         number = min(int(told[1]), len(texts)) if told else len(texts)
         why = AT_LINE.split(str(error))[0].strip() or str(error)
-        raise wrong_line(file, number, texts[number - 1], f"no TOML: {why}; write name = value") from error
+        raise line_error(file, number, texts[number - 1], f"no TOML: {why}; write name = value") from error
     except (RecursionError, ValueError) as error:  # ValueError: also of numbers of more digits than Python reads
         raise ProblemError(f"{file} is no TOML that is read: {error}", name="file", value=str(file)) from error
-    return Entries(str(file), texts, _places(texts), (), values)
+    return TomlTable(str(file), texts, _places(texts), (), values)
 
 
 def _places(texts: Sequence[str]) -> dict[Place, int]:
