@@ -122,9 +122,7 @@ def subcommands(parser: argparse.ArgumentParser) -> None:
     _file(check, "--report", "write one HTML file, too: pictures, curves with limits, every row")
     _force(check)
     plan = _command(commands, "plan", "plan what a task file asks for", PLAN, PLAN_EXAMPLES, run_plan)
-    plan.set_defaults(
-        called={"missing='skip'": '[scene] meshes = "skip"', "folders=[": "[scene] folders = ["}
-    )
+    plan.set_defaults(called={"missing='skip'": '[scene] meshes = "skip"', "folders=[": "[scene] folders = ["})
     _file(plan, "task", "TOML file")
     _file(plan, "--output", "the plan (.npz), whatever the task file says", short="-o")
     _file(plan, "--output-folder", "where the task's outputs lie, or below (default: the task file's folder)")

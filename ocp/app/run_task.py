@@ -1,4 +1,4 @@
-"""Plans of task files, and plans written as others read them."""
+"""Plan the motion of a task file, and write plans in other formats."""
 
 from __future__ import annotations
 
@@ -12,168 +12,171 @@ from models import FixedBase
 from ocp.app.files import write_mcap
 from ocp.app.files.outputs import MARK, SUFFIXES, checked_output
 from ocp.app.files.task_file import Task
+from ocp.app.files.text_files import missing_package
 from ocp.errors import MOST, ProblemError, checked_instance, checked_positive
 from ocp.motion.plan import Plan, SegmentedPlan, plan, plan_in_segments
 from ocp.storage import write_text
 
 __all__ = ["EXPORT_KINDS", "check_period", "export_plan", "run_task"]
 
-TOLD = ("name", "value", "limit", "unit", "time", "passed", "verdict", "note")
-"""Of a finding of the audit."""
+FINDING_FIELDS = ("name", "value", "limit", "unit", "time", "passed", "verdict", "note")
+"""Fields of the audit's findings that JSON shows."""
 
 
 def run_task(
     task: Task, output: Path | None, progress: Callable[[str], None], force: bool = False
 ) -> tuple[int, str, Any]:
-    """Plan, audit, write: exit status, text, and what JSON shows.
+    """Plan, audit and write; return the exit status, a text, and the contents of JSON.
 
     Args:
-        output: Of the plan, wherever it is; None: as the task says. force: Whether files are overwritten that
-            selfmotion did not write.
+        task: Contents of the task file.
+        output: File of the plan, anywhere; None: as in the task.
+        progress: Is called with the name of each stage.
+        force: Whether files that selfmotion did not write are overwritten.
 
     Raises:
-        ProblemError: What is asked does not fit, or is out of reach; an output may not be written.
-        SolveError: There is no motion that passes its audit; says why.
+        ProblemError: The task is infeasible or invalid, or an output may not be written.
+        SolveError: No motion passes its audit; the message gives the reasons.
     """
     outputs = task.outputs if output is None else task.outputs | {"plan": output}
-    anywhere = () if output is None else ("plan",)
+    unrestricted = () if output is None else ("plan",)
 
     def checked(kind: str, file: Path) -> Path:
-        return checked_output(kind, file, None if kind in anywhere else task.output_folder, force)
+        return checked_output(kind, file, None if kind in unrestricted else task.output_folder, force)
 
-    def write(made: Plan, files: dict[str, Path]) -> None:
-        for kind, place in {kind: checked(kind, file) for kind, file in files.items()}.items():
-            progress(f"writing {place.name}")
-            WRITERS[kind](made, place, task.period, task.file)
+    def write(result: Plan, files: dict[str, Path]) -> None:
+        for kind, path in {kind: checked(kind, file) for kind, file in files.items()}.items():
+            progress(f"writing {path.name}")
+            WRITERS[kind](result, path, task.period, task.file)
 
-    for kind, file in outputs.items():  # before anybody waits for the plan
+    for kind, file in outputs.items():  # check the outputs before the user waits for the plan
         numbered = file.parent.glob(f"{escape(file.stem)}-*{escape(file.suffix)}") if task.in_segments else ()
-        for taken in (file, *numbered):
-            checked(kind, taken)
+        for existing in (file, *numbered):
+            checked(kind, existing)
     if task.in_segments:
-        found = plan_in_segments(checked_instance("machine", task.machine, FixedBase), task.task, **task.options)
-        if found.reconfigurations:
-            return _in_pieces(task, found, outputs, progress, write)
-        made = found.pieces[0]
+        segmented = plan_in_segments(checked_instance("machine", task.machine, FixedBase), task.task, **task.options)
+        if segmented.reconfigurations:
+            return _run_segments(task, segmented, outputs, progress, write)
+        result = segmented.pieces[0]
     else:
-        made = plan(task.machine, task.task, **task.options)
-    check_period(made, task.period)
+        result = plan(task.machine, task.task, **task.options)
+    check_period(result, task.period)
     progress("audit")
-    audit = made.audit()
-    write(made, outputs)
-    lines = [str(made), f"The plan {audit.sentence}.", *_written(list(outputs.values()))]
-    told = {
+    audit = result.audit()
+    write(result, outputs)
+    lines = [str(result), f"The plan {audit.sentence}.", *_output_lines(list(outputs.values()))]
+    data = {
         "passed": audit.passed,
         "verdict": audit.sentence,
-        "cost": made.cost,
-        "bound": made.bound,
-        "duration": made.horizon,
-        "joints": made.names,
-        "start": made.at(0.0)["joints"],
+        "cost": result.cost,
+        "bound": result.bound,
+        "duration": result.horizon,
+        "joints": result.names,
+        "start": result.at(0.0)["joints"],
         "candidates": [
-            {"cost": one.cost, "reason": None if one.reason is None else str(one.reason)} for one in made.candidates
+            {"cost": candidate.cost, "reason": None if candidate.reason is None else str(candidate.reason)}
+            for candidate in result.candidates
         ],
-        "audit": [{name: getattr(finding, name) for name in TOLD} for finding in audit.findings],
+        "audit": [{name: getattr(finding, name) for name in FINDING_FIELDS} for finding in audit.findings],
         "written": {kind: str(file) for kind, file in outputs.items()},
     }
-    return (0 if audit.passed else 1), "\n".join(lines), told
+    return (0 if audit.passed else 1), "\n".join(lines), data
 
 
-def _in_pieces(
+def _run_segments(
     task: Task,
-    found: SegmentedPlan,
+    segmented: SegmentedPlan,
     outputs: dict[str, Path],
     progress: Callable[[str], None],
     write: Callable[[Plan, dict[str, Path]], None],
 ) -> tuple[int, str, Any]:
-    """As `run_task`: pieces and the ways between them, their files numbered in the order in which they are run."""
-    order: list[Plan | None] = [found.pieces[0]]
-    for way, piece in zip(found.reconfigurations, found.pieces[1:], strict=True):
-        order += [way.way, piece]
-    lines, files, passed = [str(found)], list[Path](), None not in order
-    for number, made in enumerate(order, 1):
-        if made is None:
+    """Audit and write the segments and the motions between them, with files numbered in the order of execution."""
+    motions: list[Plan | None] = [segmented.pieces[0]]
+    for reconfiguration, segment in zip(segmented.reconfigurations, segmented.pieces[1:], strict=True):
+        motions += [reconfiguration.way, segment]
+    lines, files, passed = [str(segmented)], list[Path](), None not in motions
+    for number, motion in enumerate(motions, 1):
+        if motion is None:
             continue
-        check_period(made, task.period)
+        check_period(motion, task.period)
         progress(f"audit of motion {number}")
-        audit = made.audit()
+        audit = motion.audit()
         passed &= audit.passed
         lines.append(f"Motion {number} {audit.sentence}.")
-        own = {kind: file.with_stem(f"{file.stem}-{number}") for kind, file in outputs.items()}
-        write(made, own)
-        files += own.values()
-    told = {
+        numbered = {kind: file.with_stem(f"{file.stem}-{number}") for kind, file in outputs.items()}
+        write(motion, numbered)
+        files += numbered.values()
+    reconfiguration_fields = ("time", "before", "after", "duration", "why")
+    data = {
         "passed": passed,
-        "cost": found.cost,
-        "duration": found.duration,
-        "joints": found.pieces[0].names,
-        "fewest": found.fewest,
+        "cost": segmented.cost,
+        "duration": segmented.duration,
+        "joints": segmented.pieces[0].names,
+        "fewest": segmented.fewest,
         "pieces": [
-            {"begin": begin, "duration": one.horizon, "cost": one.cost, "bound": one.bound}
-            for begin, one in zip(found.begins, found.pieces, strict=True)
+            {"begin": begin, "duration": segment.horizon, "cost": segment.cost, "bound": segment.bound}
+            for begin, segment in zip(segmented.begins, segmented.pieces, strict=True)
         ],
         "reconfigurations": [
-            {"time": one.time, "before": one.before, "after": one.after, "duration": one.duration, "why": one.why}
-            for one in found.reconfigurations
+            {name: getattr(each, name) for name in reconfiguration_fields} for each in segmented.reconfigurations
         ],
         "written": [str(file) for file in files],
     }
-    return (0 if passed else 1), "\n".join(lines + _written(files)), told
+    return (0 if passed else 1), "\n".join(lines + _output_lines(files)), data
 
 
-def _written(files: list[Path]) -> list[str]:
-    nothing = "nothing is written: give -o FILE.npz, or [output] in the task file"
-    return [f"written: {file}" for file in files] or [nothing]
+def _output_lines(files: list[Path]) -> list[str]:
+    hint = "no file is written: give -o FILE.npz, or [output] in the task file"
+    return [f"written: {file}" for file in files] or [hint]
 
 
-def export_plan(made: Plan, file: Path, period: float, force: bool = False) -> None:
-    """Write a plan by the end of the file's name.
+def export_plan(plan: Plan, file: Path, period: float, force: bool = False) -> None:
+    """Write a plan in the format of the file's suffix.
 
     Raises:
-        ProblemError: A name with another end, a period that is not positive, a file that selfmotion did not write,
-            unless `force`.
+        ProblemError: The suffix is unknown, the period is not positive, or selfmotion did not write an existing file
+            and `force` is False.
     """
     kind = next((kind for kind in EXPORT_KINDS if file.suffix.lower() in SUFFIXES[kind]), None)
     if kind is None:
         known = tuple(SUFFIXES[kind][0] for kind in EXPORT_KINDS)
-        words = f"{file}: a plan is written as {', '.join(known)}; end the name with one of these"
+        words = f"{file}: a plan can be exported as {', '.join(known)}; end the name with one of these"
         raise ProblemError(words, name="file", value=str(file), limit=known)
-    place = checked_output(kind, file, force=force)
-    check_period(made, period)
-    WRITERS[kind](made, place, period, "")
+    path = checked_output(kind, file, force=force)
+    check_period(plan, period)
+    WRITERS[kind](plan, path, period, "")
 
 
-def check_period(made: Plan, period: float) -> None:
-    """Raise ProblemError for a period that is not positive, or gives more than MOST samples."""
+def check_period(plan: Plan, period: float) -> None:
+    """Raise ProblemError if a sampling period is not positive or gives more than MOST samples."""
     checked_positive("period", period)
-    if made.horizon / period > MOST:
-        words = f"a period of {period:g} s gives {made.horizon / period:.3g} samples, at most {MOST} are written"
-        raise ProblemError(words, name="period", value=period, limit=made.horizon / MOST)
+    if plan.horizon / period > MOST:
+        words = f"a period of {period:g} s gives {plan.horizon / period:.3g} samples; at most {MOST} can be written"
+        raise ProblemError(words, name="period", value=period, limit=plan.horizon / MOST)
 
 
-def _yaml(made: Plan, file: Path, period: float) -> None:
+def _yaml(plan: Plan, file: Path, period: float) -> None:
     try:
         import yaml
     except ImportError as error:
-        words = "YAML is written by the package pyyaml: pip install 'selfmotion[yaml]'"
-        raise ProblemError(words, name="yaml") from error
-    write_text(file, f"# {MARK}\n{yaml.safe_dump(made.to_ros(period), sort_keys=False)}")
+        raise missing_package("writing YAML", "pyyaml", "yaml") from error
+    write_text(file, f"# {MARK}\n{yaml.safe_dump(plan.to_ros(period), sort_keys=False)}")
 
 
-def _report(made: Plan, file: Path, period: float, title: str) -> None:
-    from ocp.app.view.report import report_of_plan  # draws, which takes a while to import
+def _report(plan: Plan, file: Path, period: float, title: str) -> None:
+    from ocp.app.view.report import report_of_plan  # imports matplotlib, which is slow
 
-    write_text(file, report_of_plan(made, period, title).html())
+    write_text(file, report_of_plan(plan, period, title).html())
 
 
 WRITERS: dict[str, Callable[[Plan, Path, float, str], Any]] = {
-    "plan": lambda made, file, period, title: made.save(file),
-    "csv": lambda made, file, period, title: made.write_csv(file, period),
-    "json": lambda made, file, period, title: write_text(file, json.dumps(made.to_ros(period)) + "\n"),
-    "yaml": lambda made, file, period, title: _yaml(made, file, period),
-    "mcap": lambda made, file, period, title: write_mcap(made, file, period),
-    "urdf": lambda made, file, period, title: write_text(file, made.machine.robot.to_urdf()),
+    "plan": lambda plan, file, period, title: plan.save(file),
+    "csv": lambda plan, file, period, title: plan.write_csv(file, period),
+    "json": lambda plan, file, period, title: write_text(file, json.dumps(plan.to_ros(period)) + "\n"),
+    "yaml": lambda plan, file, period, title: _yaml(plan, file, period),
+    "mcap": lambda plan, file, period, title: write_mcap(plan, file, period),
+    "urdf": lambda plan, file, period, title: write_text(file, plan.machine.robot.to_urdf()),
     "report": _report,
 }
-"""What writes each kind of output: a plan, a file, the period of samples in s, and a title."""
+"""Writers of each kind of output; arguments are the plan, the file, the sampling period in s, and a title."""
 EXPORT_KINDS = ("csv", "json", "yaml", "mcap", "urdf")

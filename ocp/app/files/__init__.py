@@ -1,4 +1,4 @@
-"""Files: tool paths from waypoints and from G-code, anybody's trajectories, plans as logs and in Rerun."""
+"""Read and write files: tool paths from waypoints and G-code, joint trajectories, and plans as MCAP and Rerun logs."""
 
 from ocp.app.files.gcode import read_gcode
 from ocp.app.files.mcap import log_rerun, write_mcap

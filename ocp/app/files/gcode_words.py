@@ -1,15 +1,13 @@
-"""The words of G-code: those of a line, and what can be read of them.
+"""Split G-code lines into words, classify the codes, and construct arcs from their centre or radius.
 
-RS274/NGC as of the LinuxCNC manual, "G-Code Overview", "G-Codes" and "M-Codes": letters of either case, blanks
-anywhere, `( )` and `;` comments, block delete `/`, line numbers N, files between two lines of `%`. A program number
-`O1000` alone in its line is passed over; parameters, expressions and control words are refused, for what they come to
-depends on the machine. Codes are in tenths: 901 is G90.1; where another dialect uses a code otherwise, it is refused.
+The dialect is RS274/NGC as in the LinuxCNC manual, "G-Code Overview", "G-Codes" and "M-Codes": letters of either case,
+blanks anywhere, `( )` and `;` comments, block delete `/`, line numbers N, files between two lines of `%`. A program
+number `O1000` alone on its line is ignored. Parameters, expressions and control words are errors because their values
+depend on the machine. Codes are in tenths: 901 is G90.1. A code with another meaning in another dialect is an error.
 
-Arcs and helices of G2 and G3, from a centre or a radius.
-
-Numbers of a program are rounded, so a centre is hardly ever as far from the end as from the start. It is moved, the
-least that is needed, onto the plane that halves the chord: then the arc meets both, and no gap is left to be closed.
-LinuxCNC runs a spiral instead, about the centre that is written; the two differ by less than the gap.
+The numbers of a program are rounded, so the centre of an arc (G2, G3) is rarely at the same distance from both ends.
+It is moved by the smallest distance onto the perpendicular bisector of the chord, so that the arc meets both ends
+exactly. LinuxCNC keeps the written centre and runs a spiral instead; the two curves differ by less than the gap.
 """
 
 from __future__ import annotations
@@ -49,15 +47,16 @@ __all__ = [
 PLANES = {170: (0, 1, 2), 180: (2, 0, 1), 190: (1, 2, 0)}
 """First axis, second axis and normal of G17, G18, G19: right-handed, so that G3 turns about the normal."""
 RADIUS_SHARE = 1e-3
-"""Of the radius: by so much the distances from the centre may differ where numbers have few digits."""
+"""Relative to the radius: difference of the distances from the centre that is accepted for numbers of few digits."""
 
 
 class ArcError(Exception):
-    """Numbers that make no arc.
+    """Numbers do not describe an arc.
 
     Attributes:
-        why: What is wrong.
-        size: Of the gap that would be left, m. limit: The largest that is closed, m.
+        why: Reason.
+        size: Remaining gap, m.
+        limit: Largest gap that is closed, m.
     """
 
     def __init__(self, why: str, size: float, limit: float) -> None:
@@ -66,18 +65,18 @@ class ArcError(Exception):
 
 
 def center_from_radius(start: Array, end: Array, radius: float, clockwise: bool, gap: float) -> Array:
-    """Centre of an arc given by its radius, the longer way round if that is negative. In the plane, shape (2,), m.
+    """Return the centre, shape (2,), m, of an arc in its plane; a negative radius selects the longer arc.
 
     Raises:
-        ArcError: A radius less than half the chord by more than `gap`, or a chord that is none.
+        ArcError: The radius is smaller than half the chord by more than `gap`, or the chord is zero.
     """
     chord = end - start
     length = float(np.hypot(*chord))
     if length == 0:
-        raise ArcError("an arc by its radius ends where it starts; give I, J, K for a full circle", 0.0, gap)
-    short = length / 2 - abs(radius)
-    if short > gap and short > RADIUS_SHARE * length / 2:
-        raise ArcError(f"R is {short:.3g} m less than half the way from start to end", short, gap)
+        raise ArcError("an arc with R ends where it starts; give I, J, K for a full circle", 0.0, gap)
+    deficit = length / 2 - abs(radius)
+    if deficit > gap and deficit > RADIUS_SHARE * length / 2:
+        raise ArcError(f"R is {deficit:.3g} m less than half the chord", deficit, gap)
     height = np.sqrt(max(radius**2 - length**2 / 4, 0.0))
     left = np.array([-chord[1], chord[0]]) / length
     return np.asarray((start + end) / 2 + (height if clockwise == (radius < 0) else -height) * left)
@@ -86,34 +85,37 @@ def center_from_radius(start: Array, end: Array, radius: float, clockwise: bool,
 def arcs_about_center(
     start: Array, end: Array, center: Array, clockwise: bool, turns: int, plane: tuple[int, int, int], gap: float
 ) -> list[Arc | Helix]:
-    """Arcs or helices from start to end: one, or two halves where one centre cannot be moved to serve both ends.
+    """Return arcs or helices from start to end: one, or two halves if no single centre serves both ends.
 
-    That is so where a circle nearly closes, but ends nearer to the centre than it starts.
+    Two are needed if a circle nearly closes but ends nearer to the centre than it starts.
 
     Args:
         start, end: Shape (3,), m.
         center: In the plane. Shape (2,), m.
-        turns: Full turns begun: 1 for an arc up to a full circle.
+        clockwise: Whether the arc turns clockwise about the normal.
+        turns: Number of begun turns: 1 for an arc up to a full circle.
         plane: First axis, second axis, normal.
         gap: Largest difference of the distances from the centre that counts as rounding, m.
 
     Raises:
-        ArcError: A centre that is not in the middle, by more than rounding.
+        ArcError: The distances from the centre differ by more than rounding.
     """
-    inside, normal = list(plane[:2]), plane[2]
-    first, last = start[inside], end[inside]
+    in_plane, normal = list(plane[:2]), plane[2]
+    first, last = start[in_plane], end[in_plane]
     radii = float(np.hypot(*(first - center))), float(np.hypot(*(last - center)))
     if min(radii) <= SHORTEST_SEGMENT:
         raise ArcError("the centre is the start or the end of the arc", max(radii), gap)
-    off = abs(radii[0] - radii[1])
-    allowed = max(gap, min(RADIUS_SHARE * max(radii), 100 * gap))  # two digits fewer than usual, at most
-    if off > allowed:
-        what = f"start and end are {radii[0]:.6g} and {radii[1]:.6g} m from the centre, {off:.3g} m apart"
-        raise ArcError(what, off, allowed)
+    difference = abs(radii[0] - radii[1])
+    allowed = max(gap, min(RADIUS_SHARE * max(radii), 100 * gap))  # at most two digits fewer than usual
+    if difference > allowed:
+        why = (
+            f"start and end are {radii[0]:.6g} and {radii[1]:.6g} m from the centre: a difference of {difference:.3g} m"
+        )
+        raise ArcError(why, difference, allowed)
     sweep = _sweep(first - center, last - center, clockwise)
     moved = _moved(center, first, last)
-    # what moving the centre does to the far side of the arc
-    if np.hypot(*(moved - center)) * (1 - np.cos(sweep / 2)) <= max(2 * off, gap):
+    # displacement of the arc's far side by moving the centre
+    if np.hypot(*(moved - center)) * (1 - np.cos(sweep / 2)) <= max(2 * difference, gap):
         if (first != last).any():
             sweep = _sweep(first - moved, last - moved, clockwise)
         return [_turned(start, end, moved, clockwise, sweep + FULL_TURN * (turns - 1), plane)]
@@ -121,19 +123,19 @@ def arcs_about_center(
     cosine, sine = np.cos(half), np.sin(half)
     out = (first - center) * (radii[0] + radii[1]) / (2 * radii[0])
     middle = start.copy()
-    middle[inside] = center + np.array([cosine * out[0] - sine * out[1], sine * out[0] + cosine * out[1]])
+    middle[in_plane] = center + np.array([cosine * out[0] - sine * out[1], sine * out[0] + cosine * out[1]])
     total = sweep + FULL_TURN * (turns - 1)
     middle[normal] += (end[normal] - start[normal]) * sweep / 2 / total
-    made = []
-    for one, other, more in ((start, middle, 0.0), (middle, end, total - sweep)):
-        there = _moved(center, one[inside], other[inside])
-        turn = _sweep(one[inside] - there, other[inside] - there, clockwise)
-        made.append(_turned(one, other, there, clockwise, turn + more, plane))
-    return made
+    halves = []
+    for begin, stop, extra in ((start, middle, 0.0), (middle, end, total - sweep)):
+        own_center = _moved(center, begin[in_plane], stop[in_plane])
+        turn = _sweep(begin[in_plane] - own_center, stop[in_plane] - own_center, clockwise)
+        halves.append(_turned(begin, stop, own_center, clockwise, turn + extra, plane))
+    return halves
 
 
 def _moved(center: Array, first: Array, last: Array) -> Array:
-    """The point nearest to a centre that is as far from one point as from another. Shape (2,) each."""
+    """Return the point nearest to `center` with equal distance from both other points. Shape (2,) each."""
     chord = last - first
     square = float(chord @ chord)
     return center if square == 0 else np.asarray(center - ((center - (first + last) / 2) @ chord) / square * chord)
@@ -142,6 +144,7 @@ def _moved(center: Array, first: Array, last: Array) -> Array:
 def _turned(
     start: Array, end: Array, center: Array, clockwise: bool, sweep: float, plane: tuple[int, int, int]
 ) -> Arc | Helix:
+    """Return the arc, or for more than a turn or a rise the helix, that begins at `start` and turns by `sweep`."""
     axis, middle = np.zeros(3), start.copy()
     axis[plane[2]] = -1.0 if clockwise else 1.0
     middle[list(plane[:2])] = center
@@ -152,9 +155,10 @@ def _turned(
 
 
 def _sweep(first: Array, last: Array, clockwise: bool) -> float:
+    """Return the angle from one vector to another, in (0, 2 pi]."""
     angle = float(np.arctan2(first[0] * last[1] - first[1] * last[0], first @ last))
     angle = (-angle if clockwise else angle) % FULL_TURN
-    return angle if angle > 1e-6 else FULL_TURN  # no arc is meant to turn by less
+    return angle if angle > 1e-6 else FULL_TURN  # a smaller angle means a full circle
 
 
 MOTIONS = (0, 10, 20, 30)
@@ -171,57 +175,57 @@ GROUPS: dict[int, str] = {
     **dict.fromkeys((*range(540, 600, 10), 591, 592, 593), "coordinate system"),
     **dict.fromkeys((400, 410, 411, 420, 421), "cutter compensation"),
 }
-"""Of G codes, in tenths, of which a line may have one."""
+"""Modal groups of G codes (in tenths), of which a line may have one each."""
 
 REPOST = "post the program without it"
 UNSUPPORTED_CODES: dict[int, str] = {
-    **dict.fromkeys((50, 51, 52, 53, 60, 61, 62), f"splines are not read; {REPOST}, as G1, G2 and G3"),
-    **dict.fromkeys((70, 330, 331, 760, 700, 710, 711, 712, 720, 721, 722), f"lathe words are not read; {REPOST}"),
-    **dict.fromkeys((120, 130), f"pocket cycles are not read; {REPOST}"),
-    **dict.fromkeys((160, 161), f"polar coordinates are not read; {REPOST}"),
-    **dict.fromkeys((310, 382, 383, 384, 385), f"probing has no path that is known before; {REPOST}"),
-    **dict.fromkeys((410, 411, 420, 421), "cutter compensation is not read; let the CAM compensate, or write G40"),
-    **dict.fromkeys((650, 660, 670), f"macro calls are not run; {REPOST}"),
-    **dict.fromkeys((680, 510, 511), f"rotated and scaled coordinates are not read; {REPOST}"),
-    **dict.fromkeys((730, 740, *range(810, 900, 10)), f"canned cycles are not read; {REPOST}, as G0 and G1"),
+    **dict.fromkeys((50, 51, 52, 53, 60, 61, 62), f"splines are not supported; {REPOST}, as G1, G2 and G3"),
+    **dict.fromkeys((70, 330, 331, 760, 700, 710, 711, 712, 720, 721, 722), f"lathe words are not supported; {REPOST}"),
+    **dict.fromkeys((120, 130), f"pocket cycles are not supported; {REPOST}"),
+    **dict.fromkeys((160, 161), f"polar coordinates are not supported; {REPOST}"),
+    **dict.fromkeys((310, 382, 383, 384, 385), f"the path of probing is not known in advance; {REPOST}"),
+    **dict.fromkeys((410, 411, 420, 421), "cutter compensation is not supported; let the CAM compensate, or write G40"),
+    **dict.fromkeys((650, 660, 670), f"macro calls are not supported; {REPOST}"),
+    **dict.fromkeys((680, 510, 511), f"rotated and scaled coordinates are not supported; {REPOST}"),
+    **dict.fromkeys((730, 740, *range(810, 900, 10)), f"canned cycles are not supported; {REPOST}, as G0 and G1"),
     100: f"offsets of the machine cannot be set here; {REPOST}",
-    520: "local offsets are not read; write G92, or post the program without it",
+    520: "local offsets are not supported; write G92, or post the program without it",
     923: "offsets kept from another program are not known; write G92 with numbers",
-    950: "feed per revolution is not read; write G94 and units per minute",
+    950: "feed per revolution is not supported; write G94 and units per minute",
 }
 IGNORED_CODES: dict[int, str] = {
-    80: "diameters off: so it is",
-    150: "polar coordinates off: so it is",
-    400: "cutter compensation off: so it is",
-    800: "canned cycles off: so it is",
+    80: "diameters off: already so",
+    150: "polar coordinates off: already so",
+    400: "cutter compensation off: already so",
+    800: "canned cycles off: already so",
     430: "tool length: the path is that of the tool's tip",
     431: "tool length: the path is that of the tool's tip",
     440: "tool length: the path is that of the tool's tip",
     490: "tool length: the path is that of the tool's tip",
-    500: "scaling off: so it is",
-    690: "rotation off: so it is",
-    960: "spindle mode, passed over",
-    970: "spindle mode, passed over",
-    980: "return of canned cycles, passed over",
-    990: "return of canned cycles, passed over",
+    500: "scaling off: already so",
+    690: "rotation off: already so",
+    960: "spindle mode, ignored",
+    970: "spindle mode, ignored",
+    980: "return of canned cycles, ignored",
+    990: "return of canned cycles, ignored",
 }
 IGNORED_LETTERS: dict[str, str] = {
-    "S": "S: spindle speed, passed over",
-    "T": "T: tool, passed over",
-    "H": "H: tool length, passed over",
-    "D": "D: tool diameter, passed over",
-    "E": "E: extrusion, passed over",
-    "L": "L: passed over",
-    "Q": "Q: passed over",
+    "S": "S: spindle speed, ignored",
+    "T": "T: tool, ignored",
+    "H": "H: tool length, ignored",
+    "D": "D: tool diameter, ignored",
+    "E": "E: extrusion, ignored",
+    "L": "L: ignored",
+    "Q": "Q: ignored",
 }
 M_WORDS = {
     **dict.fromkeys((0, 10, 600), "stop"),
     **dict.fromkeys((20, 300), "end"),
     **dict.fromkeys((970, 980, 990), "call"),
 }
-"""What M words mean for a path; all others are passed over."""
+"""M words that affect the path; all others are ignored."""
 MACHINE_CODES = (280, 281, 300, 301, 530)
-"""G words that lead to, or store, positions which the machine knows."""
+"""G words that lead to, or store, positions that only the machine knows."""
 
 WORD = re.compile(r"([A-Z])([+-]?(?:\d+\.?\d*|\.\d+))")
 COMMENT = re.compile(r"\([^()]*\)")
@@ -229,17 +233,17 @@ DELETED = re.compile(r"^/\d*")
 CHECKSUM = re.compile(r"\*\d+$")
 EXPONENT = re.compile(r"[\d.]E[+-]?\d+(?![\d.])", re.IGNORECASE)
 CONTROL, PROGRAM_NUMBER = re.compile(r"(N\d+)?O[\d<]"), re.compile(r"(N\d+)?O\d+")
-NOT_RUN = "O-words (subroutines, loops, conditions) are not run; post the program without them"
+NOT_RUN = "O-words (subroutines, loops, conditions) are not supported; post the program without them"
 
 
 class Block(NamedTuple):
-    """The words of one line.
+    """Words of one line.
 
     Attributes:
-        number: Of the line in the file, from 1.
-        text: The line as it stands.
+        number: Line number in the file, from 1.
+        text: The line as written.
         codes: G and M words in tenths: ("G", 901) is G90.1.
-        words: All others by their letter.
+        words: Values of all other words by letter.
         skipped: Whether the line begins with `/`.
     """
 
@@ -251,10 +255,10 @@ class Block(NamedTuple):
 
 
 def read_blocks(file: FileName, lines: Sequence[str]) -> Iterator[Block]:
-    """Blocks with words in them, up to the second `%`.
+    """Yield the blocks that have words, up to the second `%`.
 
     Raises:
-        ProblemError: By line: what is no word, a comment without an end, an expression, a word given twice.
+        ProblemError: With the line: an invalid word, an unclosed comment, an expression, or a repeated letter.
     """
     inside = False
     for number, text in enumerate(lines, 1):
@@ -269,19 +273,19 @@ def read_blocks(file: FileName, lines: Sequence[str]) -> Iterator[Block]:
                 return
             inside = True
             continue
-        inside = True  # a lone % after words ends the program, too
+        inside = True  # a lone % after words also ends the program
         if ("E" in line or "e" in line) and (exponent := EXPONENT.search(line)):
-            raise line_error(file, number, text, f"{exponent[0]!r} is no number of G-code; write it without E")
+            raise line_error(file, number, text, f"{exponent[0]!r} is not a G-code number; write it without E")
         line = "".join(words)
         skipped = line[0] == "/"
         line = DELETED.sub("", line) if skipped else line
         if "*" in line:
             line = CHECKSUM.sub("", line)
-        found_words = WORD.findall(line)
-        if sum(len(letter) + len(value) for letter, value in found_words) != len(line):
+        word_pairs = WORD.findall(line)
+        if sum(len(letter) + len(value) for letter, value in word_pairs) != len(line):
             _refuse(file, number, text, line)
         codes, values = [], {}
-        for letter, value in found_words:
+        for letter, value in word_pairs:
             if letter in "GM":
                 codes.append((letter, _tenths(file, number, text, letter, value)))
             elif letter == "O":
@@ -289,7 +293,7 @@ def read_blocks(file: FileName, lines: Sequence[str]) -> Iterator[Block]:
                     raise line_error(file, number, text, NOT_RUN)
             elif letter != "N":
                 if letter in values:
-                    raise line_error(file, number, text, f"{letter} stands twice in one line; leave one")
+                    raise line_error(file, number, text, f"{letter} is repeated in one line; remove one")
                 if len(value) > INPUT_LIMITS.number_characters:
                     why = f"{letter} has more than {INPUT_LIMITS.number_characters} digits"
                     raise line_error(file, number, text, why)
@@ -299,34 +303,37 @@ def read_blocks(file: FileName, lines: Sequence[str]) -> Iterator[Block]:
 
 
 def _without_comments(file: FileName, number: int, text: str) -> str:
+    """Return a line without its comments."""
     line, semicolon, _ = text.partition(";") if "(" not in text.partition(";")[0] else (text, "", "")
     if not semicolon:
         line = COMMENT.sub(" ", text)
         line = line.partition(";")[0] if "(" not in line.partition(";")[0] else line
     if "(" in line or ")" in line:
-        raise line_error(file, number, text, "a comment is not closed, or stands in another; close it by one ')'")
+        raise line_error(file, number, text, "a comment is unclosed or nested; close it with one ')'")
     return line
 
 
 def _tenths(file: FileName, number: int, text: str, letter: str, value: str) -> int:
+    """Return a code in tenths."""
     exact = float(value) * 10 if len(value) < 9 else -1.0
     if exact < 0 or abs(exact - round(exact)) > 1e-6:
-        raise line_error(file, number, text, f"{letter}{value} is no code; codes have one decimal at most")
+        raise line_error(file, number, text, f"{letter}{value} is not a code; codes have at most one decimal")
     return round(exact)
 
 
 def _refuse(file: FileName, number: int, text: str, line: str) -> None:
+    """Raise ProblemError for a line with something other than words."""
     if CONTROL.match(line):
         raise line_error(file, number, text, NOT_RUN)
     if any(sign in line for sign in "#[]=<>"):
-        why = "parameters and expressions are not evaluated; post the program with plain numbers"
+        why = "parameters and expressions are not supported; post the program with plain numbers"
         raise line_error(file, number, text, why)
     rest = WORD.sub("", line)
-    message = f"{rest[:20]!r} is no word of G-code, a letter and a number; correct it or make it a comment"
+    message = f"{rest[:20]!r} is not a G-code word (a letter and a number); correct it or make it a comment"
     raise line_error(file, number, text, message)
 
 
 def code_name(tenths: int) -> str:
-    """Of a G code as it is written."""
+    """Return a G code as it is written."""
     whole, rest = divmod(tenths, 10)
     return f"G{whole}.{rest}" if rest else f"G{whole}"

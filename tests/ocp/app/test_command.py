@@ -173,16 +173,16 @@ def test_a_report_of_a_check_names_the_faults(capsys: Any, tmp_path: Path) -> No
         ("speed = 0.1\n", "", 6, "'speed' is missing: a number above 0, m/s"),
         ("speed = 0.1", "speed = -1", 8, "must be a number above 0, m/s"),
         ("speed = 0.1", 'speed = "fast"', 8, "must be a number above 0"),
-        ("speed = 0.1", "speed 0.1", 8, "no TOML"),
+        ("speed = 0.1", "speed 0.1", 8, "invalid TOML"),
         ("points = [[0.75, 0.1, 0.3], [0.75, 0.3, 0.3]]", "points = [[0.75, 0.1, 0.3]]", 7, "two or more of three"),
         ("points = [[0.75, 0.1, 0.3], [0.75, 0.3, 0.3]]", 'file = "none.csv"', 7, "there is no file"),
         ("points =", 'file = "a.csv"\npoints =', 6, "not both"),
         ('tool = "free"', 'tool = "loose"', 9, 'one of "free roll", "given", "free"'),
         ('kind = "start"', 'kind = "best"', 12, 'one of "postures", "start", "global"'),
-        ('kind = "start"', 'kind = "pieces"\ncyclic = true', 13, "leave it out"),
-        ('kind = "start"', 'kind = "pieces"\npace = "free"', 13, "leave it out"),
+        ('kind = "start"', 'kind = "pieces"\ncyclic = true', 13, "remove it"),
+        ('kind = "start"', 'kind = "pieces"\npace = "free"', 13, "remove it"),
         ('kind = "start"', "start = { elbw = 1 }", 12, "no joint 'elbw'"),
-        ('kind = "start"', "start = { elbow = 1 }", 12, "start lacks shoulder, wrist, slide"),
+        ('kind = "start"', "start = { elbow = 1 }", 12, "start has no shoulder, wrist, slide"),
         ('kind = "start"', 'kind = "start"\nseed = -1', 13, "seed must be a whole number"),
         ('shape = "box"', 'shape = "ball"', 15, 'one of "box", "sphere"'),
         ("size = [0.1, 0.1, 0.1]", "size = [0.1, 0.1]", 16, "three lengths, m"),
@@ -323,8 +323,8 @@ class Terminal(io.StringIO):
 def test_long_work_says_that_it_goes_on(monkeypatch: pytest.MonkeyPatch, terminal: bool) -> None:
     stream = Terminal() if terminal else io.StringIO()
     monkeypatch.setattr(sys, "stderr", stream)
-    monkeypatch.setattr("ocp.app.progress.EVERY", 0.05)
-    monkeypatch.setattr("ocp.app.progress.AFTER", 0.05)
+    monkeypatch.setattr("ocp.app.progress.LOG_PERIOD_S", 0.05)
+    monkeypatch.setattr("ocp.app.progress.TERMINAL_DELAY_S", 0.05)
     with Progress("work") as progress:
         progress("half of it")
         while "half of it" not in stream.getvalue():

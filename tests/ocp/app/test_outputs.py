@@ -67,7 +67,7 @@ def test_a_task_writes_nothing_outside_of_its_folder(kind: str, how: str, tmp_pa
     }[how]
     status, out, err = run(capsys, "plan", task(folder, f'{kind} = "{name}"'), "--force", "--quiet")
     assert (status, out) == (2, "")
-    assert "lies outside of" in err
+    assert "is outside of" in err
     assert "--output-folder" in err
     assert re.search(r"seam\.toml, line \d+, ", err)
     assert sorted(file.name for file in home.iterdir()) == [f"a{suffix}"]
@@ -108,7 +108,7 @@ def test_numbered_outputs_stay_there_too(tmp_path: Path, capsys: Any) -> None:
     file = task(folder, 'csv = "seam.csv"')
     file.write_text(file.read_text().replace('kind = "start"', 'kind = "pieces"'))
     status, _, err = run(capsys, "plan", file, "--quiet")
-    assert (status, "lies outside of" in err) == (2, True)
+    assert (status, "is outside of" in err) == (2, True)
     assert own.read_text() == "export PATH=/mine\n"
 
 

@@ -338,7 +338,7 @@ def test_the_largest_gap_is_that_of_the_digits_of_its_unit(
     if fits:
         program(text)
         return
-    with pytest.raises(ProblemError, match=r"from the centre, .* m apart; correct it, or read with gap=") as caught:
+    with pytest.raises(ProblemError, match=r"from the centre, .* m more or less; correct it, or read with gap=") as caught:
         program(text)
     assert caught.value.name == "line 3"
     larger = float(str(caught.value).rpartition("gap=")[2])
