@@ -1,8 +1,8 @@
-"""What is odd about a trajectory before any limit is looked at, and the motion that is left without it.
+"""Check the data of a trajectory before any limit, and return the motion without the faulty data.
 
-Joints that nobody has or that are missing, values that are no numbers, times that do not increase, other units than
-radians, metres and seconds, jumps, turns that were wrapped, followers that do not follow. Each is a fault by name and
-time; what is left is looked at further, as told.
+The checks find unknown and missing joints, values that are not numbers, times that do not increase, units other than
+radians, metres and seconds, jumps, wrapped turns, and mimic joints that do not follow. Each is a fault with name and
+time; the corrected motion is then checked further, as the fault says.
 """
 
 from __future__ import annotations
@@ -33,17 +33,18 @@ __all__ = [
 
 @dataclass(frozen=True)
 class DataThresholds:
-    """From where on a file is doubted.
+    """Thresholds of the data checks.
 
     Attributes:
-        wild: Of a limit, and 1 rad or m more: a position beyond is hardly in rad or m.
-        leap: Times how far the steps around it differ: a step that is a jump, if it is twice as long as they, too.
-        hardest: Acceleration that a lone step takes, rad/s^2 or m/s^2: arms of industry give up to about 30.
-        around: Steps before and after one with which it is compared: enough for a median that one outlier leaves.
-        longest_step: Time between samples, s: no controller waits so long.
-        tip_samples: Samples at which the tip is compared with that of exchanged joints.
-        straight, even: The tip's distance from a line over its length, and the relative spread of its speed, below
-            which it goes straight or keeps its speed: far below what joints make by chance.
+        wild: Relative to a limit, plus 1 rad or m: a position beyond it is unlikely to be in rad or m.
+        leap: A step is a jump if its velocity differs from those around it by this many times their spread, and by more
+            than their median.
+        hardest: Acceleration of a single step that counts as a jump, rad/s^2 or m/s^2; industrial arms reach about 30.
+        around: Number of steps before and after one that are compared with it; their median ignores one outlier.
+        longest_step: Time between samples, s, that no controller exceeds.
+        tip_samples: Samples at which the tip is computed for exchanged joints.
+        straight, even: A tip path is straight, or its speed constant, below this distance from a line over its length,
+            or this relative standard deviation. Both are far below the values of arbitrary joint motions.
     """
 
     wild: float = 1.5
@@ -66,20 +67,22 @@ FACTORS = {
     1e-3: "per millisecond",
     -1.0: "of the opposite sign",
 }
-"""Velocities written by those that the positions have, and what they are then; by 1000 the times are milliseconds."""
+"""Ratios of the velocities in a file to those of its positions, and their likely unit; by 1000: times in ms."""
 
 
 @dataclass(frozen=True)
 class Fault:
-    """Something that is wrong with a trajectory.
+    """A fault of a trajectory.
 
     Attributes:
         kind: "jump", "velocity", "clearance", "suspicion", ...
-        name: Of the joint, the two bodies, or the waypoint; "" where it is about the whole.
-        text: What is wrong, in words.
-        time: Where it is worst, s; None where it is everywhere. first: Where it begins.
-        value, limit: What was found and what may be. unit: Of both.
-        line: Of the file, where it is one line's.
+        name: Joint, pair of bodies, or waypoint; "" if it concerns the whole trajectory.
+        text: Description.
+        time: Time of the worst violation, s; None if it holds throughout.
+        first: Time of the first violation, s.
+        value, limit: Worst value and what is allowed.
+        unit: Unit of both.
+        line: Line in the file, if the fault is in one line.
     """
 
     kind: str
@@ -99,15 +102,15 @@ class Fault:
 
 @dataclass(frozen=True, eq=False)
 class CleanedTrajectory:
-    """What is left of a trajectory.
+    """Usable part of a trajectory.
 
     Attributes:
-        joints: Columns of the robot's joint vector that are there. Shape (k,).
-        motion: Of these.
-        faults, notes: What was found; what was passed over or taken otherwise than it stands.
+        joints: Indices of its joints in the robot's joint vector. Shape (k,).
+        motion: Motion of these joints.
+        faults, notes: Faults, and what was ignored or interpreted.
         base: Configuration of a floating base over time, or None. Shape (M, 3) or (M, 7).
-        efforts: Of the same joints, or None. Shape (M, k).
-        samples: Of the file.
+        efforts: Efforts of these joints, or None. Shape (M, k).
+        samples: Number of samples in the file.
     """
 
     joints: Indices
@@ -120,7 +123,7 @@ class CleanedTrajectory:
 
 
 BASES = (("base.x", "base.y", "base.z", "base.qw", "base.qx", "base.qy", "base.qz"), ("base.x", "base.y", "base.angle"))
-"""Names of the columns of a floating base."""
+"""Columns of the configuration of a floating base."""
 
 
 def clean_trajectory(
@@ -132,33 +135,35 @@ def clean_trajectory(
     stated: bool = False,
     unwrap: bool = False,
 ) -> CleanedTrajectory:
-    """What is left of a file's trajectory for a robot.
+    """Return the usable part of a trajectory, with its faults.
 
     Args:
-        lower, upper, velocity: Limits of the joint vector, infinite where there are none. Shape (dof,) each.
+        raw: The trajectory as written.
+        robot: The robot that it moves.
+        lower, upper, velocity: Limits of the joint vector, infinite if there are none. Shape (dof,) each.
         stated: Whether the times are known to be in seconds.
-        unwrap: Take joints with limits that were wrapped as turning on, which is no fault then.
+        unwrap: Unwrap joints with limits; wrapped values are then a note instead of a fault.
 
     Raises:
-        ProblemError: Nothing is left: no joint of the robot, or no sample without a fault.
+        ProblemError: No joint of the robot, or no sample without a fault, is left.
     """
     faults: list[Fault] = []
     notes = list(raw.notes)
     base_names = next((names for names in BASES if set(names) <= set(raw.names)), ())
     columns, joints = _columns(raw, robot, base_names, faults, notes)
     used = [*columns, *(raw.names.index(name) for name in base_names)]
-    kept = _finite(raw, robot, columns, used, joints, faults, notes)
-    rows = _in_order(raw, kept, faults)
+    finite_rows = _finite(raw, robot, columns, used, joints, faults, notes)
+    rows = _in_order(raw, finite_rows, faults)
     t, q = raw.t[rows], raw.positions[rows][:, columns]
     v, a, efforts = (
-        None if whole is None or not np.isfinite(whole[kept][:, columns]).all() else whole[rows][:, columns]
-        for whole in (raw.velocities, raw.accelerations, raw.efforts)
+        None if values is None or not np.isfinite(values[finite_rows][:, columns]).all() else values[rows][:, columns]
+        for values in (raw.velocities, raw.accelerations, raw.efforts)
     )
-    for kind, told, left in (("velocities", raw.velocities, v), ("accelerations", raw.accelerations, a)):
-        if told is not None and left is None:
-            notes.append(f"{kind} are not those of every joint, and are not used")
+    for kind, values, usable in (("velocities", raw.velocities, v), ("accelerations", raw.accelerations, a)):
+        if values is not None and usable is None:
+            notes.append(f"{kind} are not given for every joint and are not used")
     if v is None and a is not None:
-        notes.append("accelerations without velocities are not used")
+        notes.append("accelerations without velocities are ignored")
         a = None
     base = raw.positions[rows][:, used[len(columns) :]] if base_names else None
     names = [robot.joint_names[k] for k in joints]
@@ -167,10 +172,12 @@ def clean_trajectory(
     t = t if stated else _in_seconds(t, q, limits[2], faults)
     q, v, a = _in_units(t, q, v, a, names, kinds, limits, faults)
     if len(t) == 1:
-        notes.append("one sample is a posture, not a motion: it is looked at as one that rests for a second")
+        notes.append("one sample is a configuration, not a motion: it is checked as a rest of one second")
         t = np.array([t[0], t[0] + 1.0])
         q = np.repeat(q, 2, axis=0)
-        v, a, efforts, base = (None if one is None else np.repeat(one, 2, axis=0) for one in (v, a, efforts, base))
+        v, a, efforts, base = (
+            None if values is None else np.repeat(values, 2, axis=0) for values in (v, a, efforts, base)
+        )
     q, wrapped = _unwrapped(t, q, names, kinds, limits, notes)
     faults += [] if unwrap else wrapped
     notes += [f"{fault.name} {fault.text}" for fault in wrapped] if unwrap else []
@@ -183,37 +190,39 @@ def clean_trajectory(
 def _columns(
     raw: RawTrajectory, robot: Robot, base: Sequence[str], faults: list[Fault], notes: list[str]
 ) -> tuple[list[int], Indices]:
-    """Columns of the file of the joints that are there, and their places in the joint vector."""
+    """Return the columns of the joints in the file, and their indices in the joint vector."""
     names = robot.joint_names
-    found = [k for k, name in enumerate(names) if name in raw.names]
+    joints = [k for k, name in enumerate(names) if name in raw.names]
     missing = [name for name in names if name not in raw.names]
-    strange = []
+    unknown = []
     for name in raw.names:
         if name in names or name in base:
             continue
-        known = {joint.name: joint for joint in robot.joints}.get(name)
-        if known is None:
-            strange.append(name)
-        elif not known.moves:
-            notes.append(f"{name} is fixed in the robot; its column is not read")
-    for name in strange:
-        near = get_close_matches(name, missing, n=1, cutoff=0.7)
-        if raw.names_are_joints or near:
-            hint = f"; is it {near[0]}?" if near else ""
+        joint = {joint.name: joint for joint in robot.joints}.get(name)
+        if joint is None:
+            unknown.append(name)
+        elif not joint.moves:
+            notes.append(f"{name} is fixed in the robot; its column is ignored")
+    for name in unknown:
+        similar = get_close_matches(name, missing, n=1, cutoff=0.7)
+        if raw.names_are_joints or similar:
+            hint = f"; is it {similar[0]}?" if similar else ""
             faults.append(Fault("unknown joint", name, f"the robot has no joint of that name{hint}"))
         else:
-            notes.append(f"column {name} is no joint of the robot and is not read")
-    if not found:
+            notes.append(f"column {name} is not a joint of the robot and is ignored")
+    if not joints:
         words = (
             f"{raw.file}: none of its columns is a joint of {robot.name!r}: it has {', '.join(raw.names[:12])}, the "
             f"robot {', '.join(names)}"
         )
         raise ProblemError(words, name="joints", value=raw.names, limit=names)
-    led = {joint.mimic.joint: joint.name for joint in robot.joints if joint.mimic and joint.name in raw.names}
+    followers = {joint.mimic.joint: joint.name for joint in robot.joints if joint.mimic and joint.name in raw.names}
     for name in missing:
-        hint = f"{led[name]}, which is there, follows it: say where it is itself" if name in led else "hold it: --lock"
-        faults.append(Fault("missing joint", name, f"the trajectory does not say where it is; {hint}"))
-    return [raw.names.index(names[k]) for k in found], np.array(found)
+        hint = "lock it: --lock"
+        if name in followers:
+            hint = f"its follower {followers[name]} is given: give the joint itself"
+        faults.append(Fault("missing joint", name, f"the trajectory has no positions for it; {hint}"))
+    return [raw.names.index(names[k]) for k in joints], np.array(joints)
 
 
 def _finite(
@@ -225,11 +234,11 @@ def _finite(
     faults: list[Fault],
     notes: list[str],
 ) -> Indices:
-    """Numbers of the samples without a value that is no number. Shape (K,)."""
-    good = np.isfinite(raw.t)
-    if not good.all():
-        k = int(np.flatnonzero(~good)[0])
-        faults.append(Fault("not a number", "time", _count(~good, raw, k), None, line=int(raw.lines[k])))
+    """Return the indices of the samples in which all values are numbers. Shape (K,)."""
+    finite = np.isfinite(raw.t)
+    if not finite.all():
+        k = int(np.flatnonzero(~finite)[0])
+        faults.append(Fault("not a number", "time", _count(~finite, raw, k), None, line=int(raw.lines[k])))
     for kind, values in (
         ("", raw.positions),
         ("velocity of ", raw.velocities),
@@ -238,49 +247,57 @@ def _finite(
         if values is None:
             continue
         for column, joint in zip([*columns, *used[len(columns) :]], [*joints, *[None] * len(used)], strict=False):
-            wrong = ~np.isfinite(values[:, column])
-            if not wrong.any() or (kind and (joint is None or wrong.all())):
+            invalid = ~np.isfinite(values[:, column])
+            if not invalid.any() or (kind and (joint is None or invalid.all())):
                 continue
-            k = int(np.flatnonzero(wrong)[0])
+            k = int(np.flatnonzero(invalid)[0])
             name = raw.names[column]
             time = float(raw.t[k]) if np.isfinite(raw.t[k]) else None
-            faults.append(Fault("not a number", name, kind + _count(wrong, raw, k), time, time, line=int(raw.lines[k])))
-            good &= ~wrong
-    if not good.any():
-        words = f"{raw.file}: no sample is without a value that is no number"
+            faults.append(
+                Fault("not a number", name, kind + _count(invalid, raw, k), time, time, line=int(raw.lines[k]))
+            )
+            finite &= ~invalid
+    if not finite.any():
+        words = f"{raw.file}: every sample has a value that is not a number"
         raise ProblemError(words, name=raw.names[used[0]], value=len(raw.t))
-    if not good.all():
-        notes.append(f"{int((~good).sum())} of {len(good)} samples have a value that is no number, and are left out")
-    return np.flatnonzero(good)
+    if not finite.all():
+        notes.append(
+            f"{int((~finite).sum())} of {len(finite)} samples have a value that is not a number and are left out"
+        )
+    return np.flatnonzero(finite)
 
 
-def _count(wrong: Any, raw: RawTrajectory, k: int) -> str:
-    """How many are wrong and where the first is."""
-    several = f"{int(wrong.sum())} values are no numbers, the first" if wrong.sum() > 1 else "a value is no number,"
-    return f"{several} at {raw.t[k]:.6g} s (line {raw.lines[k]})"
+def _count(invalid: Any, raw: RawTrajectory, k: int) -> str:
+    """Return how many values are invalid and where the first one is."""
+    text = (
+        f"{int(invalid.sum())} values are not numbers, the first" if invalid.sum() > 1 else "a value is not a number,"
+    )
+    return f"{text} at {raw.t[k]:.6g} s (line {raw.lines[k]})"
 
 
-def _in_order(raw: RawTrajectory, kept: Indices, faults: list[Fault]) -> Indices:
-    """Numbers of samples whose times increase."""
-    t = raw.t[kept]
+def _in_order(raw: RawTrajectory, finite_rows: Indices, faults: list[Fault]) -> Indices:
+    """Return the indices of samples with increasing times."""
+    t = raw.t[finite_rows]
     steps = np.diff(t)
-    for wrong, kind, words in (
+    for violated, kind, words in (
         (steps < 0, "times", "goes back from {:.6g} s to {:.6g} s"),
-        (steps == 0, "times", "{:.6g} s is there twice"),
+        (steps == 0, "times", "{:.6g} s is repeated"),
     ):
-        if wrong.any():
-            k = int(np.flatnonzero(wrong)[0])
-            more = f", and {int(wrong.sum()) - 1} times more" if wrong.sum() > 1 else ""
-            line, time = int(raw.lines[kept[k + 1]]), float(t[k + 1])
+        if violated.any():
+            k = int(np.flatnonzero(violated)[0])
+            more = f", and {int(violated.sum()) - 1} times more" if violated.sum() > 1 else ""
+            line, time = int(raw.lines[finite_rows[k + 1]]), float(t[k + 1])
             text = words.format(t[k], t[k + 1]) + f" at line {line}{more}"
             faults.append(Fault(kind, "", f"time {text}; times must increase", time, time, line=line))
-    return np.asarray(kept[np.unique(t, return_index=True)[1]])
+    return np.asarray(finite_rows[np.unique(t, return_index=True)[1]])
 
 
 def likely_unit(t: Array, q: Array, velocity: Array) -> tuple[str, float]:
-    """The unit below a second in which the times make a plausible motion, or ""; the share of a limit used in seconds.
+    """Return the unit below a second in which times are plausible, or "", and the share of the velocity limits used.
 
-    Plausible are samples at 10 kHz or less, and a fastest joint at 1 to 1000 % of its limit, or of 1 where it has none.
+    The share is that of the fastest joint if the times are in seconds.
+
+    Plausible are samples at 10 kHz or less, and a fastest joint at 1 to 1000 % of its limit, or of 1 if it has none.
     """
     h, usual = np.diff(t), np.where(np.isfinite(velocity), velocity, 1.0)
     used = float((np.abs(np.diff(q, axis=0)) / h[:, None] / usual).max())
@@ -289,11 +306,11 @@ def likely_unit(t: Array, q: Array, velocity: Array) -> tuple[str, float]:
 
 
 def _in_seconds(t: Array, q: Array, velocity: Array, faults: list[Fault]) -> Array:
-    """The times; in seconds where they are whole numbers that far apart that they must be in a smaller unit."""
+    """Return the times in seconds; convert integers that are so far apart that they must be in a smaller unit."""
     if len(t) < 3 or not (t == np.rint(t)).all() or (step := float(np.median(np.diff(t)))) < THRESHOLDS.longest_step:
         return t
     unit = likely_unit(t, q, velocity)[0] or ("nanoseconds" if step >= 1e5 else "microseconds")
-    words = f"times look like {unit}: whole numbers, {step:.6g} apart; what follows is of times in {unit}"
+    words = f"times look like {unit}: whole numbers, {step:.6g} apart; the rest of the check takes them as {unit}"
     faults.append(Fault("units", "time", words, None, None, step, THRESHOLDS.longest_step, "s"))
     return t / SMALL_UNITS[unit]
 
@@ -308,132 +325,137 @@ def _in_units(
     limits: tuple[Array, Array, Array],
     faults: list[Fault],
 ) -> tuple[Array, Array | None, Array | None]:
-    """Positions, velocities and accelerations, of joints that look like degrees or millimetres in rad and m."""
+    """Return positions, velocities and accelerations in rad and m; convert likely degrees and millimetres."""
     lower, upper, _ = limits
     most, scale = np.maximum(np.abs(lower), np.abs(upper)), np.ones(len(names))
-    room = 0.05 * np.where(np.isfinite(most), upper - lower, 1.0)
+    margin = 0.05 * np.where(np.isfinite(most), upper - lower, 1.0)
 
     def doubt(k: int, unit: str, why: str, plain: str) -> None:
         at = int(np.abs(q[:, k]).argmax())
         words = (
-            f"positions look like {unit}: {q[at, k]:.5g} at {t[at]:.6g} s, {why}; what follows is of the motion in "
-            f"{unit}, taken as such"
+            f"positions look like {unit}: {q[at, k]:.5g} at {t[at]:.6g} s, {why}; the rest of the check takes them as "
+            f"{unit}"
         )
         faults.append(Fault("units", names[k], words, float(t[at]), None, float(q[at, k]), float(most[k]), plain))
 
     turning = [k for k, kind in enumerate(kinds) if kind != "prismatic"]
-    worst = _worst_in_degrees(t, q, turning, limits, room)
+    worst = _worst_in_degrees(t, q, turning, limits, margin)
     if worst is not None:
-        doubt(worst, "degrees", "which in rad is beyond any limit, and in degrees all joints keep theirs", "rad")
+        doubt(worst, "degrees", "in rad beyond any limit, while in degrees all joints keep theirs", "rad")
         scale[turning] = np.pi / 180
     for k, kind in enumerate(kinds):
-        in_m, far = q[:, k] * 1e-3, np.abs(q[:, k]).max()
-        fits = ((in_m >= lower[k] - room[k]) & (in_m <= upper[k] + room[k])).all()
-        if kind == "prismatic" and np.isfinite(most[k]) and far > max(10 * most[k], 1.0) and fits:
+        in_m, largest = q[:, k] * 1e-3, np.abs(q[:, k]).max()
+        fits = ((in_m >= lower[k] - margin[k]) & (in_m <= upper[k] + margin[k])).all()
+        if kind == "prismatic" and np.isfinite(most[k]) and largest > max(10 * most[k], 1.0) and fits:
             doubt(k, "millimetres", f"limits {lower[k]:g} .. {upper[k]:g} m", "m")
             scale[k] = 1e-3
     return q * scale, None if v is None else v * scale, None if a is None else a * scale
 
 
 def _worst_in_degrees(
-    t: Array, q: Array, turning: Sequence[int], limits: tuple[Array, Array, Array], room: Array
+    t: Array, q: Array, turning: Sequence[int], limits: tuple[Array, Array, Array], margin: Array
 ) -> int | None:
-    """The joint that is farthest beyond what is possible in rad, where all are possible in degrees.
+    """Return the joint farthest beyond what is possible in rad, if all joints are possible in degrees; else None.
 
-    At least half of the joints that move must be so. Those without position limits may turn on for ever: where no joint
-    has any, they are judged by how fast they would be.
+    At least half of the moving joints must be impossible in rad. If no joint has position limits, their velocities are
+    compared with the velocity limits instead.
     """
     lower, upper, velocity = limits
-    far, most, in_degrees = np.abs(q).max(axis=0), np.maximum(np.abs(lower), np.abs(upper)), np.deg2rad(q)
+    largest, most, in_degrees = np.abs(q).max(axis=0), np.maximum(np.abs(lower), np.abs(upper)), np.deg2rad(q)
     limited = [k for k in turning if np.isfinite(most[k])]
     if limited:
-        wild = [k for k in limited if far[k] > max(THRESHOLDS.wild * most[k] + 1, 2 * np.pi)]
-        moving = [k for k in limited if np.ptp(q[:, k]) > 0 or far[k] > 0]
-        inside = (in_degrees >= lower - room) & (in_degrees <= upper + room)
+        wild = [k for k in limited if largest[k] > max(THRESHOLDS.wild * most[k] + 1, 2 * np.pi)]
+        moving = [k for k in limited if np.ptp(q[:, k]) > 0 or largest[k] > 0]
+        inside = (in_degrees >= lower - margin) & (in_degrees <= upper + margin)
         possible = bool(inside[:, limited].all())
     else:
-        fast = np.zeros(q.shape[1])
+        speeds = np.zeros(q.shape[1])
         if len(t) > 1:
-            fast = np.median(np.abs(np.diff(np.unwrap(q, axis=0), axis=0)) / np.diff(t)[:, None], axis=0)
-        wild, moving = [k for k in turning if fast[k] > velocity[k]], list(turning)
-        possible = all(np.deg2rad(fast[k]) <= velocity[k] for k in turning) and far.max() > 2 * np.pi
+            speeds = np.median(np.abs(np.diff(np.unwrap(q, axis=0), axis=0)) / np.diff(t)[:, None], axis=0)
+        wild, moving = [k for k in turning if speeds[k] > velocity[k]], list(turning)
+        possible = all(np.deg2rad(speeds[k]) <= velocity[k] for k in turning) and largest.max() > 2 * np.pi
     suspected = wild and 2 * len(wild) >= len(moving) and possible
-    return max(wild, key=lambda k: far[k]) if suspected else None
+    return max(wild, key=lambda k: largest[k]) if suspected else None
 
 
 def _unwrapped(
     t: Array, q: Array, names: Sequence[str], kinds: Sequence[str], limits: tuple[Array, ...], notes: list[str]
 ) -> tuple[Array, list[Fault]]:
-    """Positions without the leaps of whole turns, and a fault for each joint with limits that had some.
+    """Return the positions without jumps by whole turns, and a fault for each joint with limits that had some.
 
-    Of such a joint a leap is nearly a whole turn, and a step that it is too slow for, or that no arm makes. It turns on
-    where its limits have room for that, if need be whole turns away; elsewhere the leaps are left.
+    For a joint with limits, a jump is nearly a whole turn in a step that the joint is too slow for, or that no arm
+    makes. It is removed if the limits allow, if necessary after a shift by whole turns.
     """
-    found, wrapped, (lower, upper, velocity), h = q.copy(), [], limits, np.diff(t)
+    unwrapped, faults, (lower, upper, velocity), h = q.copy(), [], limits, np.diff(t)
     for k, kind in enumerate(kinds):
-        on, steps = np.unwrap(q[:, k]), np.diff(q[:, k])
-        leaps = np.abs(np.diff(on) - steps) > np.pi
+        continued, steps = np.unwrap(q[:, k]), np.diff(q[:, k])
+        leaps = np.abs(np.diff(continued) - steps) > np.pi
         if kind != "continuous":
             swift = (np.abs(steps) > velocity[k] * h) | (np.abs(steps) > THRESHOLDS.hardest * h**2)
-            leaps &= swift & (np.abs(np.diff(on)) < 0.5)
-            on = q[:, k] - np.cumsum([0.0, *np.where(leaps, steps - np.diff(on), 0.0)])
-            if on.min() < lower[k] or on.max() > upper[k]:
-                on += 2 * np.pi * np.rint((lower[k] + upper[k] - on.min() - on.max()) / (4 * np.pi))
-        if kind == "prismatic" or not leaps.any() or on.min() < lower[k] or on.max() > upper[k]:
+            leaps &= swift & (np.abs(np.diff(continued)) < 0.5)
+            continued = q[:, k] - np.cumsum([0.0, *np.where(leaps, steps - np.diff(continued), 0.0)])
+            if continued.min() < lower[k] or continued.max() > upper[k]:
+                continued += (
+                    2 * np.pi * np.rint((lower[k] + upper[k] - continued.min() - continued.max()) / (4 * np.pi))
+                )
+        if kind == "prismatic" or not leaps.any() or continued.min() < lower[k] or continued.max() > upper[k]:
             continue
-        found[:, k], at = on, int(leaps.argmax())
-        words = f"is wrapped at {t[at]:.6g} s ({leaps.sum()} in all); it turns on"
+        unwrapped[:, k], at = continued, int(leaps.argmax())
+        words = f"is wrapped at {t[at]:.6g} s ({leaps.sum()} in all); it is unwrapped"
         if kind == "continuous":
             notes.append(f"{names[k]} {words}")
             continue
-        words += " in what follows, within its limits: unwrap it, or state --unwrap if the controller does"
-        wrapped.append(Fault("jump", names[k], words, float(t[at + 1]), float(t[at + 1]), float(steps[at]), unit="rad"))
-    return found, wrapped
+        words += " in the rest of the check, within its limits: unwrap it, or pass --unwrap if the controller does"
+        faults.append(Fault("jump", names[k], words, float(t[at + 1]), float(t[at + 1]), float(steps[at]), unit="rad"))
+    return unwrapped, faults
 
 
 def _time_by_velocities(t: Array, q: Array, v: Array | None, names: Sequence[str], faults: list[Fault]) -> Array:
-    """The times, in s where the velocities say that they are in ms; faults of velocities that are not the motion's."""
+    """Return the times in s, converted if the velocities show a smaller unit; add faults of inconsistent velocities."""
     if v is None or len(t) < 10:
         return t
     h = np.diff(t)[:, None]
-    by_positions, told = np.diff(q, axis=0) / h, (v[1:] + v[:-1]) / 2
+    by_positions, given = np.diff(q, axis=0) / h, (v[1:] + v[:-1]) / 2
     most = np.abs(by_positions).max(axis=0)
     rough = np.median(np.abs(np.diff(by_positions, axis=0)), axis=0)
     ratios: dict[int, float] = {}
     for k in range(q.shape[1]):
-        if most[k] * (t[-1] - t[0]) < 1e-6 or rough[k] > 0.2 * most[k] or not np.abs(told[:, k]).any():
-            continue  # at rest, too coarse to say, or asked to stop at every sample
+        if most[k] * (t[-1] - t[0]) < 1e-6 or rough[k] > 0.2 * most[k] or not np.abs(given[:, k]).any():
+            continue  # at rest, too coarse to judge, or commanded to stop at every sample
         fast = np.abs(by_positions[:, k]) > 0.05 * most[k]
-        ratio = np.median(told[fast, k] / by_positions[fast, k])
-        off = np.median(np.abs(told[fast, k] - ratio * by_positions[fast, k]))
-        if abs(ratio - 1) > 0.2 or off > 0.3 * abs(ratio) * most[k]:
-            ratios[k] = float(ratio) if off <= 0.3 * abs(ratio) * most[k] else np.nan
+        ratio = np.median(given[fast, k] / by_positions[fast, k])
+        deviation = np.median(np.abs(given[fast, k] - ratio * by_positions[fast, k]))
+        if abs(ratio - 1) > 0.2 or deviation > 0.3 * abs(ratio) * most[k]:
+            ratios[k] = float(ratio) if deviation <= 0.3 * abs(ratio) * most[k] else np.nan
     if ratios and len(ratios) == int((most * (t[-1] - t[0]) >= 1e-6).sum()):
         whole = np.median(list(ratios.values()))
         for unit, power in SMALL_UNITS.items():
             if abs(whole / power - 1) < 0.1:
-                words = f"times look like {unit}: velocities are {whole:.4g} times those of the positions over them"
-                words += f"; what follows is of times in {unit}"
+                words = (
+                    f"times look like {unit}: velocities are {whole:.4g} times the differences of positions over times"
+                )
+                words += f"; the rest of the check takes them as {unit}"
                 faults.append(Fault("units", "time", words, value=float(whole)))
                 return t / power
     for k, ratio in ratios.items():
-        near = next((words for factor, words in FACTORS.items() if abs(ratio / factor - 1) < 0.1), "")
-        at = int(np.abs(told[:, k] - by_positions[:, k]).argmax())
+        likely = next((words for factor, words in FACTORS.items() if abs(ratio / factor - 1) < 0.1), "")
+        at = int(np.abs(given[:, k] - by_positions[:, k]).argmax())
         if np.isnan(ratio):
-            words = "velocities are not those of its positions"
+            words = "velocities do not match its positions"
         else:
-            words = f"velocities are {ratio:.4g} times those of its positions" + (near and f": they look like {near}")
-        text = f"{words}, most so at {t[at]:.6g} s: {told[at, k]:.4g} told, {by_positions[at, k]:.4g} by positions"
-        kind = "units" if near else "velocities"
-        found = float(told[at, k]), float(by_positions[at, k])
-        faults.append(Fault(kind, names[k], text, float(t[at]), None, *found))
+            words = f"velocities are {ratio:.4g} times those of its positions" + (
+                likely and f": they look like {likely}"
+            )
+        pair = float(given[at, k]), float(by_positions[at, k])
+        text = f"{words}, worst at {t[at]:.6g} s: {pair[0]:.4g} given, {pair[1]:.4g} from positions"
+        faults.append(Fault("units" if likely else "velocities", names[k], text, float(t[at]), None, *pair))
     return t
 
 
 def _jumps(
     t: Array, q: Array, names: Sequence[str], kinds: Sequence[str], velocity: Array, faults: list[Fault]
 ) -> None:
-    """Steps that are far longer than those around them, and that no arm makes."""
+    """Add a fault for each joint with steps far longer than those around them, which no arm makes."""
     h = np.diff(t)
     steps = np.diff(q, axis=0)
     speeds = steps / h[:, None]
@@ -442,34 +464,34 @@ def _jumps(
         return
     digits, around = half_digits(q), THRESHOLDS.around
     places = np.arange(count)[:, None] + np.array([d for d in range(-around, around + 1) if d])
-    inside = (places >= 0) & (places < count)
+    in_range = (places >= 0) & (places < count)
     for k, name in enumerate(names):
-        beside = np.where(inside, speeds[np.clip(places, 0, count - 1), k], np.nan)
-        usual = np.nanmedian(beside, axis=1)
-        spread = np.nanmedian(np.abs(beside - usual[:, None]), axis=1)
-        off = np.abs(speeds[:, k] - usual)
-        spread = np.maximum(spread, np.median(off))  # of noise
-        tall = (off > THRESHOLDS.leap * spread) & (off > np.abs(usual))
-        tall &= (off / h > THRESHOLDS.hardest) | (np.abs(speeds[:, k]) > velocity[k])
-        tall &= off * h > np.maximum(6 * digits[k], 1e-6 * max(1.0, float(np.abs(q[:, k]).max())))
-        where = np.flatnonzero(tall)
-        if not where.size:
+        neighbours = np.where(in_range, speeds[np.clip(places, 0, count - 1), k], np.nan)
+        median = np.nanmedian(neighbours, axis=1)
+        spread = np.nanmedian(np.abs(neighbours - median[:, None]), axis=1)
+        deviation = np.abs(speeds[:, k] - median)
+        spread = np.maximum(spread, np.median(deviation))  # at least that of the noise
+        is_jump = (deviation > THRESHOLDS.leap * spread) & (deviation > np.abs(median))
+        is_jump &= (deviation / h > THRESHOLDS.hardest) | (np.abs(speeds[:, k]) > velocity[k])
+        is_jump &= deviation * h > np.maximum(6 * digits[k], 1e-6 * max(1.0, float(np.abs(q[:, k]).max())))
+        jumps = np.flatnonzero(is_jump)
+        if not jumps.size:
             continue
         unit = "m" if kinds[k] == "prismatic" else "rad"
-        worst = int(where[np.abs(steps[where, k]).argmax()])
+        worst = int(jumps[np.abs(steps[jumps, k]).argmax()])
         turn = unit == "rad" and abs(abs(steps[worst, k]) - 2 * np.pi) < 0.5
         words = (
             f"jumps by {steps[worst, k]:.4g} {unit} from {t[worst]:.6g} to {t[worst + 1]:.6g} s"
-            + (", a whole turn: it was wrapped, and this joint cannot turn on" if turn else "")
-            + (f"; {len(where)} such steps, the first at {t[where[0]]:.6g} s" if len(where) > 1 else "")
+            + (", a whole turn: it was wrapped, and this joint cannot turn further" if turn else "")
+            + (f"; {len(jumps)} such steps, the first at {t[jumps[0]]:.6g} s" if len(jumps) > 1 else "")
         )
-        times = float(t[worst + 1]), float(t[where[0] + 1])
-        step, usual_step = float(steps[worst, k]), float(abs(usual[worst]) * h[worst])
+        times = float(t[worst + 1]), float(t[jumps[0] + 1])
+        step, usual_step = float(steps[worst, k]), float(abs(median[worst]) * h[worst])
         faults.append(Fault("jump", name, words, *times, step, usual_step, unit))
 
 
 def _followers(raw: RawTrajectory, robot: Robot, rows: Indices, faults: list[Fault]) -> None:
-    """Joints that follow others and are told where they do not."""
+    """Add a fault for each mimic joint that does not follow its leader."""
     for joint in robot.joints:
         if joint.mimic is None or not joint.moves or joint.name not in raw.names:
             continue
@@ -477,11 +499,11 @@ def _followers(raw: RawTrajectory, robot: Robot, rows: Indices, faults: list[Fau
         leader = robot.joint_names[column]
         if leader not in raw.names:
             continue
-        told, led = (raw.positions[rows, raw.names.index(name)] for name in (joint.name, leader))
-        off = np.abs(told - (ratio * led + offset))
-        k = int(np.nanargmax(off)) if np.isfinite(off).any() else 0
-        room = 1e-3 * max(1e-3, float(np.nanmax(np.abs(told), initial=0.0)))
-        if not off[k] <= room:
+        given, leading = (raw.positions[rows, raw.names.index(name)] for name in (joint.name, leader))
+        deviation = np.abs(given - (ratio * leading + offset))
+        k = int(np.nanargmax(deviation)) if np.isfinite(deviation).any() else 0
+        tolerance = 1e-3 * max(1e-3, float(np.nanmax(np.abs(given), initial=0.0)))
+        if not deviation[k] <= tolerance:
             time = float(raw.t[rows[k]])
-            words = f"follows {leader} and is {off[k]:.4g} {joint.unit} from where that takes it at {time:.6g} s"
-            faults.append(Fault("follower", joint.name, words, time, time, float(off[k]), room, joint.unit))
+            words = f"follows {leader} but deviates by {deviation[k]:.4g} {joint.unit} at {time:.6g} s"
+            faults.append(Fault("follower", joint.name, words, time, time, float(deviation[k]), tolerance, joint.unit))

@@ -1,16 +1,16 @@
-"""What a controller makes of samples: polynomials from one to the next, and how far they go, between the samples too.
+"""Interpolate joint samples as controllers do, and bound the interpolant between the samples.
 
-The rule is that of the usual controllers: straight lines where a file has positions alone, cubics where it has
-velocities (Hermite), quintics where it has accelerations, too. Polynomials are kept by their Bernstein coefficients,
-which enclose them: halving a piece until the enclosure is met by a value tells its greatest value for sure.
+A file with positions alone is interpolated linearly, one with velocities by cubics (Hermite), and one with
+accelerations by quintics. Polynomials are stored by their Bernstein coefficients, which enclose them: splitting an
+interval until a value reaches its enclosure gives the maximum with certainty.
 
-Where the acceleration of the sampled motion jumps, these polynomials have more of it than the motion had: a cubic up to
-two thirds, a quintic a sixth. Samples are silent about what happens between them. A file is therefore held only to what
-every motion through its samples needs (`Motion.needed`), unless the rule of its controller is stated.
+Where the acceleration of the sampled motion jumps, the interpolant overestimates it: a cubic by up to two thirds, a
+quintic by a sixth. The samples do not show what happens between them. A quantity is therefore compared with a limit
+only as far as every motion through the samples needs it (`Motion.needed`), unless the rule of the controller is stated.
 
-Straight lines have no acceleration to look at. What the samples say of it are their divided differences: of any
-twice differentiable motion through three samples, 2 q[t0, t1, t2] is its acceleration at some time between them, and
-6 q[t0, t1, t2, t3] the jerk of any smoother one. The same holds of velocities where these are given.
+Linear interpolation has no acceleration. The samples bound it by divided differences: any twice differentiable motion
+through three samples has the acceleration 2 q[t0, t1, t2] at some time between them, and any smoother one the jerk
+6 q[t0, t1, t2, t3]. The same holds for differences of given velocities.
 """
 
 from __future__ import annotations
@@ -34,52 +34,52 @@ Rule: TypeAlias = Literal["linear", "cubic", "quintic"]
 
 @dataclass(frozen=True, eq=False)
 class PiecewisePolynomial:
-    """Polynomials one after the other.
+    """Piecewise polynomials in Bernstein form.
 
     Attributes:
-        t: Where they begin and end, increasing. Shape (N + 1,), s.
-        coefficients: Bernstein's. Shape (N, d + 1, n).
+        t: Break points, increasing. Shape (N + 1,), s.
+        coefficients: Bernstein coefficients. Shape (N, d + 1, n).
     """
 
     t: Array
     coefficients: Array
 
     def derivative(self) -> PiecewisePolynomial:
-        """In time."""
+        """Return the time derivative."""
         degree = self.coefficients.shape[1] - 1
         width = np.diff(self.t)[:, None, None]
         return PiecewisePolynomial(self.t, degree * np.diff(self.coefficients, axis=1) / width)
 
     def at(self, times: Array) -> Array:
-        """Values at times (M,), continuous from the right, clipped to the ends. Shape (M, n)."""
-        piece = np.clip(np.searchsorted(self.t, times, side="right") - 1, 0, len(self.t) - 2)
-        begin, end = self.t[piece], self.t[piece + 1]
-        return self.within(piece, np.clip((times - begin) / (end - begin), 0.0, 1.0))
+        """Return the values at times (M,), continuous from the right, clipped to the ends. Shape (M, n)."""
+        interval = np.clip(np.searchsorted(self.t, times, side="right") - 1, 0, len(self.t) - 2)
+        begin, end = self.t[interval], self.t[interval + 1]
+        return self.within(interval, np.clip((times - begin) / (end - begin), 0.0, 1.0))
 
-    def within(self, piece: Indices, place: Array) -> Array:
-        """Values at places (M,), 0 to 1, of pieces (M,). Shape (M, n)."""
+    def within(self, interval: Indices, fraction: Array) -> Array:
+        """Return the values at fractions (M,), 0 to 1, of intervals (M,). Shape (M, n)."""
         degree = self.coefficients.shape[1] - 1
-        s = place[:, None]
-        total = np.zeros((len(piece), self.coefficients.shape[2]))
+        s = fraction[:, None]
+        total = np.zeros((len(interval), self.coefficients.shape[2]))
         for k in range(degree + 1):
-            total += comb(degree, k) * s**k * (1 - s) ** (degree - k) * self.coefficients[piece, k]
+            total += comb(degree, k) * s**k * (1 - s) ** (degree - k) * self.coefficients[interval, k]
         return total
 
     @property
     def greatest(self) -> Array:
-        """Bounds of the sizes in every piece. Shape (N, n)."""
+        """Bounds of the absolute values in every interval. Shape (N, n)."""
         return np.asarray(np.abs(self.coefficients).max(axis=1))
 
 
 def polynomial_maxima(coefficients: Array) -> tuple[Array, Array]:
-    """Greatest values of polynomials by their Bernstein coefficients (K, d + 1), and where, 0 to 1. Shape (K,) each."""
+    """Return the maxima of polynomials with Bernstein coefficients (K, d + 1), and where, 0 to 1. Shape (K,) each."""
     first, last = coefficients[:, 0], coefficients[:, -1]
-    best, place = np.maximum(first, last), np.where(last > first, 1.0, 0.0)
-    enough = 1e-10 * np.abs(coefficients).max(axis=1, initial=0.0)  # far below what any limit is known to
+    best, argument = np.maximum(first, last), np.where(last > first, 1.0, 0.0)
+    tolerance = 1e-10 * np.abs(coefficients).max(axis=1, initial=0.0)  # far below the accuracy of any limit
     owner = np.arange(len(coefficients))
     begin, width, part = np.zeros(len(owner)), 1.0, coefficients
-    for _ in range(40):  # a part is then 1e-12 of its piece
-        open_ = part.max(axis=1) > best[owner] + enough[owner]
+    for _ in range(40):  # a part is then 1e-12 of its interval
+        open_ = part.max(axis=1) > best[owner] + tolerance[owner]
         if not open_.any():
             break
         owner, begin, part = owner[open_], begin[open_], part[open_]
@@ -87,16 +87,16 @@ def polynomial_maxima(coefficients: Array) -> tuple[Array, Array]:
         left, right = _halves(part)
         middle = left[:, -1]
         order = np.lexsort((-middle, owner))
-        lead = order[np.unique(owner[order], return_index=True)[1]]
-        better = lead[middle[lead] > best[owner[lead]]]
-        best[owner[better]], place[owner[better]] = middle[better], begin[better] + width
+        leading = order[np.unique(owner[order], return_index=True)[1]]
+        improved = leading[middle[leading] > best[owner[leading]]]
+        best[owner[improved]], argument[owner[improved]] = middle[improved], begin[improved] + width
         owner, begin = np.tile(owner, 2), np.concatenate([begin, begin + width])
         part = np.concatenate([left, right])
-    return best, place
+    return best, argument
 
 
 def _halves(coefficients: Array) -> tuple[Array, Array]:
-    """Of both halves (de Casteljau). Shape (K, d + 1) each."""
+    """Return the coefficients of both halves (de Casteljau). Shape (K, d + 1) each."""
     left, right, row = [coefficients[:, 0]], [coefficients[:, -1]], coefficients
     for _ in range(coefficients.shape[1] - 1):
         row = (row[:, 1:] + row[:, :-1]) / 2
@@ -106,14 +106,14 @@ def _halves(coefficients: Array) -> tuple[Array, Array]:
 
 
 class MotionQuantity(NamedTuple):
-    """Something of every joint along a motion.
+    """A quantity of every joint along a motion.
 
     Attributes:
-        pieces: It, as polynomials; or constants, what divided differences say between two times.
-        blur: By how much the digits of the file may make it more than it is. Shape (N, n).
-        closed: Whether it is that of the interpolant, at every time; else what the samples prove of any motion.
-        needed: The largest value, and the largest of the negative, that every motion through the samples needs in each
-            piece; infinite where the interpolant itself counts. Shape (N, n) each, or ().
+        pieces: The quantity as polynomials, or the constants between two times that divided differences give.
+        blur: Largest error of the quantity due to the digits of the file. Shape (N, n).
+        closed: Whether it is that of the interpolant, at every time; else it holds for any motion through the samples.
+        needed: Largest value, and largest value of the negative, that every motion through the samples needs in each
+            interval; infinite if the interpolant itself counts. Shape (N, n) each, or ().
     """
 
     pieces: PiecewisePolynomial
@@ -124,12 +124,12 @@ class MotionQuantity(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Samples of joints and what is between them.
+    """Joint samples with their interpolation.
 
     Attributes:
         t: Increasing, at least two. Shape (M,), s.
         q, v, a: Positions, velocities or None, accelerations or None. Shape (M, n).
-        stated: Whether the controller is known to join them by this rule, so that the interpolant itself counts.
+        stated: Whether the controller is known to interpolate by this rule, so that the interpolant itself counts.
     """
 
     t: Array
@@ -140,28 +140,28 @@ class Motion:
 
     @property
     def rule(self) -> Rule:
-        """How the samples are joined."""
+        """The interpolation rule."""
         return "linear" if self.v is None else "cubic" if self.a is None else "quintic"
 
     def by(self, rule: Rule) -> Motion:
-        """The same samples, joined by another rule that needs no more than they tell.
+        """Return the same samples with another interpolation rule.
 
         Raises:
-            ProblemError: The rule needs velocities, or accelerations, that they do not tell.
+            ProblemError: The rule needs velocities or accelerations that the samples do not have.
         """
-        for needed, what, values in (
+        for needed, name, values in (
             (("cubic", "quintic"), "velocities", self.v),
             (("quintic",), "accelerations", self.a),
         ):
             if rule in needed and values is None:
-                words = f"the rule {rule!r} needs {what}, which are not those of every joint; leave the rule out"
+                words = f"the rule {rule!r} needs {name}, which are not given for every joint; omit the rule"
                 raise ProblemError(words, name="rule", value=rule)
         v, a = None if rule == "linear" else self.v, self.a if rule == "quintic" else None
         return Motion(self.t, self.q, v, a, stated=True)
 
     @cached_property
     def position(self) -> PiecewisePolynomial:
-        """As polynomials."""
+        """Positions as polynomials."""
         h = np.diff(self.t)[:, None]
         q, v, a = self.q, self.v, self.a
         if v is None:
@@ -179,81 +179,81 @@ class Motion:
 
     @cached_property
     def velocity(self) -> PiecewisePolynomial:
-        """As polynomials; steps where the file has positions alone."""
+        """Velocities as polynomials, piecewise constant if the file has positions alone."""
         return self.position.derivative()
 
     @cached_property
     def acceleration(self) -> PiecewisePolynomial | None:
-        """As polynomials; None where there is none, of straight lines."""
+        """Accelerations as polynomials; None for linear interpolation."""
         return None if self.v is None else self.velocity.derivative()
 
     @cached_property
     def digits(self) -> tuple[Array, Array, Array]:
-        """Half of the last digit that positions, velocities and accelerations are written with. Shape (n,) each."""
+        """Half of the last written digit of positions, velocities and accelerations. Shape (n,) each."""
         none = np.zeros(self.q.shape[1])
         return tuple(none if values is None else half_digits(values) for values in (self.q, self.v, self.a))  # type: ignore[return-value]
 
-    def quantity(self, what: str) -> MotionQuantity | None:
-        """Its "position", "velocity", "acceleration" or "jerk"; None where there are too few samples."""
+    def quantity(self, name: str) -> MotionQuantity | None:
+        """Return the "position", "velocity", "acceleration" or "jerk"; None if there are too few samples."""
         h = np.diff(self.t)[:, None]
         eq, ev, ea = self.digits
         smooth = {"linear": 0, "cubic": 1, "quintic": 2}[self.rule]
-        if what == "position":
+        if name == "position":
             return MotionQuantity(self.position, np.broadcast_to(eq, h.shape[:1] + eq.shape), True)
-        if what == "velocity":
-            # of the Bernstein coefficients only the middle one has the difference of positions in it
-            grows = {0: 2 * eq / h, 1: 3 * eq / h + ev, 2: 3.75 * eq / h + 2.5 * ev + 0.2 * h * ea}[smooth]
-            return MotionQuantity(self.velocity, grows, True, self.needed(what))
-        if what == "acceleration" and smooth:
+        if name == "velocity":
+            # only the middle Bernstein coefficient contains the difference of positions
+            blur = {0: 2 * eq / h, 1: 3 * eq / h + ev, 2: 3.75 * eq / h + 2.5 * ev + 0.2 * h * ea}[smooth]
+            return MotionQuantity(self.velocity, blur, True, self.needed(name))
+        if name == "acceleration" and smooth:
             assert self.acceleration is not None
-            grows = 12 * eq / h**2 + 6 * ev / h if smooth == 1 else 30 * eq / h**2 + 15 * ev / h + 3 * ea
-            return MotionQuantity(self.acceleration, grows, True, self.needed(what))
-        if what == "jerk" and smooth == 2:
+            blur = 12 * eq / h**2 + 6 * ev / h if smooth == 1 else 30 * eq / h**2 + 15 * ev / h + 3 * ea
+            return MotionQuantity(self.acceleration, blur, True, self.needed(name))
+        if name == "jerk" and smooth == 2:
             assert self.acceleration is not None
-            grows = 120 * eq / h**3 + 60 * ev / h**2 + 12 * ea / h
-            return MotionQuantity(self.acceleration.derivative(), grows, True, self.needed(what))
-        values, digits, order = (self.q, eq, 2 if what == "acceleration" else 3) if smooth == 0 else (self.v, ev, 2)
+            blur = 120 * eq / h**3 + 60 * ev / h**2 + 12 * ea / h
+            return MotionQuantity(self.acceleration.derivative(), blur, True, self.needed(name))
+        values, digits, order = (self.q, eq, 2 if name == "acceleration" else 3) if smooth == 0 else (self.v, ev, 2)
         assert values is not None
         return self._differences(values, digits, order)
 
-    def needed(self, what: str) -> tuple[Any, Any]:
-        """What every motion through the samples needs in each piece, as `MotionQuantity.needed`.
+    def needed(self, name: str) -> tuple[Any, Any]:
+        """Return the value that every motion through the samples needs in each interval, as `MotionQuantity.needed`.
 
-        Acceleration: a motion between positions and velocities needs the least if it switches once from A to -A, where
-        A = (2 |e| + sqrt(4 e^2 + h^2 d^2)) / h^2, d is the change of velocity, and e the way less h times the mean
-        velocity of both ends. Accelerations that are given count, too. Jerk: by three weighted means, of weights 1 and
-        the Chebyshev polynomials U1 and U2 of the piece; from rest to rest 32 of the 60 that a quintic has. Velocity:
-        the peak of a trapezium, the lowest of all motions that accelerate no harder than this piece or the one before
-        or after it needs; without that bound only the mean velocity would be certain.
+        Acceleration: a motion between given positions and velocities needs the least if it switches once from A to -A,
+        where A = (2 |e| + sqrt(4 e^2 + h^2 d^2)) / h^2, d is the change of velocity, and e is the displacement minus h
+        times the mean of both velocities. Given accelerations count as well. Jerk: three weighted means, with weights 1
+        and the Chebyshev polynomials U1 and U2 of the interval; from rest to rest this gives 32 of the 60 that a
+        quintic has. Velocity: the peak of a trapezoidal profile, the lowest of all motions that accelerate no harder
+        than this interval or its neighbours need; without that bound only the mean velocity would be certain.
         """
         if self.stated or self.v is None:
             return np.inf, np.inf
         h, v, a = np.diff(self.t)[:, None], self.v, self.a
-        way, change, mean = np.diff(self.q, axis=0), np.diff(v, axis=0), (v[1:] + v[:-1]) / 2
-        off = way - h * mean
-        if what == "jerk" and a is not None:
-            turn = np.diff(a, axis=0)
-            means = turn * h**2, 4 * h * (change - h * (a[1:] + a[:-1]) / 2), 32 * off + 3 * h**2 * turn
+        displacement, change, mean = np.diff(self.q, axis=0), np.diff(v, axis=0), (v[1:] + v[:-1]) / 2
+        residual = displacement - h * mean
+        if name == "jerk" and a is not None:
+            step = np.diff(a, axis=0)
+            means = (step * h**2, 4 * h * (change - h * (a[1:] + a[:-1]) / 2), 32 * residual + 3 * h**2 * step)
             jerk = np.abs(means).max(axis=0) / h**3
             return jerk, jerk
-        least = (2 * np.abs(off) + np.sqrt(4 * off**2 + (h * change) ** 2)) / h**2
+        least = (2 * np.abs(residual) + np.sqrt(4 * residual**2 + (h * change) ** 2)) / h**2
         if a is not None:
             least = np.maximum(least, np.maximum(np.abs(a[1:]), np.abs(a[:-1])))
-        if what == "acceleration":
+        if name == "acceleration":
             return least, least
-        around = np.pad(least, ((1, 1), (0, 0)))
-        hardest = np.maximum(least, np.maximum(around[2:], around[:-2]))
+        padded = np.pad(least, ((1, 1), (0, 0)))
+        hardest = np.maximum(least, np.maximum(padded[2:], padded[:-2]))
         ends = (v[1:] ** 2 + v[:-1] ** 2) / 2
 
         def peak(sign: float) -> Array:
             middle = hardest * h / 2 + sign * mean
-            lowest = middle - np.sqrt(np.maximum(middle**2 - sign * hardest * way - ends, 0.0))
+            lowest = middle - np.sqrt(np.maximum(middle**2 - sign * hardest * displacement - ends, 0.0))
             return np.asarray(np.maximum(lowest, np.maximum(sign * v[1:], sign * v[:-1])))
 
         return peak(1.0), peak(-1.0)
 
     def _differences(self, values: Array, digits: Array, order: int) -> MotionQuantity | None:
-        """order! times divided differences, each between the times of all of its samples."""
+        """Return order! times the divided differences, each between the times of its samples."""
         if len(self.t) <= order:
             return None
         table, blur = values, np.broadcast_to(digits, values.shape)
@@ -267,21 +267,22 @@ class Motion:
 
 
 def half_digits(values: Array) -> Array:
-    """Half of the last digit that each column is written with; of single precision half of its last bit. Shape (n,).
+    """Return half of the last digit (or single-precision bit) with which each column is written. Shape (n,).
 
-    A column of few digits may be exact: digits coarser than a thousandth, and those of few values, count as such.
+    A column of few digits may be exact: columns with digits coarser than a thousandth or with few values count as
+    exact.
     """
-    found = np.asarray(2.0**-53 * np.abs(values).max(axis=0))
+    errors = np.asarray(2.0**-53 * np.abs(values).max(axis=0))
     for k, column in enumerate(values.T):
-        several = np.unique(column)
-        if len(several) < 20:
+        distinct = np.unique(column)
+        if len(distinct) < 20:
             continue
         for power in range(3, 13):
-            scaled = several * 10.0**power
+            scaled = distinct * 10.0**power
             if (np.abs(scaled - np.rint(scaled)) <= 1e-14 * np.abs(scaled) + 1e-9).all():
-                found[k] = 0.5 * 10.0**-power
+                errors[k] = 0.5 * 10.0**-power
                 break
         else:
-            if (several.astype(np.float32) == several).all():
-                found[k] = 2.0**-25 * np.abs(several).max()
-    return found
+            if (distinct.astype(np.float32) == distinct).all():
+                errors[k] = 2.0**-25 * np.abs(distinct).max()
+    return errors

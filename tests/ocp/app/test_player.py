@@ -458,7 +458,7 @@ def test_a_page_is_whole_small_the_same_again_and_asks_nobody(plans: dict[str, P
     assert all(np.isfinite(values).all() for values in arrays.values() if values.dtype.kind == "f")
     assert {name for name, _ in surfaces(told, arrays)} == {"hull", "upper/arm", "fore", "hand", "finger"}
     rows = told["motions"][0]["rows"]
-    assert {row[5] for row in rows} <= {"ok", "told"}
+    assert {row[5] for row in rows} <= {"ok", "info"}
 
 
 def test_a_page_that_is_too_large_is_not_written(plans: dict[str, Plan], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -515,7 +515,7 @@ def test_the_command_writes_a_page_or_serves_it(
     assert main(["view", words[0], "--port", "0"]) == 0
     shown = capsys.readouterr()
     assert "http://127.0.0.1:" in shown.err
-    assert "not shown: package://arm_description/upper.obj" in shown.err
+    assert "package://arm_description/upper.obj is not shown: " in shown.err
 
 
 def test_shapes_that_are_no_look_are_refused() -> None:

@@ -226,7 +226,7 @@ def test_the_command_takes_a_wrapped_joint_as_turning_on(
     file = write_table(tmp_path / "motion.csv", t, q, v, names=ur5.joint_names)
     urdf = str(next(one.locate() for one in files("example-robot-data") or () if one.name == "ur5_robot.urdf"))
     assert main(["check", urdf, str(file), "--no-clearance", "--quiet"]) == 1
-    assert "state --unwrap if the controller does" in capsys.readouterr().out
+    assert "pass --unwrap if the controller does" in capsys.readouterr().out
     assert main(["check", urdf, str(file), "--no-clearance", "--quiet", "--unwrap"]) == 0
     assert "is wrapped at" in capsys.readouterr().out
 

@@ -152,7 +152,7 @@ def test_a_message_that_ends_too_early(tmp_path: Path, data: bytes) -> None:
         channel = writer.register_channel("/joint_states", "cdr", schema)
         writer.add_message(channel, 0, data, 0)
         writer.finish()
-    with pytest.raises(ProblemError, match="no log that can be read"):
+    with pytest.raises(ProblemError, match="not a valid log"):
         read_trajectory(tmp_path / "log.mcap")
 
 
@@ -187,10 +187,10 @@ def test_a_joint_whose_name_looks_like_something_else(tmp_path: Path) -> None:
         ('{"joint_names": ["a"], "points": []}', "a.json", "at least one point"),
         ('{"joint_names": ["a"], "points": [{"positions": [1]}]}', "a.json", "point 1: time_from_start"),
         ('{"joint_names": ["a"], "points": [{"time_from_start": 0}]}', "a.json", "point 1 has no positions"),
-        ('{"joint_names": ["a", "a"], "points": [{}]}', "a.json", "names that differ"),
-        ('{"joint_names": ["a"], "points": [{"positions": ["x"], "time_from_start": 0}]}', "a.json", "no numbers"),
+        ('{"joint_names": ["a", "a"], "points": [{}]}', "a.json", "distinct names"),
+        ('{"joint_names": ["a"], "points": [{"positions": ["x"], "time_from_start": 0}]}', "a.json", "not numbers"),
         ("a: [", "a.yaml", "is not valid YAML"),
-        ("no log", "a.mcap", "no log"),
+        ("no log", "a.mcap", "not a valid log"),
     ],
 )
 def test_what_is_no_trajectory_is_refused(tmp_path: Path, text: str, name: str, words: str) -> None:

@@ -261,7 +261,7 @@ def test_points_that_turn_back_are_split_given_width_or_refused_by_line(waypoint
         ("x,y,z,qw,qx,qy,qz\n0,0,0,1,0,0,0\n1,0,0,1,1,0,0\n", "line 3", "norm 1.41421"),
         ("x,y,z,qw,qx,qy,qz\n0,0,0,0,0,0,0\n", "line 2", "norm 0"),
         ("x,y,z,ax,ay,az\n0,0,0,0,0,0\n1,0,0,0,0,1\n", "line 2", "axis is zero"),
-        ("x,y,z,ax,ay,az\n0,0,0,0,0,1\n1,0,0,0,0,-1\n", "line 3", "turns round against line 2"),
+        ("x,y,z,ax,ay,az\n0,0,0,0,0,1\n1,0,0,0,0,-1\n", "line 3", "opposite to that of line 2"),
     ],
 )
 def test_a_table_that_is_wrong_is_refused_by_line_or_column(
@@ -275,12 +275,8 @@ def test_a_table_that_is_wrong_is_refused_by_line_or_column(
 @pytest.mark.parametrize(
     ("rows", "name", "words"),
     [
-        (["0,0,0,0,0,0", "0,0,0,0,0,1"], "line 3", r"turns by 57\.3 deg in one place"),
-        (
-            ["0,0,0,0,0,0", "1,0,0,0,0,0", "1,0,0,0,0,3.14159265", "2,0,0,0,0,3.14159265"],
-            "line 4",
-            "180 deg in one place",
-        ),
+        (["0,0,0,0,0,0", "0,0,0,0,0,1"], "line 3", r"turns by 57\.3 deg in place"),
+        (["0,0,0,0,0,0", "1,0,0,0,0,0", "1,0,0,0,0,3.14159265", "2,0,0,0,0,3.14159265"], "line 4", "180 deg in place"),
         (["0,0,0,0,0,0", "1,0,0,0,0,3.1415"], "line 3", "from line 2 to here .* ambiguous"),
         (["1,0,0,0,0,0", "1,0,0,0,0,0"], "positions", "all waypoints are at one place"),
         (["1,0,0,0,0,0"], "positions", "all waypoints are at one place"),
