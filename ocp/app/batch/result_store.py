@@ -1,12 +1,12 @@
-"""The folder of a batch: what it is of, and one record for each task that has come to its end.
+"""Store the results of a batch in a folder: one record for each finished task.
 
     batch.json              the function, its version, the format
     results/ab/KEY.json     a record: task, status, value, cost, verdict, seconds, message
     results/ab/KEY.0.npz    plans and solutions of its value
-    lock                    which the driver at work holds; when it ends, whatever ends it, the system lets go
+    lock                    held by the active driver; the system releases it when the driver ends for any reason
 
-Files are there whole or not at all. They are not waited for to reach the disk: after a loss of power the last of them
-may be empty or cut short, which is seen, and counts as missing.
+Files are complete or absent. They are not synchronised to the disk: after a loss of power the last ones may be empty or
+truncated, which is detected and counts as missing.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from ocp.console import LOG
 from ocp.errors import ProblemError
 from ocp.storage import END, checked_path, open_unlinked, write_whole
 
-__all__ = ["ENDS", "ResultStore"]
+__all__ = ["STATUSES", "ResultStore"]
 
 FORMAT = 2
 HEAD = "batch.json"
 LOCK = "lock"
-OWN = {HEAD, "results", LOCK}
-ENDS = ("done", "failed", "killed")
-PARTS = {
+OWN_NAMES = {HEAD, "results", LOCK}
+STATUSES = ("done", "failed", "killed")
+RECORD_FIELDS = {
     "key": str,
     "task": object,
     "status": str,
@@ -47,14 +47,15 @@ PARTS = {
     "neighbour": str | None,
     "inputs": dict,
 }
-"""Of a record, with their kinds."""
+"""Fields of a record, with their types."""
 
 
 class ResultStore:
-    """The records of a folder.
+    """The records in a folder.
 
     Attributes:
-        folder: Where they are. function, version: What made them.
+        folder: The folder.
+        function, version: Function that computed the results, and its version.
     """
 
     def __init__(self, folder: Path, function: str, version: str) -> None:
@@ -62,86 +63,89 @@ class ResultStore:
 
     @classmethod
     def at(cls, folder: Any) -> ResultStore:
-        """The ledger that is there.
+        """Return the existing store in a folder.
 
         Raises:
-            ProblemError: There is none, or of another format, or folder is no path.
+            ProblemError: The folder is invalid, has no store, or has one of another format.
         """
         path = checked_folder(folder)
-        for link in (path / name for name in sorted(OWN) if (path / name).is_symlink()):
-            words = f"{link} is a link, which may lead out of the folder; link the whole folder instead"
+        for link in (path / name for name in sorted(OWN_NAMES) if (path / name).is_symlink()):
+            words = f"{link} is a link and may lead out of the folder; link the whole folder instead"
             raise ProblemError(words, name="folder", value=str(link))
         try:
             head = loaded(path / HEAD)
-            found = cls(path, str(head["function"]), str(head["version"]))
+            store = cls(path, str(head["function"]), str(head["version"]))
             if head["format"] != FORMAT:
-                words = f"{path} was written in format {head['format']} of batches, not {FORMAT}; take another folder"
+                words = f"{path} has batch format {head['format']}, not {FORMAT}; use another folder"
                 raise ProblemError(words, name="folder", value=str(path), limit=FORMAT)
         except (FileNotFoundError, NotADirectoryError):
-            words = f"{path} is no folder of a batch: there is no {HEAD} in it"
+            words = f"{path} is not the folder of a batch: it has no {HEAD}"
             raise ProblemError(words, name="folder", value=str(path)) from None
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             if isinstance(error, ProblemError):
                 raise
-            words = f"{path / HEAD} is damaged: {error!r}; take another folder"
+            words = f"{path / HEAD} is damaged: {error!r}; use another folder"
             raise ProblemError(words, name="folder", value=str(path)) from error
-        return found
+        return store
 
     @classmethod
     def of(cls, folder: Any, function: str, version: str, chosen: bool) -> ResultStore:
-        """The ledger of a function in a folder, begun where the folder is new or empty.
+        """Return the store of a function in a folder; create it if the folder is new or empty.
 
         Args:
-            chosen: Whether the version is a user's word, and not that of the source.
+            folder: The folder.
+            function: Name of the function.
+            version: Its version.
+            chosen: Whether the user chose the version; else it is that of the source.
 
         Raises:
-            ProblemError: The folder is another function's, or holds results of another version, or is nobody's and not
-                empty.
-            OSError: It cannot be made.
+            ProblemError: The folder belongs to another function, has results of another version, or has other files.
+            OSError: The folder cannot be created.
         """
         path = checked_folder(folder)
         if not os.path.lexists(path / HEAD):
             path.mkdir(parents=True, exist_ok=True)
-            strange = sorted(set(os.listdir(path)) - OWN)
-            if strange:
-                words = f"{path} holds {strange[0]!r} and is no folder of a batch; take a new or an empty one"
+            others = sorted(set(os.listdir(path)) - OWN_NAMES)
+            if others:
+                words = f"{path} contains {others[0]!r} and is not the folder of a batch; use a new or empty one"
                 raise ProblemError(words, name="folder", value=str(path))
-            begun = cls(path, function, version)
-            with begun.alone():
+            new = cls(path, function, version)
+            with new.locked():
                 if not os.path.lexists(path / HEAD):
-                    begun._begin()
+                    new._begin()
             (path / "results").mkdir(exist_ok=True)
-        found = cls.at(path)
-        if found.function != function:
-            words = f"{path} holds results of {found.function}, not of {function}; take another folder"
-            raise ProblemError(words, name="folder", value=function, limit=found.function)
-        if found.version != version and not found._keeps():
-            with found.alone():  # a driver that is waited for may have written one
-                if not found._keeps():
-                    found = cls(path, function, version)
-                    found._begin()
-        if found.version != version:
-            words = f"{path} holds results of version {found.version!r} of {function}, this is {version!r}; "
-            words += "take another folder" if chosen else "its source has changed: take another folder, or, where the "
-            words += "" if chosen else f"results would be the same, say version={found.version!r}"
-            raise ProblemError(words, name="version", value=version, limit=found.version)
-        return found
+        store = cls.at(path)
+        if store.function != function:
+            words = f"{path} contains results of {store.function}, not of {function}; use another folder"
+            raise ProblemError(words, name="folder", value=function, limit=store.function)
+        if store.version != version and not store._has_result():
+            with store.locked():  # a driver that held the lock may have written one
+                if not store._has_result():
+                    store = cls(path, function, version)
+                    store._begin()
+        if store.version != version:
+            words = f"{path} contains results of version {store.version!r} of {function}, not of {version!r}; "
+            words += "use another folder" if chosen else "the source has changed: use another folder, or, if the "
+            words += "" if chosen else f"results would be the same, pass version={store.version!r}"
+            raise ProblemError(words, name="version", value=version, limit=store.version)
+        return store
 
     def _begin(self) -> None:
+        """Write the head of the store."""
         text = json.dumps({"format": FORMAT, "function": self.function, "version": self.version}, indent=1).encode()
         write_whole(self.folder / HEAD, lambda stream: stream.write(text))
 
-    def _keeps(self) -> bool:
-        """Whether a result is there."""
+    def _has_result(self) -> bool:
+        """Return whether the store has a result."""
         records = (self.read(key) for key in self.recorded())
         return any(record and record["status"] == "done" for record in records)
 
     @contextmanager
-    def alone(self) -> Iterator[None]:
-        """Inside, no other driver is at work in this folder; one that is so is waited for.
+    def locked(self) -> Iterator[None]:
+        """Hold the lock of the folder; wait if another driver holds it.
 
         Raises:
-            ProblemError: The folder's file system has no locks.
+            ProblemError: The file system of the folder has no locks.
             OSError: The folder cannot be written.
         """
         file = os.open(self.folder / LOCK, os.O_CREAT | os.O_RDWR | os.O_NOFOLLOW, 0o644)
@@ -149,12 +153,12 @@ class ResultStore:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
-                LOG.warning("another driver is at work in %s: waiting for its end", self.folder)
+                LOG.warning("another driver is active in %s: waiting for its end", self.folder)
                 fcntl.flock(file, fcntl.LOCK_EX)
             except OSError as error:
                 if error.errno not in (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS):
                     raise
-                words = f"the file system of {self.folder} has no locks, which keep two drivers apart; take another"
+                words = f"the file system of {self.folder} has no locks, which separate two drivers; use another one"
                 raise ProblemError(words, name="folder", value=str(self.folder)) from error
             yield
         finally:
@@ -163,21 +167,21 @@ class ResultStore:
     # ---- records -----------------------------------------------------------------------------------------------
 
     def read(self, key: str) -> dict[str, Any] | None:
-        """The record of a key; None where there is none, or none that is whole; links are not followed."""
+        """Return the record of a key, or None if it is missing or incomplete; links are not followed."""
         try:
-            place = self._place(key)
-            record: Any = None if place.parent.is_symlink() else loaded(place)
-            sound = record.keys() == PARTS.keys() and record["key"] == key == key_of(
+            path = self._place(key)
+            record: Any = None if path.parent.is_symlink() else loaded(path)
+            is_valid = record.keys() == RECORD_FIELDS.keys() and record["key"] == key == key_of(
                 canonical_text(record["task"], "task")
             )
-            sound = sound and all(isinstance(record[name], kind) for name, kind in PARTS.items())
-            if not sound or record["status"] not in ENDS:
+            is_valid = is_valid and all(isinstance(record[name], kind) for name, kind in RECORD_FIELDS.items())
+            if not is_valid or record["status"] not in STATUSES:
                 return None
-            for i, told in enumerate(record["files"]):
-                with open_unlinked(file_at(place, i)) as stream:
-                    if stream.seek(0, os.SEEK_END) != told["bytes"]:
+            for i, file in enumerate(record["files"]):
+                with open_unlinked(file_at(path, i)) as stream:
+                    if stream.seek(0, os.SEEK_END) != file["bytes"]:
                         return None
-                    stream.seek(-22, os.SEEK_END)  # of a zip archive; it was not written to its end without
+                    stream.seek(-22, os.SEEK_END)  # the end record of a zip archive
                     if stream.read(4) != END:
                         return None
         except (FileNotFoundError, NotADirectoryError, ValueError, AttributeError, KeyError, TypeError, RecursionError):
@@ -185,27 +189,28 @@ class ResultStore:
         return dict(record)
 
     def write(self, record: dict[str, Any], files: Sequence[bytes]) -> None:
-        """Keep a record, its files first, in the place of any link that is there.
+        """Write a record after its files, replacing links.
 
         Raises:
-            OSError: They cannot be written; none of them is there then in part.
+            OSError: A file cannot be written; no file is then incomplete.
         """
-        place = self._place(record["key"])
-        for link in (place.parent, place, *(file_at(place, i) for i in range(len(files)))):
+        path = self._place(record["key"])
+        for link in (path.parent, path, *(file_at(path, i) for i in range(len(files)))):
             if os.path.islink(link):
                 link.unlink()
-        if not os.path.isdir(place.parent):
-            place.parent.mkdir(parents=True, exist_ok=True)
+        if not os.path.isdir(path.parent):
+            path.parent.mkdir(parents=True, exist_ok=True)
         for i, file in enumerate(files):
-            write_whole(file_at(place, i), lambda stream, file=file: stream.write(file), synced=False)  # type: ignore[misc]
+            write_whole(file_at(path, i), lambda stream, file=file: stream.write(file), synced=False)  # type: ignore[misc]
         text = json.dumps(record, allow_nan=False).encode()
-        write_whole(place, lambda stream: stream.write(text), synced=False)
+        write_whole(path, lambda stream: stream.write(text), synced=False)
 
-    def parcel(self, record: dict[str, Any]) -> Payload:
-        """A record with its files.
+    def payload(self, record: dict[str, Any]) -> Payload:
+        """Return a record with its files.
 
         Raises:
-            OSError: A file is gone. ProblemError: It is a link or larger than what is read.
+            OSError: A file is missing.
+            ProblemError: A file is a link, or too large.
         """
         files = []
         for i in range(len(record["files"])):
@@ -214,11 +219,11 @@ class ResultStore:
         return Payload(record, tuple(files))
 
     def value(self, record: dict[str, Any]) -> Any:
-        """What the function had returned."""
-        return unpack_result(self.parcel(record))
+        """Return the value of a record."""
+        return unpack_result(self.payload(record))
 
     def recorded(self) -> Iterator[str]:
-        """Keys of all records, in order."""
+        """Yield the keys of all records in order."""
         shards: list[str] = []
         with suppress(FileNotFoundError):
             shards = sorted(os.listdir(self.folder / "results"))
@@ -233,34 +238,36 @@ class ResultStore:
 
 
 def loaded(path: Path) -> Any:
-    """The data of a file of JSON, whose numbers are finite."""
+    """Return the data of a JSON file; raise ValueError if a number is not finite."""
     with open_unlinked(path) as stream:
         return json.loads(stream.read(), parse_float=finite, parse_constant=finite)
 
 
 def finite(text: str) -> float:
+    """Return a finite number."""
     if not isfinite(value := float(text)):
-        raise ValueError(f"{text} is no finite number")
+        raise ValueError(f"{text} is not a finite number")
     return value
 
 
 def file_at(place: Path, number: int) -> Path:
+    """Return the path of a record's numbered file."""
     return place.with_suffix(f".{number}.npz")
 
 
 def checked_folder(folder: Any) -> Path:
-    """A folder's whole path; it need not be there.
+    """Return the absolute path of a folder, which need not exist.
 
     Raises:
-        ProblemError: It is no path, or that of a file or of a store that is no folder.
+        ProblemError: The path is invalid, is that of a file, or of a remote store.
     """
     path = Path(checked_path(folder))
     text = os.fspath(folder)
     if not isinstance(text, str) or not text or "\0" in text:
-        raise ProblemError(f"folder: {folder!r} is no path", name="folder", value=folder)
+        raise ProblemError(f"folder: {folder!r} is not a path", name="folder", value=folder)
     if "://" in text:
-        words = f"folder: {text} is no folder of this machine; results come to the driver, no store has to be shared"
+        words = f"folder: {text} is not a folder of this machine; results are sent to the driver"
         raise ProblemError(words, name="folder", value=text)
     if any(place.is_file() for place in (path, *path.parents)):
-        raise ProblemError(f"folder: {path} is no folder", name="folder", value=str(path))
+        raise ProblemError(f"folder: {path} is not a folder", name="folder", value=str(path))
     return path.absolute()

@@ -69,7 +69,7 @@ def said_to(stranger: ssl.SSLContext | None, address: str) -> bytes:
 def test_no_other_user_of_the_machine_reaches_the_workers_of_a_batch() -> None:
     """They have no certificate of this batch's, one of their own does not help, and no page answers without one."""
     with Engine(functions.square, False, 1, None) as engine:
-        own = engine._own
+        own = engine._local_cluster
         (nanny,) = own.workers.values()
         nobody = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
         foreign: Any = Security.temporary().get_connection_args("client")["ssl_context"]

@@ -45,9 +45,9 @@ def test_one_driver_at_a_time_is_at_work_in_a_folder(tmp_path: Path) -> None:
     crowd = [ResultStore.of(tmp_path, "f", "1", True) for _ in range(8)]
     inside: list[int] = []
 
-    def work(ledger: ResultStore) -> None:
+    def work(store: ResultStore) -> None:
         for _ in range(20):
-            with ledger.alone():
+            with store.locked():
                 inside.append(1)
                 assert len(inside) == 1
                 inside.pop()
@@ -86,7 +86,7 @@ def test_a_full_or_read_only_disk_stops_with_one_error_and_breaks_nothing(
         return written(path, write, synced)
 
     monkeypatch.setattr("ocp.app.batch.result_store.write_whole", full)
-    with pytest.raises(OSError, match="7 of 20 results are kept") as caught:
+    with pytest.raises(OSError, match="7 of 20 results are stored") as caught:
         run_batch(functions.square, tasks, tmp_path / "b", cluster=here)
     assert caught.value.errno == number
     assert caught.value.filename == str(tmp_path / "b")
@@ -126,7 +126,7 @@ def check_read_only(tasks: list[Any], folder: Path, monkeypatch: pytest.MonkeyPa
 def test_a_worker_without_room_stops_the_batch_and_is_no_failure_of_its_task(tmp_path: Path, here: Any) -> None:
     room = tmp_path / "full"
     room.touch()
-    with pytest.raises(OSError, match="0 of 1 results are kept") as caught:
+    with pytest.raises(OSError, match="0 of 1 results are stored") as caught:
         run_batch(functions.without_room, [{"until": str(room)}], tmp_path / "b", cluster=here)
     assert caught.value.errno == errno.ENOSPC
     room.unlink()

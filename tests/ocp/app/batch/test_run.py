@@ -134,8 +134,8 @@ def test_errors_and_numbers_that_are_none_are_failures_with_their_reason_and_not
         "mistake": ("ZeroDivisionError", "float division by zero (functions.py, line "),
         "exit": ("SystemExit", "left"),
         "interrupt": ("KeyboardInterrupt", ""),
-        "set": ("ProblemError", "the result['found'] is a set, no data"),
-        "nan": ("ProblemError", "the result is nan, no finite number"),
+        "set": ("ProblemError", "the result['found'] is a set, which is not data"),
+        "nan": ("ProblemError", "the result is nan, not a finite number"),
         "inf": ("ProblemError", "the result[1] is inf"),
         "inside": ("ProblemError", "the result['a']['b'][1] is nan"),
     }
@@ -238,10 +238,10 @@ def test_a_script_runs_its_own_function_under_its_guard(end: str, says: str, tmp
 def test_a_folder_of_another_function_or_version_or_of_something_else_is_refused(tmp_path: Path) -> None:
     ResultStore.of(tmp_path / "b", "tests.ocp.app.batch.functions:square", source_version(functions.square), False)
     run_batch(functions.square, X[:1], tmp_path / "b")
-    with pytest.raises(ProblemError, match=r"holds results of .*square, not of .*same") as caught:
+    with pytest.raises(ProblemError, match=r"contains results of .*square, not of .*same") as caught:
         run_batch(functions.same, X, tmp_path / "b")
     assert caught.value.name == "folder"
-    with pytest.raises(ProblemError, match="take another folder") as caught:
+    with pytest.raises(ProblemError, match="use another folder") as caught:
         run_batch(functions.square, X, tmp_path / "b", version="2")
     assert caught.value.name == "version"
     head = tmp_path / "b" / "batch.json"

@@ -22,7 +22,7 @@ from ocp.app.batch.run import source_version
 
 def written(folder: Path, results: list[tuple[Any, Any]]) -> Batch:
     """A folder with these tasks and what the function returned; an exception is one."""
-    ledger = ResultStore.of(folder, "m:f", "1", True)
+    store = ResultStore.of(folder, "m:f", "1", True)
     for task, value in results:
         if isinstance(value, Exception):
             record, files = failed("failed", type(value).__name__, str(value))
@@ -30,7 +30,7 @@ def written(folder: Path, results: list[tuple[Any, Any]]) -> Batch:
             found = pack_result(value)
             record, files = {"status": "done", "error": "", "message": "", "seconds": 0.25, **found.record}, found.files
         own = {"key": key_of(canonical_text(task, "task")), "task": task, "neighbour": None, "inputs": {}}
-        ledger.write({**own, **record}, files)
+        store.write({**own, **record}, files)
     return read_batch(folder)
 
 
@@ -103,10 +103,10 @@ def test_the_best_of_a_group_is_the_cheapest_that_is_done_and_of_no_bad_verdict(
 )
 def test_solutions_come_back_wherever_they_stood(at: Any) -> None:
     plan = solved()
-    parcel = pack_result(at(plan))
-    json.dumps(parcel.record)
-    assert len(parcel.files) == len(parcel.record["files"]) >= 1
-    found = unpack_result(parcel)
+    payload = pack_result(at(plan))
+    json.dumps(payload.record)
+    assert len(payload.files) == len(payload.record["files"]) >= 1
+    found = unpack_result(payload)
 
     def same(one: Any, two: Any) -> bool:
         if isinstance(one, Solution):
