@@ -61,7 +61,7 @@ _LOCK = threading.RLock()
 
 
 def attempts(
-    function: Function, jobs: list[tuple[str, Payload | None]], with_guess: bool, most: float
+    function: Function, jobs: list[tuple[str, Payload | None]], near: bool, most: float
 ) -> list[Payload]:
     """Call :func:`attempt` for one job after another; begin no more after ``most`` s."""
     began, results = time.perf_counter(), list[Payload]()

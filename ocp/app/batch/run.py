@@ -104,9 +104,8 @@ def run_batch(
 
     def recorded(keys: Iterable[str]) -> dict[str, Result]:
         recorded_keys = set(store.recorded())
-        records = [
-            record for key in keys if key in recorded_keys and (record := store.read(key)) and is_current(record)
-        ]
+        candidates = (store.read(key) for key in keys if key in recorded_keys)
+        records = [record for record in candidates if record and is_current(record)]
         return {record["key"]: row_of(record, store) for record in records}
 
     results = recorded(texts)
