@@ -72,7 +72,7 @@ class Scene:
     mark: Array | None = None
     nearest_points: Array | None = None
     solids: tuple[Part, ...] = ()
-    detail: int = SURFACE_STYLE.most_faces
+    detail: int = SURFACE_STYLE.max_faces
 
     @cached_property
     def looks(self) -> Appearance:

@@ -60,9 +60,7 @@ _LOCK = threading.RLock()
 """Serialises the threads of a worker, because CasADi expressions are not thread-safe."""
 
 
-def attempts(
-    function: Function, jobs: list[tuple[str, Payload | None]], near: bool, most: float
-) -> list[Payload]:
+def attempts(function: Function, jobs: list[tuple[str, Payload | None]], near: bool, most: float) -> list[Payload]:
     """Call :func:`attempt` for one job after another; begin no more after ``most`` s."""
     began, results = time.perf_counter(), list[Payload]()
     for task, guess in jobs:

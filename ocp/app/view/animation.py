@@ -1,9 +1,7 @@
-"""A motion as it is shown: a plan, a solution of a problem of one's own or anybody's trajectory.
+"""Sample a motion for display: a plan, the solution of any problem, or a joint trajectory from any source.
 
-Whatever it was made by, it is sampled once, with what is known of it: what was asked, limits, costs, the bodies that
-come nearest, the audit.
-
-What is drawn over the time of a motion, with its limits: joints, torques, costs, what a base does.
+Every motion is sampled once, together with its targets, limits, costs, closest bodies and audit, as far as they are
+known. Curves over time show the joints, torques, costs and the motion of the base with their limits.
 """
 
 from __future__ import annotations
@@ -55,12 +53,14 @@ __all__ = [
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """A number over the time of a motion.
+    """A quantity over the time of a motion.
 
     Attributes:
-        group: What it is drawn with. name: Of it. unit: "" of a pure number.
+        group: Curves of one group share a diagram.
+        name: Name of the quantity.
+        unit: "" if it has none.
         values: At the motion's M times. Shape (M,).
-        lower, upper: Its limits, infinite where there is none.
+        lower, upper: Limits, infinite if there are none.
     """
 
     group: str
@@ -73,12 +73,12 @@ class Curve:
 
 @dataclass(frozen=True, eq=False)
 class GroundContact:
-    """Where the ground pushes on a machine that stands.
+    """Contact of a standing machine with the ground.
 
     Attributes:
-        corners: Of the region under its foot. Shape (k, 2), m.
-        points: Zero moment points, at the motion's M times. Shape (M, 2), m.
-        forces: Whether forces from outside are known, and in them.
+        corners: Corners of the contact area. Shape (k, 2), m.
+        points: Zero moment points at the motion's M times. Shape (M, 2), m.
+        forces: Whether they include external forces.
     """
 
     corners: Array
@@ -89,24 +89,24 @@ class GroundContact:
 def joint_curves(
     machine: Machine, bounds: JointBounds, joints: Array, rates: Array, accelerations: Array | None
 ) -> list[Curve]:
-    """Positions, rates and torques of all joints, shape (M, n) each, with what bounds them."""
-    robot, found = machine.robot, []
+    """Return curves of positions, velocities and torques of all joints, shape (M, n) each, with their limits."""
+    robot, curves = machine.robot, []
     torques = None if accelerations is None else _torques(machine, joints, rates, accelerations)
-    torque_group = "Torques, without forces from outside" if isinstance(machine, Standing) else "Torques"
+    torque_group = "Torques, without external forces" if isinstance(machine, Standing) else "Torques"
     for k, joint in enumerate(robot.moving_joints):
-        found.append(Curve("Joints", joint.name, joint.unit, joints[:, k], bounds.lower[k], bounds.upper[k]))
+        curves.append(Curve("Joints", joint.name, joint.unit, joints[:, k], bounds.lower[k], bounds.upper[k]))
     for k, joint in enumerate(robot.moving_joints):
-        most = float(bounds.velocity[k])
-        found.append(Curve("Joint rates", joint.name, f"{joint.unit}/s", rates[:, k], -most, most))
+        limit = float(bounds.velocity[k])
+        curves.append(Curve("Joint velocities", joint.name, f"{joint.unit}/s", rates[:, k], -limit, limit))
     for k, joint in enumerate(robot.moving_joints if torques is not None else ()):
         assert torques is not None
-        most = float(bounds.torque[k])
-        found.append(Curve(torque_group, joint.name, joint.effort_unit, torques[:, k], -most, most))
-    return found
+        limit = float(bounds.torque[k])
+        curves.append(Curve(torque_group, joint.name, joint.effort_unit, torques[:, k], -limit, limit))
+    return curves
 
 
 def _torques(machine: Machine, joints: Array, rates: Array, accelerations: Array) -> Array | None:
-    """By inverse dynamics, shape (M, n); None of a robot without masses."""
+    """Return torques by inverse dynamics, shape (M, n); None for a robot without masses."""
     robot = machine.robot
     if robot.total_mass == 0:
         return None
@@ -117,88 +117,89 @@ def _torques(machine: Machine, joints: Array, rates: Array, accelerations: Array
         gravity = getattr(machine, "gravity_in_world", GRAVITY)
         frame = machine.world_from_base(())
         torque = inverse_dynamics(simplified(robot), q, v, a, (), gravity, frame)
-    found: Array = Sampler([q, v, a], [torque])(joints, rates, accelerations)[0]
-    return found
+    torques: Array = Sampler([q, v, a], [torque])(joints, rates, accelerations)[0]
+    return torques
 
 
 def machine_curves(machine: Machine, base: Array, joints: Array, rates: Array, base_rates: Array | None) -> list[Curve]:
-    """Manipulability and speed of the tip; of a floating machine its momentum, where rates of its base are known."""
-    robot, found = machine.robot, []
+    """Return curves of manipulability and tip speed, and of the momentum of a floating machine with base rates."""
+    robot, curves = machine.robot, []
     b, q, v = ca.SX.sym("b", machine.base_size), ca.SX.sym("q", robot.dof), ca.SX.sym("v", robot.dof)
     if robot.tip is not None:
         rows = range(6) if robot.dof >= 6 else range(3, 6) if robot.dof >= 3 else (3, 4)
-        what = "of the pose" if robot.dof >= 6 else "of the position" if robot.dof >= 3 else "in the plane"
+        description = "of the pose" if robot.dof >= 6 else "of the position" if robot.dof >= 3 else "in the plane"
         twist = machine.tip_twist(b, q, v)
         sampler = Sampler([b, q, v], [machine.manipulability(b, q, rows), ca.norm_2(twist[3:6])])
         index, speed = sampler(base, joints, rates)
-        found.append(Curve("The motion", f"manipulability {what}", "", index[:, 0]))
-        found.append(Curve("The motion", "speed of the tip", "m/s", speed[:, 0]))
+        curves.append(Curve("The motion", f"manipulability {description}", "", index[:, 0]))
+        curves.append(Curve("The motion", "speed of the tip", "m/s", speed[:, 0]))
     if isinstance(machine, FreeFloating) and base_rates is not None:
         r = ca.SX.sym("r", machine.base_size)
-        whole = machine.momentum(b, q, machine.twist_of_rate(b, r), v)
-        own = machine.momentum(b, q, ca.SX(len(machine.twist_rows), 1), v)
-        turns = 3 if machine.base_size == 7 else 1
-        parts = [whole[:turns], whole[turns:], own[:turns], own[turns:]]
-        spin, push, own_spin, own_push = Sampler([b, q, v, r], [ca.norm_2(part) for part in parts])(
+        total = machine.momentum(b, q, machine.twist_of_rate(b, r), v)
+        joints_only = machine.momentum(b, q, ca.SX(len(machine.twist_rows), 1), v)
+        angular_rows = 3 if machine.base_size == 7 else 1
+        parts = [total[:angular_rows], total[angular_rows:], joints_only[:angular_rows], joints_only[angular_rows:]]
+        angular, linear, joints_angular, joints_linear = Sampler([b, q, v, r], [ca.norm_2(part) for part in parts])(
             base, joints, rates, base_rates
         )
-        for name, value, share, unit in (
-            ("moment of momentum", spin, own_spin, "N m s"),
-            ("momentum", push, own_push, "N s"),
+        for name, value, part, unit in (
+            ("moment of momentum", angular, joints_angular, "N m s"),
+            ("momentum", linear, joints_linear, "N s"),
         ):
-            found.append(Curve("Momentum", f"{name}, of the whole", unit, value[:, 0]))
-            found.append(Curve("Momentum", f"{name}, of the joints alone", unit, share[:, 0]))
-    return found
+            curves.append(Curve("Momentum", f"{name}, total", unit, value[:, 0]))
+            curves.append(Curve("Momentum", f"{name}, of the joints alone", unit, part[:, 0]))
+    return curves
 
 
 def ground_contact(
     machine: Standing, joints: Array, rates: Array, accelerations: Array, inside: Sequence[Curve] = ()
 ) -> tuple[GroundContact, list[Curve]]:
-    """Where the ground pushes, and how far from the edge of the foot.
+    """Return the zero moment points and a curve of their distance from the edge of the foot.
 
     Args:
+        machine: The machine.
         joints, rates, accelerations: Shape (M, n) each.
-        inside: How far it is inside each edge, as a problem says that knows of forces from outside; less a margin that
-            is the same everywhere. Without, no such forces are known.
+        inside: Distances inside each edge, up to a constant margin, from a problem that includes external forces.
+            Without them the external forces are unknown.
     """
     normals, corners = machine.support.normals, np.asarray(machine.support.vertices)
     if len(inside) == len(normals):
         point = ca.SX.sym("point", 2)
         edges = np.array(ca.Function("edges", [point], [machine.support.distances(point)])(np.zeros(2))).ravel()
         rows = np.column_stack([normals, -np.ones(len(normals))])
-        told = np.column_stack([one.values for one in inside]) - edges
-        found, *_ = np.linalg.lstsq(rows, told.T, rcond=None)
-        if np.abs(rows @ found - told.T).max() < 1e-8:  # m: rounding; they are those of one point
-            points = np.ascontiguousarray(found[:2].T)
+        edge_distances = np.column_stack([one.values for one in inside]) - edges
+        solution, *_ = np.linalg.lstsq(rows, edge_distances.T, rcond=None)
+        if np.abs(rows @ solution - edge_distances.T).max() < 1e-8:  # m, rounding: they belong to one point
+            points = np.ascontiguousarray(solution[:2].T)
             distances = edges + points @ normals.T
             margin = Curve("Standing", "zero moment point from the edge of the foot", "m", distances.min(axis=1), 0.0)
             return GroundContact(corners, points, True), [margin]
     q, v, a = (ca.SX.sym(name, machine.joint_size) for name in ("q", "v", "a"))
     point = center_of_pressure(machine.ground_reaction(q, v, a))
-    points, inner = Sampler([q, v, a], [point, machine.support.margin(point)])(joints, rates, accelerations)
-    words = "zero moment point from the edge of the foot, no forces from outside"
-    return GroundContact(corners, points, False), [Curve("Standing", words, "m", inner[:, 0], 0.0)]
+    points, margins = Sampler([q, v, a], [point, machine.support.margin(point)])(joints, rates, accelerations)
+    name = "zero moment point from the edge of the foot, without external forces"
+    return GroundContact(corners, points, False), [Curve("Standing", name, "m", margins[:, 0], 0.0)]
 
 
 def cumulative_integral(t: Array, values: Array) -> Array:
-    """The integral of samples (M,) up to each time, by trapezia. Shape (M,)."""
+    """Return the integral of samples (M,) up to each time, by the trapezoidal rule. Shape (M,)."""
     return np.concatenate([[0.0], np.cumsum(np.diff(t) * (values[1:] + values[:-1]) / 2)])
 
 
-FOOT = "zero moment point"
-"""What problems of standing machines call the constraint that keeps it in the foot."""
+ZMP_CONSTRAINT = "zero moment point"
+"""Name of the constraint that keeps the zero moment point in the foot, in problems of standing machines."""
 
 
 @dataclass(frozen=True)
 class PageSettings:
-    """How finely a page shows a motion.
+    """Resolution of a page.
 
     Attributes:
-        per_second, least, most: Times at which a motion is sampled.
-        poses: Of them those at which poses are told, at most; between them they are interpolated.
-        near: Times at which the nearest bodies are looked for, which takes longer.
-        same_cost: Relative: costs that end nearer to each other are told once.
-        most_bytes: Of a page.
+        per_second, least, most: Samples of a motion per second, and their smallest and largest number.
+        poses: Largest number of samples with poses, between which the page interpolates.
+        near: Number of times at which the closest bodies are computed, which is slower.
+        same_cost: Relative: of costs with a smaller final difference only one is shown.
+        most_bytes: Largest size of a page.
     """
 
     per_second: int = 50
@@ -214,12 +215,13 @@ PAGE_SETTINGS = PageSettings()
 
 
 class ClosestPairs(NamedTuple):
-    """The two bodies that are nearest to each other, at K times.
+    """The two bodies with the smallest clearance margin at K times.
 
     Attributes:
         t: s. Shape (K,).
-        points: On their cores, in world. Shape (K, 2, 3), m.
-        distances: m. Shape (K,). asked: The least allowed. Shape (K,), m.
+        points: Closest points of their cores, in world. Shape (K, 2, 3), m.
+        distances: m. Shape (K,).
+        asked: Required distances. Shape (K,), m.
         bodies: Their names.
     """
 
@@ -232,21 +234,23 @@ class ClosestPairs(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Animation:
-    """A motion, sampled.
+    """A sampled motion.
 
     Attributes:
-        name: What it is called.
-        machine: What moves.
+        name: Name of the motion.
+        machine: The machine that moves.
         t: s. Shape (M,).
-        joints: Shape (M, n). base: Shape (M, base_size).
-        curves: What is drawn over time.
-        targets: What tips were asked to do.
-        footing: Where the ground pushes; None of a machine that does not stand.
-        near: The nearest bodies; None where nothing is known of them.
-        around: Obstacles; what moves has its places at the times t.
-        verdict: Of the audit, a sentence, or "". passed: Whether it is good; None where nothing was looked at.
-        rows: Of the audit.
-        cost: Of it; None where it is not known.
+        joints: Shape (M, n).
+        base: Shape (M, base_size).
+        curves: Quantities over time.
+        targets: Targets of the tips.
+        footing: Contact with the ground; None for a machine that does not stand.
+        near: The closest bodies; None if they are unknown.
+        around: Obstacles; moving ones have their poses at the times t.
+        verdict: Sentence of the audit, or "".
+        passed: Whether the audit passes; None if there is none.
+        rows: Rows of the audit.
+        cost: Cost; None if it is unknown.
     """
 
     name: str
@@ -266,26 +270,26 @@ class Animation:
 
 
 def animate_plan(plan: Plan, name: str = "plan", **settings: Any) -> Animation:
-    """A plan, with its audit, of which `settings` are."""
+    """Return a sampled plan with its audit; `settings` are those of the audit."""
     times = _times(plan.horizon)
     sample = plan.sampled(times)
     base = plan.at(times)["base"] if plan.machine.base_size else np.zeros((len(times), 0))
     near = _near(plan)
     single = len(plan.parts) == 1
-    told: list[Curve] = []
+    own_curves: list[Curve] = []
     if single:
         fractions = plan._fractions(plan.parts[0], times)
-        own = fractions * plan.solution.horizon if CLOCK in plan.solution.states else times
-        told = _told(plan.solution, fractions, own)
-    given = sample.joints, sample.rates, sample.accelerations
-    about: dict[str, Any] = {
+        solution_times = fractions * plan.solution.horizon if CLOCK in plan.solution.states else times
+        own_curves = _problem_curves(plan.solution, fractions, solution_times)
+    derivatives = sample.joints, sample.rates, sample.accelerations
+    details: dict[str, Any] = {
         "near": near,
         "around": tuple(obstacles_of(plan.solution, times_by_part(plan, times))),
         "cost": plan.cost,
         "targets": plan.targets,
     }
-    about |= _audited(plan.solution, lambda: verdict_of(plan, sample, name, **settings))
-    return _shown(name, plan.machine, times, base, *given, _base_rates(times, base), told, **about)
+    details |= _audited(plan.solution, lambda: verdict_of(plan, sample, name, **settings))
+    return _animation(name, plan.machine, times, base, *derivatives, _base_rates(times, base), own_curves, **details)
 
 
 def animate_solution(
@@ -297,24 +301,26 @@ def animate_solution(
     base: str = "base",
     **settings: Any,
 ) -> Animation:
-    """A solution of a problem of one's own.
+    """Return the sampled solution of a problem.
 
     Args:
-        machine: Whose joints, and base, are states of the problem.
-        joints, base: What these states are called.
-        settings: Of the audit.
+        solution: The solution.
+        machine: Its joints, and its base, are states of the problem.
+        name: Name of the motion.
+        joints, base: Names of these states.
+        settings: Settings of the audit.
 
     Raises:
-        ProblemError: No such state, or another size.
+        ProblemError: A state is missing or has the wrong size.
     """
-    wanted = {joints: machine.joint_size} | ({base: machine.base_size} if machine.base_size else {})
-    for state, size in wanted.items():
+    sizes = {joints: machine.joint_size} | ({base: machine.base_size} if machine.base_size else {})
+    for state, size in sizes.items():
         if state not in solution.states:
             raise unknown_name("state", state, list(solution.states))
-        found = solution.states[state].shape[1]
-        if found != size:
-            words = f"state {state!r} has {found} entries, the machine {size}: {list(machine.robot.joint_names)}"
-            raise ProblemError(words, name=state, value=found, limit=size)
+        actual = solution.states[state].shape[1]
+        if actual != size:
+            words = f"state {state!r} has {actual} entries, the machine {size}: {list(machine.robot.joint_names)}"
+            raise ProblemError(words, name=state, value=actual, limit=size)
     times = _times(solution.horizon)
     fractions = times / solution.horizon
     columns, at = {}, 0
@@ -324,56 +330,56 @@ def animate_solution(
     curve = solution.state_interpolant
     states = curve(fractions)
     slopes = curve.derivative()(fractions) / solution.horizon
-    bends = curve.derivative().derivative()(fractions) / solution.horizon**2
-    q, v, a = (one[:, columns[joints]] for one in (states, slopes, bends))
-    place = states[:, columns[base]] if machine.base_size else np.zeros((len(times), 0))
-    moves = slopes[:, columns[base]] if machine.base_size else np.zeros((len(times), 0))
-    about: dict[str, Any] = {"cost": solution.cost, "around": tuple(obstacles_of(solution, [("", times)]))}
-    about |= _audited(solution, lambda: solution.audit(**settings))
+    second_derivatives = curve.derivative().derivative()(fractions) / solution.horizon**2
+    q, v, a = (samples[:, columns[joints]] for samples in (states, slopes, second_derivatives))
+    base_path = states[:, columns[base]] if machine.base_size else np.zeros((len(times), 0))
+    base_rates = slopes[:, columns[base]] if machine.base_size else np.zeros((len(times), 0))
+    details: dict[str, Any] = {"cost": solution.cost, "around": tuple(obstacles_of(solution, [("", times)]))}
+    details |= _audited(solution, lambda: solution.audit(**settings))
     if solution.problem is not None:
-        looks = np.linspace(0.0, solution.horizon, PAGE_SETTINGS.near)
-        about["near"] = _joined(looks, nearest_along(solution.problem, solution, looks))
+        times_of_pairs = np.linspace(0.0, solution.horizon, PAGE_SETTINGS.near)
+        details["near"] = _joined(times_of_pairs, nearest_along(solution.problem, solution, times_of_pairs))
     smooth = _torque_like(solution, joints)
-    told = _told(solution, fractions, times)
-    return _shown(name, machine, times, place, q, v, a if smooth else None, moves, told, **about)
+    own_curves = _problem_curves(solution, fractions, times)
+    return _animation(name, machine, times, base_path, q, v, a if smooth else None, base_rates, own_curves, **details)
 
 
 def animate_trajectory(raw: RawTrajectory, machine: Machine, name: str = "") -> Animation:
-    """Anybody's trajectory, between its samples as a controller makes it.
+    """Return a sampled joint trajectory, interpolated as controllers do.
 
     Raises:
-        ProblemError: It lacks joints of the machine, or has no sample that can be read.
+        ProblemError: The trajectory lacks joints of the machine, or has no valid sample.
     """
     robot = machine.robot
     bounds = bounds_of(robot)
-    found = clean_trajectory(raw, robot, bounds.lower, bounds.upper, bounds.velocity)
-    if len(found.joints) < robot.dof:
-        lacking = [one for k, one in enumerate(robot.joint_names) if k not in found.joints]
-        words = f"{raw.file} does not move {lacking}; hold them: --lock {lacking[0]}=VALUE"
-        raise ProblemError(words, name=lacking[0], value=raw.file)
-    motion = found.motion
+    cleaned = clean_trajectory(raw, robot, bounds.lower, bounds.upper, bounds.velocity)
+    if len(cleaned.joints) < robot.dof:
+        missing = [joint for k, joint in enumerate(robot.joint_names) if k not in cleaned.joints]
+        words = f"{raw.file} does not move {missing}; lock them: --lock {missing[0]}=VALUE"
+        raise ProblemError(words, name=missing[0], value=raw.file)
+    motion = cleaned.motion
     begin, end = float(motion.t[0]), float(motion.t[-1])
     times = _times(end - begin)
     joints, rates = motion.position.at(begin + times), motion.velocity.at(begin + times)
     accelerations = None if motion.acceleration is None else motion.acceleration.at(begin + times)
-    base, moves = np.zeros((len(times), 0)), None
+    base, base_rates = np.zeros((len(times), 0)), None
     if machine.base_size:
-        told = found.base
-        if told is None:
+        base_path = cleaned.base
+        if base_path is None:
             assert isinstance(machine, FreeFloating)
-            told = integrate_base(machine, motion)[0]  # moves as its momentum has it
+            base_path = integrate_base(machine, motion)[0]  # by conservation of momentum
         else:
-            moves = _between(begin + times, motion.t, np.gradient(told, motion.t, axis=0))
-        base = _between(begin + times, motion.t, told)
-    return _shown(name or raw.file, machine, times, base, joints, rates, accelerations, moves, [])
+            base_rates = _between(begin + times, motion.t, np.gradient(base_path, motion.t, axis=0))
+        base = _between(begin + times, motion.t, base_path)
+    return _animation(name or raw.file, machine, times, base, joints, rates, accelerations, base_rates, [])
 
 
 def _between(times: Array, t: Array, values: Array) -> Array:
-    """Columns of samples, straight between them."""
+    """Return samples interpolated linearly. Shape (K, n)."""
     return np.column_stack([np.interp(times, t, column) for column in values.T])
 
 
-def _shown(
+def _animation(
     name: str,
     machine: Machine,
     t: Array,
@@ -382,43 +388,45 @@ def _shown(
     rates: Array,
     accelerations: Array | None,
     base_rates: Array | None,
-    told: Sequence[Curve],
-    **about: Any,
+    own_curves: Sequence[Curve],
+    **details: Any,
 ) -> Animation:
-    """With what every motion tells."""
+    """Return a motion with the curves that every motion has."""
     effort = cumulative_integral(t, (rates**2).sum(axis=1) / 2)
-    curves = [Curve("Cost", "half the squared joint rates, so far", "", effort)]
-    own = [one for one in told if one.group == "Cost"]
+    curves = [Curve("Cost", "integral of half the squared joint velocities", "", effort)]
+    costs = [one for one in own_curves if one.group == "Cost"]
     curves += [
-        one for one in own if abs(one.values[-1] - effort[-1]) > PAGE_SETTINGS.same_cost * max(abs(effort[-1]), 1e-12)
+        one for one in costs if abs(one.values[-1] - effort[-1]) > PAGE_SETTINGS.same_cost * max(abs(effort[-1]), 1e-12)
     ]
     curves += machine_curves(machine, base, joints, rates, base_rates)
-    near = about.get("near")
+    near = details.get("near")
     if near is not None:
         distances = np.interp(t, near.t, near.distances)
-        curves.append(Curve("The motion", "nearest two bodies", "m", distances, float(near.asked.min())))
+        curves.append(Curve("The motion", "closest two bodies", "m", distances, float(near.asked.min())))
     footing = None
     if isinstance(machine, Standing) and accelerations is not None:
         footing, more = ground_contact(
-            machine, joints, rates, accelerations, [one for one in told if one.group == FOOT]
+            machine, joints, rates, accelerations, [one for one in own_curves if one.group == ZMP_CONSTRAINT]
         )
         curves += more
     curves += joint_curves(machine, bounds_of(machine.robot), joints, rates, accelerations)
-    curves += _rooms([one for one in told if one.group != "Cost"])
-    return Animation(name, machine, t, joints, base, tuple(curves), footing=footing, **about)
+    curves += _margins([one for one in own_curves if one.group != "Cost"])
+    return Animation(name, machine, t, joints, base, tuple(curves), footing=footing, **details)
 
 
 def _times(horizon: float) -> Array:
+    """Return uniform times of a motion."""
     count = int(np.clip(np.ceil(PAGE_SETTINGS.per_second * horizon), PAGE_SETTINGS.least, PAGE_SETTINGS.most))
     return np.linspace(0.0, horizon, count + 1)
 
 
 def _base_rates(t: Array, base: Array) -> Array:
+    """Return the time derivative of the base, by differences."""
     return np.asarray(np.gradient(base, t, axis=0, edge_order=2)) if base.shape[1] else base
 
 
 def _torque_like(solution: Solution, joints: str) -> bool:
-    """Whether the joints' accelerations are of the plan: the states' own curves bend smoothly."""
+    """Return whether the joints are smooth enough for torques: another state has their size."""
     return len(solution.state_interpolant.nodes) > 2 and any(
         name != joints and values.shape[1] == solution.states[joints].shape[1]
         for name, values in solution.states.items()
@@ -426,18 +434,18 @@ def _torque_like(solution: Solution, joints: str) -> bool:
 
 
 def _audited(solution: Solution, judge: Callable[[], Audit | PlanVerdict]) -> dict[str, Any]:
-    """What the audit says; of a solution without its problem that there can be none."""
+    """Return sentence, result and rows of the audit, or only a sentence if the problem is missing."""
     if solution.problem is None:
-        return {"verdict": f"Its problem is not in the file, so that nothing is audited: {solution.problem_lost}."}
+        return {"verdict": f"There is no audit, because the file has no problem: {solution.problem_lost}."}
     verdict = judge()
     audit = verdict.audit if isinstance(verdict, PlanVerdict) else verdict
     return {"verdict": f"The plan {verdict.sentence}.", "passed": verdict.passed, "rows": tuple(audit_rows(audit))}
 
 
-def _told(solution: Solution, fractions: Array, times: Array) -> list[Curve]:
-    """What the problem itself says along the motion: its running cost so far, and every row of its path constraints.
+def _problem_curves(solution: Solution, fractions: Array, times: Array) -> list[Curve]:
+    """Return the integral of the problem's running cost, and every row of its path constraints.
 
-    The rows of a constraint have its name for their group.
+    The group of a row is the name of its constraint.
     """
     if solution.problem is None:
         return []
@@ -447,43 +455,45 @@ def _told(solution: Solution, fractions: Array, times: Array) -> list[Curve]:
     p = form.parameter_vector(ordered.parameters)
     running, rows = form.sampled([form.running, form.path.expression], x, u, times, ordered.horizon, p)
     lower, upper = (side[form.path.bounds] for side in form.bound_values(p))
-    own = cumulative_integral(fractions * ordered.horizon, running[:, 0])
-    return [Curve("Cost", "the problem's own, so far", "", own)] + [
+    integral = cumulative_integral(fractions * ordered.horizon, running[:, 0])
+    return [Curve("Cost", "the problem's own cost, integrated", "", integral)] + [
         Curve(owner, label, form.units[owner], rows[:, k], float(lower[k]), float(upper[k]))
         for k, (owner, label) in enumerate(zip(form.path.owners, form.path.labels, strict=True))
     ]
 
 
-def _rooms(rows: Sequence[Curve]) -> list[Curve]:
-    """Of each constraint, how far its tightest row is from its limit, or of equations how far the worst is off."""
-    found = []
+def _margins(rows: Sequence[Curve]) -> list[Curve]:
+    """Return the smallest margin of each constraint to its limits, and the largest error of its equations."""
+    curves = []
     for name in dict.fromkeys(one.group for one in rows):
-        own = [one for one in rows if one.group == name]
-        unit = own[0].unit if "," not in own[0].unit else ""
-        if equal := [one for one in own if one.lower == one.upper]:
-            off = np.max([np.abs(one.values - one.lower) for one in equal], axis=0)
-            found.append(Curve("Constraints", f"{name}: off by", unit, off))
-        if open_ := [one for one in own if one.lower < one.upper]:
-            rooms = [np.minimum(one.values - one.lower, one.upper - one.values) for one in open_]
-            found.append(Curve("Constraints", f"{name}: room to its limit", unit, np.min(rooms, axis=0), 0.0))
-    return [one for one in found if np.isfinite(one.values).any()]
+        group = [one for one in rows if one.group == name]
+        unit = group[0].unit if "," not in group[0].unit else ""
+        if equations := [one for one in group if one.lower == one.upper]:
+            errors = np.max([np.abs(one.values - one.lower) for one in equations], axis=0)
+            curves.append(Curve("Constraints", f"{name}: error", unit, errors))
+        if inequalities := [one for one in group if one.lower < one.upper]:
+            margins = [np.minimum(one.values - one.lower, one.upper - one.values) for one in inequalities]
+            curves.append(Curve("Constraints", f"{name}: margin to its limit", unit, np.min(margins, axis=0), 0.0))
+    return [one for one in curves if np.isfinite(one.values).any()]
 
 
 def _near(plan: Plan) -> ClosestPairs | None:
+    """Return the closest bodies along a plan, or None if they are unknown."""
     problem = plan.solution.problem
     if problem is None:
         return None
-    looks = np.linspace(0.0, plan.horizon, PAGE_SETTINGS.near)
-    found = []
-    for suffix, times in times_by_part(plan, looks):
-        found += nearest_along(problem, plan.solution, times, suffix)
-    return _joined(looks, found)
+    all_times = np.linspace(0.0, plan.horizon, PAGE_SETTINGS.near)
+    pairs = []
+    for suffix, times in times_by_part(plan, all_times):
+        pairs += nearest_along(problem, plan.solution, times, suffix)
+    return _joined(all_times, pairs)
 
 
-def _joined(t: Array, found: Sequence[Any]) -> ClosestPairs | None:
-    if len(found) < len(t):
+def _joined(t: Array, pairs: Sequence[Any]) -> ClosestPairs | None:
+    """Return the closest bodies at several times, or None if some are unknown."""
+    if len(pairs) < len(t):
         return None
-    points, distances, asked = (
-        np.array([getattr(one, what) for one in found]) for what in ("points", "distance", "asked")
+    points, distances, required = (
+        np.array([getattr(pair, name) for pair in pairs]) for name in ("points", "distance", "asked")
     )
-    return ClosestPairs(t, points, distances, asked, tuple(one.bodies for one in found))
+    return ClosestPairs(t, points, distances, required, tuple(pair.bodies for pair in pairs))

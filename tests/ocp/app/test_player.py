@@ -96,7 +96,7 @@ OBJ = "v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nv 0 0 0.1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 
 OPTIONS: dict[str, Any] = {"tip": "finger", "lock": {"grip": 0.05}, "tip_translation": [0.2, 0.0, 0.01]}
 TURN = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
 START = np.array([0.4, 0.7, -0.6])
-GROUPS = {"Cost", "The motion", "Joints", "Joint rates"}
+GROUPS = {"Cost", "The motion", "Joints", "Joint velocities"}
 
 
 @pytest.fixture(scope="module")
@@ -301,8 +301,8 @@ def test_costs_end_at_that_of_the_plan_and_torques_do_the_work_that_energy_shows
     shown = animate_plan(plan)
     found = curves_of(shown)
     assert {group for group, _ in found} >= GROUPS | {"Torques"}
-    assert found["Cost", "half the squared joint rates, so far"].values[-1] == pytest.approx(plan.cost, rel=1e-4)
-    assert ("Cost", "the problem's own, so far") not in found  # the same
+    assert found["Cost", "integral of half the squared joint velocities"].values[-1] == pytest.approx(plan.cost, rel=1e-4)
+    assert ("Cost", "the problem's own cost, integrated") not in found  # the same
     assert found["Joints", "shoulder"].upper == 3.0
     assert found["Joints", "elbow"].upper == np.inf
     robot, q = plan.machine.robot, ca.SX.sym("q", 3)
@@ -322,7 +322,7 @@ def test_costs_end_at_that_of_the_plan_and_torques_do_the_work_that_energy_shows
 
 def test_the_momentum_of_the_whole_is_that_of_a_floating_plan(plans: dict[str, Plan]) -> None:
     found = curves_of(animate_plan(plans["floating"]))
-    whole, own = (found["Momentum", f"momentum, of {which}"].values for which in ("the whole", "the joints alone"))
+    whole, own = (found["Momentum", f"momentum, {which}"].values for which in ("total", "of the joints alone"))
     assert own.max() > 0.1
     assert whole.max() < 1e-3 * own.max()
 
