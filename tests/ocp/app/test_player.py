@@ -301,7 +301,9 @@ def test_costs_end_at_that_of_the_plan_and_torques_do_the_work_that_energy_shows
     shown = animate_plan(plan)
     found = curves_of(shown)
     assert {group for group, _ in found} >= GROUPS | {"Torques"}
-    assert found["Cost", "integral of half the squared joint velocities"].values[-1] == pytest.approx(plan.cost, rel=1e-4)
+    assert found["Cost", "integral of half the squared joint velocities"].values[-1] == pytest.approx(
+        plan.cost, rel=1e-4
+    )
     assert ("Cost", "the problem's own cost, integrated") not in found  # the same
     assert found["Joints", "shoulder"].upper == 3.0
     assert found["Joints", "elbow"].upper == np.inf
