@@ -152,7 +152,7 @@ def clean_trajectory(
     base_names = next((names for names in BASES if set(names) <= set(raw.names)), ())
     columns, joints = _columns(raw, robot, base_names, faults, notes)
     used = [*columns, *(raw.names.index(name) for name in base_names)]
-    finite_rows = _finite(raw, robot, columns, used, joints, faults, notes)
+    finite_rows = _finite(raw, used, joints, faults, notes)
     rows = _in_order(raw, finite_rows, faults)
     t, q = raw.t[rows], raw.positions[rows][:, columns]
     v, a, efforts = (
@@ -175,9 +175,7 @@ def clean_trajectory(
         notes.append("one sample is a configuration, not a motion: it is checked as a rest of one second")
         t = np.array([t[0], t[0] + 1.0])
         q = np.repeat(q, 2, axis=0)
-        v, a, efforts, base = (
-            None if values is None else np.repeat(values, 2, axis=0) for values in (v, a, efforts, base)
-        )
+        v, a, efforts, base = (None if x is None else np.repeat(x, 2, axis=0) for x in (v, a, efforts, base))
     q, wrapped = _unwrapped(t, q, names, kinds, limits, notes)
     faults += [] if unwrap else wrapped
     notes += [f"{fault.name} {fault.text}" for fault in wrapped] if unwrap else []
@@ -225,37 +223,25 @@ def _columns(
     return [raw.names.index(names[k]) for k in joints], np.array(joints)
 
 
-def _finite(
-    raw: RawTrajectory,
-    robot: Robot,
-    columns: list[int],
-    used: list[int],
-    joints: Indices,
-    faults: list[Fault],
-    notes: list[str],
-) -> Indices:
+def _finite(raw: RawTrajectory, used: list[int], joints: Indices, faults: list[Fault], notes: list[str]) -> Indices:
     """Return the indices of the samples in which all values are numbers. Shape (K,)."""
     finite = np.isfinite(raw.t)
     if not finite.all():
         k = int(np.flatnonzero(~finite)[0])
         faults.append(Fault("not a number", "time", _count(~finite, raw, k), None, line=int(raw.lines[k])))
-    for kind, values in (
-        ("", raw.positions),
-        ("velocity of ", raw.velocities),
-        ("acceleration of ", raw.accelerations),
-    ):
+    quantities = {"": raw.positions, "velocity of ": raw.velocities, "acceleration of ": raw.accelerations}
+    for kind, values in quantities.items():
         if values is None:
             continue
-        for column, joint in zip([*columns, *used[len(columns) :]], [*joints, *[None] * len(used)], strict=False):
+        for column, joint in zip(used, [*joints, *[None] * len(used)], strict=False):
             invalid = ~np.isfinite(values[:, column])
             if not invalid.any() or (kind and (joint is None or invalid.all())):
                 continue
             k = int(np.flatnonzero(invalid)[0])
             name = raw.names[column]
             time = float(raw.t[k]) if np.isfinite(raw.t[k]) else None
-            faults.append(
-                Fault("not a number", name, kind + _count(invalid, raw, k), time, time, line=int(raw.lines[k]))
-            )
+            text = kind + _count(invalid, raw, k)
+            faults.append(Fault("not a number", name, text, time, time, line=int(raw.lines[k])))
             finite &= ~invalid
     if not finite.any():
         words = f"{raw.file}: every sample has a value that is not a number"
@@ -269,9 +255,8 @@ def _finite(
 
 def _count(invalid: Any, raw: RawTrajectory, k: int) -> str:
     """Return how many values are invalid and where the first one is."""
-    text = (
-        f"{int(invalid.sum())} values are not numbers, the first" if invalid.sum() > 1 else "a value is not a number,"
-    )
+    count = int(invalid.sum())
+    text = f"{count} values are not numbers, the first" if count > 1 else "a value is not a number,"
     return f"{text} at {raw.t[k]:.6g} s (line {raw.lines[k]})"
 
 
@@ -279,25 +264,22 @@ def _in_order(raw: RawTrajectory, finite_rows: Indices, faults: list[Fault]) -> 
     """Return the indices of samples with increasing times."""
     t = raw.t[finite_rows]
     steps = np.diff(t)
-    for violated, kind, words in (
-        (steps < 0, "times", "goes back from {:.6g} s to {:.6g} s"),
-        (steps == 0, "times", "{:.6g} s is repeated"),
-    ):
+    descriptions = (steps < 0, "goes back from {:.6g} s to {:.6g} s"), (steps == 0, "{:.6g} s is repeated")
+    for violated, words in descriptions:
         if violated.any():
             k = int(np.flatnonzero(violated)[0])
             more = f", and {int(violated.sum()) - 1} times more" if violated.sum() > 1 else ""
             line, time = int(raw.lines[finite_rows[k + 1]]), float(t[k + 1])
             text = words.format(t[k], t[k + 1]) + f" at line {line}{more}"
-            faults.append(Fault(kind, "", f"time {text}; times must increase", time, time, line=line))
+            faults.append(Fault("times", "", f"time {text}; times must increase", time, time, line=line))
     return np.asarray(finite_rows[np.unique(t, return_index=True)[1]])
 
 
 def likely_unit(t: Array, q: Array, velocity: Array) -> tuple[str, float]:
     """Return the unit below a second in which times are plausible, or "", and the share of the velocity limits used.
 
-    The share is that of the fastest joint if the times are in seconds.
-
-    Plausible are samples at 10 kHz or less, and a fastest joint at 1 to 1000 % of its limit, or of 1 if it has none.
+    The share is that of the fastest joint if the times are in seconds. Plausible are samples at 10 kHz or less, and a
+    fastest joint at 1 to 1000 % of its limit, or of 1 if it has none.
     """
     h, usual = np.diff(t), np.where(np.isfinite(velocity), velocity, 1.0)
     used = float((np.abs(np.diff(q, axis=0)) / h[:, None] / usual).max())
@@ -431,9 +413,7 @@ def _time_by_velocities(t: Array, q: Array, v: Array | None, names: Sequence[str
         whole = np.median(list(ratios.values()))
         for unit, power in SMALL_UNITS.items():
             if abs(whole / power - 1) < 0.1:
-                words = (
-                    f"times look like {unit}: velocities are {whole:.4g} times the differences of positions over times"
-                )
+                words = f"times look like {unit}: velocities are {whole:.4g} times those of the positions"
                 words += f"; the rest of the check takes them as {unit}"
                 faults.append(Fault("units", "time", words, value=float(whole)))
                 return t / power
@@ -443,9 +423,8 @@ def _time_by_velocities(t: Array, q: Array, v: Array | None, names: Sequence[str
         if np.isnan(ratio):
             words = "velocities do not match its positions"
         else:
-            words = f"velocities are {ratio:.4g} times those of its positions" + (
-                likely and f": they look like {likely}"
-            )
+            words = f"velocities are {ratio:.4g} times those of its positions"
+            words += f": they look like {likely}" if likely else ""
         pair = float(given[at, k]), float(by_positions[at, k])
         text = f"{words}, worst at {t[at]:.6g} s: {pair[0]:.4g} given, {pair[1]:.4g} from positions"
         faults.append(Fault("units" if likely else "velocities", names[k], text, float(t[at]), None, *pair))

@@ -34,10 +34,10 @@ __all__ = [
     "Row",
     "RowVerdict",
     "audit_rows",
+    "floating_base_rows",
     "floating_torques",
     "integrate_base",
     "limit_rows",
-    "momentum_rows",
     "standing_rows",
     "torque_rows",
     "torque_samples",
@@ -338,6 +338,18 @@ def standing_rows(machine: Standing, motion: Motion, friction: float) -> tuple[l
             "friction", spare, 0.0, "N", f"the foot slips: {slide[k, 0]:.4g} N along the ground, {push[k]:.4g} N on it,"
         )
     return rows, faults
+
+
+def floating_base_rows(
+    machine: FreeFloating, motion: Motion, base: Array | None
+) -> tuple[Array, list[Row], list[Fault]]:
+    """Return the configurations of a floating base at the samples, shape (M, base_size), with rows and faults.
+
+    If the file gives the base, its momentum is checked; otherwise it moves so that momentum is conserved.
+    """
+    if base is None:
+        return (*integrate_base(machine, motion), [])
+    return (base, *momentum_rows(machine, motion, base))
 
 
 def integrate_base(machine: FreeFloating, motion: Motion) -> tuple[Array, list[Row]]:

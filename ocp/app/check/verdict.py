@@ -9,23 +9,15 @@ from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
-from models import CollisionScene, FixedBase, FreeFloating, Machine, Robot, Standing, Support, footprint
+from models import CollisionScene, FixedBase, FreeFloating, Robot, Standing, Support, footprint
 from models.arrays import Array, ArrayInput
 from models.robot.dynamics import GRAVITY
 from models.shapes.mesh_files import find_mesh
 from models.shapes.shapes import Shape
 from ocp.app.check.collisions import clearance_rows, path_rows, with_wide_limits
 from ocp.app.check.data_checks import CleanedTrajectory, Fault, clean_trajectory
-from ocp.app.check.interpolation import Motion, Rule
-from ocp.app.check.joint_limits import (
-    Row,
-    RowVerdict,
-    integrate_base,
-    limit_rows,
-    momentum_rows,
-    standing_rows,
-    torque_rows,
-)
+from ocp.app.check.interpolation import Rule
+from ocp.app.check.joint_limits import Row, RowVerdict, floating_base_rows, limit_rows, standing_rows, torque_rows
 from ocp.app.check.suspicions import doubtful_times, exchanged_joints
 from ocp.app.files import RawTrajectory, Waypoints
 from ocp.app.files.trajectory import UNITS
@@ -141,28 +133,6 @@ class Check:
         return data
 
 
-@dataclass(frozen=True, eq=False)
-class CheckRequest:
-    """Options of a check that concern the whole machine; see `check_trajectory`."""
-
-    base: BaseKind
-    translation: Array
-    rotation: Array
-    gravity: Array
-    foot: Support | None
-    friction: float
-    obstacles: tuple[Shape, ...]
-    clearance: float | None
-    ignored: tuple[tuple[str, str], ...]
-    srdf: str | Path | None
-    folders: tuple[str | Path, ...]
-    missing: Literal["raise", "skip"]
-    path: Waypoints | None
-    path_tolerance: float
-    path_angle: float
-    share: float
-
-
 @interruptible
 def check_trajectory(
     robot: Robot,
@@ -268,25 +238,38 @@ def check_trajectory(
     if not complete:
         unchecked.append("torques, clearance and the tip, because joints are missing")
     else:
-        request = CheckRequest(
-            base,
+        gravity = np.asarray(gravity, dtype=float)
+        pose = (
             np.asarray(translation, dtype=float),
             np.eye(3) if rotation is None else np.asarray(rotation, dtype=float),
-            np.asarray(gravity, dtype=float),
-            foot,
-            friction,
-            tuple(obstacles),
-            clearance,
-            tuple(ignored),
-            srdf,
-            tuple(folders),
-            missing,
-            path,
-            path_tolerance,
-            path_angle,
-            share,
         )
-        notes += _machine_rows(robot, cleaned, bounds, request, add, unchecked, progress)
+        machine = _machine_of(robot, cleaned, base, pose, gravity, foot, notes)
+        bases = None
+        if base == "floating":
+            progress("momentum")
+            bases, base_rows, base_faults = floating_base_rows(machine, motion, cleaned.base)
+            add((base_rows, base_faults))
+        elif base == "standing":
+            progress("ground")
+            add(standing_rows(machine, motion, friction))
+        if robot.total_mass == 0:
+            unchecked.append("torques, because the robot has no masses")
+        else:
+            progress("torques")
+            add(torque_rows(motion, machine, bounds, gravity, share, check_time))
+        if path is not None:
+            progress("path")
+            add(path_rows(machine, motion, bases, path, path_tolerance, path_angle))
+        progress("clearance")
+        if clearance is None:
+            unchecked.append("clearance, as requested")
+        elif not any(link.collisions for link in robot.links):
+            unchecked.append("clearance, because the robot has no collision shapes")
+        else:
+            unchecked += _missing_meshes(robot, folders) if missing == "skip" else []
+            wide, others = with_wide_limits(machine, motion), tuple(obstacles)
+            scene = CollisionScene(wide, others, clearance, tuple(ignored), srdf, tuple(folders), missing)
+            add(clearance_rows(scene, motion, bases if others else None))
     suspicions: list[Fault] = []
     if time_unit is None and not any(fault.kind == "units" and fault.name == "time" for fault in faults):
         suspicions += doubtful_times(motion, bounds.velocity[cleaned.joints])
@@ -314,89 +297,35 @@ def check_trajectory(
     )
 
 
-def _machine_rows(
+def _machine_of(
     robot: Robot,
     cleaned: CleanedTrajectory,
-    bounds: JointBounds,
-    request: CheckRequest,
-    add: Callable[[tuple[list[Row], list[Fault]]], None],
-    unchecked: list[str],
-    progress: Callable[[str], None],
-) -> list[str]:
-    """Check everything that requires the whole robot, and return notes."""
-    motion, notes = cleaned.motion, []
-    machine: Any
-    bases: Array | None = None
-    if request.base == "floating":
+    base: BaseKind,
+    pose: tuple[Array, Array],
+    gravity: Array,
+    foot: Support | None,
+    notes: list[str],
+) -> Any:
+    """Return the robot on its base."""
+    if base == "floating":
         planar = cleaned.base is not None and cleaned.base.shape[1] == 3
-        machine = FreeFloating(robot, "planar" if planar else "spatial")
-        progress("momentum")
-        if cleaned.base is not None:
-            bases = cleaned.base
-            add(momentum_rows(machine, motion, bases))
-        else:
-            bases, rows = integrate_base(machine, motion)
-            add((rows, []))
-    elif request.base == "standing":
-        foot, translation = request.foot, request.translation
-        if foot is None:
-            contact = footprint(robot, q=motion.q[0], rotation=request.rotation)
-            foot, translation = contact.support, contact.translation
-            notes.append(f"it stands on {', '.join(contact.links)}")
-        gravity = -float(request.gravity[2])
-        machine = Standing(
-            robot=robot, translation=translation, rotation=request.rotation, support=foot, gravity=gravity
-        )
-        progress("ground")
-        add(standing_rows(machine, motion, request.friction))
-    else:
-        machine = FixedBase(robot, request.translation, request.rotation)
-    if robot.total_mass == 0:
-        unchecked.append("torques, because the robot has no masses")
-    else:
-        progress("torques")
-        add(torque_rows(motion, machine, bounds, request.gravity, request.share, check_time))
-    if request.path is not None:
-        progress("path")
-        add(path_rows(machine, motion, bases, request.path, request.path_tolerance, request.path_angle))
-    progress("clearance")
-    _check_clearance(machine, motion, bases, request, add, unchecked)
-    return notes
+        return FreeFloating(robot, "planar" if planar else "spatial")
+    translation, rotation = pose
+    if base == "fixed":
+        return FixedBase(robot, translation, rotation)
+    if foot is None:
+        contact = footprint(robot, q=cleaned.motion.q[0], rotation=rotation)
+        foot, translation = contact.support, contact.translation
+        notes.append(f"it stands on {', '.join(contact.links)}")
+    down = -float(gravity[2])
+    return Standing(robot=robot, translation=translation, rotation=rotation, support=foot, gravity=down)
 
 
-def _check_clearance(
-    machine: Machine,
-    motion: Motion,
-    bases: Array | None,
-    request: CheckRequest,
-    add: Callable[[tuple[list[Row], list[Fault]]], None],
-    unchecked: list[str],
-) -> None:
-    """Check the clearance of the machine."""
-    robot = machine.robot
-    if request.clearance is None:
-        unchecked.append("clearance, as requested")
-        return
-    if not any(link.collisions for link in robot.links):
-        unchecked.append("clearance, because the robot has no collision shapes")
-        return
-    if request.missing == "skip":
-        shapes = [(link.name, shape) for link in robot.links for shape in link.collisions if shape.kind == "mesh"]
-        missing = [
-            name for name, shape in shapes if find_mesh(shape.file, shape.folder or None, request.folders) is None
-        ]
-        if missing:
-            unchecked.append(f"clearance of {', '.join(dict.fromkeys(missing))}, whose meshes are missing")
-    scene = CollisionScene(
-        with_wide_limits(machine, motion),
-        request.obstacles,
-        request.clearance,
-        request.ignored,
-        request.srdf,
-        request.folders,
-        request.missing,
-    )
-    add(clearance_rows(scene, motion, bases if request.obstacles else None))
+def _missing_meshes(robot: Robot, folders: Sequence[str | Path]) -> list[str]:
+    """Return a sentence about the links whose meshes are missing, if there are any."""
+    shapes = [(link.name, shape) for link in robot.links for shape in link.collisions if shape.kind == "mesh"]
+    names = [name for name, shape in shapes if find_mesh(shape.file, shape.folder or None, folders) is None]
+    return [f"clearance of {', '.join(dict.fromkeys(names))}, whose meshes are missing"] if names else []
 
 
 def bounds_of(

@@ -133,8 +133,8 @@ CASES = [
     Case(
         "Batch",
         Batch,
-        {"ledger": ResultStore(Path("b"), "f", "1"), "results": ()},
-        {"ledger": INSTANCE, "results": NAMES | {"one": read_batch}},
+        {"store": ResultStore(Path("b"), "f", "1"), "results": ()},
+        {"store": INSTANCE, "results": NAMES | {"one": read_batch}},
     ),
     method(batch, "best", {"by": "z"}, by=NOTHING | {"number": 3, "unknown": "nobody", "list": ["x"], "no text": "y"}),
     method(batch, "write_csv", {"path": "a.csv"}, path=PATH),

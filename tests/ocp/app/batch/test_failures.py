@@ -19,13 +19,13 @@ from tests.ocp.app.batch.drivers import ROOT, stored
 
 SCRIPT = """
 from models import FixedBase, Robot
-from ocp.app.batch import kept, run_batch
+from ocp.app.batch import cached, run_batch
 
 def arm(file):
     return FixedBase(Robot.from_urdf(file, tip="tool0"))
 
 def joints(task):
-    return kept(arm, "robot.urdf").joint_size + task["x"]
+    return cached(arm, "robot.urdf").joint_size + task["x"]
 
 if __name__ == "__main__":
     run_batch(joints, [{"x": i} for i in range(20)], "b", workers=1).write_csv("b.csv")
@@ -110,7 +110,7 @@ if __name__ == "__main__":
     assert "b: 2 done" in told.stdout
     assert told.returncode == 0
     changed = run("return 2 * x", "return 3 * helper(task)")
-    assert "its source has changed" in changed.stderr, "results of two functions are not mixed"
+    assert "the source has changed" in changed.stderr, "results of two functions are not mixed"
 
 
 def test_again_tries_failures_though_nothing_has_changed(tmp_path: Path, here: Any) -> None:

@@ -30,7 +30,7 @@ def test_a_driver_waits_for_another_and_takes_over_what_it_leaves(tmp_path: Path
     until(lambda: count(tmp_path / "b") > 0)
     two = driver(tmp_path / "b", tasks, 1)
     assert two.stdout is not None
-    assert "another driver is at work" in two.stdout.readline()
+    assert "another driver is active" in two.stdout.readline()
     kill(one.pid)
     one.communicate()
     gate.touch()

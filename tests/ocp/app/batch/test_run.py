@@ -247,7 +247,7 @@ def test_a_folder_of_another_function_or_version_or_of_something_else_is_refused
     head = tmp_path / "b" / "batch.json"
     written = json.loads(head.read_text())
     head.write_text(json.dumps(written | {"version": "0123"}))
-    with pytest.raises(ProblemError, match=r"its source has changed: .* say version='0123'"):
+    with pytest.raises(ProblemError, match=r"the source has changed: .* pass version='0123'"):
         run_batch(functions.square, X, tmp_path / "b")
     run_batch(functions.square, [], tmp_path / "b", version="0123")
     head.write_text(json.dumps(written | {"format": 7}))
