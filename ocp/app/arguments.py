@@ -148,7 +148,7 @@ def subcommands(parser: argparse.ArgumentParser) -> None:
     view.add_argument("--open", action="store_true", help="open the page in this machine's browser")
     view.add_argument(
         "--tolerance",
-        type=_tolerance,
+        type=_named_number,
         action="append",
         default=[],
         metavar="NAME=VALUE",
@@ -268,29 +268,22 @@ def run_check(options: argparse.Namespace, progress: Progress) -> tuple[int, str
         kind: dict(getattr(options, kind)) or None for kind in ("velocity", "acceleration", "jerk", "torque")
     }
     obstacles = read_obstacles(options.obstacles) if options.obstacles else ()
+    direct = ("friction", "srdf", "path_tolerance", "path_angle", "share", "rule", "time_unit", "unwrap")
     check = check_trajectory(
         robot,
         raw,
         **limits,
+        **{name: getattr(options, name) for name in (*direct, "names_confirmed")},
         base="standing" if options.standing else "floating" if options.floating else "fixed",
         translation=translation,
         rotation=rotation,
         foot=foot,
-        friction=options.friction,
         obstacles=obstacles,
         clearance=None if options.no_clearance else options.clearance,
         ignored=tuple(options.ignore),
-        srdf=options.srdf,
         folders=tuple(options.folder),
         missing="skip" if options.no_meshes else "raise",
         path=read_waypoints(options.path) if options.path else None,
-        path_tolerance=options.path_tolerance,
-        path_angle=options.path_angle,
-        share=options.share,
-        rule=options.rule,
-        time_unit=options.time_unit,
-        unwrap=options.unwrap,
-        names_confirmed=options.names_confirmed,
         progress=progress,
     )
     if options.report is not None:
@@ -450,18 +443,10 @@ def _limit(text: str) -> tuple[str, float]:
 
 
 def _named_number(text: str) -> tuple[str, float]:
-    """Return the joint and the number of JOINT=VALUE."""
-    name, value = _limit(text)
-    if not name:
-        raise argparse.ArgumentTypeError(f"{text!r} is not JOINT=VALUE")
-    return name, value
-
-
-def _tolerance(text: str) -> tuple[str, float]:
     """Return the name and the number of NAME=VALUE."""
     name, value = _limit(text)
     if not name:
-        raise argparse.ArgumentTypeError(f"{text!r} is not NAME=VALUE with the NAME of a state, control or constraint")
+        raise argparse.ArgumentTypeError(f"{text!r} is not NAME=VALUE")
     return name, value
 
 

@@ -268,17 +268,9 @@ def floating_torques(machine: FreeFloating, q: ca.SX, v: ca.SX, a: ca.SX) -> ca.
     twist = ca.mtimes(rows, machine.base_twist(base, q, v))
     rate = machine.base_rate(base, q, v)
     change = ca.jtimes(twist, ca.vertcat(base, q, v), ca.vertcat(rate, v, a))
-    torque = inverse_dynamics(
-        machine.robot,
-        q,
-        v,
-        a,
-        (),
-        (0.0, 0.0, 0.0),
-        machine.world_from_base(base),
-        base_twist=twist,
-        base_acceleration=change,
-    )
+    motion_of_base = {"base_twist": twist, "base_acceleration": change}
+    frame, no_gravity = machine.world_from_base(base), (0.0, 0.0, 0.0)
+    torque = inverse_dynamics(machine.robot, q, v, a, (), no_gravity, frame, **motion_of_base)
     return ca.substitute(torque, base, ca.SX(ca.DM(machine.base_home())))
 
 

@@ -198,26 +198,14 @@ IGNORED_CODES: dict[int, str] = {
     150: "polar coordinates off: already so",
     400: "cutter compensation off: already so",
     800: "canned cycles off: already so",
-    430: "tool length: the path is that of the tool's tip",
-    431: "tool length: the path is that of the tool's tip",
-    440: "tool length: the path is that of the tool's tip",
-    490: "tool length: the path is that of the tool's tip",
+    **dict.fromkeys((430, 431, 440, 490), "tool length: the path is that of the tool's tip"),
     500: "scaling off: already so",
     690: "rotation off: already so",
-    960: "spindle mode, ignored",
-    970: "spindle mode, ignored",
-    980: "return of canned cycles, ignored",
-    990: "return of canned cycles, ignored",
+    **dict.fromkeys((960, 970), "spindle mode, ignored"),
+    **dict.fromkeys((980, 990), "return of canned cycles, ignored"),
 }
-IGNORED_LETTERS: dict[str, str] = {
-    "S": "S: spindle speed, ignored",
-    "T": "T: tool, ignored",
-    "H": "H: tool length, ignored",
-    "D": "D: tool diameter, ignored",
-    "E": "E: extrusion, ignored",
-    "L": "L: ignored",
-    "Q": "Q: ignored",
-}
+_WORDS = {"S": "spindle speed, ", "T": "tool, ", "H": "tool length, ", "D": "tool diameter, ", "E": "extrusion, "}
+IGNORED_LETTERS = {letter: f"{letter}: {_WORDS.get(letter, '')}ignored" for letter in "STHDELQ"}
 M_WORDS = {
     **dict.fromkeys((0, 10, 600), "stop"),
     **dict.fromkeys((20, 300), "end"),

@@ -38,20 +38,9 @@ WORDS = {
 }
 TIMES = ("time", "t", "time_from_start", "timestamp", "secs", "seconds")
 UNITS = {
-    "s": 1.0,
-    "sec": 1.0,
-    "ms": 1e-3,
-    "us": 1e-6,
-    "ns": 1e-9,
-    "rad": 1.0,
-    "deg": np.pi / 180,
-    "°": np.pi / 180,
-    "m": 1.0,
-    "mm": 1e-3,
-    "cm": 1e-2,
-    "n m": 1.0,
-    "nm": 1.0,
-    "n": 1.0,
+    **dict.fromkeys(("s", "sec", "rad", "m", "n m", "nm", "n"), 1.0),
+    **{"ms": 1e-3, "us": 1e-6, "ns": 1e-9, "mm": 1e-3, "cm": 1e-2},
+    **dict.fromkeys(("deg", "°"), np.pi / 180),
 }
 HEADER_WITH_UNIT = re.compile(r"(.*)[\[(]([^\[(\])]*)[\])]")
 FORMATS = {".json": "json", ".yaml": "yaml", ".yml": "yaml", ".mcap": "mcap"}

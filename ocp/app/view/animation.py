@@ -274,7 +274,7 @@ def animate_plan(plan: Plan, name: str = "plan", **settings: Any) -> Animation:
     times = _times(plan.horizon)
     sample = plan.sampled(times)
     base = plan.at(times)["base"] if plan.machine.base_size else np.zeros((len(times), 0))
-    near = _near(plan)
+    times_of_pairs = np.linspace(0.0, plan.horizon, PAGE_SETTINGS.near)
     single = len(plan.parts) == 1
     own_curves: list[Curve] = []
     if single:
@@ -283,13 +283,14 @@ def animate_plan(plan: Plan, name: str = "plan", **settings: Any) -> Animation:
         own_curves = _problem_curves(plan.solution, fractions, solution_times)
     derivatives = sample.joints, sample.rates, sample.accelerations
     details: dict[str, Any] = {
-        "near": near,
+        "near": _closest_pairs(plan.solution, times_by_part(plan, times_of_pairs), plan.horizon),
         "around": tuple(obstacles_of(plan.solution, times_by_part(plan, times))),
         "cost": plan.cost,
         "targets": plan.targets,
     }
     details |= _audited(plan.solution, lambda: verdict_of(plan, sample, name, **settings))
-    return _animation(name, plan.machine, times, base, *derivatives, _base_rates(times, base), own_curves, **details)
+    base_rates = np.gradient(base, times, axis=0, edge_order=2) if base.shape[1] else base
+    return _animation(name, plan.machine, times, base, *derivatives, base_rates, own_curves, **details)
 
 
 def animate_solution(
@@ -336,9 +337,8 @@ def animate_solution(
     base_rates = slopes[:, columns[base]] if machine.base_size else np.zeros((len(times), 0))
     details: dict[str, Any] = {"cost": solution.cost, "around": tuple(obstacles_of(solution, [("", times)]))}
     details |= _audited(solution, lambda: solution.audit(**settings))
-    if solution.problem is not None:
-        times_of_pairs = np.linspace(0.0, solution.horizon, PAGE_SETTINGS.near)
-        details["near"] = _joined(times_of_pairs, nearest_along(solution.problem, solution, times_of_pairs))
+    times_of_pairs = np.linspace(0.0, solution.horizon, PAGE_SETTINGS.near)
+    details["near"] = _closest_pairs(solution, [("", times_of_pairs)], solution.horizon)
     smooth = _torque_like(solution, joints)
     own_curves = _problem_curves(solution, fractions, times)
     return _animation(name, machine, times, base_path, q, v, a if smooth else None, base_rates, own_curves, **details)
@@ -420,11 +420,6 @@ def _times(horizon: float) -> Array:
     return np.linspace(0.0, horizon, count + 1)
 
 
-def _base_rates(t: Array, base: Array) -> Array:
-    """Return the time derivative of the base, by differences."""
-    return np.asarray(np.gradient(base, t, axis=0, edge_order=2)) if base.shape[1] else base
-
-
 def _torque_like(solution: Solution, joints: str) -> bool:
     """Return whether the joints are smooth enough for torques: another state has their size."""
     return len(solution.state_interpolant.nodes) > 2 and any(
@@ -477,20 +472,18 @@ def _margins(rows: Sequence[Curve]) -> list[Curve]:
     return [one for one in curves if np.isfinite(one.values).any()]
 
 
-def _near(plan: Plan) -> ClosestPairs | None:
-    """Return the closest bodies along a plan, or None if they are unknown."""
-    problem = plan.solution.problem
-    if problem is None:
+def _closest_pairs(solution: Solution, parts: Sequence[tuple[str, Array]], horizon: float) -> ClosestPairs | None:
+    """Return the closest bodies at uniform times of a motion, or None if they are unknown.
+
+    Args:
+        solution: The solution.
+        parts: As returned by `times_by_part` for these times.
+        horizon: Duration of the motion, s.
+    """
+    if solution.problem is None:
         return None
-    all_times = np.linspace(0.0, plan.horizon, PAGE_SETTINGS.near)
-    pairs = []
-    for suffix, times in times_by_part(plan, all_times):
-        pairs += nearest_along(problem, plan.solution, times, suffix)
-    return _joined(all_times, pairs)
-
-
-def _joined(t: Array, pairs: Sequence[Any]) -> ClosestPairs | None:
-    """Return the closest bodies at several times, or None if some are unknown."""
+    pairs = [pair for suffix, times in parts for pair in nearest_along(solution.problem, solution, times, suffix)]
+    t = np.linspace(0.0, horizon, PAGE_SETTINGS.near)
     if len(pairs) < len(t):
         return None
     points, distances, required = (

@@ -34,7 +34,7 @@ from ocp.app.view.animation import PAGE_SETTINGS, Animation
 from ocp.app.view.appearance import TIP_FRAME, Appearance, Frames, appearance_of, frames_along, part_of
 from ocp.errors import ProblemError
 
-__all__ = ["Buffers", "Page", "PageServer", "build_page", "unpack_page"]
+__all__ = ["Buffers", "Page", "PageServer", "build_page"]
 
 SCRIPTS = ("scene.js", "curves.js", "player.js")
 
@@ -109,31 +109,6 @@ def build_page(
         words = f"the page has {size / 1e6:.3g} MB, at most {most / 1e6:g} are allowed; show fewer motions"
         raise ProblemError(words, name="page", value=size, limit=most)
     return Page(text, missing)
-
-
-def unpack_page(text: str) -> tuple[dict[str, Any], dict[int, NDArray[Any]]]:
-    """Return the contents of a page: its description, and the arrays by their offsets."""
-    mark = '<script id="data" type="text/plain">'
-    begin = text.index(mark) + len(mark)
-    data_bytes = gzip.decompress(base64.b64decode(text[begin : text.index("</script>", begin)]))
-    size = int.from_bytes(data_bytes[:4], "little")
-    description, body = json.loads(data_bytes[4 : 4 + size]), data_bytes[4 + size :]
-    arrays: dict[int, NDArray[Any]] = {}
-
-    def collect(value: Any) -> None:
-        if isinstance(value, dict) and set(value) == {"at", "kind", "shape"}:
-            count = int(np.prod(value["shape"]))
-            array = np.frombuffer(body, f"<{value['kind']}" if value["kind"] != "i1" else "i1", count, value["at"])
-            arrays[value["at"]] = array.reshape(value["shape"])
-        elif isinstance(value, dict):
-            for part in value.values():
-                collect(part)
-        elif isinstance(value, list):
-            for part in value:
-                collect(part)
-
-    collect(description)
-    return description, arrays
 
 
 def _filled(title: str, first: Animation, data: str) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import gzip
 import json
 import re
 import urllib.error
@@ -14,6 +16,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from models import (
     Box,
@@ -61,7 +64,7 @@ from ocp.app.view.animation import (
     ground_contact,
 )
 from ocp.app.view.appearance import appearance_of, frames_along
-from ocp.app.view.player import PageServer, build_page, unpack_page
+from ocp.app.view.player import PageServer, build_page
 from ocp.motion.local.collisions import distances_along
 from ocp.motion.plan.motion import Part
 from ocp.motion.tasks.targets import targets_along
@@ -97,6 +100,31 @@ OPTIONS: dict[str, Any] = {"tip": "finger", "lock": {"grip": 0.05}, "tip_transla
 TURN = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
 START = np.array([0.4, 0.7, -0.6])
 GROUPS = {"Cost", "The motion", "Joints", "Joint velocities"}
+
+
+def unpack_page(text: str) -> tuple[dict[str, Any], dict[int, NDArray[Any]]]:
+    """Return the contents of a page: its description, and the arrays by their offsets."""
+    mark = '<script id="data" type="text/plain">'
+    begin = text.index(mark) + len(mark)
+    data_bytes = gzip.decompress(base64.b64decode(text[begin : text.index("</script>", begin)]))
+    size = int.from_bytes(data_bytes[:4], "little")
+    description, body = json.loads(data_bytes[4 : 4 + size]), data_bytes[4 + size :]
+    arrays: dict[int, NDArray[Any]] = {}
+
+    def collect(value: Any) -> None:
+        if isinstance(value, dict) and set(value) == {"at", "kind", "shape"}:
+            count = int(np.prod(value["shape"]))
+            array = np.frombuffer(body, f"<{value['kind']}" if value["kind"] != "i1" else "i1", count, value["at"])
+            arrays[value["at"]] = array.reshape(value["shape"])
+        elif isinstance(value, dict):
+            for part in value.values():
+                collect(part)
+        elif isinstance(value, list):
+            for part in value:
+                collect(part)
+
+    collect(description)
+    return description, arrays
 
 
 @pytest.fixture(scope="module")
