@@ -60,12 +60,12 @@ _LOCK = threading.RLock()
 """Serialises the threads of a worker, because CasADi expressions are not thread-safe."""
 
 
-def attempts(function: Function, jobs: list[tuple[str, Payload | None]], near: bool, most: float) -> list[Payload]:
-    """Call :func:`attempt` for one job after another; begin no more after ``most`` s."""
+def attempts(function: Function, jobs: list[tuple[str, Payload | None]], near: bool, limit_s: float) -> list[Payload]:
+    """Call :func:`attempt` for one job after another; begin none after ``limit_s``."""
     began, results = time.perf_counter(), list[Payload]()
     for task, guess in jobs:
         results.append(attempt(function, task, near, guess))
-        if time.perf_counter() - began > most:
+        if time.perf_counter() - began > limit_s:
             break
     return results
 

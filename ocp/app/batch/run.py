@@ -175,10 +175,10 @@ class PendingTasks:
                 if self.failures:
                     bar.set_postfix(failed=self.failures, refresh=False)
 
-    def _suspect(self, key: str, deaths: int, most: int) -> None:
+    def _suspect(self, key: str, deaths: int, max_deaths: int) -> None:
         """Isolate a task that was running when a worker ended, or give it up after too many ended workers."""
         self.deaths[key] += deaths
-        if key == self.isolated and self.deaths[key] >= most:
+        if key == self.isolated and self.deaths[key] >= max_deaths:
             self._end(key, failed("killed", "", f"it ended {self.deaths[key]} workers"))
         else:
             self.suspects.append(key)

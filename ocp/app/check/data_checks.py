@@ -309,8 +309,8 @@ def _in_units(
 ) -> tuple[Array, Array | None, Array | None]:
     """Return positions, velocities and accelerations in rad and m; convert likely degrees and millimetres."""
     lower, upper, _ = limits
-    most, scale = np.maximum(np.abs(lower), np.abs(upper)), np.ones(len(names))
-    margin = 0.05 * np.where(np.isfinite(most), upper - lower, 1.0)
+    bound, scale = np.maximum(np.abs(lower), np.abs(upper)), np.ones(len(names))
+    margin = 0.05 * np.where(np.isfinite(bound), upper - lower, 1.0)
 
     def doubt(k: int, unit: str, why: str, plain: str) -> None:
         at = int(np.abs(q[:, k]).argmax())
@@ -318,7 +318,7 @@ def _in_units(
             f"positions look like {unit}: {q[at, k]:.5g} at {t[at]:.6g} s, {why}; the rest of the check takes them as "
             f"{unit}"
         )
-        faults.append(Fault("units", names[k], words, float(t[at]), None, float(q[at, k]), float(most[k]), plain))
+        faults.append(Fault("units", names[k], words, float(t[at]), None, float(q[at, k]), float(bound[k]), plain))
 
     turning = [k for k, kind in enumerate(kinds) if kind != "prismatic"]
     worst = _worst_in_degrees(t, q, turning, limits, margin)
@@ -328,7 +328,7 @@ def _in_units(
     for k, kind in enumerate(kinds):
         in_m, largest = q[:, k] * 1e-3, np.abs(q[:, k]).max()
         fits = ((in_m >= lower[k] - margin[k]) & (in_m <= upper[k] + margin[k])).all()
-        if kind == "prismatic" and np.isfinite(most[k]) and largest > max(10 * most[k], 1.0) and fits:
+        if kind == "prismatic" and np.isfinite(bound[k]) and largest > max(10 * bound[k], 1.0) and fits:
             doubt(k, "millimetres", f"limits {lower[k]:g} .. {upper[k]:g} m", "m")
             scale[k] = 1e-3
     return q * scale, None if v is None else v * scale, None if a is None else a * scale
@@ -343,10 +343,10 @@ def _worst_in_degrees(
     compared with the velocity limits instead.
     """
     lower, upper, velocity = limits
-    largest, most, in_degrees = np.abs(q).max(axis=0), np.maximum(np.abs(lower), np.abs(upper)), np.deg2rad(q)
-    limited = [k for k in turning if np.isfinite(most[k])]
+    largest, bound, in_degrees = np.abs(q).max(axis=0), np.maximum(np.abs(lower), np.abs(upper)), np.deg2rad(q)
+    limited = [k for k in turning if np.isfinite(bound[k])]
     if limited:
-        wild = [k for k in limited if largest[k] > max(THRESHOLDS.wild * most[k] + 1, 2 * np.pi)]
+        wild = [k for k in limited if largest[k] > max(THRESHOLDS.wild * bound[k] + 1, 2 * np.pi)]
         moving = [k for k in limited if np.ptp(q[:, k]) > 0 or largest[k] > 0]
         inside = (in_degrees >= lower - margin) & (in_degrees <= upper + margin)
         possible = bool(inside[:, limited].all())
@@ -397,19 +397,19 @@ def _time_by_velocities(t: Array, q: Array, v: Array | None, names: Sequence[str
     if v is None or len(t) < 10:
         return t
     h = np.diff(t)[:, None]
-    by_positions, given = np.diff(q, axis=0) / h, (v[1:] + v[:-1]) / 2
-    most = np.abs(by_positions).max(axis=0)
+    by_positions, stated = np.diff(q, axis=0) / h, (v[1:] + v[:-1]) / 2
+    peak = np.abs(by_positions).max(axis=0)
     rough = np.median(np.abs(np.diff(by_positions, axis=0)), axis=0)
     ratios: dict[int, float] = {}
     for k in range(q.shape[1]):
-        if most[k] * (t[-1] - t[0]) < 1e-6 or rough[k] > 0.2 * most[k] or not np.abs(given[:, k]).any():
+        if peak[k] * (t[-1] - t[0]) < 1e-6 or rough[k] > 0.2 * peak[k] or not np.abs(stated[:, k]).any():
             continue  # at rest, too coarse to judge, or commanded to stop at every sample
-        fast = np.abs(by_positions[:, k]) > 0.05 * most[k]
-        ratio = np.median(given[fast, k] / by_positions[fast, k])
-        deviation = np.median(np.abs(given[fast, k] - ratio * by_positions[fast, k]))
-        if abs(ratio - 1) > 0.2 or deviation > 0.3 * abs(ratio) * most[k]:
-            ratios[k] = float(ratio) if deviation <= 0.3 * abs(ratio) * most[k] else np.nan
-    if ratios and len(ratios) == int((most * (t[-1] - t[0]) >= 1e-6).sum()):
+        fast = np.abs(by_positions[:, k]) > 0.05 * peak[k]
+        ratio = np.median(stated[fast, k] / by_positions[fast, k])
+        deviation = np.median(np.abs(stated[fast, k] - ratio * by_positions[fast, k]))
+        if abs(ratio - 1) > 0.2 or deviation > 0.3 * abs(ratio) * peak[k]:
+            ratios[k] = float(ratio) if deviation <= 0.3 * abs(ratio) * peak[k] else np.nan
+    if ratios and len(ratios) == int((peak * (t[-1] - t[0]) >= 1e-6).sum()):
         whole = np.median(list(ratios.values()))
         for unit, power in SMALL_UNITS.items():
             if abs(whole / power - 1) < 0.1:
@@ -419,13 +419,13 @@ def _time_by_velocities(t: Array, q: Array, v: Array | None, names: Sequence[str
                 return t / power
     for k, ratio in ratios.items():
         likely = next((words for factor, words in FACTORS.items() if abs(ratio / factor - 1) < 0.1), "")
-        at = int(np.abs(given[:, k] - by_positions[:, k]).argmax())
+        at = int(np.abs(stated[:, k] - by_positions[:, k]).argmax())
         if np.isnan(ratio):
             words = "velocities do not match its positions"
         else:
             words = f"velocities are {ratio:.4g} times those of its positions"
             words += f": they look like {likely}" if likely else ""
-        pair = float(given[at, k]), float(by_positions[at, k])
+        pair = float(stated[at, k]), float(by_positions[at, k])
         text = f"{words}, worst at {t[at]:.6g} s: {pair[0]:.4g} given, {pair[1]:.4g} from positions"
         faults.append(Fault("units" if likely else "velocities", names[k], text, float(t[at]), None, *pair))
     return t
@@ -478,10 +478,10 @@ def _followers(raw: RawTrajectory, robot: Robot, rows: Indices, faults: list[Fau
         leader = robot.joint_names[column]
         if leader not in raw.names:
             continue
-        given, leading = (raw.positions[rows, raw.names.index(name)] for name in (joint.name, leader))
-        deviation = np.abs(given - (ratio * leading + offset))
+        actual, leading = (raw.positions[rows, raw.names.index(name)] for name in (joint.name, leader))
+        deviation = np.abs(actual - (ratio * leading + offset))
         k = int(np.nanargmax(deviation)) if np.isfinite(deviation).any() else 0
-        tolerance = 1e-3 * max(1e-3, float(np.nanmax(np.abs(given), initial=0.0)))
+        tolerance = 1e-3 * max(1e-3, float(np.nanmax(np.abs(actual), initial=0.0)))
         if not deviation[k] <= tolerance:
             time = float(raw.t[rows[k]])
             words = f"follows {leader} but deviates by {deviation[k]:.4g} {joint.unit} at {time:.6g} s"

@@ -53,9 +53,9 @@ def verdict_of(plan: Plan, sample: PlanSample, name: str, **settings: Any) -> Pl
         name: Name of the plan.
         settings: Settings of the audit.
     """
-    machine, given = plan.machine, (sample.joints, sample.rates, sample.accelerations)
+    machine, derivatives = plan.machine, (sample.joints, sample.rates, sample.accelerations)
     lines = np.arange(1, len(sample.t) + 1)
-    raw = RawTrajectory(plan.names, sample.t, *given, None, lines, True, (), name)
+    raw = RawTrajectory(plan.names, sample.t, *derivatives, None, lines, True, (), name)
     base: Any = "floating" if isinstance(machine, FreeFloating) else "fixed"
     options: dict[str, Any] = {} if machine.base_size else _mount(machine)
     options |= {"time_unit": "s", "names_confirmed": True}  # both are certain for a plan
@@ -64,6 +64,7 @@ def verdict_of(plan: Plan, sample: PlanSample, name: str, **settings: Any) -> Pl
 
 
 def _mount(machine: Machine) -> dict[str, Array]:
+    """Return the pose of a fixed base."""
     frame = machine.world_from_base(())
     return {
         "translation": np.array(frame.position, dtype=float).ravel(),

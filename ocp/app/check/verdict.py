@@ -108,11 +108,11 @@ class Check:
         if self.faults:
             lines.append("faults:")
             lines += [f"  {fault}" for fault in self.faults]
-        shown = [row for row in self.rows if row.verdict is not RowVerdict.UNLIMITED]
-        if shown:
-            width = max(len(row.name) for row in shown)
+        limited = [row for row in self.rows if row.verdict is not RowVerdict.UNLIMITED]
+        if limited:
+            width = max(len(row.name) for row in limited)
             lines.append(f"  {'':<{width}}  {'worst':>11}  {'limit':>10}  {'unit':<8}{'at, s':>10}")
-            for row in shown:
+            for row in limited:
                 limit = "" if row.limit is None else f"{row.limit:.4g}"
                 time = "" if row.time is None else f"{row.time:.5g}"
                 line = f"  {row.name:<{width}}  {row.value:>11.5g}  {limit:>10}  {row.unit:<8}{time:>10}  {row.verdict}"
@@ -342,7 +342,7 @@ def bounds_of(
     """
     free = np.full(robot.dof, np.inf)
     limits = {}
-    for quantity, own, given in (
+    for quantity, own, override in (
         ("velocity", robot.velocity, velocity),
         ("acceleration", free, acceleration),
         ("jerk", free, jerk),
@@ -351,7 +351,7 @@ def bounds_of(
         values = own.copy()
         if notes is not None and (names := unknown_limits(robot, quantity)):
             notes.append(f"the robot gives {', '.join(names)} a {quantity} limit of 0: treated as none")
-        by_name = given if isinstance(given, Mapping) else {} if given is None else {"": given}
+        by_name = override if isinstance(override, Mapping) else {} if override is None else {"": override}
         for name, value in checked_mapping(quantity, by_name).items():
             if not real(value) > 0:
                 words = f"{quantity} of {name or 'all joints'} must be a number above 0, not {value!r}"

@@ -228,12 +228,12 @@ def _meanings(
 def _kind(name: str) -> tuple[str, str]:
     """Return the joint and the kind of value in a column's name."""
     for sign in "./:_ ":
-        before, _, last = name.rpartition(sign)
-        if before and last.lower() in WORDS:
-            return before, WORDS[last.lower()]
-        first, _, behind = name.partition(sign)
-        if behind and first.lower() in WORDS:
-            return behind, WORDS[first.lower()]
+        prefix, _, last = name.rpartition(sign)
+        if prefix and last.lower() in WORDS:
+            return prefix, WORDS[last.lower()]
+        first, _, suffix = name.partition(sign)
+        if suffix and first.lower() in WORDS:
+            return suffix, WORDS[first.lower()]
     return name, "positions"
 
 

@@ -373,8 +373,8 @@ def _aligned(quaternions: Array) -> Array:
 
 def _least_roll(file: FileName, axes: Array, lines: NDArray[np.intp], texts: Sequence[str]) -> Array:
     """Return orientations with the tool axis as z axis, by parallel transport from row to row."""
-    before = np.vstack([[0.0, 0.0, 1.0], axes[:-1]])
-    steps = np.column_stack([1 + (before * axes).sum(axis=1), np.cross(before, axes)])
+    previous = np.vstack([[0.0, 0.0, 1.0], axes[:-1]])
+    steps = np.column_stack([1 + (previous * axes).sum(axis=1), np.cross(previous, axes)])
     opposite = steps[:, 0] < 1e-7  # 1 + cosine; half of the digits of double precision
     if opposite[0]:
         steps[0], opposite[0] = (0.0, 1.0, 0.0, 0.0), False  # upside down: about x

@@ -197,7 +197,7 @@ class PageSettings:
     Attributes:
         per_second, least, most: Samples of a motion per second, and their smallest and largest number.
         poses: Largest number of samples with poses, between which the page interpolates.
-        near: Number of times at which the closest bodies are computed, which is slower.
+        pair_samples: Number of times at which the closest bodies are computed, which is slower.
         same_cost: Relative: of costs with a smaller final difference only one is shown.
         most_bytes: Largest size of a page.
     """
@@ -206,7 +206,7 @@ class PageSettings:
     least: int = 200
     most: int = 600
     poses: int = 301
-    near: int = 161
+    pair_samples: int = 161
     same_cost: float = 1e-3
     most_bytes: int = 8_000_000
 
@@ -221,14 +221,14 @@ class ClosestPairs(NamedTuple):
         t: s. Shape (K,).
         points: Closest points of their cores, in world. Shape (K, 2, 3), m.
         distances: m. Shape (K,).
-        asked: Required distances. Shape (K,), m.
+        required: Required distances. Shape (K,), m.
         bodies: Their names.
     """
 
     t: Array
     points: Array
     distances: Array
-    asked: Array
+    required: Array
     bodies: tuple[tuple[str, str], ...]
 
 
@@ -245,8 +245,8 @@ class Animation:
         curves: Quantities over time.
         targets: Targets of the tips.
         footing: Contact with the ground; None for a machine that does not stand.
-        near: The closest bodies; None if they are unknown.
-        around: Obstacles; moving ones have their poses at the times t.
+        closest: The closest bodies; None if they are unknown.
+        obstacles: Obstacles; moving ones have their poses at the times t.
         verdict: Sentence of the audit, or "".
         passed: Whether the audit passes; None if there is none.
         rows: Rows of the audit.
@@ -261,8 +261,8 @@ class Animation:
     curves: tuple[Curve, ...]
     targets: tuple[Target, ...] = ()
     footing: GroundContact | None = None
-    near: ClosestPairs | None = None
-    around: tuple[Obstacle, ...] = ()
+    closest: ClosestPairs | None = None
+    obstacles: tuple[Obstacle, ...] = ()
     verdict: str = ""
     passed: bool | None = None
     rows: tuple[Row, ...] = ()
@@ -274,7 +274,7 @@ def animate_plan(plan: Plan, name: str = "plan", **settings: Any) -> Animation:
     times = _times(plan.horizon)
     sample = plan.sampled(times)
     base = plan.at(times)["base"] if plan.machine.base_size else np.zeros((len(times), 0))
-    times_of_pairs = np.linspace(0.0, plan.horizon, PAGE_SETTINGS.near)
+    times_of_pairs = np.linspace(0.0, plan.horizon, PAGE_SETTINGS.pair_samples)
     single = len(plan.parts) == 1
     own_curves: list[Curve] = []
     if single:
@@ -283,8 +283,8 @@ def animate_plan(plan: Plan, name: str = "plan", **settings: Any) -> Animation:
         own_curves = _problem_curves(plan.solution, fractions, solution_times)
     derivatives = sample.joints, sample.rates, sample.accelerations
     details: dict[str, Any] = {
-        "near": _closest_pairs(plan.solution, times_by_part(plan, times_of_pairs), plan.horizon),
-        "around": tuple(obstacles_of(plan.solution, times_by_part(plan, times))),
+        "closest": _closest_pairs(plan.solution, times_by_part(plan, times_of_pairs), plan.horizon),
+        "obstacles": tuple(obstacles_of(plan.solution, times_by_part(plan, times))),
         "cost": plan.cost,
         "targets": plan.targets,
     }
@@ -335,10 +335,10 @@ def animate_solution(
     q, v, a = (samples[:, columns[joints]] for samples in (states, slopes, second_derivatives))
     base_path = states[:, columns[base]] if machine.base_size else np.zeros((len(times), 0))
     base_rates = slopes[:, columns[base]] if machine.base_size else np.zeros((len(times), 0))
-    details: dict[str, Any] = {"cost": solution.cost, "around": tuple(obstacles_of(solution, [("", times)]))}
+    details: dict[str, Any] = {"cost": solution.cost, "obstacles": tuple(obstacles_of(solution, [("", times)]))}
     details |= _audited(solution, lambda: solution.audit(**settings))
-    times_of_pairs = np.linspace(0.0, solution.horizon, PAGE_SETTINGS.near)
-    details["near"] = _closest_pairs(solution, [("", times_of_pairs)], solution.horizon)
+    times_of_pairs = np.linspace(0.0, solution.horizon, PAGE_SETTINGS.pair_samples)
+    details["closest"] = _closest_pairs(solution, [("", times_of_pairs)], solution.horizon)
     smooth = _torque_like(solution, joints)
     own_curves = _problem_curves(solution, fractions, times)
     return _animation(name, machine, times, base_path, q, v, a if smooth else None, base_rates, own_curves, **details)
@@ -399,10 +399,10 @@ def _animation(
         one for one in costs if abs(one.values[-1] - effort[-1]) > PAGE_SETTINGS.same_cost * max(abs(effort[-1]), 1e-12)
     ]
     curves += machine_curves(machine, base, joints, rates, base_rates)
-    near = details.get("near")
-    if near is not None:
-        distances = np.interp(t, near.t, near.distances)
-        curves.append(Curve("The motion", "closest two bodies", "m", distances, float(near.asked.min())))
+    closest = details.get("closest")
+    if closest is not None:
+        distances = np.interp(t, closest.t, closest.distances)
+        curves.append(Curve("The motion", "closest two bodies", "m", distances, float(closest.required.min())))
     footing = None
     if isinstance(machine, Standing) and accelerations is not None:
         footing, more = ground_contact(
@@ -483,7 +483,7 @@ def _closest_pairs(solution: Solution, parts: Sequence[tuple[str, Array]], horiz
     if solution.problem is None:
         return None
     pairs = [pair for suffix, times in parts for pair in nearest_along(solution.problem, solution, times, suffix)]
-    t = np.linspace(0.0, horizon, PAGE_SETTINGS.near)
+    t = np.linspace(0.0, horizon, PAGE_SETTINGS.pair_samples)
     if len(pairs) < len(t):
         return None
     points, distances, required = (

@@ -121,18 +121,18 @@ def _filled(title: str, first: Animation, data: str) -> str:
     return re.sub(f"@({'|'.join(fields)})@", lambda match: fields[match[1]], text)
 
 
-def _alike(one: Robot, other: Robot) -> bool:
+def _alike(a: Robot, b: Robot) -> bool:
     """Return whether two robots look the same."""
-    if one is other:
+    if a is b:
         return True
-    names = [[part.name for part in robot.links] for robot in (one, other)]
-    if names[0] != names[1] or one.tip != other.tip or not np.array_equal(one.tip_translation, other.tip_translation):
+    names = [[part.name for part in robot.links] for robot in (a, b)]
+    if names[0] != names[1] or a.tip != b.tip or not np.array_equal(a.tip_translation, b.tip_translation):
         return False
     looks = [
         [(shape.kind, shape.file, tuple(np.ravel(shape.translation))) for link in robot.links for shape in link.visuals]
-        for robot in (one, other)
+        for robot in (a, b)
     ]
-    return looks[0] == looks[1] and all(a.moves == b.moves for a, b in zip(one.joints, other.joints, strict=True))
+    return looks[0] == looks[1] and all(a.moves == b.moves for a, b in zip(a.joints, b.joints, strict=True))
 
 
 def _carriers(robot: Robot) -> dict[str, tuple[str, Array, Array]]:
@@ -205,7 +205,7 @@ def _motion(motion: Animation, buffers: Buffers) -> dict[str, Any]:
     points = np.vstack([*frames.positions.values()])
     movers = _movers(motion.machine.robot)
     obstacles = []
-    for number, obstacle in enumerate(motion.around):
+    for number, obstacle in enumerate(motion.obstacles):
         mover = None
         if obstacle.rotations is not None and obstacle.positions is not None:
             mover, name = len(movers), f"what moves by itself, {number}"
@@ -256,14 +256,14 @@ def _motion(motion: Animation, buffers: Buffers) -> dict[str, Any]:
             "points": buffers.put(motion.footing.points, "f4"),
             "forces": motion.footing.forces,
         }
-    if motion.near is not None:
-        bodies = list(dict.fromkeys(motion.near.bodies))
+    if motion.closest is not None:
+        bodies = list(dict.fromkeys(motion.closest.bodies))
         description["near"] = {
-            "t": buffers.put(motion.near.t, "f4"),
-            "points": buffers.put(motion.near.points, "f4"),
-            "distances": buffers.put(motion.near.distances, "f4"),
+            "t": buffers.put(motion.closest.t, "f4"),
+            "points": buffers.put(motion.closest.points, "f4"),
+            "distances": buffers.put(motion.closest.distances, "f4"),
             "bodies": [list(pair) for pair in bodies],
-            "which": [bodies.index(pair) for pair in motion.near.bodies],
+            "which": [bodies.index(pair) for pair in motion.closest.bodies],
         }
     return description
 

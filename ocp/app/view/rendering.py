@@ -333,7 +333,7 @@ def _batches(counts: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
 class _Sun:
     """Directional light: the direction to it (3,), and the depth map of the first surfaces that it meets."""
 
-    way: Array
+    to_sun: Array
     axes: Array
     low: Array
     step: float
@@ -345,15 +345,15 @@ class _Sun:
         """Return the sun for a scene and a camera."""
         back = camera.axes[2]
         azimuth, elevation = np.arctan2(back[1], back[0]) - PICTURE_STYLE.sun[0], PICTURE_STYLE.sun[1]
-        way = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+        to_sun = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
         right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
-        axes = np.stack([right, np.cross(way, right), way])
+        axes = np.stack([right, np.cross(to_sun, right), to_sun])
         points, places = mesh.corners @ axes.T, round(PICTURE_STYLE.shadow_map * max(camera.size)) + 16
         low = points.min(axis=0)[:2]
         step = float((points.max(axis=0)[:2] - low).max()) / (places - 8) or 1.0
         low = low - 4 * step
         height, _ = _nearest(((points[:, :2] - low) / step)[mesh.faces], points[:, 2][mesh.faces], (places, places))
-        return cls(way, axes, low, step, places, height)
+        return cls(to_sun, axes, low, step, places, height)
 
     def lit(self, points: Array) -> Array:
         """Return the share of sunlight that reaches points (k, 3), 0 to 1."""
@@ -403,14 +403,14 @@ def _shaded(mesh: _Mesh, faces: NDArray[np.intp], ray: Array, camera: Camera, su
     back = -ray / np.sqrt(_dot(ray, ray))[:, None]
     facing = _dot(normal, back)
     normal *= np.where(facing < 0, -1.0, 1.0)[:, None]
-    way = camera.axes[2] if sun is None else sun.way
+    to_light = camera.axes[2] if sun is None else sun.to_sun
     reaches = (
         1.0
         if sun is None
-        else sun.lit(place + PICTURE_STYLE.shadow_bias * sun.step * np.sign(normal @ way)[:, None] * normal)
+        else sun.lit(place + PICTURE_STYLE.shadow_bias * sun.step * np.sign(normal @ to_light)[:, None] * normal)
     )
-    key = np.maximum(normal @ way, 0.0)
-    gloss = np.maximum(2 * key * np.abs(facing) - back @ way, 0.0)
+    key = np.maximum(normal @ to_light, 0.0)
+    gloss = np.maximum(2 * key * np.abs(facing) - back @ to_light, 0.0)
     light = 0.44 + 0.1 * normal[:, 2] + 0.44 * key * reaches + 0.12 * np.abs(facing)
     return np.asarray(mesh.colors[faces] * light[:, None] + (0.12 * reaches * gloss**24)[:, None])
 

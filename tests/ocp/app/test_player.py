@@ -369,7 +369,7 @@ def test_the_nearest_bodies_are_those_of_the_plan_at_every_time(tmp_path: Path) 
         clearance_constraints=clearance_constraints,
     )
     plan = Plan(machine, solve(problem, Collocation(intervals=6, degree=3)), (Part(0.0, 1.0, ""),))
-    near = animate_plan(plan).near
+    near = animate_plan(plan).closest
     assert near is not None
     joints = plan.at(near.t)["joints"]
     apart = distances_along(clearance_constraints.scene, np.zeros((len(near.t), 0)), joints, near.t)
@@ -408,7 +408,7 @@ def test_obstacles_that_move_are_shown_where_they_are_at_every_time_and_half_spa
     )
     plan = Plan(machine, solve(problem, Collocation(intervals=6, degree=3)), (Part(0.0, 1.0, ""),))
     shown = animate_plan(plan)
-    plane, moved = shown.around
+    plane, moved = shown.obstacles
     assert plane.normal is not None
     assert moved.rotations is not None
     assert moved.positions is not None
