@@ -256,7 +256,7 @@ def test_a_folder_of_another_function_or_version_or_of_something_else_is_refused
     head.write_text("{")
     with pytest.raises(ProblemError, match="damaged"):
         run_batch(functions.square, X, tmp_path / "b")
-    with pytest.raises(ProblemError, match="no folder of a batch"):
+    with pytest.raises(ProblemError, match="not the folder of a batch"):
         run_batch(functions.square, X, tmp_path)
     assert not (tmp_path / "results").exists()
     (tmp_path / "file").write_text("")
