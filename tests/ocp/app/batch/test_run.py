@@ -260,7 +260,7 @@ def test_a_folder_of_another_function_or_version_or_of_something_else_is_refused
         run_batch(functions.square, X, tmp_path)
     assert not (tmp_path / "results").exists()
     (tmp_path / "file").write_text("")
-    with pytest.raises(ProblemError, match="no folder"):
+    with pytest.raises(ProblemError, match="not a folder"):
         run_batch(functions.square, X, tmp_path / "file")
 
 
