@@ -1,6 +1,6 @@
-"""The command `selfmotion`: plan from a task file, check anybody's trajectory, export, report.
+"""The command `selfmotion`: plan from task files, check joint trajectories, export, report and view.
 
-The only part of the packages that draws.
+No other package draws.
 """
 
 from ocp.app.check.verdict import Check, Fault, Row, check_trajectory

@@ -1,4 +1,4 @@
-"""That something is at work: a line on a terminal, and where there is none one of the log now and then."""
+"""Show progress on a terminal line, or in a log by a line every 30 s."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from typing import Self
 
 __all__ = ["Progress"]
 
-EVERY = 30.0
-"""s between two lines of a log."""
-AFTER = 0.5
-"""s before a line appears on a terminal."""
+LOG_PERIOD_S = 30.0
+"""Time between two lines in a log."""
+TERMINAL_DELAY_S = 0.5
+"""Time before the line appears on a terminal, and between its updates."""
 
 
 class Progress:
-    """On a terminal one line that is overwritten; else a line at the start, every 30 s, and at the end."""
+    """Progress line of a command on a terminal; in a log, lines at the start, every 30 s, and at the end."""
 
     def __init__(self, title: str, quiet: bool = False) -> None:
         self.title, self.stage, self.began = title, "", time.monotonic()
@@ -26,18 +26,18 @@ class Progress:
         self._lock = threading.Lock()
 
     def __call__(self, stage: str) -> None:
-        """What comes next."""
+        """Set the name of the next stage."""
         self.stage = stage
-        if self.terminal and self.seconds > AFTER:
+        if self.terminal and self.seconds > TERMINAL_DELAY_S:
             self._draw()
 
     @property
     def seconds(self) -> float:
-        """Since it began."""
+        """Time since the start, s."""
         return time.monotonic() - self.began
 
     def say(self, text: str) -> None:
-        """A line of its own, warnings say."""
+        """Print a line of its own, for example a warning."""
         with self._lock:
             self._wipe()
             print(f"{self.title}: {text}", file=sys.stderr, flush=True)
@@ -59,7 +59,7 @@ class Progress:
             self.say(f"{'done' if kind is None else 'ended'} after {self.seconds:.3g} s")
 
     def _watch(self) -> None:
-        while not self._ended.wait(AFTER if self.terminal else EVERY):
+        while not self._ended.wait(TERMINAL_DELAY_S if self.terminal else LOG_PERIOD_S):
             if self.terminal:
                 self._draw()
             else:

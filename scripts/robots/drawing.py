@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from models import Robot
 from models.arrays import Array
 from ocp.app.view.appearance import SURFACE_STYLE, Appearance, Frames, Part, appearance_of, part_of, rod
-from ocp.app.view.rendering import Camera, Floor, Layer, placed, render, tube
+from ocp.app.view.rendering import Camera, Floor, Layer, parts_in_world, render, tube
 from scripts.drawing import COLORS, DASHES, add_note, gif, sheet
 
 JOINT_COLORS = [COLORS[name] for name in ("blue", "orange", "green", "purple", "yellow", "sky", "black")]
@@ -72,7 +72,7 @@ class Scene:
     mark: Array | None = None
     nearest_points: Array | None = None
     solids: tuple[Part, ...] = ()
-    detail: int = SURFACE_STYLE.most_faces
+    detail: int = SURFACE_STYLE.max_faces
 
     @cached_property
     def looks(self) -> Appearance:
@@ -85,7 +85,7 @@ class Scene:
         """Of boxes around everything, at some times of the motion. Shape (k, 3), m."""
         clouds = [self.frames.tip, *(part.vertices for part in self.solids)]
         for k in np.linspace(0, len(self.t) - 1, LOOKS).astype(int):
-            clouds += [_box(part.vertices) for part in placed(self.looks, self.frames, k)]
+            clouds += [_box(part.vertices) for part in parts_in_world(self.looks, self.frames, k)]
         if self.surface is not None:
             clouds.append(np.stack([np.ravel(part) for part in self.surface], axis=1))
         for flat in (self.footprint, self.mark):
@@ -128,7 +128,7 @@ class Scene:
 
     def at(self, k: int) -> list[Part]:
         """The robot at sample k, and its mark."""
-        found = placed(self.looks, self.frames, k)
+        found = parts_in_world(self.looks, self.frames, k)
         if self.mark is not None:
             foot = np.append(self.mark[k], (self.floor or 0.0) + 1e-3)
             spot = rod(foot, foot + np.array([0.0, 0.0, 0.012]) * self.size, 0.014 * self.size)
@@ -156,7 +156,7 @@ def draw_scene(
     numbers = [scene.nearest(time) for time in times]
     layers = [Layer(scene.at(numbers[-1])), Layer(scene.still)]
     for k, opacity in zip(numbers[:-1], np.linspace(*GHOSTS, max(len(numbers) - 1, 1)), strict=False):
-        body = [part for part in placed(scene.looks, scene.frames, k) if part.color[3] >= 1]
+        body = [part for part in parts_in_world(scene.looks, scene.frames, k) if part.color[3] >= 1]
         layers.append(Layer(body, float(opacity), to_rgb(COLORS[scene.color])))
     picture = render(layers, camera_of([scene, *beside], size), floor=scene.ground)
     ax.imshow(picture, interpolation="antialiased")

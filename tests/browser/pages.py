@@ -15,9 +15,9 @@ import numpy as np
 
 from ocp import Plan
 from ocp.app.files import read_trajectory
+from ocp.app.view.animation import Animation, animate_plan, animate_trajectory
 from ocp.app.view.appearance import TIP_FRAME, frames_along
-from ocp.app.view.player import Served, page
-from ocp.app.view.shown import Shown, shown_plan, shown_trajectory
+from ocp.app.view.player import PageServer, build_page
 
 __all__ = ["Look", "failures"]
 
@@ -84,8 +84,11 @@ def failures(look: Look, root: Path) -> list[str]:
         file = root / "results" / "gallery" / f"{name}.npz"
         plan = Plan.load(file)
         raw = read_trajectory(file.with_suffix(".local.csv"), joints=plan.names)
-        shown = [shown_plan(plan, "optimum", **LOOSE.get(name, {})), shown_trajectory(raw, plan.machine, "compared")]
-        text = page(shown, title=title).text
+        shown = [
+            animate_plan(plan, "optimum", **LOOSE.get(name, {})),
+            animate_trajectory(raw, plan.machine, "compared"),
+        ]
+        text = build_page(shown, title=title).text
         target = look.folder / f"{name}.html"
         target.write_text(text, encoding="utf-8")
         look.check(len(text.encode()) <= 8_000_000, f"{name}: the page has {len(text.encode())} bytes")
@@ -97,7 +100,7 @@ def failures(look: Look, root: Path) -> list[str]:
             look.check(wide <= 390, f"{name}: on a phone the page is {wide} px wide")
             look.picture(opened, f"{name}_phone")
         if name == "panda":
-            with Served(text) as served, look.opened(served.address, "served") as opened:
+            with PageServer(text) as served, look.opened(served.address, "served") as opened:
                 player(look, opened, "served", shown[0], ends=False)
             with look.opened(target.as_uri(), "dark", color_scheme="dark") as opened:
                 ready(opened)
@@ -121,7 +124,7 @@ def until(opened: Any, holds: str) -> None:
         opened.wait_for_timeout(20)
 
 
-def player(look: Look, opened: Any, name: str, first: Shown, *, ends: bool) -> None:
+def player(look: Look, opened: Any, name: str, first: Animation, *, ends: bool) -> None:
     """Play, pause, scrub, switch plans, with `ends` to the end and over it; the drawn poses are those of the model."""
     ready(opened)
     scene = opened.locator("#scene")
@@ -186,7 +189,7 @@ def player(look: Look, opened: Any, name: str, first: Shown, *, ends: bool) -> N
     look.picture(opened, f"{name}_below")
 
 
-def poses(look: Look, opened: Any, name: str, first: Shown) -> None:
+def poses(look: Look, opened: Any, name: str, first: Animation) -> None:
     """What the page draws between its times, against the model."""
     robot = first.machine.robot
     links = [robot.root, *(joint.child for joint in robot.joints if joint.moves), TIP_FRAME]

@@ -1,7 +1,7 @@
-"""Many plans: tasks that are data, done by processes or a Dask cluster, results kept in a folder, each once."""
+"""Run many tasks in processes or on a Dask cluster; tasks are data, and each result is stored once in a folder."""
 
-from ocp.app.batch.engine import kept
+from ocp.app.batch.engine import cached
 from ocp.app.batch.run import run_batch
 from ocp.app.batch.table import Batch, BatchError, Result, read_batch
 
-__all__ = ["Batch", "BatchError", "Result", "kept", "read_batch", "run_batch"]
+__all__ = ["Batch", "BatchError", "Result", "cached", "read_batch", "run_batch"]

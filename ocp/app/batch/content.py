@@ -1,14 +1,12 @@
-"""Tasks and results as data: one text for one content, and the key that is made of it.
+"""Represent tasks and results as data with a canonical text and a key, and choose each task's neighbour.
 
-Data are numbers, texts, True, False, None, and lists and dictionaries by name of these. Plans and solutions that stand
-in a result are files of their own beside its text, in the formats of the library. Nothing is pickled.
+Data are numbers, texts, True, False, None, and lists and dictionaries by name of these. Plans and solutions in a result
+are stored in files of their own, in the formats of the library. Nothing is pickled.
 
-Which task begins from whose result: a tree of neighbours that the tasks alone decide.
-
-Tasks are put into an order that looks random, that of their keys, and parted in generations of 1, 1, 2, 4, 8 ...; a
-task's neighbour is the nearest of all generations before its own. So neighbours come nearer as the tasks get denser,
-a generation may be done side by side, no chain is longer than log2 of the number of tasks, and the same tasks have the
-same neighbours whoever does them in whatever order.
+The tasks alone determine from whose result a task starts. They are ordered by their keys, which looks random, and
+divided into generations of 1, 1, 2, 4, 8, ... The neighbour of a task is the nearest task of all earlier generations.
+Neighbours thus come closer as the tasks get denser, the tasks of one generation can run in parallel, no chain is longer
+than log2 of the number of tasks, and the neighbours do not depend on who runs the tasks in which order.
 """
 
 from __future__ import annotations
@@ -32,37 +30,38 @@ from ocp.motion.plan import Plan
 from ocp.solution import Solution
 from ocp.storage import open_unlinked
 
-__all__ = ["Parcel", "digest_of", "key_of", "neighbours", "packed", "plain", "text_of", "unpacked"]
+__all__ = ["Payload", "as_data", "canonical_text", "digest_of", "key_of", "neighbours", "pack_result", "unpack_result"]
 
-DEEPEST = 64
-"""Of data within data."""
+MAX_DEPTH = 64
+"""Largest depth of nested data."""
 KINDS: dict[str, type[Plan] | type[Solution]] = {"Plan": Plan, "Solution": Solution}
-"""What is kept as a file of its own, by the name that a result's text tells."""
+"""Types stored in files of their own, by the name in a result's text."""
 DATA = "numbers, texts, True, False, None, and lists and dictionaries by name of these"
 
 
-class Parcel(NamedTuple):
-    """A result on its way: what its text says, and the bytes of its files."""
+class Payload(NamedTuple):
+    """A result as transferred: the record and the bytes of its files."""
 
     record: dict[str, Any]
     files: tuple[bytes, ...] = ()
 
 
-def plain(value: Any, where: str, keep: Callable[[Any, tuple[Any, ...]], bool] = lambda value, at: False) -> Any:
-    """A value as data of its own: arrays and tuples as lists, numbers of numpy as Python's.
+def as_data(value: Any, where: str, extract: Callable[[Any, tuple[Any, ...]], bool] = lambda value, at: False) -> Any:
+    """Return a value as data: arrays and tuples as lists, numbers of numpy as Python's.
 
     Args:
-        where: How it is called, for messages: ``task``, then ``task['x'][2]``.
-        keep: Whether a value inside, at a place (names and indices), is taken out; None stands in its stead.
+        value: The value.
+        where: Name of the value in messages: ``task``, then ``task['x'][2]``.
+        extract: Whether a value inside, at a place (names and indices), is extracted; it is replaced by None.
 
     Raises:
-        ProblemError: Something in it is no data, or no finite number; names where.
+        ProblemError: The value contains something that is not data, or a number that is not finite; names the place.
     """
 
     def walk(value: Any, at: tuple[Any, ...]) -> Any:
         if isinstance(value, np.ndarray | np.generic):
             if value.size > INPUT_LIMITS.array_entries:
-                raise wrong(at, value, f"has {value.size} numbers, at most {INPUT_LIMITS.array_entries} are read")
+                raise refusal(at, value, f"has {value.size} numbers; at most {INPUT_LIMITS.array_entries} are allowed")
             value = value.tolist()
         if value is None or isinstance(value, bool):
             return value
@@ -70,118 +69,119 @@ def plain(value: Any, where: str, keep: Callable[[Any, tuple[Any, ...]], bool] =
             return int(value)
         if isinstance(value, float):
             if not isfinite(value):
-                raise wrong(at, value, f"is {value}, no finite number; leave it out, or give None")
+                raise refusal(at, value, f"is {value}, not a finite number; omit it, or give None")
             return float(value)
         if isinstance(value, str):
             try:
                 value.encode()
             except UnicodeEncodeError as error:
-                raise wrong(at, value, "has half a character, which no file can hold") from error
+                raise refusal(at, value, "has half of a surrogate pair, which no file can contain") from error
             return str(value)
-        if keep(value, at):
+        if extract(value, at):
             return None
-        if len(at) >= DEEPEST:
-            raise wrong(at[:2], value, f"is deeper than {DEEPEST}, or holds itself")
+        if len(at) >= MAX_DEPTH:
+            raise refusal(at[:2], value, f"is nested more than {MAX_DEPTH} deep, or contains itself")
         if isinstance(value, list | tuple):
             return [walk(part, (*at, i)) for i, part in enumerate(value)]
         if isinstance(value, Mapping):
             for name in value:
                 if not isinstance(name, str):
-                    raise wrong(at, value, f"has the name {name!r}, no text; names are texts")
+                    raise refusal(at, value, f"has the name {name!r}; names must be texts")
             return {str(walk(name, at)): walk(part, (*at, name)) for name, part in value.items()}
-        raise wrong(at, value, f"is a {type(value).__name__}, no data; data are {DATA}")
+        raise refusal(at, value, f"is a {type(value).__name__}, which is not data; data are {DATA}")
 
-    def wrong(at: tuple[Any, ...], value: Any, words: str) -> ProblemError:
+    def refusal(at: tuple[Any, ...], value: Any, problem: str) -> ProblemError:
         name = where + "".join(f"[{part!r}]" for part in at)
-        return ProblemError(f"{name} {words}", name=name, value=value)
+        return ProblemError(f"{name} {problem}", name=name, value=value)
 
     return walk(value, ())
 
 
-def text_of(value: Any, where: str) -> str:
-    """The one text of data: the order of names does not count, 1 and 1.0 are two, every digit of a float does.
+def canonical_text(value: Any, where: str) -> str:
+    """Return the canonical text of data: names sorted, 1 and 1.0 distinct, floats with all digits.
 
     Raises:
-        ProblemError: As :func:`plain`.
+        ProblemError: As :func:`as_data`.
     """
     try:
-        return json.dumps(plain(value, where), sort_keys=True, separators=(",", ":"), allow_nan=False)
+        return json.dumps(as_data(value, where), sort_keys=True, separators=(",", ":"), allow_nan=False)
     except ProblemError:
         raise
-    except ValueError as error:  # an integer of more digits than Python writes
+    except ValueError as error:  # an integer with more digits than Python writes
         raise ProblemError(f"{where} cannot be written: {error}", name=where) from error
 
 
 def key_of(text: str) -> str:
-    """The name under which the result of a task of this text is kept: 32 hexadecimal digits of its SHA-256."""
+    """Return the key of a task's text: 32 hexadecimal digits of its SHA-256."""
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
-def packed(value: Any) -> Parcel:
-    """What a function returned, with its cost and its verdict.
+def pack_result(value: Any) -> Payload:
+    """Return the payload of a function's result, with its cost and its verdict.
 
-    Cost: of a plan or a solution its own, of a dictionary its ``"cost"`` or that of the only plan in it, and a single
-    number. Verdict: of a dictionary its ``"verdict"``, of a plan whether its audit passes; None where nobody says.
+    The cost is that of a plan or solution, the ``"cost"`` of a dictionary or that of the only plan in it, or the number
+    itself. The verdict is the ``"verdict"`` of a dictionary, or whether the audit of the only plan passes; otherwise
+    None.
 
     Raises:
-        ProblemError: It is no data, or holds nan.
-        OSError: There is no room for temporary files.
+        ProblemError: The result is not data, or contains nan.
+        OSError: There is no space for temporary files.
     """
-    found: list[tuple[Any, list[Any]]] = []
+    objects: list[tuple[Any, list[Any]]] = []
 
-    def keep(part: Any, at: tuple[Any, ...]) -> bool:
-        kept = isinstance(part, Plan | Solution)
-        if kept:
-            found.append((part, list(at)))
-        return kept
+    def extract(part: Any, at: tuple[Any, ...]) -> bool:
+        is_object = isinstance(part, Plan | Solution)
+        if is_object:
+            objects.append((part, list(at)))
+        return is_object
 
-    data = plain(value, "the result", keep)
-    named = data if isinstance(data, dict) else {}
-    only = found[0][0] if len(found) == 1 else None
-    cost = named.get("cost", data if only is None else only.cost)
+    data = as_data(value, "the result", extract)
+    entries = data if isinstance(data, dict) else {}
+    only_object = objects[0][0] if len(objects) == 1 else None
+    cost = entries.get("cost", data if only_object is None else only_object.cost)
     if isinstance(cost, bool) or not isinstance(cost, int | float):
         cost = None
-    verdict = named.get("verdict")
-    if verdict is None and isinstance(only, Plan):
-        verdict = bool(only.audit().passed)
-    files = tuple(file_of(part) for part, _ in found)
+    verdict = entries.get("verdict")
+    if verdict is None and isinstance(only_object, Plan):
+        verdict = bool(only_object.audit().passed)
+    files = tuple(file_of(part) for part, _ in objects)
     kinds = [
         {"kind": "Plan" if isinstance(part, Plan) else "Solution", "at": at, "bytes": len(file)}
-        for (part, at), file in zip(found, files, strict=True)
+        for (part, at), file in zip(objects, files, strict=True)
     ]
-    told = {"cost": None if cost is None else plain(float(cost), "the result's cost"), "verdict": verdict}
-    return Parcel({**told, "value": data, "files": kinds}, files)
+    summary = {"cost": None if cost is None else as_data(float(cost), "the result's cost"), "verdict": verdict}
+    return Payload({**summary, "value": data, "files": kinds}, files)
 
 
-def unpacked(parcel: Parcel) -> Any:
-    """What the function had returned, of what :func:`packed` made; tuples and arrays are lists.
+def unpack_result(payload: Payload) -> Any:
+    """Return the result of a payload of :func:`pack_result`; tuples and arrays are lists.
 
     Raises:
         ProblemError: A file is damaged.
-        OSError: There is no room for temporary files.
+        OSError: There is no space for temporary files.
     """
-    value = json.loads(json.dumps(parcel.record["value"]))
+    value = json.loads(json.dumps(payload.record["value"]))
     try:
-        for told, file in zip(parcel.record["files"], parcel.files, strict=True):
-            kind, at = KINDS[told["kind"]], told["at"]
+        for entry, file in zip(payload.record["files"], payload.files, strict=True):
+            kind, at = KINDS[entry["kind"]], entry["at"]
             with tempfile.TemporaryDirectory() as folder:
                 path = Path(folder) / "result.npz"
                 path.write_bytes(file)
-                made = kind.load(path)
+                loaded = kind.load(path)
             if not at:
-                return made
-            place = value
-            for part in at[:-1]:
-                place = place[part]
-            place[at[-1]] = made
+                return loaded
+            container = value
+            for key in at[:-1]:
+                container = container[key]
+            container[at[-1]] = loaded
     except (KeyError, IndexError, TypeError) as error:
-        words = f"the result {parcel.record.get('key')} is damaged: its files have no place in it: {error!r}"
-        raise ProblemError(words, name="files", value=parcel.record["files"]) from error
+        words = f"the result {payload.record.get('key')} is damaged: its files do not fit its text: {error!r}"
+        raise ProblemError(words, name="files", value=payload.record["files"]) from error
     return value
 
 
 def digest_of(path: str) -> str | None:
-    """The digest of what a file holds; None where there is no file of that name that can be read."""
+    """Return the digest of a file's contents, or None if it cannot be read."""
     try:
         with open_unlinked(os.path.realpath(path)) as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
@@ -190,53 +190,54 @@ def digest_of(path: str) -> str | None:
 
 
 def file_of(value: Plan | Solution) -> bytes:
-    """The bytes of the file that `save` writes."""
+    """Return the bytes of the file that `save` writes."""
     with tempfile.TemporaryDirectory() as folder:
         value.save(Path(folder) / "result.npz")
         return (Path(folder) / "result.npz").read_bytes()
 
 
 def neighbours(tasks: Mapping[str, Any], names: Sequence[str]) -> dict[str, str | None]:
-    """The neighbour's key of every key, in an order in which neighbours come first; None of the first.
+    """Return the key of each key's neighbour, in an order in which neighbours come first; None for the first key.
 
     Args:
-        tasks: By key.
-        names: Of the numbers (or lists of numbers) in the tasks by which they are near. Each is divided by its range.
+        tasks: Tasks by key.
+        names: Names of the numbers (or lists of numbers) in the tasks that span the space of the distance; each is
+            divided by its range.
 
     Raises:
-        ProblemError: A task has no such numbers, or not as many as the others; names it.
+        ProblemError: A task lacks these numbers, or has not as many as the others; names the task.
     """
     order = sorted(tasks)
-    each = [place_of(tasks[key], names) for key in order]
-    for key, place in zip(order, each, strict=True):
-        if len(place) != len(each[0]):
-            words = f"near: {len(place)} numbers in the task {tasks[key]!r}, {len(each[0])} in another"
-            raise ProblemError(words, name="near", value=len(place), limit=len(each[0]))
-    places = np.array(each)
-    spread = np.ptp(places, axis=0) if order else np.ones(0)
-    places = places / np.where(spread > 0, spread, 1.0)
-    found: dict[str, str | None] = {}
+    rows = [coordinates_of(tasks[key], names) for key in order]
+    for key, row in zip(order, rows, strict=True):
+        if len(row) != len(rows[0]):
+            words = f"near: {len(row)} numbers in the task {tasks[key]!r}, {len(rows[0])} in another"
+            raise ProblemError(words, name="near", value=len(row), limit=len(rows[0]))
+    points = np.array(rows)
+    ranges = np.ptp(points, axis=0) if order else np.ones(0)
+    points = points / np.where(ranges > 0, ranges, 1.0)
+    parents: dict[str, str | None] = {}
     begin, end = 0, 1
     while begin < len(order):
         keys = order[begin:end]
         if begin:
-            nearest = cKDTree(places[:begin]).query(places[begin:end])[1]
-            found |= {key: order[int(i)] for key, i in zip(keys, nearest, strict=True)}
+            nearest = cKDTree(points[:begin]).query(points[begin:end])[1]
+            parents |= {key: order[int(i)] for key, i in zip(keys, nearest, strict=True)}
         else:
-            found |= dict.fromkeys(keys)
+            parents |= dict.fromkeys(keys)
         begin, end = end, 2 * end
-    return found
+    return parents
 
 
-def place_of(task: Any, names: Sequence[str]) -> Array:
-    """The numbers of a task by which it is near to others. Shape (n,)."""
+def coordinates_of(task: Any, names: Sequence[str]) -> Array:
+    """Return the numbers of a task from which its distance to others is computed. Shape (n,)."""
     parts = []
     for name in names:
         value = task.get(name) if isinstance(task, Mapping) else None
         try:
             part = floats(value).ravel()
         except NOT_NUMBERS as error:
-            words = f"near: {name!r} is no number and no list of numbers in the task {task!r}"
+            words = f"near: {name!r} is not a number or list of numbers in the task {task!r}"
             raise ProblemError(words, name=name, value=value) from error
         parts.append(part)
     return np.concatenate(parts) if parts else np.zeros(0)

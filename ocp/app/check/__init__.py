@@ -1,1 +1,1 @@
-"""Checks of trajectories that anybody made, sample by sample and between the samples."""
+"""Checks of joint trajectories from any source, at the samples and between them."""

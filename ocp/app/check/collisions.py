@@ -1,4 +1,4 @@
-"""What a motion may touch, and where its tip goes: distances proven between the samples, and the way off a path."""
+"""Check the clearance of a motion, proven between the samples, and the distance of its tip from a path."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import numpy as np
 
 from models import CollisionScene, Machine
 from models.arrays import Array
+from ocp.app.check.data_checks import Fault
+from ocp.app.check.interpolation import Motion
 from ocp.app.check.joint_limits import Row, RowVerdict
-from ocp.app.check.oddities import Fault
-from ocp.app.check.pieces import Motion
 from ocp.app.files import Waypoints
 from ocp.audit.clearance import Clearance
 from ocp.motion.builders.clearance import clearance_of
@@ -19,14 +19,14 @@ from ocp.motion.local.collisions import distances_along
 from ocp.problem.values import Sampler
 from ocp.tolerances import CLEARANCE_TOLERANCE_M
 
-__all__ = ["clearance_rows", "path_rows", "proof", "within_limits"]
+__all__ = ["clearance_rows", "path_rows", "prove_clearance", "with_wide_limits"]
 
-SHOWN = 20
-"""Pairs that are named."""
+MAX_REPORTED_PAIRS = 20
+"""Largest number of pairs in the table."""
 
 
-def within_limits(machine: Machine, motion: Motion) -> Machine:
-    """The machine itself where the motion keeps its limits and its slides have some; else one with limits so wide."""
+def with_wide_limits(machine: Machine, motion: Motion) -> Machine:
+    """Return the machine, with joint limits widened if the motion exceeds them or a prismatic joint has none."""
     robot = machine.robot
     low, high = (getattr(motion.position.coefficients, side)(axis=(0, 1)) for side in ("min", "max"))
     joints = []
@@ -40,106 +40,111 @@ def within_limits(machine: Machine, motion: Motion) -> Machine:
             if (lower, upper) != (joint.lower, joint.upper):
                 joint = replace(joint, lower=lower, upper=upper)
         joints.append(joint)
-    if all(one is other for one, other in zip(joints, robot.joints, strict=True)):
+    if all(new is old for new, old in zip(joints, robot.joints, strict=True)):
         return machine
-    made: Machine = replace(machine, robot=replace(robot, joints=tuple(joints)))  # type: ignore[type-var]
-    return made
+    widened: Machine = replace(machine, robot=replace(robot, joints=tuple(joints)))  # type: ignore[type-var]
+    return widened
 
 
-def proof(around: CollisionScene, motion: Motion) -> Clearance:
-    """How near each pair comes at any time of a motion, within the limits, of a machine whose base stands still."""
+def prove_clearance(scene: CollisionScene, motion: Motion) -> Clearance:
+    """Return proven bounds of each pair's clearance along a motion within its limits, for a stationary base."""
     start, horizon = float(motion.t[0]), float(motion.t[-1] - motion.t[0])
     rates = motion.velocity.greatest
     seconds = np.zeros_like(rates) if motion.acceleration is None else motion.acceleration.greatest
     smooth, breaks = motion.acceleration is not None, (motion.t - start) / horizon
     return clearance_of(
-        around, lambda at: motion.position.at(start + at * horizon), breaks, horizon, rates, seconds, smooth
+        scene, lambda at: motion.position.at(start + at * horizon), breaks, horizon, rates, seconds, smooth
     )
 
 
-def clearance_rows(around: CollisionScene, motion: Motion, bases: Array | None) -> tuple[list[Row], list[Fault]]:
-    """Rows and faults of what comes too near.
+def clearance_rows(scene: CollisionScene, motion: Motion, bases: Array | None) -> tuple[list[Row], list[Fault]]:
+    """Return rows and faults of the clearance.
 
-    Where the base moves, `bases` (M, base_size) at the samples, pairs are looked at there and at the middles between
-    them, and nothing is proven.
+    If the base moves, with configurations `bases` (M, base_size) at the samples, distances are computed at the samples
+    and midway between them, without a proof.
     """
-    assumed = [f"{pair} ({why})" for pair, why in around.assumed.items()]
-    left = f"left out by assumption: {', '.join(assumed)}"
-    told = [Row("pairs not looked at", len(assumed), None, "", None, RowVerdict.TOLD, left)] if assumed else []
-    if not len(around.pairs):
-        none = Row("clearance", np.inf, around.clearance, "m", None, RowVerdict.TOLD, "no pairs that may touch")
-        return [none, *told], []
+    assumptions = [f"{pair} ({why})" for pair, why in scene.assumed.items()]
+    ignored = []
+    if assumptions:
+        note = f"ignored by assumption: {', '.join(assumptions)}"
+        ignored = [Row("pairs not checked", len(assumptions), None, "", None, RowVerdict.TOLD, note)]
+    if not len(scene.pairs):
+        none = Row("clearance", np.inf, scene.clearance, "m", None, RowVerdict.TOLD, "no pairs that can collide")
+        return [none, *ignored], []
     if bases is not None:
-        rows, faults = _sampled(around, motion, bases)
-        return [*rows, *told], faults
-    found = proof(around, motion)
+        rows, faults = _sampled(scene, motion, bases)
+        return [*rows, *ignored], faults
+    pairs = prove_clearance(scene, motion).pairs
     start = float(motion.t[0])
     rows, faults = [], []
-    proven = min(near.least for near in found.pairs)
-    for near in sorted(found.pairs, key=lambda near: near.distance - near.required)[:SHOWN]:
-        one, other = near.bodies
-        time = start + near.time
-        if near.distance < near.required - CLEARANCE_TOLERANCE_M:
-            verdict, note = RowVerdict.FAILED, "touching" if near.distance < 0 else "too near"
+    proven = min(pair.least for pair in pairs)
+    for pair in sorted(pairs, key=lambda pair: pair.distance - pair.required)[:MAX_REPORTED_PAIRS]:
+        bodies = " and ".join(pair.bodies)
+        time = start + pair.time
+        if pair.distance < pair.required - CLEARANCE_TOLERANCE_M:
+            verdict, note = RowVerdict.FAILED, "in collision" if pair.distance < 0 else "too close"
             between = "" if np.isclose(motion.t, time, rtol=0, atol=1e-12).any() else ", between two samples"
-            how = f"overlap by {-near.distance:.4g} m" if near.distance < 0 else f"are {near.distance:.4g} m apart"
-            text = f"{how} at {time:.6g} s{between}, at least {near.required:g} m asked"
-            faults.append(Fault("clearance", f"{one} and {other}", text, time, None, near.distance, near.required, "m"))
-        elif near.missed > CLEARANCE_TOLERANCE_M:
-            verdict, note = RowVerdict.UNDECIDED, f"at least {near.least:.4g} m is proven"
+            text = f"{_distance_text(pair.distance)} at {time:.6g} s{between}, at least {pair.required:g} m required"
+            faults.append(Fault("clearance", bodies, text, time, None, pair.distance, pair.required, "m"))
+        elif pair.missed > CLEARANCE_TOLERANCE_M:
+            verdict, note = RowVerdict.UNDECIDED, f"at least {pair.least:.4g} m is proven"
         else:
-            least = "" if faults else f": at no time are any two nearer than {proven:.4g} m"
+            least = "" if faults else f": no two bodies ever come closer than {proven:.4g} m"
             verdict, note = RowVerdict.OK, f"proven{least}"
-        rows.append(Row(f"clearance of {one} and {other}", near.distance, near.required, "m", time, verdict, note))
+        rows.append(Row(f"clearance of {bodies}", pair.distance, pair.required, "m", time, verdict, note))
         if verdict == "ok":
-            break  # what is farther is proven as well, or told as not decided
-    shown = {row.name for row in rows}
-    faults = _with_beginnings(around, motion, faults)
-    for near in found.pairs:
-        name = f"clearance of {near.bodies[0]} and {near.bodies[1]}"
-        find_collisions = near.distance < near.required - CLEARANCE_TOLERANCE_M
-        if near.missed > CLEARANCE_TOLERANCE_M and not find_collisions and name not in shown:
-            note = f"at least {near.least:.4g} m is proven"
-            rows.append(Row(name, near.distance, near.required, "m", start + near.time, RowVerdict.UNDECIDED, note))
-    return [*rows, *told], faults
+            break  # pairs that are farther apart are proven as well, or listed below as undetermined
+    reported = {row.name for row in rows}
+    faults = _with_beginnings(scene, motion, faults)
+    for pair in pairs:
+        name = f"clearance of {' and '.join(pair.bodies)}"
+        violated = pair.distance < pair.required - CLEARANCE_TOLERANCE_M
+        if pair.missed > CLEARANCE_TOLERANCE_M and not violated and name not in reported:
+            note = f"at least {pair.least:.4g} m is proven"
+            rows.append(Row(name, pair.distance, pair.required, "m", start + pair.time, RowVerdict.UNDECIDED, note))
+    return [*rows, *ignored], faults
 
 
-def _with_beginnings(around: CollisionScene, motion: Motion, faults: list[Fault]) -> list[Fault]:
-    """The same faults, each with the first of the samples, or of those that are looked at, where it is one already."""
+def _distance_text(distance: float) -> str:
+    return f"overlap by {-distance:.4g} m" if distance < 0 else f"are {distance:.4g} m apart"
+
+
+def _with_beginnings(scene: CollisionScene, motion: Motion, faults: list[Fault]) -> list[Fault]:
+    """Return the faults with the time of the first sample that violates the clearance."""
     if not faults:
         return []
-    worst = np.array([fault.time for fault in faults])
-    times = np.unique(np.concatenate([motion.t[:: len(motion.t) // 1000 + 1], worst]))
-    base = around.machine.base_home()
-    apart = distances_along(around, base, motion.position.at(times), times, around.clearance)
-    columns = {f"{one} and {other}": k for k, (one, other) in enumerate(around.labels)}
-    found = []
+    worst_times = np.array([fault.time for fault in faults])
+    times = np.unique(np.concatenate([motion.t[:: len(motion.t) // 1000 + 1], worst_times]))
+    base = scene.machine.base_home()
+    distances = distances_along(scene, base, motion.position.at(times), times, scene.clearance)
+    columns = {" and ".join(pair): k for k, pair in enumerate(scene.labels)}
+    dated_faults = []
     for fault in faults:
-        near = np.flatnonzero(apart[:, columns[fault.name]] < around.clearance - CLEARANCE_TOLERANCE_M)
-        first = float(times[near[0]]) if near.size else fault.time
-        found.append(replace(fault, first=first))
-    return found
+        violated = np.flatnonzero(distances[:, columns[fault.name]] < scene.clearance - CLEARANCE_TOLERANCE_M)
+        first = float(times[violated[0]]) if violated.size else fault.time
+        dated_faults.append(replace(fault, first=first))
+    return dated_faults
 
 
-def _sampled(around: CollisionScene, motion: Motion, bases: Array) -> tuple[list[Row], list[Fault]]:
+def _sampled(scene: CollisionScene, motion: Motion, bases: Array) -> tuple[list[Row], list[Fault]]:
+    """Return rows and faults of the distances at the samples and midway between them."""
     middles = (motion.t[1:] + motion.t[:-1]) / 2
     times = np.concatenate([motion.t, middles])
     joints = motion.position.at(times)
-    places = np.concatenate([bases, (bases[1:] + bases[:-1]) / 2])
-    apart = distances_along(around, places, joints, times)
+    base_samples = np.concatenate([bases, (bases[1:] + bases[:-1]) / 2])
+    distances = distances_along(scene, base_samples, joints, times)
     rows, faults = [], []
-    for pair in np.argsort(apart.min(axis=0))[:SHOWN]:
-        k = int(apart[:, pair].argmin())
-        one, other = around.labels[pair]
-        value, time = float(apart[k, pair]), float(times[k])
-        failed = value < around.clearance - CLEARANCE_TOLERANCE_M
-        told = RowVerdict.of(failed), "at samples and middles; not proven between them"
-        rows.append(Row(f"clearance of {one} and {other}", value, around.clearance, "m", time, *told))
+    for column in np.argsort(distances.min(axis=0))[:MAX_REPORTED_PAIRS]:
+        k = int(distances[:, column].argmin())
+        bodies = " and ".join(scene.labels[column])
+        value, time = float(distances[k, column]), float(times[k])
+        failed = value < scene.clearance - CLEARANCE_TOLERANCE_M
+        note = "at samples and midway; not proven between them"
+        rows.append(Row(f"clearance of {bodies}", value, scene.clearance, "m", time, RowVerdict.of(failed), note))
         if not failed:
             break
-        how = f"overlap by {-value:.4g} m" if value < 0 else f"are {value:.4g} m apart"
-        text = f"{how} at {time:.6g} s, at least {around.clearance:g} m asked"
-        faults.append(Fault("clearance", f"{one} and {other}", text, time, None, value, around.clearance, "m"))
+        text = f"{_distance_text(value)} at {time:.6g} s, at least {scene.clearance:g} m required"
+        faults.append(Fault("clearance", bodies, text, time, None, value, scene.clearance, "m"))
     return rows, faults
 
 
@@ -149,98 +154,109 @@ def _sampled(around: CollisionScene, motion: Motion, bases: Array) -> tuple[list
 def path_rows(
     machine: Machine, motion: Motion, bases: Array | None, path: Waypoints, tolerance: float, angle: float
 ) -> tuple[list[Row], list[Fault]]:
-    """Rows and faults of the tip's distance from the straight lines through waypoints, of theirs from its way, and of
-    the lean of its z axis where they tell one.
+    """Return rows and faults of the distances between the tip's path and the waypoints, and of the tool axis.
 
-    Looked at in four times of every piece, and the distance at the worst as fine as it takes.
+    The tip is sampled four times in every interval, and more finely at the largest distance. The path consists of
+    straight lines between the waypoints. The angle is that of the z axes, if the waypoints have orientations.
+
+    Args:
+        machine: The machine.
+        motion: Motion of all joints.
+        bases: Configurations of a moving base at the samples, or None.
+        path: The waypoints.
+        tolerance: Allowed distance, m.
+        angle: Allowed angle, rad.
     """
     base, q = ca.SX.sym("base", machine.base_size), ca.SX.sym("q", machine.joint_size)
     pose = machine.tip_pose(base, q)
     sampler = Sampler([base, q], [pose.position, pose.rotation[:, 2]])
     quarters = np.arange(4) / 4
-    piece = np.repeat(np.arange(len(motion.t) - 1), len(quarters))
-    place = np.tile(quarters, len(motion.t) - 1)
-    times = np.append(motion.t[piece] + place * np.diff(motion.t)[piece], motion.t[-1])
+    interval = np.repeat(np.arange(len(motion.t) - 1), len(quarters))
+    fraction = np.tile(quarters, len(motion.t) - 1)
+    times = np.append(motion.t[interval] + fraction * np.diff(motion.t)[interval], motion.t[-1])
 
     def tips(at: Array) -> list[Array]:
         places = np.zeros((len(at), 0)) if bases is None else _between(motion.t, bases, at)
         return sampler(places, motion.position.at(at))
 
     corners = path.positions
-    way, axes = tips(times)
-    off, where = _off(way, corners)
-    worst = int(off.argmax())
+    tip_path, axes = tips(times)
+    distance, parameter = _distances(tip_path, corners)
+    worst = int(distance.argmax())
     finer = np.linspace(times[max(worst - 1, 0)], times[min(worst + 1, len(times) - 1)], 65)
-    near = _off(tips(finer)[0], corners)[0]
-    value, time = max((float(off[worst]), float(times[worst])), (float(near.max()), float(finer[near.argmax()])))
+    near = _distances(tips(finer)[0], corners)[0]
+    value, time = max((float(distance[worst]), float(times[worst])), (float(near.max()), float(finer[near.argmax()])))
     link = machine.robot.tip_link
-    rows, faults = [_row("tip off the path", value, tolerance, "m", time)], []
+    rows, faults = [_row("distance of the tip from the path", value, tolerance, "m", time)], []
     if value > tolerance:
-        first = float(times[np.flatnonzero(off > tolerance)[0]]) if (off > tolerance).any() else time
+        first = float(times[np.flatnonzero(distance > tolerance)[0]]) if (distance > tolerance).any() else time
         between = "" if time in motion.t else ", between two samples"
-        text = f"the tip is {value:.4g} m off its path at {time:.6g} s{between}, {tolerance:g} m allowed"
+        text = f"the tip is {value:.4g} m from its path at {time:.6g} s{between}, {tolerance:g} m allowed"
         faults.append(Fault("path", link, text, time, first, value, tolerance, "m"))
-    missed = _off(corners, way)[0]
-    k = int(missed.argmax())
-    rows.append(_row("waypoint off the tip's way", float(missed[k]), tolerance, "m", None))
-    if missed[k] > tolerance:
-        more = int((missed > tolerance).sum()) - 1
-        text = f"the tip comes no nearer than {missed[k]:.4g} m, {tolerance:g} m allowed"
-        text += f"; {more} others are missed, too" if more else ""
+    miss = _distances(corners, tip_path)[0]
+    k = int(miss.argmax())
+    rows.append(_row("distance of a waypoint from the tip's path", float(miss[k]), tolerance, "m", None))
+    if miss[k] > tolerance:
+        more = int((miss > tolerance).sum()) - 1
+        text = f"the tip comes no closer than {miss[k]:.4g} m, {tolerance:g} m allowed"
+        text += f"; {more} others are also missed" if more else ""
         name = f"waypoint {k + 1} (line {int(path.lines[k])})"
-        faults.append(Fault("path", name, text, None, None, float(missed[k]), tolerance, "m"))
+        faults.append(Fault("path", name, text, None, None, float(miss[k]), tolerance, "m"))
     if path.orientations is not None:
-        told = _axes(path, where)
-        lean = np.arccos(np.clip((told * axes).sum(axis=1), -1.0, 1.0))
-        k = int(lean.argmax())
-        value, time = float(lean[k]), float(times[k])
-        rows.append(_row("tool axis off the path's", value, angle, "rad", time))
+        required = _axes(path, parameter)
+        angles = np.arccos(np.clip((required * axes).sum(axis=1), -1.0, 1.0))
+        k = int(angles.argmax())
+        value, time = float(angles[k]), float(times[k])
+        rows.append(_row("angle of the tool axis from the path's", value, angle, "rad", time))
         if value > angle:
-            first = float(times[np.flatnonzero(lean > angle)[0]])
-            text = f"its z axis leans by {value:.4g} rad at {time:.6g} s, {angle:g} rad allowed"
+            first = float(times[np.flatnonzero(angles > angle)[0]])
+            text = f"its z axis deviates by {value:.4g} rad at {time:.6g} s, {angle:g} rad allowed"
             faults.append(Fault("path", link, text, time, first, value, angle, "rad"))
     return rows, faults
 
 
 def _row(name: str, value: float, limit: float, unit: str, time: float | None) -> Row:
+    """Return the row of a value and its limit, which may be infinite."""
     bounded = bool(np.isfinite(limit))
     verdict = RowVerdict.of(value > limit) if bounded else RowVerdict.TOLD
     return Row(name, value, limit if bounded else None, unit, time, verdict)
 
 
-def _axes(path: Waypoints, where: Array) -> Array:
-    """The tool's z axis at places along the waypoints, K numbers with shares between. Shape (K, 3)."""
+def _axes(path: Waypoints, parameter: Array) -> Array:
+    """Return the z axis of the tool at parameters (K,) of the path: waypoint numbers with fractions. Shape (K, 3)."""
     assert path.orientations is not None
     w, x, y, z = path.orientations.T
     at_waypoints = np.column_stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
     numbers = np.arange(len(at_waypoints))
-    found = np.column_stack([np.interp(where, numbers, column) for column in at_waypoints.T])
-    return np.asarray(found / np.maximum(np.linalg.norm(found, axis=1), 1e-12)[:, None])
+    axes = np.column_stack([np.interp(parameter, numbers, column) for column in at_waypoints.T])
+    return np.asarray(axes / np.maximum(np.linalg.norm(axes, axis=1), 1e-12)[:, None])
 
 
-def _between(t: Array, values: Array, at: Array) -> Array:
-    """Straight lines through samples; quaternions are of some length, which rotations take out. Shape (K, n)."""
-    found = np.column_stack([np.interp(at, t, column) for column in values.T])
+def _between(t: Array, values: Array, times: Array) -> Array:
+    """Return samples interpolated linearly, with normalised quaternions. Shape (K, n)."""
+    interpolated = np.column_stack([np.interp(times, t, column) for column in values.T])
     if values.shape[1] == 7:
-        found[:, 3:] /= np.linalg.norm(found[:, 3:], axis=1)[:, None]
-    return found
+        interpolated[:, 3:] /= np.linalg.norm(interpolated[:, 3:], axis=1)[:, None]
+    return interpolated
 
 
-def _off(points: Array, corners: Array) -> tuple[Array, Array]:
-    """Distances of points (K, 3) from the lines through others (M, 3), and where these are nearest: the number of the
-    corner before and a share of the way to the next. Shape (K,) each."""
+def _distances(points: Array, corners: Array) -> tuple[Array, Array]:
+    """Return the distances of points (K, 3) from the polyline through corners (M, 3), and where it is closest.
+
+    The latter are numbers of the preceding corners plus fractions. Shape (K,) each.
+    """
     if len(corners) == 1:
         return np.asarray(np.linalg.norm(points - corners[0], axis=1)), np.zeros(len(points))
-    found, where = np.full(len(points), np.inf), np.zeros(len(points))
-    begin, way = corners[:-1], np.diff(corners, axis=0)
-    long = (way * way).sum(axis=1)
-    lot = max(1, 4_000_000 // len(begin))
-    for first in range(0, len(points), lot):
-        part = points[first : first + lot]
+    distances, parameters = np.full(len(points), np.inf), np.zeros(len(points))
+    begin, edges = corners[:-1], np.diff(corners, axis=0)
+    squared_lengths = (edges * edges).sum(axis=1)
+    batch = max(1, 4_000_000 // len(begin))
+    for first in range(0, len(points), batch):
+        part = points[first : first + batch]
         to = part[:, None] - begin
-        share = np.clip((to * way).sum(axis=2) / np.where(long > 0, long, 1.0), 0.0, 1.0)
-        away = np.linalg.norm(to - share[:, :, None] * way, axis=2)
-        k = away.argmin(axis=1)
+        fraction = np.clip((to * edges).sum(axis=2) / np.where(squared_lengths > 0, squared_lengths, 1.0), 0.0, 1.0)
+        distance = np.linalg.norm(to - fraction[:, :, None] * edges, axis=2)
+        k = distance.argmin(axis=1)
         rows = np.arange(len(part))
-        found[first : first + lot], where[first : first + lot] = away[rows, k], k + share[rows, k]
-    return found, where
+        distances[first : first + batch], parameters[first : first + batch] = distance[rows, k], k + fraction[rows, k]
+    return distances, parameters

@@ -1,4 +1,4 @@
-"""The verdict on a plan: its audit, and its samples held against the limits of its own machine."""
+"""The verdict on a plan: its audit, and a check of its samples against the limits of its machine."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ __all__ = ["PlanVerdict", "verdict_of"]
 
 @dataclass(frozen=True, eq=False)
 class PlanVerdict:
-    """What is said of a plan: a plan whose samples break a limit of the machine must not be run, whatever it was asked.
+    """Audit and check of a plan. A plan that breaks a limit of its machine must not be run, even if its task allows it.
 
     Attributes:
-        audit: Of the plan, against what it was asked.
-        check: Of its samples, against the machine's own limits of joints, velocities and torques.
+        audit: Audit of the plan against its problem.
+        check: Check of its samples against the machine's limits of joints, velocities and torques.
     """
 
     audit: Audit
@@ -36,7 +36,7 @@ class PlanVerdict:
 
     @property
     def sentence(self) -> str:
-        """What follows for whoever would run the plan."""
+        """The verdict in one sentence."""
         if not self.audit.feasible or self.check.passed:
             return self.audit.sentence
         first, count = self.check.faults[0], len(self.check.faults)
@@ -48,21 +48,23 @@ def verdict_of(plan: Plan, sample: PlanSample, name: str, **settings: Any) -> Pl
     """Return the verdict on a plan.
 
     Args:
-        sample: The plan at the times at which it is held against the limits of its machine.
-        name: What the plan is called.
-        settings: Of the audit.
+        plan: The plan.
+        sample: Its samples at the times at which the limits of the machine are checked.
+        name: Name of the plan.
+        settings: Settings of the audit.
     """
-    machine, given = plan.machine, (sample.joints, sample.rates, sample.accelerations)
+    machine, derivatives = plan.machine, (sample.joints, sample.rates, sample.accelerations)
     lines = np.arange(1, len(sample.t) + 1)
-    raw = RawTrajectory(plan.names, sample.t, *given, None, lines, True, (), name)
+    raw = RawTrajectory(plan.names, sample.t, *derivatives, None, lines, True, (), name)
     base: Any = "floating" if isinstance(machine, FreeFloating) else "fixed"
-    place: dict[str, Any] = {} if machine.base_size else _mount(machine)
-    place |= {"time_unit": "s", "names_confirmed": True}  # a plan leaves no doubt of either
-    check = check_trajectory(machine.robot, raw, base=base, clearance=None, **place)
+    options: dict[str, Any] = {} if machine.base_size else _mount(machine)
+    options |= {"time_unit": "s", "names_confirmed": True}  # both are certain for a plan
+    check = check_trajectory(machine.robot, raw, base=base, clearance=None, **options)
     return PlanVerdict(plan.audit(**settings), check)
 
 
 def _mount(machine: Machine) -> dict[str, Array]:
+    """Return the pose of a fixed base."""
     frame = machine.world_from_base(())
     return {
         "translation": np.array(frame.position, dtype=float).ravel(),

@@ -1,7 +1,8 @@
-"""What a file may mean by its times and by the names of its columns, other than what it says.
+"""Detect files whose times or column names probably mean something other than they say.
 
-A suspicion accuses nobody: the motion may be meant as it stands. But if it is true, the robot does something that was
-not checked, so the verdict stays open until the unit of the times or the order of the joints is stated.
+A suspicion is not a fault: the motion may be correct as it is. But if the suspicion is true, the robot would execute a
+motion that was not checked. The verdict is therefore undetermined until the unit of the times or the order of the
+joints is confirmed.
 """
 
 from __future__ import annotations
@@ -13,52 +14,58 @@ import numpy as np
 
 from models import FixedBase, Robot
 from models.arrays import Array
-from ocp.app.check.oddities import SMALL_UNITS, THRESHOLDS, Fault, likely_unit
-from ocp.app.check.pieces import Indices, Motion
+from ocp.app.check.data_checks import SMALL_UNITS, THRESHOLDS, Fault, likely_unit
+from ocp.app.check.interpolation import Indices, Motion
 from ocp.problem.values import Sampler
 
 __all__ = ["doubtful_times", "exchanged_joints"]
 
 
 def doubtful_times(motion: Motion, velocity: Array) -> list[Fault]:
-    """A suspicion where times look like a smaller unit than seconds, or like sample numbers.
+    """Return a suspicion if the times look like a unit smaller than seconds, or like sample numbers.
 
     A smaller unit: the samples are a second or more apart, no joint is faster than 0.5 % of its velocity limit, and the
-    unit makes a plausible motion. Sample numbers: 50 or more, one apart, and no joint is faster than 10 %.
+    motion is plausible in that unit. Sample numbers: 50 or more, spaced by one, and no joint is faster than 10 %.
     """
     t, steps = motion.t, np.diff(motion.t)
     step, whole = float(np.median(steps)), bool((np.abs(t - np.rint(t)) <= 1e-9 * np.abs(t)).all())
     unit, used = likely_unit(t, motion.q, velocity)
-    counted = whole and len(t) >= 50 and np.ptp(steps) < 1e-6 and abs(step - 1) < 1e-6 and 1e-5 < used < 0.1
+    enumerated = whole and len(t) >= 50 and np.ptp(steps) < 1e-6 and abs(step - 1) < 1e-6 and 1e-5 < used < 0.1
     small = bool(unit) and step >= 1 and used < 5e-3 and len(t) >= (3 if whole else 10)
-    likely = [word for word, fits in ((unit, small), ("sample numbers", counted)) if fits]
+    likely = [word for word, fits in ((unit, small), ("sample numbers", enumerated)) if fits]
     faster = f", in {unit} {100 * used * SMALL_UNITS[unit]:.3g} %" if small else ""
     text = (
         f"times look like {' or '.join(likely)}: {step:.6g} apart, and in seconds the fastest joint is at "
-        f"{100 * used:.2g} % of its limit{faster}; state --time-unit s, ms, us, ns, or seconds from sample to sample"
+        f"{100 * used:.2g} % of its limit{faster}; pass --time-unit s, ms, us, ns, or seconds from sample to sample"
     )
     return [Fault("suspicion", "time", text)] if likely else []
 
 
 def exchanged_joints(motion: Motion, robot: Robot, columns: Indices, tip: bool = True) -> list[Fault]:
-    """A suspicion where one exchange of two joints makes a motion far simpler.
+    """Return a suspicion if exchanging two joints makes the motion far simpler.
 
-    A joint is outside its limits most of the time, and all are inside with the two exchanged. Or the tip goes straight
-    or keeps its speed with the two exchanged only (`tip`: the motion has all joints, and a base that does not float).
-    For the latter three joints must move, and not in proportion: motions from joints to joints are simple by chance.
+    Either one joint is outside its limits most of the time, and all are inside after the exchange. Or the tip moves
+    straight or at constant speed only after the exchange. The latter requires three joints that do not move in
+    proportion, because motions between two configurations are simple by chance.
+
+    Args:
+        motion: Motion of the joints.
+        robot: The robot.
+        columns: Indices of the joints in its joint vector.
+        tip: Whether the tip can be checked: all joints are known, and the base does not float.
     """
     names, lower, upper = [robot.joint_names[k] for k in columns], robot.lower[columns], robot.upper[columns]
     kinds = [robot.joint(name).kind == "prismatic" for name in names]
     pairs = [(i, j) for i, j in combinations(range(len(names)), 2) if kinds[i] == kinds[j]]
     outside = ((motion.q[:, :, None] < lower) | (motion.q[:, :, None] > upper)).mean(axis=0)  # of column i for joint j
-    own, every = outside.diagonal(), np.arange(len(names))
-    mending = [
+    current, identity = outside.diagonal(), np.arange(len(names))
+    repairs = [
         p
         for p in pairs
-        if own[[*p]].max() > 0.5 and not own[~np.isin(every, p)].any() and not outside[p] + outside[p[::-1]]
+        if current[[*p]].max() > 0.5 and not current[~np.isin(identity, p)].any() and not outside[p] + outside[p[::-1]]
     ]
-    if len(mending) == 1:
-        return [_exchanged(names, mending[0], "all joints are inside their limits")]
+    if len(repairs) == 1:
+        return [_exchanged(names, repairs[0], "all joints are inside their limits")]
     rows = np.unique(np.linspace(0, len(motion.t) - 1, THRESHOLDS.tip_samples).astype(int))
     joints = motion.q[rows]
     reach = np.ptp(joints, axis=0)
@@ -69,26 +76,27 @@ def exchanged_joints(motion: Motion, robot: Robot, columns: Indices, tip: bool =
         return []
     q = ca.SX.sym("q", robot.dof)
     sampler = Sampler([q], [FixedBase(robot).tip_pose((), q).position])
-    orders = np.tile(every, (len(pairs) + 1, 1))
+    orders = np.tile(identity, (len(pairs) + 1, 1))
     for order, pair in zip(orders[1:], pairs, strict=True):
         order[[*pair]] = pair[::-1]
     tips = sampler(np.concatenate([joints[:, order] for order in orders]))[0].reshape(-1, len(rows), 3)
-    middle = tips - tips.mean(axis=1, keepdims=True)
-    line = np.linalg.svd(middle, full_matrices=False)[2][:, :1]
-    beside = np.linalg.norm(middle - (middle * line).sum(axis=2, keepdims=True) * line, axis=2).max(axis=1)
+    centred = tips - tips.mean(axis=1, keepdims=True)
+    line = np.linalg.svd(centred, full_matrices=False)[2][:, :1]
+    distance = np.linalg.norm(centred - (centred * line).sum(axis=2, keepdims=True) * line, axis=2).max(axis=1)
     steps = np.linalg.norm(np.diff(tips, axis=1), axis=2)
     length = np.maximum(steps.sum(axis=1), 1e-12)
     speeds = (steps / np.diff(motion.t[rows]))[:, len(rows) // 5 : -(len(rows) // 5)]  # without its ends
-    off = np.column_stack([beside / length, speeds.std(axis=1) / np.maximum(speeds.mean(axis=1), 1e-12)])
-    off /= [THRESHOLDS.straight, THRESHOLDS.even]
-    off[length < max(0.01, 0.1 * length[0])] = np.inf  # m: hardly a motion of the tip
-    best, kind = divmod(int(off.argmin()), 2)
-    if off[best, kind] > min(1.0, off[0, kind] / 20) or off[0].min() < 3:
+    measure = np.column_stack([distance / length, speeds.std(axis=1) / np.maximum(speeds.mean(axis=1), 1e-12)])
+    measure /= [THRESHOLDS.straight, THRESHOLDS.even]
+    measure[length < max(0.01, 0.1 * length[0])] = np.inf  # m: hardly a motion of the tip
+    best, criterion = divmod(int(measure.argmin()), 2)
+    if measure[best, criterion] > min(1.0, measure[0, criterion] / 20) or measure[0].min() < 3:
         return []
-    return [_exchanged(names, pairs[best - 1], ("the tip goes straight", "the tip keeps its speed")[kind])]
+    return [_exchanged(names, pairs[best - 1], ("the tip goes straight", "the tip keeps its speed")[criterion])]
 
 
-def _exchanged(names: list[str], pair: tuple[int, int], words: str) -> Fault:
+def _exchanged(names: list[str], pair: tuple[int, int], evidence: str) -> Fault:
+    """Return the suspicion that two columns are exchanged."""
     both = " and ".join(names[k] for k in pair)
-    text = f"the columns of {both} look exchanged: then {words}, which is far from so as they stand"
-    return Fault("suspicion", both, f"{text}; correct the names, or state --names-confirmed")
+    text = f"the columns of {both} look exchanged: then {evidence}, which is far from true as written"
+    return Fault("suspicion", both, f"{text}; correct the names, or pass --names-confirmed")

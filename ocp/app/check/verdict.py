@@ -1,4 +1,4 @@
-"""The check of anybody's trajectory: everything that is looked at, in one table, with a verdict in a sentence."""
+"""Check a joint trajectory from any source: all quantities in one table, and a verdict in one sentence."""
 
 from __future__ import annotations
 
@@ -9,23 +9,15 @@ from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
-from models import CollisionScene, FixedBase, FreeFloating, Machine, Robot, Standing, Support, footprint
+from models import CollisionScene, FixedBase, FreeFloating, Robot, Standing, Support, footprint
 from models.arrays import Array, ArrayInput
 from models.robot.dynamics import GRAVITY
 from models.shapes.mesh_files import find_mesh
 from models.shapes.shapes import Shape
-from ocp.app.check.collisions import clearance_rows, path_rows, within_limits
-from ocp.app.check.joint_limits import (
-    Row,
-    RowVerdict,
-    floating_base,
-    limit_rows,
-    momentum_rows,
-    standing_rows,
-    torque_rows,
-)
-from ocp.app.check.oddities import Fault, Readable, readable
-from ocp.app.check.pieces import Motion, Rule
+from ocp.app.check.collisions import clearance_rows, path_rows, with_wide_limits
+from ocp.app.check.data_checks import CleanedTrajectory, Fault, clean_trajectory
+from ocp.app.check.interpolation import Rule
+from ocp.app.check.joint_limits import Row, RowVerdict, floating_base_rows, limit_rows, standing_rows, torque_rows
 from ocp.app.check.suspicions import doubtful_times, exchanged_joints
 from ocp.app.files import RawTrajectory, Waypoints
 from ocp.app.files.trajectory import UNITS
@@ -48,20 +40,26 @@ __all__ = ["BaseKind", "Check", "Fault", "Limit", "Row", "bounds_of", "check_tra
 
 BaseKind: TypeAlias = Literal["fixed", "standing", "floating"]
 Limit: TypeAlias = float | Mapping[str, float] | None
-"""One number for all joints, or numbers by name; "" is the name of all others. None: the robot's own."""
+"""One number for all joints, or numbers by name with "" for all other joints. None: the robot's own limit."""
 
 
 @dataclass(frozen=True, eq=False)
 class Check:
-    """What was found about a trajectory.
+    """Result of a check.
 
     Attributes:
-        file, robot: Their names. joints: Of the motion. samples: Of the file. duration: s.
-        rule: How the samples are joined: "linear", "cubic" or "quintic".
-        rows: Everything that was looked at. faults: What is wrong.
-        suspicions: What the file may mean other than it says; the verdict stays open until that is stated.
-        unlimited: What nothing limits. unseen: What was not looked at, and why. notes: What was taken otherwise than
-            it stands, or passed over.
+        file, robot: Names of the file and of the robot.
+        joints: Joints of the motion.
+        samples: Number of samples in the file.
+        duration: s.
+        rule: Interpolation: "linear", "cubic" or "quintic".
+        rows: All checked quantities.
+        faults: Violations.
+        suspicions: Other likely meanings of the file; the verdict is undetermined until they are excluded.
+        unlimited: Quantities without a limit.
+        unchecked: Quantities that were not checked, and why.
+        notes: What was ignored or interpreted.
+        cleaned: The motion that was checked.
     """
 
     file: str
@@ -74,47 +72,47 @@ class Check:
     faults: tuple[Fault, ...]
     suspicions: tuple[Fault, ...]
     unlimited: tuple[str, ...]
-    unseen: tuple[str, ...]
+    unchecked: tuple[str, ...]
     notes: tuple[str, ...]
-    readable: Readable
+    cleaned: CleanedTrajectory
 
     @property
     def passed(self) -> bool:
-        """Whether nothing that was looked at is wrong, or suspected to mean something else."""
+        """Whether there are neither faults nor suspicions."""
         return not self.faults and not self.suspicions
 
     @property
     def sentence(self) -> str:
-        """The verdict."""
-        open_ = [row.name for row in self.rows if row.verdict is RowVerdict.UNDECIDED]
-        but = f"; not decided: {', '.join(open_[:3])}{' ...' if len(open_) > 3 else ''}" if open_ else ""
-        without = f"; not looked at: {'; '.join(self.unseen)}" if self.unseen else ""
+        """The verdict in one sentence."""
+        names = [row.name for row in self.rows if row.verdict is RowVerdict.UNDECIDED]
+        but = f"; undetermined: {', '.join(names[:3])}{' ...' if len(names) > 3 else ''}" if names else ""
+        unchecked = f"; not checked: {'; '.join(self.unchecked)}" if self.unchecked else ""
         if self.passed:
-            return f"holds all that was looked at{but}{without}"
+            return f"meets all checked requirements{but}{unchecked}"
         if not self.faults:
-            return f"is undetermined: {'; '.join(one.text for one in self.suspicions)}{without}"
+            return f"is undetermined: {'; '.join(one.text for one in self.suspicions)}{unchecked}"
         count = len(self.faults)
-        return f"must not be run: {count} {'fault' if count == 1 else 'faults'}, first {self.faults[0]}{without}"
+        return f"must not be run: {count} {'fault' if count == 1 else 'faults'}, first {self.faults[0]}{unchecked}"
 
     def __str__(self) -> str:
-        joined = {
-            "linear": "straight lines between samples (of positions alone)",
-            "cubic": "cubics between samples (of positions and velocities)",
-            "quintic": "quintics between samples (of positions, velocities, accelerations)",
+        rule = {
+            "linear": "linear interpolation (of positions alone)",
+            "cubic": "cubic interpolation (of positions and velocities)",
+            "quintic": "quintic interpolation (of positions, velocities, accelerations)",
         }[self.rule]
         verdict = "FAILED" if self.faults else "undetermined" if self.suspicions else "passed"
         lines = [
             f"Check of {self.file} for {self.robot}: {verdict}",
-            f"  {self.samples} samples, {self.duration:.6g} s, {len(self.joints)} joints; {joined}",
+            f"  {self.samples} samples, {self.duration:.6g} s, {len(self.joints)} joints; {rule}",
         ]
         if self.faults:
             lines.append("faults:")
             lines += [f"  {fault}" for fault in self.faults]
-        shown = [row for row in self.rows if row.verdict is not RowVerdict.UNLIMITED]
-        if shown:
-            width = max(len(row.name) for row in shown)
+        limited = [row for row in self.rows if row.verdict is not RowVerdict.UNLIMITED]
+        if limited:
+            width = max(len(row.name) for row in limited)
             lines.append(f"  {'':<{width}}  {'worst':>11}  {'limit':>10}  {'unit':<8}{'at, s':>10}")
-            for row in shown:
+            for row in limited:
                 limit = "" if row.limit is None else f"{row.limit:.4g}"
                 time = "" if row.time is None else f"{row.time:.5g}"
                 line = f"  {row.name:<{width}}  {row.value:>11.5g}  {limit:>10}  {row.unit:<8}{time:>10}  {row.verdict}"
@@ -122,39 +120,17 @@ class Check:
         if self.unlimited:
             lines.append("unlimited: " + "; ".join(self.unlimited))
         lines += map(str, self.suspicions)
-        lines += [f"not looked at: {one}" for one in self.unseen]
+        lines += [f"not checked: {one}" for one in self.unchecked]
         lines += [f"note: {one}" for one in self.notes]
         return "\n".join([*lines, f"The trajectory {self.sentence}."])
 
     def to_dict(self) -> dict[str, Any]:
-        """What JSON can hold: everything but the samples."""
-        told = {name: getattr(self, name) for name in ("file", "robot", "joints", "samples", "duration", "rule")}
-        told |= {"passed": self.passed, "verdict": self.sentence}
-        told |= {name: [asdict(one) for one in getattr(self, name)] for name in ("faults", "suspicions", "rows")}
-        told |= {name: list(getattr(self, name)) for name in ("unlimited", "unseen", "notes")}
-        return told
-
-
-@dataclass(frozen=True, eq=False)
-class Asked:
-    """What a check is asked for, arguments as of `check_trajectory`."""
-
-    base: BaseKind
-    translation: Array
-    rotation: Array
-    gravity: Array
-    foot: Support | None
-    friction: float
-    obstacles: tuple[Shape, ...]
-    clearance: float | None
-    ignored: tuple[tuple[str, str], ...]
-    srdf: str | Path | None
-    folders: tuple[str | Path, ...]
-    missing: Literal["raise", "skip"]
-    path: Waypoints | None
-    path_tolerance: float
-    path_angle: float
-    share: float
+        """Return the result without the samples, as JSON can represent it."""
+        data = {name: getattr(self, name) for name in ("file", "robot", "joints", "samples", "duration", "rule")}
+        data |= {"passed": self.passed, "verdict": self.sentence}
+        data |= {name: [asdict(one) for one in getattr(self, name)] for name in ("faults", "suspicions", "rows")}
+        data |= {name: list(getattr(self, name)) for name in ("unlimited", "unchecked", "notes")}
+        return data
 
 
 @interruptible
@@ -186,34 +162,42 @@ def check_trajectory(
     time_unit: str | float | None = None,
     unwrap: bool = False,
     names_confirmed: bool = False,
-    told: Callable[[str], None] = lambda what: None,
+    progress: Callable[[str], None] = lambda name: None,
 ) -> Check:
-    """Check anybody's trajectory for a robot.
+    """Check a joint trajectory for a robot.
 
-    Between samples it is what a controller makes of them, see `check.pieces`; positions, velocities, accelerations
-    and jerks are looked at there at all times, and bodies are proven apart. Torques, the zero moment point and the tip
-    are looked at several times between two samples.
+    Between samples the motion is interpolated as controllers do, see `check.interpolation`. Positions, velocities,
+    accelerations and jerks are bounded there at all times, and clearance is proven. Torques, the zero moment point and
+    the tip are evaluated several times between two samples.
 
     Args:
-        robot: With its limits. trajectory: As `read_trajectory` reads it.
-        velocity, acceleration, jerk, torque: Limits beside, or instead of, those of the robot, rad/s or m/s, ...
-        base: "fixed"; "standing" unfastened on the ground; "floating" in space, from rest.
-        translation, rotation: Of a base that does not float, in world. gravity: m/s^2, in world.
-        foot: That it stands on; from its collision shapes if None. friction: Of the ground.
-        obstacles, clearance, ignored, srdf, folders, missing: As of `ocp.plan`; clearance None: nothing is looked at.
-        path: Waypoints that the tip is to pass on straight lines. path_tolerance: m; None: the smaller of 0.1 mm and a
-            thousandth of the path's extent. path_angle: rad, by which its z axis may lean from the one that they tell.
-        share: Of a limit, by which it may be passed.
-        rule: How the controller joins the samples, "linear", "cubic" or "quintic". None: by all that they tell, and a
-            velocity, acceleration or jerk between them counts only as far as every motion through them needs it.
-        time_unit: Of the file's times, "s", "ms", "us" or "ns", or the seconds from one sample number to the next.
+        robot: With its limits.
+        trajectory: As read by `read_trajectory`.
+        velocity, acceleration, jerk, torque: Limits in addition to, or instead of, those of the robot, rad/s or m/s,
+            ...
+        base: "fixed"; "standing" on the ground without fastening; "floating" in space, from rest.
+        translation, rotation: Pose of a base that does not float, in world.
+        gravity: m/s^2, in world.
+        foot: Contact area; None: from the collision shapes.
+        friction: Coefficient of friction of the ground.
+        obstacles, clearance, ignored, srdf, folders, missing: As in `ocp.plan`. clearance=None: clearance is not
+            checked.
+        path: Waypoints that the tip must follow on straight lines.
+        path_tolerance: Allowed distance from the path, m. None: the smaller of 0.1 mm and a thousandth of the path's
+            extent.
+        path_angle: Allowed angle of the tip's z axis from that of the waypoints, rad.
+        share: Tolerance relative to a limit.
+        rule: Interpolation of the controller, "linear", "cubic" or "quintic". None: the highest that the data allow; a
+            velocity, acceleration or jerk between samples then counts only as far as every motion through them needs
+            it.
+        time_unit: Unit of the file's times, "s", "ms", "us" or "ns", or the seconds from one sample number to the next.
             None: seconds, unless they look otherwise.
-        unwrap: Take joints with limits whose values were wrapped by whole turns as turning on.
-        names_confirmed: Do not suspect columns to be exchanged.
-        told: Is called with what comes next.
+        unwrap: Whether joints with limits are unwrapped by whole turns.
+        names_confirmed: Whether the order of the columns is certain.
+        progress: Is called with the name of each stage.
 
     Raises:
-        ProblemError, ModelError: What is given does not fit the robot, or no sample can be read.
+        ProblemError, ModelError: An argument does not fit the robot, or no sample is valid.
     """
     checked_instance("robot", robot, Robot)
     checked_instance("trajectory", trajectory, RawTrajectory)
@@ -222,163 +206,126 @@ def check_trajectory(
     if path_tolerance is None:
         path_tolerance = default_tolerance(np.zeros((1, 3)) if path is None else path.positions)
     checked_positive("path_tolerance", path_tolerance)
-    for what, value in (("path_angle", path_angle), ("friction", friction)):
-        if not real(value) > 0:  # which may be infinite
-            raise ProblemError(f"{what} must be a number above 0, not {value!r}", name=what, value=value, limit=0.0)
+    for name, value in (("path_angle", path_angle), ("friction", friction)):
+        if not real(value) > 0:  # infinity is allowed
+            raise ProblemError(f"{name} must be a number above 0, not {value!r}", name=name, value=value, limit=0.0)
     notes: list[str] = []
     bounds = bounds_of(robot, velocity, acceleration, jerk, torque, notes)
-    told("reading")
+    progress("reading")
     if time_unit is not None:
         units = ("s", "ms", "us", "ns")
-        size = time_unit if not isinstance(time_unit, str) else UNITS[checked_choice("time_unit", time_unit, units)]
-        checked_positive("time_unit", size)
-        trajectory = replace(trajectory, t=trajectory.t * size)
-    found = readable(trajectory, robot, *bounds[:3], time_unit is not None, unwrap)
+        unit_s = time_unit if not isinstance(time_unit, str) else UNITS[checked_choice("time_unit", time_unit, units)]
+        checked_positive("time_unit", unit_s)
+        trajectory = replace(trajectory, t=trajectory.t * unit_s)
+    cleaned = clean_trajectory(trajectory, robot, *bounds[:3], time_unit is not None, unwrap)
     if rule is not None:
         checked_choice("rule", rule, get_args(Rule))
-        found = replace(found, motion=found.motion.by(rule))
-    motion, whole = found.motion, len(found.joints) == robot.dof
+        cleaned = replace(cleaned, motion=cleaned.motion.by(rule))
+    motion, complete = cleaned.motion, len(cleaned.joints) == robot.dof
     rows: list[Row] = []
-    faults, unseen = list(found.faults), []
+    faults, unchecked = list(cleaned.faults), []
 
-    def add(made: tuple[list[Row], list[Fault]]) -> None:
-        rows.extend(made[0])
-        faults.extend(made[1])
+    def add(result: tuple[list[Row], list[Fault]]) -> None:
+        rows.extend(result[0])
+        faults.extend(result[1])
         check_time()
 
-    told("limits")
-    more, wrong, left = limit_rows(motion, robot, found.joints, bounds, share)
-    add((more, wrong))
-    unseen += left
-    add(_efforts(found, robot, bounds, share))
-    if not whole:
-        unseen.append("torques, clearance and the tip, as joints are missing")
+    progress("limits")
+    limit_table, limit_faults, unlimited_orders = limit_rows(motion, robot, cleaned.joints, bounds, share)
+    add((limit_table, limit_faults))
+    unchecked += unlimited_orders
+    add(_efforts(cleaned, robot, bounds, share))
+    if not complete:
+        unchecked.append("torques, clearance and the tip, because joints are missing")
     else:
-        asked = Asked(
-            base,
+        gravity = np.asarray(gravity, dtype=float)
+        pose = (
             np.asarray(translation, dtype=float),
             np.eye(3) if rotation is None else np.asarray(rotation, dtype=float),
-            np.asarray(gravity, dtype=float),
-            foot,
-            friction,
-            tuple(obstacles),
-            clearance,
-            tuple(ignored),
-            srdf,
-            tuple(folders),
-            missing,
-            path,
-            path_tolerance,
-            path_angle,
-            share,
         )
-        notes += _machine_rows(robot, found, bounds, asked, add, unseen, told)
+        machine = _machine_of(robot, cleaned, base, pose, gravity, foot, notes)
+        bases = None
+        if base == "floating":
+            progress("momentum")
+            bases, base_rows, base_faults = floating_base_rows(machine, motion, cleaned.base)
+            add((base_rows, base_faults))
+        elif base == "standing":
+            progress("ground")
+            add(standing_rows(machine, motion, friction))
+        if robot.total_mass == 0:
+            unchecked.append("torques, because the robot has no masses")
+        else:
+            progress("torques")
+            add(torque_rows(motion, machine, bounds, gravity, share, check_time))
+        if path is not None:
+            progress("path")
+            add(path_rows(machine, motion, bases, path, path_tolerance, path_angle))
+        progress("clearance")
+        if clearance is None:
+            unchecked.append("clearance, as requested")
+        elif not any(link.collisions for link in robot.links):
+            unchecked.append("clearance, because the robot has no collision shapes")
+        else:
+            unchecked += _missing_meshes(robot, folders) if missing == "skip" else []
+            wide, others = with_wide_limits(machine, motion), tuple(obstacles)
+            scene = CollisionScene(wide, others, clearance, tuple(ignored), srdf, tuple(folders), missing)
+            add(clearance_rows(scene, motion, bases if others else None))
     suspicions: list[Fault] = []
     if time_unit is None and not any(fault.kind == "units" and fault.name == "time" for fault in faults):
-        suspicions += doubtful_times(motion, bounds.velocity[found.joints])
+        suspicions += doubtful_times(motion, bounds.velocity[cleaned.joints])
     if not names_confirmed:
-        suspicions += exchanged_joints(motion, robot, found.joints, whole and base != "floating")
+        suspicions += exchanged_joints(motion, robot, cleaned.joints, complete and base != "floating")
     unlimited = _unlimited(rows)
-    order = {
+    kind_order = {
         kind: k for k, kind in enumerate(("unknown joint", "missing joint", "times", "not a number", "units", "jump"))
     }
-    faults.sort(key=lambda fault: order.get(fault.kind, len(order)))
+    faults.sort(key=lambda fault: kind_order.get(fault.kind, len(kind_order)))
     return Check(
         trajectory.file,
         robot.name,
-        tuple(robot.joint_names[k] for k in found.joints),
-        found.samples,
+        tuple(robot.joint_names[k] for k in cleaned.joints),
+        cleaned.samples,
         float(motion.t[-1] - motion.t[0]),
         motion.rule,
         tuple(rows),
         tuple(faults),
         tuple(suspicions),
         unlimited,
-        tuple(unseen),
-        (*found.notes, *notes),
-        found,
+        tuple(unchecked),
+        (*cleaned.notes, *notes),
+        cleaned,
     )
 
 
-def _machine_rows(
+def _machine_of(
     robot: Robot,
-    found: Readable,
-    bounds: JointBounds,
-    asked: Asked,
-    add: Callable[[tuple[list[Row], list[Fault]]], None],
-    unseen: list[str],
-    told: Callable[[str], None],
-) -> list[str]:
-    """Everything that takes the whole robot; what was taken otherwise than told."""
-    motion, notes = found.motion, []
-    machine: Any
-    bases: Array | None = None
-    if asked.base == "floating":
-        planar = found.base is not None and found.base.shape[1] == 3
-        machine = FreeFloating(robot, "planar" if planar else "spatial")
-        told("momentum")
-        if found.base is not None:
-            bases = found.base
-            add(momentum_rows(machine, motion, bases))
-        else:
-            bases, rows = floating_base(machine, motion)
-            add((rows, []))
-    elif asked.base == "standing":
-        foot, place = asked.foot, asked.translation
-        if foot is None:
-            under = footprint(robot, q=motion.q[0], rotation=asked.rotation)
-            foot, place = under.support, under.translation
-            notes.append(f"it stands on {', '.join(under.links)}")
-        down = -float(asked.gravity[2])
-        machine = Standing(robot=robot, translation=place, rotation=asked.rotation, support=foot, gravity=down)
-        told("ground")
-        add(standing_rows(machine, motion, asked.friction))
-    else:
-        machine = FixedBase(robot, asked.translation, asked.rotation)
-    if robot.total_mass == 0:
-        unseen.append("torques, as the robot has no masses")
-    else:
-        told("torques")
-        add(torque_rows(motion, machine, bounds, asked.gravity, asked.share, check_time))
-    if asked.path is not None:
-        told("path")
-        add(path_rows(machine, motion, bases, asked.path, asked.path_tolerance, asked.path_angle))
-    told("clearance")
-    _look_around(machine, motion, bases, asked, add, unseen)
-    return notes
+    cleaned: CleanedTrajectory,
+    base: BaseKind,
+    pose: tuple[Array, Array],
+    gravity: Array,
+    foot: Support | None,
+    notes: list[str],
+) -> Any:
+    """Return the robot on its base."""
+    if base == "floating":
+        planar = cleaned.base is not None and cleaned.base.shape[1] == 3
+        return FreeFloating(robot, "planar" if planar else "spatial")
+    translation, rotation = pose
+    if base == "fixed":
+        return FixedBase(robot, translation, rotation)
+    if foot is None:
+        contact = footprint(robot, q=cleaned.motion.q[0], rotation=rotation)
+        foot, translation = contact.support, contact.translation
+        notes.append(f"it stands on {', '.join(contact.links)}")
+    down = -float(gravity[2])
+    return Standing(robot=robot, translation=translation, rotation=rotation, support=foot, gravity=down)
 
 
-def _look_around(
-    machine: Machine,
-    motion: Motion,
-    bases: Array | None,
-    asked: Asked,
-    add: Callable[[tuple[list[Row], list[Fault]]], None],
-    unseen: list[str],
-) -> None:
-    """What the machine may touch."""
-    robot = machine.robot
-    if asked.clearance is None:
-        unseen.append("clearance, as told")
-        return
-    if not any(link.collisions for link in robot.links):
-        unseen.append("clearance, as the robot has no collision shapes")
-        return
-    if asked.missing == "skip":
-        shapes = [(link.name, shape) for link in robot.links for shape in link.collisions if shape.kind == "mesh"]
-        lost = [name for name, shape in shapes if find_mesh(shape.file, shape.folder or None, asked.folders) is None]
-        if lost:
-            unseen.append(f"clearance of {', '.join(dict.fromkeys(lost))}, whose meshes are missing")
-    around = CollisionScene(
-        within_limits(machine, motion),
-        asked.obstacles,
-        asked.clearance,
-        asked.ignored,
-        asked.srdf,
-        asked.folders,
-        asked.missing,
-    )
-    add(clearance_rows(around, motion, bases if asked.obstacles else None))
+def _missing_meshes(robot: Robot, folders: Sequence[str | Path]) -> list[str]:
+    """Return a sentence about the links whose meshes are missing, if there are any."""
+    shapes = [(link.name, shape) for link in robot.links for shape in link.collisions if shape.kind == "mesh"]
+    names = [name for name, shape in shapes if find_mesh(shape.file, shape.folder or None, folders) is None]
+    return [f"clearance of {', '.join(dict.fromkeys(names))}, whose meshes are missing"] if names else []
 
 
 def bounds_of(
@@ -389,46 +336,51 @@ def bounds_of(
     torque: Limit = None,
     notes: list[str] | None = None,
 ) -> JointBounds:
-    """Limits of the joint vector: what is told, else the robot's own; where that is 0 there is none, which is noted."""
+    """Return the limits of the joint vector: the given ones, else the robot's own.
+
+    A limit of 0 in the robot's description means none; it is added to `notes`.
+    """
     free = np.full(robot.dof, np.inf)
-    given = {}
-    for what, own, told in (
+    limits = {}
+    for quantity, own, override in (
         ("velocity", robot.velocity, velocity),
         ("acceleration", free, acceleration),
         ("jerk", free, jerk),
         ("torque", robot.effort, torque),
     ):
-        limits = own.copy()
-        if notes is not None and (names := unknown_limits(robot, what)):
-            notes.append(f"the robot gives {', '.join(names)} a {what} limit of 0: taken as none")
-        by_name = told if isinstance(told, Mapping) else {} if told is None else {"": told}
-        for name, value in checked_mapping(what, by_name).items():
+        values = own.copy()
+        if notes is not None and (names := unknown_limits(robot, quantity)):
+            notes.append(f"the robot gives {', '.join(names)} a {quantity} limit of 0: treated as none")
+        by_name = override if isinstance(override, Mapping) else {} if override is None else {"": override}
+        for name, value in checked_mapping(quantity, by_name).items():
             if not real(value) > 0:
-                words = f"{what} of {name or 'all joints'} must be a number above 0, not {value!r}"
-                raise ProblemError(words, name=what, value=value, limit=0.0)
+                words = f"{quantity} of {name or 'all joints'} must be a number above 0, not {value!r}"
+                raise ProblemError(words, name=quantity, value=value, limit=0.0)
             if name and name not in robot.joint_names:
-                raise unknown_name(f"joint in {what}", name, robot.joint_names)
+                raise unknown_name(f"joint in {quantity}", name, robot.joint_names)
         for k, name in enumerate(robot.joint_names):
-            limits[k] = by_name.get(name, by_name.get("", limits[k]))
-        given[what] = limits
-    return JointBounds(robot.lower, robot.upper, power=free, **given)
+            values[k] = by_name.get(name, by_name.get("", values[k]))
+        limits[quantity] = values
+    return JointBounds(robot.lower, robot.upper, power=free, **limits)
 
 
-def _efforts(found: Readable, robot: Robot, bounds: JointBounds, share: float) -> tuple[list[Row], list[Fault]]:
-    """Torques that the file itself tells, at its samples."""
+def _efforts(
+    cleaned: CleanedTrajectory, robot: Robot, bounds: JointBounds, share: float
+) -> tuple[list[Row], list[Fault]]:
+    """Check the torques in the file, at its samples."""
     rows: list[Row] = []
     faults: list[Fault] = []
-    if found.efforts is None:
+    if cleaned.efforts is None:
         return rows, faults
-    for column, joint in enumerate(found.joints):
+    for column, joint in enumerate(cleaned.joints):
         name = robot.joint_names[joint]
         unit, limit = robot.joint(name).effort_unit, float(bounds.torque[joint])
-        k = int(np.abs(found.efforts[:, column]).argmax())
-        value, time = float(found.efforts[k, column]), float(found.motion.t[k])
+        k = int(np.abs(cleaned.efforts[:, column]).argmax())
+        value, time = float(cleaned.efforts[k, column]), float(cleaned.motion.t[k])
         failed = abs(value) > limit * (1 + share)
         verdict = RowVerdict.FAILED if failed else RowVerdict.OK if np.isfinite(limit) else RowVerdict.UNLIMITED
-        told = limit if np.isfinite(limit) else None
-        rows.append(Row(f"told torque of {name}", value, told, unit, time, verdict, "as the file has it"))
+        row_limit = limit if np.isfinite(limit) else None
+        rows.append(Row(f"given torque of {name}", value, row_limit, unit, time, verdict, "as given in the file"))
         if failed:
             text = f"the file has {value:.5g} {unit} at {time:.6g} s, limit {limit:.5g}"
             faults.append(Fault("torque", name, text, time, time, value, limit, unit))
@@ -436,15 +388,15 @@ def _efforts(found: Readable, robot: Robot, bounds: JointBounds, share: float) -
 
 
 def _unlimited(rows: Sequence[Row]) -> tuple[str, ...]:
-    """What nothing limits, joints of one kind of limit together."""
+    """Return the quantities without a limit, joints of one kind together."""
     joints: dict[str, list[str]] = {}
     counts: dict[str, int] = {}
     for row in rows:
-        what, _, name = row.name.partition(" of ")
-        counts[what] = counts.get(what, 0) + 1
+        quantity, _, name = row.name.partition(" of ")
+        counts[quantity] = counts.get(quantity, 0) + 1
         if row.verdict is RowVerdict.UNLIMITED:
-            joints.setdefault(what, []).append(name)
+            joints.setdefault(quantity, []).append(name)
     return tuple(
-        f"{what} of {'every joint' if len(names) == counts[what] and len(names) > 1 else ', '.join(names)}"
-        for what, names in joints.items()
+        f"{quantity} of {'every joint' if len(names) == counts[quantity] and len(names) > 1 else ', '.join(names)}"
+        for quantity, names in joints.items()
     )

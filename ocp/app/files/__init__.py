@@ -1,8 +1,8 @@
-"""Files: tool paths from waypoints and from G-code, anybody's trajectories, plans as logs and in Rerun."""
+"""Read and write files: tool paths from waypoints and G-code, joint trajectories, and plans as MCAP and Rerun logs."""
 
 from ocp.app.files.gcode import read_gcode
 from ocp.app.files.mcap import log_rerun, write_mcap
-from ocp.app.files.program import Cut, Note, Pause, Program, ProgramMotion, Rapid, Stretch, TimedProgram
+from ocp.app.files.program import Cut, Note, Pause, Program, ProgramMotion, Rapid, Section, TimedProgram
 from ocp.app.files.trajectory import RawTrajectory, read_trajectory
 from ocp.app.files.waypoints import Waypoints, read_waypoints
 
@@ -14,7 +14,7 @@ __all__ = [
     "ProgramMotion",
     "Rapid",
     "RawTrajectory",
-    "Stretch",
+    "Section",
     "TimedProgram",
     "Waypoints",
     "log_rerun",

@@ -1,9 +1,8 @@
-"""MCAP, the log format that ROS 2 and Foxglove read and play: joint states over time, and the tip's path.
+"""Write and read joint motions in MCAP, the log format of ROS 2 and Foxglove, and log plans to Rerun.
 
-Messages are those of ROS 2, written and read by the package `mcap-ros2-support`, of the extra `mcap`. They are read by
-the definitions below, never by those that a file brings.
-
-Plans in Rerun's viewer, by the module `rerun` that the caller gives: nothing here asks for that package.
+MCAP messages are those of ROS 2, written and read by the package `mcap-ros2-support` of the extra `mcap`. They are
+decoded with the definitions below, never with those of the file. The caller passes the module `rerun`; nothing here
+depends on it.
 """
 
 from __future__ import annotations
@@ -18,6 +17,7 @@ from typing import IO, Any
 import numpy as np
 
 from models.input_files import INPUT_LIMITS, open_regular
+from ocp.app.files.text_files import missing_package
 from ocp.errors import ProblemError, checked_instance, checked_text
 from ocp.motion.plan import Plan
 from ocp.storage import write_whole
@@ -26,11 +26,11 @@ __all__ = ["log_rerun", "read_joint_messages", "write_mcap"]
 
 
 def _with_parts(fields: str, **parts: str) -> str:
-    """The definition of a message: its header, its fields, and those of the types in them."""
+    """Return the definition of a message: its header, its fields, and the types that they use."""
     parts["std_msgs/Header"] = "builtin_interfaces/Time stamp\nstring frame_id\n"
     parts |= {f"builtin_interfaces/{name}": "int32 sec\nuint32 nanosec\n" for name in ("Time", "Duration")}
     bar = "=" * 80
-    return f"std_msgs/Header header\n{fields}" + "".join(f"{bar}\nMSG: {name}\n{own}" for name, own in parts.items())
+    return f"std_msgs/Header header\n{fields}" + "".join(f"{bar}\nMSG: {name}\n{text}" for name, text in parts.items())
 
 
 STATE, PATH = "sensor_msgs/msg/JointState", "nav_msgs/msg/Path"
@@ -52,17 +52,19 @@ DEFINITIONS = {
 
 
 def write_mcap(plan: Plan, file: str | os.PathLike[str], period: float = 0.01, *, frame: str = "world") -> None:
-    """Write the joints every `period` s as sensor_msgs/msg/JointState on `/joint_states`, with velocities, and the
-    tip's poses at the same times as one nav_msgs/msg/Path on `/tip_path`, where the robot has a tip.
+    """Write the joint states of a plan on `/joint_states`, and the path of its tip, if it has one, on `/tip_path`.
 
-    The first is at 0 s of the log's time.
+    States are sensor_msgs/msg/JointState with velocities every `period` s, the first at 0 s of the log. The path is one
+    nav_msgs/msg/Path with poses at the same times.
 
     Args:
-        plan: To be written. file: Whole or as it was before. period: s.
-        frame: The name of the world in the messages.
+        plan: The plan.
+        file: Replaced only when the log is complete.
+        period: Sampling period, s.
+        frame: Name of the world frame in the messages.
 
     Raises:
-        ProblemError: No plan, a period that is not positive, or mcap-ros2-support is not installed.
+        ProblemError: An argument is invalid, or mcap-ros2-support is not installed.
         OSError: The file cannot be written.
     """
     checked_instance("plan", plan, Plan)
@@ -70,14 +72,13 @@ def write_mcap(plan: Plan, file: str | os.PathLike[str], period: float = 0.01, *
     try:
         from mcap_ros2.writer import Writer
     except ImportError as error:
-        words = "MCAP is written by the package mcap-ros2-support: pip install 'selfmotion[mcap]'"
-        raise ProblemError(words, name="mcap") from error
+        raise missing_package("writing MCAP", "mcap-ros2-support", "mcap") from error
     sample = plan.sample(period)
     stamps = np.round(sample.t * 1e9).astype(np.int64).tolist()
 
     def write(stream: IO[bytes]) -> None:
         writer: Any = Writer(stream)
-        writer.add_metadata("selfmotion", {})  # at the head of the file: who wrote it
+        writer.add_metadata("selfmotion", {})  # at the start of the file, where `outputs` looks for it
         if np.isfinite(sample.tip).all():
             poses = [
                 {
@@ -99,6 +100,7 @@ def write_mcap(plan: Plan, file: str | os.PathLike[str], period: float = 0.01, *
 
 
 def _header(stamp: int, frame: str) -> dict[str, Any]:
+    """Return the header of a message with a stamp in ns."""
     seconds, nanoseconds = divmod(stamp, 10**9)
     return {"stamp": {"sec": seconds, "nanosec": nanoseconds}, "frame_id": frame}
 
@@ -107,86 +109,87 @@ def _header(stamp: int, frame: str) -> dict[str, Any]:
 
 
 def read_joint_messages(file: str | os.PathLike[str], topic: str | None = None) -> tuple[str, list[tuple[int, Any]]]:
-    """The joint states, or joint trajectories, of one topic of a log: the topic; stamps, ns, and messages by fields.
+    """Return the topic, and the stamps (ns) and fields of its joint states or joint trajectories.
 
-    A stamp is that of the message's header, or where that is zero the log's own.
+    A stamp is that of the message's header, or the log time if that is zero.
 
     Args:
-        file: As ROS 2 writes it, in CDR.
-        topic: Its name; None: the only one of these kinds, or `/joint_states`.
+        file: Log as written by ROS 2, in CDR.
+        topic: Name of the topic; None: the only one of these kinds, or `/joint_states`.
 
     Raises:
-        ProblemError: No such file, no log, no such topic, or mcap-ros2-support is not installed.
+        ProblemError: The file is missing or no valid log, the topic is unknown, or mcap-ros2-support is not installed.
     """
     try:
         from mcap.records import Channel, Message, Schema
         from mcap_ros2.decoder import DecoderFactory
     except ImportError as error:
-        words = "MCAP is read by the package mcap-ros2-support: pip install 'selfmotion[mcap]'"
-        raise ProblemError(words, name="mcap") from error
-    found: dict[str, list[tuple[int, int, Any]]] = {}
+        raise missing_package("reading MCAP", "mcap-ros2-support", "mcap") from error
+    messages: dict[str, list[tuple[int, int, Any]]] = {}
     decoders, schemas = DecoderFactory(), dict[int, Any]()
-    channels: dict[int, tuple[str, Any]] = {}  # topics, and how their messages are read
+    channels: dict[int, tuple[str, Any]] = {}  # topics, and the decoders of their messages
     size = 0
     try:
         with open_regular(file, INPUT_LIMITS.log_bytes) as stream:
             for record in _records(stream):
                 if isinstance(record, Schema):
                     if record.name in (STATE, TRAJECTORY):
-                        own = Schema(record.id, DEFINITIONS[record.name].encode(), "ros2msg", record.name)
-                        schemas[record.id] = decoders.decoder_for("cdr", own)
+                        schema = Schema(record.id, DEFINITIONS[record.name].encode(), "ros2msg", record.name)
+                        schemas[record.id] = decoders.decoder_for("cdr", schema)
                 elif isinstance(record, Channel) and record.message_encoding == "cdr":
                     channels[record.id] = record.topic, schemas.get(record.schema_id)
                 elif isinstance(record, Message):
-                    name, read = channels.get(record.channel_id, ("", None))
-                    if read is not None:
+                    name, decode = channels.get(record.channel_id, ("", None))
+                    if decode is not None:
                         size += len(record.data)
                         if size > (most := INPUT_LIMITS.log_message_bytes):
-                            raise ValueError(f"its messages of joints have more than {most} bytes; split it")
-                        told = _fields(read(record.data))
-                        stamp = told["header"]["stamp"]["sec"] * 10**9 + told["header"]["stamp"]["nanosec"]
+                            raise ValueError(f"its joint messages have more than {most} bytes; split it")
+                        fields = _fields(decode(record.data))
+                        stamp = fields["header"]["stamp"]["sec"] * 10**9 + fields["header"]["stamp"]["nanosec"]
                         stamp = stamp or record.log_time
-                        found.setdefault(name, []).append((record.log_time, stamp, told))
+                        messages.setdefault(name, []).append((record.log_time, stamp, fields))
     except OSError as error:
         raise ProblemError(f"{file}: cannot be read: {error.strerror}", name="file", value=str(file)) from error
-    except Exception as error:  # what mcap, zstandard and lz4 say of broken bytes is of many kinds
-        raise ProblemError(f"{file} is no log that can be read: {error}", name="file", value=str(file)) from error
-    chosen = topic
-    if topic is None and len(found) == 1:
-        chosen = next(iter(found))
-    elif topic is None and "/joint_states" in found:
-        chosen = "/joint_states"
-    if chosen not in found:
-        known = ", ".join(sorted(found)) or "none"
-        words = f"{file}: no topic {topic!r} of joint states or joint trajectories; there are: {known}; tell the topic"
-        raise ProblemError(words, name="topic", value=topic, limit=tuple(found))
-    return chosen, [(stamp, told) for _, stamp, told in sorted(found[chosen], key=lambda one: one[0])]
+    except Exception as error:  # mcap, zstandard and lz4 raise many kinds for broken bytes
+        raise ProblemError(f"{file} is not a valid log: {error}", name="file", value=str(file)) from error
+    selected = topic
+    if topic is None and len(messages) == 1:
+        selected = next(iter(messages))
+    elif topic is None and "/joint_states" in messages:
+        selected = "/joint_states"
+    if selected not in messages:
+        known = ", ".join(sorted(messages)) or "none"
+        words = f"{file}: no topic {topic!r} of joint states or joint trajectories; available: {known}; name the topic"
+        raise ProblemError(words, name="topic", value=topic, limit=tuple(messages))
+    return selected, [
+        (stamp, fields) for _, stamp, fields in sorted(messages[selected], key=lambda message: message[0])
+    ]
 
 
 def _records(stream: IO[bytes]) -> Iterator[Any]:
-    """The records of a log in the order of its file, those in its chunks too.
+    """Yield the records of a log in the order of its file, including those in chunks.
 
     Raises:
-        ValueError: A record is too large, or all that it unpacks to.
+        ValueError: A record, or the unpacked log, is too large.
     """
     from mcap.exceptions import EndOfFile
     from mcap.records import Chunk
     from mcap.stream_reader import StreamReader
 
-    room, largest = INPUT_LIMITS.log_bytes, INPUT_LIMITS.log_record_bytes
+    remaining, largest = INPUT_LIMITS.log_bytes, INPUT_LIMITS.log_record_bytes
     for record in StreamReader(stream, emit_chunks=True, record_size_limit=largest).records:
         if not isinstance(record, Chunk):
             yield record
             continue
-        room -= record.uncompressed_size
-        if record.uncompressed_size > largest or room < 0:
-            raise ValueError(f"it unpacks to more than {INPUT_LIMITS.log_bytes} bytes, or a part of it to {largest}")
+        remaining -= record.uncompressed_size
+        if record.uncompressed_size > largest or remaining < 0:
+            raise ValueError(f"it unpacks to more than {INPUT_LIMITS.log_bytes} bytes, or a record to {largest}")
         with suppress(EndOfFile):
             yield from StreamReader(io.BytesIO(_unpacked(record)), skip_magic=True).records
 
 
 def _unpacked(chunk: Any) -> bytes:
-    """The contents of a chunk, never more than it says that it has."""
+    """Return the contents of a chunk, never more than its declared size."""
     data, size = chunk.data, chunk.uncompressed_size
     if chunk.compression == "zstd":
         zstd = import_module("zstandard").ZstdDecompressor(max_window_size=INPUT_LIMITS.log_record_bytes)
@@ -194,12 +197,12 @@ def _unpacked(chunk: Any) -> bytes:
     elif chunk.compression == "lz4":
         data = import_module("lz4.frame").LZ4FrameDecompressor().decompress(data, size + 1)
     if len(data) != size:
-        raise ValueError("a chunk does not unpack to the size that it says")
+        raise ValueError("a chunk does not unpack to its declared size")
     return bytes(data)
 
 
 def _fields(message: Any) -> Any:
-    """A message, or a list of them, as names and values."""
+    """Return a message, or a list of messages, as dictionaries."""
     if isinstance(message, list):
         return [_fields(each) for each in message] if message and hasattr(message[0], "__slots__") else message
     if not hasattr(message, "__slots__"):
@@ -207,32 +210,34 @@ def _fields(message: Any) -> Any:
     return {name: _fields(getattr(message, name)) for name in message.__slots__}
 
 
-NEEDED = ("LineStrips3D", "Points3D", "Scalars", "TimeColumn", "log", "send_columns")
-"""What is called of the module (0.23 or later)."""
+REQUIRED_NAMES = ("LineStrips3D", "Points3D", "Scalars", "TimeColumn", "log", "send_columns")
+"""Names of the module rerun that are used (0.23 or later)."""
 
 
 def log_rerun(plan: Plan, rerun: Any, period: float = 0.01, *, entity: str = "plan", timeline: str = "time") -> None:
-    """Log joints, velocities and accelerations every `period` s as scalars, and the tip as a point on its way.
+    """Log joint positions, velocities and accelerations as scalars, and the tip as a point on its path.
 
-    They stand under `ENTITY/position/JOINT`, `ENTITY/velocity/JOINT`, `ENTITY/acceleration/JOINT`, `ENTITY/tip` and
-    `ENTITY/tip_path`, in rad or m, per s and s^2, and m in the world. What is recorded and where to is the caller's:
-    `import rerun; rerun.init("seam", spawn=True); log_rerun(plan, rerun)`.
+    The entities are `ENTITY/position/JOINT`, `ENTITY/velocity/JOINT`, `ENTITY/acceleration/JOINT`, `ENTITY/tip` and
+    `ENTITY/tip_path`, in rad or m, per s and s^2, and in m in world. The caller starts the recording: `import rerun;
+    rerun.init("seam", spawn=True); log_rerun(plan, rerun)`.
 
     Args:
-        plan: To be shown. period: s.
-        rerun: The module `rerun`, or what has its `log`, `send_columns` and archetypes.
-        entity: What the paths of the entities begin with. timeline: The name of the time, from 0 s.
+        plan: The plan.
+        rerun: The module `rerun`, or an object with its `log`, `send_columns` and archetypes.
+        period: Sampling period, s.
+        entity: Prefix of the entity paths.
+        timeline: Name of the time, which starts at 0 s.
 
     Raises:
-        ProblemError: No plan, a period that is not positive, or something without what is called of the module.
+        ProblemError: The plan or the period is invalid, or `rerun` lacks a required name.
     """
     checked_instance("plan", plan, Plan)
     checked_text("entity", entity)
     checked_text("timeline", timeline)
-    missing = [name for name in NEEDED if not callable(getattr(rerun, name, None))]
+    missing = [name for name in REQUIRED_NAMES if not callable(getattr(rerun, name, None))]
     if missing:
-        words = f"the module rerun is expected (0.23 or later), not {rerun!r}, which has no {', '.join(missing)}"
-        raise ProblemError(words, name="rerun", value=rerun, limit=NEEDED)
+        words = f"the module rerun (0.23 or later) is expected, not {rerun!r}, which has no {', '.join(missing)}"
+        raise ProblemError(words, name="rerun", value=rerun, limit=REQUIRED_NAMES)
     sample = plan.sample(period)
     times = [rerun.TimeColumn(timeline, duration=sample.t)]
     kinds = {"position": sample.joints, "velocity": sample.rates, "acceleration": sample.accelerations}
@@ -241,6 +246,6 @@ def log_rerun(plan: Plan, rerun: Any, period: float = 0.01, *, entity: str = "pl
             columns = rerun.Scalars.columns(scalars=np.ascontiguousarray(column))
             rerun.send_columns(f"{entity}/{kind}/{name}", indexes=times, columns=columns)
     if np.isfinite(sample.tip).all():
-        places = np.ascontiguousarray(sample.tip[:, :3])
-        rerun.log(f"{entity}/tip_path", rerun.LineStrips3D([places]), static=True)
-        rerun.send_columns(f"{entity}/tip", indexes=times, columns=rerun.Points3D.columns(positions=places))
+        positions = np.ascontiguousarray(sample.tip[:, :3])
+        rerun.log(f"{entity}/tip_path", rerun.LineStrips3D([positions]), static=True)
+        rerun.send_columns(f"{entity}/tip", indexes=times, columns=rerun.Points3D.columns(positions=positions))

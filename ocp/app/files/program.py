@@ -1,4 +1,4 @@
-"""A program of several paths with rapids and pauses between, as it was read, and over time."""
+"""A program of cuts, rapids and pauses as read from a file, and its trajectory."""
 
 from __future__ import annotations
 
@@ -16,49 +16,49 @@ from ocp.errors import NOT_NUMBERS, ProblemError, checked_choice, checked_instan
 from ocp.motion.schedule import LineLimits, Schedule, schedule
 
 __all__ = [
-    "TOLERANCE",
+    "DEFAULT_TOLERANCE_M",
     "Cut",
     "Note",
     "Pause",
     "Program",
     "ProgramMotion",
     "Rapid",
-    "Stretch",
+    "Section",
     "TimedProgram",
     "checked_reversal",
     "smoothed",
 ]
 
-TOLERANCE = 5e-5
-"""m, where neither the file nor the caller says one: a usual contour tolerance of machine tools."""
+DEFAULT_TOLERANCE_M = 5e-5
+"""Deviation allowed when neither the file nor the caller gives one: a usual contour tolerance of machine tools."""
 
 
 class Note(NamedTuple):
-    """Something in a file that was passed over or read in one of several ways.
+    """Words of a file that were ignored or interpreted in one of several ways.
 
     Attributes:
-        text: What, and what was made of it.
-        lines: Where, counted from 1.
+        text: The words and their interpretation.
+        lines: Line numbers, from 1.
     """
 
     text: str
     lines: tuple[int, ...]
 
     def __str__(self) -> str:
-        shown = ", ".join(str(line) for line in self.lines[:8]) + (" ..." if len(self.lines) > 8 else "")
-        return f"line{'s' if len(self.lines) > 1 else ''} {shown}: {self.text}"
+        numbers = ", ".join(str(line) for line in self.lines[:8]) + (" ..." if len(self.lines) > 8 else "")
+        return f"line{'s' if len(self.lines) > 1 else ''} {numbers}: {self.text}"
 
 
 @dataclass(frozen=True, eq=False)
 class Cut:
-    """A path that is run at its feeds without a stop.
+    """A path that is traversed at its feeds without a stop.
 
     Attributes:
-        path: Of n segments.
-        feeds: Asked line speed of each segment. Shape (n,), m/s.
-        tolerances: How far the rounded path may stray in the mode of each segment, nan where the file says nothing.
+        path: Path of n segments.
+        feeds: Programmed line speed of each segment. Shape (n,), m/s.
+        tolerances: Deviation allowed for the rounded path in the mode of each segment, nan if the file gives none.
             Shape (n,), m.
-        lines: Of the file, for each segment. Shape (n,).
+        lines: Line number of each segment in the file. Shape (n,).
     """
 
     path: Path
@@ -68,24 +68,24 @@ class Cut:
 
     @property
     def name(self) -> str:
-        """With the lines it comes from."""
+        """Description with line numbers."""
         return f"cut, lines {self.lines[0]} to {self.lines[-1]}"
 
     def smooth(self, tolerance: float | None = None, **options: Any) -> SmoothPath:
-        """The path with its corners rounded, see `Program.smooth`."""
-        given = np.fmin(self.tolerances[:-1], self.tolerances[1:])
+        """Return the path with rounded corners, see `Program.smooth`."""
+        deviation = np.fmin(self.tolerances[:-1], self.tolerances[1:])
         if tolerance is not None:
-            given = np.fmin(given, checked_positive("tolerance", tolerance))
-        return smoothed(self.path, np.where(np.isnan(given), TOLERANCE, given), options)
+            deviation = np.fmin(deviation, checked_positive("tolerance", tolerance))
+        return smoothed(self.path, np.where(np.isnan(deviation), DEFAULT_TOLERANCE_M, deviation), options)
 
 
 @dataclass(frozen=True, eq=False)
 class Rapid:
-    """A straight way from one cut to another.
+    """A straight move between two cuts.
 
     Attributes:
         start, end: Shape (3,), m.
-        line: Of the file.
+        line: Line number in the file.
     """
 
     start: Array
@@ -94,7 +94,7 @@ class Rapid:
 
     @property
     def name(self) -> str:
-        """With the line it comes from."""
+        """Description with the line number."""
         return f"rapid, line {self.line}"
 
 
@@ -103,9 +103,9 @@ class Pause:
     """A stop.
 
     Attributes:
-        duration: s; zero where the program waits to be started again.
-        line: Of the file.
-        why: The word that asks for it.
+        duration: s; zero if the program waits for the operator.
+        line: Line number in the file.
+        why: The code that causes it.
     """
 
     duration: float
@@ -114,50 +114,50 @@ class Pause:
 
     @property
     def name(self) -> str:
-        """With the line it comes from."""
+        """Description with the line number."""
         return f"pause {self.why}, line {self.line}"
 
 
-Stretch: TypeAlias = Cut | Rapid | Pause
+Section: TypeAlias = Cut | Rapid | Pause
 
 
 @dataclass(frozen=True, eq=False)
 class Program:
-    """What a file asks for, in its order.
+    """Contents of a program file, in its order.
 
     Attributes:
-        stretches: Cuts, rapids and pauses; each starts where the one before ends.
-        start: Where the program begins. Shape (3,), m.
-        notes: What was passed over, by line.
+        sections: Cuts, rapids and pauses; each starts where the previous one ends.
+        start: Initial position. Shape (3,), m.
+        notes: Words that were ignored or interpreted.
     """
 
-    stretches: tuple[Stretch, ...]
+    sections: tuple[Section, ...]
     start: Array
     notes: tuple[Note, ...] = ()
 
     @cached_property
     def cuts(self) -> tuple[Cut, ...]:
-        """The paths that are run at a feed."""
-        return tuple(each for each in self.stretches if isinstance(each, Cut))
+        """The cuts of the program."""
+        return tuple(each for each in self.sections if isinstance(each, Cut))
 
     @property
     def paths(self) -> tuple[Path, ...]:
-        """Of the cuts."""
+        """The paths of the cuts."""
         return tuple(cut.path for cut in self.cuts)
 
     @property
     def feeds(self) -> tuple[Array, ...]:
-        """Asked line speeds of the paths, one for each segment, m/s."""
+        """Programmed line speed of each segment of each path, m/s."""
         return tuple(cut.feeds for cut in self.cuts)
 
     @property
     def rapids(self) -> tuple[Rapid, ...]:
-        """The ways between."""
-        return tuple(each for each in self.stretches if isinstance(each, Rapid))
+        """The rapids of the program."""
+        return tuple(each for each in self.sections if isinstance(each, Rapid))
 
     @property
     def length(self) -> float:
-        """Of all cuts, m."""
+        """Total length of the cuts, m."""
         return sum(path.length for path in self.paths)
 
     def __str__(self) -> str:
@@ -166,93 +166,96 @@ class Program:
         return "\n".join([head, *(str(note) for note in self.notes)])
 
     def placed(self, position: ArrayInput = (0.0, 0.0, 0.0), orientation: ArrayInput = NO_ROTATION) -> Program:
-        """The program where its zero has a pose in the world; see `models.Path.placed`.
+        """Return the program with its origin at a pose in world; see `models.Path.placed`.
 
         Raises:
-            ModelError: No position, no unit quaternion.
+            ModelError: The position is invalid, or the orientation is not a unit quaternion.
         """
         ends = [self.start, *(end for each in self.rapids for end in (each.start, each.end))]
         moved = iter(_moved(np.array(ends), position, orientation))
         start = next(moved)
-        made: list[Stretch] = []
-        for each in self.stretches:
+        sections: list[Section] = []
+        for each in self.sections:
             if isinstance(each, Cut):
-                made.append(replace(each, path=each.path.placed(position, orientation)))
-            else:
-                made.append(replace(each, start=next(moved), end=next(moved)) if isinstance(each, Rapid) else each)
-        return Program(tuple(made), start, self.notes)
+                each = replace(each, path=each.path.placed(position, orientation))
+            elif isinstance(each, Rapid):
+                each = replace(each, start=next(moved), end=next(moved))
+            sections.append(each)
+        return Program(tuple(sections), start, self.notes)
 
     def smooth(self, tolerance: float | None = None, **options: Any) -> tuple[SmoothPath, ...]:
-        """Every path with its corners rounded.
+        """Return every path with rounded corners.
 
         Args:
-            tolerance: How far (m) a rounded path may stray; a tolerance in the file (G64 P) holds where it is smaller.
-                None takes that of the file, or 0.05 mm.
+            tolerance: Largest deviation from the path, m. A smaller tolerance in the file (G64 P) takes precedence.
+                None: that of the file, or 0.05 mm.
             options: `kind`, `shape`, `overlap` of models.smooth.
 
         Raises:
-            ProblemError: A tolerance that is not positive, unknown options.
+            ProblemError: The tolerance is not positive, or an option is unknown.
         """
         return tuple(cut.smooth(tolerance, **options) for cut in self.cuts)
 
     def schedule(
         self, limits: LineLimits, *, rapid: float | None = None, tolerance: float | None = None, **options: Any
     ) -> TimedProgram:
-        """The whole program over time: each path at its feeds, each rapid a straight line, from rest to rest.
+        """Return the trajectory of the program: each section from rest to rest, cuts at their feeds, rapids straight.
 
         Args:
-            limits: Of all stretches; its speed, one number, is the most that a feed may be.
-            rapid: Speed of rapids, m/s; that of the limits if None.
-            tolerance, options: As of `smooth`.
+            limits: Limits of all sections; the speed, one number, also limits the feeds.
+            rapid: Speed of rapids, m/s; None: the speed of the limits.
+            tolerance, options: As in `smooth`.
 
         Raises:
-            ProblemError: No limits, joint limits, a speed for each segment.
+            ProblemError: The limits are invalid, include joint limits, or have one speed per segment.
         """
         checked_instance("limits", limits, LineLimits)
         if np.ndim(limits.speed) or limits.joints is not None:
-            what = "joints" if limits.joints is not None else "speed"
-            message = f"limits of a program: {what} must be {'None' if what == 'joints' else 'one number, m/s'}"
-            raise ProblemError(message, name=what, value=getattr(limits, what))
+            name = "joints" if limits.joints is not None else "speed"
+            message = f"limits of a program: {name} must be {'None' if name == 'joints' else 'one number, m/s'}"
+            raise ProblemError(message, name=name, value=getattr(limits, name))
         fastest = float(np.asarray(limits.speed))
-        across = fastest if rapid is None else checked_positive("rapid", rapid)
-        timed: list[Schedule | None] = []
-        for each in self.stretches:
+        rapid_speed = fastest if rapid is None else checked_positive("rapid", rapid)
+        schedules: list[Schedule | None] = []
+        for each in self.sections:
             if isinstance(each, Cut):
                 path = each.smooth(tolerance, **options)
-                timed.append(schedule(path, replace(limits, speed=np.minimum(each.feeds, fastest))))
+                schedules.append(schedule(path, replace(limits, speed=np.minimum(each.feeds, fastest))))
             elif isinstance(each, Rapid):
-                line = smooth(Path.through([each.start, each.end]), TOLERANCE)
-                timed.append(schedule(line, replace(limits, speed=across)))
+                line = smooth(Path.through([each.start, each.end]), DEFAULT_TOLERANCE_M)
+                schedules.append(schedule(line, replace(limits, speed=rapid_speed)))
             else:
-                timed.append(None)
-        return TimedProgram(self, tuple(timed))
+                schedules.append(None)
+        return TimedProgram(self, tuple(schedules))
 
 
 def checked_reversal(owner: str, value: Any) -> Reversal:
-    """`value`, or ProblemError unless it is "split" or a width, m."""
+    """Return `value`; raise ProblemError unless it is "split" or a width, m."""
     if isinstance(value, str):
         checked_choice(f"{owner}: reversal", value, ("split",))
         return "split"
     return float(checked_positive(f"{owner}: reversal", value))
 
 
-def _counted(number: int, what: str) -> str:
-    return f"{number} {what}{'' if number == 1 else 's'}"
+def _counted(number: int, noun: str) -> str:
+    """Return a count with its noun."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def _moved(points: Array, position: ArrayInput, orientation: ArrayInput) -> Array:
-    # a path of one line from the origin stands for the checks and for the rotation
+    # lines from the origin along the axes check the pose and give its rotation
+    """Return points (k, 3) moved to a pose."""
     frame = [Path.through([(0, 0, 0), axis]).placed(position, orientation).segments[0] for axis in np.eye(3)]
     origin = np.asarray(frame[0].start)
     return np.asarray(origin + points @ np.array([np.asarray(line.end) - origin for line in frame]))
 
 
 def smoothed(path: Path, deviation: ArrayInput, options: dict[str, Any]) -> SmoothPath:
-    """A path rounded within a deviation, with options of models.smooth; its errors are ProblemErrors."""
+    """Return a path rounded within a deviation, with options of models.smooth; raise its errors as ProblemError."""
     known = {"kind", "shape", "overlap"}
-    if strange := [name for name in options if name not in known]:
-        message = f"smooth: unknown option {strange[0]!r}; known: {', '.join(sorted(known))}"
-        raise ProblemError(message, name=strange[0], limit=tuple(sorted(known)))
+    if unknown := [name for name in options if name not in known]:
+        message = f"smooth: unknown option {unknown[0]!r}; known: {', '.join(sorted(known))}"
+        raise ProblemError(message, name=unknown[0], limit=tuple(sorted(known)))
     try:
         return smooth(path, deviation=deviation, **options)
     except ModelError as error:
@@ -260,19 +263,19 @@ def smoothed(path: Path, deviation: ArrayInput, options: dict[str, Any]) -> Smoo
 
 
 class ProgramMotion(NamedTuple):
-    """Where a program is at M instants.
+    """Motion of a program at M sample times.
 
     Attributes:
         t: Time. Shape (M,), s.
-        stretch: Index in the program's stretches. Shape (M,).
-        distance: Along the stretch. Shape (M,), m.
+        section: Index of the section. Shape (M,).
+        distance: Path length from the start of the section. Shape (M,), m.
         position: Shape (M, 3), m.
-        tangent: Unit; zero in a pause. Shape (M, 3).
-        speed, acceleration, jerk: Of the line. Shape (M,), m/s, m/s^2, m/s^3.
+        tangent: Unit vector; zero in a pause. Shape (M, 3).
+        speed, acceleration, jerk: Along the path. Shape (M,), m/s, m/s^2, m/s^3.
     """
 
     t: Array
-    stretch: NDArray[np.intp]
+    section: NDArray[np.intp]
     distance: Array
     position: Array
     tangent: Array
@@ -283,11 +286,11 @@ class ProgramMotion(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class TimedProgram:
-    """One trajectory of all stretches, one after the other, each from rest to rest.
+    """Trajectory of all sections in sequence, each from rest to rest.
 
     Attributes:
-        program: What it is made for.
-        schedules: Of each stretch, whose `path` is the rounded one; None for a pause.
+        program: The program.
+        schedules: Schedule of each section, whose `path` is the rounded one; None for a pause.
     """
 
     program: Program
@@ -295,26 +298,26 @@ class TimedProgram:
 
     @cached_property
     def bounds(self) -> Array:
-        """Times at which the stretches begin, and the end. Shape (K + 1,), s."""
-        pairs = zip(self.program.stretches, self.schedules, strict=True)
+        """Start times of the sections, and the end. Shape (K + 1,), s."""
+        pairs = zip(self.program.sections, self.schedules, strict=True)
         durations = [each.duration if timed is None else timed.duration for each, timed in pairs]  # type: ignore[union-attr]
         return np.concatenate([[0.0], np.cumsum(durations)])
 
     @property
     def duration(self) -> float:
-        """s."""
+        """Duration of the program, s."""
         return float(self.bounds[-1])
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the stretches, with the lines they come from."""
-        return tuple(each.name for each in self.program.stretches)
+        """Descriptions of the sections with line numbers."""
+        return tuple(each.name for each in self.program.sections)
 
     def at(self, time: ArrayLike) -> ProgramMotion:
-        """Motion at times of [0, duration]. Shape (M,), s. At a bound it is that of the stretch that begins.
+        """Return the motion at times (M,) of [0, duration], s. At a boundary it is that of the section that begins.
 
         Raises:
-            ProblemError: nan, or a time outside by more than rounding.
+            ProblemError: A time is not a number, or is outside by more than rounding.
         """
         try:
             t = np.atleast_1d(floats(time))
@@ -322,30 +325,30 @@ class TimedProgram:
             raise ProblemError(f"time {time!r} is not numeric", name="time", value=time) from error
         slack = 1e-9 * self.duration
         if t.ndim != 1 or not ((t >= -slack) & (t <= self.duration + slack)).all():
-            message = f"times must be a row within the program, 0 to {self.duration:g} s"
+            message = f"times must be a number or a vector within the program, 0 to {self.duration:g} s"
             raise ProblemError(message, name="time", value=time, limit=(0.0, self.duration))
         t = np.clip(t, 0.0, self.duration)
         index = np.clip(np.searchsorted(self.bounds, t, side="right") - 1, 0, len(self.schedules) - 1)
         rows = {name: np.zeros(len(t)) for name in ("distance", "speed", "acceleration", "jerk")}
         position, tangent = np.empty((len(t), 3)), np.zeros((len(t), 3))
-        for which in np.unique(index):
-            here = np.flatnonzero(index == which)
-            timed = self.schedules[which]
-            if timed is None:
-                position[here] = self._rest(int(which))
+        for number in np.unique(index):
+            members = np.flatnonzero(index == number)
+            plan = self.schedules[number]
+            if plan is None:
+                position[members] = self._rest(int(number))
                 continue
-            motion = timed.at(np.minimum(t[here] - self.bounds[which], timed.duration))
-            place = timed.path.at(motion.distance)
-            position[here], tangent[here] = place.position, place.tangent
+            motion = plan.at(np.minimum(t[members] - self.bounds[number], plan.duration))
+            point = plan.path.at(motion.distance)
+            position[members], tangent[members] = point.position, point.tangent
             for name, row in rows.items():
-                row[here] = getattr(motion, name)
+                row[members] = getattr(motion, name)
         return ProgramMotion(
             t, index, rows["distance"], position, tangent, rows["speed"], rows["acceleration"], rows["jerk"]
         )
 
     def _rest(self, which: int) -> Array:
-        """Where a pause stands: the end of what is before it."""
-        for each in reversed(self.program.stretches[:which]):
+        """Return the position of a pause: the end of the previous move."""
+        for each in reversed(self.program.sections[:which]):
             if isinstance(each, Rapid):
                 return each.end
             if isinstance(each, Cut):

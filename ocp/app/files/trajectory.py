@@ -1,12 +1,11 @@
-"""Anybody's joint trajectories, read as they are: CSV, JointTrajectory as JSON or YAML, MCAP.
+"""Read joint trajectories from any source: CSV, JointTrajectory as JSON or YAML, MCAP.
 
-Nothing is put right that may be wrong with the motion: values that are no numbers, times that do not increase and
-joints that nobody has are kept, for who checks the motion to name them.
+Faults of the motion are kept for the check that reports them: values that are not numbers, times that do not increase,
+and joints that the robot does not have.
 
-A CSV has a head. `time` or `t` is the time; a column is a joint's position by the joint's name, or one of its
-velocities, accelerations or efforts by a word behind or before it: `elbow.velocity`, `elbow_vel`, `velocity/elbow`. A
-unit may stand in brackets: `elbow [deg]`, `time [ms]`. Commas, semicolons, tabs or blanks part the columns, `#` begins
-a comment.
+A CSV has a header. `time` or `t` is the time. A column with the name of a joint is its position; a word before or after
+the name makes it a velocity, acceleration or effort: `elbow.velocity`, `elbow_vel`, `velocity/elbow`. A unit may follow
+in brackets: `elbow [deg]`, `time [ms]`. Commas, semicolons, tabs or blanks separate the columns; `#` begins a comment.
 """
 
 from __future__ import annotations
@@ -21,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.arrays import Array
-from ocp.app.files.lines import FileName, cells_of, is_number, parts_of, read_lines, read_tree, wrong_line
 from ocp.app.files.mcap import read_joint_messages
+from ocp.app.files.text_files import FileName, children_of, is_number, line_error, read_lines, read_tree, split_cells
 from ocp.errors import NOT_NUMBERS, ProblemError, checked_choice, checked_each, checked_positive, checked_text
 from ocp.storage import table_joints
 
@@ -39,38 +38,27 @@ WORDS = {
 }
 TIMES = ("time", "t", "time_from_start", "timestamp", "secs", "seconds")
 UNITS = {
-    "s": 1.0,
-    "sec": 1.0,
-    "ms": 1e-3,
-    "us": 1e-6,
-    "ns": 1e-9,
-    "rad": 1.0,
-    "deg": np.pi / 180,
-    "°": np.pi / 180,
-    "m": 1.0,
-    "mm": 1e-3,
-    "cm": 1e-2,
-    "n m": 1.0,
-    "nm": 1.0,
-    "n": 1.0,
+    **dict.fromkeys(("s", "sec", "rad", "m", "n m", "nm", "n"), 1.0),
+    **{"ms": 1e-3, "us": 1e-6, "ns": 1e-9, "mm": 1e-3, "cm": 1e-2},
+    **dict.fromkeys(("deg", "°"), np.pi / 180),
 }
-HEAD = re.compile(r"(.*)[\[(]([^\[(\])]*)[\])]")
+HEADER_WITH_UNIT = re.compile(r"(.*)[\[(]([^\[(\])]*)[\])]")
 FORMATS = {".json": "json", ".yaml": "yaml", ".yml": "yaml", ".mcap": "mcap"}
 
 
 @dataclass(frozen=True, eq=False)
 class RawTrajectory:
-    """What a file says of joints over time, its faults and all.
+    """Joint trajectory as written in a file, with its faults.
 
     Attributes:
-        names: Of the joints. Those of a table may be columns of something else: nothing in it tells.
-        t: As they stand, s. Shape (M,).
-        positions, velocities, accelerations, efforts: nan where there is none; None where the file has none of the
-            kind. Shape (M, n), rad or m, N m or N.
-        lines: Of the file, or numbers of points or messages, from 1. Shape (M,).
-        told: Whether the file says of every name that it is a joint's.
-        notes: What was passed over, or converted.
-        file: Its name.
+        names: Names of the joints. The columns of a table may be something else, which the table does not say.
+        t: Times as written, s. Shape (M,).
+        positions, velocities, accelerations, efforts: Shape (M, n), rad or m, per s, per s^2, N m or N. nan if a value
+            is missing, None if all are.
+        lines: Line numbers in the file, or numbers of points or messages, from 1. Shape (M,).
+        names_are_joints: Whether the format guarantees that every name is a joint.
+        notes: What was ignored or converted.
+        file: Name of the file.
     """
 
     names: tuple[str, ...]
@@ -80,7 +68,7 @@ class RawTrajectory:
     accelerations: Array | None
     efforts: Array | None
     lines: Indices
-    told: bool
+    names_are_joints: bool
     notes: tuple[str, ...]
     file: str
 
@@ -94,18 +82,18 @@ def read_trajectory(
     joints: Sequence[str] = (),
     kind: str | None = None,
 ) -> RawTrajectory:
-    """The trajectory in a file.
+    """Read a trajectory from a file.
 
     Args:
-        file: .csv or any text, .json, .yaml (needs the package `pyyaml`), .mcap (needs `mcap`).
-        columns: Names of the columns of a table without a head.
-        period: Of the samples, s, where the table has no time.
-        topic: Of an MCAP with several.
-        joints: Names that are joints even where they look like something else.
-        kind: "csv", "json", "yaml" or "mcap"; None: by the end of its name.
+        file: .csv or any text, .json, .yaml (needs the package `pyyaml`), .mcap (needs `mcap-ros2-support`).
+        columns: Names of the columns of a table without a header.
+        period: Sampling period, s, of a table without times.
+        topic: Topic of an MCAP with several.
+        joints: Names that are joints even if they look like something else.
+        kind: "csv", "json", "yaml" or "mcap"; None: by the suffix of the name.
 
     Raises:
-        ProblemError: A file that cannot be read, or holds no trajectory; by line where it has lines.
+        ProblemError: The file cannot be read or contains no trajectory; names the line where there is one.
     """
     if not isinstance(file, str | Path):
         raise ProblemError(f"a file name is expected, not {file!r}", name="file", value=file)
@@ -134,6 +122,7 @@ def read_trajectory(
 def _read_table(
     file: FileName, columns: Sequence[str] | None, period: float | None, joints: frozenset[str]
 ) -> RawTrajectory:
+    """Read a trajectory from a table."""
     numbers, texts = [], []
     for number, text in enumerate(read_lines(file), 1):
         line = text.partition("#")[0]
@@ -141,50 +130,50 @@ def _read_table(
             numbers.append(number)
             texts.append(line.strip(" "))
     if not texts:
-        raise ProblemError(f"{file}: the file is empty but for comments", name="file", value=str(file))
+        raise ProblemError(f"{file}: the file has only comments", name="file", value=str(file))
     delimiter = next((sign for sign in ";,\t" if sign in texts[0]), " ")
-    first = cells_of(texts[0], delimiter)
+    first = split_cells(texts[0], delimiter)
     if columns is None:
         if all(is_number(cell or "nan") for cell in first):
-            why = "no head names the columns; name them: --columns time,NAME,... (columns=), in their order"
-            raise wrong_line(file, numbers[0], texts[0], why)
+            why = "no header names the columns; name them in order: --columns time,NAME,... (columns=)"
+            raise line_error(file, numbers[0], texts[0], why)
         head, rows, numbers = first, texts[1:], numbers[1:]
     else:
-        told = not all(is_number(cell or "nan") for cell in first)
-        head, rows, numbers = list(columns), texts[told:], numbers[told:]
+        has_header = not all(is_number(cell or "nan") for cell in first)
+        head, rows, numbers = list(columns), texts[has_header:], numbers[has_header:]
     while head and not head[-1].strip():  # a delimiter at the end of every line
         head = head[:-1]
     if not rows:
-        raise ProblemError(f"{file}: there is a head and no sample", name="file", value=str(file))
+        raise ProblemError(f"{file}: the file has a header but no sample", name="file", value=str(file))
     table = _numbers(file, rows, numbers, delimiter, len(head))
-    time, found, notes = _meanings(file, head, joints)
+    time, columns_of_values, notes = _meanings(file, head, joints)
     if time is None and period is None:
-        words = f"{file}: no column is the time among {', '.join(map(repr, head))}; name one `time`, or tell the period"
+        words = f"{file}: no column is the time among {', '.join(map(repr, head))}; name one `time`, or give the period"
         raise ProblemError(words, name="time", value=tuple(head))
     t = np.asarray(np.arange(len(rows)) * (period or 0.0) if time is None else table[:, time[0]] * time[1], dtype=float)
-    names = tuple(dict.fromkeys(name for name, _ in found))
+    names = tuple(dict.fromkeys(name for name, _ in columns_of_values))
     values: dict[str, Array] = {}
-    for (name, what), (column, scale) in found.items():
-        array = values.setdefault(what, np.full((len(rows), len(names)), np.nan))
+    for (name, quantity), (column, scale) in columns_of_values.items():
+        array = values.setdefault(quantity, np.full((len(rows), len(names)), np.nan))
         array[:, names.index(name)] = table[:, column] * scale
     if "positions" not in values:
-        words = f"{file}: no column is a position among {', '.join(map(repr, head))}; name columns as the joints"
+        words = f"{file}: no column is a position among {', '.join(map(repr, head))}; name the columns like the joints"
         raise ProblemError(words, name="positions", value=tuple(head))
-    v, a, efforts = (values.get(what) for what in KINDS[1:])
+    v, a, efforts = (values.get(quantity) for quantity in KINDS[1:])
     lines = np.array(numbers)
     return RawTrajectory(names, t, values["positions"], v, a, efforts, lines, False, tuple(notes), str(file))
 
 
 def _numbers(file: FileName, rows: list[str], numbers: list[int], delimiter: str, width: int) -> Array:
-    """The table; nan where a cell is empty. Shape (M, width)."""
-    split = [cells_of(row, delimiter) for row in rows]
+    """Return the numbers of a table, nan for empty cells. Shape (M, width)."""
+    split = [split_cells(row, delimiter) for row in rows]
     for row, number, cells in zip(rows, numbers, split, strict=True):
         if len(cells) != width:
             while len(cells) > width and not cells[-1]:
                 cells.pop()
             if len(cells) != width:
-                why = f"{len(cells)} columns, the head has {width}; complete the row"
-                raise wrong_line(file, number, row, why, width)
+                why = f"{len(cells)} columns, the header has {width}; complete the row"
+                raise line_error(file, number, row, why, width)
     try:
         return np.array(split, dtype=float)
     except ValueError:
@@ -192,7 +181,7 @@ def _numbers(file: FileName, rows: list[str], numbers: list[int], delimiter: str
     for row, number, cells in zip(rows, numbers, split, strict=True):
         for k, cell in enumerate(cells):
             if not is_number(cell or "nan"):
-                raise wrong_line(file, number, row, f"{cell!r} is no number; correct it")
+                raise line_error(file, number, row, f"{cell!r} is not a number; correct it")
             cells[k] = cell or "nan"
     return np.array(split, dtype=float)
 
@@ -200,51 +189,51 @@ def _numbers(file: FileName, rows: list[str], numbers: list[int], delimiter: str
 def _meanings(
     file: FileName, head: list[str], joints: frozenset[str]
 ) -> tuple[tuple[int, float] | None, dict[tuple[str, str], tuple[int, float]], list[str]]:
-    """Column and unit of the time; those of each joint's values by name and kind; notes."""
-    if own := table_joints(head):  # whatever their names seem to mean
-        columns = [(name, kind) for kind in KINDS[:3] for name in own]
+    """Return column and unit of the time, those of each joint's values by name and kind, and notes."""
+    if joint_names := table_joints(head):  # our own table: the names of its joints are not interpreted
+        columns = [(name, kind) for kind in KINDS[:3] for name in joint_names]
         return (0, 1.0), {key: (column, 1.0) for column, key in enumerate(columns, 1)}, []
     time: tuple[int, float] | None = None
-    found: dict[tuple[str, str], tuple[int, float]] = {}
+    columns_of_values: dict[tuple[str, str], tuple[int, float]] = {}
     notes = []
     for column, cell in enumerate(head):
         name, unit = cell.strip(), ""
-        if name not in joints and (told := HEAD.fullmatch(name)):
-            name, unit = told[1].strip(), told[2].strip().lower()
+        if name not in joints and (match := HEADER_WITH_UNIT.fullmatch(name)):
+            name, unit = match[1].strip(), match[2].strip().lower()
             for ending in ("/s^2", "/s2", "/s²", "/s"):
                 unit = unit.removesuffix(ending) or unit
             if unit and unit not in UNITS:
-                words = f"{file}: the column {cell!r} is in an unknown unit; known: {', '.join(UNITS)}"
+                words = f"{file}: the column {cell!r} has an unknown unit; known: {', '.join(UNITS)}"
                 raise ProblemError(words, name=name, value=unit, limit=tuple(UNITS))
         scale = UNITS.get(unit, 1.0)
         if scale != 1.0:
             notes.append(f"{name} is converted from {unit}")
         if name.lower() in TIMES and name not in joints:
             if time is not None:
-                raise ProblemError(f"{file}: two columns are the time; leave one", name="time", value=tuple(head))
+                raise ProblemError(f"{file}: two columns are the time; remove one", name="time", value=tuple(head))
             time = column, scale
             continue
         if not name:
-            notes.append(f"column {column + 1} has no name and is not read")
+            notes.append(f"column {column + 1} has no name and is ignored")
             continue
         key = (name, "positions") if name in joints else _kind(name)
-        if key[0] not in joints and (last := key[0].rpartition("/")[2]) in joints:  # with the name of a topic before it
+        if key[0] not in joints and (last := key[0].rpartition("/")[2]) in joints:  # prefixed with the name of a topic
             key = last, key[1]
-        if key in found:
-            raise ProblemError(f"{file}: {cell!r} heads two columns; leave one", name=name, value=tuple(head))
-        found[key] = column, scale
-    return time, found, notes
+        if key in columns_of_values:
+            raise ProblemError(f"{file}: two columns are named {cell!r}; remove one", name=name, value=tuple(head))
+        columns_of_values[key] = column, scale
+    return time, columns_of_values, notes
 
 
 def _kind(name: str) -> tuple[str, str]:
-    """The joint and the kind of value that a column's name says."""
+    """Return the joint and the kind of value in a column's name."""
     for sign in "./:_ ":
-        before, _, last = name.rpartition(sign)
-        if before and last.lower() in WORDS:
-            return before, WORDS[last.lower()]
-        first, _, behind = name.partition(sign)
-        if behind and first.lower() in WORDS:
-            return behind, WORDS[first.lower()]
+        prefix, _, last = name.rpartition(sign)
+        if prefix and last.lower() in WORDS:
+            return prefix, WORDS[last.lower()]
+        first, _, suffix = name.partition(sign)
+        if suffix and first.lower() in WORDS:
+            return suffix, WORDS[first.lower()]
     return name, "positions"
 
 
@@ -252,29 +241,30 @@ def _kind(name: str) -> tuple[str, str]:
 
 
 def _trajectory_in(tree: Any, depth: int = 6) -> Mapping[str, Any] | None:
-    """The outermost mapping in it that has joint names and points; each value is looked at once."""
-    level, seen = [tree], set[int]()
+    """Return the outermost mapping that has joint names and points; each value is visited once."""
+    level, visited = [tree], set[int]()
     for _ in range(depth + 1):
-        below: list[Any] = []
-        for one in level:
-            if isinstance(one, Mapping) and "joint_names" in one and "points" in one:
-                return one
-            for part in parts_of(one)[:100]:
-                if id(part) not in seen:
-                    seen.add(id(part))
-                    below.append(part)
-        level = below
+        next_level: list[Any] = []
+        for node in level:
+            if isinstance(node, Mapping) and "joint_names" in node and "points" in node:
+                return node
+            for child in children_of(node)[:100]:
+                if id(child) not in visited:
+                    visited.add(id(child))
+                    next_level.append(child)
+        level = next_level
     return None
 
 
 def _from_points(file: FileName, tree: Any) -> RawTrajectory:
+    """Return the trajectory in a tree of names and values."""
     message = _trajectory_in(tree)
     if message is None:
-        words = f"{file} holds no joint trajectory: joint_names and points are expected"
+        words = f"{file} contains no joint trajectory; joint_names and points are expected"
         raise ProblemError(words, name="joint_names", value=str(file))
     names, points = message["joint_names"], message["points"]
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names) or len(set(names)) != len(names):
-        words = f"{file}: joint_names must be names that differ, not {str(names)[:80]}"
+        words = f"{file}: joint_names must be distinct names, not {str(names)[:80]}"
         raise ProblemError(words, name="joint_names", value=names)
     if not isinstance(points, list) or not points or not all(isinstance(point, Mapping) for point in points):
         raise ProblemError(
@@ -285,20 +275,20 @@ def _from_points(file: FileName, tree: Any) -> RawTrajectory:
     values: dict[str, Array | None] = {}
     for kind in KINDS:
         word = "effort" if kind == "efforts" else kind
-        given = [point.get(word) or [] for point in points]
-        lacking = [number for number, one in enumerate(given, 1) if not one]
-        if len(lacking) == len(given) and kind != "positions":
+        rows = [point.get(word) or [] for point in points]
+        missing = [number for number, row in enumerate(rows, 1) if not row]
+        if len(missing) == len(rows) and kind != "positions":
             values[kind] = None
             continue
-        if lacking and kind == "positions":
-            raise ProblemError(f"{file}: point {lacking[0]} has no positions", name=f"point {lacking[0]}")
-        if lacking:
+        if missing and kind == "positions":
+            raise ProblemError(f"{file}: point {missing[0]} has no positions", name=f"point {missing[0]}")
+        if missing:
             notes.append(
-                f"{len(lacking)} of {len(given)} points have no {kind}, point {lacking[0]} first: none are used"
+                f"{len(missing)} of {len(rows)} points have no {kind}, first point {missing[0]}: all are ignored"
             )
             values[kind] = None
             continue
-        values[kind] = _rows(file, word, given, len(names))
+        values[kind] = _rows(file, word, rows, len(names))
     position = values["positions"]
     assert position is not None
     lines = np.arange(1, len(points) + 1)
@@ -306,75 +296,76 @@ def _from_points(file: FileName, tree: Any) -> RawTrajectory:
     return RawTrajectory(tuple(names), t, position, v, a, efforts, lines, True, tuple(notes), str(file))
 
 
-def _rows(file: FileName, word: str, given: list[Any], width: int) -> Array:
-    rows = np.full((len(given), width), np.nan)
-    for number, one in enumerate(given, 1):
-        if not isinstance(one, list) or len(one) != width:
-            count = len(one) if isinstance(one, list) else repr(one)[:80]
+def _rows(file: FileName, word: str, points: list[Any], width: int) -> Array:
+    """Return the values of all points. Shape (M, width)."""
+    rows = np.full((len(points), width), np.nan)
+    for number, point in enumerate(points, 1):
+        if not isinstance(point, list) or len(point) != width:
+            count = len(point) if isinstance(point, list) else repr(point)[:80]
             words = f"{file}: point {number}: {word} has {count} entries, there are {width} joints"
             raise ProblemError(words, name=f"point {number}", value=count, limit=width)
         try:
-            rows[number - 1] = [np.nan if value is None else float(value) for value in one]
+            rows[number - 1] = [np.nan if value is None else float(value) for value in point]
         except NOT_NUMBERS as error:
-            words = f"{file}: point {number}: {word} are no numbers: {str(one)[:80]}"
-            raise ProblemError(words, name=f"point {number}", value=one) from error
+            words = f"{file}: point {number}: {word} are not numbers: {str(point)[:80]}"
+            raise ProblemError(words, name=f"point {number}", value=point) from error
     return rows
 
 
 def _seconds(file: FileName, number: int, point: Mapping[str, Any]) -> float:
-    """Of a duration, as ROS 2 or ROS 1 writes it, or a number of seconds."""
-    told = point.get("time_from_start")
+    """Return the time of a point: a duration as in ROS 2 or ROS 1, or a number of seconds."""
+    duration = point.get("time_from_start")
     try:
-        if isinstance(told, Mapping):
-            whole = told["sec"] if "sec" in told else told["secs"]
-            part = told.get("nanosec", told.get("nsecs", told.get("nsec", 0)))
-            return float(whole) + float(part) / 1e9
-        if told is None or isinstance(told, bool):
+        if isinstance(duration, Mapping):
+            whole = duration["sec"] if "sec" in duration else duration["secs"]
+            fraction = duration.get("nanosec", duration.get("nsecs", duration.get("nsec", 0)))
+            return float(whole) + float(fraction) / 1e9
+        if duration is None or isinstance(duration, bool):
             raise TypeError("missing")
-        return float(told)
+        return float(duration)
     except (*NOT_NUMBERS, KeyError) as error:
-        words = f"{file}: point {number}: time_from_start must be sec and nanosec, not {told!r}"
-        raise ProblemError(words, name=f"point {number}", value=told) from error
+        words = f"{file}: point {number}: time_from_start must be sec and nanosec, not {duration!r}"
+        raise ProblemError(words, name=f"point {number}", value=duration) from error
 
 
 # ---- logs --------------------------------------------------------------------------------------------------------
 
 
 def _from_messages(file: FileName, topic: str, messages: list[tuple[int, Any]]) -> RawTrajectory:
-    """Joint states, one a message; or the first joint trajectory, whose points are the samples."""
+    """Return the trajectory of joint states, one per message, or of the first joint trajectory."""
     notes = []
     first = messages[0][1]
     if "points" in first:
         if len(messages) > 1:
-            notes.append(f"{topic} holds {len(messages)} trajectories, of which the first is read")
-        found = _from_points(file, first)
-        return RawTrajectory(**{**vars(found), "notes": (*found.notes, *notes)})
-    sets: dict[frozenset[str], int] = {}
+            notes.append(f"{topic} has {len(messages)} trajectories; only the first is read")
+        trajectory = _from_points(file, first)
+        return RawTrajectory(**{**vars(trajectory), "notes": (*trajectory.notes, *notes)})
+    counts: dict[frozenset[str], int] = {}
     for _, state in messages:
-        sets[frozenset(state["name"])] = sets.get(frozenset(state["name"]), 0) + 1
-    chosen = max(sets, key=lambda one: sets[one])
-    kept = [(stamp, state) for stamp, state in messages if frozenset(state["name"]) == chosen]
-    if len(kept) < len(messages):
+        counts[frozenset(state["name"])] = counts.get(frozenset(state["name"]), 0) + 1
+    joint_set = max(counts, key=lambda joints: counts[joints])
+    states = [(stamp, state) for stamp, state in messages if frozenset(state["name"]) == joint_set]
+    if len(states) < len(messages):
         notes.append(
-            f"{len(messages) - len(kept)} of {len(messages)} messages on {topic} are of other joints, not read"
+            f"{len(messages) - len(states)} of {len(messages)} messages on {topic} are of other joints and are ignored"
         )
-    names = tuple(kept[0][1]["name"])
+    names = tuple(states[0][1]["name"])
     if len(set(names)) != len(names) or not names:
-        raise ProblemError(f"{file}: the joints {names} on {topic} are none, or repeat", name="name", value=names)
-    orders = [[state["name"].index(name) for name in names] for _, state in kept]
+        raise ProblemError(f"{file}: the joints {names} on {topic} must be distinct names", name="name", value=names)
+    orders = [[state["name"].index(name) for name in names] for _, state in states]
     values: dict[str, Array | None] = {}
     for kind, word in zip(KINDS, ("position", "velocity", "", "effort"), strict=True):
-        given = [state.get(word, ()) for _, state in kept]
-        if any(len(one) != len(names) for one in given):
+        rows = [state.get(word, ()) for _, state in states]
+        if any(len(joints) != len(names) for joints in rows):
             if kind == "positions":
-                raise ProblemError(f"{file}: a joint state on {topic} lacks positions", name="position")
+                raise ProblemError(f"{file}: a joint state on {topic} has no positions", name="position")
             values[kind] = None
             continue
-        values[kind] = np.array([[one[k] for k in order] for one, order in zip(given, orders, strict=True)])
-    stamps = np.array([stamp for stamp, _ in kept])
+        values[kind] = np.array([[joints[k] for k in order] for joints, order in zip(rows, orders, strict=True)])
+    stamps = np.array([stamp for stamp, _ in states])
     position = values["positions"]
     assert position is not None
     t = (stamps - stamps[0]) / 1e9
     v, a, efforts = (values[kind] for kind in KINDS[1:])
-    lines = np.arange(1, len(kept) + 1)
+    lines = np.arange(1, len(states) + 1)
     return RawTrajectory(names, t, position, v, a, efforts, lines, True, tuple(notes), str(file))

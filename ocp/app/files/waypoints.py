@@ -1,16 +1,16 @@
-"""Waypoints from tables: positions, and what is told of the tool at them, as orientations or as axes.
+"""Read waypoints from tables: positions, with tool orientations, tool axes or times where the table has them.
 
-The head names the columns, in any order; a unit may stand behind a name, as in `x [mm]`, `y (mm)`, `z_mm` or `rx/deg`:
+The header names the columns in any order. A unit may follow a name, as in `x [mm]`, `y (mm)`, `z_mm` or `rx/deg`:
 
     x y z          position, m
-    qw qx qy qz    tool orientation, quaternion; its sign is of no meaning and is aligned from row to row
+    qw qx qy qz    tool orientation, quaternion; its sign has no meaning and is made continuous from row to row
     rx ry rz       tool orientation, rotation vector, rad
-    ax ay az       or nx ny nz, or i j k: the tool's axis, of any length
+    ax ay az       or nx ny nz, or i j k: the tool axis, of any length
     t, time        s
 
-Commas, semicolons, tabs or blanks part the columns, `#` begins a comment, which may be the head. Without a head only
-three columns are read, as x, y, z: the seven of a pose may have w first or last, and nothing in the file tells; name
-`columns`.
+Commas, semicolons, tabs or blanks separate the columns. `#` begins a comment; a comment may be the header. A table
+without a header has exactly three columns, x, y, z. Name the columns of a pose with `columns`: a file of seven numbers
+does not say whether w comes first or last.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from models.paths import Line, split_at_reversals
 from models.paths.orientation import product, rotation_vector
 from models.paths.path import Reversal
 from models.paths.segments import SHORTEST_SEGMENT
-from ocp.app.files.lines import FileName, cells_of, is_number, read_lines, wrong_line
-from ocp.app.files.program import TOLERANCE, checked_reversal, smoothed
+from ocp.app.files.program import DEFAULT_TOLERANCE_M, checked_reversal, smoothed
+from ocp.app.files.text_files import FileName, is_number, line_error, read_lines, split_cells
 from ocp.errors import ProblemError, checked_choice, checked_each, checked_positive
 
 __all__ = ["Waypoints", "read_waypoints"]
@@ -60,18 +60,19 @@ SKIPPED = ("", "-", "index")
 
 @dataclass(frozen=True, eq=False)
 class Waypoints:
-    """Where a tool is to pass.
+    """Waypoints of a tool.
 
     Attributes:
         positions: Shape (M, 3), m.
-        orientations: Of the tool, unit quaternions [w, x, y, z], or None. Where only axes are given, their z axis is
-            the tool's axis and the roll about it is the least from row to row: see `free_roll`. Shape (M, 4).
-        axes: The tool's axis, unit vectors, or None where none are given. Shape (M, 3).
+        orientations: Tool orientations, unit quaternions [w, x, y, z], or None. If the file gives only axes, the z axis
+            is the tool axis and the roll about it changes as little as possible from row to row, see `free_roll`. Shape
+            (M, 4).
+        axes: Unit vectors of the tool axis, or None if the file gives none. Shape (M, 3).
         times: s, increasing, or None. Shape (M,).
-        names: Of the columns that were read.
-        ignored: Columns that were not.
-        lines: Of the file. Shape (M,).
-        file: Its name.
+        names: Names of the columns that were read.
+        ignored: Names of the columns that were not read.
+        lines: Line number of each waypoint in the file. Shape (M,).
+        file: Name of the file.
     """
 
     positions: Array
@@ -85,22 +86,22 @@ class Waypoints:
 
     @property
     def free_roll(self) -> bool:
-        """Whether the roll about the tool's axis is made up: the file gives the axis alone."""
+        """Whether the file gives only the tool axis, so that the roll about it is arbitrary."""
         return self.axes is not None
 
     def paths(self, *, reversal: Reversal = "split") -> tuple[Path, ...]:
-        """Straight lines from point to point, as one path or, where they turn back the way they came, several.
+        """Return straight lines from waypoint to waypoint as paths; a path ends where its direction reverses.
 
-        Waypoints at the place of the one before are dropped.
+        A waypoint at the position of the previous one is dropped.
 
         Args:
             reversal: "split", or the width (m) of the bulb in which the path turns round, see models.paths.chains.
 
         Raises:
-            ProblemError: By line: a tool that turns in one place, or by half a turn and more between two waypoints;
-                less than two places.
+            ProblemError: The tool turns in place, or by half a turn or more between two waypoints (names the line);
+                there are fewer than two distinct positions.
         """
-        turned_round = checked_reversal("waypoints", reversal)
+        checked = checked_reversal("waypoints", reversal)
         lines: list[Line] = []
         last = 0
         for i in range(1, len(self.positions)):
@@ -112,74 +113,77 @@ class Waypoints:
                 lines.append(Line(self.positions[last], self.positions[i], *ends))
             except ModelError as error:
                 why = f"from line {self.lines[last]} to here {error}"
-                raise wrong_line(self.file, int(self.lines[i]), self._shown(i), why, error.limit) from error
+                raise line_error(self.file, int(self.lines[i]), self._description(i), why, error.limit) from error
             last = i
         if not lines:
-            message = f"{self.file}: all waypoints are at one place; a path needs two"
+            message = f"{self.file}: all waypoints are at one place; a path needs two distinct ones"
             raise ProblemError(message, name="positions", value=self.positions[0])
-        return tuple(path for path, _ in split_at_reversals(lines, turned_round))
+        return tuple(path for path, _ in split_at_reversals(lines, checked))
 
     def path(self, *, reversal: Reversal | None = None) -> Path:
-        """The one path of `paths`.
+        """Return the only path of `paths`.
 
         Args:
-            reversal: Width (m) of the bulb in which the path turns round where it goes back the way it came. None
-                refuses that.
+            reversal: Width (m) of the bulb in which the path turns round where its direction reverses. None: a reversal
+                is an error.
 
         Raises:
-            ProblemError: As of `paths`; points that turn back.
+            ProblemError: As `paths`; the direction reverses.
         """
-        found = self.paths(reversal="split" if reversal is None else reversal)
-        if len(found) > 1:
-            end = np.asarray(found[0].segments[-1].end)
+        paths = self.paths(reversal="split" if reversal is None else reversal)
+        if len(paths) > 1:
+            end = np.asarray(paths[0].segments[-1].end)
             i = int(np.linalg.norm(self.positions - end, axis=1).argmin())
-            why = "the path turns back the way it came; take paths(), which ends there, or path(reversal=width in m)"
-            raise wrong_line(self.file, int(self.lines[i]), self._shown(i), why)
-        return found[0]
+            why = "the path reverses its direction; use paths(), which splits it there, or path(reversal=width in m)"
+            raise line_error(self.file, int(self.lines[i]), self._description(i), why)
+        return paths[0]
 
-    def smooth(self, tolerance: float = TOLERANCE, *, reversal: Reversal | None = None, **options: Any) -> SmoothPath:
-        """The path with its corners rounded.
+    def smooth(
+        self, tolerance: float = DEFAULT_TOLERANCE_M, *, reversal: Reversal | None = None, **options: Any
+    ) -> SmoothPath:
+        """Return the path with rounded corners.
 
         Args:
-            tolerance: How far (m) it may stray.
-            reversal: As of `path`.
+            tolerance: Largest deviation from the path, m.
+            reversal: As in `path`.
             options: `kind`, `shape`, `overlap` of models.smooth.
 
         Raises:
-            ProblemError: As of `path`; a tolerance that is not positive, unknown options.
+            ProblemError: As `path`; the tolerance is not positive; an option is unknown.
         """
         return smoothed(self.path(reversal=reversal), checked_positive("tolerance", tolerance), options)
 
     def _check_still(self, last: int, i: int) -> None:
+        """Raise ProblemError if the tool turns while its position stays."""
         if self.orientations is None:
             return
         turn = np.pi
-        with suppress(ModelError):  # half a turn
+        with suppress(ModelError):  # of half a turn, whose rotation vector is not unique
             turn = float(np.linalg.norm(rotation_vector(self.orientations[last], self.orientations[i])))
         if turn > ROUNDING:
-            why = f"the tool turns by {np.degrees(turn):.4g} deg in one place; turn it along a way, or drop the line"
-            raise wrong_line(self.file, int(self.lines[i]), self._shown(i), why, ROUNDING)
+            why = f"the tool turns by {np.degrees(turn):.4g} deg in place; turn it along the path, or drop the line"
+            raise line_error(self.file, int(self.lines[i]), self._description(i), why, ROUNDING)
 
-    def _shown(self, i: int) -> str:
+    def _description(self, i: int) -> str:
         return f"waypoint {i} at {self.positions[i].tolist()} m"
 
 
 def read_waypoints(file: FileName, *, unit: str | None = None, columns: Sequence[str] | None = None) -> Waypoints:
-    """Read a table of waypoints; the head of this module says which.
+    """Read a table of waypoints in the format of this module.
 
     Args:
-        file: Its name.
-        unit: Of the positions where the head says none: "m", "mm", "cm", "um" or "inch". None takes m, and warns where
-            they are that large that they look like millimetres.
-        columns: Names of the columns, instead of the head, which is passed over where there is one; "" or "-" for a
-            column that is not read.
+        file: Name of the file.
+        unit: Unit of positions for which the header gives none: "m", "mm", "cm", "um" or "inch". None: m, with a
+            warning if the values look like millimetres.
+        columns: Names of the columns, used instead of the header if there is one; "" or "-" for a column to be ignored.
 
     Raises:
-        ProblemError: An empty file, columns that are missing, unknown units; by line: a row that is too short, what is
-            no number, nan, times that do not increase, a quaternion or an axis that is none.
+        ProblemError: The file is empty, columns are missing, or a unit is unknown. With the line: a row is too short or
+            has a value that is not a finite number, times do not increase, a quaternion is not normalised, or an axis
+            is zero.
 
     Warns:
-        ModelWarning: Positions that look like millimetres, angles that look like degrees.
+        ModelWarning: Positions look like millimetres, or angles like degrees.
     """
     if unit is not None:
         checked_choice("waypoints: unit", unit, tuple(LENGTHS))
@@ -193,191 +197,196 @@ def read_waypoints(file: FileName, *, unit: str | None = None, columns: Sequence
         for kind in KINDS
         if all(name in names for name in kind)
     }
-    texts = [text for _, text, _ in rows[first:]]
+    row_texts = [text for _, text, _ in rows[first:]]
     times = parts[("time",)][:, 0] if ("time",) in parts else None
     if times is not None and (np.diff(times) <= 0).any():
         i = int((np.diff(times) <= 0).argmax()) + 1
-        why = f"the time {times[i]:g} s does not come after {times[i - 1]:g} s; sort the rows"
-        raise wrong_line(file, int(lines[i]), texts[i], why)
+        why = f"the time {times[i]:g} s is not after {times[i - 1]:g} s; sort the rows"
+        raise line_error(file, int(lines[i]), row_texts[i], why)
     positions = parts[POSITION]
     if unit is None and not any(_unit(cell) for cell, name in zip(head, names, strict=True) if name in POSITION):
         extent = np.ptp(positions, axis=0).max()
         warn_of_millimetres(extent, str(file), "unit", "an extent of the waypoints of")
-    axes = _axes(file, parts[AXIS], lines, texts) if AXIS in parts else None
+    axes = _axes(file, parts[AXIS], lines, row_texts) if AXIS in parts else None
     orientations = None
     if QUATERNION in parts:
-        orientations = _aligned(_quaternions(file, parts[QUATERNION], lines, texts))
+        orientations = _aligned(_quaternions(file, parts[QUATERNION], lines, row_texts))
     elif VECTOR in parts:
         warn_of_degrees(parts[VECTOR], str(file), "rx, ry, rz", "an angle of the waypoints of")
         orientations = _aligned(_from_vectors(parts[VECTOR]))
     elif axes is not None:
-        orientations = _aligned(_least_roll(file, axes, lines, texts))
+        orientations = _aligned(_least_roll(file, axes, lines, row_texts))
     if QUATERNION in parts or VECTOR in parts:
         axes = None
-    read = tuple(name for name in names if any(name in kind for kind in parts))
-    return Waypoints(positions, orientations, axes, times, read, ignored, lines, str(file))
+    used_names = tuple(name for name in names if any(name in kind for kind in parts))
+    return Waypoints(positions, orientations, axes, times, used_names, ignored, lines, str(file))
 
 
 def _rows(file: FileName) -> list[tuple[int, str, list[str]]]:
-    """Number, text and cells of each line with something in it, and of a comment before them that names columns."""
+    """Return number, text and cells of each row; a comment before them that names the columns is the first row."""
     rows: list[tuple[int, str, list[str]]] = []
     delimiter: str | None = None
-    remark = (0, "")
+    last_comment = (0, "")
     for number, text in enumerate(read_lines(file), 1):
         line, _, comment = text.partition("#")
         if not line.strip():
-            remark = (number, comment) if comment.strip() and not rows else remark
+            last_comment = (number, comment) if comment.strip() and not rows else last_comment
             continue
         if delimiter is None:
             delimiter = next((sign for sign in ";,\t" if sign in line), " ")
-        rows.append((number, text, cells_of(line.strip(" "), delimiter)))
+        rows.append((number, text, split_cells(line.strip(" "), delimiter)))
     if not rows or delimiter is None:
-        raise ProblemError(f"{file}: the file is empty but for comments", name="file", value=str(file))
-    named = cells_of(remark[1].strip(" "), delimiter)  # as numpy.savetxt writes a head
-    if len(named) == len(rows[0][2]) and set(POSITION) <= {_name(cell) for cell in named}:
-        rows.insert(0, (*remark, named))
+        raise ProblemError(f"{file}: the file has only comments", name="file", value=str(file))
+    comment_cells = split_cells(last_comment[1].strip(" "), delimiter)  # as numpy.savetxt writes a head
+    if len(comment_cells) == len(rows[0][2]) and set(POSITION) <= {_name(cell) for cell in comment_cells}:
+        rows.insert(0, (*last_comment, comment_cells))
     return rows
 
 
 def _name(cell: str) -> str:
-    """Of a column, as it is called here; "" where it has none."""
-    found = HEAD.match(" ".join(cell.lower().split()))
-    name = found[1].removeprefix("pose.") if found else ""
+    """Return the standard name of a column, or "" if it has none."""
+    match = HEAD.match(" ".join(cell.lower().split()))
+    name = match[1].removeprefix("pose.") if match else ""
     return OTHER_NAMES.get(name, name)
 
 
 def _head(
     file: FileName, rows: list[tuple[int, str, list[str]]], columns: Sequence[str] | None
 ) -> tuple[list[str], int]:
-    """Names of the columns as they stand, and the first row that is none of them."""
+    """Return the names of the columns as written, and the index of the first data row."""
     cells = rows[0][2]
-    told = any(cell and not is_number(cell) for cell in cells)
+    has_header = any(cell and not is_number(cell) for cell in cells)
     if columns is not None:
-        known = [] if isinstance(columns, str) else list(checked_each("columns", columns, str))
-        if len(known) != len(cells):
-            message = f"{file}: {len(known)} columns are named, the first row has {len(cells)}; name every column"
+        names = [] if isinstance(columns, str) else list(checked_each("columns", columns, str))
+        if len(names) != len(cells):
+            message = f"{file}: {len(names)} columns are named, the first row has {len(cells)}; name every column"
             raise ProblemError(message, name="columns", value=columns, limit=len(cells))
-        numbers = [cell for cell in cells if cell]
-        counted = len(numbers) > 1 and numbers == [str(i) for i in range(len(numbers))]
-        return known, 1 if told or counted or len(numbers) < len(cells) else 0
-    if told:
+        labels = [cell for cell in cells if cell]
+        is_enumeration = len(labels) > 1 and labels == [str(i) for i in range(len(labels))]
+        return names, 1 if has_header or is_enumeration or len(labels) < len(cells) else 0
+    if has_header:
         return cells, 1
     if len(cells) != 3:
-        why = (
-            f"no head names the {len(cells)} columns; name them in the file, or read with columns=('x', 'y', 'z', ...)"
-        )
-        raise wrong_line(file, rows[0][0], rows[0][1], why)
+        why = f"no header names the {len(cells)} columns; name them there, or with columns=('x', 'y', 'z', ...)"
+        raise line_error(file, rows[0][0], rows[0][1], why)
     return list(POSITION), 0
 
 
 def _unit(cell: str) -> str | None:
-    found = HEAD.match(" ".join(cell.lower().split()))
-    return found[2] if found else None
+    """Return the unit in a column's header, or None."""
+    match = HEAD.match(" ".join(cell.lower().split()))
+    return match[2] if match else None
 
 
 def _columns(file: FileName, head: Sequence[str], unit: str | None) -> tuple[list[str], list[float], tuple[str, ...]]:
-    """The name that each column has here ("" where it is not read), its unit, and those that are not read."""
+    """Return each column's standard name ("" if it is ignored), its unit in SI, and the ignored columns."""
     names: list[str] = []
     scales: list[float] = []
     ignored: list[str] = []
     for cell in head:
-        name, told = _name(cell), _unit(cell)
+        name, unit_name = _name(cell), _unit(cell)
         kind = next((kind for kind in KINDS if name in kind), None)
         scale = 1.0
         if kind is None:
             ignored += [cell] if cell.strip() not in SKIPPED else []
             name = ""
         elif name in names:
-            raise ProblemError(f"{file}: {name} heads two columns; leave one", name=name, value=tuple(head))
+            raise ProblemError(f"{file}: two columns are named {name}; remove one", name=name, value=tuple(head))
         else:
-            known = {POSITION: LENGTHS, VECTOR: ANGLES, ("time",): TIMES}.get(kind, {})
-            if told is not None and told not in known:
-                message = f"{file}: the column {cell!r} cannot be in {told}; known: {', '.join(known) or 'no unit'}"
-                raise ProblemError(message, name=name, value=told, limit=tuple(known))
+            units = {POSITION: LENGTHS, VECTOR: ANGLES, ("time",): TIMES}.get(kind, {})
+            if unit_name is not None and unit_name not in units:
+                message = (
+                    f"{file}: the column {cell!r} cannot be in {unit_name}; known: {', '.join(units) or 'no unit'}"
+                )
+                raise ProblemError(message, name=name, value=unit_name, limit=tuple(units))
             if kind == POSITION:
-                if told is not None and unit is not None and LENGTHS[told] != LENGTHS[unit]:
-                    message = f"{file}: the head says {cell!r}, the caller unit={unit!r}; leave unit out"
-                    raise ProblemError(message, name="unit", value=unit, limit=told)
-                scale = LENGTHS[told or unit or "m"]
-            elif told is not None:
-                scale = known[told]
+                if unit_name is not None and unit is not None and LENGTHS[unit_name] != LENGTHS[unit]:
+                    message = f"{file}: the header says {cell!r}, the caller unit={unit!r}; omit unit"
+                    raise ProblemError(message, name="unit", value=unit, limit=unit_name)
+                scale = LENGTHS[unit_name or unit or "m"]
+            elif unit_name is not None:
+                scale = units[unit_name]
         names.append(name)
         scales.append(scale)
     for kind in KINDS:
         missing = [name for name in kind if name not in names]
         if missing and (kind == POSITION or len(missing) < len(kind)):
             message = f"{file}: no column {', '.join(missing)} among {', '.join(repr(cell) for cell in head)}"
-            raise ProblemError(f"{message}; name it in the head or by columns=", name=missing[0], value=tuple(head))
+            raise ProblemError(f"{message}; name it in the header or with columns=", name=missing[0], value=tuple(head))
     return names, scales, tuple(ignored)
 
 
-def _table(file: FileName, rows: list[tuple[int, str, list[str]]], read: Sequence[bool]) -> Array:
-    """The numbers of the columns that are read, zero in others. Shape (M, columns)."""
+def _table(file: FileName, rows: list[tuple[int, str, list[str]]], used: Sequence[bool]) -> Array:
+    """Return the numbers of the used columns, zero in the others. Shape (M, columns)."""
     if not rows:
-        raise ProblemError(f"{file}: there is a head and no waypoint", name="file", value=str(file))
-    width = len(read)
+        raise ProblemError(f"{file}: the file has a header but no waypoint", name="file", value=str(file))
+    width = len(used)
     table = np.zeros((len(rows), width))
     for i, (number, text, cells) in enumerate(rows):
         if len(cells) < width or any(cells[width:]):
-            raise wrong_line(file, number, text, f"{len(cells)} columns, expected {width}; complete the row", width)
+            raise line_error(file, number, text, f"{len(cells)} columns, expected {width}; complete the row", width)
         for k in range(width):
-            if read[k]:
+            if used[k]:
                 try:
                     table[i, k] = float(cells[k])
                 except ValueError:
-                    raise wrong_line(file, number, text, f"{cells[k]!r} is no number; correct it") from None
-    wrong = ~np.isfinite(table).all(axis=1)
-    if wrong.any():
-        number, text, _ = rows[int(wrong.argmax())]
-        raise wrong_line(file, number, text, "a number is not finite; correct it or drop the line")
+                    raise line_error(file, number, text, f"{cells[k]!r} is not a number; correct it") from None
+    invalid = ~np.isfinite(table).all(axis=1)
+    if invalid.any():
+        number, text, _ = rows[int(invalid.argmax())]
+        raise line_error(file, number, text, "a number is not finite; correct it or drop the line")
     return table
 
 
 def _quaternions(file: FileName, values: Array, lines: NDArray[np.intp], texts: Sequence[str]) -> Array:
+    """Return normalised quaternions; raise ProblemError if a norm is not 1 within 0.01."""
     norm = np.linalg.norm(values, axis=1)
-    most = 1e-2  # more is not put down to the digits written
-    wrong = np.abs(norm - 1) > most
-    if wrong.any():
-        i = int(wrong.argmax())
+    norm_tolerance = 1e-2  # a larger deviation is not explained by rounding in the file
+    invalid = np.abs(norm - 1) > norm_tolerance
+    if invalid.any():
+        i = int(invalid.argmax())
         why = f"the quaternion has the norm {norm[i]:.6g}; give a unit quaternion"
-        raise wrong_line(file, int(lines[i]), texts[i], why, most)
+        raise line_error(file, int(lines[i]), texts[i], why, norm_tolerance)
     return np.asarray(values / norm[:, None])
 
 
 def _axes(file: FileName, values: Array, lines: NDArray[np.intp], texts: Sequence[str]) -> Array:
+    """Return unit vectors; raise ProblemError if one is zero."""
     norm = np.linalg.norm(values, axis=1)
     if not (norm > 0).all():
         i = int((norm > 0).argmin())
-        raise wrong_line(file, int(lines[i]), texts[i], "the tool's axis is zero; give a direction")
+        raise line_error(file, int(lines[i]), texts[i], "the tool's axis is zero; give a direction")
     return np.asarray(values / norm[:, None])
 
 
 def _from_vectors(vectors: Array) -> Array:
+    """Return the quaternions of rotation vectors."""
     angle = np.linalg.norm(vectors, axis=1)[:, None]
     return np.concatenate([np.cos(angle / 2), np.sinc(angle / 2 / np.pi) / 2 * vectors], axis=1)
 
 
 def _aligned(quaternions: Array) -> Array:
-    """Of two signs that say the same the one nearer to the row before."""
-    turns = np.where((quaternions[1:] * quaternions[:-1]).sum(axis=1) < 0, -1.0, 1.0)
-    return np.asarray(quaternions * np.cumprod(np.concatenate([[1.0], turns]))[:, None])
+    """Choose the sign of each quaternion so that it is the nearer one to its predecessor."""
+    signs = np.where((quaternions[1:] * quaternions[:-1]).sum(axis=1) < 0, -1.0, 1.0)
+    return np.asarray(quaternions * np.cumprod(np.concatenate([[1.0], signs]))[:, None])
 
 
 def _least_roll(file: FileName, axes: Array, lines: NDArray[np.intp], texts: Sequence[str]) -> Array:
-    """Orientations whose z axis is the tool's: from row to row the least turn, which is parallel transport."""
-    before = np.vstack([[0.0, 0.0, 1.0], axes[:-1]])
-    steps = np.column_stack([1 + (before * axes).sum(axis=1), np.cross(before, axes)])
-    opposite = steps[:, 0] < 1e-7  # 1 + cosine: half the digits of a number
+    """Return orientations with the tool axis as z axis, by parallel transport from row to row."""
+    previous = np.vstack([[0.0, 0.0, 1.0], axes[:-1]])
+    steps = np.column_stack([1 + (previous * axes).sum(axis=1), np.cross(previous, axes)])
+    opposite = steps[:, 0] < 1e-7  # 1 + cosine; half of the digits of double precision
     if opposite[0]:
         steps[0], opposite[0] = (0.0, 1.0, 0.0, 0.0), False  # upside down: about x
     if opposite.any():
         i = int(opposite.argmax())
-        why = f"the tool's axis turns round against line {lines[i - 1]}, and nothing says which way; put one between"
-        raise wrong_line(file, int(lines[i]), texts[i], why)
+        why = f"the tool axis is opposite to that of line {lines[i - 1]}, so the direction of the turn is ambiguous; "
+        why += "insert a waypoint between them"
+        raise line_error(file, int(lines[i]), texts[i], why)
     steps = steps / np.linalg.norm(steps, axis=1)[:, None]
-    found = np.empty_like(steps)
+    orientations = np.empty_like(steps)
     current = np.array([1.0, 0.0, 0.0, 0.0])
     for i, step in enumerate(steps):
         current = product(step, current)
-        found[i] = current
-    return np.asarray(found / np.linalg.norm(found, axis=1)[:, None])
+        orientations[i] = current
+    return np.asarray(orientations / np.linalg.norm(orientations, axis=1)[:, None])

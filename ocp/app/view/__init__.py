@@ -1,1 +1,1 @@
-"""Pictures, reports and the viewer's page."""
+"""Pictures, reports, and pages that play motions."""

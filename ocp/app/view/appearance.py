@@ -1,12 +1,10 @@
-"""What a robot looks like: the visual shapes of its links, where there are none the shapes that it touches with.
+"""Surfaces of a robot's links, their frames along a motion, and the colours of all pictures.
 
-Meshes that are not found are told, and what the link touches with is shown instead; faintly where the description gives
-other links a look and this one none. Links that have neither are rods from joint to joint. Nothing is ever made up from
-masses and inertias.
+A link is shown by its visual shapes, or without them by its collision shapes. A mesh that is not found is reported and
+replaced by the collision shapes. These are transparent if the description gives other links visual shapes and this one
+none. A link with neither is a rod from joint to joint. Nothing is derived from masses and inertias.
 
-What colours mean, in every picture: told apart with every kind of colour vision (Okabe, Ito 2008).
-
-Where the links of a robot are along a motion, for pictures and for the view.
+The colours are distinguishable with every kind of colour vision (Okabe, Ito 2008).
 """
 
 from __future__ import annotations
@@ -48,27 +46,27 @@ __all__ = [
 
 @dataclass(frozen=True)
 class SurfaceStyle:
-    """How surfaces look, and how fine they are.
+    """Colours and resolution of surfaces.
 
     Attributes:
-        grey, rod: Colours of links without one, and of links without a shape: red, green, blue, opacity.
-        zone: Of what a link touches with that a description shows nothing of, while it shows others: a zone, no body.
-        most_faces: Of a robot.
-        finest: First size of the cells in which corners become one, m; doubled until the faces are few enough.
-        crease: Faces that meet in a sharper edge are not shaded as one surface, rad.
-        most_around: Faces at a corner, beyond which each is shaded by itself.
-        sides: Of what is round.
-        rod_radius: Of the greatest reach of the robot's joints.
-        patch: Half the side of the piece of a plane that is drawn, of the diagonal of what moves before it.
+        grey, rod: Colours of links without a colour, and of links without a shape: red, green, blue, opacity.
+        zone: Colour of collision shapes of a link without visual shapes in a description that has some.
+        max_faces: Largest number of faces of a robot.
+        min_cell: Initial size of the cells in which corners are merged, m; doubled until there are few enough faces.
+        crease: Faces that meet at a larger angle are shaded separately, rad.
+        max_neighbours: Largest number of faces at a corner that are shaded as one surface.
+        sides: Number of sides of round shapes.
+        rod_radius: Relative to the longest distance between joints.
+        patch: Half the side of the drawn part of a plane, relative to the diagonal of what moves in front of it.
     """
 
     grey: tuple[float, ...] = (0.72, 0.74, 0.78, 1.0)
     rod: tuple[float, ...] = (0.35, 0.38, 0.42, 1.0)
     zone: tuple[float, ...] = (0.55, 0.58, 0.62, 0.22)
-    most_faces: int = 200_000
-    finest: float = 2.5e-4
+    max_faces: int = 200_000
+    min_cell: float = 2.5e-4
     crease: float = np.deg2rad(38.0)
-    most_around: int = 48
+    max_neighbours: int = 48
     sides: int = 32
     rod_radius: float = 0.012
     patch: float = 0.8
@@ -79,12 +77,12 @@ SURFACE_STYLE = SurfaceStyle()
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """A piece of surface of one colour.
+    """A surface of one colour.
 
     Attributes:
         link: Name of the link that carries it.
         vertices, normals: In the frame of the link. Shape (n, 3) each, m.
-        faces: Corners of its triangles. Shape (m, 3).
+        faces: Indices of its triangles' corners. Shape (m, 3).
         color: Red, green, blue and opacity, 0 to 1.
     """
 
@@ -97,11 +95,11 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class Appearance:
-    """What is shown of a robot.
+    """Surfaces of a robot.
 
     Attributes:
         parts: Surfaces.
-        missing: Meshes that are not shown, as the description names them, and why.
+        missing: Meshes that are not shown, as named in the description, and the reasons.
     """
 
     parts: tuple[Part, ...]
@@ -109,41 +107,39 @@ class Appearance:
 
 
 def appearance_of(
-    robot: Robot, folders: Sequence[Any] = (), *, meshes: bool = True, most: int = SURFACE_STYLE.most_faces
+    robot: Robot, folders: Sequence[Any] = (), *, meshes: bool = True, most: int = SURFACE_STYLE.max_faces
 ) -> Appearance:
-    """The surfaces of a robot's links.
+    """Return the surfaces of a robot's links.
 
     Args:
-        robot: The robot, however it was changed: shapes move with the links that they were merged into.
-        folders: Where meshes are looked for first, see `models.shapes.mesh_files.find_mesh`.
-        meshes: Whether files are read at all.
-        most: Faces in all, beyond which corners that are near to each other become one.
+        robot: The robot, modified or not: shapes move with the links into which theirs were merged.
+        folders: Folders that are searched first for meshes, see `models.shapes.mesh_files.find_mesh`.
+        meshes: Whether mesh files are read.
+        most: Largest number of faces, above which nearby corners are merged.
     """
     missing: dict[str, str] = {}
-    dressed = any(link.visuals for link in robot.links)
-    found: list[tuple[str, Triangles]] = []
+    has_visuals = any(link.visuals for link in robot.links)
+    surfaces: list[tuple[str, Triangles]] = []
     for link in robot.links:
-        shown = _shown(link.visuals, folders, meshes, missing)
-        if not shown:  # what a description that shows others leaves out is a zone rather than a body
-            zone = dressed and not link.visuals
-            shown = _shown(
-                link.collisions, folders, meshes, missing, SURFACE_STYLE.zone if zone else SURFACE_STYLE.grey
-            )
-        found += [(link.name, triangles) for triangles in shown]
-    seen = {name for name, _ in found}
-    found += [(name, rod) for name, rod in _rods(robot, seen)]
-    return Appearance(tuple(_parts(_few(found, most))), missing)
+        triangles_of_link = _triangulated(link.visuals, folders, meshes, missing)
+        if not triangles_of_link:  # a link without visuals among others with visuals is a zone rather than a body
+            color = SURFACE_STYLE.zone if has_visuals and not link.visuals else SURFACE_STYLE.grey
+            triangles_of_link = _triangulated(link.collisions, folders, meshes, missing, color)
+        surfaces += [(link.name, triangles) for triangles in triangles_of_link]
+    shown = {name for name, _ in surfaces}
+    surfaces += [(name, triangles) for name, triangles in _rods(robot, shown)]
+    return Appearance(tuple(_parts(_few(surfaces, most))), missing)
 
 
-def _shown(
+def _triangulated(
     shapes: Sequence[CollisionShape],
     folders: Sequence[Any],
     meshes: bool,
     missing: dict[str, str],
-    plain: tuple[float, ...] = SURFACE_STYLE.grey,
+    default: tuple[float, ...] = SURFACE_STYLE.grey,
 ) -> list[Triangles]:
-    """The shapes of a link as triangles, in its frame."""
-    found = []
+    """Return the shapes of a link as triangles in its frame."""
+    triangles = []
     for shape in shapes:
         if shape.kind == "mesh" and not meshes:
             continue
@@ -152,20 +148,20 @@ def _shown(
         except (ModelError, OSError) as error:
             missing[shape.file] = str(error)
             continue
-        own = getattr(shape, "color", None)
-        colors = np.where(np.isnan(colors), plain if own is None else own, colors)
-        place: Array = vertices @ np.asarray(shape.rotation).T + np.asarray(shape.translation)
-        found.append(Triangles(place, faces, colors))
-    return found
+        color = getattr(shape, "color", None)
+        colors = np.where(np.isnan(colors), default if color is None else color, colors)
+        vertices_in_link: Array = vertices @ np.asarray(shape.rotation).T + np.asarray(shape.translation)
+        triangles.append(Triangles(vertices_in_link, faces, colors))
+    return triangles
 
 
 def _triangles(shape: CollisionShape, folders: Sequence[Any]) -> Triangles:
-    """In the axes of the shape; raises ModelError where its mesh is not found or not read."""
+    """Return a shape as triangles in its own axes; raise ModelError if its mesh is not found or invalid."""
     size = np.asarray(shape.size, dtype=float)
     if shape.kind == "mesh":
         path = find_mesh(shape.file, shape.folder or None, folders)
         if path is None:
-            words = f"the mesh {shape.file!r} is not found; say in which folder its package lies"
+            words = f"the mesh {shape.file!r} is not found; give the folder of its package"
             raise ModelError(words, name=shape.file, value=shape.folder)
         vertices, faces, colors = read_painted_mesh(path)
         mirrored = np.prod(size) < 0
@@ -185,7 +181,7 @@ def _triangles(shape: CollisionShape, folders: Sequence[Any]) -> Triangles:
 
 
 def _turned(profile: Array) -> Triangles:
-    """What a line of (radius, z), (k, 2), from the axis to the axis, sweeps as it turns about z."""
+    """Return the surface of revolution about z of a profile of (radius, z), shape (k, 2), from axis to axis."""
     sides = SURFACE_STYLE.sides
     angle = np.arange(sides) * (2 * np.pi / sides)
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -198,75 +194,75 @@ def _turned(profile: Array) -> Triangles:
 
 
 def rod(start: Array, end: Array, radius: float) -> Triangles:
-    """A round bar from a point to another."""
-    along = end - start
-    length = float(np.linalg.norm(along))
-    axis = along / length
-    other = np.eye(3)[int(np.abs(axis).argmin())]
-    first = np.cross(axis, other)
+    """Return a round rod between two points."""
+    path_tracks = end - start
+    length = float(np.linalg.norm(path_tracks))
+    axis = path_tracks / length
+    coordinate_axis = np.eye(3)[int(np.abs(axis).argmin())]
+    first = np.cross(axis, coordinate_axis)
     first /= np.linalg.norm(first)
-    turn = np.column_stack([first, np.cross(axis, first), axis])
+    rotation = np.column_stack([first, np.cross(axis, first), axis])
     half = length / 2
     profile = np.array([[0.0, -half], [radius, -half], [radius, half], [0.0, half]])
     vertices, faces, _ = _turned(profile)
-    return Triangles(vertices @ turn.T + (start + end) / 2, faces, np.tile(SURFACE_STYLE.rod, (len(faces), 1)))
+    return Triangles(vertices @ rotation.T + (start + end) / 2, faces, np.tile(SURFACE_STYLE.rod, (len(faces), 1)))
 
 
-def _rods(robot: Robot, seen: set[str]) -> list[tuple[str, Triangles]]:
-    """Of links that move and have nothing to show, from where they are joined to where others are; to the tip."""
+def _rods(robot: Robot, shown: set[str]) -> list[tuple[str, Triangles]]:
+    """Return rods for the moving links without surfaces, from joint to joint and to the tip."""
     ends = [(joint.parent, np.asarray(joint.translation, dtype=float)) for joint in robot.joints]
     if robot.tip is not None:
         ends.append((robot.tip, np.asarray(robot.tip_translation, dtype=float)))
     radius = SURFACE_STYLE.rod_radius * max((float(np.linalg.norm(end)) for _, end in ends), default=0.0)
     tool = robot.tip if robot.tip is not None and np.any(robot.tip_translation) else None
-    moved = {joint.child for joint in robot.joints if joint.moves}
-    bare_links = {link.name for link in robot.links if link.name not in seen and (link.name in moved or not seen)}
-    found = []
+    moving = {joint.child for joint in robot.joints if joint.moves}
+    bare_links = {link.name for link in robot.links if link.name not in shown and (link.name in moving or not shown)}
+    rods = []
     for k, (link, end) in enumerate(ends):
         to_tip = link == tool and k == len(ends) - 1
         if (link in bare_links or to_tip) and np.linalg.norm(end) > radius:
-            found.append((link, rod(np.zeros(3), end, radius)))
-    return found
+            rods.append((link, rod(np.zeros(3), end, radius)))
+    return rods
 
 
-def _few(found: list[tuple[str, Triangles]], most: int) -> list[tuple[str, Triangles]]:
-    """The same, of at most so many faces in all."""
-    size = SURFACE_STYLE.finest
-    coarse = found
-    while sum(len(one.faces) for _, one in coarse) > most and size < 1.0:
-        coarse = [(link, _coarser(one, size)) for link, one in found]
+def _few(surfaces: list[tuple[str, Triangles]], most: int) -> list[tuple[str, Triangles]]:
+    """Return the surfaces with at most `most` faces in all."""
+    size = SURFACE_STYLE.min_cell
+    coarse = surfaces
+    while sum(len(mesh.faces) for _, mesh in coarse) > most and size < 1.0:
+        coarse = [(link, _coarser(mesh, size)) for link, mesh in surfaces]
         size *= 2
     return coarse
 
 
 def _coarser(mesh: Triangles, size: float) -> Triangles:
-    """The same with all corners in a cell of a grid made one, in their middle, without faces of no area."""
+    """Return a mesh with the corners in each cell of a grid merged at their mean, without degenerate faces."""
     cells = np.floor(mesh.vertices / size).astype(np.int64)
     _, cell, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
     cell = cell.ravel()
     middles = np.stack([np.bincount(cell, column) for column in mesh.vertices.T], axis=1) / counts[:, None]
     faces = cell[mesh.faces]
-    whole = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 0] != faces[:, 2])
-    _, first = np.unique(np.sort(faces[whole], axis=1), axis=0, return_index=True)
-    kept = np.flatnonzero(whole)[np.sort(first)]
-    return Triangles(middles, faces[kept], mesh.colors[kept])
+    proper = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 0] != faces[:, 2])
+    _, first = np.unique(np.sort(faces[proper], axis=1), axis=0, return_index=True)
+    distinct = np.flatnonzero(proper)[np.sort(first)]
+    return Triangles(middles, faces[distinct], mesh.colors[distinct])
 
 
-def _parts(found: list[tuple[str, Triangles]]) -> list[Part]:
-    """By link and colour."""
+def _parts(surfaces: list[tuple[str, Triangles]]) -> list[Part]:
+    """Return surfaces grouped by link and colour."""
     parts = []
-    for link in dict.fromkeys(name for name, _ in found):
-        mesh = join_meshes([one for name, one in found if name == link])
-        colors, which = np.unique(np.round(mesh.colors, 3), axis=0, return_inverse=True)
+    for link in dict.fromkeys(name for name, _ in surfaces):
+        mesh = join_meshes([triangles for name, triangles in surfaces if name == link])
+        colors, color_index = np.unique(np.round(mesh.colors, 3), axis=0, return_inverse=True)
         for k, color in enumerate(colors):
-            own = mesh.faces[which.ravel() == k]
-            if len(own):
-                parts.append(part_of(link, mesh.vertices, own, color))
+            faces = mesh.faces[color_index.ravel() == k]
+            if len(faces):
+                parts.append(part_of(link, mesh.vertices, faces, color))
     return parts
 
 
 def part_of(link: str, vertices: Array, faces: NDArray[np.intp], color: Any) -> Part:
-    """A part with normals: those of the faces around a corner that are no sharp edge away, by their area."""
+    """Return a part with normals: area-weighted means over the faces at a corner that do not meet at a crease."""
     places, where = np.unique(np.round(vertices, 6) + 0.0, axis=0, return_inverse=True)
     faces = where.ravel()[faces]
     one, two, three = (places[faces[:, k]] for k in range(3))
@@ -279,15 +275,15 @@ def part_of(link: str, vertices: Array, faces: NDArray[np.intp], color: Any) -> 
     counts = np.bincount(corners, minlength=len(places))
     starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
     around = counts[corners]
-    few = np.flatnonzero(around <= SURFACE_STYLE.most_around)
-    mine = np.repeat(few, around[few])  # corners, and beside each those at the same place
+    few = np.flatnonzero(around <= SURFACE_STYLE.max_neighbours)
+    mine = np.repeat(few, around[few])  # pairs of face corners at the same point
     step = np.arange(len(mine)) - np.repeat(np.cumsum(around[few]) - around[few], around[few])
     theirs = order[starts[corners[mine]] + step] // 3
     smooth = (units[mine // 3] * units[theirs]).sum(axis=1) > np.cos(SURFACE_STYLE.crease)
     mine, theirs = mine[smooth], theirs[smooth]
     sums = np.stack([np.bincount(mine, areas[theirs, k], len(corners)) for k in range(3)], axis=1)
-    alone = around > SURFACE_STYLE.most_around
-    sums[alone] = units[np.flatnonzero(alone) // 3]
+    exclusive = around > SURFACE_STYLE.max_neighbours
+    sums[exclusive] = units[np.flatnonzero(exclusive) // 3]
     normals = sums / np.maximum(np.linalg.norm(sums, axis=1), 1e-300)[:, None]
     fine = np.round(normals * 100).astype(np.int64)
     _, first, which = np.unique(np.column_stack([corners, fine]), axis=0, return_index=True, return_inverse=True)
@@ -297,26 +293,26 @@ def part_of(link: str, vertices: Array, faces: NDArray[np.intp], color: Any) -> 
 
 
 PLAN = "#0072B2"
-"""Of the plan, or of the motion that is looked at."""
+"""Colour of the plan, or of the main motion."""
 COMPARED = "#D55E00"
-"""Of what it is compared with: the pseudo-inverse, a paper's method, another plan."""
+"""Colour of motions compared with it: the pseudo-inverse, the method of a paper, another plan."""
 LIMIT = "#6E6E6E"
-"""Of what it must not pass; dashed."""
+"""Colour of limits; dashed."""
 FAULT = "#CC79A7"
-"""Of where it does."""
+"""Colour of violations."""
 TIP = "#009E73"
-"""Of the tip's way."""
+"""Colour of the tip path."""
 SCENE = "#6E6E6E"
-"""Of what stands around."""
+"""Colour of obstacles."""
 
 
 TIP_FRAME = "the tip frame"
-"""Key of the tip among the frames; no link can have it that is also a link of the arm drawn."""
+"""Key of the tip among the frames; no drawn link can have this name."""
 
 
 @dataclass(frozen=True)
 class Frames:
-    """Frames in the world along a motion, by link name and TIP_FRAME.
+    """Frames in world along a motion, by link name and TIP_FRAME.
 
     Attributes:
         rotations: Axes as columns. Shape (M, 3, 3) each.
@@ -333,12 +329,12 @@ class Frames:
 
 
 def frames_function(machine: Machine) -> Callable[[Any, Any], Frames]:
-    """A function of (joints, base), as of frames_along, that is made once and called often."""
+    """Return `frames_along` as a function of (joints, base), to be evaluated many times."""
     robot = machine.robot
     q, b = ca.SX.sym("q", robot.dof), ca.SX.sym("b", machine.base_size)
-    found = link_frames(robot, q, machine.world_from_base(b))
-    names = [*found]
-    entries = [ca.vertcat(ca.vec(frame.rotation), frame.position) for frame in found.values()]
+    frames_of_links = link_frames(robot, q, machine.world_from_base(b))
+    names = [*frames_of_links]
+    entries = [ca.vertcat(ca.vec(frame.rotation), frame.position) for frame in frames_of_links.values()]
     if robot.tip is not None:
         tip = machine.tip_pose(b, q)
         entries.append(ca.vertcat(ca.vec(tip.rotation), tip.position))
@@ -362,7 +358,7 @@ def frames_function(machine: Machine) -> Callable[[Any, Any], Frames]:
 
 
 def frames_along(machine: Machine, joints: Any, base: Any = None) -> Frames:
-    """Frames of all links, and of the tip where the robot has one.
+    """Return the frames of all links, and of the tip if the robot has one.
 
     Args:
         machine: The robot on its base.
@@ -370,11 +366,11 @@ def frames_along(machine: Machine, joints: Any, base: Any = None) -> Frames:
         base: Shape (M, base_size); None for a fixed base.
 
     Raises:
-        ModelError: Wrong sizes.
+        ModelError: A size is wrong.
     """
     return frames_function(machine)(joints, base)
 
 
 def chain(robot: Robot) -> list[str]:
-    """Links from the root to the tip, and TIP_FRAME: the arm as a line of points."""
+    """Return the links from the root to the tip, and TIP_FRAME: the arm as a polyline."""
     return [robot.root, *(joint.child for joint in robot.path_to(robot.tip_link)), TIP_FRAME]

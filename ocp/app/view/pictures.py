@@ -1,7 +1,4 @@
-"""Pictures of a motion for a report: the robot as it looks at several times, the curves of its joints with limits.
-
-What stands or moves around a machine, for pictures and for the view: bodies, half-spaces as pieces of a plane.
-"""
+"""Draw pictures of a motion for a report: the robot and obstacles at several times, and joint curves with limits."""
 
 from __future__ import annotations
 
@@ -17,7 +14,7 @@ from models import HalfSpace, Machine
 from models.arrays import Array
 from models.shapes.hull import convex_hull
 from models.shapes.shapes import Shape
-from ocp.app.check.pieces import Motion
+from ocp.app.check.interpolation import Motion
 from ocp.app.view.appearance import (
     COMPARED,
     FAULT,
@@ -30,7 +27,7 @@ from ocp.app.view.appearance import (
     frames_along,
     part_of,
 )
-from ocp.app.view.rendering import PICTURE_STYLE, Camera, Floor, Layer, placed, render, tube
+from ocp.app.view.rendering import PICTURE_STYLE, Camera, Floor, Layer, parts_in_world, render, tube
 from ocp.audit.clearance import separation_frames
 from ocp.motion.plan import Plan
 from ocp.motion.tasks.limits import JointBounds
@@ -42,31 +39,31 @@ __all__ = [
     "STYLE",
     "Obstacle",
     "Solid",
-    "add_names",
+    "add_legend",
     "as_svg",
-    "curves",
+    "draw_curves",
     "draw_joints",
-    "look",
-    "looks_of",
+    "draw_limits",
+    "draw_scene",
+    "line_style",
     "obstacles_of",
-    "of_shapes",
-    "scene",
-    "show_limits",
+    "obstacles_of_shapes",
+    "times_by_part",
 ]
 
 Solid = tuple[Array, NDArray[np.intp]]
-"""Corners (k, 3), m, and triangles of them (f, 3)."""
+"""Corners (k, 3), m, and triangles as their indices (f, 3)."""
 
 
 class Obstacle(NamedTuple):
-    """A body, the hull of points swelled by a radius, or all that lies behind a plane.
+    """A body, the convex hull of points inflated by a radius, or a half-space.
 
     Attributes:
-        core: Points. Shape (k, 3), m; of a half-space one of its plane.
+        core: Points. Shape (k, 3), m; for a half-space one point of its plane.
         radius: m.
-        normal: Of a half-space, out of it, shape (3,); else None.
-        rotations, positions: Of the frame in world at the times of a motion, shapes (M, 3, 3) and (M, 3), m; None where
-            it stands still, its points in world.
+        normal: Outward normal of a half-space, shape (3,); otherwise None.
+        rotations, positions: Frame of the body in world at the times of a motion, shapes (M, 3, 3) and (M, 3), m; None
+            if it is static, with points in world.
     """
 
     core: Array
@@ -75,76 +72,77 @@ class Obstacle(NamedTuple):
     rotations: Array | None = None
     positions: Array | None = None
 
-    def solid(self, before: Array) -> Solid:
-        """Its surface, in its own frame; of a half-space a square of its plane before which points (k, 3) move."""
+    def solid(self, points: Array) -> Solid:
+        """Return the surface in the body's own frame; for a half-space a square near points (k, 3)."""
         if self.normal is None:
-            around = np.zeros((1, 3))
+            offsets = np.zeros((1, 3))
             if self.radius > 0:
                 u, v = np.meshgrid(np.linspace(0, 2 * np.pi, 13)[:-1], np.linspace(-np.pi / 2, np.pi / 2, 7))
                 unit = np.stack([np.cos(v) * np.cos(u), np.cos(v) * np.sin(u), np.sin(v)], axis=-1)
-                around = self.radius * unit.reshape(-1, 3)
-            hull = convex_hull((np.asarray(self.core)[:, None] + around).reshape(-1, 3))
+                offsets = self.radius * unit.reshape(-1, 3)
+            hull = convex_hull((np.asarray(self.core)[:, None] + offsets).reshape(-1, 3))
             return np.asarray(hull.vertices), hull.faces
-        low, high = before.min(axis=0), before.max(axis=0)
+        low, high = points.min(axis=0), points.max(axis=0)
         middle = (low + high) / 2
         middle = middle - self.normal * (self.normal @ (middle - self.core[0]))
-        one = np.cross(self.normal, np.eye(3)[int(np.abs(self.normal).argmin())])
-        one /= np.linalg.norm(one)
-        sides = SURFACE_STYLE.patch * float(np.linalg.norm(high - low)) * np.stack([one, np.cross(self.normal, one)])
+        side = np.cross(self.normal, np.eye(3)[int(np.abs(self.normal).argmin())])
+        side /= np.linalg.norm(side)
+        sides = SURFACE_STYLE.patch * float(np.linalg.norm(high - low)) * np.stack([side, np.cross(self.normal, side)])
         return middle + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) @ sides, np.array([[0, 1, 2], [0, 2, 3]])
 
 
-def of_shapes(shapes: Iterable[Shape]) -> list[Obstacle]:
-    """Shapes that stand still in world."""
+def obstacles_of_shapes(shapes: Iterable[Shape]) -> list[Obstacle]:
+    """Return static obstacles of shapes in world."""
     return [
-        Obstacle(np.asarray(one.point, dtype=float)[None], 0.0, np.asarray(one.normal, dtype=float))
-        if isinstance(one, HalfSpace)
-        else Obstacle(np.asarray(one.core), one.swept_radius)
-        for one in shapes
+        Obstacle(np.asarray(shape.point, dtype=float)[None], 0.0, np.asarray(shape.normal, dtype=float))
+        if isinstance(shape, HalfSpace)
+        else Obstacle(np.asarray(shape.core), shape.swept_radius)
+        for shape in shapes
     ]
 
 
 def obstacles_of(solution: Solution, parts: Sequence[tuple[str, Array]]) -> list[Obstacle]:
-    """Obstacles as the problem of a solution knows them.
+    """Return the obstacles in the problem of a solution.
 
-    Those that move ride on a frame that depends on the time and on no state.
+    A moving obstacle is attached to a frame that depends on time but on no state.
 
     Args:
-        solution: Its problem says what has to stay apart; without one nothing is known.
-        parts: Of a motion, one after the other: the suffix of the names of its states, "" of a whole, and the times in
-            the solution, shape (K,), s, at which it is looked at.
+        solution: Its problem declares the separations; without a problem there are no obstacles.
+        parts: Parts of a motion in sequence: the suffix of the names of its states, "" for a single part, and the times
+            in the solution, shape (K,), s, to evaluate.
     """
     problem = solution.problem
     if problem is None:
         return []
-    still: dict[str, Obstacle] = {}
+    static: dict[str, Obstacle] = {}
     moving: dict[str, list[tuple[Any, Array, Array]]] = {}
     for suffix, times in parts:
-        placed: list[tuple[Separation, Any]] | None = None
-        for apart in problem.declared.apart.values():
-            if not all(name.endswith(suffix) for name in apart.movers):
+        placements: list[tuple[Separation, Any]] | None = None
+        for separation in problem.declared.apart.values():
+            if not all(name.endswith(suffix) for name in separation.movers):
                 continue
-            riding = [frame for frame in {hull.frame for hull in apart.hulls.values()} if _moves(problem, apart, frame)]
-            for name, hull in apart.hulls.items():
+            frames_of_hulls = {hull.frame for hull in separation.hulls.values()}
+            moving_frames = [frame for frame in frames_of_hulls if _moves(problem, separation, frame)]
+            for name, hull in separation.hulls.items():
                 if hull.frame < 0:
-                    still[name] = Obstacle(hull.core, hull.radius, hull.normal if hull.normal.size else None)
-                elif hull.frame in riding:
-                    if placed is None:
-                        placed = separation_frames(problem, solution, times, suffix)
-                    frames = next(frames for one, frames in placed if one is apart)
-                    at = frames.rotations[:, hull.frame], frames.positions[:, hull.frame]
-                    moving.setdefault(name, []).append((hull, *at))
-    found = list(still.values())
-    for pieces in moving.values():
-        hull = pieces[0][0]
-        rotations, positions = (np.concatenate([piece[k] for piece in pieces]) for k in (1, 2))
+                    static[name] = Obstacle(hull.core, hull.radius, hull.normal if hull.normal.size else None)
+                elif hull.frame in moving_frames:
+                    if placements is None:
+                        placements = separation_frames(problem, solution, times, suffix)
+                    frames = next(frames for one, frames in placements if one is separation)
+                    poses = frames.rotations[:, hull.frame], frames.positions[:, hull.frame]
+                    moving.setdefault(name, []).append((hull, *poses))
+    obstacles = list(static.values())
+    for segments in moving.values():
+        hull = segments[0][0]
+        rotations, positions = (np.concatenate([segment[k] for segment in segments]) for k in (1, 2))
         if len(positions) == sum(len(times) for _, times in parts):
-            found.append(Obstacle(hull.core, hull.radius, None, rotations, positions))
-    return found
+            obstacles.append(Obstacle(hull.core, hull.radius, None, rotations, positions))
+    return obstacles
 
 
-def looks_of(plan: Plan, times: Array) -> list[tuple[str, Array]]:
-    """Ascending times of a plan (M,), s, part by part: the suffix of its states, and the times in its solution."""
+def times_by_part(plan: Plan, times: Array) -> list[tuple[str, Array]]:
+    """Return increasing times of a plan (M,), s, by part: the suffix of its states, and the times in its solution."""
     begins = [part.begin for part in plan.parts]
     which = np.clip(np.searchsorted(begins, times, "right") - 1, 0, len(begins) - 1)
     return [
@@ -153,65 +151,69 @@ def looks_of(plan: Plan, times: Array) -> list[tuple[str, Array]]:
     ]
 
 
-def _moves(problem: Problem, apart: Separation, frame: int) -> bool:
-    """Whether a frame moves by the time alone."""
+def _moves(problem: Problem, separation: Separation, frame: int) -> bool:
+    """Return whether a frame moves by time alone."""
     if frame < 0:
         return False
-    rows = apart.placements[12 * frame : 12 * frame + 12]
-    states = ca.vertcat(*(ca.vec(one.symbol) for one in problem.declared.states.values()))
+    rows = separation.placements[12 * frame : 12 * frame + 12]
+    states = ca.vertcat(*(ca.vec(state.symbol) for state in problem.declared.states.values()))
     return bool(ca.depends_on(rows, problem.time)) and not ca.depends_on(rows, states)
 
 
 STYLE: Any = {"font.size": 7.5, "axes.titlesize": 8.5, "axes.spines.top": False, "axes.spines.right": False}
-STYLE |= {"text.parse_math": False}  # a dollar in a joint's name is a dollar
+"""Settings of matplotlib."""
+STYLE |= {"text.parse_math": False}  # a joint's name may contain a dollar
 DASHES: tuple[Any, ...] = ((0, (1, 1)), (0, (5, 1.5)), (0, (4, 1.2, 1, 1.2)))
-"""Of what a plan is compared with, so that nothing is known by its colour alone."""
+"""Line styles of the motions compared with a plan, so that colour is not the only distinction."""
 
 
-def scene(
-    machine: Machine, motion: Motion, bases: Array | None, around: Sequence[Obstacle], folders: Sequence[Any] = ()
+def draw_scene(
+    machine: Machine, motion: Motion, bases: Array | None, obstacles: Sequence[Obstacle], folders: Sequence[Any] = ()
 ) -> bytes:
-    """The robot as it looks at several times, at the last one solid, its tip's way, and what is around; a PNG.
+    """Return a PNG of the robot at several times (the last one solid), its tip path, and obstacles.
 
-    Obstacles that move stand where they are at the end; `around` has them at equal times of the motion.
+    Moving obstacles are drawn at the final time; `obstacles` has them at uniform times of the motion.
     """
     from matplotlib.colors import to_rgb
     from matplotlib.image import imsave
 
     times = np.linspace(motion.t[0], motion.t[-1], PICTURE_STYLE.curve_points)
-    places = None if bases is None else np.column_stack([np.interp(times, motion.t, column) for column in bases.T])
-    frames = frames_along(machine, motion.position.at(times), places)
-    looks = appearance_of(machine.robot, folders)
-    shown = [placed(looks, frames, int(k)) for k in np.linspace(0, PICTURE_STYLE.curve_points - 1, PICTURE_STYLE.poses)]
-    clouds = [part.vertices for parts in shown for part in parts]
-    before, still = np.vstack(clouds), []
-    for one in around:
-        corners, faces = one.solid(before)
-        if one.rotations is not None and one.positions is not None:
-            corners = corners @ one.rotations[-1].T + one.positions[-1]
-        still.append(part_of("", corners, faces, (*to_rgb(SCENE), 1.0)))
-        if one.normal is None:
-            clouds.append(corners)
+    base = None if bases is None else np.column_stack([np.interp(times, motion.t, column) for column in bases.T])
+    frames = frames_along(machine, motion.position.at(times), base)
+    appearance = appearance_of(machine.robot, folders)
+    poses = [
+        parts_in_world(appearance, frames, int(k))
+        for k in np.linspace(0, PICTURE_STYLE.curve_points - 1, PICTURE_STYLE.poses)
+    ]
+    points = [part.vertices for parts in poses for part in parts]
+    robot_points, static = np.vstack(points), []
+    for obstacle in obstacles:
+        corners, faces = obstacle.solid(robot_points)
+        if obstacle.rotations is not None and obstacle.positions is not None:
+            corners = corners @ obstacle.rotations[-1].T + obstacle.positions[-1]
+        static.append(part_of("", corners, faces, (*to_rgb(SCENE), 1.0)))
+        if obstacle.normal is None:
+            points.append(corners)
     if machine.robot.tip is not None:
-        clouds.append(frames.tip)
-    cloud = np.vstack(clouds)
-    low, high = cloud.min(axis=0), cloud.max(axis=0)
+        points.append(frames.tip)
+    all_points = np.vstack(points)
+    low, high = all_points.min(axis=0), all_points.max(axis=0)
     size = float((high - low).max())
     if machine.robot.tip is not None:
-        still.append(tube(frames.tip, PICTURE_STYLE.line * size, to_rgb(TIP)))
-    pale = [Layer(parts, 0.12 + 0.08 * k, to_rgb(PLAN)) for k, parts in enumerate(shown[:-1])]
+        static.append(tube(frames.tip, PICTURE_STYLE.line * size, to_rgb(TIP)))
+    transparent = [Layer(parts, 0.12 + 0.08 * k, to_rgb(PLAN)) for k, parts in enumerate(poses[:-1])]
     floor = None if machine.base_size else Floor(low[2], tuple((low + high)[:2] / 2), 1.1 * size, 0.1)
-    layers = [Layer(shown[-1]), Layer(still), *pale]
-    picture = render(layers, Camera.around(cloud, PICTURE_STYLE.size), floor=floor)
+    layers = [Layer(poses[-1]), Layer(static), *transparent]
+    picture = render(layers, Camera.around(all_points, PICTURE_STYLE.size), floor=floor)
     stream = io.BytesIO()
     imsave(stream, picture, format="png")
     return stream.getvalue()
 
 
-def curves(
+def draw_curves(
     motion: Motion, names: Sequence[str], units: Sequence[str], bounds: JointBounds, faults: Sequence[Any]
 ) -> str:
-    """Position, velocity and acceleration of every joint with its limits, and where faults are; an SVG."""
+    """Return an SVG of position, velocity and acceleration of every joint with its limits and faults."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(PICTURE_STYLE.width, 0.4 + 1.15 * len(names)), layout="constrained")
@@ -227,9 +229,9 @@ def draw_joints(
     bounds: JointBounds,
     faults: Sequence[Any] = (),
 ) -> None:
-    """Position, velocity and acceleration of every joint over time into an empty figure, with limits and faults.
+    """Draw position, velocity and acceleration of every joint over time into an empty figure, with limits and faults.
 
-    Of several motions, by name, the first is the plan, and the others are what it is compared with.
+    The first of several motions is the plan; the others are compared with it.
     """
     import matplotlib
 
@@ -237,26 +239,26 @@ def draw_joints(
     with matplotlib.rc_context(STYLE):
         grid: Any = figure.subplots(len(names), 3, squeeze=False, sharex=True)
         for column, (kind, per) in enumerate(kinds):
-            drawn = []
-            for number, motion in reversed([*enumerate(motions.values())]):  # the plan on top
-                spread = motion.t[:: len(motion.t) // PICTURE_STYLE.curve_points + 1]
+            samples = []
+            for number, motion in reversed([*enumerate(motions.values())]):  # the plan last, on top
+                own_times = motion.t[:: len(motion.t) // PICTURE_STYLE.curve_points + 1]
                 times = np.unique(
-                    np.concatenate([np.linspace(motion.t[0], motion.t[-1], PICTURE_STYLE.curve_points), spread])
+                    np.concatenate([np.linspace(motion.t[0], motion.t[-1], PICTURE_STYLE.curve_points), own_times])
                 )
-                one = motion.along(kind)
-                drawn.append((number, times, None if one is None else one.pieces.at(times)))
-            most = getattr(bounds, kind, None)
-            lower, upper = (bounds.lower, bounds.upper) if most is None else (-most, most)
-            least = PICTURE_STYLE.flat * max(
-                (np.abs(values).max() for _, _, values in drawn if values is not None), default=1.0
+                quantity = motion.quantity(kind)
+                samples.append((number, times, None if quantity is None else quantity.pieces.at(times)))
+            limit = getattr(bounds, kind, None)
+            lower, upper = (bounds.lower, bounds.upper) if limit is None else (-limit, limit)
+            min_range = PICTURE_STYLE.flat * max(
+                (np.abs(values).max() for _, _, values in samples if values is not None), default=1.0
             )
             grid[0, column].set_title(kind)
             for row, name in enumerate(names):
                 ax = grid[row, column]
-                for number, times, values in drawn:
+                for number, times, values in samples:
                     if values is not None:
-                        ax.plot(times, values[:, row], **look(number))
-                show_limits(ax, lower[row], upper[row], least)
+                        ax.plot(times, values[:, row], **line_style(number))
+                draw_limits(ax, lower[row], upper[row], min_range)
                 for fault in faults:
                     if fault.name == name and fault.kind == kind and fault.time is not None:
                         ax.axvline(fault.time, color=FAULT, lw=1.6)
@@ -265,47 +267,47 @@ def draw_joints(
         for ax in grid[-1]:
             ax.set_xlabel("time, s")
         if len(motions) > 1:
-            add_names(figure, list(motions))
+            add_legend(figure, list(motions))
 
 
-def show_limits(ax: Any, lower: float, upper: float, least: float) -> None:
-    """Limits of the curves in some axes: dashed where they are near, and said in words where they are far.
+def draw_limits(ax: Any, lower: float, upper: float, min_range: float) -> None:
+    """Draw the limits of the curves in an axes: dashed if they are close, as text if they are far.
 
-    Curves that change by less than `least` are drawn as ones that do not.
+    Curves with a range smaller than `min_range` are drawn as constant.
     """
     low, high = ax.dataLim.y0, ax.dataLim.y1
     if not np.isfinite([low, high]).all():
         low = high = 0.0
-    span = max(high - low, least) or 1.0
-    far = []
+    span = max(high - low, min_range) or 1.0
+    distant = []
     for limit in (lower, upper):
-        if low - PICTURE_STYLE.limit_room * span <= limit <= high + PICTURE_STYLE.limit_room * span:
+        if low - PICTURE_STYLE.limit_distance * span <= limit <= high + PICTURE_STYLE.limit_distance * span:
             ax.axhline(limit, color=LIMIT, lw=0.9, ls=(0, (5, 2)))
             low, high = min(low, limit), max(high, limit)
         elif np.isfinite(limit):
-            far.append(f"{limit:.3g}")
-    if far:
-        words = f"limit{'s' if len(far) > 1 else ''} {', '.join(far)}"
+            distant.append(f"{limit:.3g}")
+    if distant:
+        words = f"limit{'s' if len(distant) > 1 else ''} {', '.join(distant)}"
         ax.annotate(words, (0.99, 0.97), xycoords="axes fraction", ha="right", va="top", color=LIMIT, fontsize=6)
-    room = max(0.06 * (high - low), 0.55 * (span - (high - low)))
-    ax.set_ylim(low - room, high + room + (0.1 * span if far else 0.0))
+    margin = max(0.06 * (high - low), 0.55 * (span - (high - low)))
+    ax.set_ylim(low - margin, high + margin + (0.1 * span if distant else 0.0))
 
 
-def look(number: int) -> dict[str, Any]:
-    """How the curve of a plan, number 0, and those of what it is compared with are drawn."""
+def line_style(number: int) -> dict[str, Any]:
+    """Return the line style of a plan, number 0, or of a motion compared with it."""
     return {"color": PLAN, "lw": 1.4} if number == 0 else {"color": COMPARED, "lw": 1.1, "ls": DASHES[number % 3]}
 
 
-def add_names(figure: Any, names: Sequence[str]) -> None:
-    """A legend below a figure: the plan's name, and those of what it is compared with."""
+def add_legend(figure: Any, names: Sequence[str]) -> None:
+    """Add a legend below a figure: the name of the plan, and those of the motions compared with it."""
     from matplotlib.lines import Line2D
 
-    lines = [Line2D([], [], **look(number)) for number in range(len(names))]
+    lines = [Line2D([], [], **line_style(number)) for number in range(len(names))]
     figure.legend(lines, names, loc="outside lower center", ncols=len(names), frameon=False, fontsize=8)
 
 
 def as_svg(figure: Any) -> str:
-    """A figure as the element `svg`, for a page."""
+    """Return a figure as an `svg` element for a page."""
     import matplotlib
 
     stream = io.StringIO()

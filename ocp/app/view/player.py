@@ -1,14 +1,12 @@
-"""A page that plays motions: robots as they look, paths, curves with limits and a time cursor, the audit.
+"""Create a page that plays motions, with robots, paths, curves with limits and the audit, and serve it on this machine.
 
-The page holds all it needs, geometry and script, and its policy forbids the browser to ask any host for anything: it
-plays from a file, without a server. What `selfmotion view` serves is the same page.
+The page contains its geometry and scripts, and its policy forbids requests to any host, so that it plays from a file
+without a server. `selfmotion view` serves the same page until Ctrl-C. A request must name this machine as its host,
+which excludes the page of a stranger whose domain resolves to this machine.
 
-Scene and curves are drawn by scripts of our own (ocp/app/page/): the clients of viewer libraries play recordings, but
-offer neither the time that they show nor a way to set it, which curves beside them need, and weigh more than this page.
-
-A page served on this machine alone, until Ctrl-C.
-
-A request must name this machine as its host: the page of a stranger whose own name was made to lead here names another.
+Scene and curves are drawn by scripts of our own (ocp/app/view/page/). The clients of viewer libraries also play
+recordings, but they neither report the displayed time nor let it be set, which the time cursor of the curves needs,
+and they are larger than this page.
 """
 
 from __future__ import annotations
@@ -32,31 +30,31 @@ from numpy.typing import NDArray
 from models import Robot
 from models.arrays import Array
 from models.spatial import quaternion_from_rotation
-from ocp.app.view.appearance import TIP_FRAME, Appearance, Frames, appearance_of, frames_along
-from ocp.app.view.shown import PAGE_SETTINGS, Shown
+from ocp.app.view.animation import PAGE_SETTINGS, Animation
+from ocp.app.view.appearance import TIP_FRAME, Appearance, Frames, appearance_of, frames_along, part_of
 from ocp.errors import ProblemError
 
-__all__ = ["Buffers", "Page", "Served", "page", "unpacked"]
+__all__ = ["Buffers", "Page", "PageServer", "build_page"]
 
 SCRIPTS = ("scene.js", "curves.js", "player.js")
 
 
 class Buffers:
-    """Arrays one after the other, which a description refers to by their place."""
+    """Arrays in one block of bytes, referred to by their offsets."""
 
     def __init__(self) -> None:
         self.parts: list[bytes] = []
         self.size = 0
 
     def put(self, values: Any, kind: str) -> dict[str, Any]:
-        """Keep an array as numbers of a kind, "f4", "u2", "i1", "u4"; what a description holds instead."""
+        """Store an array as numbers of a kind, "f4", "u2", "i1" or "u4", and return its reference."""
         array = np.ascontiguousarray(values, dtype=f"<{kind}" if kind != "i1" else kind)
         data = array.tobytes()
-        told = {"at": self.size, "kind": kind, "shape": list(array.shape)}
+        reference = {"at": self.size, "kind": kind, "shape": list(array.shape)}
         data += b"\0" * (-len(data) % 4)
         self.parts.append(data)
         self.size += len(data)
-        return told
+        return reference
 
 
 class Page(NamedTuple):
@@ -64,189 +62,168 @@ class Page(NamedTuple):
 
     Attributes:
         text: HTML.
-        missing: Meshes that it does not show, as the descriptions name them, and why.
+        missing: Meshes that are not shown, as named in the descriptions, and the reasons.
     """
 
     text: str
     missing: dict[str, str]
 
 
-def page(shown: Sequence[Shown], *, title: str = "", folders: Sequence[Any] = (), meshes: bool = True) -> Page:
-    """The page of one motion, or of several, the first held against the others.
+def build_page(
+    shown: Sequence[Animation], *, title: str = "", folders: Sequence[Any] = (), meshes: bool = True
+) -> Page:
+    """Return the page of one motion, or of a motion and others to compare it with.
 
     Args:
         shown: The motions.
-        title: The first motion's name if "".
-        folders: Where meshes are looked for first.
-        meshes: Whether files of meshes are read; else what links touch with is shown.
+        title: Title; "": the name of the first motion.
+        folders: Folders that are searched first for meshes.
+        meshes: Whether mesh files are read; otherwise collision shapes are shown.
 
     Raises:
-        ProblemError: Nothing to show, or a page that is too large.
+        ProblemError: There is no motion, or the page is too large.
     """
     if not shown:
         raise ProblemError("a page shows at least one motion", name="shown", value=0)
     buffers = Buffers()
     robots: list[tuple[Robot, dict[str, Any]]] = []
     motions, missing = [], dict[str, str]()
-    for one in shown:
-        robot = one.machine.robot
+    for motion in shown:
+        robot = motion.machine.robot
         number = next((k for k, (known, _) in enumerate(robots) if _alike(known, robot)), None)
         if number is None:
-            looks = appearance_of(robot, folders, meshes=meshes)
-            missing |= looks.missing
-            robots.append((robot, _robot(robot, looks, buffers)))
+            appearance = appearance_of(robot, folders, meshes=meshes)
+            missing |= appearance.missing
+            robots.append((robot, _robot(robot, appearance, buffers)))
             number = len(robots) - 1
-        motions.append({**_motion(one, buffers), "robot": number})
+        motions.append({**_motion(motion, buffers), "robot": number})
     name = title or shown[0].name
-    told = {"title": name, "robots": [one for _, one in robots], "motions": motions, "missing": missing}
-    head = json.dumps(told, allow_nan=False, separators=(",", ":")).encode()
+    description = {"title": name, "robots": [motion for _, motion in robots], "motions": motions, "missing": missing}
+    head = json.dumps(description, allow_nan=False, separators=(",", ":")).encode()
     head += b" " * (-len(head) % 4)
-    whole = len(head).to_bytes(4, "little") + head + b"".join(buffers.parts)
-    data = base64.b64encode(gzip.compress(whole, 9, mtime=0)).decode()
+    data_bytes = len(head).to_bytes(4, "little") + head + b"".join(buffers.parts)
+    data = base64.b64encode(gzip.compress(data_bytes, 9, mtime=0)).decode()
     text = _filled(name, shown[0], data)
     size, most = len(text.encode()), PAGE_SETTINGS.most_bytes
     if size > most:
-        words = f"the page has {size / 1e6:.3g} MB, at most {most / 1e6:g} are written; show fewer motions"
+        words = f"the page has {size / 1e6:.3g} MB, at most {most / 1e6:g} are allowed; show fewer motions"
         raise ProblemError(words, name="page", value=size, limit=most)
     return Page(text, missing)
 
 
-def unpacked(text: str) -> tuple[dict[str, Any], dict[int, NDArray[Any]]]:
-    """What a page holds: its description, and the arrays by their places."""
-    mark = '<script id="data" type="text/plain">'
-    begin = text.index(mark) + len(mark)
-    whole = gzip.decompress(base64.b64decode(text[begin : text.index("</script>", begin)]))
-    size = int.from_bytes(whole[:4], "little")
-    told, body = json.loads(whole[4 : 4 + size]), whole[4 + size :]
-    arrays: dict[int, NDArray[Any]] = {}
-
-    def look(value: Any) -> None:
-        if isinstance(value, dict) and set(value) == {"at", "kind", "shape"}:
-            count = int(np.prod(value["shape"]))
-            found = np.frombuffer(body, f"<{value['kind']}" if value["kind"] != "i1" else "i1", count, value["at"])
-            arrays[value["at"]] = found.reshape(value["shape"])
-        elif isinstance(value, dict):
-            for part in value.values():
-                look(part)
-        elif isinstance(value, list):
-            for part in value:
-                look(part)
-
-    look(told)
-    return told, arrays
-
-
-def _filled(title: str, first: Shown, data: str) -> str:
-    """The page's text."""
+def _filled(title: str, first: Animation, data: str) -> str:
+    """Return the text of the page."""
     source = files("ocp.app.view").joinpath("page")
     text = source.joinpath("page.html").read_text(encoding="utf-8")
     script = "\n".join(source.joinpath(name).read_text(encoding="utf-8") for name in SCRIPTS)
     style = source.joinpath("page.css").read_text(encoding="utf-8")
-    given = {"TITLE": escape(title), "STYLE": style, "SCRIPT": script, "DATA": data, "VERDICT": escape(first.verdict)}
-    return re.sub(f"@({'|'.join(given)})@", lambda mark: given[mark[1]], text)
+    fields = {"TITLE": escape(title), "STYLE": style, "SCRIPT": script, "DATA": data, "VERDICT": escape(first.verdict)}
+    return re.sub(f"@({'|'.join(fields)})@", lambda match: fields[match[1]], text)
 
 
-def _alike(one: Robot, other: Robot) -> bool:
-    """Whether two robots look the same."""
-    if one is other:
+def _alike(a: Robot, b: Robot) -> bool:
+    """Return whether two robots look the same."""
+    if a is b:
         return True
-    names = [[part.name for part in robot.links] for robot in (one, other)]
-    if names[0] != names[1] or one.tip != other.tip or not np.array_equal(one.tip_translation, other.tip_translation):
+    names = [[part.name for part in robot.links] for robot in (a, b)]
+    if names[0] != names[1] or a.tip != b.tip or not np.array_equal(a.tip_translation, b.tip_translation):
         return False
     looks = [
         [(shape.kind, shape.file, tuple(np.ravel(shape.translation))) for link in robot.links for shape in link.visuals]
-        for robot in (one, other)
+        for robot in (a, b)
     ]
-    return looks[0] == looks[1] and all(a.moves == b.moves for a, b in zip(one.joints, other.joints, strict=True))
+    return looks[0] == looks[1] and all(a.moves == b.moves for a, b in zip(a.joints, b.joints, strict=True))
 
 
 def _carriers(robot: Robot) -> dict[str, tuple[str, Array, Array]]:
-    """Of each link the moving link that it is fixed to, or the root, and its placement there."""
-    found = {robot.root: (robot.root, np.eye(3), np.zeros(3))}
+    """Return for each link the moving link (or root) that it is fixed to, and its pose there."""
+    carriers = {robot.root: (robot.root, np.eye(3), np.zeros(3))}
     for joint in robot.joints:
         if joint.moves:
-            found[joint.child] = (joint.child, np.eye(3), np.zeros(3))
+            carriers[joint.child] = (joint.child, np.eye(3), np.zeros(3))
             continue
-        carrier, turn, shift = found[joint.parent]
-        found[joint.child] = (carrier, turn @ joint.rotation, shift + turn @ np.asarray(joint.translation))
-    return found
+        carrier, rotation, shift = carriers[joint.parent]
+        carriers[joint.child] = (carrier, rotation @ joint.rotation, shift + rotation @ np.asarray(joint.translation))
+    return carriers
 
 
 def _movers(robot: Robot) -> list[str]:
+    """Return the root and the links that move."""
     return [robot.root, *(joint.child for joint in robot.joints if joint.moves)]
 
 
-def _robot(robot: Robot, looks: Appearance, buffers: Buffers) -> dict[str, Any]:
-    """Surfaces, in the frames of the links that move."""
+def _robot(robot: Robot, appearance: Appearance, buffers: Buffers) -> dict[str, Any]:
+    """Return the surfaces in the frames of the moving links."""
     carriers, movers = _carriers(robot), _movers(robot)
     parts = []
-    for part in looks.parts:
-        carrier, turn, shift = carriers[part.link]
+    for part in appearance.parts:
+        carrier, rotation, translation = carriers[part.link]
         parts.append(
             {
                 "mover": movers.index(carrier),
                 "link": part.link,
                 "color": [round(float(value), 4) for value in part.color],
-                **_surface(part.vertices @ turn.T + shift, part.normals @ turn.T, part.faces, buffers),
+                **_surface(part.vertices @ rotation.T + translation, part.normals @ rotation.T, part.faces, buffers),
             }
         )
     return {"name": robot.name, "movers": movers, "parts": parts}
 
 
 def _surface(vertices: Array, normals: Array, faces: NDArray[np.intp], buffers: Buffers) -> dict[str, Any]:
-    """Corners to a 65535th of the size of their box, normals to a 127th."""
+    """Return a surface with corners quantised to 1/65535 of its bounding box, and normals to 1/127."""
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     step = np.maximum(high - low, 1e-9) / 65535
     padded = np.zeros((len(vertices), 4))
     padded[:, :3] = np.round((vertices - low) / step)
-    turned = np.zeros((len(normals), 4))
-    turned[:, :3] = np.round(normals * 127)
+    padded_normals = np.zeros((len(normals), 4))
+    padded_normals[:, :3] = np.round(normals * 127)
     return {
         "low": low.tolist(),
         "step": step.tolist(),
         "vertices": buffers.put(padded, "u2"),
-        "normals": buffers.put(turned, "i1"),
+        "normals": buffers.put(padded_normals, "i1"),
         "faces": buffers.put(faces, "u2" if len(vertices) < 65536 else "u4"),
     }
 
 
 def _poses(frames: Frames, names: Sequence[str]) -> Array:
-    """Positions and quaternions, each no farther from the one before than its opposite. Shape (M, k, 7)."""
-    found = []
+    """Return positions and quaternions, with signs continuous over time. Shape (M, k, 7)."""
+    poses = []
     for name in names:
-        turns = quaternion_from_rotation(frames.rotations[name])
-        flips = np.where((turns[1:] * turns[:-1]).sum(axis=1) < 0, -1.0, 1.0)
-        turns[1:] *= np.cumprod(flips)[:, None]
-        found.append(np.column_stack([frames.positions[name], turns]))
-    return np.stack(found, axis=1)
+        quaternions = quaternion_from_rotation(frames.rotations[name])
+        signs = np.where((quaternions[1:] * quaternions[:-1]).sum(axis=1) < 0, -1.0, 1.0)
+        quaternions[1:] *= np.cumprod(signs)[:, None]
+        poses.append(np.column_stack([frames.positions[name], quaternions]))
+    return np.stack(poses, axis=1)
 
 
-def _motion(one: Shown, buffers: Buffers) -> dict[str, Any]:
-    rows = np.unique(np.linspace(0, len(one.t) - 1, min(len(one.t), PAGE_SETTINGS.poses)).round().astype(int))
-    frames = frames_along(one.machine, one.joints[rows], one.base[rows])
-    tip = one.machine.robot.tip is not None
-    before = np.vstack([*frames.positions.values()])
-    movers = _movers(one.machine.robot)
-    around = []
-    for number, obstacle in enumerate(one.around):
+def _motion(motion: Animation, buffers: Buffers) -> dict[str, Any]:
+    """Return the description of a motion."""
+    rows = np.unique(np.linspace(0, len(motion.t) - 1, min(len(motion.t), PAGE_SETTINGS.poses)).round().astype(int))
+    frames = frames_along(motion.machine, motion.joints[rows], motion.base[rows])
+    tip = motion.machine.robot.tip is not None
+    points = np.vstack([*frames.positions.values()])
+    movers = _movers(motion.machine.robot)
+    obstacles = []
+    for number, obstacle in enumerate(motion.obstacles):
         mover = None
         if obstacle.rotations is not None and obstacle.positions is not None:
             mover, name = len(movers), f"what moves by itself, {number}"
             movers.append(name)
             frames.rotations[name], frames.positions[name] = obstacle.rotations[rows], obstacle.positions[rows]
-        around.append({**_solid(*obstacle.solid(before), buffers), "mover": mover})
+        obstacles.append({**_solid(*obstacle.solid(points), buffers), "mover": mover})
     names = [*movers, *([TIP_FRAME] if tip else [])]
-    told: dict[str, Any] = {
-        "name": one.name,
-        "verdict": one.verdict,
-        "passed": one.passed,
-        "cost": one.cost,
-        "horizon": float(one.t[-1]),
-        "t": buffers.put(one.t[rows], "f4"),
+    description: dict[str, Any] = {
+        "name": motion.name,
+        "verdict": motion.verdict,
+        "passed": motion.passed,
+        "cost": motion.cost,
+        "horizon": float(motion.t[-1]),
+        "t": buffers.put(motion.t[rows], "f4"),
         "poses": buffers.put(_poses(frames, names), "f4"),
         "tip": tip,
-        "floats": bool(one.machine.base_size),
-        "time": buffers.put(one.t, "f4"),
+        "floats": bool(motion.machine.base_size),
+        "time": buffers.put(motion.t, "f4"),
         "curves": [
             {
                 "group": curve.group,
@@ -256,7 +233,7 @@ def _motion(one: Shown, buffers: Buffers) -> dict[str, Any]:
                 "lower": float(curve.lower) if np.isfinite(curve.lower) else None,
                 "upper": float(curve.upper) if np.isfinite(curve.upper) else None,
             }
-            for curve in one.curves
+            for curve in motion.curves
         ],
         "targets": [
             {
@@ -264,61 +241,61 @@ def _motion(one: Shown, buffers: Buffers) -> dict[str, Any]:
                 "position": buffers.put(target.position, "f4"),
                 "rotation": buffers.put(target.rotation.reshape(-1, 9), "f4"),
             }
-            for target in one.targets
+            for target in motion.targets
             if np.isfinite(target.position).any()
         ],
-        "around": around,
+        "around": obstacles,
         "rows": [
             [row.name, _plain(row.value), _plain(row.limit), row.unit, _plain(row.time), row.verdict, row.note]
-            for row in one.rows
+            for row in motion.rows
         ],
     }
-    if one.footing is not None:
-        told["footing"] = {
-            "corners": one.footing.corners.tolist(),
-            "points": buffers.put(one.footing.points, "f4"),
-            "forces": one.footing.forces,
+    if motion.footing is not None:
+        description["footing"] = {
+            "corners": motion.footing.corners.tolist(),
+            "points": buffers.put(motion.footing.points, "f4"),
+            "forces": motion.footing.forces,
         }
-    if one.near is not None:
-        bodies = list(dict.fromkeys(one.near.bodies))
-        told["near"] = {
-            "t": buffers.put(one.near.t, "f4"),
-            "points": buffers.put(one.near.points, "f4"),
-            "distances": buffers.put(one.near.distances, "f4"),
+    if motion.closest is not None:
+        bodies = list(dict.fromkeys(motion.closest.bodies))
+        description["near"] = {
+            "t": buffers.put(motion.closest.t, "f4"),
+            "points": buffers.put(motion.closest.points, "f4"),
+            "distances": buffers.put(motion.closest.distances, "f4"),
             "bodies": [list(pair) for pair in bodies],
-            "which": [bodies.index(pair) for pair in one.near.bodies],
+            "which": [bodies.index(pair) for pair in motion.closest.bodies],
         }
-    return told
+    return description
 
 
 def _solid(vertices: Array, faces: NDArray[np.intp], buffers: Buffers) -> dict[str, Any]:
-    from ocp.app.view.appearance import part_of
-
+    """Return the surface of a solid."""
     part = part_of("", vertices, faces, (0.0, 0.0, 0.0, 1.0))
     return _surface(part.vertices, part.normals, part.faces, buffers)
 
 
 def _plain(value: float | None) -> float | None:
+    """Return a finite number, otherwise None."""
     return None if value is None or not np.isfinite(value) else float(value)
 
 
-TRIED = 20
-"""Ports after the one that is wanted."""
+PORT_ATTEMPTS = 20
+"""Number of ports to try from the requested one."""
 HOST = "127.0.0.1"
 
 
-class Served:
-    """A page on a server, which runs as long as the block.
+class PageServer:
+    """A server of one page, as a context manager.
 
     Attributes:
-        address: Where a browser finds it.
+        address: Address for the browser.
     """
 
     def __init__(self, text: str, port: int = 0) -> None:
-        """Listen, on the port or the next that is free; 0 for any.
+        """Listen on a port or the next free one; 0: any port.
 
         Raises:
-            ProblemError: No port is free, or it is none.
+            ProblemError: No port is free, or the number is invalid.
         """
         self._server = _listening(text.encode(), port)
         self.address = f"http://{HOST}:{self._server.server_address[1]}"
@@ -335,7 +312,7 @@ class Served:
         self._server.server_close()
 
     def wait(self) -> None:
-        """Until Ctrl-C, which ends it and goes no further."""
+        """Wait until Ctrl-C, which is not raised further."""
         try:
             Event().wait()
         except KeyboardInterrupt:
@@ -343,27 +320,29 @@ class Served:
 
 
 def _listening(page: bytes, port: int) -> ThreadingHTTPServer:
+    """Return a server of a page on the first free port."""
+
     class Answer(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
-            known = (self.headers.get("Host") or "").rpartition(":")[0] in (HOST, "localhost")
-            found = known and self.path.partition("?")[0] == "/"
-            self.send_response(200 if found else 404 if known else 421)
-            self.send_header("Content-Type", "text/html; charset=utf-8" if found else "text/plain")
-            self.send_header("Content-Length", str(len(page) if found else 0))
+            is_local = (self.headers.get("Host") or "").rpartition(":")[0] in (HOST, "localhost")
+            is_page = is_local and self.path.partition("?")[0] == "/"
+            self.send_response(200 if is_page else 404 if is_local else 421)
+            self.send_header("Content-Type", "text/html; charset=utf-8" if is_page else "text/plain")
+            self.send_header("Content-Length", str(len(page) if is_page else 0))
             self.end_headers()
-            if found:
+            if is_page:
                 self.wfile.write(page)
 
         def log_message(self, *words: object) -> None:
-            """Nothing: who serves a page to himself reads no log."""
+            """Log nothing: the user is the only visitor."""
 
     if not 0 <= port < 65536:
-        raise ProblemError(f"port {port} is none, 0 to 65535", name="port", value=port, limit=(0, 65535))
-    for tried in range(port, min(port + TRIED, 65536)) if port else (0,):
+        raise ProblemError(f"port {port} is invalid; use 0 to 65535", name="port", value=port, limit=(0, 65535))
+    for candidate in range(port, min(port + PORT_ATTEMPTS, 65536)) if port else (0,):
         try:
-            return ThreadingHTTPServer((HOST, tried), Answer)
+            return ThreadingHTTPServer((HOST, candidate), Answer)
         except OSError as error:
             if error.errno not in (errno.EADDRINUSE, errno.EACCES):
                 raise
-    words = f"no port from {port} to {port + TRIED - 1} is free; name another one: --port 0 takes any"
+    words = f"no port from {port} to {port + PORT_ATTEMPTS - 1} is free; choose another one, or --port 0 for any"
     raise ProblemError(words, name="port", value=port)

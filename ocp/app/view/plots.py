@@ -1,7 +1,7 @@
-"""Plans and solutions drawn: their curves with limits, beside what they are compared with; and what a notebook shows.
+"""Plot plans and solutions with limits, compare them with other motions, and display them in notebooks.
 
-`Plan.plot` and `Solution.plot` ask for these when they are called. Figures are matplotlib's, of no window: a notebook
-shows them, `figure.savefig` writes them, and one of pyplot's may be drawn into instead.
+`Plan.plot` and `Solution.plot` call these functions. The figures are matplotlib figures without a window: a notebook
+displays them, and `figure.savefig` writes them. A figure of pyplot can be passed instead.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from models.arrays import Array
-from ocp.app.check.pieces import Motion
-from ocp.app.view.pictures import STYLE, add_names, as_svg, draw_joints, look, show_limits
+from ocp.app.check.interpolation import Motion
+from ocp.app.view.pictures import STYLE, add_legend, as_svg, draw_joints, draw_limits, line_style
 from ocp.app.view.rendering import PICTURE_STYLE
 from ocp.errors import ProblemError, checked_instance
 from ocp.motion.local.accelerations import AccelerationSolution
@@ -31,7 +31,7 @@ __all__ = ["Picture", "html_of_plan", "html_of_solution", "plot_plan", "plot_sol
 
 
 class Picture(Figure):
-    """A figure that a notebook shows as it is."""
+    """A figure that a notebook displays as SVG."""
 
     def _repr_svg_(self) -> str:
         return as_svg(self)
@@ -41,34 +41,34 @@ class Picture(Figure):
 
 
 def plot_plan(plan: Plan, against: Any = None, figure: Any = None) -> Any:
-    """Position, velocity and acceleration of every joint over time, with the robot's limits.
+    """Plot position, velocity and acceleration of every joint over time, with the robot's limits.
 
     Args:
-        plan: In blue.
-        against: What it is compared with, in orange: a plan, what `resolve` or `resolve_accelerations` made, a
-            trajectory of joints; or several by name.
-        figure: An empty figure of matplotlib's to draw into, for example pyplot's, for a window; a new one if None.
+        plan: Drawn in blue.
+        against: Motion to compare with, in orange: a plan, a result of `resolve` or `resolve_accelerations`, a joint
+            trajectory; or several by name.
+        figure: Empty matplotlib figure to draw into, for example one of pyplot for a window; None: a new one.
 
     Returns:
         The figure.
 
     Raises:
-        ProblemError: Nothing that can be compared, or of other joints.
+        ProblemError: A motion cannot be compared, or has other joints.
     """
     names = plan.names
     others = {name: _compared(name, one, names) for name, one in _named(against).items()}
     motions = {"plan": _motion_of(plan), **{name: motion for name, (motion, _) in others.items()}}
-    made = _figure(figure, (PICTURE_STYLE.width, 0.9 + 1.15 * len(names)))
+    target = _figure(figure, (PICTURE_STYLE.width, 0.9 + 1.15 * len(names)))
     robot = plan.machine.robot
     units = [joint.unit for joint in robot.moving_joints]
-    draw_joints(made, motions, names, units, Limits().bounds(plan.machine))
+    draw_joints(target, motions, names, units, Limits().bounds(plan.machine))
     costs = "".join(f", that of {name} {cost:.4g}" for name, (_, cost) in others.items() if cost is not None)
-    made.suptitle(f"{robot.name}: cost {plan.cost:.4g} in {plan.horizon:.4g} s{costs}", fontsize=9.5)
-    return made
+    target.suptitle(f"{robot.name}: cost {plan.cost:.4g} in {plan.horizon:.4g} s{costs}", fontsize=9.5)
+    return target
 
 
 def html_of_plan(plan: Plan) -> str:
-    """A plan as a notebook shows it: what it costs, what its audit says where it was asked, its curves."""
+    """Return a plan as HTML for a notebook: its cost, its audit if it was computed, and its curves."""
     lines = str(plan).splitlines()
     parts = [f"<p><b>{escape(lines[0])}</b></p>"]
     if plan.audits:
@@ -76,38 +76,42 @@ def html_of_plan(plan: Plan) -> str:
     parts.append(as_svg(plot_plan(plan)))
     if len(lines) > 1:
         rest = escape("\n".join(lines[1:]))
-        parts.append(f"<details><summary>the motions that were looked at</summary><pre>{rest}</pre></details>")
+        parts.append(f"<details><summary>the candidates</summary><pre>{rest}</pre></details>")
     return f'<div style="max-width: 56rem">{"".join(parts)}</div>'
 
 
 def _motion_of(plan: Plan) -> Motion:
+    """Return the samples of a plan."""
     sample = plan.sample(plan.horizon / PICTURE_STYLE.curve_points)
     return Motion(sample.t, sample.joints, sample.rates, sample.accelerations)
 
 
 def _compared(name: str, other: Any, names: tuple[str, ...]) -> tuple[Motion, float | None]:
-    """The motion of what a plan of these joints is compared with, and what it costs, where that is known."""
+    """Return a motion to compare with a plan, and its cost if it is known."""
     cost: float | None = None
     if isinstance(other, Plan):
-        told, motion, cost = other.names, _motion_of(other), other.cost
+        joints, motion, cost = other.names, _motion_of(other), other.cost
     elif isinstance(other, LocalSolution):
-        told, motion, cost = names, Motion(other.t, other.joints, other.joint_rates), float(other.cost[-1])
+        joints, motion, cost = names, Motion(other.t, other.joints, other.joint_rates), float(other.cost[-1])
     elif isinstance(other, AccelerationSolution):
-        moved = other.motion
-        told, motion = names, Motion(moved.t, moved.joints, moved.joint_velocities, moved.joint_accelerations)
+        samples = other.motion
+        joints, motion = (
+            names,
+            Motion(samples.t, samples.joints, samples.joint_velocities, samples.joint_accelerations),
+        )
     elif isinstance(other, JointTrajectory):
-        told, motion = other.names, Motion(other.t, other.positions, other.velocities, other.accelerations)
+        joints, motion = other.names, Motion(other.t, other.positions, other.velocities, other.accelerations)
     else:
         words = (
-            f"plot: {name!r} is a {type(other).__name__}; a plan is compared with a plan, with what resolve or "
-            "resolve_accelerations made, or with a JointTrajectory"
+            f"plot: {name!r} is a {type(other).__name__}; a plan can be compared with a plan, a result of resolve or "
+            "resolve_accelerations, or a JointTrajectory"
         )
         raise ProblemError(words, name="against", value=other)
-    if told != names or motion.q.shape[1] != len(names) or len(motion.t) < 2:
+    if joints != names or motion.q.shape[1] != len(names) or len(motion.t) < 2:
         words = (
-            f"plot: {name!r} has joints {', '.join(told)} at {len(motion.t)} times; the plan's are {', '.join(names)}"
+            f"plot: {name!r} has joints {', '.join(joints)} at {len(motion.t)} times; the plan's: {', '.join(names)}"
         )
-        raise ProblemError(words, name="against", value=told, limit=names)
+        raise ProblemError(words, name="against", value=joints, limit=names)
     return motion, cost
 
 
@@ -115,37 +119,38 @@ def _compared(name: str, other: Any, names: tuple[str, ...]) -> tuple[Motion, fl
 
 
 def plot_solution(solution: Solution, against: Any = None, figure: Any = None) -> Any:
-    """States and controls over time, each entry with its bounds where the solution has its problem.
+    """Plot states and controls over time, each entry with its bounds if the solution has its problem.
 
     Args:
-        solution: In blue.
-        against: A solution of the same states and controls, what `resolve` made of the same joints, or several by name,
-            in orange. Costs are told; what `resolve` tells is the integral of half the squared joint rates.
-        figure: As of a plan.
+        solution: Drawn in blue.
+        against: Solution with the same states and controls, result of `resolve` for the same joints, or several by
+            name, in orange. The title gives the costs; that of `resolve` is the integral of half the squared joint
+            rates.
+        figure: As in `plot_plan`.
 
     Returns:
         The figure.
 
     Raises:
-        ProblemError: Nothing that can be compared, or of other states and controls.
+        ProblemError: A motion cannot be compared, or has other states and controls.
     """
     others = _named(against)
-    shapes = _widths(solution)
+    own_widths = _widths(solution)
     for name, other in others.items():
-        told = _widths(other) if isinstance(other, Solution) else _local_widths(name, other)
-        wanted = {what: shapes.get(what) for what in (told if isinstance(other, LocalSolution) else shapes)}
-        if told != wanted:
-            words = f"plot: {name!r} has {told}, the solution has {shapes}"
-            raise ProblemError(words, name="against", value=told, limit=shapes)
-    entries = [(name, k) for name, width in shapes.items() for k in range(width)]
-    left_out, entries = entries[PICTURE_STYLE.entries :], entries[: PICTURE_STYLE.entries]
+        widths = _widths(other) if isinstance(other, Solution) else _local_widths(name, other)
+        expected = {name: own_widths.get(name) for name in (widths if isinstance(other, LocalSolution) else own_widths)}
+        if widths != expected:
+            words = f"plot: {name!r} has {widths}, the solution has {own_widths}"
+            raise ProblemError(words, name="against", value=widths, limit=own_widths)
+    entries = [(name, k) for name, width in own_widths.items() for k in range(width)]
+    omitted, entries = entries[PICTURE_STYLE.entries :], entries[: PICTURE_STYLE.entries]
     bounds, units = _bounds(solution)
     rows = -(-len(entries) // PICTURE_STYLE.columns)
-    made = _figure(figure, (PICTURE_STYLE.width, 0.9 + 1.35 * rows))
+    target = _figure(figure, (PICTURE_STYLE.width, 0.9 + 1.35 * rows))
     import matplotlib
 
     with matplotlib.rc_context(STYLE):
-        grid: Any = made.subplots(rows, min(PICTURE_STYLE.columns, len(entries)), squeeze=False, sharex=True)
+        grid: Any = target.subplots(rows, min(PICTURE_STYLE.columns, len(entries)), squeeze=False, sharex=True)
         for ax in grid.ravel()[len(entries) :]:
             ax.remove()
         curves = [_along(one) for one in (solution, *others.values())]
@@ -153,86 +158,89 @@ def plot_solution(solution: Solution, against: Any = None, figure: Any = None) -
             for number, curve in reversed([*enumerate(curves)]):
                 if name in curve:
                     times, values = curve[name]
-                    ax.plot(times, values[:, k], **look(number))
+                    ax.plot(times, values[:, k], **line_style(number))
             lower, upper = bounds[name][:, k] if name in bounds else (-np.inf, np.inf)
-            show_limits(
+            draw_limits(
                 ax, lower, upper, PICTURE_STYLE.flat * max(np.abs(c[name][1]).max() for c in curves if name in c)
             )
-            ax.set_title(name if shapes[name] == 1 else f"{name} [{k}]")
+            ax.set_title(name if own_widths[name] == 1 else f"{name} [{k}]")
             ax.set_ylabel(units.get(name, ""), fontsize=7)
             ax.margins(x=0.01)
         for ax in grid.ravel()[max(0, len(entries) - grid.shape[1]) : len(entries)]:
             ax.set_xlabel("time, s")
             ax.tick_params(labelbottom=True)
         if others:
-            add_names(made, ["solution", *others])
+            add_legend(target, ["solution", *others])
     costs = "".join(f", that of {name} {np.ravel(other.cost)[-1]:.6g}" for name, other in others.items())
-    rest = f"; {len(left_out)} entries are not drawn" if left_out else ""
-    made.suptitle(f"{solution.name}: cost {solution.cost:.6g}{costs}{rest}", fontsize=9.5)
-    return made
+    rest = f"; {len(omitted)} entries are omitted" if omitted else ""
+    target.suptitle(f"{solution.name}: cost {solution.cost:.6g}{costs}{rest}", fontsize=9.5)
+    return target
 
 
 def html_of_solution(solution: Solution) -> str:
-    """A solution as a notebook shows it."""
+    """Return a solution as HTML for a notebook."""
     head, *rest = str(solution).splitlines()
     table = f"<pre>{escape(chr(10).join(rest))}</pre>"
     return f'<div style="max-width: 56rem"><p><b>{escape(head)}</b></p>{as_svg(plot_solution(solution))}{table}</div>'
 
 
 def _widths(solution: Solution) -> dict[str, int]:
+    """Return the numbers of entries of states and controls."""
     return {name: values.shape[1] for name, values in {**solution.states, **solution.controls}.items()}
 
 
 def _local_widths(name: str, other: Any) -> dict[str, int]:
-    """What is known of a motion that `resolve` made, by the names that `minimum_velocity_problem` gives."""
+    """Return the numbers of entries of a result of `resolve`, by the names of `minimum_velocity_problem`."""
     if not isinstance(other, LocalSolution):
         words = (
-            f"plot: {name!r} is a {type(other).__name__}; a solution is compared with a solution, or what resolve made"
+            f"plot: {name!r} is a {type(other).__name__}; a solution can be compared with a solution or a result of "
+            "resolve"
         )
         raise ProblemError(words, name="against", value=other)
-    return {what: values.shape[1] for what, values in _local(other).items()}
+    return {entry: values.shape[1] for entry, values in _local(other).items()}
 
 
 def _local(other: LocalSolution) -> dict[str, Array]:
-    named = {"base": other.base, "joints": other.joints, "rates": other.joint_rates}
-    return {what: values for what, values in named.items() if values.shape[1]}
+    """Return base, joints and rates of a result of `resolve`, by the names of `minimum_velocity_problem`."""
+    samples = {"base": other.base, "joints": other.joints, "rates": other.joint_rates}
+    return {name: values for name, values in samples.items() if values.shape[1]}
 
 
-def _along(one: Any) -> dict[str, tuple[Array, Array]]:
-    """By name times, both sides of every node of a solution among them, s, and the values there.
+def _along(motion: Any) -> dict[str, tuple[Array, Array]]:
+    """Return times, s, and values of states and controls by name; the times include both sides of every node.
 
-    States and controls of a phase are told over its own stretch of time.
+    States and controls of a phase are given over the interval of that phase.
     """
-    if isinstance(one, LocalSolution):
-        return {name: (one.t, values) for name, values in _local(one).items()}
-    nodes = one.control_interpolant.breaks[1:-1]
-    even = np.linspace(0.0, 1.0, PICTURE_STYLE.curve_points + 1)
-    at = np.unique(np.concatenate([even, nodes - ROUNDING_SHARE, nodes + ROUNDING_SHARE]))
-    spans = one.phases
-    found = {}
-    for name, values in one.at_fraction(at).items():
-        begin, end = spans.get(name.partition(".")[0], (0.0, one.horizon))
-        found[name] = (begin + (end - begin) * at, values)
-    return found
+    if isinstance(motion, LocalSolution):
+        return {name: (motion.t, values) for name, values in _local(motion).items()}
+    nodes = motion.control_interpolant.breaks[1:-1]
+    uniform = np.linspace(0.0, 1.0, PICTURE_STYLE.curve_points + 1)
+    fractions = np.unique(np.concatenate([uniform, nodes - ROUNDING_SHARE, nodes + ROUNDING_SHARE]))
+    spans = motion.phases
+    curves = {}
+    for name, values in motion.at_fraction(fractions).items():
+        begin, end = spans.get(name.partition(".")[0], (0.0, motion.horizon))
+        curves[name] = (begin + (end - begin) * fractions, values)
+    return curves
 
 
 def _bounds(solution: Solution) -> tuple[dict[str, Array], dict[str, str]]:
-    """Lower and upper bounds (2, n) and units of states and controls by name; none without the problem."""
+    """Return lower and upper bounds (2, n) and units of states and controls by name; empty without the problem."""
     if solution.problem is None:
         return {}, {}
     form = Formulation.of(solution.problem)
     both = np.array(form.bound_values(form.parameter_vector(solution.parameters)))
-    found: dict[str, Array] = {}
+    bounds: dict[str, Array] = {}
     for kind, pool in (("state", form.states), ("control", form.controls)):
-        found |= {name: both[:, form.bounds.places[kind]][:, place] for name, place in pool.items()}
-    return found, form.units
+        bounds |= {name: both[:, form.bounds.places[kind]][:, place] for name, place in pool.items()}
+    return bounds, form.units
 
 
 # ---- both --------------------------------------------------------------------------------------------------------
 
 
 def _named(against: Any) -> dict[str, Any]:
-    """What something is compared with, by name."""
+    """Return the motions to compare with, by name."""
     if against is None:
         return {}
     if isinstance(against, Mapping):
@@ -242,19 +250,19 @@ def _named(against: Any) -> dict[str, Any]:
     else:
         named = {"the other": against}
     if not named:
-        words = f"plot: nothing to compare with in {against!r}; give a motion, several, or none at all"
+        words = f"plot: {against!r} has no motion to compare with; pass a motion, several, or None"
         raise ProblemError(words, name="against", value=against)
     return named
 
 
-def _figure(given: Any, size: tuple[float, float]) -> Any:
-    """A new figure, or the one that is given; ProblemError where it is none or not empty."""
-    if given is None:
+def _figure(figure: Any, size: tuple[float, float]) -> Any:
+    """Return a new figure, or the given one if it is empty; raise ProblemError if it is invalid."""
+    if figure is None:
         return Picture(figsize=size, layout="constrained")
-    checked_instance("plot: figure", given, Figure)
-    if given.axes:
-        words = "plot: the figure has axes already; give an empty one"
-        raise ProblemError(words, name="figure", value=given)
-    given.set_layout_engine("constrained")
-    given.set_size_inches(size)
-    return given
+    checked_instance("plot: figure", figure, Figure)
+    if figure.axes:
+        words = "plot: the figure already has axes; pass an empty one"
+        raise ProblemError(words, name="figure", value=figure)
+    figure.set_layout_engine("constrained")
+    figure.set_size_inches(size)
+    return figure

@@ -1,8 +1,8 @@
-"""Pictures of surfaces, drawn by a z-buffer in numpy: they need no display, no graphics card and no system library.
+"""Render surfaces with a z-buffer in numpy, without a display, a graphics card or a system library.
 
-Of all triangles that cover a place of the picture the nearest is seen (Catmull 1974); what is seen is shaded with
-normals interpolated over its triangle (Phong 1975), lit from the sky, by a lamp at the eye and by a sun, whose shadows
-are those of a depth map (Williams 1978). Each pixel is the mean of several places.
+The nearest triangle at each sample of the picture is visible (Catmull 1974). It is shaded with interpolated normals
+(Phong 1975) by light from the sky, a lamp at the eye and a sun, whose shadows come from a depth map (Williams 1978).
+Each pixel is the mean of several samples.
 """
 
 from __future__ import annotations
@@ -18,37 +18,43 @@ from models.arrays import Array
 from ocp.app.view.appearance import Appearance, Frames, Part
 from ocp.errors import ProblemError
 
-__all__ = ["PICTURE_STYLE", "Camera", "Floor", "Layer", "PictureStyle", "placed", "render", "tube"]
+__all__ = ["PICTURE_STYLE", "Camera", "Floor", "Layer", "PictureStyle", "parts_in_world", "render", "tube"]
 
 
 @dataclass(frozen=True)
 class PictureStyle:
-    """How pictures and curves look.
+    """Style of pictures and curves.
 
     Attributes:
-        size: Of a rendered picture, pixels. most_pixels: Of any.
-        half_view: Angle under which half of a picture's height is seen, rad.
-        finer: Places along each side of a pixel, of which it is the mean.
-        at_once: Places that are looked at together, for the sake of memory.
-        fading: Share of the lesser side of a picture within which the floor fades towards its edge.
-        sun: Azimuth from the camera's, to its left, and elevation, rad.
-        shadow_map: Places along each side of the map of shadows, of the pixels along the greater side of the picture.
-        shadow_blur: Places of that map around one at which it is looked at.
-        shadow_bias: How far off a surface its shadow is asked for, places of that map.
-        behind: A veil that is less than this share of its distance before what is solid counts as behind it.
-        tube_sides: Of a round line. line: Its radius, of the size of what a picture shows.
-        poses: Times at which the robot is shown.
-        curve_points: Of a curve.
-        limit_room: Limits further from a curve than this many of its spans would leave nothing of its shape to see.
-        flat: Share of the largest value of a kind: what changes by less is rounding.
-        width: Of a figure, inches. columns: Of solutions' curves in it. entries: Of states and controls in it at most.
+        size: Size of a rendered picture, pixels.
+        max_pixels: Largest number of pixels.
+        half_field_of_view: Half of the vertical field of view, rad.
+        side_samples: Samples along each side of a pixel.
+        batch_size: Samples that are processed together, to limit memory.
+        fading: Share of the smaller side of a picture within which the floor fades towards the edge.
+        sun: Azimuth to the left of the camera's, and elevation, rad.
+        shadow_map: Samples along each side of the shadow map, relative to the pixels along the longer side of the
+            picture.
+        shadow_blur: Offsets around a sample of the shadow map that are averaged.
+        shadow_bias: Distance from a surface at which its shadow is looked up, in samples of the map.
+        behind: A transparent surface closer than this share of its distance to a solid one counts as behind it.
+        tube_sides: Number of sides of a round line.
+        line: Radius of a line, relative to the size of the scene.
+        poses: Number of times at which the robot is shown.
+        curve_points: Number of points of a curve.
+        limit_distance: Limits farther from a curve than this many of its ranges are given in words, to keep its shape
+            visible.
+        flat: Relative to the largest value of a kind: smaller changes are rounding.
+        width: Width of a figure, inches.
+        columns: Number of columns in a figure of a solution.
+        entries: Largest number of states and controls in it.
     """
 
     size: tuple[int, int] = (960, 680)
-    most_pixels: int = 2**24
-    half_view: float = 0.22
-    finer: int = 2
-    at_once: int = 1_000_000
+    max_pixels: int = 2**24
+    half_field_of_view: float = 0.22
+    side_samples: int = 2
+    batch_size: int = 1_000_000
     fading: float = 0.1
     sun: tuple[float, float] = (np.deg2rad(38.0), np.deg2rad(52.0))
     shadow_map: float = 1.25
@@ -59,7 +65,7 @@ class PictureStyle:
     line: float = 0.003
     poses: int = 4
     curve_points: int = 400
-    limit_room: float = 1.5
+    limit_distance: float = 1.5
     flat: float = 1e-3
     width: float = 7.4
     columns: int = 3
@@ -67,18 +73,18 @@ class PictureStyle:
 
     @property
     def lens(self) -> float:
-        """The distance at which a picture is seen over half its height."""
-        return float(1 / np.tan(self.half_view))
+        """Distance from which half the height of a picture is seen as length 1."""
+        return float(1 / np.tan(self.half_field_of_view))
 
 
 PICTURE_STYLE = PictureStyle()
 
 
 class Camera(NamedTuple):
-    """Where a picture is taken from, in perspective.
+    """A perspective camera.
 
     Attributes:
-        eye: In world. Shape (3,), m.
+        eye: Position in world. Shape (3,), m.
         axes: Unit vectors to the right, up and back towards the eye, as rows, in world. Shape (3, 3).
         size: Width and height of the picture, pixels.
     """
@@ -91,15 +97,15 @@ class Camera(NamedTuple):
     def around(
         cls, points: Any, size: tuple[int, int], elevation: float = 22.0, azimuth: float = -58.0, room: float = 0.04
     ) -> Camera:
-        """The nearest camera, looking from a side, that sees all points (k, 3), m; angles in degrees.
+        """Return the closest camera with a given direction of view that sees all points (k, 3), m; angles in degrees.
 
-        `room` is left at every edge, a share of the picture. Each edge of the picture is a plane through the eye that
-        must leave all points on its inner side, so that the eye's place is known in closed form.
+        Each edge of the picture is a plane through the eye with all points on its inner side, which gives the position
+        in closed form. `room` is the margin at every edge, relative to the picture.
         """
-        most, lens = PICTURE_STYLE.most_pixels, PICTURE_STYLE.lens
-        if min(size) < 1 or size[0] * size[1] > most:
-            text = f"a picture of {size[0]} by {size[1]} pixels: from 1 to {most} in all"
-            raise ProblemError(text, name="size", value=size, limit=most)
+        max_pixels, lens = PICTURE_STYLE.max_pixels, PICTURE_STYLE.lens
+        if min(size) < 1 or size[0] * size[1] > max_pixels:
+            text = f"a picture of {size[0]} by {size[1]} pixels: from 1 to {max_pixels} in all"
+            raise ProblemError(text, name="size", value=size, limit=max_pixels)
         rise, turn = np.deg2rad(elevation), np.deg2rad(azimuth)
         back = np.array([np.cos(rise) * np.cos(turn), np.cos(rise) * np.sin(turn), np.sin(rise)])
         right = np.array([-np.sin(turn), np.cos(turn), 0.0])
@@ -113,15 +119,15 @@ class Camera(NamedTuple):
         return cls(eye @ axes, axes, size)
 
     def seen(self, points: Any) -> tuple[Array, Array]:
-        """Where points (..., 3) are in the picture, pixels from its upper left corner, (..., 2), and how far, m."""
+        """Return the pixels of points (..., 3), from the upper left corner of the picture, (..., 2), and depths, m."""
         x, y, z = np.moveaxis((np.asarray(points, dtype=float) - self.eye) @ self.axes.T, -1, 0)
-        far = np.maximum(-z, 1e-9)
+        depth = np.maximum(-z, 1e-9)
         width, height = self.size
-        scale = PICTURE_STYLE.lens * height / 2 / far
-        return np.stack([width / 2 + scale * x, height / 2 - scale * y], axis=-1), far
+        scale = PICTURE_STYLE.lens * height / 2 / depth
+        return np.stack([width / 2 + scale * x, height / 2 - scale * y], axis=-1), depth
 
     def rays(self, cells: NDArray[np.intp]) -> Array:
-        """Ways from the eye through the middles of cells, numbered row by row, one m deep each. Shape (k, 3), m."""
+        """Return rays of depth 1 m through the centres of cells, which are numbered row by row. Shape (k, 3), m."""
         width, height = self.size
         row, column = np.divmod(cells, width)
         step = 2 / (PICTURE_STYLE.lens * height)
@@ -130,13 +136,13 @@ class Camera(NamedTuple):
 
 
 class Layer(NamedTuple):
-    """Surfaces that are seen together, in world.
+    """Surfaces that are rendered together, in world.
 
     Attributes:
         parts: Surfaces.
-        opacity: Below 1 it is a veil: of it the nearest surface alone is seen, it casts no shadow, it never covers what
-            is solid in the first layer, and veils lie over each other in the order in which they are given.
-        tint: Red, green and blue that take the place of the parts' own colours.
+        opacity: Below 1 the layer is transparent: only its nearest surface is visible, it casts no shadow, it never
+            covers solid surfaces of the first layer, and layers are blended in the given order.
+        tint: Red, green and blue that replace the colours of the parts.
     """
 
     parts: Sequence[Part]
@@ -145,10 +151,13 @@ class Layer(NamedTuple):
 
 
 class Floor(NamedTuple):
-    """Level ground with a square grid, which fades away from its middle.
+    """Horizontal ground with a square grid, which fades with the distance from its centre.
 
     Attributes:
-        height: m. middle: x and y, m. radius: Where it has faded, m. grid: Between two lines, m.
+        height: m.
+        middle: x and y of the centre, m.
+        radius: Distance at which it has faded, m.
+        grid: Distance of the lines, m.
     """
 
     height: float
@@ -157,46 +166,58 @@ class Floor(NamedTuple):
     grid: float
 
 
-def placed(looks: Appearance, frames: Frames, k: int) -> list[Part]:
-    """What a robot looks like at sample k of a motion, in world."""
-    found = []
-    for part in looks.parts:
-        turn, shift = frames.rotations[part.link][k], frames.positions[part.link][k]
-        found.append(replace(part, vertices=part.vertices @ turn.T + shift, normals=part.normals @ turn.T))
-    return found
+def parts_in_world(appearance: Appearance, frames: Frames, k: int) -> list[Part]:
+    """Return the surfaces of a robot at sample k of a motion, in world."""
+    parts = []
+    for part in appearance.parts:
+        rotation, position = frames.rotations[part.link][k], frames.positions[part.link][k]
+        parts.append(replace(part, vertices=part.vertices @ rotation.T + position, normals=part.normals @ rotation.T))
+    return parts
 
 
 def tube(points: Any, radius: float, color: tuple[float, float, float]) -> Part:
-    """A round line through points (k, 3), m, of a radius, m, and a colour, red, green and blue."""
+    """Return a round line through points (k, 3), m.
+
+    Args:
+        points: Centre line.
+        radius: m.
+        color: Red, green, blue.
+    """
     line = np.asarray(points, dtype=float)
     steps = np.linalg.norm(np.diff(line, axis=0), axis=1) > 1e-9 * max(float(np.ptp(line, axis=0).max()), 1e-12)
     line = line[np.append(True, steps)]
     if len(line) < 2:
         line = line[:1] + np.array([[-1e-6, 0, 0], [1e-6, 0, 0]])
-    along = np.gradient(line, axis=0)
-    along /= np.maximum(np.linalg.norm(along, axis=1), 1e-12)[:, None]
-    side = np.cross(along[0], np.eye(3)[int(np.abs(along[0]).argmin())])
+    tangents = np.gradient(line, axis=0)
+    tangents /= np.maximum(np.linalg.norm(tangents, axis=1), 1e-12)[:, None]
+    side = np.cross(tangents[0], np.eye(3)[int(np.abs(tangents[0]).argmin())])
     sides = np.empty_like(line)
-    for k, one in enumerate(along):  # carried along without a twist
-        side = side - one * (one @ side)
+    for k, tangent in enumerate(tangents):  # parallel transport
+        side = side - tangent * (tangent @ side)
         side /= np.linalg.norm(side)
         sides[k] = side
     count = PICTURE_STYLE.tube_sides
     angle = np.arange(count) * (2 * np.pi / count)
-    around = np.cos(angle)[:, None] * sides[:, None] + np.sin(angle)[:, None] * np.cross(along, sides)[:, None]
-    rings, places = (one.ravel() for one in np.meshgrid(np.arange(len(line) - 1), np.arange(count), indexing="ij"))
-    a, b = rings * count + places, rings * count + (places + 1) % count
+    offsets = np.cos(angle)[:, None] * sides[:, None] + np.sin(angle)[:, None] * np.cross(tangents, sides)[:, None]
+    rings, columns = (
+        tangent.ravel() for tangent in np.meshgrid(np.arange(len(line) - 1), np.arange(count), indexing="ij")
+    )
+    a, b = rings * count + columns, rings * count + (columns + 1) % count
     faces = np.concatenate([np.stack([a, b, b + count], axis=1), np.stack([a, b + count, a + count], axis=1)])
-    flat = around.reshape(-1, 3)
-    return Part("", (line[:, None] + radius * around).reshape(-1, 3), flat, faces, (*color, 1.0))
+    flat = offsets.reshape(-1, 3)
+    return Part("", (line[:, None] + radius * offsets).reshape(-1, 3), flat, faces, (*color, 1.0))
 
 
 def render(
-    layers: Sequence[Layer], camera: Camera, *, floor: Floor | None = None, finer: int = PICTURE_STYLE.finer
+    layers: Sequence[Layer],
+    camera: Camera,
+    *,
+    floor: Floor | None = None,
+    side_samples: int = PICTURE_STYLE.side_samples,
 ) -> NDArray[np.uint8]:
-    """The picture, on white, each pixel the mean of `finer` places to a side. Shape (height, width, 3)."""
+    """Return the picture on white, each pixel the mean of `side_samples` squared. Shape (height, width, 3)."""
     width, height = camera.size
-    fine = camera._replace(size=(finer * width, finer * height))
+    fine = camera._replace(size=(side_samples * width, side_samples * height))
     solid = _Mesh.of([part for layer in layers if layer.opacity >= 1 for part in layer.parts if part.color[3] >= 1])
     sun = _Sun.on(solid, camera) if len(solid.faces) else None
     picture = np.ones((fine.size[0] * fine.size[1], 3), dtype=np.float32)
@@ -214,11 +235,11 @@ def render(
             veil = _Mesh.of([part for part in layer.parts if part.color[3] == opacity], layer.tint)
             near, faces = _nearest(*_projected(fine, veil), fine.size)
             cells = np.flatnonzero((faces >= 0) & (near > (1 + PICTURE_STYLE.behind) * nearness))
-            share = np.float32(layer.opacity * opacity)
+            alpha = np.float32(layer.opacity * opacity)
             lit = _shaded(veil, faces[cells], fine.rays(cells), fine, None)
-            picture[cells] = (1 - share) * picture[cells] + share * lit
-    small = picture.reshape(height, finer, width, finer, 3).mean(axis=(1, 3))
-    return np.asarray(np.round(255 * np.clip(small, 0.0, 1.0)), dtype=np.uint8)
+            picture[cells] = (1 - alpha) * picture[cells] + alpha * lit
+    pixels = picture.reshape(height, side_samples, width, side_samples, 3).mean(axis=(1, 3))
+    return np.asarray(np.round(255 * np.clip(pixels, 0.0, 1.0)), dtype=np.uint8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,16 +264,17 @@ class _Mesh:
 
 
 def _projected(camera: Camera, mesh: _Mesh) -> tuple[Array, Array]:
-    """Places of the corners of all triangles (f, 3, 2), and one over their depths (f, 3), linear in the picture."""
-    places, far = camera.seen(mesh.corners)
-    return places[mesh.faces], (1.0 / far)[mesh.faces]
+    """Return the picture positions of all triangles' corners, (f, 3, 2), and their inverse depths, (f, 3)."""
+    positions, depths = camera.seen(mesh.corners)
+    return positions[mesh.faces], (1.0 / depths)[mesh.faces]
 
 
 def _nearest(places: Array, near: Array, size: tuple[int, int]) -> tuple[Array, NDArray[np.intp]]:
-    """How near the nearest triangle is at the middle of every cell, -inf where there is none, and its number, -1.
+    """Return the inverse depth of the nearest triangle at every cell centre, or -inf, and its index, or -1.
 
     Args:
-        places: Corners (f, 3, 2), in cells from the upper left. near: Of the corners (f, 3), linear over a triangle.
+        places: Corners (f, 3, 2), in cells from the upper left.
+        near: Inverse depths of the corners (f, 3), linear over a triangle.
         size: Columns and rows of cells, which are numbered row by row.
     """
     width, height = size
@@ -261,28 +283,27 @@ def _nearest(places: Array, near: Array, size: tuple[int, int]) -> tuple[Array, 
     area = one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]
     top = np.clip(np.ceil(places[..., 1].min(axis=1) - 0.5), 0, height).astype(np.int64)
     rows = np.clip(np.floor(places[..., 1].max(axis=1) - 0.5) + 1, 0, height).astype(np.int64) - top
-    kept = np.flatnonzero((rows > 0) & (np.abs(area) > 1e-12) & (near < 1e8).all(axis=1))
-    one, two, start, rows = one[kept], two[kept], places[kept, 0], rows[kept]
-    second = (
-        np.column_stack([two[:, 1], -two[:, 0]]) / area[kept, None]
-    )  # slopes of the second and third corners' shares
-    third = np.column_stack([-one[:, 1], one[:, 0]]) / area[kept, None]
-    slope = (near[kept, 1] - near[kept, 0])[:, None] * second + (near[kept, 2] - near[kept, 0])[:, None] * third
+    valid = np.flatnonzero((rows > 0) & (np.abs(area) > 1e-12) & (near < 1e8).all(axis=1))
+    one, two, start, rows = one[valid], two[valid], places[valid, 0], rows[valid]
+    # gradients of the barycentric coordinates of the second and third corners
+    second = np.column_stack([two[:, 1], -two[:, 0]]) / area[valid, None]
+    third = np.column_stack([-one[:, 1], one[:, 0]]) / area[valid, None]
+    slope = (near[valid, 1] - near[valid, 0])[:, None] * second + (near[valid, 2] - near[valid, 0])[:, None] * third
     which, step = _counted(rows)
-    row = top[kept][which] + step
+    row = top[valid][which] + step
     dy = row + 0.5 - start[which, 1]
     least, most = np.full(len(which), -0.5), np.full(len(which), width - 0.5)
-    b, c = second[which, 1] * dy, third[which, 1] * dy  # of each row, where x is that of the first corner
+    b, c = second[which, 1] * dy, third[which, 1] * dy  # in each row, at the x of the first corner
     for value, rise in ((b, second[which, 0]), (c, third[which, 0]), (1 - b - c, -(second + third)[which, 0])):
-        with np.errstate(divide="ignore", invalid="ignore"):  # shares are nowhere negative in a triangle
+        with np.errstate(divide="ignore", invalid="ignore"):  # barycentric coordinates are not negative
             end = start[which, 0] - value / rise - 0.5
         least = np.where(rise > 0, np.maximum(least, end), least)
         most = np.where(rise < 0, np.minimum(most, end), np.where((rise == 0) & (value < 0), -1.0, most))
     first = np.ceil(least).astype(np.int64)
     lengths = np.maximum(np.floor(most).astype(np.int64) - first + 1, 0)
-    value = near[kept[which], 0] + slope[which, 1] * dy + slope[which, 0] * (first + 0.5 - start[which, 0])
-    rise, cell, which = slope[which, 0], row * width + first, kept[which]
-    for begin, end in _lots(lengths):
+    value = near[valid[which], 0] + slope[which, 1] * dy + slope[which, 0] * (first + 0.5 - start[which, 0])
+    rise, cell, which = slope[which, 0], row * width + first, valid[which]
+    for begin, end in _batches(lengths):
         own, step = _counted(lengths[begin:end])
         own += begin
         cells, values = cell[own] + step, value[own] + rise[own] * step
@@ -293,26 +314,26 @@ def _nearest(places: Array, near: Array, size: tuple[int, int]) -> tuple[Array, 
 
 
 def _counted(counts: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
-    """The numbers 0, 1, ... each so often as told, and which time it is."""
+    """Return the numbers 0, 1, ..., each repeated by its count, and the number of the repetition."""
     which = np.repeat(np.arange(len(counts)), counts)
     return which, np.arange(len(which)) - (np.cumsum(counts) - counts)[which]
 
 
-def _lots(counts: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
-    """Ranges whose counts are at most `at_once` together, or little more."""
+def _batches(counts: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
+    """Yield ranges whose counts sum to at most `batch_size`, or little more."""
     ends = np.cumsum(counts)
     begin = 0
     while begin < len(counts):
-        end = min(int(np.searchsorted(ends, ends[begin] - counts[begin] + PICTURE_STYLE.at_once)) + 1, len(counts))
+        end = min(int(np.searchsorted(ends, ends[begin] - counts[begin] + PICTURE_STYLE.batch_size)) + 1, len(counts))
         yield begin, end
         begin = end
 
 
 @dataclass(frozen=True, eq=False)
 class _Sun:
-    """Light from one side: the way to it (3,), and the map of what it meets first."""
+    """Directional light: the direction to it (3,), and the depth map of the first surfaces that it meets."""
 
-    way: Array
+    to_sun: Array
     axes: Array
     low: Array
     step: float
@@ -321,35 +342,37 @@ class _Sun:
 
     @classmethod
     def on(cls, mesh: _Mesh, camera: Camera) -> _Sun:
+        """Return the sun for a scene and a camera."""
         back = camera.axes[2]
-        turn, rise = np.arctan2(back[1], back[0]) - PICTURE_STYLE.sun[0], PICTURE_STYLE.sun[1]
-        way = np.array([np.cos(rise) * np.cos(turn), np.cos(rise) * np.sin(turn), np.sin(rise)])
-        right = np.array([-np.sin(turn), np.cos(turn), 0.0])
-        axes = np.stack([right, np.cross(way, right), way])
+        azimuth, elevation = np.arctan2(back[1], back[0]) - PICTURE_STYLE.sun[0], PICTURE_STYLE.sun[1]
+        to_sun = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+        right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+        axes = np.stack([right, np.cross(to_sun, right), to_sun])
         points, places = mesh.corners @ axes.T, round(PICTURE_STYLE.shadow_map * max(camera.size)) + 16
         low = points.min(axis=0)[:2]
         step = float((points.max(axis=0)[:2] - low).max()) / (places - 8) or 1.0
         low = low - 4 * step
         height, _ = _nearest(((points[:, :2] - low) / step)[mesh.faces], points[:, 2][mesh.faces], (places, places))
-        return cls(way, axes, low, step, places, height)
+        return cls(to_sun, axes, low, step, places, height)
 
     def lit(self, points: Array) -> Array:
-        """Share of the sun that reaches points (k, 3), 0 to 1."""
+        """Return the share of sunlight that reaches points (k, 3), 0 to 1."""
         x, y, z = self.axes @ points.T
         column, row = (
-            np.floor((one - at) / self.step).astype(np.int64) for one, at in zip((x, y), self.low, strict=True)
+            np.floor((coordinate - corner) / self.step).astype(np.int64)
+            for coordinate, corner in zip((x, y), self.low, strict=True)
         )
-        found = np.zeros(len(points), dtype=np.float32)
+        share = np.zeros(len(points), dtype=np.float32)
         for i in PICTURE_STYLE.shadow_blur:
             for j in PICTURE_STYLE.shadow_blur:
                 inside = (row + i >= 0) & (row + i < self.places) & (column + j >= 0) & (column + j < self.places)
                 cell = np.where(inside, (row + i) * self.places + column + j, 0)
-                found += ~(inside & (self.height[cell] > z + self.step))
-        return np.asarray(found / len(PICTURE_STYLE.shadow_blur) ** 2)
+                share += ~(inside & (self.height[cell] > z + self.step))
+        return np.asarray(share / len(PICTURE_STYLE.shadow_blur) ** 2)
 
 
 def _lay(picture: NDArray[np.float32], floor: Floor, camera: Camera, sun: _Sun | None) -> None:
-    """The floor, with the shadows on it, into an empty picture."""
+    """Draw the floor with its shadows into an empty picture."""
     below = np.flatnonzero(camera.rays(np.arange(len(picture)))[:, 2] * (floor.height - camera.eye[2]) > 0)
     ray = camera.rays(below)
     place = camera.eye + ray * ((floor.height - camera.eye[2]) / ray[:, 2])[:, None]
@@ -364,10 +387,10 @@ def _lay(picture: NDArray[np.float32], floor: Floor, camera: Camera, sun: _Sun |
 
 
 def _shaded(mesh: _Mesh, faces: NDArray[np.intp], ray: Array, camera: Camera, sun: _Sun | None) -> Array:
-    """Colours of triangles (k,) of a mesh where rays from the eye (k, 3) meet them. Shape (k, 3)."""
+    """Return the colours of triangles (k,) of a mesh where rays (k, 3) from the eye meet them. Shape (k, 3)."""
     a, b, c = (mesh.corners[mesh.faces[:, k]] for k in range(3))
     one, two, to = b - a, c - a, camera.eye - a
-    # shares of the second and of the third corner (Moeller, Trumbore 1997)
+    # barycentric coordinates of the second and third corners (Moeller, Trumbore 1997)
     across, beside, normal = np.cross(to, one), np.cross(two, to), np.cross(one, two)
     whole = _dot(ray, normal[faces])
     whole = -np.where(np.abs(whole) > 1e-30, whole, 1e-30)
@@ -380,17 +403,18 @@ def _shaded(mesh: _Mesh, faces: NDArray[np.intp], ray: Array, camera: Camera, su
     back = -ray / np.sqrt(_dot(ray, ray))[:, None]
     facing = _dot(normal, back)
     normal *= np.where(facing < 0, -1.0, 1.0)[:, None]
-    way = camera.axes[2] if sun is None else sun.way
+    to_light = camera.axes[2] if sun is None else sun.to_sun
     reaches = (
         1.0
         if sun is None
-        else sun.lit(place + PICTURE_STYLE.shadow_bias * sun.step * np.sign(normal @ way)[:, None] * normal)
+        else sun.lit(place + PICTURE_STYLE.shadow_bias * sun.step * np.sign(normal @ to_light)[:, None] * normal)
     )
-    key = np.maximum(normal @ way, 0.0)
-    gloss = np.maximum(2 * key * np.abs(facing) - back @ way, 0.0)
+    key = np.maximum(normal @ to_light, 0.0)
+    gloss = np.maximum(2 * key * np.abs(facing) - back @ to_light, 0.0)
     light = 0.44 + 0.1 * normal[:, 2] + 0.44 * key * reaches + 0.12 * np.abs(facing)
     return np.asarray(mesh.colors[faces] * light[:, None] + (0.12 * reaches * gloss**24)[:, None])
 
 
-def _dot(one: Array, other: Array) -> Array:
-    return np.asarray(np.einsum("ij,ij->i", one, other))
+def _dot(first: Array, second: Array) -> Array:
+    """Return the scalar products of rows."""
+    return np.asarray(np.einsum("ij,ij->i", first, second))

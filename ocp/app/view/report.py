@@ -1,6 +1,6 @@
-"""One HTML file to show a colleague: the verdict in a sentence, pictures, curves with limits, every row with its unit.
+"""Write an HTML report: the verdict in a sentence, pictures, curves with limits, and all rows with units.
 
-Nothing in it is asked from another host.
+The page loads nothing from another host.
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ from typing import Any
 import numpy as np
 
 from models import Machine
-from ocp.app.check.joint_limits import Row, RowVerdict, rows_of
-from ocp.app.check.pieces import Motion
+from ocp.app.check.interpolation import Motion
+from ocp.app.check.joint_limits import Row, RowVerdict, audit_rows
 from ocp.app.check.plan_verdict import verdict_of
 from ocp.app.check.verdict import Check, bounds_of
-from ocp.app.view.pictures import Obstacle, curves, looks_of, obstacles_of, scene
+from ocp.app.view.pictures import Obstacle, draw_curves, draw_scene, obstacles_of, times_by_part
 from ocp.motion.plan import Plan
 from ocp.motion.tasks.limits import JointBounds
 
 __all__ = ["Report", "report_of_check", "report_of_plan"]
 
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
-"""Of the page: no script runs, and nothing is asked from anywhere."""
+"""Content security policy of the page: no script runs, and nothing is loaded."""
 STYLE = """
 :root { color-scheme: light dark; --ink: #1b1f24; --paper: #fff; --soft: #f3f5f7; --line: #d5dae0;
   --good: #00734f; --bad: #b23b00 }
@@ -50,14 +50,17 @@ footer { margin-top: 3rem; font-size: .8rem; opacity: .7 }
 
 @dataclass(frozen=True)
 class Report:
-    """What a report says.
+    """Contents of a report.
 
     Attributes:
-        title, verdict: In words. passed: Whether it is good.
-        facts: Short ones. faults: In words.
-        picture: A PNG, or b"". plots: An SVG.
+        title, verdict: Texts.
+        passed: Whether the verdict is good.
+        facts: Short facts.
+        faults: Descriptions of the faults.
+        picture: A PNG, or b"".
+        plots: An SVG.
         tables: Titles, and rows.
-        notes: Below.
+        notes: Notes below the tables.
     """
 
     title: str
@@ -71,7 +74,7 @@ class Report:
     notes: tuple[str, ...]
 
     def html(self) -> str:
-        """The whole file."""
+        """Return the page."""
         mood = "good" if self.passed else "bad"
         parts = [
             f'<p class="verdict {mood}">{escape(self.verdict)}</p>',
@@ -85,12 +88,12 @@ class Report:
             parts.append(
                 "<h2>The motion</h2><figure>"
                 f'<img alt="the robot at several times" src="data:image/png;base64,{data}">'
-                "<figcaption>The robot at four times, at the last one solid; the way of its tip in green, obstacles in "
+                "<figcaption>The robot at four times, solid at the last one; its tip path in green, obstacles in "
                 "grey.</figcaption></figure>"
             )
         parts.append(
-            f"<h2>The joints</h2><figure>{self.plots}<figcaption>Blue: the motion, between its samples as a controller "
-            "makes it. Grey: limits, dashed or, far off, in words. Purple: where they are passed.</figcaption></figure>"
+            f"<h2>The joints</h2><figure>{self.plots}<figcaption>Blue: the motion, interpolated between its samples as "
+            "by a controller. Grey: limits, dashed or, if far, as text. Purple: violations.</figcaption></figure>"
         )
         parts += [f"<h2>{escape(title)}</h2>{_table(rows)}" for title, rows in self.tables]
         if self.notes:
@@ -108,7 +111,8 @@ class Report:
 
 
 def _table(rows: Sequence[Row]) -> str:
-    head = "<tr><th>looked at</th><th class=n>worst</th><th class=n>limit</th><th>unit</th><th class=n>at, s</th>"
+    """Return rows as an HTML table."""
+    head = "<tr><th>quantity</th><th class=n>worst</th><th class=n>limit</th><th>unit</th><th class=n>at, s</th>"
     lines = [
         f"<tr><td>{escape(row.name)}</td><td class=n>{row.value:.5g}</td>"
         f"<td class=n>{'' if row.limit is None else f'{row.limit:.4g}'}</td><td>{escape(row.unit)}</td>"
@@ -121,19 +125,19 @@ def _table(rows: Sequence[Row]) -> str:
 
 
 def report_of_check(
-    check: Check, machine: Machine, bounds: JointBounds, around: Sequence[Obstacle] = (), folders: Sequence[Any] = ()
+    check: Check, machine: Machine, bounds: JointBounds, obstacles: Sequence[Obstacle] = (), folders: Sequence[Any] = ()
 ) -> Report:
-    """Of a check. The limits are those that it held the motion against."""
-    motion, robot = check.readable.motion, machine.robot
-    whole = len(check.joints) == robot.dof
-    bases = check.readable.base if machine.base_size else None
-    if machine.base_size and bases is None:
-        bases = np.repeat(machine.base_home()[None], len(motion.t), axis=0)
-    columns = check.readable.joints
-    taken = JointBounds(*(one[columns] for one in bounds))
+    """Return the report of a check, with the limits of the check."""
+    motion, robot = check.cleaned.motion, machine.robot
+    complete = len(check.joints) == robot.dof
+    base_path = check.cleaned.base if machine.base_size else None
+    if machine.base_size and base_path is None:
+        base_path = np.repeat(machine.base_home()[None], len(motion.t), axis=0)
+    columns = check.cleaned.joints
+    own_bounds = JointBounds(*(item[columns] for item in bounds))
     units = [robot.joint(name).unit for name in check.joints]
-    picture = scene(machine, motion, bases, around, folders) if whole else b""
-    shown = [row for row in check.rows if row.verdict is not RowVerdict.UNLIMITED]
+    picture = draw_scene(machine, motion, base_path, obstacles, folders) if complete else b""
+    limited = [row for row in check.rows if row.verdict is not RowVerdict.UNLIMITED]
     return Report(
         f"{check.file} for {robot.name}",
         f"The trajectory {check.sentence}.",
@@ -141,36 +145,36 @@ def report_of_check(
         (f"{check.samples} samples", f"{check.duration:.5g} s", f"{len(check.joints)} joints", f"{check.rule} between"),
         tuple(str(fault) for fault in check.faults),
         picture,
-        curves(motion, check.joints, units, taken, check.faults),
-        (("What was looked at", tuple(shown)),),
+        draw_curves(motion, check.joints, units, own_bounds, check.faults),
+        (("Checked quantities", tuple(limited)),),
         (
-            *(f"unlimited: {one}" for one in check.unlimited),
-            *(f"not looked at: {one}" for one in check.unseen),
+            *(f"unlimited: {item}" for item in check.unlimited),
+            *(f"not checked: {item}" for item in check.unchecked),
             *check.notes,
         ),
     )
 
 
 def report_of_plan(plan: Plan, period: float, title: str) -> Report:
-    """Of a plan: its audit, and its samples held against the robot's limits."""
+    """Return the report of a plan: its audit, and a check of its samples against the robot's limits."""
     machine, robot = plan.machine, plan.machine.robot
     sample = plan.sample(period)
     motion = Motion(sample.t, sample.joints, sample.rates, sample.accelerations)
     verdict = verdict_of(plan, sample, title)
     audit, check = verdict.audit, verdict.check
     bounds = bounds_of(robot)
-    bases = plan.at(sample.t)["base"] if machine.base_size else None
+    base_path = plan.at(sample.t)["base"] if machine.base_size else None
     units = [joint.unit for joint in robot.moving_joints]
     cost = f"cost {plan.cost:.5g}" + ("" if plan.bound is None else f", none below {plan.bound:.5g}")
-    told = [row for row in check.rows if row.verdict is not RowVerdict.UNLIMITED]
+    limited = [row for row in check.rows if row.verdict is not RowVerdict.UNLIMITED]
     return Report(
         title,
         f"The plan {verdict.sentence}.",
         verdict.passed,
-        (robot.name, f"{plan.horizon:.5g} s", f"{robot.dof} joints", cost, f"{len(plan.candidates)} motions found"),
+        (robot.name, f"{plan.horizon:.5g} s", f"{robot.dof} joints", cost, f"{len(plan.candidates)} candidates"),
         tuple(str(fault) for fault in check.faults),
-        scene(machine, motion, bases, obstacles_of(plan.solution, looks_of(plan, sample.t))),
-        curves(motion, plan.names, units, bounds, check.faults),
-        (("The audit", tuple(rows_of(audit))), (f"Samples of {period:g} s against the robot's limits", tuple(told))),
+        draw_scene(machine, motion, base_path, obstacles_of(plan.solution, times_by_part(plan, sample.t))),
+        draw_curves(motion, plan.names, units, bounds, check.faults),
+        (("The audit", tuple(audit_rows(audit))), (f"Samples every {period:g} s against the limits", tuple(limited))),
         tuple(f"unlimited: {one}" for one in check.unlimited),
     )

@@ -17,7 +17,7 @@ from toppra.algorithm import TOPPRA
 from toppra.constraint import JointAccelerationConstraint, JointVelocityConstraint
 
 from ocp.app import Check, check_trajectory
-from ocp.app.check.pieces import Motion
+from ocp.app.check.interpolation import Motion
 from ocp.app.files import RawTrajectory
 from tests.ocp.app.test_check_toppra import arm
 

@@ -108,7 +108,7 @@ def test_a_plan_keeps_to_the_path_it_was_made_for(capsys: Any) -> None:
     status, out, _ = run(capsys, *words)
     rows = {row["name"]: row for row in json.loads(out)["rows"]}
     assert status == 0
-    assert rows["tip off the path"]["value"] < 1e-5
+    assert rows["distance of the tip from the path"]["value"] < 1e-5
     (folder / "path.csv").write_text("x,y,z\n0.75,0.1,0.3\n0.75,0.3,0.31\n")
     assert run(capsys, *words)[0] == 1
 
@@ -173,16 +173,16 @@ def test_a_report_of_a_check_names_the_faults(capsys: Any, tmp_path: Path) -> No
         ("speed = 0.1\n", "", 6, "'speed' is missing: a number above 0, m/s"),
         ("speed = 0.1", "speed = -1", 8, "must be a number above 0, m/s"),
         ("speed = 0.1", 'speed = "fast"', 8, "must be a number above 0"),
-        ("speed = 0.1", "speed 0.1", 8, "no TOML"),
-        ("points = [[0.75, 0.1, 0.3], [0.75, 0.3, 0.3]]", "points = [[0.75, 0.1, 0.3]]", 7, "two or more of three"),
+        ("speed = 0.1", "speed 0.1", 8, "invalid TOML"),
+        ("points = [[0.75, 0.1, 0.3], [0.75, 0.3, 0.3]]", "points = [[0.75, 0.1, 0.3]]", 7, "two or more triples"),
         ("points = [[0.75, 0.1, 0.3], [0.75, 0.3, 0.3]]", 'file = "none.csv"', 7, "there is no file"),
         ("points =", 'file = "a.csv"\npoints =', 6, "not both"),
         ('tool = "free"', 'tool = "loose"', 9, 'one of "free roll", "given", "free"'),
         ('kind = "start"', 'kind = "best"', 12, 'one of "postures", "start", "global"'),
-        ('kind = "start"', 'kind = "pieces"\ncyclic = true', 13, "leave it out"),
-        ('kind = "start"', 'kind = "pieces"\npace = "free"', 13, "leave it out"),
-        ('kind = "start"', "start = { elbw = 1 }", 12, "no joint 'elbw'"),
-        ('kind = "start"', "start = { elbow = 1 }", 12, "start lacks shoulder, wrist, slide"),
+        ('kind = "start"', 'kind = "pieces"\ncyclic = true', 13, "remove it"),
+        ('kind = "start"', 'kind = "pieces"\npace = "free"', 13, "remove it"),
+        ('kind = "start"', "start = { elbw = 1 }", 12, "no independent joint 'elbw'"),
+        ('kind = "start"', "start = { elbow = 1 }", 12, "start has no shoulder, wrist, slide"),
         ('kind = "start"', 'kind = "start"\nseed = -1', 13, "seed must be a whole number"),
         ('shape = "box"', 'shape = "ball"', 15, 'one of "box", "sphere"'),
         ("size = [0.1, 0.1, 0.1]", "size = [0.1, 0.1]", 16, "three lengths, m"),
@@ -223,7 +223,7 @@ def test_a_place_out_of_reach_is_bad_input_and_no_motion_is_a_failure(
         raise SolveError("no motion passes its audit", name="plan")
 
     (tmp_path / "seam.toml").write_text(TASK)
-    monkeypatch.setattr("ocp.app.planned.plan", nothing)
+    monkeypatch.setattr("ocp.app.run_task.plan", nothing)
     status, out, err = run(capsys, "plan", tmp_path / "seam.toml", "--json")
     assert status == 1
     assert json.loads(out)["error"] == "no motion passes its audit"
@@ -251,12 +251,12 @@ def test_what_no_one_motion_does_is_written_in_pieces_and_the_ways_between_them_
         made.append(plan_in_segments(*given, **options))
         return made[0]
 
-    monkeypatch.setattr("ocp.app.planned.plan_in_pieces", kept_too)
+    monkeypatch.setattr("ocp.app.run_task.plan_in_segments", kept_too)
     (tmp_path / "robot.urdf").write_text(LIFTED)
     (tmp_path / "line.toml").write_text(
         "[robot]\nurdf = 'robot.urdf'\ntip = 'tip'\n"
         "[path]\npoints = [[0.6, -0.45, 0], [0.6, 0.45, 0]]\nspeed = 0.45\ntool = 'free'\n"
-        "[search]\nkind = 'pieces'\n[surroundings]\nlook = false\n[output]\ncsv = 'line.csv'\n"
+        "[search]\nkind = 'pieces'\n[scene]\nlook = false\n[output]\ncsv = 'line.csv'\n"
     )
     status, out, err = run(capsys, "plan", tmp_path / "line.toml", "-o", tmp_path / "line.npz", "--json")
     assert status == 0, err
@@ -275,7 +275,7 @@ def test_what_no_one_motion_does_is_written_in_pieces_and_the_ways_between_them_
         Path(file).unlink()
     barred = [replace(one, way=None, why="the way is barred") for one in made[0].reconfigurations]
     monkeypatch.setattr(
-        "ocp.app.planned.plan_in_pieces", lambda *_, **__: replace(made[0], reconfigurations=tuple(barred))
+        "ocp.app.run_task.plan_in_segments", lambda *_, **__: replace(made[0], reconfigurations=tuple(barred))
     )
     status, out, _ = run(capsys, "plan", tmp_path / "line.toml", "--json")
     assert status == 1  # the pieces are there, and pass
@@ -293,7 +293,7 @@ def test_statuses_and_streams(tmp_path: Path, capsys: Any) -> None:
     robot, file = write_robot(tmp_path), write_table(tmp_path / "m.csv", t, q)
     status, out, err = run(capsys, "check", robot, file)
     assert status == 0
-    assert out.rstrip().endswith("The trajectory holds all that was looked at.")
+    assert out.rstrip().endswith("The trajectory meets all checked requirements.")
     assert err.startswith("selfmotion check: started\n")
     assert "done after" in err
     status, out, err = run(capsys, "check", robot, file, "--velocity", "0.1", "--quiet")
@@ -323,8 +323,8 @@ class Terminal(io.StringIO):
 def test_long_work_says_that_it_goes_on(monkeypatch: pytest.MonkeyPatch, terminal: bool) -> None:
     stream = Terminal() if terminal else io.StringIO()
     monkeypatch.setattr(sys, "stderr", stream)
-    monkeypatch.setattr("ocp.app.progress.EVERY", 0.05)
-    monkeypatch.setattr("ocp.app.progress.AFTER", 0.05)
+    monkeypatch.setattr("ocp.app.progress.LOG_PERIOD_S", 0.05)
+    monkeypatch.setattr("ocp.app.progress.TERMINAL_DELAY_S", 0.05)
     with Progress("work") as progress:
         progress("half of it")
         while "half of it" not in stream.getvalue():

@@ -22,7 +22,7 @@ from ocp import Plan, ProblemError
 from ocp.app import main
 from ocp.app.files import read_trajectory
 from ocp.app.files.outputs import SUFFIXES, checked_output
-from ocp.app.view.player import Served
+from ocp.app.view.player import PageServer
 from ocp.app.view.report import POLICY
 from ocp.motion.schedule import JointTrajectory
 from ocp.storage import column_name, joint_name, table_head, table_joints
@@ -67,7 +67,7 @@ def test_a_task_writes_nothing_outside_of_its_folder(kind: str, how: str, tmp_pa
     }[how]
     status, out, err = run(capsys, "plan", task(folder, f'{kind} = "{name}"'), "--force", "--quiet")
     assert (status, out) == (2, "")
-    assert "lies outside of" in err
+    assert "is outside of" in err
     assert "--output-folder" in err
     assert re.search(r"seam\.toml, line \d+, ", err)
     assert sorted(file.name for file in home.iterdir()) == [f"a{suffix}"]
@@ -108,7 +108,7 @@ def test_numbered_outputs_stay_there_too(tmp_path: Path, capsys: Any) -> None:
     file = task(folder, 'csv = "seam.csv"')
     file.write_text(file.read_text().replace('kind = "start"', 'kind = "pieces"'))
     status, _, err = run(capsys, "plan", file, "--quiet")
-    assert (status, "lies outside of" in err) == (2, True)
+    assert (status, "is outside of" in err) == (2, True)
     assert own.read_text() == "export PATH=/mine\n"
 
 
@@ -158,7 +158,7 @@ def test_each_command_asks_before_it_overwrites(tmp_path: Path, capsys: Any) -> 
         assert (status, "was not written by selfmotion" in err, "--force" in err) == (2, True, True), call
         assert {file.read_text() for file in names.values()} == {"export PATH=/mine\n"}
     assert run(capsys, *calls[2], "--quiet", "--force")[0] == 0
-    assert read_trajectory(names["a.csv"]).told is False
+    assert read_trajectory(names["a.csv"]).names_are_joints is False
     assert run(capsys, *calls[2], "--quiet")[0] == 0  # now it is our own
 
 
@@ -281,7 +281,7 @@ def test_reports_and_pages_ask_nobody_and_run_nothing_of_others(tmp_path: Path, 
 
 def test_a_page_is_served_to_who_names_this_machine_alone() -> None:
     """A name of somebody else that leads to this machine gets nothing."""
-    with Served("secret") as served:
+    with PageServer("secret") as served:
         host, port = served.address.removeprefix("http://").split(":")
         assert host == "127.0.0.1"
         for name, status in [

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import gzip
 import json
 import re
 import urllib.error
@@ -14,6 +16,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from models import (
     Box,
@@ -52,9 +55,16 @@ from ocp import (
 from ocp.app import main
 from ocp.app.files import read_trajectory
 from ocp.app.view import appearance, player
+from ocp.app.view.animation import (
+    PAGE_SETTINGS,
+    Curve,
+    animate_plan,
+    animate_solution,
+    animate_trajectory,
+    ground_contact,
+)
 from ocp.app.view.appearance import appearance_of, frames_along
-from ocp.app.view.player import Served, page, unpacked
-from ocp.app.view.shown import PAGE_SETTINGS, Curve, footing_of, shown_plan, shown_solution, shown_trajectory
+from ocp.app.view.player import PageServer, build_page
 from ocp.motion.local.collisions import distances_along
 from ocp.motion.plan.motion import Part
 from ocp.motion.tasks.targets import targets_along
@@ -89,7 +99,32 @@ OBJ = "v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nv 0 0 0.1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 
 OPTIONS: dict[str, Any] = {"tip": "finger", "lock": {"grip": 0.05}, "tip_translation": [0.2, 0.0, 0.01]}
 TURN = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
 START = np.array([0.4, 0.7, -0.6])
-GROUPS = {"Cost", "The motion", "Joints", "Joint rates"}
+GROUPS = {"Cost", "The motion", "Joints", "Joint velocities"}
+
+
+def unpack_page(text: str) -> tuple[dict[str, Any], dict[int, NDArray[Any]]]:
+    """Return the contents of a page: its description, and the arrays by their offsets."""
+    mark = '<script id="data" type="text/plain">'
+    begin = text.index(mark) + len(mark)
+    data_bytes = gzip.decompress(base64.b64decode(text[begin : text.index("</script>", begin)]))
+    size = int.from_bytes(data_bytes[:4], "little")
+    description, body = json.loads(data_bytes[4 : 4 + size]), data_bytes[4 + size :]
+    arrays: dict[int, NDArray[Any]] = {}
+
+    def collect(value: Any) -> None:
+        if isinstance(value, dict) and set(value) == {"at", "kind", "shape"}:
+            count = int(np.prod(value["shape"]))
+            array = np.frombuffer(body, f"<{value['kind']}" if value["kind"] != "i1" else "i1", count, value["at"])
+            arrays[value["at"]] = array.reshape(value["shape"])
+        elif isinstance(value, dict):
+            for part in value.values():
+                collect(part)
+        elif isinstance(value, list):
+            for part in value:
+                collect(part)
+
+    collect(description)
+    return description, arrays
 
 
 @pytest.fixture(scope="module")
@@ -148,7 +183,7 @@ def test_every_frame_and_the_tip_stand_where_the_model_has_them(
     plans: dict[str, Plan], machines: dict[str, Machine], kind: str
 ) -> None:
     machine, plan = machines[kind], plans[kind]
-    told, arrays = unpacked(page([shown_plan(plan)]).text)
+    told, arrays = unpack_page(build_page([animate_plan(plan)]).text)
     motion, movers = told["motions"][0], told["robots"][0]["movers"]
     t, poses = arrays[motion["t"]["at"]], arrays[motion["poses"]["at"]]
     assert movers == ["hull", "upper/arm", "fore", "hand"]
@@ -279,7 +314,7 @@ def test_what_is_asked_for_is_told_in_the_world(robot: Robot, tmp_path: Path) ->
     for one, other in zip(made.targets, again.targets, strict=True):
         for part, stored in zip(one, other, strict=True):
             np.testing.assert_array_equal(part, stored)
-    told, _ = unpacked(page([shown_plan(again)]).text)
+    told, _ = unpack_page(build_page([animate_plan(again)]).text)
     assert len(told["motions"][0]["targets"]) == 2
     looks = [[(s.kind, s.file) for link in m.robot.links for s in link.visuals] for m in (machine, again.machine)]
     assert looks[0] == looks[1] != []
@@ -291,11 +326,13 @@ def curves_of(shown: Any) -> dict[tuple[str, str], Curve]:
 
 def test_costs_end_at_that_of_the_plan_and_torques_do_the_work_that_energy_shows(plans: dict[str, Plan]) -> None:
     plan = plans["fixed"]
-    shown = shown_plan(plan)
+    shown = animate_plan(plan)
     found = curves_of(shown)
     assert {group for group, _ in found} >= GROUPS | {"Torques"}
-    assert found["Cost", "half the squared joint rates, so far"].values[-1] == pytest.approx(plan.cost, rel=1e-4)
-    assert ("Cost", "the problem's own, so far") not in found  # the same
+    assert found["Cost", "integral of half the squared joint velocities"].values[-1] == pytest.approx(
+        plan.cost, rel=1e-4
+    )
+    assert ("Cost", "the problem's own cost, integrated") not in found  # the same
     assert found["Joints", "shoulder"].upper == 3.0
     assert found["Joints", "elbow"].upper == np.inf
     robot, q = plan.machine.robot, ca.SX.sym("q", 3)
@@ -314,8 +351,8 @@ def test_costs_end_at_that_of_the_plan_and_torques_do_the_work_that_energy_shows
 
 
 def test_the_momentum_of_the_whole_is_that_of_a_floating_plan(plans: dict[str, Plan]) -> None:
-    found = curves_of(shown_plan(plans["floating"]))
-    whole, own = (found["Momentum", f"momentum, of {which}"].values for which in ("the whole", "the joints alone"))
+    found = curves_of(animate_plan(plans["floating"]))
+    whole, own = (found["Momentum", f"momentum, {which}"].values for which in ("total", "of the joints alone"))
     assert own.max() > 0.1
     assert whole.max() < 1e-3 * own.max()
 
@@ -332,7 +369,7 @@ def test_the_nearest_bodies_are_those_of_the_plan_at_every_time(tmp_path: Path) 
         clearance_constraints=clearance_constraints,
     )
     plan = Plan(machine, solve(problem, Collocation(intervals=6, degree=3)), (Part(0.0, 1.0, ""),))
-    near = shown_plan(plan).near
+    near = animate_plan(plan).closest
     assert near is not None
     joints = plan.at(near.t)["joints"]
     apart = distances_along(clearance_constraints.scene, np.zeros((len(near.t), 0)), joints, near.t)
@@ -340,7 +377,7 @@ def test_the_nearest_bodies_are_those_of_the_plan_at_every_time(tmp_path: Path) 
     best = apart.argmin(axis=1)
     labels = clearance_constraints.scene.labels
     assert [tuple(labels[k]) for k in best] == [tuple(pair) for pair in near.bodies]
-    told, arrays = unpacked(page([shown_plan(plan)]).text)
+    told, arrays = unpack_page(build_page([animate_plan(plan)]).text)
     assert len(told["motions"][0]["around"]) == 1  # the ball
     ball = told["motions"][0]["around"][0]
     corners = np.array(ball["low"]) + np.array(ball["step"]) * arrays[ball["vertices"]["at"]][:, :3]
@@ -370,8 +407,8 @@ def test_obstacles_that_move_are_shown_where_they_are_at_every_time_and_half_spa
         clearance_constraints=clearance_constraints,
     )
     plan = Plan(machine, solve(problem, Collocation(intervals=6, degree=3)), (Part(0.0, 1.0, ""),))
-    shown = shown_plan(plan)
-    plane, moved = shown.around
+    shown = animate_plan(plan)
+    plane, moved = shown.obstacles
     assert plane.normal is not None
     assert moved.rotations is not None
     assert moved.positions is not None
@@ -379,7 +416,7 @@ def test_obstacles_that_move_are_shown_where_they_are_at_every_time_and_half_spa
     np.testing.assert_allclose(moved.rotations, [np.array(turn(t)) for t in shown.t], atol=1e-12)
     corners, _ = plane.solid(np.random.default_rng(0).normal(size=(20, 3)))
     np.testing.assert_allclose((corners - [0.0, 0.0, -1.5]) @ [0.6, 0.0, 0.8], 0.0, atol=1e-12)
-    told, arrays = unpacked(page([shown]).text)
+    told, arrays = unpack_page(build_page([shown]).text)
     motion = told["motions"][0]
     still, box = motion["around"]
     assert still["mover"] is None
@@ -398,11 +435,11 @@ def test_where_the_ground_pushes_is_found_from_the_rows_of_the_problem(robot: Ro
     offsets = (machine.support.normals * machine.support.vertices).sum(axis=1)
     rows = points @ machine.support.normals.T - offsets - 0.02
     inside = [Curve("zero moment point", str(k), "m", row, 0.0) for k, row in enumerate(rows.T)]
-    found, (margin,) = footing_of(machine, joints, still, still, inside)
+    found, (margin,) = ground_contact(machine, joints, still, still, inside)
     np.testing.assert_allclose(found.points, points, atol=1e-12)
     np.testing.assert_allclose(margin.values, rows.min(axis=1) + 0.02, atol=1e-12)
     assert found.forces
-    rest, _ = footing_of(machine, joints, still, still)
+    rest, _ = ground_contact(machine, joints, still, still)
     centers = centers_of_mass(robot, ca.DM(START))
     weighed = np.array([robot.link(name).mass * np.array(ca.DM(c)).ravel() for name, c in centers.items()])
     middle = weighed.sum(axis=0) / robot.total_mass
@@ -415,11 +452,11 @@ def test_solutions_and_files_are_shown_as_plans_are(
 ) -> None:
     for kind, plan in plans.items():
         machine = machines[kind]
-        wanted = shown_plan(plan)
+        wanted = animate_plan(plan)
         plan.solution.save(tmp_path / "solution.npz")
         plan.write_csv(tmp_path / "motion.csv", 0.01)
         raw = read_trajectory(tmp_path / "motion.csv", joints=plan.names)
-        shown = [shown_solution(Solution.load(tmp_path / "solution.npz"), machine), shown_trajectory(raw, machine)]
+        shown = [animate_solution(Solution.load(tmp_path / "solution.npz"), machine), animate_trajectory(raw, machine)]
         for one in shown:
             np.testing.assert_allclose(one.t, wanted.t, atol=1e-12)
             np.testing.assert_allclose(one.joints, wanted.joints, atol=1e-4)
@@ -427,43 +464,43 @@ def test_solutions_and_files_are_shown_as_plans_are(
         assert shown[0].verdict == wanted.verdict
         assert shown[0].passed is wanted.passed is True
         assert shown[1].passed is None
-        told, _ = unpacked(page([wanted, *shown], title="three").text)
+        told, _ = unpack_page(build_page([wanted, *shown], title="three").text)
         assert len(told["robots"]) == 1  # the same robot is held once
         assert [motion["robot"] for motion in told["motions"]] == [0, 0, 0]
     with pytest.raises(ProblemError, match="elbows"):
-        shown_solution(plans["fixed"].solution, machines["fixed"], joints="elbows")
+        animate_solution(plans["fixed"].solution, machines["fixed"], joints="elbows")
     with pytest.raises(ProblemError, match="base"):
-        shown_solution(plans["fixed"].solution, machines["floating"])
+        animate_solution(plans["fixed"].solution, machines["floating"])
 
 
 def test_a_page_is_whole_small_the_same_again_and_asks_nobody(plans: dict[str, Plan], folder: Path) -> None:
-    shown = [shown_plan(plans["fixed"], "<b>one</b> & 'two'"), shown_plan(plans["floating"])]
-    text = page(shown, folders=[folder / "share"]).text
-    assert text == page(shown, folders=[folder / "share"]).text
+    shown = [animate_plan(plans["fixed"], "<b>one</b> & 'two'"), animate_plan(plans["floating"])]
+    text = build_page(shown, folders=[folder / "share"]).text
+    assert text == build_page(shown, folders=[folder / "share"]).text
     assert len(text.encode()) < 300_000
     assert "default-src 'none'" in text
     assert set(re.findall(r"https?://[^\s\"'<)]+", text)) == {"http://www.w3.org/2000/svg"}  # a name, not an address
     assert not re.findall(r"\b(?:src|href)=(?!\"data:)", text)
     assert "<title>&lt;b&gt;one" in text
     assert "<b>one</b>" not in text
-    told, arrays = unpacked(text)
+    told, arrays = unpack_page(text)
     assert told["motions"][0]["name"] == "<b>one</b> & 'two'"
     assert all(np.isfinite(values).all() for values in arrays.values() if values.dtype.kind == "f")
     assert {name for name, _ in surfaces(told, arrays)} == {"hull", "upper/arm", "fore", "hand", "finger"}
     rows = told["motions"][0]["rows"]
-    assert {row[5] for row in rows} <= {"ok", "told"}
+    assert {row[5] for row in rows} <= {"ok", "info"}
 
 
 def test_a_page_that_is_too_large_is_not_written(plans: dict[str, Plan], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ocp.app.view.player.PAGE_SETTINGS", replace(PAGE_SETTINGS, most_bytes=10_000))
     with pytest.raises(ProblemError, match="MB"):
-        page([shown_plan(plans["fixed"])])
+        build_page([animate_plan(plans["fixed"])])
     with pytest.raises(ProblemError, match="at least one"):
-        page([])
+        build_page([])
 
 
 def test_a_page_is_served_on_this_machine_as_long_as_it_lasts() -> None:
-    with Served("<p>ä</p>") as served, Served("b", int(served.address.rpartition(":")[2])) as other:
+    with PageServer("<p>ä</p>") as served, PageServer("b", int(served.address.rpartition(":")[2])) as other:
         assert served.address.startswith("http://127.0.0.1:")
         assert served.address != other.address  # the next port that is free
         with urllib.request.urlopen(served.address, timeout=20) as answer:
@@ -473,7 +510,7 @@ def test_a_page_is_served_on_this_machine_as_long_as_it_lasts() -> None:
     with pytest.raises(urllib.error.URLError):
         urllib.request.urlopen(served.address, timeout=20)
     with pytest.raises(ProblemError, match="65535"):
-        Served("", 70000)
+        PageServer("", 70000)
 
 
 def test_the_command_writes_a_page_or_serves_it(
@@ -489,7 +526,7 @@ def test_the_command_writes_a_page_or_serves_it(
     told = json.loads(capsys.readouterr().out)
     assert told["passed"] is True
     assert told["bytes"] == target.stat().st_size
-    assert [one["name"] for one in unpacked(target.read_text(encoding="utf-8"))[0]["motions"]] == [
+    assert [one["name"] for one in unpack_page(target.read_text(encoding="utf-8"))[0]["motions"]] == [
         "optimum",
         "same.csv",
     ]
@@ -502,11 +539,13 @@ def test_the_command_writes_a_page_or_serves_it(
     assert "grip" in capsys.readouterr().err
     loose = ["--tolerance", "rates=1e-30"]
     assert main(["view", words[0], "--page", str(target), "--quiet", *loose]) in (0, 1)
-    monkeypatch.setattr(player.Served, "wait", lambda self: urllib.request.urlopen(self.address, timeout=20).close())
+    monkeypatch.setattr(
+        player.PageServer, "wait", lambda self: urllib.request.urlopen(self.address, timeout=20).close()
+    )
     assert main(["view", words[0], "--port", "0"]) == 0
     shown = capsys.readouterr()
     assert "http://127.0.0.1:" in shown.err
-    assert "not shown: package://arm_description/upper.obj" in shown.err
+    assert "package://arm_description/upper.obj is not shown: " in shown.err
 
 
 def test_shapes_that_are_no_look_are_refused() -> None:

@@ -58,7 +58,7 @@ def test_what_is_seen_is_what_rays_from_the_eye_meet_first(seed: int) -> None:
         for triangle, color in zip(corners, tint, strict=True)
     ]
     camera = Camera.around(corners, (36, 27), 30.0, -40.0)
-    picture = render([Layer(parts)], camera, finer=1).astype(int)
+    picture = render([Layer(parts)], camera, side_samples=1).astype(int)
     # by the plane of each triangle and the sides on which the corners' cross products lie, ray by ray
     hit = np.full((27, 36), -1)
     for row in range(27):
@@ -118,7 +118,9 @@ def test_the_shadow_of_a_plate_lies_where_the_sun_puts_it() -> None:
 
 def test_shading_is_that_of_the_smooth_surface_which_triangles_stand_for() -> None:
     camera = Camera.around(ball(0.5).vertices, (120, 120))
-    coarse, fine = (render([Layer([]), Layer([ball(0.5, sides=sides)], 0.999)], camera, finer=1) for sides in (16, 120))
+    coarse, fine = (
+        render([Layer([]), Layer([ball(0.5, sides=sides)], 0.999)], camera, side_samples=1) for sides in (16, 120)
+    )
     row, column = np.mgrid[:120, :120] - 59.5
     inner = np.hypot(row, column) < 45
     assert np.abs(coarse.astype(int) - fine)[inner].max() <= 4
@@ -128,10 +130,10 @@ def test_shading_is_that_of_the_smooth_surface_which_triangles_stand_for() -> No
 def test_a_veil_takes_the_colour_away_that_its_opacity_says_and_never_covers_what_is_solid() -> None:
     veil, solid = ball(0.5, sides=20), ball(0.2, (1.0, 0.0, 0.0), sides=20)
     camera = Camera.around(veil.vertices, (80, 80))
-    thin, thick = (255.0 - render([Layer([]), Layer([veil], share)], camera, finer=1) for share in (0.2, 0.6))
+    thin, thick = (255.0 - render([Layer([]), Layer([veil], share)], camera, side_samples=1) for share in (0.2, 0.6))
     np.testing.assert_allclose(3 * thin, thick, atol=2.1)  # rounded to whole numbers
-    alone = render([Layer([solid])], camera, finer=1)
-    both = render([Layer([solid]), Layer([veil], 0.5, (0.0, 0.0, 1.0))], camera, finer=1)
+    alone = render([Layer([solid])], camera, side_samples=1)
+    both = render([Layer([solid]), Layer([veil], 0.5, (0.0, 0.0, 1.0))], camera, side_samples=1)
     inside = alone[..., 1] < 200
     assert inside.sum() > 100
     np.testing.assert_array_equal(both[inside], alone[inside])

@@ -13,7 +13,7 @@ import pytest
 
 from models import FixedBase, Robot
 from ocp.app import Check, check_trajectory, main
-from ocp.app.check.pieces import Motion
+from ocp.app.check.interpolation import Motion
 from ocp.app.check.suspicions import exchanged_joints
 from ocp.app.files import RawTrajectory
 from ocp.errors import ProblemError
@@ -205,7 +205,7 @@ def test_a_wrapped_joint_is_told_once_and_offered_unwrapped(ur5: Robot, rates: i
     assert [(row.name, row.verdict) for row in found.rows] == [(row.name, row.verdict) for row in sound.rows]
     again = checked(ur5, t, *(wrong, v)[:rates], unwrap=True)
     assert again.passed, again
-    np.testing.assert_allclose(again.readable.motion.q, q, atol=1e-12)
+    np.testing.assert_allclose(again.cleaned.motion.q, q, atol=1e-12)
 
 
 def test_a_joint_that_begins_a_turn_away_is_unwrapped_into_its_limits(ur5: Robot) -> None:
@@ -215,7 +215,7 @@ def test_a_joint_that_begins_a_turn_away_is_unwrapped_into_its_limits(ur5: Robot
     wrong[:, 4] = (q[:, 4] + np.pi) % (2 * np.pi) - np.pi
     again = checked(ur5, t, wrong, unwrap=True)
     assert again.passed, again
-    np.testing.assert_allclose(np.diff(again.readable.motion.q, axis=0), np.diff(q, axis=0), atol=1e-12)
+    np.testing.assert_allclose(np.diff(again.cleaned.motion.q, axis=0), np.diff(q, axis=0), atol=1e-12)
 
 
 def test_the_command_takes_a_wrapped_joint_as_turning_on(
@@ -226,7 +226,7 @@ def test_the_command_takes_a_wrapped_joint_as_turning_on(
     file = write_table(tmp_path / "motion.csv", t, q, v, names=ur5.joint_names)
     urdf = str(next(one.locate() for one in files("example-robot-data") or () if one.name == "ur5_robot.urdf"))
     assert main(["check", urdf, str(file), "--no-clearance", "--quiet"]) == 1
-    assert "state --unwrap if the controller does" in capsys.readouterr().out
+    assert "pass --unwrap if the controller does" in capsys.readouterr().out
     assert main(["check", urdf, str(file), "--no-clearance", "--quiet", "--unwrap"]) == 0
     assert "is wrapped at" in capsys.readouterr().out
 

@@ -117,7 +117,7 @@ class FootChart {
     this.figure.className = "chart";
     const caption = document.createElement("figcaption"), title = document.createElement("b");
     const lacking = feet.length > 1 && feet[0].forces !== feet[1].forces ? `, ${feet[0].forces ? "what it is held against" :
-      "the plan"} without forces from outside` : feet[0].forces ? "" : ", without forces from outside";
+      "the plan"} without external forces` : feet[0].forces ? "" : ", without external forces";
     title.textContent = `zero moment point in the footprint, seen from above${lacking}`;
     caption.append(title);
     const all = feet.flatMap(({corners, points}) => [...corners.map(([x, y]) => [x, y]),

@@ -201,7 +201,7 @@ def check_killed_cluster(folder: Path, number: int, wait: float, address: str, p
 
     killer = threading.Thread(target=kill_some)
     killer.start()
-    with pytest.raises(SolveError, match="scheduler is gone; what is done is kept") as caught:
+    with pytest.raises(SolveError, match="scheduler is lost; finished results are stored") as caught:
         run_batch(functions.square, tasks, folder, cluster=address)
     killer.join()
     assert caught.value.name == "cluster"

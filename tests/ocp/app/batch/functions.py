@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ocp import Collocation, Problem, ProblemError, Solution, SolveError, prepare
-from ocp.app.batch import kept, run_batch
+from ocp.app.batch import cached, run_batch
 
 
 def square(task: Any) -> dict[str, Any]:
@@ -87,18 +87,18 @@ def read(path: str) -> str:
 
 def of_file(task: Any) -> float:
     """A number of a file, plus another."""
-    return float(kept(read, task["file"])) + float(task["x"])
+    return float(cached(read, task["file"])) + float(task["x"])
 
 
 def spring(task: Any) -> dict[str, Any]:
     """A solution, of a problem that is prepared once in each worker."""
-    made = kept(arm, task["stiffness"])
+    made = cached(arm, task["stiffness"])
     return {"plan": made.solve(parameters={"mass": task["mass"]}), "built": id(made), "process": os.getpid()}
 
 
 def warm(task: Any, guess: Any) -> dict[str, Any]:
     """The same from a neighbour's solution."""
-    solution: Solution = kept(arm, 1.0).solve(
+    solution: Solution = cached(arm, 1.0).solve(
         parameters={"mass": task["mass"]}, guess=None if guess is None else guess["plan"]
     )
     told = {"solver": solution.solver, "guess": None if guess is None else guess["mass"]}

@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 from distributed import Client, LocalCluster
 
-from ocp.app.batch import Batch, kept, read_batch, run_batch
-from ocp.app.batch.ledger import Ledger
+from ocp.app.batch import Batch, cached, read_batch, run_batch
+from ocp.app.batch.result_store import ResultStore
 from tests.bad_values import (
     CALLABLE,
     COUNT,
@@ -125,16 +125,16 @@ CASES = [
     ),
     Case("read_batch", read_batch, {}, {"folder": FOLDER | {"nowhere": "/nowhere/to/be/found"}}),
     Case(
-        "kept",
-        lambda make, argument: kept(make, argument),
+        "cached",
+        lambda make, argument: cached(make, argument),
         {"make": list, "argument": [1]},
         {"make": CALLABLE | {"raises": int}, "argument": DATA},
     ),
     Case(
         "Batch",
         Batch,
-        {"ledger": Ledger(Path("b"), "f", "1"), "results": ()},
-        {"ledger": INSTANCE, "results": NAMES | {"one": read_batch}},
+        {"store": ResultStore(Path("b"), "f", "1"), "results": ()},
+        {"store": INSTANCE, "results": NAMES | {"one": read_batch}},
     ),
     method(batch, "best", {"by": "z"}, by=NOTHING | {"number": 3, "unknown": "nobody", "list": ["x"], "no text": "y"}),
     method(batch, "write_csv", {"path": "a.csv"}, path=PATH),

@@ -55,13 +55,13 @@ def test_a_cluster_does_what_processes_do_and_loses_nothing_when_it_is_killed(
 def said_to(stranger: ssl.SSLContext | None, address: str) -> bytes:
     """What a server says first: one of Dask's greets whom it accepts."""
     host, port = address.rpartition("/")[2].split(":")
-    with socket.create_connection((host, int(port))) as plain:
+    with socket.create_connection((host, int(port))) as as_data:
         try:
             if stranger is not None:
-                with stranger.wrap_socket(plain) as wrapped:
+                with stranger.wrap_socket(as_data) as wrapped:
                     return wrapped.recv(1)
-            plain.sendall(bytes(64))
-            return plain.recv(1)
+            as_data.sendall(bytes(64))
+            return as_data.recv(1)
         except OSError:
             return b""
 
@@ -69,7 +69,7 @@ def said_to(stranger: ssl.SSLContext | None, address: str) -> bytes:
 def test_no_other_user_of_the_machine_reaches_the_workers_of_a_batch() -> None:
     """They have no certificate of this batch's, one of their own does not help, and no page answers without one."""
     with Engine(functions.square, False, 1, None) as engine:
-        own = engine._own
+        own = engine._local_cluster
         (nanny,) = own.workers.values()
         nobody = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
         foreign: Any = Security.temporary().get_connection_args("client")["ssl_context"]

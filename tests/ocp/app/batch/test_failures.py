@@ -12,20 +12,20 @@ from typing import Any
 
 import pytest
 
-from ocp.app.batch import Batch, BatchError, kept, read_batch, run_batch
+from ocp.app.batch import Batch, BatchError, cached, read_batch, run_batch
 from ocp.errors import ProblemError
 from tests.ocp.app.batch import functions
 from tests.ocp.app.batch.drivers import ROOT, stored
 
 SCRIPT = """
 from models import FixedBase, Robot
-from ocp.app.batch import kept, run_batch
+from ocp.app.batch import cached, run_batch
 
 def arm(file):
     return FixedBase(Robot.from_urdf(file, tip="tool0"))
 
 def joints(task):
-    return kept(arm, "robot.urdf").joint_size + task["x"]
+    return cached(arm, "robot.urdf").joint_size + task["x"]
 
 if __name__ == "__main__":
     run_batch(joints, [{"x": i} for i in range(20)], "b", workers=1).write_csv("b.csv")
@@ -76,7 +76,7 @@ def test_failures_are_tried_again_when_a_file_has_changed_and_results_stay(tmp_p
     kept_results = {name: text for name, text in stored(tmp_path / "b").items() if b'"done"' in text[1]}
     message = read_batch(tmp_path / "b").results
     assert {result.error for result in message} == {"", "ProblemError"}
-    assert any("kept: read('" in result.message and "FileNotFoundError" in result.message for result in message)
+    assert any("cached: read('" in result.message and "FileNotFoundError" in result.message for result in message)
     before = stored(tmp_path / "b")
     assert counts() == {"done": 2, "failed": 2}
     assert stored(tmp_path / "b") == before, "nothing has changed"
@@ -110,7 +110,7 @@ if __name__ == "__main__":
     assert "b: 2 done" in told.stdout
     assert told.returncode == 0
     changed = run("return 2 * x", "return 3 * helper(task)")
-    assert "its source has changed" in changed.stderr, "results of two functions are not mixed"
+    assert "the source has changed" in changed.stderr, "results of two functions are not mixed"
 
 
 def test_again_tries_failures_though_nothing_has_changed(tmp_path: Path, here: Any) -> None:
@@ -139,8 +139,8 @@ def test_the_error_carries_the_results_and_can_be_had_later(tmp_path: Path, here
 
 
 def test_what_kept_raises_names_the_function_and_its_arguments(tmp_path: Path) -> None:
-    with pytest.raises(ProblemError, match=r"kept: read\('.*nothing'\) raised FileNotFoundError") as caught:
-        kept(functions.read, str(tmp_path / "nothing"))
+    with pytest.raises(ProblemError, match=r"cached: read\('.*nothing'\) raised FileNotFoundError") as caught:
+        cached(functions.read, str(tmp_path / "nothing"))
     assert caught.value.name == "make"
     assert isinstance(caught.value.__cause__, FileNotFoundError)
 

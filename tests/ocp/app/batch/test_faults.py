@@ -13,7 +13,7 @@ import pytest
 import ocp.storage
 from ocp import ProblemError
 from ocp.app.batch import run_batch
-from ocp.app.batch.ledger import Ledger
+from ocp.app.batch.result_store import ResultStore
 from tests.ocp.app.batch import functions
 from tests.ocp.app.batch.drivers import check_disturbed, count, driver, kill, stored, until
 
@@ -30,7 +30,7 @@ def test_a_driver_waits_for_another_and_takes_over_what_it_leaves(tmp_path: Path
     until(lambda: count(tmp_path / "b") > 0)
     two = driver(tmp_path / "b", tasks, 1)
     assert two.stdout is not None
-    assert "another driver is at work" in two.stdout.readline()
+    assert "another driver is active" in two.stdout.readline()
     kill(one.pid)
     one.communicate()
     gate.touch()
@@ -42,12 +42,12 @@ def test_a_driver_waits_for_another_and_takes_over_what_it_leaves(tmp_path: Path
 
 
 def test_one_driver_at_a_time_is_at_work_in_a_folder(tmp_path: Path) -> None:
-    crowd = [Ledger.of(tmp_path, "f", "1", True) for _ in range(8)]
+    crowd = [ResultStore.of(tmp_path, "f", "1", True) for _ in range(8)]
     inside: list[int] = []
 
-    def work(ledger: Ledger) -> None:
+    def work(store: ResultStore) -> None:
         for _ in range(20):
-            with ledger.alone():
+            with store.locked():
                 inside.append(1)
                 assert len(inside) == 1
                 inside.pop()
@@ -60,7 +60,7 @@ def test_a_file_system_without_locks_is_refused(tmp_path: Path, monkeypatch: pyt
     def none(*_: Any) -> None:
         raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
 
-    monkeypatch.setattr("ocp.app.batch.ledger.fcntl.flock", none)
+    monkeypatch.setattr("ocp.app.batch.result_store.fcntl.flock", none)
     with pytest.raises(ProblemError, match="has no locks") as caught:
         run_batch(functions.square, [{"x": 1}], tmp_path / "b")
     assert caught.value.name == "folder"
@@ -85,8 +85,8 @@ def test_a_full_or_read_only_disk_stops_with_one_error_and_breaks_nothing(
             return written(path, some, synced)
         return written(path, write, synced)
 
-    monkeypatch.setattr("ocp.app.batch.ledger.write_whole", full)
-    with pytest.raises(OSError, match="7 of 20 results are kept") as caught:
+    monkeypatch.setattr("ocp.app.batch.result_store.write_whole", full)
+    with pytest.raises(OSError, match="7 of 20 results are stored") as caught:
         run_batch(functions.square, tasks, tmp_path / "b", cluster=here)
     assert caught.value.errno == number
     assert caught.value.filename == str(tmp_path / "b")
@@ -126,7 +126,7 @@ def check_read_only(tasks: list[Any], folder: Path, monkeypatch: pytest.MonkeyPa
 def test_a_worker_without_room_stops_the_batch_and_is_no_failure_of_its_task(tmp_path: Path, here: Any) -> None:
     room = tmp_path / "full"
     room.touch()
-    with pytest.raises(OSError, match="0 of 1 results are kept") as caught:
+    with pytest.raises(OSError, match="0 of 1 results are stored") as caught:
         run_batch(functions.without_room, [{"until": str(room)}], tmp_path / "b", cluster=here)
     assert caught.value.errno == errno.ENOSPC
     room.unlink()

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from ocp import ProblemError, SolveError
-from ocp.app.batch import BatchError, kept, read_batch, run_batch
-from ocp.app.batch.ledger import Ledger
+from ocp.app.batch import BatchError, cached, read_batch, run_batch
+from ocp.app.batch.result_store import ResultStore
 from ocp.app.batch.run import source_version
 from tests.ocp.app.batch import functions
 from tests.ocp.app.batch.drivers import ROOT, count, driver, runs, stored, until, workers_of
@@ -134,8 +134,8 @@ def test_errors_and_numbers_that_are_none_are_failures_with_their_reason_and_not
         "mistake": ("ZeroDivisionError", "float division by zero (functions.py, line "),
         "exit": ("SystemExit", "left"),
         "interrupt": ("KeyboardInterrupt", ""),
-        "set": ("ProblemError", "the result['found'] is a set, no data"),
-        "nan": ("ProblemError", "the result is nan, no finite number"),
+        "set": ("ProblemError", "the result['found'] is a set, which is not data"),
+        "nan": ("ProblemError", "the result is nan, not a finite number"),
         "inf": ("ProblemError", "the result[1] is inf"),
         "inside": ("ProblemError", "the result['a']['b'][1] is nan"),
     }
@@ -236,18 +236,18 @@ def test_a_script_runs_its_own_function_under_its_guard(end: str, says: str, tmp
 
 
 def test_a_folder_of_another_function_or_version_or_of_something_else_is_refused(tmp_path: Path) -> None:
-    Ledger.of(tmp_path / "b", "tests.ocp.app.batch.functions:square", source_version(functions.square), False)
+    ResultStore.of(tmp_path / "b", "tests.ocp.app.batch.functions:square", source_version(functions.square), False)
     run_batch(functions.square, X[:1], tmp_path / "b")
-    with pytest.raises(ProblemError, match=r"holds results of .*square, not of .*same") as caught:
+    with pytest.raises(ProblemError, match=r"contains results of .*square, not of .*same") as caught:
         run_batch(functions.same, X, tmp_path / "b")
     assert caught.value.name == "folder"
-    with pytest.raises(ProblemError, match="take another folder") as caught:
+    with pytest.raises(ProblemError, match="use another folder") as caught:
         run_batch(functions.square, X, tmp_path / "b", version="2")
     assert caught.value.name == "version"
     head = tmp_path / "b" / "batch.json"
     written = json.loads(head.read_text())
     head.write_text(json.dumps(written | {"version": "0123"}))
-    with pytest.raises(ProblemError, match=r"its source has changed: .* say version='0123'"):
+    with pytest.raises(ProblemError, match=r"the source has changed: .* pass version='0123'"):
         run_batch(functions.square, X, tmp_path / "b")
     run_batch(functions.square, [], tmp_path / "b", version="0123")
     head.write_text(json.dumps(written | {"format": 7}))
@@ -256,11 +256,11 @@ def test_a_folder_of_another_function_or_version_or_of_something_else_is_refused
     head.write_text("{")
     with pytest.raises(ProblemError, match="damaged"):
         run_batch(functions.square, X, tmp_path / "b")
-    with pytest.raises(ProblemError, match="no folder of a batch"):
+    with pytest.raises(ProblemError, match="not the folder of a batch"):
         run_batch(functions.square, X, tmp_path)
     assert not (tmp_path / "results").exists()
     (tmp_path / "file").write_text("")
-    with pytest.raises(ProblemError, match="no folder"):
+    with pytest.raises(ProblemError, match="not a folder"):
         run_batch(functions.square, X, tmp_path / "file")
 
 
@@ -271,11 +271,11 @@ def test_what_is_kept_is_made_once_for_each_content_and_forgotten_in_turn() -> N
         made.append(value["a"])
         return value["a"]
 
-    assert [kept(make, {"a": value}) for value in (1.0, 1.0, 2.0, 1.0)] == [1.0, 1.0, 2.0, 1.0]
+    assert [cached(make, {"a": value}) for value in (1.0, 1.0, 2.0, 1.0)] == [1.0, 1.0, 2.0, 1.0]
     assert made == [1.0, 2.0]
     for value in range(3, 10):
-        kept(make, {"a": float(value)})
-    kept(make, {"a": 1.0})
-    kept(make, {"a": 2.0})
+        cached(make, {"a": float(value)})
+    cached(make, {"a": 1.0})
+    cached(make, {"a": 2.0})
     assert made[-1] == 2.0
     assert made.count(1.0) == 1 or made.count(1.0) == 2

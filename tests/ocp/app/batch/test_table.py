@@ -14,23 +14,23 @@ from pyarrow import parquet
 
 from ocp import Collocation, Problem, Solution, solve
 from ocp.app.batch import Batch, read_batch
-from ocp.app.batch.content import key_of, neighbours, packed, plain, text_of, unpacked
+from ocp.app.batch.content import as_data, canonical_text, key_of, neighbours, pack_result, unpack_result
 from ocp.app.batch.engine import failed
-from ocp.app.batch.ledger import Ledger
+from ocp.app.batch.result_store import ResultStore
 from ocp.app.batch.run import source_version
 
 
 def written(folder: Path, results: list[tuple[Any, Any]]) -> Batch:
     """A folder with these tasks and what the function returned; an exception is one."""
-    ledger = Ledger.of(folder, "m:f", "1", True)
+    store = ResultStore.of(folder, "m:f", "1", True)
     for task, value in results:
         if isinstance(value, Exception):
             record, files = failed("failed", type(value).__name__, str(value))
         else:
-            found = packed(value)
+            found = pack_result(value)
             record, files = {"status": "done", "error": "", "message": "", "seconds": 0.25, **found.record}, found.files
-        own = {"key": key_of(text_of(task, "task")), "task": task, "neighbour": None, "inputs": {}}
-        ledger.write({**own, **record}, files)
+        own = {"key": key_of(canonical_text(task, "task")), "task": task, "neighbour": None, "inputs": {}}
+        store.write({**own, **record}, files)
     return read_batch(folder)
 
 
@@ -61,9 +61,9 @@ def test_a_table_has_a_row_for_each_result_and_every_digit(tmp_path: Path) -> No
         texts = list(csv.DictReader(stream))
     table = parquet.read_table(tmp_path / "a.parquet").to_pylist()
     assert len(texts) == len(table) == len(RESULTS)
-    values = {text_of(task, "task"): value for task, value in RESULTS}
+    values = {canonical_text(task, "task"): value for task, value in RESULTS}
     for result, text, row in zip(batch, texts, table, strict=True):
-        value = values[text_of(result.task, "task")]
+        value = values[canonical_text(result.task, "task")]
         assert text["key"] == row["key"] == result.key
         assert row["cost"] == result.cost == (None if text["cost"] == "" else float(text["cost"]))
         assert text["status"] == row["status"] == ("failed" if isinstance(value, Exception) else "done")
@@ -103,10 +103,10 @@ def test_the_best_of_a_group_is_the_cheapest_that_is_done_and_of_no_bad_verdict(
 )
 def test_solutions_come_back_wherever_they_stood(at: Any) -> None:
     plan = solved()
-    parcel = packed(at(plan))
-    json.dumps(parcel.record)
-    assert len(parcel.files) == len(parcel.record["files"]) >= 1
-    found = unpacked(parcel)
+    payload = pack_result(at(plan))
+    json.dumps(payload.record)
+    assert len(payload.files) == len(payload.record["files"]) >= 1
+    found = unpack_result(payload)
 
     def same(one: Any, two: Any) -> bool:
         if isinstance(one, Solution):
@@ -122,21 +122,21 @@ def test_solutions_come_back_wherever_they_stood(at: Any) -> None:
 
 def test_the_cost_is_what_the_function_says_or_the_only_plan() -> None:
     plan = solved()
-    assert packed(plan).record["cost"] == plan.cost
-    assert packed({"plan": plan, "cost": 7}).record["cost"] == 7.0
-    assert packed({"one": plan, "two": plan}).record["cost"] is None
-    assert packed(3).record["cost"] == 3.0
-    assert packed(True).record["cost"] is None
-    assert packed({"cost": "dear"}).record["cost"] is None
-    assert packed(None).record == {"cost": None, "verdict": None, "value": None, "files": []}
+    assert pack_result(plan).record["cost"] == plan.cost
+    assert pack_result({"plan": plan, "cost": 7}).record["cost"] == 7.0
+    assert pack_result({"one": plan, "two": plan}).record["cost"] is None
+    assert pack_result(3).record["cost"] == 3.0
+    assert pack_result(True).record["cost"] is None
+    assert pack_result({"cost": "dear"}).record["cost"] is None
+    assert pack_result(None).record == {"cost": None, "verdict": None, "value": None, "files": []}
 
 
 def test_data_are_plain_and_their_own() -> None:
     given = {"a": (np.int64(1), np.arange(2.0)), "b": [np.bool_(True)]}
-    assert plain(given, "task") == {"a": [1, [0.0, 1.0]], "b": [True]}
-    assert text_of({"b": 1, "a": {"d": 1, "c": 2}}, "task") == '{"a":{"c":2,"d":1},"b":1}'
-    assert len({key_of(text_of(value, "task")) for value in (0.1, 0.1 + 1e-18, np.float64(0.1))}) == 1
-    assert len({key_of(text_of(value, "task")) for value in (0.1, np.nextafter(0.1, 1), np.float32(0.1))}) == 3
+    assert as_data(given, "task") == {"a": [1, [0.0, 1.0]], "b": [True]}
+    assert canonical_text({"b": 1, "a": {"d": 1, "c": 2}}, "task") == '{"a":{"c":2,"d":1},"b":1}'
+    assert len({key_of(canonical_text(value, "task")) for value in (0.1, 0.1 + 1e-18, np.float64(0.1))}) == 1
+    assert len({key_of(canonical_text(value, "task")) for value in (0.1, np.nextafter(0.1, 1), np.float32(0.1))}) == 3
 
 
 def test_a_neighbour_is_the_nearest_of_all_generations_before() -> None:

@@ -81,12 +81,12 @@ def of_canonical(text: str) -> list[Move]:
 def of_program(program: Program) -> list[Move]:
     """The same of what was read."""
     moves: list[Move] = []
-    for stretch in program.stretches:
-        if isinstance(stretch, Rapid):
-            moves.append(Move("rapid", stretch.end, np.zeros(3), 0.0, 0.0))
-        elif isinstance(stretch, Cut):
+    for section in program.sections:
+        if isinstance(section, Rapid):
+            moves.append(Move("rapid", section.end, np.zeros(3), 0.0, 0.0))
+        elif isinstance(section, Cut):
             last = 0
-            for segment, feed, line in zip(stretch.path.segments, stretch.feeds, stretch.lines, strict=True):
+            for segment, feed, line in zip(section.path.segments, section.feeds, section.lines, strict=True):
                 if isinstance(segment, Arc | Helix):
                     sense = float(np.sign(np.asarray(segment.axis).sum()))
                     end, center = np.asarray(segment.end), np.asarray(segment.center)

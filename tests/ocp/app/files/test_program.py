@@ -45,7 +45,7 @@ def timed(program: Program) -> TimedProgram:
 
 
 def test_the_stretches_are_those_of_the_file(program: Program, timed: TimedProgram) -> None:
-    kinds = [type(each) for each in program.stretches]
+    kinds = [type(each) for each in program.sections]
     assert kinds == [Rapid, Cut, Pause, Rapid, Pause, Rapid, Cut]
     assert timed.names == (
         "rapid, line 2",
@@ -70,7 +70,7 @@ def test_the_durations_add_up_and_every_stretch_is_from_rest_to_rest(timed: Time
     assert np.diff(timed.bounds) == pytest.approx(parts, abs=1e-12)
     at = timed.at(timed.bounds)
     assert at.speed == pytest.approx(0, abs=1e-9)
-    assert at.stretch.tolist() == [0, 1, 2, 3, 5, 5, 6, 6]  # a stop of no duration is passed
+    assert at.section.tolist() == [0, 1, 2, 3, 5, 5, 6, 6]  # a stop of no duration is passed
     assert at.position[0] == pytest.approx([0, 0, 0])
     assert at.position[-1] == pytest.approx([0.005, 0, -0.003], abs=1e-9)
 
@@ -100,17 +100,17 @@ def test_a_time_may_be_beyond_the_end_by_rounding_of_its_own_size_and_no_more(pr
 
 def test_no_feed_and_no_limit_is_exceeded(program: Program, timed: TimedProgram) -> None:
     motion = timed.at(np.linspace(0, timed.duration, 20_001))
-    for i, stretch in enumerate(program.stretches):
-        here = motion.stretch == i
+    for i, section in enumerate(program.sections):
+        here = motion.section == i
         if not here.any():
             continue
-        most = {Rapid: 0.4, Pause: 0.0}.get(type(stretch), max(stretch.feeds) if isinstance(stretch, Cut) else 0.0)
+        most = {Rapid: 0.4, Pause: 0.0}.get(type(section), max(section.feeds) if isinstance(section, Cut) else 0.0)
         assert motion.speed[here].max() <= most * (1 + 1e-9)
-        if isinstance(stretch, Rapid):
-            assert np.abs(np.cross(motion.position[here] - stretch.start, stretch.end - stretch.start)).max() < 1e-12
+        if isinstance(section, Rapid):
+            assert np.abs(np.cross(motion.position[here] - section.start, section.end - section.start)).max() < 1e-12
     assert np.abs(motion.acceleration).max() <= 2.0 * (1 + 1e-9)
     assert np.abs(motion.jerk).max() <= 100.0 * (1 + 1e-9)
-    assert motion.speed[motion.stretch == 1].max() == pytest.approx(0.05)
+    assert motion.speed[motion.section == 1].max() == pytest.approx(0.05)
 
 
 def test_the_speed_of_the_limits_is_the_most_a_feed_may_be(program: Program) -> None:
@@ -137,7 +137,7 @@ def test_a_program_that_is_placed_is_the_same_elsewhere(program: Program, seed: 
     matrix = np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k  # Rodrigues
     there = program.placed(shift, turned(vector))
     assert there.start == pytest.approx(shift)
-    for one, other in zip(program.stretches, there.stretches, strict=True):
+    for one, other in zip(program.sections, there.sections, strict=True):
         if isinstance(one, Rapid) and isinstance(other, Rapid):
             assert other.start == pytest.approx(shift + matrix @ one.start, abs=1e-12)
             assert other.end == pytest.approx(shift + matrix @ one.end, abs=1e-12)

@@ -152,7 +152,7 @@ def test_a_message_that_ends_too_early(tmp_path: Path, data: bytes) -> None:
         channel = writer.register_channel("/joint_states", "cdr", schema)
         writer.add_message(channel, 0, data, 0)
         writer.finish()
-    with pytest.raises(ProblemError, match="no log that can be read"):
+    with pytest.raises(ProblemError, match="not a valid log"):
         read_trajectory(tmp_path / "log.mcap")
 
 
@@ -176,21 +176,21 @@ def test_a_joint_whose_name_looks_like_something_else(tmp_path: Path) -> None:
     ("text", "name", "words"),
     [
         ("time,a\n0,1\n1,2,3\n", "a.csv", "line 3.*3 columns"),
-        ("time,a\n0,1\n1,x\n", "a.csv", "line 3.*'x' is no number"),
+        ("time,a\n0,1\n1,x\n", "a.csv", "line 3.*'x' is not a number"),
         ("0,1\n1,2\n", "a.csv", "line 1.*no head"),
         ("a,b\n0,1\n", "a.csv", "no column is the time"),
-        ("time,a,a\n0,1,2\n", "a.csv", "heads two columns"),
+        ("time,a,a\n0,1,2\n", "a.csv", "two columns are named"),
         ("time,a.velocity\n0,1\n", "a.csv", "no column is a position"),
         ("time,a\n", "a.csv", "no sample"),
-        ("{", "a.json", "is no JSON"),
+        ("{", "a.json", "is not valid JSON"),
         ("[[]]", "a.json", "joint_names and points"),
         ('{"joint_names": ["a"], "points": []}', "a.json", "at least one point"),
         ('{"joint_names": ["a"], "points": [{"positions": [1]}]}', "a.json", "point 1: time_from_start"),
         ('{"joint_names": ["a"], "points": [{"time_from_start": 0}]}', "a.json", "point 1 has no positions"),
-        ('{"joint_names": ["a", "a"], "points": [{}]}', "a.json", "names that differ"),
-        ('{"joint_names": ["a"], "points": [{"positions": ["x"], "time_from_start": 0}]}', "a.json", "no numbers"),
-        ("a: [", "a.yaml", "is no YAML"),
-        ("no log", "a.mcap", "no log"),
+        ('{"joint_names": ["a", "a"], "points": [{}]}', "a.json", "distinct names"),
+        ('{"joint_names": ["a"], "points": [{"positions": ["x"], "time_from_start": 0}]}', "a.json", "not numbers"),
+        ("a: [", "a.yaml", "is not valid YAML"),
+        ("no log", "a.mcap", "not a valid log"),
     ],
 )
 def test_what_is_no_trajectory_is_refused(tmp_path: Path, text: str, name: str, words: str) -> None:

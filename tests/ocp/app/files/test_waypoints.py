@@ -107,7 +107,7 @@ def test_a_unit_of_the_caller_holds_where_the_head_says_none(waypoints: Callable
         waypoints(text)
     assert said[0].message.name == "unit"  # type: ignore[union-attr]
     assert waypoints(table(["x mm", "y mm", "z mm"], 1e3 * POINTS), unit="mm").positions == pytest.approx(POINTS)
-    with pytest.raises(ProblemError, match=r"the head says 'x mm', the caller unit='m'; leave unit out"):
+    with pytest.raises(ProblemError, match=r"the header says 'x mm', the caller unit='m'; omit unit"):
         waypoints(table(["x mm", "y mm", "z mm"], 1e3 * POINTS), unit="m")
 
 
@@ -176,7 +176,7 @@ def test_without_a_head_three_columns_are_a_place_and_seven_are_asked_for(waypoi
     text = "\n".join(" ".join(map(str, row)) for row in POINTS)
     assert waypoints(text).positions == pytest.approx(POINTS)
     poses = "\n".join("0,0,0,1,0,0,0".replace("0", str(i), 1) for i in range(3))
-    with pytest.raises(ProblemError, match=r"line 1, .*no head names the 7 columns; .* columns="):
+    with pytest.raises(ProblemError, match=r"line 1, .*no header names the 7 columns; .* columns="):
         waypoints(poses)
     order = ("x", "y", "z", "qx", "qy", "qz", "qw")
     found = waypoints(poses.replace("1,0,0,0", "0,0,0,1"), columns=order)
@@ -232,7 +232,7 @@ def test_the_path_goes_through_the_points_and_turns_the_tool(
 
 def test_points_that_turn_back_are_split_given_width_or_refused_by_line(waypoints: Callable[..., Waypoints]) -> None:
     found = waypoints("x,y,z\n0,0,0\n1,0,0\n0.5,0,0\n0.5,1,0\n")
-    with pytest.raises(ProblemError, match=r"turns back the way it came; take paths\(\)") as caught:
+    with pytest.raises(ProblemError, match=r"reverses its direction; use paths\(\)") as caught:
         found.path()
     assert caught.value.name == "line 3"
     assert [len(path.segments) for path in found.paths()] == [1, 2]
@@ -245,23 +245,23 @@ def test_points_that_turn_back_are_split_given_width_or_refused_by_line(waypoint
     ("text", "name", "words"),
     [
         ("", "file", "empty"),
-        ("# only a comment\n", "file", "empty but for comments"),
+        ("# only a comment\n", "file", "only comments"),
         ("x,y,z\n", "file", "no waypoint"),
         ("x,y,z\n0,0,nan\n1,0,0\n", "line 2", "not finite"),
         ("x,y,z\n0,0,inf\n1,0,0\n", "line 2", "not finite"),
         ("x,y,z\n0,0,0\n1,0\n", "line 3", "2 columns, expected 3"),
         ("x,y,z\n0,0,0\n1,0,0,7\n", "line 3", "4 columns, expected 3"),
-        ("x,y,z\n0,0,0\n1,0,north\n", "line 3", "'north' is no number"),
+        ("x,y,z\n0,0,0\n1,0,north\n", "line 3", "'north' is not a number"),
         ("x,y,w\n0,0,0\n", "z", "no column z among 'x', 'y', 'w'"),
         ("x,y,z,qw,qx,qy\n0,0,0,1,0,0\n", "qz", "no column qz"),
-        ("x,y,z,x\n0,0,0,1\n", "x", "heads two columns"),
+        ("x,y,z,x\n0,0,0,1\n", "x", "two columns are named"),
         ("x [rad],y,z\n0,0,0\n", "x", "cannot be in rad"),
-        ("t,x,y,z\n0,0,0,0\n2,1,0,0\n1,2,0,0\n", "line 4", "1 s does not come after 2 s; sort"),
-        ("t,x,y,z\n0,0,0,0\n0,1,0,0\n", "line 3", "0 s does not come after 0 s"),
+        ("t,x,y,z\n0,0,0,0\n2,1,0,0\n1,2,0,0\n", "line 4", "1 s is not after 2 s; sort"),
+        ("t,x,y,z\n0,0,0,0\n0,1,0,0\n", "line 3", "0 s is not after 0 s"),
         ("x,y,z,qw,qx,qy,qz\n0,0,0,1,0,0,0\n1,0,0,1,1,0,0\n", "line 3", "norm 1.41421"),
         ("x,y,z,qw,qx,qy,qz\n0,0,0,0,0,0,0\n", "line 2", "norm 0"),
         ("x,y,z,ax,ay,az\n0,0,0,0,0,0\n1,0,0,0,0,1\n", "line 2", "axis is zero"),
-        ("x,y,z,ax,ay,az\n0,0,0,0,0,1\n1,0,0,0,0,-1\n", "line 3", "turns round against line 2"),
+        ("x,y,z,ax,ay,az\n0,0,0,0,0,1\n1,0,0,0,0,-1\n", "line 3", "opposite to that of line 2"),
     ],
 )
 def test_a_table_that_is_wrong_is_refused_by_line_or_column(
@@ -275,12 +275,8 @@ def test_a_table_that_is_wrong_is_refused_by_line_or_column(
 @pytest.mark.parametrize(
     ("rows", "name", "words"),
     [
-        (["0,0,0,0,0,0", "0,0,0,0,0,1"], "line 3", r"turns by 57\.3 deg in one place"),
-        (
-            ["0,0,0,0,0,0", "1,0,0,0,0,0", "1,0,0,0,0,3.14159265", "2,0,0,0,0,3.14159265"],
-            "line 4",
-            "180 deg in one place",
-        ),
+        (["0,0,0,0,0,0", "0,0,0,0,0,1"], "line 3", r"turns by 57\.3 deg in place"),
+        (["0,0,0,0,0,0", "1,0,0,0,0,0", "1,0,0,0,0,3.14159265", "2,0,0,0,0,3.14159265"], "line 4", "180 deg in place"),
         (["0,0,0,0,0,0", "1,0,0,0,0,3.1415"], "line 3", "from line 2 to here .* ambiguous"),
         (["1,0,0,0,0,0", "1,0,0,0,0,0"], "positions", "all waypoints are at one place"),
         (["1,0,0,0,0,0"], "positions", "all waypoints are at one place"),

@@ -13,8 +13,8 @@ from models import Box, FixedBase, MovingObstacle, Sphere, planar_chain
 from ocp import Collocation, Limits, Plan, Problem, StorageWarning, TipTask, plan, solve
 from ocp.app.check.plan_verdict import verdict_of
 from ocp.app.command import main
+from ocp.app.view.animation import animate_plan
 from ocp.app.view.report import report_of_plan
-from ocp.app.view.shown import shown_plan
 from ocp.motion.plan.motion import Part
 from tests.ocp.motion.plan.motions import planned
 
@@ -45,7 +45,7 @@ def test_a_problem_without_limits_does_not_excuse_a_motion_beyond_those_of_its_m
         assert audit["rates of the machine, 'shoulder_pan_joint'"].value == pytest.approx(90 - np.pi, rel=0.01)
         assert not verdict.passed
         assert verdict.sentence.startswith("must not be run")
-    shown = shown_plan(fast)
+    shown = animate_plan(fast)
     assert ("must not be run" in shown.verdict, shown.passed) == (True, False)
     assert main(["report", str(path), str(page)]) == 1
     assert main(["view", str(path), "--page", str(tmp_path / "view.html")]) in (0, 1)

@@ -1,4 +1,4 @@
-(refused: line 3: X stands twice)
+(refused: line 3: X is repeated)
 G21
 G1 X10 X20 F100
 M2

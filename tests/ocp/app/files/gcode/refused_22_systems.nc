@@ -1,4 +1,4 @@
-(refused: line 5: another coordinate system)
+(refused: line 5: a second coordinate system)
 G21
 G54 G0 X0 Y0
 G1 X10 F100

@@ -1,4 +1,4 @@
-(refused: no word of it moves anything)
+(refused: no line moves anything)
 G21 G90
 (nothing)
 M2

@@ -13,10 +13,10 @@ import pytest
 from models import CollisionScene, FixedBase, FreeFloating, Robot, Sphere, Standing, mass_matrix, rectangle
 from ocp import Plan
 from ocp.app import Check, check_trajectory
-from ocp.app.check.collisions import proof, within_limits
-from ocp.app.check.joint_limits import floating_base, floating_torques
-from ocp.app.check.oddities import BASES
-from ocp.app.check.pieces import Motion, Pieces, highest
+from ocp.app.check.collisions import prove_clearance, with_wide_limits
+from ocp.app.check.data_checks import BASES
+from ocp.app.check.interpolation import Motion, PiecewisePolynomial, polynomial_maxima
+from ocp.app.check.joint_limits import floating_torques, integrate_base
 from ocp.app.files import read_trajectory
 from ocp.errors import ProblemError
 from ocp.motion.local.collisions import distances_along
@@ -55,9 +55,9 @@ def checked(folder: Path, urdf: str, names: tuple[str, ...], t: Any, *values: An
 def test_greatest_values_are_those_of_a_fine_sampling() -> None:
     rng = np.random.default_rng(0)
     coefficients = rng.normal(size=(300, 6))
-    value, place = highest(coefficients)
+    value, place = polynomial_maxima(coefficients)
     s = np.linspace(0.0, 1.0, 2001)
-    whole = Pieces(np.arange(301.0), coefficients[:, :, None])
+    whole = PiecewisePolynomial(np.arange(301.0), coefficients[:, :, None])
     fine = np.array([whole.within(np.full(2001, k), s)[:, 0].max() for k in range(300)])
     assert (value >= fine).all()
     assert (value <= fine + 1e-4).all()
@@ -79,7 +79,7 @@ def test_a_rule_gives_back_polynomials_of_its_degree(degree: int) -> None:
 def test_divided_differences_are_exact_for_polynomials_of_their_order() -> None:
     f = np.polynomial.Polynomial([0.3, -1.0, 0.7, 0.25])
     t = np.sort(np.random.default_rng(1).uniform(0.0, 2.0, 9))
-    found = Motion(t, f(t)[:, None]).along("jerk")
+    found = Motion(t, f(t)[:, None]).quantity("jerk")
     assert found is not None
     assert not found.closed
     np.testing.assert_allclose(found.pieces.coefficients[:, 0, 0], f.deriv(3)(0.0), rtol=1e-6)
@@ -97,8 +97,8 @@ def test_proven_distances_lie_below_a_fine_sampling_and_near_it(rates: int, coun
     motion = Motion(t, *values[:rates])
     arm = FixedBase(Robot.from_urdf(URDF, tip="finger"))
     ball = Sphere(radius=0.1, position=rng.uniform([0.3, -0.2, 0.3], [0.9, 0.6, 0.6]))
-    around = CollisionScene(within_limits(arm, motion), [ball], 0.05)
-    found = proof(around, motion)
+    around = CollisionScene(with_wide_limits(arm, motion), [ball], 0.05)
+    found = prove_clearance(around, motion)
     assert found.settled
     fine = np.unique(np.concatenate([a + (b - a) * np.linspace(0.0, 1.0, 21) for a, b in pairwise(t)]))
     apart = distances_along(around, np.zeros(0), motion.position.at(fine), fine)
@@ -119,7 +119,7 @@ def test_digits_that_a_file_has_not_are_no_fault(tmp_path: Path, digits: int) ->
     t, q, *_ = smooth(2001)
     found = checked(tmp_path, URDF, NAMES, t, np.round(q, digits), acceleration=8.0, jerk=60.0)
     assert found.passed, found
-    assert "not decided" in found.sentence
+    assert "undetermined" in found.sentence
     t, q, v, _ = smooth(2001)
     single = q.astype(np.float32).astype(float), v.astype(np.float32).astype(float)
     assert checked(tmp_path, URDF, NAMES, t, *single, acceleration=8.0, jerk=60.0).passed
@@ -168,7 +168,7 @@ def test_followers_follow(tmp_path: Path) -> None:
     assert (fault.kind, fault.name) == ("follower", "right")
     assert (fault.time or 0.0) > 1.2
     found = checked(tmp_path, SPINNING, ("spin", "right"), t, np.column_stack([t, 2 * left]), clearance=None)
-    assert "right, which is there, follows it" in found.faults[0].text
+    assert "its follower right is given" in found.faults[0].text
 
 
 def test_times_in_nanoseconds(tmp_path: Path) -> None:
@@ -205,7 +205,7 @@ def test_a_floating_base_keeps_its_momentum_or_is_told_wrong(tmp_path: Path, pla
     text = URDF if not planar else URDF.replace('axis xyz="0 -1 0"', 'axis xyz="0 0 1"')
     t, q, v, a = smooth()
     machine = FreeFloating(Robot.from_urdf(text), "planar" if planar else "spatial")
-    base, rows = floating_base(machine, Motion(t, q, v, a))
+    base, rows = integrate_base(machine, Motion(t, q, v, a))
     assert max(row.value for row in rows) > 0.05
     names = (*NAMES, *BASES[1 if planar else 0])
     assert checked(tmp_path, text, names, t, np.column_stack([q, base]), base="floating").passed

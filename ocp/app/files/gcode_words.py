@@ -1,0 +1,327 @@
+"""Split G-code lines into words, classify the codes, and construct arcs from their centre or radius.
+
+The dialect is RS274/NGC as in the LinuxCNC manual, "G-Code Overview", "G-Codes" and "M-Codes": letters of either case,
+blanks anywhere, `( )` and `;` comments, block delete `/`, line numbers N, files between two lines of `%`. A program
+number `O1000` alone on its line is ignored. Parameters, expressions and control words are errors because their values
+depend on the machine. Codes are in tenths: 901 is G90.1. A code with another meaning in another dialect is an error.
+
+The numbers of a program are rounded, so the centre of an arc (G2, G3) is rarely at the same distance from both ends.
+It is moved by the smallest distance onto the perpendicular bisector of the chord, so that the arc meets both ends
+exactly. LinuxCNC keeps the written centre and runs a spiral instead; the two curves differ by less than the gap.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from models.arrays import Array
+from models.input_files import INPUT_LIMITS
+from models.paths import Arc, Helix
+from models.paths.segments import SHORTEST_SEGMENT
+from models.spatial import FULL_TURN
+from ocp.app.files.text_files import FileName, line_error
+from ocp.tolerances import STANDSTILL
+
+__all__ = [
+    "GROUPS",
+    "IGNORED_CODES",
+    "IGNORED_LETTERS",
+    "MACHINE_CODES",
+    "MOTIONS",
+    "M_WORDS",
+    "PLANES",
+    "REPOST",
+    "UNSUPPORTED_CODES",
+    "ArcError",
+    "Block",
+    "arcs_about_center",
+    "center_from_radius",
+    "code_name",
+    "read_blocks",
+]
+
+PLANES = {170: (0, 1, 2), 180: (2, 0, 1), 190: (1, 2, 0)}
+"""First axis, second axis and normal of G17, G18, G19: right-handed, so that G3 turns about the normal."""
+RADIUS_SHARE = 1e-3
+"""Relative to the radius: difference of the distances from the centre that is accepted for numbers of few digits."""
+
+
+class ArcError(Exception):
+    """Numbers do not describe an arc.
+
+    Attributes:
+        why: Reason.
+        size: Remaining gap, m.
+        limit: Largest gap that is closed, m.
+    """
+
+    def __init__(self, why: str, size: float, limit: float) -> None:
+        super().__init__(why)
+        self.why, self.size, self.limit = why, size, limit
+
+
+def center_from_radius(start: Array, end: Array, radius: float, clockwise: bool, gap: float) -> Array:
+    """Return the centre, shape (2,), m, of an arc in its plane; a negative radius selects the longer arc.
+
+    Raises:
+        ArcError: The radius is smaller than half the chord by more than `gap`, or the chord is zero.
+    """
+    chord = end - start
+    length = float(np.hypot(*chord))
+    if length == 0:
+        raise ArcError("an arc with R ends where it starts; give I, J, K for a full circle", 0.0, gap)
+    deficit = length / 2 - abs(radius)
+    if deficit > gap and deficit > RADIUS_SHARE * length / 2:
+        raise ArcError(f"R is {deficit:.3g} m less than half the chord", deficit, gap)
+    height = np.sqrt(max(radius**2 - length**2 / 4, 0.0))
+    left = np.array([-chord[1], chord[0]]) / length
+    return np.asarray((start + end) / 2 + (height if clockwise == (radius < 0) else -height) * left)
+
+
+def arcs_about_center(
+    start: Array, end: Array, center: Array, clockwise: bool, turns: int, plane: tuple[int, int, int], gap: float
+) -> list[Arc | Helix]:
+    """Return arcs or helices from start to end: one, or two halves if no single centre serves both ends.
+
+    Two are needed if a circle nearly closes but ends nearer to the centre than it starts.
+
+    Args:
+        start, end: Shape (3,), m.
+        center: In the plane. Shape (2,), m.
+        clockwise: Whether the arc turns clockwise about the normal.
+        turns: Number of begun turns: 1 for an arc up to a full circle.
+        plane: First axis, second axis, normal.
+        gap: Largest difference of the distances from the centre that counts as rounding, m.
+
+    Raises:
+        ArcError: The distances from the centre differ by more than rounding.
+    """
+    in_plane, normal = list(plane[:2]), plane[2]
+    first, last = start[in_plane], end[in_plane]
+    radii = float(np.hypot(*(first - center))), float(np.hypot(*(last - center)))
+    if min(radii) <= SHORTEST_SEGMENT:
+        raise ArcError("the centre is the start or the end of the arc", max(radii), gap)
+    difference = abs(radii[0] - radii[1])
+    allowed = max(gap, min(RADIUS_SHARE * max(radii), 100 * gap))  # at most two digits fewer than usual
+    if difference > allowed:
+        why = (
+            f"start and end are {radii[0]:.6g} and {radii[1]:.6g} m from the centre: a difference of {difference:.3g} m"
+        )
+        raise ArcError(why, difference, allowed)
+    sweep = _sweep(first - center, last - center, clockwise)
+    moved = _moved(center, first, last)
+    # displacement of the arc's far side by moving the centre
+    if np.hypot(*(moved - center)) * (1 - np.cos(sweep / 2)) <= max(2 * difference, gap):
+        if (first != last).any():
+            sweep = _sweep(first - moved, last - moved, clockwise)
+        return [_turned(start, end, moved, clockwise, sweep + FULL_TURN * (turns - 1), plane)]
+    half = (-sweep if clockwise else sweep) / 2
+    cosine, sine = np.cos(half), np.sin(half)
+    out = (first - center) * (radii[0] + radii[1]) / (2 * radii[0])
+    middle = start.copy()
+    middle[in_plane] = center + np.array([cosine * out[0] - sine * out[1], sine * out[0] + cosine * out[1]])
+    total = sweep + FULL_TURN * (turns - 1)
+    middle[normal] += (end[normal] - start[normal]) * sweep / 2 / total
+    halves = []
+    for begin, stop, extra in ((start, middle, 0.0), (middle, end, total - sweep)):
+        own_center = _moved(center, begin[in_plane], stop[in_plane])
+        turn = _sweep(begin[in_plane] - own_center, stop[in_plane] - own_center, clockwise)
+        halves.append(_turned(begin, stop, own_center, clockwise, turn + extra, plane))
+    return halves
+
+
+def _moved(center: Array, first: Array, last: Array) -> Array:
+    """Return the point nearest to `center` with equal distance from both other points. Shape (2,) each."""
+    chord = last - first
+    square = float(chord @ chord)
+    return center if square == 0 else np.asarray(center - ((center - (first + last) / 2) @ chord) / square * chord)
+
+
+def _turned(
+    start: Array, end: Array, center: Array, clockwise: bool, sweep: float, plane: tuple[int, int, int]
+) -> Arc | Helix:
+    """Return the arc, or for more than a turn or a rise the helix, that begins at `start` and turns by `sweep`."""
+    axis, middle = np.zeros(3), start.copy()
+    axis[plane[2]] = -1.0 if clockwise else 1.0
+    middle[list(plane[:2])] = center
+    rise = float((end - start) @ axis)
+    if sweep <= FULL_TURN * (1 + 1e-12) and abs(rise) <= STANDSTILL:
+        return Arc(start, middle, axis, min(sweep, FULL_TURN))
+    return Helix(start, middle, axis, sweep, rise)
+
+
+def _sweep(first: Array, last: Array, clockwise: bool) -> float:
+    """Return the angle from one vector to another, in (0, 2 pi]."""
+    angle = float(np.arctan2(first[0] * last[1] - first[1] * last[0], first @ last))
+    angle = (-angle if clockwise else angle) % FULL_TURN
+    return angle if angle > 1e-6 else FULL_TURN  # a smaller angle means a full circle
+
+
+MOTIONS = (0, 10, 20, 30)
+"""G0, G1, G2, G3."""
+
+GROUPS: dict[int, str] = {
+    **dict.fromkeys((*MOTIONS, 330, 331, 382, 383, 384, 385, 730, 760, *range(810, 900, 10), 50, 51, 52, 53), "motion"),
+    **dict.fromkeys(PLANES, "plane"),
+    **dict.fromkeys((900, 910), "distances"),
+    **dict.fromkeys((901, 911), "centres"),
+    **dict.fromkeys((930, 940, 950), "feed mode"),
+    **dict.fromkeys((200, 210), "units"),
+    **dict.fromkeys((610, 611, 640), "path control"),
+    **dict.fromkeys((*range(540, 600, 10), 591, 592, 593), "coordinate system"),
+    **dict.fromkeys((400, 410, 411, 420, 421), "cutter compensation"),
+}
+"""Modal groups of G codes (in tenths), of which a line may have one each."""
+
+REPOST = "post the program without it"
+UNSUPPORTED_CODES: dict[int, str] = {
+    **dict.fromkeys((50, 51, 52, 53, 60, 61, 62), f"splines are not supported; {REPOST}, as G1, G2 and G3"),
+    **dict.fromkeys((70, 330, 331, 760, 700, 710, 711, 712, 720, 721, 722), f"lathe words are not supported; {REPOST}"),
+    **dict.fromkeys((120, 130), f"pocket cycles are not supported; {REPOST}"),
+    **dict.fromkeys((160, 161), f"polar coordinates are not supported; {REPOST}"),
+    **dict.fromkeys((310, 382, 383, 384, 385), f"the path of probing is not known in advance; {REPOST}"),
+    **dict.fromkeys((410, 411, 420, 421), "cutter compensation is not supported; let the CAM compensate, or write G40"),
+    **dict.fromkeys((650, 660, 670), f"macro calls are not supported; {REPOST}"),
+    **dict.fromkeys((680, 510, 511), f"rotated and scaled coordinates are not supported; {REPOST}"),
+    **dict.fromkeys((730, 740, *range(810, 900, 10)), f"canned cycles are not supported; {REPOST}, as G0 and G1"),
+    100: f"offsets of the machine cannot be set here; {REPOST}",
+    520: "local offsets are not supported; write G92, or post the program without it",
+    923: "offsets kept from another program are not known; write G92 with numbers",
+    950: "feed per revolution is not supported; write G94 and units per minute",
+}
+IGNORED_CODES: dict[int, str] = {
+    80: "diameters off: already so",
+    150: "polar coordinates off: already so",
+    400: "cutter compensation off: already so",
+    800: "canned cycles off: already so",
+    **dict.fromkeys((430, 431, 440, 490), "tool length: the path is that of the tool's tip"),
+    500: "scaling off: already so",
+    690: "rotation off: already so",
+    **dict.fromkeys((960, 970), "spindle mode, ignored"),
+    **dict.fromkeys((980, 990), "return of canned cycles, ignored"),
+}
+_WORDS = {"S": "spindle speed, ", "T": "tool, ", "H": "tool length, ", "D": "tool diameter, ", "E": "extrusion, "}
+IGNORED_LETTERS = {letter: f"{letter}: {_WORDS.get(letter, '')}ignored" for letter in "STHDELQ"}
+M_WORDS = {
+    **dict.fromkeys((0, 10, 600), "stop"),
+    **dict.fromkeys((20, 300), "end"),
+    **dict.fromkeys((970, 980, 990), "call"),
+}
+"""M words that affect the path; all others are ignored."""
+MACHINE_CODES = (280, 281, 300, 301, 530)
+"""G words that lead to, or store, positions that only the machine knows."""
+
+WORD = re.compile(r"([A-Z])([+-]?(?:\d+\.?\d*|\.\d+))")
+COMMENT = re.compile(r"\([^()]*\)")
+DELETED = re.compile(r"^/\d*")
+CHECKSUM = re.compile(r"\*\d+$")
+EXPONENT = re.compile(r"[\d.]E[+-]?\d+(?![\d.])", re.IGNORECASE)
+CONTROL, PROGRAM_NUMBER = re.compile(r"(N\d+)?O[\d<]"), re.compile(r"(N\d+)?O\d+")
+NOT_RUN = "O-words (subroutines, loops, conditions) are not supported; post the program without them"
+
+
+class Block(NamedTuple):
+    """Words of one line.
+
+    Attributes:
+        number: Line number in the file, from 1.
+        text: The line as written.
+        codes: G and M words in tenths: ("G", 901) is G90.1.
+        words: Values of all other words by letter.
+        skipped: Whether the line begins with `/`.
+    """
+
+    number: int
+    text: str
+    codes: tuple[tuple[str, int], ...]
+    words: dict[str, float]
+    skipped: bool
+
+
+def read_blocks(file: FileName, lines: Sequence[str]) -> Iterator[Block]:
+    """Yield the blocks that have words, up to the second `%`.
+
+    Raises:
+        ProblemError: With the line: an invalid word, an unclosed comment, an expression, or a repeated letter.
+    """
+    inside = False
+    for number, text in enumerate(lines, 1):
+        line = text
+        if "(" in line or ")" in line or ";" in line:
+            line = _without_comments(file, number, text)
+        words = line.upper().split()
+        if not words:
+            continue
+        if words[0][0] == "%":
+            if inside:
+                return
+            inside = True
+            continue
+        inside = True  # a lone % after words also ends the program
+        if ("E" in line or "e" in line) and (exponent := EXPONENT.search(line)):
+            raise line_error(file, number, text, f"{exponent[0]!r} is not a G-code number; write it without E")
+        line = "".join(words)
+        skipped = line[0] == "/"
+        line = DELETED.sub("", line) if skipped else line
+        if "*" in line:
+            line = CHECKSUM.sub("", line)
+        word_pairs = WORD.findall(line)
+        if sum(len(letter) + len(value) for letter, value in word_pairs) != len(line):
+            _refuse(file, number, text, line)
+        codes, values = [], {}
+        for letter, value in word_pairs:
+            if letter in "GM":
+                codes.append((letter, _tenths(file, number, text, letter, value)))
+            elif letter == "O":
+                if not PROGRAM_NUMBER.fullmatch(line):
+                    raise line_error(file, number, text, NOT_RUN)
+            elif letter != "N":
+                if letter in values:
+                    raise line_error(file, number, text, f"{letter} is repeated in one line; remove one")
+                if len(value) > INPUT_LIMITS.number_characters:
+                    why = f"{letter} has more than {INPUT_LIMITS.number_characters} digits"
+                    raise line_error(file, number, text, why)
+                values[letter] = float(value)
+        if codes or values:
+            yield Block(number, text, tuple(codes), values, skipped)
+
+
+def _without_comments(file: FileName, number: int, text: str) -> str:
+    """Return a line without its comments."""
+    line, semicolon, _ = text.partition(";") if "(" not in text.partition(";")[0] else (text, "", "")
+    if not semicolon:
+        line = COMMENT.sub(" ", text)
+        line = line.partition(";")[0] if "(" not in line.partition(";")[0] else line
+    if "(" in line or ")" in line:
+        raise line_error(file, number, text, "a comment is unclosed or nested; close it with one ')'")
+    return line
+
+
+def _tenths(file: FileName, number: int, text: str, letter: str, value: str) -> int:
+    """Return a code in tenths."""
+    exact = float(value) * 10 if len(value) < 9 else -1.0
+    if exact < 0 or abs(exact - round(exact)) > 1e-6:
+        raise line_error(file, number, text, f"{letter}{value} is not a code; codes have at most one decimal")
+    return round(exact)
+
+
+def _refuse(file: FileName, number: int, text: str, line: str) -> None:
+    """Raise ProblemError for a line with something other than words."""
+    if CONTROL.match(line):
+        raise line_error(file, number, text, NOT_RUN)
+    if any(sign in line for sign in "#[]=<>"):
+        why = "parameters and expressions are not supported; post the program with plain numbers"
+        raise line_error(file, number, text, why)
+    rest = WORD.sub("", line)
+    message = f"{rest[:20]!r} is not a G-code word (a letter and a number); correct it or make it a comment"
+    raise line_error(file, number, text, message)
+
+
+def code_name(tenths: int) -> str:
+    """Return a G code as it is written."""
+    whole, rest = divmod(tenths, 10)
+    return f"G{whole}.{rest}" if rest else f"G{whole}"

@@ -1,0 +1,492 @@
+"""Sample a motion for display: a plan, the solution of any problem, or a joint trajectory from any source.
+
+Every motion is sampled once, together with its targets, limits, costs, closest bodies and audit, as far as they are
+known. Curves over time show the joints, torques, costs and the motion of the base with their limits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from models import FreeFloating, Machine, Standing, inverse_dynamics, simplify
+from models.arrays import Array
+from models.machines.standing import center_of_pressure
+from models.robot.dynamics import GRAVITY
+from ocp.app.check.data_checks import clean_trajectory
+from ocp.app.check.joint_limits import Row, audit_rows, floating_torques, integrate_base
+from ocp.app.check.plan_verdict import PlanVerdict, verdict_of
+from ocp.app.check.verdict import bounds_of
+from ocp.app.files import RawTrajectory
+from ocp.app.view.pictures import Obstacle, obstacles_of, times_by_part
+from ocp.audit.audit import Audit
+from ocp.audit.clearance import closest_pairs_along
+from ocp.errors import ProblemError, unknown_name
+from ocp.motion.builders.tool_motion import CLOCK
+from ocp.motion.plan import Plan
+from ocp.motion.tasks.limits import JointBounds
+from ocp.motion.tasks.targets import Target
+from ocp.problem.formulation import Formulation
+from ocp.problem.values import Sampler
+from ocp.solution import Solution, in_order_of
+
+__all__ = [
+    "PAGE_SETTINGS",
+    "Animation",
+    "ClosestPairs",
+    "Curve",
+    "GroundContact",
+    "PageSettings",
+    "animate_plan",
+    "animate_solution",
+    "animate_trajectory",
+    "cumulative_integral",
+    "ground_contact",
+    "joint_curves",
+    "machine_curves",
+]
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """A quantity over the time of a motion.
+
+    Attributes:
+        group: Curves of one group share a diagram.
+        name: Name of the quantity.
+        unit: "" if it has none.
+        values: At the motion's M times. Shape (M,).
+        lower, upper: Limits, infinite if there are none.
+    """
+
+    group: str
+    name: str
+    unit: str
+    values: Array
+    lower: float = -np.inf
+    upper: float = np.inf
+
+
+@dataclass(frozen=True, eq=False)
+class GroundContact:
+    """Contact of a standing machine with the ground.
+
+    Attributes:
+        corners: Corners of the contact area. Shape (k, 2), m.
+        points: Zero moment points at the motion's M times. Shape (M, 2), m.
+        forces: Whether they include external forces.
+    """
+
+    corners: Array
+    points: Array
+    forces: bool
+
+
+def joint_curves(
+    machine: Machine, bounds: JointBounds, joints: Array, rates: Array, accelerations: Array | None
+) -> list[Curve]:
+    """Return curves of positions, velocities and torques of all joints, shape (M, n) each, with their limits."""
+    robot, curves = machine.robot, []
+    torques = None if accelerations is None else _torques(machine, joints, rates, accelerations)
+    torque_group = "Torques, without external forces" if isinstance(machine, Standing) else "Torques"
+    for k, joint in enumerate(robot.moving_joints):
+        curves.append(Curve("Joints", joint.name, joint.unit, joints[:, k], bounds.lower[k], bounds.upper[k]))
+    for k, joint in enumerate(robot.moving_joints):
+        limit = float(bounds.velocity[k])
+        curves.append(Curve("Joint velocities", joint.name, f"{joint.unit}/s", rates[:, k], -limit, limit))
+    for k, joint in enumerate(robot.moving_joints if torques is not None else ()):
+        assert torques is not None
+        limit = float(bounds.torque[k])
+        curves.append(Curve(torque_group, joint.name, joint.effort_unit, torques[:, k], -limit, limit))
+    return curves
+
+
+def _torques(machine: Machine, joints: Array, rates: Array, accelerations: Array) -> Array | None:
+    """Return torques by inverse dynamics, shape (M, n); None for a robot without masses."""
+    robot = machine.robot
+    if robot.total_mass == 0:
+        return None
+    q, v, a = (ca.SX.sym(name, robot.dof) for name in ("q", "v", "a"))
+    if isinstance(machine, FreeFloating):
+        torque = floating_torques(machine, q, v, a)
+    else:
+        gravity = getattr(machine, "gravity_in_world", GRAVITY)
+        frame = machine.world_from_base(())
+        torque = inverse_dynamics(simplify(robot), q, v, a, (), gravity, frame)
+    torques: Array = Sampler([q, v, a], [torque])(joints, rates, accelerations)[0]
+    return torques
+
+
+def machine_curves(machine: Machine, base: Array, joints: Array, rates: Array, base_rates: Array | None) -> list[Curve]:
+    """Return curves of manipulability and tip speed, and of the momentum of a floating machine with base rates."""
+    robot, curves = machine.robot, []
+    b, q, v = ca.SX.sym("b", machine.base_size), ca.SX.sym("q", robot.dof), ca.SX.sym("v", robot.dof)
+    if robot.tip is not None:
+        rows = range(6) if robot.dof >= 6 else range(3, 6) if robot.dof >= 3 else (3, 4)
+        description = "of the pose" if robot.dof >= 6 else "of the position" if robot.dof >= 3 else "in the plane"
+        twist = machine.tip_twist(b, q, v)
+        sampler = Sampler([b, q, v], [machine.manipulability(b, q, rows), ca.norm_2(twist[3:6])])
+        index, speed = sampler(base, joints, rates)
+        curves.append(Curve("The motion", f"manipulability {description}", "", index[:, 0]))
+        curves.append(Curve("The motion", "speed of the tip", "m/s", speed[:, 0]))
+    if isinstance(machine, FreeFloating) and base_rates is not None:
+        r = ca.SX.sym("r", machine.base_size)
+        total = machine.momentum(b, q, machine.twist_of_rate(b, r), v)
+        joints_only = machine.momentum(b, q, ca.SX(len(machine.twist_rows), 1), v)
+        angular_rows = 3 if machine.base_size == 7 else 1
+        parts = [total[:angular_rows], total[angular_rows:], joints_only[:angular_rows], joints_only[angular_rows:]]
+        angular, linear, joints_angular, joints_linear = Sampler([b, q, v, r], [ca.norm_2(part) for part in parts])(
+            base, joints, rates, base_rates
+        )
+        for name, value, part, unit in (
+            ("moment of momentum", angular, joints_angular, "N m s"),
+            ("momentum", linear, joints_linear, "N s"),
+        ):
+            curves.append(Curve("Momentum", f"{name}, total", unit, value[:, 0]))
+            curves.append(Curve("Momentum", f"{name}, of the joints alone", unit, part[:, 0]))
+    return curves
+
+
+def ground_contact(
+    machine: Standing, joints: Array, rates: Array, accelerations: Array, inside: Sequence[Curve] = ()
+) -> tuple[GroundContact, list[Curve]]:
+    """Return the zero moment points and a curve of their distance from the edge of the foot.
+
+    Args:
+        machine: The machine.
+        joints, rates, accelerations: Shape (M, n) each.
+        inside: Distances inside each edge, up to a constant margin, from a problem that includes external forces.
+            Without them the external forces are unknown.
+    """
+    normals, corners = machine.support.normals, np.asarray(machine.support.vertices)
+    if len(inside) == len(normals):
+        point = ca.SX.sym("point", 2)
+        edges = np.array(ca.Function("edges", [point], [machine.support.distances(point)])(np.zeros(2))).ravel()
+        rows = np.column_stack([normals, -np.ones(len(normals))])
+        edge_distances = np.column_stack([one.values for one in inside]) - edges
+        solution, *_ = np.linalg.lstsq(rows, edge_distances.T, rcond=None)
+        if np.abs(rows @ solution - edge_distances.T).max() < 1e-8:  # m, rounding: they belong to one point
+            points = np.ascontiguousarray(solution[:2].T)
+            distances = edges + points @ normals.T
+            margin = Curve("Standing", "zero moment point from the edge of the foot", "m", distances.min(axis=1), 0.0)
+            return GroundContact(corners, points, True), [margin]
+    q, v, a = (ca.SX.sym(name, machine.joint_size) for name in ("q", "v", "a"))
+    point = center_of_pressure(machine.ground_reaction(q, v, a))
+    points, margins = Sampler([q, v, a], [point, machine.support.margin(point)])(joints, rates, accelerations)
+    name = "zero moment point from the edge of the foot, without external forces"
+    return GroundContact(corners, points, False), [Curve("Standing", name, "m", margins[:, 0], 0.0)]
+
+
+def cumulative_integral(t: Array, values: Array) -> Array:
+    """Return the integral of samples (M,) up to each time, by the trapezoidal rule. Shape (M,)."""
+    return np.concatenate([[0.0], np.cumsum(np.diff(t) * (values[1:] + values[:-1]) / 2)])
+
+
+ZMP_CONSTRAINT = "zero moment point"
+"""Name of the constraint that keeps the zero moment point in the foot, in problems of standing machines."""
+
+
+@dataclass(frozen=True)
+class PageSettings:
+    """Resolution of a page.
+
+    Attributes:
+        per_second, least, most: Samples of a motion per second, and their smallest and largest number.
+        poses: Largest number of samples with poses, between which the page interpolates.
+        pair_samples: Number of times at which the closest bodies are computed, which is slower.
+        same_cost: Relative: of costs with a smaller final difference only one is shown.
+        most_bytes: Largest size of a page.
+    """
+
+    per_second: int = 50
+    least: int = 200
+    most: int = 600
+    poses: int = 301
+    pair_samples: int = 161
+    same_cost: float = 1e-3
+    most_bytes: int = 8_000_000
+
+
+PAGE_SETTINGS = PageSettings()
+
+
+class ClosestPairs(NamedTuple):
+    """The two bodies with the smallest clearance margin at K times.
+
+    Attributes:
+        t: s. Shape (K,).
+        points: Closest points of their cores, in world. Shape (K, 2, 3), m.
+        distances: m. Shape (K,).
+        required: Required distances. Shape (K,), m.
+        bodies: Their names.
+    """
+
+    t: Array
+    points: Array
+    distances: Array
+    required: Array
+    bodies: tuple[tuple[str, str], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Animation:
+    """A sampled motion.
+
+    Attributes:
+        name: Name of the motion.
+        machine: The machine that moves.
+        t: s. Shape (M,).
+        joints: Shape (M, n).
+        base: Shape (M, base_size).
+        curves: Quantities over time.
+        targets: Targets of the tips.
+        footing: Contact with the ground; None for a machine that does not stand.
+        closest: The closest bodies; None if they are unknown.
+        obstacles: Obstacles; moving ones have their poses at the times t.
+        verdict: Sentence of the audit, or "".
+        passed: Whether the audit passes; None if there is none.
+        rows: Rows of the audit.
+        cost: Cost; None if it is unknown.
+    """
+
+    name: str
+    machine: Machine
+    t: Array
+    joints: Array
+    base: Array
+    curves: tuple[Curve, ...]
+    targets: tuple[Target, ...] = ()
+    footing: GroundContact | None = None
+    closest: ClosestPairs | None = None
+    obstacles: tuple[Obstacle, ...] = ()
+    verdict: str = ""
+    passed: bool | None = None
+    rows: tuple[Row, ...] = ()
+    cost: float | None = None
+
+
+def animate_plan(plan: Plan, name: str = "plan", **settings: Any) -> Animation:
+    """Return a sampled plan with its audit; `settings` are those of the audit."""
+    times = _times(plan.horizon)
+    sample = plan.sampled(times)
+    base = plan.at(times)["base"] if plan.machine.base_size else np.zeros((len(times), 0))
+    times_of_pairs = np.linspace(0.0, plan.horizon, PAGE_SETTINGS.pair_samples)
+    single = len(plan.parts) == 1
+    own_curves: list[Curve] = []
+    if single:
+        fractions = plan._fractions(plan.parts[0], times)
+        solution_times = fractions * plan.solution.horizon if CLOCK in plan.solution.states else times
+        own_curves = _problem_curves(plan.solution, fractions, solution_times)
+    derivatives = sample.joints, sample.rates, sample.accelerations
+    details: dict[str, Any] = {
+        "closest": _closest_pairs(plan.solution, times_by_part(plan, times_of_pairs), plan.horizon),
+        "obstacles": tuple(obstacles_of(plan.solution, times_by_part(plan, times))),
+        "cost": plan.cost,
+        "targets": plan.targets,
+    }
+    details |= _audited(plan.solution, lambda: verdict_of(plan, sample, name, **settings))
+    base_rates = np.gradient(base, times, axis=0, edge_order=2) if base.shape[1] else base
+    return _animation(name, plan.machine, times, base, *derivatives, base_rates, own_curves, **details)
+
+
+def animate_solution(
+    solution: Solution,
+    machine: Machine,
+    name: str = "solution",
+    *,
+    joints: str = "joints",
+    base: str = "base",
+    **settings: Any,
+) -> Animation:
+    """Return the sampled solution of a problem.
+
+    Args:
+        solution: The solution.
+        machine: Its joints, and its base, are states of the problem.
+        name: Name of the motion.
+        joints, base: Names of these states.
+        settings: Settings of the audit.
+
+    Raises:
+        ProblemError: A state is missing or has the wrong size.
+    """
+    sizes = {joints: machine.joint_size} | ({base: machine.base_size} if machine.base_size else {})
+    for state, size in sizes.items():
+        if state not in solution.states:
+            raise unknown_name("state", state, list(solution.states))
+        actual = solution.states[state].shape[1]
+        if actual != size:
+            words = f"state {state!r} has {actual} entries, the machine {size}: {list(machine.robot.joint_names)}"
+            raise ProblemError(words, name=state, value=actual, limit=size)
+    times = _times(solution.horizon)
+    fractions = times / solution.horizon
+    columns, at = {}, 0
+    for state, values in solution.states.items():
+        columns[state] = slice(at, at + values.shape[1])
+        at += values.shape[1]
+    curve = solution.state_interpolant
+    states = curve(fractions)
+    slopes = curve.derivative()(fractions) / solution.horizon
+    second_derivatives = curve.derivative().derivative()(fractions) / solution.horizon**2
+    q, v, a = (samples[:, columns[joints]] for samples in (states, slopes, second_derivatives))
+    base_path = states[:, columns[base]] if machine.base_size else np.zeros((len(times), 0))
+    base_rates = slopes[:, columns[base]] if machine.base_size else np.zeros((len(times), 0))
+    details: dict[str, Any] = {"cost": solution.cost, "obstacles": tuple(obstacles_of(solution, [("", times)]))}
+    details |= _audited(solution, lambda: solution.audit(**settings))
+    times_of_pairs = np.linspace(0.0, solution.horizon, PAGE_SETTINGS.pair_samples)
+    details["closest"] = _closest_pairs(solution, [("", times_of_pairs)], solution.horizon)
+    smooth = _torque_like(solution, joints)
+    own_curves = _problem_curves(solution, fractions, times)
+    return _animation(name, machine, times, base_path, q, v, a if smooth else None, base_rates, own_curves, **details)
+
+
+def animate_trajectory(raw: RawTrajectory, machine: Machine, name: str = "") -> Animation:
+    """Return a sampled joint trajectory, interpolated as controllers do.
+
+    Raises:
+        ProblemError: The trajectory lacks joints of the machine, or has no valid sample.
+    """
+    robot = machine.robot
+    bounds = bounds_of(robot)
+    cleaned = clean_trajectory(raw, robot, bounds.lower, bounds.upper, bounds.velocity)
+    if len(cleaned.joints) < robot.dof:
+        missing = [joint for k, joint in enumerate(robot.joint_names) if k not in cleaned.joints]
+        words = f"{raw.file} does not move {missing}; lock them: --lock {missing[0]}=VALUE"
+        raise ProblemError(words, name=missing[0], value=raw.file)
+    motion = cleaned.motion
+    begin, end = float(motion.t[0]), float(motion.t[-1])
+    times = _times(end - begin)
+    joints, rates = motion.position.at(begin + times), motion.velocity.at(begin + times)
+    accelerations = None if motion.acceleration is None else motion.acceleration.at(begin + times)
+    base, base_rates = np.zeros((len(times), 0)), None
+    if machine.base_size:
+        base_path = cleaned.base
+        if base_path is None:
+            assert isinstance(machine, FreeFloating)
+            base_path = integrate_base(machine, motion)[0]  # by conservation of momentum
+        else:
+            base_rates = _between(begin + times, motion.t, np.gradient(base_path, motion.t, axis=0))
+        base = _between(begin + times, motion.t, base_path)
+    return _animation(name or raw.file, machine, times, base, joints, rates, accelerations, base_rates, [])
+
+
+def _between(times: Array, t: Array, values: Array) -> Array:
+    """Return samples interpolated linearly. Shape (K, n)."""
+    return np.column_stack([np.interp(times, t, column) for column in values.T])
+
+
+def _animation(
+    name: str,
+    machine: Machine,
+    t: Array,
+    base: Array,
+    joints: Array,
+    rates: Array,
+    accelerations: Array | None,
+    base_rates: Array | None,
+    own_curves: Sequence[Curve],
+    **details: Any,
+) -> Animation:
+    """Return a motion with the curves that every motion has."""
+    effort = cumulative_integral(t, (rates**2).sum(axis=1) / 2)
+    curves = [Curve("Cost", "integral of half the squared joint velocities", "", effort)]
+    costs = [one for one in own_curves if one.group == "Cost"]
+    curves += [
+        one for one in costs if abs(one.values[-1] - effort[-1]) > PAGE_SETTINGS.same_cost * max(abs(effort[-1]), 1e-12)
+    ]
+    curves += machine_curves(machine, base, joints, rates, base_rates)
+    closest = details.get("closest")
+    if closest is not None:
+        distances = np.interp(t, closest.t, closest.distances)
+        curves.append(Curve("The motion", "closest two bodies", "m", distances, float(closest.required.min())))
+    footing = None
+    if isinstance(machine, Standing) and accelerations is not None:
+        footing, more = ground_contact(
+            machine, joints, rates, accelerations, [one for one in own_curves if one.group == ZMP_CONSTRAINT]
+        )
+        curves += more
+    curves += joint_curves(machine, bounds_of(machine.robot), joints, rates, accelerations)
+    curves += _margins([one for one in own_curves if one.group != "Cost"])
+    return Animation(name, machine, t, joints, base, tuple(curves), footing=footing, **details)
+
+
+def _times(horizon: float) -> Array:
+    """Return uniform times of a motion."""
+    count = int(np.clip(np.ceil(PAGE_SETTINGS.per_second * horizon), PAGE_SETTINGS.least, PAGE_SETTINGS.most))
+    return np.linspace(0.0, horizon, count + 1)
+
+
+def _torque_like(solution: Solution, joints: str) -> bool:
+    """Return whether the joints are smooth enough for torques: another state has their size."""
+    return len(solution.state_interpolant.nodes) > 2 and any(
+        name != joints and values.shape[1] == solution.states[joints].shape[1]
+        for name, values in solution.states.items()
+    )
+
+
+def _audited(solution: Solution, judge: Callable[[], Audit | PlanVerdict]) -> dict[str, Any]:
+    """Return sentence, result and rows of the audit, or only a sentence if the problem is missing."""
+    if solution.problem is None:
+        return {"verdict": f"There is no audit, because the file has no problem: {solution.problem_lost}."}
+    verdict = judge()
+    audit = verdict.audit if isinstance(verdict, PlanVerdict) else verdict
+    return {"verdict": f"The plan {verdict.sentence}.", "passed": verdict.passed, "rows": tuple(audit_rows(audit))}
+
+
+def _problem_curves(solution: Solution, fractions: Array, times: Array) -> list[Curve]:
+    """Return the integral of the problem's running cost, and every row of its path constraints.
+
+    The group of a row is the name of its constraint.
+    """
+    if solution.problem is None:
+        return []
+    form = Formulation.of(solution.problem)
+    ordered = in_order_of(form, solution)
+    x, u = ordered.state_interpolant(fractions), ordered.control_interpolant(fractions)
+    p = form.parameter_vector(ordered.parameters)
+    running, rows = form.sampled([form.running, form.path.expression], x, u, times, ordered.horizon, p)
+    lower, upper = (side[form.path.bounds] for side in form.bound_values(p))
+    integral = cumulative_integral(fractions * ordered.horizon, running[:, 0])
+    return [Curve("Cost", "the problem's own cost, integrated", "", integral)] + [
+        Curve(owner, label, form.units[owner], rows[:, k], float(lower[k]), float(upper[k]))
+        for k, (owner, label) in enumerate(zip(form.path.owners, form.path.labels, strict=True))
+    ]
+
+
+def _margins(rows: Sequence[Curve]) -> list[Curve]:
+    """Return the smallest margin of each constraint to its limits, and the largest error of its equations."""
+    curves = []
+    for name in dict.fromkeys(one.group for one in rows):
+        group = [one for one in rows if one.group == name]
+        unit = group[0].unit if "," not in group[0].unit else ""
+        if equations := [one for one in group if one.lower == one.upper]:
+            errors = np.max([np.abs(one.values - one.lower) for one in equations], axis=0)
+            curves.append(Curve("Constraints", f"{name}: error", unit, errors))
+        if inequalities := [one for one in group if one.lower < one.upper]:
+            margins = [np.minimum(one.values - one.lower, one.upper - one.values) for one in inequalities]
+            curves.append(Curve("Constraints", f"{name}: margin to its limit", unit, np.min(margins, axis=0), 0.0))
+    return [one for one in curves if np.isfinite(one.values).any()]
+
+
+def _closest_pairs(solution: Solution, parts: Sequence[tuple[str, Array]], horizon: float) -> ClosestPairs | None:
+    """Return the closest bodies at uniform times of a motion, or None if they are unknown.
+
+    Args:
+        solution: The solution.
+        parts: As returned by `times_by_part` for these times.
+        horizon: Duration of the motion, s.
+    """
+    if solution.problem is None:
+        return None
+    pairs = [pair for suffix, times in parts for pair in closest_pairs_along(solution.problem, solution, times, suffix)]
+    t = np.linspace(0.0, horizon, PAGE_SETTINGS.pair_samples)
+    if len(pairs) < len(t):
+        return None
+    points, distances, required = (
+        np.array([getattr(pair, name) for pair in pairs]) for name in ("points", "distance", "asked")
+    )
+    return ClosestPairs(t, points, distances, required, tuple(pair.bodies for pair in pairs))
