@@ -54,7 +54,7 @@ def run_task(
         found = plan_in_segments(checked_instance("machine", task.machine, FixedBase), task.task, **task.options)
         if found.reconfigurations:
             return _in_pieces(task, found, outputs, progress, write)
-        made = found.pieces[0]
+        made = found.segments[0]
     else:
         made = plan(task.machine, task.task, **task.options)
     check_period(made, task.period)
@@ -87,9 +87,9 @@ def _in_pieces(
     write: Callable[[Plan, dict[str, Path]], None],
 ) -> tuple[int, str, Any]:
     """As `run_task`: pieces and the ways between them, their files numbered in the order in which they are run."""
-    order: list[Plan | None] = [found.pieces[0]]
-    for way, piece in zip(found.reconfigurations, found.pieces[1:], strict=True):
-        order += [way.way, piece]
+    order: list[Plan | None] = [found.segments[0]]
+    for way, piece in zip(found.reconfigurations, found.segments[1:], strict=True):
+        order += [way.motion, piece]
     lines, files, passed = [str(found)], list[Path](), None not in order
     for number, made in enumerate(order, 1):
         if made is None:
@@ -106,14 +106,14 @@ def _in_pieces(
         "passed": passed,
         "cost": found.cost,
         "duration": found.duration,
-        "joints": found.pieces[0].names,
+        "joints": found.segments[0].names,
         "fewest": found.fewest,
         "pieces": [
             {"begin": begin, "duration": one.horizon, "cost": one.cost, "bound": one.bound}
-            for begin, one in zip(found.begins, found.pieces, strict=True)
+            for begin, one in zip(found.start_times, found.segments, strict=True)
         ],
         "reconfigurations": [
-            {"time": one.time, "before": one.before, "after": one.after, "duration": one.duration, "why": one.why}
+            {"time": one.time, "before": one.before, "after": one.after, "duration": one.duration, "why": one.failure}
             for one in found.reconfigurations
         ],
         "written": [str(file) for file in files],

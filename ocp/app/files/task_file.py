@@ -21,7 +21,7 @@ velocity = 2.0                      # for all joints, rad/s or m/s, or { elbow =
 [cost]
 weights = { elbow = 4 }             # of squared joint rates; 1 of all others
 [search]
-kind = "postures"                   # or "start", "global"; "pieces": the fewest motions, where one does not do
+kind = "configurations"                   # or "start", "global"; "pieces": the fewest motions, where one does not do
 # start = { elbow = 1.2 }           # joints at the start, all of them; cyclic = true; seed = 1; pace = "free"
 [surroundings]
 clearance = 0.01                    # m; ignored = [["link1", "link3"]]; srdf = "..."; folders = ["..."]
@@ -347,7 +347,7 @@ def _check_joints(entries: Entries, name: str, told: dict[str, float], names: tu
 
 
 def _search(entries: Entries, names: tuple[str, ...], folder: Path) -> dict[str, Any]:
-    kind = entries.choice("kind", ("postures", "start", "global", "pieces"), "postures")
+    kind = entries.choice("kind", ("configurations", "start", "global", "pieces"), "configurations")
     cyclic, pace = entries.flag("cyclic"), entries.choice("pace", ("given", "free"), "given")
     found: dict[str, Any] = {"seed": entries.count("seed", "a whole number, 0 or more", 0)}
     if kind == "pieces":

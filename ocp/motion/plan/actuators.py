@@ -19,12 +19,12 @@ from ocp.motion.builders.dynamics_plan import within_limits
 from ocp.motion.builders.tool_motion import ToolMotion
 from ocp.motion.plan.motion import CHECKED_TIMES, Plan
 from ocp.motion.plan.request import declared_motion
-from ocp.motion.search.configurations import Asked
+from ocp.motion.search.configurations import PlanRequest
 from ocp.motion.tasks.limits import Limits
 from ocp.problem.problem import Problem
 from ocp.solution import Solution
 
-__all__ = ["Demand", "limits_actuators", "within_actuator_limits", "without_actuators"]
+__all__ = ["ActuatorDemand", "limits_actuators", "solve_within_actuator_limits", "without_actuators"]
 
 ACTUATOR_LIMITS = ("acceleration", "jerk", "torque", "power")
 
@@ -40,7 +40,7 @@ def without_actuators(limits: Limits) -> Limits:
 
 
 @dataclass(frozen=True)
-class Demand:
+class ActuatorDemand:
     """What a motion takes most of, as a share of its limit.
 
     Attributes:
@@ -61,7 +61,7 @@ class Demand:
         )
 
     @classmethod
-    def of(cls, plan: Plan, limits: Limits) -> Demand | None:
+    def of(cls, plan: Plan, limits: Limits) -> ActuatorDemand | None:
         """Of a plan; None where no actuator is limited."""
         machine = checked_motors("limits", plan.machine)
         robot, bounds = machine.robot, limits.bounds(machine)
@@ -72,7 +72,7 @@ class Demand:
         torques = np.array(
             torques_at.map(CHECKED_TIMES)(bases.T, sample.joints.T, sample.rates.T, sample.accelerations.T)
         ).T
-        worst: tuple[float, Demand] | None = None
+        worst: tuple[float, ActuatorDemand] | None = None
         for what, values, most, units in (
             ("acceleration", np.abs(sample.accelerations), bounds.acceleration, ("rad/s^2", "m/s^2")),
             ("torque", np.abs(torques), bounds.torque, ("N m", "N")),
@@ -89,7 +89,7 @@ class Demand:
         return None if worst is None else worst[1]
 
 
-def within_actuator_limits(request: Asked, start: Array, reference: Array, free: Plan) -> Solution:
+def solve_within_actuator_limits(request: PlanRequest, start: Array, reference: Array, free: Plan) -> Solution:
     """A motion within the limits of the actuators, from one without; audited from its own start if many are as good.
 
     Args:
@@ -126,11 +126,11 @@ def within_actuator_limits(request: Asked, start: Array, reference: Array, free:
     except SolveError as error:
         if isinstance(error.__cause__, KeyboardInterrupt):
             raise
-        raise _beyond(error, Demand.of(free, limits)) from error
+        raise _beyond(error, ActuatorDemand.of(free, limits)) from error
     return solution
 
 
-def _beyond(error: SolveError, demand: Demand | None) -> SolveError:
+def _beyond(error: SolveError, demand: ActuatorDemand | None) -> SolveError:
     """The error with what the motion takes without the limits."""
     details = {"name": error.name, "value": error.value, "limit": error.limit, "time": error.time}
     words = "no motion holds the limits of its actuators"
@@ -141,7 +141,7 @@ def _beyond(error: SolveError, demand: Demand | None) -> SolveError:
     return SolveError(f"{words}\n{error}", error.solution, error.conflicts, **details)
 
 
-def _breaks(request: Asked) -> list[float]:
+def _breaks(request: PlanRequest) -> list[float]:
     """Fractions of the horizon at which tasks are less smooth."""
     parts = [(stretch.breaks - stretch.begin) / stretch.duration for stretch in request.stretches]
     return np.unique(np.concatenate([np.zeros(0), *parts])).tolist()  # type: ignore[no-any-return]

@@ -25,12 +25,17 @@ from ocp.motion.builders.clearance import APART
 from ocp.motion.builders.tool_motion import CLOCK, ToolMotion
 from ocp.motion.local.collisions import Collision
 from ocp.motion.local.inverse_kinematics import Unreachable
-from ocp.motion.plan.actuators import within_actuator_limits
+from ocp.motion.plan.actuators import solve_within_actuator_limits
 from ocp.motion.plan.candidate import Candidate, Reason, Rejection, Seed, Stage, collision
 from ocp.motion.plan.candidate_queue import Solver
 from ocp.motion.plan.motion import Plan, parts_of
 from ocp.motion.plan.request import declared_motion
-from ocp.motion.search.configurations import OUT_OF_REACH, Asked, clear_postures, others_told
+from ocp.motion.search.configurations import (
+    REACH_TOLERANCE,
+    PlanRequest,
+    count_clear_configurations,
+    describe_alternatives,
+)
 from ocp.problem.values import constant
 from ocp.refinement import refined, split
 from ocp.solution import Solution
@@ -46,7 +51,7 @@ class CandidateSolver(Solver):
         motion: Its problem, without bodies that are separated.
     """
 
-    def __init__(self, request: Asked, start: Array, reference: Array) -> None:
+    def __init__(self, request: PlanRequest, start: Array, reference: Array) -> None:
         """
         Args:
             request: What is asked.
@@ -152,7 +157,7 @@ class CandidateSolver(Solver):
 
     def _limit(self, candidate: Candidate) -> Candidate:
         """Solve a candidate again within the limits of actuators."""
-        solution = within_actuator_limits(self.request, self.start, self.reference, self.plan([candidate]))
+        solution = solve_within_actuator_limits(self.request, self.start, self.reference, self.plan([candidate]))
         return replace(candidate, stage=Stage.ACTUATED, cost=solution.cost, solution=solution)
 
     def _freed(self, found: Candidate) -> list[Candidate]:
@@ -291,7 +296,7 @@ class CandidateSolver(Solver):
             if not found.success:
                 raise SolveError(f"on a finer mesh: {found.status}", found)
             before, deviations = deviations.max(), self._deviations(motion, found)
-            if deviations.max() > max(OUT_OF_REACH, settings.least_progress * before):
+            if deviations.max() > max(REACH_TOLERANCE, settings.least_progress * before):
                 break
             solution = found
         return solution
@@ -367,7 +372,7 @@ class CandidateSolver(Solver):
     def _clear_at(self, time: float) -> int | Unreachable | None:
         """How many postures that do the tasks at a time are clear, or why none is; None where that is not known."""
         if time not in self._clear:
-            self._clear[time] = clear_postures(self.request, time)
+            self._clear[time] = count_clear_configurations(self.request, time)
         return self._clear[time]
 
     def _collision(self, near: Collision | Nearest, then: str = "") -> Reason:
@@ -385,7 +390,7 @@ class CandidateSolver(Solver):
         worst = min(touching, key=lambda one: np.inf if np.isnan(one.cost) else one.cost).reason
         assert worst is not None
         assert worst.time is not None
-        others = others_told(self._clear_at(worst.time))
+        others = describe_alternatives(self._clear_at(worst.time))
         words = "; ".join([f"{error}\nthe cheapest that touches: {worst.detail}", *others])
         details = {"name": worst.name, "value": worst.value, "limit": worst.limit, "time": worst.time}
         return SolveError(words, error.solution, error.conflicts, **details)

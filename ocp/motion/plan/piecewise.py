@@ -27,8 +27,8 @@ from ocp.motion.local.collisions import distances_along
 from ocp.motion.local.inverse_kinematics import Unreachable
 from ocp.motion.plan.candidate import Candidate, Stage
 from ocp.motion.plan.motion import Part, Plan
-from ocp.motion.plan.planner import checked_asked, clear_of, planned
-from ocp.motion.search.configurations import Asked, followed_from, postures_at_the_start, settled
+from ocp.motion.plan.planner import checked_request, clearance_constraints_for, planned
+from ocp.motion.search.configurations import PlanRequest, fix_ignorable_joints, local_motions_from, start_configurations
 from ocp.motion.search.task_search import TaskSearch
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.tip_task import TipTask, timed
@@ -76,17 +76,17 @@ class Reconfiguration:
     time: float
     before: Array
     after: Array
-    way: Plan | None
-    why: str = ""
+    motion: Plan | None
+    failure: str = ""
 
     @property
     def duration(self) -> float:
         """Of the way, s; nan where there is none."""
-        return np.nan if self.way is None else self.way.horizon
+        return np.nan if self.motion is None else self.motion.horizon
 
     def __str__(self) -> str:
         far = np.abs(self.after - self.before).max()
-        how = f"in {self.duration:.4g} s" if self.way is not None else f"no clear way was found: {self.why}"
+        how = f"in {self.duration:.4g} s" if self.motion is not None else f"no clear way was found: {self.failure}"
         return f"at {self.time:.4g} s the arm reconfigures, a joint by {far:.3g}: {how}"
 
 
@@ -103,20 +103,20 @@ class SegmentedPlan:
     """
 
     machine: FixedBase
-    pieces: tuple[Plan, ...]
-    begins: tuple[float, ...]
+    segments: tuple[Plan, ...]
+    start_times: tuple[float, ...]
     reconfigurations: tuple[Reconfiguration, ...]
     fewest: int
 
     @property
     def cost(self) -> float:
         """Of the pieces together, without the reconfigurations."""
-        return float(sum(piece.cost for piece in self.pieces))
+        return float(sum(piece.cost for piece in self.segments))
 
     @property
     def horizon(self) -> float:
         """Of the tasks, s."""
-        return self.begins[-1] + self.pieces[-1].horizon
+        return self.start_times[-1] + self.segments[-1].horizon
 
     @property
     def duration(self) -> float:
@@ -124,7 +124,7 @@ class SegmentedPlan:
         return self.horizon + float(sum(one.duration for one in self.reconfigurations))
 
     def __repr__(self) -> str:
-        return f"<PlanInPieces of {self.horizon:.6g} s: {len(self.pieces)} pieces, cost {self.cost:.6g}>"
+        return f"<PlanInPieces of {self.horizon:.6g} s: {len(self.segments)} pieces, cost {self.cost:.6g}>"
 
     def __str__(self) -> str:
         count = len(self.reconfigurations)
@@ -132,10 +132,10 @@ class SegmentedPlan:
         fewest = "none has fewer" if self.fewest == count else f"any has at least {self.fewest}"
         names = ", ".join(self.machine.robot.joint_names)
         lines = [f"plan of {self.horizon:.6g} s for {names}: {many}, {fewest}; cost {self.cost:.6g}"]
-        for k, piece in enumerate(self.pieces):
-            end = self.begins[k] + piece.horizon
+        for k, piece in enumerate(self.segments):
+            end = self.start_times[k] + piece.horizon
             low = "" if piece.bound is None else f", at least {piece.bound:.6g} any"
-            lines.append(f"  {self.begins[k]:.4g} to {end:.4g} s: cost {piece.cost:.6g}{low}")
+            lines.append(f"  {self.start_times[k]:.4g} to {end:.4g} s: cost {piece.cost:.6g}{low}")
             if k < count:
                 lines.append(f"  {self.reconfigurations[k]}")
         return "\n".join(lines)
@@ -177,16 +177,18 @@ def plan_in_segments(
         SolveError: Pieces that could not be planned, however the tasks were cut.
     """
     checked_instance("machine", machine, FixedBase)
-    asked = checked_asked(machine, tasks, horizon, start, None, False, weights, limits, "global", seed, 1.0)
-    clearance_constraints = clear_of(machine, obstacles, clearance, ignored, srdf, folders, missing, limits)
+    asked = checked_request(machine, tasks, horizon, start, None, False, weights, limits, "global", seed, 1.0)
+    clearance_constraints = clearance_constraints_for(
+        machine, obstacles, clearance, ignored, srdf, folders, missing, limits
+    )
     if clearance_constraints is not None and clearance_constraints.scene.moves_by_itself:
         words = "obstacles that move do not wait while the arm reconfigures; give those that stand still"
         raise ProblemError(words, name="obstacles", value=obstacles)
     asked = replace(asked, clearance_constraints=clearance_constraints)
-    postures = postures_at_the_start(asked)
+    postures = start_configurations(asked)
     if asked.start is None:
-        postures = settled(asked, postures)[1]
-    searched = TaskSearch(asked, followed_from(asked, postures))
+        postures = fix_ignorable_joints(asked, postures)[1]
+    searched = TaskSearch(asked, local_motions_from(asked, postures))
     barred: list[tuple[float, float]] = []
     known: dict[tuple[float, float], Plan] = {}
     error: SolveError | ProblemError | None = None
@@ -217,7 +219,7 @@ def plan_in_segments(
     return SegmentedPlan(machine, tuple(pieces), begins, tuple(between), fewest - 1)
 
 
-def _piece(asked: Asked, begin: float, end: float) -> Plan:
+def _piece(asked: PlanRequest, begin: float, end: float) -> Plan:
     """The plan of the tasks from one time to another.
 
     Raises:
@@ -240,7 +242,7 @@ def _part(task: TipTask, begin: float, end: float) -> TipTask | None:
     return replace(own, begin=first - begin, duration=last - first, breaks=inside)
 
 
-def _reconfigured(asked: Asked, time: float, before: Array, after: Array) -> Reconfiguration:
+def _reconfigured(asked: PlanRequest, time: float, before: Array, after: Array) -> Reconfiguration:
     """A motion from one posture to another, straight or round what is in the way."""
     settings, limits = ReconfigurationSettings(), asked.bounds.velocity
     fastest = np.where(np.isfinite(limits), limits, settings.unlimited_rate)
@@ -268,7 +270,7 @@ def _reconfigured(asked: Asked, time: float, before: Array, after: Array) -> Rec
 
 
 def _round(
-    asked: Asked,
+    asked: PlanRequest,
     clearance_constraints: ClearanceConstraints,
     before: Array,
     after: Array,
@@ -285,7 +287,7 @@ def _round(
 
 
 def _way(
-    asked: Asked,
+    asked: PlanRequest,
     before: Array,
     via: Array,
     after: Array,

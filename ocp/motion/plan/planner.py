@@ -42,17 +42,17 @@ from ocp.motion.plan.candidate_queue import CandidateQueue
 from ocp.motion.plan.candidate_solver import CandidateSolver
 from ocp.motion.plan.motion import Plan
 from ocp.motion.plan.standing import plan_to_stand
-from ocp.motion.search.cells import CellSearch, follows
+from ocp.motion.search.cells import CellSearch, tracks_tasks
 from ocp.motion.search.configurations import (
-    OUT_OF_REACH,
-    Asked,
+    REACH_TOLERANCE,
+    PlanRequest,
     SearchKind,
     check_clear_start,
-    followed_from,
-    misfits_of,
-    postures_at_the_start,
-    settled,
-    touches_at_the_start,
+    fix_ignorable_joints,
+    largest_pose_errors,
+    local_motions_from,
+    start_collisions,
+    start_configurations,
 )
 from ocp.motion.search.dead_end import DeadEnd
 from ocp.motion.search.search import checked_bound
@@ -62,10 +62,19 @@ from ocp.motion.tasks.equations import bind
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.tip_task import TipTask
 
-__all__ = ["checked_asked", "clear_of", "plan", "plan_from_seeds", "planned", "seeds_of"]
+__all__ = [
+    "candidates_from",
+    "checked_request",
+    "clearance_constraints_for",
+    "plan",
+    "plan_from_configurations",
+    "planned",
+]
 
 
-def plan_from_seeds(request: Asked, postures: Array, solver: CandidateSolver) -> tuple[Plan, float | None]:
+def plan_from_configurations(
+    request: PlanRequest, postures: Array, solver: CandidateSolver
+) -> tuple[Plan, float | None]:
     """The plan that postures lead to, and a lower bound of its cost; None if none was looked for.
 
     Args:
@@ -78,11 +87,11 @@ def plan_from_seeds(request: Asked, postures: Array, solver: CandidateSolver) ->
     """
     queue = CandidateQueue(solver, request.settings)
     floats, alone = request.machine.base_size > 0, len(postures) == 1
-    if request.search == "start" or (request.search == "postures" and alone):
+    if request.search == "start" or (request.search == "configurations" and alone):
         _one_by_one(queue, solver, postures, last=alone and not floats)
         if queue.passed or (alone and not floats):
             return queue.plan(), None
-    followed = followed_from(request, postures)
+    followed = local_motions_from(request, postures)
     if floats and (request.search == "global" or alone):
         _through_cells(queue, solver, followed, postures)
         return queue.plan(), None
@@ -91,7 +100,7 @@ def plan_from_seeds(request: Asked, postures: Array, solver: CandidateSolver) ->
         _all_motions(queue, solver, searched)
         if queue.passed:
             return queue.plan(), searched.bound
-    seeds = seeds_of(solver, followed, postures)
+    seeds = candidates_from(solver, followed, postures)
     queue.run(seeds)
     if not queue.passed and queue.collided and not solver.barred:
         _alternatives(queue, solver, seeds)
@@ -99,7 +108,9 @@ def plan_from_seeds(request: Asked, postures: Array, solver: CandidateSolver) ->
         if floats:
             _through_cells(queue, solver, followed, postures)
         else:
-            seed = seeds_of(solver, followed_from(request, postures[:1]), postures[:1], direct=True, thorough=True)
+            seed = candidates_from(
+                solver, local_motions_from(request, postures[:1]), postures[:1], direct=True, thorough=True
+            )
             queue.run(seed)
     try:
         return queue.plan(), None if searched is None else searched.bound
@@ -109,7 +120,7 @@ def plan_from_seeds(request: Asked, postures: Array, solver: CandidateSolver) ->
         raise
 
 
-def seeds_of(
+def candidates_from(
     solver: CandidateSolver, followed: Sequence[LocalMotion], postures: Array, **kind: bool
 ) -> list[Candidate]:
     """Candidates of local motions, those that do their tasks before others, then the cheapest first.
@@ -119,8 +130,8 @@ def seeds_of(
         postures: They begin with. Shape (K, n).
         kind: What else the seeds say, as of `Seed`.
     """
-    misfits, costs = np.array(misfits_of([*followed])), np.sum([part.cost for part in followed], axis=0)
-    tracked = misfits <= max(OUT_OF_REACH, misfits.min(initial=np.inf))
+    misfits, costs = np.array(largest_pose_errors([*followed])), np.sum([part.cost for part in followed], axis=0)
+    tracked = misfits <= max(REACH_TOLERANCE, misfits.min(initial=np.inf))
     seeds = []
     for number in np.lexsort((costs, ~tracked)).tolist():
         local = [part.of(slice(number, number + 1)) for part in followed]
@@ -142,10 +153,10 @@ def _one_by_one(queue: CandidateQueue, solver: CandidateSolver, postures: Array,
     """
     request = solver.request
     for joints in postures[: request.settings.max_failures]:
-        followed = followed_from(request, joints[None])
-        if request.machine.base_size and not follows(request, followed)[0]:
+        followed = local_motions_from(request, joints[None])
+        if request.machine.base_size and not tracks_tasks(request, followed)[0]:
             continue  # what such a guess leads to takes long, and fails
-        queue.run(seeds_of(solver, followed, joints[None], direct=True, thorough=last))
+        queue.run(candidates_from(solver, followed, joints[None], direct=True, thorough=last))
         if queue.passed:
             return
 
@@ -166,16 +177,16 @@ def _all_motions(queue: CandidateQueue, solver: CandidateSolver, searched: TaskS
         found = searched.followed(every)
         if found[0].cost.size:
             starts = found[0].joints[:, 0]
-            queue.run(seeds_of(solver, found, starts))
+            queue.run(candidates_from(solver, found, starts))
             fixed = solver.request.start is None
-            for seed in seeds_of(solver, found, starts, direct=True, fixed=fixed):
+            for seed in candidates_from(solver, found, starts, direct=True, fixed=fixed):
                 near = queue.cost <= settings.near_bound * searched.bound
                 if near or seed.cost >= (1 - settings.gain) * queue.cost:
                     break
                 queue.run([seed])
         if queue.passed:
             return
-    while searched.looked_closer():
+    while searched.refine_samples():
         _check_dead_end(searched)
 
 
@@ -193,8 +204,8 @@ def _through_cells(
         Unreachable, DeadEnd: As of `CellSearch`, where no local motion leads on either.
     """
     request, every = solver.request, solver.request.search == "global"
-    sound = np.flatnonzero(follows(request, followed))
-    local = seeds_of(solver, [part.of(sound) for part in followed], postures[sound], direct=every)
+    sound = np.flatnonzero(tracks_tasks(request, followed))
+    local = candidates_from(solver, [part.of(sound) for part in followed], postures[sound], direct=every)
     try:
         found = CellSearch(request, postures).followed()
     except DeadEnd:
@@ -202,7 +213,7 @@ def _through_cells(
         if not queue.passed:
             raise
         return
-    batches = [seeds_of(solver, ways, ways[0].joints[:, 0], direct=True) for ways in found]
+    batches = [candidates_from(solver, ways, ways[0].joints[:, 0], direct=True) for ways in found]
     if every:
         least = [min((seed.cost for seed in batch), default=np.inf) for batch in batches]
         cheaper = [batch for batch, cost in zip(batches, least, strict=True) if batch is batches[0] or cost < least[0]]
@@ -210,7 +221,7 @@ def _through_cells(
         return
     # where others wait a motion is given up early
     settings = request.settings
-    solver.settings = replace(settings, max_refinements=2, max_deviation=OUT_OF_REACH)
+    solver.settings = replace(settings, max_refinements=2, max_deviation=REACH_TOLERANCE)
     for begin in range(0, settings.max_failures, settings.batch):
         for batch in batches:
             queue.run(batch[begin : begin + settings.batch])
@@ -245,9 +256,9 @@ def _alternatives(queue: CandidateQueue, solver: CandidateSolver, seeds: list[Ca
             )
     others = [seed for _, seed in sorted(ways, key=lambda way: -way[0])[:most]]
     if request.start is None:
-        touching_starts = touches_at_the_start(request, np.array([seed.start for seed in seeds]))
+        touching_starts = start_collisions(request, np.array([seed.start for seed in seeds]))
         clear_starts = [seed for seed, touch in zip(seeds, touching_starts, strict=True) if touch is None]
-        tracked = [one for one in clear_starts if max(misfits_of([*one.seed.local])) <= OUT_OF_REACH]
+        tracked = [one for one in clear_starts if max(largest_pose_errors([*one.seed.local])) <= REACH_TOLERANCE]
         tracked.sort(key=lambda one: one.seed.cost)
         others += [replace(one, seed=replace(one.seed, direct=True, fixed=True)) for one in tracked[:most]]
     for seed in others:
@@ -269,7 +280,7 @@ def plan(
     cyclic: bool = False,
     weights: Any = None,
     limits: Limits | None = None,
-    search: SearchKind = "postures",
+    search: SearchKind = "configurations",
     seed: int = 0,
     time_cost: float = 1.0,
     obstacles: Any = (),
@@ -295,7 +306,7 @@ def plan(
             `plan.actuators`). Rates are then continuous, but as free at both ends as without: a machine that is
             to start from rest is asked to by its tasks, and what these leave free may move there.
         search: "start": from the given start, or from the one that is best conditioned of those that inverse kinematics
-            finds; "postures": from all of these, and the cheapest motion is the plan. Each may slide along its
+            finds; "configurations": from all of these, and the cheapest motion is the plan. Each may slide along its
             self-motion. "global": the cheapest of all motions in the tasks' own time. On a fixed base with a `bound`
             that none falls below, for poses that leave at most two directions free, see `search.search`. Joints
             that move no task's frame, as a gripper's, stand still then, as in `start` or in the middle of their limits.
@@ -322,28 +333,30 @@ def plan(
     around = (machine, obstacles, clearance, ignored, srdf, folders, missing, limits)
     if isinstance(machine, Standing):
         given = {"start": start, "cyclic": cyclic, "weights": weights, "limits": limits, "search": search, "seed": seed}
-        return plan_to_stand(machine, tasks, horizon, clearance_constraints=clear_of(*around), **given)
-    asked = checked_asked(machine, tasks, horizon, start, start_base, cyclic, weights, limits, search, seed, time_cost)
-    return planned(replace(asked, clearance_constraints=clear_of(*around)))
+        return plan_to_stand(machine, tasks, horizon, clearance_constraints=clearance_constraints_for(*around), **given)
+    asked = checked_request(
+        machine, tasks, horizon, start, start_base, cyclic, weights, limits, search, seed, time_cost
+    )
+    return planned(replace(asked, clearance_constraints=clearance_constraints_for(*around)))
 
 
-def planned(asked: Asked) -> Plan:
+def planned(asked: PlanRequest) -> Plan:
     """As `plan`, of what is asked.
 
     Raises:
         ProblemError, SolveError: As `plan`.
     """
-    postures = postures_at_the_start(asked)
+    postures = start_configurations(asked)
     start = asked.start
     if start is None:
-        start, postures = settled(asked, postures)
+        start, postures = fix_ignorable_joints(asked, postures)
     else:
         check_clear_start(asked, postures)
-    made, bound = plan_from_seeds(asked, postures, CandidateSolver(asked, start, postures[0]))
+    made, bound = plan_from_configurations(asked, postures, CandidateSolver(asked, start, postures[0]))
     return made if bound is None else replace(made, bound=checked_bound(bound, made.cost))
 
 
-def clear_of(
+def clearance_constraints_for(
     machine: Machine,
     obstacles: Any,
     clearance: Any,
@@ -376,7 +389,7 @@ def _empty(value: Any) -> bool:
     return value is None or (isinstance(value, tuple | list) and not len(value))
 
 
-def checked_asked(
+def checked_request(
     machine: Machine,
     tasks: Any,
     horizon: Any,
@@ -388,7 +401,7 @@ def checked_asked(
     search: Any,
     seed: Any,
     time_cost: Any,
-) -> Asked:
+) -> PlanRequest:
     """What `plan` is asked, but for what has to be clear.
 
     Raises:
@@ -404,7 +417,7 @@ def checked_asked(
     if free:
         checked_choice("horizon", horizon, ("free",))
         if search == "global":
-            words = "search='global' keeps the tasks' own time; give a horizon in s, or search='postures'"
+            words = "search='global' keeps the tasks' own time; give a horizon in s, or search='configurations'"
             raise ProblemError(words, name="search", value="global")
     checked_positive("time_cost", time_cost)
     told.bounds(machine, ("velocity", "torque") if limits_actuators(told) else ("velocity",))
@@ -428,7 +441,7 @@ def checked_asked(
         names, hint = machine.robot.joint_names, "start inside them"
         joints = inside_limits("start", names, joints, bounds.lower, bounds.upper, hint)
     heavy = checked_weights(weights, machine.joint_size)
-    return Asked(
+    return PlanRequest(
         machine,
         given,
         duration,

@@ -44,7 +44,7 @@ from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.dynamics import dynamics_problem
 from ocp.motion.builders.standing.problem import FreeTime, Weights, standing_problem
 from ocp.motion.builders.tool_motion import ToolMotion, stretches_of, tool_motion_problem
-from ocp.motion.search.configurations import Asked
+from ocp.motion.search.configurations import PlanRequest
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.motion.tasks.tracks import rated
@@ -105,7 +105,7 @@ class MotionRequest:
 
 
 def declared_motion(
-    asked: Asked,
+    asked: PlanRequest,
     *,
     start: Any,
     reference: Any,

@@ -33,8 +33,8 @@ class WaypointPlan:
     joints: Array
     cost: float
     bound: float
-    ways: tuple[tuple[float, str], ...] = ()
-    between: Clearance | None = None
+    candidates: tuple[tuple[float, str], ...] = ()
+    clearance: Clearance | None = None
     reconfigurations: tuple[int, ...] = ()
 
     @property
@@ -57,9 +57,9 @@ class WaypointPlan:
             places = ", ".join(map(str, self.reconfigurations))
             count = f"{len(self.reconfigurations)} time{'s' if len(self.reconfigurations) > 1 else ''}"
             lines.append(f"  the arm reconfigures {count}, after waypoint {places}")
-        if self.between is not None and self.between.worst is not None:
-            near = self.between.worst
+        if self.clearance is not None and self.clearance.worst is not None:
+            near = self.clearance.worst
             how = "too near" if near.missed else "proven clear, the nearest"
             apart = f"{near.distance:.4g} m apart, {near.asked:g} m asked, at waypoint {near.time:.4g}"
             lines.append(f"  straight between waypoints {how}: {' and '.join(near.bodies)}, {apart}")
-        return "\n".join(lines + [f"  {cost:10.6g}  {why or 'the plan'}" for cost, why in self.ways])
+        return "\n".join(lines + [f"  {cost:10.6g}  {why or 'the plan'}" for cost, why in self.candidates])

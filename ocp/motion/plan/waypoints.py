@@ -25,27 +25,27 @@ from ocp.errors import NOT_NUMBERS, ProblemError, SolveError, checked_choice, ch
 from ocp.motion.builders.clearance import clearance_of
 from ocp.motion.local.collisions import Collision, distances_along, find_collisions
 from ocp.motion.local.inverse_kinematics import LARGEST_SEED, Unreachable, at_rest
-from ocp.motion.plan.planner import clear_of
+from ocp.motion.plan.planner import clearance_constraints_for
 from ocp.motion.plan.waypoint_plan import WaypointPlan
-from ocp.motion.search.charts import Instant, SelfMotions
-from ocp.motion.search.dead_end import GiveKind, dead_end
-from ocp.motion.search.joint_space import TOLERANCE, Held, JointSpace
-from ocp.motion.search.reconfigurations import Piece, Sections, SectionSettings, fewest_pieces, values_of
-from ocp.motion.search.search import FREE, Search, SearchSettings, checked_bound
-from ocp.motion.search.steps import Homogeneous, Largest, Length
-from ocp.motion.search.value import drawn_tight
+from ocp.motion.search.charts import SelfMotionManifolds, TimeSample
+from ocp.motion.search.dead_end import RelaxationKind, dead_end
+from ocp.motion.search.joint_space import TOLERANCE, JointSpace, TasksWithFixedJoints
+from ocp.motion.search.reconfigurations import SectionSearch, SectionSettings, Segment, fewest_segments, section_values
+from ocp.motion.search.search import MAX_FREE_DIRECTIONS, AtlasSearch, SearchSettings, checked_bound
+from ocp.motion.search.steps import Homogeneous, LargestMotion, PathLength
+from ocp.motion.search.value import shorten_path
 from ocp.motion.tasks.checks import checked_numbers
 from ocp.motion.tasks.equations import bind
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.tip_task import TipTask
 
-__all__ = ["Reconfigurations", "WayCost", "WaypointPlan", "plan_waypoints"]
+__all__ = ["PathCost", "Reconfigurations", "WaypointPlan", "plan_waypoints"]
 
-WayCost: TypeAlias = Literal["length", "largest", "time"]
+PathCost: TypeAlias = Literal["length", "largest", "time"]
 Reconfigurations: TypeAlias = Literal["forbidden", "counted"]
 
 WAYPOINT = "waypoint {:g}"
-POSTURES = "postures"
+POSTURES = "configurations"
 """What an error is about where there are more than memory is for."""
 NONE_FOUND = "no way through the waypoints keeps all limits"
 
@@ -97,7 +97,7 @@ def plan_waypoints(
     positions: ArrayLike,
     quaternions: ArrayLike,
     *,
-    cost: WayCost = "length",
+    cost: PathCost = "length",
     step: Any = np.inf,
     weights: Any = None,
     limits: Limits | None = None,
@@ -143,7 +143,7 @@ def plan_waypoints(
     heavy = np.ones(n) if weights is None else checked_numbers(weights, n, "weights", "one for each joint")
     if not ((heavy >= 0).all() and heavy.any()):
         raise ProblemError(f"weights {heavy.tolist()} must be positive, or 0", name="weights", value=heavy, limit=0.0)
-    checked_choice("cost", cost, get_args(WayCost))
+    checked_choice("cost", cost, get_args(PathCost))
     checked_choice("reconfigurations", reconfigurations, get_args(Reconfigurations))
     for what in ("velocity", "acceleration", "jerk", "torque", "power"):
         if getattr(told, what) is not None and not (what == "velocity" and cost == "time"):
@@ -156,9 +156,20 @@ def plan_waypoints(
         if not heavy.any():
             raise ProblemError("no joint has a velocity limit, by which the time is told", name="velocity")
     most = _step(step, n)
-    clearance_constraints = clear_of(machine, obstacles, clearance, ignored, srdf, folders, missing, told)
+    clearance_constraints = clearance_constraints_for(
+        machine, obstacles, clearance, ignored, srdf, folders, missing, told
+    )
     around = None if clearance_constraints is None else clearance_constraints.scene
-    way = _Ways(machine, places, turns, most, (Length if cost == "length" else Largest)(heavy), told, around, int(seed))
+    way = _Ways(
+        machine,
+        places,
+        turns,
+        most,
+        (PathLength if cost == "length" else LargestMotion)(heavy),
+        told,
+        around,
+        int(seed),
+    )
     return way.plan(reconfigurations == "counted")
 
 
@@ -184,18 +195,18 @@ class _Ways:
         self.lower, self.upper = bounds.lower, bounds.upper
         self.space = JointSpace(machine, bounds.lower, bounds.upper, np.ones(machine.joint_size))
         free = bind(machine, self._task(0))
-        equations = Held(machine, free.bound, tuple(np.flatnonzero(free.idle).tolist()))
+        equations = TasksWithFixedJoints(machine, free.bound, tuple(np.flatnonzero(free.idle).tolist()))
         at = at_rest(self.lower, self.upper)
         targets = np.zeros((len(places), 18))
         targets[:, :3] = places
         targets[:, 6:15] = turns.transpose(0, 2, 1).reshape(-1, 9)
         targets = np.column_stack([targets, np.tile(at[free.idle], (len(places), 1))])
-        self.sets = SelfMotions(self.space, equations, targets)
+        self.sets = SelfMotionManifolds(self.space, equations, targets)
         self._known = dict[int, Array]()
-        if not 0 <= self.sets.size <= FREE:
+        if not 0 <= self.sets.size <= MAX_FREE_DIRECTIONS:
             words = f"{machine.robot.name}: {int((~free.idle).sum())} joints for the {free.size} rows of a pose"
-            words += f"; hold joints until at most {FREE} are left over"
-            raise ProblemError(words, name="machine", value=self.sets.size, limit=FREE)
+            words += f"; hold joints until at most {MAX_FREE_DIRECTIONS} are left over"
+            raise ProblemError(words, name="machine", value=self.sets.size, limit=MAX_FREE_DIRECTIONS)
         # with two free directions it is held that is nearest to the base: it moves all others
         robot = machine.robot
         names = [joint.name for joint in robot.path_to(robot.tip_link) if joint.name in robot.joint_names]
@@ -238,13 +249,13 @@ class _Ways:
             ways += self._rescued(search)
         return self._made(ways, bound)
 
-    def _chains(self, search: Search, cut: bool) -> tuple[list[list[Piece]], float]:
+    def _chains(self, search: AtlasSearch, cut: bool) -> tuple[list[list[Segment]], float]:
         """Motions through the waypoints that are searched, each in its pieces, and what none costs less than."""
         if cut:
-            found = fewest_pieces(search)
+            found = fewest_segments(search)
             return ([], np.inf) if found is None else ([found[0]], found[1])
         paths, bound = search.ways()
-        return [[Piece(0, len(path) - 1, path, search.steps(path), bound)] for path in paths], bound
+        return [[Segment(0, len(path) - 1, path, search.steps(path), bound)] for path in paths], bound
 
     def _made(self, ways: list[_Way], bound: float) -> WaypointPlan:
         """The plan of the cheapest way that keeps all limits.
@@ -290,7 +301,7 @@ class _Ways:
         some = (max(min(each, count // settings.steps), int(np.ceil(least)), 1) for each in settings.strides)
         return [-(-count // settings.few), *some], 2
 
-    def _begun(self, stride: int, known: Search | None = None) -> Search | None:
+    def _begun(self, stride: int, known: AtlasSearch | None = None) -> AtlasSearch | None:
         """A search of one of so many waypoints, of fewer where that were more postures than memory is for.
 
         None where these are no more than those of a search that is known.
@@ -309,7 +320,7 @@ class _Ways:
                     raise
             stride *= 2
 
-    def _closer(self, search: Search, way: _Way | None) -> Search | None:
+    def _closer(self, search: AtlasSearch, way: _Way | None) -> AtlasSearch | None:
         """A search of the waypoints where a way is wrong as well; None where that are no more, or too many."""
         chosen = search.times.astype(int)
         if way is None or self._held is not None or np.isin(way.wrong, chosen).all():
@@ -321,22 +332,25 @@ class _Ways:
                 raise
             return None
 
-    def _search(self, chosen: NDArray[np.intp], coarse: bool = False) -> Search:
+    def _search(self, chosen: NDArray[np.intp], coarse: bool = False) -> AtlasSearch:
         """Of all postures at some waypoints; with two free directions of those on some curves."""
-        sets, far = SelfMotions(self.space, self.sets.equations, self.sets.targets[chosen]), np.diff(chosen)[:, None]
+        sets, far = (
+            SelfMotionManifolds(self.space, self.sets.equations, self.sets.targets[chosen]),
+            np.diff(chosen)[:, None],
+        )
         told: dict[str, Any] = {"seeds": lambda k: self._seeds(int(chosen[k])), "scene": self.around}
-        instants = [Instant(sets, k) for k in range(len(chosen))]
+        instants = [TimeSample(sets, k) for k in range(len(chosen))]
         held = self._held
         given = self.space, instants, chosen.astype(float), self.cost, far * self.step
         if held is None:
-            return Search(*given, **told, settings=self.settings.search)
+            return AtlasSearch(*given, **told, settings=self.settings.search)
         slides = self.machine.robot.moving_joints[held].kind == "prismatic"
         own, limit = self.settings.sections, float((far * self.step)[:, held].min())
         curves: dict[str, Any] = {"radius": own.radii[coarse], "charts": own.charts}
-        curves["values"] = values_of(slides, self.lower[held], self.upper[held], limit, own)
-        return Sections(*given, **told, **curves, joint=held)
+        curves["values"] = section_values(slides, self.lower[held], self.upper[held], limit, own)
+        return SectionSearch(*given, **told, **curves, joint=held)
 
-    def _ended(self, search: Search) -> SolveError:
+    def _ended(self, search: AtlasSearch) -> SolveError:
         """Where no way goes on, at first seen from the waypoints that were searched, then from each of those there."""
         end, chosen = dead_end(search, WAYPOINT), search.times.astype(int)
         if end is None:
@@ -345,7 +359,7 @@ class _Ways:
         closer = np.union1d(chosen, np.arange(int(end.time), int(end.until) + 1))
         return (None if len(closer) == len(chosen) else dead_end(self._search(closer), WAYPOINT)) or end
 
-    def _rescued(self, search: Search) -> list[_Way]:
+    def _rescued(self, search: AtlasSearch) -> list[_Way]:
         """What comes through though no way was found: a motion that gives way, by nothing that counts.
 
         Raises:
@@ -359,15 +373,15 @@ class _Ways:
         end = dead_end(search, WAYPOINT, proven=False)
         if end is None:
             return []
-        of_pose = [give for give in end.gives if give.kind is not GiveKind.CLEARANCE]
+        of_pose = [give for give in end.relaxations if give.kind is not RelaxationKind.CLEARANCE]
         paths = [give.joints for give in of_pose if give.amount <= self.settings.missed]
         if not paths:
             raise end
-        return [self._drawn(search, [Piece(0, len(path) - 1, path, search.steps(path), 0.0)]) for path in paths]
+        return [self._drawn(search, [Segment(0, len(path) - 1, path, search.steps(path), 0.0)]) for path in paths]
 
     # ---- ways through all waypoints ------------------------------------------------------------------------------
 
-    def _drawn(self, search: Search, chain: list[Piece]) -> _Way:
+    def _drawn(self, search: AtlasSearch, chain: list[Segment]) -> _Way:
         """A way through all waypoints beside pieces through some of them.
 
         It is wrong where it reconfigures between two that are no neighbours, whatever comes of the rest.
@@ -380,11 +394,11 @@ class _Ways:
         parts = []
         for piece in chain:
             rows = slice(int(chosen[piece.first]), int(chosen[piece.last]) + 1)
-            instants = [Instant(self.sets, k) for k in range(len(self.places))[rows]]
+            instants = [TimeSample(self.sets, k) for k in range(len(self.places))[rows]]
             far, bounds = np.repeat(self.step[None], len(instants) - 1, axis=0), (self.lower, self.upper)
             times = np.arange(len(self.places), dtype=float)[rows]
             told = self.cost, times, far, bounds, self.around, self.settings.widths
-            parts.append(drawn_tight(joints[rows], instants, *told))
+            parts.append(shorten_path(joints[rows], instants, *told))
         joints = np.concatenate(parts)
         steps = np.delete(self.cost.of(np.diff(joints, axis=0), 1.0), list(after))
         return _Way(float(steps.sum()), *self._wrong(joints, after), joints, after)
@@ -405,7 +419,7 @@ class _Ways:
             words = f"waypoint {number} at {self.places[number].round(6).tolist()} m: {error}"
             raise Unreachable(words, **{**vars(error), "time": float(number)}) from error
 
-    def _through(self, chosen: NDArray[np.intp], chain: list[Piece]) -> Array:
+    def _through(self, chosen: NDArray[np.intp], chain: list[Segment]) -> Array:
         """Joints at all waypoints, (N, n), beside pieces through some of them, each turned within the limits."""
         numbers = np.arange(len(self.places))
         path = np.concatenate([piece.joints for piece in chain])

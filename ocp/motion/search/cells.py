@@ -27,11 +27,11 @@ from models.arrays import Array
 from ocp.motion.local.collisions import distances_along
 from ocp.motion.local.inverse_kinematics import Unreachable
 from ocp.motion.local.rates import LocalMotion
-from ocp.motion.search.configurations import OUT_OF_REACH, Asked, misfits_of, placed
+from ocp.motion.search.configurations import REACH_TOLERANCE, PlanRequest, largest_pose_errors, placed
 from ocp.motion.search.dead_end import DeadEnd
-from ocp.motion.search.reduced import ReducedKinematics, Side, Slopes, check_floating_reach, within
+from ocp.motion.search.reduced import LimitSide, ReducedKinematics, TaskKinematics, check_floating_reach, within
 
-__all__ = ["CellSearch", "follows"]
+__all__ = ["CellSearch", "tracks_tasks"]
 
 Indices = NDArray[np.intp]
 
@@ -74,7 +74,7 @@ class CellSettings:
     classes: int = 48
 
 
-def follows(asked: Asked, followed: Sequence[LocalMotion]) -> NDArray[np.bool_]:
+def tracks_tasks(asked: PlanRequest, followed: Sequence[LocalMotion]) -> NDArray[np.bool_]:
     """Which local motions meet their poses, and run most of the way that velocities ask for. Shape (K,)."""
     count = len(followed[0].cost)
     missed, way = np.zeros(count), np.zeros(count)
@@ -84,7 +84,7 @@ def follows(asked: Asked, followed: Sequence[LocalMotion]) -> NDArray[np.bool_]:
             base, joints = ((value[:, k] + value[:, k + 1]) / 2 for value in (part.base, part.joints))
             speeds = kinematics.missed(base, joints, part.rates[:, k], part.t[k] + step / 2)
             missed, way = missed + step * speeds[0], way + step * speeds[1]
-    return np.asarray((np.array(misfits_of(list(followed))) <= OUT_OF_REACH) & (missed <= OFF_SHARE * way))
+    return np.asarray((np.array(largest_pose_errors(list(followed))) <= REACH_TOLERANCE) & (missed <= OFF_SHARE * way))
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +109,7 @@ class _Layer:
 class CellSearch:
     """Motions from some postures through all stretches of what is asked."""
 
-    def __init__(self, asked: Asked, postures: Array, settings: CellSettings = CellSettings()) -> None:
+    def __init__(self, asked: PlanRequest, postures: Array, settings: CellSettings = CellSettings()) -> None:
         """
         Args:
             asked: What is asked.
@@ -183,7 +183,7 @@ class _Cells:
 
     def __init__(
         self,
-        asked: Asked,
+        asked: PlanRequest,
         kinematics: Sequence[ReducedKinematics],
         most: float,
         whole: bool,
@@ -230,7 +230,7 @@ class _Cells:
         self.cost = float(layers[-1].cost.min())
 
     def _grown(
-        self, kinematics: ReducedKinematics, layer: _Layer, slopes: Slopes, time: float, limited: bool
+        self, kinematics: ReducedKinematics, layer: _Layer, slopes: TaskKinematics, time: float, limited: bool
     ) -> tuple[_Layer | None, Counter[tuple[int, int]]]:
         """The states that are reached from a layer, the best of each cell; None where there are none.
 
@@ -259,12 +259,12 @@ class _Cells:
         best = self._kept(base, layer.joints[before] + step * rates / root, cost, tight=True)
         before, rates = before[best], rates[best]
         start, first = layer.base[before], layer.joints[before]
-        exact = OUT_OF_REACH / 10
+        exact = REACH_TOLERANCE / 10
         base, joints, off = kinematics.stepped(start, first, slopes.of(before), rates, layer.time, time, exact)
         cost = layer.cost[before] + ((root * (joints - first)) ** 2).sum(axis=1) / (2 * step)
         near = np.isfinite(base).all(axis=1) & (np.abs(joints - first).max(axis=1) <= self._settings.longest)
         made = _Layer(time, base, joints, cost, before)
-        made = made.of(np.flatnonzero(near & (cost <= self.most) & (off <= OUT_OF_REACH)))
+        made = made.of(np.flatnonzero(near & (cost <= self.most) & (off <= REACH_TOLERANCE)))
         made = made.of(np.flatnonzero(self._allowed(kinematics, made)))
         if not len(made.cost):
             return None, told
@@ -310,7 +310,7 @@ class _Cells:
         good, times = np.isfinite(layer.cost), np.full(len(layer.cost), layer.time)
         if kinematics.equations is not None and len(times):
             over = kinematics.equations.overhangs(times, layer.base, layer.joints)
-            good &= over.max(axis=1, initial=0.0) <= OUT_OF_REACH
+            good &= over.max(axis=1, initial=0.0) <= REACH_TOLERANCE
         if self.asked.clearance_constraints is not None and good.any():
             around, at = self.asked.clearance_constraints.scene, np.flatnonzero(good)
             apart = distances_along(around, layer.base[at], layer.joints[at], times[at], around.clearance)
@@ -320,11 +320,11 @@ class _Cells:
     def _begun(self, layer: _Layer, kinematics: ReducedKinematics) -> _Layer:
         """States at the poses that begin at a time, each as near as it comes to where it was."""
         moved = kinematics.corrected(
-            layer.base, layer.joints, layer.time, OUT_OF_REACH / 10, most=self._settings.corrections
+            layer.base, layer.joints, layer.time, REACH_TOLERANCE / 10, most=self._settings.corrections
         )
         base, joints, off = moved
         cost = layer.cost + ((self.root * (joints - layer.joints)) ** 2).sum(axis=1) / (2 * layer.time)
-        good = np.flatnonzero(off <= OUT_OF_REACH)
+        good = np.flatnonzero(off <= REACH_TOLERANCE)
         if not good.size:
             raise self._stuck(layer, Counter())
         return _Layer(layer.time, base, joints, cost, np.arange(len(cost))).of(good)
@@ -336,7 +336,7 @@ class _Cells:
         if why:
             (joint, which), _ = why.most_common(1)[0]
             limit = float((bounds.lower, bounds.upper, -bounds.velocity, bounds.velocity)[which][joint])
-            what = "can go no faster than" if which >= Side.SLOW else "can go no farther than"
+            what = "can go no faster than" if which >= LimitSide.SLOW else "can go no farther than"
             words = f"{names[joint]!r} {what} {limit:g}"
             value = float(layer.joints[layer.cost.argmin(), joint])
             details |= {"name": names[joint], "value": value, "limit": limit}

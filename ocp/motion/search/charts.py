@@ -28,7 +28,7 @@ from ocp.motion.tasks.equations import TaskEquations
 from ocp.problem.values import Sampler
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = ["ChartSettings", "Charts", "Instant", "Parts", "SelfMotions", "point"]
+__all__ = ["ChartSettings", "Charts", "Parts", "SelfMotionManifolds", "TimeSample", "point"]
 
 Indices = NDArray[np.intp]
 
@@ -155,7 +155,7 @@ class _Edges(NamedTuple):
         return _Edges(*(part[chosen] for part in self))
 
 
-class SelfMotions:
+class SelfMotionManifolds:
     """The sets of postures that do a task at some instants.
 
     Attributes:
@@ -361,7 +361,7 @@ class SelfMotions:
                     f"more than {most} charts of {radius:.3g} rad cover the postures that do the task; "
                     "take larger ones, or fewer instants"
                 )
-                raise ProblemError(words, name="postures", value=len(charts), limit=most)
+                raise ProblemError(words, name="configurations", value=len(charts), limit=most)
             kept = edges._replace(radii=tight)
             narrow = tight < radius / 2**self.settings.halvings
             self.lost += int(narrow.sum())
@@ -466,10 +466,10 @@ class SelfMotions:
         return charts, _Edges(charts.layer[owner], points[owner, side], ways, number + owner, charts.radii[owner])
 
 
-class Instant(NamedTuple):
+class TimeSample(NamedTuple):
     """Which set of postures of whose."""
 
-    sets: SelfMotions
+    sets: SelfMotionManifolds
     number: int
 
 

@@ -24,18 +24,28 @@ from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.motion.tasks.tip_task import TipTask
 
 __all__ = [
-    "OUT_OF_REACH", "Asked", "SearchKind", "check_clear_start", "clear_postures", "followed_from", "misfits_of",
-    "others_told", "placed", "postures_at_the_start", "settled", "touches_at_the_start",
+    "REACH_TOLERANCE",
+    "PlanRequest",
+    "SearchKind",
+    "check_clear_start",
+    "count_clear_configurations",
+    "describe_alternatives",
+    "fix_ignorable_joints",
+    "largest_pose_errors",
+    "local_motions_from",
+    "placed",
+    "start_collisions",
+    "start_configurations",
 ]  # fmt: skip
 
 SETTINGS = PlannerSettings()
-SearchKind: TypeAlias = Literal["start", "postures", "global"]
-OUT_OF_REACH = 1e-4
+SearchKind: TypeAlias = Literal["start", "configurations", "global"]
+REACH_TOLERANCE = 1e-4
 """m or rad: a pose missed by more may be out of reach."""
 
 
 @dataclass(frozen=True, eq=False)
-class Asked:
+class PlanRequest:
     """What is asked, checked.
 
     Attributes:
@@ -59,7 +69,7 @@ class Asked:
     cyclic: bool
     seed: int
     time_cost: float | None
-    search: SearchKind = "postures"
+    search: SearchKind = "configurations"
     drives: Limits | None = None
     clearance_constraints: ClearanceConstraints | None = None
     settings: PlannerSettings = SETTINGS
@@ -85,7 +95,7 @@ class Asked:
         return self.limits.bounds(self.machine)
 
 
-def postures_at_the_start(asked: Asked) -> Array:
+def start_configurations(asked: PlanRequest) -> Array:
     """Joints at the start, those that are clear before those that touch, the best conditioned first. Shape (K, n)."""
     if asked.start is not None:
         return asked.start[None]
@@ -107,11 +117,11 @@ def postures_at_the_start(asked: Asked) -> Array:
     found = [replace(posture, joints=np.where(asked.idle, resting, posture.joints)) for posture in found]
     found = distinct(found, np.array([joint.kind != "prismatic" for joint in slides]))
     joints = np.array([posture.joints for posture in found])
-    touching = [touch is not None for touch in touches_at_the_start(asked, joints)]
+    touching = [touch is not None for touch in start_collisions(asked, joints)]
     return joints[np.argsort(touching, kind="stable")]
 
 
-def touches_at_the_start(asked: Asked, postures: Array) -> list[Collision | None]:
+def start_collisions(asked: PlanRequest, postures: Array) -> list[Collision | None]:
     """Of each posture (K, n) the pair of bodies that comes nearest, where it comes too near."""
     if asked.clearance_constraints is None:
         return [None] * len(postures)
@@ -122,18 +132,18 @@ def touches_at_the_start(asked: Asked, postures: Array) -> list[Collision | None
     return [touch if touch.distance < around.clearance else None for touch in found]
 
 
-def check_clear_start(asked: Asked, postures: Array) -> None:
+def check_clear_start(asked: PlanRequest, postures: Array) -> None:
     """Raise ProblemError where bodies come too near at the start that is given."""
-    if (touch := touches_at_the_start(asked, postures)[0]) is not None:
+    if (touch := start_collisions(asked, postures)[0]) is not None:
         assert asked.clearance_constraints is not None
         around, name = asked.clearance_constraints.scene, " and ".join(touch.bodies)
         ignored = [around.told_as(touch.pair)]
         words = f"start: {touch}; start clear of everything, or name what may touch: {ignored=}"
-        words = "; ".join([words, *others_told(clear_postures(asked, touch.time))])
+        words = "; ".join([words, *describe_alternatives(count_clear_configurations(asked, touch.time))])
         raise ProblemError(words, name=name, value=touch.distance, limit=around.clearance, time=touch.time)
 
 
-def clear_postures(asked: Asked, time: float) -> int | Unreachable | None:
+def count_clear_configurations(asked: PlanRequest, time: float) -> int | Unreachable | None:
     """How many postures that do the tasks at a time (s) are clear, or why none is.
 
     None where that says nothing: no pose is asked for then, or the base may come from elsewhere.
@@ -148,7 +158,7 @@ def clear_postures(asked: Asked, time: float) -> int | Unreachable | None:
         return error
 
 
-def others_told(others: int | Unreachable | None) -> list[str]:
+def describe_alternatives(others: int | Unreachable | None) -> list[str]:
     """Whether another posture is clear, in words; nothing where that is not known."""
     if others is None:
         return []
@@ -157,7 +167,7 @@ def others_told(others: int | Unreachable | None) -> list[str]:
     return [f"clear then, and not on a motion that was found: {others} other posture{'s' if others > 1 else ''}"]
 
 
-def settled(asked: Asked, postures: Array) -> tuple[Array, Array]:
+def fix_ignorable_joints(asked: PlanRequest, postures: Array) -> tuple[Array, Array]:
     """Joints at the start, nan where they are free, and the postures moved to those that are told.
 
     An ignorable coordinate, by whose value nothing that is asked changes but the joint itself (the last joint of an arm
@@ -175,7 +185,7 @@ def settled(asked: Asked, postures: Array) -> tuple[Array, Array]:
     start[ignorable] = np.where(ended, at_rest(bounds.lower, bounds.upper), postures[0])[ignorable]
 
     def collision_count(values: Array) -> int:
-        return touches_at_the_start(asked, np.where(ignorable, values, postures)).count(None)
+        return start_collisions(asked, np.where(ignorable, values, postures)).count(None)
 
     if ignorable.any() and not collision_count(start):
         others = starts_of(asked.machine, bounds.lower, bounds.upper, asked.settings.ik_starts, None, asked.seed)
@@ -183,7 +193,7 @@ def settled(asked: Asked, postures: Array) -> tuple[Array, Array]:
     return start, np.where(ignorable, start, postures)
 
 
-def followed_from(asked: Asked, postures: Array) -> list[LocalMotion]:
+def local_motions_from(asked: PlanRequest, postures: Array) -> list[LocalMotion]:
     """The local motions from all postures through all stretches, with the least damping that lets one of them follow.
 
     Raises:
@@ -210,13 +220,13 @@ def followed_from(asked: Asked, postures: Array) -> list[LocalMotion]:
                 found.append(follow(equations, joints, base, times, lower=bounds.lower, upper=bounds.upper, **soft))
             base, joints = found[-1].base[:, -1], found[-1].joints[:, -1]
         best = best or found
-        if min(misfits_of(found)) <= OUT_OF_REACH:
+        if min(largest_pose_errors(found)) <= REACH_TOLERANCE:
             return found
     _check_reach(asked, best)
     return best
 
 
-def _begun(asked: Asked, stretch: Stretch, base: Array, joints: Array) -> Array:
+def _begun(asked: PlanRequest, stretch: Stretch, base: Array, joints: Array) -> Array:
     """Joints (K, n) at which the poses that begin in a stretch are met, each the nearest to where it comes from.
 
     There they still do what was asked until then.
@@ -251,33 +261,35 @@ def _straight(part: LocalMotion, joints: Array) -> LocalMotion:
     return replace(part, joints=part.joints[:, :1] + share * way, rates=rates)
 
 
-def misfits_of(followed: list[LocalMotion]) -> list[float]:
+def largest_pose_errors(followed: list[LocalMotion]) -> list[float]:
     """Of each posture the largest pose error on its way."""
     return np.max([part.misfit for part in followed], axis=0).tolist()  # type: ignore[no-any-return]
 
 
-def _check_reach(asked: Asked, followed: list[LocalMotion]) -> None:
+def _check_reach(asked: PlanRequest, followed: list[LocalMotion]) -> None:
     """Raise where no posture follows the tasks and no joints reach them, seen from a fixed base."""
     if asked.machine.base_size:
         return
     for stretch, part in zip(asked.stretches, followed, strict=True):
         poses = [
-            asked.tasks[i] for i in stretch.tasks if asked.tasks[i].is_pose and asked.tasks[i].start_gap <= OUT_OF_REACH
+            asked.tasks[i]
+            for i in stretch.tasks
+            if asked.tasks[i].is_pose and asked.tasks[i].start_gap <= REACH_TOLERANCE
         ]
         if not poses:
             continue
-        lost = np.unique(part.lost_at[part.misfit > OUT_OF_REACH])
+        lost = np.unique(part.lost_at[part.misfit > REACH_TOLERANCE])
         for time in lost.tolist():
             near = part.joints[:, int(np.searchsorted(part.t, time))]
             try:
                 inverse_kinematics(
-                    asked.machine, poses, time=time, near=near, limits=asked.limits.joints, tolerance=OUT_OF_REACH
+                    asked.machine, poses, time=time, near=near, limits=asked.limits.joints, tolerance=REACH_TOLERANCE
                 )
             except Unreachable as error:
                 raise placed(asked, error, time) from error
 
 
-def placed(asked: Asked, error: Unreachable, time: float) -> Unreachable:
+def placed(asked: PlanRequest, error: Unreachable, time: float) -> Unreachable:
     """The same with its time and the places that are asked for there."""
     places = []
     for number, task in enumerate(asked.tasks):

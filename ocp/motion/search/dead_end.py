@@ -22,10 +22,10 @@ from ocp.motion.builders.clearance import LOOKS, MARGIN, ROUNDING
 from ocp.motion.local.collisions import distances_along, find_collisions
 from ocp.motion.search.charts import Charts
 from ocp.motion.search.joint_space import TOLERANCE
-from ocp.motion.search.search import Search
-from ocp.motion.search.value import Graph
+from ocp.motion.search.search import AtlasSearch
+from ocp.motion.search.value import ChartGraph
 
-__all__ = ["DeadEnd", "Give", "Stop", "dead_end"]
+__all__ = ["DeadEnd", "Obstruction", "Relaxation", "dead_end"]
 
 Indices = NDArray[np.intp]
 
@@ -35,17 +35,17 @@ NEGLIGIBLE = 1e-9
 """m or rad: a motion that gives way by less has not been asked to."""
 
 
-class StopKind(StrEnum):
+class ObstructionKind(StrEnum):
     """What stops motions: the position of a joint, how far it can go, bodies, what is out of reach, what is narrow."""
 
     LIMIT = "limit"
     STEP = "step"
-    TOUCH = "touch"
+    COLLISION = "collision"
     REACH = "reach"
     NARROW = "narrow"
 
 
-class GiveKind(StrEnum):
+class RelaxationKind(StrEnum):
     """What gives way: the tip's place, its axes, or the clearance."""
 
     DEVIATION = "deviation"
@@ -53,7 +53,7 @@ class GiveKind(StrEnum):
     CLEARANCE = "clearance"
 
 
-class Stop(NamedTuple):
+class Obstruction(NamedTuple):
     """What stops motions where none goes on.
 
     Attributes:
@@ -65,7 +65,7 @@ class Stop(NamedTuple):
         before, after: Postures, the last one that is reached and where it would have to go. Shape (n,).
     """
 
-    kind: StopKind
+    kind: ObstructionKind
     name: str
     value: float
     limit: float
@@ -79,15 +79,15 @@ class Stop(NamedTuple):
 
     def __str__(self) -> str:
         return {
-            StopKind.LIMIT: f"{self.name!r} would pass its limit {self.limit:.4g} by {self.excess:.3g}",
-            StopKind.STEP: f"{self.name!r} would have to go {self.value:.3g} in one step, {self.limit:.3g} at most",
-            StopKind.TOUCH: f"{self.name} would be {self.value:.3g} m apart, {self.limit:.3g} at least",
-            StopKind.NARROW: "what leads on is too narrow to be followed",
-            StopKind.REACH: f"the tip stays {self.value:.3g} off from there",
+            ObstructionKind.LIMIT: f"{self.name!r} would pass its limit {self.limit:.4g} by {self.excess:.3g}",
+            ObstructionKind.STEP: f"{self.name!r} would have to go {self.value:.3g} in one step, {self.limit:.3g} at most",
+            ObstructionKind.COLLISION: f"{self.name} would be {self.value:.3g} m apart, {self.limit:.3g} at least",
+            ObstructionKind.NARROW: "what leads on is too narrow to be followed",
+            ObstructionKind.REACH: f"the tip stays {self.value:.3g} off from there",
         }[self.kind]
 
 
-class Give(NamedTuple):
+class Relaxation(NamedTuple):
     """A motion that would do the task if it gave way.
 
     Attributes:
@@ -95,16 +95,16 @@ class Give(NamedTuple):
         amount: How far. times: The instants, s, or numbers of waypoints. Shape (K,). joints: There. Shape (K, n).
     """
 
-    kind: GiveKind
+    kind: RelaxationKind
     amount: float
     times: Array
     joints: Array
 
     def __str__(self) -> str:
         return {
-            GiveKind.DEVIATION: f"the tip may be {self.amount:.3g} m off",
-            GiveKind.LEAN: f"the tip may be turned by {np.degrees(self.amount):.3g} deg",
-            GiveKind.CLEARANCE: f"the clearance is {self.amount:.3g} m",
+            RelaxationKind.DEVIATION: f"the tip may be {self.amount:.3g} m off",
+            RelaxationKind.LEAN: f"the tip may be turned by {np.degrees(self.amount):.3g} deg",
+            RelaxationKind.CLEARANCE: f"the clearance is {self.amount:.3g} m",
         }[self.kind]
 
 
@@ -117,67 +117,71 @@ class DeadEnd(SolveError):
         name, value, limit: Of the least of the stops; of a machine whose base moves by itself, which may have been
             there in any attitude, of the joint whose limit stops most, where it is, and that limit, else "task".
         stops: What stops motions there, each where it does so by the least, the least first.
-        gives: Motions that would do if the task gave way, the least that was found of each kind.
-        pieces: In how few pieces it may be done, see `plan_in_segments`; None where that is not known.
+        relaxations: Motions that would do if the task gave way, the least that was found of each kind.
+        segments: In how few segments it may be done, see `plan_in_segments`; None where that is not known.
     """
 
     until: float
-    stops: tuple[Stop, ...]
-    gives: tuple[Give, ...]
-    pieces: int | None
+    obstructions: tuple[Obstruction, ...]
+    relaxations: tuple[Relaxation, ...]
+    segments: int | None
 
     def __init__(
         self,
         words: str,
         until: float = np.nan,
-        stops: tuple[Stop, ...] = (),
-        gives: tuple[Give, ...] = (),
-        pieces: int | None = None,
+        obstructions: tuple[Obstruction, ...] = (),
+        relaxations: tuple[Relaxation, ...] = (),
+        segments: int | None = None,
         **details: Any,
     ) -> None:
         super().__init__(words, **details)
-        self.until, self.stops, self.gives, self.pieces = until, stops, gives, pieces
+        self.until, self.obstructions, self.relaxations, self.segments = until, obstructions, relaxations, segments
 
     def __reduce__(self) -> Any:
         """Pickled with what it is made from, and with its fields."""
-        return type(self), (*self.args, self.until, self.stops, self.gives, self.pieces), self.__dict__
+        return type(self), (*self.args, self.until, self.obstructions, self.relaxations, self.segments), self.__dict__
 
 
-def dead_end(search: Search, unit: str = "{:.4g} s", proven: bool = True, pieces: int | None = None) -> DeadEnd | None:
+def dead_end(
+    search: AtlasSearch, unit: str = "{:.4g} s", proven: bool = True, segments: int | None = None
+) -> DeadEnd | None:
     """Where the motions of a search end; None where one comes through.
 
     Args:
         unit: How its times are told.
         proven: Whether the search shows that there is none, under its assumptions.
-        pieces: As of `DeadEnd`.
+        segments: As of `DeadEnd`.
     """
     front = _Walk(search)
     last = front.last
     if last == len(search.times) - 1:
         return None
     stops = _stops(search, front)
-    worst, gives = stops[0], list[Give]()
-    if any(stop.kind is StopKind.TOUCH for stop in stops) and np.isfinite(front.width[-1].max(initial=-np.inf)):
+    worst, relaxations = stops[0], list[Relaxation]()
+    if any(stop.kind is ObstructionKind.COLLISION for stop in stops) and np.isfinite(
+        front.width[-1].max(initial=-np.inf)
+    ):
         best = int(front.width[-1].argmax())
         joints = front.way(len(search.times) - 1, best)
-        gives.append(Give(GiveKind.CLEARANCE, float(front.width[-1][best]), search.times, joints))
+        relaxations.append(Relaxation(RelaxationKind.CLEARANCE, float(front.width[-1][best]), search.times, joints))
     path = _carried_on(search, front, stops[0].before)
-    for turning, kind in ((False, GiveKind.DEVIATION), (True, GiveKind.LEAN)):
+    for turning, kind in ((False, RelaxationKind.DEVIATION), (True, RelaxationKind.LEAN)):
         if (give := _given(search, path, turning, kind)) is not None:
-            gives.append(give)
+            relaxations.append(give)
     there = unit.format(search.times[last + 1])
     where = (
         f"from {unit.format(search.times[last])} on none goes on to {there}" if last >= 0 else f"none begins at {there}"
     )
     first = "no motion does the tasks" if proven else "no motion was found, though the search does not rule one out"
     words = f"{first}: {where}; {'; '.join(map(str, stops[:WORST]))}"
-    if gives:
-        words += f"; one does if {', or '.join(map(str, gives))}"
-    if pieces is not None:
-        many = "a reconfiguration" if pieces == 2 else f"{pieces - 1} reconfigurations"
+    if relaxations:
+        words += f"; one does if {', or '.join(map(str, relaxations))}"
+    if segments is not None:
+        many = "a reconfiguration" if segments == 2 else f"{segments - 1} reconfigurations"
         words += f"; with {many} on the way one may: plan_in_pieces"
     told = {"name": worst.name, "value": worst.value, "limit": worst.limit, "time": float(search.times[max(last, 0)])}
-    return DeadEnd(words, float(search.times[last + 1]), tuple(stops), tuple(gives), pieces, **told)
+    return DeadEnd(words, float(search.times[last + 1]), tuple(stops), tuple(relaxations), segments, **told)
 
 
 class _Walk:
@@ -190,7 +194,7 @@ class _Walk:
         parent: Charts that they are reached from. Shapes (N,).
     """
 
-    def __init__(self, search: Search) -> None:
+    def __init__(self, search: AtlasSearch) -> None:
         self.search = search
         self.asked = np.inf if search.scene is None else search.scene.clearance
         self.layers = _narrow(search)
@@ -219,7 +223,7 @@ class _Walk:
             chart = int(self.parent[instant][chart])
         return np.array(found[::-1])
 
-    def _gone_on(self, graph: Graph, k: int) -> None:
+    def _gone_on(self, graph: ChartGraph, k: int) -> None:
         """From all postures of an instant to the charts of the next one, the nearest of the widest first."""
         space, limit, other = self.search.space, self.search.limits[k], k + 1
         parts = [(i[np.isfinite(self.at[k][i, 0])], j[np.isfinite(self.at[k][i, 0])]) for i, j in graph.steps(k, other)]
@@ -265,7 +269,7 @@ class _Walk:
         self.at[k][own], self.width[k][own], self.parent[k][own] = joints[good], width[good], parents[good]
 
 
-def _narrow(search: Search) -> list[Charts]:
+def _narrow(search: AtlasSearch) -> list[Charts]:
     """Charts of all postures, halved until steps cross them or there are as many as memory is for."""
     layers = search.covered
     steps = search.limits.max(axis=1) / 2
@@ -278,7 +282,7 @@ def _narrow(search: Search) -> list[Charts]:
         layers = [search.halved(charts, k) if k in wide else charts for k, charts in enumerate(layers)]
 
 
-def _stops(search: Search, front: _Walk) -> list[Stop]:
+def _stops(search: AtlasSearch, front: _Walk) -> list[Obstruction]:
     """What stops motions at the last instant that is reached, the least first; of each kind and name the least."""
     space, around, last = search.space, search.scene, front.last
     names, n, there = search.instants[0].sets.equations.machine.robot.joint_names, len(space.scale), last + 1
@@ -295,34 +299,38 @@ def _stops(search: Search, front: _Walk) -> list[Stop]:
     worst = excess.argmax(axis=1)
     most = excess[np.arange(len(worst)), worst]
 
-    def stop(row: int) -> Stop:
+    def stop(row: int) -> Obstruction:
         """What stops the motion of a row, by its column."""
         kind, joint = divmod(int(worst[row]) - 1, n)
         here, next_ = before[row], after[row]
         if worst[row] == 0:
-            return Stop(StopKind.REACH, "tip", float(miss[row]), 0.0, here, next_)
+            return Obstruction(ObstructionKind.REACH, "tip", float(miss[row]), 0.0, here, next_)
         if kind < 2:
             bound = float((space.upper, space.lower)[kind][joint])
-            return Stop(StopKind.LIMIT, names[joint], float(next_[joint]), bound, here, next_)
+            return Obstruction(ObstructionKind.LIMIT, names[joint], float(next_[joint]), bound, here, next_)
         if kind == 2:
-            return Stop(StopKind.STEP, names[joint], float(ways[row, joint]), float(limit[joint]), here, next_)
+            return Obstruction(
+                ObstructionKind.STEP, names[joint], float(ways[row, joint]), float(limit[joint]), here, next_
+            )
         assert around is not None
         pair = int(worst[row]) - 1 - 3 * n
         bodies = " and ".join(around.labels[pair])
-        return Stop(StopKind.TOUCH, bodies, float(apart[row, pair]), clearance, here, next_)
+        return Obstruction(ObstructionKind.COLLISION, bodies, float(apart[row, pair]), clearance, here, next_)
 
-    best: dict[tuple[StopKind, str], Stop] = {}
+    best: dict[tuple[ObstructionKind, str], Obstruction] = {}
     for row in np.argsort(most, kind="stable").tolist():
         if most[row] > TOLERANCE:
             own = stop(row)
             best.setdefault((own.kind, own.name), own)
     if not best:  # postures go on, but none that was followed
         charts = front.layers[there].centers
-        return [Stop(StopKind.NARROW, "tip", 0.0, 0.0, before[0], charts[0] if len(charts) else before[0])]
+        return [
+            Obstruction(ObstructionKind.NARROW, "tip", 0.0, 0.0, before[0], charts[0] if len(charts) else before[0])
+        ]
     return list(best.values())
 
 
-def _onward(search: Search, front: _Walk) -> tuple[Array, Array, NDArray[np.bool_]]:
+def _onward(search: AtlasSearch, front: _Walk) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Postures that are reached last, where each would have to go on to, and which of these do the task.
 
     That is to the posture nearest to each, and to those of the next instant that keep all limits but are too far.
@@ -347,7 +355,7 @@ def _onward(search: Search, front: _Walk) -> tuple[Array, Array, NDArray[np.bool
 # ---- what gives way ----------------------------------------------------------------------------------------------
 
 
-def _carried_on(search: Search, front: _Walk, stopped: Array) -> Array:
+def _carried_on(search: AtlasSearch, front: _Walk, stopped: Array) -> Array:
     """Joints at all instants, (K, n): as far as is reached, then straight to the nearest chart of the last instant."""
     space, last, count = search.space, max(front.last, 0), len(search.times)
     apart = np.nan_to_num(space.length(front.at[last] - stopped), nan=np.inf)
@@ -358,7 +366,7 @@ def _carried_on(search: Search, front: _Walk, stopped: Array) -> Array:
     return np.vstack([first, first[-1] + share * onward])
 
 
-def _given(search: Search, path: Array, turning: bool, kind: GiveKind) -> Give | None:
+def _given(search: AtlasSearch, path: Array, turning: bool, kind: RelaxationKind) -> Relaxation | None:
     """A motion like one of joints (K, n) whose tips are off in places, or turned, by as little as is found; else None.
 
     All else is done, at the instants, limits are kept and everything is clear.
@@ -377,7 +385,7 @@ def _given(search: Search, path: Array, turning: bool, kind: GiveKind) -> Give |
             [] if around is None else [touch.pair for touch in find_collisions(around, np.zeros(0), path, search.times)]
         )
         if not missing:
-            return Give(kind, program.amount(path), search.times, path)
+            return Relaxation(kind, program.amount(path), search.times, path)
         if set(missing) <= set(pairs):
             return None
         pairs = sorted({*pairs, *missing})
@@ -387,7 +395,7 @@ def _given(search: Search, path: Array, turning: bool, kind: GiveKind) -> Give |
 class _Giving:
     """The motion through all instants whose tips are off in places, or turned, by the least, some pairs held apart."""
 
-    def __init__(self, search: Search, turning: bool, pairs: list[int]) -> None:
+    def __init__(self, search: AtlasSearch, turning: bool, pairs: list[int]) -> None:
         self.search, self.turning = search, turning
         count, n = len(search.times), len(search.space.scale)
         self.shape = count, n
@@ -402,11 +410,11 @@ class _Giving:
                 continue
             q, wanted = ca.SX.sym("q", n), ca.SX.sym("wanted", sets.targets.shape[1])
             error, rows_turn = sets.equations.error(ca.SX(0, 1), q, wanted), sets.equations.turning
-            gives = np.append(rows_turn == turning, np.zeros(sets.equations.size - len(rows_turn), dtype=bool))
+            relaxations = np.append(rows_turn == turning, np.zeros(sets.equations.size - len(rows_turn), dtype=bool))
             ends = np.cumsum([0, *(part.task.size for part in sets.equations.bound)]).tolist()
-            parts = [a + np.flatnonzero(gives[a:b]) for a, b in pairwise(ends)]
+            parts = [a + np.flatnonzero(relaxations[a:b]) for a, b in pairwise(ends)]
             each = ca.vertcat(*(ca.sumsqr(error[part.tolist()]) for part in parts if part.size))
-            wholes = [error[np.flatnonzero(chosen).tolist()] for chosen in (~gives, gives)]
+            wholes = [error[np.flatnonzero(chosen).tolist()] for chosen in (~relaxations, relaxations)]
             errors = ca.Function("errors", [q, wanted], [*wholes, each]).map(len(own))
             targets = sets.targets[[search.instants[k].number for k in own]].T
             for found, part in zip((rest, rows, sizes), errors(self.joints[:, own], targets), strict=True):

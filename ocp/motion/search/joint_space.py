@@ -17,14 +17,14 @@ from models import Machine
 from models.arrays import Array
 from ocp.motion.tasks.equations import TaskEquations
 
-__all__ = ["FARTHEST", "TOLERANCE", "TURN", "Held", "JointSpace"]
+__all__ = ["FULL_TURN", "MAX_STEP", "TOLERANCE", "JointSpace", "TasksWithFixedJoints"]
 
 Indices = NDArray[np.intp]
 
 TOLERANCE = 1e-9
 """m and rad: by which postures may miss their tasks and pass limits."""
-TURN = 2 * np.pi
-FARTHEST = 1e6
+FULL_TURN = 2 * np.pi
+MAX_STEP = 1e6
 """rad or m: no step goes farther, and in the tree that neighbours are looked up in the sets of two instants are as far
 from each other."""
 
@@ -43,7 +43,7 @@ class JointSpace:
         coupled = {joint.mimic.joint for joint in robot.joints if joint.mimic is not None}
         turns = [joint.kind != "prismatic" and joint.name not in coupled for joint in robot.moving_joints]
         self.scale = np.sqrt(weights)
-        self.periodic = np.array(turns) & ~(upper - lower < 2 * TURN - 1e-6)
+        self.periodic = np.array(turns) & ~(upper - lower < 2 * FULL_TURN - 1e-6)
         self.lower = np.where(self.periodic, -np.inf, lower)
         self.upper = np.where(self.periodic, np.inf, upper)
 
@@ -51,7 +51,7 @@ class JointSpace:
         """to - of, (..., n), the shorter way round for joints that turn without end."""
         apart = to - of
         around = apart[..., self.periodic]
-        apart[..., self.periodic] = around - TURN * np.round(around / TURN)
+        apart[..., self.periodic] = around - FULL_TURN * np.round(around / FULL_TURN)
         return np.asarray(apart)
 
     def length(self, way: Array) -> Array:
@@ -68,23 +68,23 @@ class JointSpace:
         own = np.flatnonzero(self.periodic & np.isfinite(lower) & np.isfinite(upper))
         middle = (lower[own] + upper[own] - path[:, own].min(axis=0) - path[:, own].max(axis=0)) / 2
         turned = path.copy()
-        turned[:, own] += TURN * np.round(middle / TURN)
+        turned[:, own] += FULL_TURN * np.round(middle / FULL_TURN)
         return turned
 
     def tree(self, joints: Array, layer: Indices | None = None) -> Any:
         """Tree of postures (M, n), to be asked with what `placed` says; those of other layers are far."""
-        size = np.append(0.0, np.where(self.periodic, TURN * self.scale, 0.0))
+        size = np.append(0.0, np.where(self.periodic, FULL_TURN * self.scale, 0.0))
         return cKDTree(self.placed(joints, layer), boxsize=size if self.periodic.any() else None)  # None is faster
 
     def placed(self, joints: Array, layer: Indices | None = None) -> Array:
         """Points of the tree."""
         wrapped = joints.copy()
-        wrapped[:, self.periodic] = np.remainder(wrapped[:, self.periodic], TURN)
-        return np.column_stack([np.zeros(len(joints)) if layer is None else FARTHEST * layer, wrapped * self.scale])
+        wrapped[:, self.periodic] = np.remainder(wrapped[:, self.periodic], FULL_TURN)
+        return np.column_stack([np.zeros(len(joints)) if layer is None else MAX_STEP * layer, wrapped * self.scale])
 
 
 @dataclass(frozen=True, eq=False)
-class Held(TaskEquations):
+class TasksWithFixedJoints(TaskEquations):
     """Equations of tasks and last rows: some joints are to be where the last of the targets say.
 
     Attributes:

@@ -25,11 +25,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from models.arrays import Array
-from ocp.motion.search.charts import Charts, Parts, SelfMotions
-from ocp.motion.search.joint_space import TURN, Held
-from ocp.motion.search.search import Search
+from ocp.motion.search.charts import Charts, Parts, SelfMotionManifolds
+from ocp.motion.search.joint_space import FULL_TURN, TasksWithFixedJoints
+from ocp.motion.search.search import AtlasSearch
 
-__all__ = ["Piece", "SectionSettings", "Sections", "Span", "farthest", "fewest_pieces", "values_of"]
+__all__ = ["SectionSearch", "SectionSettings", "Segment", "Span", "farthest", "fewest_segments", "section_values"]
 
 Span = tuple[int, int]
 """First and last instant of a piece."""
@@ -48,7 +48,7 @@ class SegmentSettings:
     gap: float = 0.005
 
 
-class Piece(NamedTuple):
+class Segment(NamedTuple):
     """A motion from one instant to another.
 
     Attributes:
@@ -63,9 +63,9 @@ class Piece(NamedTuple):
     bound: float
 
 
-def fewest_pieces(
-    search: Search, gap: int = 1, barred: Collection[Span] = (), settings: SegmentSettings = SegmentSettings()
-) -> tuple[list[Piece], float] | None:
+def fewest_segments(
+    search: AtlasSearch, gap: int = 1, barred: Collection[Span] = (), settings: SegmentSettings = SegmentSettings()
+) -> tuple[list[Segment], float] | None:
     """The cheapest of the fewest pieces through all instants, one after the other, and what none cost less than.
 
     Args:
@@ -81,7 +81,7 @@ def fewest_pieces(
     if ranges is None:
         return None
     least = {span: cost for span, cost in _bounds(search, *ranges).items() if not _without(span, gap, barred)}
-    known = dict[Span, Piece | None]()
+    known = dict[Span, Segment | None]()
 
     def cheapest(bounded: bool, bounds: bool = False) -> tuple[list[Span], float]:
         """The cheapest chain of what is known, by its costs or bounds; with the bounds of all else, or without."""
@@ -100,7 +100,7 @@ def fewest_pieces(
     return [one for key in chain if (one := known[key]) is not None], cheapest(True, bounds=True)[1]
 
 
-def _ranges(search: Search, gap: int, barred: Collection[Span]) -> tuple[list[range], list[range]] | None:
+def _ranges(search: AtlasSearch, gap: int, barred: Collection[Span]) -> tuple[list[range], list[range]] | None:
     """Where each of the fewest pieces may begin and end; None where nothing goes on somewhere.
 
     Pieces that each go as far as they can tell how late each may end, those followed back how early it may begin.
@@ -121,11 +121,11 @@ def _ranges(search: Search, gap: int, barred: Collection[Span]) -> tuple[list[ra
     return begins, stops
 
 
-def farthest(search: Search, gap: int = 1, barred: Collection[Span] = (), ruled_out: bool = False) -> list[int]:
+def farthest(search: AtlasSearch, gap: int = 1, barred: Collection[Span] = (), ruled_out: bool = False) -> list[int]:
     """The last instants of pieces that each go as far as they can: the last of all, or where nothing goes on.
 
     Args:
-        gap, barred: As of `fewest_pieces`.
+        gap, barred: As of `fewest_segments`.
         ruled_out: Whether a piece ends only where the search shows that no motion goes on, under its assumptions;
             else where it finds none. So none are fewer.
     """
@@ -144,15 +144,15 @@ def _without(span: Span, gap: int, barred: Collection[Span]) -> bool:
     return (span[0] == span[1] and not gap) or any(span[0] <= one[0] and one[1] <= span[1] for one in barred)
 
 
-def _piece(search: Search, first: int, last: int) -> Piece | None:
+def _piece(search: AtlasSearch, first: int, last: int) -> Segment | None:
     """The cheapest motion from one instant to another; None where none was found."""
     part = search.part(first, last)
     joints, bound = part.best(np.inf)
-    return None if joints is None else Piece(first, last, joints, part.steps(joints), bound)
+    return None if joints is None else Segment(first, last, joints, part.steps(joints), bound)
 
 
 def _farthest(
-    search: Search, start: int, barred: Collection[Span], back: bool = False, ruled_out: bool = False
+    search: AtlasSearch, start: int, barred: Collection[Span], back: bool = False, ruled_out: bool = False
 ) -> int | None:
     """The last instant, or the first one, that motions from one lead to; None where not even that one is kept."""
 
@@ -178,13 +178,13 @@ def _farthest(
     return None if good < 0 else start + way * good
 
 
-def _bounds(search: Search, begins: list[range], stops: list[range]) -> dict[Span, float]:
+def _bounds(search: AtlasSearch, begins: list[range], stops: list[range]) -> dict[Span, float]:
     """What pieces cost at least, by their first and last instants; those that cannot be left out."""
     found = dict[Span, float]()
     for own, ends in zip(begins, stops, strict=True):
         if len(ends) == 1:  # from the end
             graph = search.part(own[0], ends[0]).whole_graph()
-            values = graph.to_come()
+            values = graph.cost_to_go()
             found |= {(k, ends[0]): float(graph.least(values[k - own[0]], k - own[0]).min()) for k in own}
             continue
         for first in own:
@@ -227,7 +227,7 @@ class SectionSettings:
     charts: int = 80_000
 
 
-def values_of(
+def section_values(
     slides: bool, lower: float, upper: float, far: float, settings: SectionSettings = SectionSettings()
 ) -> Array:
     """At which a joint is held: its limits and between, or all round. Shape (V,), rad or m.
@@ -237,18 +237,18 @@ def values_of(
     """
     low, high = np.clip((lower, upper), -np.pi, np.pi).tolist()
     count = int(np.ceil(min((high - low) / min(settings.apart[not slides], far), settings.values - 1.0)))
-    if not slides and high - low >= TURN - 1e-6:
+    if not slides and high - low >= FULL_TURN - 1e-6:
         return np.linspace(low, high, max(count, 1), endpoint=False)
     return np.linspace(low, high, count + 1)
 
 
-class Sections(Search):
+class SectionSearch(AtlasSearch):
     """The search for ways beside postures in which one joint has one of some values."""
 
     def __init__(self, *told: Any, joint: int, values: Array, radius: float, charts: int, **more: Any) -> None:
         """
         Args:
-            told, more: As of `Search`; the instants all of one set of postures with two directions free.
+            told, more: As of `AtlasSearch`; the instants all of one set of postures with two directions free.
             joint: The number of the joint. values: At which it is held. Shape (V,).
             radius: Of the charts, at most. charts: Their number, at most.
         """
@@ -260,9 +260,9 @@ class Sections(Search):
         whole, count = self.instants[0].sets, len(self.instants)
         numbers, each = [instant.number for instant in self.instants], len(self._values)
         targets = np.tile(whole.targets[numbers], (each, 1))
-        others = whole.equations.held if isinstance(whole.equations, Held) else ()
-        held = Held(whole.equations.machine, whole.equations.bound, (*others, self._joint))
-        self._curves = SelfMotions(self.space, held, np.column_stack([targets, np.repeat(self._values, count)]))
+        others = whole.equations.held if isinstance(whole.equations, TasksWithFixedJoints) else ()
+        held = TasksWithFixedJoints(whole.equations.machine, whole.equations.bound, (*others, self._joint))
+        self._curves = SelfMotionManifolds(self.space, held, np.column_stack([targets, np.repeat(self._values, count)]))
         found = [seeds(k) for k in range(count)]
         own = np.repeat(np.arange(count), [len(some) for some in found])
         layer = (own + count * np.arange(each)[:, None]).ravel()

@@ -30,10 +30,10 @@ from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.values import Sampler
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = ["ReducedKinematics", "Side", "Slopes", "check_floating_reach", "within"]
+__all__ = ["LimitSide", "ReducedKinematics", "TaskKinematics", "check_floating_reach", "within"]
 
 
-class Side(IntEnum):
+class LimitSide(IntEnum):
     """Limits of a joint: of its position, and of its rate."""
 
     LOW = 0
@@ -42,7 +42,7 @@ class Side(IntEnum):
     FAST = 3
 
 
-class Slopes(NamedTuple):
+class TaskKinematics(NamedTuple):
     """Kinematics at K states of n joints, m rows of tasks and a base of size b.
 
     Attributes:
@@ -60,9 +60,9 @@ class Slopes(NamedTuple):
     lower: Array
     null: Array
 
-    def of(self, rows: Any) -> Slopes:
+    def of(self, rows: Any) -> TaskKinematics:
         """Of some states."""
-        return Slopes(*(part[rows] for part in self))
+        return TaskKinematics(*(part[rows] for part in self))
 
     def given(self, rates: Array) -> Array:
         """What scaled rates (K, n) do for the task. Shape (K, m)."""
@@ -107,7 +107,7 @@ class ReducedKinematics:
             parts += [equations.jacobian(b, q), equations.right(b, q, wanted), equations.error(b, q, wanted)]
         self._sampler = Sampler(symbols, parts)
 
-    def at(self, base: Array, joints: Array, time: float) -> Slopes:
+    def at(self, base: Array, joints: Array, time: float) -> TaskKinematics:
         """At states (K, b), (K, n)."""
         count, n = joints.shape
         given = [base, joints]
@@ -123,7 +123,7 @@ class ReducedKinematics:
             lower[:, i, i] = np.where(np.abs(lower[:, i, i]) < least, least, lower[:, i, i])
         if self.equations is not None:
             error = np.where(self.equations.posed, error, 0.0)
-        return Slopes(right, error, turning, drift, whole[:, :, : self.rows], lower, whole[:, :, self.rows :])
+        return TaskKinematics(right, error, turning, drift, whole[:, :, : self.rows], lower, whole[:, :, self.rows :])
 
     def speed(self, base: Array, joints: Array, time: float) -> Array:
         """About how large squared scaled rates (K,) the tasks of then need, far from singularities."""
@@ -146,7 +146,7 @@ class ReducedKinematics:
         )
 
     def stepped(
-        self, base: Array, joints: Array, slopes: Slopes, rates: Array, begin: float, end: float, exact: float
+        self, base: Array, joints: Array, slopes: TaskKinematics, rates: Array, begin: float, end: float, exact: float
     ) -> tuple[Array, Array, Array]:
         """States after a step with the self-motion of scaled rates (K, n), by the rule of the middle.
 
@@ -161,7 +161,7 @@ class ReducedKinematics:
         if self.equations is None or self.equations.posed.all():
             return self.corrected(base, joints, end, exact)
 
-        def missed(there: Slopes, joints: Array) -> Array:
+        def missed(there: TaskKinematics, joints: Array) -> Array:
             """Of the ways that velocities ask for in this step, by Simpson's rule."""
             straight = (joints - first) * self.root
             parts = ((1, slopes), (4, middle), (1, there))
@@ -176,7 +176,7 @@ class ReducedKinematics:
         time: float,
         exact: float,
         most: int = 3,
-        missed: Callable[[Slopes, Array], Array] | None = None,
+        missed: Callable[[TaskKinematics, Array], Array] | None = None,
     ) -> tuple[Array, Array, Array]:
         """States with the errors of their poses taken back; returns and `exact` as of `stepped`.
 
@@ -218,7 +218,7 @@ def within(rates: Array, null: Array, low: Array, high: Array, fast: Array) -> t
         fast: Limits of the rates alone. Shape (n,).
 
     Returns:
-        The rates, and of each the joint that cannot keep a limit and which `Side`, or -1. (K, 2).
+        The rates, and of each the joint that cannot keep a limit and which `LimitSide`, or -1. (K, 2).
     """
     rates, why = rates.copy(), np.full((len(rates), 2), -1, dtype=np.intp)
     busy = np.arange(len(rates))
@@ -235,7 +235,7 @@ def within(rates: Array, null: Array, low: Array, high: Array, fast: Array) -> t
         of_rate = np.abs(limit) >= fast[worst]
         why[busy, 0], why[busy, 1] = (
             worst,
-            np.where(below, Side.LOW, Side.HIGH) + np.where(of_rate, Side.SLOW, Side.LOW),
+            np.where(below, LimitSide.LOW, LimitSide.HIGH) + np.where(of_rate, LimitSide.SLOW, LimitSide.LOW),
         )
         turn = null[busy, worst]
         lever = (turn**2).sum(axis=1)

@@ -27,15 +27,15 @@ from models.arrays import Array
 from ocp.errors import BoundWarning
 from ocp.motion.local.collisions import distances_along
 from ocp.motion.local.inverse_kinematics import Unreachable
-from ocp.motion.search.charts import Charts, Instant, Parts, point
-from ocp.motion.search.joint_space import FARTHEST, TOLERANCE, JointSpace
-from ocp.motion.search.steps import StepCost, Values
-from ocp.motion.search.value import PENALTY, Graph, drawn_tight
+from ocp.motion.search.charts import Charts, Parts, TimeSample, point
+from ocp.motion.search.joint_space import MAX_STEP, TOLERANCE, JointSpace
+from ocp.motion.search.steps import QuadraticBounds, StepCost
+from ocp.motion.search.value import PENALTY, ChartGraph, shorten_path
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = ["FREE", "Search", "SearchSettings", "checked_bound"]
+__all__ = ["MAX_FREE_DIRECTIONS", "AtlasSearch", "SearchSettings", "checked_bound"]
 
-FREE = 2
+MAX_FREE_DIRECTIONS = 2
 """Directions that a task may leave free: of more there are too many postures."""
 
 
@@ -80,7 +80,7 @@ def checked_bound(bound: float, cost: float) -> float | None:
     return None
 
 
-class Search:
+class AtlasSearch:
     """All postures at some instants, and the motions through them.
 
     Attributes:
@@ -90,7 +90,7 @@ class Search:
     def __init__(
         self,
         space: JointSpace,
-        instants: Sequence[Instant],
+        instants: Sequence[TimeSample],
         times: Array,
         cost: StepCost,
         limits: Array,
@@ -118,7 +118,7 @@ class Search:
         """
         self.space, self.instants, self.times, self.cost, self.limits = space, instants, times, cost, limits
         self.start, self.scene, self.settings = start, scene, settings
-        self._known: tuple[Graph, list[Values], list[Values] | None] | None = None
+        self._known: tuple[ChartGraph, list[QuadraticBounds], list[QuadraticBounds] | None] | None = None
         self.covered = self._cover(seeds)
         self.layers = [self.allowed(charts, k) for k, charts in enumerate(self.covered)]
 
@@ -163,15 +163,15 @@ class Search:
         apart = distances_along(around, none, charts.centers, times, around.clearance)
         return np.asarray((apart + charts.spans @ around.levers.joints.T >= around.clearance).all(axis=1))
 
-    def graph(self, layers: list[Charts], most: Array) -> Graph:
+    def graph(self, layers: list[Charts], most: Array) -> ChartGraph:
         """The steps between charts, which cost at most so much each. Shape (K - 1,)."""
-        return Graph(self.space, layers, np.diff(self.times), self.cost, self.limits, most)
+        return ChartGraph(self.space, layers, np.diff(self.times), self.cost, self.limits, most)
 
-    def whole_graph(self) -> Graph:
+    def whole_graph(self) -> ChartGraph:
         """All steps between the charts that the search begins with."""
         return self.graph(self.layers, np.full(len(self.times) - 1, np.inf))
 
-    def part(self, first: int, last: int) -> Search:
+    def part(self, first: int, last: int) -> AtlasSearch:
         """The search from one of its instants to another one, both of them included."""
         own, rows = copy(self), slice(first, last + 1)
         own.instants, own.times, own.limits = self.instants[rows], self.times[rows], self.limits[first:last]
@@ -201,13 +201,13 @@ class Search:
         """
         if self._known is None or every:
             graph = self.graph(self.layers, np.full(len(self.times) - 1, most))
-            self._known = graph, graph.to_come(), None
-        graph, to_come, passed = self._known
+            self._known = graph, graph.cost_to_go(), None
+        graph, cost_to_go, passed = self._known
         passed = passed or graph.passed()
         seats = []
         for k in np.unique(np.linspace(0, len(graph.layers) - 1, self.settings.seats).astype(int)).tolist():
             charts = graph.layers[k]
-            total = graph.through(passed, to_come, k)
+            total = graph.through(passed, cost_to_go, k)
             lowest = np.isfinite(total)
             pairs = self.space.tree(charts.centers).query_pairs(3 * float(charts.radii.max()), output_type="ndarray")
             for one, other in (pairs.T, pairs.T[::-1]):
@@ -217,22 +217,24 @@ class Search:
         for bound, k, chart in sorted(seats):
             if len(found) == self.settings.motions or (found and bound > self.settings.far * found[0][0]):
                 break
-            path = self._path(graph, k, chart, passed, to_come)
+            path = self._path(graph, k, chart, passed, cost_to_go)
             same = (np.abs(self.space.difference(path, other)).max() for _, other in found if path is not None)
             if path is None or any(apart < self.settings.same for apart in same):
                 continue
             found.append((self.steps(path), path))
         return [path for _, path in sorted(found, key=lambda one: one[0])]
 
-    def _path(self, graph: Graph, k: int, chart: int, passed: list[Values], to_come: list[Values]) -> Array | None:
+    def _path(
+        self, graph: ChartGraph, k: int, chart: int, passed: list[QuadraticBounds], cost_to_go: list[QuadraticBounds]
+    ) -> Array | None:
         """The cheapest way through a chart; None where it ends."""
-        slope, box = to_come[k].slope[chart] + (passed[k].slope[chart] if k else 0.0), graph.layers[k].of([chart])
+        slope, box = cost_to_go[k].slope[chart] + (passed[k].slope[chart] if k else 0.0), graph.layers[k].of([chart])
         at = np.where(slope > 0, box.low[0], np.where(slope < 0, box.high[0], 0.0))
         first = self.allowed_in(k, box, at)
         if first is None:
             return None
         path, last = {k: first}, len(self.layers) - 1
-        for values, order in ((to_come, range(k + 1, last + 1)), (passed, range(k - 1, -1, -1))):
+        for values, order in ((cost_to_go, range(k + 1, last + 1)), (passed, range(k - 1, -1, -1))):
             here = first
             for other in order:
                 ways = graph.nearest(here, other - int(np.sign(order.step)), other, values[other])
@@ -274,7 +276,7 @@ class Search:
             charts would be needed than memory is for.
         """
         seconds = np.diff(self.times)[:, None]
-        dearest = float(self.cost.of(np.minimum(self.limits, FARTHEST), seconds).max(initial=0.0))
+        dearest = float(self.cost.of(np.minimum(self.limits, MAX_STEP), seconds).max(initial=0.0))
         while True:
             path, bound = self._best(most)
             if most >= dearest:
@@ -298,28 +300,30 @@ class Search:
             return None, np.inf
         if best is None:
             graph = self.graph(layers, np.full(len(self.times) - 1, most))
-            return None, max(float(graph.least(graph.to_come()[0], 0).min()), 0.0)
+            return None, max(float(graph.least(graph.cost_to_go()[0], 0).min()), 0.0)
         least = self.steps(best)
         coarse, others = True, np.zeros(len(self.times) - 1)  # what a motion costs at least before and after each step
-        rest: list[Values] | None = None  # what has passed until each chart, at least
+        rest: list[QuadraticBounds] | None = None  # what has passed until each chart, at least
         while True:
             graph = self.graph(layers, min(most, least) - others)
             # beyond that nothing is looked for: a class at first, whose motion steps miss some of, then bounds
             far = least / share if coarse else share * least
-            to_come = graph.to_come(rest, far)
+            cost_to_go = graph.cost_to_go(rest, far)
             if coarse:
-                self._known = graph, to_come, None
-            low = float(graph.least(to_come[0], 0).min(initial=np.inf))
-            path = self._led(graph, to_come) if np.isfinite(low) else None
+                self._known = graph, cost_to_go, None
+            low = float(graph.least(cost_to_go[0], 0).min(initial=np.inf))
+            path = self._led(graph, cost_to_go) if np.isfinite(low) else None
             if path is not None and (cost := self.steps(path)) < least:
                 best, least = path, cost
             if low >= share * least:
                 return best, share * least
-            passed = graph.passed(to_come, far)
+            passed = graph.passed(cost_to_go, far)
             if coarse:
-                self._known, coarse = (graph, to_come, passed), False
-            through = [graph.through(passed, to_come, k) for k in range(len(layers))]
-            before, after = ([float(graph.least(each, k).min()) for k, each in enumerate(v)] for v in (passed, to_come))
+                self._known, coarse = (graph, cost_to_go, passed), False
+            through = [graph.through(passed, cost_to_go, k) for k in range(len(layers))]
+            before, after = (
+                [float(graph.least(each, k).min()) for k, each in enumerate(v)] for v in (passed, cost_to_go)
+            )
             others = np.maximum(others, np.array(before[:-1]) + np.array(after[1:]))
             cheap = [total < share * least for total in through]
             kept = [charts.of(own) for charts, own in zip(layers, cheap, strict=True)]
@@ -347,23 +351,23 @@ class Search:
             layers = [charts.of(own) for charts, own in zip(layers, alive, strict=True)]
             if coarse:
                 graph = self.graph(layers, graph.most)
-                path = self._led(graph, graph.to_come())
+                path = self._led(graph, graph.cost_to_go())
             if path is not None or not self._may_be_halved(layers, self.settings.first):
                 return layers, path
             coarse = False
             layers = [self.allowed(self.halved(charts, k), k) for k, charts in enumerate(layers)]
 
-    def _led(self, graph: Graph, to_come: list[Values]) -> Array | None:
+    def _led(self, graph: ChartGraph, cost_to_go: list[QuadraticBounds]) -> Array | None:
         """A motion as cheap as values say; None where it comes to no end, or is too fast."""
-        chart = int(graph.least(to_come[0], 0).argmin())
-        return self._tight(self._path(graph, 0, chart, to_come, to_come), graph.layers)
+        chart = int(graph.least(cost_to_go[0], 0).argmin())
+        return self._tight(self._path(graph, 0, chart, cost_to_go, cost_to_go), graph.layers)
 
     def _may_be_halved(self, layers: list[Charts], most: int) -> bool:
         """Whether charts of half the radius are no more than so many, and not too small."""
         finer = sum(2 ** charts.tangents.shape[2] * len(charts) for charts in layers)
         return finer <= most and max(float(charts.radii.max()) for charts in layers) >= self.settings.finest
 
-    def _through_centers(self, graph: Graph) -> Array | None:
+    def _through_centers(self, graph: ChartGraph) -> Array | None:
         """The cheapest way from centre to centre of charts, too far steps being dear; None if there is none."""
         layers = graph.layers
         cost, back = np.where(self._clear(layers[-1].centers, len(layers) - 1), 0.0, np.inf), list[Array]()
@@ -407,7 +411,7 @@ class Search:
             return None
         if self.start is None:
             width = max(float(charts.radii.max()) for charts in layers)
-            made = drawn_tight(path, self.instants, *steps, bounds, self.scene, (width / 2, width / 64))
+            made = shorten_path(path, self.instants, *steps, bounds, self.scene, (width / 2, width / 64))
             path = made if all(self._on(k, joints) is not None for k, joints in enumerate(made)) else path
         return path if (np.abs(np.diff(path, axis=0)) <= self.limits + TOLERANCE).all() else None
 
@@ -421,9 +425,9 @@ class Search:
         own = replace(charts, layer=np.full(len(charts), self.instants[k].number))
         return self.instants[k].sets.parts(own)
 
-    def _finer(self, charts: Charts, k: int, values: Values) -> tuple[Charts, Values]:
+    def _finer(self, charts: Charts, k: int, values: QuadraticBounds) -> tuple[Charts, QuadraticBounds]:
         """Charts of half the radius but for those on which every posture touches something, and values on these."""
         parts = self._parts(charts, k)
         good = self._allowed(parts.charts, k)
         values, low, high = values.of(parts.owners[good]), parts.low[good], parts.high[good]
-        return parts.charts.of(good), Values.constant(values.lowest(low, high)[0], low.shape[1])
+        return parts.charts.of(good), QuadraticBounds.constant(values.lowest(low, high)[0], low.shape[1])

@@ -16,7 +16,17 @@ import numpy as np
 from models.arrays import Array
 from ocp.motion.search.charts import Charts
 
-__all__ = ["Homogeneous", "Largest", "Length", "Sheets", "Squares", "StepCost", "Steps", "Values", "least_in_box"]
+__all__ = [
+    "CurvedCharts",
+    "Homogeneous",
+    "LargestMotion",
+    "PathLength",
+    "QuadraticBounds",
+    "SquaredRates",
+    "StepBounds",
+    "StepCost",
+    "least_in_box",
+]
 
 MEETINGS = 8
 """Times that the least of what is homogeneous is looked for where lines meet: one of as many as joints, each time."""
@@ -24,7 +34,7 @@ CONCAVE = 0.5
 """Curvature of values, of the step's own, that is taken as it is; what is more concave is bounded by its ends."""
 
 
-class Values(NamedTuple):
+class QuadraticBounds(NamedTuple):
     """Bounds of what is to come (or has been) on the charts of an instant: least + slope . t + t . curve . t / 2.
 
     Attributes:
@@ -35,12 +45,12 @@ class Values(NamedTuple):
     slope: Array
     curve: Array
 
-    def of(self, chosen: Any) -> Values:
+    def of(self, chosen: Any) -> QuadraticBounds:
         """Some of them."""
-        return Values(*(part[chosen] for part in self))
+        return QuadraticBounds(*(part[chosen] for part in self))
 
     @classmethod
-    def constant(cls, least: Array, free: int) -> Values:
+    def constant(cls, least: Array, free: int) -> QuadraticBounds:
         """The same everywhere on charts of so many free directions."""
         return cls(least, np.zeros((len(least), free)), np.zeros((len(least), free, free)))
 
@@ -55,7 +65,7 @@ class Values(NamedTuple):
         return np.asarray(self.least + (places * (self.slope + pressed / 2)).sum(axis=1))
 
 
-class Sheets(NamedTuple):
+class CurvedCharts(NamedTuple):
     """Charts, and how the set that they touch bends away from them: bends[t, t] / 2 + rest.
 
     Attributes:
@@ -66,18 +76,20 @@ class Sheets(NamedTuple):
     bends: Array
     rest: Array
 
-    def of(self, chosen: Any) -> Sheets:
+    def of(self, chosen: Any) -> CurvedCharts:
         """Some of them."""
-        return Sheets(self.charts.of(chosen), self.bends[chosen], self.rest[chosen])
+        return CurvedCharts(self.charts.of(chosen), self.bends[chosen], self.rest[chosen])
 
 
 class StepCost(Protocol):
     """What a straight step costs at least."""
 
-    def cheapest(self, delta: Array, into: Charts, after: Values, seconds: float) -> tuple[Array, Array]:
+    def cheapest(self, delta: Array, into: Charts, after: QuadraticBounds, seconds: float) -> tuple[Array, Array]:
         """Costs (P,) of the cheapest steps into P charts, whose centres are `delta` (P, n) away, and places (P, r)."""
 
-    def below(self, delta: Array, out: Sheets, into: Sheets, after: Values, seconds: float) -> Steps:
+    def below(
+        self, delta: Array, out: CurvedCharts, into: CurvedCharts, after: QuadraticBounds, seconds: float
+    ) -> StepBounds:
         """Bounds of P steps from charts into others, whose centres are `delta` (P, n) away."""
 
     def of(self, delta: Array, seconds: Any) -> Array:
@@ -88,7 +100,7 @@ class StepCost(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Squares:
+class SquaredRates:
     """The integral of half the weighted squared rates.
 
     A step d moves along the chart that it goes into and across it. Along, the cost is convex in both places, and the
@@ -105,13 +117,15 @@ class Squares:
     def farthest(self, cost: float, seconds: float) -> float:
         return float(np.sqrt(2 * seconds * cost))
 
-    def cheapest(self, delta: Array, into: Charts, after: Values, seconds: float) -> tuple[Array, Array]:
+    def cheapest(self, delta: Array, into: Charts, after: QuadraticBounds, seconds: float) -> tuple[Array, Array]:
         flat = np.einsum("pnr,pn->pr", into.tangents, self.weights * delta)
         square = after.curve + np.eye(flat.shape[1]) / seconds
         least, place = least_in_box(flat / seconds + after.slope, square, into.low, into.high)
         return self.of(delta, seconds) + after.least + least, place
 
-    def below(self, delta: Array, out: Sheets, into: Sheets, after: Values, seconds: float) -> Steps:
+    def below(
+        self, delta: Array, out: CurvedCharts, into: CurvedCharts, after: QuadraticBounds, seconds: float
+    ) -> StepBounds:
         here, there = out.charts, into.charts
         way, weights = _last(delta), self.weights[:, None]
         ways, heavy = _last(here.tangents), _last(there.tangents) * weights[:, None]
@@ -141,7 +155,7 @@ class Squares:
         lost += _dot(slid, np.abs(slope) + _times(np.abs(curve), wide + slid / 2))
         level = -_dot(out_bends, pull[:, None, None])
         least = after.least + _dot(pull, way) - share**2 * size / 2 - lost
-        return SquareSteps(seconds, least, -_back(ways, pull), level, flat, turn, slope, curve, within, own)
+        return SquaredRateBounds(seconds, least, -_back(ways, pull), level, flat, turn, slope, curve, within, own)
 
 
 def _last(rows: Array) -> Array:
@@ -194,7 +208,7 @@ def _nearest(
 
 
 @dataclass(frozen=True, eq=False)
-class SquareSteps:
+class SquaredRateBounds:
     """least + slope . t + t . level . t / 2, and the least of v . v / (2 dt) + after . t' + t' . curved . t' / 2.
 
     There v = flat - turn . t + t' is the way along the chart, t' in a box `into`, t in one `out`. All arrays have the
@@ -212,7 +226,7 @@ class SquareSteps:
     into: Array
     out: Array
 
-    def of(self, chosen: Any) -> SquareSteps:
+    def of(self, chosen: Any) -> SquaredRateBounds:
         names = ("least", "slope", "level", "flat", "turn", "after", "curved", "into", "out")
         return replace(self, **{name: getattr(self, name)[..., chosen] for name in names})
 
@@ -273,7 +287,7 @@ class Homogeneous:
         """Gradients by ways (P, n)."""
         raise NotImplementedError
 
-    def least(self, delta: Array, into: Charts, after: Values) -> tuple[Array, Array, Array]:
+    def least(self, delta: Array, into: Charts, after: QuadraticBounds) -> tuple[Array, Array, Array]:
         """The cheapest steps on charts: bounds (P,), their multipliers (P, n), the gradient by the way, and places."""
         count = len(delta)
         if not into.tangents.shape[2]:
@@ -309,15 +323,17 @@ class Homogeneous:
         least = np.minimum(rest * box[0], rest * box[1])
         return (pull * delta).sum(axis=1) + least + after.least, pull, place[:, None]
 
-    def cheapest(self, delta: Array, into: Charts, after: Values, seconds: float) -> tuple[Array, Array]:
+    def cheapest(self, delta: Array, into: Charts, after: QuadraticBounds, seconds: float) -> tuple[Array, Array]:
         cost, _, place = self.least(delta, into, after)
         return cost, place
 
-    def below(self, delta: Array, out: Sheets, into: Sheets, after: Values, seconds: float) -> Steps:
-        return HomogeneousSteps(self, delta, out, into, after)
+    def below(
+        self, delta: Array, out: CurvedCharts, into: CurvedCharts, after: QuadraticBounds, seconds: float
+    ) -> StepBounds:
+        return HomogeneousBounds(self, delta, out, into, after)
 
 
-class Length(Homogeneous):
+class PathLength(Homogeneous):
     """The weighted sum of the joints' ways."""
 
     def of(self, delta: Array, seconds: Any) -> Array:
@@ -330,7 +346,7 @@ class Length(Homogeneous):
         return np.asarray(self.weights * np.sign(way))
 
 
-class Largest(Homogeneous):
+class LargestMotion(Homogeneous):
     """The largest of the joints' weighted ways: the time, where the weights are one over the joints' velocities."""
 
     def of(self, delta: Array, seconds: Any) -> Array:
@@ -347,18 +363,18 @@ class Largest(Homogeneous):
 
 
 @dataclass(frozen=True, eq=False)
-class HomogeneousSteps:
+class HomogeneousBounds:
     """Arguments as of `Homogeneous.below`."""
 
     cost: Homogeneous
     delta: Array
-    out: Sheets
-    into: Sheets
-    after: Values
+    out: CurvedCharts
+    into: CurvedCharts
+    after: QuadraticBounds
 
-    def of(self, chosen: Any) -> HomogeneousSteps:
+    def of(self, chosen: Any) -> HomogeneousBounds:
         out, into, after = self.out.of(chosen), self.into.of(chosen), self.after.of(chosen)
-        return HomogeneousSteps(self.cost, self.delta[chosen], out, into, after)
+        return HomogeneousBounds(self.cost, self.delta[chosen], out, into, after)
 
     @property
     def curve(self) -> Array:
@@ -377,7 +393,7 @@ class HomogeneousSteps:
         return places
 
 
-Steps: TypeAlias = SquareSteps | HomogeneousSteps
+StepBounds: TypeAlias = SquaredRateBounds | HomogeneousBounds
 """Bounds of P steps, and the cost after them, by the place in the box that they go from."""
 
 

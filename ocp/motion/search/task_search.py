@@ -14,13 +14,13 @@ from models.arrays import Array
 from ocp.errors import ProblemError
 from ocp.motion.local.inverse_kinematics import Unreachable
 from ocp.motion.local.rates import LocalMotion
-from ocp.motion.search.charts import Instant, SelfMotions
-from ocp.motion.search.configurations import OUT_OF_REACH, Asked, misfits_of, placed
+from ocp.motion.search.charts import SelfMotionManifolds, TimeSample
+from ocp.motion.search.configurations import REACH_TOLERANCE, PlanRequest, largest_pose_errors, placed
 from ocp.motion.search.dead_end import DeadEnd, dead_end
-from ocp.motion.search.joint_space import Held, JointSpace
-from ocp.motion.search.reconfigurations import farthest, fewest_pieces
-from ocp.motion.search.search import FREE, Search
-from ocp.motion.search.steps import Squares
+from ocp.motion.search.joint_space import JointSpace, TasksWithFixedJoints
+from ocp.motion.search.reconfigurations import farthest, fewest_segments
+from ocp.motion.search.search import MAX_FREE_DIRECTIONS, AtlasSearch
+from ocp.motion.search.steps import SquaredRates
 from ocp.motion.tasks.equations import TaskEquations
 
 __all__ = ["TaskSearch"]
@@ -62,7 +62,7 @@ class TaskSearch:
     """
 
     def __init__(
-        self, asked: Asked, followed: list[LocalMotion], settings: InstantSettings = InstantSettings()
+        self, asked: PlanRequest, followed: list[LocalMotion], settings: InstantSettings = InstantSettings()
     ) -> None:
         """
         Args:
@@ -73,12 +73,12 @@ class TaskSearch:
         self.asked, self._settings = asked, settings
         machine, bounds = asked.machine, asked.bounds
         if machine.base_size:
-            words = "search='global' is for machines on a fixed base; search='postures' for those that move"
+            words = "search='global' is for machines on a fixed base; search='configurations' for those that move"
             raise ProblemError(words, name="search", value="global")
         cost = np.sum([part.cost for part in followed], axis=0)
-        follows = np.array(misfits_of(followed)) <= OUT_OF_REACH
-        self._known = float(cost[follows].min()) if follows.any() else np.inf
-        best = int(np.where(follows | ~follows.any(), cost, np.inf).argmin())
+        tracks_tasks = np.array(largest_pose_errors(followed)) <= REACH_TOLERANCE
+        self._known = float(cost[tracks_tasks].min()) if tracks_tasks.any() else np.inf
+        best = int(np.where(tracks_tasks | ~tracks_tasks.any(), cost, np.inf).argmin())
         self.space = JointSpace(machine, bounds.lower, bounds.upper, asked.weights)
         self.bound = 0.0
         self._held = tuple(np.flatnonzero(asked.idle).tolist())
@@ -91,12 +91,12 @@ class TaskSearch:
                 words = "search='global' needs poses, and a task gives velocities; say where its tip is: position=..."
                 raise ProblemError(words, name="search", value="global", time=stretch.begin)
             size = machine.joint_size - equations.size - len(self._held)
-            if size > FREE:
+            if size > MAX_FREE_DIRECTIONS:
                 words = (
                     f"search='global': the tasks leave {size} directions free from {stretch.begin:g} s on, "
-                    f"at most {FREE} can be searched; fix more, or search='postures'"
+                    f"at most {MAX_FREE_DIRECTIONS} can be searched; fix more, or search='configurations'"
                 )
-                raise ProblemError(words, name="search", value=size, limit=FREE, time=stretch.begin)
+                raise ProblemError(words, name="search", value=size, limit=MAX_FREE_DIRECTIONS, time=stretch.begin)
             steps = int(np.ceil(settings.steps * stretch.duration / asked.horizon))
             own = instants_of(part.t, part.joints[best], asked.weights, settings.lost[max(size, 0)], steps)
             times.append(own[1:] if times and own[0] <= times[-1][-1] else own)  # what went before leads there
@@ -115,21 +115,21 @@ class TaskSearch:
 
     def _place(self, times: list[Array]) -> None:
         """Cover the postures at the times of each stretch that has tasks."""
-        asked, instants = self.asked, list[Instant]()
+        asked, instants = self.asked, list[TimeSample]()
         for equations, own in zip(self._equations, times, strict=True):
             sets = self._sets(equations, own)
-            instants += [Instant(sets, number) for number in range(len(own))]
+            instants += [TimeSample(sets, number) for number in range(len(own))]
         self._instants, self._parts, self.times = instants, times, np.concatenate(times)
         clearance_constraints = None if asked.clearance_constraints is None else asked.clearance_constraints.scene
         limits = asked.bounds.velocity * np.diff(self.times)[:, None]
         told: dict[str, Any] = {"seeds": self._seeds, "start": asked.start, "scene": clearance_constraints}
-        self._search = Search(self.space, instants, self.times, Squares(asked.weights), limits, **told)
+        self._search = AtlasSearch(self.space, instants, self.times, SquaredRates(asked.weights), limits, **told)
 
-    def _sets(self, equations: TaskEquations, times: Array) -> SelfMotions:
+    def _sets(self, equations: TaskEquations, times: Array) -> SelfMotionManifolds:
         """The postures at some times; joints that move no tip stay where they are at the start."""
         targets = np.array(equations.target_function().map(len(times))(times[None, :])).T
-        held = Held(equations.machine, equations.bound, self._held)
-        return SelfMotions(self.space, held, np.column_stack([targets, np.tile(self._at, (len(times), 1))]))
+        held = TasksWithFixedJoints(equations.machine, equations.bound, self._held)
+        return SelfMotionManifolds(self.space, held, np.column_stack([targets, np.tile(self._at, (len(times), 1))]))
 
     @property
     def _equations(self) -> list[TaskEquations]:
@@ -141,7 +141,7 @@ class TaskSearch:
             return None
         ends = farthest(self._search, 0)
         through = len(ends) > 1 and ends[-1] == len(self.times) - 1
-        return dead_end(self._search, proven=not np.isfinite(self.bound), pieces=len(ends) if through else None)
+        return dead_end(self._search, proven=not np.isfinite(self.bound), segments=len(ends) if through else None)
 
     def pieces(self, barred: Collection[tuple[float, float]] = ()) -> tuple[list[tuple[float, float]], int] | None:
         """Begin and end of pieces in which motions do the tasks, the cheapest of the fewest, and how few any are.
@@ -165,7 +165,7 @@ class TaskSearch:
                     closer = self.times[wide] + inside * np.diff(self.times)[wide]
                     self._place(self._closer(closer.ravel()))
                     continue
-            found = fewest_pieces(self._search, 0, spans) if through else None
+            found = fewest_segments(self._search, 0, spans) if through else None
             if found is None:
                 return None
             times = self.times.tolist()
@@ -180,7 +180,7 @@ class TaskSearch:
         """The instants of each stretch with others between them."""
         return [np.union1d(own, times[(times > own[0]) & (times < own[-1])]) for own in self._parts]
 
-    def looked_closer(self) -> bool:
+    def refine_samples(self) -> bool:
         """Search again with instants between those at which the best motion has hardly any room; False where it has."""
         if self._best is None:
             return False

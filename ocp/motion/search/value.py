@@ -31,12 +31,12 @@ from numpy.typing import NDArray
 from models import CollisionScene
 from models.arrays import Array
 from ocp.motion.local.collisions import distances_along
-from ocp.motion.search.charts import Charts, Instant
-from ocp.motion.search.joint_space import FARTHEST, JointSpace
-from ocp.motion.search.steps import Sheets, StepCost, Steps, Values
+from ocp.motion.search.charts import Charts, TimeSample
+from ocp.motion.search.joint_space import MAX_STEP, JointSpace
+from ocp.motion.search.steps import CurvedCharts, QuadraticBounds, StepBounds, StepCost
 from ocp.tolerances import CLEARANCE_TOLERANCE_M
 
-__all__ = ["PENALTY", "Graph", "GraphSettings", "TightSettings", "drawn_tight"]
+__all__ = ["PENALTY", "ChartGraph", "GraphSettings", "ShorteningSettings", "shorten_path"]
 
 Indices = NDArray[np.intp]
 
@@ -60,7 +60,7 @@ class GraphSettings:
     lower: int = 3
 
 
-class Graph:
+class ChartGraph:
     """The charts of all instants, and the steps between them that a motion may take."""
 
     def __init__(
@@ -87,17 +87,17 @@ class Graph:
         self.most, self.settings = most, settings
 
     @cached_property
-    def sheets(self) -> list[Sheets]:
+    def sheets(self) -> list[CurvedCharts]:
         """Charts of each instant, and how the set bends away from them."""
-        return [Sheets(charts, *charts.bent()) for charts in self.layers]
+        return [CurvedCharts(charts, *charts.bent()) for charts in self.layers]
 
-    def to_come(self, passed: list[Values] | None = None, most: float = np.inf) -> list[Values]:
+    def cost_to_go(self, passed: list[QuadraticBounds] | None = None, most: float = np.inf) -> list[QuadraticBounds]:
         """Bounds of what is to come from each instant, of motions that cost less than `most` with what has `passed`."""
         return self._swept(range(len(self.layers) - 1, -1, -1), -1, passed, most)
 
-    def passed(self, to_come: list[Values] | None = None, most: float = np.inf) -> list[Values]:
-        """Bounds of what has been until each instant, of motions that cost less than `most` with what is `to_come`."""
-        return self._swept(range(len(self.layers)), 1, to_come, most)
+    def passed(self, cost_to_go: list[QuadraticBounds] | None = None, most: float = np.inf) -> list[QuadraticBounds]:
+        """Bounds of what has been until each instant, of motions that cost less than `most` with what is `cost_to_go`."""
+        return self._swept(range(len(self.layers)), 1, cost_to_go, most)
 
     def alive(self) -> list[NDArray[np.bool_]]:
         """Of the charts of each instant, which lie on a way from the first instant to the last. Shapes (N,)."""
@@ -122,10 +122,10 @@ class Graph:
         limit = self.limits[between]
         dearest = max(float(self.most[between]), 0.0)
         way = min(self.cost.farthest(dearest, float(self.seconds[between])), float(self.space.length(limit)))
-        way = min(way, FARTHEST)
+        way = min(way, MAX_STEP)
         tree = self.space.tree(there.centers)
         some = self.space.tree(here.centers[:: max(len(here) // self.settings.sample, 1)])
-        number = some.count_neighbors(tree, min(way + float(sizes[0].max() + sizes[1].max()), FARTHEST)) / some.n
+        number = some.count_neighbors(tree, min(way + float(sizes[0].max() + sizes[1].max()), MAX_STEP)) / some.n
         share = max(16, int(self.settings.pairs / max(number, 1.0)))
         for first in range(0, len(here), share):
             part = np.arange(first, min(first + share, len(here)))
@@ -142,7 +142,7 @@ class Graph:
             order = np.argsort(i, kind="stable")
             yield i[order], j[order]
 
-    def nearest(self, joints: Array, k: int, other: int, after: Values) -> Iterator[tuple[Charts, Array]]:
+    def nearest(self, joints: Array, k: int, other: int, after: QuadraticBounds) -> Iterator[tuple[Charts, Array]]:
         """Charts of an instant to go on to from a posture (n,) of another, the cheapest first, and where in them.
 
         Returns:
@@ -161,27 +161,31 @@ class Graph:
         for i in np.argsort(costs, kind="stable")[: self.settings.onward].tolist():
             yield replace(into.of([i]), centers=joints + delta[chosen[[i]]]), places[i]
 
-    def _swept(self, order: range, direction: int, rest: list[Values] | None, most: float) -> list[Values]:
+    def _swept(
+        self, order: range, direction: int, rest: list[QuadraticBounds] | None, most: float
+    ) -> list[QuadraticBounds]:
         layers = self.layers
         found: list[Any] = [None] * len(layers)
         first = order[0]
         count, free = layers[first].low.shape
-        found[first] = Values.constant(np.zeros(count), free)
+        found[first] = QuadraticBounds.constant(np.zeros(count), free)
         if rest is not None:
             dear = self.least(rest[first], first) >= most
-            found[first] = Values.constant(np.where(dear, np.inf, 0.0), free)
+            found[first] = QuadraticBounds.constant(np.where(dear, np.inf, 0.0), free)
         for k in order[1:]:
             found[k] = self._before(k, k - direction, found[k - direction], None if rest is None else rest[k], most)
         return found
 
-    def _before(self, k: int, other: int, after: Values, rest: Values | None, most: float) -> Values:
+    def _before(
+        self, k: int, other: int, after: QuadraticBounds, rest: QuadraticBounds | None, most: float
+    ) -> QuadraticBounds:
         """Bounds on the charts of an instant by those of the one that motions go on to.
 
         With what is known of the `rest` of the motions, those that cost `most` or more are left out.
         """
         here, there = self.layers[k], self.layers[other]
         seconds = float(self.seconds[min(k, other)])
-        found = Values.constant(np.full(len(here), np.inf), here.low.shape[1])
+        found = QuadraticBounds.constant(np.full(len(here), np.inf), here.low.shape[1])
         known = np.zeros(len(here)) if rest is None else self.least(rest, k)
         # steps that are nowhere the cheapest from their chart are left out: seen from far, then by their tangents
         here_spans, there_spans = here.spans, there.spans
@@ -214,27 +218,27 @@ class Graph:
         return found
 
     @staticmethod
-    def _raised(values: Values, charts: Charts, floor: Array) -> Values:
+    def _raised(values: QuadraticBounds, charts: Charts, floor: Array) -> QuadraticBounds:
         """Values, or constants that are bounds, too, where these are higher in the middle and at the least together."""
         least = values.lowest(charts.low, charts.high)[0]
         flat = values.at((charts.low + charts.high) / 2) + least < 2 * floor
-        return Values(
+        return QuadraticBounds(
             np.where(flat, floor, values.least),
             np.where(flat[:, None], 0.0, values.slope),
             np.where(flat[:, None, None], 0.0, values.curve),
         )
 
-    def least(self, values: Values, k: int) -> Array:
+    def least(self, values: QuadraticBounds, k: int) -> Array:
         """The least of values anywhere on the charts of an instant. Shape (N,)."""
         return values.lowest(self.layers[k].low, self.layers[k].high)[0]
 
-    def through(self, passed: list[Values], to_come: list[Values], k: int) -> Array:
+    def through(self, passed: list[QuadraticBounds], cost_to_go: list[QuadraticBounds], k: int) -> Array:
         """Bounds of what motions cost that pass through the charts of an instant. Shape (N,)."""
-        both = Values(*(one + other for one, other in zip(passed[k], to_come[k], strict=True)))
+        both = QuadraticBounds(*(one + other for one, other in zip(passed[k], cost_to_go[k], strict=True)))
         return np.where(np.isfinite(both.least), self.least(both, k), np.inf)
 
 
-def _whole(steps: Steps, own: Charts, rest: Values) -> Array:
+def _whole(steps: StepBounds, own: Charts, rest: QuadraticBounds) -> Array:
     """What steps from charts cost at least, with what is known of the rest. Shape (P,)."""
     middle, curve = (own.low + own.high) / 2, steps.curve
     both = _tangents(middle, steps.at(middle), curve, -rest.curve, -rest.slope)
@@ -247,7 +251,9 @@ def _least_of_groups(values: Array, group: Indices) -> Array:
     return np.repeat(np.minimum.reduceat(values, starts), np.diff(np.append(starts, len(values))))
 
 
-def _below_all(steps: Steps, own: Charts, starts: Indices, most: Array, settings: GraphSettings) -> Values:
+def _below_all(
+    steps: StepBounds, own: Charts, starts: Indices, most: Array, settings: GraphSettings
+) -> QuadraticBounds:
     """A bound for each chart that steps go from, whose steps are together and begin at `starts`.
 
     Above `most`, of shape (M,), it is of no use.
@@ -283,10 +289,10 @@ def _below_all(steps: Steps, own: Charts, starts: Indices, most: Array, settings
         other = _tangents(place, part.at(place), curves[rows], level, lean[rows])
         best, least[rows] = _mixed(best, least[rows], other, box)
     least = np.minimum.reduceat(least, starts)
-    return Values(least, slope, curve)
+    return QuadraticBounds(least, slope, curve)
 
 
-def _mixed(best: Values, most: Array, other: Values, charts: Charts) -> tuple[Values, Array]:
+def _mixed(best: QuadraticBounds, most: Array, other: QuadraticBounds, charts: Charts) -> tuple[QuadraticBounds, Array]:
     """The mean with others, as curved, whose least is the largest, of those level along an axis; and that least.
 
     The least of the first is the `most` that is known. Shape (P,).
@@ -314,11 +320,11 @@ def _pressed_all(curve: Array, places: list[Array], starts: Indices) -> Array:
     return np.stack([_pressed(curve, place[starts]) for place in places])
 
 
-def _tangents(place: Array, values: tuple[Array, Array], curve: Array, common: Array, lean: Array) -> Values:
+def _tangents(place: Array, values: tuple[Array, Array], curve: Array, common: Array, lean: Array) -> QuadraticBounds:
     """Below functions less lean . t + t . common . t / 2, of such values and slopes at places, which bend by curve."""
     value, slope = values
     at_origin = value - (place * slope).sum(axis=1) + _pressed(curve, place)
-    return Values(at_origin, slope - np.einsum("pab,pb->pa", curve, place) - lean, curve - common)
+    return QuadraticBounds(at_origin, slope - np.einsum("pab,pb->pa", curve, place) - lean, curve - common)
 
 
 def _sunk(values: Array, half: Array, curve: Array) -> Array:
@@ -352,7 +358,7 @@ PENALTY = 1e6
 
 
 @dataclass(frozen=True)
-class TightSettings:
+class ShorteningSettings:
     """How a way is drawn tight.
 
     Attributes:
@@ -368,16 +374,16 @@ class TightSettings:
     still: float = 1e-4
 
 
-def drawn_tight(
+def shorten_path(
     path: Array,
-    instants: Sequence[Instant],
+    instants: Sequence[TimeSample],
     cost: StepCost,
     times: Array,
     far: Array,
     bounds: tuple[Array, Array],
     around: CollisionScene | None,
     widths: tuple[float, float],
-    settings: TightSettings = TightSettings(),
+    settings: ShorteningSettings = ShorteningSettings(),
 ) -> Array:
     """A way beside another one that is cheaper, or keeps limits better. Shape (K, n).
 

@@ -178,7 +178,7 @@ def test_a_report_of_a_check_names_the_faults(capsys: Any, tmp_path: Path) -> No
         ("points = [[0.75, 0.1, 0.3], [0.75, 0.3, 0.3]]", 'file = "none.csv"', 7, "there is no file"),
         ("points =", 'file = "a.csv"\npoints =', 6, "not both"),
         ('tool = "free"', 'tool = "loose"', 9, 'one of "free roll", "given", "free"'),
-        ('kind = "start"', 'kind = "best"', 12, 'one of "postures", "start", "global"'),
+        ('kind = "start"', 'kind = "best"', 12, 'one of "configurations", "start", "global"'),
         ('kind = "start"', 'kind = "pieces"\ncyclic = true', 13, "leave it out"),
         ('kind = "start"', 'kind = "pieces"\npace = "free"', 13, "leave it out"),
         ('kind = "start"', "start = { elbw = 1 }", 12, "no joint 'elbw'"),
@@ -273,7 +273,7 @@ def test_what_no_one_motion_does_is_written_in_pieces_and_the_ways_between_them_
     assert first.at(0.0)["joints"][2] * last.at(last.horizon)["joints"][2] < 0  # the elbow has changed its side
     for file in told["written"]:
         Path(file).unlink()
-    barred = [replace(one, way=None, why="the way is barred") for one in made[0].reconfigurations]
+    barred = [replace(one, motion=None, failure="the way is barred") for one in made[0].reconfigurations]
     monkeypatch.setattr(
         "ocp.app.planned.plan_in_pieces", lambda *_, **__: replace(made[0], reconfigurations=tuple(barred))
     )

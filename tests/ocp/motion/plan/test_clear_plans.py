@@ -45,7 +45,7 @@ from ocp.motion.local.collisions import distances_along
 from ocp.motion.plan import planner
 from ocp.motion.plan.candidate import Candidate, Rejection
 from ocp.motion.plan.candidate_solver import CandidateSolver
-from ocp.motion.plan.planner import checked_asked
+from ocp.motion.plan.planner import checked_request
 from tests.models.machines.armoured import armoured_arm
 from tests.ocp.motion.plan.motions import DOWN, bent_seam
 from tests.ocp.motion.search.test_charts import planar
@@ -185,7 +185,7 @@ def test_what_no_task_moves_begins_out_of_the_way_of_what_it_would_hinder() -> N
 def test_held_apart_the_barrier_begins_worth_no_more_than_the_motion() -> None:
     """As many limits as the program has, each with the barrier that it begins with, cost what the motion costs."""
     around = CollisionScene(ARM, [POST])
-    asked = checked_asked(ARM, line(), None, START, None, False, None, None, "start", 0, 1.0)
+    asked = checked_request(ARM, line(), None, START, None, False, None, None, "start", 0, 1.0)
     solver = CandidateSolver(replace(asked, clearance_constraints=ClearanceConstraints(around)), START, START)
     pair = around.labels.index(("link6", "obstacle 0"))
     cost = 0.25
@@ -272,7 +272,7 @@ def test_every_motion_along_a_seam_is_clear_or_says_what_touches() -> None:
     assert any("tool0" in pair[1] and "upper_arm" in pair[0] for pair in around.labels)
     result = plan(machine, TipTask.along(bent_seam(), 0.03, direction=DOWN))
     assert result.audit().passed
-    assert result.audit().clearances["clearance"].settled
+    assert result.audit().clearances["clearance"].fix_ignorable_joints
     reasons = [one.reason for one in result.candidates if one.reason is not None]
     collisions = [reason for reason in reasons if reason.kind is Rejection.COLLISION]
     assert collisions

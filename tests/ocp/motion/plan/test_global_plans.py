@@ -12,7 +12,7 @@ from models import FixedBase, planar_chain
 from ocp import BoundWarning, Candidate, Plan, ProblemError, TipTask, Unreachable, plan
 from ocp.motion.plan.candidate import Reason, Rejection
 from ocp.motion.plan.candidate_solver import CandidateSolver
-from ocp.motion.search.search import Search, checked_bound
+from ocp.motion.search.search import AtlasSearch, checked_bound
 from ocp.motion.search.task_search import instants_of
 from tests.ocp.motion.search.test_charts import moved, planar
 from tests.ocp.motion.tasks.space_tasks import PANDA_START, UR5_START, panda, ur5
@@ -24,7 +24,7 @@ from tests.ocp.motion.tasks.space_tasks import PANDA_START, UR5_START, panda, ur
 def test_the_cheapest_of_all_motions_has_a_bound_near_its_cost(machine, start, rows, tmp_path) -> None:  # type: ignore[no-untyped-def]
     task = moved(machine, start, rows)
     found = plan(machine, task, search="global", clearance=None)
-    others = plan(machine, task, search="postures", clearance=None)
+    others = plan(machine, task, search="configurations", clearance=None)
     assert found.audit().passed
     assert found.bound is not None
     assert 0.98 * found.cost <= found.bound <= found.cost
@@ -61,7 +61,7 @@ def test_where_the_classes_that_may_be_the_cheapest_fail_every_one_is_followed_u
     machine, start = planar(np.array([0.5, 0.4, 0.3]), 2.5), np.array([0.5, 1.2, -1.4])
     asked, failed = list[bool](), list[Candidate]()
 
-    def followed(search: Search, most: float, every: bool) -> list[np.ndarray]:
+    def followed(search: AtlasSearch, most: float, every: bool) -> list[np.ndarray]:
         asked.append(every)
         return motions(search, most, every)
 
@@ -71,8 +71,8 @@ def test_where_the_classes_that_may_be_the_cheapest_fail_every_one_is_followed_u
         failed.append(candidate)
         return [candidate.rejected(Reason(Rejection.AUDIT, "fails"))]
 
-    motions, advance = Search.motions, CandidateSolver.advance
-    monkeypatch.setattr(Search, "motions", followed)
+    motions, advance = AtlasSearch.motions, CandidateSolver.advance
+    monkeypatch.setattr(AtlasSearch, "motions", followed)
     monkeypatch.setattr(CandidateSolver, "advance", failing)
     found = plan(machine, moved(machine, start, "place"), search="global", clearance=None)
     assert asked == [False, True]
@@ -109,15 +109,15 @@ def test_the_motion_that_the_search_found_is_solved_where_a_coarse_mesh_loses_it
 def test_a_bound_above_the_cost_of_a_motion_is_no_bound_and_warned_of(monkeypatch: pytest.MonkeyPatch) -> None:
     """In use a warning, in these tests, where warnings are errors, a failure."""
 
-    def best(search: Search, most: float) -> tuple[np.ndarray | None, float]:
+    def best(search: AtlasSearch, most: float) -> tuple[np.ndarray | None, float]:
         path, bound = right(search, most)
         return path, 2 * bound
 
-    right = Search.best
+    right = AtlasSearch.best
     machine, start = planar(np.array([0.5, 0.4, 0.3]), 2.5), np.array([0.5, 1.2, -1.4])
     task = moved(machine, start, "place")
     cost = plan(machine, task, search="global", clearance=None).cost
-    monkeypatch.setattr(Search, "best", best)
+    monkeypatch.setattr(AtlasSearch, "best", best)
     with pytest.raises(BoundWarning):
         plan(machine, task, search="global", clearance=None)
     with pytest.warns(BoundWarning, match="less than the bound") as caught:
@@ -135,7 +135,7 @@ def test_a_bound_above_the_cost_of_a_motion_is_no_bound_and_warned_of(monkeypatc
 def test_where_the_set_of_postures_is_of_points_branches_are_compared() -> None:
     task = moved(ur5(), UR5_START, "pose")
     found = plan(ur5(), task, search="global", clearance=None)
-    others = plan(ur5(), task, search="postures", clearance=None)
+    others = plan(ur5(), task, search="configurations", clearance=None)
     assert found.cost == pytest.approx(others.cost, rel=1e-6)
     assert found.bound is not None
     assert 0.98 * found.cost <= found.bound <= found.cost
@@ -197,7 +197,7 @@ def test_stretches_of_time_are_searched_together(case: str) -> None:
         "cyclic": ([closed], {"cyclic": True}),
     }[case]
     found = plan(machine, tasks, search="global", clearance=None, **more)  # type: ignore[arg-type]
-    others = plan(machine, tasks, search="postures", clearance=None, **more)  # type: ignore[arg-type]
+    others = plan(machine, tasks, search="configurations", clearance=None, **more)  # type: ignore[arg-type]
     assert found.bound is not None
     assert found.cost <= others.cost * (1 + 1e-6)
     assert 0.97 * found.cost <= found.bound <= found.cost

@@ -59,11 +59,11 @@ def test_of_two_links_the_pieces_are_the_branches_and_meet_where_that_costs_leas
     made = plan_in_segments(machine, line(reach), clearance=None)
     assert made.fewest == len(made.reconfigurations) == 1
     (where,) = made.reconfigurations
-    assert made.begins == (0.0, where.time)
-    assert made.pieces[0].horizon == where.time
+    assert made.start_times == (0.0, where.time)
+    assert made.segments[0].horizon == where.time
     assert made.horizon == pytest.approx(SECONDS)
     spans = [(0.0, where.time, -1), (where.time, SECONDS, 1)]
-    for piece, (begin, end, elbow) in zip(made.pieces, spans, strict=True):
+    for piece, (begin, end, elbow) in zip(made.segments, spans, strict=True):
         assert piece.audit().passed
         expected = posture(begin + piece.t, reach, elbow)
         assert (np.abs(expected) <= HIGH + 1e-6).all()
@@ -79,21 +79,21 @@ def test_of_two_links_the_pieces_are_the_branches_and_meet_where_that_costs_leas
     assert best * (1 - 1e-5) <= made.cost <= best * 1.002
     np.testing.assert_allclose(where.before, posture(np.array([where.time]), reach, -1)[0], atol=1e-6)
     np.testing.assert_allclose(where.after, posture(np.array([where.time]), reach, 1)[0], atol=1e-6)
-    assert where.way is not None
+    assert where.motion is not None
     assert where.duration == pytest.approx(np.abs(where.after - where.before).max() / 3.0)
     assert made.duration == pytest.approx(SECONDS + where.duration)
-    np.testing.assert_allclose(where.way.at([0.0, where.duration])["joints"], [where.before, where.after], atol=1e-9)
+    np.testing.assert_allclose(where.motion.at([0.0, where.duration])["joints"], [where.before, where.after], atol=1e-9)
     assert "1 reconfiguration, none has fewer" in str(made)
     assert f"at {where.time:.4g} s the arm reconfigures" in str(made)
     with pytest.raises(DeadEnd, match="plan_in_pieces") as refused:
         plan(machine, line(reach), search="global", clearance=None)
-    assert refused.value.pieces == pickle.loads(pickle.dumps(refused.value)).pieces == 2
+    assert refused.value.segments == pickle.loads(pickle.dumps(refused.value)).segments == 2
 
 
 @pytest.mark.long
 def test_what_one_motion_does_is_one_piece_and_the_plan() -> None:
     made = plan_in_segments(arm(), line(0.1), clearance=None)
-    assert (len(made.pieces), made.reconfigurations, made.fewest) == (1, (), 0)
+    assert (len(made.segments), made.reconfigurations, made.fewest) == (1, (), 0)
     alone = plan(arm(), line(0.1), search="global", clearance=None)
     assert made.cost == pytest.approx(alone.cost, rel=1e-9)
     assert made.duration == made.horizon == SECONDS
@@ -120,11 +120,11 @@ def test_a_reconfiguration_goes_round_what_is_in_the_way(angle: float) -> None:
     machine, ball = with_bodies(), Sphere(0.03, (*place, 0.0))
     made = plan_in_segments(machine, line(0.45), obstacles=[ball], clearance=0.01)
     (where,) = made.reconfigurations
-    assert all(piece.audit().passed for piece in made.pieces)
-    assert where.way is not None, where.why
+    assert all(piece.audit().passed for piece in made.segments)
+    assert where.motion is not None, where.failure
     straight = np.abs(where.after - where.before).max() / 3.0
     assert where.duration > straight
-    joints = where.way.at(np.linspace(0, where.duration, 2001))["joints"]
+    joints = where.motion.at(np.linspace(0, where.duration, 2001))["joints"]
     assert (np.abs(joints) <= HIGH + 1e-6).all()
     assert (np.abs(np.diff(joints, axis=0)) <= 3.0 * where.duration / 2000 * (1 + 1e-5)).all()
     # the ball from the axes of the capsules, by hand

@@ -60,7 +60,7 @@ def planned(machine: FixedBase, **options: Any) -> Any:
 
 
 def in_pieces(machine: FixedBase) -> Any:
-    return [piece.cost for piece in plan_in_segments(machine, task(machine)).pieces]
+    return [piece.cost for piece in plan_in_segments(machine, task(machine)).segments]
 
 
 def least_velocities(machine: FixedBase) -> Any:
@@ -78,7 +78,7 @@ def moved(machine: FixedBase, **options: Any) -> Any:
 
 REQUESTS: dict[str, tuple[Callable[[FixedBase], Any], set[str]]] = {
     "start": (partial(planned, search="start", start=START), {"velocity"}),
-    "postures": (planned, {"velocity"}),
+    "configurations": (planned, {"velocity"}),
     "global": (partial(planned, search="global"), {"velocity"}),
     "free horizon": (partial(planned, horizon="free", start=START), {"velocity"}),
     "own velocities": (partial(planned, start=START, limits=Limits(velocity=5.0)), set()),

@@ -15,7 +15,7 @@ from models.robot.rebuild import locked
 from models.spatial import quaternion_from_rotation
 from ocp import DeadEnd, Limits, ProblemError, Unreachable, plan_waypoints
 from ocp.motion.local.collisions import distances_along
-from ocp.motion.plan.waypoints import WayCost
+from ocp.motion.plan.waypoints import PathCost
 from tests.ocp.motion.search.test_charts import planar
 from tests.ocp.motion.tasks.space_tasks import PANDA_START, UR5_START, panda, ur5
 from tests.redundancy_benchmark import problem_of
@@ -77,9 +77,9 @@ def test_the_largest_way_and_the_time_are_least_where_they_are_the_cost() -> Non
     places, turns = poses(panda(), PANDA_START, 21)
     velocity = panda().robot.velocity
     free: dict[str, Any] = {"clearance": None}
-    kinds: tuple[WayCost, ...] = get_args(WayCost)
+    kinds: tuple[PathCost, ...] = get_args(PathCost)
     found = {cost: plan_waypoints(panda(), places, turns, cost=cost, **free) for cost in kinds}
-    measures: dict[WayCost, Callable[[Array], float]] = {
+    measures: dict[PathCost, Callable[[Array], float]] = {
         "length": lambda ways: ways.sum(),
         "largest": lambda ways: ways.max(axis=1).sum(),
         "time": lambda ways: (ways / velocity).max(axis=1).sum(),
@@ -106,13 +106,13 @@ def test_what_stands_in_the_way_makes_it_longer_and_is_kept_clear_of() -> None:
     numbers = np.linspace(0, 20, 2001)
     joints = np.stack([np.interp(numbers, np.arange(21), column) for column in boxed.joints.T], axis=1)
     apart = distances_along(around, np.zeros(0), joints, numbers).min()
-    assert boxed.between is not None
-    worst = boxed.between.worst
+    assert boxed.clearance is not None
+    worst = boxed.clearance.worst
     assert worst is not None
-    assert min(near.least for near in boxed.between.pairs) <= apart + 1e-9
+    assert min(near.least for near in boxed.clearance.pairs) <= apart + 1e-9
     assert apart == pytest.approx(worst.distance, abs=1e-3)
     assert f"{worst.bodies[0]} and {worst.bodies[1]}, {worst.distance:.4g} m apart" in str(boxed)
-    assert plan_waypoints(panda(), places[:6], turns[:6], clearance=None).between is None
+    assert plan_waypoints(panda(), places[:6], turns[:6], clearance=None).clearance is None
 
 
 def test_what_cannot_be_done_is_refused() -> None:

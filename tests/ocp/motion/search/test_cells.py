@@ -14,7 +14,7 @@ from models.papers import paper_example
 from ocp import Candidate, Plan, SolveError, TipTask, Unreachable, plan
 from ocp.motion.plan.candidate import Reason, Rejection, Stage
 from ocp.motion.plan.candidate_solver import CandidateSolver
-from ocp.motion.plan.planner import checked_asked
+from ocp.motion.plan.planner import checked_request
 from ocp.motion.search.cells import CellSearch
 from ocp.motion.search.dead_end import DeadEnd
 from ocp.motion.tasks.equations import task_errors
@@ -63,7 +63,7 @@ def farthest_from_center() -> float:
     return float(np.array(far.map(len(grid))(grid.T)).max())
 
 
-@pytest.mark.parametrize("search", ["global", "postures"])
+@pytest.mark.parametrize("search", ["global", "configurations"])
 @pytest.mark.parametrize("told", ["velocity", "place"])
 def test_what_leads_out_of_reach_is_refused_with_the_time_from_which_on_it_does(search: Any, told: str) -> None:
     machine = paper_example()
@@ -104,7 +104,7 @@ def test_every_way_does_its_task_keeps_limits_and_moves_the_base_as_momentum_has
     way = np.array([-0.5, -0.5, 0.0])
     place = TipTask(position=lambda t: ca.DM(first) + t * ca.DM(way), rows=[3, 4], duration=4.0)
     task = TipTask(velocity=way[:2], rows=[3, 4], duration=4.0) if told == "velocity" else place
-    asked = checked_asked(machine, task, None, START, None, False, None, None, "global", 0, 1.0)
+    asked = checked_request(machine, task, None, START, None, False, None, None, "global", 0, 1.0)
     b, q, u = (ca.SX.sym(name, 3) for name in "bqu")
     center = ca.Function("center", [b, q], [center_of_mass(machine.robot, q, machine.world_from_base(b))])
     rate = ca.Function("rate", [b, q, u], [machine.base_rate(b, q, u)])
@@ -152,7 +152,7 @@ def test_of_ways_that_all_fail_a_few_of_each_search_are_tried_and_the_others_are
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     machine, task, tried = paper_example(), example(4.0), list[float]()
-    asked = checked_asked(machine, task, None, START, None, False, None, None, "postures", 0, 1.0)
+    asked = checked_request(machine, task, None, START, None, False, None, None, "configurations", 0, 1.0)
     sizes = [len(ways[0].cost) for ways in CellSearch(asked, START[None]).followed()]
 
     def fails(solver: CandidateSolver, candidate: Candidate) -> list[Candidate]:

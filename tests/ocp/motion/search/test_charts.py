@@ -12,7 +12,7 @@ import pytest
 from models import FixedBase, Joint, Link, Robot
 from models.arrays import Array
 from ocp import ProblemError, TipTask, inverse_kinematics
-from ocp.motion.search.charts import Charts, SelfMotions
+from ocp.motion.search.charts import Charts, SelfMotionManifolds
 from ocp.motion.search.joint_space import JointSpace
 from ocp.motion.tasks.equations import bind
 from tests.ocp.motion.tasks.space_tasks import PANDA_START, UR5_START, panda, ur5
@@ -61,11 +61,13 @@ def moved(machine: FixedBase, joints: Array, rows: str) -> TipTask:
     )
 
 
-def sets_of(machine: FixedBase, task: TipTask) -> tuple[SelfMotions, Array]:
+def sets_of(machine: FixedBase, task: TipTask) -> tuple[SelfMotionManifolds, Array]:
     equations, times = bind(machine, task), np.linspace(0.0, SECONDS, INSTANTS)
     robot = machine.robot
     space = JointSpace(machine, robot.lower, robot.upper, np.ones(robot.dof))
-    return SelfMotions(space, equations, np.array(equations.target_function().map(INSTANTS)(times[None])).T), times
+    return SelfMotionManifolds(
+        space, equations, np.array(equations.target_function().map(INSTANTS)(times[None])).T
+    ), times
 
 
 def found(machine: FixedBase, task: TipTask, times: Array, starts: int, seed: int) -> tuple[Any, Array]:
