@@ -102,15 +102,15 @@ def landscape(machine: FixedBase, task: TipTask, count: int, known: float) -> tu
     search = AtlasSearch(space, instants, times, SquaredRates(np.ones(robot.dof)), limits, **told)
     layers = search.layers
     for _ in range(HALVINGS):
-        layers = [search.allowed(search.halved(charts, k), k) for k, charts in enumerate(layers)]
+        layers = [search.without_collisions(search.split_charts(charts, k), k) for k, charts in enumerate(layers)]
     graph = search.graph(layers, np.full(count - 1, MOST * known))
-    passed, cost_to_go = graph.passed(), graph.cost_to_go()
-    cost = np.concatenate([graph.through(passed, cost_to_go, k) for k in range(count)])
+    passed, cost_to_go = graph.cost_to_come(), graph.cost_to_go()
+    cost = np.concatenate([graph.cost_through(passed, cost_to_go, k) for k in range(count)])
     first = np.concatenate([[0], np.cumsum([len(charts) for charts in layers])])
     steps = [
         (first[k] + i[alive], first[k + 1] + j[alive])
         for k in range(count - 1)
-        for i, j in graph.steps(k, k + 1)
+        for i, j in graph.edges(k, k + 1)
         if (alive := np.isfinite(cost[first[k] + i]) & np.isfinite(cost[first[k + 1] + j])).any()
     ]
     rows, columns = (np.concatenate(part) for part in zip(*steps, strict=True))
@@ -191,5 +191,5 @@ def rolls_of(robot: Robot, joints: Array) -> Array:
 
 def _nearest(space: JointSpace, charts: Charts, joints: Array, layers: Any) -> Array:
     """Which charts joints (M, n) at some instants lie in. Shape (M,)."""
-    _, found = space.tree(charts.centers, charts.layer).query(space.placed(joints, np.array(layers)))
+    _, found = space.tree(charts.centers, charts.layer).query(space.tree_points(joints, np.array(layers)))
     return np.asarray(found)

@@ -156,7 +156,7 @@ def postures(machine: FixedBase, task: TipTask, count: int) -> Reached:
     search = AtlasSearch(
         space, [TimeSample(sets, k) for k in range(count)], times, SquaredRates(np.ones(n)), limits, **told
     )
-    layers = [search.allowed(search.halved(charts, k), k) for k, charts in enumerate(search.layers)]
+    layers = [search.without_collisions(search.split_charts(charts, k), k) for k, charts in enumerate(search.layers)]
     graph = search.graph(layers, np.full(count - 1, np.inf))
     ahead, back = (_led(graph, order) for order in (range(count), range(count - 1, -1, -1)))
     whole = Charts(*(np.concatenate([getattr(part, name) for part in layers]) for name in Charts.__dataclass_fields__))
@@ -167,7 +167,7 @@ def _led(graph: ChartGraph, order: range) -> NDArray[np.bool_]:
     """Which charts steps lead to from those of the first instant of an order. Shape (N,)."""
     found = [np.full(len(charts), k == order[0]) for k, charts in enumerate(graph.layers)]
     for k, other in pairwise(order):
-        for i, j in graph.steps(k, other):
+        for i, j in graph.edges(k, other):
             found[other][j[found[k][i]]] = True
     return np.concatenate(found)
 

@@ -73,8 +73,8 @@ def judged(kind: str, seed: int) -> dict[str, Any]:
     try:
         instants = [TimeSample(sets, k) for k in range(INSTANTS)]
         search = AtlasSearch(space, instants, times, price, np.repeat(most[None], INSTANTS - 1, axis=0), seeds=seeds)
-        path, bound = search.best(np.inf)
-        steps = np.inf if path is None else search.steps(path)
+        path, bound = search.solve(np.inf)
+        steps = np.inf if path is None else search.path_cost(path)
     except Unreachable:
         pass
     wrong = []
@@ -113,7 +113,7 @@ def _least(nodes: list[Array], price: StepCost, seconds: float, most: Array, spa
         for first in range(0, len(here), share):
             way = there - here[first : first + share, None]
             way[..., space.periodic] -= FULL_TURN * np.round(way[..., space.periodic] / FULL_TURN)
-            total = np.where((np.abs(way) <= most).all(axis=2), value + price.of(way, seconds), np.inf)
+            total = np.where((np.abs(way) <= most).all(axis=2), value + price.evaluate(way, seconds), np.inf)
             before[first : first + share] = total.min(axis=1, initial=np.inf)
         value = before
     return float(value.min(initial=np.inf))

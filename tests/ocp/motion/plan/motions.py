@@ -182,9 +182,7 @@ def seam_space_arm() -> PlanCase:
     position, rotation = space_tip()
     corners = position + np.array([[0, 0, 0], [0, 0.1, 0.02], [0.06, 0.12, 0.05]])
     path, axis = smooth(Path.through(corners), deviation=0.003), rotation[:, 2]
-    return PlanCase(
-        floating_manipulator(), TipTask.along(path, 0.01, direction=axis), space_peer(), path, 0.01, axis
-    )
+    return PlanCase(floating_manipulator(), TipTask.along(path, 0.01, direction=axis), space_peer(), path, 0.01, axis)
 
 
 @asked

@@ -185,7 +185,7 @@ def test_what_no_task_moves_begins_out_of_the_way_of_what_it_would_hinder() -> N
 def test_held_apart_the_barrier_begins_worth_no_more_than_the_motion() -> None:
     """As many limits as the program has, each with the barrier that it begins with, cost what the motion costs."""
     around = CollisionScene(ARM, [POST])
-    asked = checked_request(ARM, line(), None, START, None, False, None, None, "start", 0, 1.0)
+    asked = checked_request(ARM, line(), None, start=START, search="start")
     solver = CandidateSolver(replace(asked, clearance_constraints=ClearanceConstraints(around)), START, START)
     pair = around.labels.index(("link6", "obstacle 0"))
     cost = 0.25
@@ -319,7 +319,7 @@ def test_a_start_that_touches_names_the_pair_and_the_depth() -> None:
     assert caught.value.name == "link6 and obstacle 0"
     assert caught.value.value < 0
     assert caught.value.time == 0
-    assert re.search(r"clear then, .*: \d+ other postures", str(caught.value))
+    assert re.search(r"; \d+ other configurations? (is|are) collision-free then", str(caught.value))
 
 
 def test_a_target_inside_an_obstacle_names_the_pair_the_time_and_the_depth() -> None:
@@ -329,16 +329,16 @@ def test_a_target_inside_an_obstacle_names_the_pair_the_time_and_the_depth() -> 
     assert caught.value.value < caught.value.limit == 0.01
     assert 1 <= caught.value.time <= SECONDS
     last = str(caught.value).split("\n")[-1]
-    assert last.startswith("the cheapest that touches: link6 and obstacle 0 overlap")
-    assert re.search(r"; no other posture is clear then: each of the \d+ postures found touches", last)
+    assert last.startswith("the cheapest candidate in collision: link6 and obstacle 0 overlap")
+    assert re.search(r"; no other configuration is collision-free then: each of the \d+ postures found touches", last)
 
 
 def test_where_no_posture_is_clear_no_alternatives_are_searched(monkeypatch: pytest.MonkeyPatch) -> None:
     def alternatives(*_: object) -> None:
         raise AssertionError
 
-    monkeypatch.setattr(planner, "_alternatives", alternatives)
-    with pytest.raises(SolveError, match="; no other posture is clear then: each of the"):
+    monkeypatch.setattr(planner, "_try_alternatives", alternatives)
+    with pytest.raises(SolveError, match="; no other configuration is collision-free then: each of the"):
         plan(ARM, line(), obstacles=[Sphere(0.1, FIRST + WAY)], clearance=0.01)
 
 

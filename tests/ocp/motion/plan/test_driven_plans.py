@@ -72,7 +72,7 @@ def test_accelerations_are_within_their_limits_and_told_otherwise() -> None:
     most = np.array([0.85, 9.0, 9.0])
     demand = ActuatorDemand.of(free, Limits(acceleration=most))
     assert demand is not None
-    assert (demand.what, demand.joint, demand.allowed, demand.unit) == ("acceleration", "joint1", 0.85, "rad/s^2")
+    assert (demand.quantity, demand.joint, demand.allowed, demand.unit) == ("acceleration", "joint1", 0.85, "rad/s^2")
     made = plan(FIXED, task, start=START, limits=Limits(acceleration=most))
     assert (np.abs(made.sample(0.001).accelerations).max(axis=0) <= most + 1e-5).all()
     assert made.cost > free.cost

@@ -13,7 +13,7 @@ from ocp import BoundWarning, Candidate, Plan, ProblemError, TipTask, Unreachabl
 from ocp.motion.plan.candidate import Reason, Rejection
 from ocp.motion.plan.candidate_solver import CandidateSolver
 from ocp.motion.search.search import AtlasSearch, checked_bound
-from ocp.motion.search.task_search import instants_of
+from ocp.motion.search.task_search import choose_samples
 from tests.ocp.motion.search.test_charts import moved, planar
 from tests.ocp.motion.tasks.space_tasks import PANDA_START, UR5_START, panda, ur5
 
@@ -71,8 +71,8 @@ def test_where_the_classes_that_may_be_the_cheapest_fail_every_one_is_followed_u
         failed.append(candidate)
         return [candidate.rejected(Reason(Rejection.AUDIT, "fails"))]
 
-    motions, advance = AtlasSearch.motions, CandidateSolver.advance
-    monkeypatch.setattr(AtlasSearch, "motions", followed)
+    motions, advance = AtlasSearch.class_representatives, CandidateSolver.advance
+    monkeypatch.setattr(AtlasSearch, "class_representatives", followed)
     monkeypatch.setattr(CandidateSolver, "advance", failing)
     found = plan(machine, moved(machine, start, "place"), search="global", clearance=None)
     assert asked == [False, True]
@@ -113,11 +113,11 @@ def test_a_bound_above_the_cost_of_a_motion_is_no_bound_and_warned_of(monkeypatc
         path, bound = right(search, most)
         return path, 2 * bound
 
-    right = AtlasSearch.best
+    right = AtlasSearch.solve
     machine, start = planar(np.array([0.5, 0.4, 0.3]), 2.5), np.array([0.5, 1.2, -1.4])
     task = moved(machine, start, "place")
     cost = plan(machine, task, search="global", clearance=None).cost
-    monkeypatch.setattr(AtlasSearch, "best", best)
+    monkeypatch.setattr(AtlasSearch, "solve", best)
     with pytest.raises(BoundWarning):
         plan(machine, task, search="global", clearance=None)
     with pytest.warns(BoundWarning, match="less than the bound") as caught:
@@ -159,7 +159,7 @@ def test_what_cannot_be_searched_is_refused() -> None:
 def test_instants_are_left_out_until_steps_miss_a_share_of_the_cost() -> None:
     t = np.linspace(0, 2, 81)
     bent = np.column_stack([np.abs(t - 1), np.where(t < 1, 0.0, 2 * (t - 1))])
-    assert instants_of(t, bent, np.ones(2), 1e-9, 2) == pytest.approx([0, 1, 2])
+    assert choose_samples(t, bent, np.ones(2), 1e-9, 2) == pytest.approx([0, 1, 2])
     round_way = np.column_stack([np.sin(3 * t), np.cos(3 * t)])
     weights = np.array([1.0, 1.0])
 
@@ -168,10 +168,10 @@ def test_instants_are_left_out_until_steps_miss_a_share_of_the_cost() -> None:
         return float((weights * np.diff(at, axis=0) ** 2 / (2 * np.diff(times)[:, None])).sum())
 
     for share in (0.1, 0.01):
-        kept = instants_of(t, round_way, weights, share, 2)
+        kept = choose_samples(t, round_way, weights, share, 2)
         assert cost(kept) >= (1 - share) * cost(t)
         assert len(kept) <= 2 * np.sqrt(3 * 3 * 4 / (24 * share)) + 3
-    assert len(instants_of(t, round_way, weights, 0.9, 10)) == 11
+    assert len(choose_samples(t, round_way, weights, 0.9, 10)) == 11
 
 
 def line(first: np.ndarray, way: tuple[float, float], seconds: float) -> Any:

@@ -15,7 +15,7 @@ from models import CollisionShape, FixedBase, Path, Sphere, smooth
 from models.arrays import Array
 from models.machines.moving_obstacle import MovingObstacle
 from ocp import DeadEnd, ProblemError, TipTask, plan, plan_in_segments
-from ocp.motion.plan.piecewise import _part
+from ocp.motion.plan.piecewise import _task_between
 from tests.ocp.motion.search.test_charts import planar
 from tests.ocp.motion.search.test_reconfigurations import limited
 
@@ -138,12 +138,12 @@ def test_a_reconfiguration_goes_round_what_is_in_the_way(angle: float) -> None:
         assert np.linalg.norm(far - share[:, None] * way, axis=1).min() >= 0.03 + 0.02 + 0.01 - 1e-6
 
 
-def test_a_part_of_a_task_asks_for_the_same_at_its_times() -> None:
+def test_a_task_between_of_a_task_asks_for_the_same_at_its_times() -> None:
     path = smooth(Path.through([[0.4, -0.3, 0.0], [0.6, 0.0, 0.0], [0.4, 0.3, 0.0]]), deviation=0.02)
     task = TipTask.along(path, 0.4, rows=(3, 4), begin=0.5)
     end = task.end
     for first, last in ((0.0, 0.9), (0.9, 1.3), (1.3, end), (0.0, end)):
-        part = _part(task, first, last)
+        part = _task_between(task, first, last)
         assert part is not None
         begin = max(first, 0.5)
         assert [part.begin, part.end] == pytest.approx([begin - first, last - first])
@@ -156,11 +156,11 @@ def test_a_part_of_a_task_asks_for_the_same_at_its_times() -> None:
             np.testing.assert_allclose(one(times - 0.5), other(times - begin), atol=1e-12)
         inside = [t for t in task.begin + np.asarray(task.breaks) if begin < t < last]
         np.testing.assert_allclose(first + part.begin + np.asarray(part.breaks), inside)
-    assert _part(task, 0.0, 0.5) is None
-    assert _part(task, end, end + 1.0) is None
+    assert _task_between(task, 0.0, 0.5) is None
+    assert _task_between(task, end, end + 1.0) is None
 
 
-def test_a_horizon_of_which_the_task_is_no_part_is_refused() -> None:
+def test_a_horizon_of_which_the_task_is_no_task_between_is_refused() -> None:
     for planner in (plan_in_segments, partial(plan, search="global")):
         with pytest.raises(ProblemError, match="no part") as refused:
             planner(arm(), line(0.1), 1e12, start=posture(np.zeros(1), 0.1, 1)[0], clearance=None)

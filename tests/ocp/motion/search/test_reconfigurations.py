@@ -18,7 +18,7 @@ from ocp import DeadEnd, ProblemError, TipTask, inverse_kinematics, plan_waypoin
 from ocp.motion.local.closed_forms import closed_forms
 from ocp.motion.search.charts import SelfMotionManifolds, TimeSample
 from ocp.motion.search.joint_space import JointSpace
-from ocp.motion.search.reconfigurations import farthest, fewest_segments
+from ocp.motion.search.reconfigurations import fewest_segments, segment_ends
 from ocp.motion.search.search import AtlasSearch
 from ocp.motion.search.steps import PathLength
 from ocp.motion.tasks.equations import bind
@@ -161,7 +161,7 @@ def test_where_the_way_waits_pieces_meet_at_an_instant_and_none_are_fewer_or_sho
     assert bound <= min(cost, expected[1] + 1e-9)
     assert cost <= 1.002 * expected[1]
     for gap in (0, 1):
-        assert len(farthest(search, gap, ruled_out=bool(gap))) == len(pieces)
+        assert len(segment_ends(search, gap, ruled_out=bool(gap))) == len(pieces)
     first, last = pieces[0].first, pieces[0].last
     again = fewest_segments(search, 0, [(first, last)])  # what is barred is no piece, nor what holds it
     assert again is None or not any(piece.first <= first and last <= piece.last for piece in again[0])

@@ -29,7 +29,7 @@ STEP = 0.1
 def test_values_are_no_farther_apart_than_a_step_and_reach_the_limits(
     slides: bool, low: float, far: float, step: float
 ) -> None:
-    values, most = section_values(slides, low, low + far, step), min(SectionSettings().apart[not slides], step)
+    values, most = section_values(slides, low, low + far, step), min(SectionSettings().spacing[not slides], step)
     ends = np.clip((low, low + far), -np.pi, np.pi)
     gap = float(np.diff(values).max(initial=0.0))
     assert gap <= most * (1 + 1e-9) or len(values) >= SectionSettings().values - 1
@@ -66,7 +66,7 @@ def planned(count: int, **told: Any) -> WaypointPlan:
 def limit_charts(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
     """Memory for so many charts."""
     own = WaypointSettings(search=SearchSettings(charts=count), sections=SectionSettings(charts=count))
-    monkeypatch.setattr(waypoints, "_Ways", partial(waypoints._Ways, settings=own))
+    monkeypatch.setattr(waypoints, "_WaypointPlanner", partial(waypoints._WaypointPlanner, settings=own))
 
 
 def test_a_way_keeps_its_poses_and_steps_and_is_no_dearer_than_with_the_lift_held() -> None:
@@ -164,7 +164,7 @@ def test_where_nothing_is_clear_at_the_first_waypoint_none_begins() -> None:
 
 
 def test_where_the_joint_is_held_at_no_value_that_does_the_waypoint_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(waypoints, "values_of", lambda *_: np.array([10.0]))
+    monkeypatch.setattr(waypoints, "section_values", lambda *_: np.array([10.0]))
     machine = problem_of("fetch__square").machine
     with pytest.raises(SolveError, match="none was found at waypoint 0 with 'torso_lift_joint'") as refused:
         plan_waypoints(machine, *task(40), clearance=None, step=STEP)

@@ -44,7 +44,7 @@ def slid(way: float) -> Array:
     joints, tangents = START, None
     for _ in range(20):
         tangents = SETS.tangents_at(np.array([0]), joints[None], tangents)
-        joints = SETS.corrected(np.array([0]), (joints + way / 20 * tangents[0, :, 0])[None])[0][0]
+        joints = SETS.project(np.array([0]), (joints + way / 20 * tangents[0, :, 0])[None])[0][0]
     return joints
 
 
@@ -52,7 +52,7 @@ def followed(start: Array = START) -> Array:
     """A way that does the task, each posture from the one before."""
     path = [start]
     for k in range(len(TIMES)):
-        joints, good = SETS.corrected(np.array([k]), path[-1][None])
+        joints, good = SETS.project(np.array([k]), path[-1][None])
         assert good.all()
         path.append(joints[0])
     return np.array(path[1:])
@@ -90,7 +90,7 @@ def middle_of_the_last_link(joints: Array) -> Array:
 def test_it_is_no_longer_and_does_its_task() -> None:
     found = tight()
     assert length(found) < 0.99 * length(followed())
-    error = SETS.linearised(np.arange(len(TIMES)), found)[0]
+    error = SETS.linearize(np.arange(len(TIMES)), found)[0]
     assert_allclose(error, 0.0, atol=1e-9)
 
 

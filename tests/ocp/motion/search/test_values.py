@@ -25,7 +25,7 @@ from ocp.motion.search.steps import (
     StepCost,
     least_in_box,
 )
-from ocp.motion.search.value import GraphSettings, _below_all, _rise, _whole
+from ocp.motion.search.value import GraphSettings, _bound_charts, _bound_with_rest, _secant_slopes
 from ocp.motion.tasks.equations import bind
 from tests.ocp.motion.search.test_charts import planar
 
@@ -55,7 +55,7 @@ def brute_force(nodes: list[Array], cost: StepCost, seconds: float, limit: Array
     value = np.zeros(len(nodes[-1]))
     for here, there in zip(nodes[-2::-1], nodes[:0:-1], strict=True):
         way = there[None] - here[:, None]
-        steps = np.where((np.abs(way) <= limit).all(axis=2), cost.of(way, seconds), np.inf)
+        steps = np.where((np.abs(way) <= limit).all(axis=2), cost.evaluate(way, seconds), np.inf)
         value = (steps + value).min(axis=1)
     return float(value.min())
 
@@ -105,9 +105,9 @@ def test_the_bound_is_below_brute_force_and_near_it(seed: int, kind: Any) -> Non
     seconds = SECONDS / (INSTANTS - 1)
     least = brute_force(nodes, cost, seconds, machine.robot.velocity * seconds)
     search = search_of(machine, places, cost)
-    path, bound = search.best(np.inf)
+    path, bound = search.solve(np.inf)
     assert path is not None
-    steps = search.steps(path)
+    steps = search.path_cost(path)
     tips = np.array([np.array(ca.DM(machine.tip_pose((), joints).position)).ravel()[:2] for joints in path])
     assert tips == pytest.approx(places, abs=1e-8)
     assert (np.abs(np.diff(path, axis=0)) <= machine.robot.velocity * seconds + 0.1).all()
@@ -121,14 +121,14 @@ def test_in_charts_that_limits_cut_a_posture_is_found_that_keeps_them() -> None:
     search, beyond = search_of(planar(lengths, 2.0), places, SquaredRates(weights)), 0
     for k, charts in enumerate(search.layers):
         for i in range(len(charts)):
-            box = charts.of([i])
+            box = charts.select([i])
             for end in (box.low[0], box.high[0]):
                 at = box.centers + (box.tangents @ end[:, None])[:, :, 0]
-                there, good = search.instants[k].sets.corrected(np.array([k]), at)
-                found = search.allowed_in(k, box, end)
+                there, good = search.samples[k].manifolds.project(np.array([k]), at)
+                found = search.project_in_box(k, box, end)
                 if found is not None:
                     assert search.space.within(found)
-                    assert search.instants[k].sets.linearised(np.array([k]), found[None])[0] == pytest.approx(
+                    assert search.samples[k].manifolds.linearize(np.array([k]), found[None])[0] == pytest.approx(
                         0, abs=1e-9
                     )
                 if good[0] and search.space.within(there)[0]:
@@ -142,7 +142,7 @@ def test_in_charts_that_limits_cut_a_posture_is_found_that_keeps_them() -> None:
 def test_what_is_found_and_its_bound_grow_with_the_weights(seed: int) -> None:
     machine, _, places, weights = random_case(seed)
     (path, bound), (other, more) = (
-        search_of(machine, places, PathLength(own)).best(np.inf) for own in (weights, 100 * weights)
+        search_of(machine, places, PathLength(own)).solve(np.inf) for own in (weights, 100 * weights)
     )
     assert path is not None
     assert other is not None
@@ -154,12 +154,14 @@ def test_what_is_found_and_its_bound_grow_with_the_weights(seed: int) -> None:
 def test_of_every_class_dearer_ones_are_told_beside_those_that_may_be_the_cheapest(seed: int) -> None:
     machine, _, places, weights = random_case(seed)
     search = search_of(machine, places, SquaredRates(weights))
-    path, _ = search.best(np.inf)
+    path, _ = search.solve(np.inf)
     assert path is not None
-    told, every = ([search.steps(way) for way in search.motions(np.inf, each)] for each in (False, True))
+    told, every = (
+        [search.path_cost(way) for way in search.class_representatives(np.inf, each)] for each in (False, True)
+    )
     assert told == sorted(told)
     assert every == sorted(every)
-    assert told[0] <= 1.02 * search.steps(path)  # one of a few is drawn from chart to chart, not tight
+    assert told[0] <= 1.02 * search.path_cost(path)  # one of a few is drawn from chart to chart, not tight
     assert every[0] <= told[0] * 1.01
     assert len(every) > len(told)
     assert every[-1] > 1.1 * told[-1]
@@ -185,7 +187,9 @@ def test_what_is_below_a_step_is_nowhere_above_it_and_touches_it(kind: Any, free
     curve = rng.normal(size=(count, free, free)) * 0.2 * (kind is SquaredRates)
     after = QuadraticBounds(rng.normal(size=count), rng.normal(size=(count, free)), curve + curve.transpose(0, 2, 1))
     delta = 0.3 * rng.normal(size=(count, n))
-    steps = cost.below(delta, CurvedCharts(out, *out.bent()), CurvedCharts(into, *into.bent()), after, seconds)
+    steps = cost.lower_bounds(
+        delta, CurvedCharts(out, *out.curvature()), CurvedCharts(into, *into.curvature()), after, seconds
+    )
     grid = np.array(list(product(np.linspace(0, 1, 41 if free > 1 else 1001), repeat=free)))
     there = into.low[:, None] + (into.high - into.low)[:, None] * grid
     cost_to_go = after.least[:, None] + (after.slope[:, None] * there).sum(axis=2)
@@ -194,7 +198,7 @@ def test_what_is_below_a_step_is_nowhere_above_it_and_touches_it(kind: Any, free
     def costs(place: Array) -> Array:
         start = delta - np.einsum("pnr,pr->pn", out.tangents, place)
         ways = start[:, None] + np.einsum("pnr,pgr->pgn", into.tangents, there)
-        return np.asarray((cost.of(ways, seconds) + cost_to_go).min(axis=1))
+        return np.asarray((cost.evaluate(ways, seconds) + cost_to_go).min(axis=1))
 
     def somewhere() -> Array:
         return np.asarray(out.low + (out.high - out.low) * rng.uniform(size=(count, free)))
@@ -231,12 +235,14 @@ def test_what_is_below_a_step_is_so_where_the_sets_bend_away_from_their_charts_a
             cubic = np.einsum("pna,pga->pgn", cubes, (at / half) ** 3)
             return np.asarray(np.einsum("pga,pnab,pgb->pgn", at, bends, at) / 2 + cubic)
 
-        return replace(flat_charts(rng, count, scale, free, half), strays=stray(rim)), stray
+        return replace(flat_charts(rng, count, scale, free, half), deviations=stray(rim)), stray
 
     (out, away), (into, beyond) = bent(), bent()
     after = QuadraticBounds(rng.normal(size=count), rng.normal(size=(count, free)), np.zeros((count, free, free)))
     delta = 0.3 * rng.normal(size=(count, n))
-    steps = cost.below(delta, CurvedCharts(out, *out.bent()), CurvedCharts(into, *into.bent()), after, seconds)
+    steps = cost.lower_bounds(
+        delta, CurvedCharts(out, *out.curvature()), CurvedCharts(into, *into.curvature()), after, seconds
+    )
     grid = np.array(list(product(np.linspace(0, 1, 31 if free > 1 else 501), repeat=free)))
     there = into.low[:, None] + (into.high - into.low)[:, None] * grid
     cost_to_go = after.least[:, None] + (after.slope[:, None] * there).sum(axis=2)
@@ -244,7 +250,7 @@ def test_what_is_below_a_step_is_so_where_the_sets_bend_away_from_their_charts_a
     for shares in rng.choice([0.0, 0.3, 0.8, 1.0], size=(12, 2, count, free)):
         place, other = out.low + (out.high - out.low) * shares
         start = np.einsum("pnr,pr->pn", out.tangents, other) + away(other[:, None])[:, 0]
-        costs = (cost.of(delta[:, None] + ends - start[:, None], seconds) + cost_to_go).min(axis=1)
+        costs = (cost.evaluate(delta[:, None] + ends - start[:, None], seconds) + cost_to_go).min(axis=1)
         value, slope = steps.at(place)
         way = other - place
         below = value + (slope * way).sum(axis=1) + np.einsum("pa,pab,pb->p", way, steps.curve, way) / 2
@@ -278,7 +284,9 @@ def test_what_is_lost_of_steps_between_sets_that_bend_is_of_higher_order_than_th
         (out, away), (into, beyond) = bent(), bent()
         after = QuadraticBounds(np.zeros(count), rng.normal(size=(count, free)), np.zeros((count, free, free)))
         delta, cost = 0.3 * rng.normal(size=(count, n)), SquaredRates(weights)
-        steps = cost.below(delta, CurvedCharts(out, *out.bent()), CurvedCharts(into, *into.bent()), after, seconds)
+        steps = cost.lower_bounds(
+            delta, CurvedCharts(out, *out.curvature()), CurvedCharts(into, *into.curvature()), after, seconds
+        )
         grid = np.array(list(product(np.linspace(-half, half, 41 if free > 1 else 501), repeat=free)))
         there = np.broadcast_to(grid, (count, *grid.shape))
         cost_to_go = (after.slope[:, None] * there).sum(axis=2)
@@ -286,7 +294,7 @@ def test_what_is_lost_of_steps_between_sets_that_bend_is_of_higher_order_than_th
         for shares in rng.choice([-1.0, -0.5, 0.0, 0.4, 1.0], size=(12, count, free)):
             place = half * shares
             start = np.einsum("pnr,pr->pn", along, place) + away(place[:, None])[:, 0]
-            costs = cost.of(delta[:, None] + ends - start[:, None], seconds) + cost_to_go
+            costs = cost.evaluate(delta[:, None] + ends - start[:, None], seconds) + cost_to_go
             gaps.append(costs.min(axis=1) - steps.at(place)[0])
         return np.array(gaps)
 
@@ -304,20 +312,26 @@ def test_bounds_on_a_chart_are_above_no_step_from_it_nor_with_what_is_known_of_t
     count = groups * each
     weights = rng.uniform(0.5, 2.0, n)
     cost, scale = kind(weights), np.sqrt(weights) if kind is SquaredRates else np.ones(n)
-    out = flat_charts(rng, groups, scale, free, half).of(np.repeat(np.arange(groups), each))
+    out = flat_charts(rng, groups, scale, free, half).select(np.repeat(np.arange(groups), each))
     into = flat_charts(rng, count, scale, free, half)
     curve = rng.normal(size=(count, free, free)) * 0.2 * (kind is SquaredRates)
     after = QuadraticBounds(
         rng.normal(size=count) / 50, rng.normal(size=(count, free)) / 5, curve + curve.transpose(0, 2, 1)
     )
     delta = np.repeat(0.3 * rng.normal(size=(groups, n)), each, axis=0) + 0.05 * rng.normal(size=(count, n))
-    steps = cost.below(delta, CurvedCharts(out, *out.bent()), CurvedCharts(into, *into.bent()), after, seconds)
+    steps = cost.lower_bounds(
+        delta, CurvedCharts(out, *out.curvature()), CurvedCharts(into, *into.curvature()), after, seconds
+    )
     starts = np.arange(0, count, each)
-    found, boxes, gaps = _below_all(steps, out, starts, np.full(groups, np.inf), GraphSettings()), out.of(starts), []
+    found, boxes, gaps = (
+        _bound_charts(steps, out, starts, np.full(groups, np.inf), GraphSettings()),
+        out.select(starts),
+        [],
+    )
     rest = QuadraticBounds(
         rng.normal(size=count), rng.normal(size=(count, free)), 0.1 * (curve + curve.transpose(0, 2, 1))
     )
-    whole, corners = _whole(steps, out, rest), np.array(list(product((0.0, 1.0), repeat=free)))
+    whole, corners = _bound_with_rest(steps, out, rest), np.array(list(product((0.0, 1.0), repeat=free)))
     for share in [*np.repeat(corners[:, None], groups, axis=1), *rng.uniform(size=(50, groups, free))]:
         place = boxes.low + (boxes.high - boxes.low) * share
         places = np.repeat(place, each, axis=0)
@@ -333,14 +347,14 @@ def test_steps_that_are_not_looked_at_change_no_bound(kind: Any, monkeypatch: py
     """All steps to every chart that limits allow, beside those that are thought to be worth it."""
     machine, _, places, weights = random_case(4)
     search = search_of(machine, places, kind(weights))
-    graph = search.whole_graph()
-    some = [graph.cost_to_go(), graph.passed()]
+    graph = search.full_graph()
+    some = [graph.cost_to_go(), graph.cost_to_come()]
     monkeypatch.setattr("ocp.motion.search.value._least_of_groups", lambda high, group: np.full(len(high), np.inf))
-    whole = [graph.cost_to_go(), graph.passed()]
+    whole = [graph.cost_to_go(), graph.cost_to_come()]
     for k in range(INSTANTS):
         for few, every in zip(some, whole, strict=True):
-            assert graph.least(few[k], k) == pytest.approx(graph.least(every[k], k), rel=0.02, abs=1e-9)
-    low = [float(graph.least(each[0][0], 0).min()) for each in (some, whole)]
+            assert graph.minima(few[k], k) == pytest.approx(graph.minima(every[k], k), rel=0.02, abs=1e-9)
+    low = [float(graph.minima(each[0][0], 0).min()) for each in (some, whole)]
     assert low[0] >= low[1] * (1 - 1e-9)
 
 
@@ -351,21 +365,21 @@ def test_with_the_rest_known_the_bounds_hold_for_all_motions_below_a_cost(kind: 
     machine, lengths, places, weights = random_case(seed)
     cost, seconds, rng = kind(weights), SECONDS / (INSTANTS - 1), np.random.default_rng(seed)
     search = search_of(machine, places, cost)
-    graph = search.whole_graph()
+    graph = search.full_graph()
     nodes = [reached(lengths, place, float(machine.robot.upper[0]), 400) for place in places]
     value = [np.zeros(len(nodes[-1]))]
     for here, there in zip(nodes[-2::-1], nodes[:0:-1], strict=True):
-        value.insert(0, (cost.of(there[None] - here[:, None], seconds) + value[0]).min(axis=1))
+        value.insert(0, (cost.evaluate(there[None] - here[:, None], seconds) + value[0]).min(axis=1))
     most = 1.3 * float(value[0].min())
-    cost_to_go = graph.cost_to_go(most=most)
-    passed = graph.passed(cost_to_go, most)
+    cost_to_go = graph.cost_to_go(max_cost=most)
+    passed = graph.cost_to_come(cost_to_go, most)
     again = graph.cost_to_go(passed, most)
-    left = sum(int(np.isfinite(graph.through(passed, again, k)).sum()) for k in range(INSTANTS))
+    left = sum(int(np.isfinite(graph.cost_through(passed, again, k)).sum()) for k in range(INSTANTS))
     assert left < sum(map(len, graph.layers))
     for first in rng.permutation(np.flatnonzero(value[0] < most))[:40].tolist():
         path = [first]
         for k in range(INSTANTS - 1):
-            steps = cost.of(nodes[k + 1] - nodes[k][path[-1]], seconds) + value[k + 1]
+            steps = cost.evaluate(nodes[k + 1] - nodes[k][path[-1]], seconds) + value[k + 1]
             path.append(int(steps.argmin()))
         total = float(value[0][first])
         for k, at in enumerate(path):
@@ -391,7 +405,7 @@ def test_a_bound_leans_as_what_it_bounds_from_end_to_end_and_where_that_bends_up
         return np.asarray((places * (slope + bend / 2 * places)).sum(axis=1))
 
     sides = [side * half * np.eye(free)[axis] for axis in range(free) for side in (-1.0, 1.0)]
-    found = _rise([value(place) for place in (np.zeros_like(half), *sides)], half)
+    found = _secant_slopes([value(place) for place in (np.zeros_like(half), *sides)], half)
     # of the lines below a parabola at its ends and its middle the flattest; of one that bends down the chord
     flattest = np.sign(slope) * np.maximum(np.abs(slope) - bend * half / 2, 0.0)
     np.testing.assert_allclose(found, flattest if bend > 0 else slope, atol=1e-12)
