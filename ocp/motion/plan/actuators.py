@@ -72,9 +72,8 @@ class ActuatorDemand:
         bases = plan.at(sample.t)["base"] if machine.base_size else np.zeros((CHECKED_TIMES, 0))
         symbols = [ca.SX.sym("v", size) for size in (machine.base_size, *[machine.joint_size] * 3)]
         torques_at = ca.Function("torques", symbols, [joint_torques(machine, *symbols)])
-        torques = np.array(
-            torques_at.map(CHECKED_TIMES)(bases.T, sample.joints.T, sample.rates.T, sample.accelerations.T)
-        ).T
+        samples = bases.T, sample.joints.T, sample.rates.T, sample.accelerations.T
+        torques = np.array(torques_at.map(CHECKED_TIMES)(*samples)).T
         largest: tuple[float, ActuatorDemand] | None = None
         for quantity, values, most_allowed, units in (
             ("acceleration", np.abs(sample.accelerations), bounds.acceleration, ("rad/s^2", "m/s^2")),
@@ -88,10 +87,8 @@ class ActuatorDemand:
             if largest is None or ratios[row, joint] > largest[0]:
                 kind = robot.moving_joints[joint].kind
                 numbers = float(sample.t[row]), float(values[row, joint]), float(most_allowed[joint])
-                largest = (
-                    ratios[row, joint],
-                    cls(quantity, robot.joint_names[joint], *numbers, units[kind == "prismatic"]),
-                )
+                unit = units[kind == "prismatic"]
+                largest = ratios[row, joint], cls(quantity, robot.joint_names[joint], *numbers, unit)
         return None if largest is None else largest[1]
 
 
@@ -113,10 +110,9 @@ def solve_within_actuator_limits(request: PlanRequest, start: Array, reference: 
         start = np.where(np.isclose(unlimited.at(0.0)["joints"], start, rtol=0.0), start, np.nan)
 
     def solve_from(initial: Array) -> Solution:
-        def declare(clearance_constraints: ClearanceConstraints | None) -> Problem:
-            motion = declared_motion(
-                request, start=initial, reference=reference, clearance_constraints=clearance_constraints, limits=limits
-            )
+        def declare(constraints: ClearanceConstraints | None) -> Problem:
+            guess = {"start": initial, "reference": reference}
+            motion = declared_motion(request, **guess, constraints=constraints, limits=limits)
             _set_guess(motion, unlimited)
             return motion.problem
 

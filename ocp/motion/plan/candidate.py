@@ -86,9 +86,7 @@ class Reason:
     def of_error(cls, kind: Rejection, error: Exception) -> Reason:
         """Return a reason with the first line of an error, and its value, limit and time if they are numbers."""
         numbers = {name: getattr(error, name, None) for name in ("value", "limit", "time")}
-        details: dict[str, Any] = {
-            name: float(value) for name, value in numbers.items() if isinstance(value, int | float)
-        }
+        details: dict[str, Any] = {name: float(x) for name, x in numbers.items() if isinstance(x, int | float)}
         name = getattr(error, "name", None)
         return cls(kind, str(error).split("\n")[0], None if name is None else str(name), **details)
 
@@ -133,7 +131,7 @@ class Candidate:
         stage: Stage that it has reached.
         solution: Solution of the last solve; of a finished candidate only if that was on the fine mesh.
         seed: Guess from which it started.
-        clearance_constraints: Clearance constraints with the separated pairs.
+        constraints: Clearance constraints with the separated pairs.
         separations: Number of solves that separated pairs, or separated them farther.
         separated: Reason of the last separation.
     """
@@ -144,7 +142,7 @@ class Candidate:
     stage: Stage = Stage.SEED
     solution: Solution | None = None
     seed: Seed = field(default_factory=Seed, repr=False)
-    clearance_constraints: ClearanceConstraints | None = field(default=None, repr=False)
+    constraints: ClearanceConstraints | None = field(default=None, repr=False)
     separations: int = field(default=0, repr=False)
     separated: Reason | None = field(default=None, repr=False)
 
@@ -160,9 +158,8 @@ class Candidate:
             KeyError, TypeError, ValueError: The record is damaged.
         """
         rejection = None if reason is None else Reason.of_record(reason)
-        return cls(
-            np.array(start, dtype=float), float(cost), rejection, Stage(stage), solution if rejection is None else None
-        )
+        motion = solution if rejection is None else None
+        return cls(np.array(start, dtype=float), float(cost), rejection, Stage(stage), motion)
 
     @property
     def passed(self) -> bool:

@@ -95,10 +95,7 @@ class CandidateQueue:
     @property
     def collided(self) -> bool:
         """Whether a candidate was rejected for a collision."""
-        return any(
-            candidate.reason is not None and candidate.reason.kind is Rejection.COLLISION
-            for candidate in self.candidates
-        )
+        return any(c.reason is not None and c.reason.kind is Rejection.COLLISION for c in self.candidates)
 
     def run(self, seeds: Iterable[Candidate], include_costlier: bool = False) -> None:
         """Advance a batch of seeds until no candidate can become cheaper than the best that passed.
@@ -135,17 +132,13 @@ class CandidateQueue:
         """
         if not self.passed:
             raise self.solver.failure(self.candidates)
-        best = min(
-            (candidate for candidate in self.candidates if candidate.passed), key=lambda candidate: candidate.cost
-        )
+        best = min((c for c in self.candidates if c.passed), key=lambda c: c.cost)
         costlier = Reason(Rejection.COSTLIER)
         finished = [
             replace(candidate, reason=costlier) if candidate.passed and candidate is not best else candidate
             for candidate in self.candidates
         ]
-        finished.sort(
-            key=lambda candidate: (candidate is not best, np.inf if np.isnan(candidate.cost) else candidate.cost)
-        )
+        finished.sort(key=lambda c: (c is not best, np.inf if np.isnan(c.cost) else c.cost))
         return self.solver.plan([candidate.finished() for candidate in finished])
 
     def _push(self, candidate: Candidate) -> None:
@@ -173,15 +166,11 @@ class CandidateQueue:
         if stage is Stage.SEED:
             if not candidate.seed.tracked and np.isfinite(self._least):
                 return Reason(Rejection.UNTRACKED)
-            too_costly = (
-                np.isfinite(candidate.seed.cost) and candidate.seed.cost > settings.max_cost_ratio * self._least
-            )
+            cost = candidate.seed.cost
+            too_costly = np.isfinite(cost) and cost > settings.max_cost_ratio * self._least
             return Reason(Rejection.COSTLIER, "by far, judged by its local motion") if too_costly else None
-        if (
-            self._include_costlier
-            and self._audits < settings.max_failures
-            and candidate.cost <= settings.max_cost_ratio * best
-        ):
+        audited = self._include_costlier and self._audits < settings.max_failures
+        if audited and candidate.cost <= settings.max_cost_ratio * best:
             return Reason(Rejection.DUPLICATE) if stage > Stage.FINE and self._has_passed(candidate.cost) else None
         if stage < Stage.FINE and candidate.cost > best * (1 + self._coarse_error):
             return self.solver.collision(candidate) or Reason(Rejection.COSTLIER, "on a coarse mesh")
@@ -196,10 +185,7 @@ class CandidateQueue:
     def _has_passed(self, cost: float) -> bool:
         """Return whether a candidate of this cost passed."""
         tolerance = self.settings.same_cost
-        return any(
-            candidate.passed and abs(cost - candidate.cost) <= tolerance * candidate.cost
-            for candidate in self.candidates
-        )
+        return any(c.passed and abs(cost - c.cost) <= tolerance * c.cost for c in self.candidates)
 
     def _take(self, previous: Candidate, advanced: Candidate) -> None:
         """Store or push the result of an advance."""

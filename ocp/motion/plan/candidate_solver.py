@@ -60,9 +60,8 @@ class CandidateSolver(Solver):
             start, reference: As in `tool_motion_problem`.
         """
         self.request, self.settings, self.start, self.reference = request, request.settings, start, reference
-        self.motion = declared_motion(
-            request, start=start, reference=reference, clearance_constraints=request.clearance_constraints
-        )
+        constraints = request.clearance_constraints
+        self.motion = declared_motion(request, start=start, reference=reference, constraints=constraints)
         self.last = Stage.AUDITED if request.actuator_limits is None else Stage.ACTUATED
         self._clear_counts: dict[float, int | Unreachable | None] = {}
         self._prepared: dict[Any, tuple[ToolMotion, Collocation, Prepared]] = {}
@@ -103,9 +102,8 @@ class CandidateSolver(Solver):
         if not collisions:
             return self._solve(candidate, Stage.FINE, candidate.solution)
         if isinstance(unreachable := self._count_clear_at(collisions[0].time), Unreachable):
-            return candidate.rejected(
-                self._collision_reason(collisions[0], f"at {collisions[0].time:.4g} s {unreachable}")
-            )
+            remedy = f"at {collisions[0].time:.4g} s {unreachable}"
+            return candidate.rejected(self._collision_reason(collisions[0], remedy))
         return self._separate_pairs(candidate, Stage.SEPARATED, collisions)
 
     def _refine(self, candidate: Candidate) -> Candidate:
@@ -128,23 +126,15 @@ class CandidateSolver(Solver):
         audited with its start fixed.
         """
         motion, mesh, _ = self.prepared(candidate, fine=True)
-        clearance_constraints, joints_name = candidate.clearance_constraints, f"joints{motion.stretches[0].suffix}"
+        constraints, joints_name = candidate.constraints, f"joints{motion.stretches[0].suffix}"
         assert candidate.solution is not None
         solution, audit = self._audit_and_refine(motion, mesh, candidate.solution, check=not _is_separated(candidate))
         if np.isnan(self._start(candidate)).any() and audit.feasible and audit.optimal is None:
-            fixed = declared_motion(
-                self.request,
-                start=solution[joints_name][0],
-                reference=self.reference,
-                clearance_constraints=clearance_constraints,
-            )
+            start = solution[joints_name][0]
+            fixed = declared_motion(self.request, start=start, reference=self.reference, constraints=constraints)
             current_mesh = _mesh_of(mesh, solution)
-            fixed_solution = solve(
-                fixed.problem,
-                current_mesh,
-                guess=solution,
-                options=self._options(fixed, current_mesh, solution.cost, {}),
-            )
+            options = self._options(fixed, current_mesh, solution.cost, {})
+            fixed_solution = solve(fixed.problem, current_mesh, guess=solution, options=options)
             fixed_solution = self._refine_for_tasks(fixed, mesh, fixed_solution, check=True)
             fixed_solution, fixed_audit = self._audit_and_refine(fixed, mesh, fixed_solution, check=True)
             slack = self.settings.negligible_rate * motion.horizon
@@ -153,8 +143,8 @@ class CandidateSolver(Solver):
         candidate = replace(candidate, cost=solution.cost, solution=solution)
         proofs = list(audit.clearances.values())
         closest = max((pair for proof in proofs for pair in proof.pairs), key=attrgetter("missed"), default=None)
-        if clearance_constraints is not None and closest is not None and closest.missed > 0:
-            widened = replace(candidate, clearance_constraints=clearance_constraints.widened(proofs))
+        if constraints is not None and closest is not None and closest.missed > 0:
+            widened = replace(candidate, constraints=constraints.widened(proofs))
             return self._solve_again(widened, Stage.FINE, self._collision_reason(closest))
         if audit.passed:
             return replace(candidate, stage=Stage.AUDITED)
@@ -173,18 +163,11 @@ class CandidateSolver(Solver):
         """Return a new candidate with a free start for one that passed with a fixed start."""
         if not (candidate.seed.fixed and candidate.passed and candidate.stage is Stage.AUDITED):
             return []
-        clearance_constraints = self.request.clearance_constraints
-        if clearance_constraints is not None:
-            clearance_constraints = clearance_constraints.holding(
-                [collision.pair for collision in self.local_collisions(candidate.seed)]
-            )
-        return [
-            Candidate(
-                candidate.start,
-                seed=Seed(candidate.solution, local=candidate.seed.local, direct=True),
-                clearance_constraints=clearance_constraints,
-            )
-        ]
+        constraints = self.request.clearance_constraints
+        if constraints is not None:
+            constraints = constraints.holding([collision.pair for collision in self.local_collisions(candidate.seed)])
+        seed = Seed(candidate.solution, local=candidate.seed.local, direct=True)
+        return [Candidate(candidate.start, seed=seed, constraints=constraints)]
 
     # ---- solves ------------------------------------------------------------------------------------------------------
 
@@ -198,13 +181,10 @@ class CandidateSolver(Solver):
 
     def _separate_pairs(self, candidate: Candidate, stage: Stage, collisions: list[Collision]) -> Candidate:
         """Solve a candidate again with more separated pairs."""
-        assert candidate.clearance_constraints is not None
-        clearance_constraints = candidate.clearance_constraints.holding([collision.pair for collision in collisions])
-        return self._solve_again(
-            replace(candidate, clearance_constraints=clearance_constraints),
-            stage,
-            self._collision_reason(collisions[0]),
-        )
+        assert candidate.constraints is not None
+        constraints = candidate.constraints.holding([collision.pair for collision in collisions])
+        reason = self._collision_reason(collisions[0])
+        return self._solve_again(replace(candidate, constraints=constraints), stage, reason)
 
     def _solve_again(self, candidate: Candidate, stage: Stage, reason: Reason) -> Candidate:
         count = candidate.separations + 1
@@ -217,27 +197,20 @@ class CandidateSolver(Solver):
     ) -> tuple[ToolMotion, Collocation, Prepared]:
         """Return the problem of a candidate, its first mesh, and both prepared for guesses of about this cost."""
         settings, separated = self.settings, _is_separated(candidate)
-        margins = (
-            tuple(sorted(candidate.clearance_constraints.margins.items()))
-            if candidate.clearance_constraints is not None and separated
-            else ()
-        )
+        margins: tuple[Any, ...] = ()
+        if candidate.constraints is not None and separated:
+            margins = tuple(sorted(candidate.constraints.margins.items()))
         key = margins, fine, tuple(candidate.start) if candidate.seed.fixed else ()
         if key not in self._prepared:
             start, motion = self._start(candidate), self.motion
             if margins or candidate.seed.fixed:
                 reference = candidate.start if candidate.seed.fixed else self.reference
-                motion = declared_motion(
-                    self.request,
-                    start=start,
-                    reference=reference,
-                    clearance_constraints=candidate.clearance_constraints,
-                )
+                constraints = candidate.constraints
+                motion = declared_motion(self.request, start=start, reference=reference, constraints=constraints)
             min_intervals = settings.separated_intervals if margins and not fine else settings.min_intervals
             degree = settings.fine_degree if fine else settings.coarse_degree
-            mesh = Collocation(min_intervals if len(motion.breaks) < min_intervals else 1, degree).with_nodes_at(
-                motion.breaks
-            )
+            count = min_intervals if len(motion.breaks) < min_intervals else 1
+            mesh = Collocation(count, degree).with_nodes_at(motion.breaks)
             base_options = settings.fine_options if fine else settings.coarse_options
             options = self._options(motion, mesh, cost, base_options)
             self._prepared[key] = motion, mesh, mesh.prepare(motion.problem, options=options)
@@ -247,10 +220,10 @@ class CandidateSolver(Solver):
         """Return the joints at the start, nan where free; joints that move separated bodies are not ignorable."""
         if candidate.seed.fixed:
             return candidate.start
-        clearance_constraints = candidate.clearance_constraints
-        if clearance_constraints is None or not clearance_constraints.margins or self.request.start is not None:
+        constraints = candidate.constraints
+        if constraints is None or not constraints.margins or self.request.start is not None:
             return self.start
-        affecting = clearance_constraints.scene.levers.joints[sorted(clearance_constraints.margins)].any(axis=0)
+        affecting = constraints.scene.levers.joints[sorted(constraints.margins)].any(axis=0)
         return np.where(affecting & ~self.request.fixed_joints, np.nan, self.start)
 
     def _options(
@@ -292,11 +265,10 @@ class CandidateSolver(Solver):
                 current_mesh = _mesh_of(mesh, solution)
                 options = self._options(motion, current_mesh, solution.cost, self.settings.fine_options)
                 solution, audit = refined(motion.problem, current_mesh, solution, audit, options, check)
-            if (
-                not _refinable_failures(audit)
-                and (refined_solution := self._refine_for_tasks(motion, mesh, solution, check)) is not solution
-            ):
-                solution, audit = refined_solution, refined_solution.audit()
+            if not _refinable_failures(audit):
+                refined_solution = self._refine_for_tasks(motion, mesh, solution, check)
+                if refined_solution is not solution:
+                    solution, audit = refined_solution, refined_solution.audit()
         return solution, audit
 
     def _refine_for_tasks(self, motion: ToolMotion, mesh: Collocation, solution: Solution, check: bool) -> Solution:
@@ -354,23 +326,22 @@ class CandidateSolver(Solver):
 
     def collisions(self, candidate: Candidate) -> list[Collision]:
         """Return the closest approaches of colliding pairs that are not separated, the worst first."""
-        clearance_constraints, solution = candidate.clearance_constraints, candidate.solution
-        if clearance_constraints is None or solution is None:
+        constraints, solution = candidate.constraints, candidate.solution
+        if constraints is None or solution is None:
             return []
         if self._collisions[0] is not solution:
             fractions = self._samples(solution)
             sample, collisions = solution.at_fraction(fractions), []
             for stretch in self.motion.stretches:
-                base = (
-                    sample[f"base{stretch.suffix}"] if self.request.machine.base_size else np.zeros((len(fractions), 0))
-                )
+                has_base = self.request.machine.base_size > 0
+                base = sample[f"base{stretch.suffix}"] if has_base else np.zeros((len(fractions), 0))
                 times = stretch.begin + fractions * stretch.duration
-                collisions += clearance_constraints.find_collisions(base, sample[f"joints{stretch.suffix}"], times)
+                collisions += constraints.find_collisions(base, sample[f"joints{stretch.suffix}"], times)
             worst: dict[int, Collision] = {}
             for collision in sorted(collisions, key=lambda collision: collision.distance):
                 worst.setdefault(collision.pair, collision)
             self._collisions = solution, list(worst.values())
-        return [collision for collision in self._collisions[1] if collision.pair not in clearance_constraints.margins]
+        return [collision for collision in self._collisions[1] if collision.pair not in constraints.margins]
 
     def collision(self, candidate: Candidate) -> Reason | None:
         """Return the reason of the worst collision in its motion; None without collisions."""
@@ -379,10 +350,10 @@ class CandidateSolver(Solver):
 
     def local_collisions(self, seed: Seed) -> list[Collision]:
         """Return the collisions in a local motion, the worst first."""
-        clearance_constraints, collisions = self.request.clearance_constraints, list[Collision]()
-        for motion in seed.local if clearance_constraints is not None else ():
-            assert clearance_constraints is not None
-            collisions += clearance_constraints.find_collisions(motion.base[0], motion.joints[0], motion.t)
+        constraints, collisions = self.request.clearance_constraints, list[Collision]()
+        for motion in seed.local if constraints is not None else ():
+            assert constraints is not None
+            collisions += constraints.find_collisions(motion.base[0], motion.joints[0], motion.t)
         return sorted(collisions, key=lambda collision: collision.distance)
 
     @property
@@ -405,11 +376,8 @@ class CandidateSolver(Solver):
     def failure(self, candidates: Sequence[Candidate]) -> SolveError:
         """Return the error that none passes; with collisions, about the cheapest candidate in collision."""
         error = super().failure(candidates)
-        colliding = [
-            candidate
-            for candidate in candidates
-            if candidate.reason is not None and candidate.reason.kind is Rejection.COLLISION
-        ]
+        reasons = ((candidate, candidate.reason) for candidate in candidates)
+        colliding = [c for c, reason in reasons if reason is not None and reason.kind is Rejection.COLLISION]
         if not colliding:
             return error
         worst = min(colliding, key=lambda candidate: np.inf if np.isnan(candidate.cost) else candidate.cost).reason
@@ -431,7 +399,7 @@ class CandidateSolver(Solver):
 
 
 def _is_separated(candidate: Candidate) -> bool:
-    return candidate.clearance_constraints is not None and bool(candidate.clearance_constraints.margins)
+    return candidate.constraints is not None and bool(candidate.constraints.margins)
 
 
 def _mesh_of(mesh: Collocation, solution: Solution) -> Collocation:

@@ -166,9 +166,8 @@ class Plan:
         t = np.atleast_1d(self._checked_times(times))
         at = self.at(t)
         bases = at["base"] if "base" in at else np.zeros((len(t), 0))
-        return PlanSample(
-            t, at["joints"], at["rates"], self._over(t, self.accelerations), self._tips(bases, at["joints"])
-        )
+        accelerations, tips = self._over(t, self.accelerations), self._tips(bases, at["joints"])
+        return PlanSample(t, at["joints"], at["rates"], accelerations, tips)
 
     @property
     def request(self) -> MotionRequest | None:
@@ -358,9 +357,8 @@ class Plan:
             return plan.with_targets(request.tasks) if request.builder and targets else plan
         except (*DAMAGED, ModelError) as error:
             name = getattr(error, "name", None) or "plan"
-            raise ProblemError(
-                f"{path}: the plan in it is damaged: {error}", name=str(name), value=str(path)
-            ) from error
+            words = f"{path}: the plan in it is damaged: {error}"
+            raise ProblemError(words, name=str(name), value=str(path)) from error
 
     def trajectory(self, period: float) -> JointTrajectory:
         """Return the joint trajectory with a point every `period` s."""
@@ -401,9 +399,8 @@ class Plan:
         clock = self.solution.states.get(CLOCK)
         if not (self.parts and contiguous and ends[-1] == (self.solution.horizon if clock is None else clock[-1, 0])):
             raise ValueError(f"its parts {self.parts} do not fill the time of its solution one after the other")
-        sizes_by_name = {
-            name: values.shape[1] for name, values in {**self.solution.states, **self.solution.controls}.items()
-        }
+        variables = {**self.solution.states, **self.solution.controls}
+        sizes_by_name = {name: values.shape[1] for name, values in variables.items()}
         sizes = {"joints": self.machine.joint_size, "base": self.machine.base_size}
         for part in self.parts:
             rate_sizes = [sizes_by_name.get(name + part.suffix) for name in RATES]
@@ -438,11 +435,8 @@ class Plan:
 
     def accelerations(self, part: Part, fraction: Array) -> Array:
         """Return the joint accelerations at fractions (M,) of a part. Shape (M, n)."""
-        sample, name, duration = (
-            self.solution.at_fraction(fraction),
-            self.rate_name + part.suffix,
-            part.end - part.begin,
-        )
+        sample, duration = self.solution.at_fraction(fraction), part.end - part.begin
+        name = self.rate_name + part.suffix
         if "accelerations" + part.suffix in sample:
             return sample["accelerations" + part.suffix]
         slope = self._slope(name, fraction)

@@ -27,7 +27,7 @@ from ocp.motion.local.collisions import distances_along
 from ocp.motion.local.inverse_kinematics import Unreachable
 from ocp.motion.plan.candidate import Candidate, Stage
 from ocp.motion.plan.motion import Part, Plan
-from ocp.motion.plan.planner import checked_request, clearance_constraints_for, plan_request
+from ocp.motion.plan.planner import checked_request, clearance_for, plan_request
 from ocp.motion.search.configurations import PlanRequest, fix_ignorable_joints, local_motions_from, start_configurations
 from ocp.motion.search.task_search import TaskSearch
 from ocp.motion.tasks.limits import Limits
@@ -87,11 +87,9 @@ class Reconfiguration:
 
     def __str__(self) -> str:
         largest = np.abs(self.after - self.before).max()
-        how = (
-            f"in {self.duration:.4g} s"
-            if self.motion is not None
-            else f"no collision-free motion was found: {self.failure}"
-        )
+        how = f"no collision-free motion was found: {self.failure}"
+        if self.motion is not None:
+            how = f"in {self.duration:.4g} s"
         return f"at {self.time:.4g} s the arm reconfigures, a joint by up to {largest:.3g}: {how}"
 
 
@@ -185,16 +183,13 @@ def plan_in_segments(
         SolveError: No segment could be planned, however the tasks were divided.
     """
     checked_instance("machine", machine, FixedBase)
-    request = checked_request(
-        machine, tasks, horizon, start=start, weights=weights, limits=limits, search="global", seed=seed
-    )
-    clearance_constraints = clearance_constraints_for(
-        machine, obstacles, clearance, ignored, srdf, folders, missing, limits
-    )
-    if clearance_constraints is not None and clearance_constraints.scene.moves_by_itself:
+    options: dict[str, Any] = {"start": start, "weights": weights, "limits": limits, "seed": seed}
+    request = checked_request(machine, tasks, horizon, search="global", **options)
+    constraints = clearance_for(machine, obstacles, clearance, ignored, srdf, folders, missing, limits)
+    if constraints is not None and constraints.scene.moves_by_itself:
         words = "moving obstacles do not wait while the arm reconfigures; give static obstacles"
         raise ProblemError(words, name="obstacles", value=obstacles)
-    request = replace(request, clearance_constraints=clearance_constraints)
+    request = replace(request, clearance_constraints=constraints)
     configurations = start_configurations(request)
     if request.start is None:
         configurations = fix_ignorable_joints(request, configurations)[1]
@@ -266,36 +261,33 @@ def _plan_reconfiguration(request: PlanRequest, time: float, before: Array, afte
         ]
     for via, duration in vias:
         try:
-            solution = _solve_reconfiguration(
-                request, before, via, after, duration, fastest, duration > straight, settings
-            )
+            path, separate = (before, via, after), duration > straight
+            solution = _solve_reconfiguration(request, *path, duration, fastest, separate, settings)
         except SolveError as error:
             if isinstance(error.__cause__, KeyboardInterrupt):
                 raise
             failure = failure or str(error).split("\n")[0]
             continue
         candidate = Candidate(before, solution.cost, None, Stage.AUDITED, solution)
-        return Reconfiguration(
-            time, before, after, Plan(request.machine, solution, (Part(0.0, duration, ""),), (candidate,))
-        )
+        motion = Plan(request.machine, solution, (Part(0.0, duration, ""),), (candidate,))
+        return Reconfiguration(time, before, after, motion)
     return Reconfiguration(time, before, after, None, failure)
 
 
 def _via_configurations(
     request: PlanRequest,
-    clearance_constraints: ClearanceConstraints,
+    constraints: ClearanceConstraints,
     before: Array,
     after: Array,
     settings: ReconfigurationSettings,
 ) -> Array:
     """Return collision-free random configurations, the nearest to the middle of two others first. Shape (K, n)."""
-    bounds, clearance = request.bounds, clearance_constraints.scene.clearance
+    bounds, clearance = request.bounds, constraints.scene.clearance
     low = np.maximum(np.minimum(before, after) - settings.reach, bounds.lower)
     high = np.minimum(np.maximum(before, after) + settings.reach, bounds.upper)
     samples = low + (high - low) * np.random.default_rng(request.seed).random((settings.samples, len(before)))
-    distances = distances_along(
-        clearance_constraints.scene, np.zeros(0), samples, np.zeros(settings.samples), clearance
-    )
+    scene, base, times = constraints.scene, np.zeros(0), np.zeros(settings.samples)
+    distances = distances_along(scene, base, samples, times, clearance)
     clear = samples[(distances >= clearance).all(axis=1)]
     return np.asarray(clear[np.argsort(((clear - (before + after) / 2) ** 2).sum(axis=1))[: settings.detours]])
 
@@ -321,7 +313,7 @@ def _solve_reconfiguration(
     machine, n, bounds = request.machine, request.machine.joint_size, request.bounds
     guess = {"joints": Samples(np.array([0.0, duration / 2, duration]), np.array([before, via, after]))}
 
-    def run(clearance_constraints: ClearanceConstraints | None) -> Solution:
+    def run(constraints: ClearanceConstraints | None) -> Solution:
         problem = Problem("reconfiguration")
         problem.horizon(duration)
         options: dict[str, Any] = {"lower": bounds.lower, "upper": bounds.upper, "unit": machine.robot.unit()}
@@ -329,8 +321,8 @@ def _solve_reconfiguration(
         max_rates = (1 + settings.rate_slack) * fastest
         rates = problem.control("rates", n, lower=-max_rates, upper=max_rates, unit=machine.robot.unit("/s"))
         problem.dynamics(joints, rates)
-        if clearance_constraints is not None:
-            clearance_constraints.declare(problem, machine.base_home(), joints, horizon=duration)
+        if constraints is not None:
+            constraints.declare(problem, machine.base_home(), joints, horizon=duration)
         problem.minimize(running=ca.dot(rates, ca.DM(request.weights) * rates) / 2)
         solution = solve(problem, settings.mesh, guess=guess, options=settings.options)
         audit = solution.audit()

@@ -61,14 +61,7 @@ from ocp.motion.tasks.equations import bind
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.tip_task import TipTask
 
-__all__ = [
-    "candidates_from",
-    "checked_request",
-    "clearance_constraints_for",
-    "plan",
-    "plan_from_configurations",
-    "plan_request",
-]
+__all__ = ["candidates_from", "checked_request", "clearance_for", "plan", "plan_from_configurations", "plan_request"]
 
 
 def plan_from_configurations(
@@ -135,7 +128,7 @@ def candidates_from(
         guess = solver.motion.guess(local, 0)
         seed = Seed(guess, float(costs[index]), local, bool(tracked[index]), **options)
         constraints = solver.request.clearance_constraints
-        candidates.append(Candidate(configurations[index], seed.cost, seed=seed, clearance_constraints=constraints))
+        candidates.append(Candidate(configurations[index], seed.cost, seed=seed, constraints=constraints))
     return candidates
 
 
@@ -239,36 +232,22 @@ def _try_alternatives(queue: CandidateQueue, solver: CandidateSolver, seeds: lis
     for seed in seeds:
         finished = finished_by_seed[id(seed.seed)]
         colliding = solver.collisions(finished)
-        if finished.clearance_constraints is not None and (colliding or finished.clearance_constraints.margins):
+        if finished.constraints is not None and (colliding or finished.constraints.margins):
             local = solver.local_collisions(seed.seed)
-            clearance_constraints = finished.clearance_constraints.holding(
-                [collision.pair for collision in (*colliding, *local)]
-            )
-            rerouted.append(
-                (
-                    min((collision.distance for collision in local), default=np.inf),
-                    replace(seed, clearance_constraints=clearance_constraints),
-                )
-            )
+            pairs = [collision.pair for collision in (*colliding, *local)]
+            constraints = finished.constraints.holding(pairs)
+            distance = min((collision.distance for collision in local), default=np.inf)
+            rerouted.append((distance, replace(seed, constraints=constraints)))
     alternatives = [seed for _, seed in sorted(rerouted, key=lambda entry: -entry[0])[:max_tries]]
     if request.start is None:
         collisions = start_collisions(request, np.array([seed.start for seed in seeds]))
         clear_starts = [seed for seed, collision in zip(seeds, collisions, strict=True) if collision is None]
-        tracked = [
-            candidate
-            for candidate in clear_starts
-            if max(largest_pose_errors([*candidate.seed.local])) <= REACH_TOLERANCE
-        ]
+        tracked = [c for c in clear_starts if max(largest_pose_errors([*c.seed.local])) <= REACH_TOLERANCE]
         tracked.sort(key=lambda candidate: candidate.seed.cost)
-        alternatives += [
-            replace(candidate, seed=replace(candidate.seed, direct=True, fixed=True))
-            for candidate in tracked[:max_tries]
-        ]
+        alternatives += [replace(c, seed=replace(c.seed, direct=True, fixed=True)) for c in tracked[:max_tries]]
     for seed in alternatives:
         start = seed.start
-        queue.candidates = [
-            candidate for candidate in queue.candidates if candidate.start is not start
-        ]  # it finishes again
+        queue.candidates = [c for c in queue.candidates if c.start is not start]  # it finishes again
         queue.run([seed])
         if queue.passed:
             return
@@ -338,12 +317,11 @@ def plan(
     options: dict[str, Any] = {"start": start, "cyclic": cyclic, "weights": weights, "limits": limits}
     options |= {"search": search, "seed": seed}
     if isinstance(machine, Standing):
-        return plan_to_stand(
-            machine, tasks, horizon, clearance_constraints=clearance_constraints_for(*collision_options), **options
-        )
+        constraints = clearance_for(*collision_options)
+        return plan_to_stand(machine, tasks, horizon, clearance_constraints=constraints, **options)
     options |= {"start_base": start_base, "time_cost": time_cost}
     request = checked_request(machine, tasks, horizon, **options)
-    return plan_request(replace(request, clearance_constraints=clearance_constraints_for(*collision_options)))
+    return plan_request(replace(request, clearance_constraints=clearance_for(*collision_options)))
 
 
 def plan_request(request: PlanRequest) -> Plan:
@@ -358,13 +336,12 @@ def plan_request(request: PlanRequest) -> Plan:
         start, configurations = fix_ignorable_joints(request, configurations)
     else:
         check_clear_start(request, configurations)
-    result, bound = plan_from_configurations(
-        request, configurations, CandidateSolver(request, start, configurations[0])
-    )
+    solver = CandidateSolver(request, start, configurations[0])
+    result, bound = plan_from_configurations(request, configurations, solver)
     return result if bound is None else replace(result, bound=checked_bound(bound, result.cost))
 
 
-def clearance_constraints_for(
+def clearance_for(
     machine: Machine,
     obstacles: Any,
     clearance: Any,

@@ -58,18 +58,8 @@ __all__ = ["MotionRequest", "declared_motion", "request_of", "restored_request",
 
 SHAPES = (Box, Capsule, Cylinder, HalfSpace, Mesh, Sphere)
 PARTS = (Robot, Link, Joint, Mimic, CollisionShape, VisualShape, Support)
-ARGUMENTS = (
-    TipTask,
-    Limits,
-    ClearanceConstraints,
-    Effort,
-    JointFriction,
-    Weights,
-    FreeTime,
-    InFoot,
-    Pinned,
-    IndexAtLeast,
-)
+STANDING = (Weights, FreeTime, InFoot, Pinned, IndexAtLeast)
+ARGUMENTS = (TipTask, Limits, ClearanceConstraints, Effort, JointFriction, *STANDING)
 MACHINES = (FixedBase, FreeFloating, Standing)
 KINDS = {kind.__name__: kind for kind in (*MACHINES, *PARTS, *SHAPES, *ARGUMENTS, MovingObstacle, Body)}
 SYMBOLS = {"SX": ca.SX, "MX": ca.MX}
@@ -120,14 +110,14 @@ def declared_motion(
     *,
     start: Any,
     reference: Any,
-    clearance_constraints: ClearanceConstraints | None,
+    constraints: ClearanceConstraints | None,
     limits: Limits | None = None,
 ) -> ToolMotion:
     """Declare the problem of a motion, which keeps its origin.
 
     Args:
         request: The request.
-        start, reference, clearance_constraints: As in `tool_motion_problem`.
+        start, reference, constraints: As in `tool_motion_problem`.
         limits: Limits that include those of the actuators, if these are limited; else None.
     """
     options: dict[str, Any] = {
@@ -139,7 +129,7 @@ def declared_motion(
         "time_cost": request.time_cost,
         "driven": limits is not None,
         "held": request.fixed_joints if limits is None else None,
-        "clearance_constraints": clearance_constraints,
+        "clearance_constraints": constraints,
     }
     bounds = (limits or request.limits).bounds(request.machine)
     motion = tool_motion_problem(request.machine, request.stretches, bounds=bounds, **options)
@@ -196,10 +186,8 @@ def stored_request(builder: str, arguments: Mapping[str, Any]) -> dict[str, Any]
             placed = {"vertices": value.hull.vertices, "position": value.position, "rotation": value.rotation}
             return {"kind": "Mesh", "fields": {name: put(part) for name, part in placed.items()}}
         if isinstance(value, CollisionScene) and value.machine is owner:
-            return {
-                "kind": "CollisionScene",
-                "fields": {name: put(part) for name, part in _scene_fields(value).items()},
-            }
+            scene_fields = {name: put(part) for name, part in _scene_fields(value).items()}
+            return {"kind": "CollisionScene", "fields": scene_fields}
         if is_dataclass(value) and KINDS.get(type(value).__name__) is type(value):
             parts = {each.name: getattr(value, each.name) for each in fields(value) if each.init}
             tracks = TRACKS.get(type(value), ())
@@ -277,9 +265,8 @@ def restored_request(record: Any) -> MotionRequest:
         machine = _read(pool["machine"], functions, None)
         if not isinstance(machine, MACHINES):
             raise TypeError(f"the machine is of type {type(machine).__name__}")
-        arguments = {
-            name: machine if name == "machine" else _read(value, functions, machine) for name, value in pool.items()
-        }
+        arguments = {name: _read(value, functions, machine) for name, value in pool.items() if name != "machine"}
+        arguments["machine"] = machine
         if record["builder"] not in BUILDERS and record["builder"] != "":
             raise ValueError(f"builder {record['builder']!r} is not known")
         return MotionRequest(record["builder"], arguments)

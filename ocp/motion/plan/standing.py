@@ -73,10 +73,8 @@ def plan_to_stand(
     equations = bind(machine, all_tasks)
     options: Asked = {"weights": weights, "limits": limits, "symbols": ca.SX if _takes_scalars(equations) else ca.MX}
     options["start"], options["end"] = _rest(equations, 0.0), _rest(equations, duration)
-    queue = CandidateQueue(
-        _StandingSolver(machine, all_tasks, duration, clearance_constraints, options, start is not None),
-        PlannerSettings(),
-    )
+    solver = _StandingSolver(machine, all_tasks, duration, clearance_constraints, options, start is not None)
+    queue = CandidateQueue(solver, PlannerSettings())
     seeds = [Candidate(joints) for joints in _start_configurations(machine, all_tasks, start, limits, seed)]
     for batch in [[candidate] for candidate in seeds] if search == "start" else [seeds]:
         queue.run(batch)

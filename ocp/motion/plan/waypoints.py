@@ -25,7 +25,7 @@ from ocp.errors import NOT_NUMBERS, ProblemError, SolveError, checked_choice, ch
 from ocp.motion.builders.clearance import clearance_of
 from ocp.motion.local.collisions import Collision, distances_along, find_collisions
 from ocp.motion.local.inverse_kinematics import LARGEST_SEED, Unreachable, at_rest
-from ocp.motion.plan.planner import clearance_constraints_for
+from ocp.motion.plan.planner import clearance_for
 from ocp.motion.plan.waypoint_plan import WaypointPlan
 from ocp.motion.search.charts import SelfMotionManifolds, TimeSample
 from ocp.motion.search.dead_end import RelaxationKind, dead_end
@@ -148,12 +148,8 @@ def plan_waypoints(
     checked_limits = Limits() if limits is None else checked_instance("limits", limits, Limits)
     joint_weights = np.ones(n) if weights is None else checked_numbers(weights, n, "weights", "one for each joint")
     if not ((joint_weights >= 0).all() and joint_weights.any()):
-        raise ProblemError(
-            f"weights {joint_weights.tolist()} must be non-negative and not all 0",
-            name="weights",
-            value=joint_weights,
-            limit=0.0,
-        )
+        words = f"weights {joint_weights.tolist()} must be non-negative and not all 0"
+        raise ProblemError(words, name="weights", value=joint_weights, limit=0.0)
     checked_choice("cost", cost, get_args(PathCost))
     checked_choice("reconfigurations", reconfigurations, get_args(Reconfigurations))
     for quantity in ("velocity", "acceleration", "jerk", "torque", "power"):
@@ -167,10 +163,8 @@ def plan_waypoints(
         if not joint_weights.any():
             raise ProblemError("cost='time' needs a joint with a velocity limit", name="velocity")
     max_step = _step(step, n)
-    clearance_constraints = clearance_constraints_for(
-        machine, obstacles, clearance, ignored, srdf, folders, missing, checked_limits
-    )
-    scene = None if clearance_constraints is None else clearance_constraints.scene
+    constraints = clearance_for(machine, obstacles, clearance, ignored, srdf, folders, missing, checked_limits)
+    scene = None if constraints is None else constraints.scene
     planner = _WaypointPlanner(
         machine,
         positions,
@@ -280,10 +274,8 @@ class _WaypointPlanner:
             raise SolveError(f"{NONE_FOUND}{reasons and ': '}{reasons}", name="waypoints")
         best = paths[0]
         candidates = tuple((path.cost, path.failure or ("" if path is best else "costlier")) for path in paths)
-        lower_bound, clearance = (
-            checked_bound(bound, best.cost) or 0.0,
-            self._verify_clearance(best.joints, best.breaks),
-        )
+        lower_bound = checked_bound(bound, best.cost) or 0.0
+        clearance = self._verify_clearance(best.joints, best.breaks)
         return WaypointPlan(self.machine, best.joints, best.cost, lower_bound, candidates, clearance, best.breaks)
 
     def _verify_clearance(self, joints: Array, breaks: tuple[int, ...]) -> Clearance | None:

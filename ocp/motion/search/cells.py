@@ -86,9 +86,8 @@ def tracks_tasks(request: PlanRequest, motions: Sequence[LocalMotion]) -> NDArra
             base, joints = ((value[:, k] + value[:, k + 1]) / 2 for value in (motion.base, motion.joints))
             speeds = kinematics.velocity_errors(base, joints, motion.rates[:, k], motion.t[k] + step / 2)
             missing, prescribed = missing + step * speeds[0], prescribed + step * speeds[1]
-    return np.asarray(
-        (np.array(largest_pose_errors(list(motions))) <= REACH_TOLERANCE) & (missing <= MAX_VELOCITY_ERROR * prescribed)
-    )
+    tracked = np.array(largest_pose_errors(list(motions))) <= REACH_TOLERANCE
+    return np.asarray(tracked & (missing <= MAX_VELOCITY_ERROR * prescribed))
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,9 +246,8 @@ class _CellPass:
         request, step, root = self.request, time - layer.time, self.root
         self_motions = self._sample_self_motions(len(layer.cost), task.null.shape[2])
         parents = np.repeat(np.arange(len(layer.cost)), self_motions.shape[1])
-        null_rates = (
-            np.asarray(task.null @ self_motions.transpose(0, 2, 1)).transpose(0, 2, 1).reshape(len(parents), -1)
-        )
+        null_rates = np.asarray(task.null @ self_motions.transpose(0, 2, 1)).transpose(0, 2, 1)
+        null_rates = null_rates.reshape(len(parents), -1)
         rates, limit_counts = task.least_rates(task.right)[parents] + null_rates, Counter[tuple[int, int]]()
         if limited:
             bounds, joints = request.bounds, layer.joints[parents]
@@ -269,20 +267,17 @@ class _CellPass:
         kept = self._best_of_cells(base, layer.joints[parents] + step * rates / root, cost, resize=True)
         parents, rates = parents[kept], rates[kept]
         start_base, start_joints = layer.base[parents], layer.joints[parents]
-        tolerance = REACH_TOLERANCE / 10
-        base, joints, pose_error = kinematics.step(
-            start_base, start_joints, task.select(parents), rates, layer.time, time, tolerance
-        )
+        states = start_base, start_joints, task.select(parents)
+        base, joints, error = kinematics.step(*states, rates, layer.time, time, REACH_TOLERANCE / 10)
         cost = layer.cost[parents] + ((root * (joints - start_joints)) ** 2).sum(axis=1) / (2 * step)
         finite = np.isfinite(base).all(axis=1) & (np.abs(joints - start_joints).max(axis=1) <= self._settings.longest)
         expanded = _Layer(time, base, joints, cost, parents)
-        expanded = expanded.select(np.flatnonzero(finite & (cost <= self.max_cost) & (pose_error <= REACH_TOLERANCE)))
+        expanded = expanded.select(np.flatnonzero(finite & (cost <= self.max_cost) & (error <= REACH_TOLERANCE)))
         expanded = expanded.select(np.flatnonzero(self._valid_states(kinematics, expanded)))
         if not len(expanded.cost):
             return None, limit_counts
-        return expanded.select(
-            self._best_of_cells(expanded.base, expanded.joints, expanded.cost, resize=False)
-        ), limit_counts
+        best = self._best_of_cells(expanded.base, expanded.joints, expanded.cost, resize=False)
+        return expanded.select(best), limit_counts
 
     def _sample_self_motions(self, count: int, r: int) -> Array:
         """Return self-motions to be tried from each state, as coordinates in its null space. Shape (count, C, r)."""
@@ -292,9 +287,8 @@ class _CellPass:
         if r <= 1:
             return np.tile(rates[None, :, None] if r else np.zeros((1, 1, 0)), (count, 1, 1))
         samples = self._rng.normal(size=(count, levels * r, r))
-        samples *= self._rng.choice(np.abs(rates), size=(*samples.shape[:2], 1)) / np.linalg.norm(
-            samples, axis=2, keepdims=True
-        )
+        sizes = self._rng.choice(np.abs(rates), size=(*samples.shape[:2], 1))
+        samples *= sizes / np.linalg.norm(samples, axis=2, keepdims=True)
         samples[:, 0] = 0.0
         return np.asarray(samples)
 
@@ -304,9 +298,8 @@ class _CellPass:
         points = np.hstack([joints * self.root, attitude * np.sqrt(np.mean(self.root**2))])
         hash_weights = np.random.default_rng(0).uniform(1.0, 2.0, size=points.shape[1])
         order = np.argsort(cost, kind="stable")
-        points = points[order] - points.min(
-            axis=0
-        )  # without the offset, coordinates of either sign would form cells of their own
+        # without the offset, coordinates of either sign would form cells of their own
+        points = points[order] - points.min(axis=0)
 
         def winners(width: float) -> Indices:
             return np.asarray(order[np.unique(np.floor(points / width) @ hash_weights, return_index=True)[1]])
@@ -337,9 +330,8 @@ class _CellPass:
 
     def _states_at_new_poses(self, layer: _Layer, kinematics: ReducedKinematics) -> _Layer:
         """Return states corrected to the poses of tasks that begin now."""
-        corrected = kinematics.correct_poses(
-            layer.base, layer.joints, layer.time, REACH_TOLERANCE / 10, max_steps=self._settings.corrections
-        )
+        states, max_steps = (layer.base, layer.joints, layer.time), self._settings.corrections
+        corrected = kinematics.correct_poses(*states, REACH_TOLERANCE / 10, max_steps=max_steps)
         base, joints, pose_error = corrected
         cost = layer.cost + ((self.root * (joints - layer.joints)) ** 2).sum(axis=1) / (2 * layer.time)
         reached = np.flatnonzero(pose_error <= REACH_TOLERANCE)
@@ -360,9 +352,8 @@ class _CellPass:
             value = float(layer.joints[layer.cost.argmin(), joint])
             details |= {"name": names[joint], "value": value, "limit": limit}
         count = len(layer.cost)
-        return DeadEnd(
-            f"no motion continues after {layer.time:.4g} s: in the {count} states reached there, {words}", **details
-        )
+        where = f"no motion continues after {layer.time:.4g} s: in the {count} states reached there"
+        return DeadEnd(f"{where}, {words}", **details)
 
     # ---- results -----------------------------------------------------------------------------------------------------
 

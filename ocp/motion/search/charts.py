@@ -243,9 +243,8 @@ class SelfMotionManifolds:
             unfinished = ~done & np.isfinite(error_size)
             active, error, jacobian = active[unfinished], error[unfinished], jacobian[unfinished]
             if active.size:
-                step = np.einsum(
-                    "kmn,km->kn", jacobian, _solve_normal_equations(jacobian @ jacobian.transpose(0, 2, 1), error)
-                )
+                solved = _solve_normal_equations(jacobian @ jacobian.transpose(0, 2, 1), error)
+                step = np.einsum("kmn,km->kn", jacobian, solved)
                 projected[active] += np.clip(step, -1.0, 1.0) / self.space.scale
         return projected, converged
 
@@ -283,9 +282,8 @@ class SelfMotionManifolds:
                 break
             projected, distances = self._deviations(layer[active], joints[active], tangents[active], radii[active])
             points[active], deviations[active] = projected, distances
-            curved = ~(
-                self.space.length(distances) <= self.settings.flatness[tangents.shape[2]] * radii[active, None]
-            ).all(axis=1)
+            largest = self.settings.flatness[tangents.shape[2]] * radii[active, None]
+            curved = ~(self.space.length(distances) <= largest).all(axis=1)
             if halving < self.settings.halvings:
                 radii[active[curved]] /= 2
             active = active[curved]
@@ -390,9 +388,8 @@ class SelfMotionManifolds:
         """Replace charts by charts of half the radius; a chart whose halves cannot be projected stays."""
         r = charts.tangents.shape[2]
         signs = np.array(list(product((-0.5, 0.5), repeat=r))).reshape(2**r, r)
-        tangent_points = charts.centers[:, None] + charts.radii[:, None, None] * np.einsum(
-            "knr,cr->kcn", charts.tangents, signs
-        )
+        offsets = charts.radii[:, None, None] * np.einsum("knr,cr->kcn", charts.tangents, signs)
+        tangent_points = charts.centers[:, None] + offsets
         shape = tangent_points.shape
         layer = np.repeat(charts.layer, shape[1])
         joints, valid = self.project(layer, tangent_points.reshape(-1, shape[2]))

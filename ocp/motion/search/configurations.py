@@ -104,9 +104,8 @@ def start_configurations(request: PlanRequest) -> Array:
     except Unreachable as error:
         raise locate_error(request, error, 0.0) from error
     resting, moving = at_rest(request.bounds.lower, request.bounds.upper), request.machine.robot.moving_joints
-    solutions = [
-        replace(solution, joints=np.where(request.idle_joints, resting, solution.joints)) for solution in solutions
-    ]
+    idle = request.idle_joints
+    solutions = [replace(solution, joints=np.where(idle, resting, solution.joints)) for solution in solutions]
     solutions = distinct(solutions, np.array([joint.kind != "prismatic" for joint in moving]))
     joints = np.array([solution.joints for solution in solutions])
     colliding = [collision is not None for collision in start_collisions(request, joints)]
@@ -214,9 +213,8 @@ def local_motions_from(request: PlanRequest, configurations: Array) -> list[Loca
                 motions.append(LocalMotion.resting(times, base, joints))
             else:
                 options: dict[str, Any] = {"weights": request.weights, "damping": damping}
-                motions.append(
-                    follow(equations, joints, base, times, lower=bounds.lower, upper=bounds.upper, **options)
-                )
+                options |= {"lower": bounds.lower, "upper": bounds.upper}
+                motions.append(follow(equations, joints, base, times, **options))
             base, joints = motions[-1].base[:, -1], motions[-1].joints[:, -1]
         least_damped = least_damped or motions
         if min(largest_pose_errors(motions)) <= REACH_TOLERANCE:

@@ -231,10 +231,8 @@ class _Propagation:
     def _propagate(self, graph: ChartGraph, k: int) -> None:
         """Step from a sample to the charts of the next one: from the largest clearance first, then the nearest."""
         space, limit, successor = self.search.space, self.search.limits[k], k + 1
-        parts = [
-            (i[np.isfinite(self.joints[k][i, 0])], j[np.isfinite(self.joints[k][i, 0])])
-            for i, j in graph.edges(k, successor)
-        ]
+        reached = np.isfinite(self.joints[k][:, 0])
+        parts = [(i[reached[i]], j[reached[i]]) for i, j in graph.edges(k, successor)]
         if not parts:
             return
         i, j = (np.concatenate(part) for part in zip(*parts, strict=True))
@@ -305,9 +303,8 @@ def _find_obstructions(search: AtlasSearch, front: _Propagation) -> list[Obstruc
         times = np.full(len(targets), search.times[next_sample])
         distances = distances_along(scene, np.zeros(0), targets, times, clearance)
     displacements = np.abs(targets - before)
-    excess = np.column_stack(
-        [pose_errors, targets - space.upper, space.lower - targets, displacements - limits, clearance - distances]
-    )
+    over, under = targets - space.upper, space.lower - targets
+    excess = np.column_stack([pose_errors, over, under, displacements - limits, clearance - distances])
     excess[~converged, 1:] = 0.0
     worst = excess.argmax(axis=1)
     largest = excess[np.arange(len(worst)), worst]
@@ -322,9 +319,8 @@ def _find_obstructions(search: AtlasSearch, front: _Propagation) -> list[Obstruc
             bound = float((space.upper, space.lower)[kind][joint])
             return Obstruction(ObstructionKind.LIMIT, names[joint], float(next_[joint]), bound, here, next_)
         if kind == 2:
-            return Obstruction(
-                ObstructionKind.STEP, names[joint], float(displacements[row, joint]), float(limits[joint]), here, next_
-            )
+            step, largest_step = float(displacements[row, joint]), float(limits[joint])
+            return Obstruction(ObstructionKind.STEP, names[joint], step, largest_step, here, next_)
         assert scene is not None
         pair = int(worst[row]) - 1 - 3 * n
         bodies = " and ".join(scene.labels[pair])
@@ -337,9 +333,8 @@ def _find_obstructions(search: AtlasSearch, front: _Propagation) -> list[Obstruc
             smallest.setdefault((entry.kind, entry.name), entry)
     if not smallest:  # configurations go on, but no propagated one does
         charts = front.layers[next_sample].centers
-        return [
-            Obstruction(ObstructionKind.NARROW, "tip", 0.0, 0.0, before[0], charts[0] if len(charts) else before[0])
-        ]
+        after = charts[0] if len(charts) else before[0]
+        return [Obstruction(ObstructionKind.NARROW, "tip", 0.0, 0.0, before[0], after)]
     return list(smallest.values())
 
 
@@ -421,22 +416,19 @@ class _RelaxedProblem:
                 continue
             q, target = ca.SX.sym("q", n), ca.SX.sym("wanted", manifolds.targets.shape[1])
             error, turning_rows = manifolds.equations.error(ca.SX(0, 1), q, target), manifolds.equations.turning
-            relaxed = np.append(
-                turning_rows == turning, np.zeros(manifolds.equations.size - len(turning_rows), dtype=bool)
-            )
+            rest = np.zeros(manifolds.equations.size - len(turning_rows), dtype=bool)
+            relaxed = np.append(turning_rows == turning, rest)
             ends = np.cumsum([0, *(part.task.size for part in manifolds.equations.bound)]).tolist()
             parts = [a + np.flatnonzero(relaxed[a:b]) for a, b in pairwise(ends)]
             norms = ca.vertcat(*(ca.sumsqr(error[part.tolist()]) for part in parts if part.size))
             errors_by_kind = [error[np.flatnonzero(chosen).tolist()] for chosen in (~relaxed, relaxed)]
             errors = ca.Function("errors", [q, target], [*errors_by_kind, norms]).map(len(indices))
             targets = manifolds.targets[[search.samples[k].row for k in indices]].T
-            for expressions, part in zip(
-                (constraints, rows, norms_squared), errors(self.joints[:, indices], targets), strict=True
-            ):
+            values = errors(self.joints[:, indices], targets)
+            for expressions, part in zip((constraints, rows, norms_squared), values, strict=True):
                 expressions.append(ca.vec(part))
-        self._constraints, self._relaxed_rows, self._norms = (
-            ca.vertcat(ca.MX(0, 1), *part) for part in (constraints, rows, norms_squared)
-        )
+        stacked = (ca.vertcat(ca.MX(0, 1), *part) for part in (constraints, rows, norms_squared))
+        self._constraints, self._relaxed_rows, self._norms = stacked
         self._largest_norm = ca.Function("size", [self.joints], [ca.mmax(self._norms)])
         self._separations = ca.MX(0, 1)
         if search.scene is not None and pairs:

@@ -81,17 +81,13 @@ def fewest_segments(
     ranges = _segment_ranges(search, gap, barred)
     if ranges is None:
         return None
-    lower_bounds = {
-        span: cost for span, cost in _segment_bounds(search, *ranges).items() if not _is_barred(span, gap, barred)
-    }
+    bounds = _segment_bounds(search, *ranges).items()
+    lower_bounds = {span: bound for span, bound in bounds if not _is_barred(span, gap, barred)}
     segments = dict[Span, Segment | None]()
 
     def best_chain(bounded: bool, bounds: bool = False) -> tuple[list[Span], float]:
         """Return the best chain by costs or bounds of known segments, with or without bounds of the others."""
-        costs = {
-            span: np.inf if segment is None else segment.bound if bounds else segment.cost
-            for span, segment in segments.items()
-        }
+        costs = {span: np.inf if s is None else s.bound if bounds else s.cost for span, s in segments.items()}
         return _best_chain(*ranges, gap, (lower_bounds if bounded else {}) | costs)
 
     for _ in range(settings.max_iterations):
@@ -123,9 +119,8 @@ def _segment_ranges(search: AtlasSearch, gap: int, barred: Collection[Span]) -> 
     # backwards, fewer segments can only result from a miss of the forward search
     earliest = [0, *starts[::-1][1:]] if len(starts) == len(ends) else [0, *(end + gap for end in ends[:-1])]
     start_ranges = [range(earliest[m], (ends[m - 1] + gap if m else 0) + 1) for m in range(len(ends))]
-    end_ranges = [range(start_ranges[m + 1][0] - gap, ends[m] + 1) for m in range(len(ends) - 1)] + [
-        range(last, last + 1)
-    ]
+    end_ranges = [range(start_ranges[m + 1][0] - gap, ends[m] + 1) for m in range(len(ends) - 1)]
+    end_ranges.append(range(last, last + 1))
     return start_ranges, end_ranges
 
 
@@ -281,9 +276,8 @@ class SectionSearch(AtlasSearch):
         targets = np.tile(manifolds.targets[indices], (value_count, 1))
         fixed = manifolds.equations.fixed if isinstance(manifolds.equations, TasksWithFixedJoints) else ()
         equations = TasksWithFixedJoints(manifolds.equations.machine, manifolds.equations.bound, (*fixed, self._joint))
-        self._curves = SelfMotionManifolds(
-            self.space, equations, np.column_stack([targets, np.repeat(self._values, count)])
-        )
+        targets = np.column_stack([targets, np.repeat(self._values, count)])
+        self._curves = SelfMotionManifolds(self.space, equations, targets)
         seed_configurations = [seeds(k) for k in range(count)]
         samples = np.repeat(np.arange(count), [len(configurations) for configurations in seed_configurations])
         layer = (samples + count * np.arange(value_count)[:, None]).ravel()

@@ -125,9 +125,8 @@ class ReducedKinematics:
             lower[:, i, i] = np.where(np.abs(lower[:, i, i]) < threshold, threshold, lower[:, i, i])
         if self.equations is not None:
             error = np.where(self.equations.posed, error, 0.0)
-        return TaskKinematics(
-            right, error, base_jacobian, drift, basis[:, :, : self.rows], lower, basis[:, :, self.rows :]
-        )
+        row_space, null = basis[:, :, : self.rows], basis[:, :, self.rows :]
+        return TaskKinematics(right, error, base_jacobian, drift, row_space, lower, null)
 
     def speed(self, base: Array, joints: Array, time: float) -> Array:
         """Estimate the squared scaled rates (K,) that the tasks require at a time, far from singularities."""
@@ -145,9 +144,8 @@ class ReducedKinematics:
         if self.equations is None or self.equations.posed.all():
             return zeros, zeros
         task, rows = self.at(base, joints, time), ~self.equations.posed
-        return np.linalg.norm((task.task_rates(rates * self.root) - task.right)[:, rows], axis=1), np.linalg.norm(
-            task.right[:, rows], axis=1
-        )
+        errors = (task.task_rates(rates * self.root) - task.right)[:, rows]
+        return np.linalg.norm(errors, axis=1), np.linalg.norm(task.right[:, rows], axis=1)
 
     def step(
         self, base: Array, joints: Array, task: TaskKinematics, rates: Array, begin: float, end: float, tolerance: float
@@ -195,9 +193,9 @@ class ReducedKinematics:
             return base, joints, pose_error
         for iteration in range(max_steps + 1):
             task = self.at(base, joints, time)
-            error = (
-                task.error if remaining is None else np.where(self.equations.posed, task.error, remaining(task, joints))
-            )
+            error = task.error
+            if remaining is not None:
+                error = np.where(self.equations.posed, error, remaining(task, joints))
             pose_error = np.abs(error).max(axis=1)
             pose_error = np.where(np.isfinite(pose_error), pose_error, np.inf)
             if iteration == max_steps or pose_error.max(initial=0.0) <= tolerance:
@@ -247,9 +245,8 @@ def limit_rates(
         )
         directions = null[active, worst]
         leverage = (directions**2).sum(axis=1)
-        share = np.where(
-            leverage > ROUNDING_SHARE, (limit - rates[active, worst]) / np.maximum(leverage, ROUNDING_SHARE), 0.0
-        )
+        change = (limit - rates[active, worst]) / np.maximum(leverage, ROUNDING_SHARE)
+        share = np.where(leverage > ROUNDING_SHARE, change, 0.0)
         rates[active] += share[:, None] * (null[active] @ directions[:, :, None])[:, :, 0]
     return rates, violations
 

@@ -217,9 +217,8 @@ class AtlasSearch:
             minima += [(float(costs[i]), k, i) for i in np.flatnonzero(is_minimum).tolist()]
         paths: list[tuple[float, Array]] = []
         for lower_bound, k, chart in sorted(minima):
-            if len(paths) == self.settings.max_classes or (
-                paths and lower_bound > self.settings.max_cost_ratio * paths[0][0]
-            ):
+            too_costly = paths and lower_bound > settings.max_cost_ratio * paths[0][0]
+            if len(paths) == settings.max_classes or too_costly:
                 break
             path = self._path_through(graph, k, chart, cost_to_come, cost_to_go)
             differences = (np.abs(self.space.difference(path, known)).max() for _, known in paths if path is not None)
@@ -237,10 +236,8 @@ class AtlasSearch:
         cost_to_go: list[QuadraticBounds],
     ) -> Array | None:
         """Return the lowest-cost path through a chart, or None if it cannot be continued."""
-        slope, start_chart = (
-            cost_to_go[k].slope[chart] + (cost_to_come[k].slope[chart] if k else 0.0),
-            graph.layers[k].select([chart]),
-        )
+        slope = cost_to_go[k].slope[chart] + (cost_to_come[k].slope[chart] if k else 0.0)
+        start_chart = graph.layers[k].select([chart])
         place = np.where(slope > 0, start_chart.low[0], np.where(slope < 0, start_chart.high[0], 0.0))
         start = self.project_in_box(k, start_chart, place)
         if start is None:
@@ -249,9 +246,8 @@ class AtlasSearch:
         for values, order in ((cost_to_go, range(k + 1, last + 1)), (cost_to_come, range(k - 1, -1, -1))):
             current = start
             for neighbour in order:
-                candidates = graph.successors(
-                    current, neighbour - int(np.sign(order.step)), neighbour, values[neighbour]
-                )
+                previous = neighbour - int(np.sign(order.step))
+                candidates = graph.successors(current, previous, neighbour, values[neighbour])
                 successor = next(
                     (
                         configuration
@@ -274,10 +270,8 @@ class AtlasSearch:
         middle = (box.low[0] + box.high[0]) / 2
         shares = (0.0, 0.25, 0.5, 1.0)
         candidates = (box.centers[0] + box.tangents[0] @ (place + share * (middle - place)) for share in shares)
-        return next(
-            (configuration for candidate in candidates if (configuration := self._project(k, candidate)) is not None),
-            None,
-        )
+        projected = (self._project(k, candidate) for candidate in candidates)
+        return next((configuration for configuration in projected if configuration is not None), None)
 
     def _project(self, k: int, joints: Array) -> Array | None:
         """Project joints onto the manifold of a sample; return None if limits or clearance are then violated."""
@@ -344,9 +338,8 @@ class AtlasSearch:
             if coarse:
                 self._cost_bounds, coarse = (graph, cost_to_go, cost_to_come), False
             through = [graph.cost_through(cost_to_come, cost_to_go, k) for k in range(len(layers))]
-            before, after = (
-                [float(graph.minima(values, k).min()) for k, values in enumerate(v)] for v in (cost_to_come, cost_to_go)
-            )
+            bounds = cost_to_come, cost_to_go
+            before, after = ([float(graph.minima(each, k).min()) for k, each in enumerate(v)] for v in bounds)
             remaining = np.maximum(remaining, np.array(before[:-1]) + np.array(after[1:]))
             promising = [total < target * best_cost for total in through]
             layers_left = [charts.select(rows) for charts, rows in zip(layers, promising, strict=True)]
@@ -354,9 +347,8 @@ class AtlasSearch:
                 return best_path, target * best_cost
             if not self._can_split(layers_left, self.settings.charts):
                 return best_path, max(bound, 0.0)
-            refined = [
-                self._refine(layers_left[k], k, cost_to_come[k].select(rows)) for k, rows in enumerate(promising)
-            ]
+            come = [values.select(rows) for values, rows in zip(cost_to_come, promising, strict=True)]
+            refined = [self._refine(charts, k, come[k]) for k, charts in enumerate(layers_left)]
             layers, known_bounds = [charts for charts, _ in refined], [values for _, values in refined]
 
     def find_path(self, max_cost: float) -> tuple[list[Charts], Array | None]:
@@ -437,9 +429,8 @@ class AtlasSearch:
         if self.start is None:
             radius = max(float(charts.radii.max()) for charts in layers)
             shortened = shorten_path(path, self.samples, *steps, bounds, self.scene, (radius / 2, radius / 64))
-            path = (
-                shortened if all(self._project(k, joints) is not None for k, joints in enumerate(shortened)) else path
-            )
+            valid = all(self._project(k, joints) is not None for k, joints in enumerate(shortened))
+            path = shortened if valid else path
         return path if (np.abs(np.diff(path, axis=0)) <= self.limits + TOLERANCE).all() else None
 
     def split_charts(self, charts: Charts, k: int) -> Charts:

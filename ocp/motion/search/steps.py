@@ -17,16 +17,9 @@ from models.arrays import Array
 from ocp.motion.search.charts import Charts
 
 __all__ = [
-    "CurvedCharts",
-    "Homogeneous",
-    "LargestMotion",
-    "PathLength",
-    "QuadraticBounds",
-    "SquaredRates",
-    "StepBounds",
-    "StepCost",
-    "least_in_box",
-]
+    "CurvedCharts", "Homogeneous", "LargestMotion", "PathLength", "QuadraticBounds", "SquaredRates", "StepBounds",
+    "StepCost", "least_in_box",
+]  # fmt: skip
 
 MAX_CUTS = 8
 """Cuts with tangents by which the minimum of a homogeneous cost is bracketed; it has one linear piece per joint."""
@@ -269,10 +262,8 @@ class SquaredRateBounds:
 
     def lower(self, places: Array, slope: Array, curve: Array) -> Array:
         """Return places (P, r) where the bounds, less slope . t + t . curve . t / 2, are lower."""
-        gradient = (
-            -_apply_transposed(self.rotation, self.projection + self._minimize_after(_rows_last(places))[2])
-            / self.seconds
-        )
+        end_place = self._minimize_after(_rows_last(places))[2]
+        gradient = -_apply_transposed(self.rotation, self.projection + end_place) / self.seconds
         square = _multiply_transposed(self.rotation, self.rotation) / self.seconds + self.level - _rows_last(curve)
         return _rows_first(_least_in_box(gradient + self.slope - _rows_last(slope), square, *self.start_box)[1])
 
@@ -470,7 +461,6 @@ def _raise_eigenvalues(square: Array, floor: float) -> tuple[Array, Array]:
     if rows.size:
         values, vectors = np.linalg.eigh(np.moveaxis(square[..., rows], -1, 0))
         square = square.copy()
-        square[..., rows] = np.moveaxis(
-            (vectors * np.maximum(values, floor)[:, None]) @ vectors.transpose(0, 2, 1), 0, -1
-        )
+        raised = (vectors * np.maximum(values, floor)[:, None]) @ vectors.transpose(0, 2, 1)
+        square[..., rows] = np.moveaxis(raised, 0, -1)
     return square, excess

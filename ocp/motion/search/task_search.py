@@ -104,9 +104,8 @@ class TaskSearch:
             steps = int(np.ceil(settings.steps * stretch.duration / request.horizon))
             lost = settings.lost[max(free_directions, 0)]
             chosen = choose_samples(motion.t, motion.joints[best], request.weights, lost, steps)
-            times.append(
-                chosen[1:] if times and chosen[0] <= times[-1][-1] else chosen
-            )  # the stretch before ends there
+            shared = bool(times) and chosen[0] <= times[-1][-1]  # the stretch before ends there
+            times.append(chosen[1:] if shared else chosen)
         if not times:
             words = f"no task is active within the horizon of {request.horizon:g} s; shorten the horizon"
             raise ProblemError(words, name="horizon", value=request.horizon)

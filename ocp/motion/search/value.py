@@ -132,16 +132,14 @@ class ChartGraph:
         reach = min(reach, MAX_STEP)
         tree = self.space.tree(there.centers)
         sample = self.space.tree(here.centers[:: max(len(here) // self.settings.sample, 1)])
-        mean_count = (
-            sample.count_neighbors(tree, min(reach + float(sizes[0].max() + sizes[1].max()), MAX_STEP)) / sample.n
-        )
+        radius = min(reach + float(sizes[0].max() + sizes[1].max()), MAX_STEP)
+        mean_count = sample.count_neighbors(tree, radius) / sample.n
         batch = max(16, int(self.settings.pairs / max(mean_count, 1.0)))
         for first in range(0, len(here), batch):
             rows = np.arange(first, min(first + batch, len(here)))
             batch_tree = self.space.tree(here.centers[rows])
-            pairs = batch_tree.sparse_distance_matrix(
-                tree, reach + float(sizes[0][rows].max() + sizes[1].max()), output_type="ndarray"
-            )
+            radius = reach + float(sizes[0][rows].max() + sizes[1].max())
+            pairs = batch_tree.sparse_distance_matrix(tree, radius, output_type="ndarray")
             i, j, distance = rows[pairs["i"]], pairs["j"].astype(np.intp), pairs["v"]
             close = distance <= reach + sizes[0][i] + sizes[1][j]
             i, j = i[close], j[close]
@@ -185,9 +183,8 @@ class ChartGraph:
             excluded = self.minima(known_bounds[first], first) >= max_cost
             bounds[first] = QuadraticBounds.constant(np.where(excluded, np.inf, 0.0), free)
         for k in order[1:]:
-            bounds[k] = self._propagate(
-                k, k - direction, bounds[k - direction], None if known_bounds is None else known_bounds[k], max_cost
-            )
+            rest = None if known_bounds is None else known_bounds[k]
+            bounds[k] = self._propagate(k, k - direction, bounds[k - direction], rest, max_cost)
         return bounds
 
     def _propagate(
@@ -218,9 +215,8 @@ class ChartGraph:
             np.minimum.at(floor, i, lower)
             promising = (lower <= _least_of_groups(upper, i)) & (known_costs[i] + lower < max_cost)
             i, j, delta = i[promising], j[promising], delta[promising]
-            steps = self.cost.lower_bounds(
-                delta, self.curved[k].select(i), self.curved[neighbour].select(j), after.select(j), seconds
-            )
+            ends = self.curved[k].select(i), self.curved[neighbour].select(j)
+            steps = self.cost.lower_bounds(delta, *ends, after.select(j), seconds)
             if known_bounds is not None:
                 affordable = np.flatnonzero(_bound_with_rest(steps, here.select(i), known_bounds.select(i)) < max_cost)
                 i, steps = i[affordable], steps.select(affordable)
@@ -280,23 +276,20 @@ def _bound_charts(
     middle, half = (charts.low + charts.high) / 2, (charts.high - charts.low) / 2
     places = [middle, *(middle + side * half * np.eye(r)[axis] for axis in range(r) for side in (-1.0, 1.0))]
     # less the curvature of the cheapest step and the concavity of the least of all, they are nearly affine
-    values_and_slopes, curves = [steps.at(place) for place in places], steps.curve
-    curve = curves[np.lexsort((values_and_slopes[0][0], group))[starts]].copy()
-    heights = np.minimum.reduceat(np.stack([value for value, _ in values_and_slopes]), starts, axis=1)
+    tangents, curves = [steps.at(place) for place in places], steps.curve
+    curve = curves[np.lexsort((tangents[0][0], group))[starts]].copy()
+    heights = np.minimum.reduceat(np.stack([value for value, _ in tangents]), starts, axis=1)
     heights = np.minimum(heights, max_costs)
     curve += _concavity(heights - _quadratic_at_places(curve, places, starts), half[starts], curve)
     common = curve[group]
-    values = np.stack(
-        [value - _quadratic(common, place) for (value, _), place in zip(values_and_slopes, places, strict=True)]
-    )
+    values = np.stack([tangent[0] - _quadratic(common, place) for tangent, place in zip(tangents, places, strict=True)])
     slope = _secant_slopes([*(heights - _quadratic_at_places(curve, places, starts))], half[starts])
     # how far the steps lie above the linear functions: by tangent planes at places where they are low
     tilt, rows = slope[group], np.arange(len(charts))
     excess = values - np.stack([(place * tilt).sum(axis=1) for place in places])
     upper, best_place = np.minimum.reduceat(excess.min(axis=0), starts)[group], excess.argmin(axis=0)
-    lowest, value, slope_at = (
-        np.stack(parts)[best_place, rows] for parts in (places, *zip(*values_and_slopes, strict=True))
-    )
+    stacked = (np.stack(parts)[best_place, rows] for parts in (places, *zip(*tangents, strict=True)))
+    lowest, value, slope_at = stacked
     best = _tangent_bounds(lowest, (value, slope_at), curves, common, tilt)
     least = best.minimum(charts.low, charts.high)[0]
     for _ in range(settings.tangents):  # the steps that may be the least of their chart
@@ -359,9 +352,8 @@ def _concavity(values: Array, half: Array, curve: Array) -> Array:
     """
     second_differences = (values[1::2] + values[2::2] - 2 * values[0]).T
     with np.errstate(divide="ignore", invalid="ignore"):
-        second_differences = np.where(
-            half > 0, np.clip(second_differences / half**2, -np.maximum(np.einsum("paa->pa", curve), 0.0), 0.0), 0.0
-        )
+        largest = np.maximum(np.einsum("paa->pa", curve), 0.0)
+        second_differences = np.where(half > 0, np.clip(second_differences / half**2, -largest, 0.0), 0.0)
     return second_differences[:, :, None] * np.eye(half.shape[1])
 
 
@@ -441,13 +433,11 @@ def shorten_path(
         for part, (manifold, those) in enumerate(rows):
             tangents[part] = manifold.tangents_at(indices[those], joints[those], tangents.get(part))
             tangent_points = joints[those, None] + width * np.einsum("knr,sr->ksn", tangents[part], shifts)
-            projected, converged = manifold.project(
-                np.repeat(indices[those], count), tangent_points.reshape(-1, tangent_points.shape[2])
-            )
+            flat = tangent_points.reshape(-1, tangent_points.shape[2])
+            projected, converged = manifold.project(np.repeat(indices[those], count), flat)
             valid[those] = converged.reshape(len(those), -1)
-            candidates[those] = np.where(
-                valid[those][:, :, None], projected.reshape(tangent_points.shape), tangent_points
-            )
+            projected = projected.reshape(tangent_points.shape)
+            candidates[those] = np.where(valid[those][:, :, None], projected, tangent_points)
         violations = np.where(valid, _violation(candidates, times, bounds, scene, settings.margin), 1.0)
         values, back_pointers = PENALTY * violations[0], []
         for k in range(1, len(joints)):

@@ -194,7 +194,7 @@ def test_after_so_many_failures_what_collides_is_no_longer_repaired_and_what_is_
 
 def test_a_reason_is_read_as_it_was_written_and_not_where_it_is_damaged() -> None:
     assert Reason.of_record(FAILS.record()) == FAILS
-    assert str(FAILS) == "the audit fails: row 2"
+    assert str(FAILS) == "fails the audit: row 2"
     plain = Reason(Rejection.DUPLICATE)
     assert Reason.of_record(plain.record()) == plain
     damages: list[dict[str, Any]] = [

@@ -85,7 +85,7 @@ def test_what_no_motion_does_is_named_with_what_it_takes() -> None:
     assert (caught.value.name, caught.value.limit) == ("joint1", 0.05)
     assert caught.value.value > 1.0
     assert 0 < caught.value.time < SECONDS
-    with pytest.raises(ProblemError, match="a free horizon knows no limits of drives"):
+    with pytest.raises(ProblemError, match="actuator limits need a fixed horizon"):
         plan(FIXED, smooth_task(FIXED), "free", start=START, limits=Limits(torque=1.0))
 
 

@@ -31,7 +31,7 @@ def test_the_cheapest_of_all_motions_has_a_bound_near_its_cost(machine, start, r
     assert found.cost <= others.cost * (1 + 1e-6)
     assert found.bound <= others.cost
     assert all(found.bound <= one.cost * (1 + 1e-4) for one in found.candidates if np.isfinite(one.cost))
-    assert f"at least {found.bound:.6g}" in str(found)
+    assert f"lower bound {found.bound:.6g}" in str(found)
     found.save(tmp_path / "plan.npz")
     assert Plan.load(tmp_path / "plan.npz").bound == found.bound
 
@@ -120,7 +120,7 @@ def test_a_bound_above_the_cost_of_a_motion_is_no_bound_and_warned_of(monkeypatc
     monkeypatch.setattr(AtlasSearch, "solve", best)
     with pytest.raises(BoundWarning):
         plan(machine, task, search="global", clearance=None)
-    with pytest.warns(BoundWarning, match="less than the bound") as caught:
+    with pytest.warns(BoundWarning, match="less than its lower bound") as caught:
         found = plan(machine, task, search="global", clearance=None)
     assert found.cost == pytest.approx(cost)
     assert found.bound is None
@@ -146,9 +146,9 @@ def test_what_cannot_be_searched_is_refused() -> None:
     loose = TipTask(position=[0.4, 0.0, 0.4], duration=1.0)
     turning = TipTask(velocity=[0.01, 0.0, 0.0], rows=[3, 4, 5], duration=1.0)
     for machine, asked, more, words in (
-        (panda(), loose, {}, "leave 4 directions free"),
+        (panda(), loose, {}, "leave 4 degrees of freedom"),
         (panda(), turning, {"start": PANDA_START}, "needs poses"),
-        (panda(), task, {"horizon": "free"}, "keeps the tasks' own time"),
+        (panda(), task, {"horizon": "free"}, "needs a fixed horizon"),
     ):
         with pytest.raises(ProblemError, match=words):
             plan(machine, asked, search="global", clearance=None, **more)

@@ -85,7 +85,7 @@ def test_what_leads_out_of_reach_is_refused_with_the_time_from_which_on_it_does(
 def test_limits_that_stop_a_motion_are_named() -> None:
     robot = paper_example().robot
     slow = tuple(replace(joint, velocity=0.6) for joint in robot.joints)
-    with pytest.raises(DeadEnd, match=r"can go no faster than -?0\.6") as caught:
+    with pytest.raises(DeadEnd, match=r"is at its rate limit -?0\.6") as caught:
         plan(FreeFloating(replace(robot, joints=slow), base="planar"), example(5.0), start=START, clearance=None)
     assert (caught.value.name, caught.value.limit) in {(joint.name, s) for joint in slow for s in (-0.6, 0.6)}
     narrow = tuple(replace(joint, lower=-1.3, upper=1.3) for joint in robot.joints)

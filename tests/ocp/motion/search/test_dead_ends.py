@@ -96,7 +96,7 @@ def test_a_tool_that_turns_too_fast_may_lean_instead(seed: int) -> None:
     with pytest.raises(DeadEnd) as refused:
         plan(machine, task, search="global", clearance=None)
     deviation, lean = refused.value.relaxations
-    assert (deviation.kind, lean.kind) == ("deviation", "lean")
+    assert (deviation.kind, lean.kind) == ("deviation", "rotation")
     assert f"turned by {np.degrees(lean.amount):.3g} deg" in str(refused.value)
     for give in (deviation, lean):
         off = [tip(machine, q) - wanted(task, t) for t, q in zip(give.times, give.joints, strict=True)]

@@ -166,7 +166,7 @@ def test_where_nothing_is_clear_at_the_first_waypoint_none_begins() -> None:
 def test_where_the_joint_is_held_at_no_value_that_does_the_waypoint_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(waypoints, "section_values", lambda *_: np.array([10.0]))
     machine = problem_of("fetch__square").machine
-    with pytest.raises(SolveError, match="none was found at waypoint 0 with 'torso_lift_joint'") as refused:
+    with pytest.raises(SolveError, match="at waypoint 0 on the sections of 'torso_lift_joint'") as refused:
         plan_waypoints(machine, *task(40), clearance=None, step=STEP)
     assert (refused.value.name, refused.value.time) == ("torso_lift_joint", 0.0)
 
