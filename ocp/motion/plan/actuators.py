@@ -109,6 +109,9 @@ def solve_within_actuator_limits(request: PlanRequest, start: Array, reference: 
         # a joint that started elsewhere separates bodies and is not ignorable
         start = np.where(np.isclose(unlimited.at(0.0)["joints"], start, rtol=0.0), start, np.nan)
 
+    fractions = [(stretch.breaks - stretch.begin) / stretch.duration for stretch in request.stretches]
+    breaks = np.unique(np.concatenate([np.zeros(0), *fractions])).tolist()
+
     def solve_from(initial: Array) -> Solution:
         def declare(constraints: ClearanceConstraints | None) -> Problem:
             guess = {"start": initial, "reference": reference}
@@ -117,7 +120,7 @@ def solve_within_actuator_limits(request: PlanRequest, start: Array, reference: 
             return motion.problem
 
         joints = {"": (request.machine, limits)}
-        return within_limits(declare, request.clearance_constraints, None, _breaks(request), None, None, joints)
+        return within_limits(declare, request.clearance_constraints, None, breaks, None, None, joints)
 
     try:
         solution = solve_from(start)
@@ -142,12 +145,6 @@ def _with_demand(error: SolveError, demand: ActuatorDemand | None) -> SolveError
         if demand.required > demand.allowed:
             details = {"name": demand.joint, "value": demand.required, "limit": demand.allowed, "time": demand.time}
     return SolveError(f"{words}\n{error}", error.solution, error.conflicts, **details)
-
-
-def _breaks(request: PlanRequest) -> list[float]:
-    """Return the fractions of the horizon at which tasks are not smooth."""
-    fractions = [(stretch.breaks - stretch.begin) / stretch.duration for stretch in request.stretches]
-    return np.unique(np.concatenate([np.zeros(0), *fractions])).tolist()  # type: ignore[no-any-return]
 
 
 def _set_guess(motion: ToolMotion, unlimited: Plan) -> None:

@@ -124,7 +124,8 @@ class Plan:
 
     def __getitem__(self, name: str) -> Array:
         """Return "joints", "rates" or "base" at the times `t`. Shape (M, n)."""
-        self._check_name(name)
+        if name not in self._names():
+            raise unknown_name("name in a plan", name, self._names())
         if self.rate_name == SLOPES and name == "rates":
             return np.asarray(self.solution[SLOPES] / self.solution[PACE])
         own = self.rate_name if name == "rates" else name
@@ -410,10 +411,6 @@ class Plan:
 
     def _names(self) -> tuple[str, ...]:
         return ("joints", "rates", *(("base",) if self.machine.base_size else ()))
-
-    def _check_name(self, name: str) -> None:
-        if name not in self._names():
-            raise unknown_name("name in a plan", name, self._names())
 
     def _checked_times(self, time: Any) -> Array:
         try:

@@ -124,7 +124,7 @@ class SegmentedPlan:
     @property
     def duration(self) -> float:
         """Duration of tasks and reconfigurations, s; nan if a reconfiguration has no motion."""
-        return self.horizon + float(sum(one.duration for one in self.reconfigurations))
+        return self.horizon + float(sum(each.duration for each in self.reconfigurations))
 
     def __repr__(self) -> str:
         return f"<SegmentedPlan of {self.horizon:.6g} s: {len(self.segments)} segments, cost {self.cost:.6g}>"

@@ -166,8 +166,8 @@ def _search_globally(queue: CandidateQueue, solver: CandidateSolver, search: Tas
             queue.run(candidates_from(solver, motions, starts))
             fixed = solver.request.start is None
             for seed in candidates_from(solver, motions, starts, direct=True, fixed=fixed):
-                near = queue.cost <= settings.near_bound * search.bound
-                if near or seed.cost >= (1 - settings.gain) * queue.cost:
+                near_bound = queue.cost <= settings.near_bound * search.bound
+                if near_bound or seed.cost >= (1 - settings.gain) * queue.cost:
                     break
                 queue.run([seed])
         if queue.passed:
@@ -358,7 +358,7 @@ def clearance_for(
     """
     if clearance is None:
         for name, value in (("obstacles", obstacles), ("ignored", ignored), ("srdf", srdf)):
-            if not _empty(value):
+            if value is not None and not (isinstance(value, tuple | list) and not len(value)):
                 words = f"{name}: collisions are not checked without a clearance; give one in m, 0 to exclude contact"
                 raise ProblemError(words, name=name, value=value)
         return None
@@ -368,10 +368,6 @@ def clearance_for(
     except ModelError as error:
         raise ProblemError(str(error), **vars(error)) from error
     return ClearanceConstraints(scene) if len(scene.pairs) else None
-
-
-def _empty(value: Any) -> bool:
-    return value is None or (isinstance(value, tuple | list) and not len(value))
 
 
 def checked_request(

@@ -55,11 +55,10 @@ class WaypointSettings:
     """Settings of the search through waypoints.
 
     Attributes:
-        stride: With at most one free direction, every so many-th waypoint is searched; half the stride follows if no
-            path found goes through all.
+        stride: With at most one free direction, every so many-th waypoint is searched, and half the stride is tried
+            next if no path found goes through all.
         first_steps: With two free directions, number of steps of a first search, which finds short paths.
-        steps: Approximate number of steps of the next searches.
-        strides: Their least strides: of the second search, and of the third one if no path goes through all.
+        steps, strides: Approximate number of steps of the next two searches, and their least strides.
         max_paths: Paths of a search that are shortened, the cheapest first.
         widths: Initial and final spacing of the configurations of `shorten_path`, rad or m.
         pose_tolerance: Largest pose error, m and rad, which the last width leaves.
@@ -414,15 +413,13 @@ class _WaypointPlanner:
     def _seeds(self, number: int) -> Array:
         """Return cached configurations at a waypoint."""
         if number not in self._seed_cache:
-            self._seed_cache[number] = self._find_seeds(number)
+            try:
+                seeds = self.manifolds.seeds(number, self.joint_limits, self.seed + number)
+            except Unreachable as error:
+                words = f"waypoint {number} at {self.positions[number].round(6).tolist()} m: {error}"
+                raise Unreachable(words, **{**vars(error), "time": float(number)}) from error
+            self._seed_cache[number] = seeds
         return self._seed_cache[number]
-
-    def _find_seeds(self, number: int) -> Array:
-        try:
-            return self.manifolds.seeds(number, self.joint_limits, self.seed + number)
-        except Unreachable as error:
-            words = f"waypoint {number} at {self.positions[number].round(6).tolist()} m: {error}"
-            raise Unreachable(words, **{**vars(error), "time": float(number)}) from error
 
     def _interpolate(self, chosen: NDArray[np.intp], chain: list[Segment]) -> Array:
         """Return joints at all waypoints, (N, n), near segments through some, shifted by full turns into the limits."""

@@ -28,7 +28,13 @@ from models.arrays import Array
 from ocp.motion.local.collisions import distances_along
 from ocp.motion.local.inverse_kinematics import Unreachable
 from ocp.motion.local.rates import LocalMotion
-from ocp.motion.search.configurations import REACH_TOLERANCE, PlanRequest, largest_pose_errors, locate_error
+from ocp.motion.search.configurations import (
+    REACH_TOLERANCE,
+    PlanRequest,
+    largest_pose_errors,
+    locate_error,
+    sampled_motions,
+)
 from ocp.motion.search.dead_end import DeadEnd
 from ocp.motion.search.reduced import LimitSide, ReducedKinematics, TaskKinematics, check_floating_reach, limit_rates
 
@@ -264,8 +270,8 @@ class _CellPass:
             return None, limit_counts
         parents, rates, cost = parents[affordable], rates[affordable], cost[affordable]
         base = layer.base[parents] + step * ((task.base[parents] @ rates[:, :, None])[:, :, 0] + task.drift[parents])
-        kept = self._best_of_cells(base, layer.joints[parents] + step * rates / root, cost, resize=True)
-        parents, rates = parents[kept], rates[kept]
+        best = self._best_of_cells(base, layer.joints[parents] + step * rates / root, cost, resize=True)
+        parents, rates = parents[best], rates[best]
         start_base, start_joints = layer.base[parents], layer.joints[parents]
         states = start_base, start_joints, task.select(parents)
         base, joints, error = kinematics.step(*states, rates, layer.time, time, REACH_TOLERANCE / 10)
@@ -389,8 +395,4 @@ class _CellPass:
         base = np.stack([layer.base[row] for layer, row in zip(layers, paths, strict=True)], axis=1)
         joints = np.stack([layer.joints[row] for layer, row in zip(layers, paths, strict=True)], axis=1)
         joints = np.clip(joints, self.request.bounds.lower, self.request.bounds.upper)
-        rates = np.diff(joints, axis=1) / np.diff(times)[:, None]
-        cost = np.einsum("kmn,n,m->k", rates**2, self.request.weights, np.diff(times)) / 2
-        zeros = np.zeros(paths.shape[1])
-        rates = np.concatenate([rates, rates[:, -1:]], axis=1)
-        return LocalMotion(times, base, joints, rates, np.asarray(cost), zeros, zeros)
+        return sampled_motions(times, base, joints, self.request.weights)

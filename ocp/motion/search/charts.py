@@ -6,8 +6,8 @@ there (the self-motions, which do not move the tip), and a box in the tangent sp
 
 The atlas grows from the solutions of inverse kinematics at all time samples. Wherever the edge of a chart lies in no
 other chart, the next chart is put there, until the union of the charts has no edge except at the joint limits
-(Henderson 2002, Multiple parameter continuation, Int. J. Bifurcation and Chaos 12). Connected components are thus
-covered completely. Folds and bifurcations need no special treatment, and no coordinate has to be chosen.
+(Henderson 2002, Multiple parameter continuation, Int. J. Bifurcation and Chaos 12). Connected components are covered
+completely. Folds and bifurcations need no special treatment.
 """
 
 from __future__ import annotations
@@ -40,13 +40,11 @@ class ChartSettings:
     """Settings of the atlas.
 
     Attributes:
-        corrections: Largest number of Newton steps of a projection; few suffice from a tangent space.
-        spacing: Share of its radius by which a chart is put beyond the edge that it shall cover. Neighbours overlap by
-            the rest.
-        flatness: Largest distance from a chart to the manifold, as a share of the radius, by the number of free
-            directions. The radius is halved until it holds. For two directions, half the value takes two to three times
-            as long, and twice the value loses bounds.
-        halvings: Largest number of halvings of the radius. The atlas ends where singular configurations are nearer.
+        corrections: Largest number of Newton steps of a projection.
+        spacing: Share of its radius by which a chart is put beyond the edge that it covers; the rest is overlap.
+        flatness: Largest distance of the manifold from a chart, relative to the radius, by the number of free
+            directions. With two, half the value takes two to three times as long, and twice the value loses bounds.
+        halvings: Largest number of halvings of the radius; the atlas ends closer to singular configurations.
         listed: Samples of the free parameter at which a closed form lists all configurations.
         starts: Random starts of inverse kinematics at a time sample.
         neighbours: Charts in which a point of an edge is searched.
@@ -71,8 +69,7 @@ class Charts:
         tangents: Basis of the tangent space, orthonormal in the metric. Shape (N, n, r).
         radii: Half widths of the boxes, in the metric. Shape (N,).
         low, high: Ends of the boxes, cut where the joint limits are nearer. Shape (N, r).
-        deviations: Vectors from the rim of the box, its corners and the midpoints of its sides, to the manifold.
-            Shape (N, c, n).
+        deviations: Vectors from the c points of `_rim` on the box to the manifold. Shape (N, c, n).
     """
 
     layer: Indices
@@ -100,6 +97,10 @@ class Charts:
     def max_deviation(self) -> Array:
         """How far the manifold leaves the boxes in each joint. Shape (N, n)."""
         return np.asarray(np.abs(self.deviations).max(axis=1, initial=0.0))
+
+    def points(self, places: Array) -> Array:
+        """Return the points (N, n) of the tangent spaces at places (N, r) in the boxes."""
+        return np.asarray(self.centers + np.einsum("knr,kr->kn", self.tangents, places))
 
     def curvature(self) -> tuple[Array, Array]:
         """Fit a quadratic form to the deviations of the manifold from the boxes by least squares.
@@ -135,8 +136,7 @@ class SplitCharts(NamedTuple):
     """Charts of half the radius.
 
     Attributes:
-        charts: N charts.
-        owners: Rows of the charts that they replace. Shape (N,).
+        charts, owners: N charts, and the rows of the charts that they replace, (N,).
         low, high: Ends of the replaced part in the box of the owner. Shape (N, r).
     """
 
@@ -150,10 +150,9 @@ class _Edges(NamedTuple):
     """Points of the manifold at the edges of charts.
 
     Attributes:
-        layer: Index of the time sample. Shape (E,).
+        layer, owners: Indices of the time samples and rows of the charts. Shape (E,).
         points: Configurations. Shape (E, n).
         directions: Unit vectors that lead away from the chart. Shape (E, n).
-        owners: Rows of the charts whose edges they are. Shape (E,).
         radii: Radii of the charts to be put there. Shape (E,).
     """
 
@@ -230,9 +229,8 @@ class SelfMotionManifolds:
 
     def project(self, layer: Indices, joints: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Project configurations (M, n) onto their manifolds by Newton steps; also return which converged, (M,)."""
-        projected = joints.copy()
-        converged = np.zeros(len(projected), dtype=bool)
-        active = np.arange(len(projected))
+        projected, converged = joints.copy(), np.zeros(len(joints), dtype=bool)
+        active = np.arange(len(joints))
         for _ in range(self.settings.corrections):
             if not active.size:
                 break
@@ -272,18 +270,17 @@ class SelfMotionManifolds:
             The charts, and the points of the manifold at their rims, nan where none was found. Shape (N, c, n).
         """
         tangents = self.tangents_at(layer, joints, like)
-        rim = _rim(tangents.shape[2])
-        radii = radii.copy()
-        deviations = np.zeros((len(joints), len(rim), joints.shape[1]))
+        radii, rim_size = radii.copy(), len(_rim(tangents.shape[2]))
+        deviations = np.zeros((len(joints), rim_size, joints.shape[1]))
         points = np.full_like(deviations, np.nan)
         active = np.arange(len(joints))
         for halving in range(self.settings.halvings + 1):
             if not active.size:
                 break
-            projected, distances = self._deviations(layer[active], joints[active], tangents[active], radii[active])
-            points[active], deviations[active] = projected, distances
+            box = layer[active], joints[active], tangents[active], radii[active]
+            points[active], deviations[active] = self._deviations(*box)
             largest = self.settings.flatness[tangents.shape[2]] * radii[active, None]
-            curved = ~(self.space.length(distances) <= largest).all(axis=1)
+            curved = ~(self.space.length(deviations[active]) <= largest).all(axis=1)
             if halving < self.settings.halvings:
                 radii[active[curved]] /= 2
             active = active[curved]
@@ -325,8 +322,7 @@ class SelfMotionManifolds:
 
         Args:
             layer, joints: Indices of time samples and configurations on their manifolds. Shapes (M,), (M, n).
-            radius: Largest radius of a chart.
-            max_charts: Largest number of charts.
+            radius, max_charts: Largest radius and largest number of charts.
 
         Raises:
             ProblemError: The atlas needs more charts.
@@ -371,15 +367,12 @@ class SelfMotionManifolds:
             halved = edges.radii / 2
             charts = concatenate([charts, added])
             if len(charts) > max_charts:
-                words = (
-                    f"the self-motion manifold needs more than {max_charts} charts of radius {radius:.3g} rad; "
-                    "use larger charts or fewer time samples"
-                )
+                words = f"the self-motion manifold needs more than {max_charts} charts of radius {radius:.3g} rad; "
+                words += "use larger charts or fewer time samples"
                 raise ProblemError(words, name="configurations", value=len(charts), limit=max_charts)
-            remaining = edges._replace(radii=halved)  # retried nearer to the edge if still uncovered
             lost = halved < radius / 2**self.settings.halvings
             self.lost += int(lost.sum())
-            remaining = remaining.select(~lost)
+            remaining = edges._replace(radii=halved).select(~lost)  # retried nearer to the edge if still uncovered
             edges = _Edges(*(np.concatenate(pair) for pair in zip(remaining, added_edges, strict=True)))
             edges = edges.select(~self.is_covered(charts, edges.layer, edges.points, edges.owners))
         return charts
@@ -457,8 +450,7 @@ class SelfMotionManifolds:
         """Return the rows of configurations that are not within the radius of an earlier one."""
         if not len(layer):
             return np.zeros(0, dtype=np.intp)
-        tree = self.space.tree(joints, layer)
-        pairs = tree.query_pairs(float(radii.max()), output_type="ndarray")
+        pairs = self.space.tree(joints, layer).query_pairs(float(radii.max()), output_type="ndarray")
         chosen = np.ones(len(layer), dtype=bool)
         if len(pairs):
             distances = self.space.length(self.space.difference(joints[pairs[:, 0]], joints[pairs[:, 1]]))
@@ -494,8 +486,7 @@ def _rim(r: int) -> Array:
     """Return the midpoints of the sides and the corners of a box of half width 1. Shape (c, r)."""
     middles = [side * np.eye(r)[axis] for axis in range(r) for side in (-1.0, 1.0)] if r > 1 else []
     corners = [np.array(signs) for signs in product((-1.0, 1.0), repeat=r)] if r else []
-    points = [*middles, *corners]
-    return np.array(points).reshape(len(points), r)
+    return np.array([*middles, *corners]).reshape(-1 if r else 0, r)
 
 
 def _solve_normal_equations(square: Array, right: Array) -> Array:

@@ -27,7 +27,7 @@ from ocp.motion.tasks.tip_task import TipTask
 __all__ = [
     "REACH_TOLERANCE", "PlanRequest", "SearchKind", "check_clear_start", "count_clear_configurations",
     "describe_alternatives", "fix_ignorable_joints", "largest_pose_errors", "local_motions_from", "locate_error",
-    "start_collisions", "start_configurations",
+    "sampled_motions", "start_collisions", "start_configurations",
 ]  # fmt: skip
 
 SETTINGS = PlannerSettings()
@@ -248,6 +248,14 @@ def _straight_motion(motion: LocalMotion, joints: Array) -> LocalMotion:
     displacement = (joints - motion.joints[:, 0])[:, None]
     rates = np.repeat(displacement / (motion.t[-1] - motion.t[0]), len(motion.t), axis=1)
     return replace(motion, joints=motion.joints[:, :1] + share * displacement, rates=rates)
+
+
+def sampled_motions(times: Array, base: Array, joints: Array, weights: Array) -> LocalMotion:
+    """Return K motions through configurations (K, M, n) at times (M,), with rates by forward differences."""
+    rates = np.diff(joints, axis=1) / np.diff(times)[:, None]
+    cost = np.einsum("kmn,n,m->k", rates**2, weights, np.diff(times)) / 2
+    rates, zeros = np.concatenate([rates, rates[:, -1:]], axis=1), np.zeros(len(joints))
+    return LocalMotion(times, base, joints, rates, np.asarray(cost), zeros, zeros)
 
 
 def largest_pose_errors(motions: Sequence[LocalMotion]) -> list[float]:

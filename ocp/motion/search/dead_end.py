@@ -208,10 +208,9 @@ class _Propagation:
         self.clearance = [np.full(len(charts), -np.inf) for charts in self.layers]
         self.parent = [np.zeros(len(charts), dtype=np.intp) for charts in self.layers]
         charts = self.layers[0]
-        middle = np.clip(0.0, charts.low, charts.high)
         rows = np.arange(len(charts))
-        self._record(0, rows, charts.centers + np.einsum("knr,kr->kn", charts.tangents, middle), rows)
-        graph = search.graph(self.layers, np.full(count - 1, np.inf))
+        self._record(0, rows, charts.points(np.clip(0.0, charts.low, charts.high)), rows)
+        graph = search.graph(self.layers)
         for k in range(count - 1):
             self._propagate(graph, k)
 
@@ -312,19 +311,19 @@ def _find_obstructions(search: AtlasSearch, front: _Propagation) -> list[Obstruc
     def obstruction_of(row: int) -> Obstruction:
         """Return the obstruction of a row, by its worst column."""
         kind, joint = divmod(int(worst[row]) - 1, n)
-        here, next_ = before[row], targets[row]
+        current, target = before[row], targets[row]
         if worst[row] == 0:
-            return Obstruction(ObstructionKind.REACH, "tip", float(pose_errors[row]), 0.0, here, next_)
+            return Obstruction(ObstructionKind.REACH, "tip", float(pose_errors[row]), 0.0, current, target)
         if kind < 2:
             bound = float((space.upper, space.lower)[kind][joint])
-            return Obstruction(ObstructionKind.LIMIT, names[joint], float(next_[joint]), bound, here, next_)
+            return Obstruction(ObstructionKind.LIMIT, names[joint], float(target[joint]), bound, current, target)
         if kind == 2:
             step, largest_step = float(displacements[row, joint]), float(limits[joint])
-            return Obstruction(ObstructionKind.STEP, names[joint], step, largest_step, here, next_)
+            return Obstruction(ObstructionKind.STEP, names[joint], step, largest_step, current, target)
         assert scene is not None
         pair = int(worst[row]) - 1 - 3 * n
         bodies = " and ".join(scene.labels[pair])
-        return Obstruction(ObstructionKind.COLLISION, bodies, float(distances[row, pair]), clearance, here, next_)
+        return Obstruction(ObstructionKind.COLLISION, bodies, float(distances[row, pair]), clearance, current, target)
 
     smallest: dict[tuple[ObstructionKind, str], Obstruction] = {}
     for row in np.argsort(largest, kind="stable").tolist():
@@ -353,8 +352,7 @@ def _continuations(search: AtlasSearch, front: _Propagation) -> tuple[Array, Arr
     charts = front.layers[last + 1].select(front.clearance[last + 1] < front.required)
     if last < 0 or not len(charts):
         return before, projections, converged
-    middle = np.clip(0.0, charts.low, charts.high)
-    tangent_points = charts.centers + np.einsum("knr,kr->kn", charts.tangents, middle)
+    tangent_points = charts.points(np.clip(0.0, charts.low, charts.high))
     projected, valid = sample.manifolds.project(np.full(len(tangent_points), sample.row), tangent_points)
     starts = before[space.tree(before).query(space.tree_points(projected))[1]]
     continued = starts + space.difference(projected, starts)

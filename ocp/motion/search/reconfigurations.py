@@ -149,7 +149,7 @@ def segment_ends(
 
 def _is_barred(span: Span, gap: int, barred: Collection[Span]) -> bool:
     """Return whether a span has no segment: it is empty, or contains a barred span."""
-    return (span[0] == span[1] and not gap) or any(span[0] <= other[0] and other[1] <= span[1] for other in barred)
+    return (span[0] == span[1] and not gap) or any(span[0] <= bar[0] and bar[1] <= span[1] for bar in barred)
 
 
 def _solve_segment(search: AtlasSearch, first: int, last: int) -> Segment | None:
@@ -164,8 +164,8 @@ def _last_reachable(
 ) -> int | None:
     """Return the last (or first, if `back`) sample that a segment from a sample reaches; None if there is none."""
 
-    def reaches(other: int) -> bool:
-        span = min(start, other), max(start, other)
+    def reaches(sample: int) -> bool:
+        span = min(start, sample), max(start, sample)
         if _is_barred(span, 1, barred):
             return False
         layers, path = search.restrict(*span).find_path(np.inf)

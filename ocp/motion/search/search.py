@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
+from typing import Any
 from warnings import warn
 
 import numpy as np
@@ -104,7 +105,7 @@ class AtlasSearch:
         """
         Args:
                 space: Joint space.
-                instants: Manifolds of the time samples, by rising time.
+                samples: Manifolds of the time samples, by rising time.
                 times: Times of the samples, s. Shape (K,).
                 cost: Cost of a step between two samples.
                 limits: Largest step of each joint between samples. Shape (K - 1, n).
@@ -164,13 +165,14 @@ class AtlasSearch:
         distances = distances_along(scene, base, charts.centers, times, scene.clearance)
         return np.asarray((distances + charts.spans @ scene.levers.joints.T >= scene.clearance).all(axis=1))
 
-    def graph(self, layers: list[Charts], max_costs: Array) -> ChartGraph:
-        """Return the graph of steps between charts, each step costing at most `max_costs`, shape (K - 1,)."""
+    def graph(self, layers: list[Charts], max_costs: Any = np.inf) -> ChartGraph:
+        """Return the graph of steps between charts, each step costing at most `max_costs`, one or shape (K - 1,)."""
+        max_costs = np.broadcast_to(max_costs, len(self.times) - 1)
         return ChartGraph(self.space, layers, np.diff(self.times), self.cost, self.limits, max_costs)
 
     def full_graph(self) -> ChartGraph:
         """Return the graph of all steps between the initial charts."""
-        return self.graph(self.layers, np.full(len(self.times) - 1, np.inf))
+        return self.graph(self.layers)
 
     def restrict(self, first: int, last: int) -> AtlasSearch:
         """Return the search restricted to the samples from `first` to `last`, both included."""
@@ -202,7 +204,7 @@ class AtlasSearch:
             include_costlier: Whether excluded classes are returned as well.
         """
         if self._cost_bounds is None or include_costlier:
-            graph = self.graph(self.layers, np.full(len(self.times) - 1, max_cost))
+            graph = self.graph(self.layers, max_cost)
             self._cost_bounds = graph, graph.cost_to_go(), None
         graph, cost_to_go, cost_to_come = self._cost_bounds
         cost_to_come = cost_to_come or graph.cost_to_come()
@@ -316,7 +318,7 @@ class AtlasSearch:
         if not layers:
             return None, np.inf
         if best_path is None:
-            graph = self.graph(layers, np.full(len(self.times) - 1, max_cost))
+            graph = self.graph(layers, max_cost)
             return None, max(float(graph.minima(graph.cost_to_go()[0], 0).min()), 0.0)
         best_cost = self.path_cost(best_path)
         coarse, remaining = True, np.zeros(len(self.times) - 1)  # least cost before and after each step
@@ -358,7 +360,7 @@ class AtlasSearch:
         """
         layers, coarse = self.layers, True
         while True:
-            graph = self.graph(layers, np.full(len(self.times) - 1, max_cost))
+            graph = self.graph(layers, max_cost)
             path = self._shorten(self._path_through_centers(graph), layers)
             if path is not None:
                 return layers, path

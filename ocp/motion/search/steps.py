@@ -7,9 +7,10 @@ its rim.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any, NamedTuple, Protocol, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -78,26 +79,32 @@ class CurvedCharts(NamedTuple):
         return CurvedCharts(self.charts.select(rows), self.bends[rows], self.rest[rows])
 
 
-class StepCost(Protocol):
+class StepCost(ABC):
     """Lower bound of the cost of a straight step."""
 
-    def cheapest_steps(self, delta: Array, into: Charts, after: QuadraticBounds, seconds: float) -> tuple[Array, Array]:
+    @abstractmethod
+    def cheapest_steps(
+        self, delta: Array, target: Charts, after: QuadraticBounds, seconds: float
+    ) -> tuple[Array, Array]:
         """Return costs (P,) and places (P, r) of the cheapest steps into P charts, with centres `delta` (P, n) away."""
 
+    @abstractmethod
     def lower_bounds(
-        self, delta: Array, out: CurvedCharts, into: CurvedCharts, after: QuadraticBounds, seconds: float
+        self, delta: Array, source: CurvedCharts, target: CurvedCharts, after: QuadraticBounds, seconds: float
     ) -> StepBounds:
         """Return lower bounds of P steps between charts whose centres are `delta` (P, n) apart."""
 
+    @abstractmethod
     def evaluate(self, delta: Array, seconds: Any) -> Array:
         """Return the cost of steps (..., n)."""
 
+    @abstractmethod
     def reach(self, cost: float, seconds: float) -> float:
         """Return the largest length, in the metric of the charts, of a step that costs at most `cost`."""
 
 
 @dataclass(frozen=True, eq=False)
-class SquaredRates:
+class SquaredRates(StepCost):
     """Integral of half the weighted squared rates.
 
     A step d has a component along the chart that it enters and one across it. Along the chart, the cost is convex in
@@ -115,16 +122,18 @@ class SquaredRates:
     def reach(self, cost: float, seconds: float) -> float:
         return float(np.sqrt(2 * seconds * cost))
 
-    def cheapest_steps(self, delta: Array, into: Charts, after: QuadraticBounds, seconds: float) -> tuple[Array, Array]:
-        flat = np.einsum("pnr,pn->pr", into.tangents, self.weights * delta)
+    def cheapest_steps(
+        self, delta: Array, target: Charts, after: QuadraticBounds, seconds: float
+    ) -> tuple[Array, Array]:
+        flat = np.einsum("pnr,pn->pr", target.tangents, self.weights * delta)
         square = after.curve + np.eye(flat.shape[1]) / seconds
-        least, place = least_in_box(flat / seconds + after.slope, square, into.low, into.high)
+        least, place = least_in_box(flat / seconds + after.slope, square, target.low, target.high)
         return self.evaluate(delta, seconds) + after.least + least, place
 
     def lower_bounds(
-        self, delta: Array, out: CurvedCharts, into: CurvedCharts, after: QuadraticBounds, seconds: float
+        self, delta: Array, source: CurvedCharts, target: CurvedCharts, after: QuadraticBounds, seconds: float
     ) -> StepBounds:
-        start, end = out.charts, into.charts
+        start, end = source.charts, target.charts
         displacement, column_weights = _rows_last(delta), self.weights[:, None]
         start_tangents = _rows_last(start.tangents)
         weighted_tangents = _rows_last(end.tangents) * column_weights[:, None]
@@ -134,14 +143,14 @@ class SquaredRates:
         rotation = _multiply_transposed(weighted_tangents, start_tangents)
         projection = _apply_transposed(weighted_tangents, displacement)
         start_place, end_place = _nearest_places(projection, rotation, start_box, end_box, slope, curve, seconds)
-        start_bends, end_bends = _rows_last(out.bends), _rows_last(into.bends)
+        start_bends, end_bends = _rows_last(source.bends), _rows_last(target.bends)
         relative_bend = _apply(_apply(end_bends, end_place), end_place)
         relative_bend -= _apply(_apply(start_bends, start_place), start_place)
         normal = displacement - _apply(start_tangents, start_place) + relative_bend / 2
         normal -= _apply(_rows_last(end.tangents), _apply_transposed(weighted_tangents, normal))
         multiplier = column_weights * normal / seconds
         normal_cost = _dot(multiplier, normal)
-        loss = _support(_rows_last(out.rest), multiplier) + _support(_rows_last(into.rest), -multiplier)
+        loss = _support(_rows_last(source.rest), multiplier) + _support(_rows_last(target.rest), -multiplier)
         # the more the manifold may deviate across the charts, the smaller the multiplier
         with np.errstate(divide="ignore", invalid="ignore"):
             share = np.where(normal_cost > 0, np.clip(1 - loss / normal_cost, 0.0, 1.0), 0.0)
@@ -274,7 +283,7 @@ def _rows_first(columns: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class Homogeneous:
+class Homogeneous(StepCost):
     """Cost that is proportional to the length of a step, with at most one free direction; its bounds are affine.
 
     Attributes:
@@ -283,25 +292,17 @@ class Homogeneous:
 
     weights: Array
 
-    def evaluate(self, delta: Array, seconds: Any) -> Array:
-        """Return the cost of steps (..., n)."""
-        raise NotImplementedError
-
-    def reach(self, cost: float, seconds: float) -> float:
-        """Return the largest length, in the metric of the charts, of a step that costs at most `cost`."""
-        raise NotImplementedError
-
+    @abstractmethod
     def gradient(self, displacement: Array) -> Array:
         """Return the gradients of the cost at displacements (P, n)."""
-        raise NotImplementedError
 
-    def minimize(self, delta: Array, into: Charts, after: QuadraticBounds) -> tuple[Array, Array, Array]:
+    def minimize(self, delta: Array, target: Charts, after: QuadraticBounds) -> tuple[Array, Array, Array]:
         """Return bounds (P,) of the cheapest steps into charts, multipliers (P, n) (gradients), and places (P, 1)."""
         count = len(delta)
-        if not into.tangents.shape[2]:
+        if not target.tangents.shape[2]:
             return self.evaluate(delta, 1.0) + after.least, self.gradient(delta), np.zeros((count, 0))
-        along, slope = into.tangents[:, :, 0], after.slope[:, 0]
-        box = into.low[:, 0], into.high[:, 0]
+        along, slope = target.tangents[:, :, 0], after.slope[:, 0]
+        box = target.low[:, 0], target.high[:, 0]
 
         def linearize(place: Array) -> list[Array]:
             """Return place, gradient there, its value at the origin, and the slope of the total."""
@@ -331,14 +332,16 @@ class Homogeneous:
         least = np.minimum(slope_left * box[0], slope_left * box[1])
         return (gradient * delta).sum(axis=1) + least + after.least, gradient, place[:, None]
 
-    def cheapest_steps(self, delta: Array, into: Charts, after: QuadraticBounds, seconds: float) -> tuple[Array, Array]:
-        cost, _, place = self.minimize(delta, into, after)
+    def cheapest_steps(
+        self, delta: Array, target: Charts, after: QuadraticBounds, seconds: float
+    ) -> tuple[Array, Array]:
+        cost, _, place = self.minimize(delta, target, after)
         return cost, place
 
     def lower_bounds(
-        self, delta: Array, out: CurvedCharts, into: CurvedCharts, after: QuadraticBounds, seconds: float
+        self, delta: Array, source: CurvedCharts, target: CurvedCharts, after: QuadraticBounds, seconds: float
     ) -> StepBounds:
-        return HomogeneousBounds(self, delta, out, into, after)
+        return HomogeneousBounds(self, delta, source, target, after)
 
 
 class PathLength(Homogeneous):
@@ -376,26 +379,26 @@ class HomogeneousBounds:
 
     cost: Homogeneous
     delta: Array
-    out: CurvedCharts
-    into: CurvedCharts
+    source: CurvedCharts
+    target: CurvedCharts
     after: QuadraticBounds
 
     def select(self, rows: Any) -> HomogeneousBounds:
-        out, into, after = self.out.select(rows), self.into.select(rows), self.after.select(rows)
-        return HomogeneousBounds(self.cost, self.delta[rows], out, into, after)
+        source, target, after = (self.source.select(rows), self.target.select(rows), self.after.select(rows))
+        return HomogeneousBounds(self.cost, self.delta[rows], source, target, after)
 
     @property
     def curve(self) -> Array:
-        r = self.out.charts.tangents.shape[2]
+        r = self.source.charts.tangents.shape[2]
         return np.zeros((len(self.delta), r, r))
 
     def at(self, places: Array) -> tuple[Array, Array]:
-        start_charts, end_charts = self.out.charts, self.into.charts
-        start = np.einsum("pnr,pr->pn", start_charts.tangents, places)
-        cost, gradient, _ = self.cost.minimize(self.delta - start, end_charts, self.after)
-        end_loss = np.einsum("pcn,pn->pc", end_charts.deviations, gradient).min(axis=1, initial=0.0)
-        loss = np.einsum("pcn,pn->pc", start_charts.deviations, gradient).max(axis=1, initial=0.0) - end_loss
-        return cost - loss, -np.einsum("pnr,pn->pr", start_charts.tangents, gradient)
+        source, target = self.source.charts, self.target.charts
+        start = np.einsum("pnr,pr->pn", source.tangents, places)
+        cost, gradient, _ = self.cost.minimize(self.delta - start, target, self.after)
+        end_loss = np.einsum("pcn,pn->pc", target.deviations, gradient).min(axis=1, initial=0.0)
+        loss = np.einsum("pcn,pn->pc", source.deviations, gradient).max(axis=1, initial=0.0) - end_loss
+        return cost - loss, -np.einsum("pnr,pn->pr", source.tangents, gradient)
 
     def lower(self, places: Array, slope: Array, curve: Array) -> Array:
         return places

@@ -15,7 +15,13 @@ from ocp.errors import ProblemError
 from ocp.motion.local.inverse_kinematics import Unreachable
 from ocp.motion.local.rates import LocalMotion
 from ocp.motion.search.charts import SelfMotionManifolds, TimeSample
-from ocp.motion.search.configurations import REACH_TOLERANCE, PlanRequest, largest_pose_errors, locate_error
+from ocp.motion.search.configurations import (
+    REACH_TOLERANCE,
+    PlanRequest,
+    largest_pose_errors,
+    locate_error,
+    sampled_motions,
+)
 from ocp.motion.search.dead_end import DeadEnd, dead_end
 from ocp.motion.search.joint_space import JointSpace, TasksWithFixedJoints
 from ocp.motion.search.reconfigurations import fewest_segments, segment_ends
@@ -172,11 +178,11 @@ class TaskSearch:
                     times_between = self.times[divisible] + inside * np.diff(self.times)[divisible]
                     self._build_search(self._with_samples(times_between.ravel()))
                     continue
-            found = fewest_segments(self._search, 0, spans) if through else None
-            if found is None:
+            result = fewest_segments(self._search, 0, spans) if through else None
+            if result is None:
                 return None
             times = self.times.tolist()
-            return [(times[segment.first], times[segment.last]) for segment in found[0]], fewest
+            return [(times[segment.first], times[segment.last]) for segment in result[0]], fewest
 
     @property
     def _can_subdivide(self) -> NDArray[np.bool_]:
@@ -232,11 +238,8 @@ class TaskSearch:
                 indices = np.tile(np.arange(len(times)), count)
                 samples = manifolds.project(indices, samples.reshape(-1, n))[0].reshape(samples.shape)
             samples = np.clip(samples, request.bounds.lower, request.bounds.upper)
-            rates = np.diff(samples, axis=1) / np.diff(times)[:, None]
-            cost = np.einsum("kmn,n,m->k", rates**2, request.weights, np.diff(times)) / 2
-            base, none = np.zeros((count, len(times), 0)), np.zeros(count)
-            rates = np.concatenate([rates, rates[:, -1:]], axis=1)
-            motions.append(LocalMotion(times, base, samples, rates, np.asarray(cost), none, none))
+            base = np.zeros((count, len(times), 0))
+            motions.append(sampled_motions(times, base, samples, request.weights))
         return motions
 
 

@@ -121,29 +121,29 @@ class ChartGraph:
 
     def edges(self, k: int, neighbour: int) -> Iterator[tuple[Indices, Indices]]:
         """Yield, in batches, pairs of charts of a sample and of its neighbour between which a step is possible."""
-        here, there = self.layers[k], self.layers[neighbour]
-        if not len(here) or not len(there):
+        source, target = self.layers[k], self.layers[neighbour]
+        if not len(source) or not len(target):
             return
-        between, spans = min(k, neighbour), (here.spans, there.spans)
+        between, spans = min(k, neighbour), (source.spans, target.spans)
         sizes = [self.space.length(span) for span in spans]
         limit = self.limits[between]
         max_cost = max(float(self.max_costs[between]), 0.0)
         reach = min(self.cost.reach(max_cost, float(self.seconds[between])), float(self.space.length(limit)))
         reach = min(reach, MAX_STEP)
-        tree = self.space.tree(there.centers)
-        sample = self.space.tree(here.centers[:: max(len(here) // self.settings.sample, 1)])
+        tree = self.space.tree(target.centers)
+        sample = self.space.tree(source.centers[:: max(len(source) // self.settings.sample, 1)])
         radius = min(reach + float(sizes[0].max() + sizes[1].max()), MAX_STEP)
         mean_count = sample.count_neighbors(tree, radius) / sample.n
         batch = max(16, int(self.settings.pairs / max(mean_count, 1.0)))
-        for first in range(0, len(here), batch):
-            rows = np.arange(first, min(first + batch, len(here)))
-            batch_tree = self.space.tree(here.centers[rows])
+        for first in range(0, len(source), batch):
+            rows = np.arange(first, min(first + batch, len(source)))
+            batch_tree = self.space.tree(source.centers[rows])
             radius = reach + float(sizes[0][rows].max() + sizes[1].max())
             pairs = batch_tree.sparse_distance_matrix(tree, radius, output_type="ndarray")
             i, j, distance = rows[pairs["i"]], pairs["j"].astype(np.intp), pairs["v"]
             close = distance <= reach + sizes[0][i] + sizes[1][j]
             i, j = i[close], j[close]
-            delta = np.abs(self.space.difference(there.centers[j], here.centers[i]))
+            delta = np.abs(self.space.difference(target.centers[j], source.centers[i]))
             close = (delta <= limit + spans[0][i] + spans[1][j]).all(axis=1)
             i, j = i[close], j[close]
             order = np.argsort(i, kind="stable")
@@ -157,18 +157,18 @@ class ChartGraph:
         Yields:
             A single chart, shifted by full turns to the configuration, and the place in its box, (r,).
         """
-        there = self.layers[neighbour]
+        charts = self.layers[neighbour]
         between = min(k, neighbour)
         seconds = float(self.seconds[between])
-        delta = self.space.difference(there.centers, np.repeat(joints[None], len(there), axis=0))
-        reachable = (np.abs(delta) <= self.limits[between] + there.spans).all(axis=1) & np.isfinite(after.least)
+        delta = self.space.difference(charts.centers, np.repeat(joints[None], len(charts), axis=0))
+        reachable = (np.abs(delta) <= self.limits[between] + charts.spans).all(axis=1) & np.isfinite(after.least)
         rows = np.flatnonzero(reachable)
         if not rows.size:
             return
-        into = there.select(rows)
-        costs, places = self.cost.cheapest_steps(delta[rows], into, after.select(rows), seconds)
+        candidates = charts.select(rows)
+        costs, places = self.cost.cheapest_steps(delta[rows], candidates, after.select(rows), seconds)
         for i in np.argsort(costs, kind="stable")[: self.settings.successors].tolist():
-            yield replace(into.select([i]), centers=joints + delta[rows[[i]]]), places[i]
+            yield replace(candidates.select([i]), centers=joints + delta[rows[[i]]]), places[i]
 
     def _sweep(
         self, order: range, direction: int, known_bounds: list[QuadraticBounds] | None, max_cost: float
@@ -194,37 +194,39 @@ class ChartGraph:
 
         With `known_bounds` of the rest of the motions, those that cost `max_cost` or more are left out.
         """
-        here, there = self.layers[k], self.layers[neighbour]
+        source, target = self.layers[k], self.layers[neighbour]
         seconds = float(self.seconds[min(k, neighbour)])
-        bounds = QuadraticBounds.constant(np.full(len(here), np.inf), here.low.shape[1])
-        known_costs = np.zeros(len(here)) if known_bounds is None else self.minima(known_bounds, k)
+        bounds = QuadraticBounds.constant(np.full(len(source), np.inf), source.low.shape[1])
+        known_costs = np.zeros(len(source)) if known_bounds is None else self.minima(known_bounds, k)
         # leave out steps that are nowhere the cheapest of their chart: first by distances, then by tangent planes
-        here_spans, there_spans = here.spans, there.spans
-        places = np.clip(0.0, there.low, there.high)
+        start_spans, end_spans = source.spans, target.spans
+        places = np.clip(0.0, target.low, target.high)
         lowest, middle = self.minima(after, neighbour), after.at(places)
         for i, j in self.edges(k, neighbour):
             feasible = np.isfinite(after.least[j]) & (known_costs[i] + lowest[j] < max_cost)
             i, j = i[feasible], j[feasible]
             if not i.size:
                 continue
-            delta = self.space.difference(there.centers[j], here.centers[i])
-            distances, spans = np.abs(delta), here_spans[i] + there_spans[j]
+            delta = self.space.difference(target.centers[j], source.centers[i])
+            distances, spans = np.abs(delta), start_spans[i] + end_spans[j]
             lower = self.cost.evaluate(np.maximum(distances - spans, 0.0), seconds) + lowest[j]
             upper = self.cost.evaluate(distances + spans, seconds) + middle[j]
-            floor = np.full(len(here), np.inf)
+            floor = np.full(len(source), np.inf)
             np.minimum.at(floor, i, lower)
             promising = (lower <= _least_of_groups(upper, i)) & (known_costs[i] + lower < max_cost)
             i, j, delta = i[promising], j[promising], delta[promising]
             ends = self.curved[k].select(i), self.curved[neighbour].select(j)
             steps = self.cost.lower_bounds(delta, *ends, after.select(j), seconds)
             if known_bounds is not None:
-                affordable = np.flatnonzero(_bound_with_rest(steps, here.select(i), known_bounds.select(i)) < max_cost)
+                affordable = np.flatnonzero(
+                    _bound_with_rest(steps, source.select(i), known_bounds.select(i)) < max_cost
+                )
                 i, steps = i[affordable], steps.select(affordable)
             if not i.size:
                 continue
             starts = np.flatnonzero(np.diff(i, prepend=-1))
-            parts = _bound_charts(steps, here.select(i), starts, max_cost - known_costs[i[starts]], self.settings)
-            parts = self._raise_to_floor(parts, here.select(i[starts]), floor[i[starts]])
+            parts = _bound_charts(steps, source.select(i), starts, max_cost - known_costs[i[starts]], self.settings)
+            parts = self._raise_to_floor(parts, source.select(i[starts]), floor[i[starts]])
             for whole, part in zip(bounds, parts, strict=True):
                 whole[i[starts]] = part
         return bounds
