@@ -185,7 +185,9 @@ def plan_in_segments(
     checked_instance("machine", machine, FixedBase)
     options: dict[str, Any] = {"start": start, "weights": weights, "limits": limits, "seed": seed}
     request = checked_request(machine, tasks, horizon, search="global", **options)
-    constraints = clearance_for(machine, obstacles, clearance, ignored, srdf, folders, missing, limits)
+    collision: dict[str, Any] = {"obstacles": obstacles, "clearance": clearance, "ignored": ignored}
+    collision |= {"srdf": srdf, "folders": folders, "missing": missing}
+    constraints = clearance_for(machine, limits, **collision)
     if constraints is not None and constraints.scene.moves_by_itself:
         words = "moving obstacles do not wait while the arm reconfigures; give static obstacles"
         raise ProblemError(words, name="obstacles", value=obstacles)

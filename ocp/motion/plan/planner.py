@@ -313,15 +313,16 @@ def plan(
             the motions of a global search end, what obstructs them, by how much the tasks would have to be relaxed, and
             in how few segments they may be done (`plan_in_segments`).
     """
-    collision_options = (machine, obstacles, clearance, ignored, srdf, folders, missing, limits)
+    collision: dict[str, Any] = {"obstacles": obstacles, "clearance": clearance, "ignored": ignored}
+    collision |= {"srdf": srdf, "folders": folders, "missing": missing}
     options: dict[str, Any] = {"start": start, "cyclic": cyclic, "weights": weights, "limits": limits}
     options |= {"search": search, "seed": seed}
     if isinstance(machine, Standing):
-        constraints = clearance_for(*collision_options)
+        constraints = clearance_for(machine, limits, **collision)
         return plan_to_stand(machine, tasks, horizon, clearance_constraints=constraints, **options)
     options |= {"start_base": start_base, "time_cost": time_cost}
     request = checked_request(machine, tasks, horizon, **options)
-    return plan_request(replace(request, clearance_constraints=clearance_for(*collision_options)))
+    return plan_request(replace(request, clearance_constraints=clearance_for(machine, limits, **collision)))
 
 
 def plan_request(request: PlanRequest) -> Plan:
@@ -343,13 +344,14 @@ def plan_request(request: PlanRequest) -> Plan:
 
 def clearance_for(
     machine: Machine,
+    limits: Limits | None,
+    *,
     obstacles: Any,
     clearance: Any,
     ignored: Any,
     srdf: Any,
     folders: Any,
     missing: Any,
-    limits: Limits | None,
 ) -> ClearanceConstraints | None:
     """Return the clearance constraints of a motion, or None if no pair of bodies has to be checked.
 

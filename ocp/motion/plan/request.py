@@ -265,8 +265,8 @@ def restored_request(record: Any) -> MotionRequest:
         machine = _read(pool["machine"], functions, None)
         if not isinstance(machine, MACHINES):
             raise TypeError(f"the machine is of type {type(machine).__name__}")
-        arguments = {name: _read(value, functions, machine) for name, value in pool.items() if name != "machine"}
-        arguments["machine"] = machine
+        others = {name: _read(value, functions, machine) for name, value in pool.items() if name != "machine"}
+        arguments = {"machine": machine, **others}
         if record["builder"] not in BUILDERS and record["builder"] != "":
             raise ValueError(f"builder {record['builder']!r} is not known")
         return MotionRequest(record["builder"], arguments)

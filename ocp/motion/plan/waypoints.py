@@ -162,7 +162,9 @@ def plan_waypoints(
         if not joint_weights.any():
             raise ProblemError("cost='time' needs a joint with a velocity limit", name="velocity")
     max_step = _step(step, n)
-    constraints = clearance_for(machine, obstacles, clearance, ignored, srdf, folders, missing, checked_limits)
+    collision: dict[str, Any] = {"obstacles": obstacles, "clearance": clearance, "ignored": ignored}
+    collision |= {"srdf": srdf, "folders": folders, "missing": missing}
+    constraints = clearance_for(machine, checked_limits, **collision)
     scene = None if constraints is None else constraints.scene
     planner = _WaypointPlanner(
         machine,
