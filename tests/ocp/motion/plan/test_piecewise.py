@@ -160,7 +160,7 @@ def test_a_task_between_of_a_task_asks_for_the_same_at_its_times() -> None:
     assert _task_between(task, end, end + 1.0) is None
 
 
-def test_a_horizon_of_which_the_task_is_no_task_between_is_refused() -> None:
+def test_a_horizon_of_which_the_task_is_no_part_is_refused() -> None:
     for planner in (plan_in_segments, partial(plan, search="global")):
         with pytest.raises(ProblemError, match="no task is active") as refused:
             planner(arm(), line(0.1), 1e12, start=posture(np.zeros(1), 0.1, 1)[0], clearance=None)
