@@ -138,7 +138,7 @@ def test_a_reconfiguration_goes_round_what_is_in_the_way(angle: float) -> None:
         assert np.linalg.norm(far - share[:, None] * way, axis=1).min() >= 0.03 + 0.02 + 0.01 - 1e-6
 
 
-def test_a_task_between_of_a_task_asks_for_the_same_at_its_times() -> None:
+def test_a_part_of_a_task_asks_for_the_same_at_its_times() -> None:
     path = smooth(Path.through([[0.4, -0.3, 0.0], [0.6, 0.0, 0.0], [0.4, 0.3, 0.0]]), deviation=0.02)
     task = TipTask.along(path, 0.4, rows=(3, 4), begin=0.5)
     end = task.end
