@@ -57,7 +57,7 @@ def run_task(
         segmented = plan_in_segments(checked_instance("machine", task.machine, FixedBase), task.task, **task.options)
         if segmented.reconfigurations:
             return _run_segments(task, segmented, outputs, progress, write)
-        result = segmented.pieces[0]
+        result = segmented.segments[0]
     else:
         result = plan(task.machine, task.task, **task.options)
     check_period(result, task.period)
@@ -91,9 +91,9 @@ def _run_segments(
     write: Callable[[Plan, dict[str, Path]], None],
 ) -> tuple[int, str, Any]:
     """Audit and write the segments and the motions between them, with files numbered in the order of execution."""
-    motions: list[Plan | None] = [segmented.pieces[0]]
-    for reconfiguration, segment in zip(segmented.reconfigurations, segmented.pieces[1:], strict=True):
-        motions += [reconfiguration.way, segment]
+    motions: list[Plan | None] = [segmented.segments[0]]
+    for reconfiguration, segment in zip(segmented.reconfigurations, segmented.segments[1:], strict=True):
+        motions += [reconfiguration.motion, segment]
     lines, files, passed = [str(segmented)], list[Path](), None not in motions
     for number, motion in enumerate(motions, 1):
         if motion is None:
@@ -111,11 +111,11 @@ def _run_segments(
         "passed": passed,
         "cost": segmented.cost,
         "duration": segmented.duration,
-        "joints": segmented.pieces[0].names,
+        "joints": segmented.segments[0].names,
         "fewest": segmented.fewest,
         "pieces": [
             {"begin": begin, "duration": segment.horizon, "cost": segment.cost, "bound": segment.bound}
-            for begin, segment in zip(segmented.begins, segmented.pieces, strict=True)
+            for begin, segment in zip(segmented.start_times, segmented.segments, strict=True)
         ],
         "reconfigurations": [
             {name: getattr(each, name) for name in reconfiguration_fields} for each in segmented.reconfigurations

@@ -22,10 +22,10 @@ from models.paths import rest_to_rest
 from ocp import Limits, SolveError, TipTask, inverse_kinematics, resolve
 from ocp import plan as planned
 from ocp.app.view.appearance import frames_along
-from ocp.motion.search.charts import Charts, Instant, SelfMotions
+from ocp.motion.search.charts import Charts, SelfMotionManifolds, TimeSample
 from ocp.motion.search.joint_space import JointSpace
-from ocp.motion.search.search import Search
-from ocp.motion.search.steps import Squares
+from ocp.motion.search.search import AtlasSearch
+from ocp.motion.search.steps import SquaredRates
 from ocp.motion.tasks.equations import bind
 from scripts.drawing import COLORS, VIRIDIS, sheet
 from scripts.robots.results import FINE, Example
@@ -90,7 +90,7 @@ def landscape(machine: FixedBase, task: TipTask, count: int, known: float) -> tu
     bounds = Limits().bounds(machine)
     space = JointSpace(machine, bounds.lower, bounds.upper, np.ones(robot.dof))
     equations = bind(machine, task)
-    sets = SelfMotions(space, equations, np.array(equations.target_function().map(count)(times[None])).T)
+    sets = SelfMotionManifolds(space, equations, np.array(equations.target_function().map(count)(times[None])).T)
 
     def seeds(k: int) -> Array:
         found = inverse_kinematics(machine, task, time=float(times[k]), seed=k, starts=STARTS)
@@ -98,19 +98,19 @@ def landscape(machine: FixedBase, task: TipTask, count: int, known: float) -> tu
 
     limits = bounds.velocity * np.diff(times)[:, None]
     told: dict[str, Any] = {"seeds": seeds, "scene": CollisionScene(machine)}
-    instants = [Instant(sets, k) for k in range(count)]
-    search = Search(space, instants, times, Squares(np.ones(robot.dof)), limits, **told)
+    instants = [TimeSample(sets, k) for k in range(count)]
+    search = AtlasSearch(space, instants, times, SquaredRates(np.ones(robot.dof)), limits, **told)
     layers = search.layers
     for _ in range(HALVINGS):
-        layers = [search.allowed(search.halved(charts, k), k) for k, charts in enumerate(layers)]
+        layers = [search.without_collisions(search.split_charts(charts, k), k) for k, charts in enumerate(layers)]
     graph = search.graph(layers, np.full(count - 1, MOST * known))
-    passed, to_come = graph.passed(), graph.to_come()
-    cost = np.concatenate([graph.through(passed, to_come, k) for k in range(count)])
+    passed, cost_to_go = graph.cost_to_come(), graph.cost_to_go()
+    cost = np.concatenate([graph.cost_through(passed, cost_to_go, k) for k in range(count)])
     first = np.concatenate([[0], np.cumsum([len(charts) for charts in layers])])
     steps = [
         (first[k] + i[alive], first[k + 1] + j[alive])
         for k in range(count - 1)
-        for i, j in graph.steps(k, k + 1)
+        for i, j in graph.edges(k, k + 1)
         if (alive := np.isfinite(cost[first[k] + i]) & np.isfinite(cost[first[k + 1] + j])).any()
     ]
     rows, columns = (np.concatenate(part) for part in zip(*steps, strict=True))
@@ -191,5 +191,5 @@ def rolls_of(robot: Robot, joints: Array) -> Array:
 
 def _nearest(space: JointSpace, charts: Charts, joints: Array, layers: Any) -> Array:
     """Which charts joints (M, n) at some instants lie in. Shape (M,)."""
-    _, found = space.tree(charts.centers, charts.layer).query(space.placed(joints, np.array(layers)))
+    _, found = space.tree(charts.centers, charts.layer).query(space.tree_points(joints, np.array(layers)))
     return np.asarray(found)

@@ -26,11 +26,11 @@ from models.paths import rest_to_rest
 from ocp import Audit, Limits, Plan, Reconfiguration, SegmentedPlan, TipTask, inverse_kinematics, plan_in_segments
 from ocp.app.view.appearance import frames_along
 from ocp.app.view.rendering import tube
-from ocp.motion.search.charts import Charts, Instant, SelfMotions
+from ocp.motion.search.charts import Charts, SelfMotionManifolds, TimeSample
 from ocp.motion.search.joint_space import JointSpace
-from ocp.motion.search.search import Search
-from ocp.motion.search.steps import Squares
-from ocp.motion.search.value import Graph
+from ocp.motion.search.search import AtlasSearch
+from ocp.motion.search.steps import SquaredRates
+from ocp.motion.search.value import ChartGraph
 from ocp.motion.tasks.equations import bind, task_errors
 from scripts.drawing import COLORS, DASHES, sheet
 from scripts.robots.drawing import Scene, animate, draw_scene
@@ -89,8 +89,8 @@ class InPieces:
     @property
     def audits(self) -> list[Audit]:
         """Of the pieces, and of the ways between them."""
-        ways = [one.way for one in self.made.reconfigurations if one.way is not None]
-        return [motion.audit() for motion in (*self.made.pieces, *ways)]
+        ways = [one.motion for one in self.made.reconfigurations if one.motion is not None]
+        return [motion.audit() for motion in (*self.made.segments, *ways)]
 
     @property
     def audit(self) -> Audit:
@@ -107,7 +107,7 @@ class InPieces:
             "duration_s": made.duration,
             "cost_local": None,
             "cost_optimal": made.cost,
-            "tip_error": max(self._tip_error(number) for number in range(len(made.pieces))),
+            "tip_error": max(self._tip_error(number) for number in range(len(made.segments))),
             "joint_return_rad": None,
             "audit_passed": all(audit.passed for audit in self.audits),
             "reconfigurations": len(made.reconfigurations),
@@ -117,7 +117,7 @@ class InPieces:
         }
 
     def _tip_error(self, number: int) -> float:
-        piece, begin = self.made.pieces[number], self.made.begins[number]
+        piece, begin = self.made.segments[number], self.made.start_times[number]
         times = np.linspace(0.0, piece.horizon, FINE)
         errors = task_errors(self.machine, self.task, begin + times, None, piece.at(times)["joints"])
         return float(np.abs(errors).max())
@@ -145,7 +145,7 @@ def postures(machine: FixedBase, task: TipTask, count: int) -> Reached:
     n, times = machine.joint_size, np.linspace(0.0, DURATION, count)
     bounds, equations = Limits().bounds(machine), bind(machine, task)
     space = JointSpace(machine, bounds.lower, bounds.upper, np.ones(n))
-    sets = SelfMotions(space, equations, np.array(equations.target_function().map(count)(times[None])).T)
+    sets = SelfMotionManifolds(space, equations, np.array(equations.target_function().map(count)(times[None])).T)
 
     def seeds(k: int) -> Array:
         found = inverse_kinematics(machine, task, time=float(times[k]), seed=k, starts=STARTS)
@@ -153,19 +153,21 @@ def postures(machine: FixedBase, task: TipTask, count: int) -> Reached:
 
     limits = bounds.velocity * np.diff(times)[:, None]
     told: dict[str, Any] = {"seeds": seeds, "scene": CollisionScene(machine)}
-    search = Search(space, [Instant(sets, k) for k in range(count)], times, Squares(np.ones(n)), limits, **told)
-    layers = [search.allowed(search.halved(charts, k), k) for k, charts in enumerate(search.layers)]
+    search = AtlasSearch(
+        space, [TimeSample(sets, k) for k in range(count)], times, SquaredRates(np.ones(n)), limits, **told
+    )
+    layers = [search.without_collisions(search.split_charts(charts, k), k) for k, charts in enumerate(search.layers)]
     graph = search.graph(layers, np.full(count - 1, np.inf))
     ahead, back = (_led(graph, order) for order in (range(count), range(count - 1, -1, -1)))
     whole = Charts(*(np.concatenate([getattr(part, name) for part in layers]) for name in Charts.__dataclass_fields__))
     return Reached(times, whole, ahead, back)
 
 
-def _led(graph: Graph, order: range) -> NDArray[np.bool_]:
+def _led(graph: ChartGraph, order: range) -> NDArray[np.bool_]:
     """Which charts steps lead to from those of the first instant of an order. Shape (N,)."""
     found = [np.full(len(charts), k == order[0]) for k, charts in enumerate(graph.layers)]
     for k, other in pairwise(order):
-        for i, j in graph.steps(k, other):
+        for i, j in graph.edges(k, other):
             found[other][j[found[k][i]]] = True
     return np.concatenate(found)
 
@@ -200,7 +202,7 @@ def draw(example: InPieces, folder: Path, *, animation: bool = True) -> None:
             draw_scene(figure.add_subplot(grid[0, place]), scene, 1, (790, 560), scenes)
         _landscape(figure.add_subplot(grid[1, :]), example, change, joint)
     if animation:
-        scene = _scene(example, f"a ring in {len(made.pieces)} pieces", "blue", *_motion(made))
+        scene = _scene(example, f"a ring in {len(made.segments)} pieces", "blue", *_motion(made))
         told = f"The ring waits at {change.time:.2f} s, for {change.duration:.2g} s, while the arm reconfigures"
         animate(folder / "reconfiguration.gif", [scene], frames=FRAMES, seconds=PACE, note=told)
 
@@ -217,8 +219,8 @@ def _landscape(ax: Any, example: InPieces, change: Reconfiguration, joint: int) 
         lines.set_rasterized(True)  # thousands of them
         ax.add_collection(lines)
     for name, color, piece, begin in (
-        ("first piece", FROM_THE_BEGINNING, made.pieces[0], made.begins[0]),
-        ("last piece", TO_THE_END, made.pieces[-1], made.begins[-1]),
+        ("first piece", FROM_THE_BEGINNING, made.segments[0], made.start_times[0]),
+        ("last piece", TO_THE_END, made.segments[-1], made.start_times[-1]),
     ):
         t = np.linspace(0.0, piece.horizon, FINE)
         angle = np.degrees(piece.at(t)["joints"][:, joint])
@@ -257,9 +259,9 @@ def _scene(example: InPieces, title: str, color: str, joints: Array, t: Array | 
 
 def _motion(made: SegmentedPlan) -> tuple[Array, Array]:
     """All joints from the beginning to the end, the ways between the pieces too, and their times, s."""
-    order: list[Plan | None] = [made.pieces[0]]
-    for change, piece in zip(made.reconfigurations, made.pieces[1:], strict=True):
-        order += [change.way, piece]
+    order: list[Plan | None] = [made.segments[0]]
+    for change, piece in zip(made.reconfigurations, made.segments[1:], strict=True):
+        order += [change.motion, piece]
     joints, times, begin = [], [], 0.0
     for motion in order:
         if motion is not None:

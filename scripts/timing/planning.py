@@ -70,7 +70,7 @@ def run(repeats: int = 5) -> dict[str, Any]:
 
 def pairs() -> list[tuple[str, SearchKind]]:
     """Cases and how their start is searched; given starts are not."""
-    searches: tuple[SearchKind, ...] = ("start", "postures")
+    searches: tuple[SearchKind, ...] = ("start", "configurations")
     return [(case, search) for case in CASES for search in searches if search == "start" or "space" not in case]
 
 
@@ -88,7 +88,7 @@ def row(case: str, search: SearchKind, repeats: int) -> dict[str, Any]:
         "intervals": len(found.solution.state_interpolant.breaks) - 1,
         "cost": found.cost,
         "plan_s": min(seconds for _, seconds in runs),
-        "goal_s": None if goals is None else goals[search == "postures"],
+        "goal_s": None if goals is None else goals[search == "configurations"],
     }
 
 
@@ -99,7 +99,7 @@ def report(numbers: dict[str, Any]) -> str:
     ratios = [
         f"{row['case']}: {row['postures']} postures take {row['plan_s'] / firsts[row['case']]:.1f} times the first"
         for row in rows
-        if row["search"] == "postures"
+        if row["search"] == "configurations"
     ]
     return "\n".join([text_table(rows, 4), *ratios])
 
@@ -116,10 +116,12 @@ def plot(path: Path, numbers: dict[str, Any]) -> None:
     with drawing.sheet(path, (1, 1), (7.6, 3.6), note, title=title) as (_, axes):
         axis = np.ravel(axes)[0]
         names = list(CASES)
-        for shift, search, color in ((-0.2, "start", "blue"), (0.2, "postures", "green")):
+        for shift, search, color in ((-0.2, "start", "blue"), (0.2, "configurations", "green")):
             rows = [row for row in numbers["rows"] if row["search"] == search]
             places = [names.index(row["case"]) + shift for row in rows]
-            told = {"start": "from the first posture that leads to a plan", "postures": "from all postures"}[search]
+            told = {"start": "from the first posture that leads to a plan", "configurations": "from all postures"}[
+                search
+            ]
             axis.barh(places, [row["plan_s"] for row in rows], 0.35, color=drawing.COLORS[color], label=told)
             for place, row in zip(places, rows, strict=True):
                 if row["goal_s"]:

@@ -119,18 +119,18 @@ def test_no_posture_of_the_ring_is_reached_from_its_beginning_and_leads_to_its_e
     example = reconfiguration.plan(coarse=True)
     made, reached = example.made, example.reached
     assert all(audit.feasible for audit in example.audits)
-    assert all(piece.audit().passed for piece in made.pieces)
+    assert all(piece.audit().passed for piece in made.segments)
     assert (len(made.reconfigurations), made.fewest) == (1, 1)
     assert not (reached.from_the_beginning & reached.to_the_end).any()
     (change,) = made.reconfigurations
-    for own, apart in ((reached.from_the_beginning, made.pieces[0]), (reached.to_the_end, made.pieces[1])):
-        begin = 0.0 if apart is made.pieces[0] else change.time
+    for own, apart in ((reached.from_the_beginning, made.segments[0]), (reached.to_the_end, made.segments[1])):
+        begin = 0.0 if apart is made.segments[0] else change.time
         for k in np.flatnonzero((reached.times >= begin) & (reached.times <= begin + apart.horizon)):
             charts = reached.charts.centers[own & (reached.charts.layer == k)]
             far = np.abs(charts - apart.at(reached.times[k] - begin)["joints"]).max(axis=1)
             assert far.min() < 0.07  # each piece runs through its own postures
-    machine, joints = example.machine, np.concatenate([piece["joints"] for piece in made.pieces])
-    times = np.concatenate([begin + piece.t for begin, piece in zip(made.begins, made.pieces, strict=True)])
+    machine, joints = example.machine, np.concatenate([piece["joints"] for piece in made.segments])
+    times = np.concatenate([begin + piece.t for begin, piece in zip(made.start_times, made.segments, strict=True)])
     rotations, places = placed(robots.PANDA, joints, machine.robot.tip_link)
     angle = np.pi * (2 * rest_to_rest(times / reconfiguration.DURATION) - 1)
     radius = reconfiguration.RADIUS

@@ -17,10 +17,10 @@ import numpy as np
 from models.arrays import Array
 from ocp import TipTask, inverse_kinematics
 from ocp.motion.local.inverse_kinematics import Unreachable
-from ocp.motion.search.charts import Instant, SelfMotions
-from ocp.motion.search.joint_space import TURN, JointSpace
-from ocp.motion.search.search import Search
-from ocp.motion.search.steps import Length, Squares, StepCost
+from ocp.motion.search.charts import SelfMotionManifolds, TimeSample
+from ocp.motion.search.joint_space import FULL_TURN, JointSpace
+from ocp.motion.search.search import AtlasSearch
+from ocp.motion.search.steps import PathLength, SquaredRates, StepCost
 from ocp.motion.tasks.equations import bind
 from tests.ocp.motion.search.test_charts import planar
 from tests.ocp.motion.search.test_values import INSTANTS, SECONDS, reached
@@ -41,7 +41,7 @@ AS_CHEAP = {False: 1.01, True: 1.02}
 def judged(kind: str, seed: int) -> dict[str, Any]:
     """One case: what was found, its bound, the least on the grid, and what is wrong."""
     rng = np.random.default_rng([list(KINDS).index(kind), seed])
-    two, cost = kind == "two", (Squares, Length)[seed % 2 if kind != "two" else 0]
+    two, cost = kind == "two", (SquaredRates, PathLength)[seed % 2 if kind != "two" else 0]
     size = 4 if two else 3
     limit = {"cut": rng.uniform(1.0, 2.2), "turning": 7.0, "two": 1.6}.get(kind, 2.8)
     speed = rng.uniform(0.15, 0.5) if kind == "slow" else 3.0
@@ -56,14 +56,14 @@ def judged(kind: str, seed: int) -> dict[str, Any]:
     places *= np.minimum(1.0, 0.97 * lengths.sum() / np.linalg.norm(places, axis=1).max())
     times = np.linspace(0, SECONDS, INSTANTS)
     price, seconds = cost(weights), float(times[1])
-    metric = weights if cost is Squares else np.ones(size)
+    metric = weights if cost is SquaredRates else np.ones(size)
     space = JointSpace(machine, machine.robot.lower, machine.robot.upper, metric)
     most = machine.robot.velocity * seconds
     angles = min(limit, np.pi) * (1 - 1e-9)
     nodes = [(_by_four if two else _by_three)(lengths, place, angles) for place in places]
     least = _least(nodes, price, seconds, most, space)
     equations = bind(machine, TipTask(position=[*places[0]], rows=[3, 4]))
-    sets = SelfMotions(space, equations, np.array([np.r_[place, 0.0, 0.0, 0.0, 0.0] for place in places]))
+    sets = SelfMotionManifolds(space, equations, np.array([np.r_[place, 0.0, 0.0, 0.0, 0.0] for place in places]))
 
     def seeds(k: int) -> Array:
         at = TipTask(position=[*places[k]], rows=[3, 4])
@@ -71,10 +71,10 @@ def judged(kind: str, seed: int) -> dict[str, Any]:
 
     begun, steps, bound = time.process_time(), np.inf, np.inf
     try:
-        instants = [Instant(sets, k) for k in range(INSTANTS)]
-        search = Search(space, instants, times, price, np.repeat(most[None], INSTANTS - 1, axis=0), seeds=seeds)
-        path, bound = search.best(np.inf)
-        steps = np.inf if path is None else search.steps(path)
+        instants = [TimeSample(sets, k) for k in range(INSTANTS)]
+        search = AtlasSearch(space, instants, times, price, np.repeat(most[None], INSTANTS - 1, axis=0), seeds=seeds)
+        path, bound = search.solve(np.inf)
+        steps = np.inf if path is None else search.path_cost(path)
     except Unreachable:
         pass
     wrong = []
@@ -112,8 +112,8 @@ def _least(nodes: list[Array], price: StepCost, seconds: float, most: Array, spa
         share = max(1, AT_ONCE // max(len(there), 1))
         for first in range(0, len(here), share):
             way = there - here[first : first + share, None]
-            way[..., space.periodic] -= TURN * np.round(way[..., space.periodic] / TURN)
-            total = np.where((np.abs(way) <= most).all(axis=2), value + price.of(way, seconds), np.inf)
+            way[..., space.periodic] -= FULL_TURN * np.round(way[..., space.periodic] / FULL_TURN)
+            total = np.where((np.abs(way) <= most).all(axis=2), value + price.evaluate(way, seconds), np.inf)
             before[first : first + share] = total.min(axis=1, initial=np.inf)
         value = before
     return float(value.min(initial=np.inf))

@@ -195,9 +195,9 @@ def _turned(profile: Array) -> Triangles:
 
 def rod(start: Array, end: Array, radius: float) -> Triangles:
     """Return a round rod between two points."""
-    path_tracks = end - start
-    length = float(np.linalg.norm(path_tracks))
-    axis = path_tracks / length
+    along = end - start
+    length = float(np.linalg.norm(along))
+    axis = along / length
     coordinate_axis = np.eye(3)[int(np.abs(axis).argmin())]
     first = np.cross(axis, coordinate_axis)
     first /= np.linalg.norm(first)

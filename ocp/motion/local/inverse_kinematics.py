@@ -165,7 +165,7 @@ def inverse_kinematics(
     base_values = checked_configuration(machine, np.zeros(size), base)[1]
     unbounded = np.full(size, np.inf)
     lower, upper = (machine.robot.lower, machine.robot.upper) if limits else (-unbounded, unbounded)
-    first = start_configurations(machine, lower, upper, int(starts), near, seed)
+    first = sample_starts(machine, lower, upper, int(starts), near, seed)
     targets = np.array(equations.target_function()(float(time))).ravel()
     if not np.isfinite(targets).all():
         words = f"the task's targets are not finite at {time:g} s"
@@ -204,7 +204,7 @@ def inverse_kinematics_at(
     """
     machine, unbounded = equations.machine, np.full(equations.machine.joint_size, np.inf)
     lower, upper = (machine.robot.lower, machine.robot.upper) if limits else (-unbounded, unbounded)
-    first = start_configurations(machine, lower, upper, starts, None, seed)
+    first = sample_starts(machine, lower, upper, starts, None, seed)
     return _MultiStart(equations, np.zeros(0), targets, lower, upper).solve(first, starts)
 
 
@@ -290,7 +290,7 @@ def equivalent_pose(machine: Machine, task: TipTask, start: Array, time: float, 
     return replace(task, velocity=None, rows=rows, position=np.array(ca.DM(origin)).ravel() + displacement)
 
 
-def start_configurations(machine: Machine, lower: Array, upper: Array, count: int, near: Any, seed: int) -> Array:
+def sample_starts(machine: Machine, lower: Array, upper: Array, count: int, near: Any, seed: int) -> Array:
     """Return the starts: those of `near`, then `count` random ones between the limits. Shape (K, n)."""
     size, rng = machine.joint_size, np.random.default_rng(seed)
     prismatic = np.array([joint.kind == "prismatic" for joint in machine.robot.moving_joints])

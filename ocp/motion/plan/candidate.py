@@ -1,4 +1,4 @@
-"""A motion on its way to become the plan: how far it has come, what it costs, and why it is rejected."""
+"""Candidate of a plan: how far its motion has been solved, its cost, and the reason for its rejection."""
 
 from __future__ import annotations
 
@@ -16,32 +16,32 @@ from ocp.motion.local.collisions import Collision
 from ocp.motion.local.rates import LocalMotion
 from ocp.solution import Solution
 
-__all__ = ["Candidate", "Reason", "Rejection", "Seed", "Stage", "collision"]
+__all__ = ["Candidate", "Reason", "Rejection", "Seed", "Stage", "collision_reason"]
 
 
 class Stage(IntEnum):
-    """How far a candidate has come."""
+    """Stage that a candidate has reached."""
 
-    SEED = 0  # a guess, mostly a local motion
+    SEED = 0  # guess, mostly a local motion
     COARSE = 1  # solved on the coarse mesh
-    SEPARATED = 2  # there with constraints that separate bodies
+    SEPARATED = 2  # solved on the coarse mesh with separation constraints
     FINE = 3  # solved on the fine mesh
-    REFINED = 4  # on a mesh on which its tips keep to their poses
+    REFINED = 4  # on a mesh on which the tips follow their tasks
     AUDITED = 5  # passed its audit
-    ACTUATED = 6  # within the limits of actuators, too
+    ACTUATED = 6  # within actuator limits as well
 
 
 class Rejection(Enum):
-    """Why a candidate is not the plan."""
+    """Reasons for which a candidate is not the plan."""
 
-    COLLISION = "touches"
+    COLLISION = "collides"
     COSTLIER = "costlier"
-    DUPLICATE = "the same as another one, or of the same cost"
-    UNTRACKED = "the tasks cannot be tracked from there"
-    INFEASIBLE = "no motion was found"
-    AUDIT = "the audit fails"
-    UNDETERMINED = "not decided"
-    ACTUATORS = "beyond the limits of actuators"
+    DUPLICATE = "the same motion or cost as another candidate"
+    UNTRACKED = "the tasks cannot be tracked from this start"
+    INFEASIBLE = "the solver found no motion"
+    AUDIT = "fails the audit"
+    UNDETERMINED = "undetermined"
+    ACTUATORS = "exceeds actuator limits"
     NOT_TRIED = "not tried"
 
 
@@ -50,10 +50,10 @@ class Reason:
     """Why a candidate is not the plan.
 
     Attributes:
-        kind: What kind of reason it is.
-        detail: What exactly.
-        then: What was tried against it, and what came of that.
-        name, value, limit, time: The offending thing, its value, what is allowed, and when, s; None if unknown.
+        kind: Kind of the reason.
+        detail: Details in words.
+        remedy: What was tried against it, and with which result.
+        name, value, limit, time: Offending item, its value, its limit and the time, s; None if unknown.
     """
 
     kind: Rejection
@@ -62,54 +62,52 @@ class Reason:
     value: float | None = None
     limit: float | None = None
     time: float | None = None
-    then: str = ""
+    remedy: str = ""
 
     def __str__(self) -> str:
-        return self.kind.value + (self.detail and f": {self.detail}") + (self.then and f"; {self.then}")
+        return self.kind.value + (self.detail and f": {self.detail}") + (self.remedy and f"; {self.remedy}")
 
     def record(self) -> dict[str, Any]:
-        """What a file holds of it."""
+        """Return the record that a file holds."""
         return {**asdict(self), "kind": self.kind.name}
 
     @classmethod
     def of_record(cls, record: Mapping[str, Any]) -> Reason:
-        """The reason of which `record` returned the record. Nothing in it is trusted.
+        """Return the reason of a record, which is not trusted.
 
         Raises:
-            KeyError, TypeError, ValueError: It is damaged.
+            KeyError, TypeError, ValueError: The record is damaged.
         """
         numbers = {name: None if record[name] is None else float(record[name]) for name in ("value", "limit", "time")}
         name = None if record["name"] is None else str(record["name"])
-        return cls(Rejection[record["kind"]], str(record["detail"]), name, then=str(record["then"]), **numbers)
+        return cls(Rejection[record["kind"]], str(record["detail"]), name, remedy=str(record["remedy"]), **numbers)
 
     @classmethod
     def of_error(cls, kind: Rejection, error: Exception) -> Reason:
-        """The first line of an error, with its value, limit and time where these are numbers."""
+        """Return a reason with the first line of an error, and its value, limit and time if they are numbers."""
         numbers = {name: getattr(error, name, None) for name in ("value", "limit", "time")}
-        given: dict[str, Any] = {
-            name: float(value) for name, value in numbers.items() if isinstance(value, int | float)
-        }
+        details: dict[str, Any] = {name: float(x) for name, x in numbers.items() if isinstance(x, int | float)}
         name = getattr(error, "name", None)
-        return cls(kind, str(error).split("\n")[0], None if name is None else str(name), **given)
+        return cls(kind, str(error).split("\n")[0], None if name is None else str(name), **details)
 
 
-def collision(near: Collision | ClosestPair, limit: float, then: str = "") -> Reason:
-    """That two bodies come nearer than a limit, m."""
-    return Reason(Rejection.COLLISION, str(near), " and ".join(near.bodies), near.distance, limit, near.time, then)
+def collision_reason(pair: Collision | ClosestPair, limit: float, remedy: str = "") -> Reason:
+    """Return the reason that two bodies are closer than a limit, m."""
+    return Reason(Rejection.COLLISION, str(pair), " and ".join(pair.bodies), pair.distance, limit, pair.time, remedy)
 
 
 @dataclass(frozen=True, eq=False)
 class Seed:
-    """What a candidate begins from.
+    """Guess from which a candidate is solved.
 
     Attributes:
-        guess: Of its first solve.
-        cost: Of the local motion; inf if there is none.
-        local: The local motion, one in each stretch of time; () if there is none.
-        tracked: Whether it does its tasks.
-        direct: Whether it is solved on the fine mesh at once.
-        fixed: Whether the start stays where it is, though it might move along its self-motion.
-        thorough: Whether a solve that fails is begun from other guesses, too, and diagnosed.
+        guess: Guess of the first solve.
+        cost: Cost of the local motion; inf if there is none.
+        local: Local motion in each stretch of time; () if there is none.
+        tracked: Whether the local motion does the tasks.
+        direct: Whether the first solve is on the fine mesh.
+        fixed: Whether the start is fixed, though it could move along its self-motion.
+        thorough: Whether a failed solve is repeated from other guesses and diagnosed.
     """
 
     guess: Any = None
@@ -123,18 +121,19 @@ class Seed:
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A motion that may become the plan.
+    """Motion that may become the plan.
 
     Attributes:
-        start: Joints that the search began with, rad or m. Shape (n,).
-        cost: Of the motion, nan where none was found. Before it is solved on the fine mesh it is an estimate, and more
-            constraints can but make it larger.
-        reason: Why it is not the plan; None for the plan itself.
-        stage: How far it has come.
-        solution: Of the last solve; of a candidate that has ended, where that was on the fine mesh.
-        seed: What it began from.
-        clearance_constraints: What it has to stay clear of, with the pairs that constraints separate.
-        separations: How often pairs were separated, or farther. separated: The reason of the last time.
+        start: Initial joints of the search, rad or m. Shape (n,).
+        cost: Cost of the motion, nan if none was found. Until it is solved on the fine mesh, it is an estimate, which
+            further constraints can only increase.
+        reason: Why it is not the plan; None for the plan.
+        stage: Stage that it has reached.
+        solution: Solution of the last solve; of a finished candidate only if that was on the fine mesh.
+        seed: Guess from which it started.
+        constraints: Clearance constraints with the separated pairs.
+        separations: Number of solves that separated pairs, or separated them farther.
+        separated: Reason of the last separation.
     """
 
     start: Array
@@ -143,7 +142,7 @@ class Candidate:
     stage: Stage = Stage.SEED
     solution: Solution | None = None
     seed: Seed = field(default_factory=Seed, repr=False)
-    clearance_constraints: ClearanceConstraints | None = field(default=None, repr=False)
+    constraints: ClearanceConstraints | None = field(default=None, repr=False)
     separations: int = field(default=0, repr=False)
     separated: Reason | None = field(default=None, repr=False)
 
@@ -153,26 +152,27 @@ class Candidate:
 
     @classmethod
     def of_record(cls, start: Any, cost: Any, stage: Any, reason: Any, solution: Solution) -> Candidate:
-        """A candidate of a plan that a file holds, whose motion is the solution unless it was rejected.
+        """Return the candidate of a plan file; its motion is the given solution unless it was rejected.
 
         Raises:
-            KeyError, TypeError, ValueError: What the file says is damaged.
+            KeyError, TypeError, ValueError: The record is damaged.
         """
-        why = None if reason is None else Reason.of_record(reason)
-        return cls(np.array(start, dtype=float), float(cost), why, Stage(stage), solution if why is None else None)
+        rejection = None if reason is None else Reason.of_record(reason)
+        motion = solution if rejection is None else None
+        return cls(np.array(start, dtype=float), float(cost), rejection, Stage(stage), motion)
 
     @property
     def passed(self) -> bool:
-        """Whether it ended and nothing is wrong with it."""
+        """Whether it has no reason for rejection."""
         return self.reason is None
 
     def rejected(self, reason: Reason) -> Candidate:
-        """The same with the reason why it is not the plan; where bodies were separated for that they collided first."""
+        """Return the candidate with a reason; separated bodies are named as the first reason."""
         if self.separated is not None and reason.kind not in (Rejection.COSTLIER, Rejection.DUPLICATE):
-            reason = replace(self.separated, then=f"held apart: {reason}")
+            reason = replace(self.separated, remedy=f"with separated bodies: {reason}")
         return replace(self, reason=reason, cost=np.nan if reason.kind is Rejection.UNTRACKED else self.cost)
 
-    def ended(self) -> Candidate:
-        """The same as a plan tells it."""
+    def finished(self) -> Candidate:
+        """Return the candidate as a plan lists it."""
         solution = self.solution if self.stage >= Stage.FINE else None
         return Candidate(self.start, self.cost, self.reason, self.stage, solution)

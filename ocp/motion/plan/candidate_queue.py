@@ -1,9 +1,9 @@
-"""Best-first search over candidates: each is advanced one stage at a time, the one of least cost first.
+"""Best-first search over candidates: the one of least cost is advanced by one stage at a time.
 
-A cost on the coarse mesh is an estimate, and separated bodies or limits of actuators can but raise it. So what a
-candidate costs is, but for the error of the coarse mesh, a lower bound of what it can become, and none has to be
-advanced that costs more than one that passed. Candidates that become one motion are one, and the others wait: where it
-is rejected the next one of them goes on in its place.
+The cost on the coarse mesh is an estimate, and separation constraints or actuator limits can only increase it. Apart
+from the error of the coarse mesh, the cost of a candidate is therefore a lower bound of its final cost, and candidates
+that cost more than one that passed need not be advanced. Candidates that converge to one motion are merged. The others
+wait, and if the first is rejected, the next one continues in its place.
 """
 
 from __future__ import annotations
@@ -25,33 +25,33 @@ __all__ = ["CandidateQueue", "Solver"]
 
 
 class Solver:
-    """What advances candidates of one request.
+    """Interface of the solvers that advance the candidates of one request.
 
     Attributes:
-        last: The stage that the plan has to reach.
-        error: The last error of a solve.
+        last: Stage that a plan must reach.
+        error: Last error of a solve.
     """
 
     last = Stage.AUDITED
     error: SolveError | None = None
 
     def advance(self, candidate: Candidate) -> list[Candidate]:
-        """The candidate one stage further, or rejected; and candidates that stem from it."""
+        """Advance a candidate by one stage or reject it; also return candidates derived from it."""
         raise NotImplementedError
 
     def collision(self, candidate: Candidate) -> Reason | None:
-        """That bodies collide in its motion; None if none do."""
+        """Return the reason if bodies collide in its motion; else None."""
         return None
 
-    def same_path(self, one: Solution, other: Solution) -> bool:
-        """Whether two motions are one."""
+    def same_path(self, solution: Solution, reference: Solution) -> bool:
+        """Return whether two solutions are the same motion."""
         return False
 
     def failure(self, candidates: Sequence[Candidate]) -> SolveError:
-        """That none passes, with the reasons, the most frequent first, and what the last solve says of them."""
-        reasons = Counter(str(one.reason) for one in candidates).most_common()
-        listed = "\n".join(f"  {count} of {len(candidates)} postures: {reason}" for reason, count in reasons)
-        last = next((one.solution for one in candidates if one.solution is not None), None)
+        """Return the error that no candidate passes: the reasons by frequency, and the last error of a solve."""
+        reasons = Counter(str(candidate.reason) for candidate in candidates).most_common()
+        listed = "\n".join(f"  {count} of {len(candidates)} candidates: {reason}" for reason, count in reasons)
+        last = next((candidate.solution for candidate in candidates if candidate.solution is not None), None)
         words, cause = f"no motion passes its audit:\n{listed}", self.error
         if cause is None:
             return SolveError(words, last, name="plan")
@@ -59,23 +59,23 @@ class Solver:
         return SolveError(f"{words}\n{cause}", cause.solution or last, cause.conflicts, **details)
 
     def plan(self, candidates: Sequence[Candidate]) -> Plan:
-        """The plan of which the first one is the motion."""
+        """Return the plan of the first candidate, with the others."""
         raise NotImplementedError
 
 
 @dataclass
 class _Motion:
-    """A motion that candidates of a batch were solved to: the first of them, and those that wait."""
+    """Motion to which candidates of a batch converged: the first of them, and those that wait."""
 
     first: Candidate
     waiting: list[Candidate] = field(default_factory=list)
 
 
 class CandidateQueue:
-    """Candidates of one request.
+    """Priority queue of the candidates of one request.
 
     Attributes:
-        candidates: Those that ended: they passed, or were rejected.
+        candidates: Finished candidates, which passed or were rejected.
     """
 
     def __init__(self, solver: Solver, settings: PlannerSettings) -> None:
@@ -84,66 +84,70 @@ class CandidateQueue:
 
     @property
     def cost(self) -> float:
-        """Of the best that passed; inf if none did."""
-        return min((one.cost for one in self.candidates if one.passed), default=np.inf)
+        """Cost of the best candidate that passed; inf if none did."""
+        return min((candidate.cost for candidate in self.candidates if candidate.passed), default=np.inf)
 
     @property
     def passed(self) -> bool:
-        """Whether one passed."""
+        """Whether a candidate passed."""
         return bool(np.isfinite(self.cost))
 
     @property
     def collided(self) -> bool:
-        """Whether one was rejected for a collision."""
-        return any(one.reason is not None and one.reason.kind is Rejection.COLLISION for one in self.candidates)
+        """Whether a candidate was rejected for a collision."""
+        return any(c.reason is not None and c.reason.kind is Rejection.COLLISION for c in self.candidates)
 
-    def run(self, seeds: Iterable[Candidate], every: bool = False) -> None:
-        """Advance a batch of seeds until none is left that can become cheaper than what passed.
+    def run(self, seeds: Iterable[Candidate], include_costlier: bool = False) -> None:
+        """Advance a batch of seeds until no candidate can become cheaper than the best that passed.
 
         Args:
-            seeds: In the order in which they are solved first.
-            every: Whether motions are wanted that are costlier, too, as far as their number and cost are limited.
+            seeds: Seeds in the order of their first solve.
+            include_costlier: Whether costlier motions are completed as well, as far as their number and cost are
+                limited.
         """
         self._heap: list[tuple[float, int, int, Candidate]] = []
         self._motions: list[_Motion] = []
         self._pushed = self._failures = self._audits = 0
-        self._least, self._coarse_error, self._every = np.inf, 0.0, every
+        self._least, self._coarse_error, self._include_costlier = np.inf, 0.0, include_costlier
         for seed in seeds:
             self._push(seed)
         while self._heap:
             candidate = heappop(self._heap)[-1]
-            if (same := self._same_motion(candidate)) is not None:
-                same.waiting.append(candidate)
-            elif (reason := self._needless(candidate)) is not None:
+            if (motion := self._find_motion(candidate)) is not None:
+                motion.waiting.append(candidate)
+            elif (reason := self._prune(candidate)) is not None:
                 self.candidates.append(candidate.rejected(reason))
             else:
                 self._audits += candidate.stage is Stage.REFINED
-                for found in self.solver.advance(candidate):
-                    self._take(candidate, found)
+                for advanced in self.solver.advance(candidate):
+                    self._take(candidate, advanced)
         duplicate = Reason(Rejection.DUPLICATE)
-        self.candidates += [one.rejected(duplicate) for motion in self._motions for one in motion.waiting]
+        self.candidates += [candidate.rejected(duplicate) for motion in self._motions for candidate in motion.waiting]
 
     def plan(self) -> Plan:
-        """The plan of the best candidate that passed, with the others and why they are not the plan.
+        """Return the plan of the best candidate that passed, with the others and the reasons of their rejection.
 
         Raises:
-            SolveError: None passed.
+            SolveError: No candidate passed.
         """
         if not self.passed:
             raise self.solver.failure(self.candidates)
-        best = min((one for one in self.candidates if one.passed), key=lambda one: one.cost)
+        best = min((c for c in self.candidates if c.passed), key=lambda c: c.cost)
         costlier = Reason(Rejection.COSTLIER)
-        ended = [replace(one, reason=costlier) if one.passed and one is not best else one for one in self.candidates]
-        ended.sort(key=lambda one: (one is not best, np.inf if np.isnan(one.cost) else one.cost))
-        return self.solver.plan([one.ended() for one in ended])
+        finished = [
+            replace(candidate, reason=costlier) if candidate.passed and candidate is not best else candidate
+            for candidate in self.candidates
+        ]
+        finished.sort(key=lambda c: (c is not best, np.inf if np.isnan(c.cost) else c.cost))
+        return self.solver.plan([candidate.finished() for candidate in finished])
 
     def _push(self, candidate: Candidate) -> None:
         self._pushed += 1
         cost = -np.inf if candidate.stage is Stage.SEED else candidate.cost
         heappush(self._heap, (cost, -candidate.stage, self._pushed, candidate))
 
-    def _same_motion(self, candidate: Candidate) -> _Motion | None:
-        """The motion that another candidate has become that this one is, too, after its first solve; else None."""
+    def _find_motion(self, candidate: Candidate) -> _Motion | None:
+        """Return the known motion to which a candidate converged in its first solve; else None."""
         if candidate.stage not in (Stage.COARSE, Stage.FINE) or candidate.separations or candidate.solution is None:
             return None
         if any(motion.first.seed is candidate.seed for motion in self._motions):
@@ -156,15 +160,17 @@ class CandidateQueue:
         self._motions.append(_Motion(candidate))
         return None
 
-    def _needless(self, candidate: Candidate) -> Reason | None:
-        """Why a candidate need not be advanced; None if it has to be."""
+    def _prune(self, candidate: Candidate) -> Reason | None:
+        """Return the reason for which a candidate need not be advanced; None if it must."""
         settings, stage, best = self.settings, candidate.stage, self.cost
         if stage is Stage.SEED:
             if not candidate.seed.tracked and np.isfinite(self._least):
                 return Reason(Rejection.UNTRACKED)
-            far = np.isfinite(candidate.seed.cost) and candidate.seed.cost > settings.max_cost_ratio * self._least
-            return Reason(Rejection.COSTLIER, "by far, by its local motion") if far else None
-        if self._every and self._audits < settings.max_failures and candidate.cost <= settings.max_cost_ratio * best:
+            cost = candidate.seed.cost
+            too_costly = np.isfinite(cost) and cost > settings.max_cost_ratio * self._least
+            return Reason(Rejection.COSTLIER, "by far, judged by its local motion") if too_costly else None
+        audited = self._include_costlier and self._audits < settings.max_failures
+        if audited and candidate.cost <= settings.max_cost_ratio * best:
             return Reason(Rejection.DUPLICATE) if stage > Stage.FINE and self._has_passed(candidate.cost) else None
         if stage < Stage.FINE and candidate.cost > best * (1 + self._coarse_error):
             return self.solver.collision(candidate) or Reason(Rejection.COSTLIER, "on a coarse mesh")
@@ -173,41 +179,41 @@ class CandidateQueue:
         if self._failures < settings.max_failures:
             return None
         if stage is Stage.AUDITED:
-            return Reason(Rejection.NOT_TRIED, f"{self._failures} before it failed")
+            return Reason(Rejection.NOT_TRIED, f"{self._failures} candidates before it failed")
         return self.solver.collision(candidate) if stage <= Stage.FINE else None
 
     def _has_passed(self, cost: float) -> bool:
-        """Whether a candidate of that cost passed."""
-        same = self.settings.same_cost
-        return any(one.passed and abs(cost - one.cost) <= same * one.cost for one in self.candidates)
+        """Return whether a candidate of this cost passed."""
+        tolerance = self.settings.same_cost
+        return any(c.passed and abs(cost - c.cost) <= tolerance * c.cost for c in self.candidates)
 
-    def _take(self, before: Candidate, found: Candidate) -> None:
-        """Note what an advance came to."""
-        if not found.passed:
-            self.candidates.append(found)
-            self._failures += before.stage is not Stage.SEED
-            assert found.reason is not None
-            if found.reason.kind is not Rejection.COLLISION and self._failures < self.settings.max_failures:
-                self._replace(found)
-        elif found.stage >= self.solver.last:
-            repeated = self._has_passed(found.cost)
-            self.candidates.append(found.rejected(Reason(Rejection.DUPLICATE)) if repeated else found)
+    def _take(self, previous: Candidate, advanced: Candidate) -> None:
+        """Store or push the result of an advance."""
+        if not advanced.passed:
+            self.candidates.append(advanced)
+            self._failures += previous.stage is not Stage.SEED
+            assert advanced.reason is not None
+            if advanced.reason.kind is not Rejection.COLLISION and self._failures < self.settings.max_failures:
+                self._replace(advanced)
+        elif advanced.stage >= self.solver.last:
+            repeated = self._has_passed(advanced.cost)
+            self.candidates.append(advanced.rejected(Reason(Rejection.DUPLICATE)) if repeated else advanced)
         else:
-            if before.stage is Stage.SEED:
-                self._least = min(self._least, found.cost)
-            elif before.stage < Stage.FINE <= found.stage:
-                self._learn_error(before, found)
-            self._push(found)
+            if previous.stage is Stage.SEED:
+                self._least = min(self._least, advanced.cost)
+            elif previous.stage < Stage.FINE <= advanced.stage:
+                self._learn_error(previous, advanced)
+            self._push(advanced)
 
     def _replace(self, rejected: Candidate) -> None:
-        """Let those that wait for a motion that was rejected go on in its place."""
+        """Let the candidates that waited for a rejected one continue."""
         for motion in [motion for motion in self._motions if motion.first.seed is rejected.seed]:
             self._motions.remove(motion)
             for candidate in motion.waiting:
                 self._push(candidate)
 
     def _learn_error(self, coarse: Candidate, fine: Candidate) -> None:
-        """Note how much the coarse mesh was wrong; what became another motion says nothing of the mesh."""
+        """Update the error of the coarse mesh, unless the candidate became another motion."""
         assert coarse.solution is not None
         assert fine.solution is not None
         if self.solver.same_path(coarse.solution, fine.solution):

@@ -1,7 +1,7 @@
-"""One stage of a candidate: solved on the coarse mesh, separated, solved on the fine mesh, refined, audited, limited.
+"""Stages of a candidate: coarse mesh, separation of bodies, fine mesh, refinement, audit, actuator limits.
 
-All candidates of a request have one problem, but for the bodies that constraints separate in it and for starts that are
-fixed. It is declared and prepared once for each of these.
+All candidates of a request share one problem, except for separated pairs and fixed starts. Each variant is declared and
+prepared once.
 """
 
 from __future__ import annotations
@@ -25,12 +25,17 @@ from ocp.motion.builders.clearance import APART
 from ocp.motion.builders.tool_motion import CLOCK, ToolMotion
 from ocp.motion.local.collisions import Collision
 from ocp.motion.local.inverse_kinematics import Unreachable
-from ocp.motion.plan.actuators import within_actuator_limits
-from ocp.motion.plan.candidate import Candidate, Reason, Rejection, Seed, Stage, collision
+from ocp.motion.plan.actuators import solve_within_actuator_limits
+from ocp.motion.plan.candidate import Candidate, Reason, Rejection, Seed, Stage, collision_reason
 from ocp.motion.plan.candidate_queue import Solver
 from ocp.motion.plan.motion import Plan, parts_of
 from ocp.motion.plan.request import declared_motion
-from ocp.motion.search.configurations import OUT_OF_REACH, Asked, clear_postures, others_told
+from ocp.motion.search.configurations import (
+    REACH_TOLERANCE,
+    PlanRequest,
+    count_clear_configurations,
+    describe_alternatives,
+)
 from ocp.problem.values import constant
 from ocp.refinement import refined, split
 from ocp.solution import Solution
@@ -39,40 +44,41 @@ __all__ = ["CandidateSolver"]
 
 
 class CandidateSolver(Solver):
-    """Advances candidates of machines whose base is fixed or floats.
+    """Solver of the candidates of a machine with a fixed or floating base.
 
     Attributes:
-        request: What is asked. settings: Of the planner. start: Joints at the start, nan where they are free.
-        motion: Its problem, without bodies that are separated.
+        request: The request.
+        settings: Settings of the planner.
+        start: Joints at the start, nan where they are free.
+        motion: Problem without separation constraints.
     """
 
-    def __init__(self, request: Asked, start: Array, reference: Array) -> None:
+    def __init__(self, request: PlanRequest, start: Array, reference: Array) -> None:
         """
         Args:
-            request: What is asked.
-            start, reference: As of `tool_motion_problem`.
+            request: The request.
+            start, reference: As in `tool_motion_problem`.
         """
         self.request, self.settings, self.start, self.reference = request, request.settings, start, reference
-        self.motion = declared_motion(
-            request, start=start, reference=reference, clearance_constraints=request.clearance_constraints
-        )
-        self.last = Stage.AUDITED if request.drives is None else Stage.ACTUATED
-        self._clear: dict[float, int | Unreachable | None] = {}
+        constraints = request.clearance_constraints
+        self.motion = declared_motion(request, start=start, reference=reference, constraints=constraints)
+        self.last = Stage.AUDITED if request.actuator_limits is None else Stage.ACTUATED
+        self._clear_counts: dict[float, int | Unreachable | None] = {}
         self._prepared: dict[Any, tuple[ToolMotion, Collocation, Prepared]] = {}
         self._collisions: tuple[Solution | None, list[Collision]] = None, []
 
     def advance(self, candidate: Candidate) -> list[Candidate]:
-        """The candidate one stage further, or rejected; and candidates that stem from it."""
+        """Advance a candidate by one stage or reject it; also return candidates derived from it."""
         steps = {
-            Stage.SEED: self._begin,
+            Stage.SEED: self._solve_seed,
             Stage.COARSE: self._separate,
             Stage.SEPARATED: self._separate,
             Stage.FINE: self._refine,
             Stage.REFINED: self._audit,
-            Stage.AUDITED: self._limit,
+            Stage.AUDITED: self._limit_actuators,
         }
         try:
-            found = steps[candidate.stage](candidate)
+            integrate_jerk = steps[candidate.stage](candidate)
         except SolveError as error:
             if isinstance(error.__cause__, KeyboardInterrupt):
                 raise
@@ -80,68 +86,66 @@ class CandidateSolver(Solver):
             kind = Rejection.ACTUATORS if candidate.stage is Stage.AUDITED else Rejection.INFEASIBLE
             failed = replace(candidate, cost=np.nan, solution=error.solution, stage=max(candidate.stage, Stage.FINE))
             return [failed.rejected(Reason.of_error(kind, error))]
-        return [found, *self._freed(found)]
+        return [integrate_jerk, *self._free_start(integrate_jerk)]
 
-    # ---- stages ----------------------------------------------------------------------------------------------------
+    # ---- stages ------------------------------------------------------------------------------------------------------
 
-    def _begin(self, candidate: Candidate) -> Candidate:
-        seed, apart = candidate.seed, _is_separated(candidate)
+    def _solve_seed(self, candidate: Candidate) -> Candidate:
+        seed, separated = candidate.seed, _is_separated(candidate)
         if seed.direct:
-            return self._solved(candidate, Stage.FINE, seed.guess, check=seed.thorough and not apart)
-        return self._solved(candidate, Stage.SEPARATED if apart else Stage.COARSE, seed.guess)
+            return self._solve(candidate, Stage.FINE, seed.guess, check=seed.thorough and not separated)
+        return self._solve(candidate, Stage.SEPARATED if separated else Stage.COARSE, seed.guess)
 
     def _separate(self, candidate: Candidate) -> Candidate:
-        """Separate the bodies that collide on the coarse mesh; where none do go on to the fine mesh."""
-        touching = self.collisions(candidate)
-        if not touching:
-            return self._solved(candidate, Stage.FINE, candidate.solution)
-        if isinstance(unreachable := self._clear_at(touching[0].time), Unreachable):
-            return candidate.rejected(self._collision(touching[0], f"at {touching[0].time:.4g} s {unreachable}"))
-        return self._apart(candidate, Stage.SEPARATED, touching)
+        """Separate the bodies that collide on the coarse mesh; without collisions go on to the fine mesh."""
+        collisions = self.collisions(candidate)
+        if not collisions:
+            return self._solve(candidate, Stage.FINE, candidate.solution)
+        if isinstance(unreachable := self._count_clear_at(collisions[0].time), Unreachable):
+            remedy = f"at {collisions[0].time:.4g} s {unreachable}"
+            return candidate.rejected(self._collision_reason(collisions[0], remedy))
+        return self._separate_pairs(candidate, Stage.SEPARATED, collisions)
 
     def _refine(self, candidate: Candidate) -> Candidate:
-        """Separate the bodies that collide on the fine mesh; where none do refine it for the tips."""
-        if touching := self.collisions(candidate):
-            return self._apart(candidate, Stage.FINE, touching)
+        """Separate the bodies that collide on the fine mesh; without collisions refine it for the tips."""
+        if collisions := self.collisions(candidate):
+            return self._separate_pairs(candidate, Stage.FINE, collisions)
         motion, mesh, _ = self.prepared(candidate, fine=True)
         assert candidate.solution is not None
-        solution = self._on_task(motion, mesh, candidate.solution, check=not _is_separated(candidate))
+        solution = self._refine_for_tasks(motion, mesh, candidate.solution, check=not _is_separated(candidate))
         if (deviation := self._deviations(motion, solution).max()) > self.settings.max_deviation:
-            words = f"the tips deviate by {deviation:.2g} (m or rad) on finer meshes, too"
+            words = f"the tips deviate by {deviation:.2g} (m or rad) on finer meshes as well"
             limit = self.settings.tip_tolerance
             return candidate.rejected(Reason(Rejection.UNTRACKED, words, "task", float(deviation), limit))
         return replace(candidate, stage=Stage.REFINED, cost=solution.cost, solution=solution)
 
     def _audit(self, candidate: Candidate) -> Candidate:
-        """Audit a candidate, on finer meshes where that may mend what fails; separate farther what comes too near.
+        """Audit a candidate, refine its mesh if that may correct a failure, and widen separations that are too small.
 
-        Where many starts are equally good no one of them is decided to be the best. The motion is then audited with its
-        start fixed.
+        If many starts are equally good, the optimality of one of them is undetermined. The motion is then solved and
+        audited with its start fixed.
         """
         motion, mesh, _ = self.prepared(candidate, fine=True)
-        clearance_constraints, first = candidate.clearance_constraints, f"joints{motion.stretches[0].suffix}"
+        constraints, joints_name = candidate.constraints, f"joints{motion.stretches[0].suffix}"
         assert candidate.solution is not None
-        solution, audit = self._audited(motion, mesh, candidate.solution, check=not _is_separated(candidate))
+        solution, audit = self._audit_and_refine(motion, mesh, candidate.solution, check=not _is_separated(candidate))
         if np.isnan(self._start(candidate)).any() and audit.feasible and audit.optimal is None:
-            fixed = declared_motion(
-                self.request,
-                start=solution[first][0],
-                reference=self.reference,
-                clearance_constraints=clearance_constraints,
-            )
-            same = _mesh_of(mesh, solution)
-            again = solve(fixed.problem, same, guess=solution, options=self._options(fixed, same, solution.cost, {}))
-            again = self._on_task(fixed, mesh, again, check=True)
-            again, other = self._audited(fixed, mesh, again, check=True)
+            start = solution[joints_name][0]
+            fixed = declared_motion(self.request, start=start, reference=self.reference, constraints=constraints)
+            current_mesh = _mesh_of(mesh, solution)
+            options = self._options(fixed, current_mesh, solution.cost, {})
+            fixed_solution = solve(fixed.problem, current_mesh, guess=solution, options=options)
+            fixed_solution = self._refine_for_tasks(fixed, mesh, fixed_solution, check=True)
+            fixed_solution, fixed_audit = self._audit_and_refine(fixed, mesh, fixed_solution, check=True)
             slack = self.settings.negligible_rate * motion.horizon
-            if other.passed and again.cost <= solution.cost * (1 + self.settings.same_cost) + slack:
-                solution, audit = again, other
+            if fixed_audit.passed and fixed_solution.cost <= solution.cost * (1 + self.settings.same_cost) + slack:
+                solution, audit = fixed_solution, fixed_audit
         candidate = replace(candidate, cost=solution.cost, solution=solution)
         proofs = list(audit.clearances.values())
-        near = max((pair for proof in proofs for pair in proof.pairs), key=attrgetter("missed"), default=None)
-        if clearance_constraints is not None and near is not None and near.missed > 0:
-            wider = replace(candidate, clearance_constraints=clearance_constraints.widened(proofs))
-            return self._again(wider, Stage.FINE, self._collision(near))
+        closest = max((pair for proof in proofs for pair in proof.pairs), key=attrgetter("missed"), default=None)
+        if constraints is not None and closest is not None and closest.missed > 0:
+            widened = replace(candidate, constraints=constraints.widened(proofs))
+            return self._solve_again(widened, Stage.FINE, self._collision_reason(closest))
         if audit.passed:
             return replace(candidate, stage=Stage.AUDITED)
         if not audit.failures:
@@ -150,31 +154,24 @@ class CandidateSolver(Solver):
         words = f"{worst.name} {worst.value:.2g}"
         return candidate.rejected(Reason(Rejection.AUDIT, words, worst.name, worst.value, worst.limit, worst.time))
 
-    def _limit(self, candidate: Candidate) -> Candidate:
-        """Solve a candidate again within the limits of actuators."""
-        solution = within_actuator_limits(self.request, self.start, self.reference, self.plan([candidate]))
+    def _limit_actuators(self, candidate: Candidate) -> Candidate:
+        """Solve a candidate again within the actuator limits."""
+        solution = solve_within_actuator_limits(self.request, self.start, self.reference, self.plan([candidate]))
         return replace(candidate, stage=Stage.ACTUATED, cost=solution.cost, solution=solution)
 
-    def _freed(self, found: Candidate) -> list[Candidate]:
-        """What passed with a fixed start, to be solved again with its start free."""
-        if not (found.seed.fixed and found.passed and found.stage is Stage.AUDITED):
+    def _free_start(self, candidate: Candidate) -> list[Candidate]:
+        """Return a new candidate with a free start for one that passed with a fixed start."""
+        if not (candidate.seed.fixed and candidate.passed and candidate.stage is Stage.AUDITED):
             return []
-        clearance_constraints = self.request.clearance_constraints
-        if clearance_constraints is not None:
-            clearance_constraints = clearance_constraints.holding(
-                [touch.pair for touch in self.local_collisions(found.seed)]
-            )
-        return [
-            Candidate(
-                found.start,
-                seed=Seed(found.solution, local=found.seed.local, direct=True),
-                clearance_constraints=clearance_constraints,
-            )
-        ]
+        constraints = self.request.clearance_constraints
+        if constraints is not None:
+            constraints = constraints.holding([collision.pair for collision in self.local_collisions(candidate.seed)])
+        seed = Seed(candidate.solution, local=candidate.seed.local, direct=True)
+        return [Candidate(candidate.start, seed=seed, constraints=constraints)]
 
-    # ---- solves ----------------------------------------------------------------------------------------------------
+    # ---- solves ------------------------------------------------------------------------------------------------------
 
-    def _solved(self, candidate: Candidate, stage: Stage, guess: Any, check: bool = False) -> Candidate:
+    def _solve(self, candidate: Candidate, stage: Stage, guess: Any, check: bool = False) -> Candidate:
         cost = guess.cost if isinstance(guess, Solution) else np.inf
         solution = self.prepared(candidate, stage >= Stage.FINE, cost)[2].solve(guess=guess, check=check)
         if solution.success:
@@ -182,216 +179,217 @@ class CandidateSolver(Solver):
         reason = Reason(Rejection.INFEASIBLE, str(solution.status))
         return replace(candidate, cost=np.nan, solution=None).rejected(reason)
 
-    def _apart(self, candidate: Candidate, stage: Stage, touching: list[Collision]) -> Candidate:
-        """Solve a candidate again with more bodies separated."""
-        assert candidate.clearance_constraints is not None
-        clearance_constraints = candidate.clearance_constraints.holding([touch.pair for touch in touching])
-        return self._again(
-            replace(candidate, clearance_constraints=clearance_constraints), stage, self._collision(touching[0])
-        )
+    def _separate_pairs(self, candidate: Candidate, stage: Stage, collisions: list[Collision]) -> Candidate:
+        """Solve a candidate again with more separated pairs."""
+        assert candidate.constraints is not None
+        constraints = candidate.constraints.holding([collision.pair for collision in collisions])
+        reason = self._collision_reason(collisions[0])
+        return self._solve_again(replace(candidate, constraints=constraints), stage, reason)
 
-    def _again(self, candidate: Candidate, stage: Stage, reason: Reason) -> Candidate:
+    def _solve_again(self, candidate: Candidate, stage: Stage, reason: Reason) -> Candidate:
         count = candidate.separations + 1
         if count > self.settings.max_separations:
             return replace(candidate, separated=None).rejected(reason)
-        return self._solved(replace(candidate, separations=count, separated=reason), stage, candidate.solution)
+        return self._solve(replace(candidate, separations=count, separated=reason), stage, candidate.solution)
 
     def prepared(
         self, candidate: Candidate, fine: bool, cost: float = np.inf
     ) -> tuple[ToolMotion, Collocation, Prepared]:
-        """The problem of a candidate, the first mesh for it, and both prepared for guesses of about a cost."""
-        settings, apart = self.settings, _is_separated(candidate)
-        held = (
-            tuple(sorted(candidate.clearance_constraints.margins.items()))
-            if candidate.clearance_constraints is not None and apart
-            else ()
-        )
-        key = held, fine, tuple(candidate.start) if candidate.seed.fixed else ()
+        """Return the problem of a candidate, its first mesh, and both prepared for guesses of about this cost."""
+        settings, separated = self.settings, _is_separated(candidate)
+        margins: tuple[Any, ...] = ()
+        if candidate.constraints is not None and separated:
+            margins = tuple(sorted(candidate.constraints.margins.items()))
+        key = margins, fine, tuple(candidate.start) if candidate.seed.fixed else ()
         if key not in self._prepared:
             start, motion = self._start(candidate), self.motion
-            if held or candidate.seed.fixed:
+            if margins or candidate.seed.fixed:
                 reference = candidate.start if candidate.seed.fixed else self.reference
-                motion = declared_motion(
-                    self.request,
-                    start=start,
-                    reference=reference,
-                    clearance_constraints=candidate.clearance_constraints,
-                )
-            least = settings.separated_intervals if held and not fine else settings.min_intervals
+                constraints = candidate.constraints
+                motion = declared_motion(self.request, start=start, reference=reference, constraints=constraints)
+            min_intervals = settings.separated_intervals if margins and not fine else settings.min_intervals
             degree = settings.fine_degree if fine else settings.coarse_degree
-            mesh = Collocation(least if len(motion.breaks) < least else 1, degree).with_nodes_at(motion.breaks)
-            given = settings.fine_options if fine else settings.coarse_options
-            options = self._options(motion, mesh, cost, given)
+            count = min_intervals if len(motion.breaks) < min_intervals else 1
+            mesh = Collocation(count, degree).with_nodes_at(motion.breaks)
+            base_options = settings.fine_options if fine else settings.coarse_options
+            options = self._options(motion, mesh, cost, base_options)
             self._prepared[key] = motion, mesh, mesh.prepare(motion.problem, options=options)
         return self._prepared[key]
 
     def _start(self, candidate: Candidate) -> Array:
-        """Joints at the start, nan where they are free: what bodies that are separated ride on is not ignorable."""
+        """Return the joints at the start, nan where free; joints that move separated bodies are not ignorable."""
         if candidate.seed.fixed:
             return candidate.start
-        clearance_constraints = candidate.clearance_constraints
-        if clearance_constraints is None or not clearance_constraints.margins or self.request.start is not None:
+        constraints = candidate.constraints
+        if constraints is None or not constraints.margins or self.request.start is not None:
             return self.start
-        moves = clearance_constraints.scene.levers.joints[sorted(clearance_constraints.margins)].any(axis=0)
-        return np.where(moves & ~self.request.held, np.nan, self.start)
+        affecting = constraints.scene.levers.joints[sorted(constraints.margins)].any(axis=0)
+        return np.where(affecting & ~self.request.fixed_joints, np.nan, self.start)
 
-    def _options(self, motion: ToolMotion, mesh: Collocation, cost: float, given: Mapping[str, Any]) -> dict[str, Any]:
-        """Options of a solve with bodies separated, from a motion of some cost: no barrier that is worth more.
+    def _options(
+        self, motion: ToolMotion, mesh: Collocation, cost: float, options: Mapping[str, Any]
+    ) -> dict[str, Any]:
+        """Return options of a solve with separated bodies: an initial barrier parameter in proportion to the cost.
 
-        An interior-point method with a barrier mu goes to where the cost is above the least by mu for each limit (Boyd,
-        Vandenberghe 2004, section 11.2.2). Where that is more than the whole cost of the motion that it begins from,
-        the barrier alone says where it goes: far away from the bodies, on the other side of others.
+        An interior-point method with barrier parameter mu leads to a point whose cost exceeds the least one by mu for
+        each limit (Boyd, Vandenberghe 2004, section 11.2.2). If that is more than the cost of the guess, the barrier
+        alone determines where
+        it leads: far away from the bodies, into another homotopy class.
         """
         declared = motion.problem.declared
-        least = self.settings.negligible_rate * motion.horizon
-        if not any(name.startswith(APART) for name in declared.path) or not least < cost < np.inf:
-            return dict(given)
+        min_barrier = self.settings.negligible_rate * motion.horizon
+        if not any(name.startswith(APART) for name in declared.path) or not min_barrier < cost < np.inf:
+            return dict(options)
         limits = [(each.lower, each.upper) for each in (*declared.states.values(), *declared.controls.values())]
         limits += [(each.lower, each.upper) for each in declared.path.values()]
-        sides = 0
+        limit_count = 0
         for low, high in ((constant(low), constant(high)) for low, high in limits):
-            sides += int(np.isfinite(np.array([low, high])[:, low < high]).sum())
-        most = cost / (sides * mesh.intervals * mesh.degree)
-        own, least = self.settings.barriers
-        return {**given, "mu_init": max(min(given.get("mu_init", own), most), least)}
+            limit_count += int(np.isfinite(np.array([low, high])[:, low < high]).sum())
+        max_barrier = cost / (limit_count * mesh.intervals * mesh.degree)
+        default_barrier, min_barrier = self.settings.barriers
+        return {**options, "mu_init": max(min(options.get("mu_init", default_barrier), max_barrier), min_barrier)}
 
-    # ---- meshes ----------------------------------------------------------------------------------------------------
+    # ---- meshes ------------------------------------------------------------------------------------------------------
 
-    def _audited(
+    def _audit_and_refine(
         self, motion: ToolMotion, mesh: Collocation, solution: Solution, check: bool
     ) -> tuple[Solution, Audit]:
-        """A motion and its audit, on finer meshes where its audit asks for them.
+        """Return a motion and its audit, on finer meshes if the audit requires them.
 
-        With `check` what fails on a finer mesh is tried from other guesses, and what conflicts is found.
+        With `check`, a solve that fails on a finer mesh is repeated from other guesses and diagnosed.
         """
         audit: Audit = solution.audit()
-        if _mendable(audit):
+        if _refinable_failures(audit):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", RefinementWarning)
-                same = _mesh_of(mesh, solution)
-                options = self._options(motion, same, solution.cost, self.settings.fine_options)
-                solution, audit = refined(motion.problem, same, solution, audit, options, check)
-            if not _mendable(audit) and (finer := self._on_task(motion, mesh, solution, check)) is not solution:
-                solution, audit = finer, finer.audit()
+                current_mesh = _mesh_of(mesh, solution)
+                options = self._options(motion, current_mesh, solution.cost, self.settings.fine_options)
+                solution, audit = refined(motion.problem, current_mesh, solution, audit, options, check)
+            if not _refinable_failures(audit):
+                refined_solution = self._refine_for_tasks(motion, mesh, solution, check)
+                if refined_solution is not solution:
+                    solution, audit = refined_solution, refined_solution.audit()
         return solution, audit
 
-    def _on_task(self, motion: ToolMotion, mesh: Collocation, solution: Solution, check: bool) -> Solution:
-        """A motion, on a finer mesh where its tips deviate, as long as that may lead them back."""
+    def _refine_for_tasks(self, motion: ToolMotion, mesh: Collocation, solution: Solution, check: bool) -> Solution:
+        """Refine the mesh where the tips deviate from their tasks, as long as that may reduce the deviation."""
         settings, deviations = self.settings, self._deviations(motion, solution)
         for _ in range(settings.max_refinements):
             if deviations.max() <= settings.tip_tolerance:
                 break
-            # where a limit becomes active or inactive it is smooth to the second order
-            more = np.ceil(np.sqrt(deviations / settings.tip_tolerance)).clip(2, settings.max_pieces).astype(int)
-            pieces = np.where(deviations > settings.tip_tolerance / len(deviations), more, 1)
-            nodes = split(solution.state_interpolant.breaks, pieces, deviations, settings.max_intervals)
+            # where a limit becomes active or inactive, the error is of second order in the interval
+            splits = np.ceil(np.sqrt(deviations / settings.tip_tolerance)).clip(2, settings.max_splits).astype(int)
+            parts = np.where(deviations > settings.tip_tolerance / len(deviations), splits, 1)
+            nodes = split(solution.state_interpolant.breaks, parts, deviations, settings.max_intervals)
             finer = mesh.with_mesh(nodes)
             options = self._options(motion, finer, solution.cost, settings.fine_options)
-            found = solve(motion.problem, finer, guess=solution, options=options, check=check)
-            if not found.success:
-                raise SolveError(f"on a finer mesh: {found.status}", found)
-            before, deviations = deviations.max(), self._deviations(motion, found)
-            if deviations.max() > max(OUT_OF_REACH, settings.least_progress * before):
+            refined_solution = solve(motion.problem, finer, guess=solution, options=options, check=check)
+            if not refined_solution.success:
+                raise SolveError(f"on a finer mesh: {refined_solution.status}", refined_solution)
+            previous, deviations = deviations.max(), self._deviations(motion, refined_solution)
+            if deviations.max() > max(REACH_TOLERANCE, settings.least_progress * previous):
                 break
-            solution = found
+            solution = refined_solution
         return solution
 
     def _deviations(self, motion: ToolMotion, solution: Solution) -> Array:
-        """How far the tips are from their poses in each interval of the mesh, m and rad. Shape (N,)."""
-        at, count = self._samples(solution), self.settings.samples_per_interval
-        sample, worst = solution.at_fraction(at), np.zeros(len(at))
+        """Return the largest deviation of the tips from their tasks in each mesh interval, m and rad. Shape (N,)."""
+        fractions, samples = self._samples(solution), self.settings.samples_per_interval
+        sample, worst = solution.at_fraction(fractions), np.zeros(len(fractions))
         for stretch in motion.stretches:
             if stretch.equations is not None:
                 base = sample[f"base{stretch.suffix}"] if self.request.machine.base_size else None
-                times, joints = stretch.begin + at * stretch.duration, sample[f"joints{stretch.suffix}"]
+                times, joints = stretch.begin + fractions * stretch.duration, sample[f"joints{stretch.suffix}"]
                 sizes = np.cumsum([part.task.size for part in stretch.equations.bound])[:-1]
                 errors = np.split(stretch.equations.errors(times, base, joints), sizes, axis=1)
-                for part, own in zip(stretch.equations.bound, errors, strict=True):
-                    if part.task.start_gap <= self.settings.tip_tolerance:  # the feedback closes a larger one
-                        worst = np.maximum(worst, np.linalg.norm(own, axis=1))
+                for part, error in zip(stretch.equations.bound, errors, strict=True):
+                    if part.task.start_gap <= self.settings.tip_tolerance:  # feedback closes a larger initial gap
+                        worst = np.maximum(worst, np.linalg.norm(error, axis=1))
                 worst = np.maximum(worst, stretch.equations.cone_violations(times, base, joints).max(axis=1, initial=0))
-        return np.asarray(np.maximum(worst[:-1], worst[1:]).reshape(-1, count).max(axis=1))
+        return np.asarray(np.maximum(worst[:-1], worst[1:]).reshape(-1, samples).max(axis=1))
 
     def _samples(self, solution: Solution) -> Array:
-        """Fractions of the horizon, some in each interval of the mesh, and the end."""
+        """Return fractions of the horizon: several per mesh interval, and the end."""
         nodes, count = solution.state_interpolant.breaks, self.settings.samples_per_interval
         return np.append((nodes[:-1, None] + np.diff(nodes)[:, None] * np.arange(count) / count).ravel(), 1.0)
 
-    def same_path(self, one: Solution, other: Solution) -> bool:
-        """Whether two motions are one, but for what a coarse mesh misses and full turns of joints."""
-        places = np.linspace(0.0, 1.0, self.settings.compared_samples)
+    def same_path(self, solution: Solution, reference: Solution) -> bool:
+        """Return whether two motions are the same but for mesh errors and full turns of joints."""
+        fractions = np.linspace(0.0, 1.0, self.settings.compared_samples)
         names = [f"joints{stretch.suffix}" for stretch in self.motion.stretches]
-        paths = [np.hstack([each.at_fraction(places)[name] for name in names]) for each in (one, other)]
-        apart = paths[0] - paths[1]
-        turns = 2 * np.pi * np.round(apart[0] / (2 * np.pi))
-        return bool(np.abs(apart - turns).max() <= self.settings.same_path)
+        paths = [np.hstack([each.at_fraction(fractions)[name] for name in names]) for each in (solution, reference)]
+        difference = paths[0] - paths[1]
+        turns = 2 * np.pi * np.round(difference[0] / (2 * np.pi))
+        return bool(np.abs(difference - turns).max() <= self.settings.same_path)
 
-    # ---- collisions ------------------------------------------------------------------------------------------------
+    # ---- collisions --------------------------------------------------------------------------------------------------
 
     def collisions(self, candidate: Candidate) -> list[Collision]:
-        """The bodies that come too near in a candidate's motion and are not separated, the worst first."""
-        clearance_constraints, solution = candidate.clearance_constraints, candidate.solution
-        if clearance_constraints is None or solution is None:
+        """Return the closest approaches of colliding pairs that are not separated, the worst first."""
+        constraints, solution = candidate.constraints, candidate.solution
+        if constraints is None or solution is None:
             return []
         if self._collisions[0] is not solution:
-            at = self._samples(solution)
-            sample, found = solution.at_fraction(at), []
+            fractions = self._samples(solution)
+            sample, collisions = solution.at_fraction(fractions), []
             for stretch in self.motion.stretches:
-                base = sample[f"base{stretch.suffix}"] if self.request.machine.base_size else np.zeros((len(at), 0))
-                times = stretch.begin + at * stretch.duration
-                found += clearance_constraints.find_collisions(base, sample[f"joints{stretch.suffix}"], times)
+                has_base = self.request.machine.base_size > 0
+                base = sample[f"base{stretch.suffix}"] if has_base else np.zeros((len(fractions), 0))
+                times = stretch.begin + fractions * stretch.duration
+                collisions += constraints.find_collisions(base, sample[f"joints{stretch.suffix}"], times)
             worst: dict[int, Collision] = {}
-            for touch in sorted(found, key=lambda touch: touch.distance):
-                worst.setdefault(touch.pair, touch)
+            for collision in sorted(collisions, key=lambda collision: collision.distance):
+                worst.setdefault(collision.pair, collision)
             self._collisions = solution, list(worst.values())
-        return [touch for touch in self._collisions[1] if touch.pair not in clearance_constraints.margins]
+        return [collision for collision in self._collisions[1] if collision.pair not in constraints.margins]
 
     def collision(self, candidate: Candidate) -> Reason | None:
-        """That bodies collide in its motion, the worst pair; None if none do."""
-        touching = self.collisions(candidate)
-        return self._collision(touching[0]) if touching else None
+        """Return the reason of the worst collision in its motion; None without collisions."""
+        collisions = self.collisions(candidate)
+        return self._collision_reason(collisions[0]) if collisions else None
 
     def local_collisions(self, seed: Seed) -> list[Collision]:
-        """The bodies that come too near in a local motion, the worst first."""
-        clearance_constraints, found = self.request.clearance_constraints, list[Collision]()
-        for part in seed.local if clearance_constraints is not None else ():
-            assert clearance_constraints is not None
-            found += clearance_constraints.find_collisions(part.base[0], part.joints[0], part.t)
-        return sorted(found, key=lambda touch: touch.distance)
+        """Return the collisions in a local motion, the worst first."""
+        constraints, collisions = self.request.clearance_constraints, list[Collision]()
+        for motion in seed.local if constraints is not None else ():
+            assert constraints is not None
+            collisions += constraints.find_collisions(motion.base[0], motion.joints[0], motion.t)
+        return sorted(collisions, key=lambda collision: collision.distance)
 
     @property
-    def barred(self) -> bool:
-        """Whether there was a time at which no posture that does the tasks is clear."""
-        return any(isinstance(value, Unreachable) for value in self._clear.values())
+    def no_clear_configuration(self) -> bool:
+        """Whether at some time no configuration that does the tasks is collision-free."""
+        return any(isinstance(value, Unreachable) for value in self._clear_counts.values())
 
-    def _clear_at(self, time: float) -> int | Unreachable | None:
-        """How many postures that do the tasks at a time are clear, or why none is; None where that is not known."""
-        if time not in self._clear:
-            self._clear[time] = clear_postures(self.request, time)
-        return self._clear[time]
+    def _count_clear_at(self, time: float) -> int | Unreachable | None:
+        """Return the cached `count_clear_configurations` at a time."""
+        if time not in self._clear_counts:
+            self._clear_counts[time] = count_clear_configurations(self.request, time)
+        return self._clear_counts[time]
 
-    def _collision(self, near: Collision | ClosestPair, then: str = "") -> Reason:
+    def _collision_reason(self, pair: Collision | ClosestPair, remedy: str = "") -> Reason:
         assert self.request.clearance_constraints is not None
-        return collision(near, self.request.clearance_constraints.scene.clearance, then)
+        return collision_reason(pair, self.request.clearance_constraints.scene.clearance, remedy)
 
-    # ---- what comes of them ------------------------------------------------------------------------------------------
+    # ---- results -----------------------------------------------------------------------------------------------------
 
     def failure(self, candidates: Sequence[Candidate]) -> SolveError:
-        """That none passes; where bodies collide, it is about the cheapest candidate in which they do."""
+        """Return the error that none passes; with collisions, about the cheapest candidate in collision."""
         error = super().failure(candidates)
-        touching = [one for one in candidates if one.reason is not None and one.reason.kind is Rejection.COLLISION]
-        if not touching:
+        reasons = ((candidate, candidate.reason) for candidate in candidates)
+        colliding = [c for c, reason in reasons if reason is not None and reason.kind is Rejection.COLLISION]
+        if not colliding:
             return error
-        worst = min(touching, key=lambda one: np.inf if np.isnan(one.cost) else one.cost).reason
+        worst = min(colliding, key=lambda candidate: np.inf if np.isnan(candidate.cost) else candidate.cost).reason
         assert worst is not None
         assert worst.time is not None
-        others = others_told(self._clear_at(worst.time))
-        words = "; ".join([f"{error}\nthe cheapest that touches: {worst.detail}", *others])
+        alternatives = describe_alternatives(self._count_clear_at(worst.time))
+        words = "; ".join([f"{error}\nthe cheapest candidate in collision: {worst.detail}", *alternatives])
         details = {"name": worst.name, "value": worst.value, "limit": worst.limit, "time": worst.time}
         return SolveError(words, error.solution, error.conflicts, **details)
 
     def plan(self, candidates: Sequence[Candidate]) -> Plan:
-        """The plan of which the first one is the motion."""
+        """Return the plan of the first candidate, with the others."""
         best = candidates[0]
         assert best.solution is not None
         parts = parts_of(self.motion.stretches)
@@ -401,13 +399,13 @@ class CandidateSolver(Solver):
 
 
 def _is_separated(candidate: Candidate) -> bool:
-    return candidate.clearance_constraints is not None and bool(candidate.clearance_constraints.margins)
+    return candidate.constraints is not None and bool(candidate.constraints.margins)
 
 
 def _mesh_of(mesh: Collocation, solution: Solution) -> Collocation:
     return mesh.with_mesh(solution.state_interpolant.breaks)
 
 
-def _mendable(audit: Audit) -> list[Finding]:
-    """What a finer mesh may mend: all that fails but bodies that come too near."""
+def _refinable_failures(audit: Audit) -> list[Finding]:
+    """Return the failures that a finer mesh may correct: all but violated clearances."""
     return [finding for finding in audit.failures if finding.name not in audit.clearances]

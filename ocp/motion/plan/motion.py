@@ -1,4 +1,4 @@
-"""What a plan is: a machine's motion over time, its cost, its audit, and the other motions that were found."""
+"""Plan: the motion of a machine, its cost and audit, the rejected candidates, and its file format."""
 
 from __future__ import annotations
 
@@ -34,20 +34,20 @@ from ocp.storage import read_arrays, table_head, write_arrays, write_text
 __all__ = ["CHECKED_TIMES", "Part", "Plan", "PlanSample", "parts_of"]
 
 RATES = ("rates", SLOPES, "velocities")
-MOST_LINES = 15
-"""Of a plan that is printed."""
+MAX_LINES = 15
+"""Lines of a printed plan."""
 TARGET_TIMES = 401
-"""At which a plan keeps what its tasks ask for."""
-ACCURACY = 1e-3
-"""Share of its limit by which a joint may pass it, as in the audit."""
+"""Samples at which a plan keeps the targets of its tasks."""
+LIMIT_TOLERANCE = 1e-3
+"""Largest relative excess over a joint limit, as in the audit."""
 CHECKED_TIMES = 2001
-"""At which joints are held against limits, beside the times of the plan."""
-SAME_TIME = 1e-9
-"""Share of the horizon: times beyond it by less are its ends."""
+"""Samples at which joint limits are checked, besides the times of the plan."""
+TIME_TOLERANCE = 1e-9
+"""Share of the horizon by which a time may lie outside it."""
 
 
 class Part(NamedTuple):
-    """A stretch of a plan's time, and the suffix of the names that its states and controls have in the solution."""
+    """Interval of a plan, s, and the suffix of its states and controls in the solution."""
 
     begin: float
     end: float
@@ -55,13 +55,13 @@ class Part(NamedTuple):
 
 
 class PlanSample(NamedTuple):
-    """A plan at M times.
+    """Plan at M times.
 
     Attributes:
         t: s. Shape (M,).
         joints: rad or m. Shape (M, n).
-        rates, accelerations: Of the joints, their derivatives. Shape (M, n).
-        tip: Pose of the machine's tip in the world, position (m) and quaternion [w, x, y, z]. Shape (M, 7).
+        rates, accelerations: First and second derivatives of the joints. Shape (M, n).
+        tip: Pose of the machine's tip in world: position (m) and quaternion [w, x, y, z]. Shape (M, 7).
     """
 
     t: Array
@@ -78,15 +78,15 @@ class PlanSample(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """The cheapest motion that was found and that passes its audit.
+    """Lowest-cost motion found that passes its audit.
 
     Attributes:
-        machine: What moves.
-        solution: Of the problem that was solved, with it.
-        parts: Stretches of time in which the same tasks are done; in the solution they stand side by side.
-        candidates: Every motion found, the plan among them, the cheapest first.
-        bound: A lower bound of the cost of any motion that does the tasks; None where none was looked for.
-        targets: The poses that the tasks ask for, along the plan, in the world.
+        machine: The machine.
+        solution: Solution of the optimal control problem.
+        parts: Intervals of time with the same tasks; in the solution they run side by side.
+        candidates: All motions found, the plan first, then by rising cost.
+        bound: Lower bound of the cost of any motion that does the tasks; None if none was computed.
+        targets: Poses that the tasks require along the plan, in world.
     """
 
     machine: Machine
@@ -97,11 +97,11 @@ class Plan:
     targets: tuple[Target, ...] = ()
     _audits: dict[str, Any] = field(default_factory=dict, repr=False)
 
-    # ---- what it says ------------------------------------------------------------------------------------------
+    # ---- values ------------------------------------------------------------------------------------------------------
 
     @property
     def cost(self) -> float:
-        """Of the motion."""
+        """Cost of the motion."""
         return self.solution.cost
 
     @property
@@ -111,50 +111,51 @@ class Plan:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the joints that move."""
+        """Names of the moving joints."""
         return tuple(self.machine.robot.joint_names)
 
     @property
     def t(self) -> Array:
-        """Times of the plan's own grid; where two parts meet there are two of the same. Shape (M,), s."""
+        """Times of the plan's own grid, with both copies of the times between parts. Shape (M,), s."""
         if CLOCK in self.solution.states:
             return np.asarray(self.solution[CLOCK][:, 0])
         share = self.solution.t / self.solution.horizon
         return np.concatenate([part.begin + (part.end - part.begin) * share for part in self.parts])
 
     def __getitem__(self, name: str) -> Array:
-        """Values of "joints", "rates" or "base" at the times `t`. Shape (M, n)."""
-        self._check_name(name)
-        if self.rated == SLOPES and name == "rates":
+        """Return "joints", "rates" or "base" at the times `t`. Shape (M, n)."""
+        if name not in self._names():
+            raise unknown_name("name in a plan", name, self._names())
+        if self.rate_name == SLOPES and name == "rates":
             return np.asarray(self.solution[SLOPES] / self.solution[PACE])
-        own = self.rated if name == "rates" else name
+        own = self.rate_name if name == "rates" else name
         return np.concatenate([self.solution[own + part.suffix] for part in self.parts])
 
     def at(self, time: Any) -> dict[str, Array]:
-        """Values of "joints", "rates" and "base" at a time, each (n,), or at times (M,), each (M, n).
+        """Return "joints", "rates" and "base" at a time, each (n,), or at times (M,), each (M, n).
 
         Raises:
-            ProblemError: A time outside 0 to the horizon, or not finite.
+            ProblemError: A time is not finite or outside 0 to the horizon.
         """
         times = self._checked_times(time)
 
-        def named(name: str) -> Array:
-            def said(part: Part, fraction: Array) -> Array:
+        def values_of(name: str) -> Array:
+            def values(part: Part, fraction: Array) -> Array:
                 sample = self.solution.at_fraction(fraction)
                 if name == "rates":
-                    return sample[self.rated + part.suffix] / (sample[PACE] if self.rated == SLOPES else 1.0)
+                    return sample[self.rate_name + part.suffix] / (sample[PACE] if self.rate_name == SLOPES else 1.0)
                 return sample[name + part.suffix]
 
-            return self._over(times.ravel(), said)
+            return self._over(times.ravel(), values)
 
-        found = {name: named(name) for name in self._names()}
-        return {name: values[0] if times.ndim == 0 else values for name, values in found.items()}
+        values_by_name = {name: values_of(name) for name in self._names()}
+        return {name: values[0] if times.ndim == 0 else values for name, values in values_by_name.items()}
 
     def sample(self, period: float) -> PlanSample:
-        """The motion every `period` s from 0; the last sample, at the end, comes as early as the horizon says.
+        """Sample the motion every `period` s from 0; the last sample is at the horizon.
 
-        Rates may jump where the tasks do, for example where a path begins at full speed; accelerations there are
-        those after the jump.
+        Rates may jump where the tasks do, such as where a path begins at full speed. Accelerations there are those
+        after the jump.
 
         Raises:
             ProblemError: A period that is not positive, or too short.
@@ -162,47 +163,46 @@ class Plan:
         return self.sampled(sample_times("sample: period", period, self.horizon))
 
     def sampled(self, times: Any) -> PlanSample:
-        """The motion at times (M,), s."""
+        """Sample the motion at times (M,), s."""
         t = np.atleast_1d(self._checked_times(times))
         at = self.at(t)
         bases = at["base"] if "base" in at else np.zeros((len(t), 0))
-        return PlanSample(
-            t, at["joints"], at["rates"], self._over(t, self.accelerations), self._tips(bases, at["joints"])
-        )
+        accelerations, tips = self._over(t, self.accelerations), self._tips(bases, at["joints"])
+        return PlanSample(t, at["joints"], at["rates"], accelerations, tips)
 
     @property
     def request(self) -> MotionRequest | None:
-        """What was asked, from which the problem can be declared again; None of a problem of one's own."""
+        """Builder and arguments of the problem; None for a problem that the user declared."""
         return request_of(self.solution.problem)
 
     def task_share(self, times: Any) -> Array:
         """Return the share of the tasks' own time that has passed at times (M,), s.
 
-        It is that of the horizon, unless the horizon was free: the pace of the tasks is planned then.
+        It equals the share of the horizon unless the horizon is free, in which case the pace of the tasks is planned.
 
         Raises:
-            ProblemError: A time outside 0 to the horizon, or not finite.
+            ProblemError: A time is not finite or outside 0 to the horizon.
         """
         t = np.atleast_1d(self._checked_times(times))
         return self._fractions(self.parts[0], t) if CLOCK in self.solution.states else t / self.horizon
 
     @interruptible
     def audit(self, **settings: Any) -> Any:
-        """Check the motion independently of what made it; see `ocp.audit.audit.audit`. Done once for each setting.
+        """Check the motion independently of its solver; see `ocp.audit.audit.audit`. Results are cached by settings.
 
-        A plan without a `request` is also held against the limits of its own machine, for nobody knows what those of
-        its problem stand for.
+        For a plan without a `request`, the limits of its machine are checked as well, since the meaning of the limits
+        in its problem is unknown.
         """
         key = repr(sorted(settings.items()))
         if key not in self._audits:
             audit = self.solution.audit(**settings)
             if self.request is None:
-                audit = replace(audit, findings=(*audit.findings, *self._against_machine()))
+                audit = replace(audit, findings=(*audit.findings, *self._machine_limit_findings()))
             self._audits[key] = audit
         return self._audits[key]
 
-    def _against_machine(self) -> list[Finding]:
-        """How far joints are beyond the limits of the machine, where they are most."""
+    def _machine_limit_findings(self) -> list[Finding]:
+        """Return the largest excess of joints and rates over the limits of the machine."""
         robot, t = self.machine.robot, np.union1d(self.t, np.linspace(0.0, self.horizon, CHECKED_TIMES))
         at, findings = self.at(t), list[Finding]()
         for name, values, lower, upper in (
@@ -215,64 +215,64 @@ class Plan:
             unit = ("rad", "m")[robot.moving_joints[joint].kind == "prismatic"] + ("/s" if name == "rates" else "")
             label = f"{name} of the machine, {self.names[joint]!r}"
             value = max(float(excess[row, joint]), 0.0)
-            limit = ACCURACY * (size if np.isfinite(size) else 1.0)
+            limit = LIMIT_TOLERANCE * (size if np.isfinite(size) else 1.0)
             findings.append(Finding(label, value, limit, float(t[row]), unit=unit))
         return findings
 
     @property
     def audits(self) -> tuple[Any, ...]:
-        """Those that were done, the first one first."""
+        """Cached audits, the first one first."""
         return tuple(self._audits.values())
 
     def __repr__(self) -> str:
-        return f"<Plan of {self.horizon:.6g} s: {len(self.names)} joints, {self._costs}, {self._found}>"
+        return f"<Plan of {self.horizon:.6g} s: {len(self.names)} joints, {self._costs}, {self._counts}>"
 
     def __str__(self) -> str:
-        """What it costs, and why the other motions are not the plan, by reason; 15 lines at most."""
-        lines = [f"plan of {self.horizon:.6g} s for {', '.join(self.names)}: {self._costs}; {self._found}"]
-        told: dict[str, list[float]] = {}
-        for one in self.candidates:
-            told.setdefault(str(one.reason or "the plan"), []).append(one.cost)
-        for why, costs in list(told.items())[: MOST_LINES - 2]:
-            found = [cost for cost in costs if np.isfinite(cost)] or [np.nan]
-            low, high = min(found), max(found)
+        """Return the cost, and the rejected motions by reason, in at most 15 lines."""
+        lines = [f"plan of {self.horizon:.6g} s for {', '.join(self.names)}: {self._costs}; {self._counts}"]
+        costs_by_reason: dict[str, list[float]] = {}
+        for candidate in self.candidates:
+            costs_by_reason.setdefault(str(candidate.reason or "the plan"), []).append(candidate.cost)
+        for reason, costs in list(costs_by_reason.items())[: MAX_LINES - 2]:
+            finite = [cost for cost in costs if np.isfinite(cost)] or [np.nan]
+            low, high = min(finite), max(finite)
             span = f"{low:10.6g}" + (f" to {high:.6g}" if low < high else "")
-            several = "" if len(costs) == 1 else f"{len(costs)} motions: "
-            lines.append(f"  {span:<23}  {several}{why}")
-        if len(told) > MOST_LINES - 2:
-            rest = sum(len(costs) for costs in list(told.values())[MOST_LINES - 2 :])
-            lines.append(f"  {rest} more: `candidates` of the plan")
+            prefix = "" if len(costs) == 1 else f"{len(costs)} motions: "
+            lines.append(f"  {span:<23}  {prefix}{reason}")
+        if len(costs_by_reason) > MAX_LINES - 2:
+            remaining = sum(len(costs) for costs in list(costs_by_reason.values())[MAX_LINES - 2 :])
+            lines.append(f"  {remaining} more, see `candidates`")
         return "\n".join(lines)
 
     @property
     def _costs(self) -> str:
-        return f"cost {self.cost:.6g}" + ("" if self.bound is None else f", at least {self.bound:.6g} any")
+        return f"cost {self.cost:.6g}" + ("" if self.bound is None else f", lower bound {self.bound:.6g}")
 
     @property
-    def _found(self) -> str:
+    def _counts(self) -> str:
         solved = sum(1 for candidate in self.candidates if candidate.solution is not None)
         return f"{solved} of {len(self.candidates)} motions solved"
 
-    # ---- what it looks like --------------------------------------------------------------------------------------
+    # ---- figures -----------------------------------------------------------------------------------------------------
 
     def plot(self, against: Any = None, *, figure: Any = None) -> Any:
-        """Position, velocity and acceleration of every joint over time, with limits; see `view.plots.plot_plan`.
+        """Plot position, velocity and acceleration of every joint over time, with limits; see `view.plots.plot_plan`.
 
-        The plan is blue; what it is compared with, another plan or what `resolve` made, or several by name, orange.
-        A notebook shows the figure, `.savefig("plan.png")` writes it; `figure=plt.figure()` draws into a window.
+        The plan is blue; what it is compared with, another plan, a result of `resolve`, or several by name, is orange.
+        A notebook shows the figure, `.savefig("plan.png")` writes it, and `figure=plt.figure()` draws into a window.
 
         Raises:
-            ProblemError: Nothing that can be compared, or of other joints.
+            ProblemError: `against` cannot be compared, or has other joints.
         """
         return call_registered("plot_plan", self, against, figure)
 
     def _repr_html_(self) -> str:
         return str(call_registered("html_of_plan", self))
 
-    # ---- what was asked -----------------------------------------------------------------------------------------
+    # ---- targets -----------------------------------------------------------------------------------------------------
 
     def with_targets(self, tasks: Sequence[TipTask]) -> Plan:
-        """The same plan, which tells what the tasks that it does ask for at TARGET_TIMES times."""
+        """Return the plan with the targets of the tasks that it does, at TARGET_TIMES times."""
         times = np.linspace(0.0, self.horizon, TARGET_TIMES)
         clock = times
         if CLOCK in self.solution.states:
@@ -281,34 +281,34 @@ class Plan:
         base = at["base"] if "base" in at else np.zeros((TARGET_TIMES, 0))
         return replace(self, targets=targets_along(self.machine, tasks, clock, base, at["joints"], times))
 
-    # ---- files -------------------------------------------------------------------------------------------------
+    # ---- files -------------------------------------------------------------------------------------------------------
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the plan to one `.npz` file, whole or not at all. The file is data: reading it runs nothing.
+        """Write the plan to one `.npz` file, atomically. The file is data: reading it runs nothing.
 
-        It holds what was asked, from which `load` declares the problem again; of a problem of one's own its machine and
-        its expressions, operation by operation.
+        It holds the request, from which `load` declares the problem again. For a problem that the user declared, it
+        holds the machine and the expressions of the problem, operation by operation.
 
         Raises:
-            ProblemError, OSError: As `Solution.save`; a machine that is none of models'.
+            ProblemError, OSError: As in `Solution.save`; or a machine of an unknown kind.
 
         Warns:
-            StorageWarning: A part of the request is no data, such as a callback of Python's, so that the problem is
-                written in its place; or the problem cannot be written, either.
+            StorageWarning: A part of the request is not data, such as a Python callback. The file then holds the
+                problem instead, or only the solution if that cannot be written either.
         """
         try:
-            request, why_none = stored_request("", {"machine": self.machine}), ""
+            request, hint = stored_request("", {"machine": self.machine}), ""
         except ProblemError as error:
-            words = f"the machine cannot be written to a file: {error}; save the plan's solution alone"
+            words = f"the machine cannot be stored in a file: {error}; save the plan's solution alone"
             raise ProblemError(words, name="machine", value=error.value) from error
         if self.request is not None and self.request.machine is self.machine:
             try:
                 request = stored_request(self.request.builder, self.request.arguments)
-                why_none = "it is declared again from what the plan was asked: read the file with Plan.load"
+                hint = "it is declared again from the request of the plan: read the file with Plan.load"
             except ProblemError as error:
-                words = f"{path} is saved without what was asked, by the problem alone: {error}"
+                words = f"{path} is saved with the problem instead of the request: {error}"
                 warnings.warn(StorageWarning(words, name=error.name), stacklevel=2)
-        told, numbers = packed(
+        head, numbers = packed(
             {
                 "request": request,
                 "parts": self.parts,
@@ -316,22 +316,25 @@ class Plan:
                 "candidates": [
                     [c.start.tolist(), c.cost, int(c.stage), c.reason and c.reason.record()] for c in self.candidates
                 ],
-                "targets": [np.column_stack([o.t, o.position, o.rotation.reshape(-1, 9)]) for o in self.targets],
+                "targets": [
+                    np.column_stack([target.t, target.position, target.rotation.reshape(-1, 9)])
+                    for target in self.targets
+                ],
             }
         )
-        arrays = {**self.solution.arrays(path, why_none), "plan": np.frombuffer(json.dumps(told).encode(), np.uint8)}
+        arrays = {**self.solution.arrays(path, hint), "plan": np.frombuffer(json.dumps(head).encode(), np.uint8)}
         write_arrays(path, {**arrays, **{f"plan.{name}": values for name, values in numbers.items()}})
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Plan:
-        """Read a file that `save` wrote. Of the candidates only the plan has its solution.
+        """Read a file that `save` wrote. Of the candidates, only the plan has its solution.
 
-        The problem is declared again from what was asked, by the code that plans, so that the audit holds the motion
-        against the machine, limits, tasks and obstacles of the request. What the file says of its bound and of other
-        candidates is told as it stands there.
+        The problem is declared again from the request by the planner's own code, so that the audit checks the motion
+        against the machine, limits, tasks and obstacles of the request. The bound and the other candidates are read as
+        stored.
 
         Raises:
-            FileNotFoundError, ProblemError: As `Solution.load`; a file that is no plan's.
+            FileNotFoundError, ProblemError: As in `Solution.load`; or the file holds no plan.
         """
         arrays = read_arrays(path)
         solution = Solution.of_arrays(path, arrays)
@@ -339,39 +342,39 @@ class Plan:
             words = f"{path} holds a solution and no plan; read it with Solution.load"
             raise ProblemError(words, name="path", value=str(path))
         try:
-            told = unpacked(read_head(path, arrays["plan"]), {name: arrays[f"plan.{name}"] for name in NUMBERS})
-            request = restored_request(told["request"])
+            head = unpacked(read_head(path, arrays["plan"]), {name: arrays[f"plan.{name}"] for name in NUMBERS})
+            request = restored_request(head["request"])
             if request.builder:
                 solution = solution.tied_to(request.problem())
-            parts = tuple(Part(float(a), float(b), str(suffix)) for a, b, suffix in told["parts"])
+            parts = tuple(Part(float(a), float(b), str(suffix)) for a, b, suffix in head["parts"])
             candidates = tuple(
                 Candidate.of_record(start, cost, stage, reason, solution)
-                for start, cost, stage, reason in told["candidates"]
+                for start, cost, stage, reason in head["candidates"]
             )
-            bound = None if told["bound"] is None else float(told["bound"])
-            targets = tuple(Target(one[:, 0], one[:, 1:4], one[:, 4:].reshape(-1, 3, 3)) for one in told["targets"])
+            bound = None if head["bound"] is None else float(head["bound"])
+            targets = tuple(Target(rows[:, 0], rows[:, 1:4], rows[:, 4:].reshape(-1, 3, 3)) for rows in head["targets"])
             plan = cls(request.machine, solution, parts, candidates, bound, targets)
             plan._check_parts()
             return plan.with_targets(request.tasks) if request.builder and targets else plan
         except (*DAMAGED, ModelError) as error:
             name = getattr(error, "name", None) or "plan"
-            raise ProblemError(
-                f"{path}: the plan in it is damaged: {error}", name=str(name), value=str(path)
-            ) from error
+            words = f"{path}: the plan in it is damaged: {error}"
+            raise ProblemError(words, name=str(name), value=str(path)) from error
 
     def trajectory(self, period: float) -> JointTrajectory:
-        """The joints every `period` s, as a trajectory of joints."""
-        found = self.sample(period)
-        return JointTrajectory(self.names, found.t, found.joints, found.rates, found.accelerations)
+        """Return the joint trajectory with a point every `period` s."""
+        sample = self.sample(period)
+        return JointTrajectory(self.names, sample.t, sample.joints, sample.rates, sample.accelerations)
 
     def table(self, period: float = 0.01) -> dict[str, Array]:
-        """Columns by name, a row every `period` s: what pandas.DataFrame, polars.DataFrame and pyarrow.table take.
+        """Return columns by name with a row every `period` s, as for pandas, polars or pyarrow.
 
-        `time` (s), the joints (rad or m), `NAME.velocity` and `NAME.acceleration` of each. Shape (M,) each.
+        They are `time` (s), the joints (rad or m), and `NAME.velocity` and `NAME.acceleration` of each. Shape (M,)
+        each.
         """
-        found = self.sample(period)
-        columns = {"time": found.t}
-        for end, values in (("", found.joints), (".velocity", found.rates), (".acceleration", found.accelerations)):
+        sample = self.sample(period)
+        columns = {"time": sample.t}
+        for end, values in (("", sample.joints), (".velocity", sample.rates), (".acceleration", sample.accelerations)):
             columns |= {f"{name}{end}": column for name, column in zip(self.names, values.T, strict=True)}
         return columns
 
@@ -385,32 +388,29 @@ class Plan:
         write_text(path, stream.getvalue())
 
     def to_ros(self, period: float = 0.01) -> dict[str, Any]:
-        """Plain dictionary of the fields of trajectory_msgs/msg/JointTrajectory, a point every `period` s."""
+        """Return a dictionary with the fields of trajectory_msgs/msg/JointTrajectory, a point every `period` s."""
         return self.trajectory(period).to_ros()
 
-    # ---- between the motion's time and the solution's ----------------------------------------------------------
+    # ---- time of the motion and time of the solution -----------------------------------------------------------------
 
     def _check_parts(self) -> None:
-        """Raise ValueError where the parts are not the solution's, or its joints are not the machine's."""
+        """Raise ValueError if the parts do not match the solution, or its joints not the machine."""
         ends = [0.0, *(part.end for part in self.parts)]
-        follow = all(part.begin == end < part.end for part, end in zip(self.parts, ends, strict=False))
+        contiguous = all(part.begin == end < part.end for part, end in zip(self.parts, ends, strict=False))
         clock = self.solution.states.get(CLOCK)
-        if not (self.parts and follow and ends[-1] == (self.solution.horizon if clock is None else clock[-1, 0])):
+        if not (self.parts and contiguous and ends[-1] == (self.solution.horizon if clock is None else clock[-1, 0])):
             raise ValueError(f"its parts {self.parts} do not fill the time of its solution one after the other")
-        found = {name: values.shape[1] for name, values in {**self.solution.states, **self.solution.controls}.items()}
+        variables = {**self.solution.states, **self.solution.controls}
+        sizes_by_name = {name: values.shape[1] for name, values in variables.items()}
         sizes = {"joints": self.machine.joint_size, "base": self.machine.base_size}
         for part in self.parts:
-            rated = [found.get(name + part.suffix) for name in RATES]
-            known = [found.get(name + part.suffix, 0) for name in sizes]
-            if known != list(sizes.values()) or sizes["joints"] not in rated:
+            rate_sizes = [sizes_by_name.get(name + part.suffix) for name in RATES]
+            sizes_of_part = [sizes_by_name.get(name + part.suffix, 0) for name in sizes]
+            if sizes_of_part != list(sizes.values()) or sizes["joints"] not in rate_sizes:
                 raise ValueError(f"the solution has no joints and rates of this machine, {sizes}, in {part}")
 
     def _names(self) -> tuple[str, ...]:
         return ("joints", "rates", *(("base",) if self.machine.base_size else ()))
-
-    def _check_name(self, name: str) -> None:
-        if name not in self._names():
-            raise unknown_name("name in a plan", name, self._names())
 
     def _checked_times(self, time: Any) -> Array:
         try:
@@ -418,59 +418,60 @@ class Plan:
         except NOT_NUMBERS as error:
             words = f"a time or an array of times is expected, not {time!r}"
             raise ProblemError(words, name="time", value=time) from error
-        slack = SAME_TIME * self.horizon
+        slack = TIME_TOLERANCE * self.horizon
         if not ((times >= -slack) & (times <= self.horizon + slack)).all():
             words = f"time {time!r} is outside the plan, 0 to {self.horizon:g} s"
             raise ProblemError(words, name="time", value=time, limit=(0.0, self.horizon))
         return np.asarray(np.clip(times, 0.0, self.horizon))
 
     @property
-    def rated(self) -> str:
-        """What the joint rates are called in the solution; SLOPES by the path, over the pace, are these too."""
-        told = {**self.solution.states, **self.solution.controls}
-        return next(name for name in RATES if name + self.parts[0].suffix in told)
+    def rate_name(self) -> str:
+        """Name of the joint rates in the solution; SLOPES are derivatives by the path, to be divided by the pace."""
+        names = {**self.solution.states, **self.solution.controls}
+        return next(name for name in RATES if name + self.parts[0].suffix in names)
 
     def accelerations(self, part: Part, fraction: Array) -> Array:
-        """Of the joints, at fractions (M,) of a part. Shape (M, n)."""
-        sample, name, long = self.solution.at_fraction(fraction), self.rated + part.suffix, part.end - part.begin
+        """Return the joint accelerations at fractions (M,) of a part. Shape (M, n)."""
+        sample, duration = self.solution.at_fraction(fraction), part.end - part.begin
+        name = self.rate_name + part.suffix
         if "accelerations" + part.suffix in sample:
             return sample["accelerations" + part.suffix]
         slope = self._slope(name, fraction)
-        if self.rated != SLOPES:
-            return np.asarray(slope / long)
+        if self.rate_name != SLOPES:
+            return np.asarray(slope / duration)
         pace, change = sample[PACE], self._slope(PACE, fraction)
         return np.asarray((slope * pace - sample[name] * change) / pace**3 / self.solution.horizon)
 
     def _slope(self, name: str, fraction: Array) -> Array:
-        """Derivative of a state or a control by the fraction. Shape (M, n)."""
-        own = name in self.solution.states
-        pool = self.solution.states if own else self.solution.controls
-        curve = self.solution.state_interpolant if own else self.solution.control_interpolant
-        before = sum(values.shape[1] for values in list(pool.values())[: list(pool).index(name)])
-        return np.asarray(curve.derivative()(fraction)[:, before : before + pool[name].shape[1]])
+        """Return the derivative of a state or control by the fraction. Shape (M, n)."""
+        is_state = name in self.solution.states
+        pool = self.solution.states if is_state else self.solution.controls
+        interpolant = self.solution.state_interpolant if is_state else self.solution.control_interpolant
+        offset = sum(values.shape[1] for values in list(pool.values())[: list(pool).index(name)])
+        return np.asarray(interpolant.derivative()(fraction)[:, offset : offset + pool[name].shape[1]])
 
     def _fractions(self, part: Part, times: Array) -> Array:
-        """Fractions of the solution's horizon at times (M,) of a part."""
+        """Return the fractions of the solution's horizon at times (M,) of a part."""
         if CLOCK not in self.solution.states:
             return np.asarray(np.clip((times - part.begin) / (part.end - part.begin), 0.0, 1.0))
         low, high = np.zeros(len(times)), np.ones(len(times))
-        for _ in range(np.finfo(float).nmant):  # the clock never stands still
+        for _ in range(np.finfo(float).nmant):  # bisection; the clock always advances
             middle = (low + high) / 2
-            late = self.solution.at_fraction(middle)[CLOCK][:, 0] > times
-            low, high = np.where(late, low, middle), np.where(late, middle, high)
+            is_late = self.solution.at_fraction(middle)[CLOCK][:, 0] > times
+            low, high = np.where(is_late, low, middle), np.where(is_late, middle, high)
         return np.asarray((low + high) / 2)
 
-    def _over(self, times: Array, ask: Callable[[Part, Array], Array]) -> Array:
-        """What each part says at its fractions, of the times (M,) that it covers; the later one where two meet."""
+    def _over(self, times: Array, evaluate: Callable[[Part, Array], Array]) -> Array:
+        """Evaluate each part at the fractions of the times (M,) that it covers; the later one where two meet."""
         begins = [part.begin for part in self.parts]
         which = np.clip(np.searchsorted(begins, times, side="right") - 1, 0, len(self.parts) - 1)
-        found: Array | None = None
+        result: Array | None = None
         for number in np.unique(which):
             part, rows = self.parts[number], np.flatnonzero(which == number)
-            values = ask(part, self._fractions(part, times[rows]))
-            found = np.empty((len(times), values.shape[1])) if found is None else found
-            found[rows] = values
-        return np.zeros((0, self.machine.joint_size)) if found is None else found
+            values = evaluate(part, self._fractions(part, times[rows]))
+            result = np.empty((len(times), values.shape[1])) if result is None else result
+            result[rows] = values
+        return np.zeros((0, self.machine.joint_size)) if result is None else result
 
     def _tips(self, bases: Array, joints: Array) -> Array:
         if self.machine.robot.tip is None:
@@ -484,5 +485,5 @@ class Plan:
 
 
 def parts_of(stretches: Sequence[Stretch]) -> tuple[Part, ...]:
-    """The parts of a plan made of stretches."""
+    """Return the parts of a plan that consists of stretches."""
     return tuple(Part(stretch.begin, stretch.end, stretch.suffix) for stretch in stretches)

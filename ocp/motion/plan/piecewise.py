@@ -1,8 +1,8 @@
-"""Tasks that no single motion does: done in the fewest pieces, between which the arm reconfigures.
+"""Plans in the fewest segments, for tasks that no single motion does, with reconfigurations between the segments.
 
-Where a branch of postures ends, the tool stops, leaves the task, and comes back to the same place of it in another
-posture. What is planned are the pieces, each a plan of its part of the tasks' time, and a motion from the end of each
-to the beginning of the next, clear of everything, while the tasks wait.
+Where a branch of inverse kinematics ends, the tool stops, leaves the task, and returns to the same place in another
+configuration. Planned are the segments, each a plan of its part of the tasks' time, and a collision-free motion from
+the end of each to the start of the next, while the tasks wait.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from ocp.motion.local.collisions import distances_along
 from ocp.motion.local.inverse_kinematics import Unreachable
 from ocp.motion.plan.candidate import Candidate, Stage
 from ocp.motion.plan.motion import Part, Plan
-from ocp.motion.plan.planner import checked_asked, clear_of, planned
-from ocp.motion.search.configurations import Asked, followed_from, postures_at_the_start, settled
+from ocp.motion.plan.planner import checked_request, clearance_for, plan_request
+from ocp.motion.search.configurations import PlanRequest, fix_ignorable_joints, local_motions_from, start_configurations
 from ocp.motion.search.task_search import TaskSearch
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.tip_task import TipTask, timed
@@ -40,22 +40,23 @@ __all__ = ["Reconfiguration", "SegmentedPlan", "plan_in_segments"]
 
 @dataclass(frozen=True)
 class ReconfigurationSettings:
-    """Settings of the motions between pieces.
+    """Settings of the motions between segments.
 
     Attributes:
-        mesh: Of their problem. options: Of IPOPT.
-        slowness: Times as long as the straight way takes one round an obstacle.
-        detours, sampled: Configurations by which it is tried to go round, of so many that are sampled.
-        reach: rad or m: how far these are from what lies between, at most.
-        unlimited_rate: rad/s or m/s: of joints whose rate has no limit.
-        rate_slack: Share of its limit that a rate may exceed: a joint that goes straight is at its limit all the time.
+        mesh: Mesh of their problem.
+        options: Options of IPOPT.
+        slowness: Duration of a motion around an obstacle, as a multiple of the straight motion's.
+        detours, samples: Via configurations that are tried, the best of so many random samples.
+        reach: Largest distance of the samples from the box between start and end, rad or m.
+        unlimited_rate: Rate of joints without a rate limit, rad/s or m/s.
+        rate_slack: Relative excess allowed over a rate limit, since a straight motion is at its limit all the time.
     """
 
     mesh: Collocation = field(default_factory=lambda: Collocation(12, 3))
     options: Mapping[str, Any] = field(default_factory=lambda: {"max_iter": 200})
     slowness: float = 3.0
     detours: int = 4
-    sampled: int = 256
+    samples: int = 256
     reach: float = np.pi / 2
     unlimited_rate: float = 1.0
     rate_slack: float = 1e-9
@@ -63,31 +64,33 @@ class ReconfigurationSettings:
 
 @dataclass(frozen=True, eq=False)
 class Reconfiguration:
-    """Where the arm leaves its tasks, and comes back to the same place of them in another posture.
+    """Motion between two segments, to the same place of the tasks in another configuration.
 
     Attributes:
-        time: Of the tasks, which wait, s.
+        time: Time of the tasks, which wait, s.
         before, after: Joints, rad or m. Shape (n,).
-        way: A motion from the one to the other, clear of everything, no joint faster than its limit; its joints do not
-            start from rest, as those of a plan. None where none was found: that does not say that there is none.
-        why: Why not; "" with a way.
+        motion: Collision-free motion within the rate limits; unlike in a plan, its joints do not start at rest. None if
+            none was found, which does not prove that there is none.
+        failure: Why there is no motion; "" otherwise.
     """
 
     time: float
     before: Array
     after: Array
-    way: Plan | None
-    why: str = ""
+    motion: Plan | None
+    failure: str = ""
 
     @property
     def duration(self) -> float:
-        """Of the way, s; nan where there is none."""
-        return np.nan if self.way is None else self.way.horizon
+        """Duration of the motion, s; nan without a motion."""
+        return np.nan if self.motion is None else self.motion.horizon
 
     def __str__(self) -> str:
-        far = np.abs(self.after - self.before).max()
-        how = f"in {self.duration:.4g} s" if self.way is not None else f"no clear way was found: {self.why}"
-        return f"at {self.time:.4g} s the arm reconfigures, a joint by {far:.3g}: {how}"
+        largest = np.abs(self.after - self.before).max()
+        how = f"no collision-free motion was found: {self.failure}"
+        if self.motion is not None:
+            how = f"in {self.duration:.4g} s"
+        return f"at {self.time:.4g} s the arm reconfigures, a joint by up to {largest:.3g}: {how}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,47 +98,47 @@ class SegmentedPlan:
     """Motions that do the tasks one after the other.
 
     Attributes:
-        machine: What moves.
-        pieces: Each a plan of its part of the tasks, audited; its time begins with 0.
-        begins: When each begins in the tasks' time, s; it ends where the next one begins.
-        reconfigurations: One between each piece and the next.
-        fewest: Reconfigurations that any plan has at least, under the assumptions of `ocp.motion.search.search`.
+        machine: The arm.
+        segments: Audited plans of parts of the tasks; the time of each starts at 0.
+        start_times: Time of the tasks at which each segment starts, s; each ends where the next one starts.
+        reconfigurations: Motions between segments.
+        fewest: Lower bound of the number of reconfigurations, under the assumptions of `ocp.motion.search.search`.
     """
 
     machine: FixedBase
-    pieces: tuple[Plan, ...]
-    begins: tuple[float, ...]
+    segments: tuple[Plan, ...]
+    start_times: tuple[float, ...]
     reconfigurations: tuple[Reconfiguration, ...]
     fewest: int
 
     @property
     def cost(self) -> float:
-        """Of the pieces together, without the reconfigurations."""
-        return float(sum(piece.cost for piece in self.pieces))
+        """Cost of all segments, without reconfigurations."""
+        return float(sum(segment.cost for segment in self.segments))
 
     @property
     def horizon(self) -> float:
-        """Of the tasks, s."""
-        return self.begins[-1] + self.pieces[-1].horizon
+        """Duration of the tasks, s."""
+        return self.start_times[-1] + self.segments[-1].horizon
 
     @property
     def duration(self) -> float:
-        """Of the tasks and the reconfigurations, s; nan where one of these has no way."""
-        return self.horizon + float(sum(one.duration for one in self.reconfigurations))
+        """Duration of tasks and reconfigurations, s; nan if a reconfiguration has no motion."""
+        return self.horizon + float(sum(each.duration for each in self.reconfigurations))
 
     def __repr__(self) -> str:
-        return f"<PlanInPieces of {self.horizon:.6g} s: {len(self.pieces)} pieces, cost {self.cost:.6g}>"
+        return f"<SegmentedPlan of {self.horizon:.6g} s: {len(self.segments)} segments, cost {self.cost:.6g}>"
 
     def __str__(self) -> str:
         count = len(self.reconfigurations)
-        many = f"{count} reconfiguration{'' if count == 1 else 's'}"
-        fewest = "none has fewer" if self.fewest == count else f"any has at least {self.fewest}"
+        counted = f"{count} reconfiguration{'' if count == 1 else 's'}"
+        fewest = "the fewest possible" if self.fewest == count else f"at least {self.fewest} needed"
         names = ", ".join(self.machine.robot.joint_names)
-        lines = [f"plan of {self.horizon:.6g} s for {names}: {many}, {fewest}; cost {self.cost:.6g}"]
-        for k, piece in enumerate(self.pieces):
-            end = self.begins[k] + piece.horizon
-            low = "" if piece.bound is None else f", at least {piece.bound:.6g} any"
-            lines.append(f"  {self.begins[k]:.4g} to {end:.4g} s: cost {piece.cost:.6g}{low}")
+        lines = [f"plan of {self.horizon:.6g} s for {names}: {counted}, {fewest}; cost {self.cost:.6g}"]
+        for k, segment in enumerate(self.segments):
+            end = self.start_times[k] + segment.horizon
+            bound = "" if segment.bound is None else f", lower bound {segment.bound:.6g}"
+            lines.append(f"  {self.start_times[k]:.4g} to {end:.4g} s: cost {segment.cost:.6g}{bound}")
             if k < count:
                 lines.append(f"  {self.reconfigurations[k]}")
         return "\n".join(lines)
@@ -158,164 +161,171 @@ def plan_in_segments(
     folders: Any = (),
     missing: str = "raise",
 ) -> SegmentedPlan:
-    """Plan tasks in the fewest motions, between which the arm reconfigures, and of these the cheapest.
+    """Plan tasks in the fewest segments, between which the arm reconfigures, at the least cost.
 
-    Where one motion does, it is one piece: the plan of `plan(..., search="global")`. Else the time of the tasks is cut,
-    at instants that come as close as a thousandth of it where that may spare a piece: how few any plan has is told. Of
-    places to cut that spare none, those are taken from which the pieces cost least; reconfigurations cost nothing.
+    If one motion does the tasks, there is one segment, the plan of `plan(..., search="global")`. Else the tasks are
+    divided at time samples, refined to a thousandth of the horizon where that may save a segment. Among divisions into
+    the fewest segments, the one whose segments cost least is chosen; reconfigurations cost nothing.
 
     Args:
-        machine: On a fixed base.
-        tasks, horizon, start, weights, limits, seed: As of `plan`; the tasks are poses that leave at most two
-            directions free. With limits of drives, pieces are cut as without, and planned within them.
-        obstacles, clearance, ignored, srdf, folders, missing: As of `plan`; obstacles that do not move by themselves,
-            since a reconfiguration takes time.
+        machine: An arm on a fixed base.
+        tasks, horizon, start, weights, limits, seed: As in `plan`; the tasks are poses that leave at most two
+            directions free. Actuator limits do not influence the division, but the segments are planned within them.
+        obstacles, clearance, ignored, srdf, folders, missing: As in `plan`, for static obstacles, since a
+            reconfiguration takes time.
+
+    Returns:
+        The segments and reconfigurations, with a lower bound of their number.
 
     Raises:
-        ProblemError: As `plan`; an obstacle that moves.
-        DeadEnd: Somewhere no motion does the tasks for the least while, in whatever posture.
-        SolveError: Pieces that could not be planned, however the tasks were cut.
+        ProblemError: As in `plan`; or an obstacle moves.
+        DeadEnd: At some time no motion does the tasks even for the shortest while, in any configuration.
+        SolveError: No segment could be planned, however the tasks were divided.
     """
     checked_instance("machine", machine, FixedBase)
-    asked = checked_asked(machine, tasks, horizon, start, None, False, weights, limits, "global", seed, 1.0)
-    clearance_constraints = clear_of(machine, obstacles, clearance, ignored, srdf, folders, missing, limits)
-    if clearance_constraints is not None and clearance_constraints.scene.has_moving_obstacles:
-        words = "obstacles that move do not wait while the arm reconfigures; give those that stand still"
+    options: dict[str, Any] = {"start": start, "weights": weights, "limits": limits, "seed": seed}
+    request = checked_request(machine, tasks, horizon, search="global", **options)
+    collision: dict[str, Any] = {"obstacles": obstacles, "clearance": clearance, "ignored": ignored}
+    collision |= {"srdf": srdf, "folders": folders, "missing": missing}
+    constraints = clearance_for(machine, limits, **collision)
+    if constraints is not None and constraints.scene.has_moving_obstacles:
+        words = "moving obstacles do not wait while the arm reconfigures; give static obstacles"
         raise ProblemError(words, name="obstacles", value=obstacles)
-    asked = replace(asked, clearance_constraints=clearance_constraints)
-    postures = postures_at_the_start(asked)
-    if asked.start is None:
-        postures = settled(asked, postures)[1]
-    searched = TaskSearch(asked, followed_from(asked, postures))
-    barred: list[tuple[float, float]] = []
-    known: dict[tuple[float, float], Plan] = {}
+    request = replace(request, clearance_constraints=constraints)
+    configurations = start_configurations(request)
+    if request.start is None:
+        configurations = fix_ignorable_joints(request, configurations)[1]
+    search = TaskSearch(request, local_motions_from(request, configurations))
+    excluded: list[tuple[float, float]] = []
+    plans: dict[tuple[float, float], Plan] = {}
     error: SolveError | ProblemError | None = None
     while True:
-        cut = searched.pieces(barred)
-        if cut is None:
-            raise error or searched.dead_end() or SolveError("no motion does the tasks in pieces", name="tasks")
-        spans, fewest = cut
+        division = search.segments(excluded)
+        if division is None:
+            raise error or search.dead_end() or SolveError("no division into segments does the tasks", name="tasks")
+        spans, fewest = division
         for begin, end in spans:
-            if (begin, end) in known:
+            if (begin, end) in plans:
                 continue
             try:
-                known[begin, end] = _piece(asked, begin, end)
+                plans[begin, end] = _plan_segment(request, begin, end)
             except (SolveError, Unreachable) as failed:
                 if isinstance(failed.__cause__, KeyboardInterrupt):
                     raise
                 error = failed
-                barred.append((begin, end))
+                excluded.append((begin, end))
                 break
         else:
             break
-    pieces = [known[span] for span in spans]
-    between = []
-    for (begin, _), before, after in zip(spans[1:], pieces, pieces[1:], strict=False):
+    segments = [plans[span] for span in spans]
+    reconfigurations = []
+    for (begin, _), before, after in zip(spans[1:], segments, segments[1:], strict=False):
         ends = before.at(before.horizon)["joints"], after.at(0.0)["joints"]
-        between.append(_reconfigured(asked, begin, *ends))
-    begins = tuple(begin for begin, _ in spans)
-    return SegmentedPlan(machine, tuple(pieces), begins, tuple(between), fewest - 1)
+        reconfigurations.append(_plan_reconfiguration(request, begin, *ends))
+    start_times = tuple(begin for begin, _ in spans)
+    return SegmentedPlan(machine, tuple(segments), start_times, tuple(reconfigurations), fewest - 1)
 
 
-def _piece(asked: Asked, begin: float, end: float) -> Plan:
-    """The plan of the tasks from one time to another.
+def _plan_segment(request: PlanRequest, begin: float, end: float) -> Plan:
+    """Plan the tasks from one time to another.
 
     Raises:
-        ProblemError, SolveError: As `plan`.
+        ProblemError, SolveError: As in `plan`.
     """
-    tasks = tuple(part for task in asked.tasks if (part := _part(task, begin, end)) is not None)
-    stretches = stretches_of(asked.machine, tasks, end - begin)
-    start = asked.start if begin == 0 else None
-    return planned(replace(asked, tasks=tasks, horizon=end - begin, stretches=stretches, start=start))
+    tasks = tuple(part for task in request.tasks if (part := _task_between(task, begin, end)) is not None)
+    stretches = stretches_of(request.machine, tasks, end - begin)
+    start = request.start if begin == 0 else None
+    return plan_request(replace(request, tasks=tasks, horizon=end - begin, stretches=stretches, start=start))
 
 
-def _part(task: TipTask, begin: float, end: float) -> TipTask | None:
-    """What of a task is to be done from one time to another, with the first as 0; None if nothing."""
+def _task_between(task: TipTask, begin: float, end: float) -> TipTask | None:
+    """Return the part of a task between two times, which starts at 0; None if it is empty."""
     first, last = max(task.begin, begin), min(task.end, end)
     if last <= first:
         return None
     shift, breaks = first - task.begin, np.asarray(task.breaks)
     inside = breaks[(breaks > shift) & (breaks < last - task.begin)] - shift
-    own = replace(task, breaks=()) if shift == 0 else timed(replace(task, breaks=()), lambda time: time + shift)
-    return replace(own, begin=first - begin, duration=last - first, breaks=inside)
+    shifted = replace(task, breaks=()) if shift == 0 else timed(replace(task, breaks=()), lambda time: time + shift)
+    return replace(shifted, begin=first - begin, duration=last - first, breaks=inside)
 
 
-def _reconfigured(asked: Asked, time: float, before: Array, after: Array) -> Reconfiguration:
-    """A motion from one posture to another, straight or round what is in the way."""
-    settings, limits = ReconfigurationSettings(), asked.bounds.velocity
+def _plan_reconfiguration(request: PlanRequest, time: float, before: Array, after: Array) -> Reconfiguration:
+    """Return a motion between two configurations: straight, or around obstacles."""
+    settings, limits = ReconfigurationSettings(), request.bounds.velocity
     fastest = np.where(np.isfinite(limits), limits, settings.unlimited_rate)
     straight = float((np.abs(after - before) / fastest).max())
-    middle, why = (before + after) / 2, ""
-    ways = [(middle, straight)]
-    if asked.clearance_constraints is not None:
-        ways += [
+    middle, failure = (before + after) / 2, ""
+    vias = [(middle, straight)]
+    if request.clearance_constraints is not None:
+        vias += [
             (via, settings.slowness * straight)
-            for via in (middle, *_round(asked, asked.clearance_constraints, before, after, settings))
+            for via in (middle, *_via_configurations(request, request.clearance_constraints, before, after, settings))
         ]
-    for via, duration in ways:
+    for via, duration in vias:
         try:
-            solution = _way(asked, before, via, after, duration, fastest, duration > straight, settings)
+            path, separate = (before, via, after), duration > straight
+            solution = _solve_reconfiguration(request, *path, duration, fastest, separate, settings)
         except SolveError as error:
             if isinstance(error.__cause__, KeyboardInterrupt):
                 raise
-            why = why or str(error).split("\n")[0]
+            failure = failure or str(error).split("\n")[0]
             continue
         candidate = Candidate(before, solution.cost, None, Stage.AUDITED, solution)
-        return Reconfiguration(
-            time, before, after, Plan(asked.machine, solution, (Part(0.0, duration, ""),), (candidate,))
-        )
-    return Reconfiguration(time, before, after, None, why)
+        motion = Plan(request.machine, solution, (Part(0.0, duration, ""),), (candidate,))
+        return Reconfiguration(time, before, after, motion)
+    return Reconfiguration(time, before, after, None, failure)
 
 
-def _round(
-    asked: Asked,
-    clearance_constraints: ClearanceConstraints,
+def _via_configurations(
+    request: PlanRequest,
+    constraints: ClearanceConstraints,
     before: Array,
     after: Array,
     settings: ReconfigurationSettings,
 ) -> Array:
-    """Postures that are clear, the nearest to the middle between two others. Shape (K, n)."""
-    bounds, least = asked.bounds, clearance_constraints.scene.clearance
+    """Return collision-free random configurations, the nearest to the middle of two others first. Shape (K, n)."""
+    bounds, clearance = request.bounds, constraints.scene.clearance
     low = np.maximum(np.minimum(before, after) - settings.reach, bounds.lower)
     high = np.minimum(np.maximum(before, after) + settings.reach, bounds.upper)
-    some = low + (high - low) * np.random.default_rng(asked.seed).random((settings.sampled, len(before)))
-    apart = distances_along(clearance_constraints.scene, np.zeros(0), some, np.zeros(settings.sampled), least)
-    free = some[(apart >= least).all(axis=1)]
-    return np.asarray(free[np.argsort(((free - (before + after) / 2) ** 2).sum(axis=1))[: settings.detours]])
+    samples = low + (high - low) * np.random.default_rng(request.seed).random((settings.samples, len(before)))
+    scene, base, times = constraints.scene, np.zeros(0), np.zeros(settings.samples)
+    distances = distances_along(scene, base, samples, times, clearance)
+    clear = samples[(distances >= clearance).all(axis=1)]
+    return np.asarray(clear[np.argsort(((clear - (before + after) / 2) ** 2).sum(axis=1))[: settings.detours]])
 
 
-def _way(
-    asked: Asked,
+def _solve_reconfiguration(
+    request: PlanRequest,
     before: Array,
     via: Array,
     after: Array,
     duration: float,
     fastest: Array,
-    apart: bool,
+    separate: bool,
     settings: ReconfigurationSettings,
 ) -> Solution:
-    """The motion of least squared rates from one posture to another that begins from a way by a third.
+    """Return the motion of least squared rates between two configurations, from a guess through a third.
 
     Args:
-        apart: Whether bodies that come too near are held apart.
+        separate: Whether bodies that come too close are separated by constraints.
 
     Raises:
-        SolveError: None was found that keeps its limits and is clear.
+        SolveError: No motion was found within limits and clearance.
     """
-    machine, n, bounds = asked.machine, asked.machine.joint_size, asked.bounds
+    machine, n, bounds = request.machine, request.machine.joint_size, request.bounds
     guess = {"joints": Samples(np.array([0.0, duration / 2, duration]), np.array([before, via, after]))}
 
-    def run(clearance_constraints: ClearanceConstraints | None) -> Solution:
+    def run(constraints: ClearanceConstraints | None) -> Solution:
         problem = Problem("reconfiguration")
         problem.horizon(duration)
-        told: dict[str, Any] = {"lower": bounds.lower, "upper": bounds.upper, "unit": machine.robot.unit()}
-        joints = problem.state("joints", n, initial=before, terminal=after, **told)
-        most = (1 + settings.rate_slack) * fastest
-        rates = problem.control("rates", n, lower=-most, upper=most, unit=machine.robot.unit("/s"))
+        options: dict[str, Any] = {"lower": bounds.lower, "upper": bounds.upper, "unit": machine.robot.unit()}
+        joints = problem.state("joints", n, initial=before, terminal=after, **options)
+        max_rates = (1 + settings.rate_slack) * fastest
+        rates = problem.control("rates", n, lower=-max_rates, upper=max_rates, unit=machine.robot.unit("/s"))
         problem.dynamics(joints, rates)
-        if clearance_constraints is not None:
-            clearance_constraints.declare(problem, machine.base_home(), joints, horizon=duration)
-        problem.minimize(running=ca.dot(rates, ca.DM(asked.weights) * rates) / 2)
+        if constraints is not None:
+            constraints.declare(problem, machine.base_home(), joints, horizon=duration)
+        problem.minimize(running=ca.dot(rates, ca.DM(request.weights) * rates) / 2)
         solution = solve(problem, settings.mesh, guess=guess, options=settings.options)
         audit = solution.audit()
         if not audit.feasible:
@@ -323,4 +333,4 @@ def _way(
             raise collision_error(audit, solution) or SolveError(str(worst), solution, name=worst.name)
         return solution
 
-    return solve_with_clearance(asked.clearance_constraints, run) if apart else run(asked.clearance_constraints)
+    return solve_with_clearance(request.clearance_constraints, run) if separate else run(request.clearance_constraints)

@@ -1,13 +1,12 @@
-"""One call from a machine and its tasks to the cheapest motion that passes its audit, or the reasons why there is none.
+"""One call from a machine and its tasks to the lowest-cost motion that passes its audit.
 
-Where the start is not given it is searched: inverse kinematics finds postures at the start, in every branch and spread
-over the self-motion. Each is followed through the tasks by its local motion, which is the seed of a candidate, the
-start free along its self-motion (`plan.planner`). Candidates are advanced from stage to stage, the cheapest first
-(`ocp.motion.plan.candidate_queue`), until none is left that may be cheaper than what was found.
+If the start is not given, inverse kinematics finds start configurations on every branch and spread over the
+self-motion. Resolved-rate control tracks the tasks from each of them. These local motions are the seeds of candidates,
+whose start is free along its self-motion. The queue advances the candidates by rising cost
+(`ocp.motion.plan.candidate_queue`), until none is left that may be cheaper than the best one found.
 
-Where candidates come from: one posture, all that inverse kinematics finds, or a search over all motions.
-
-Each kind of seeds that takes more work is tried where none before it led to a plan, or to one that is good enough.
+Seeds come from one configuration, from all that inverse kinematics finds, or from a global search. A more expensive
+kind of seeds is used only if the kinds before it led to no plan, or to none that is good enough.
 """
 
 from __future__ import annotations
@@ -42,17 +41,17 @@ from ocp.motion.plan.candidate_queue import CandidateQueue
 from ocp.motion.plan.candidate_solver import CandidateSolver
 from ocp.motion.plan.motion import Plan
 from ocp.motion.plan.standing import plan_to_stand
-from ocp.motion.search.cells import CellSearch, follows
+from ocp.motion.search.cells import CellSearch, tracks_tasks
 from ocp.motion.search.configurations import (
-    OUT_OF_REACH,
-    Asked,
+    REACH_TOLERANCE,
+    PlanRequest,
     SearchKind,
     check_clear_start,
-    followed_from,
-    misfits_of,
-    postures_at_the_start,
-    settled,
-    touches_at_the_start,
+    fix_ignorable_joints,
+    largest_pose_errors,
+    local_motions_from,
+    start_collisions,
+    start_configurations,
 )
 from ocp.motion.search.dead_end import DeadEnd
 from ocp.motion.search.search import checked_bound
@@ -62,155 +61,154 @@ from ocp.motion.tasks.equations import bind
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.tip_task import TipTask
 
-__all__ = ["checked_asked", "clear_of", "plan", "plan_from_seeds", "planned", "seeds_of"]
+__all__ = ["candidates_from", "checked_request", "clearance_for", "plan", "plan_from_configurations", "plan_request"]
 
 
-def plan_from_seeds(request: Asked, postures: Array, solver: CandidateSolver) -> tuple[Plan, float | None]:
-    """The plan that postures lead to, and a lower bound of its cost; None if none was looked for.
+def plan_from_configurations(
+    request: PlanRequest, configurations: Array, solver: CandidateSolver
+) -> tuple[Plan, float | None]:
+    """Return the plan that start configurations lead to, and a lower bound of its cost or None.
 
     Args:
-        request: What is asked.
-        postures: Joints at the start, the best conditioned first. Shape (K, n).
-        solver: Of the candidates.
+        request: The request.
+        configurations: Joints at the start, the best conditioned first. Shape (K, n).
+        solver: Solver of the candidates.
 
     Raises:
-        ProblemError, SolveError: As `ocp.motion.plan.plan`.
+        ProblemError, SolveError: As in `ocp.motion.plan.plan`.
     """
     queue = CandidateQueue(solver, request.settings)
-    floats, alone = request.machine.base_size > 0, len(postures) == 1
-    if request.search == "start" or (request.search == "postures" and alone):
-        _one_by_one(queue, solver, postures, last=alone and not floats)
-        if queue.passed or (alone and not floats):
+    floating, single = request.machine.base_size > 0, len(configurations) == 1
+    if request.search == "start" or (request.search == "configurations" and single):
+        _try_one_by_one(queue, solver, configurations, thorough=single and not floating)
+        if queue.passed or (single and not floating):
             return queue.plan(), None
-    followed = followed_from(request, postures)
-    if floats and (request.search == "global" or alone):
-        _through_cells(queue, solver, followed, postures)
+    motions = local_motions_from(request, configurations)
+    if floating and (request.search == "global" or single):
+        _search_cells(queue, solver, motions, configurations)
         return queue.plan(), None
-    searched = TaskSearch(request, followed) if request.search == "global" else None
-    if searched is not None:
-        _all_motions(queue, solver, searched)
+    search = TaskSearch(request, motions) if request.search == "global" else None
+    if search is not None:
+        _search_globally(queue, solver, search)
         if queue.passed:
-            return queue.plan(), searched.bound
-    seeds = seeds_of(solver, followed, postures)
+            return queue.plan(), search.bound
+    seeds = candidates_from(solver, motions, configurations)
     queue.run(seeds)
-    if not queue.passed and queue.collided and not solver.barred:
-        _alternatives(queue, solver, seeds)
-    if not queue.passed and not queue.collided:  # whatever helps a solver, and what conflicts
-        if floats:
-            _through_cells(queue, solver, followed, postures)
+    if not queue.passed and queue.collided and not solver.no_clear_configuration:
+        _try_alternatives(queue, solver, seeds)
+    if not queue.passed and not queue.collided:  # try other guesses and diagnose conflicts
+        if floating:
+            _search_cells(queue, solver, motions, configurations)
         else:
-            seed = seeds_of(solver, followed_from(request, postures[:1]), postures[:1], direct=True, thorough=True)
-            queue.run(seed)
+            motions = local_motions_from(request, configurations[:1])
+            queue.run(candidates_from(solver, motions, configurations[:1], direct=True, thorough=True))
     try:
-        return queue.plan(), None if searched is None else searched.bound
+        return queue.plan(), None if search is None else search.bound
     except SolveError as error:
-        if searched is not None and (end := searched.dead_end()) is not None:
-            raise end from error
+        if search is not None and (dead_end := search.dead_end()) is not None:
+            raise dead_end from error
         raise
 
 
-def seeds_of(
-    solver: CandidateSolver, followed: Sequence[LocalMotion], postures: Array, **kind: bool
+def candidates_from(
+    solver: CandidateSolver, motions: Sequence[LocalMotion], configurations: Array, **options: bool
 ) -> list[Candidate]:
-    """Candidates of local motions, those that do their tasks before others, then the cheapest first.
+    """Return candidates of local motions: those that do their tasks first, then by rising cost.
 
     Args:
-        followed: The motions, through each stretch of time.
-        postures: They begin with. Shape (K, n).
-        kind: What else the seeds say, as of `Seed`.
+        motions: K local motions through each stretch.
+        configurations: Their start configurations. Shape (K, n).
+        options: Further fields of `Seed`.
     """
-    misfits, costs = np.array(misfits_of([*followed])), np.sum([part.cost for part in followed], axis=0)
-    tracked = misfits <= max(OUT_OF_REACH, misfits.min(initial=np.inf))
-    seeds = []
-    for number in np.lexsort((costs, ~tracked)).tolist():
-        local = [part.take(slice(number, number + 1)) for part in followed]
+    errors, costs = np.array(largest_pose_errors([*motions])), np.sum([motion.cost for motion in motions], axis=0)
+    tracked = errors <= max(REACH_TOLERANCE, errors.min(initial=np.inf))
+    candidates = []
+    for index in np.lexsort((costs, ~tracked)).tolist():
+        local = [motion.take(slice(index, index + 1)) for motion in motions]
         guess = solver.motion.guess(local, 0)
-        seed = Seed(guess, float(costs[number]), local, bool(tracked[number]), **kind)
-        seeds.append(
-            Candidate(
-                postures[number], seed.cost, seed=seed, clearance_constraints=solver.request.clearance_constraints
-            )
-        )
-    return seeds
+        seed = Seed(guess, float(costs[index]), local, bool(tracked[index]), **options)
+        constraints = solver.request.clearance_constraints
+        candidates.append(Candidate(configurations[index], seed.cost, seed=seed, constraints=constraints))
+    return candidates
 
 
-def _one_by_one(queue: CandidateQueue, solver: CandidateSolver, postures: Array, last: bool) -> None:
-    """Postures one after the other, the best conditioned first, until one leads to a plan.
+def _try_one_by_one(queue: CandidateQueue, solver: CandidateSolver, configurations: Array, thorough: bool) -> None:
+    """Try configurations one after the other, the best conditioned first, until one leads to a plan.
 
     Args:
-        last: Whether nothing else is tried where none does.
+        thorough: Whether failures are diagnosed, since nothing else is tried.
     """
     request = solver.request
-    for joints in postures[: request.settings.max_failures]:
-        followed = followed_from(request, joints[None])
-        if request.machine.base_size and not follows(request, followed)[0]:
-            continue  # what such a guess leads to takes long, and fails
-        queue.run(seeds_of(solver, followed, joints[None], direct=True, thorough=last))
+    for joints in configurations[: request.settings.max_failures]:
+        motions = local_motions_from(request, joints[None])
+        if request.machine.base_size and not tracks_tasks(request, motions)[0]:
+            continue  # solving from such a guess is slow and fails
+        queue.run(candidates_from(solver, motions, joints[None], direct=True, thorough=thorough))
         if queue.passed:
             return
 
 
-def _all_motions(queue: CandidateQueue, solver: CandidateSolver, searched: TaskSearch) -> None:
-    """The classes of motions that may be the cheapest; where none of these passes one of every class.
+def _search_globally(queue: CandidateQueue, solver: CandidateSolver, search: TaskSearch) -> None:
+    """Run the classes of motions that may hold the optimum; if none passes, one motion of every class.
 
-    A free start and a coarse mesh may lead away from a motion that is nearly the cheapest. So motions of the search
-    that promise to be cheaper than what passed are solved as they are, their starts fixed, until the plan is near its
-    bound.
+    A free start and a coarse mesh may lead away from a nearly optimal motion. Motions of the search that promise a
+    lower cost than the plan are therefore also solved with their start fixed, until the plan is close to its bound.
 
     Raises:
         DeadEnd: Motions end somewhere.
     """
     settings = solver.settings
-    _check_dead_end(searched)
-    for every in (False, True):
-        found = searched.followed(every)
-        if found[0].cost.size:
-            starts = found[0].joints[:, 0]
-            queue.run(seeds_of(solver, found, starts))
+    _check_dead_end(search)
+    for include_costlier in (False, True):
+        motions = search.local_motions(include_costlier)
+        if motions[0].cost.size:
+            starts = motions[0].joints[:, 0]
+            queue.run(candidates_from(solver, motions, starts))
             fixed = solver.request.start is None
-            for seed in seeds_of(solver, found, starts, direct=True, fixed=fixed):
-                near = queue.cost <= settings.near_bound * searched.bound
-                if near or seed.cost >= (1 - settings.gain) * queue.cost:
+            for seed in candidates_from(solver, motions, starts, direct=True, fixed=fixed):
+                near_bound = queue.cost <= settings.near_bound * search.bound
+                if near_bound or seed.cost >= (1 - settings.gain) * queue.cost:
                     break
                 queue.run([seed])
         if queue.passed:
             return
-    while searched.looked_closer():
-        _check_dead_end(searched)
+    while search.refine_samples():
+        _check_dead_end(search)
 
 
-def _check_dead_end(searched: TaskSearch) -> None:
-    if not np.isfinite(searched.bound) and (end := searched.dead_end()) is not None:
-        raise end
+def _check_dead_end(search: TaskSearch) -> None:
+    if not np.isfinite(search.bound) and (dead_end := search.dead_end()) is not None:
+        raise dead_end
 
 
-def _through_cells(
-    queue: CandidateQueue, solver: CandidateSolver, followed: Sequence[LocalMotion], postures: Array
+def _search_cells(
+    queue: CandidateQueue, solver: CandidateSolver, motions: Sequence[LocalMotion], configurations: Array
 ) -> None:
-    """The motions of a floating machine that a search over exact states leads to, with those that local ones do.
+    """Run the motions of a floating machine that a search over exact states finds, and its local motions.
 
     Raises:
-        Unreachable, DeadEnd: As of `CellSearch`, where no local motion leads on either.
+        Unreachable, DeadEnd: As in `CellSearch`, if no local motion leads to a plan either.
     """
-    request, every = solver.request, solver.request.search == "global"
-    sound = np.flatnonzero(follows(request, followed))
-    local = seeds_of(solver, [part.take(sound) for part in followed], postures[sound], direct=every)
+    request, include_costlier = solver.request, solver.request.search == "global"
+    tracked = np.flatnonzero(tracks_tasks(request, motions))
+    motions = [motion.take(tracked) for motion in motions]
+    local = candidates_from(solver, motions, configurations[tracked], direct=include_costlier)
     try:
-        found = CellSearch(request, postures).followed()
+        passes = CellSearch(request, configurations).local_motions()
     except DeadEnd:
-        queue.run(local, every)
+        queue.run(local, include_costlier)
         if not queue.passed:
             raise
         return
-    batches = [seeds_of(solver, ways, ways[0].joints[:, 0], direct=True) for ways in found]
-    if every:
-        least = [min((seed.cost for seed in batch), default=np.inf) for batch in batches]
-        cheaper = [batch for batch, cost in zip(batches, least, strict=True) if batch is batches[0] or cost < least[0]]
-        queue.run([*local, *(seed for batch in cheaper for seed in batch)], every=True)
+    batches = [candidates_from(solver, motions, motions[0].joints[:, 0], direct=True) for motions in passes]
+    if include_costlier:
+        lowest_costs = [min((seed.cost for seed in batch), default=np.inf) for batch in batches]
+        cheaper = [batch for batch, cost in zip(batches, lowest_costs, strict=True) if cost < lowest_costs[0]]
+        queue.run([*local, *(seed for batch in (*batches[:1], *cheaper) for seed in batch)], include_costlier=True)
         return
-    # where others wait a motion is given up early
+    # give up a motion early while others wait
     settings = request.settings
-    solver.settings = replace(settings, max_refinements=2, max_deviation=OUT_OF_REACH)
+    solver.settings = replace(settings, max_refinements=2, max_deviation=REACH_TOLERANCE)
     for begin in range(0, settings.max_failures, settings.batch):
         for batch in batches:
             queue.run(batch[begin : begin + settings.batch])
@@ -221,38 +219,35 @@ def _through_cells(
     queue.candidates += [seed.rejected(reason) for seed in rest]
 
 
-def _alternatives(queue: CandidateQueue, solver: CandidateSolver, seeds: list[Candidate]) -> None:
-    """Run candidates whose motions collide, each from its own local motion; then with starts that are clear and fixed.
+def _try_alternatives(queue: CandidateQueue, solver: CandidateSolver, seeds: list[Candidate]) -> None:
+    """Rerun candidates in collision: from their own local motions, then from fixed, collision-free starts.
 
-    Where nothing is in the way postures slide along their self-motion into one motion, however clear they were. Their
-    local motions pass on other sides; those that are clear, or nearest to it, come first. And a start that may slide is
-    pushed about by all that is separated later on the way; fixed, what it leads to is nearer.
+    Without obstacles, free starts slide along their self-motion into one motion, whatever their clearance. Their local
+    motions belong to different homotopy classes; those without collision, or with the least, come first. A free start
+    is also displaced by every separation later on the path. A fixed one leads to a motion closer to its guess.
     """
-    request, most = solver.request, solver.settings.max_failures
-    ended = {id(one.seed): one for one in queue.candidates}
-    ways = []
+    request, max_tries = solver.request, solver.settings.max_failures
+    finished_by_seed = {id(candidate.seed): candidate for candidate in queue.candidates}
+    rerouted = []
     for seed in seeds:
-        end = ended[id(seed.seed)]
-        colliding = solver.collisions(end)
-        if end.clearance_constraints is not None and (colliding or end.clearance_constraints.margins):
+        finished = finished_by_seed[id(seed.seed)]
+        colliding = solver.collisions(finished)
+        if finished.constraints is not None and (colliding or finished.constraints.margins):
             local = solver.local_collisions(seed.seed)
-            clearance_constraints = end.clearance_constraints.holding([touch.pair for touch in (*colliding, *local)])
-            ways.append(
-                (
-                    min((touch.distance for touch in local), default=np.inf),
-                    replace(seed, clearance_constraints=clearance_constraints),
-                )
-            )
-    others = [seed for _, seed in sorted(ways, key=lambda way: -way[0])[:most]]
+            pairs = [collision.pair for collision in (*colliding, *local)]
+            constraints = finished.constraints.holding(pairs)
+            distance = min((collision.distance for collision in local), default=np.inf)
+            rerouted.append((distance, replace(seed, constraints=constraints)))
+    alternatives = [seed for _, seed in sorted(rerouted, key=lambda entry: -entry[0])[:max_tries]]
     if request.start is None:
-        touching_starts = touches_at_the_start(request, np.array([seed.start for seed in seeds]))
-        clear_starts = [seed for seed, touch in zip(seeds, touching_starts, strict=True) if touch is None]
-        tracked = [one for one in clear_starts if max(misfits_of([*one.seed.local])) <= OUT_OF_REACH]
-        tracked.sort(key=lambda one: one.seed.cost)
-        others += [replace(one, seed=replace(one.seed, direct=True, fixed=True)) for one in tracked[:most]]
-    for seed in others:
+        collisions = start_collisions(request, np.array([seed.start for seed in seeds]))
+        clear_starts = [seed for seed, collision in zip(seeds, collisions, strict=True) if collision is None]
+        tracked = [c for c in clear_starts if max(largest_pose_errors([*c.seed.local])) <= REACH_TOLERANCE]
+        tracked.sort(key=lambda candidate: candidate.seed.cost)
+        alternatives += [replace(c, seed=replace(c.seed, direct=True, fixed=True)) for c in tracked[:max_tries]]
+    for seed in alternatives:
         start = seed.start
-        queue.candidates = [one for one in queue.candidates if one.start is not start]  # which ends anew
+        queue.candidates = [c for c in queue.candidates if c.start is not start]  # it finishes again
         queue.run([seed])
         if queue.passed:
             return
@@ -269,7 +264,7 @@ def plan(
     cyclic: bool = False,
     weights: Any = None,
     limits: Limits | None = None,
-    search: SearchKind = "postures",
+    search: SearchKind = "configurations",
     seed: int = 0,
     time_cost: float = 1.0,
     obstacles: Any = (),
@@ -279,167 +274,159 @@ def plan(
     folders: Any = (),
     missing: str = "raise",
 ) -> Plan:
-    """Plan the cheapest motion that does the tasks: the least integral of half the squared joint rates.
+    """Plan the lowest-cost motion that does the tasks: the least integral of half the squared joint rates.
 
     Args:
-        machine: On a fixed or a floating base; or standing, see `plan_to_stand`, whose cost is that of `plan_standing`.
-        tasks: What its tips do; each from its `begin` on for its `duration`.
-        horizon: s; None: until the last task ends. "free": the tasks may be done slower than they say, never faster;
-            pace and self-motion are found at once, for the least of `time_cost` and joint rates together.
-        start: Joints at the start, rad or m, shape (n,); None: wherever the first tasks can begin, which is searched.
+        machine: A machine on a fixed or floating base, or standing, see `plan_to_stand` for its cost.
+        tasks: Tasks of its tips; each lasts from its `begin` for its `duration`.
+        horizon: s; None: until the last task ends. "free": the tasks may be done more slowly than they say, never
+            faster; their pace is planned together with the self-motion, for the least sum of `time_cost` and joint
+            rates.
+        start: Joints at the start, rad or m, shape (n,); None: any that do the first tasks, which are searched.
         start_base: Base at the start, shape (base_size,); the machine's base_home() if None.
         cyclic: Whether the joints end where they start.
-        weights: Of the squared joint rates, shape (n,); all 1 if None.
-        limits: Of the joints' positions and rates; the robot's own if None. Where accelerations, jerks, torques or
-            power are given, they hold at all times, and the robot's own torques with them, at the same cost (see
-            `plan.actuators`). Rates are then continuous, but as free at both ends as without: a machine that is
-            to start from rest is asked to by its tasks, and what these leave free may move there.
-        search: "start": from the given start, or from the one that is best conditioned of those that inverse kinematics
-            finds; "postures": from all of these, and the cheapest motion is the plan. Each may slide along its
-            self-motion. "global": the cheapest of all motions in the tasks' own time. On a fixed base with a `bound`
-            that none falls below, for poses that leave at most two directions free, see `search.search`. Joints
-            that move no task's frame, as a gripper's, stand still then, as in `start` or in the middle of their limits.
-            On a floating one of all that a search over exact states finds, without a bound, see `search.cells`,
-            which also goes on where local motions come to a singularity.
-        seed: Of inverse kinematics.
-        obstacles: Shapes in world, or `MovingObstacle` ones, that the machine's bodies stay clear of.
-        clearance: Least distance to obstacles and between the links, m; None: nothing is looked at.
-        ignored, srdf, folders, missing: As of `models.CollisionScene`: pairs that are not checked, and what becomes of
-            meshes that are not found.
-        time_cost: Of each second where the horizon is free, in units of the cost, (rad/s)^2; the larger, the nearer the
-            motion is to that of least time.
+        weights: Weights of the squared joint rates, shape (n,); all 1 if None.
+        limits: Limits of joint positions and rates; the robot's own if None. Limits of acceleration, jerk, torque or
+            power, if given, hold at all times together with the robot's own torque limits, at the same cost (see
+            `plan.actuators`). Rates are then continuous. A machine starts or ends at rest only if its tasks require it.
+        search: "start": from the given start, or from the best conditioned solution of inverse kinematics.
+            "configurations": from all solutions of inverse kinematics; each may slide along its self-motion.
+            "global": among all motions in the tasks' own time. On a fixed base, the plan has a lower `bound`; the tasks
+            must be poses that leave at most two directions free, and joints that move no task frame, such as a
+            gripper's, stand still in `start` or in the middle of their limits (see `search.search`). On a floating
+            base, the motions come from a search over exact states without a bound (see `search.cells`), which also
+            passes singularities.
+        seed: Seed of inverse kinematics.
+        obstacles: Shapes in world, or `MovingObstacle` ones.
+        clearance: Least distance to obstacles and between links, m; None: collisions are not checked.
+        ignored, srdf, folders, missing: As in `models.CollisionScene`: pairs that are not checked, and the treatment of
+            missing meshes.
+        time_cost: Cost of a second if the horizon is free, in (rad/s)^2; the larger, the closer to the least time.
 
     Returns:
-        The plan, audited, with every other motion that was found, its cost and why it is not the plan.
+        The audited plan, with all other motions found, their costs and the reasons of their rejection.
 
     Raises:
-        ProblemError: What is asked does not fit the machine, or cannot be asked at once; Unreachable, which is one,
-            names the time and the place that is out of reach.
-        SolveError: No motion passes its audit; says what became of each posture. DeadEnd, which is one: the search over
-            all motions says from where on none goes on, what stops it, and how far the tasks would have to give way, or
-            in how few pieces they may be done (`plan_in_segments`).
+        ProblemError: The request does not fit the machine or is contradictory. Its subclass Unreachable names the time
+            and the place out of reach.
+        SolveError: No motion passes its audit; names what happened to each candidate. Its subclass DeadEnd says where
+            the motions of a global search end, what obstructs them, by how much the tasks would have to be relaxed, and
+            in how few segments they may be done (`plan_in_segments`).
     """
-    around = (machine, obstacles, clearance, ignored, srdf, folders, missing, limits)
+    collision: dict[str, Any] = {"obstacles": obstacles, "clearance": clearance, "ignored": ignored}
+    collision |= {"srdf": srdf, "folders": folders, "missing": missing}
+    options: dict[str, Any] = {"start": start, "cyclic": cyclic, "weights": weights, "limits": limits}
+    options |= {"search": search, "seed": seed}
     if isinstance(machine, Standing):
-        given = {"start": start, "cyclic": cyclic, "weights": weights, "limits": limits, "search": search, "seed": seed}
-        return plan_to_stand(machine, tasks, horizon, clearance_constraints=clear_of(*around), **given)
-    asked = checked_asked(machine, tasks, horizon, start, start_base, cyclic, weights, limits, search, seed, time_cost)
-    return planned(replace(asked, clearance_constraints=clear_of(*around)))
+        constraints = clearance_for(machine, limits, **collision)
+        return plan_to_stand(machine, tasks, horizon, clearance_constraints=constraints, **options)
+    options |= {"start_base": start_base, "time_cost": time_cost}
+    request = checked_request(machine, tasks, horizon, **options)
+    return plan_request(replace(request, clearance_constraints=clearance_for(machine, limits, **collision)))
 
 
-def planned(asked: Asked) -> Plan:
-    """As `plan`, of what is asked.
+def plan_request(request: PlanRequest) -> Plan:
+    """Plan a checked request.
 
     Raises:
-        ProblemError, SolveError: As `plan`.
+        ProblemError, SolveError: As in `plan`.
     """
-    postures = postures_at_the_start(asked)
-    start = asked.start
+    configurations = start_configurations(request)
+    start = request.start
     if start is None:
-        start, postures = settled(asked, postures)
+        start, configurations = fix_ignorable_joints(request, configurations)
     else:
-        check_clear_start(asked, postures)
-    made, bound = plan_from_seeds(asked, postures, CandidateSolver(asked, start, postures[0]))
-    return made if bound is None else replace(made, bound=checked_bound(bound, made.cost))
+        check_clear_start(request, configurations)
+    solver = CandidateSolver(request, start, configurations[0])
+    result, bound = plan_from_configurations(request, configurations, solver)
+    return result if bound is None else replace(result, bound=checked_bound(bound, result.cost))
 
 
-def clear_of(
+def clearance_for(
     machine: Machine,
+    limits: Limits | None,
+    *,
     obstacles: Any,
     clearance: Any,
     ignored: Any,
     srdf: Any,
     folders: Any,
     missing: Any,
-    limits: Limits | None,
 ) -> ClearanceConstraints | None:
-    """What a motion has to stay clear of; None where there is nothing.
+    """Return the clearance constraints of a motion, or None if no pair of bodies has to be checked.
 
     Raises:
-        ProblemError: What is given is not what `plan` takes, or given where nothing is looked at.
+        ProblemError: An argument is invalid, or given though collisions are not checked.
     """
     if clearance is None:
-        for what, value in (("obstacles", obstacles), ("ignored", ignored), ("srdf", srdf)):
-            if not _empty(value):
-                words = f"{what} are of no use where nothing is looked at; give a clearance in m, 0 to touch nothing"
-                raise ProblemError(words, name=what, value=value)
+        for name, value in (("obstacles", obstacles), ("ignored", ignored), ("srdf", srdf)):
+            if value is not None and not (isinstance(value, tuple | list) and not len(value)):
+                words = f"{name}: collisions are not checked without a clearance; give one in m, 0 to exclude contact"
+                raise ProblemError(words, name=name, value=value)
         return None
     try:
-        kept = not isinstance(limits, Limits) or limits.joints
-        around = CollisionScene(machine, obstacles, clearance, ignored, srdf, folders, missing, kept)
+        joint_limits = not isinstance(limits, Limits) or limits.joints
+        scene = CollisionScene(machine, obstacles, clearance, ignored, srdf, folders, missing, joint_limits)
     except ModelError as error:
         raise ProblemError(str(error), **vars(error)) from error
-    return ClearanceConstraints(around) if len(around.pairs) else None
+    return ClearanceConstraints(scene) if len(scene.pairs) else None
 
 
-def _empty(value: Any) -> bool:
-    return value is None or (isinstance(value, tuple | list) and not len(value))
-
-
-def checked_asked(
+def checked_request(
     machine: Machine,
     tasks: Any,
     horizon: Any,
-    start: Any,
-    start_base: Any,
-    cyclic: Any,
-    weights: Any,
-    limits: Any,
-    search: Any,
-    seed: Any,
-    time_cost: Any,
-) -> Asked:
-    """What `plan` is asked, but for what has to be clear.
+    *,
+    start: Any = None,
+    start_base: Any = None,
+    cyclic: Any = False,
+    weights: Any = None,
+    limits: Any = None,
+    search: Any = "configurations",
+    seed: Any = 0,
+    time_cost: Any = 1.0,
+) -> PlanRequest:
+    """Check the arguments of `plan`, except those of the collision scene.
 
     Raises:
-        ProblemError: As `plan`.
+        ProblemError: As in `plan`.
     """
     checked_choice("search", search, get_args(SearchKind))
     checked_flag("cyclic", cyclic)
     checked_count("seed", seed, 0, LARGEST_SEED)
-    given = (tasks,) if isinstance(tasks, TipTask) else checked_each("tasks", tasks, TipTask)
-    equations = bind(machine, given)
-    told = Limits() if limits is None else checked_instance("limits", limits, Limits)
+    all_tasks = (tasks,) if isinstance(tasks, TipTask) else checked_each("tasks", tasks, TipTask)
+    bind(machine, all_tasks)  # checks the tasks against the machine
+    checked_limits = Limits() if limits is None else checked_instance("limits", limits, Limits)
     free = isinstance(horizon, str)
     if free:
         checked_choice("horizon", horizon, ("free",))
         if search == "global":
-            words = "search='global' keeps the tasks' own time; give a horizon in s, or search='postures'"
+            words = "search='global' needs a fixed horizon; give it in s, or use search='configurations'"
             raise ProblemError(words, name="search", value="global")
     checked_positive("time_cost", time_cost)
-    told.bounds(machine, ("velocity", "torque") if limits_actuators(told) else ("velocity",))
-    if limits_actuators(told):
-        checked_motors("plan: limits of drives", machine)
+    checked_limits.bounds(machine, ("velocity", "torque") if limits_actuators(checked_limits) else ("velocity",))
+    if limits_actuators(checked_limits):
+        checked_motors("plan: actuator limits", machine)
         if free:
-            words = "a free horizon knows no limits of drives; give it in s, or limit the rates alone"
+            words = "actuator limits need a fixed horizon; give it in s, or limit the rates alone"
             raise ProblemError(words, name="horizon", value=horizon)
-    duration = horizon_of(given, None if free else horizon)
-    place = checked_configuration(machine, np.zeros(machine.joint_size), start_base)[1]
+    duration = horizon_of(all_tasks, None if free else horizon)
+    base = checked_configuration(machine, np.zeros(machine.joint_size), start_base)[1]
     joints = None if start is None else checked_configuration(machine, start, start_base)[0]
-    stretches = stretches_of(machine, given, duration)
-    middle = np.zeros(machine.joint_size) if joints is None else joints
+    stretches = stretches_of(machine, all_tasks, duration)
+    configuration = np.zeros(machine.joint_size) if joints is None else joints
     for stretch in stretches:
         if stretch.equations is not None:
             first = stretch is stretches[0] and joints is not None
-            checked_tasks(stretch.equations, place, middle, duration, start=first)
-    del equations
+            checked_tasks(stretch.equations, base, configuration, duration, start=first)
     if joints is not None:
-        bounds = told.bounds(machine)
+        bounds = checked_limits.bounds(machine)
         names, hint = machine.robot.joint_names, "start inside them"
         joints = clip_to_limits("start", names, joints, bounds.lower, bounds.upper, hint)
-    heavy = checked_weights(weights, machine.joint_size)
-    return Asked(
-        machine,
-        given,
-        duration,
-        stretches,
-        joints,
-        place,
-        heavy,
-        without_actuators(told),
-        cyclic,
-        int(seed),
-        float(time_cost) if free else None,
+    joint_weights = checked_weights(weights, machine.joint_size)
+    return PlanRequest(
+        *(machine, all_tasks, duration, stretches, joints, base, joint_weights, without_actuators(checked_limits)),
+        *(cyclic, int(seed), float(time_cost) if free else None),
         search=search,
-        drives=told if limits_actuators(told) else None,
+        actuator_limits=checked_limits if limits_actuators(checked_limits) else None,
     )

@@ -1,8 +1,8 @@
-"""What a plan was asked, as data: from it the problem of the plan is declared again by whoever reads its file.
+"""Origin of a plan's problem as data, from which the reader of a plan file declares the problem again.
 
-A request names a builder and holds its arguments: the machine, tasks, limits, weights, and what to stay clear of. These
-are written by the fields of their dataclasses, and read by the constructors of these, which check them. Functions of
-time (where a task leads its tip, how an obstacle moves) are written as elementary operations.
+A request names a builder and holds its arguments: machine, tasks, limits, weights and clearance constraints. They are
+written by the fields of their dataclasses, and read by the constructors, which check them. Functions of time (of a task
+or a moving obstacle) are written as elementary operations.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.dynamics import dynamics_problem
 from ocp.motion.builders.standing.problem import FreeTime, Weights, standing_problem
 from ocp.motion.builders.tool_motion import ToolMotion, stretches_of, tool_motion_problem
-from ocp.motion.search.configurations import Asked
+from ocp.motion.search.configurations import PlanRequest
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.motion.tasks.tracks import TrackWithRate
@@ -58,9 +58,10 @@ __all__ = ["MotionRequest", "declared_motion", "request_of", "restored_request",
 
 SHAPES = (Box, Capsule, Cylinder, HalfSpace, Mesh, Sphere)
 PARTS = (Robot, Link, Joint, Mimic, CollisionShape, VisualShape, Support)
-ASKED = (TipTask, Limits, ClearanceConstraints, Effort, JointFriction, Weights, FreeTime, InFoot, Pinned, IndexAtLeast)
+STANDING = (Weights, FreeTime, InFoot, Pinned, IndexAtLeast)
+ARGUMENTS = (TipTask, Limits, ClearanceConstraints, Effort, JointFriction, *STANDING)
 MACHINES = (FixedBase, FreeFloating, Standing)
-KINDS = {kind.__name__: kind for kind in (*MACHINES, *PARTS, *SHAPES, *ASKED, MovingObstacle, Body)}
+KINDS = {kind.__name__: kind for kind in (*MACHINES, *PARTS, *SHAPES, *ARGUMENTS, MovingObstacle, Body)}
 SYMBOLS = {"SX": ca.SX, "MX": ca.MX}
 TRACKS = {TipTask: ("velocity", "position", "orientation", "direction"), MovingObstacle: ("position", "rotation")}
 """Fields that may be functions of time."""
@@ -68,11 +69,11 @@ TRACKS = {TipTask: ("velocity", "position", "orientation", "direction"), MovingO
 
 @dataclass(frozen=True, eq=False)
 class MotionRequest:
-    """What a problem was declared from.
+    """Builder and arguments from which a problem was declared.
 
     Attributes:
-        builder: Its name among BUILDERS.
-        arguments: Of the builder, by name.
+        builder: Name of the builder in BUILDERS.
+        arguments: Arguments of the builder, by name.
     """
 
     builder: str
@@ -80,13 +81,13 @@ class MotionRequest:
 
     @property
     def machine(self) -> Machine:
-        """What moves."""
+        """Machine of the problem."""
         machine: Machine = self.arguments["machine"]
         return machine
 
     @property
     def tasks(self) -> tuple[TipTask, ...]:
-        """What its tips do."""
+        """Tasks of the problem."""
         tasks = self.arguments.get("tasks", ())
         return (tasks,) if isinstance(tasks, TipTask) else tuple(tasks)
 
@@ -105,41 +106,42 @@ class MotionRequest:
 
 
 def declared_motion(
-    asked: Asked,
+    request: PlanRequest,
     *,
     start: Any,
     reference: Any,
-    clearance_constraints: ClearanceConstraints | None,
+    constraints: ClearanceConstraints | None,
     limits: Limits | None = None,
 ) -> ToolMotion:
-    """Declare the problem of a motion, which remembers what it was declared from.
+    """Declare the problem of a motion, which keeps its origin.
 
     Args:
-        asked: What is asked. start, reference, clear: As of `tool_motion_problem`.
-        limits: With those of the drives, where these are limited; else None.
+        request: The request.
+        start, reference, constraints: As in `tool_motion_problem`.
+        limits: Limits that include those of the actuators, if these are limited; else None.
     """
-    own: dict[str, Any] = {
-        "base": asked.base,
+    options: dict[str, Any] = {
+        "base": request.base,
         "start": start,
         "reference": reference,
-        "cyclic": asked.cyclic,
-        "weights": asked.weights,
-        "time_cost": asked.time_cost,
+        "cyclic": request.cyclic,
+        "weights": request.weights,
+        "time_cost": request.time_cost,
         "driven": limits is not None,
-        "held": asked.held if limits is None else None,
-        "clearance_constraints": clearance_constraints,
+        "held": request.fixed_joints if limits is None else None,
+        "clearance_constraints": constraints,
     }
-    bounds = (limits or asked.limits).bounds(asked.machine)
-    motion = tool_motion_problem(asked.machine, asked.stretches, bounds=bounds, **own)
-    given = {"machine": asked.machine, "tasks": asked.tasks, "horizon": asked.horizon}
-    arguments = {**given, "limits": limits or asked.limits, **own}
+    bounds = (limits or request.limits).bounds(request.machine)
+    motion = tool_motion_problem(request.machine, request.stretches, bounds=bounds, **options)
+    arguments = {"machine": request.machine, "tasks": request.tasks, "horizon": request.horizon}
+    arguments |= {"limits": limits or request.limits, **options}
     motion.problem.origin = MotionRequest("tool motion", arguments)
     return motion
 
 
-def _tool_motion(machine: Machine, tasks: Any, horizon: float, *, limits: Limits, **own: Any) -> Problem:
+def _tool_motion(machine: Machine, tasks: Any, horizon: float, *, limits: Limits, **options: Any) -> Problem:
     stretches = stretches_of(machine, tasks, horizon)
-    return tool_motion_problem(machine, stretches, bounds=limits.bounds(machine), **own).problem
+    return tool_motion_problem(machine, stretches, bounds=limits.bounds(machine), **options).problem
 
 
 BUILDERS: dict[str, Callable[..., Problem]] = {
@@ -150,21 +152,21 @@ BUILDERS: dict[str, Callable[..., Problem]] = {
 
 
 def request_of(problem: Problem | None) -> MotionRequest | None:
-    """Return what a problem was declared from; None where that is not known."""
+    """Return the origin of a problem, or None if it is unknown."""
     origin = None if problem is None else problem.origin
-    if isinstance(origin, tuple):  # a builder below this module, and its arguments
+    if isinstance(origin, tuple):  # name and arguments of a builder that does not import this module
         origin = MotionRequest(*origin)
     return origin if isinstance(origin, MotionRequest) else None
 
 
-# ---- writing -------------------------------------------------------------------------------------------------------
+# ---- writing ---------------------------------------------------------------------------------------------------------
 
 
 def stored_request(builder: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
     """Return a record of names, numbers and arrays.
 
     Raises:
-        ProblemError: An argument is no data, such as a machine of another kind or a callback of Python's.
+        ProblemError: An argument is not data, such as a machine of another kind or a Python callback.
     """
     writer = FunctionWriter()
     owner: Machine | None = arguments.get("machine")
@@ -180,15 +182,16 @@ def stored_request(builder: str, arguments: Mapping[str, Any]) -> dict[str, Any]
             return {"pool": [[put(key), put(part)] for key, part in value.items()]}
         if isinstance(value, tuple | list):
             return [put(part) for part in value]
-        if isinstance(value, Mesh):  # its file stays where it is: the hull is what counts
-            placed = {"vertices": value.hull.vertices, "position": value.position, "rotation": value.rotation}
-            return {"kind": "Mesh", "fields": {name: put(part) for name, part in placed.items()}}
+        if isinstance(value, Mesh):  # only the hull of the file is stored
+            parts_in_world = {"vertices": value.hull.vertices, "position": value.position, "rotation": value.rotation}
+            return {"kind": "Mesh", "fields": {name: put(part) for name, part in parts_in_world.items()}}
         if isinstance(value, CollisionScene) and value.machine is owner:
-            return {"kind": "CollisionScene", "fields": {name: put(part) for name, part in _around(value).items()}}
+            scene_fields = {name: put(part) for name, part in _scene_fields(value).items()}
+            return {"kind": "CollisionScene", "fields": scene_fields}
         if is_dataclass(value) and KINDS.get(type(value).__name__) is type(value):
-            parts = {one.name: getattr(value, one.name) for one in fields(value) if one.init}
+            parts = {each.name: getattr(value, each.name) for each in fields(value) if each.init}
             tracks = TRACKS.get(type(value), ())
-            if isinstance(value, MovingObstacle):  # as it takes them: its tables are polynomials already
+            if isinstance(value, MovingObstacle):  # as its arguments: tables are stored as polynomials
                 parts |= {"position": lambda time: value.frame(time).position}
                 parts |= {"rotation": lambda time: value.frame(time).rotation}
             return {
@@ -201,7 +204,7 @@ def stored_request(builder: str, arguments: Mapping[str, Any]) -> dict[str, Any]
         kind = next((name for name, symbols in SYMBOLS.items() if value is symbols), None)
         if kind is not None:
             return {"symbols": kind}
-        words = f"a {type(value).__name__} is no data that a file can hold"
+        words = f"a {type(value).__name__} cannot be stored in a file"
         raise ProblemError(words, name=type(value).__name__, value=repr(value)[:80])
 
     pool = []
@@ -213,63 +216,62 @@ def stored_request(builder: str, arguments: Mapping[str, Any]) -> dict[str, Any]
     return {"builder": builder, "arguments": {"pool": pool}, "functions": writer.records}
 
 
-def _around(around: CollisionScene) -> dict[str, Any]:
-    """What its machine keeps clear of, by the bodies that cover meshes in place of the files of these."""
+def _scene_fields(scene: CollisionScene) -> dict[str, Any]:
+    """Return the arguments of a collision scene, with the bodies that cover meshes in place of mesh files."""
     return {
-        "obstacles": around.obstacles,
-        "clearance": around.clearance,
-        "ignored": [*around.ignored, *around.disabled],
-        "limits": around.limits,
+        "obstacles": scene.obstacles,
+        "clearance": scene.clearance,
+        "ignored": [*scene.ignored, *scene.disabled],
+        "limits": scene.limits,
         "covered": {
             f"{link}/{number}": [
                 bodies[0].mesh.hull.core if bodies and bodies[0].mesh is not None else (),
                 [[body.shape, body.overhang] for body in bodies],
             ]
-            for (link, number), bodies in (around.covered or {}).items()
+            for (link, number), bodies in (scene.covered or {}).items()
         },
     }
 
 
 def _put_track(name: str, track: Callable[[Any], Any], writer: FunctionWriter) -> dict[str, Any]:
-    """A function of time, and its rate where it has one."""
+    """Return the record of a function of time and of its rate, if it has one."""
     parts = {"track": track, "rate": getattr(track, "rate", None)}
-    return {what: writer.write(_traced(name, part)) for what, part in parts.items() if part is not None}
+    return {role: writer.write(_traced(name, part)) for role, part in parts.items() if part is not None}
 
 
 def _traced(name: str, track: Callable[[Any], Any]) -> Any:
-    """A function of time as a casadi Function."""
+    """Return a function of time as a CasADi function."""
     for symbols in (ca.SX, ca.MX):
         time = symbols.sym("time")
         try:
             return ca.Function("track", [time], [ca.densify(symbols(expression(track(time))))])
         except (RuntimeError, NotImplementedError, TypeError, ModelError) as error:
-            why = str(error).strip().splitlines()[-1]
-    raise ProblemError(f"{name} is no function of casadi's time alone: {why}", name=name)
+            reason = str(error).strip().splitlines()[-1]
+    raise ProblemError(f"{name} is not a CasADi function of time alone: {reason}", name=name)
 
 
-# ---- reading -------------------------------------------------------------------------------------------------------
+# ---- reading ---------------------------------------------------------------------------------------------------------
 
 
 def restored_request(record: Any) -> MotionRequest:
-    """Return the request of which `stored_request` returned the record. Nothing in it is trusted.
+    """Return the request of a record of `stored_request`. Nothing in the record is trusted.
 
     Raises:
         ProblemError: The record is damaged.
     """
     try:
         functions = FunctionReader(record["functions"]).functions
-        own = dict(record["arguments"]["pool"])
-        machine = _read(own["machine"], functions, None)
+        pool = dict(record["arguments"]["pool"])
+        machine = _read(pool["machine"], functions, None)
         if not isinstance(machine, MACHINES):
-            raise TypeError(f"what was written is no machine but {type(machine).__name__}")
-        arguments = {
-            name: machine if name == "machine" else _read(value, functions, machine) for name, value in own.items()
-        }
+            raise TypeError(f"the machine is of type {type(machine).__name__}")
+        other_feet = {name: _read(value, functions, machine) for name, value in pool.items() if name != "machine"}
+        arguments = {"machine": machine, **other_feet}
         if record["builder"] not in BUILDERS and record["builder"] != "":
             raise ValueError(f"builder {record['builder']!r} is not known")
         return MotionRequest(record["builder"], arguments)
     except (*DAMAGED, ProblemError) as error:
-        raise ProblemError(f"the request that was written is damaged: {error}", name="request") from error
+        raise ProblemError(f"the stored request is damaged: {error}", name="request") from error
 
 
 def _read(value: Any, functions: list[Any], machine: Machine | None) -> Any:
@@ -287,26 +289,26 @@ def _read(value: Any, functions: list[Any], machine: Machine | None) -> Any:
     if "track" in value:
         at = _of_time(functions[value["track"]])
         return at if "rate" not in value else TrackWithRate(at, _of_time(functions[value["rate"]]))
-    own = {name: read(part) for name, part in value["fields"].items()}
+    fields = {name: read(part) for name, part in value["fields"].items()}
     if value["kind"] == "CollisionScene":
-        around = {name: own[name] for name in ("obstacles", "clearance", "ignored", "limits")}
-        return CollisionScene(machine, **around, covered=_covered(own["covered"]))  # type: ignore[arg-type]
-    if own.get("file") is not None and value["kind"] == "Mesh":
-        raise ValueError("a mesh names a file, which is not opened")
-    return KINDS[value["kind"]](**own)
+        options = {name: fields[name] for name in ("obstacles", "clearance", "ignored", "limits")}
+        return CollisionScene(machine, **options, covered=_covered(fields["covered"]))  # type: ignore[arg-type]
+    if fields.get("file") is not None and value["kind"] == "Mesh":
+        raise ValueError("a mesh names a file, which is not read")
+    return KINDS[value["kind"]](**fields)
 
 
 def _of_time(function: Any) -> Any:
     if function.n_in() != 1 or function.size_in(0) != (1, 1) or function.n_out() != 1:
-        raise ValueError("a track is no function of one number")
+        raise ValueError("a track is not a function of one number")
     return function
 
 
 def _covered(written: Mapping[str, Any]) -> dict[tuple[str, int], tuple[Body, ...]]:
-    """The bodies that cover each mesh, by the link and the place of the mesh among its collision shapes."""
-    found = {}
+    """Return the bodies that cover each mesh, by the link and the index of the mesh among its collision shapes."""
+    bodies = {}
     for place, (points, shapes) in written.items():
         link, _, number = place.rpartition("/")
         mesh = LinkMesh(np.asarray(points, dtype=float).reshape(-1, 3), int(number))
-        found[link, int(number)] = tuple(Body(link, shape, overhang, mesh) for shape, overhang in shapes)
-    return found
+        bodies[link, int(number)] = tuple(Body(link, shape, overhang, mesh) for shape, overhang in shapes)
+    return bodies

@@ -1,4 +1,4 @@
-"""The cheapest motion of a machine that stands unfastened on the ground, from the postures in which it can stand."""
+"""Lowest-cost motion of a machine that stands on the ground without being fastened to it."""
 
 from __future__ import annotations
 
@@ -40,44 +40,43 @@ def plan_to_stand(
     seed: int,
     clearance_constraints: ClearanceConstraints | None,
 ) -> Plan:
-    """Do the tasks with the zero moment point inside the foot, at the least cost of `plan_standing`.
+    """Plan a motion that does the tasks with the zero moment point inside the foot, at the cost of `plan_standing`.
 
-    The joints start and end at rest where their tasks do, else they are free to move. From every posture at the start
-    that inverse kinematics finds and that stands, or, with search "start", from the best conditioned that leads to a
-    plan.
+    The joints start and end at rest if their tasks do; else they may move there. Candidates start from every
+    configuration that inverse kinematics finds and that stands; with search "start", from the best conditioned one that
+    leads to a plan.
 
     Args:
-        machine: What stands.
-        tasks, horizon, start, limits, search, seed: As of `ocp.motion.plan.plan`.
-        cyclic: False: a standing motion is not closed by this.
-        weights: Of the parts of the cost. clear: What the motion has to stay clear of, or None.
+        machine: The standing machine.
+        tasks, horizon, start, limits, search, seed: As in `ocp.motion.plan.plan`.
+        cyclic: Must be False.
+        weights: Weights of the terms of the cost.
+        clearance_constraints: Clearance constraints, or None.
 
     Raises:
-        ProblemError: A cyclic motion, tasks in intervals of time, a horizon that is no number, or as plan_standing.
-        SolveError: No posture leads to a plan that passes its audit.
+        ProblemError: A cyclic motion, tasks that are active only a part of the time, a horizon that is no number, or as
+            in `plan_standing`.
+        SolveError: No start leads to a plan that passes its audit.
     """
     checked_flag("cyclic", cyclic)
     if cyclic:
-        words = "a standing motion is not closed: give plan_standing(..., end_joints=...) the joints at the end"
+        words = "a standing motion cannot be cyclic; give the joints at the end with plan_standing(..., end_joints=...)"
         raise ProblemError(words, name="cyclic", value=cyclic)
     if weights is not None:
         checked_instance("weights", weights, Weights)
-    given = [part.task for part in bind(machine, tasks).bound]
-    duration = horizon_of(given, horizon)
-    for number, task in enumerate(given):
+    all_tasks = [part.task for part in bind(machine, tasks).bound]
+    duration = horizon_of(all_tasks, horizon)
+    for number, task in enumerate(all_tasks):
         if task.begin > 0 or task.end < duration * (1 - 1e-9):
-            words = (
-                f"task {number} is from {task.begin:g} to {task.end:g} s; a standing motion does all its tasks at once"
-            )
+            words = f"task {number} lasts from {task.begin:g} to {task.end:g} s, not for the whole standing motion"
             raise ProblemError(words, name=f"task {number}", value=(task.begin, task.end), limit=(0.0, duration))
-    equations = bind(machine, given)
-    asked: Asked = {"weights": weights, "limits": limits, "symbols": ca.SX if _takes_scalars(equations) else ca.MX}
-    asked["start"], asked["end"] = _rest(equations, 0.0), _rest(equations, duration)
-    queue = CandidateQueue(
-        _StandingSolver(machine, given, duration, clearance_constraints, asked, start is not None), PlannerSettings()
-    )
-    seeds = [Candidate(joints) for joints in _postures(machine, given, start, limits, seed)]
-    for batch in [[one] for one in seeds] if search == "start" else [seeds]:
+    equations = bind(machine, all_tasks)
+    options: Asked = {"weights": weights, "limits": limits, "symbols": ca.SX if _takes_scalars(equations) else ca.MX}
+    options["start"], options["end"] = _rest(equations, 0.0), _rest(equations, duration)
+    solver = _StandingSolver(machine, all_tasks, duration, clearance_constraints, options, start is not None)
+    queue = CandidateQueue(solver, PlannerSettings())
+    seeds = [Candidate(joints) for joints in _start_configurations(machine, all_tasks, start, limits, seed)]
+    for batch in [[candidate] for candidate in seeds] if search == "start" else [seeds]:
         queue.run(batch)
         if queue.passed:
             break
@@ -86,20 +85,20 @@ def plan_to_stand(
 
 @dataclass
 class _StandingSolver(Solver):
-    """Advances candidates of a standing machine, all in one stage: `plan_standing` solves, refines and audits."""
+    """Solver of the candidates of a standing machine in one stage: `plan_standing` solves, refines and audits."""
 
     machine: Standing
     tasks: list[TipTask]
     duration: float
     clearance_constraints: ClearanceConstraints | None
-    asked: Asked
+    options: Asked
     start_given: bool
 
     def advance(self, candidate: Candidate) -> list[Candidate]:
-        """The candidate, audited or rejected.
+        """Return the candidate, audited or rejected.
 
         Raises:
-            ProblemError, SolveError: Of the start that was given.
+            ProblemError, SolveError: Errors of a given start.
         """
         try:
             start = candidate.start
@@ -109,7 +108,7 @@ class _StandingSolver(Solver):
                 start,
                 self.duration,
                 clearance_constraints=self.clearance_constraints,
-                **self.asked,
+                **self.options,
             )
         except (ProblemError, SolveError) as error:
             if self.start_given or isinstance(error.__cause__, KeyboardInterrupt):
@@ -118,7 +117,7 @@ class _StandingSolver(Solver):
         return [replace(candidate, stage=Stage.AUDITED, cost=solution.cost, solution=solution)]
 
     def plan(self, candidates: Sequence[Candidate]) -> Plan:
-        """The plan of which the first one is the motion."""
+        """Return the plan of the first candidate, with the others."""
         best = candidates[0].solution
         assert best is not None
         parts = (Part(0.0, self.duration, ""),)
@@ -126,7 +125,7 @@ class _StandingSolver(Solver):
 
 
 def _rest(equations: TaskEquations, time: float) -> Literal["rest", "free"]:
-    """Whether the joints rest at a time, as the tasks do."""
+    """Return "rest" if the tasks are at rest at a time, else "free"."""
     try:
         check_rest(equations, time)
     except ProblemError:
@@ -135,7 +134,7 @@ def _rest(equations: TaskEquations, time: float) -> Literal["rest", "free"]:
 
 
 def _takes_scalars(equations: TaskEquations) -> bool:
-    """Whether the tracks are expressions of SX symbols."""
+    """Return whether the tracks can be expressed by SX symbols."""
     try:
         equations.targets(ca.SX.sym("time"))
     except (RuntimeError, NotImplementedError):
@@ -143,13 +142,15 @@ def _takes_scalars(equations: TaskEquations) -> bool:
     return True
 
 
-def _postures(machine: Standing, tasks: list[TipTask], start: Any, limits: Limits | None, seed: int) -> list[Array]:
-    """Joints at the start, the best conditioned first."""
+def _start_configurations(
+    machine: Standing, tasks: list[TipTask], start: Any, limits: Limits | None, seed: int
+) -> list[Array]:
+    """Return the joints at the start, the best conditioned first."""
     if start is not None:
         return [start]
     poses = [task for task in tasks if task.is_pose]
     if not poses:
-        words = "start is missing: no task says by a pose where the tip is at the start; give plan(..., start=...)"
+        words = "start is missing: no task gives the tip's pose at the start; give plan(..., start=...)"
         raise ProblemError(words, name="start")
-    found = inverse_kinematics(machine, poses, seed=seed, limits=limits is None or limits.joints)
-    return [posture.joints for posture in found]
+    solutions = inverse_kinematics(machine, poses, seed=seed, limits=limits is None or limits.joints)
+    return [solution.joints for solution in solutions]

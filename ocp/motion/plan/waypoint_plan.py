@@ -1,4 +1,4 @@
-"""A way through waypoints: joints at each, their cost, and a bound of any way's cost."""
+"""Joint path through a sequence of tool poses."""
 
 from __future__ import annotations
 
@@ -15,51 +15,53 @@ __all__ = ["WaypointPlan"]
 
 @dataclass(frozen=True, eq=False)
 class WaypointPlan:
-    """A way through waypoints.
+    """Joint path through a sequence of tool poses, with a lower bound of its cost.
 
     Attributes:
-        machine: What moves.
-        joints: At the waypoints. Shape (N, n), rad or m.
-        cost: Of the way, without what lies in reconfigurations.
-        bound: Of the cost of any way through the waypoints, in no more pieces; 0 where none is known.
-        ways: Costs of all ways that were found, and why they are not the plan.
-        between: How near bodies come on straight lines of the joints from waypoint to waypoint, proven; its times are
-            numbers of waypoints. None where nothing was to be looked at. Reconfigurations are left out.
-        reconfigurations: Numbers of the waypoints from which the arm comes to the next one in another posture, by a way
-            that is not planned.
+        machine: The arm.
+        joints: Joints at the waypoints. Shape (N, n), rad or m.
+        cost: Cost of the path, without reconfigurations.
+        bound: Lower bound of the cost of any path with at most as many segments; 0 if unknown.
+        candidates: Costs of all paths found, and the reasons why they are not the plan.
+        clearance: Verified clearance on straight joint motions between waypoints, without reconfigurations; its times
+            are waypoint numbers. None without a collision check.
+        reconfigurations: Waypoints from which the arm moves to the next one in another configuration, by a motion that
+            is not planned.
     """
 
     machine: FixedBase
     joints: Array
     cost: float
     bound: float
-    ways: tuple[tuple[float, str], ...] = ()
-    between: Clearance | None = None
+    candidates: tuple[tuple[float, str], ...] = ()
+    clearance: Clearance | None = None
     reconfigurations: tuple[int, ...] = ()
 
     @property
     def steps(self) -> Array:
-        """Largest way of each joint from one waypoint to the next, but for reconfigurations. Shape (n,), rad or m."""
-        ways = np.delete(np.abs(np.diff(self.joints, axis=0)), list(self.reconfigurations), axis=0)
-        return np.asarray(ways.max(axis=0, initial=0.0))
+        """Largest step of each joint between waypoints, without reconfigurations. Shape (n,), rad or m."""
+        steps = np.delete(np.abs(np.diff(self.joints, axis=0)), list(self.reconfigurations), axis=0)
+        return np.asarray(steps.max(axis=0, initial=0.0))
 
     def __repr__(self) -> str:
         return (
-            f"<WaypointPlan through {len(self.joints)} waypoints: cost {self.cost:.6g}, at least {self.bound:.6g} any>"
+            f"<WaypointPlan through {len(self.joints)} waypoints: cost {self.cost:.6g}, lower bound {self.bound:.6g}>"
         )
 
     def __str__(self) -> str:
         lines = [
-            f"way through {len(self.joints)} waypoints of {', '.join(self.machine.robot.joint_names)}: "
-            f"cost {self.cost:.6g}, at least {self.bound:.6g} any"
+            f"path through {len(self.joints)} waypoints of {', '.join(self.machine.robot.joint_names)}: "
+            f"cost {self.cost:.6g}, lower bound {self.bound:.6g}"
         ]
         if self.reconfigurations:
             places = ", ".join(map(str, self.reconfigurations))
             count = f"{len(self.reconfigurations)} time{'s' if len(self.reconfigurations) > 1 else ''}"
             lines.append(f"  the arm reconfigures {count}, after waypoint {places}")
-        if self.between is not None and self.between.worst is not None:
-            near = self.between.worst
-            how = "too near" if near.missed else "proven clear, the nearest"
-            apart = f"{near.distance:.4g} m apart, {near.required:g} m asked, at waypoint {near.time:.4g}"
-            lines.append(f"  straight between waypoints {how}: {' and '.join(near.bodies)}, {apart}")
-        return "\n".join(lines + [f"  {cost:10.6g}  {why or 'the plan'}" for cost, why in self.ways])
+        if self.clearance is not None and self.clearance.worst is not None:
+            closest = self.clearance.worst
+            verdict = "too close" if closest.missed else "verified, closest"
+            distance = (
+                f"{closest.distance:.4g} m apart, {closest.required:g} m required, at waypoint {closest.time:.4g}"
+            )
+            lines.append(f"  straight lines between waypoints {verdict}: {' and '.join(closest.bodies)}, {distance}")
+        return "\n".join(lines + [f"  {cost:10.6g}  {why or 'the plan'}" for cost, why in self.candidates])

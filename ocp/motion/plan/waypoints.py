@@ -1,11 +1,11 @@
-"""The cheapest way of an arm through poses: all joints at many waypoints, and a bound of its cost.
+"""Lowest-cost joint path of an arm through a sequence of tool poses, and a lower bound of its cost.
 
-The cost is the weighted sum of the ways of all joints, or of the largest of them, which may be a time; between two
-waypoints no joint moves more than a step. Some of the waypoints are searched whole (see `search.search`); since a
-way through all of them is no shorter than through some, what bounds these bounds all. The best ways found are then
-drawn tight through all waypoints: dynamic programming over the postures beside the way, nearer and nearer, in which
-what is not allowed is dear, so that a way may come out of it as well. Where no way goes through all, one in the fewest
-pieces may be asked for (see `ocp.motion.search.reconfigurations`).
+The cost is the weighted sum of all joint displacements, or the largest of them, which may be a time. Between waypoints,
+no joint moves more than a given step. A global search covers some of the waypoints (see `search.search`). A path
+through all waypoints costs no less than one through some of them, so that the bound holds for all. The best paths found
+are then extended to all waypoints and shortened there by dynamic programming over neighbouring configurations.
+Violations are penalised, so that a path may leave them. If no path goes through all waypoints, one in the fewest
+segments may be requested (see `ocp.motion.search.reconfigurations`).
 """
 
 from __future__ import annotations
@@ -25,70 +25,73 @@ from ocp.errors import NOT_NUMBERS, ProblemError, SolveError, checked_choice, ch
 from ocp.motion.builders.clearance import clearance_of
 from ocp.motion.local.collisions import Collision, distances_along, find_collisions
 from ocp.motion.local.inverse_kinematics import LARGEST_SEED, Unreachable, idle_positions
-from ocp.motion.plan.planner import clear_of
+from ocp.motion.plan.planner import clearance_for
 from ocp.motion.plan.waypoint_plan import WaypointPlan
-from ocp.motion.search.charts import Instant, SelfMotions
-from ocp.motion.search.dead_end import GiveKind, dead_end
-from ocp.motion.search.joint_space import TOLERANCE, Held, JointSpace
-from ocp.motion.search.reconfigurations import Piece, Sections, SectionSettings, fewest_pieces, values_of
-from ocp.motion.search.search import FREE, Search, SearchSettings, checked_bound
-from ocp.motion.search.steps import Homogeneous, Largest, Length
-from ocp.motion.search.value import drawn_tight
+from ocp.motion.search.charts import SelfMotionManifolds, TimeSample
+from ocp.motion.search.dead_end import RelaxationKind, dead_end
+from ocp.motion.search.joint_space import TOLERANCE, JointSpace, TasksWithFixedJoints
+from ocp.motion.search.reconfigurations import SectionSearch, SectionSettings, Segment, fewest_segments, section_values
+from ocp.motion.search.search import MAX_FREE_DIRECTIONS, AtlasSearch, SearchSettings, checked_bound
+from ocp.motion.search.steps import Homogeneous, LargestMotion, PathLength
+from ocp.motion.search.value import shorten_path
 from ocp.motion.tasks.checks import checked_numbers
 from ocp.motion.tasks.equations import bind
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.tip_task import TipTask
 
-__all__ = ["Reconfigurations", "WayCost", "WaypointPlan", "plan_waypoints"]
+__all__ = ["PathCost", "Reconfigurations", "WaypointPlan", "plan_waypoints"]
 
-WayCost: TypeAlias = Literal["length", "largest", "time"]
+PathCost: TypeAlias = Literal["length", "largest", "time"]
 Reconfigurations: TypeAlias = Literal["forbidden", "counted"]
 
 WAYPOINT = "waypoint {:g}"
-POSTURES = "postures"
-"""What an error is about where there are more than memory is for."""
-NONE_FOUND = "no way through the waypoints keeps all limits"
+TOO_MANY_CHARTS = "configurations"
+"""Name in the error of a search that needs too many charts."""
+NONE_FOUND = "no path through the waypoints keeps all limits"
 
 
 @dataclass(frozen=True)
 class WaypointSettings:
-    """Which waypoints are searched, and how ways through all are drawn beside those that are found.
+    """Settings of the search through waypoints.
 
     Attributes:
-        stride: With at most one free direction one of so many waypoints is searched, then one of half as many, where
-            none of the ways found goes through all.
-        few: Steps between the waypoints that are searched first with two free directions, where short ways are seen.
-        steps: Steps between those that are searched next, about, where there are so many ...
-        strides: ... but one of so many at least, and one of so many where no way goes through all.
-        drawn: Ways of a search that are drawn tight, the cheapest first.
-        search, sections: Of the searches with at most one free direction, and with two.
-        widths: Between postures beside a way that is drawn tight, at first and at last, rad or m.
-        missed: By which poses may be, m and rad: what the last width leaves.
+        stride: With at most one free direction, every so many-th waypoint is searched, and half the stride is tried
+            next if no path found goes through all.
+        first_steps: With two free directions, number of steps of a first search, which finds short paths.
+        steps, strides: Approximate number of steps of the next two searches, and their least strides.
+        max_paths: Paths of a search that are shortened, the cheapest first.
+        widths: Initial and final spacing of the configurations of `shorten_path`, rad or m.
+        pose_tolerance: Largest pose error, m and rad, which the last width leaves.
+        search, sections: Settings of the searches with at most one free direction, and with two.
     """
 
     stride: int = 5
-    few: int = 6
+    first_steps: int = 6
     steps: int = 20
     strides: tuple[int, int] = (10, 5)
-    drawn: int = 2
+    max_paths: int = 2
     widths: tuple[float, float] = (0.06, 1e-6)
-    missed: float = 1e-6
+    pose_tolerance: float = 1e-6
     search: SearchSettings = field(default_factory=SearchSettings)
     sections: SectionSettings = field(default_factory=SectionSettings)
 
 
-class _Way(NamedTuple):
-    """Joints (N, n) through all waypoints beside what a search found, what is wrong with them, and where.
+class _Path(NamedTuple):
+    """Path through all waypoints.
 
     Attributes:
-        after: The waypoints after which the arm reconfigures.
+        cost: Its cost.
+        why: Why it is not valid; "" if it is.
+        wrong: Waypoints where it is not valid.
+        joints: Shape (N, n).
+        breaks: Waypoints after which the arm reconfigures.
     """
 
     cost: float
-    why: str
-    wrong: NDArray[np.intp]
+    failure: str
+    invalid: NDArray[np.intp]
     joints: Array
-    after: tuple[int, ...] = ()
+    breaks: tuple[int, ...] = ()
 
 
 @interruptible
@@ -97,7 +100,7 @@ def plan_waypoints(
     positions: ArrayLike,
     quaternions: ArrayLike,
     *,
-    cost: WayCost = "length",
+    cost: PathCost = "length",
     step: Any = np.inf,
     weights: Any = None,
     limits: Limits | None = None,
@@ -110,351 +113,365 @@ def plan_waypoints(
     reconfigurations: Reconfigurations = "forbidden",
     seed: int = 0,
 ) -> WaypointPlan:
-    """The cheapest way through poses of the tip that keeps limits and is clear at every waypoint.
+    """Plan the lowest-cost path through poses of the tip, within limits and collision-free at every waypoint.
 
     Args:
-        machine: On a fixed base, with as many joints as a pose has rows, or one or two more. With two more the ways are
-            looked for beside postures in which the joint nearest to the base has one of some values (see
+        machine: An arm on a fixed base whose number of joints exceeds the rows of a pose by at most two. If by two,
+            paths are searched on sections in which the joint nearest to the base has one of several values (see
             `ocp.motion.search.reconfigurations`), and no bound is known.
-        positions: Of the tip in the world. Shape (N, 3), m.
-        quaternions: Of the tip there, [w, x, y, z], of any length. Shape (N, 4).
-        cost: "length": the sum of the ways of all joints; "largest": the way of the joint that goes farthest, from
-            waypoint to waypoint; "time": s, no joint being faster than its velocity limit.
-        step: How far each joint may move from one waypoint to the next, rad or m; one number or one for each.
-        weights: Of the joints' ways in the cost, 0 for what does not count. Shape (n,); all 1 if None. Not for a time.
-        limits: Of the joints' positions, and of their velocities for the time; the robot's own if None.
-        obstacles, clearance, ignored, srdf, folders, missing: As of `plan`.
-        reconfigurations: "counted": where no way goes through all waypoints, one with the fewest reconfigurations, and
-            of these the cheapest. In a reconfiguration the arm leaves the way at a waypoint and comes back to the next
-            one in any posture; this costs nothing and is not planned. With one free direction at most.
-        seed: Of inverse kinematics.
+        positions: Positions of the tip in world. Shape (N, 3), m.
+        quaternions: Orientations of the tip, [w, x, y, z], of any length. Shape (N, 4).
+        cost: "length": sum of all joint displacements; "largest": displacement of the joint that moves farthest, from
+            waypoint to waypoint; "time": s, by the velocity limits of the joints.
+        step: Largest displacement of each joint between waypoints, rad or m; one number or one per joint.
+        weights: Weights of the joint displacements in the cost, 0 to ignore a joint. Shape (n,); all 1 if None. Not for
+            a time.
+        limits: Limits of the joint positions, and of the velocities for a time; the robot's own if None.
+        obstacles, clearance, ignored, srdf, folders, missing: As in `plan`.
+        reconfigurations: "forbidden", or "counted": if no path goes through all waypoints, find the fewest
+            reconfigurations, and among these the least cost. In a reconfiguration, the arm leaves the path at a
+            waypoint and returns at the next one in any configuration; it costs nothing and is not planned. With at most
+            one free direction.
+        seed: Seed of inverse kinematics.
 
     Raises:
-        ProblemError: What is asked does not fit the machine; Unreachable, which is one, names the waypoint as time.
-        DeadEnd: No way goes through all waypoints, in one piece where reconfigurations are forbidden: from which on
-            none does, what stops it, and how far the poses or the clearance would have to give way.
-        SolveError: None was found, though some go through a part of them.
+        ProblemError: The request does not fit the machine. Its subclass Unreachable names the waypoint as time.
+        DeadEnd: No path goes through all waypoints (in one segment, if reconfigurations are forbidden): where paths
+            end, what obstructs them, and by how much the poses or the clearance would have to be relaxed.
+        SolveError: No path was found, though some pass a part of the waypoints.
     """
     checked_instance("machine", machine, FixedBase)
     checked_count("seed", seed, 0, LARGEST_SEED)
-    places, turns = _poses(positions, quaternions)
+    positions, rotations = _poses(positions, quaternions)
     n = machine.joint_size
-    told = Limits() if limits is None else checked_instance("limits", limits, Limits)
-    heavy = np.ones(n) if weights is None else checked_numbers(weights, n, "weights", "one for each joint")
-    if not ((heavy >= 0).all() and heavy.any()):
-        raise ProblemError(f"weights {heavy.tolist()} must be positive, or 0", name="weights", value=heavy, limit=0.0)
-    checked_choice("cost", cost, get_args(WayCost))
+    checked_limits = Limits() if limits is None else checked_instance("limits", limits, Limits)
+    joint_weights = np.ones(n) if weights is None else checked_numbers(weights, n, "weights", "one for each joint")
+    if not ((joint_weights >= 0).all() and joint_weights.any()):
+        words = f"weights {joint_weights.tolist()} must be non-negative and not all 0"
+        raise ProblemError(words, name="weights", value=joint_weights, limit=0.0)
+    checked_choice("cost", cost, get_args(PathCost))
     checked_choice("reconfigurations", reconfigurations, get_args(Reconfigurations))
-    for what in ("velocity", "acceleration", "jerk", "torque", "power"):
-        if getattr(told, what) is not None and not (what == "velocity" and cost == "time"):
-            words = f"limits: a way through waypoints has no time, so no {what}; leave it out, or give a step"
-            raise ProblemError(words, name=what, value=getattr(told, what))
+    for quantity in ("velocity", "acceleration", "jerk", "torque", "power"):
+        if getattr(checked_limits, quantity) is not None and not (quantity == "velocity" and cost == "time"):
+            words = f"limits: a path through waypoints has no time, hence no {quantity}; leave it out, or give a step"
+            raise ProblemError(words, name=quantity, value=getattr(checked_limits, quantity))
     if cost == "time":
         if weights is not None:
-            raise ProblemError("the time has no weights; leave them out", name="weights", value=weights)
-        heavy = 1 / told.bounds(machine, ("velocity",)).velocity
-        if not heavy.any():
-            raise ProblemError("no joint has a velocity limit, by which the time is told", name="velocity")
-    most = _step(step, n)
-    clearance_constraints = clear_of(machine, obstacles, clearance, ignored, srdf, folders, missing, told)
-    around = None if clearance_constraints is None else clearance_constraints.scene
-    way = _Ways(machine, places, turns, most, (Length if cost == "length" else Largest)(heavy), told, around, int(seed))
-    return way.plan(reconfigurations == "counted")
+            raise ProblemError("cost='time' takes no weights; leave them out", name="weights", value=weights)
+        joint_weights = 1 / checked_limits.bounds(machine, ("velocity",)).velocity
+        if not joint_weights.any():
+            raise ProblemError("cost='time' needs a joint with a velocity limit", name="velocity")
+    max_step = _step(step, n)
+    collision: dict[str, Any] = {"obstacles": obstacles, "clearance": clearance, "ignored": ignored}
+    collision |= {"srdf": srdf, "folders": folders, "missing": missing}
+    constraints = clearance_for(machine, checked_limits, **collision)
+    scene = None if constraints is None else constraints.scene
+    planner = _WaypointPlanner(
+        machine,
+        positions,
+        rotations,
+        max_step,
+        (PathLength if cost == "length" else LargestMotion)(joint_weights),
+        checked_limits,
+        scene,
+        int(seed),
+    )
+    return planner.plan(reconfigurations == "counted")
 
 
-class _Ways:
-    """The ways through waypoints, arguments as of `plan_waypoints`, checked."""
+class _WaypointPlanner:
+    """Planner of a path through waypoints, with the checked arguments of `plan_waypoints`."""
 
     def __init__(
         self,
         machine: FixedBase,
-        places: Array,
-        turns: Array,
+        positions: Array,
+        rotations: Array,
         step: Array,
         cost: Homogeneous,
         limits: Limits,
-        around: CollisionScene | None,
+        scene: CollisionScene | None,
         seed: int,
         settings: WaypointSettings = WaypointSettings(),
     ) -> None:
         self.settings = settings
-        self.machine, self.places, self.turns, self.step, self.around = machine, places, turns, step, around
-        self.seed, self.kept, self.cost = seed, limits.joints, cost
+        self.machine, self.positions, self.rotations, self.step, self.scene = machine, positions, rotations, step, scene
+        self.seed, self.joint_limits, self.cost = seed, limits.joints, cost
         bounds = limits.bounds(machine)
         self.lower, self.upper = bounds.lower, bounds.upper
         self.space = JointSpace(machine, bounds.lower, bounds.upper, np.ones(machine.joint_size))
-        free = bind(machine, self._task(0))
-        equations = Held(machine, free.bound, tuple(np.flatnonzero(free.idle).tolist()))
-        at = idle_positions(self.lower, self.upper)
-        targets = np.zeros((len(places), 18))
-        targets[:, :3] = places
-        targets[:, 6:15] = turns.transpose(0, 2, 1).reshape(-1, 9)
-        targets = np.column_stack([targets, np.tile(at[free.idle], (len(places), 1))])
-        self.sets = SelfMotions(self.space, equations, targets)
-        self._known = dict[int, Array]()
-        if not 0 <= self.sets.size <= FREE:
-            words = f"{machine.robot.name}: {int((~free.idle).sum())} joints for the {free.size} rows of a pose"
-            words += f"; hold joints until at most {FREE} are left over"
-            raise ProblemError(words, name="machine", value=self.sets.size, limit=FREE)
-        # with two free directions it is held that is nearest to the base: it moves all others
+        pose = bind(machine, self._task(0))
+        equations = TasksWithFixedJoints(machine, pose.bound, tuple(np.flatnonzero(pose.idle).tolist()))
+        stationary = idle_positions(self.lower, self.upper)
+        targets = np.zeros((len(positions), 18))
+        targets[:, :3] = positions
+        targets[:, 6:15] = rotations.transpose(0, 2, 1).reshape(-1, 9)
+        targets = np.column_stack([targets, np.tile(stationary[pose.idle], (len(positions), 1))])
+        self.manifolds = SelfMotionManifolds(self.space, equations, targets)
+        self._seed_cache = dict[int, Array]()
+        if not 0 <= self.manifolds.size <= MAX_FREE_DIRECTIONS:
+            words = f"{machine.robot.name}: {int((~pose.idle).sum())} joints for the {pose.size} rows of a pose"
+            words += f"; lock joints until at most {MAX_FREE_DIRECTIONS} degrees of freedom are left"
+            raise ProblemError(words, name="machine", value=self.manifolds.size, limit=MAX_FREE_DIRECTIONS)
+        # with two free directions, sections fix the joint nearest to the base, which moves all others
         robot = machine.robot
         names = [joint.name for joint in robot.path_to(robot.tip_link) if joint.name in robot.joint_names]
-        self._held = robot.joint_names.index(names[0]) if self.sets.size > 1 else None
+        self._section_joint = robot.joint_names.index(names[0]) if self.manifolds.size > 1 else None
 
     def plan(self, counted: bool) -> WaypointPlan:
-        """The cheapest way that goes on through all waypoints; in the fewest pieces where that is asked for.
+        """Return the lowest-cost path through all waypoints, in the fewest segments if `counted`.
 
-        Some waypoints are searched, what is found is drawn tight through all, and more are searched where that goes
-        wrong: those where it does, and closer ones.
+        Some waypoints are searched, and the paths found are extended to all waypoints. If that fails, the waypoints
+        where it fails, or more closely spaced ones, are searched as well.
         """
-        if counted and self.sets.size > 1:
-            words = f"reconfigurations are counted with one free direction at most, not with {self.sets.size}"
-            raise ProblemError(words, name="reconfigurations", value=self.sets.size, limit=1)
-        strides, looks = self._strides()
-        search = self._begun(strides.pop(0))
+        if counted and self.manifolds.size > 1:
+            words = f"reconfigurations='counted' needs at most one free direction, not {self.manifolds.size}"
+            raise ProblemError(words, name="reconfigurations", value=self.manifolds.size, limit=1)
+        strides, searches_left = self._strides()
+        search = self._search_with_stride(strides.pop(0))
         assert search is not None
-        ways, bound, cut = list[_Way](), 0.0, False
+        paths, bound, segmented = list[_Path](), 0.0, False
         while True:
-            chains, least = self._chains(search, cut)
-            if np.isfinite(least):
-                bound = least if cut else max(bound, least)
-                drawn = [self._drawn(search, chain) for chain in chains[: self.settings.drawn]]
-                ways = drawn if cut else ways + drawn
-                looks -= 1
-                if any(not way.why for way in ways) and (looks <= 0 or not strides):
-                    return self._made(ways, bound)
-                closer = self._closer(search, ways[-1]) if chains else None
-                while closer is None and strides and not cut:
-                    closer = self._begun(strides.pop(0), search)
-                if closer is not None:
-                    search = closer
+            split_at_reversals, lower_bound = self._segmented_paths(search, segmented)
+            if np.isfinite(lower_bound):
+                bound = lower_bound if segmented else max(bound, lower_bound)
+                extended = [self._extend(search, chain) for chain in split_at_reversals[: self.settings.max_paths]]
+                paths = extended if segmented else paths + extended
+                searches_left -= 1
+                if any(not path.failure for path in paths) and (searches_left <= 0 or not strides):
+                    return self._best_plan(paths, bound)
+                next_search = self._search_at_failures(search, paths[-1]) if split_at_reversals else None
+                while next_search is None and strides and not segmented:
+                    next_search = self._search_with_stride(strides.pop(0), search)
+                if next_search is not None:
+                    search = next_search
                     continue
-            if cut or not counted:
+            if segmented or not counted:
                 break
-            cut = True
-        if not np.isfinite(least):
-            raise self._ended(search)
-        if not chains and all(way.why for way in ways):
-            ways += self._rescued(search)
-        return self._made(ways, bound)
+            segmented = True
+        if not np.isfinite(lower_bound):
+            raise self._dead_end_error(search)
+        if not split_at_reversals and all(path.failure for path in paths):
+            paths += self._negligibly_relaxed_paths(search)
+        return self._best_plan(paths, bound)
 
-    def _chains(self, search: Search, cut: bool) -> tuple[list[list[Piece]], float]:
-        """Motions through the waypoints that are searched, each in its pieces, and what none costs less than."""
-        if cut:
-            found = fewest_pieces(search)
-            return ([], np.inf) if found is None else ([found[0]], found[1])
-        paths, bound = search.ways()
-        return [[Piece(0, len(path) - 1, path, search.steps(path), bound)] for path in paths], bound
+    def _segmented_paths(self, search: AtlasSearch, segmented: bool) -> tuple[list[list[Segment]], float]:
+        """Return paths through the searched waypoints, each as segments, and a lower bound of their cost."""
+        if segmented:
+            result = fewest_segments(search)
+            return ([], np.inf) if result is None else ([result[0]], result[1])
+        paths, bound = search.paths()
+        return [[Segment(0, len(path) - 1, path, search.path_cost(path), bound)] for path in paths], bound
 
-    def _made(self, ways: list[_Way], bound: float) -> WaypointPlan:
-        """The plan of the cheapest way that keeps all limits.
+    def _best_plan(self, paths: list[_Path], bound: float) -> WaypointPlan:
+        """Return the plan of the lowest-cost valid path.
 
         Raises:
-            SolveError: None does.
+            SolveError: No path is valid.
         """
-        ways = sorted(ways, key=lambda way: (bool(way.why), way.cost))
-        if not ways or ways[0].why:
-            reasons = "; ".join(dict.fromkeys(way.why for way in ways))
+        paths = sorted(paths, key=lambda path: (bool(path.failure), path.cost))
+        if not paths or paths[0].failure:
+            reasons = "; ".join(dict.fromkeys(path.failure for path in paths))
             raise SolveError(f"{NONE_FOUND}{reasons and ': '}{reasons}", name="waypoints")
-        best = ways[0]
-        listed = tuple((way.cost, way.why or ("" if way is best else "dearer")) for way in ways)
-        least, between = checked_bound(bound, best.cost) or 0.0, self._between(best.joints, best.after)
-        return WaypointPlan(self.machine, best.joints, best.cost, least, listed, between, best.after)
+        best = paths[0]
+        candidates = tuple((path.cost, path.failure or ("" if path is best else "costlier")) for path in paths)
+        lower_bound = checked_bound(bound, best.cost) or 0.0
+        clearance = self._verify_clearance(best.joints, best.breaks)
+        return WaypointPlan(self.machine, best.joints, best.cost, lower_bound, candidates, clearance, best.breaks)
 
-    def _between(self, joints: Array, breaks: tuple[int, ...]) -> Clearance | None:
-        """What is proven of straight lines from waypoint to waypoint, one of each a second, but for breaks."""
-        if self.around is None:
+    def _verify_clearance(self, joints: Array, breaks: tuple[int, ...]) -> Clearance | None:
+        """Verify the clearance of straight lines between waypoints, one second each, without the breaks."""
+        if self.scene is None:
             return None
         numbers, last = np.arange(len(joints), dtype=float), len(joints) - 1.0
         rates = np.abs(np.diff(joints, axis=0))
         rates[list(breaks)] = 0.0
 
-        def along(at: Array) -> Array:
-            place = at * last
-            held = np.isin(np.floor(place), breaks)  # until the next waypoint, where the arm is back
-            place = np.where(held, np.floor(place), place)
-            return np.stack([np.interp(place, numbers, column) for column in joints.T], axis=1)
+        def path_tracks(fractions: Array) -> Array:
+            places = fractions * last
+            waiting = np.isin(np.floor(places), breaks)  # a break lasts until the next waypoint
+            places = np.where(waiting, np.floor(places), places)
+            return np.stack([np.interp(places, numbers, column) for column in joints.T], axis=1)
 
-        return clearance_of(self.around, along, numbers / last, last, rates, np.zeros_like(rates), False)
+        return clearance_of(self.scene, path_tracks, numbers / last, last, rates, np.zeros_like(rates), False)
 
-    # ---- which waypoints are searched ----------------------------------------------------------------------------
+    # ---- searched waypoints ------------------------------------------------------------------------------------------
 
     def _strides(self) -> tuple[list[int], int]:
-        """One of how many waypoints is searched, one after the other, and how many of these searches always."""
-        settings, count = self.settings, len(self.places)
-        if self._held is None:
+        """Return the strides of the searches in order, and how many of the searches are always done."""
+        settings, count = self.settings, len(self.positions)
+        if self._section_joint is None:
             halves = int(np.log2(settings.stride)) + 1
             return [settings.stride // 2**k for k in range(halves)], 1
-        # steps from one curve to the next are no shorter than between charts
-        least = min(4 * settings.sections.radii[1] / np.delete(self.step, self._held).min(), count)
-        some = (max(min(each, count // settings.steps), int(np.ceil(least)), 1) for each in settings.strides)
-        return [-(-count // settings.few), *some], 2
+        # a step must be able to lead from one section to the next
+        min_stride = min(4 * settings.sections.radii[1] / np.delete(self.step, self._section_joint).min(), count)
+        strides = (max(min(each, count // settings.steps), int(np.ceil(min_stride)), 1) for each in settings.strides)
+        return [-(-count // settings.first_steps), *strides], 2
 
-    def _begun(self, stride: int, known: Search | None = None) -> Search | None:
-        """A search of one of so many waypoints, of fewer where that were more postures than memory is for.
+    def _search_with_stride(self, stride: int, known: AtlasSearch | None = None) -> AtlasSearch | None:
+        """Return a search of every so many-th waypoint; the stride is doubled while the atlas needs too many charts.
 
-        None where these are no more than those of a search that is known.
+        None if it has no more waypoints than a known search.
         """
-        last, before = len(self.places) - 1, 1 if known is None else len(known.times)
+        last, known_count = len(self.positions) - 1, 1 if known is None else len(known.times)
         while True:
             chosen = np.unique(np.linspace(0, last, -(-last // stride) + 1).round().astype(int))
-            if known is not None and self._held is None:
+            if known is not None and self._section_joint is None:
                 chosen = np.union1d(chosen, known.times.astype(int))
-            if len(chosen) <= before:
+            if len(chosen) <= known_count:
                 return None
             try:
                 return self._search(chosen, known is not None)
             except ProblemError as error:
-                if error.name != POSTURES or len(chosen) == 2:
+                if error.name != TOO_MANY_CHARTS or len(chosen) == 2:
                     raise
             stride *= 2
 
-    def _closer(self, search: Search, way: _Way | None) -> Search | None:
-        """A search of the waypoints where a way is wrong as well; None where that are no more, or too many."""
+    def _search_at_failures(self, search: AtlasSearch, path: _Path | None) -> AtlasSearch | None:
+        """Return a search that includes the waypoints where a path is invalid; None if there are none or too many."""
         chosen = search.times.astype(int)
-        if way is None or self._held is not None or np.isin(way.wrong, chosen).all():
+        if path is None or self._section_joint is not None or np.isin(path.invalid, chosen).all():
             return None
         try:
-            return self._search(np.union1d(chosen, way.wrong))
+            return self._search(np.union1d(chosen, path.invalid))
         except ProblemError as error:
-            if error.name != POSTURES:
+            if error.name != TOO_MANY_CHARTS:
                 raise
             return None
 
-    def _search(self, chosen: NDArray[np.intp], coarse: bool = False) -> Search:
-        """Of all postures at some waypoints; with two free directions of those on some curves."""
-        sets, far = SelfMotions(self.space, self.sets.equations, self.sets.targets[chosen]), np.diff(chosen)[:, None]
-        told: dict[str, Any] = {"seeds": lambda k: self._seeds(int(chosen[k])), "scene": self.around}
-        instants = [Instant(sets, k) for k in range(len(chosen))]
-        held = self._held
-        given = self.space, instants, chosen.astype(float), self.cost, far * self.step
-        if held is None:
-            return Search(*given, **told, settings=self.settings.search)
-        slides = self.machine.robot.moving_joints[held].kind == "prismatic"
-        own, limit = self.settings.sections, float((far * self.step)[:, held].min())
-        curves: dict[str, Any] = {"radius": own.radii[coarse], "charts": own.charts}
-        curves["values"] = values_of(slides, self.lower[held], self.upper[held], limit, own)
-        return Sections(*given, **told, **curves, joint=held)
+    def _search(self, chosen: NDArray[np.intp], coarse: bool = False) -> AtlasSearch:
+        """Return the search of some waypoints: all configurations, or with two free directions those on sections."""
+        manifolds = SelfMotionManifolds(self.space, self.manifolds.equations, self.manifolds.targets[chosen])
+        distances = np.diff(chosen)[:, None]
+        options: dict[str, Any] = {"seeds": lambda k: self._seeds(int(chosen[k])), "scene": self.scene}
+        samples = [TimeSample(manifolds, k) for k in range(len(chosen))]
+        joint = self._section_joint
+        arguments = self.space, samples, chosen.astype(float), self.cost, distances * self.step
+        if joint is None:
+            return AtlasSearch(*arguments, **options, settings=self.settings.search)
+        prismatic = self.machine.robot.moving_joints[joint].kind == "prismatic"
+        section_settings, limit = self.settings.sections, float((distances * self.step)[:, joint].min())
+        sections: dict[str, Any] = {"radius": section_settings.radii[coarse], "charts": section_settings.charts}
+        sections["values"] = section_values(prismatic, self.lower[joint], self.upper[joint], limit, section_settings)
+        return SectionSearch(*arguments, **options, **sections, joint=joint)
 
-    def _ended(self, search: Search) -> SolveError:
-        """Where no way goes on, at first seen from the waypoints that were searched, then from each of those there."""
-        end, chosen = dead_end(search, WAYPOINT), search.times.astype(int)
-        if end is None:
-            return SolveError("no way goes through the waypoints", name="waypoints")
-        assert end.time is not None
-        closer = np.union1d(chosen, np.arange(int(end.time), int(end.until) + 1))
-        return (None if len(closer) == len(chosen) else dead_end(self._search(closer), WAYPOINT)) or end
+    def _dead_end_error(self, search: AtlasSearch) -> SolveError:
+        """Return the error about where paths end, refined to the waypoints between searched ones."""
+        error, chosen = dead_end(search, WAYPOINT), search.times.astype(int)
+        if error is None:
+            return SolveError("no path goes through the waypoints", name="waypoints")
+        assert error.time is not None
+        refined = np.union1d(chosen, np.arange(int(error.time), int(error.until) + 1))
+        return (None if len(refined) == len(chosen) else dead_end(self._search(refined), WAYPOINT)) or error
 
-    def _rescued(self, search: Search) -> list[_Way]:
-        """What comes through though no way was found: a motion that gives way, by nothing that counts.
+    def _negligibly_relaxed_paths(self, search: AtlasSearch) -> list[_Path]:
+        """Return paths that a diagnosis finds with a negligible pose relaxation, though the search found none.
 
         Raises:
-            SolveError: None does.
+            SolveError: There is none.
         """
-        empty = [float(time) for time, charts in zip(search.times, search.covered, strict=True) if not len(charts)]
-        if empty and self._held is not None:
-            name = self.machine.robot.joint_names[self._held]
-            words = f"{NONE_FOUND}: none was found at waypoint {empty[0]:g} with {name!r} where it was held"
-            raise SolveError(words, name=name, time=empty[0])
-        end = dead_end(search, WAYPOINT, proven=False)
-        if end is None:
+        uncovered = [float(time) for time, charts in zip(search.times, search.atlas, strict=True) if not len(charts)]
+        if uncovered and self._section_joint is not None:
+            name = self.machine.robot.joint_names[self._section_joint]
+            words = f"{NONE_FOUND}: no configuration was found at waypoint {uncovered[0]:g} on the sections of {name!r}"
+            raise SolveError(words, name=name, time=uncovered[0])
+        error = dead_end(search, WAYPOINT, proven=False)
+        if error is None:
             return []
-        of_pose = [give for give in end.gives if give.kind is not GiveKind.CLEARANCE]
-        paths = [give.joints for give in of_pose if give.amount <= self.settings.missed]
+        of_pose = [each for each in error.relaxations if each.kind is not RelaxationKind.CLEARANCE]
+        paths = [each.joints for each in of_pose if each.amount <= self.settings.pose_tolerance]
         if not paths:
-            raise end
-        return [self._drawn(search, [Piece(0, len(path) - 1, path, search.steps(path), 0.0)]) for path in paths]
+            raise error
+        return [self._extend(search, [Segment(0, len(path) - 1, path, search.path_cost(path), 0.0)]) for path in paths]
 
-    # ---- ways through all waypoints ------------------------------------------------------------------------------
+    # ---- paths through all waypoints ---------------------------------------------------------------------------------
 
-    def _drawn(self, search: Search, chain: list[Piece]) -> _Way:
-        """A way through all waypoints beside pieces through some of them.
+    def _extend(self, search: AtlasSearch, chain: list[Segment]) -> _Path:
+        """Return a path through all waypoints near segments through some of them.
 
-        It is wrong where it reconfigures between two that are no neighbours, whatever comes of the rest.
+        It is invalid if it reconfigures between two waypoints that are not consecutive.
         """
         chosen = search.times.astype(int)
-        breaks = [(int(chosen[piece.last]), int(chosen[piece.last + 1])) for piece in chain[:-1]]
-        joints, after = self._through(chosen, chain), tuple(one for one, _ in breaks)
-        if wide := [np.arange(*pair) for pair in breaks if pair[1] > pair[0] + 1]:
-            return _Way(np.inf, "it reconfigures between waypoints", np.concatenate(wide), joints, after)
-        parts = []
-        for piece in chain:
-            rows = slice(int(chosen[piece.first]), int(chosen[piece.last]) + 1)
-            instants = [Instant(self.sets, k) for k in range(len(self.places))[rows]]
-            far, bounds = np.repeat(self.step[None], len(instants) - 1, axis=0), (self.lower, self.upper)
-            times = np.arange(len(self.places), dtype=float)[rows]
-            told = self.cost, times, far, bounds, self.around, self.settings.widths
-            parts.append(drawn_tight(joints[rows], instants, *told))
-        joints = np.concatenate(parts)
-        steps = np.delete(self.cost.of(np.diff(joints, axis=0), 1.0), list(after))
-        return _Way(float(steps.sum()), *self._wrong(joints, after), joints, after)
+        breaks = [(int(chosen[segment.last]), int(chosen[segment.last + 1])) for segment in chain[:-1]]
+        joints, break_numbers = self._interpolate(chosen, chain), tuple(first for first, _ in breaks)
+        if distant := [np.arange(*pair) for pair in breaks if pair[1] > pair[0] + 1]:
+            failure = "it reconfigures between waypoints that were not searched"
+            return _Path(np.inf, failure, np.concatenate(distant), joints, break_numbers)
+        paths = []
+        for segment in chain:
+            rows = slice(int(chosen[segment.first]), int(chosen[segment.last]) + 1)
+            samples = [TimeSample(self.manifolds, k) for k in range(len(self.positions))[rows]]
+            limits, bounds = np.repeat(self.step[None], len(samples) - 1, axis=0), (self.lower, self.upper)
+            times = np.arange(len(self.positions), dtype=float)[rows]
+            options = self.cost, times, limits, bounds, self.scene, self.settings.widths
+            paths.append(shorten_path(joints[rows], samples, *options))
+        joints = np.concatenate(paths)
+        steps = np.delete(self.cost.evaluate(np.diff(joints, axis=0), 1.0), list(break_numbers))
+        return _Path(float(steps.sum()), *self._check_path(joints, break_numbers), joints, break_numbers)
 
     def _task(self, number: int) -> TipTask:
-        return TipTask(position=self.places[number], orientation=self.turns[number])
+        return TipTask(position=self.positions[number], orientation=self.rotations[number])
 
     def _seeds(self, number: int) -> Array:
-        """Postures at a waypoint, looked for once."""
-        if number not in self._known:
-            self._known[number] = self._sought(number)
-        return self._known[number]
+        """Return cached configurations at a waypoint."""
+        if number not in self._seed_cache:
+            try:
+                seeds = self.manifolds.seeds(number, self.joint_limits, self.seed + number)
+            except Unreachable as error:
+                words = f"waypoint {number} at {self.positions[number].round(6).tolist()} m: {error}"
+                raise Unreachable(words, **{**vars(error), "time": float(number)}) from error
+            self._seed_cache[number] = seeds
+        return self._seed_cache[number]
 
-    def _sought(self, number: int) -> Array:
-        try:
-            return self.sets.seeds(number, self.kept, self.seed + number)
-        except Unreachable as error:
-            words = f"waypoint {number} at {self.places[number].round(6).tolist()} m: {error}"
-            raise Unreachable(words, **{**vars(error), "time": float(number)}) from error
-
-    def _through(self, chosen: NDArray[np.intp], chain: list[Piece]) -> Array:
-        """Joints at all waypoints, (N, n), beside pieces through some of them, each turned within the limits."""
-        numbers = np.arange(len(self.places))
-        path = np.concatenate([piece.joints for piece in chain])
+    def _interpolate(self, chosen: NDArray[np.intp], chain: list[Segment]) -> Array:
+        """Return joints at all waypoints, (N, n), near segments through some, shifted by full turns into the limits."""
+        numbers = np.arange(len(self.positions))
+        path = np.concatenate([segment.joints for segment in chain])
         joints = np.column_stack([np.interp(numbers, chosen, column) for column in path.T])
-        on, good = self.sets.corrected(numbers, joints)
-        joints[good] = on[good]
-        for piece in chain:
-            rows = slice(int(chosen[piece.first]), int(chosen[piece.last]) + 1)
-            joints[rows] = self.space.turned(joints[rows], self.lower, self.upper)
+        projected, converged = self.manifolds.project(numbers, joints)
+        joints[converged] = projected[converged]
+        for segment in chain:
+            rows = slice(int(chosen[segment.first]), int(chosen[segment.last]) + 1)
+            joints[rows] = self.space.shift_turns(joints[rows], self.lower, self.upper)
         return joints
 
-    def _wrong(self, joints: Array, breaks: tuple[int, ...]) -> tuple[str, NDArray[np.intp]]:
-        """What limit a way does not keep, "" if none, and the waypoints where it keeps one not, or is off."""
-        names, numbers = self.machine.robot.joint_names, np.arange(len(joints))
-        error = np.abs(self.sets.linearised(numbers, joints)[0]).max(axis=1)
-        over = np.maximum(joints - self.upper, self.lower - joints)
+    def _check_path(self, joints: Array, breaks: tuple[int, ...]) -> tuple[str, NDArray[np.intp]]:
+        """Return which limit a path violates, "" if none, and the waypoints where it violates one."""
+        names, indices = self.machine.robot.joint_names, np.arange(len(joints))
+        errors = np.abs(self.manifolds.linearize(indices, joints)[0]).max(axis=1)
+        excess = np.maximum(joints - self.upper, self.lower - joints)
         steps = np.abs(np.diff(joints, axis=0)) - self.step
         steps[list(breaks)] = -self.step
-        far = (steps > TOLERANCE).any(axis=1)
-        wrong = (error > self.settings.missed) | (over > TOLERANCE).any(axis=1)
-        wrong[:-1] |= far
-        wrong[1:] |= far
-        near: NDArray[np.bool_] = np.zeros(len(joints), dtype=bool)
-        if self.around is not None:
-            times, clearance = numbers.astype(float), self.around.clearance
-            near = np.asarray(
-                (distances_along(self.around, np.zeros(0), joints, times, clearance) < clearance).any(axis=1)
-            )
+        too_far = (steps > TOLERANCE).any(axis=1)
+        invalid = (errors > self.settings.pose_tolerance) | (excess > TOLERANCE).any(axis=1)
+        invalid[:-1] |= too_far
+        invalid[1:] |= too_far
+        colliding: NDArray[np.bool_] = np.zeros(len(joints), dtype=bool)
+        if self.scene is not None:
+            times, clearance = indices.astype(float), self.scene.clearance
+            distances = distances_along(self.scene, np.zeros(0), joints, times, clearance)
+            colliding = np.asarray((distances < clearance).any(axis=1))
         words = ""
-        if error.max() > self.settings.missed:
-            words = f"waypoint {int(error.argmax())} is missed by {error.max():.2g} m or rad"
-        elif over.max() > TOLERANCE:
-            k, j = np.unravel_index(int(over.argmax()), over.shape)
-            words = f"joint {names[j]!r} passes its limit by {over.max():.2g} at waypoint {k}"
-        elif far.any():
+        if errors.max() > self.settings.pose_tolerance:
+            words = f"waypoint {int(errors.argmax())} is missed by {errors.max():.2g} m or rad"
+        elif excess.max() > TOLERANCE:
+            k, j = np.unravel_index(int(excess.argmax()), excess.shape)
+            words = f"joint {names[j]!r} passes its limit by {excess.max():.2g} at waypoint {k}"
+        elif too_far.any():
             k, j = np.unravel_index(int(steps.argmax()), steps.shape)
             words = f"joint {names[j]!r} moves {steps.max() + self.step[j]:.3g} from waypoint {k} to the next"
-        elif self.around is not None and near.any():
-            worst: Collision = find_collisions(self.around, np.zeros(0), joints, numbers.astype(float))[0]
-            words = f"touches: {worst.bodies[0]} and {worst.bodies[1]} at waypoint {worst.time:g}"
-        return words, np.flatnonzero(wrong | near)
+        elif self.scene is not None and colliding.any():
+            closest: Collision = find_collisions(self.scene, np.zeros(0), joints, indices.astype(float))[0]
+            words = f"collision: {closest.bodies[0]} and {closest.bodies[1]} at waypoint {closest.time:g}"
+        return words, np.flatnonzero(invalid | colliding)
 
 
 def _step(step: Any, size: int) -> Array:
-    """How far each joint may move, (n,)."""
+    """Return the largest step of each joint, (n,)."""
     try:
-        given = floats(step)
-        if given.shape in ((), (1,), (size,)) and (given > 0).all():
-            return np.array(np.broadcast_to(given, (size,)))
+        steps = floats(step)
+        if steps.shape in ((), (1,), (size,)) and (steps > 0).all():
+            return np.array(np.broadcast_to(steps, (size,)))
     except NOT_NUMBERS:
         pass
     words = f"step must be positive, one number or one for each of {size} joints, not {step!r}"
@@ -462,22 +479,22 @@ def _step(step: Any, size: int) -> Array:
 
 
 def _poses(positions: ArrayLike, quaternions: ArrayLike) -> tuple[Array, Array]:
-    """Places (N, 3) and rotations (N, 3, 3)."""
-    found = []
-    for what, values, size in (("positions", positions, 3), ("quaternions", quaternions, 4)):
-        words = f"{what} must be finite numbers of shape (N, {size}) with N > 1"
+    """Return checked positions (N, 3) and rotations (N, 3, 3)."""
+    arrays = []
+    for name, values, size in (("positions", positions, 3), ("quaternions", quaternions, 4)):
+        words = f"{name} must be finite numbers of shape (N, {size}) with N > 1"
         try:
             array = floats(values)
         except NOT_NUMBERS as error:
-            raise ProblemError(words, name=what, value=values, limit=size) from error
+            raise ProblemError(words, name=name, value=values, limit=size) from error
         if array.ndim != 2 or array.shape[1] != size or len(array) < 2 or not np.isfinite(array).all():
-            raise ProblemError(f"{words}, not {array.shape}", name=what, value=array.shape, limit=size)
-        found.append(array)
-    places, turns = found
-    if len(places) != len(turns):
-        words = f"there are {len(places)} positions and {len(turns)} quaternions"
-        raise ProblemError(words, name="quaternions", value=len(turns), limit=len(places))
-    sizes = np.linalg.norm(turns, axis=1)
-    if not (sizes > 0).all():
-        raise ProblemError(f"quaternion {int(sizes.argmin())} is zero", name="quaternions", value=0.0)
-    return places, np.asarray(Rotation.from_quat(turns[:, [1, 2, 3, 0]]).as_matrix())
+            raise ProblemError(f"{words}, not {array.shape}", name=name, value=array.shape, limit=size)
+        arrays.append(array)
+    positions, rotations = arrays
+    if len(positions) != len(rotations):
+        words = f"there are {len(positions)} positions and {len(rotations)} quaternions"
+        raise ProblemError(words, name="quaternions", value=len(rotations), limit=len(positions))
+    norms = np.linalg.norm(rotations, axis=1)
+    if not (norms > 0).all():
+        raise ProblemError(f"quaternion {int(norms.argmin())} is zero", name="quaternions", value=0.0)
+    return positions, np.asarray(Rotation.from_quat(rotations[:, [1, 2, 3, 0]]).as_matrix())

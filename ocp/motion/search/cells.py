@@ -1,14 +1,15 @@
-"""The cheapest motions of machines whose base moves by itself: forward search over exact states kept in cells.
+"""Low-cost motions of machines with a moving base: forward search over exact states, pruned by cells.
 
-What such a machine can reach is no set of postures at each instant: the base's attitude depends on the way. So states
-are kept that were reached, each integrated so that it does its tasks, and of those that fall into one cell of joints
-and attitude the one that was reached at the least cost. From each a fan of self-motions goes on. Cells are as large as
-leaves so many states as are kept. Rates are tried in proportion to what a motion may cost: searches with few states
-say how much that is, the last one, with many, looks for all motions within a multiple of it.
+What such a machine can reach is no manifold of configurations at each time, since the attitude of the base depends on
+the path. The search therefore keeps states that were reached by exact integration of the tasks. Of the states that fall
+into one cell of joints and attitude, it keeps the one reached at least cost. From each state, a fan of self-motions
+leads on. The cells are as large as the number of states requires. The tried rates are in proportion to the cost that a
+motion may have: searches with few states estimate this cost, and the last one, with many states, covers all motions
+within a multiple of it.
 
-Every state at the end has its way; the ways that are cheaper than all that are near to them are the classes of motions,
-the first guesses of the whole motion's problem. Nothing is proven by this: a motion through a passage narrower than a
-cell may be missed, and no bound comes of it.
+Each final state has a path. Paths that cost less than all neighbouring ones represent the classes of motions, and are
+guesses for the optimal control problem. The search proves nothing: it may miss a motion through a passage narrower
+than a cell, and gives no bound.
 """
 
 from __future__ import annotations
@@ -27,46 +28,53 @@ from models.arrays import Array
 from ocp.motion.local.collisions import distances_along
 from ocp.motion.local.inverse_kinematics import Unreachable
 from ocp.motion.local.rates import LocalMotion
-from ocp.motion.search.configurations import OUT_OF_REACH, Asked, misfits_of, placed
+from ocp.motion.search.configurations import (
+    REACH_TOLERANCE,
+    PlanRequest,
+    largest_pose_errors,
+    locate_error,
+    sampled_motions,
+)
 from ocp.motion.search.dead_end import DeadEnd
-from ocp.motion.search.reduced import ReducedKinematics, Side, Slopes, check_floating_reach, within
+from ocp.motion.search.reduced import LimitSide, ReducedKinematics, TaskKinematics, check_floating_reach, limit_rates
 
-__all__ = ["CellSearch", "follows"]
+__all__ = ["CellSearch", "tracks_tasks"]
 
 Indices = NDArray[np.intp]
 
-OFF_SHARE = 0.1
-"""Share of the way of a tip that a local motion may miss of it where velocities are asked for."""
+MAX_VELOCITY_ERROR = 0.1
+"""Largest share of the prescribed tip displacement that a local motion may miss under velocity tasks."""
 
 
 @dataclass(frozen=True)
 class CellSettings:
-    """How closely states are looked at.
+    """Resolution of the search.
 
     Attributes:
-        states: Kept at each instant, of 1 kB each.
-        few: Share of these that the searches keep which say what a motion costs.
-        searches: At most, with those in which nothing goes on; each of these is followed by one with `far` the cost.
-        far: Motions so many times as dear as the best are not looked for.
-        steps: Over the motion, at least.
-        halvings: Of a step after which no state would be left.
-        levels: Rates of a self-motion of one direction; of more directions so many times more are drawn.
-        longest: That a joint goes in one step, rad or m.
-        wider, narrowest: By which cells are widened or narrowed until the states fit in, and rad or m of a cell.
-        corrections: Newton steps from where a motion is to the poses of tasks that begin.
-        neighbours: Ways to which a way is compared, for each direction that is free, at so many instants: `seats`.
-        classes: Ways that are told, the cheapest first.
+        states: States kept at each time, of 1 kB each.
+        few: Share of these that the searches keep which estimate the cost.
+        searches: Largest number of searches, including those that end early, whose cost limit is then raised.
+        max_cost_ratio: Motions that cost more than so many times the best one are not searched.
+        steps: Least number of time steps.
+        halvings: Largest number of halvings of a step that leaves no state.
+        levels: Rates of a one-dimensional self-motion; for more directions, that many more are drawn at random.
+        longest: Largest joint displacement in one step, rad or m.
+        growth, narrowest: Factor by which cells are resized to fit the number of states, and least size, rad or m.
+        corrections: Newton steps from a state to the poses of tasks that begin.
+        neighbours: Paths with which a path is compared, for each free direction.
+        seats: Times at which they are compared.
+        classes: Largest number of paths returned, the cheapest first.
     """
 
     states: int = 2000
     few: float = 0.25
     searches: int = 6
-    far: float = 10.0
+    max_cost_ratio: float = 10.0
     steps: int = 40
     halvings: int = 6
     levels: int = 15
     longest: float = 1.0
-    wider: float = 1.2
+    growth: float = 1.2
     narrowest: float = 1e-3
     corrections: int = 12
     neighbours: int = 8
@@ -74,17 +82,18 @@ class CellSettings:
     classes: int = 48
 
 
-def follows(asked: Asked, followed: Sequence[LocalMotion]) -> NDArray[np.bool_]:
-    """Which local motions meet their poses, and run most of the way that velocities ask for. Shape (K,)."""
-    count = len(followed[0].cost)
-    missed, way = np.zeros(count), np.zeros(count)
-    for stretch, part in zip(asked.stretches, followed, strict=True):
-        kinematics = ReducedKinematics(asked.machine, stretch.equations, asked.weights)
-        for k, step in enumerate(np.diff(part.t).tolist()):
-            base, joints = ((value[:, k] + value[:, k + 1]) / 2 for value in (part.base, part.joints))
-            speeds = kinematics.missed(base, joints, part.rates[:, k], part.t[k] + step / 2)
-            missed, way = missed + step * speeds[0], way + step * speeds[1]
-    return np.asarray((np.array(misfits_of(list(followed))) <= OUT_OF_REACH) & (missed <= OFF_SHARE * way))
+def tracks_tasks(request: PlanRequest, motions: Sequence[LocalMotion]) -> NDArray[np.bool_]:
+    """Return which local motions (K,) reach their poses and follow most of the prescribed velocities."""
+    count = len(motions[0].cost)
+    missing, prescribed = np.zeros(count), np.zeros(count)
+    for stretch, motion in zip(request.stretches, motions, strict=True):
+        kinematics = ReducedKinematics(request.machine, stretch.equations, request.weights)
+        for k, step in enumerate(np.diff(motion.t).tolist()):
+            base, joints = ((value[:, k] + value[:, k + 1]) / 2 for value in (motion.base, motion.joints))
+            speeds = kinematics.velocity_errors(base, joints, motion.rates[:, k], motion.t[k] + step / 2)
+            missing, prescribed = missing + step * speeds[0], prescribed + step * speeds[1]
+    tracked = np.array(largest_pose_errors(list(motions))) <= REACH_TOLERANCE
+    return np.asarray(tracked & (missing <= MAX_VELOCITY_ERROR * prescribed))
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,293 +101,298 @@ class _Layer:
     """States reached at a time.
 
     Attributes:
-        time: s. base, joints: Shapes (K, b), (K, n). cost: Until then. Shape (K,).
-        before: From which state of the layer before each comes. Shape (K,).
+        time: s.
+        base, joints: Shapes (K, b), (K, n).
+        cost: Cost until then. Shape (K,).
+        parent: Index of the preceding state in the layer before. Shape (K,).
     """
 
     time: float
     base: Array
     joints: Array
     cost: Array
-    before: Indices
+    parent: Indices
 
-    def of(self, rows: Any) -> _Layer:
-        return _Layer(self.time, self.base[rows], self.joints[rows], self.cost[rows], self.before[rows])
+    def select(self, rows: Any) -> _Layer:
+        return _Layer(self.time, self.base[rows], self.joints[rows], self.cost[rows], self.parent[rows])
 
 
 class CellSearch:
-    """Motions from some postures through all stretches of what is asked."""
+    """Search for motions from some configurations through all stretches of a request."""
 
-    def __init__(self, asked: Asked, postures: Array, settings: CellSettings = CellSettings()) -> None:
+    def __init__(self, request: PlanRequest, configurations: Array, settings: CellSettings = CellSettings()) -> None:
         """
         Args:
-            asked: What is asked.
-            postures: Joints to start from. Shape (K, n).
-            settings: How closely states are looked at.
+            request: The request.
+            configurations: Joints at the start. Shape (K, n).
+            settings: Resolution of the search.
 
         Raises:
-            Unreachable: From some time on a task is out of reach in any attitude of the base.
-            DeadEnd: Nothing goes on from some time on.
+            Unreachable: From some time on, a task is out of reach for any attitude of the base.
+            DeadEnd: From some time on, no state can be continued.
         """
-        self.asked, self._settings, self._found = asked, settings, list[_Cells]()
-        self._kinematics = [ReducedKinematics(asked.machine, each.equations, asked.weights) for each in asked.stretches]
-        most, whole = settings.far * self._speed(postures), False
+        self.request, self._settings, self._searches = request, settings, list[_CellPass]()
+        machine, weights = request.machine, request.weights
+        self._kinematics = [ReducedKinematics(machine, stretch.equations, weights) for stretch in request.stretches]
+        max_cost, full = settings.max_cost_ratio * self._cost_estimate(configurations), False
         for number in range(settings.searches):
             last = number == settings.searches - 1
-            cells = _Cells(asked, self._kinematics, most, whole or last, asked.seed + number, settings)
+            search = _CellPass(request, self._kinematics, max_cost, full or last, request.seed + number, settings)
             try:
-                with np.errstate(all="ignore"):  # states that run away are left out
-                    cells.search(postures)
-            except DeadEnd as stuck:
+                with np.errstate(all="ignore"):  # diverging states are discarded
+                    search.search(configurations)
+            except DeadEnd as error:
                 if not number:
-                    self._check_reach(stuck)
-                if not self._found and last:
+                    self._check_reach(error)
+                if not self._searches and last:
                     raise
-                if whole:
+                if full:
                     break
-                most, whole = (most, True) if self._found else (settings.far * most, False)
+                max_cost, full = (max_cost, True) if self._searches else (settings.max_cost_ratio * max_cost, False)
                 continue
-            self._found.append(cells)
-            if whole:
+            self._searches.append(search)
+            if full:
                 break
-            needed = settings.far * min(each.cost for each in self._found)
-            most, whole = needed, needed >= most / 2
+            wanted = settings.max_cost_ratio * min(search.cost for search in self._searches)
+            max_cost, full = wanted, wanted >= max_cost / 2
 
-    def _check_reach(self, stuck: DeadEnd) -> None:
-        """Raise Unreachable where that is why nothing goes on."""
-        asked, machine, bounds = self.asked, self.asked.machine, self.asked.bounds
-        if asked.start is None or not isinstance(machine, FreeFloating):
-            return  # where the centre of mass is depends on the start
-        told: dict[str, Any] = {"lower": bounds.lower, "upper": bounds.upper, "seed": asked.seed}
+    def _check_reach(self, error: DeadEnd) -> None:
+        """Raise Unreachable if a pose out of reach explains the dead end."""
+        request, machine, bounds = self.request, self.request.machine, self.request.bounds
+        if request.start is None or not isinstance(machine, FreeFloating):
+            return  # the path of the centre of mass depends on the start
+        options: dict[str, Any] = {"lower": bounds.lower, "upper": bounds.upper, "seed": request.seed}
+        options |= {"begin": error.time, "end": request.horizon}
         try:
-            check_floating_reach(machine, asked.tasks, asked.base, asked.start, stuck.time, asked.horizon, **told)
-        except Unreachable as error:
-            raise placed(asked, error, error.time) from stuck
+            check_floating_reach(machine, request.tasks, request.base, request.start, **options)
+        except Unreachable as unreachable:
+            raise locate_error(request, unreachable, unreachable.time) from error
 
-    def _speed(self, postures: Array) -> float:
-        """What the tasks would cost if the machine moved at each instant as well as it can at the start, about."""
-        asked, total, count = self.asked, 0.0, self._settings.seats
-        base = np.tile(asked.base, (len(postures), 1))
-        for stretch, kinematics in zip(asked.stretches, self._kinematics, strict=True):
+    def _cost_estimate(self, configurations: Array) -> float:
+        """Estimate the cost of the tasks as if the machine moved as well as at the start at all times."""
+        request, total, count = self.request, 0.0, self._settings.seats
+        base = np.tile(request.base, (len(configurations), 1))
+        for stretch, kinematics in zip(request.stretches, self._kinematics, strict=True):
             for time in np.linspace(stretch.begin, stretch.end, count + 2)[1:-1].tolist():
-                least = float(kinematics.speed(base, postures, time).min())
-                total += least / 2 * stretch.duration / count
+                squared_rate = float(kinematics.speed(base, configurations, time).min())
+                total += squared_rate / 2 * stretch.duration / count
         return total
 
-    def followed(self) -> list[list[LocalMotion]]:
-        """Of each search, the largest first, the cheapest motion of each class through all stretches.
-
-        They are what a plan begins from.
-        """
-        return [cells.followed() for cells in reversed(self._found)]
+    def local_motions(self) -> list[list[LocalMotion]]:
+        """Return for each search, the largest first, the lowest-cost motion of each class through all stretches."""
+        return [search.local_motions() for search in reversed(self._searches)]
 
 
-class _Cells:
-    """One search.
+class _CellPass:
+    """One pass of the search.
 
     Attributes:
-        cost: Of the cheapest way.
-        layers: States at each instant.
+        cost: Cost of the best path.
+        layers: States at each time.
+        max_cost: Largest cost of a motion.
+        states: Largest number of states.
     """
 
     def __init__(
         self,
-        asked: Asked,
+        request: PlanRequest,
         kinematics: Sequence[ReducedKinematics],
-        most: float,
-        whole: bool,
+        max_cost: float,
+        full: bool,
         seed: int,
         settings: CellSettings,
     ) -> None:
-        """Among motions that cost at most so much, with all states that may be kept or with a few."""
-        self.asked, self.kinematics, self.most, self._settings = asked, kinematics, most, settings
-        self.states = settings.states if whole else int(settings.few * settings.states)
-        self.root, self._rng = np.sqrt(asked.weights), np.random.default_rng(seed)
-        self._fastest, self._width = np.sqrt(2 * most / asked.horizon), settings.narrowest
-        self._begins = list[int]()
+        """Set up a pass over motions of limited cost, with the full number of states or with a few."""
+        self.request, self.kinematics, self.max_cost, self._settings = request, kinematics, max_cost, settings
+        self.states = settings.states if full else int(settings.few * settings.states)
+        self.root, self._rng = np.sqrt(request.weights), np.random.default_rng(seed)
+        self._max_rate, self._cell_size = np.sqrt(2 * max_cost / request.horizon), settings.narrowest
+        self._stretch_layers = list[int]()
         self.layers = list[_Layer]()
         self.cost = np.inf
 
-    def search(self, postures: Array) -> None:
-        """From postures (K, n) to the end.
+    def search(self, configurations: Array) -> None:
+        """Search from configurations (K, n) to the end.
 
         Raises:
-            DeadEnd: No state gets there.
+            DeadEnd: No state reaches it.
         """
-        asked, layers = self.asked, self.layers
-        count = len(postures)
-        layers.append(_Layer(0.0, np.tile(asked.base, (count, 1)), postures, np.zeros(count), np.arange(count)))
-        for stretch, kinematics in zip(asked.stretches, self.kinematics, strict=True):
+        request, layers = self.request, self.layers
+        count = len(configurations)
+        layers.append(_Layer(0.0, np.tile(request.base, (count, 1)), configurations, np.zeros(count), np.arange(count)))
+        for stretch, kinematics in zip(request.stretches, self.kinematics, strict=True):
             if stretch.begin > 0 and any(stretch.new):
-                layers.append(self._begun(layers[-1], kinematics))
-            self._begins.append(len(layers) - 1)
-            steps = max(int(np.ceil(self._settings.steps * stretch.duration / asked.horizon)), 1)
-            ahead = np.union1d(np.linspace(stretch.begin, stretch.end, steps + 1), stretch.breaks)[:0:-1].tolist()
+                layers.append(self._states_at_new_poses(layers[-1], kinematics))
+            self._stretch_layers.append(len(layers) - 1)
+            steps = max(int(np.ceil(self._settings.steps * stretch.duration / request.horizon)), 1)
+            remaining = np.union1d(np.linspace(stretch.begin, stretch.end, steps + 1), stretch.breaks)[:0:-1].tolist()
             shortest = stretch.duration / steps / 2**self._settings.halvings
-            slopes = kinematics.at(layers[-1].base, layers[-1].joints, stretch.begin)
-            while ahead:
-                last = layers[-1]
-                made, why = self._grown(kinematics, last, slopes, ahead[-1], limited=True)
-                if made is not None:
-                    layers.append(made)
-                    slopes = kinematics.at(made.base, made.joints, ahead.pop())
-                elif ahead[-1] - last.time > shortest:
-                    ahead.append((ahead[-1] + last.time) / 2)
+            task = kinematics.at(layers[-1].base, layers[-1].joints, stretch.begin)
+            while remaining:
+                current = layers[-1]
+                grown, limit_counts = self._expand(kinematics, current, task, remaining[-1], limited=True)
+                if grown is not None:
+                    layers.append(grown)
+                    task = kinematics.at(grown.base, grown.joints, remaining.pop())
+                elif remaining[-1] - current.time > shortest:
+                    remaining.append((remaining[-1] + current.time) / 2)
                 else:
-                    free, _ = self._grown(kinematics, last, slopes, ahead[-1], limited=False)
-                    raise self._stuck(last, why if free is not None else Counter())
+                    unlimited, _ = self._expand(kinematics, current, task, remaining[-1], limited=False)
+                    raise self._dead_end_error(current, limit_counts if unlimited is not None else Counter())
         self.cost = float(layers[-1].cost.min())
 
-    def _grown(
-        self, kinematics: ReducedKinematics, layer: _Layer, slopes: Slopes, time: float, limited: bool
+    def _expand(
+        self, kinematics: ReducedKinematics, layer: _Layer, task: TaskKinematics, time: float, limited: bool
     ) -> tuple[_Layer | None, Counter[tuple[int, int]]]:
-        """The states that are reached from a layer, the best of each cell; None where there are none.
+        """Return the best state of each cell that is reached from a layer by a time, or None if there is none.
 
-        And how many are stopped by which limit of which joint, where the joints are `limited`.
+        Also count, if the joints are `limited`, the states that each limit of each joint stops, by (joint,
+        `LimitSide`).
         """
-        asked, step, root = self.asked, time - layer.time, self.root
-        fan = self._fan(len(layer.cost), slopes.null.shape[2])
-        before = np.repeat(np.arange(len(layer.cost)), fan.shape[1])
-        idle = np.asarray(slopes.null @ fan.transpose(0, 2, 1)).transpose(0, 2, 1).reshape(len(before), -1)
-        rates, told = slopes.least(slopes.right)[before] + idle, Counter[tuple[int, int]]()
+        request, step, root = self.request, time - layer.time, self.root
+        self_motions = self._sample_self_motions(len(layer.cost), task.null.shape[2])
+        parents = np.repeat(np.arange(len(layer.cost)), self_motions.shape[1])
+        null_rates = np.asarray(task.null @ self_motions.transpose(0, 2, 1)).transpose(0, 2, 1)
+        null_rates = null_rates.reshape(len(parents), -1)
+        rates, limit_counts = task.least_rates(task.right)[parents] + null_rates, Counter[tuple[int, int]]()
         if limited:
-            bounds, joints = asked.bounds, layer.joints[before]
-            fast = bounds.velocity * root
-            low = np.maximum(-fast, (bounds.lower - joints) / step * root)
-            high = np.minimum(fast, (bounds.upper - joints) / step * root)
-            rates, why = within(rates, slopes.null[before], low, high, fast)
-            told.update(map(tuple, why[why[:, 0] >= 0].tolist()))
-            rates[why[:, 0] >= 0] = np.nan
-        far = np.abs(rates / root).max(axis=1) * step
-        cost = layer.cost[before] + step / 2 * (rates**2).sum(axis=1)
-        good = np.flatnonzero((cost <= self.most) & (far <= self._settings.longest))
-        if not good.size:
-            return None, told
-        before, rates, cost = before[good], rates[good], cost[good]
-        base = layer.base[before] + step * ((slopes.base[before] @ rates[:, :, None])[:, :, 0] + slopes.drift[before])
-        best = self._kept(base, layer.joints[before] + step * rates / root, cost, tight=True)
-        before, rates = before[best], rates[best]
-        start, first = layer.base[before], layer.joints[before]
-        exact = OUT_OF_REACH / 10
-        base, joints, off = kinematics.stepped(start, first, slopes.of(before), rates, layer.time, time, exact)
-        cost = layer.cost[before] + ((root * (joints - first)) ** 2).sum(axis=1) / (2 * step)
-        near = np.isfinite(base).all(axis=1) & (np.abs(joints - first).max(axis=1) <= self._settings.longest)
-        made = _Layer(time, base, joints, cost, before)
-        made = made.of(np.flatnonzero(near & (cost <= self.most) & (off <= OUT_OF_REACH)))
-        made = made.of(np.flatnonzero(self._allowed(kinematics, made)))
-        if not len(made.cost):
-            return None, told
-        return made.of(self._kept(made.base, made.joints, made.cost, tight=False)), told
+            bounds, joints = request.bounds, layer.joints[parents]
+            max_rates = bounds.velocity * root
+            lower = np.maximum(-max_rates, (bounds.lower - joints) / step * root)
+            upper = np.minimum(max_rates, (bounds.upper - joints) / step * root)
+            rates, violations = limit_rates(rates, task.null[parents], lower, upper, max_rates)
+            limit_counts.update(map(tuple, violations[violations[:, 0] >= 0].tolist()))
+            rates[violations[:, 0] >= 0] = np.nan
+        displacement = np.abs(rates / root).max(axis=1) * step
+        cost = layer.cost[parents] + step / 2 * (rates**2).sum(axis=1)
+        affordable = np.flatnonzero((cost <= self.max_cost) & (displacement <= self._settings.longest))
+        if not affordable.size:
+            return None, limit_counts
+        parents, rates, cost = parents[affordable], rates[affordable], cost[affordable]
+        base = layer.base[parents] + step * ((task.base[parents] @ rates[:, :, None])[:, :, 0] + task.drift[parents])
+        best = self._best_of_cells(base, layer.joints[parents] + step * rates / root, cost, resize=True)
+        parents, rates = parents[best], rates[best]
+        start_base, start_joints = layer.base[parents], layer.joints[parents]
+        states = start_base, start_joints, task.select(parents)
+        base, joints, error = kinematics.step(*states, rates, layer.time, time, REACH_TOLERANCE / 10)
+        cost = layer.cost[parents] + ((root * (joints - start_joints)) ** 2).sum(axis=1) / (2 * step)
+        finite = np.isfinite(base).all(axis=1) & (np.abs(joints - start_joints).max(axis=1) <= self._settings.longest)
+        expanded = _Layer(time, base, joints, cost, parents)
+        expanded = expanded.select(np.flatnonzero(finite & (cost <= self.max_cost) & (error <= REACH_TOLERANCE)))
+        expanded = expanded.select(np.flatnonzero(self._valid_states(kinematics, expanded)))
+        if not len(expanded.cost):
+            return None, limit_counts
+        best = self._best_of_cells(expanded.base, expanded.joints, expanded.cost, resize=False)
+        return expanded.select(best), limit_counts
 
-    def _fan(self, count: int, r: int) -> Array:
-        """Self-motions that are tried from each of some states, in their null spaces. Shape (count, C, r)."""
-        many = self._settings.levels
-        share = np.linspace(-1.0, 1.0, many)
-        levels = self._fastest * np.sign(share) * share**2  # finer where most motions are
+    def _sample_self_motions(self, count: int, r: int) -> Array:
+        """Return self-motions to be tried from each state, as coordinates in its null space. Shape (count, C, r)."""
+        levels = self._settings.levels
+        share = np.linspace(-1.0, 1.0, levels)
+        rates = self._max_rate * np.sign(share) * share**2  # finer near zero, where most motions are
         if r <= 1:
-            return np.tile(levels[None, :, None] if r else np.zeros((1, 1, 0)), (count, 1, 1))
-        way = self._rng.normal(size=(count, many * r, r))
-        way *= self._rng.choice(np.abs(levels), size=(*way.shape[:2], 1)) / np.linalg.norm(way, axis=2, keepdims=True)
-        way[:, 0] = 0.0
-        return np.asarray(way)
+            return np.tile(rates[None, :, None] if r else np.zeros((1, 1, 0)), (count, 1, 1))
+        samples = self._rng.normal(size=(count, levels * r, r))
+        sizes = self._rng.choice(np.abs(rates), size=(*samples.shape[:2], 1))
+        samples *= sizes / np.linalg.norm(samples, axis=2, keepdims=True)
+        samples[:, 0] = 0.0
+        return np.asarray(samples)
 
-    def _kept(self, base: Array, joints: Array, cost: Array, tight: bool) -> Indices:
-        """The cheapest state of each cell; the cells grow until no more are left than are kept, or shrink, too."""
-        turn = base[:, 2:] if base.shape[1] == 3 else 2 * base[:, 3:]
-        place = np.hstack([joints * self.root, turn * np.sqrt(np.mean(self.root**2))])
-        mixed = np.random.default_rng(0).uniform(1.0, 2.0, size=place.shape[1])
+    def _best_of_cells(self, base: Array, joints: Array, cost: Array, resize: bool) -> Indices:
+        """Return the cheapest state of each cell; cells grow to fit the number of states, or shrink with `resize`."""
+        attitude = base[:, 2:] if base.shape[1] == 3 else 2 * base[:, 3:]
+        points = np.hstack([joints * self.root, attitude * np.sqrt(np.mean(self.root**2))])
+        hash_weights = np.random.default_rng(0).uniform(1.0, 2.0, size=points.shape[1])
         order = np.argsort(cost, kind="stable")
-        place = place[order] - place.min(axis=0)  # the signs of many coordinates would be cells of their own
+        # without the offset, coordinates of either sign would form cells of their own
+        points = points[order] - points.min(axis=0)
 
         def winners(width: float) -> Indices:
-            return np.asarray(order[np.unique(np.floor(place / width) @ mixed, return_index=True)[1]])
+            return np.asarray(order[np.unique(np.floor(points / width) @ hash_weights, return_index=True)[1]])
 
-        found = winners(self._width)
-        while len(found) > self.states:
-            self._width *= self._settings.wider
-            found = winners(self._width)
+        best = winners(self._cell_size)
+        while len(best) > self.states:
+            self._cell_size *= self._settings.growth
+            best = winners(self._cell_size)
         while (
-            tight
-            and self._width > self._settings.narrowest
-            and len(finer := winners(self._width / self._settings.wider)) <= self.states
+            resize
+            and self._cell_size > self._settings.narrowest
+            and len(finer := winners(self._cell_size / self._settings.growth)) <= self.states
         ):
-            self._width, found = self._width / self._settings.wider, finer
-        return found
+            self._cell_size, best = self._cell_size / self._settings.growth, finer
+        return best
 
-    def _allowed(self, kinematics: ReducedKinematics, layer: _Layer) -> NDArray[np.bool_]:
-        """Which states lean no farther than they may, and are clear."""
-        good, times = np.isfinite(layer.cost), np.full(len(layer.cost), layer.time)
+    def _valid_states(self, kinematics: ReducedKinematics, layer: _Layer) -> NDArray[np.bool_]:
+        """Return which states keep tilt limits and clearance. Shape (K,)."""
+        valid, times = np.isfinite(layer.cost), np.full(len(layer.cost), layer.time)
         if kinematics.equations is not None and len(times):
-            over = kinematics.equations.cone_violations(times, layer.base, layer.joints)
-            good &= over.max(axis=1, initial=0.0) <= OUT_OF_REACH
-        if self.asked.clearance_constraints is not None and good.any():
-            around, at = self.asked.clearance_constraints.scene, np.flatnonzero(good)
-            apart = distances_along(around, layer.base[at], layer.joints[at], times[at], around.clearance)
-            good[at] = (apart >= around.clearance).all(axis=1)
-        return np.asarray(good)
+            cone_violations = kinematics.equations.cone_violations(times, layer.base, layer.joints)
+            valid &= cone_violations.max(axis=1, initial=0.0) <= REACH_TOLERANCE
+        if self.request.clearance_constraints is not None and valid.any():
+            scene, rows = self.request.clearance_constraints.scene, np.flatnonzero(valid)
+            distances = distances_along(scene, layer.base[rows], layer.joints[rows], times[rows], scene.clearance)
+            valid[rows] = (distances >= scene.clearance).all(axis=1)
+        return np.asarray(valid)
 
-    def _begun(self, layer: _Layer, kinematics: ReducedKinematics) -> _Layer:
-        """States at the poses that begin at a time, each as near as it comes to where it was."""
-        moved = kinematics.corrected(
-            layer.base, layer.joints, layer.time, OUT_OF_REACH / 10, most=self._settings.corrections
-        )
-        base, joints, off = moved
+    def _states_at_new_poses(self, layer: _Layer, kinematics: ReducedKinematics) -> _Layer:
+        """Return states corrected to the poses of tasks that begin now."""
+        states, max_steps = (layer.base, layer.joints, layer.time), self._settings.corrections
+        corrected = kinematics.correct_poses(*states, REACH_TOLERANCE / 10, max_steps=max_steps)
+        base, joints, pose_error = corrected
         cost = layer.cost + ((self.root * (joints - layer.joints)) ** 2).sum(axis=1) / (2 * layer.time)
-        good = np.flatnonzero(off <= OUT_OF_REACH)
-        if not good.size:
-            raise self._stuck(layer, Counter())
-        return _Layer(layer.time, base, joints, cost, np.arange(len(cost))).of(good)
+        reached = np.flatnonzero(pose_error <= REACH_TOLERANCE)
+        if not reached.size:
+            raise self._dead_end_error(layer, Counter())
+        return _Layer(layer.time, base, joints, cost, np.arange(len(cost))).select(reached)
 
-    def _stuck(self, layer: _Layer, why: Counter[tuple[int, int]]) -> DeadEnd:
-        bounds, names = self.asked.bounds, self.asked.machine.robot.joint_names
+    def _dead_end_error(self, layer: _Layer, limit_counts: Counter[tuple[int, int]]) -> DeadEnd:
+        """Return the error that no state can be continued, with the limit that stops most of them."""
+        bounds, names = self.request.bounds, self.request.machine.robot.joint_names
         details: dict[str, Any] = {"time": layer.time, "name": "task"}
-        words = "the tasks would need ever faster joints: they lead past what the machine can do, or by a singularity"
-        if why:
-            (joint, which), _ = why.most_common(1)[0]
-            limit = float((bounds.lower, bounds.upper, -bounds.velocity, bounds.velocity)[which][joint])
-            what = "can go no faster than" if which >= Side.SLOW else "can go no farther than"
-            words = f"{names[joint]!r} {what} {limit:g}"
+        words = "the joint rates would diverge: the tasks lead beyond the workspace or through a singularity"
+        if limit_counts:
+            (joint, side), _ = limit_counts.most_common(1)[0]
+            limit = float((bounds.lower, bounds.upper, -bounds.velocity, bounds.velocity)[side][joint])
+            verb = "is at its rate limit" if side >= LimitSide.SLOW else "is at its position limit"
+            words = f"{names[joint]!r} {verb} {limit:g}"
             value = float(layer.joints[layer.cost.argmin(), joint])
             details |= {"name": names[joint], "value": value, "limit": limit}
         count = len(layer.cost)
-        return DeadEnd(f"nothing goes on after {layer.time:.4g} s: in {count} states reached there, {words}", **details)
+        where = f"no motion continues after {layer.time:.4g} s: in the {count} states reached there"
+        return DeadEnd(f"{where}, {words}", **details)
 
-    # ---- what was found --------------------------------------------------------------------------------------------
+    # ---- results -----------------------------------------------------------------------------------------------------
 
-    def followed(self) -> list[LocalMotion]:
-        """The cheapest motion of each class through all stretches."""
-        layers, asked = self.layers, self.asked
-        final, rows = layers[-1], np.arange(len(layers[-1].cost))
-        ways = np.empty((len(layers), len(rows)), dtype=np.intp)
+    def local_motions(self) -> list[LocalMotion]:
+        """Return the lowest-cost motion of each class through all stretches."""
+        layers, request = self.layers, self.request
+        final, states = layers[-1], np.arange(len(layers[-1].cost))
+        paths = np.empty((len(layers), len(states)), dtype=np.intp)
         for k in range(len(layers) - 1, -1, -1):
-            ways[k] = rows
-            rows = layers[k].before[rows]
+            paths[k] = states
+            states = layers[k].parent[states]
         cost = final.cost.copy()
-        if asked.cyclic:
-            back = final.joints - layers[0].joints[ways[0]]
-            cost += ((self.root * back) ** 2).sum(axis=1) / (2 * asked.horizon)
+        if request.cyclic:
+            closing = final.joints - layers[0].joints[paths[0]]
+            cost += ((self.root * closing) ** 2).sum(axis=1) / (2 * request.horizon)
         seats = np.unique(np.linspace(0, len(layers) - 1, self._settings.seats + 1).astype(int)).tolist()
-        place = np.hstack([layers[k].joints[ways[k]] * self.root for k in seats])
-        free = max(asked.machine.joint_size - max(each.rows for each in self.kinematics), 1)
-        near = min(self._settings.neighbours * free + 1, len(cost))
-        beside = np.reshape(cKDTree(place).query(place, k=near)[1], (len(cost), near))
-        least = np.flatnonzero((cost[:, None] <= cost[beside]).all(axis=1))
-        chosen = least[np.argsort(cost[least])][: self._settings.classes]
-        found, ends = [], [*self._begins[1:], len(layers) - 1]
-        for begin, end in zip(self._begins, ends, strict=True):
-            # what is met where others begin belongs to these
+        points = np.hstack([layers[k].joints[paths[k]] * self.root for k in seats])
+        free_directions = max(request.machine.joint_size - max(each.rows for each in self.kinematics), 1)
+        count = min(self._settings.neighbours * free_directions + 1, len(cost))
+        neighbours = np.reshape(cKDTree(points).query(points, k=count)[1], (len(cost), count))
+        minima = np.flatnonzero((cost[:, None] <= cost[neighbours]).all(axis=1))
+        chosen = minima[np.argsort(cost[minima])][: self._settings.classes]
+        motions, ends = [], [*self._stretch_layers[1:], len(layers) - 1]
+        for begin, end in zip(self._stretch_layers, ends, strict=True):
+            # a correction where new tasks begin belongs to their stretch
             last = end - 1 if end < len(layers) - 1 and layers[end].time == layers[end - 1].time else end
-            found.append(self._told(layers[begin : last + 1], ways[begin : last + 1, chosen]))
-        return found
+            motions.append(self._local_motion(layers[begin : last + 1], paths[begin : last + 1, chosen]))
+        return motions
 
-    def _told(self, layers: Sequence[_Layer], ways: Indices) -> LocalMotion:
-        """Ways through some layers."""
+    def _local_motion(self, layers: Sequence[_Layer], paths: Indices) -> LocalMotion:
+        """Return the motions along paths, rows of states (L, K), through some layers."""
         times = np.array([layer.time for layer in layers])
-        base = np.stack([layer.base[row] for layer, row in zip(layers, ways, strict=True)], axis=1)
-        joints = np.stack([layer.joints[row] for layer, row in zip(layers, ways, strict=True)], axis=1)
-        joints = np.clip(joints, self.asked.bounds.lower, self.asked.bounds.upper)
-        rates = np.diff(joints, axis=1) / np.diff(times)[:, None]
-        cost = np.einsum("kmn,n,m->k", rates**2, self.asked.weights, np.diff(times)) / 2
-        none = np.zeros(ways.shape[1])
-        rates = np.concatenate([rates, rates[:, -1:]], axis=1)
-        return LocalMotion(times, base, joints, rates, np.asarray(cost), none, none)
+        base = np.stack([layer.base[row] for layer, row in zip(layers, paths, strict=True)], axis=1)
+        joints = np.stack([layer.joints[row] for layer, row in zip(layers, paths, strict=True)], axis=1)
+        joints = np.clip(joints, self.request.bounds.lower, self.request.bounds.upper)
+        return sampled_motions(times, base, joints, self.request.weights)

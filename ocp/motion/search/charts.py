@@ -1,11 +1,13 @@
-"""All postures that do a task at some instants, covered by charts: boxes in tangent spaces of the set of solutions.
+"""Atlas of the self-motion manifold: charts that cover all configurations which do a task at some time samples.
 
-Where a task leaves r of n joints free, the postures that do it at one time form curves (r = 1), surfaces (r = 2) or lie
-apart (r = 0). A chart is a posture, the r directions in which it can move without moving the tip, and how far a box of
-such moves stays near the set. The set is covered from the solutions of inverse kinematics at all instants: wherever the
-edge of a chart lies in no other chart, the next one is put there, until the union of the charts has no edge but at the
-joints' limits (Henderson 2002, Multiple parameter continuation, Int. J. Bifurcation and Chaos 12). Curves so are found
-whole, folds and branches that meet are nothing special, and no angle has to be chosen to list them by.
+If a task leaves r of n joint directions free, the configurations that do it at one time form curves (r = 1), surfaces
+(r = 2) or isolated points (r = 0). A chart consists of a configuration, an orthonormal basis of the tangent space
+there (the self-motions, which do not move the tip), and a box in the tangent space that stays near the manifold.
+
+The atlas grows from the solutions of inverse kinematics at all time samples. Wherever the edge of a chart lies in no
+other chart, the next chart is put there, until the union of the charts has no edge except at the joint limits
+(Henderson 2002, Multiple parameter continuation, Int. J. Bifurcation and Chaos 12). Connected components are covered
+completely. Folds and bifurcations need no special treatment.
 """
 
 from __future__ import annotations
@@ -28,31 +30,29 @@ from ocp.motion.tasks.equations import TaskEquations
 from ocp.problem.values import Sampler
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = ["ChartSettings", "Charts", "Instant", "Parts", "SelfMotions", "point"]
+__all__ = ["ChartSettings", "Charts", "SelfMotionManifolds", "SplitCharts", "TimeSample", "point_chart"]
 
 Indices = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
 class ChartSettings:
-    """How sets of postures are covered.
+    """Settings of the atlas.
 
     Attributes:
-        corrections: Newton steps at most; from a tangent space a few are enough.
-        beyond: Share of its radius by which a chart is put beyond the edge that it is to cover: neighbours overlap by
-            the rest.
-        bent: Share of its radius by which the set may leave a chart at its edge, by the directions that are free; the
-            radius is halved until it does not. Of two directions half as much takes two to three times as long, and
-            twice as much loses bounds.
-        halvings: Of the radius, at most: nearer to singular postures the cover ends.
-        listed: Places of what is free at which closed forms list all postures of an instant.
-        starts: Random starts of inverse kinematics at an instant.
-        neighbours: Charts in which a point of an edge is looked for.
+        corrections: Largest number of Newton steps of a projection.
+        spacing: Share of its radius by which a chart is put beyond the edge that it covers; the rest is overlap.
+        flatness: Largest distance of the manifold from a chart, relative to the radius, by the number of free
+            directions. With two, half the value takes two to three times as long, and twice the value loses bounds.
+        halvings: Largest number of halvings of the radius; the atlas ends closer to singular configurations.
+        listed: Samples of the free parameter at which a closed form lists all configurations.
+        starts: Random starts of inverse kinematics at a time sample.
+        neighbours: Charts in which a point of an edge is searched.
     """
 
     corrections: int = 12
-    beyond: float = 0.9
-    bent: tuple[float, float, float] = (0.1, 0.1, 0.15)
+    spacing: float = 0.9
+    flatness: tuple[float, float, float] = (0.1, 0.1, 0.15)
     halvings: int = 7
     listed: int = 64
     starts: int = 16
@@ -61,15 +61,15 @@ class ChartSettings:
 
 @dataclass(frozen=True, eq=False)
 class Charts:
-    """Parts of the set of postures, of some instants.
+    """Charts of the self-motion manifolds at some time samples.
 
     Attributes:
-        layer: Number of the instant. Shape (N,).
-        centers: Postures, rad or m. Shape (N, n).
-        tangents: Directions that keep the tip where it is, orthonormal in the metric. Shape (N, n, r).
+        layer: Index of the time sample. Shape (N,).
+        centers: Configurations on the manifold, rad or m. Shape (N, n).
+        tangents: Basis of the tangent space, orthonormal in the metric. Shape (N, n, r).
         radii: Half widths of the boxes, in the metric. Shape (N,).
-        low, high: Ends of the boxes, nearer where the joints' limits are. Shape (N, r).
-        strays: From the corners of the box, and the middles of its sides, to the set. Shape (N, c, n).
+        low, high: Ends of the boxes, cut where the joint limits are nearer. Shape (N, r).
+        deviations: Vectors from the c points of `_rim` on the box to the manifold. Shape (N, c, n).
     """
 
     layer: Indices
@@ -78,57 +78,66 @@ class Charts:
     radii: Array
     low: Array
     high: Array
-    strays: Array
+    deviations: Array
 
     def __len__(self) -> int:
         return len(self.layer)
 
-    def of(self, chosen: Any) -> Charts:
-        """Some of them."""
+    def select(self, chosen: Any) -> Charts:
+        """Return the charts of the given rows."""
         return Charts(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
 
     @property
     def spans(self) -> Array:
-        """How far the boxes reach from their centres, by joints. Shape (N, n)."""
+        """How far the boxes reach from their centres in each joint. Shape (N, n)."""
         reach = np.maximum(np.abs(self.low), np.abs(self.high))
-        return np.asarray((np.abs(self.tangents) * reach[:, None]).sum(axis=2) + self.most_stray)
+        return np.asarray((np.abs(self.tangents) * reach[:, None]).sum(axis=2) + self.max_deviation)
 
     @property
-    def most_stray(self) -> Array:
-        """How far the set leaves the boxes, by joints. Shape (N, n)."""
-        return np.asarray(np.abs(self.strays).max(axis=1, initial=0.0))
+    def max_deviation(self) -> Array:
+        """How far the manifold leaves the boxes in each joint. Shape (N, n)."""
+        return np.asarray(np.abs(self.deviations).max(axis=1, initial=0.0))
 
-    def bent(self) -> tuple[Array, Array]:
-        """How the set leaves the boxes: the quadratic form nearest to that, (N, n, r, r), and the rest, (N, c, n)."""
+    def points(self, places: Array) -> Array:
+        """Return the points (N, n) of the tangent spaces at places (N, r) in the boxes."""
+        return np.asarray(self.centers + np.einsum("knr,kr->kn", self.tangents, places))
+
+    def curvature(self) -> tuple[Array, Array]:
+        """Fit a quadratic form to the deviations of the manifold from the boxes by least squares.
+
+        Returns:
+            The form, (N, n, r, r), and the residuals at the rim, (N, c, n).
+        """
         r = self.tangents.shape[2]
-        rim, count = _rim(r), self.strays.shape[1]
+        rim, count = _rim(r), self.deviations.shape[1]
         rows, columns = np.triu_indices(r)
         terms = rim[:, rows] * rim[:, columns] * np.where(rows == columns, 0.5, 1.0)
-        bends = np.zeros((*self.tangents.shape, r))
+        form = np.zeros((*self.tangents.shape, r))
         if not r or not count:
-            return bends, self.strays
-        found = np.einsum("tc,kcn->knt", np.linalg.pinv(terms), self.strays)
-        bends[:, :, rows, columns] = bends[:, :, columns, rows] = found / self.radii[:, None, None] ** 2
-        return bends, self.strays - np.einsum("ct,knt->kcn", terms, found)
+            return form, self.deviations
+        coefficients = np.einsum("tc,kcn->knt", np.linalg.pinv(terms), self.deviations)
+        form[:, :, rows, columns] = form[:, :, columns, rows] = coefficients / self.radii[:, None, None] ** 2
+        return form, self.deviations - np.einsum("ct,knt->kcn", terms, coefficients)
 
 
-def point(joints: Array) -> Charts:
-    """The chart of a posture (n,) alone."""
-    n, none = len(joints), np.zeros((1, 0))
-    strays = np.zeros((1, 0, n))
-    return Charts(np.zeros(1, dtype=np.intp), joints[None], np.zeros((1, n, 0)), np.zeros(1), none, none, strays)
+def point_chart(joints: Array) -> Charts:
+    """Return the chart of a single configuration (n,)."""
+    n, empty = len(joints), np.zeros((1, 0))
+    deviations = np.zeros((1, 0, n))
+    return Charts(np.zeros(1, dtype=np.intp), joints[None], np.zeros((1, n, 0)), np.zeros(1), empty, empty, deviations)
 
 
-def together(parts: list[Charts]) -> Charts:
-    """One after the other."""
+def concatenate(parts: list[Charts]) -> Charts:
+    """Concatenate charts."""
     return Charts(*(np.concatenate([getattr(part, name) for part in parts]) for name in Charts.__dataclass_fields__))
 
 
-class Parts(NamedTuple):
+class SplitCharts(NamedTuple):
     """Charts of half the radius.
 
     Attributes:
-        charts: N of them. owners: Whose parts they are. Shape (N,). low, high: Ends of the part. Shape (N, r).
+        charts, owners: N charts, and the rows of the charts that they replace, (N,).
+        low, high: Ends of the replaced part in the box of the owner. Shape (N, r).
     """
 
     charts: Charts
@@ -138,30 +147,32 @@ class Parts(NamedTuple):
 
 
 class _Edges(NamedTuple):
-    """Points at the edges of charts.
+    """Points of the manifold at the edges of charts.
 
     Attributes:
-        layer: Shape (E,). points: On the set. Shape (E, n). ways: Unit vectors away from the chart. Shape (E, n).
-        owners: Charts that they belong to. Shape (E,). radii: Of the charts to be put there. Shape (E,).
+        layer, owners: Indices of the time samples and rows of the charts. Shape (E,).
+        points: Configurations. Shape (E, n).
+        directions: Unit vectors that lead away from the chart. Shape (E, n).
+        radii: Radii of the charts to be put there. Shape (E,).
     """
 
     layer: Indices
     points: Array
-    ways: Array
+    directions: Array
     owners: Indices
     radii: Array
 
-    def of(self, chosen: Any) -> _Edges:
+    def select(self, chosen: Any) -> _Edges:
         return _Edges(*(part[chosen] for part in self))
 
 
-class SelfMotions:
-    """The sets of postures that do a task at some instants.
+class SelfMotionManifolds:
+    """Self-motion manifolds of a task at some time samples.
 
     Attributes:
-        space: Where they lie.
-        size: How many directions are free in a regular posture.
-        lost: Edges of charts beyond which nothing was found, near singular postures.
+        space: Joint space.
+        size: Dimension r of the manifold at a regular configuration.
+        lost: Number of chart edges beyond which no chart was found, close to singular configurations.
     """
 
     def __init__(
@@ -169,323 +180,322 @@ class SelfMotions:
     ) -> None:
         """
         Args:
-            space: Of the machine's joints, which stands on a fixed base.
-            equations: Of poses.
-            targets: Of the equations at each instant. Shape (K, size).
-            settings: How they are covered.
+            space: Joint space of a machine on a fixed base.
+            equations: Equations of pose tasks.
+            targets: Targets of the equations at each time sample. Shape (K, size).
+            settings: Settings of the atlas.
         """
         self.settings = settings
         self.space, self.equations, self.targets = space, equations, targets
         n = equations.machine.joint_size
         self.size, self.lost = n - equations.size, 0
-        q, wanted, none = ca.SX.sym("q", n), ca.SX.sym("wanted", targets.shape[1]), ca.SX(0, 1)
-        parts = [equations.error(none, q, wanted), equations.jacobian(none, q)]
-        self._sampler = Sampler([q, wanted], parts)
+        q, target, base = ca.SX.sym("q", n), ca.SX.sym("wanted", targets.shape[1]), ca.SX(0, 1)
+        outputs = [equations.error(base, q, target), equations.jacobian(base, q)]
+        self._sampler = Sampler([q, target], outputs)
 
-    # ---- postures ------------------------------------------------------------------------------------------------
+    # ---- configurations ----------------------------------------------------------------------------------------------
 
     @cached_property
     def _branches(self) -> IkBranches | None:
         return ik_branches(self.equations, self.space.lower, self.space.upper)
 
-    def seeds(self, number: int, limits: Any, seed: int) -> Array:
-        """Postures of an instant within limits, of as many parts of the set as are found. Shape (K, n).
+    def seeds(self, index: int, limits: Any, seed: int) -> Array:
+        """Return configurations (K, n) of a time sample within limits, on as many components as possible.
 
-        Some of every branch by closed forms, and those of inverse kinematics from random starts.
+        A closed form lists some of every branch; inverse kinematics from random starts adds others.
 
         Raises:
-            Unreachable: None is found.
+            Unreachable: No configuration was found.
         """
         listed, count = np.zeros((0, len(self.space.scale))), self.settings.listed
         if self._branches is not None:
-            found = self._branches.solutions(self.targets[number], count, count * number)
-            on, good = self.corrected(np.full(len(found), number), found)
-            listed = on[good & self.space.within(on)]
-        told: dict[str, Any] = {"limits": limits, "seed": seed, "starts": self.settings.starts}
+            solutions = self._branches.solutions(self.targets[index], count, count * index)
+            projected, good = self.project(np.full(len(solutions), index), solutions)
+            listed = projected[good & self.space.within(projected)]
+        options: dict[str, Any] = {"limits": limits, "seed": seed, "starts": self.settings.starts}
         try:
-            sought = [one.joints for one in inverse_kinematics_at(self.equations, self.targets[number], **told)]
+            random = [
+                solution.joints for solution in inverse_kinematics_at(self.equations, self.targets[index], **options)
+            ]
         except Unreachable:
             if not len(listed):
                 raise
-            sought = []
-        return np.vstack([listed, *sought])
+            random = []
+        return np.vstack([listed, *random])
 
-    def linearised(self, layer: Indices, joints: Array) -> tuple[Array, Array]:
-        """What the tasks miss (M, m), and their Jacobian by joints of the metric (M, m, n)."""
+    def linearize(self, layer: Indices, joints: Array) -> tuple[Array, Array]:
+        """Return the task errors (M, m) and their Jacobians in the scaled joints (M, m, n)."""
         error, jacobian = self._sampler(joints, self.targets[layer])
         m, n = error.shape[1], joints.shape[1]
         return error, jacobian.reshape(-1, n, m).transpose(0, 2, 1) / self.space.scale
 
-    def corrected(self, layer: Indices, joints: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """The nearest postures that do the task, by Newton's method, shape (M, n), and whether they do. Shape (M,)."""
-        found = joints.copy()
-        good = np.zeros(len(found), dtype=bool)
-        busy = np.arange(len(found))
+    def project(self, layer: Indices, joints: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Project configurations (M, n) onto their manifolds by Newton steps; also return which converged, (M,)."""
+        projected, converged = joints.copy(), np.zeros(len(joints), dtype=bool)
+        active = np.arange(len(joints))
         for _ in range(self.settings.corrections):
-            if not busy.size:
+            if not active.size:
                 break
-            error, jacobian = self.linearised(layer[busy], found[busy])
-            worst = np.abs(error).max(axis=1, initial=0.0)
-            done = worst < TOLERANCE
-            good[busy[done]] = True
-            on = ~done & np.isfinite(worst)
-            busy, error, jacobian = busy[on], error[on], jacobian[on]
-            if busy.size:
-                step = np.einsum("kmn,km->kn", jacobian, _solved(jacobian @ jacobian.transpose(0, 2, 1), error))
-                found[busy] += np.clip(step, -1.0, 1.0) / self.space.scale
-        return found, good
+            error, jacobian = self.linearize(layer[active], projected[active])
+            error_size = np.abs(error).max(axis=1, initial=0.0)
+            done = error_size < TOLERANCE
+            converged[active[done]] = True
+            unfinished = ~done & np.isfinite(error_size)
+            active, error, jacobian = active[unfinished], error[unfinished], jacobian[unfinished]
+            if active.size:
+                solved = _solve_normal_equations(jacobian @ jacobian.transpose(0, 2, 1), error)
+                step = np.einsum("kmn,km->kn", jacobian, solved)
+                projected[active] += np.clip(step, -1.0, 1.0) / self.space.scale
+        return projected, converged
 
     def tangents_at(self, layer: Indices, joints: Array, like: Array | None = None) -> Array:
-        """Directions that keep the tips where they are, orthonormal in the metric, turned as others are.
+        """Return tangent bases at configurations (M, n), orthonormal in the metric. Shape (M, n, r).
 
         Args:
-            joints: Shape (M, n). like: Directions to be near to, shape (M, n, r).
+            like: Bases with which they are aligned as closely as possible. Shape (M, n, r).
         """
-        _, jacobian = self.linearised(layer, joints)
+        _, jacobian = self.linearize(layer, joints)
         r = self.size if like is None else like.shape[2]
-        _, _, rows = np.linalg.svd(jacobian, full_matrices=True)
-        free = rows[:, rows.shape[1] - r :].transpose(0, 2, 1)
+        _, _, right_vectors = np.linalg.svd(jacobian, full_matrices=True)
+        null = right_vectors[:, right_vectors.shape[1] - r :].transpose(0, 2, 1)
         if like is not None and r:
-            left, _, right = np.linalg.svd(free.transpose(0, 2, 1) @ (like * self.space.scale[:, None]))
-            free = free @ (left @ right)
-        return np.asarray(free / self.space.scale[:, None])
+            left, _, right = np.linalg.svd(null.transpose(0, 2, 1) @ (like * self.space.scale[:, None]))
+            null = null @ (left @ right)
+        return np.asarray(null / self.space.scale[:, None])
 
-    # ---- charts --------------------------------------------------------------------------------------------------
+    # ---- charts ------------------------------------------------------------------------------------------------------
 
-    def at(self, layer: Indices, joints: Array, radii: Array, like: Array | None = None) -> tuple[Charts, Array]:
-        """Charts about postures, their radii halved until the set stays near, and where it is at their rims.
+    def charts_at(self, layer: Indices, joints: Array, radii: Array, like: Array | None = None) -> tuple[Charts, Array]:
+        """Return charts at configurations, with the radii halved until the manifold is flat enough.
 
         Returns:
-            The charts, and the points of the set at the rims, shape (N, c, n), nan where none was found.
+            The charts, and the points of the manifold at their rims, nan where none was found. Shape (N, c, n).
         """
         tangents = self.tangents_at(layer, joints, like)
-        rim = _rim(tangents.shape[2])
-        radii = radii.copy()
-        strays = np.zeros((len(joints), len(rim), joints.shape[1]))
-        points = np.full_like(strays, np.nan)
-        busy = np.arange(len(joints))
+        radii, rim_size = radii.copy(), len(_rim(tangents.shape[2]))
+        deviations = np.zeros((len(joints), rim_size, joints.shape[1]))
+        points = np.full_like(deviations, np.nan)
+        active = np.arange(len(joints))
         for halving in range(self.settings.halvings + 1):
-            if not busy.size:
+            if not active.size:
                 break
-            on, apart = self._strays(layer[busy], joints[busy], tangents[busy], radii[busy])
-            points[busy], strays[busy] = on, apart
-            far = ~(self.space.length(apart) <= self.settings.bent[tangents.shape[2]] * radii[busy, None]).all(axis=1)
+            box = layer[active], joints[active], tangents[active], radii[active]
+            points[active], deviations[active] = self._deviations(*box)
+            largest = self.settings.flatness[tangents.shape[2]] * radii[active, None]
+            curved = ~(self.space.length(deviations[active]) <= largest).all(axis=1)
             if halving < self.settings.halvings:
-                radii[busy[far]] /= 2
-            busy = busy[far]
-        return self._within(layer, joints, tangents, radii, strays), points
+                radii[active[curved]] /= 2
+            active = active[curved]
+        return self._clip_boxes(layer, joints, tangents, radii, deviations), points
 
-    def _within(self, layer: Indices, joints: Array, tangents: Array, radii: Array, strays: Array) -> Charts:
-        """Charts, their boxes cut where no posture of theirs is within the joints' limits."""
-        strays = np.nan_to_num(strays)
-        stray = np.abs(strays).max(axis=1, initial=0.0)
+    def _clip_boxes(self, layer: Indices, joints: Array, tangents: Array, radii: Array, deviations: Array) -> Charts:
+        """Return charts whose boxes end where no configuration beyond lies within the joint limits."""
+        deviations = np.nan_to_num(deviations)
+        max_deviation = np.abs(deviations).max(axis=1, initial=0.0)
         reach = np.abs(tangents) * radii[:, None, None]
-        others = reach.sum(axis=2)[:, :, None] - reach
-        up, down = self.space.upper - joints + stray, joints - self.space.lower + stray
-        room = np.stack([up, down])[:, :, :, None] + others
-        room[(room < 0) & (room >= -TOLERANCE)] = 0.0  # a joint that is held at its limit is there up to rounding
+        other_axes = reach.sum(axis=2)[:, :, None] - reach
+        above, below = self.space.upper - joints + max_deviation, joints - self.space.lower + max_deviation
+        margin = np.stack([above, below])[:, :, :, None] + other_axes
+        margin[(margin < 0) & (margin >= -TOLERANCE)] = 0.0  # a joint fixed at its limit exceeds it by rounding
         with np.errstate(divide="ignore", invalid="ignore"):
-            far = room / np.abs(tangents)
-        far[np.isnan(far)] = np.inf
-        rising, limit = tangents > 0, radii[:, None]
-        high = np.where(rising, far[0], far[1]).min(axis=1).clip(-2 * limit, limit)
-        low = np.where(rising, far[1], far[0]).min(axis=1).clip(-2 * limit, limit)
-        return Charts(layer, joints, tangents, radii, -low, high, strays)
+            reach = margin / np.abs(tangents)
+        reach[np.isnan(reach)] = np.inf
+        increasing, radius = tangents > 0, radii[:, None]
+        high = np.where(increasing, reach[0], reach[1]).min(axis=1).clip(-2 * radius, radius)
+        low = np.where(increasing, reach[1], reach[0]).min(axis=1).clip(-2 * radius, radius)
+        return Charts(layer, joints, tangents, radii, -low, high, deviations)
 
-    def _strays(self, layer: Indices, joints: Array, tangents: Array, radii: Array) -> tuple[Array, Array]:
-        """Points of the set at the rims of boxes, nan where there are none, and how far they are from these."""
+    def _deviations(self, layer: Indices, joints: Array, tangents: Array, radii: Array) -> tuple[Array, Array]:
+        """Return the points of the manifold at the rims of boxes, nan if there are none, and their offsets."""
         rim = _rim(tangents.shape[2])
-        flat = joints[:, None] + radii[:, None, None] * np.einsum("knr,cr->kcn", tangents, rim)
-        on, good = self.corrected(np.repeat(layer, len(rim)), flat.reshape(-1, joints.shape[1]))
-        on = np.where(good[:, None], on, np.nan).reshape(flat.shape)
-        return on, on - flat
+        tangent_points = joints[:, None] + radii[:, None, None] * np.einsum("knr,cr->kcn", tangents, rim)
+        projected, converged = self.project(np.repeat(layer, len(rim)), tangent_points.reshape(-1, joints.shape[1]))
+        projected = np.where(converged[:, None], projected, np.nan).reshape(tangent_points.shape)
+        return projected, projected - tangent_points
 
-    def inside(self, charts: Charts) -> NDArray[np.bool_]:
-        """Which charts have a part within the joints' limits. Shape (N,)."""
+    def within_limits(self, charts: Charts) -> NDArray[np.bool_]:
+        """Return which charts have a part within the joint limits. Shape (N,)."""
         low, high = charts.centers - charts.spans, charts.centers + charts.spans
         reached = ((high >= self.space.lower) & (low <= self.space.upper)).all(axis=1)
         return np.asarray(reached & (charts.low <= charts.high).all(axis=1))
 
-    def cover(self, layer: Indices, joints: Array, radius: float, most: int) -> Charts:
-        """Charts of all that is connected with some postures, at their instants or from one instant to the next.
+    def cover(self, layer: Indices, joints: Array, radius: float, max_charts: int) -> Charts:
+        """Cover all components connected with some configurations, within a time sample or across samples.
 
         Args:
-            layer, joints: The postures, which do their tasks. Shapes (M,), (M, n).
-            radius: Of the charts, at most.
-            most: Charts, beyond which the set is too large.
+            layer, joints: Indices of time samples and configurations on their manifolds. Shapes (M,), (M, n).
+            radius, max_charts: Largest radius and largest number of charts.
 
         Raises:
-            ProblemError: There are more.
+            ProblemError: The atlas needs more charts.
         """
-        charts, left = None, np.arange(len(layer))
-        while charts is None or left.size:
-            # one of each instant, and of what has not grown from it another one
-            _, first = np.unique(layer[left], return_index=True)
-            charts = self._grown(charts, layer[left[first]], joints[left[first]], radius, most)
-            left = np.delete(left, first)
-            left = left[~self.covered(charts, layer[left], joints[left])]
-        last, new = len(self.targets) - 1, charts
-        while len(new):
-            layer = np.concatenate([new.layer - 1, new.layer + 1])
+        charts, pending = None, np.arange(len(layer))
+        while charts is None or pending.size:
+            # one configuration per sample, then another one that is not covered yet
+            _, first = np.unique(layer[pending], return_index=True)
+            charts = self._grow(charts, layer[pending[first]], joints[pending[first]], radius, max_charts)
+            pending = np.delete(pending, first)
+            pending = pending[~self.is_covered(charts, layer[pending], joints[pending])]
+        last, added = len(self.targets) - 1, charts
+        while len(added):
+            layer = np.concatenate([added.layer - 1, added.layer + 1])
             within = np.flatnonzero((layer >= 0) & (layer <= last))
-            there, good = self.corrected(layer[within], np.tile(new.centers, (2, 1))[within])
-            good &= self.space.within(there)
-            layer, there = layer[within][good], there[good]
-            fresh = ~self.covered(charts, layer, there)
+            projected, valid = self.project(layer[within], np.tile(added.centers, (2, 1))[within])
+            valid &= self.space.within(projected)
+            layer, projected = layer[within][valid], projected[valid]
+            uncovered = ~self.is_covered(charts, layer, projected)
             before = len(charts)
-            charts = self._grown(charts, layer[fresh], there[fresh], radius, most)
-            new = charts.of(slice(before, None))
+            charts = self._grow(charts, layer[uncovered], projected[uncovered], radius, max_charts)
+            added = charts.select(slice(before, None))
         return charts
 
-    def _grown(self, known: Charts | None, layer: Indices, joints: Array, radius: float, most: int) -> Charts:
-        """The charts that are known, and those of all that is connected with some postures at their instants."""
-        number = 0 if known is None else len(known)
-        charts, edges = self._begun(layer, joints, np.full(len(layer), radius), None, number)
-        charts = charts if known is None else together([known, charts])
-        edges = edges.of(~self.covered(charts, edges.layer, edges.points, edges.owners))
+    def _grow(self, atlas: Charts | None, layer: Indices, joints: Array, radius: float, max_charts: int) -> Charts:
+        """Return the atlas extended by the components of some configurations at their time samples."""
+        first = 0 if atlas is None else len(atlas)
+        charts, edges = self._new_charts(layer, joints, np.full(len(layer), radius), None, first)
+        charts = charts if atlas is None else concatenate([atlas, charts])
+        edges = edges.select(~self.is_covered(charts, edges.layer, edges.points, edges.owners))
         while len(edges.layer):
-            beyond = edges.points + self.settings.beyond * edges.radii[:, None] * edges.ways
-            joints, good = self.corrected(edges.layer, beyond)
-            shift = self.space.length(joints - beyond)
-            good &= shift <= 2 * self.settings.bent[charts.tangents.shape[2]] * edges.radii
-            chosen = np.flatnonzero(good)
-            chosen = chosen[self._apart(edges.layer[chosen], joints[chosen], edges.radii[chosen])]
+            outside = edges.points + self.settings.spacing * edges.radii[:, None] * edges.directions
+            joints, valid = self.project(edges.layer, outside)
+            shift = self.space.length(joints - outside)
+            valid &= shift <= 2 * self.settings.flatness[charts.tangents.shape[2]] * edges.radii
+            chosen = np.flatnonzero(valid)
+            chosen = chosen[self._thin_out(edges.layer[chosen], joints[chosen], edges.radii[chosen])]
             like = charts.tangents[edges.owners[chosen]]
-            new, ends = self._begun(
+            added, added_edges = self._new_charts(
                 edges.layer[chosen], joints[chosen], np.minimum(2 * edges.radii[chosen], radius), like, len(charts)
             )
-            tight = edges.radii / 2  # of what is not covered by these: nearer by
-            charts = together([charts, new])
-            if len(charts) > most:
-                words = (
-                    f"more than {most} charts of {radius:.3g} rad cover the postures that do the task; "
-                    "take larger ones, or fewer instants"
-                )
-                raise ProblemError(words, name="postures", value=len(charts), limit=most)
-            kept = edges._replace(radii=tight)
-            narrow = tight < radius / 2**self.settings.halvings
-            self.lost += int(narrow.sum())
-            kept = kept.of(~narrow)
-            edges = _Edges(*(np.concatenate(pair) for pair in zip(kept, ends, strict=True)))
-            edges = edges.of(~self.covered(charts, edges.layer, edges.points, edges.owners))
+            halved = edges.radii / 2
+            charts = concatenate([charts, added])
+            if len(charts) > max_charts:
+                words = f"the self-motion manifold needs more than {max_charts} charts of radius {radius:.3g} rad; "
+                words += "use larger charts or fewer time samples"
+                raise ProblemError(words, name="configurations", value=len(charts), limit=max_charts)
+            lost = halved < radius / 2**self.settings.halvings
+            self.lost += int(lost.sum())
+            remaining = edges._replace(radii=halved).select(~lost)  # retried nearer to the edge if still uncovered
+            edges = _Edges(*(np.concatenate(pair) for pair in zip(remaining, added_edges, strict=True)))
+            edges = edges.select(~self.is_covered(charts, edges.layer, edges.points, edges.owners))
         return charts
 
-    def parts(self, charts: Charts) -> Parts:
-        """Charts of half the radius in their place, and what of these they are."""
+    def split(self, charts: Charts) -> SplitCharts:
+        """Replace charts by charts of half the radius; a chart whose halves cannot be projected stays."""
         r = charts.tangents.shape[2]
         signs = np.array(list(product((-0.5, 0.5), repeat=r))).reshape(2**r, r)
-        flat = charts.centers[:, None] + charts.radii[:, None, None] * np.einsum("knr,cr->kcn", charts.tangents, signs)
-        shape = flat.shape
+        offsets = charts.radii[:, None, None] * np.einsum("knr,cr->kcn", charts.tangents, signs)
+        tangent_points = charts.centers[:, None] + offsets
+        shape = tangent_points.shape
         layer = np.repeat(charts.layer, shape[1])
-        joints, good = self.corrected(layer, flat.reshape(-1, shape[2]))
-        like = np.repeat(charts.tangents, shape[1], axis=0)
-        radii = self._half(charts, signs)
-        whole = good.reshape(shape[:2]).all(axis=1)
-        part = np.flatnonzero(np.repeat(whole, shape[1]))
-        layer, joints, radii = layer[part], joints[part], radii[part]
-        tangents = self.tangents_at(layer, joints, like[part])
-        strays = self._strays(layer, joints, tangents, radii)[1]
-        new = self._within(layer, joints, tangents, radii, strays)
-        inside, rest = self.inside(new), np.flatnonzero(~whole)
-        owners = np.append((part // max(shape[1], 1))[inside], rest)
-        sides = np.vstack([signs[part % shape[1]][inside], np.zeros((len(rest), r))])
+        joints, valid = self.project(layer, tangent_points.reshape(-1, shape[2]))
+        bases = np.repeat(charts.tangents, shape[1], axis=0)
+        radii = self._split_radii(charts, signs)
+        splittable = valid.reshape(shape[:2]).all(axis=1)
+        rows = np.flatnonzero(np.repeat(splittable, shape[1]))
+        layer, joints, radii = layer[rows], joints[rows], radii[rows]
+        tangents = self.tangents_at(layer, joints, bases[rows])
+        deviations = self._deviations(layer, joints, tangents, radii)[1]
+        halves = self._clip_boxes(layer, joints, tangents, radii, deviations)
+        within_limits, unsplit = self.within_limits(halves), np.flatnonzero(~splittable)
+        owners = np.append((rows // max(shape[1], 1))[within_limits], unsplit)
+        sides = np.vstack([signs[rows % shape[1]][within_limits], np.zeros((len(unsplit), r))])
         ends = charts.low[owners], charts.high[owners]
         low = np.where(sides > 0, np.maximum(ends[0], 0.0), ends[0])
         high = np.where(sides < 0, np.minimum(ends[1], 0.0), ends[1])
-        none = low > high  # of a box that ends before: what is there belongs to its other side
-        low, high = np.where(none, ends[0], low), np.where(none, ends[1], high)
-        return Parts(together([new.of(inside), charts.of(rest)]), owners, low, high)
+        empty = low > high  # the box ends before this half, which then belongs to the other side
+        low, high = np.where(empty, ends[0], low), np.where(empty, ends[1], high)
+        return SplitCharts(concatenate([halves.select(within_limits), charts.select(unsplit)]), owners, low, high)
 
-    def _half(self, charts: Charts, signs: Array) -> Array:
-        """Radii of the parts of charts, of middles at signs (c, r) of their boxes. Shape (N c,).
+    def _split_radii(self, charts: Charts, signs: Array) -> Array:
+        """Return the radii of half charts centred at signs (c, r) of the boxes. Shape (N c,).
 
-        Beside the middle of a part, where the set leaves the chart by Ds, a shift u in the chart is one by
-        (1 + Ds' Ds)^1/2 u in the part, whose axes are turned as little as may be, and Ds' of what the set bends within
-        it; beyond that, what it strays from the quadratic form.
+        At the centre of a half, let the manifold leave the chart with slope Ds. A shift u in the chart is then a shift
+        (1 + Ds' Ds)^1/2 u in the half, whose axes are aligned as closely as possible. Added are Ds' times the quadratic
+        deviation within the half, and the residual of the quadratic form.
         """
         r = charts.tangents.shape[2]
-        bends, rest = charts.bent()
-        slopes = np.einsum("knab,cb->kcna", bends * self.space.scale[:, None, None], signs)
-        lean = charts.radii[:, None] * np.sqrt((slopes**2).sum(axis=(2, 3)))
-        longer = 1 + np.sqrt(max(r, 1)) * (np.sqrt(1 + lean**2) - 1)
-        bent = self.space.length(charts.strays - rest).max(axis=1, initial=0.0) / 4
-        strays = self.space.length(rest).max(axis=1, initial=0.0)
-        return np.asarray(charts.radii[:, None] / 2 * longer + lean * bent[:, None] + strays[:, None]).ravel()
+        form, residuals = charts.curvature()
+        slopes = np.einsum("knab,cb->kcna", form * self.space.scale[:, None, None], signs)
+        tilt = charts.radii[:, None] * np.sqrt((slopes**2).sum(axis=(2, 3)))
+        stretch = 1 + np.sqrt(max(r, 1)) * (np.sqrt(1 + tilt**2) - 1)
+        quadratic = self.space.length(charts.deviations - residuals).max(axis=1, initial=0.0) / 4
+        residual = self.space.length(residuals).max(axis=1, initial=0.0)
+        return np.asarray(charts.radii[:, None] / 2 * stretch + tilt * quadratic[:, None] + residual[:, None]).ravel()
 
-    def covered(self, charts: Charts, layer: Indices, joints: Array, but: Indices | None = None) -> NDArray[np.bool_]:
-        """Whether postures lie in charts; of edges, in others `but` their own. Shape (M,)."""
+    def is_covered(
+        self, charts: Charts, layer: Indices, joints: Array, excluded: Indices | None = None
+    ) -> NDArray[np.bool_]:
+        """Return which configurations lie in a chart other than the one `excluded` for each. Shape (M,)."""
         if not len(layer) or not len(charts):
             return np.zeros(len(layer), dtype=bool)
         r = charts.tangents.shape[2]
-        within = 2 * float(charts.radii.max()) * np.sqrt(max(r, 1)) + 1e-6
+        search_radius = 2 * float(charts.radii.max()) * np.sqrt(max(r, 1)) + 1e-6
         tree = self.space.tree(charts.centers, charts.layer)
-        count = min(self.settings.neighbours * 2 ** max(r - 1, 0), len(charts))
-        _, near = tree.query(self.space.placed(joints, layer), k=count, distance_upper_bound=within)
-        near = np.reshape(near, (len(layer), -1))
-        found = np.zeros(len(layer), dtype=bool)
-        for column in near.T:
-            rows = np.flatnonzero((column < len(charts)) & ~found)
-            if but is not None:
-                rows = rows[column[rows] != but[rows]]
-            which = column[rows]
-            apart = self.space.difference(joints[rows], charts.centers[which]) * self.space.scale
-            flat = np.einsum("kn,knr->kr", apart, charts.tangents[which] * self.space.scale[:, None])
-            normal = np.sqrt(np.maximum((apart**2).sum(axis=1) - (flat**2).sum(axis=1), 0.0))
-            radii = charts.radii[which]
-            near = normal <= 2 * self.settings.bent[r] * radii + 1e-6
-            found[rows] = near & (np.abs(flat) <= radii[:, None] * (1 + 1e-9)).all(axis=1)
-        return found
+        neighbours = min(self.settings.neighbours * 2 ** max(r - 1, 0), len(charts))
+        _, nearest = tree.query(self.space.tree_points(joints, layer), k=neighbours, distance_upper_bound=search_radius)
+        nearest = np.reshape(nearest, (len(layer), -1))
+        covered = np.zeros(len(layer), dtype=bool)
+        for column in nearest.T:
+            rows = np.flatnonzero((column < len(charts)) & ~covered)
+            if excluded is not None:
+                rows = rows[column[rows] != excluded[rows]]
+            candidates = column[rows]
+            delta = self.space.difference(joints[rows], charts.centers[candidates]) * self.space.scale
+            coordinates = np.einsum("kn,knr->kr", delta, charts.tangents[candidates] * self.space.scale[:, None])
+            normal = np.sqrt(np.maximum((delta**2).sum(axis=1) - (coordinates**2).sum(axis=1), 0.0))
+            radii = charts.radii[candidates]
+            close = normal <= 2 * self.settings.flatness[r] * radii + 1e-6
+            covered[rows] = close & (np.abs(coordinates) <= radii[:, None] * (1 + 1e-9)).all(axis=1)
+        return covered
 
-    def _apart(self, layer: Indices, joints: Array, radii: Array) -> Indices:
-        """Of postures to put charts at, those that are not within the radius of one before."""
+    def _thin_out(self, layer: Indices, joints: Array, radii: Array) -> Indices:
+        """Return the rows of configurations that are not within the radius of an earlier one."""
         if not len(layer):
             return np.zeros(0, dtype=np.intp)
-        tree = self.space.tree(joints, layer)
-        pairs = tree.query_pairs(float(radii.max()), output_type="ndarray")
-        kept = np.ones(len(layer), dtype=bool)
+        pairs = self.space.tree(joints, layer).query_pairs(float(radii.max()), output_type="ndarray")
+        chosen = np.ones(len(layer), dtype=bool)
         if len(pairs):
-            far = self.space.length(self.space.difference(joints[pairs[:, 0]], joints[pairs[:, 1]]))
-            pairs = pairs[far < np.minimum(radii[pairs[:, 0]], radii[pairs[:, 1]])]
-            for one, other in pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))].tolist():
-                if kept[one]:
-                    kept[other] = False
-        return np.flatnonzero(kept)
+            distances = self.space.length(self.space.difference(joints[pairs[:, 0]], joints[pairs[:, 1]]))
+            pairs = pairs[distances < np.minimum(radii[pairs[:, 0]], radii[pairs[:, 1]])]
+            for first, second in pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))].tolist():
+                if chosen[first]:
+                    chosen[second] = False
+        return np.flatnonzero(chosen)
 
-    def _begun(
-        self, layer: Indices, joints: Array, radii: Array, like: Array | None, number: int = 0
+    def _new_charts(
+        self, layer: Indices, joints: Array, radii: Array, like: Array | None, first: int = 0
     ) -> tuple[Charts, _Edges]:
-        """Charts about postures, and the points of their edges within limits; the first one has the given number."""
+        """Return charts at configurations, and their edge points within limits; `first` is the first row."""
         if like is None:
-            kept = self._apart(layer, joints, radii)
-            layer, joints, radii = layer[kept], joints[kept], radii[kept]
-        charts, points = self.at(layer, joints, radii, like)
-        good = self.inside(charts)
-        charts, points = charts.of(good), points[good]
+            chosen = self._thin_out(layer, joints, radii)
+            layer, joints, radii = layer[chosen], joints[chosen], radii[chosen]
+        charts, points = self.charts_at(layer, joints, radii, like)
+        valid = self.within_limits(charts)
+        charts, points = charts.select(valid), points[valid]
         owner, side = np.nonzero(self.space.within(points))
-        ways = np.einsum("enr,er->en", charts.tangents[owner], _rim(charts.tangents.shape[2])[side])
-        return charts, _Edges(charts.layer[owner], points[owner, side], ways, number + owner, charts.radii[owner])
+        directions = np.einsum("enr,er->en", charts.tangents[owner], _rim(charts.tangents.shape[2])[side])
+        return charts, _Edges(charts.layer[owner], points[owner, side], directions, first + owner, charts.radii[owner])
 
 
-class Instant(NamedTuple):
-    """Which set of postures of whose."""
+class TimeSample(NamedTuple):
+    """Self-motion manifold of a time sample: its task, and its index among the samples of this task."""
 
-    sets: SelfMotions
-    number: int
+    manifolds: SelfMotionManifolds
+    row: int
 
 
 def _rim(r: int) -> Array:
-    """Places at the rim of a box of half width 1: the middles of its sides, and its corners. Shape (c, r)."""
+    """Return the midpoints of the sides and the corners of a box of half width 1. Shape (c, r)."""
     middles = [side * np.eye(r)[axis] for axis in range(r) for side in (-1.0, 1.0)] if r > 1 else []
     corners = [np.array(signs) for signs in product((-1.0, 1.0), repeat=r)] if r else []
-    found = [*middles, *corners]
-    return np.array(found).reshape(len(found), r)
+    return np.array([*middles, *corners]).reshape(-1 if r else 0, r)
 
 
-def _solved(square: Array, right: Array) -> Array:
-    """Solutions (K, m) of normal equations (K, m, m), those that are singular softened."""
+def _solve_normal_equations(square: Array, right: Array) -> Array:
+    """Solve normal equations (K, m, m) for (K, m), regularised where they are singular."""
     m = square.shape[1]
     if not m:
         return right
-    size = np.trace(square, axis1=1, axis2=2)[:, None, None]
-    soft = ROUNDING_SHARE**2 * size + np.finfo(float).tiny
-    return np.asarray(np.linalg.solve(square + soft * np.eye(m), right[:, :, None])[:, :, 0])
+    trace = np.trace(square, axis1=1, axis2=2)[:, None, None]
+    regularization = ROUNDING_SHARE**2 * trace + np.finfo(float).tiny
+    return np.asarray(np.linalg.solve(square + regularization * np.eye(m), right[:, :, None])[:, :, 0])

@@ -1,7 +1,8 @@
-"""Where a motion may begin: postures that inverse kinematics finds, followed through the tasks side by side."""
+"""Start configurations of a motion, and the local motions that resolved-rate control tracks from them."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal, TypeAlias
@@ -15,13 +16,7 @@ from ocp.errors import ProblemError
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.tool_motion import Stretch
 from ocp.motion.local.collisions import Collision, distances_along
-from ocp.motion.local.inverse_kinematics import (
-    Unreachable,
-    distinct_solutions,
-    idle_positions,
-    inverse_kinematics,
-    start_configurations,
-)
+from ocp.motion.local.inverse_kinematics import Unreachable, idle_positions, inverse_kinematics, sample_starts
 from ocp.motion.local.rates import LocalMotion, track_tasks
 from ocp.motion.search.settings import PlannerSettings
 from ocp.motion.tasks.checks import ignorable_joints
@@ -30,28 +25,33 @@ from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.motion.tasks.tip_task import TipTask
 
 __all__ = [
-    "OUT_OF_REACH", "Asked", "SearchKind", "check_clear_start", "clear_postures", "followed_from", "misfits_of",
-    "others_told", "placed", "postures_at_the_start", "settled", "touches_at_the_start",
+    "REACH_TOLERANCE", "PlanRequest", "SearchKind", "check_clear_start", "count_clear_configurations",
+    "describe_alternatives", "fix_ignorable_joints", "largest_pose_errors", "local_motions_from", "locate_error",
+    "sampled_motions", "start_collisions", "start_configurations",
 ]  # fmt: skip
 
 SETTINGS = PlannerSettings()
-SearchKind: TypeAlias = Literal["start", "postures", "global"]
-OUT_OF_REACH = 1e-4
-"""m or rad: a pose missed by more may be out of reach."""
+SearchKind: TypeAlias = Literal["start", "configurations", "global"]
+REACH_TOLERANCE = 1e-4
+"""m or rad: a pose with a larger error may be out of reach."""
 
 
 @dataclass(frozen=True, eq=False)
-class Asked:
-    """What is asked, checked.
+class PlanRequest:
+    """Checked arguments of `ocp.motion.plan.plan`.
 
     Attributes:
-        machine, tasks, horizon: As of `plan`.
-        start: Joints at the start, or None. base: Base there. weights: Of the joint rates.
-        limits: Of the joints.
+        machine, tasks, horizon: As in `plan`.
+        stretches: Intervals of time in which the same tasks are active.
+        start: Joints at the start, rad or m, or None if they are searched. Shape (n,).
+        base: Base at the start. Shape (base_size,).
+        weights: Weights of the squared joint rates. Shape (n,).
+        limits: Limits of joint positions and rates.
+        time_cost: Cost of a second if the horizon is free; else None.
         search: How the start is searched.
-        drives: Limits with those of actuators, or None where these are not limited.
-        clearance_constraints: What the motion has to stay clear of, or None.
-        settings: Of the planner.
+        actuator_limits: Limits that include those of the actuators; None if these are not limited.
+        clearance_constraints: Clearance constraints of the motion, or None.
+        settings: Settings of the planner.
     """
 
     machine: Machine
@@ -65,234 +65,230 @@ class Asked:
     cyclic: bool
     seed: int
     time_cost: float | None
-    search: SearchKind = "postures"
-    drives: Limits | None = None
+    search: SearchKind = "configurations"
+    actuator_limits: Limits | None = None
     clearance_constraints: ClearanceConstraints | None = None
     settings: PlannerSettings = SETTINGS
 
     @cached_property
-    def idle(self) -> NDArray[np.bool_]:
-        """Which joints move the frame of no task, at any time. Shape (n,)."""
+    def idle_joints(self) -> NDArray[np.bool_]:
+        """Mask of the joints that never move a task's frame. Shape (n,)."""
         return bind(self.machine, self.tasks).idle
 
     @property
-    def held(self) -> NDArray[np.bool_]:
-        """Which joints stand still: where all motions are searched, those that move no task's frame. Shape (n,)."""
-        return self.idle & (self.search == "global")
+    def fixed_joints(self) -> NDArray[np.bool_]:
+        """Mask of the joints that stand still: the idle ones if the search is global. Shape (n,)."""
+        return self.idle_joints & (self.search == "global")
 
     @property
     def ik_options(self) -> dict[str, Any]:
-        """Of inverse kinematics."""
+        """Options of inverse kinematics."""
         return {"seed": self.seed, "limits": self.limits.joints, "starts": self.settings.ik_starts}
 
     @cached_property
     def bounds(self) -> JointBounds:
-        """Of the joints."""
+        """Bounds of the joints."""
         return self.limits.bounds(self.machine)
 
 
-def postures_at_the_start(asked: Asked) -> Array:
-    """Joints at the start, those that are clear before those that touch, the best conditioned first. Shape (K, n)."""
-    if asked.start is not None:
-        return asked.start[None]
-    first = [asked.tasks[i] for i in asked.stretches[0].tasks if asked.tasks[i].is_pose]
+def start_configurations(request: PlanRequest) -> Array:
+    """Return joint vectors at the start: collision-free ones first, then by condition. Shape (K, n)."""
+    if request.start is not None:
+        return request.start[None]
+    first = [request.tasks[i] for i in request.stretches[0].tasks if request.tasks[i].is_pose]
     if not first:
-        words = "start is missing: no task says by a pose where the tip is at the start; give plan(..., start=...)"
+        words = "start is missing: no task gives the tip's pose at the start; give plan(..., start=...)"
         raise ProblemError(words, name="start")
-    options: dict[str, Any] = {
-        "base": asked.base,
-        "seed": asked.seed,
-        "limits": asked.limits.joints,
-        "starts": asked.settings.ik_starts,
-    }
     try:
-        found = inverse_kinematics(asked.machine, first, **options)
+        solutions = inverse_kinematics(request.machine, first, base=request.base, **request.ik_options)
     except Unreachable as error:
-        raise placed(asked, error, 0.0) from error
-    resting, slides = idle_positions(asked.bounds.lower, asked.bounds.upper), asked.machine.robot.moving_joints
-    found = [replace(posture, joints=np.where(asked.idle, resting, posture.joints)) for posture in found]
-    found = distinct_solutions(found, np.array([joint.kind != "prismatic" for joint in slides]))
-    joints = np.array([posture.joints for posture in found])
-    touching = [touch is not None for touch in touches_at_the_start(asked, joints)]
-    return joints[np.argsort(touching, kind="stable")]
+        raise locate_error(request, error, 0.0) from error
+    stationary, moving = idle_positions(request.bounds.lower, request.bounds.upper), request.machine.robot.moving_joints
+    idle = request.idle_joints
+    solutions = [replace(solution, joints=np.where(idle, stationary, solution.joints)) for solution in solutions]
+    solutions = distinct_solutions(solutions, np.array([joint.kind != "prismatic" for joint in moving]))
+    joints = np.array([solution.joints for solution in solutions])
+    colliding = [collision is not None for collision in start_collisions(request, joints)]
+    return joints[np.argsort(colliding, kind="stable")]
 
 
-def touches_at_the_start(asked: Asked, postures: Array) -> list[Collision | None]:
-    """Of each posture (K, n) the pair of bodies that comes nearest, where it comes too near."""
-    if asked.clearance_constraints is None:
-        return [None] * len(postures)
-    around = asked.clearance_constraints.scene
-    apart = distances_along(around, asked.base, postures, np.zeros(len(postures)))
-    nearest, labels = apart.argmin(axis=1).tolist(), around.labels
-    found = [Collision(pair, labels[pair], float(row[pair]), 0.0) for row, pair in zip(apart, nearest, strict=True)]
-    return [touch if touch.distance < around.clearance else None for touch in found]
+def start_collisions(request: PlanRequest, configurations: Array) -> list[Collision | None]:
+    """Return the closest pair of bodies in each configuration (K, n), or None if it keeps the clearance."""
+    if request.clearance_constraints is None:
+        return [None] * len(configurations)
+    scene = request.clearance_constraints.scene
+    distances = distances_along(scene, request.base, configurations, np.zeros(len(configurations)))
+    closest = zip(distances, distances.argmin(axis=1).tolist(), strict=True)
+    collisions = [Collision(pair, scene.labels[pair], float(row[pair]), 0.0) for row, pair in closest]
+    return [collision if collision.distance < scene.clearance else None for collision in collisions]
 
 
-def check_clear_start(asked: Asked, postures: Array) -> None:
-    """Raise ProblemError where bodies come too near at the start that is given."""
-    if (touch := touches_at_the_start(asked, postures)[0]) is not None:
-        assert asked.clearance_constraints is not None
-        around, name = asked.clearance_constraints.scene, " and ".join(touch.bodies)
-        ignored = [around.pair_names(touch.pair)]
-        words = f"start: {touch}; start clear of everything, or name what may touch: {ignored=}"
-        words = "; ".join([words, *others_told(clear_postures(asked, touch.time))])
-        raise ProblemError(words, name=name, value=touch.distance, limit=around.clearance, time=touch.time)
+def check_clear_start(request: PlanRequest, configurations: Array) -> None:
+    """Raise ProblemError if the given start is in collision."""
+    if (collision := start_collisions(request, configurations)[0]) is not None:
+        assert request.clearance_constraints is not None
+        scene, name = request.clearance_constraints.scene, " and ".join(collision.bodies)
+        ignored = [scene.pair_names(collision.pair)]
+        words = f"start: {collision}; give a collision-free start, or ignore this pair of bodies: {ignored=}"
+        alternatives = count_clear_configurations(request, collision.time)
+        words = "; ".join([words, *describe_alternatives(alternatives)])
+        raise ProblemError(words, name=name, value=collision.distance, limit=scene.clearance, time=collision.time)
 
 
-def clear_postures(asked: Asked, time: float) -> int | Unreachable | None:
-    """How many postures that do the tasks at a time (s) are clear, or why none is.
+def count_clear_configurations(request: PlanRequest, time: float) -> int | Unreachable | None:
+    """Count the collision-free configurations that do the tasks at a time (s), or return why there is none.
 
-    None where that says nothing: no pose is asked for then, or the base may come from elsewhere.
+    The result is None if it would prove nothing: no task gives a pose then, or the base may be elsewhere.
     """
-    tasks = [task for task in asked.tasks if task.is_pose and task.begin <= time <= task.end]
-    if asked.clearance_constraints is None or not tasks or asked.machine.base_size:
+    tasks = [task for task in request.tasks if task.is_pose and task.begin <= time <= task.end]
+    if request.clearance_constraints is None or not tasks or request.machine.base_size:
         return None
-    around: dict[str, Any] = {"scene": asked.clearance_constraints.scene, "limits": asked.limits.joints}
+    options: dict[str, Any] = {"scene": request.clearance_constraints.scene, "limits": request.limits.joints}
     try:
-        return len(inverse_kinematics(asked.machine, tasks, time=time, seed=asked.seed, **around))
+        return len(inverse_kinematics(request.machine, tasks, time=time, seed=request.seed, **options))
     except Unreachable as error:
         return error
 
 
-def others_told(others: int | Unreachable | None) -> list[str]:
-    """Whether another posture is clear, in words; nothing where that is not known."""
-    if others is None:
+def describe_alternatives(count: int | Unreachable | None) -> list[str]:
+    """Return a sentence for an error about the result of `count_clear_configurations`, if there is one."""
+    if count is None:
         return []
-    if isinstance(others, Unreachable):
-        return [f"no other posture is clear then: {others}"]
-    return [f"clear then, and not on a motion that was found: {others} other posture{'s' if others > 1 else ''}"]
+    if isinstance(count, Unreachable):
+        return [f"no other configuration is collision-free then: {count}"]
+    plural = "s are" if count > 1 else " is"
+    return [f"{count} other configuration{plural} collision-free then, but no motion found passes through them"]
 
 
-def settled(asked: Asked, postures: Array) -> tuple[Array, Array]:
-    """Joints at the start, nan where they are free, and the postures moved to those that are told.
+def fix_ignorable_joints(request: PlanRequest, configurations: Array) -> tuple[Array, Array]:
+    """Return the joints at the start, nan where they are free, and the configurations with the others fixed.
 
-    An ignorable coordinate, by whose value nothing that is asked changes but the joint itself (the last joint of an arm
-    whose roll is free turns about the tool's axis), has the middle of its range: with it free, every motion would be
-    one of a family of the same cost. So has a joint that moves no tip, a gripper's finger. Where every posture touches
-    something with that, they have the values of a posture, or random ones, with which the most are clear.
+    An ignorable coordinate changes nothing but the joint itself: the last joint of an arm whose roll is free turns
+    about the tool's axis, and a gripper's finger moves no task frame. If it were free, each motion would belong to a
+    family of equal cost. It is therefore fixed in the middle of its range. If that puts every configuration in
+    collision, it takes the values of a configuration, or random ones, for which most configurations are
+    collision-free.
     """
-    bounds = asked.bounds
-    start = np.full(asked.machine.joint_size, np.nan)
-    ignorable = np.ones(asked.machine.joint_size, dtype=bool)
-    for stretch in asked.stretches:
+    bounds = request.bounds
+    start = np.full(request.machine.joint_size, np.nan)
+    ignorable = np.ones(request.machine.joint_size, dtype=bool)
+    for stretch in request.stretches:
         if stretch.equations is not None:
-            ignorable &= ignorable_joints(stretch.equations, asked.base)
-    ended = np.isfinite(bounds.upper - bounds.lower)
-    start[ignorable] = np.where(ended, idle_positions(bounds.lower, bounds.upper), postures[0])[ignorable]
+            ignorable &= ignorable_joints(stretch.equations, request.base)
+    bounded = np.isfinite(bounds.upper - bounds.lower)
+    start[ignorable] = np.where(bounded, idle_positions(bounds.lower, bounds.upper), configurations[0])[ignorable]
 
-    def collision_count(values: Array) -> int:
-        return touches_at_the_start(asked, np.where(ignorable, values, postures)).count(None)
+    def clear_count(values: Array) -> int:
+        return start_collisions(request, np.where(ignorable, values, configurations)).count(None)
 
-    if ignorable.any() and not collision_count(start):
-        others = start_configurations(
-            asked.machine, bounds.lower, bounds.upper, asked.settings.ik_starts, None, asked.seed
+    if ignorable.any() and not clear_count(start):
+        samples = sample_starts(
+            request.machine, bounds.lower, bounds.upper, request.settings.ik_starts, None, request.seed
         )
-        start[ignorable] = max((start, *postures, *others), key=collision_count)[ignorable]
-    return start, np.where(ignorable, start, postures)
+        start[ignorable] = max((start, *configurations, *samples), key=clear_count)[ignorable]
+    return start, np.where(ignorable, start, configurations)
 
 
-def followed_from(asked: Asked, postures: Array) -> list[LocalMotion]:
-    """The local motions from all postures through all stretches, with the least damping that lets one of them follow.
+def local_motions_from(request: PlanRequest, configurations: Array) -> list[LocalMotion]:
+    """Track the tasks from all configurations (K, n) by resolved-rate control; return one result per stretch.
+
+    The damping is the least with which one of them reaches its poses.
 
     Raises:
-        Unreachable: A place on the way that no posture reaches.
+        Unreachable: A pose that no joints within their limits reach.
     """
-    bounds, settings = asked.bounds, asked.settings
-    best: list[LocalMotion] = []
+    bounds, settings = request.bounds, request.settings
+    least_damped: list[LocalMotion] = []
     for damping in settings.dampings:
-        found: list[LocalMotion] = []
-        base, joints = np.tile(asked.base, (len(postures), 1)), postures
-        for stretch in asked.stretches:
+        motions: list[LocalMotion] = []
+        base, joints = np.tile(request.base, (len(configurations), 1)), configurations
+        for stretch in request.stretches:
             if stretch.begin > 0:
-                joints = _begun(asked, stretch, base, joints)
-                if asked.stretches[len(found) - 1].equations is None:
-                    found[-1] = _straight(found[-1], joints)
-            share = int(np.ceil(settings.local_steps * stretch.duration / asked.horizon))
-            share = max(share, settings.min_intervals)
-            times = np.union1d(np.linspace(stretch.begin, stretch.end, share + 1), stretch.breaks)
+                joints = _joints_at_new_poses(request, stretch, base, joints)
+                if request.stretches[len(motions) - 1].equations is None:
+                    motions[-1] = _straight_motion(motions[-1], joints)
+            steps = int(np.ceil(settings.local_steps * stretch.duration / request.horizon))
+            steps = max(steps, settings.min_intervals)
+            times = np.union1d(np.linspace(stretch.begin, stretch.end, steps + 1), stretch.breaks)
             equations = stretch.equations
             if equations is None:
-                found.append(LocalMotion.stationary(times, base, joints))
+                motions.append(LocalMotion.stationary(times, base, joints))
             else:
-                soft: dict[str, Any] = {"weights": asked.weights, "damping": damping}
-                found.append(
-                    track_tasks(equations, joints, base, times, lower=bounds.lower, upper=bounds.upper, **soft)
-                )
-            base, joints = found[-1].base[:, -1], found[-1].joints[:, -1]
-        best = best or found
-        if min(misfits_of(found)) <= OUT_OF_REACH:
-            return found
-    _check_reach(asked, best)
-    return best
+                options: dict[str, Any] = {"weights": request.weights, "damping": damping}
+                options |= {"lower": bounds.lower, "upper": bounds.upper}
+                motions.append(track_tasks(equations, joints, base, times, **options))
+            base, joints = motions[-1].base[:, -1], motions[-1].joints[:, -1]
+        least_damped = least_damped or motions
+        if min(largest_pose_errors(motions)) <= REACH_TOLERANCE:
+            return motions
+    _check_reach(request, least_damped)
+    return least_damped
 
 
-def _begun(asked: Asked, stretch: Stretch, base: Array, joints: Array) -> Array:
-    """Joints (K, n) at which the poses that begin in a stretch are met, each the nearest to where it comes from.
-
-    There they still do what was asked until then.
-    """
-    before = asked.stretches[asked.stretches.index(stretch) - 1]
-    begins = [asked.tasks[i].is_pose and new for i, new in zip(stretch.tasks, stretch.new, strict=True)]
+def _joints_at_new_poses(request: PlanRequest, stretch: Stretch, base: Array, joints: Array) -> Array:
+    """Return the nearest joints (K, n) that meet the poses which begin in a stretch and the tasks until then."""
+    before = request.stretches[request.stretches.index(stretch) - 1]
+    begins = [request.tasks[i].is_pose and new for i, new in zip(stretch.tasks, stretch.new, strict=True)]
     if not any(begins):
         return joints
-    tasks = [asked.tasks[i] for i in sorted({*before.tasks, *stretch.tasks})]
-    options: dict[str, Any] = {
-        "near": joints,
-        "seed": asked.seed,
-        "limits": asked.limits.joints,
-        "starts": asked.settings.ik_starts,
-    }
+    tasks = [request.tasks[i] for i in sorted({*before.tasks, *stretch.tasks})]
+    options: dict[str, Any] = {"time": stretch.begin, "base": base[0], "near": joints, **request.ik_options}
     try:
-        found = inverse_kinematics(asked.machine, tasks, time=stretch.begin, base=base[0], **options)
+        solutions = inverse_kinematics(request.machine, tasks, **options)
     except Unreachable as error:
-        if asked.machine.base_size:  # which may come nearer
+        if request.machine.base_size:  # the base may bring the pose into reach
             return joints
-        raise placed(asked, error, stretch.begin) from error
-    ways = np.array([posture.joints for posture in found])
-    far = (asked.weights * (joints[:, None] - ways) ** 2).sum(axis=2)
-    return np.asarray(ways[far.argmin(axis=1)])
+        raise locate_error(request, error, stretch.begin) from error
+    candidates = np.array([solution.joints for solution in solutions])
+    distances = (request.weights * (joints[:, None] - candidates) ** 2).sum(axis=2)
+    return np.asarray(candidates[distances.argmin(axis=1)])
 
 
-def _straight(part: LocalMotion, joints: Array) -> LocalMotion:
-    """A motion without a task that leads straight to joints (K, n)."""
-    share = ((part.t - part.t[0]) / (part.t[-1] - part.t[0]))[:, None]
-    way = (joints - part.joints[:, 0])[:, None]
-    rates = np.repeat(way / (part.t[-1] - part.t[0]), len(part.t), axis=1)
-    return replace(part, joints=part.joints[:, :1] + share * way, rates=rates)
+def _straight_motion(motion: LocalMotion, joints: Array) -> LocalMotion:
+    """Return a motion without a task that leads straight to joints (K, n)."""
+    share = ((motion.t - motion.t[0]) / (motion.t[-1] - motion.t[0]))[:, None]
+    displacement = (joints - motion.joints[:, 0])[:, None]
+    rates = np.repeat(displacement / (motion.t[-1] - motion.t[0]), len(motion.t), axis=1)
+    return replace(motion, joints=motion.joints[:, :1] + share * displacement, rates=rates)
 
 
-def misfits_of(followed: list[LocalMotion]) -> list[float]:
-    """Of each posture the largest pose error on its way."""
-    return np.max([part.pose_error for part in followed], axis=0).tolist()  # type: ignore[no-any-return]
+def sampled_motions(times: Array, base: Array, joints: Array, weights: Array) -> LocalMotion:
+    """Return K motions through configurations (K, M, n) at times (M,), with rates by forward differences."""
+    rates = np.diff(joints, axis=1) / np.diff(times)[:, None]
+    cost = np.einsum("kmn,n,m->k", rates**2, weights, np.diff(times)) / 2
+    rates, zeros = np.concatenate([rates, rates[:, -1:]], axis=1), np.zeros(len(joints))
+    return LocalMotion(times, base, joints, rates, np.asarray(cost), zeros, zeros)
 
 
-def _check_reach(asked: Asked, followed: list[LocalMotion]) -> None:
-    """Raise where no posture follows the tasks and no joints reach them, seen from a fixed base."""
-    if asked.machine.base_size:
+def largest_pose_errors(motions: Sequence[LocalMotion]) -> list[float]:
+    """Return the largest pose error of each of K motions over all stretches."""
+    return np.max([motion.pose_error for motion in motions], axis=0).tolist()  # type: ignore[no-any-return]
+
+
+def _check_reach(request: PlanRequest, motions: list[LocalMotion]) -> None:
+    """Raise Unreachable if no joints reach a pose that all motions miss; only for a fixed base."""
+    if request.machine.base_size:
         return
-    for stretch, part in zip(asked.stretches, followed, strict=True):
-        poses = [
-            asked.tasks[i] for i in stretch.tasks if asked.tasks[i].is_pose and asked.tasks[i].start_gap <= OUT_OF_REACH
-        ]
+    for stretch, motion in zip(request.stretches, motions, strict=True):
+        tasks = [request.tasks[i] for i in stretch.tasks]
+        poses = [task for task in tasks if task.is_pose and task.start_gap <= REACH_TOLERANCE]
         if not poses:
             continue
-        lost = np.unique(part.worst_time[part.pose_error > OUT_OF_REACH])
-        for time in lost.tolist():
-            near = part.joints[:, int(np.searchsorted(part.t, time))]
+        for time in np.unique(motion.worst_time[motion.pose_error > REACH_TOLERANCE]).tolist():
+            near = motion.joints[:, int(np.searchsorted(motion.t, time))]
+            options: dict[str, Any] = {"near": near, "limits": request.limits.joints, "tolerance": REACH_TOLERANCE}
             try:
-                inverse_kinematics(
-                    asked.machine, poses, time=time, near=near, limits=asked.limits.joints, tolerance=OUT_OF_REACH
-                )
+                inverse_kinematics(request.machine, poses, time=time, **options)
             except Unreachable as error:
-                raise placed(asked, error, time) from error
+                raise locate_error(request, error, time) from error
 
 
-def placed(asked: Asked, error: Unreachable, time: float) -> Unreachable:
-    """The same with its time and the places that are asked for there."""
+def locate_error(request: PlanRequest, error: Unreachable, time: float) -> Unreachable:
+    """Return the error with its time and the positions of the tasks then."""
     places = []
-    for number, task in enumerate(asked.tasks):
+    for number, task in enumerate(request.tasks):
         if task.position is not None and task.begin <= time <= task.end:
-            targets = np.array(bind(asked.machine, task).target_function()(time)).ravel()
+            targets = np.array(bind(request.machine, task).target_function()(time)).ravel()
             places.append(f"task {number} is at {np.round(targets[:3], 6).tolist()} m")
     where = f" ({', '.join(places)})" if places else ""
     return Unreachable(f"at {time:.4g} s{where}: {error}", **{**vars(error), "time": time})

@@ -1,9 +1,9 @@
-"""Where no motion does a task: how far the farthest comes, what stops it there, and how far the task has to give.
+"""Diagnosis of a task that no motion does: where motions end, what obstructs them, and by how much to relax the task.
 
-Postures are followed from the first instant on, one a chart, each to all charts that a step within the limits reaches;
-what is held of each is the widest berth of a way to it. The last instant that is reached is where the task ends, and
-what stops motions there is seen by going on all the same. A motion that gives way only in what is told is then looked
-for from there on: what it needs is no bound, another one may need less.
+From the first time sample on, configurations are propagated from chart to chart by all steps within the limits. Each
+chart keeps the configuration whose path has the largest clearance. The task ends at the last sample that is reached,
+and the obstructions are found by going on regardless. From there, a motion is sought that violates only one
+requirement, by as little as possible. The amount found is no bound; another motion may need less.
 """
 
 from __future__ import annotations
@@ -22,50 +22,50 @@ from ocp.motion.builders.clearance import LOOKS, MARGIN, ROUNDING
 from ocp.motion.local.collisions import distances_along, find_collisions
 from ocp.motion.search.charts import Charts
 from ocp.motion.search.joint_space import TOLERANCE
-from ocp.motion.search.search import Search
-from ocp.motion.search.value import Graph
+from ocp.motion.search.search import AtlasSearch
+from ocp.motion.search.value import ChartGraph
 
-__all__ = ["DeadEnd", "Give", "Stop", "dead_end"]
+__all__ = ["DeadEnd", "Obstruction", "Relaxation", "dead_end"]
 
 Indices = NDArray[np.intp]
 
-WORST = 3
-"""Postures from which each chart is tried to be reached; and stops that are told in words."""
+MAX_TRIALS = 3
+"""Configurations from which each chart is tried, and obstructions that the message names."""
 NEGLIGIBLE = 1e-9
-"""m or rad: a motion that gives way by less has not been asked to."""
+"""m or rad: smaller relaxations count as none."""
 
 
-class StopKind(StrEnum):
-    """What stops motions: the position of a joint, how far it can go, bodies, what is out of reach, what is narrow."""
+class ObstructionKind(StrEnum):
+    """Kinds of obstructions: a position limit, a step limit, a collision, a pose out of reach, a narrow passage."""
 
     LIMIT = "limit"
     STEP = "step"
-    TOUCH = "touch"
+    COLLISION = "collision"
     REACH = "reach"
     NARROW = "narrow"
 
 
-class GiveKind(StrEnum):
-    """What gives way: the tip's place, its axes, or the clearance."""
+class RelaxationKind(StrEnum):
+    """Requirements that can be relaxed: the position of the tip, its orientation, the clearance."""
 
     DEVIATION = "deviation"
-    LEAN = "lean"
+    ROTATION = "rotation"
     CLEARANCE = "clearance"
 
 
-class Stop(NamedTuple):
-    """What stops motions where none goes on.
+class Obstruction(NamedTuple):
+    """What obstructs motions where none can be continued.
 
     Attributes:
-        kind: A limit of a joint's position; a step, how far it can go until the next instant; bodies that touch; what
-            is out of reach; or narrow: what leads on passes no limit, and was not followed.
+        kind: Position limit of a joint; largest step of a joint until the next sample; collision of two bodies; a pose
+            out of reach; or a narrow passage, through which configurations go on but no propagated one did.
         name: The joint; two bodies, "one and other"; or "tip".
-        value: What it would be: a position, a way, a distance or a miss, rad or m.
-        limit: What it may be.
-        before, after: Postures, the last one that is reached and where it would have to go. Shape (n,).
+        value: Value that it would take: position, step, distance or pose error, rad or m.
+        limit: Its limit.
+        before, after: Configurations: the last one reached, and the one that would have to follow. Shape (n,).
     """
 
-    kind: StopKind
+    kind: ObstructionKind
     name: str
     value: float
     limit: float
@@ -74,386 +74,401 @@ class Stop(NamedTuple):
 
     @property
     def excess(self) -> float:
-        """By how much the limit is passed, rad or m."""
+        """Excess over the limit, rad or m."""
         return abs(self.value - self.limit)
 
     def __str__(self) -> str:
         return {
-            StopKind.LIMIT: f"{self.name!r} would pass its limit {self.limit:.4g} by {self.excess:.3g}",
-            StopKind.STEP: f"{self.name!r} would have to go {self.value:.3g} in one step, {self.limit:.3g} at most",
-            StopKind.TOUCH: f"{self.name} would be {self.value:.3g} m apart, {self.limit:.3g} at least",
-            StopKind.NARROW: "what leads on is too narrow to be followed",
-            StopKind.REACH: f"the tip stays {self.value:.3g} off from there",
+            ObstructionKind.LIMIT: f"{self.name!r} would pass its limit {self.limit:.4g} by {self.excess:.3g}",
+            ObstructionKind.STEP: f"{self.name!r} would move {self.value:.3g} in one step, {self.limit:.3g} at most",
+            ObstructionKind.COLLISION: f"{self.name} would be {self.value:.3g} m apart, {self.limit:.3g} at least",
+            ObstructionKind.NARROW: "the passage is too narrow to be followed",
+            ObstructionKind.REACH: f"the tip stays {self.value:.3g} off (m or rad)",
         }[self.kind]
 
 
-class Give(NamedTuple):
-    """A motion that would do the task if it gave way.
+class Relaxation(NamedTuple):
+    """Motion that would do the task if a requirement were relaxed.
 
     Attributes:
-        kind: Deviation of the tip's place, m; lean of its axes, rad; or the clearance, m, which it would have to be.
-        amount: How far. times: The instants, s, or numbers of waypoints. Shape (K,). joints: There. Shape (K, n).
+        kind: Deviation of the tip's position, m; rotation of its axes, rad; or the clearance that remains, m.
+        amount: Its amount.
+        times: Times of the samples, s, or waypoint numbers. Shape (K,).
+        joints: Configurations at the samples. Shape (K, n).
     """
 
-    kind: GiveKind
+    kind: RelaxationKind
     amount: float
     times: Array
     joints: Array
 
     def __str__(self) -> str:
         return {
-            GiveKind.DEVIATION: f"the tip may be {self.amount:.3g} m off",
-            GiveKind.LEAN: f"the tip may be turned by {np.degrees(self.amount):.3g} deg",
-            GiveKind.CLEARANCE: f"the clearance is {self.amount:.3g} m",
+            RelaxationKind.DEVIATION: f"the tip may be {self.amount:.3g} m off",
+            RelaxationKind.ROTATION: f"the tip may be turned by {np.degrees(self.amount):.3g} deg",
+            RelaxationKind.CLEARANCE: f"the clearance is {self.amount:.3g} m",
         }[self.kind]
 
 
 class DeadEnd(SolveError):
-    """No motion does the tasks, or none was found by a search over all.
+    """No motion does the tasks, or a search over all motions found none.
 
     Attributes:
-        time: s (the number of a waypoint), from which on none goes on; `until`: the first one that is not reached, nan
-            where that is not known.
-        name, value, limit: Of the least of the stops; of a machine whose base moves by itself, which may have been
-            there in any attitude, of the joint whose limit stops most, where it is, and that limit, else "task".
-        stops: What stops motions there, each where it does so by the least, the least first.
-        gives: Motions that would do if the task gave way, the least that was found of each kind.
-        pieces: In how few pieces it may be done, see `plan_in_segments`; None where that is not known.
+        time: Time, s, or waypoint number, from which no motion can be continued.
+        until: First sample that is not reached; nan if unknown.
+        name, value, limit: Of the smallest obstruction. With a moving base, whose attitude is not known there: the
+            joint whose limit obstructs most states, its position and limit; or "task".
+        obstructions: What obstructs motions there, one of each kind and name with the least excess, the least first.
+        relaxations: Motions that would do the task with a relaxed requirement, the smallest one found of each kind.
+        segments: Number of segments in which the task may be done, see `plan_in_segments`; None if unknown.
     """
 
     until: float
-    stops: tuple[Stop, ...]
-    gives: tuple[Give, ...]
-    pieces: int | None
+    obstructions: tuple[Obstruction, ...]
+    relaxations: tuple[Relaxation, ...]
+    segments: int | None
 
     def __init__(
         self,
         words: str,
         until: float = np.nan,
-        stops: tuple[Stop, ...] = (),
-        gives: tuple[Give, ...] = (),
-        pieces: int | None = None,
+        obstructions: tuple[Obstruction, ...] = (),
+        relaxations: tuple[Relaxation, ...] = (),
+        segments: int | None = None,
         **details: Any,
     ) -> None:
         super().__init__(words, **details)
-        self.until, self.stops, self.gives, self.pieces = until, stops, gives, pieces
+        self.until, self.obstructions, self.relaxations, self.segments = until, obstructions, relaxations, segments
 
     def __reduce__(self) -> Any:
-        """Pickled with what it is made from, and with its fields."""
-        return type(self), (*self.args, self.until, self.stops, self.gives, self.pieces), self.__dict__
+        """Pickle the error with its arguments and fields."""
+        return type(self), (*self.args, self.until, self.obstructions, self.relaxations, self.segments), self.__dict__
 
 
-def dead_end(search: Search, unit: str = "{:.4g} s", proven: bool = True, pieces: int | None = None) -> DeadEnd | None:
-    """Where the motions of a search end; None where one comes through.
+def dead_end(
+    search: AtlasSearch, unit: str = "{:.4g} s", proven: bool = True, segments: int | None = None
+) -> DeadEnd | None:
+    """Diagnose where the motions of a search end; return None if one comes through.
 
     Args:
-        unit: How its times are told.
-        proven: Whether the search shows that there is none, under its assumptions.
-        pieces: As of `DeadEnd`.
+        unit: Format of its times.
+        proven: Whether the search proves, under its assumptions, that no motion exists.
+        segments: As in `DeadEnd`.
     """
-    front = _Walk(search)
+    front = _Propagation(search)
     last = front.last
     if last == len(search.times) - 1:
         return None
-    stops = _stops(search, front)
-    worst, gives = stops[0], list[Give]()
-    if any(stop.kind is StopKind.TOUCH for stop in stops) and np.isfinite(front.width[-1].max(initial=-np.inf)):
-        best = int(front.width[-1].argmax())
-        joints = front.way(len(search.times) - 1, best)
-        gives.append(Give(GiveKind.CLEARANCE, float(front.width[-1][best]), search.times, joints))
-    path = _carried_on(search, front, stops[0].before)
-    for turning, kind in ((False, GiveKind.DEVIATION), (True, GiveKind.LEAN)):
-        if (give := _given(search, path, turning, kind)) is not None:
-            gives.append(give)
-    there = unit.format(search.times[last + 1])
-    where = (
-        f"from {unit.format(search.times[last])} on none goes on to {there}" if last >= 0 else f"none begins at {there}"
-    )
+    obstructions = _find_obstructions(search, front)
+    smallest, relaxations = obstructions[0], list[Relaxation]()
+    clearances = front.clearance[-1]
+    collides = any(obstruction.kind is ObstructionKind.COLLISION for obstruction in obstructions)
+    if collides and np.isfinite(clearances.max(initial=-np.inf)):
+        best = int(clearances.argmax())
+        joints = front.path(len(search.times) - 1, best)
+        relaxations.append(Relaxation(RelaxationKind.CLEARANCE, float(clearances[best]), search.times, joints))
+    path = _extend_path(search, front, obstructions[0].before)
+    for turning, kind in ((False, RelaxationKind.DEVIATION), (True, RelaxationKind.ROTATION)):
+        if (relaxation := _find_relaxation(search, path, turning, kind)) is not None:
+            relaxations.append(relaxation)
+    next_sample = unit.format(search.times[last + 1])
+    where = f"none begins at {next_sample}"
+    if last >= 0:
+        where = f"from {unit.format(search.times[last])} on none continues to {next_sample}"
     first = "no motion does the tasks" if proven else "no motion was found, though the search does not rule one out"
-    words = f"{first}: {where}; {'; '.join(map(str, stops[:WORST]))}"
-    if gives:
-        words += f"; one does if {', or '.join(map(str, gives))}"
-    if pieces is not None:
-        many = "a reconfiguration" if pieces == 2 else f"{pieces - 1} reconfigurations"
-        words += f"; with {many} on the way one may: plan_in_pieces"
-    told = {"name": worst.name, "value": worst.value, "limit": worst.limit, "time": float(search.times[max(last, 0)])}
-    return DeadEnd(words, float(search.times[last + 1]), tuple(stops), tuple(gives), pieces, **told)
+    words = f"{first}: {where}; {'; '.join(map(str, obstructions[:MAX_TRIALS]))}"
+    if relaxations:
+        words += f"; one exists if {', or '.join(map(str, relaxations))}"
+    if segments is not None:
+        count = "a reconfiguration" if segments == 2 else f"{segments - 1} reconfigurations"
+        words += f"; with {count} on the way one may: plan_in_segments"
+    time, until = float(search.times[max(last, 0)]), float(search.times[last + 1])
+    details = {"name": smallest.name, "value": smallest.value, "limit": smallest.limit, "time": time}
+    return DeadEnd(words, until, tuple(obstructions), tuple(relaxations), segments, **details)
 
 
-class _Walk:
-    """Postures that are reached step by step, one a chart.
+class _Propagation:
+    """Propagation of configurations from sample to sample, one per chart.
 
     Attributes:
-        layers: Charts of each instant, no wider than steps, those on which everything touches, too.
-        at: Postures. Shapes (N, n). width: How far apart bodies stay on the way to them, at most what is asked,
-            m; infinite where nothing is looked at, -inf where none is reached. Shapes (N,).
-        parent: Charts that they are reached from. Shapes (N,).
+        layers: Charts of each sample, no wider than steps, including those in collision.
+        joints: Configurations reached. Shapes (N, n).
+        clearance: Least clearance on the path to each, at most the required one, m; inf without a scene, -inf where
+            none is reached. Shapes (N,).
+        parent: Charts from which they are reached. Shapes (N,).
+        required: Required clearance, m; inf without a scene.
     """
 
-    def __init__(self, search: Search) -> None:
+    def __init__(self, search: AtlasSearch) -> None:
         self.search = search
-        self.asked = np.inf if search.scene is None else search.scene.clearance
-        self.layers = _narrow(search)
+        self.required = np.inf if search.scene is None else search.scene.clearance
+        self.layers = _fine_charts(search)
         count, n = len(search.times), len(search.space.scale)
-        self.at = [np.full((len(charts), n), np.nan) for charts in self.layers]
-        self.width = [np.full(len(charts), -np.inf) for charts in self.layers]
+        self.joints = [np.full((len(charts), n), np.nan) for charts in self.layers]
+        self.clearance = [np.full(len(charts), -np.inf) for charts in self.layers]
         self.parent = [np.zeros(len(charts), dtype=np.intp) for charts in self.layers]
         charts = self.layers[0]
-        middle = np.clip(0.0, charts.low, charts.high)
-        own = np.arange(len(charts))
-        self._reached(0, own, charts.centers + np.einsum("knr,kr->kn", charts.tangents, middle), own)
-        graph = search.graph(self.layers, np.full(count - 1, np.inf))
+        rows = np.arange(len(charts))
+        self._record(0, rows, charts.points(np.clip(0.0, charts.low, charts.high)), rows)
+        graph = search.graph(self.layers)
         for k in range(count - 1):
-            self._gone_on(graph, k)
+            self._propagate(graph, k)
 
     @property
     def last(self) -> int:
-        """The last instant that is reached by what is wide enough, -1 if none."""
-        return max((k for k, width in enumerate(self.width) if (width >= self.asked).any()), default=-1)
+        """Last sample that is reached with the required clearance, -1 if none."""
+        return max((k for k, clearance in enumerate(self.clearance) if (clearance >= self.required).any()), default=-1)
 
-    def way(self, k: int, chart: int) -> Array:
-        """Joints from the first instant of the walk to a posture. Shape (K', n)."""
-        found = []
-        for instant in range(k, -1, -1):
-            found.append(self.at[instant][chart])
-            chart = int(self.parent[instant][chart])
-        return np.array(found[::-1])
+    def path(self, k: int, chart: int) -> Array:
+        """Return the configurations from the first sample to a chart of sample k. Shape (K', n)."""
+        path = []
+        for sample in range(k, -1, -1):
+            path.append(self.joints[sample][chart])
+            chart = int(self.parent[sample][chart])
+        return np.array(path[::-1])
 
-    def _gone_on(self, graph: Graph, k: int) -> None:
-        """From all postures of an instant to the charts of the next one, the nearest of the widest first."""
-        space, limit, other = self.search.space, self.search.limits[k], k + 1
-        parts = [(i[np.isfinite(self.at[k][i, 0])], j[np.isfinite(self.at[k][i, 0])]) for i, j in graph.steps(k, other)]
+    def _propagate(self, graph: ChartGraph, k: int) -> None:
+        """Step from a sample to the charts of the next one: from the largest clearance first, then the nearest."""
+        space, limit, successor = self.search.space, self.search.limits[k], k + 1
+        reached = np.isfinite(self.joints[k][:, 0])
+        parts = [(i[reached[i]], j[reached[i]]) for i, j in graph.edges(k, successor)]
         if not parts:
             return
         i, j = (np.concatenate(part) for part in zip(*parts, strict=True))
-        into = self.layers[other].of(j)
-        delta = space.difference(into.centers, self.at[k][i])
-        place = -np.einsum("pnr,pn->pr", into.tangents, space.scale**2 * delta)
-        way = delta + np.einsum("pnr,pr->pn", into.tangents, np.clip(place, into.low, into.high))
-        near = (np.abs(way) <= limit + into.most_stray + TOLERANCE).all(axis=1)
-        i, j, way = i[near], j[near], way[near]
-        order = np.lexsort((space.length(way), -self.width[k][i], j))
-        i, j, way = i[order], j[order], way[order]
+        targets = self.layers[successor].select(j)
+        delta = space.difference(targets.centers, self.joints[k][i])
+        place = -np.einsum("pnr,pn->pr", targets.tangents, space.scale**2 * delta)
+        displacement = delta + np.einsum("pnr,pr->pn", targets.tangents, np.clip(place, targets.low, targets.high))
+        possible = (np.abs(displacement) <= limit + targets.max_deviation + TOLERANCE).all(axis=1)
+        i, j, displacement = i[possible], j[possible], displacement[possible]
+        order = np.lexsort((space.length(displacement), -self.clearance[k][i], j))
+        i, j, displacement = i[order], j[order], displacement[order]
         nth = np.arange(len(j)) - np.searchsorted(j, j)
-        for trial in range(WORST):
+        for trial in range(MAX_TRIALS):
             chosen = nth == trial
-            self._reached(other, j[chosen], self.at[k][i[chosen]] + way[chosen], i[chosen])
+            self._record(successor, j[chosen], self.joints[k][i[chosen]] + displacement[chosen], i[chosen])
 
-    def _reached(self, k: int, charts: Indices, joints: Array, parents: Indices) -> None:
-        """Hold what does the task and keeps limits, where it is wider than what was held before."""
+    def _record(self, k: int, charts: Indices, joints: Array, parents: Indices) -> None:
+        """Record configurations that do the task within limits and have more clearance than the recorded ones."""
         search = self.search
-        instant, clearance = search.instants[k], self.asked
+        sample, required = search.samples[k], self.required
         if k == 0 and search.start is not None:
-            joints, good = np.repeat(search.start[None], len(charts), axis=0), np.ones(len(charts), dtype=bool)
+            joints, valid = np.repeat(search.start[None], len(charts), axis=0), np.ones(len(charts), dtype=bool)
         else:
-            joints, good = instant.sets.corrected(np.full(len(charts), instant.number), joints)
-            good &= search.space.within(joints)
-        width = np.full(len(charts), np.inf)
+            joints, valid = sample.manifolds.project(np.full(len(charts), sample.row), joints)
+            valid &= search.space.within(joints)
+        clearances = np.full(len(charts), np.inf)
         if k:
-            width = self.width[k - 1][parents]
-            way = np.abs(joints - self.at[k - 1][parents])
-            good &= (way <= search.limits[k - 1] + TOLERANCE).all(axis=1)
+            clearances = self.clearance[k - 1][parents]
+            displacement = np.abs(joints - self.joints[k - 1][parents])
+            valid &= (displacement <= search.limits[k - 1] + TOLERANCE).all(axis=1)
         if search.scene is not None:
-            wide = width > self.width[k][charts]
-            good &= wide
-            at = np.flatnonzero(good)
-            times = np.full(len(at), search.times[k])
-            apart = distances_along(search.scene, np.zeros(0), joints[at], times, clearance).min(axis=1)
-            width[at] = np.minimum(np.minimum(width[at], apart), clearance)
-        good &= width > self.width[k][charts]
-        own = charts[good]
-        self.at[k][own], self.width[k][own], self.parent[k][own] = joints[good], width[good], parents[good]
+            better = clearances > self.clearance[k][charts]
+            valid &= better
+            checked = np.flatnonzero(valid)
+            times = np.full(len(checked), search.times[k])
+            distances = distances_along(search.scene, np.zeros(0), joints[checked], times, required).min(axis=1)
+            clearances[checked] = np.minimum(np.minimum(clearances[checked], distances), required)
+        valid &= clearances > self.clearance[k][charts]
+        rows = charts[valid]
+        for recorded, values in ((self.joints, joints), (self.clearance, clearances), (self.parent, parents)):
+            recorded[k][rows] = values[valid]
 
 
-def _narrow(search: Search) -> list[Charts]:
-    """Charts of all postures, halved until steps cross them or there are as many as memory is for."""
-    layers = search.covered
-    steps = search.limits.max(axis=1) / 2
-    far = np.minimum(np.append(steps, np.inf), np.append(np.inf, steps))
+def _fine_charts(search: AtlasSearch) -> list[Charts]:
+    """Return charts of all configurations, split until steps cross them or there are too many."""
+    layers = search.atlas
+    reach = search.limits.max(axis=1) / 2
+    max_radius = np.minimum(np.append(reach, np.inf), np.append(np.inf, reach))
     while True:
-        wide = [k for k, charts in enumerate(layers) if len(charts) and (charts.radii > far[k]).any()]
-        more = sum((2 ** layers[k].tangents.shape[2] - 1) * len(layers[k]) for k in wide)
-        if not more or sum(map(len, layers)) + more > search.settings.charts:
+        too_wide = [k for k, charts in enumerate(layers) if len(charts) and (charts.radii > max_radius[k]).any()]
+        added = sum((2 ** layers[k].tangents.shape[2] - 1) * len(layers[k]) for k in too_wide)
+        if not added or sum(map(len, layers)) + added > search.settings.charts:
             return layers
-        layers = [search.halved(charts, k) if k in wide else charts for k, charts in enumerate(layers)]
+        layers = [search.split_charts(charts, k) if k in too_wide else charts for k, charts in enumerate(layers)]
 
 
-def _stops(search: Search, front: _Walk) -> list[Stop]:
-    """What stops motions at the last instant that is reached, the least first; of each kind and name the least."""
-    space, around, last = search.space, search.scene, front.last
-    names, n, there = search.instants[0].sets.equations.machine.robot.joint_names, len(space.scale), last + 1
-    before, after, on = _onward(search, front)
-    instant, clearance = search.instants[there], 0.0 if around is None else around.clearance
-    miss = np.where(on, 0.0, np.abs(instant.sets.linearised(np.full(len(after), instant.number), after)[0]).max(axis=1))
-    limit = search.limits[last] if last >= 0 else np.full(n, np.inf)
-    apart = np.full((len(after), 1), np.inf)
-    if around is not None:
-        apart = distances_along(around, np.zeros(0), after, np.full(len(after), search.times[there]), clearance)
-    ways = np.abs(after - before)
-    excess = np.column_stack([miss, after - space.upper, space.lower - after, ways - limit, clearance - apart])
-    excess[~on, 1:] = 0.0
+def _find_obstructions(search: AtlasSearch, front: _Propagation) -> list[Obstruction]:
+    """Return what obstructs motions at the last sample reached: of each kind and name the least, the least first."""
+    space, scene, last = search.space, search.scene, front.last
+    names, n, next_sample = search.samples[0].manifolds.equations.machine.robot.joint_names, len(space.scale), last + 1
+    before, targets, converged = _continuations(search, front)
+    sample, clearance = search.samples[next_sample], 0.0 if scene is None else scene.clearance
+    errors = sample.manifolds.linearize(np.full(len(targets), sample.row), targets)[0]
+    pose_errors = np.where(converged, 0.0, np.abs(errors).max(axis=1))
+    limits = search.limits[last] if last >= 0 else np.full(n, np.inf)
+    distances = np.full((len(targets), 1), np.inf)
+    if scene is not None:
+        times = np.full(len(targets), search.times[next_sample])
+        distances = distances_along(scene, np.zeros(0), targets, times, clearance)
+    displacements = np.abs(targets - before)
+    over, under = targets - space.upper, space.lower - targets
+    excess = np.column_stack([pose_errors, over, under, displacements - limits, clearance - distances])
+    excess[~converged, 1:] = 0.0
     worst = excess.argmax(axis=1)
-    most = excess[np.arange(len(worst)), worst]
+    largest = excess[np.arange(len(worst)), worst]
 
-    def stop(row: int) -> Stop:
-        """What stops the motion of a row, by its column."""
+    def obstruction_of(row: int) -> Obstruction:
+        """Return the obstruction of a row, by its worst column."""
         kind, joint = divmod(int(worst[row]) - 1, n)
-        here, next_ = before[row], after[row]
+        current, target = before[row], targets[row]
         if worst[row] == 0:
-            return Stop(StopKind.REACH, "tip", float(miss[row]), 0.0, here, next_)
+            return Obstruction(ObstructionKind.REACH, "tip", float(pose_errors[row]), 0.0, current, target)
         if kind < 2:
             bound = float((space.upper, space.lower)[kind][joint])
-            return Stop(StopKind.LIMIT, names[joint], float(next_[joint]), bound, here, next_)
+            return Obstruction(ObstructionKind.LIMIT, names[joint], float(target[joint]), bound, current, target)
         if kind == 2:
-            return Stop(StopKind.STEP, names[joint], float(ways[row, joint]), float(limit[joint]), here, next_)
-        assert around is not None
+            step, largest_step = float(displacements[row, joint]), float(limits[joint])
+            return Obstruction(ObstructionKind.STEP, names[joint], step, largest_step, current, target)
+        assert scene is not None
         pair = int(worst[row]) - 1 - 3 * n
-        bodies = " and ".join(around.labels[pair])
-        return Stop(StopKind.TOUCH, bodies, float(apart[row, pair]), clearance, here, next_)
+        bodies = " and ".join(scene.labels[pair])
+        return Obstruction(ObstructionKind.COLLISION, bodies, float(distances[row, pair]), clearance, current, target)
 
-    best: dict[tuple[StopKind, str], Stop] = {}
-    for row in np.argsort(most, kind="stable").tolist():
-        if most[row] > TOLERANCE:
-            own = stop(row)
-            best.setdefault((own.kind, own.name), own)
-    if not best:  # postures go on, but none that was followed
-        charts = front.layers[there].centers
-        return [Stop(StopKind.NARROW, "tip", 0.0, 0.0, before[0], charts[0] if len(charts) else before[0])]
-    return list(best.values())
+    smallest: dict[tuple[ObstructionKind, str], Obstruction] = {}
+    for row in np.argsort(largest, kind="stable").tolist():
+        if largest[row] > TOLERANCE:
+            entry = obstruction_of(row)
+            smallest.setdefault((entry.kind, entry.name), entry)
+    if not smallest:  # configurations go on, but no propagated one does
+        charts = front.layers[next_sample].centers
+        after = charts[0] if len(charts) else before[0]
+        return [Obstruction(ObstructionKind.NARROW, "tip", 0.0, 0.0, before[0], after)]
+    return list(smallest.values())
 
 
-def _onward(search: Search, front: _Walk) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Postures that are reached last, where each would have to go on to, and which of these do the task.
+def _continuations(search: AtlasSearch, front: _Propagation) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Return configurations reached last (M, n), their targets (M, n), and whether these do the task (M,).
 
-    That is to the posture nearest to each, and to those of the next instant that keep all limits but are too far.
+    Targets are the projection of each configuration to the next sample, and the configurations there which keep all
+    limits but are too far away.
     """
     space, last = search.space, front.last
-    instant, seat = search.instants[last + 1], max(last, 0)
-    before = front.at[last][front.width[last] >= front.asked] if last >= 0 else front.layers[0].centers
+    sample, layer = search.samples[last + 1], max(last, 0)
+    before = front.joints[last][front.clearance[last] >= front.required] if last >= 0 else front.layers[0].centers
     if not len(before):
-        before = front.layers[seat].centers
-    nearest, on = instant.sets.corrected(np.full(len(before), instant.number), before)
-    charts = front.layers[last + 1].of(front.width[last + 1] < front.asked)
+        before = front.layers[layer].centers
+    projections, converged = sample.manifolds.project(np.full(len(before), sample.row), before)
+    charts = front.layers[last + 1].select(front.clearance[last + 1] < front.required)
     if last < 0 or not len(charts):
-        return before, nearest, on
-    middle = np.clip(0.0, charts.low, charts.high)
-    flat = charts.centers + np.einsum("knr,kr->kn", charts.tangents, middle)
-    ways, good = instant.sets.corrected(np.full(len(flat), instant.number), flat)
-    own = before[space.tree(before).query(space.placed(ways))[1]]
-    there = own + space.difference(ways, own)
-    return np.concatenate([before, own]), np.concatenate([nearest, there]), np.concatenate([on, good])
+        return before, projections, converged
+    tangent_points = charts.points(np.clip(0.0, charts.low, charts.high))
+    projected, valid = sample.manifolds.project(np.full(len(tangent_points), sample.row), tangent_points)
+    starts = before[space.tree(before).query(space.tree_points(projected))[1]]
+    continued = starts + space.difference(projected, starts)
+    targets = np.concatenate([projections, continued])
+    return np.concatenate([before, starts]), targets, np.concatenate([converged, valid])
 
 
-# ---- what gives way ----------------------------------------------------------------------------------------------
+# ---- relaxations -----------------------------------------------------------------------------------------------------
 
 
-def _carried_on(search: Search, front: _Walk, stopped: Array) -> Array:
-    """Joints at all instants, (K, n): as far as is reached, then straight to the nearest chart of the last instant."""
+def _extend_path(search: AtlasSearch, front: _Propagation, blocked: Array) -> Array:
+    """Return a path (K, n) as far as it is reached, then straight to the nearest chart of the last sample."""
     space, last, count = search.space, max(front.last, 0), len(search.times)
-    apart = np.nan_to_num(space.length(front.at[last] - stopped), nan=np.inf)
-    first = front.way(last, int(apart.argmin())) if np.isfinite(apart).any() else stopped[None]
-    ways = space.difference(front.layers[-1].centers, np.repeat(first[-1:], len(front.layers[-1]), axis=0))
-    onward = ways[space.length(ways).argmin()] if len(ways) else np.zeros(len(stopped))
-    share = np.arange(1, count - len(first) + 1)[:, None] / max(count - len(first), 1)
-    return np.vstack([first, first[-1] + share * onward])
+    distances = np.nan_to_num(space.length(front.joints[last] - blocked), nan=np.inf)
+    path = front.path(last, int(distances.argmin())) if np.isfinite(distances).any() else blocked[None]
+    displacements = space.difference(front.layers[-1].centers, np.repeat(path[-1:], len(front.layers[-1]), axis=0))
+    displacement = displacements[space.length(displacements).argmin()] if len(displacements) else np.zeros(len(blocked))
+    share = np.arange(1, count - len(path) + 1)[:, None] / max(count - len(path), 1)
+    return np.vstack([path, path[-1] + share * displacement])
 
 
-def _given(search: Search, path: Array, turning: bool, kind: GiveKind) -> Give | None:
-    """A motion like one of joints (K, n) whose tips are off in places, or turned, by as little as is found; else None.
-
-    All else is done, at the instants, limits are kept and everything is clear.
-    """
-    if not any((sets.equations.turning == turning).any() for sets in {instant.sets for instant in search.instants}):
+def _find_relaxation(search: AtlasSearch, path: Array, turning: bool, kind: RelaxationKind) -> Relaxation | None:
+    """Return a motion near a path (K, n) whose tips deviate or rotate as little as possible, all else kept; or None."""
+    if not any((sample.manifolds.equations.turning == turning).any() for sample in search.samples):
         return None
-    around, pairs = search.scene, list[int]()
+    scene, pairs = search.scene, list[int]()
     for _ in range(LOOKS):
-        program = _Giving(search, turning, pairs)
-        rough = program.solved(path, None)  # row by row, which is smooth where nothing gives way
+        problem = _RelaxedProblem(search, turning, pairs)
+        rough = problem.solve(path, None)  # the largest row is smooth at zero, unlike a norm
         if rough is None:
             return None
-        made = program.solved(rough, max(program.amount(rough), NEGLIGIBLE))
-        path = rough if made is None else made
-        missing = (
-            [] if around is None else [touch.pair for touch in find_collisions(around, np.zeros(0), path, search.times)]
-        )
-        if not missing:
-            return Give(kind, program.amount(path), search.times, path)
-        if set(missing) <= set(pairs):
+        refined = problem.solve(rough, max(problem.amount(rough), NEGLIGIBLE))
+        path = rough if refined is None else refined
+        collisions = [] if scene is None else find_collisions(scene, np.zeros(0), path, search.times)
+        colliding = [collision.pair for collision in collisions]
+        if not colliding:
+            return Relaxation(kind, problem.amount(path), search.times, path)
+        if set(colliding) <= set(pairs):
             return None
-        pairs = sorted({*pairs, *missing})
+        pairs = sorted({*pairs, *colliding})
     return None
 
 
-class _Giving:
-    """The motion through all instants whose tips are off in places, or turned, by the least, some pairs held apart."""
+class _RelaxedProblem:
+    """Nonlinear program for the motion that deviates or rotates the tips least, with some pairs separated."""
 
-    def __init__(self, search: Search, turning: bool, pairs: list[int]) -> None:
+    def __init__(self, search: AtlasSearch, turning: bool, pairs: list[int]) -> None:
         self.search, self.turning = search, turning
         count, n = len(search.times), len(search.space.scale)
         self.shape = count, n
         self.joints = ca.MX.sym("joints", n, count)
-        rest, rows, sizes = list[ca.MX](), list[ca.MX](), list[ca.MX]()
+        constraints, rows, norms_squared = list[ca.MX](), list[ca.MX](), list[ca.MX]()
         if search.start is not None:
-            rest.append(self.joints[:, 0] - search.start)
-        for sets in dict.fromkeys(instant.sets for instant in search.instants):
-            own = [k for k, instant in enumerate(search.instants) if instant.sets is sets]
-            own = own[int(search.start is not None and own[0] == 0) :]
-            if not own:
+            constraints.append(self.joints[:, 0] - search.start)
+        for manifolds in dict.fromkeys(sample.manifolds for sample in search.samples):
+            indices = [k for k, sample in enumerate(search.samples) if sample.manifolds is manifolds]
+            indices = indices[int(search.start is not None and indices[0] == 0) :]
+            if not indices:
                 continue
-            q, wanted = ca.SX.sym("q", n), ca.SX.sym("wanted", sets.targets.shape[1])
-            error, rows_turn = sets.equations.error(ca.SX(0, 1), q, wanted), sets.equations.turning
-            gives = np.append(rows_turn == turning, np.zeros(sets.equations.size - len(rows_turn), dtype=bool))
-            ends = np.cumsum([0, *(part.task.size for part in sets.equations.bound)]).tolist()
-            parts = [a + np.flatnonzero(gives[a:b]) for a, b in pairwise(ends)]
-            each = ca.vertcat(*(ca.sumsqr(error[part.tolist()]) for part in parts if part.size))
-            wholes = [error[np.flatnonzero(chosen).tolist()] for chosen in (~gives, gives)]
-            errors = ca.Function("errors", [q, wanted], [*wholes, each]).map(len(own))
-            targets = sets.targets[[search.instants[k].number for k in own]].T
-            for found, part in zip((rest, rows, sizes), errors(self.joints[:, own], targets), strict=True):
-                found.append(ca.vec(part))
-        self._rest, self._rows, self._sizes = (ca.vertcat(ca.MX(0, 1), *part) for part in (rest, rows, sizes))
-        self._size = ca.Function("size", [self.joints], [ca.mmax(self._sizes)])
-        self._apart = ca.MX(0, 1)
+            q, target = ca.SX.sym("q", n), ca.SX.sym("wanted", manifolds.targets.shape[1])
+            error, turning_rows = manifolds.equations.error(ca.SX(0, 1), q, target), manifolds.equations.turning
+            rest = np.zeros(manifolds.equations.size - len(turning_rows), dtype=bool)
+            relaxed = np.append(turning_rows == turning, rest)
+            ends = np.cumsum([0, *(part.task.size for part in manifolds.equations.bound)]).tolist()
+            parts = [a + np.flatnonzero(relaxed[a:b]) for a, b in pairwise(ends)]
+            norms = ca.vertcat(*(ca.sumsqr(error[part.tolist()]) for part in parts if part.size))
+            errors_by_kind = [error[np.flatnonzero(chosen).tolist()] for chosen in (~relaxed, relaxed)]
+            errors = ca.Function("errors", [q, target], [*errors_by_kind, norms]).map(len(indices))
+            targets = manifolds.targets[[search.samples[k].row for k in indices]].T
+            values = errors(self.joints[:, indices], targets)
+            for expressions, part in zip((constraints, rows, norms_squared), values, strict=True):
+                expressions.append(ca.vec(part))
+        stacked = (ca.vertcat(ca.MX(0, 1), *part) for part in (constraints, rows, norms_squared))
+        self._constraints, self._relaxed_rows, self._norms = stacked
+        self._largest_norm = ca.Function("size", [self.joints], [ca.mmax(self._norms)])
+        self._separations = ca.MX(0, 1)
         if search.scene is not None and pairs:
             q, time = ca.SX.sym("q", n), ca.SX.sym("time")
-            apart = search.scene.distances(ca.SX(0, 1), q, time, pairs=pairs, rounding=ROUNDING)
-            apart = ca.Function("apart", [q, time], [apart]).map(count)(self.joints, search.times[None, :])
-            self._apart = ca.vec(apart) - search.scene.clearance - MARGIN
+            distances = search.scene.distances(ca.SX(0, 1), q, time, pairs=pairs, rounding=ROUNDING)
+            distances = ca.Function("apart", [q, time], [distances]).map(count)(self.joints, search.times[None, :])
+            self._separations = ca.vec(distances) - search.scene.clearance - MARGIN
 
     def amount(self, path: Array) -> float:
-        """How far the tips of a motion (K, n) are off, m, or turned, rad."""
-        most = float(np.sqrt(float(self._size(path.T))))
-        return float(np.arcsin(min(most, 1.0))) if self.turning else most
+        """Return the largest deviation, m, or rotation, rad, of the tips along a motion (K, n)."""
+        largest = float(np.sqrt(float(self._largest_norm(path.T))))
+        return float(np.arcsin(min(largest, 1.0))) if self.turning else largest
 
-    def solved(self, path: Array, scale: float | None) -> Array | None:
-        """Joints (K, n) of the best one near a guess, row by row if no scale is given; None where none is found."""
+    def solve(self, path: Array, scale: float | None) -> Array | None:
+        """Return the best joints (K, n) near a guess, row by row without a scale; None if the solver fails."""
         search, slack = self.search, ca.MX.sym("slack")
         if scale is None:
-            over, first = ca.vertcat(self._rows - slack, -self._rows - slack), 0.1
+            relaxed_constraints, slack_guess = ca.vertcat(self._relaxed_rows - slack, -self._relaxed_rows - slack), 0.1
         else:
-            over, first = self._sizes / scale**2 - slack**2, 1.0
+            relaxed_constraints, slack_guess = self._norms / scale**2 - slack**2, 1.0
         steps = self.joints[:, 1:] - self.joints[:, :-1]
         seconds = np.diff(search.times)
-        rough = ca.sum2(ca.sum1(steps**2) / seconds[None, :])
-        # a motion that gives way is the smoother of those that do by as little, as good as
+        smoothness = ca.sum2(ca.sum1(steps**2) / seconds[None, :])
+        # among motions with the same relaxation, prefer the smoother one
         size = max(float((np.diff(path, axis=0) ** 2 / seconds[:, None]).sum()), NEGLIGIBLE)
         program = {
             "x": ca.vertcat(ca.vec(self.joints), slack),
-            "f": slack + 1e-4 * rough / size,
-            "g": ca.vertcat(self._rest, over, self._apart, ca.vec(steps)),
+            "f": slack + 1e-4 * smoothness / size,
+            "g": ca.vertcat(self._constraints, relaxed_constraints, self._separations, ca.vec(steps)),
         }
         options = {"print_level": 0, "sb": "yes", "max_iter": 100, "bound_relax_factor": 0.0}
-        told = {"print_time": False, "ipopt": options, "error_on_fail": False}
-        solver = ca.nlpsol("give", "ipopt", program, told)
-        sizes = [part.numel() for part in (self._rest, over, self._apart)]
-        far, space, count = search.limits.ravel(), search.space, self.shape[0]
-        found = solver(
-            x0=np.append(np.clip(path, space.lower, space.upper).ravel(), first),
+        solver_options = {"print_time": False, "ipopt": options, "error_on_fail": False}
+        solver = ca.nlpsol("give", "ipopt", program, solver_options)
+        counts = [part.numel() for part in (self._constraints, relaxed_constraints, self._separations)]
+        max_steps, space, count = search.limits.ravel(), search.space, self.shape[0]
+        result = solver(
+            x0=np.append(np.clip(path, space.lower, space.upper).ravel(), slack_guess),
             lbx=np.append(np.tile(space.lower, count), 0.0),
             ubx=np.append(np.tile(space.upper, count), np.inf),
-            lbg=np.concatenate([np.zeros(sizes[0]), np.full(sizes[1], -np.inf), np.zeros(sizes[2]), -far]),
-            ubg=np.concatenate([np.zeros(sizes[0]), np.zeros(sizes[1]), np.full(sizes[2], np.inf), far]),
+            lbg=np.concatenate([np.zeros(counts[0]), np.full(counts[1], -np.inf), np.zeros(counts[2]), -max_steps]),
+            ubg=np.concatenate([np.zeros(counts[0]), np.zeros(counts[1]), np.full(counts[2], np.inf), max_steps]),
         )
         if not solver.stats()["success"]:
             return None
-        return np.array(found["x"][:-1]).reshape(self.shape)
+        return np.array(result["x"][:-1]).reshape(self.shape)

@@ -1,7 +1,4 @@
-"""Where postures lie: joints that turn without end come round, and distances are those of the squared rates.
-
-Tasks of a machine some of whose joints are held.
-"""
+"""Metric of the joint space with periodic joints, and task equations with some joints fixed."""
 
 from __future__ import annotations
 
@@ -17,25 +14,25 @@ from models import Machine
 from models.arrays import Array
 from ocp.motion.tasks.equations import TaskEquations
 
-__all__ = ["FARTHEST", "TOLERANCE", "TURN", "Held", "JointSpace"]
+__all__ = ["FULL_TURN", "MAX_STEP", "TOLERANCE", "JointSpace", "TasksWithFixedJoints"]
 
 Indices = NDArray[np.intp]
 
 TOLERANCE = 1e-9
-"""m and rad: by which postures may miss their tasks and pass limits."""
-TURN = 2 * np.pi
-FARTHEST = 1e6
-"""rad or m: no step goes farther, and in the tree that neighbours are looked up in the sets of two instants are as far
-from each other."""
+"""m and rad: largest task error of a configuration, and largest excess over a limit."""
+FULL_TURN = 2 * np.pi
+MAX_STEP = 1e6
+"""rad or m: upper bound of any step. The nearest-neighbour tree also keeps the layers of two samples this far apart."""
 
 
 class JointSpace:
-    """Where postures lie: joints that turn without end come round, and distances are those of the squared rates.
+    """Joint space with the metric of the weighted squared rates, in which unlimited joints are periodic.
 
     Attributes:
-        scale: Square roots of the weights: the metric is |scale * dq|. Shape (n,).
-        periodic: Which joints turn without end; two turns within their limits do, since one of these can be chosen.
-        lower, upper: Limits of the others. Shape (n,).
+        scale: Square roots of the weights; the metric is |scale * dq|. Shape (n,).
+        periodic: Mask of the joints that turn without end. A revolute joint whose range holds two full turns counts as
+            one, since some turn always lies within its limits. Shape (n,).
+        lower, upper: Limits of the other joints, rad or m. Shape (n,).
     """
 
     def __init__(self, machine: Machine, lower: Array, upper: Array, weights: Array) -> None:
@@ -43,62 +40,62 @@ class JointSpace:
         coupled = {joint.mimic.joint for joint in robot.joints if joint.mimic is not None}
         turns = [joint.kind != "prismatic" and joint.name not in coupled for joint in robot.moving_joints]
         self.scale = np.sqrt(weights)
-        self.periodic = np.array(turns) & ~(upper - lower < 2 * TURN - 1e-6)
+        self.periodic = np.array(turns) & ~(upper - lower < 2 * FULL_TURN - 1e-6)
         self.lower = np.where(self.periodic, -np.inf, lower)
         self.upper = np.where(self.periodic, np.inf, upper)
 
-    def difference(self, to: Array, of: Array) -> Array:
-        """to - of, (..., n), the shorter way round for joints that turn without end."""
-        apart = to - of
-        around = apart[..., self.periodic]
-        apart[..., self.periodic] = around - TURN * np.round(around / TURN)
-        return np.asarray(apart)
+    def difference(self, to: Array, start: Array) -> Array:
+        """Return to - start, (..., n), periodic joints by the shorter way round."""
+        delta = to - start
+        turns = delta[..., self.periodic]
+        delta[..., self.periodic] = turns - FULL_TURN * np.round(turns / FULL_TURN)
+        return np.asarray(delta)
 
-    def length(self, way: Array) -> Array:
-        """Of ways (..., n) in the metric."""
-        return np.asarray(np.linalg.norm(way * self.scale, axis=-1))
+    def length(self, displacement: Array) -> Array:
+        """Return the lengths of displacements (..., n) in the metric."""
+        return np.asarray(np.linalg.norm(displacement * self.scale, axis=-1))
 
     def within(self, joints: Array) -> NDArray[np.bool_]:
-        """Whether postures (..., n) keep the limits."""
+        """Return which configurations (..., n) keep the limits."""
         with np.errstate(invalid="ignore"):
             return np.asarray(((joints >= self.lower - TOLERANCE) & (joints <= self.upper + TOLERANCE)).all(axis=-1))
 
-    def turned(self, path: Array, lower: Array, upper: Array) -> Array:
-        """A path (K, n) moved by whole turns of joints to the middle between limits (n,) of theirs."""
-        own = np.flatnonzero(self.periodic & np.isfinite(lower) & np.isfinite(upper))
-        middle = (lower[own] + upper[own] - path[:, own].min(axis=0) - path[:, own].max(axis=0)) / 2
-        turned = path.copy()
-        turned[:, own] += TURN * np.round(middle / TURN)
-        return turned
+    def shift_turns(self, path: Array, lower: Array, upper: Array) -> Array:
+        """Return a path (K, n) shifted by full turns so that it lies in the middle between limits (n,)."""
+        limited = np.flatnonzero(self.periodic & np.isfinite(lower) & np.isfinite(upper))
+        middle = (lower[limited] + upper[limited] - path[:, limited].min(axis=0) - path[:, limited].max(axis=0)) / 2
+        shifted = path.copy()
+        shifted[:, limited] += FULL_TURN * np.round(middle / FULL_TURN)
+        return shifted
 
     def tree(self, joints: Array, layer: Indices | None = None) -> Any:
-        """Tree of postures (M, n), to be asked with what `placed` says; those of other layers are far."""
-        size = np.append(0.0, np.where(self.periodic, TURN * self.scale, 0.0))
-        return cKDTree(self.placed(joints, layer), boxsize=size if self.periodic.any() else None)  # None is faster
+        """Return a nearest-neighbour tree of configurations (M, n), to be queried with `tree_points`."""
+        box = np.append(0.0, np.where(self.periodic, FULL_TURN * self.scale, 0.0))
+        return cKDTree(self.tree_points(joints, layer), boxsize=box if self.periodic.any() else None)  # None is faster
 
-    def placed(self, joints: Array, layer: Indices | None = None) -> Array:
-        """Points of the tree."""
+    def tree_points(self, joints: Array, layer: Indices | None = None) -> Array:
+        """Return the coordinates of configurations (M, n) in the tree; layers lie MAX_STEP apart. Shape (M, 1 + n)."""
         wrapped = joints.copy()
-        wrapped[:, self.periodic] = np.remainder(wrapped[:, self.periodic], TURN)
-        return np.column_stack([np.zeros(len(joints)) if layer is None else FARTHEST * layer, wrapped * self.scale])
+        wrapped[:, self.periodic] = np.remainder(wrapped[:, self.periodic], FULL_TURN)
+        return np.column_stack([np.zeros(len(joints)) if layer is None else MAX_STEP * layer, wrapped * self.scale])
 
 
 @dataclass(frozen=True, eq=False)
-class Held(TaskEquations):
-    """Equations of tasks and last rows: some joints are to be where the last of the targets say.
+class TasksWithFixedJoints(TaskEquations):
+    """Task equations with further rows that fix some joints at the last of the targets.
 
     Attributes:
-        held: Numbers of these joints.
+        fixed: Indices of the fixed joints.
     """
 
-    held: tuple[int, ...]
+    fixed: tuple[int, ...]
 
     @property
     def size(self) -> int:
-        return super().size + len(self.held)
+        return super().size + len(self.fixed)
 
     def _rows(self, joints: Any, targets: Any) -> Any:
-        return targets[targets.numel() - len(self.held) :] - joints[list(self.held)]
+        return targets[targets.numel() - len(self.fixed) :] - joints[list(self.fixed)]
 
     def error(self, base: Any, joints: Any, targets: Any) -> Any:
         return ca.vertcat(super().error(base, joints, targets), self._rows(joints, targets))
@@ -107,10 +104,10 @@ class Held(TaskEquations):
         return ca.vertcat(super().pose_residual(base, joints, targets), self._rows(joints, targets))
 
     def jacobian(self, base: Any, joints: Any) -> Any:
-        rows = ca.DM.eye(self.machine.joint_size)[list(self.held), :]
+        rows = ca.DM.eye(self.machine.joint_size)[list(self.fixed), :]
         return ca.vertcat(super().jacobian(base, joints), rows)
 
     @property
     def _symbols(self) -> tuple[Any, Any, Any]:
         base, joints, targets = super()._symbols
-        return base, joints, ca.SX.sym("targets", targets.numel() + len(self.held))
+        return base, joints, ca.SX.sym("targets", targets.numel() + len(self.fixed))

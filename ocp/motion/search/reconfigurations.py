@@ -1,18 +1,16 @@
-"""Ways with the fewest reconfigurations: in how few pieces motions come through all instants, and which are cheapest.
+"""Paths in the fewest segments, between which the arm reconfigures, and paths found on sections of the manifold.
 
-Where no motion goes on the arm has to leave the way, and to come back to it in any posture that does the task there: to
-the next instant, where the instants are all there is, or to that which it left, where they stand for a time that runs
-on. What can be done in one piece can be done from a later instant on, too, and until an earlier one; so pieces that
-each go as far as they can are the fewest, and those followed back from the end tell how early each may begin. Of all
-places between, the cheapest are found best first: pieces cost at least what values on charts say, and are searched one
-by one until none that is left can be cheaper. Fewest first, then cheapest, as of IKLink (Wang and others 2024).
+Where a motion cannot be continued, the arm has to leave the task and come back to it in any configuration that does the
+task: at the next time sample, if the samples are all there is, or at the same one if they stand for a continuous time.
+A segment can always start later and end earlier. Greedily extended segments are therefore the fewest, and greedy
+segments from the end give the earliest start of each. Among all divisions, the one of least cost is found best first:
+the bounds of the cost-to-go bound the cost of a segment, and segments are searched one by one until no other division
+can cost less. Fewest first, then cheapest, as in IKLink (Wang et al. 2024).
 
-Ways where two directions are free, beside postures in which one joint has one of some values.
-
-The postures at an instant form surfaces, which are too many charts for an arm of eight joints. Where one joint is held
-they are curves. Such curves at several values of it lie close enough together for steps to lead from one to another, so
-that ways on which the joint moves are found as well; drawn tight through the surfaces they leave the curves. Nothing is
-proven by this, and no bound comes of it.
+If a task leaves two directions free, the manifold at a time sample is a surface, which takes too many charts for an arm
+of eight joints. With one joint fixed it is a curve. The curves for several values of the joint are close enough for
+steps between them, so that paths on which the joint moves are found as well; shortened on the surfaces, they leave the
+curves. This proves nothing and gives no bound.
 """
 
 from __future__ import annotations
@@ -25,35 +23,37 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from models.arrays import Array
-from ocp.motion.search.charts import Charts, Parts, SelfMotions
-from ocp.motion.search.joint_space import TURN, Held
-from ocp.motion.search.search import Search
+from ocp.motion.search.charts import Charts, SelfMotionManifolds, SplitCharts
+from ocp.motion.search.joint_space import FULL_TURN, TasksWithFixedJoints
+from ocp.motion.search.search import AtlasSearch
 
-__all__ = ["Piece", "SectionSettings", "Sections", "Span", "farthest", "fewest_pieces", "values_of"]
+__all__ = ["SectionSearch", "SectionSettings", "Segment", "Span", "fewest_segments", "section_values", "segment_ends"]
 
 Span = tuple[int, int]
-"""First and last instant of a piece."""
+"""First and last sample of a segment."""
 
 
 @dataclass(frozen=True)
 class SegmentSettings:
-    """How long it is looked for the cheapest of the fewest pieces.
+    """Effort spent on the lowest-cost division into segments.
 
     Attributes:
-        searched: Chains at most: beyond that the best that is known is taken, and the bound stays what it is.
-        gap: Share of the cost by which what is left would have to be cheaper.
+        max_iterations: Largest number of divisions that are evaluated; then the best known one is taken.
+        gap: Relative cost reduction that must be possible to go on.
     """
 
-    searched: int = 40
+    max_iterations: int = 40
     gap: float = 0.005
 
 
-class Piece(NamedTuple):
-    """A motion from one instant to another.
+class Segment(NamedTuple):
+    """Path from one time sample to another.
 
     Attributes:
-        first, last: Numbers of its instants. joints: There. Shape (last - first + 1, n).
-        cost: Of its steps. bound: What no motion's steps cost less than.
+        first, last: Indices of the samples.
+        joints: Configurations at the samples. Shape (last - first + 1, n).
+        cost: Cost of the steps.
+        bound: Lower bound of the cost of any path between the samples.
     """
 
     first: int
@@ -63,225 +63,240 @@ class Piece(NamedTuple):
     bound: float
 
 
-def fewest_pieces(
-    search: Search, gap: int = 1, barred: Collection[Span] = (), settings: SegmentSettings = SegmentSettings()
-) -> tuple[list[Piece], float] | None:
-    """The cheapest of the fewest pieces through all instants, one after the other, and what none cost less than.
+def fewest_segments(
+    search: AtlasSearch, gap: int = 1, barred: Collection[Span] = (), settings: SegmentSettings = SegmentSettings()
+) -> tuple[list[Segment], float] | None:
+    """Return the fewest segments through all samples at least cost, and a lower bound of this cost.
 
     Args:
-        gap: From the last instant of a piece to the first of the next: 1; or 0, of instants of a time that runs on.
-        barred: What is known not to be done in one piece, nor is what it is a part of.
-        settings: How long it is looked for the cheapest.
+        gap: Samples from the end of a segment to the start of the next one: 1, or 0 if the samples stand for a
+            continuous time.
+        barred: Spans that are known not to be done in one segment, nor any span that contains them.
+        settings: Effort.
 
     Returns:
-        None where nothing goes on somewhere: with a gap where an instant has no posture that is found, in a piece of
+        None if the motion cannot be continued somewhere. With gap 1, a sample without a configuration is a segment of
         its own.
     """
-    ranges = _ranges(search, gap, barred)
+    ranges = _segment_ranges(search, gap, barred)
     if ranges is None:
         return None
-    least = {span: cost for span, cost in _bounds(search, *ranges).items() if not _without(span, gap, barred)}
-    known = dict[Span, Piece | None]()
+    bounds = _segment_bounds(search, *ranges).items()
+    lower_bounds = {span: bound for span, bound in bounds if not _is_barred(span, gap, barred)}
+    segments = dict[Span, Segment | None]()
 
-    def cheapest(bounded: bool, bounds: bool = False) -> tuple[list[Span], float]:
-        """The cheapest chain of what is known, by its costs or bounds; with the bounds of all else, or without."""
-        own = {key: np.inf if one is None else one.bound if bounds else one.cost for key, one in known.items()}
-        return _cheapest(*ranges, gap, (least if bounded else {}) | own)
+    def best_chain(bounded: bool, bounds: bool = False) -> tuple[list[Span], float]:
+        """Return the best chain by costs or bounds of known segments, with or without bounds of the others."""
+        costs = {span: np.inf if s is None else s.bound if bounds else s.cost for span, s in segments.items()}
+        return _best_chain(*ranges, gap, (lower_bounds if bounded else {}) | costs)
 
-    for _ in range(settings.searched):
-        chain, total = cheapest(True)
-        missing = [key for key in chain if key not in known]
-        if not missing or total >= (1 - settings.gap) * cheapest(False)[1]:
+    for _ in range(settings.max_iterations):
+        chain, total = best_chain(True)
+        missing = [span for span in chain if span not in segments]
+        if not missing or total >= (1 - settings.gap) * best_chain(False)[1]:
             break
-        known |= {key: _piece(search, *key) for key in missing}
-    chain, total = cheapest(False)
+        segments |= {span: _solve_segment(search, *span) for span in missing}
+    chain, total = best_chain(False)
     if not np.isfinite(total):
         return None
-    return [one for key in chain if (one := known[key]) is not None], cheapest(True, bounds=True)[1]
+    return [segment for span in chain if (segment := segments[span]) is not None], best_chain(True, bounds=True)[1]
 
 
-def _ranges(search: Search, gap: int, barred: Collection[Span]) -> tuple[list[range], list[range]] | None:
-    """Where each of the fewest pieces may begin and end; None where nothing goes on somewhere.
+def _segment_ranges(search: AtlasSearch, gap: int, barred: Collection[Span]) -> tuple[list[range], list[range]] | None:
+    """Return where each of the fewest segments may begin and end, or None if the motion cannot be continued somewhere.
 
-    Pieces that each go as far as they can tell how late each may end, those followed back how early it may begin.
+    Segments extended greedily forwards give the latest ends, those extended backwards the earliest starts.
     """
     last = len(search.times) - 1
-    ends, starts = farthest(search, gap, barred), list[int]()
+    ends, starts = segment_ends(search, gap, barred), list[int]()
     if not ends or ends[-1] < last:
         return None
     while not starts or starts[-1] > 0:
-        start = _farthest(search, starts[-1] - gap if starts else last, barred, back=True)
+        start = _last_reachable(search, starts[-1] - gap if starts else last, barred, back=True)
         if start is None or len(starts) > len(ends):
             return None
         starts.append(start)
-    # the other way round fewer could only have been missed
-    first = [0, *starts[::-1][1:]] if len(starts) == len(ends) else [0, *(end + gap for end in ends[:-1])]
-    begins = [range(first[m], (ends[m - 1] + gap if m else 0) + 1) for m in range(len(ends))]
-    stops = [range(begins[m + 1][0] - gap, ends[m] + 1) for m in range(len(ends) - 1)] + [range(last, last + 1)]
-    return begins, stops
+    # backwards, fewer segments can only result from a miss of the forward search
+    earliest = [0, *starts[::-1][1:]] if len(starts) == len(ends) else [0, *(end + gap for end in ends[:-1])]
+    start_ranges = [range(earliest[m], (ends[m - 1] + gap if m else 0) + 1) for m in range(len(ends))]
+    end_ranges = [range(start_ranges[m + 1][0] - gap, ends[m] + 1) for m in range(len(ends) - 1)]
+    end_ranges.append(range(last, last + 1))
+    return start_ranges, end_ranges
 
 
-def farthest(search: Search, gap: int = 1, barred: Collection[Span] = (), ruled_out: bool = False) -> list[int]:
-    """The last instants of pieces that each go as far as they can: the last of all, or where nothing goes on.
+def segment_ends(
+    search: AtlasSearch, gap: int = 1, barred: Collection[Span] = (), ruled_out: bool = False
+) -> list[int]:
+    """Return the last samples of segments that each go as far as possible.
+
+    The list ends with the last sample of all, or with the one from which the motion cannot be continued.
 
     Args:
-        gap, barred: As of `fewest_pieces`.
-        ruled_out: Whether a piece ends only where the search shows that no motion goes on, under its assumptions;
-            else where it finds none. So none are fewer.
+        gap, barred: As in `fewest_segments`.
+        ruled_out: Whether a segment ends only where the search proves, under its assumptions, that it cannot be
+            extended. The number of segments is then a lower bound. Otherwise it ends where the search finds no
+            extension.
     """
     last, ends = len(search.times) - 1, list[int]()
     while not ends or ends[-1] < last:
         start = ends[-1] + gap if ends else 0
-        end = _farthest(search, start, barred, ruled_out=ruled_out)
+        end = _last_reachable(search, start, barred, ruled_out=ruled_out)
         if end is None or (end == start and not gap and last):
             break
         ends.append(end)
     return ends
 
 
-def _without(span: Span, gap: int, barred: Collection[Span]) -> bool:
-    """Whether there is no such piece: it goes nowhere, or a part of it is barred."""
-    return (span[0] == span[1] and not gap) or any(span[0] <= one[0] and one[1] <= span[1] for one in barred)
+def _is_barred(span: Span, gap: int, barred: Collection[Span]) -> bool:
+    """Return whether a span has no segment: it is empty, or contains a barred span."""
+    return (span[0] == span[1] and not gap) or any(span[0] <= bar[0] and bar[1] <= span[1] for bar in barred)
 
 
-def _piece(search: Search, first: int, last: int) -> Piece | None:
-    """The cheapest motion from one instant to another; None where none was found."""
-    part = search.part(first, last)
-    joints, bound = part.best(np.inf)
-    return None if joints is None else Piece(first, last, joints, part.steps(joints), bound)
+def _solve_segment(search: AtlasSearch, first: int, last: int) -> Segment | None:
+    """Return the lowest-cost segment between two samples, or None if none was found."""
+    part = search.restrict(first, last)
+    joints, bound = part.solve(np.inf)
+    return None if joints is None else Segment(first, last, joints, part.path_cost(joints), bound)
 
 
-def _farthest(
-    search: Search, start: int, barred: Collection[Span], back: bool = False, ruled_out: bool = False
+def _last_reachable(
+    search: AtlasSearch, start: int, barred: Collection[Span], back: bool = False, ruled_out: bool = False
 ) -> int | None:
-    """The last instant, or the first one, that motions from one lead to; None where not even that one is kept."""
+    """Return the last (or first, if `back`) sample that a segment from a sample reaches; None if there is none."""
 
-    def leads(other: int) -> bool:
-        span = min(start, other), max(start, other)
-        if _without(span, 1, barred):
+    def reaches(sample: int) -> bool:
+        span = min(start, sample), max(start, sample)
+        if _is_barred(span, 1, barred):
             return False
-        layers, path = search.part(*span).first(np.inf)
+        layers, path = search.restrict(*span).find_path(np.inf)
         return bool(layers) if ruled_out else path is not None
 
-    way = -1 if back else 1
-    most = (start if back else len(search.times) - 1 - start) if len(search.times) > 1 else 0
-    # as far as charts say it cannot be farther; twice as far each time, then in halves
-    good, bad, step = -1, most + 1, 0
-    while good < most and bad > most:
-        if leads(start + way * step):
-            good, step = step, min(max(2 * step, 1), most)
+    direction = -1 if back else 1
+    max_steps = (start if back else len(search.times) - 1 - start) if len(search.times) > 1 else 0
+    # double the distance while a segment reaches it, then bisect
+    reachable, unreachable, step = -1, max_steps + 1, 0
+    while reachable < max_steps and unreachable > max_steps:
+        if reaches(start + direction * step):
+            reachable, step = step, min(max(2 * step, 1), max_steps)
         else:
-            bad = step
-    while bad - good > 1:
-        middle = (good + bad) // 2
-        good, bad = (middle, bad) if leads(start + way * middle) else (good, middle)
-    return None if good < 0 else start + way * good
+            unreachable = step
+    while unreachable - reachable > 1:
+        middle = (reachable + unreachable) // 2
+        reachable, unreachable = (middle, unreachable) if reaches(start + direction * middle) else (reachable, middle)
+    return None if reachable < 0 else start + direction * reachable
 
 
-def _bounds(search: Search, begins: list[range], stops: list[range]) -> dict[Span, float]:
-    """What pieces cost at least, by their first and last instants; those that cannot be left out."""
-    found = dict[Span, float]()
-    for own, ends in zip(begins, stops, strict=True):
-        if len(ends) == 1:  # from the end
-            graph = search.part(own[0], ends[0]).whole_graph()
-            values = graph.to_come()
-            found |= {(k, ends[0]): float(graph.least(values[k - own[0]], k - own[0]).min()) for k in own}
+def _segment_bounds(search: AtlasSearch, start_ranges: list[range], end_ranges: list[range]) -> dict[Span, float]:
+    """Return lower bounds of the cost of segments by their spans; those without a path may be missing."""
+    bounds = dict[Span, float]()
+    for starts, ends in zip(start_ranges, end_ranges, strict=True):
+        if len(ends) == 1:  # one backward sweep serves all starts
+            graph = search.restrict(starts[0], ends[0]).full_graph()
+            values = graph.cost_to_go()
+            bounds |= {(k, ends[0]): float(graph.minima(values[k - starts[0]], k - starts[0]).min()) for k in starts}
             continue
-        for first in own:
-            graph = search.part(first, ends[-1]).whole_graph()
-            values = graph.passed()
-            found |= {(first, k): float(graph.least(values[k - first], k - first).min()) for k in ends if k >= first}
-    return found
+        for first in starts:
+            graph = search.restrict(first, ends[-1]).full_graph()
+            values = graph.cost_to_come()
+            bounds |= {(first, k): float(graph.minima(values[k - first], k - first).min()) for k in ends if k >= first}
+    return bounds
 
 
-def _cheapest(begins: list[range], stops: list[range], gap: int, costs: dict[Span, float]) -> tuple[list[Span], float]:
-    """The chain of pieces of least cost, and that cost; none and inf where there is no chain."""
-    best: dict[int, tuple[float, list[Span]]] = {begins[0][0]: (0.0, [])}
-    for own, ends in zip(begins, stops, strict=True):
+def _best_chain(
+    start_ranges: list[range], end_ranges: list[range], gap: int, costs: dict[Span, float]
+) -> tuple[list[Span], float]:
+    """Return the chain of segments of least cost, and this cost; empty and inf if there is none."""
+    best: dict[int, tuple[float, list[Span]]] = {start_ranges[0][0]: (0.0, [])}
+    for starts, ends in zip(start_ranges, end_ranges, strict=True):
         after: dict[int, tuple[float, list[Span]]] = {}
-        for first in own:
+        for first in starts:
             for last in ends:
                 if first in best and np.isfinite(cost := costs.get((first, last), np.inf)):
                     total = best[first][0] + cost
                     if total < after.get(last + gap, (np.inf,))[0]:
                         after[last + gap] = total, [*best[first][1], (first, last)]
         best = after
-    total, chain = min(best.values(), key=lambda one: one[0], default=(np.inf, []))
+    total, chain = min(best.values(), key=lambda entry: entry[0], default=(np.inf, []))
     return chain, total
 
 
 @dataclass(frozen=True)
 class SectionSettings:
-    """Which curves are covered.
+    """Settings of the sections on which curves are covered.
 
     Attributes:
-        radii: Of the charts at few instants, and at many, rad or m.
-        apart: From one value of the joint to the next, at most: of one that slides, m, and of one that turns, rad.
-        values: Of the joint, at most.
-        charts: Of all instants and values together, of which no steps are kept.
+        radii: Radii of the charts for few and for many samples, rad or m.
+        spacing: Largest difference between values of the joint: prismatic, m, and revolute, rad.
+        values: Largest number of values.
+        charts: Largest number of charts, over all samples and values.
     """
 
     radii: tuple[float, float] = (0.07, 0.14)
-    apart: tuple[float, float] = (0.1, 0.6)
+    spacing: tuple[float, float] = (0.1, 0.6)
     values: int = 64
     charts: int = 80_000
 
 
-def values_of(
-    slides: bool, lower: float, upper: float, far: float, settings: SectionSettings = SectionSettings()
+def section_values(
+    prismatic: bool, lower: float, upper: float, max_step: float, settings: SectionSettings = SectionSettings()
 ) -> Array:
-    """At which a joint is held: its limits and between, or all round. Shape (V,), rad or m.
+    """Return the values at which a joint is fixed: evenly spaced over its range. Shape (V,), rad or m.
 
     Args:
-        slides: Whether it does. far: How far it may go from one instant to the next: values are no farther apart.
+        prismatic: Whether the joint is prismatic.
+        lower, upper: Its limits.
+        max_step: Its largest step between samples, which bounds the spacing.
     """
     low, high = np.clip((lower, upper), -np.pi, np.pi).tolist()
-    count = int(np.ceil(min((high - low) / min(settings.apart[not slides], far), settings.values - 1.0)))
-    if not slides and high - low >= TURN - 1e-6:
+    count = int(np.ceil(min((high - low) / min(settings.spacing[not prismatic], max_step), settings.values - 1.0)))
+    if not prismatic and high - low >= FULL_TURN - 1e-6:
         return np.linspace(low, high, max(count, 1), endpoint=False)
     return np.linspace(low, high, count + 1)
 
 
-class Sections(Search):
-    """The search for ways beside postures in which one joint has one of some values."""
+class SectionSearch(AtlasSearch):
+    """Search for paths on sections of the manifolds, in which one joint has one of several values."""
 
-    def __init__(self, *told: Any, joint: int, values: Array, radius: float, charts: int, **more: Any) -> None:
+    def __init__(self, *args: Any, joint: int, values: Array, radius: float, charts: int, **options: Any) -> None:
         """
         Args:
-            told, more: As of `Search`; the instants all of one set of postures with two directions free.
-            joint: The number of the joint. values: At which it is held. Shape (V,).
-            radius: Of the charts, at most. charts: Their number, at most.
+            args, options: As in `AtlasSearch`; all samples must belong to one `SelfMotionManifolds` of dimension two.
+            joint: Index of the joint.
+            values: Values at which it is fixed. Shape (V,).
+            radius: Largest radius of the charts.
+            charts: Largest number of charts.
         """
-        self._joint, self._values, self._radius, self._most = joint, values, radius, charts
-        super().__init__(*told, **more)
+        self._joint, self._values, self._radius, self._max_charts = joint, values, radius, charts
+        super().__init__(*args, **options)
 
-    def _cover(self, seeds: Callable[[int], Array]) -> list[Charts]:
-        """Charts of the curves of each instant, none where no seed leads to one; numbered by values, then instants."""
-        whole, count = self.instants[0].sets, len(self.instants)
-        numbers, each = [instant.number for instant in self.instants], len(self._values)
-        targets = np.tile(whole.targets[numbers], (each, 1))
-        others = whole.equations.held if isinstance(whole.equations, Held) else ()
-        held = Held(whole.equations.machine, whole.equations.bound, (*others, self._joint))
-        self._curves = SelfMotions(self.space, held, np.column_stack([targets, np.repeat(self._values, count)]))
-        found = [seeds(k) for k in range(count)]
-        own = np.repeat(np.arange(count), [len(some) for some in found])
-        layer = (own + count * np.arange(each)[:, None]).ravel()
-        joints, good = self._curves.corrected(layer, np.tile(np.concatenate(found), (each, 1)))
-        good &= self.space.within(joints)
-        charts = self._curves.cover(layer[good], joints[good], self._radius, self._most)
-        return [charts.of(charts.layer % count == k) for k in range(count)]
+    def _build_atlas(self, seeds: Callable[[int], Array]) -> list[Charts]:
+        """Return charts of the curves of each sample, possibly none; their layers number values first, then samples."""
+        manifolds, count = self.samples[0].manifolds, len(self.samples)
+        indices, value_count = [sample.row for sample in self.samples], len(self._values)
+        targets = np.tile(manifolds.targets[indices], (value_count, 1))
+        fixed = manifolds.equations.fixed if isinstance(manifolds.equations, TasksWithFixedJoints) else ()
+        equations = TasksWithFixedJoints(manifolds.equations.machine, manifolds.equations.bound, (*fixed, self._joint))
+        targets = np.column_stack([targets, np.repeat(self._values, count)])
+        self._curves = SelfMotionManifolds(self.space, equations, targets)
+        seed_configurations = [seeds(k) for k in range(count)]
+        samples = np.repeat(np.arange(count), [len(configurations) for configurations in seed_configurations])
+        layer = (samples + count * np.arange(value_count)[:, None]).ravel()
+        joints, valid = self._curves.project(layer, np.tile(np.concatenate(seed_configurations), (value_count, 1)))
+        valid &= self.space.within(joints)
+        charts = self._curves.cover(layer[valid], joints[valid], self._radius, self._max_charts)
+        return [charts.select(charts.layer % count == k) for k in range(count)]
 
-    def _parts(self, charts: Charts, k: int) -> Parts:
-        return self._curves.parts(charts)
+    def _split(self, charts: Charts, k: int) -> SplitCharts:
+        return self._curves.split(charts)
 
-    def ways(self) -> tuple[list[Array], float]:
-        """Of the cheapest way that is found, and of the cheapest on which the joint keeps each of its values."""
-        count = len(self.instants)
-        found = [path for path in (self.first(np.inf)[1],) if path is not None]
+    def paths(self) -> tuple[list[Array], float]:
+        """Return the path found and the best paths on which the joint keeps a value, by rising cost; the bound is 0."""
+        count = len(self.samples)
+        paths = [path for path in (self.find_path(np.inf)[1],) if path is not None]
         for value in range(len(self._values)):
-            own = copy(self)
-            own.layers = [charts.of(charts.layer // count == value) for charts in self.layers]
-            if all(len(charts) for charts in own.layers):
-                path = own._tight(own._through_centers(own.whole_graph()), own.layers)
-                found += [path] if path is not None else []
-        return sorted(found, key=self.steps), 0.0
+            restricted = copy(self)
+            restricted.layers = [charts.select(charts.layer // count == value) for charts in self.layers]
+            if all(len(charts) for charts in restricted.layers):
+                path = restricted._shorten(restricted._path_through_centers(restricted.full_graph()), restricted.layers)
+                paths += [path] if path is not None else []
+        return sorted(paths, key=self.path_cost), 0.0

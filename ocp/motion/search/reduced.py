@@ -1,13 +1,13 @@
-"""Many states of a machine whose base moves by itself, moved at once: its kinematics in the scaled rates of the joints.
+"""Vectorised kinematics of many states of a machine with a moving base, in scaled joint rates; and its reach.
 
-With the scaled rates p = sqrt(W) dq/dt the running cost is |p|^2 / 2. Those that do a task, A p = v, are the least ones
-and any in the null space of A, its self-motion; the base moves along as its momentum is conserved.
+With the scaled rates p = sqrt(W) dq/dt, the running cost is |p|^2 / 2. The rates that do a task, A p = v, are the
+least-norm solution plus any rates in the null space of A, the self-motions. The base follows, since its momentum is
+conserved.
 
-Whether a machine whose base floats can be where its tasks want its tips, in whatever attitude.
-
-Its momentum lets the centre of mass move on a straight line, whatever the joints do, and the attitude of the base
-depends on the way. So a pose is out of reach if no joints and no attitude put the tips there with the centre of mass
-where it is then: seen so, the machine is one on a fixed base, with a joint more that turns about the centre of mass.
+Conserved momentum moves the centre of mass of a free-floating machine on a straight line, whatever its joints do, while
+the attitude of the base depends on the path. A pose is therefore out of reach if no joints and no attitude bring the
+tips there with the centre of mass where it is then. For this test, the machine has a fixed base and a further joint
+that turns it about the centre of mass.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from ocp.motion.local.inverse_kinematics import (
     Unreachable,
     equivalent_pose,
     gauss_newton,
-    start_configurations,
+    sample_starts,
     unreachable_error,
 )
 from ocp.motion.search.joint_space import TOLERANCE
@@ -36,10 +36,10 @@ from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.values import Sampler
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = ["ReducedKinematics", "Side", "Slopes", "check_floating_reach", "within"]
+__all__ = ["LimitSide", "ReducedKinematics", "TaskKinematics", "check_floating_reach", "limit_rates"]
 
 
-class Side(IntEnum):
+class LimitSide(IntEnum):
     """Limits of a joint: of its position, and of its rate."""
 
     LOW = 0
@@ -48,55 +48,57 @@ class Side(IntEnum):
     FAST = 3
 
 
-class Slopes(NamedTuple):
-    """Kinematics at K states of n joints, m rows of tasks and a base of size b.
+class TaskKinematics(NamedTuple):
+    """Linearised tasks at K states of n joints, with m task rows and a base of size b.
 
     Attributes:
-        right, error: What the rates are to give, and what poses are off. Shape (K, m).
-        base, drift: The base's rate is base @ p + drift. Shapes (K, b, n), (K, b).
-        ways, lower: A = lower @ ways', the ways orthonormal, lower triangular. Shapes (K, n, m), (K, m, m).
-        null: Directions in which nothing is done for the task, orthonormal. Shape (K, n, r).
+        right, error: Required task rates, and pose errors. Shape (K, m).
+        base, drift: The rate of the base is base @ p + drift. Shapes (K, b, n), (K, b).
+        row_space, lower: A = lower @ row_space', with orthonormal columns of row_space and lower triangular.
+            Shapes (K, n, m), (K, m, m).
+        null: Orthonormal basis of the null space of A. Shape (K, n, r).
     """
 
     right: Array
     error: Array
     base: Array
     drift: Array
-    ways: Array
+    row_space: Array
     lower: Array
     null: Array
 
-    def of(self, rows: Any) -> Slopes:
-        """Of some states."""
-        return Slopes(*(part[rows] for part in self))
+    def select(self, rows: Any) -> TaskKinematics:
+        """Return the kinematics of the given states."""
+        return TaskKinematics(*(part[rows] for part in self))
 
-    def given(self, rates: Array) -> Array:
-        """What scaled rates (K, n) do for the task. Shape (K, m)."""
-        done: Array = self.lower @ (self.ways.transpose(0, 2, 1) @ rates[:, :, None])
-        return done[:, :, 0]
+    def task_rates(self, rates: Array) -> Array:
+        """Return the task rates (K, m) of scaled joint rates (K, n)."""
+        rates_of_tasks: Array = self.lower @ (self.row_space.transpose(0, 2, 1) @ rates[:, :, None])
+        return rates_of_tasks[:, :, 0]
 
-    def least(self, wanted: Array) -> Array:
-        """Least scaled rates (K, n) that give what is wanted (K, m)."""
-        if not wanted.shape[1]:
+    def least_rates(self, required: Array) -> Array:
+        """Return the least-norm scaled rates (K, n) with the required task rates (K, m)."""
+        if not required.shape[1]:
             return np.zeros(self.null.shape[:2])
-        found: Array = self.ways @ np.linalg.solve(self.lower, wanted[:, :, None])
-        return found[:, :, 0]
+        solutions: Array = self.row_space @ np.linalg.solve(self.lower, required[:, :, None])
+        return solutions[:, :, 0]
 
-    def idle(self, rates: Array) -> Array:
-        """The part of scaled rates (K, n) that does nothing for the task."""
-        used: Array = self.ways @ (self.ways.transpose(0, 2, 1) @ rates[:, :, None])
-        return np.asarray(rates - used[:, :, 0])
+    def null_rates(self, rates: Array) -> Array:
+        """Return the components of scaled rates (K, n) in the null space."""
+        projected: Array = self.row_space @ (self.row_space.transpose(0, 2, 1) @ rates[:, :, None])
+        return np.asarray(rates - projected[:, :, 0])
 
-    def moved(self, rates: Array) -> Array:
-        """Rates of the base (K, b) to those of the joints, but for its drift."""
+    def base_rates(self, rates: Array) -> Array:
+        """Return the rates of the base (K, b) for scaled joint rates (K, n), without the drift."""
         return np.asarray((self.base @ rates[:, :, None])[:, :, 0])
 
 
 class ReducedKinematics:
-    """Of a machine that does tasks, or none.
+    """Kinematics of a machine that does tasks, or none.
 
     Attributes:
-        rows: Of the tasks. equations: Of these, or None.
+        rows: Number of task rows.
+        equations: Task equations, or None.
         root: Square roots of the weights. Shape (n,).
     """
 
@@ -109,153 +111,156 @@ class ReducedKinematics:
         parts = [ca.jacobian(machine.base_rate(b, q, u), u), machine.base_rate(b, q, ca.DM.zeros(n))]
         if equations is not None:
             assert self._targets is not None
-            symbols.append(wanted := ca.SX.sym("targets", self._targets.numel_out()))
-            parts += [equations.jacobian(b, q), equations.right(b, q, wanted), equations.error(b, q, wanted)]
+            symbols.append(targets := ca.SX.sym("targets", self._targets.numel_out()))
+            parts += [equations.jacobian(b, q), equations.right(b, q, targets), equations.error(b, q, targets)]
         self._sampler = Sampler(symbols, parts)
 
-    def at(self, base: Array, joints: Array, time: float) -> Slopes:
-        """At states (K, b), (K, n)."""
+    def at(self, base: Array, joints: Array, time: float) -> TaskKinematics:
+        """Return the linearised tasks at states (K, b), (K, n)."""
         count, n = joints.shape
-        given = [base, joints]
+        arguments = [base, joints]
         if self._targets is not None:
-            given.append(np.array(self._targets(time)).ravel())
-        turning, drift, *task = self._sampler(*given)
+            arguments.append(np.array(self._targets(time)).ravel())
+        base_jacobian, drift, *task = self._sampler(*arguments)
         matrix, right, error = task if task else (np.zeros((count, 0)),) * 3
-        turning = turning.reshape(count, n, -1).transpose(0, 2, 1) / self.root
-        whole, upper = np.linalg.qr(matrix.reshape(count, n, self.rows) / self.root[:, None], mode="complete")
-        lower = upper[:, : self.rows].transpose(0, 2, 1).copy()
-        for i in range(self.rows):  # rows that depend on others give what they can
-            least = ROUNDING_SHARE * np.abs(lower).max(axis=(1, 2)) + np.finfo(float).tiny
-            lower[:, i, i] = np.where(np.abs(lower[:, i, i]) < least, least, lower[:, i, i])
+        base_jacobian = base_jacobian.reshape(count, n, -1).transpose(0, 2, 1) / self.root
+        basis, triangular = np.linalg.qr(matrix.reshape(count, n, self.rows) / self.root[:, None], mode="complete")
+        lower = triangular[:, : self.rows].transpose(0, 2, 1).copy()
+        for i in range(self.rows):  # regularise dependent rows
+            threshold = ROUNDING_SHARE * np.abs(lower).max(axis=(1, 2)) + np.finfo(float).tiny
+            lower[:, i, i] = np.where(np.abs(lower[:, i, i]) < threshold, threshold, lower[:, i, i])
         if self.equations is not None:
             error = np.where(self.equations.pose_rows, error, 0.0)
-        return Slopes(right, error, turning, drift, whole[:, :, : self.rows], lower, whole[:, :, self.rows :])
+        row_space, null = basis[:, :, : self.rows], basis[:, :, self.rows :]
+        return TaskKinematics(right, error, base_jacobian, drift, row_space, lower, null)
 
     def speed(self, base: Array, joints: Array, time: float) -> Array:
-        """About how large squared scaled rates (K,) the tasks of then need, far from singularities."""
+        """Estimate the squared scaled rates (K,) that the tasks require at a time, far from singularities."""
         if self.equations is None:
             return np.zeros(len(joints))
         tasks = [part.task for part in self.equations.bound]
         gains = np.repeat([float(task.gain) for task in tasks], [task.size for task in tasks])
-        slopes = self.at(base, joints, time)
-        moved = ((slopes.right - gains * slopes.error) ** 2).sum(axis=1)
-        return np.asarray(self.rows * moved / (slopes.lower**2).sum(axis=(1, 2)))
+        task = self.at(base, joints, time)
+        rates_squared = ((task.right - gains * task.error) ** 2).sum(axis=1)
+        return np.asarray(self.rows * rates_squared / (task.lower**2).sum(axis=(1, 2)))
 
-    def missed(self, base: Array, joints: Array, rates: Array, time: float) -> tuple[Array, Array]:
-        """How fast joint rates (K, n) move tips off what velocities ask for, and how fast these are. Shapes (K,)."""
-        none = np.zeros(len(joints))
+    def velocity_errors(self, base: Array, joints: Array, rates: Array, time: float) -> tuple[Array, Array]:
+        """Return the speed errors of joint rates (K, n) under velocity tasks, and the required speeds. Shapes (K,)."""
+        zeros = np.zeros(len(joints))
         if self.equations is None or self.equations.pose_rows.all():
-            return none, none
-        slopes, rows = self.at(base, joints, time), ~self.equations.pose_rows
-        return np.linalg.norm((slopes.given(rates * self.root) - slopes.right)[:, rows], axis=1), np.linalg.norm(
-            slopes.right[:, rows], axis=1
-        )
+            return zeros, zeros
+        task, rows = self.at(base, joints, time), ~self.equations.pose_rows
+        errors = (task.task_rates(rates * self.root) - task.right)[:, rows]
+        return np.linalg.norm(errors, axis=1), np.linalg.norm(task.right[:, rows], axis=1)
 
-    def stepped(
-        self, base: Array, joints: Array, slopes: Slopes, rates: Array, begin: float, end: float, exact: float
+    def step(
+        self, base: Array, joints: Array, task: TaskKinematics, rates: Array, begin: float, end: float, tolerance: float
     ) -> tuple[Array, Array, Array]:
-        """States after a step with the self-motion of scaled rates (K, n), by the rule of the middle.
+        """Advance states by the midpoint rule with the self-motions of scaled rates (K, n).
 
         Returns:
-            Base (K, b), joints (K, n), and what is left of the errors of poses (K,), corrected until they are `exact`.
+            Base (K, b), joints (K, n) and remaining pose errors (K,), which are corrected down to the tolerance.
         """
-        step, first = end - begin, joints
-        half = base + step / 2 * (slopes.moved(rates) + slopes.drift)
-        middle = self.at(_sound(half), joints + step / 2 * rates / self.root, begin + step / 2)
-        rates = middle.least(middle.right) + middle.idle(slopes.idle(rates))
-        base, joints = _sound(base + step * (middle.moved(rates) + middle.drift)), joints + step * rates / self.root
+        duration, start_joints = end - begin, joints
+        half_base = base + duration / 2 * (task.base_rates(rates) + task.drift)
+        middle = self.at(_normalize(half_base), joints + duration / 2 * rates / self.root, begin + duration / 2)
+        rates = middle.least_rates(middle.right) + middle.null_rates(task.null_rates(rates))
+        base = _normalize(base + duration * (middle.base_rates(rates) + middle.drift))
+        joints = joints + duration * rates / self.root
         if self.equations is None or self.equations.pose_rows.all():
-            return self.corrected(base, joints, end, exact)
+            return self.correct_poses(base, joints, end, tolerance)
 
-        def missed(there: Slopes, joints: Array) -> Array:
-            """Of the ways that velocities ask for in this step, by Simpson's rule."""
-            straight = (joints - first) * self.root
-            parts = ((1, slopes), (4, middle), (1, there))
-            return np.asarray(sum(k / 6 * (step * each.right - each.given(straight)) for k, each in parts))
+        def remaining(at_end: TaskKinematics, joints: Array) -> Array:
+            """Return the missing tip displacement under velocity tasks in this step, by Simpson's rule."""
+            straight = (joints - start_joints) * self.root
+            parts = ((1, task), (4, middle), (1, at_end))
+            return np.asarray(sum(k / 6 * (duration * each.right - each.task_rates(straight)) for k, each in parts))
 
-        return self.corrected(base, joints, end, exact, missed=missed)
+        return self.correct_poses(base, joints, end, tolerance, remaining=remaining)
 
-    def corrected(
+    def correct_poses(
         self,
         base: Array,
         joints: Array,
         time: float,
-        exact: float,
-        most: int = 3,
-        missed: Callable[[Slopes, Array], Array] | None = None,
+        tolerance: float,
+        max_steps: int = 3,
+        remaining: Callable[[TaskKinematics, Array], Array] | None = None,
     ) -> tuple[Array, Array, Array]:
-        """States with the errors of their poses taken back; returns and `exact` as of `stepped`.
+        """Correct the pose errors of states by Newton steps; returns as in `step`.
 
         Args:
-            most: Newton steps.
-            missed: Of slopes and joints there what velocities ask for and was not done, in all rows. Shape (K, m).
+            tolerance: Pose error, m and rad, below which the iteration ends.
+            max_steps: Largest number of Newton steps.
+            remaining: Returns the missing displacements in all rows, (K, m), for linearised tasks and joints.
         """
-        off = np.zeros(len(joints))
-        if self.equations is None or (missed is None and not self.equations.pose_rows.any()):
-            return base, joints, off
-        for number in range(most + 1):
-            slopes = self.at(base, joints, time)
-            error = (
-                slopes.error
-                if missed is None
-                else np.where(self.equations.pose_rows, slopes.error, missed(slopes, joints))
-            )
-            off = np.abs(error).max(axis=1)
-            off = np.where(np.isfinite(off), off, np.inf)
-            if number == most or off.max(initial=0.0) <= exact:
+        pose_error = np.zeros(len(joints))
+        if self.equations is None or (remaining is None and not self.equations.pose_rows.any()):
+            return base, joints, pose_error
+        for iteration in range(max_steps + 1):
+            task = self.at(base, joints, time)
+            error = task.error
+            if remaining is not None:
+                error = np.where(self.equations.pose_rows, error, remaining(task, joints))
+            pose_error = np.abs(error).max(axis=1)
+            pose_error = np.where(np.isfinite(pose_error), pose_error, np.inf)
+            if iteration == max_steps or pose_error.max(initial=0.0) <= tolerance:
                 break
-            rates = slopes.least(error)
+            rates = task.least_rates(error)
             rates /= np.maximum(np.linalg.norm(rates, axis=1, keepdims=True), 1.0)
-            base, joints = _sound(base + slopes.moved(rates)), joints + rates / self.root
-        return base, joints, off
+            base, joints = _normalize(base + task.base_rates(rates)), joints + rates / self.root
+        return base, joints, pose_error
 
 
-def _sound(base: Array) -> Array:
-    """Configurations of bases (K, b), their quaternions of length one."""
+def _normalize(base: Array) -> Array:
+    """Return base configurations (K, b) with unit quaternions."""
     if base.shape[1] == 7:
         base[:, 3:] /= np.linalg.norm(base[:, 3:], axis=1, keepdims=True)
     return base
 
 
-def within(rates: Array, null: Array, low: Array, high: Array, fast: Array) -> tuple[Array, NDArray[np.intp]]:
-    """Rates (K, n) bent along self-motions so that each keeps its limits.
+def limit_rates(
+    rates: Array, null: Array, lower: Array, upper: Array, max_rates: Array
+) -> tuple[Array, NDArray[np.intp]]:
+    """Change scaled rates (K, n) along self-motions so that each joint keeps its limits.
 
     Args:
-        null: Directions of the self-motions. Shape (K, n, r).
-        low, high: Limits. Shape (K, n).
-        fast: Limits of the rates alone. Shape (n,).
+        null: Bases of the self-motions. Shape (K, n, r).
+        lower, upper: Limits. Shape (K, n).
+        max_rates: Rate limits alone. Shape (n,).
 
     Returns:
-        The rates, and of each the joint that cannot keep a limit and which `Side`, or -1. (K, 2).
+        The rates, and for each state the joint that cannot keep a limit and its `LimitSide`, or -1. Shape (K, 2).
     """
-    rates, why = rates.copy(), np.full((len(rates), 2), -1, dtype=np.intp)
-    busy = np.arange(len(rates))
-    for _ in range(2 * rates.shape[1] + 1):  # of each joint both limits
-        over = np.maximum(rates[busy] - high[busy], low[busy] - rates[busy])
-        worst = over.argmax(axis=1)
-        beyond = over[np.arange(len(busy)), worst] > TOLERANCE
-        why[busy[~beyond]] = -1
-        busy, worst = busy[beyond], worst[beyond]
-        if not busy.size:
+    rates, violations = rates.copy(), np.full((len(rates), 2), -1, dtype=np.intp)
+    active = np.arange(len(rates))
+    for _ in range(2 * rates.shape[1] + 1):  # two limits per joint
+        excess = np.maximum(rates[active] - upper[active], lower[active] - rates[active])
+        worst = excess.argmax(axis=1)
+        beyond = excess[np.arange(len(active)), worst] > TOLERANCE
+        violations[active[~beyond]] = -1
+        active, worst = active[beyond], worst[beyond]
+        if not active.size:
             break
-        below = rates[busy, worst] < low[busy, worst]
-        limit = np.where(below, low[busy, worst], high[busy, worst])
-        of_rate = np.abs(limit) >= fast[worst]
-        why[busy, 0], why[busy, 1] = (
+        below = rates[active, worst] < lower[active, worst]
+        limit = np.where(below, lower[active, worst], upper[active, worst])
+        is_rate_limit = np.abs(limit) >= max_rates[worst]
+        violations[active, 0], violations[active, 1] = (
             worst,
-            np.where(below, Side.LOW, Side.HIGH) + np.where(of_rate, Side.SLOW, Side.LOW),
+            np.where(below, LimitSide.LOW, LimitSide.HIGH) + np.where(is_rate_limit, LimitSide.SLOW, LimitSide.LOW),
         )
-        turn = null[busy, worst]
-        lever = (turn**2).sum(axis=1)
-        share = np.where(lever > ROUNDING_SHARE, (limit - rates[busy, worst]) / np.maximum(lever, ROUNDING_SHARE), 0.0)
-        rates[busy] += share[:, None] * (null[busy] @ turn[:, :, None])[:, :, 0]
-    return rates, why
+        directions = null[active, worst]
+        leverage = (directions**2).sum(axis=1)
+        change = (limit - rates[active, worst]) / np.maximum(leverage, ROUNDING_SHARE)
+        share = np.where(leverage > ROUNDING_SHARE, change, 0.0)
+        rates[active] += share[:, None] * (null[active] @ directions[:, :, None])[:, :, 0]
+    return rates, violations
 
 
 STARTS = 64
-"""Random joints and attitudes to search from at each time."""
+"""Random joints and attitudes from which inverse kinematics starts at each time."""
 PLACE_TOLERANCE = 1e-4
-"""m or rad: of a pose that is met."""
+"""m or rad: largest error of a pose that is reached."""
 
 
 def check_floating_reach(
@@ -269,35 +274,35 @@ def check_floating_reach(
     lower: Array,
     upper: Array,
     seed: int = 0,
-    looks: int = 17,
+    samples: int = 17,
 ) -> None:
-    """Raise where poses of the tasks are out of reach in any attitude, by multi-start inverse kinematics.
+    """Raise Unreachable if a pose is out of reach for any attitude, by multi-start inverse kinematics.
 
-    Velocities in the world's axes are summed up to positions, orientations from velocities are left out.
+    Velocities in world axes are integrated to positions; orientations from velocities are ignored.
 
     Args:
-        machine: Whose momentum is conserved.
-        tasks: All that are done, each in its own time.
+        machine: Free-floating machine with conserved momentum.
+        tasks: All tasks, each in its own time.
         base, start: Base and joints at 0 s. Shapes (base_size,), (n,).
-        begin, end: s, between which it is looked.
+        begin, end: Checked interval of time, s.
         lower, upper: Limits of the joints. Shape (n,).
-        seed: Of the random starts.
-        looks: Times at which poses are looked at, and 2**10 times closer where one is out of reach.
+        seed: Seed of the random starts.
+        samples: Checked times. The interval before an unreachable pose is bisected to a 2**10th.
 
     Raises:
-        Unreachable: Names the time from which on a pose is out of reach, and the nearest miss.
+        Unreachable: Names the time from which a pose is out of reach, and the least pose error.
     """
-    n, turns = machine.joint_size, 1 if machine.base_size == 3 else 4
+    n, attitude_size = machine.joint_size, 1 if machine.base_size == 3 else 4
     rng = np.random.default_rng(seed)
-    attitudes = rng.normal(size=(STARTS, 4)) if turns == 4 else rng.uniform(-np.pi, np.pi, (STARTS, 1))
-    starts = np.hstack([start_configurations(machine, lower, upper, STARTS, None, seed), attitudes])
-    free = np.full(turns, np.inf)
-    limits = np.concatenate([lower, -free]), np.concatenate([upper, free])
-    known = np.zeros((0, n + turns))  # where the poses of the time before were met
+    attitudes = rng.normal(size=(STARTS, 4)) if attitude_size == 4 else rng.uniform(-np.pi, np.pi, (STARTS, 1))
+    starts = np.hstack([sample_starts(machine, lower, upper, STARTS, None, seed), attitudes])
+    unlimited = np.full(attitude_size, np.inf)
+    limits = np.concatenate([lower, -unlimited]), np.concatenate([upper, unlimited])
+    solutions = np.zeros((0, n + attitude_size))  # solutions at the preceding time
 
-    def missed_at(time: float) -> Unreachable | None:
-        """What is out of reach at a time."""
-        nonlocal known
+    def unreachable_at(time: float) -> Unreachable | None:
+        """Return the error about a pose that is out of reach at a time."""
+        nonlocal solutions
         poses = []
         for task in tasks:
             if task.begin <= time <= task.end and (task.is_pose or not task.begin):
@@ -307,40 +312,41 @@ def check_floating_reach(
             return None
         equations = bind(machine, poses)
         targets = np.array(equations.target_function()(time)).ravel()
-        z = ca.SX.sym("z", n + turns)
-        misfit = equations.pose_residual(_placed(machine, base, start, z, time), z[:n], ca.SX(ca.DM(targets)))
-        function = ca.Function("misfit", [z], [misfit, ca.densify(ca.jacobian(misfit, z))], {"cse": True})
-        found, off = gauss_newton(function, np.vstack([known, starts]), *limits, PLACE_TOLERANCE, 100)
-        good = off <= PLACE_TOLERANCE
-        if good.any():
-            known = found[good][:STARTS]
+        z = ca.SX.sym("z", n + attitude_size)
+        base_then = _base_about_center_of_mass(machine, base, start, z, time)
+        residual = equations.pose_residual(base_then, z[:n], ca.SX(ca.DM(targets)))
+        function = ca.Function("pose_residual", [z], [residual, ca.densify(ca.jacobian(residual, z))], {"cse": True})
+        candidates, errors = gauss_newton(function, np.vstack([solutions, starts]), *limits, PLACE_TOLERANCE, 100)
+        reached = errors <= PLACE_TOLERANCE
+        if reached.any():
+            solutions = candidates[reached][:STARTS]
             return None
-        best = int(off.argmin())
-        return unreachable_error(equations, found[best, :n], float(off[best]), lower, upper)
+        best = int(errors.argmin())
+        return unreachable_error(equations, candidates[best, :n], float(errors[best]), lower, upper)
 
     reached = begin
-    for time in np.linspace(begin, end, looks).tolist():
-        if (error := missed_at(time)) is None:
+    for time in np.linspace(begin, end, samples).tolist():
+        if (error := unreachable_at(time)) is None:
             reached = time
             continue
-        while time - reached > (end - begin) / (looks - 1) / 2**10:
+        while time - reached > (end - begin) / (samples - 1) / 2**10:
             middle = (reached + time) / 2
-            if (missed := missed_at(middle)) is None:
+            if (unreachable_then := unreachable_at(middle)) is None:
                 reached = middle
             else:
-                time, error = middle, missed
+                time, error = middle, unreachable_then
         error.time = time
         raise error
 
 
-def _placed(machine: FreeFloating, base: Array, start: Array, z: Any, time: float) -> Any:
-    """The base at a time where joints and its attitude, both in z, have the centre of mass where it is then."""
+def _base_about_center_of_mass(machine: FreeFloating, base: Array, start: Array, z: Any, time: float) -> Any:
+    """Return the base at a time for joints and attitude z that keeps the centre of mass on its line."""
     robot, frame, n = machine.robot, machine.world_from_base(ca.DM(base)), machine.joint_size
-    joints, turn = z[:n], z[n:]
+    joints, attitude = z[:n], z[n:]
     momentum = np.zeros(6)
     momentum[machine.twist_rows] = np.asarray(machine.conserved_momentum)
     center = center_of_mass(robot, ca.DM(start), frame) + time * ca.DM(momentum[3:]) / robot.total_mass
-    if turn.numel() == 1:
-        place = center - ca.mtimes(rotation((0, 0, 1), turn), center_of_mass(robot, joints))
-        return ca.vertcat(place[:2], turn)
-    return ca.vertcat(center - ca.mtimes(rotation_from_quaternion(turn), center_of_mass(robot, joints)), turn)
+    if attitude.numel() == 1:
+        position = center - ca.mtimes(rotation((0, 0, 1), attitude), center_of_mass(robot, joints))
+        return ca.vertcat(position[:2], attitude)
+    return ca.vertcat(center - ca.mtimes(rotation_from_quaternion(attitude), center_of_mass(robot, joints)), attitude)

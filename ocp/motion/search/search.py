@@ -1,15 +1,15 @@
-"""The cheapest motion of all, and a bound that none falls below: search over all postures that do a task.
+"""Global search over the self-motion manifolds: the lowest-cost motion, and a lower bound of the cost of all.
 
-All postures at a number of instants are covered by charts; dynamic programming over these finds the classes of motions
-that are cheapest, each of which becomes a guess for the whole motion's problem. Charts through which no motion can pass
-that is cheaper than a share of the best one found are left out, the others are halved, and again, until none is left:
-then none is cheaper than that share. Straight steps from instant to instant cost no more than the motion itself.
+An atlas of charts covers all configurations that do the tasks at some time samples. Dynamic programming over the
+charts yields lower bounds of the cost-to-go and the cost-to-come, and the classes of motions of least cost, each of
+which is a guess for the optimal control problem. Then branch and bound: charts through which no motion can cost less
+than a share of the best known cost are discarded, and the others are split, until none is left. No motion then costs
+less than that share, since straight steps from sample to sample cost no more than the motion itself.
 
-The bound is a proof under these assumptions, and no others: closed forms, where the arm has one, at samples of what is
-free, or inverse kinematics from random starts found a posture of every part of the set of postures that is connected,
-over all instants; within a box the set strays from its chart, and from the quadratic
-form that its rim tells, no farther than at the rim; where something has to be clear, bodies that overlap do so as deep
-as it is measured.
+The bound holds under these assumptions alone. Closed forms at samples of the free parameter, or inverse kinematics from
+random starts, found a configuration on every connected component, over all time samples. Within a box, the manifold
+deviates from its chart, and from the quadratic form fitted at the rim, no farther than at the rim. The measured
+penetration depth of overlapping bodies is correct.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
+from typing import Any
 from warnings import warn
 
 import numpy as np
@@ -27,70 +28,71 @@ from models.arrays import Array
 from ocp.errors import BoundWarning
 from ocp.motion.local.collisions import distances_along
 from ocp.motion.local.inverse_kinematics import Unreachable
-from ocp.motion.search.charts import Charts, Instant, Parts, point
-from ocp.motion.search.joint_space import FARTHEST, TOLERANCE, JointSpace
-from ocp.motion.search.steps import StepCost, Values
-from ocp.motion.search.value import PENALTY, Graph, drawn_tight
+from ocp.motion.search.charts import Charts, SplitCharts, TimeSample, point_chart
+from ocp.motion.search.joint_space import MAX_STEP, TOLERANCE, JointSpace
+from ocp.motion.search.steps import QuadraticBounds, StepCost
+from ocp.motion.search.value import PENALTY, ChartGraph, shorten_path
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = ["FREE", "Search", "SearchSettings", "checked_bound"]
+__all__ = ["MAX_FREE_DIRECTIONS", "AtlasSearch", "SearchSettings", "checked_bound"]
 
-FREE = 2
-"""Directions that a task may leave free: of more there are too many postures."""
+MAX_FREE_DIRECTIONS = 2
+"""Largest dimension of the self-motion manifold; an atlas of more dimensions is too large."""
 
 
 @dataclass(frozen=True)
 class SearchSettings:
-    """How far a search goes.
+    """Settings of the global search.
 
     Attributes:
-        radii: Of the charts that the search begins with, rad or m, by the number of directions that are free.
-        charts: Of all instants together at most, of 1 kB each with what is known of their steps.
-        first: Of these, before there is any motion: where one has hardly room, neither it nor that there is none may be
-            found.
-        finest: Smaller charts are not halved, rad or m.
-        gaps: Share of what a plan's steps cost that the bound may stay below, by the directions that are free.
-        motions: Classes of motions that are followed up, the cheapest first.
-        far: Share of the least cost beyond which they are not.
-        same: Motions nearer to each other than this everywhere are one, rad or m.
-        seats: Instants at which the cheapest motions through all charts are compared.
+        radii: Initial radii of the charts, rad or m, by the number of free directions.
+        charts: Largest number of charts over all time samples; each takes about 1 kB with its steps.
+        charts_without_path: The same while no path is known. In a narrow passage, neither a path nor a proof that there
+            is none may then be found.
+        finest: Charts of a smaller radius are not split, rad or m.
+        gaps: Relative gap between cost and bound at which the search stops, by the number of free directions.
+        max_classes: Largest number of classes of motions that are returned.
+        max_cost_ratio: Classes of motions that cost more than so many times the best one are not returned.
+        same_path: Motions that differ by less everywhere count as one, rad or m.
+        seats: Time samples at which the lowest-cost motions through each chart are compared.
     """
 
     radii: tuple[float, float, float] = (0.07, 0.07, 0.2)
     charts: int = 40_000
-    first: int = 10_000
+    charts_without_path: int = 10_000
     finest: float = 1e-6
     gaps: tuple[float, float, float] = (0.01, 0.01, 0.04)
-    motions: int = 12
-    far: float = 3.0
-    same: float = 0.1
+    max_classes: int = 12
+    max_cost_ratio: float = 3.0
+    same_path: float = 0.1
     seats: int = 5
 
 
 def checked_bound(bound: float, cost: float) -> float | None:
-    """The bound of the cost of all motions; None where one costs less, which a bound excludes.
+    """Return a lower bound of the cost of all motions, or None if a motion refutes it.
 
     Warns:
-        BoundWarning: That it does.
+        BoundWarning: The cost of a motion lies below the bound.
     """
     if bound <= cost * (1 + ROUNDING_SHARE):
         return bound
-    words = f"a motion costs {cost:.9g}, less than the bound {bound:.9g} of all motions, which is left out: report this"
+    words = f"a motion costs {cost:.9g}, less than its lower bound {bound:.9g}, which is dropped: report this"
     warn(BoundWarning(words, name="bound", value=cost, limit=bound), stacklevel=2)
     return None
 
 
-class Search:
-    """All postures at some instants, and the motions through them.
+class AtlasSearch:
+    """Search over an atlas of the self-motion manifolds at some time samples.
 
     Attributes:
-        covered: Charts of each instant. layers: But for those on which every posture touches something.
+        atlas: Charts of each time sample.
+        layers: The same without charts on which every configuration is in collision.
     """
 
     def __init__(
         self,
         space: JointSpace,
-        instants: Sequence[Instant],
+        samples: Sequence[TimeSample],
         times: Array,
         cost: StepCost,
         limits: Array,
@@ -102,328 +104,350 @@ class Search:
     ) -> None:
         """
         Args:
-            space: Where the postures lie.
-            instants: By rising time.
-            times: s. Shape (K,).
-            cost: Of a step between two of them.
-            limits: How far the joints may go from each to the next. Shape (K - 1, n).
-            seeds: Postures at an instant, of as many parts of the set as are found, shape (M, n); raises Unreachable.
-            start: The posture of the first instant, where it is given. Shape (n,).
-            scene: What has to be clear.
-            settings: How far it goes.
+                space: Joint space.
+                samples: Manifolds of the time samples, by rising time.
+                times: Times of the samples, s. Shape (K,).
+                cost: Cost of a step between two samples.
+                limits: Largest step of each joint between samples. Shape (K - 1, n).
+                seeds: Returns configurations (M, n) at a sample, on as many components as possible; raises Unreachable.
+                start: Configuration at the first sample, if given. Shape (n,).
+                scene: Collision scene, or None.
+                settings: Settings of the search.
 
         Raises:
-            Unreachable: An instant at which no posture does the tasks within limits, and clear.
-            ProblemError: More postures than memory is for.
+            Unreachable: At some sample no configuration does the tasks within limits.
+            ProblemError: The atlas needs too many charts.
         """
-        self.space, self.instants, self.times, self.cost, self.limits = space, instants, times, cost, limits
+        self.space, self.samples, self.times, self.cost, self.limits = space, samples, times, cost, limits
         self.start, self.scene, self.settings = start, scene, settings
-        self._known: tuple[Graph, list[Values], list[Values] | None] | None = None
-        self.covered = self._cover(seeds)
-        self.layers = [self.allowed(charts, k) for k, charts in enumerate(self.covered)]
+        self._cost_bounds: tuple[ChartGraph, list[QuadraticBounds], list[QuadraticBounds] | None] | None = None
+        self.atlas = self._build_atlas(seeds)
+        self.layers = [self.without_collisions(charts, k) for k, charts in enumerate(self.atlas)]
 
-    def _cover(self, seeds: Callable[[int], Array]) -> list[Charts]:
-        """Charts of all postures of each instant.
+    def _build_atlas(self, seeds: Callable[[int], Array]) -> list[Charts]:
+        """Return charts of all configurations of each time sample.
 
         Raises:
-            Unreachable, ProblemError: As the search itself.
+            Unreachable, ProblemError: As in the constructor.
         """
-        covered = list[Charts]()
-        for sets in dict.fromkeys(instant.sets for instant in self.instants):
-            own = [k for k, instant in enumerate(self.instants) if instant.sets is sets]
-            found: list[tuple[int, Array]] = []
-            for k in own:
+        atlas = list[Charts]()
+        for sets in dict.fromkeys(sample.manifolds for sample in self.samples):
+            rows = [k for k, sample in enumerate(self.samples) if sample.manifolds is sets]
+            configurations: list[tuple[int, Array]] = []
+            for k in rows:
                 try:
-                    found += [(self.instants[k].number, joints) for joints in seeds(k)]
+                    configurations += [(self.samples[k].row, joints) for joints in seeds(k)]
                 except Unreachable:
-                    if not found:
+                    if not configurations:
                         raise
-            layer, joints = (np.array(part) for part in zip(*found, strict=True))
+            layer, joints = (np.array(part) for part in zip(*configurations, strict=True))
             charts = sets.cover(layer, joints, self.settings.radii[sets.size], self.settings.charts)
-            covered += [charts.of(charts.layer == self.instants[k].number) for k in own]
+            atlas += [charts.select(charts.layer == self.samples[k].row) for k in rows]
         if self.start is not None:
-            covered[0] = point(self.start)
-        for k, charts in enumerate(covered):
+            atlas[0] = point_chart(self.start)
+        for k, charts in enumerate(atlas):
             if not len(charts):
-                seeds(k)  # says what is out of reach
-                words = f"at {self.times[k]:.4g} s no posture that does the tasks is within limits"
+                seeds(k)  # raises an error that names the pose
+                words = f"at {self.times[k]:.4g} s no configuration that does the tasks is within limits"
                 time = float(self.times[k])
                 raise Unreachable(words, np.full(len(self.space.scale), np.nan), np.nan, time=time)
-        return covered
+        return atlas
 
-    def allowed(self, charts: Charts, k: int) -> Charts:
-        """But for charts on which every posture touches something."""
-        return charts.of(self._allowed(charts, k))
+    def without_collisions(self, charts: Charts, k: int) -> Charts:
+        """Return the charts of a time sample without those on which every configuration is in collision."""
+        return charts.select(self._collision_free(charts, k))
 
-    def _allowed(self, charts: Charts, k: int) -> NDArray[np.bool_]:
-        around = self.scene
-        if around is None or not len(charts):
+    def _collision_free(self, charts: Charts, k: int) -> NDArray[np.bool_]:
+        scene = self.scene
+        if scene is None or not len(charts):
             return np.ones(len(charts), dtype=bool)
-        times, none = np.full(len(charts), self.times[k]), np.zeros(0)
-        apart = distances_along(around, none, charts.centers, times, around.clearance)
-        return np.asarray((apart + charts.spans @ around.levers.joints.T >= around.clearance).all(axis=1))
+        times, base = np.full(len(charts), self.times[k]), np.zeros(0)
+        distances = distances_along(scene, base, charts.centers, times, scene.clearance)
+        return np.asarray((distances + charts.spans @ scene.levers.joints.T >= scene.clearance).all(axis=1))
 
-    def graph(self, layers: list[Charts], most: Array) -> Graph:
-        """The steps between charts, which cost at most so much each. Shape (K - 1,)."""
-        return Graph(self.space, layers, np.diff(self.times), self.cost, self.limits, most)
+    def graph(self, layers: list[Charts], max_costs: Any = np.inf) -> ChartGraph:
+        """Return the graph of steps between charts, each step costing at most `max_costs`, one or shape (K - 1,)."""
+        max_costs = np.broadcast_to(max_costs, len(self.times) - 1)
+        return ChartGraph(self.space, layers, np.diff(self.times), self.cost, self.limits, max_costs)
 
-    def whole_graph(self) -> Graph:
-        """All steps between the charts that the search begins with."""
-        return self.graph(self.layers, np.full(len(self.times) - 1, np.inf))
+    def full_graph(self) -> ChartGraph:
+        """Return the graph of all steps between the initial charts."""
+        return self.graph(self.layers)
 
-    def part(self, first: int, last: int) -> Search:
-        """The search from one of its instants to another one, both of them included."""
-        own, rows = copy(self), slice(first, last + 1)
-        own.instants, own.times, own.limits = self.instants[rows], self.times[rows], self.limits[first:last]
-        own.covered, own.layers, own._known = self.covered[rows], self.layers[rows], None
-        own.start = self.start if first == 0 else None
-        return own
+    def restrict(self, first: int, last: int) -> AtlasSearch:
+        """Return the search restricted to the samples from `first` to `last`, both included."""
+        part, rows = copy(self), slice(first, last + 1)
+        part.samples, part.times, part.limits = self.samples[rows], self.times[rows], self.limits[first:last]
+        part.atlas, part.layers, part._cost_bounds = self.atlas[rows], self.layers[rows], None
+        part.start = self.start if first == 0 else None
+        return part
 
-    def ways(self) -> tuple[list[Array], float]:
-        """Joints at the instants, (K, n), of motions by rising cost of their steps, and what none costs less than."""
-        path, bound = self.best(np.inf)
+    def paths(self) -> tuple[list[Array], float]:
+        """Return paths (K, n) by rising cost of their steps, and a lower bound of the cost of all."""
+        path, bound = self.solve(np.inf)
         return [] if path is None else [path], bound
 
-    def steps(self, path: Array) -> float:
-        """What straight steps through joints (K, n) at the instants cost."""
-        return float(self.cost.of(np.diff(path, axis=0), np.diff(self.times)[:, None]).sum())
+    def path_cost(self, path: Array) -> float:
+        """Return the cost of straight steps along a path (K, n)."""
+        return float(self.cost.evaluate(np.diff(path, axis=0), np.diff(self.times)[:, None]).sum())
 
-    # ---- motions -------------------------------------------------------------------------------------------------
+    # ---- classes of motions ------------------------------------------------------------------------------------------
 
-    def motions(self, most: float, every: bool = False) -> list[Array]:
-        """Joints at the instants, (K, n), of the cheapest motion of each class, by rising cost of their steps.
+    def class_representatives(self, max_cost: float, include_costlier: bool = False) -> list[Array]:
+        """Return the lowest-cost path (K, n) of each class of motions, by rising cost.
 
-        After `best` of those that may be the cheapest, for what the bound leaves open.
+        A class is represented by a chart through which a motion costs less than through its neighbours. After `solve`,
+        only classes are returned that its bound does not exclude.
 
         Args:
-            most: What one step may cost: that of a motion that is known, or inf.
-            every: Also of classes that are dearer.
+            max_cost: Largest cost of one step, such as the cost of a known motion; or inf.
+            include_costlier: Whether excluded classes are returned as well.
         """
-        if self._known is None or every:
-            graph = self.graph(self.layers, np.full(len(self.times) - 1, most))
-            self._known = graph, graph.to_come(), None
-        graph, to_come, passed = self._known
-        passed = passed or graph.passed()
-        seats = []
-        for k in np.unique(np.linspace(0, len(graph.layers) - 1, self.settings.seats).astype(int)).tolist():
+        if self._cost_bounds is None or include_costlier:
+            graph = self.graph(self.layers, max_cost)
+            self._cost_bounds = graph, graph.cost_to_go(), None
+        graph, cost_to_go, cost_to_come = self._cost_bounds
+        cost_to_come = cost_to_come or graph.cost_to_come()
+        minima, settings = [], self.settings
+        for k in np.unique(np.linspace(0, len(graph.layers) - 1, settings.seats).astype(int)).tolist():
             charts = graph.layers[k]
-            total = graph.through(passed, to_come, k)
-            lowest = np.isfinite(total)
+            costs = graph.cost_through(cost_to_come, cost_to_go, k)
+            is_minimum = np.isfinite(costs)
             pairs = self.space.tree(charts.centers).query_pairs(3 * float(charts.radii.max()), output_type="ndarray")
-            for one, other in (pairs.T, pairs.T[::-1]):
-                lowest[one[total[one] > total[other]]] = False
-            seats += [(float(total[i]), k, i) for i in np.flatnonzero(lowest).tolist()]
-        found: list[tuple[float, Array]] = []
-        for bound, k, chart in sorted(seats):
-            if len(found) == self.settings.motions or (found and bound > self.settings.far * found[0][0]):
+            for first, second in (pairs.T, pairs.T[::-1]):
+                is_minimum[first[costs[first] > costs[second]]] = False
+            minima += [(float(costs[i]), k, i) for i in np.flatnonzero(is_minimum).tolist()]
+        paths: list[tuple[float, Array]] = []
+        for lower_bound, k, chart in sorted(minima):
+            too_costly = paths and lower_bound > settings.max_cost_ratio * paths[0][0]
+            if len(paths) == settings.max_classes or too_costly:
                 break
-            path = self._path(graph, k, chart, passed, to_come)
-            same = (np.abs(self.space.difference(path, other)).max() for _, other in found if path is not None)
-            if path is None or any(apart < self.settings.same for apart in same):
+            path = self._path_through(graph, k, chart, cost_to_come, cost_to_go)
+            differences = (np.abs(self.space.difference(path, known)).max() for _, known in paths if path is not None)
+            if path is None or any(difference < self.settings.same_path for difference in differences):
                 continue
-            found.append((self.steps(path), path))
-        return [path for _, path in sorted(found, key=lambda one: one[0])]
+            paths.append((self.path_cost(path), path))
+        return [path for _, path in sorted(paths, key=lambda entry: entry[0])]
 
-    def _path(self, graph: Graph, k: int, chart: int, passed: list[Values], to_come: list[Values]) -> Array | None:
-        """The cheapest way through a chart; None where it ends."""
-        slope, box = to_come[k].slope[chart] + (passed[k].slope[chart] if k else 0.0), graph.layers[k].of([chart])
-        at = np.where(slope > 0, box.low[0], np.where(slope < 0, box.high[0], 0.0))
-        first = self.allowed_in(k, box, at)
-        if first is None:
+    def _path_through(
+        self,
+        graph: ChartGraph,
+        k: int,
+        chart: int,
+        cost_to_come: list[QuadraticBounds],
+        cost_to_go: list[QuadraticBounds],
+    ) -> Array | None:
+        """Return the lowest-cost path through a chart, or None if it cannot be continued."""
+        slope = cost_to_go[k].slope[chart] + (cost_to_come[k].slope[chart] if k else 0.0)
+        start_chart = graph.layers[k].select([chart])
+        place = np.where(slope > 0, start_chart.low[0], np.where(slope < 0, start_chart.high[0], 0.0))
+        start = self.project_in_box(k, start_chart, place)
+        if start is None:
             return None
-        path, last = {k: first}, len(self.layers) - 1
-        for values, order in ((to_come, range(k + 1, last + 1)), (passed, range(k - 1, -1, -1))):
-            here = first
-            for other in order:
-                ways = graph.nearest(here, other - int(np.sign(order.step)), other, values[other])
-                there = next((good for way in ways if (good := self.allowed_in(other, *way)) is not None), None)
-                if there is None:
+        path, last = {k: start}, len(self.layers) - 1
+        for values, order in ((cost_to_go, range(k + 1, last + 1)), (cost_to_come, range(k - 1, -1, -1))):
+            current = start
+            for neighbour in order:
+                previous = neighbour - int(np.sign(order.step))
+                candidates = graph.successors(current, previous, neighbour, values[neighbour])
+                successor = next(
+                    (
+                        configuration
+                        for candidate in candidates
+                        if (configuration := self.project_in_box(neighbour, *candidate)) is not None
+                    ),
+                    None,
+                )
+                if successor is None:
                     return None
-                here = here + self.space.difference(there, here)
-                path[other] = here
+                current = current + self.space.difference(successor, current)
+                path[neighbour] = current
         return np.array([path[number] for number in range(last + 1)])
 
-    def allowed_in(self, k: int, box: Charts, place: Array) -> Array | None:
-        """The posture at a place (r,) in the box of a chart, or nearer to its middle; None where none is allowed.
+    def project_in_box(self, k: int, box: Charts, place: Array) -> Array | None:
+        """Return the configuration at a place (r,) in a box, or nearer to its middle; None if none is valid.
 
-        Boxes end beyond the limits, by how far the set strays from them.
+        A box reaches beyond the joint limits by the deviation of the manifold.
         """
         middle = (box.low[0] + box.high[0]) / 2
-        inwards = (0.0, 0.25, 0.5, 1.0)
-        ways = (box.centers[0] + box.tangents[0] @ (place + share * (middle - place)) for share in inwards)
-        return next((good for way in ways if (good := self._on(k, way)) is not None), None)
+        shares = (0.0, 0.25, 0.5, 1.0)
+        candidates = (box.centers[0] + box.tangents[0] @ (place + share * (middle - place)) for share in shares)
+        projected = (self._project(k, candidate) for candidate in candidates)
+        return next((configuration for configuration in projected if configuration is not None), None)
 
-    def _on(self, k: int, joints: Array) -> Array | None:
-        """The posture of an instant next to joints, None where it leaves the limits or touches something."""
+    def _project(self, k: int, joints: Array) -> Array | None:
+        """Project joints onto the manifold of a sample; return None if limits or clearance are then violated."""
         if k == 0 and self.start is not None:
             return self.start
-        found, good = self.instants[k].sets.corrected(np.array([self.instants[k].number]), joints[None])
-        return np.asarray(found[0]) if good[0] and self._clear(found, k)[0] else None
+        projected, converged = self.samples[k].manifolds.project(np.array([self.samples[k].row]), joints[None])
+        return np.asarray(projected[0]) if converged[0] and self._is_clear(projected, k)[0] else None
 
-    # ---- the best of all -------------------------------------------------------------------------------------------
+    # ---- branch and bound --------------------------------------------------------------------------------------------
 
-    def best(self, most: float) -> tuple[Array | None, float]:
-        """Joints at the instants, (K, n), whose steps cost nearly least, and what no motion's steps cost less than.
+    def solve(self, max_cost: float) -> tuple[Array | None, float]:
+        """Return a path (K, n) of nearly least cost, and a lower bound of the cost of all paths.
 
         Args:
-            most: What one step may cost at first: that of a motion that is known, or inf. Where nothing so cheap is
-                found it is raised: motions with a dearer step are dearer than what is found.
+            max_cost: Initial limit of the cost of one step, such as the cost of a known motion; or inf. It is raised if
+                no path costs so little, since a path with a costlier step costs more.
 
         Returns:
-            None and inf where no motion goes through all instants; a bound that is lower than it might be where more
-            charts would be needed than memory is for.
+            None and inf if no path exists. The bound is looser if the atlas would need too many charts.
         """
         seconds = np.diff(self.times)[:, None]
-        dearest = float(self.cost.of(np.minimum(self.limits, FARTHEST), seconds).max(initial=0.0))
+        largest_step_cost = float(self.cost.evaluate(np.minimum(self.limits, MAX_STEP), seconds).max(initial=0.0))
         while True:
-            path, bound = self._best(most)
-            if most >= dearest:
+            path, bound = self._solve(max_cost)
+            if max_cost >= largest_step_cost:
                 return path, bound
-            # a motion with a step that was left out costs more than `most`
-            cost, bound = np.inf if path is None else self.steps(path), min(bound, most)
-            if path is not None and (cost <= most or bound >= self._share * cost):
+            # a motion with an excluded step costs more than `max_cost`
+            cost, bound = np.inf if path is None else self.path_cost(path), min(bound, max_cost)
+            if path is not None and (cost <= max_cost or bound >= self._target_share * cost):
                 return path, bound
-            most = dearest if path is None else cost
+            max_cost = largest_step_cost if path is None else cost
 
     @property
-    def _share(self) -> float:
-        """Of what a motion's steps cost, which the bound has to reach."""
-        return 1 - self.settings.gaps[max(0, *(instant.sets.size for instant in self.instants))]
+    def _target_share(self) -> float:
+        """Share of the cost of a path at which the bound is tight enough."""
+        return 1 - self.settings.gaps[max(0, *(sample.manifolds.size for sample in self.samples))]
 
-    def _best(self, most: float) -> tuple[Array | None, float]:
-        """As `best`, of motions all of whose steps cost at most so much."""
-        share = self._share
-        layers, best = self.first(most)
+    def _solve(self, max_cost: float) -> tuple[Array | None, float]:
+        """As `solve`, for paths whose steps all cost at most `max_cost`."""
+        target = self._target_share
+        layers, best_path = self.find_path(max_cost)
         if not layers:
             return None, np.inf
-        if best is None:
-            graph = self.graph(layers, np.full(len(self.times) - 1, most))
-            return None, max(float(graph.least(graph.to_come()[0], 0).min()), 0.0)
-        least = self.steps(best)
-        coarse, others = True, np.zeros(len(self.times) - 1)  # what a motion costs at least before and after each step
-        rest: list[Values] | None = None  # what has passed until each chart, at least
+        if best_path is None:
+            graph = self.graph(layers, max_cost)
+            return None, max(float(graph.minima(graph.cost_to_go()[0], 0).min()), 0.0)
+        best_cost = self.path_cost(best_path)
+        coarse, remaining = True, np.zeros(len(self.times) - 1)  # least cost before and after each step
+        known_bounds: list[QuadraticBounds] | None = None  # lower bounds of the cost-to-come
         while True:
-            graph = self.graph(layers, min(most, least) - others)
-            # beyond that nothing is looked for: a class at first, whose motion steps miss some of, then bounds
-            far = least / share if coarse else share * least
-            to_come = graph.to_come(rest, far)
+            graph = self.graph(layers, min(max_cost, best_cost) - remaining)
+            # bounds beyond the cutoff are not needed; at first it leaves a margin for other classes
+            cutoff = best_cost / target if coarse else target * best_cost
+            cost_to_go = graph.cost_to_go(known_bounds, cutoff)
             if coarse:
-                self._known = graph, to_come, None
-            low = float(graph.least(to_come[0], 0).min(initial=np.inf))
-            path = self._led(graph, to_come) if np.isfinite(low) else None
-            if path is not None and (cost := self.steps(path)) < least:
-                best, least = path, cost
-            if low >= share * least:
-                return best, share * least
-            passed = graph.passed(to_come, far)
+                self._cost_bounds = graph, cost_to_go, None
+            bound = float(graph.minima(cost_to_go[0], 0).min(initial=np.inf))
+            path = self._follow_bounds(graph, cost_to_go) if np.isfinite(bound) else None
+            if path is not None and (cost := self.path_cost(path)) < best_cost:
+                best_path, best_cost = path, cost
+            if bound >= target * best_cost:
+                return best_path, target * best_cost
+            cost_to_come = graph.cost_to_come(cost_to_go, cutoff)
             if coarse:
-                self._known, coarse = (graph, to_come, passed), False
-            through = [graph.through(passed, to_come, k) for k in range(len(layers))]
-            before, after = ([float(graph.least(each, k).min()) for k, each in enumerate(v)] for v in (passed, to_come))
-            others = np.maximum(others, np.array(before[:-1]) + np.array(after[1:]))
-            cheap = [total < share * least for total in through]
-            kept = [charts.of(own) for charts, own in zip(layers, cheap, strict=True)]
-            if not all(len(charts) for charts in kept):
-                return best, share * least
-            if not self._may_be_halved(kept, self.settings.charts):
-                return best, max(low, 0.0)
-            finer = [self._finer(kept[k], k, passed[k].of(own)) for k, own in enumerate(cheap)]
-            layers, rest = [charts for charts, _ in finer], [values for _, values in finer]
+                self._cost_bounds, coarse = (graph, cost_to_go, cost_to_come), False
+            through = [graph.cost_through(cost_to_come, cost_to_go, k) for k in range(len(layers))]
+            bounds = cost_to_come, cost_to_go
+            before, after = ([float(graph.minima(each, k).min()) for k, each in enumerate(v)] for v in bounds)
+            remaining = np.maximum(remaining, np.array(before[:-1]) + np.array(after[1:]))
+            promising = [total < target * best_cost for total in through]
+            layers_left = [charts.select(rows) for charts, rows in zip(layers, promising, strict=True)]
+            if not all(len(charts) for charts in layers_left):
+                return best_path, target * best_cost
+            if not self._can_split(layers_left, self.settings.charts):
+                return best_path, max(bound, 0.0)
+            come = [values.select(rows) for values, rows in zip(cost_to_come, promising, strict=True)]
+            refined = [self._refine(charts, k, come[k]) for k, charts in enumerate(layers_left)]
+            layers, known_bounds = [charts for charts, _ in refined], [values for _, values in refined]
 
-    def first(self, most: float) -> tuple[list[Charts], Array | None]:
-        """Charts through which motions may pass all of whose steps cost at most so much, and one motion.
+    def find_path(self, max_cost: float) -> tuple[list[Charts], Array | None]:
+        """Return the charts through which paths may pass whose steps cost at most `max_cost`, and one such path.
 
-        No charts where there is none; no motion where memory is for no more charts.
+        The list of charts is empty if no path exists. The path is None if the atlas would need too many charts.
         """
         layers, coarse = self.layers, True
         while True:
-            graph = self.graph(layers, np.full(len(self.times) - 1, most))
-            path = self._tight(self._through_centers(graph), layers)
+            graph = self.graph(layers, max_cost)
+            path = self._shorten(self._path_through_centers(graph), layers)
             if path is not None:
                 return layers, path
-            alive = graph.alive()
-            if not all(own.any() for own in alive):
+            alive = graph.reachable()
+            if not all(mask.any() for mask in alive):
                 return [], None
-            layers = [charts.of(own) for charts, own in zip(layers, alive, strict=True)]
+            layers = [charts.select(mask) for charts, mask in zip(layers, alive, strict=True)]
             if coarse:
-                graph = self.graph(layers, graph.most)
-                path = self._led(graph, graph.to_come())
-            if path is not None or not self._may_be_halved(layers, self.settings.first):
+                graph = self.graph(layers, graph.max_costs)
+                path = self._follow_bounds(graph, graph.cost_to_go())
+            if path is not None or not self._can_split(layers, self.settings.charts_without_path):
                 return layers, path
             coarse = False
-            layers = [self.allowed(self.halved(charts, k), k) for k, charts in enumerate(layers)]
+            layers = [self.without_collisions(self.split_charts(charts, k), k) for k, charts in enumerate(layers)]
 
-    def _led(self, graph: Graph, to_come: list[Values]) -> Array | None:
-        """A motion as cheap as values say; None where it comes to no end, or is too fast."""
-        chart = int(graph.least(to_come[0], 0).argmin())
-        return self._tight(self._path(graph, 0, chart, to_come, to_come), graph.layers)
+    def _follow_bounds(self, graph: ChartGraph, cost_to_go: list[QuadraticBounds]) -> Array | None:
+        """Return a path along the least cost-to-go, shortened; None if it cannot be continued or is too fast."""
+        chart = int(graph.minima(cost_to_go[0], 0).argmin())
+        return self._shorten(self._path_through(graph, 0, chart, cost_to_go, cost_to_go), graph.layers)
 
-    def _may_be_halved(self, layers: list[Charts], most: int) -> bool:
-        """Whether charts of half the radius are no more than so many, and not too small."""
-        finer = sum(2 ** charts.tangents.shape[2] * len(charts) for charts in layers)
-        return finer <= most and max(float(charts.radii.max()) for charts in layers) >= self.settings.finest
+    def _can_split(self, layers: list[Charts], max_charts: int) -> bool:
+        """Return whether charts of half the radius are at most `max_charts`, and not too small."""
+        count = sum(2 ** charts.tangents.shape[2] * len(charts) for charts in layers)
+        return count <= max_charts and max(float(charts.radii.max()) for charts in layers) >= self.settings.finest
 
-    def _through_centers(self, graph: Graph) -> Array | None:
-        """The cheapest way from centre to centre of charts, too far steps being dear; None if there is none."""
+    def _path_through_centers(self, graph: ChartGraph) -> Array | None:
+        """Return the lowest-cost path through centres of charts; too long steps are penalised."""
         layers = graph.layers
-        cost, back = np.where(self._clear(layers[-1].centers, len(layers) - 1), 0.0, np.inf), list[Array]()
+        cost, back_pointers = np.where(self._is_clear(layers[-1].centers, len(layers) - 1), 0.0, np.inf), list[Array]()
         for k in range(len(layers) - 2, -1, -1):
-            here, there = layers[k], layers[k + 1]
-            least, onward = np.full(len(here), np.inf), np.zeros(len(here))
-            for i, j in graph.steps(k, k + 1):
-                way = self.space.difference(there.centers[j], here.centers[i])
-                total = cost[j] + self.cost.of(way, self.times[k + 1] - self.times[k])
-                total += PENALTY * np.maximum(np.abs(way) - self.limits[k], 0.0).sum(axis=1)
+            charts, successors = layers[k], layers[k + 1]
+            least_cost, next_chart = np.full(len(charts), np.inf), np.zeros(len(charts))
+            for i, j in graph.edges(k, k + 1):
+                displacement = self.space.difference(successors.centers[j], charts.centers[i])
+                total = cost[j] + self.cost.evaluate(displacement, self.times[k + 1] - self.times[k])
+                total += PENALTY * np.maximum(np.abs(displacement) - self.limits[k], 0.0).sum(axis=1)
                 order = np.lexsort((total, i))
                 i, j, total = i[order], j[order], total[order]
                 first = np.flatnonzero(np.diff(i, prepend=-1))
-                least[i[first]], onward[i[first]] = total[first], j[first]
-            cost = np.where(self._clear(here.centers, k), least, np.inf)
-            back.append(onward)
+                least_cost[i[first]], next_chart[i[first]] = total[first], j[first]
+            cost = np.where(self._is_clear(charts.centers, k), least_cost, np.inf)
+            back_pointers.append(next_chart)
         if not np.isfinite(cost).any():
             return None
         chart = int(cost.argmin())
         path = [layers[0].centers[chart]]
-        for k, onward in enumerate(reversed(back)):
-            chart = int(onward[chart])
+        for k, next_chart in enumerate(reversed(back_pointers)):
+            chart = int(next_chart[chart])
             path.append(path[-1] + self.space.difference(layers[k + 1].centers[chart], path[-1]))
         return np.array(path)
 
-    def _clear(self, joints: Array, k: int) -> NDArray[np.bool_]:
-        """Whether postures (N, n) of an instant keep limits and clearance. Shape (N,)."""
-        good, around = self.space.within(joints), self.scene
-        if around is not None:
-            at = np.flatnonzero(good)
-            times = np.full(len(at), self.times[k])
-            apart = distances_along(around, np.zeros(0), joints[at], times, around.clearance)
-            good[at] = (apart >= around.clearance).all(axis=1)
-        return good
+    def _is_clear(self, joints: Array, k: int) -> NDArray[np.bool_]:
+        """Return which configurations (N, n) of a sample keep limits and clearance. Shape (N,)."""
+        valid, scene = self.space.within(joints), self.scene
+        if scene is not None:
+            rows = np.flatnonzero(valid)
+            times = np.full(len(rows), self.times[k])
+            distances = distances_along(scene, np.zeros(0), joints[rows], times, scene.clearance)
+            valid[rows] = (distances >= scene.clearance).all(axis=1)
+        return valid
 
-    def _tight(self, path: Array | None, layers: list[Charts]) -> Array | None:
-        """A way drawn tight within charts; as it was where that touches; None if it is too fast."""
+    def _shorten(self, path: Array | None, layers: list[Charts]) -> Array | None:
+        """Shorten a path within its charts unless that causes a collision; return None if it is too fast."""
         bounds = self.space.lower, self.space.upper
         steps = self.cost, self.times, self.limits
         if path is None:
             return None
         if self.start is None:
-            width = max(float(charts.radii.max()) for charts in layers)
-            made = drawn_tight(path, self.instants, *steps, bounds, self.scene, (width / 2, width / 64))
-            path = made if all(self._on(k, joints) is not None for k, joints in enumerate(made)) else path
+            radius = max(float(charts.radii.max()) for charts in layers)
+            shortened = shorten_path(path, self.samples, *steps, bounds, self.scene, (radius / 2, radius / 64))
+            valid = all(self._project(k, joints) is not None for k, joints in enumerate(shortened))
+            path = shortened if valid else path
         return path if (np.abs(np.diff(path, axis=0)) <= self.limits + TOLERANCE).all() else None
 
-    def halved(self, charts: Charts, k: int) -> Charts:
-        """Charts of an instant of half the radius in their place."""
-        return self._parts(charts, k).charts
+    def split_charts(self, charts: Charts, k: int) -> Charts:
+        """Return charts of half the radius that replace those of a sample."""
+        return self._split(charts, k).charts
 
-    def _parts(self, charts: Charts, k: int) -> Parts:
+    def _split(self, charts: Charts, k: int) -> SplitCharts:
         if not charts.tangents.shape[2]:
-            return Parts(charts, np.arange(len(charts)), charts.low, charts.high)
-        own = replace(charts, layer=np.full(len(charts), self.instants[k].number))
-        return self.instants[k].sets.parts(own)
+            return SplitCharts(charts, np.arange(len(charts)), charts.low, charts.high)
+        numbered = replace(charts, layer=np.full(len(charts), self.samples[k].row))
+        return self.samples[k].manifolds.split(numbered)
 
-    def _finer(self, charts: Charts, k: int, values: Values) -> tuple[Charts, Values]:
-        """Charts of half the radius but for those on which every posture touches something, and values on these."""
-        parts = self._parts(charts, k)
-        good = self._allowed(parts.charts, k)
-        values, low, high = values.of(parts.owners[good]), parts.low[good], parts.high[good]
-        return parts.charts.of(good), Values.constant(values.lowest(low, high)[0], low.shape[1])
+    def _refine(self, charts: Charts, k: int, values: QuadraticBounds) -> tuple[Charts, QuadraticBounds]:
+        """Return the collision-free half charts that replace charts, and bounds on them."""
+        halves = self._split(charts, k)
+        free = self._collision_free(halves.charts, k)
+        values, low, high = values.select(halves.owners[free]), halves.low[free], halves.high[free]
+        return halves.charts.select(free), QuadraticBounds.constant(values.minimum(low, high)[0], low.shape[1])

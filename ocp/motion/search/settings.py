@@ -1,4 +1,4 @@
-"""What a planner takes for granted: its meshes, its tolerances, and how much it tries."""
+"""Settings of the planner: meshes, tolerances and effort."""
 
 from __future__ import annotations
 
@@ -11,33 +11,34 @@ __all__ = ["PlannerSettings"]
 
 @dataclass(frozen=True)
 class PlannerSettings:
-    """Settings of `ocp.motion.plan.plan`; those that are no law were chosen by the families of tests/sweep.
+    """Settings of `ocp.motion.plan.plan`, chosen by the problem families of tests/sweep where no law gives them.
 
     Attributes:
         ik_starts: Random starts of inverse kinematics.
-        local_steps: Steps of a local motion, beside the breaks of its tasks.
-        dampings: Of local motions, relative to the singular values; the next one where no posture follows with one.
-        min_intervals: Of a mesh, where its tasks have fewer pieces.
-        coarse_degree, fine_degree: Of collocation. One interval of the fine one meets a smooth piece to rounding.
-        separated_intervals: Of a coarse mesh with separation constraints, which hold at its points alone.
-        coarse_options, fine_options: Of IPOPT. A coarse solve begins from a guess that does its tasks.
-        barriers: IPOPT's own mu_init, and its tolerance, at which the barrier ends.
-        samples_per_interval: Times at which collisions and deviations are looked for.
-        compared_samples: Times at which two motions are compared.
-        same_cost, same_path: Two motions are one if they differ by less than either: relative, and rad or m.
-        negligible_rate: (rad/s)^2 or (m/s)^2: mean squared rates below are rounding of what stands still.
-        tip_tolerance: m and rad: how far a tip may be from its task anywhere, all rows together.
-        max_deviation: m and rad: a motion whose tips are farther off on its last mesh is rejected without an audit.
-        max_refinements, max_pieces, max_intervals: Meshes made for the tips; into how many pieces each splits an
-            interval; intervals of the last.
-        least_progress: Share of the deviation that a finer mesh may leave, where it cannot be known to be in reach.
-        max_failures: Candidates of one batch of seeds that fail before no further one is repaired; seeds of a batch
-            whose order says which are worth it; motions that are audited where all are asked for.
-        batch: Seeds that are solved before the best of them is audited, where each takes seconds.
-        max_separations: Solves of one candidate that separate more bodies, or farther.
-        max_cost_ratio: A local motion that costs so many times the cheapest solve is not worth one.
-        gain: Share of the cost that a motion has to promise to spare, to be solved with its start fixed.
-        near_bound: A plan that costs no more than so many times its lower bound is good enough.
+        local_steps: Steps of a local motion, besides the breaks of its tasks.
+        dampings: Dampings of local motions, relative to the singular values; the next one is tried if none tracks.
+        min_intervals: Least number of mesh intervals.
+        coarse_degree, fine_degree: Degrees of collocation. One interval of the fine degree represents a smooth segment
+            to rounding.
+        separated_intervals: Intervals of a coarse mesh with separation constraints, which hold only at its points.
+        coarse_options, fine_options: Options of IPOPT. A coarse solve starts from a guess that does its tasks.
+        barriers: Default mu_init of IPOPT, and the tolerance at which the barrier parameter ends.
+        samples_per_interval: Samples of an interval at which collisions and deviations are checked.
+        compared_samples: Samples at which two motions are compared.
+        same_cost, same_path: Two candidates count as one motion if either difference is smaller: relative; rad or m.
+        negligible_rate: (rad/s)^2 or (m/s)^2: smaller mean squared rates are rounding errors of a motion at rest.
+        tip_tolerance: m and rad: largest deviation of a tip from its task at any time, over all rows.
+        max_deviation: m and rad: a motion with a larger deviation on its last mesh is rejected without an audit.
+        max_refinements, max_splits, max_intervals: Meshes refined for the deviation of the tips; parts into which one
+            refinement splits an interval; intervals of the last mesh.
+        least_progress: Largest share of the deviation that a refinement may leave if the task may be out of reach.
+        max_failures: Failed candidates of a batch after which no further one is repaired; also the number of sorted
+            seeds that are tried, and of motions that are audited if all are requested.
+        batch: Seeds that are solved before the best of them is audited, if each takes seconds.
+        max_separations: Solves of one candidate with more, or wider, separation constraints.
+        max_cost_ratio: A local motion whose cost exceeds that of the best solve by this factor is not solved.
+        gain: Relative cost reduction that a motion must promise to be solved with its start fixed.
+        near_bound: A plan whose cost is within this factor of its lower bound is accepted.
     """
 
     ik_starts: int = 64
@@ -58,7 +59,7 @@ class PlannerSettings:
     tip_tolerance: float = 1e-6
     max_deviation: float = float("inf")
     max_refinements: int = 6
-    max_pieces: int = 4
+    max_splits: int = 4
     max_intervals: int = 400
     least_progress: float = 0.9
     max_failures: int = 8

@@ -1,416 +1,443 @@
-"""What the straight step between two instants costs at least, from one chart into another, by the place it begins at.
+"""Lower bounds of the cost of straight steps between charts, as functions of the place where a step begins.
 
-The integral of half the squared rates is no less than |dq|^2 / (2 dt), the length no less than |dq|_1. Charts touch the
-sets; what a set bends away from them is taken into account, and for the rest it is assumed that within a box it strays
-no farther than at the rim.
+The integral of half the squared rates is no less than |dq|^2 / (2 dt), the length no less than |dq|_1. Charts are
+tangent to the manifold; its measured deviation is taken into account, and assumed to be no larger within a box than at
+its rim.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any, NamedTuple, Protocol, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
 from models.arrays import Array
 from ocp.motion.search.charts import Charts
 
-__all__ = ["Homogeneous", "Largest", "Length", "Sheets", "Squares", "StepCost", "Steps", "Values", "least_in_box"]
+__all__ = [
+    "CurvedCharts", "Homogeneous", "LargestMotion", "PathLength", "QuadraticBounds", "SquaredRates", "StepBounds",
+    "StepCost", "least_in_box",
+]  # fmt: skip
 
-MEETINGS = 8
-"""Times that the least of what is homogeneous is looked for where lines meet: one of as many as joints, each time."""
-CONCAVE = 0.5
-"""Curvature of values, of the step's own, that is taken as it is; what is more concave is bounded by its ends."""
+MAX_CUTS = 8
+"""Cuts with tangents by which the minimum of a homogeneous cost is bracketed; it has one linear piece per joint."""
+MAX_CONCAVITY = 0.5
+"""Largest concavity of bounds that is kept, as a share of the step's own curvature; the rest becomes a constant."""
 
 
-class Values(NamedTuple):
-    """Bounds of what is to come (or has been) on the charts of an instant: least + slope . t + t . curve . t / 2.
+class QuadraticBounds(NamedTuple):
+    """Lower bounds of a value function on the charts of a sample: least + slope . t + t . curve . t / 2.
 
     Attributes:
-        least: Infinite where nothing leads on. Shape (N,). slope: Shape (N, r). curve: Symmetric. Shape (N, r, r).
+        least: Constant terms, infinite where no motion passes. Shape (N,).
+        slope: Shape (N, r).
+        curve: Symmetric. Shape (N, r, r).
     """
 
     least: Array
     slope: Array
     curve: Array
 
-    def of(self, chosen: Any) -> Values:
-        """Some of them."""
-        return Values(*(part[chosen] for part in self))
+    def select(self, rows: Any) -> QuadraticBounds:
+        """Return the bounds of the given rows."""
+        return QuadraticBounds(*(part[rows] for part in self))
 
     @classmethod
-    def constant(cls, least: Array, free: int) -> Values:
-        """The same everywhere on charts of so many free directions."""
+    def constant(cls, least: Array, free: int) -> QuadraticBounds:
+        """Return constant bounds on charts with `free` directions."""
         return cls(least, np.zeros((len(least), free)), np.zeros((len(least), free, free)))
 
-    def lowest(self, low: Array, high: Array) -> tuple[Array, Array]:
-        """The least in boxes (N, r), and where."""
+    def minimum(self, low: Array, high: Array) -> tuple[Array, Array]:
+        """Return the minima in boxes (N, r), and where they lie."""
         least, place = least_in_box(self.slope, self.curve, low, high)
         return self.least + least, place
 
     def at(self, places: Array) -> Array:
-        """Values (N,) at places (N, r)."""
-        pressed = np.einsum("nab,nb->na", self.curve, places)
-        return np.asarray(self.least + (places * (self.slope + pressed / 2)).sum(axis=1))
+        """Return the values (N,) at places (N, r)."""
+        products = np.einsum("nab,nb->na", self.curve, places)
+        return np.asarray(self.least + (places * (self.slope + products / 2)).sum(axis=1))
 
 
-class Sheets(NamedTuple):
-    """Charts, and how the set that they touch bends away from them: bends[t, t] / 2 + rest.
+class CurvedCharts(NamedTuple):
+    """Charts with the quadratic deviation of the manifold, bends[t, t] / 2, and its residuals.
 
     Attributes:
-        charts: N of them. bends: Shape (N, n, r, r). rest: At the rim. Shape (N, c, n).
+        charts: N charts.
+        bends: Quadratic forms. Shape (N, n, r, r).
+        rest: Residuals at the rim. Shape (N, c, n).
     """
 
     charts: Charts
     bends: Array
     rest: Array
 
-    def of(self, chosen: Any) -> Sheets:
-        """Some of them."""
-        return Sheets(self.charts.of(chosen), self.bends[chosen], self.rest[chosen])
+    def select(self, rows: Any) -> CurvedCharts:
+        """Return the charts of the given rows."""
+        return CurvedCharts(self.charts.select(rows), self.bends[rows], self.rest[rows])
 
 
-class StepCost(Protocol):
-    """What a straight step costs at least."""
+class StepCost(ABC):
+    """Lower bound of the cost of a straight step."""
 
-    def cheapest(self, delta: Array, into: Charts, after: Values, seconds: float) -> tuple[Array, Array]:
-        """Costs (P,) of the cheapest steps into P charts, whose centres are `delta` (P, n) away, and places (P, r)."""
+    @abstractmethod
+    def cheapest_steps(
+        self, delta: Array, target: Charts, after: QuadraticBounds, seconds: float
+    ) -> tuple[Array, Array]:
+        """Return costs (P,) and places (P, r) of the cheapest steps into P charts, with centres `delta` (P, n) away."""
 
-    def below(self, delta: Array, out: Sheets, into: Sheets, after: Values, seconds: float) -> Steps:
-        """Bounds of P steps from charts into others, whose centres are `delta` (P, n) away."""
+    @abstractmethod
+    def lower_bounds(
+        self, delta: Array, source: CurvedCharts, target: CurvedCharts, after: QuadraticBounds, seconds: float
+    ) -> StepBounds:
+        """Return lower bounds of P steps between charts whose centres are `delta` (P, n) apart."""
 
-    def of(self, delta: Array, seconds: Any) -> Array:
-        """Of steps (..., n)."""
+    @abstractmethod
+    def evaluate(self, delta: Array, seconds: Any) -> Array:
+        """Return the cost of steps (..., n)."""
 
-    def farthest(self, cost: float, seconds: float) -> float:
-        """How far a step of at most this cost goes in the metric of the charts."""
+    @abstractmethod
+    def reach(self, cost: float, seconds: float) -> float:
+        """Return the largest length, in the metric of the charts, of a step that costs at most `cost`."""
 
 
 @dataclass(frozen=True, eq=False)
-class Squares:
-    """The integral of half the weighted squared rates.
+class SquaredRates(StepCost):
+    """Integral of half the weighted squared rates.
 
-    A step d moves along the chart that it goes into and across it. Along, the cost is convex in both places, and the
-    least over the place in the box is quadratic in the place that is gone from, by the multipliers of the box. Across,
-    |d|^2 / (2 dt) is at least p . d - dt |p|^2 / 2, p what it is from the nearest places: what the set bends goes into
-    the curvature of the values, where it cancels from step to step, and only the rest, of third order, is lost.
+    A step d has a component along the chart that it enters and one across it. Along the chart, the cost is convex in
+    both places, and its minimum over the place in the box is quadratic in the starting place, by the multipliers of the
+    box. Across, |d|^2 / (2 dt) is at least p . d - dt |p|^2 / 2, with the multiplier p taken at the nearest places. The
+    quadratic deviation of the manifold enters the curvature of the bounds, where it cancels from step to step. Only its
+    residual, of third order, is lost.
     """
 
     weights: Array
 
-    def of(self, delta: Array, seconds: Any) -> Array:
+    def evaluate(self, delta: Array, seconds: Any) -> Array:
         return np.asarray((self.weights * delta**2 / (2 * seconds)).sum(axis=-1))
 
-    def farthest(self, cost: float, seconds: float) -> float:
+    def reach(self, cost: float, seconds: float) -> float:
         return float(np.sqrt(2 * seconds * cost))
 
-    def cheapest(self, delta: Array, into: Charts, after: Values, seconds: float) -> tuple[Array, Array]:
-        flat = np.einsum("pnr,pn->pr", into.tangents, self.weights * delta)
+    def cheapest_steps(
+        self, delta: Array, target: Charts, after: QuadraticBounds, seconds: float
+    ) -> tuple[Array, Array]:
+        flat = np.einsum("pnr,pn->pr", target.tangents, self.weights * delta)
         square = after.curve + np.eye(flat.shape[1]) / seconds
-        least, place = least_in_box(flat / seconds + after.slope, square, into.low, into.high)
-        return self.of(delta, seconds) + after.least + least, place
+        least, place = least_in_box(flat / seconds + after.slope, square, target.low, target.high)
+        return self.evaluate(delta, seconds) + after.least + least, place
 
-    def below(self, delta: Array, out: Sheets, into: Sheets, after: Values, seconds: float) -> Steps:
-        here, there = out.charts, into.charts
-        way, weights = _last(delta), self.weights[:, None]
-        ways, heavy = _last(here.tangents), _last(there.tangents) * weights[:, None]
-        slope, curve = _last(after.slope), _last(after.curve)
-        ends = np.stack([_last(there.low), _last(there.high)])
-        own = np.stack([_last(here.low), _last(here.high)])
-        turn = _product(heavy, ways)
-        flat = _back(heavy, way)
-        near, on = _nearest(flat, turn, own, ends, slope, curve, seconds)
-        out_bends, into_bends = _last(out.bends), _last(into.bends)
-        bends = _times(_times(into_bends, on), on) - _times(_times(out_bends, near), near)
-        across = way - _times(ways, near) + bends / 2
-        across -= _times(_last(there.tangents), _back(heavy, across))
-        pull = weights * across / seconds
-        size = _dot(pull, across)
-        lost = _farthest(_last(out.rest), pull) + _farthest(_last(into.rest), -pull)
-        # the multiplier of what moves across the charts is the less, the more the set may stray that way
+    def lower_bounds(
+        self, delta: Array, source: CurvedCharts, target: CurvedCharts, after: QuadraticBounds, seconds: float
+    ) -> StepBounds:
+        start, end = source.charts, target.charts
+        displacement, column_weights = _rows_last(delta), self.weights[:, None]
+        start_tangents = _rows_last(start.tangents)
+        weighted_tangents = _rows_last(end.tangents) * column_weights[:, None]
+        slope, curve = _rows_last(after.slope), _rows_last(after.curve)
+        end_box = np.stack([_rows_last(end.low), _rows_last(end.high)])
+        start_box = np.stack([_rows_last(start.low), _rows_last(start.high)])
+        rotation = _multiply_transposed(weighted_tangents, start_tangents)
+        projection = _apply_transposed(weighted_tangents, displacement)
+        start_place, end_place = _nearest_places(projection, rotation, start_box, end_box, slope, curve, seconds)
+        start_bends, end_bends = _rows_last(source.bends), _rows_last(target.bends)
+        relative_bend = _apply(_apply(end_bends, end_place), end_place)
+        relative_bend -= _apply(_apply(start_bends, start_place), start_place)
+        normal = displacement - _apply(start_tangents, start_place) + relative_bend / 2
+        normal -= _apply(_rows_last(end.tangents), _apply_transposed(weighted_tangents, normal))
+        multiplier = column_weights * normal / seconds
+        normal_cost = _dot(multiplier, normal)
+        loss = _support(_rows_last(source.rest), multiplier) + _support(_rows_last(target.rest), -multiplier)
+        # the more the manifold may deviate across the charts, the smaller the multiplier
         with np.errstate(divide="ignore", invalid="ignore"):
-            share = np.where(size > 0, np.clip(1 - lost / size, 0.0, 1.0), 0.0)
-        pull *= share
-        curve, excess = _raised(curve + _dot(into_bends, pull[:, None, None]), -CONCAVE / seconds)
-        # places along the chart as well move by what the set strays
-        slid = _widest(_last(here.strays), heavy) + _widest(_last(there.strays), heavy)
-        within = np.stack([ends[0] - slid, ends[1] + slid])
-        wide = np.abs(within).max(axis=0)
-        lost = share * lost + excess * _dot(wide, wide) / 2
-        lost += _dot(slid, np.abs(slope) + _times(np.abs(curve), wide + slid / 2))
-        level = -_dot(out_bends, pull[:, None, None])
-        least = after.least + _dot(pull, way) - share**2 * size / 2 - lost
-        return SquareSteps(seconds, least, -_back(ways, pull), level, flat, turn, slope, curve, within, own)
+            share = np.where(normal_cost > 0, np.clip(1 - loss / normal_cost, 0.0, 1.0), 0.0)
+        multiplier *= share
+        curve, excess = _raise_eigenvalues(curve + _dot(end_bends, multiplier[:, None, None]), -MAX_CONCAVITY / seconds)
+        # the deviation also shifts the places along the chart
+        slack = _symmetric_support(_rows_last(start.deviations), weighted_tangents)
+        slack += _symmetric_support(_rows_last(end.deviations), weighted_tangents)
+        widened_box = np.stack([end_box[0] - slack, end_box[1] + slack])
+        extent = np.abs(widened_box).max(axis=0)
+        loss = share * loss + excess * _dot(extent, extent) / 2
+        loss += _dot(slack, np.abs(slope) + _apply(np.abs(curve), extent + slack / 2))
+        start_curve = -_dot(start_bends, multiplier[:, None, None])
+        least = after.least + _dot(multiplier, displacement) - share**2 * normal_cost / 2 - loss
+        start_slope = -_apply_transposed(start_tangents, multiplier)
+        after_terms = projection, rotation, slope, curve, widened_box, start_box
+        return SquaredRateBounds(seconds, least, start_slope, start_curve, *after_terms)
 
 
-def _last(rows: Array) -> Array:
-    """The same with what tells the steps last: sums of a few joints and axes then go along all steps at once."""
+def _rows_last(rows: Array) -> Array:
+    """Move the axis of the steps to the end; sums over a few joints are then vectorised over all steps."""
     return np.ascontiguousarray(np.moveaxis(rows, 0, -1))
 
 
-def _times(matrix: Array, vector: Array) -> Array:
-    """Products (..., P) of matrices (..., b, P) and vectors (b, P)."""
+def _apply(matrix: Array, vector: Array) -> Array:
+    """Multiply matrices (..., b, P) by vectors (b, P)."""
     return np.asarray((matrix * vector).sum(axis=-2))
 
 
-def _back(matrix: Array, vector: Array) -> Array:
-    """Products (b, P) of matrices (a, b, P), transposed, and vectors (a, P)."""
+def _apply_transposed(matrix: Array, vector: Array) -> Array:
+    """Multiply transposed matrices (a, b, P) by vectors (a, P)."""
     return np.asarray((matrix * vector[:, None]).sum(axis=0))
 
 
-def _product(one: Array, other: Array) -> Array:
-    """Products (b, c, P) of matrices (a, b, P), transposed, and others (a, c, P)."""
-    return np.asarray((one[:, :, None] * other[:, None]).sum(axis=0))
+def _multiply_transposed(left: Array, right: Array) -> Array:
+    """Multiply transposed matrices (a, b, P) by matrices (a, c, P)."""
+    return np.asarray((left[:, :, None] * right[:, None]).sum(axis=0))
 
 
-def _dot(one: Array, other: Array) -> Array:
-    return np.asarray((one * other).sum(axis=0))
+def _dot(left: Array, right: Array) -> Array:
+    return np.asarray((left * right).sum(axis=0))
 
 
-def _farthest(places: Array, way: Array) -> Array:
-    """How far places (c, n, P) lie along a way (n, P), the origin among them. Shape (P,)."""
-    most = np.zeros(way.shape[1])
-    for place in places:
-        np.maximum(most, _dot(place, way), out=most)
-    return most
+def _support(points: Array, direction: Array) -> Array:
+    """Return the support function of points (c, n, P) and the origin in directions (n, P). Shape (P,)."""
+    support = np.zeros(direction.shape[1])
+    for point in points:
+        np.maximum(support, _dot(point, direction), out=support)
+    return support
 
 
-def _widest(places: Array, ways: Array) -> Array:
-    """How far places (c, n, P) lie along ways (n, r, P), either way. Shape (r, P)."""
-    most = np.zeros(ways.shape[1:])
-    for place in places:
-        np.maximum(most, np.abs(_back(ways, place)), out=most)
-    return most
+def _symmetric_support(points: Array, directions: Array) -> Array:
+    """Return the largest |component| of points (c, n, P) in directions (n, r, P). Shape (r, P)."""
+    support = np.zeros(directions.shape[1:])
+    for point in points:
+        np.maximum(support, np.abs(_apply_transposed(directions, point)), out=support)
+    return support
 
 
-def _nearest(
-    flat: Array, turn: Array, here: Array, there: Array, slope: Array, curve: Array, seconds: float
+def _nearest_places(
+    projection: Array, rotation: Array, start_box: Array, end_box: Array, slope: Array, curve: Array, seconds: float
 ) -> tuple[Array, Array]:
-    """Places in boxes (2, r, P) from and to which the ways along the charts cost little: flat - turn . one + other."""
-    square, start = curve + np.eye(len(flat))[:, :, None] / seconds, (here[0] + here[1]) / 2
-    other = _least((flat - _times(turn, start)) / seconds + slope, square, *there)[1]
-    return _least(-_back(turn, flat + other), _product(turn, turn), *here)[1], other
+    """Return places in boxes (2, r, P) between which the step along the charts costs little."""
+    square, middle = curve + np.eye(len(projection))[:, :, None] / seconds, (start_box[0] + start_box[1]) / 2
+    end_place = _least_in_box((projection - _apply(rotation, middle)) / seconds + slope, square, *end_box)[1]
+    slope, square = -_apply_transposed(rotation, projection + end_place), _multiply_transposed(rotation, rotation)
+    return _least_in_box(slope, square, *start_box)[1], end_place
 
 
 @dataclass(frozen=True, eq=False)
-class SquareSteps:
-    """least + slope . t + t . level . t / 2, and the least of v . v / (2 dt) + after . t' + t' . curved . t' / 2.
+class SquaredRateBounds:
+    """Bounds of steps and of the cost after them, by the starting place t in the box `start_box`.
 
-    There v = flat - turn . t + t' is the way along the chart, t' in a box `into`, t in one `out`. All arrays have the
-    steps last. Each place p gives a bound of all: value + slope . (t - p) + (t - p) . curve . (t - p) / 2.
+    The bound is least + slope . t + t . level . t / 2, plus the minimum over t' in the box `end_box` of
+    v . v / (2 dt) + after . t' + t' . after_curve . t' / 2. Here v = projection - rotation . t + t' is the step along
+    the chart. The axis of the steps comes last. Each place p yields a global lower bound: value + slope . (t - p) plus
+    (t - p) . curve . (t - p) / 2.
     """
 
     seconds: float
     least: Array
     slope: Array
     level: Array
-    flat: Array
-    turn: Array
+    projection: Array
+    rotation: Array
     after: Array
-    curved: Array
-    into: Array
-    out: Array
+    after_curve: Array
+    end_box: Array
+    start_box: Array
 
-    def of(self, chosen: Any) -> SquareSteps:
-        names = ("least", "slope", "level", "flat", "turn", "after", "curved", "into", "out")
-        return replace(self, **{name: getattr(self, name)[..., chosen] for name in names})
+    def select(self, rows: Any) -> SquaredRateBounds:
+        names = ("least", "slope", "level", "projection", "rotation", "after", "after_curve", "end_box", "start_box")
+        return replace(self, **{name: getattr(self, name)[..., rows] for name in names})
 
     @property
     def _square(self) -> Array:
-        return np.asarray(self.curved + np.eye(len(self.flat))[:, :, None] / self.seconds)
+        return np.asarray(self.after_curve + np.eye(len(self.projection))[:, :, None] / self.seconds)
 
     @property
     def curve(self) -> Array:
-        sunk = np.linalg.solve(_first(self._square), _first(self.curved)) / self.seconds
-        turn = _first(self.turn)
-        return np.asarray(turn.transpose(0, 2, 1) @ sunk @ turn + _first(self.level))
+        reduced = np.linalg.solve(_rows_first(self._square), _rows_first(self.after_curve)) / self.seconds
+        rotation = _rows_first(self.rotation)
+        return np.asarray(rotation.transpose(0, 2, 1) @ reduced @ rotation + _rows_first(self.level))
 
-    def _onward(self, places: Array) -> tuple[Array, Array, Array]:
-        start = self.flat - _times(self.turn, places)
-        return start, *_least(start / self.seconds + self.after, self._square, *self.into)
+    def _minimize_after(self, places: Array) -> tuple[Array, Array, Array]:
+        """Return the step without t', and the least cost after it with the place t' in the end box."""
+        start = self.projection - _apply(self.rotation, places)
+        return start, *_least_in_box(start / self.seconds + self.after, self._square, *self.end_box)
 
     def at(self, places: Array) -> tuple[Array, Array]:
-        """Values (P,) and slopes (P, r) at places (P, r)."""
-        places = _last(places)
-        start, onward, there = self._onward(places)
-        held = _times(self.level, places)
-        value = self.least + onward + _dot(start, start) / (2 * self.seconds)
-        slope = held + self.slope - _back(self.turn, start + there) / self.seconds
-        return value + _dot(places, held / 2 + self.slope), _first(slope)
+        """Return values (P,) and slopes (P, r) at places (P, r)."""
+        places = _rows_last(places)
+        start, after, end_place = self._minimize_after(places)
+        products = _apply(self.level, places)
+        value = self.least + after + _dot(start, start) / (2 * self.seconds)
+        slope = products + self.slope - _apply_transposed(self.rotation, start + end_place) / self.seconds
+        return value + _dot(places, products / 2 + self.slope), _rows_first(slope)
 
     def lower(self, places: Array, slope: Array, curve: Array) -> Array:
-        """Places (P, r) at which the values are lower, less slope . t + t . curve . t / 2, if some are known."""
-        pulled = -_back(self.turn, self.flat + self._onward(_last(places))[2]) / self.seconds
-        square = _product(self.turn, self.turn) / self.seconds + self.level - _last(curve)
-        return _first(_least(pulled + self.slope - _last(slope), square, *self.out)[1])
+        """Return places (P, r) where the bounds, less slope . t + t . curve . t / 2, are lower."""
+        end_place = self._minimize_after(_rows_last(places))[2]
+        gradient = -_apply_transposed(self.rotation, self.projection + end_place) / self.seconds
+        square = _multiply_transposed(self.rotation, self.rotation) / self.seconds + self.level - _rows_last(curve)
+        return _rows_first(_least_in_box(gradient + self.slope - _rows_last(slope), square, *self.start_box)[1])
 
 
-def _first(columns: Array) -> Array:
-    """The same with what tells the steps first again."""
+def _rows_first(columns: Array) -> Array:
+    """Move the axis of the steps to the front."""
     return np.ascontiguousarray(np.moveaxis(columns, -1, 0))
 
 
 @dataclass(frozen=True, eq=False)
-class Homogeneous:
-    """What is twice as much for a way twice as long, on at most one free direction; its values are affine.
+class Homogeneous(StepCost):
+    """Cost that is proportional to the length of a step, with at most one free direction; its bounds are affine.
 
     Attributes:
-        weights: Of the joints' ways, 0 for what does not count. Shape (n,).
+        weights: Weights of the joint displacements, 0 to ignore a joint. Shape (n,).
     """
 
     weights: Array
 
-    def of(self, delta: Array, seconds: Any) -> Array:
-        """Of steps (..., n)."""
-        raise NotImplementedError
+    @abstractmethod
+    def gradient(self, displacement: Array) -> Array:
+        """Return the gradients of the cost at displacements (P, n)."""
 
-    def farthest(self, cost: float, seconds: float) -> float:
-        """How far a step of at most this cost goes in the metric of the charts."""
-        raise NotImplementedError
-
-    def pull(self, way: Array) -> Array:
-        """Gradients by ways (P, n)."""
-        raise NotImplementedError
-
-    def least(self, delta: Array, into: Charts, after: Values) -> tuple[Array, Array, Array]:
-        """The cheapest steps on charts: bounds (P,), their multipliers (P, n), the gradient by the way, and places."""
+    def minimize(self, delta: Array, target: Charts, after: QuadraticBounds) -> tuple[Array, Array, Array]:
+        """Return bounds (P,) of the cheapest steps into charts, multipliers (P, n) (gradients), and places (P, 1)."""
         count = len(delta)
-        if not into.tangents.shape[2]:
-            return self.of(delta, 1.0) + after.least, self.pull(delta), np.zeros((count, 0))
-        along, slope = into.tangents[:, :, 0], after.slope[:, 0]
-        box = into.low[:, 0], into.high[:, 0]
+        if not target.tangents.shape[2]:
+            return self.evaluate(delta, 1.0) + after.least, self.gradient(delta), np.zeros((count, 0))
+        along, slope = target.tangents[:, :, 0], after.slope[:, 0]
+        box = target.low[:, 0], target.high[:, 0]
 
-        def pulled(at: Array) -> list[Array]:
-            """The place, the gradient there, its value at no place, and how the whole rises."""
-            pull = self.pull(delta + along * at[:, None])
-            return [at, pull, (pull * delta).sum(axis=1), (pull * along).sum(axis=1) + slope]
+        def linearize(place: Array) -> list[Array]:
+            """Return place, gradient there, its value at the origin, and the slope of the total."""
+            gradient = self.gradient(delta + along * place[:, None])
+            return [place, gradient, (gradient * delta).sum(axis=1), (gradient * along).sum(axis=1) + slope]
 
-        def meeting() -> Array:
-            """Where lines from both ends meet; an end that does not fall towards the other is the least."""
+        def intersect() -> Array:
+            """Return where the tangents at both ends intersect; an end that does not descend is the minimum."""
             with np.errstate(divide="ignore", invalid="ignore"):
-                meet = np.clip(np.nan_to_num((first[2] - last[2]) / (last[3] - first[3])), first[0], last[0])
-            return np.where(first[3] >= 0, first[0], np.where(last[3] <= 0, last[0], meet))
+                crossing = np.clip(np.nan_to_num((first[2] - last[2]) / (last[3] - first[3])), first[0], last[0])
+            return np.where(first[3] >= 0, first[0], np.where(last[3] <= 0, last[0], crossing))
 
-        # a piece of the convex function is left out at a time
-        first, last = (pulled(at.copy()) for at in box)
-        for _ in range(MEETINGS):
-            there = pulled(meeting())
-            falls = (there[3] < 0) & (first[3] < 0) & (last[3] > 0)
-            rises = (there[3] >= 0) & (first[3] < 0) & (last[3] > 0)
-            for end, moved in ((first, falls), (last, rises)):
-                for part, new in zip(end, there, strict=True):
-                    part[moved] = new[moved]
+        # each tangent cuts off a part of the bracket of the convex function
+        first, last = (linearize(place.copy()) for place in box)
+        for _ in range(MAX_CUTS):
+            tangent = linearize(intersect())
+            falling = (tangent[3] < 0) & (first[3] < 0) & (last[3] > 0)
+            rising = (tangent[3] >= 0) & (first[3] < 0) & (last[3] > 0)
+            for end, mask in ((first, falling), (last, rising)):
+                for part, new in zip(end, tangent, strict=True):
+                    part[mask] = new[mask]
         with np.errstate(divide="ignore", invalid="ignore"):
-            crossed = np.nan_to_num(last[3] / (last[3] - first[3]))
-        share = np.where(first[3] >= 0, 1.0, np.where(last[3] <= 0, 0.0, crossed))
-        pull, place = share[:, None] * first[1] + (1 - share[:, None]) * last[1], meeting()
-        rest = (pull * along).sum(axis=1) + slope
-        least = np.minimum(rest * box[0], rest * box[1])
-        return (pull * delta).sum(axis=1) + least + after.least, pull, place[:, None]
+            share_at_crossing = np.nan_to_num(last[3] / (last[3] - first[3]))
+        share = np.where(first[3] >= 0, 1.0, np.where(last[3] <= 0, 0.0, share_at_crossing))
+        gradient, place = share[:, None] * first[1] + (1 - share[:, None]) * last[1], intersect()
+        slope_left = (gradient * along).sum(axis=1) + slope
+        least = np.minimum(slope_left * box[0], slope_left * box[1])
+        return (gradient * delta).sum(axis=1) + least + after.least, gradient, place[:, None]
 
-    def cheapest(self, delta: Array, into: Charts, after: Values, seconds: float) -> tuple[Array, Array]:
-        cost, _, place = self.least(delta, into, after)
+    def cheapest_steps(
+        self, delta: Array, target: Charts, after: QuadraticBounds, seconds: float
+    ) -> tuple[Array, Array]:
+        cost, _, place = self.minimize(delta, target, after)
         return cost, place
 
-    def below(self, delta: Array, out: Sheets, into: Sheets, after: Values, seconds: float) -> Steps:
-        return HomogeneousSteps(self, delta, out, into, after)
+    def lower_bounds(
+        self, delta: Array, source: CurvedCharts, target: CurvedCharts, after: QuadraticBounds, seconds: float
+    ) -> StepBounds:
+        return HomogeneousBounds(self, delta, source, target, after)
 
 
-class Length(Homogeneous):
-    """The weighted sum of the joints' ways."""
+class PathLength(Homogeneous):
+    """Weighted sum of the absolute joint displacements."""
 
-    def of(self, delta: Array, seconds: Any) -> Array:
+    def evaluate(self, delta: Array, seconds: Any) -> Array:
         return np.asarray((self.weights * np.abs(delta)).sum(axis=-1))
 
-    def farthest(self, cost: float, seconds: float) -> float:
+    def reach(self, cost: float, seconds: float) -> float:
         return float(cost / self.weights.min()) if (self.weights > 0).all() else np.inf
 
-    def pull(self, way: Array) -> Array:
-        return np.asarray(self.weights * np.sign(way))
+    def gradient(self, displacement: Array) -> Array:
+        return np.asarray(self.weights * np.sign(displacement))
 
 
-class Largest(Homogeneous):
-    """The largest of the joints' weighted ways: the time, where the weights are one over the joints' velocities."""
+class LargestMotion(Homogeneous):
+    """Largest weighted joint displacement; with weights of one over the velocity limits, the least duration."""
 
-    def of(self, delta: Array, seconds: Any) -> Array:
+    def evaluate(self, delta: Array, seconds: Any) -> Array:
         return np.asarray((self.weights * np.abs(delta)).max(axis=-1))
 
-    def farthest(self, cost: float, seconds: float) -> float:
+    def reach(self, cost: float, seconds: float) -> float:
         return float(np.linalg.norm(cost / self.weights)) if (self.weights > 0).all() else np.inf
 
-    def pull(self, way: Array) -> Array:
-        pull, rows = np.zeros(way.shape), np.arange(len(way))
-        joint = (self.weights * np.abs(way)).argmax(axis=1)
-        pull[rows, joint] = (self.weights * np.sign(way))[rows, joint]
-        return pull
+    def gradient(self, displacement: Array) -> Array:
+        gradient, rows = np.zeros(displacement.shape), np.arange(len(displacement))
+        joint = (self.weights * np.abs(displacement)).argmax(axis=1)
+        gradient[rows, joint] = (self.weights * np.sign(displacement))[rows, joint]
+        return gradient
 
 
 @dataclass(frozen=True, eq=False)
-class HomogeneousSteps:
-    """Arguments as of `Homogeneous.below`."""
+class HomogeneousBounds:
+    """Bounds of steps with a homogeneous cost; arguments as of `Homogeneous.lower_bounds`."""
 
     cost: Homogeneous
     delta: Array
-    out: Sheets
-    into: Sheets
-    after: Values
+    source: CurvedCharts
+    target: CurvedCharts
+    after: QuadraticBounds
 
-    def of(self, chosen: Any) -> HomogeneousSteps:
-        out, into, after = self.out.of(chosen), self.into.of(chosen), self.after.of(chosen)
-        return HomogeneousSteps(self.cost, self.delta[chosen], out, into, after)
+    def select(self, rows: Any) -> HomogeneousBounds:
+        source, target, after = (self.source.select(rows), self.target.select(rows), self.after.select(rows))
+        return HomogeneousBounds(self.cost, self.delta[rows], source, target, after)
 
     @property
     def curve(self) -> Array:
-        r = self.out.charts.tangents.shape[2]
+        r = self.source.charts.tangents.shape[2]
         return np.zeros((len(self.delta), r, r))
 
     def at(self, places: Array) -> tuple[Array, Array]:
-        here, there = self.out.charts, self.into.charts
-        start = np.einsum("pnr,pr->pn", here.tangents, places)
-        cost, pull, _ = self.cost.least(self.delta - start, there, self.after)
-        back = np.einsum("pcn,pn->pc", there.strays, pull).min(axis=1, initial=0.0)
-        lost = np.einsum("pcn,pn->pc", here.strays, pull).max(axis=1, initial=0.0) - back
-        return cost - lost, -np.einsum("pnr,pn->pr", here.tangents, pull)
+        source, target = self.source.charts, self.target.charts
+        start = np.einsum("pnr,pr->pn", source.tangents, places)
+        cost, gradient, _ = self.cost.minimize(self.delta - start, target, self.after)
+        end_loss = np.einsum("pcn,pn->pc", target.deviations, gradient).min(axis=1, initial=0.0)
+        loss = np.einsum("pcn,pn->pc", source.deviations, gradient).max(axis=1, initial=0.0) - end_loss
+        return cost - loss, -np.einsum("pnr,pn->pr", source.tangents, gradient)
 
     def lower(self, places: Array, slope: Array, curve: Array) -> Array:
         return places
 
 
-Steps: TypeAlias = SquareSteps | HomogeneousSteps
-"""Bounds of P steps, and the cost after them, by the place in the box that they go from."""
+StepBounds: TypeAlias = SquaredRateBounds | HomogeneousBounds
+"""Lower bounds of P steps and of the cost after them, as functions of the place in the starting box."""
 
 
 def least_in_box(slope: Array, square: Array, low: Array, high: Array) -> tuple[Array, Array]:
-    """Least values (P,) of slope . t + t . square . t / 2 on boxes, and where they are, (P, r), r at most two.
+    """Return the minima (P,) of slope . t + t . square . t / 2 in boxes, and where they are, (P, r), r at most two.
 
-    Looked at are the corners, where the function is level on a side, and where it is level.
+    Compared are the corners, the stationary points on the sides, and the stationary point inside.
     """
-    least, place = _least(_last(slope), _last(square), _last(low), _last(high))
-    return least, _first(place)
+    least, place = _least_in_box(_rows_last(slope), _rows_last(square), _rows_last(low), _rows_last(high))
+    return least, _rows_first(place)
 
 
-def _least(slope: Array, square: Array, low: Array, high: Array) -> tuple[Array, Array]:
-    """As `least_in_box`, the functions last."""
+def _least_in_box(slope: Array, square: Array, low: Array, high: Array) -> tuple[Array, Array]:
+    """As `least_in_box`, with the axis of the functions last."""
     r, count = slope.shape
     if not r:
         return np.zeros(count), np.zeros(slope.shape)
-    upwards = all(bool((square[axis, axis] > 0).all()) for axis in range(r))  # then sides need no corners
-    places: list[Any] = [] if upwards else [[*side] for side in product(*zip(low, high, strict=True))]
+    convex = all(bool((square[axis, axis] > 0).all()) for axis in range(r))  # then the sides include the corners
+    places: list[Any] = [] if convex else [[*side] for side in product(*zip(low, high, strict=True))]
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         if r == 1:
             places.append([np.clip(-slope[0] / square[0, 0], low[0], high[0])])
         else:
-            for axis, beside in ((0, 1), (1, 0)):
+            for axis, other_axis in ((0, 1), (1, 0)):
                 for end in (low[axis], high[axis]):
-                    level = -(slope[beside] + square[0, 1] * end) / square[beside, beside]
-                    level = np.clip(level, low[beside], high[beside])
+                    level = -(slope[other_axis] + square[0, 1] * end) / square[other_axis, other_axis]
+                    level = np.clip(level, low[other_axis], high[other_axis])
                     places.append([end, level] if axis == 0 else [level, end])
             size = square[0, 0] * square[1, 1] - square[0, 1] ** 2
-            one = (square[0, 1] * slope[1] - square[1, 1] * slope[0]) / size
-            other = (square[0, 1] * slope[0] - square[0, 0] * slope[1]) / size
-            places.append([np.clip(one, low[0], high[0]), np.clip(other, low[1], high[1])])
-        least, found = np.full(count, np.inf), low.copy()
+            first = (square[0, 1] * slope[1] - square[1, 1] * slope[0]) / size
+            second = (square[0, 1] * slope[0] - square[0, 0] * slope[1]) / size
+            places.append([np.clip(first, low[0], high[0]), np.clip(second, low[1], high[1])])
+        least, minimizer = np.full(count, np.inf), low.copy()
         for place in places:
             value = place[0] * (slope[0] + square[0, 0] / 2 * place[0])
             if r == 2:
@@ -418,24 +445,25 @@ def _least(slope: Array, square: Array, low: Array, high: Array) -> tuple[Array,
             better = value < least
             np.copyto(least, value, where=better)
             for axis in range(r):
-                np.copyto(found[axis], place[axis], where=better)
-    return least, found
+                np.copyto(minimizer[axis], place[axis], where=better)
+    return least, minimizer
 
 
-def lowest_curvature(square: Array) -> Array:
-    """Least eigenvalues of symmetric matrices (P, r, r), r at most two. Shape (P,)."""
+def _lowest_eigenvalue(square: Array) -> Array:
+    """Return the least eigenvalues of symmetric matrices (P, r, r), r at most two. Shape (P,)."""
     if square.shape[1] < 2:
         return np.asarray(square.sum(axis=(1, 2)))
     middle, half = (square[:, 0, 0] + square[:, 1, 1]) / 2, (square[:, 0, 0] - square[:, 1, 1]) / 2
     return np.asarray(middle - np.hypot(half, square[:, 0, 1]))
 
 
-def _raised(square: Array, floor: float) -> tuple[Array, Array]:
-    """Symmetric matrices (r, r, P), their eigenvalues raised to a floor, and the most by which one was. Shape (P,)."""
-    excess = np.maximum(floor - lowest_curvature(np.moveaxis(square, -1, 0)), 0.0)
+def _raise_eigenvalues(square: Array, floor: float) -> tuple[Array, Array]:
+    """Raise the eigenvalues of symmetric matrices (r, r, P) to a floor; also return the largest increases (P,)."""
+    excess = np.maximum(floor - _lowest_eigenvalue(np.moveaxis(square, -1, 0)), 0.0)
     rows = np.flatnonzero(excess > 0)
     if rows.size:
-        values, ways = np.linalg.eigh(np.moveaxis(square[..., rows], -1, 0))
+        values, vectors = np.linalg.eigh(np.moveaxis(square[..., rows], -1, 0))
         square = square.copy()
-        square[..., rows] = np.moveaxis((ways * np.maximum(values, floor)[:, None]) @ ways.transpose(0, 2, 1), 0, -1)
+        raised = (vectors * np.maximum(values, floor)[:, None]) @ vectors.transpose(0, 2, 1)
+        square[..., rows] = np.moveaxis(raised, 0, -1)
     return square, excess

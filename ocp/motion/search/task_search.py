@@ -1,4 +1,4 @@
-"""Search over all motions that do tip tasks in their own time: which instants are looked at, and plans with a bound."""
+"""Global search over all motions that do the tasks in their own time: choice of the time samples, and bounds."""
 
 from __future__ import annotations
 
@@ -14,247 +14,258 @@ from models.arrays import Array
 from ocp.errors import ProblemError
 from ocp.motion.local.inverse_kinematics import Unreachable
 from ocp.motion.local.rates import LocalMotion
-from ocp.motion.search.charts import Instant, SelfMotions
-from ocp.motion.search.configurations import OUT_OF_REACH, Asked, misfits_of, placed
+from ocp.motion.search.charts import SelfMotionManifolds, TimeSample
+from ocp.motion.search.configurations import (
+    REACH_TOLERANCE,
+    PlanRequest,
+    largest_pose_errors,
+    locate_error,
+    sampled_motions,
+)
 from ocp.motion.search.dead_end import DeadEnd, dead_end
-from ocp.motion.search.joint_space import Held, JointSpace
-from ocp.motion.search.reconfigurations import farthest, fewest_pieces
-from ocp.motion.search.search import FREE, Search
-from ocp.motion.search.steps import Squares
+from ocp.motion.search.joint_space import JointSpace, TasksWithFixedJoints
+from ocp.motion.search.reconfigurations import fewest_segments, segment_ends
+from ocp.motion.search.search import MAX_FREE_DIRECTIONS, AtlasSearch
+from ocp.motion.search.steps import SquaredRates
 from ocp.motion.tasks.equations import TaskEquations
 
 __all__ = ["TaskSearch"]
 
 
 @dataclass(frozen=True)
-class InstantSettings:
-    """At which times the postures of tasks are searched.
+class SampleSettings:
+    """Settings of the time samples.
 
     Attributes:
-        lost: Share of the cost that straight steps between the instants may lose, by the directions that are free. With
-            two each instant is dear: with a third as much lost a plan took half as long again.
-        steps: Over the motion, at least.
-        closest: Share of the horizon: instants do not come closer.
-        tight: Share of its greatest speed at which a joint has hardly any room, so that instants are put beside.
-        at_limit: Likewise from the limit of its position, rad or m.
-        parts: Of a step between two instants where pieces of a motion end that might have to be fewer.
-        told: Times of the motions that are told, beside the breaks of the tasks.
+        lost: Share of the cost that straight steps between the samples may lose, by the number of free directions. With
+            two, each sample is expensive: a third of the loss took half as long again.
+        steps: Least number of steps over the motion.
+        closest: Least distance between samples, as a share of the horizon.
+        near_speed_limit: Share of its velocity limit from which on a joint is nearly at it, so that samples are added.
+        near_position_limit: The same for position limits: distance to the limit, rad or m.
+        subdivisions: Parts into which a step is divided where a segment ends and one segment fewer might do.
+        motion_steps: Samples of the returned motions, besides the breaks of the tasks.
     """
 
     lost: tuple[float, float, float] = (0.0033, 0.0033, 0.045)
     steps: int = 4
     closest: float = 1e-3
-    tight: float = 0.9
-    at_limit: float = 1e-3
-    parts: int = 4
-    told: int = 64
+    near_speed_limit: float = 0.9
+    near_position_limit: float = 1e-3
+    subdivisions: int = 4
+    motion_steps: int = 64
 
 
 class TaskSearch:
-    """Search over the postures of all tasks.
+    """Global search for the motions of a plan request.
 
     Attributes:
-        bound: Of the cost of any motion that does them; inf where there is none.
+        request: The request.
+        bound: Lower bound of the cost of any motion; inf if there is none.
+        times: Times of the samples, s.
 
     Raises:
-        ProblemError: A machine or a task that cannot be searched: a base that moves, velocities, too much freedom.
-        Unreachable: An instant at which no posture does the tasks.
+        ProblemError: A moving base, a task that is no pose, or too many free directions.
+        Unreachable: At some sample no configuration does the tasks.
     """
 
     def __init__(
-        self, asked: Asked, followed: list[LocalMotion], settings: InstantSettings = InstantSettings()
+        self, request: PlanRequest, motions: list[LocalMotion], settings: SampleSettings = SampleSettings()
     ) -> None:
         """
         Args:
-            asked: What is asked.
-            followed: Local motions through its stretches, of which the cheapest says where instants are needed.
-            settings: How many are taken.
+            request: The request.
+            motions: Local motions through its stretches; the best one determines where samples are needed.
+            settings: Settings of the time samples.
         """
-        self.asked, self._settings = asked, settings
-        machine, bounds = asked.machine, asked.bounds
+        self.request, self._settings = request, settings
+        machine, bounds = request.machine, request.bounds
         if machine.base_size:
-            words = "search='global' is for machines on a fixed base; search='postures' for those that move"
+            words = "search='global' needs a machine on a fixed base; use search='configurations'"
             raise ProblemError(words, name="search", value="global")
-        cost = np.sum([part.cost for part in followed], axis=0)
-        follows = np.array(misfits_of(followed)) <= OUT_OF_REACH
-        self._known = float(cost[follows].min()) if follows.any() else np.inf
-        best = int(np.where(follows | ~follows.any(), cost, np.inf).argmin())
-        self.space = JointSpace(machine, bounds.lower, bounds.upper, asked.weights)
+        costs = np.sum([motion.cost for motion in motions], axis=0)
+        tracked = np.array(largest_pose_errors(motions)) <= REACH_TOLERANCE
+        self._known_cost = float(costs[tracked].min()) if tracked.any() else np.inf
+        best = int(np.where(tracked | ~tracked.any(), costs, np.inf).argmin())
+        self.space = JointSpace(machine, bounds.lower, bounds.upper, request.weights)
         self.bound = 0.0
-        self._held = tuple(np.flatnonzero(asked.idle).tolist())
-        self._at = followed[0].joints[best, 0, list(self._held)]
+        self._fixed_joints = tuple(np.flatnonzero(request.idle_joints).tolist())
+        self._fixed_values = motions[0].joints[best, 0, list(self._fixed_joints)]
         times = list[Array]()
-        for stretch, part in zip(asked.stretches, followed, strict=True):
+        for stretch, motion in zip(request.stretches, motions, strict=True):
             if (equations := stretch.equations) is None:
                 continue
             if not equations.pose_rows.all():
-                words = "search='global' needs poses, and a task gives velocities; say where its tip is: position=..."
+                words = "search='global' needs poses, but a task gives velocities; give the tip's position=..."
                 raise ProblemError(words, name="search", value="global", time=stretch.begin)
-            size = machine.joint_size - equations.size - len(self._held)
-            if size > FREE:
+            free_directions = machine.joint_size - equations.size - len(self._fixed_joints)
+            if free_directions > MAX_FREE_DIRECTIONS:
                 words = (
-                    f"search='global': the tasks leave {size} directions free from {stretch.begin:g} s on, "
-                    f"at most {FREE} can be searched; fix more, or search='postures'"
+                    f"at t = {stretch.begin:g} s the tasks leave {free_directions} degrees of freedom undetermined; "
+                    f"search='global' supports at most {MAX_FREE_DIRECTIONS}. "
+                    "Lock a joint, add a task, or use search='configurations'"
                 )
-                raise ProblemError(words, name="search", value=size, limit=FREE, time=stretch.begin)
-            steps = int(np.ceil(settings.steps * stretch.duration / asked.horizon))
-            own = instants_of(part.t, part.joints[best], asked.weights, settings.lost[max(size, 0)], steps)
-            times.append(own[1:] if times and own[0] <= times[-1][-1] else own)  # what went before leads there
+                details: dict[str, Any] = {"value": free_directions, "limit": MAX_FREE_DIRECTIONS}
+                raise ProblemError(words, name="search", **details, time=stretch.begin)
+            steps = int(np.ceil(settings.steps * stretch.duration / request.horizon))
+            lost = settings.lost[max(free_directions, 0)]
+            chosen = choose_samples(motion.t, motion.joints[best], request.weights, lost, steps)
+            shared = bool(times) and chosen[0] <= times[-1][-1]  # the stretch before ends there
+            times.append(chosen[1:] if shared else chosen)
         if not times:
-            words = f"the tasks have no part of {asked.horizon:g} s: the horizon is that much longer"
-            raise ProblemError(words, name="horizon", value=asked.horizon)
-        self._look(times)
+            words = f"no task is active within the horizon of {request.horizon:g} s; shorten the horizon"
+            raise ProblemError(words, name="horizon", value=request.horizon)
+        self._search_at(times)
 
-    def _look(self, times: list[Array]) -> None:
-        """Search the postures at the times of each stretch that has tasks."""
-        self._place(times)
-        self._best, bound = self._search.best(self._known)
-        self.bound = max(self.bound, bound)  # of fewer instants it holds as well
-        if self._best is not None:
-            self._known = max(self._known, self._search.steps(self._best))
+    def _search_at(self, times: list[Array]) -> None:
+        """Search the configurations at the given times of each stretch that has tasks."""
+        self._build_search(times)
+        self._path, bound = self._search.solve(self._known_cost)
+        self.bound = max(self.bound, bound)  # the bound of fewer samples stays valid
+        if self._path is not None:
+            self._known_cost = max(self._known_cost, self._search.path_cost(self._path))
 
-    def _place(self, times: list[Array]) -> None:
-        """Cover the postures at the times of each stretch that has tasks."""
-        asked, instants = self.asked, list[Instant]()
-        for equations, own in zip(self._equations, times, strict=True):
-            sets = self._sets(equations, own)
-            instants += [Instant(sets, number) for number in range(len(own))]
-        self._instants, self._parts, self.times = instants, times, np.concatenate(times)
-        clearance_constraints = None if asked.clearance_constraints is None else asked.clearance_constraints.scene
-        limits = asked.bounds.velocity * np.diff(self.times)[:, None]
-        told: dict[str, Any] = {"seeds": self._seeds, "start": asked.start, "scene": clearance_constraints}
-        self._search = Search(self.space, instants, self.times, Squares(asked.weights), limits, **told)
+    def _build_search(self, times: list[Array]) -> None:
+        """Build the atlas at the given times of each stretch that has tasks."""
+        request, samples = self.request, list[TimeSample]()
+        for equations, stretch_times in zip(self._equations, times, strict=True):
+            manifolds = self._manifolds(equations, stretch_times)
+            samples += [TimeSample(manifolds, index) for index in range(len(stretch_times))]
+        self._samples, self._times_by_stretch, self.times = samples, times, np.concatenate(times)
+        scene = None if request.clearance_constraints is None else request.clearance_constraints.scene
+        limits = request.bounds.velocity * np.diff(self.times)[:, None]
+        options: dict[str, Any] = {"seeds": self._seeds, "start": request.start, "scene": scene}
+        self._search = AtlasSearch(self.space, samples, self.times, SquaredRates(request.weights), limits, **options)
 
-    def _sets(self, equations: TaskEquations, times: Array) -> SelfMotions:
-        """The postures at some times; joints that move no tip stay where they are at the start."""
+    def _manifolds(self, equations: TaskEquations, times: Array) -> SelfMotionManifolds:
+        """Return the self-motion manifolds at some times; idle joints stay where they are at the start."""
         targets = np.array(equations.target_function().map(len(times))(times[None, :])).T
-        held = Held(equations.machine, equations.bound, self._held)
-        return SelfMotions(self.space, held, np.column_stack([targets, np.tile(self._at, (len(times), 1))]))
+        fixed = TasksWithFixedJoints(equations.machine, equations.bound, self._fixed_joints)
+        targets = np.column_stack([targets, np.tile(self._fixed_values, (len(times), 1))])
+        return SelfMotionManifolds(self.space, fixed, targets)
 
     @property
     def _equations(self) -> list[TaskEquations]:
-        return [stretch.equations for stretch in self.asked.stretches if stretch.equations is not None]
+        return [stretch.equations for stretch in self.request.stretches if stretch.equations is not None]
 
     def dead_end(self) -> DeadEnd | None:
-        """Where motions end, and why; None where one does not."""
-        if self._best is not None:
+        """Return where motions end and why, or None if one does not."""
+        if self._path is not None:
             return None
-        ends = farthest(self._search, 0)
+        ends = segment_ends(self._search, 0)
         through = len(ends) > 1 and ends[-1] == len(self.times) - 1
-        return dead_end(self._search, proven=not np.isfinite(self.bound), pieces=len(ends) if through else None)
+        return dead_end(self._search, proven=not np.isfinite(self.bound), segments=len(ends) if through else None)
 
-    def pieces(self, barred: Collection[tuple[float, float]] = ()) -> tuple[list[tuple[float, float]], int] | None:
-        """Begin and end of pieces in which motions do the tasks, the cheapest of the fewest, and how few any are.
+    def segments(self, barred: Collection[tuple[float, float]] = ()) -> tuple[list[tuple[float, float]], int] | None:
+        """Return begin and end of the fewest segments at least cost, and a lower bound of their number.
 
         Args:
-            barred: What is known not to be done in one piece, from and until which of the instants, s.
+            barred: Begin and end, s, of intervals that are known not to be done in one segment.
 
         Returns:
-            None where nothing goes on somewhere, however the tasks are cut.
+            None if the motion cannot be continued somewhere, however the tasks are divided.
         """
         while True:
             spans = [(int(first), int(last)) for first, last in np.searchsorted(self.times, [*barred]).tolist()]
-            ends, last = farthest(self._search, 0, spans), len(self.times) - 1
+            ends, last = segment_ends(self._search, 0, spans), len(self.times) - 1
             through = bool(ends) and ends[-1] == last
-            # a piece of any motion ends between two instants, and the next one begins there
-            least = len(farthest(self._search, ruled_out=True))
-            if not through or len(ends) > least:
-                wide = [end for end in ends if end < last and self._wide[end]]
-                if wide:
-                    inside = (np.arange(1, self._settings.parts) / self._settings.parts)[:, None]
-                    closer = self.times[wide] + inside * np.diff(self.times)[wide]
-                    self._place(self._closer(closer.ravel()))
+            # any motion ends a segment between two samples, where the next one begins
+            fewest = len(segment_ends(self._search, ruled_out=True))
+            if not through or len(ends) > fewest:
+                divisible = [end for end in ends if end < last and self._can_subdivide[end]]
+                if divisible:
+                    inside = (np.arange(1, self._settings.subdivisions) / self._settings.subdivisions)[:, None]
+                    times_between = self.times[divisible] + inside * np.diff(self.times)[divisible]
+                    self._build_search(self._with_samples(times_between.ravel()))
                     continue
-            found = fewest_pieces(self._search, 0, spans) if through else None
-            if found is None:
+            result = fewest_segments(self._search, 0, spans) if through else None
+            if result is None:
                 return None
             times = self.times.tolist()
-            return [(times[piece.first], times[piece.last]) for piece in found[0]], least
+            return [(times[segment.first], times[segment.last]) for segment in result[0]], fewest
 
     @property
-    def _wide(self) -> NDArray[np.bool_]:
-        """Between which instants others can be put."""
-        return np.asarray(np.diff(self.times) > self._settings.closest * self.asked.horizon)
+    def _can_subdivide(self) -> NDArray[np.bool_]:
+        """Mask of the steps between samples that are long enough to be subdivided."""
+        return np.asarray(np.diff(self.times) > self._settings.closest * self.request.horizon)
 
-    def _closer(self, times: Array) -> list[Array]:
-        """The instants of each stretch with others between them."""
-        return [np.union1d(own, times[(times > own[0]) & (times < own[-1])]) for own in self._parts]
+    def _with_samples(self, times: Array) -> list[Array]:
+        """Return the times of each stretch with further samples."""
+        return [np.union1d(own, times[(times > own[0]) & (times < own[-1])]) for own in self._times_by_stretch]
 
-    def looked_closer(self) -> bool:
-        """Search again with instants between those at which the best motion has hardly any room; False where it has."""
-        if self._best is None:
+    def refine_samples(self) -> bool:
+        """Add samples where the best path is nearly at a limit and search again; return whether any was added."""
+        if self._path is None:
             return False
-        bounds, steps = self.asked.bounds, np.abs(np.diff(self._best, axis=0))
-        at_limit = (
-            np.minimum(self._best - bounds.lower, bounds.upper - self._best).min(axis=1) < self._settings.at_limit
-        )
-        tight = (steps >= self._settings.tight * self._search.limits).any(axis=1) | at_limit[1:] | at_limit[:-1]
-        tight &= self._wide
-        if not tight.any():
+        settings, bounds, path = self._settings, self.request.bounds, self._path
+        margins = np.minimum(path - bounds.lower, bounds.upper - path).min(axis=1)
+        at_limit = margins < settings.near_position_limit
+        fast = np.abs(np.diff(path, axis=0)) >= settings.near_speed_limit * self._search.limits
+        critical = (fast.any(axis=1) | at_limit[1:] | at_limit[:-1]) & self._can_subdivide
+        if not critical.any():
             return False
-        self._look(self._closer((self.times[:-1] + self.times[1:])[tight] / 2))
+        self._search_at(self._with_samples((self.times[:-1] + self.times[1:])[critical] / 2))
         return True
 
     def _seeds(self, k: int) -> Array:
-        """Postures at an instant, by closed forms and by inverse kinematics from random starts."""
-        sets, number = self._instants[k]
+        """Return configurations at a sample from closed forms and from inverse kinematics with random starts."""
+        manifolds, index = self._samples[k]
         try:
-            return sets.seeds(number, self.asked.limits.joints, self.asked.seed + k)
+            return manifolds.seeds(index, self.request.limits.joints, self.request.seed + k)
         except Unreachable as error:
-            raise placed(self.asked, error, float(self.times[k])) from error
+            raise locate_error(self.request, error, float(self.times[k])) from error
 
-    def followed(self, every: bool = False) -> list[LocalMotion]:
-        """The cheapest motion of each class through all stretches, as what a plan begins from.
+    def local_motions(self, include_costlier: bool = False) -> list[LocalMotion]:
+        """Return the lowest-cost motion of each class through all stretches, as guesses for the planner.
 
-        Of the classes that may be the cheapest; of `every` one where these do not pass.
+        By default only classes that may hold the optimum; with `include_costlier` one motion of every class.
         """
-        asked, found = self.asked, list[LocalMotion]()
-        ways = self._search.motions(self._known, every)
-        if self._best is not None:
-            ways.insert(0, self._best)
-        if asked.start is None:  # by whole turns, so that joints keep their limits
-            ways = [self.space.turned(path, asked.bounds.lower, asked.bounds.upper) for path in ways]
-        count, n = len(ways), asked.machine.joint_size
-        for stretch in asked.stretches:
-            share = max(int(np.ceil(self._settings.told * stretch.duration / asked.horizon)), self._settings.steps)
-            times = np.union1d(np.linspace(stretch.begin, stretch.end, share + 1), stretch.breaks)
-            rows = np.array([[np.interp(times, self.times, path[:, j]) for j in range(n)] for path in ways])
-            rows = rows.reshape(count, n, len(times)).transpose(0, 2, 1)
+        request, settings, motions = self.request, self._settings, list[LocalMotion]()
+        paths = self._search.class_representatives(self._known_cost, include_costlier)
+        if self._path is not None:
+            paths.insert(0, self._path)
+        if request.start is None:  # shift joints by full turns to keep their limits
+            paths = [self.space.shift_turns(path, request.bounds.lower, request.bounds.upper) for path in paths]
+        count, n = len(paths), request.machine.joint_size
+        for stretch in request.stretches:
+            steps = int(np.ceil(settings.motion_steps * stretch.duration / request.horizon))
+            steps = max(steps, settings.steps)
+            times = np.union1d(np.linspace(stretch.begin, stretch.end, steps + 1), stretch.breaks)
+            samples = np.array([[np.interp(times, self.times, path[:, j]) for j in range(n)] for path in paths])
+            samples = samples.reshape(count, n, len(times)).transpose(0, 2, 1)
             if stretch.equations is not None:
-                on = self._sets(stretch.equations, times)
-                rows = on.corrected(np.tile(np.arange(len(times)), count), rows.reshape(-1, n))[0].reshape(rows.shape)
-            rows = np.clip(rows, asked.bounds.lower, asked.bounds.upper)
-            rates = np.diff(rows, axis=1) / np.diff(times)[:, None]
-            cost = np.einsum("kmn,n,m->k", rates**2, asked.weights, np.diff(times)) / 2
-            base, none = np.zeros((count, len(times), 0)), np.zeros(count)
-            rates = np.concatenate([rates, rates[:, -1:]], axis=1)
-            found.append(LocalMotion(times, base, rows, rates, np.asarray(cost), none, none))
-        return found
+                manifolds = self._manifolds(stretch.equations, times)
+                indices = np.tile(np.arange(len(times)), count)
+                samples = manifolds.project(indices, samples.reshape(-1, n))[0].reshape(samples.shape)
+            samples = np.clip(samples, request.bounds.lower, request.bounds.upper)
+            base = np.zeros((count, len(times), 0))
+            motions.append(sampled_motions(times, base, samples, request.weights))
+        return motions
 
 
-def instants_of(t: Array, joints: Array, weights: Array, share: float, least: int) -> Array:
-    """Of the times of a motion (M,) as few as leave all but a share of its cost to the straight steps between them.
+def choose_samples(t: Array, joints: Array, weights: Array, share: float, min_steps: int) -> Array:
+    """Return as few times of a motion (M,) as possible such that straight steps lose at most a share of its cost.
 
-    At each turn that time is left out that adds least to what the steps miss; at least so many steps are left.
+    Times are left out greedily, the one that loses least first; at least `min_steps` steps remain.
     """
-    kept = list(range(len(t)))
+    chosen = list(range(len(t)))
 
     def cost(a: int, b: int) -> float:
         return float((weights * (joints[b] - joints[a]) ** 2).sum() / (2 * (t[b] - t[a])))
 
-    def missing(i: int) -> float:
-        a, b, c = kept[i - 1 : i + 2]
+    def loss(i: int) -> float:
+        a, b, c = chosen[i - 1 : i + 2]
         return cost(a, b) + cost(b, c) - cost(a, c)
 
-    room = share * sum(cost(a, b) for a, b in pairwise(kept))
-    missed = [np.inf, *(missing(i) for i in range(1, len(kept) - 1)), np.inf]
-    while len(kept) > least + 1:
-        i = int(np.argmin(missed))
-        room -= missed[i]
-        if room < 0:
+    budget = share * sum(cost(a, b) for a, b in pairwise(chosen))
+    losses = [np.inf, *(loss(i) for i in range(1, len(chosen) - 1)), np.inf]
+    while len(chosen) > min_steps + 1:
+        i = int(np.argmin(losses))
+        budget -= losses[i]
+        if budget < 0:
             break
-        del kept[i], missed[i]
+        del chosen[i], losses[i]
         for k in (i - 1, i):
-            if 0 < k < len(kept) - 1:
-                missed[k] = missing(k)
-    return np.asarray(t[kept])
+            if 0 < k < len(chosen) - 1:
+                losses[k] = loss(k)
+    return np.asarray(t[chosen])

@@ -1,20 +1,20 @@
-"""The least that a motion costs from each posture on: dynamic programming over charts, with values that are bounds.
+"""Dynamic programming over charts: lower bounds of the cost-to-go, and paths shortened within the manifolds.
 
-Between two instants a motion costs at least what the straight step costs: the integral of half the squared rates no
-less than |dq|^2 / (2 dt), the length no less than |dq|_1. So the least cost over all sequences of postures, one of each
-instant, bounds that of every motion that does the task, and it is found backwards, w_k(q) = min over q' of
-d(q, q') + w_{k+1}(q'). A value on a chart is a quadratic function of the place in its box that lies nowhere above:
-every step gives one for each corner by its multipliers, all curved nearly alike; less the curvature of the cheapest
-they are affine, the least of these is concave, and an affine function below a concave one at the corners of a box is
-below it everywhere. What is lost is of third order in the size of the charts for squares, and of second for lengths,
-whose values are affine.
+Between two time samples a motion costs at least what the straight step costs: the integral of half the squared rates is
+no less than |dq|^2 / (2 dt), the length no less than |dq|_1. The least cost over all sequences of configurations, one
+per sample, is therefore a lower bound for every motion that does the task. Backward dynamic programming finds it:
+w_k(q) = min over q' of d(q, q') + w_{k+1}(q').
 
-A way through sets of postures drawn tight: the cheapest of those beside it, nearer and nearer.
+On each chart, the value function is bounded from below by a quadratic function of the place in the box. Every step
+gives one such function for each corner by its multipliers, all with nearly the same curvature. Less the curvature of
+the cheapest step they are affine, and their least is concave. An affine function below a concave one at the corners of
+a box lies below it everywhere. The loss is of third order in the size of the charts for squared rates, and of second
+order for lengths, whose bounds are affine.
 
-At every instant some postures are taken on either side of the way, and dynamic programming finds the cheapest way
-through these; where it does not run along their edge any more, they come nearer to each other. What is not allowed is
-dear, so that a way comes out of it where it can. A way that stays is the cheapest of all beside it, whatever kinks
-its cost has.
+Paths are shortened by dynamic programming as well. At every sample, some configurations on either side of the path are
+taken, and the lowest-cost path through them replaces it. Their spacing is reduced once the path no longer runs along
+their edge. Violations are penalised, so that a path leaves them where it can. A path that no longer changes is optimal
+among its neighbours, whatever kinks its cost has.
 """
 
 from __future__ import annotations
@@ -31,37 +31,37 @@ from numpy.typing import NDArray
 from models import CollisionScene
 from models.arrays import Array
 from ocp.motion.local.collisions import distances_along
-from ocp.motion.search.charts import Charts, Instant
-from ocp.motion.search.joint_space import FARTHEST, JointSpace
-from ocp.motion.search.steps import Sheets, StepCost, Steps, Values
+from ocp.motion.search.charts import Charts, TimeSample
+from ocp.motion.search.joint_space import MAX_STEP, JointSpace
+from ocp.motion.search.steps import CurvedCharts, QuadraticBounds, StepBounds, StepCost
 from ocp.tolerances import CLEARANCE_TOLERANCE_M
 
-__all__ = ["PENALTY", "Graph", "GraphSettings", "TightSettings", "drawn_tight"]
+__all__ = ["PENALTY", "ChartGraph", "GraphSettings", "ShorteningSettings", "shorten_path"]
 
 Indices = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
 class GraphSettings:
-    """How closely steps are looked at.
+    """Settings of the graph of charts.
 
     Attributes:
-        onward: Charts that are tried to go on to from a posture.
-        pairs: Places near enough for a step between two instants that are looked at together, about, by memory.
-        sample: Charts by which it is estimated how many there are.
-        nearer, lower: Times that the least of a step in a box is looked at nearer, and places on the way to it each
-            time: with fewer the least is told too low, and charts are halved that could be left out.
+        successors: Charts that are tried as the next one of a configuration.
+        pairs: Approximate number of neighbouring charts that are processed together, limited by memory.
+        sample: Charts from which the number of neighbours is estimated.
+        tangents, refinements: Tangent planes by which the least of a step in a box is bounded more tightly, and places
+            on the way to each. Fewer give looser bounds, and split charts that could be discarded.
     """
 
-    onward: int = 8
+    successors: int = 8
     pairs: int = 200_000
     sample: int = 64
-    nearer: int = 2
-    lower: int = 3
+    tangents: int = 2
+    refinements: int = 3
 
 
-class Graph:
-    """The charts of all instants, and the steps between them that a motion may take."""
+class ChartGraph:
+    """Layered graph of the charts at all time samples, with the steps that a motion may take."""
 
     def __init__(
         self,
@@ -70,378 +70,409 @@ class Graph:
         seconds: Array,
         cost: StepCost,
         limits: Array,
-        most: Array,
+        max_costs: Array,
         settings: GraphSettings = GraphSettings(),
     ) -> None:
         """
         Args:
-            space: Where the charts lie.
-            layers: Charts of each instant.
-            seconds: From each instant to the next. Shape (K - 1,).
-            cost: Of a step.
-            limits: How far the joints may go from each instant to the next. Shape (K - 1, n).
-            most: What the step from each instant to the next may cost. Shape (K - 1,).
-            settings: How closely steps are looked at.
+            space: Joint space.
+            layers: Charts of each time sample.
+            seconds: Durations from each sample to the next, s. Shape (K - 1,).
+            cost: Cost of a step.
+            limits: Largest step of each joint. Shape (K - 1, n).
+            max_costs: Largest cost of a step. Shape (K - 1,).
+            settings: Settings of the graph.
         """
         self.space, self.layers, self.seconds, self.cost, self.limits = space, layers, seconds, cost, limits
-        self.most, self.settings = most, settings
+        self.max_costs, self.settings = max_costs, settings
 
     @cached_property
-    def sheets(self) -> list[Sheets]:
-        """Charts of each instant, and how the set bends away from them."""
-        return [Sheets(charts, *charts.bent()) for charts in self.layers]
+    def curved(self) -> list[CurvedCharts]:
+        """Charts of each time sample with the curvature of the manifold."""
+        return [CurvedCharts(charts, *charts.curvature()) for charts in self.layers]
 
-    def to_come(self, passed: list[Values] | None = None, most: float = np.inf) -> list[Values]:
-        """Bounds of what is to come from each instant, of motions that cost less than `most` with what has `passed`."""
-        return self._swept(range(len(self.layers) - 1, -1, -1), -1, passed, most)
+    def cost_to_go(
+        self, cost_to_come: list[QuadraticBounds] | None = None, max_cost: float = np.inf
+    ) -> list[QuadraticBounds]:
+        """Return lower bounds of the cost-to-go on the charts of each sample.
 
-    def passed(self, to_come: list[Values] | None = None, most: float = np.inf) -> list[Values]:
-        """Bounds of what has been until each instant, of motions that cost less than `most` with what is `to_come`."""
-        return self._swept(range(len(self.layers)), 1, to_come, most)
+        Motions that cost at least `max_cost` in all, by bounds of the `cost_to_come`, are left out.
+        """
+        return self._sweep(range(len(self.layers) - 1, -1, -1), -1, cost_to_come, max_cost)
 
-    def alive(self) -> list[NDArray[np.bool_]]:
-        """Of the charts of each instant, which lie on a way from the first instant to the last. Shapes (N,)."""
-        found = [np.ones(len(charts), dtype=bool) for charts in self.layers]
-        last = len(found) - 1
-        for order in (range(last), range(last, 0, -1)):
+    def cost_to_come(
+        self, cost_to_go: list[QuadraticBounds] | None = None, max_cost: float = np.inf
+    ) -> list[QuadraticBounds]:
+        """Return lower bounds of the cost-to-come on the charts of each sample, likewise."""
+        return self._sweep(range(len(self.layers)), 1, cost_to_go, max_cost)
+
+    def reachable(self) -> list[NDArray[np.bool_]]:
+        """Return which charts lie on a path from the first to the last sample. Shapes (N,)."""
+        masks = [np.ones(len(charts), dtype=bool) for charts in self.layers]
+        end = len(masks) - 1
+        for order in (range(end), range(end, 0, -1)):
             for k in order:
-                other = k + int(np.sign(order.step))
-                led = np.zeros(len(found[other]), dtype=bool)
-                for i, j in self.steps(k, other):
-                    led[j[found[k][i]]] = True
-                found[other] &= led
-        return found
+                neighbour = k + int(np.sign(order.step))
+                connected = np.zeros(len(masks[neighbour]), dtype=bool)
+                for i, j in self.edges(k, neighbour):
+                    connected[j[masks[k][i]]] = True
+                masks[neighbour] &= connected
+        return masks
 
-    def steps(self, k: int, other: int) -> Iterator[tuple[Indices, Indices]]:
-        """Charts of an instant and of one beside it between which a motion may go, some at a time."""
-        here, there = self.layers[k], self.layers[other]
-        if not len(here) or not len(there):
+    def edges(self, k: int, neighbour: int) -> Iterator[tuple[Indices, Indices]]:
+        """Yield, in batches, pairs of charts of a sample and of its neighbour between which a step is possible."""
+        source, target = self.layers[k], self.layers[neighbour]
+        if not len(source) or not len(target):
             return
-        between, spans = min(k, other), (here.spans, there.spans)
+        between, spans = min(k, neighbour), (source.spans, target.spans)
         sizes = [self.space.length(span) for span in spans]
         limit = self.limits[between]
-        dearest = max(float(self.most[between]), 0.0)
-        way = min(self.cost.farthest(dearest, float(self.seconds[between])), float(self.space.length(limit)))
-        way = min(way, FARTHEST)
-        tree = self.space.tree(there.centers)
-        some = self.space.tree(here.centers[:: max(len(here) // self.settings.sample, 1)])
-        number = some.count_neighbors(tree, min(way + float(sizes[0].max() + sizes[1].max()), FARTHEST)) / some.n
-        share = max(16, int(self.settings.pairs / max(number, 1.0)))
-        for first in range(0, len(here), share):
-            part = np.arange(first, min(first + share, len(here)))
-            own = self.space.tree(here.centers[part])
-            found = own.sparse_distance_matrix(
-                tree, way + float(sizes[0][part].max() + sizes[1].max()), output_type="ndarray"
-            )
-            i, j, far = part[found["i"]], found["j"].astype(np.intp), found["v"]
-            near = far <= way + sizes[0][i] + sizes[1][j]
-            i, j = i[near], j[near]
-            delta = np.abs(self.space.difference(there.centers[j], here.centers[i]))
-            near = (delta <= limit + spans[0][i] + spans[1][j]).all(axis=1)
-            i, j = i[near], j[near]
+        max_cost = max(float(self.max_costs[between]), 0.0)
+        reach = min(self.cost.reach(max_cost, float(self.seconds[between])), float(self.space.length(limit)))
+        reach = min(reach, MAX_STEP)
+        tree = self.space.tree(target.centers)
+        sample = self.space.tree(source.centers[:: max(len(source) // self.settings.sample, 1)])
+        radius = min(reach + float(sizes[0].max() + sizes[1].max()), MAX_STEP)
+        mean_count = sample.count_neighbors(tree, radius) / sample.n
+        batch = max(16, int(self.settings.pairs / max(mean_count, 1.0)))
+        for first in range(0, len(source), batch):
+            rows = np.arange(first, min(first + batch, len(source)))
+            batch_tree = self.space.tree(source.centers[rows])
+            radius = reach + float(sizes[0][rows].max() + sizes[1].max())
+            pairs = batch_tree.sparse_distance_matrix(tree, radius, output_type="ndarray")
+            i, j, distance = rows[pairs["i"]], pairs["j"].astype(np.intp), pairs["v"]
+            close = distance <= reach + sizes[0][i] + sizes[1][j]
+            i, j = i[close], j[close]
+            delta = np.abs(self.space.difference(target.centers[j], source.centers[i]))
+            close = (delta <= limit + spans[0][i] + spans[1][j]).all(axis=1)
+            i, j = i[close], j[close]
             order = np.argsort(i, kind="stable")
             yield i[order], j[order]
 
-    def nearest(self, joints: Array, k: int, other: int, after: Values) -> Iterator[tuple[Charts, Array]]:
-        """Charts of an instant to go on to from a posture (n,) of another, the cheapest first, and where in them.
+    def successors(
+        self, joints: Array, k: int, neighbour: int, after: QuadraticBounds
+    ) -> Iterator[tuple[Charts, Array]]:
+        """Yield the charts of a neighbouring sample to which a configuration (n,) can go, the cheapest first.
 
-        Returns:
-            Of each a chart alone, turned as the posture is, and the place in its box, (r,).
+        Yields:
+            A single chart, shifted by full turns to the configuration, and the place in its box, (r,).
         """
-        there = self.layers[other]
-        between = min(k, other)
+        charts = self.layers[neighbour]
+        between = min(k, neighbour)
         seconds = float(self.seconds[between])
-        delta = self.space.difference(there.centers, np.repeat(joints[None], len(there), axis=0))
-        reached = (np.abs(delta) <= self.limits[between] + there.spans).all(axis=1) & np.isfinite(after.least)
-        chosen = np.flatnonzero(reached)
-        if not chosen.size:
+        delta = self.space.difference(charts.centers, np.repeat(joints[None], len(charts), axis=0))
+        reachable = (np.abs(delta) <= self.limits[between] + charts.spans).all(axis=1) & np.isfinite(after.least)
+        rows = np.flatnonzero(reachable)
+        if not rows.size:
             return
-        into = there.of(chosen)
-        costs, places = self.cost.cheapest(delta[chosen], into, after.of(chosen), seconds)
-        for i in np.argsort(costs, kind="stable")[: self.settings.onward].tolist():
-            yield replace(into.of([i]), centers=joints + delta[chosen[[i]]]), places[i]
+        candidates = charts.select(rows)
+        costs, places = self.cost.cheapest_steps(delta[rows], candidates, after.select(rows), seconds)
+        for i in np.argsort(costs, kind="stable")[: self.settings.successors].tolist():
+            yield replace(candidates.select([i]), centers=joints + delta[rows[[i]]]), places[i]
 
-    def _swept(self, order: range, direction: int, rest: list[Values] | None, most: float) -> list[Values]:
+    def _sweep(
+        self, order: range, direction: int, known_bounds: list[QuadraticBounds] | None, max_cost: float
+    ) -> list[QuadraticBounds]:
+        """Propagate bounds over the samples in the given order."""
         layers = self.layers
-        found: list[Any] = [None] * len(layers)
+        bounds: list[Any] = [None] * len(layers)
         first = order[0]
         count, free = layers[first].low.shape
-        found[first] = Values.constant(np.zeros(count), free)
-        if rest is not None:
-            dear = self.least(rest[first], first) >= most
-            found[first] = Values.constant(np.where(dear, np.inf, 0.0), free)
+        bounds[first] = QuadraticBounds.constant(np.zeros(count), free)
+        if known_bounds is not None:
+            excluded = self.minima(known_bounds[first], first) >= max_cost
+            bounds[first] = QuadraticBounds.constant(np.where(excluded, np.inf, 0.0), free)
         for k in order[1:]:
-            found[k] = self._before(k, k - direction, found[k - direction], None if rest is None else rest[k], most)
-        return found
+            rest = None if known_bounds is None else known_bounds[k]
+            bounds[k] = self._propagate(k, k - direction, bounds[k - direction], rest, max_cost)
+        return bounds
 
-    def _before(self, k: int, other: int, after: Values, rest: Values | None, most: float) -> Values:
-        """Bounds on the charts of an instant by those of the one that motions go on to.
+    def _propagate(
+        self, k: int, neighbour: int, after: QuadraticBounds, known_bounds: QuadraticBounds | None, max_cost: float
+    ) -> QuadraticBounds:
+        """Return bounds on the charts of a sample k from those on the charts of its neighbour, `after`.
 
-        With what is known of the `rest` of the motions, those that cost `most` or more are left out.
+        With `known_bounds` of the rest of the motions, those that cost `max_cost` or more are left out.
         """
-        here, there = self.layers[k], self.layers[other]
-        seconds = float(self.seconds[min(k, other)])
-        found = Values.constant(np.full(len(here), np.inf), here.low.shape[1])
-        known = np.zeros(len(here)) if rest is None else self.least(rest, k)
-        # steps that are nowhere the cheapest from their chart are left out: seen from far, then by their tangents
-        here_spans, there_spans = here.spans, there.spans
-        place = np.clip(0.0, there.low, there.high)
-        lowest, middle = self.least(after, other), after.at(place)
-        for i, j in self.steps(k, other):
-            alive = np.isfinite(after.least[j]) & (known[i] + lowest[j] < most)
-            i, j = i[alive], j[alive]
+        source, target = self.layers[k], self.layers[neighbour]
+        seconds = float(self.seconds[min(k, neighbour)])
+        bounds = QuadraticBounds.constant(np.full(len(source), np.inf), source.low.shape[1])
+        known_costs = np.zeros(len(source)) if known_bounds is None else self.minima(known_bounds, k)
+        # leave out steps that are nowhere the cheapest of their chart: first by distances, then by tangent planes
+        start_spans, end_spans = source.spans, target.spans
+        places = np.clip(0.0, target.low, target.high)
+        lowest, middle = self.minima(after, neighbour), after.at(places)
+        for i, j in self.edges(k, neighbour):
+            feasible = np.isfinite(after.least[j]) & (known_costs[i] + lowest[j] < max_cost)
+            i, j = i[feasible], j[feasible]
             if not i.size:
                 continue
-            delta = self.space.difference(there.centers[j], here.centers[i])
-            way, span = np.abs(delta), here_spans[i] + there_spans[j]
-            low = self.cost.of(np.maximum(way - span, 0.0), seconds) + lowest[j]
-            high = self.cost.of(way + span, seconds) + middle[j]
-            floor = np.full(len(here), np.inf)
-            np.minimum.at(floor, i, low)
-            near = (low <= _least_of_groups(high, i)) & (known[i] + low < most)
-            i, j, delta = i[near], j[near], delta[near]
-            steps = self.cost.below(delta, self.sheets[k].of(i), self.sheets[other].of(j), after.of(j), seconds)
-            if rest is not None:
-                cheap = np.flatnonzero(_whole(steps, here.of(i), rest.of(i)) < most)
-                i, steps = i[cheap], steps.of(cheap)
+            delta = self.space.difference(target.centers[j], source.centers[i])
+            distances, spans = np.abs(delta), start_spans[i] + end_spans[j]
+            lower = self.cost.evaluate(np.maximum(distances - spans, 0.0), seconds) + lowest[j]
+            upper = self.cost.evaluate(distances + spans, seconds) + middle[j]
+            floor = np.full(len(source), np.inf)
+            np.minimum.at(floor, i, lower)
+            promising = (lower <= _least_of_groups(upper, i)) & (known_costs[i] + lower < max_cost)
+            i, j, delta = i[promising], j[promising], delta[promising]
+            ends = self.curved[k].select(i), self.curved[neighbour].select(j)
+            steps = self.cost.lower_bounds(delta, *ends, after.select(j), seconds)
+            if known_bounds is not None:
+                affordable = np.flatnonzero(
+                    _bound_with_rest(steps, source.select(i), known_bounds.select(i)) < max_cost
+                )
+                i, steps = i[affordable], steps.select(affordable)
             if not i.size:
                 continue
             starts = np.flatnonzero(np.diff(i, prepend=-1))
-            parts = _below_all(steps, here.of(i), starts, most - known[i[starts]], self.settings)
-            parts = self._raised(parts, here.of(i[starts]), floor[i[starts]])
-            for whole, part in zip(found, parts, strict=True):
+            parts = _bound_charts(steps, source.select(i), starts, max_cost - known_costs[i[starts]], self.settings)
+            parts = self._raise_to_floor(parts, source.select(i[starts]), floor[i[starts]])
+            for whole, part in zip(bounds, parts, strict=True):
                 whole[i[starts]] = part
-        return found
+        return bounds
 
     @staticmethod
-    def _raised(values: Values, charts: Charts, floor: Array) -> Values:
-        """Values, or constants that are bounds, too, where these are higher in the middle and at the least together."""
-        least = values.lowest(charts.low, charts.high)[0]
-        flat = values.at((charts.low + charts.high) / 2) + least < 2 * floor
-        return Values(
-            np.where(flat, floor, values.least),
-            np.where(flat[:, None], 0.0, values.slope),
-            np.where(flat[:, None, None], 0.0, values.curve),
+    def _raise_to_floor(values: QuadraticBounds, charts: Charts, floor: Array) -> QuadraticBounds:
+        """Replace bounds by constants where these are higher, in the sum of middle and minimum."""
+        least = values.minimum(charts.low, charts.high)[0]
+        higher = values.at((charts.low + charts.high) / 2) + least < 2 * floor
+        return QuadraticBounds(
+            np.where(higher, floor, values.least),
+            np.where(higher[:, None], 0.0, values.slope),
+            np.where(higher[:, None, None], 0.0, values.curve),
         )
 
-    def least(self, values: Values, k: int) -> Array:
-        """The least of values anywhere on the charts of an instant. Shape (N,)."""
-        return values.lowest(self.layers[k].low, self.layers[k].high)[0]
+    def minima(self, values: QuadraticBounds, k: int) -> Array:
+        """Return the minima of bounds on the charts of a sample. Shape (N,)."""
+        return values.minimum(self.layers[k].low, self.layers[k].high)[0]
 
-    def through(self, passed: list[Values], to_come: list[Values], k: int) -> Array:
-        """Bounds of what motions cost that pass through the charts of an instant. Shape (N,)."""
-        both = Values(*(one + other for one, other in zip(passed[k], to_come[k], strict=True)))
-        return np.where(np.isfinite(both.least), self.least(both, k), np.inf)
-
-
-def _whole(steps: Steps, own: Charts, rest: Values) -> Array:
-    """What steps from charts cost at least, with what is known of the rest. Shape (P,)."""
-    middle, curve = (own.low + own.high) / 2, steps.curve
-    both = _tangents(middle, steps.at(middle), curve, -rest.curve, -rest.slope)
-    return rest.least + both.lowest(own.low, own.high)[0]
+    def cost_through(self, cost_to_come: list[QuadraticBounds], cost_to_go: list[QuadraticBounds], k: int) -> Array:
+        """Return lower bounds of the cost of motions through each chart of a sample. Shape (N,)."""
+        total = QuadraticBounds(*(first + second for first, second in zip(cost_to_come[k], cost_to_go[k], strict=True)))
+        return np.where(np.isfinite(total.least), self.minima(total, k), np.inf)
 
 
-def _least_of_groups(values: Array, group: Indices) -> Array:
-    """Of values whose groups are together, the least of the group, for each. Shape (P,)."""
-    starts = np.flatnonzero(np.diff(group, prepend=-1))
+def _bound_with_rest(steps: StepBounds, charts: Charts, known_bounds: QuadraticBounds) -> Array:
+    """Return lower bounds of steps from charts plus known bounds of the rest of the motion. Shape (P,)."""
+    middle, curve = (charts.low + charts.high) / 2, steps.curve
+    total = _tangent_bounds(middle, steps.at(middle), curve, -known_bounds.curve, -known_bounds.slope)
+    return known_bounds.least + total.minimum(charts.low, charts.high)[0]
+
+
+def _least_of_groups(values: Array, groups: Indices) -> Array:
+    """Return for each value the least of its group; groups are contiguous. Shape (P,)."""
+    starts = np.flatnonzero(np.diff(groups, prepend=-1))
     return np.repeat(np.minimum.reduceat(values, starts), np.diff(np.append(starts, len(values))))
 
 
-def _below_all(steps: Steps, own: Charts, starts: Indices, most: Array, settings: GraphSettings) -> Values:
-    """A bound for each chart that steps go from, whose steps are together and begin at `starts`.
+def _bound_charts(
+    steps: StepBounds, charts: Charts, starts: Indices, max_costs: Array, settings: GraphSettings
+) -> QuadraticBounds:
+    """Return one lower bound for each chart from the bounds of its steps, which are contiguous from `starts` on.
 
-    Above `most`, of shape (M,), it is of no use.
+    Values above `max_costs`, shape (M,), need not be resolved.
     """
-    r = own.tangents.shape[2]
-    count = np.diff(np.append(starts, len(own)))
+    r = charts.tangents.shape[2]
+    count = np.diff(np.append(starts, len(charts)))
     group = np.repeat(np.arange(len(starts)), count)
-    middle, half = (own.low + own.high) / 2, (own.high - own.low) / 2
+    middle, half = (charts.low + charts.high) / 2, (charts.high - charts.low) / 2
     places = [middle, *(middle + side * half * np.eye(r)[axis] for axis in range(r) for side in (-1.0, 1.0))]
-    # less the curvature of the cheapest, and what the least of all bends down, they are affine, or nearly so
-    touching, curves = [steps.at(place) for place in places], steps.curve
-    curve = curves[np.lexsort((touching[0][0], group))[starts]].copy()
-    heights = np.minimum.reduceat(np.stack([value for value, _ in touching]), starts, axis=1)
-    heights = np.minimum(heights, most)
-    curve += _sunk(heights - _pressed_all(curve, places, starts), half[starts], curve)
+    # less the curvature of the cheapest step and the concavity of the least of all, they are nearly affine
+    tangents, curves = [steps.at(place) for place in places], steps.curve
+    curve = curves[np.lexsort((tangents[0][0], group))[starts]].copy()
+    heights = np.minimum.reduceat(np.stack([value for value, _ in tangents]), starts, axis=1)
+    heights = np.minimum(heights, max_costs)
+    curve += _concavity(heights - _quadratic_at_places(curve, places, starts), half[starts], curve)
     common = curve[group]
-    values = np.stack([value - _pressed(common, place) for (value, _), place in zip(touching, places, strict=True)])
-    slope = _rise([*(heights - _pressed_all(curve, places, starts))], half[starts])
-    # how far above the linear functions the steps lie: by tangents at places where they are low
-    lean, rows = slope[group], np.arange(len(own))
-    seen = values - np.stack([(place * lean).sum(axis=1) for place in places])
-    room, at = np.minimum.reduceat(seen.min(axis=0), starts)[group], seen.argmin(axis=0)
-    lowest, value, rise = (np.stack(parts)[at, rows] for parts in (places, *zip(*touching, strict=True)))
-    best = _tangents(lowest, (value, rise), curves, common, lean)
-    least = best.lowest(own.low, own.high)[0]
-    for _ in range(settings.nearer):  # those that may be the least of their chart
-        kept = np.flatnonzero(least[rows] < room[rows])
-        rows, best = rows[kept], best.of(kept)
-        part, box, level = steps.of(rows), own.of(rows), common[rows]
-        place = best.lowest(box.low, box.high)[1]
-        for _ in range(settings.lower):
-            place = part.lower(place, lean[rows], level)
-        other = _tangents(place, part.at(place), curves[rows], level, lean[rows])
-        best, least[rows] = _mixed(best, least[rows], other, box)
+    values = np.stack([tangent[0] - _quadratic(common, place) for tangent, place in zip(tangents, places, strict=True)])
+    slope = _secant_slopes([*(heights - _quadratic_at_places(curve, places, starts))], half[starts])
+    # how far the steps lie above the linear functions: by tangent planes at places where they are low
+    tilt, rows = slope[group], np.arange(len(charts))
+    excess = values - np.stack([(place * tilt).sum(axis=1) for place in places])
+    upper, best_place = np.minimum.reduceat(excess.min(axis=0), starts)[group], excess.argmin(axis=0)
+    stacked = (np.stack(parts)[best_place, rows] for parts in (places, *zip(*tangents, strict=True)))
+    lowest, value, slope_at = stacked
+    best = _tangent_bounds(lowest, (value, slope_at), curves, common, tilt)
+    least = best.minimum(charts.low, charts.high)[0]
+    for _ in range(settings.tangents):  # the steps that may be the least of their chart
+        undecided = np.flatnonzero(least[rows] < upper[rows])
+        rows, best = rows[undecided], best.select(undecided)
+        remaining, boxes, curvature = steps.select(rows), charts.select(rows), common[rows]
+        place = best.minimum(boxes.low, boxes.high)[1]
+        for _ in range(settings.refinements):
+            place = remaining.lower(place, tilt[rows], curvature)
+        tangent = _tangent_bounds(place, remaining.at(place), curves[rows], curvature, tilt[rows])
+        best, least[rows] = _best_combination(best, least[rows], tangent, boxes)
     least = np.minimum.reduceat(least, starts)
-    return Values(least, slope, curve)
+    return QuadraticBounds(least, slope, curve)
 
 
-def _mixed(best: Values, most: Array, other: Values, charts: Charts) -> tuple[Values, Array]:
-    """The mean with others, as curved, whose least is the largest, of those level along an axis; and that least.
+def _best_combination(
+    best: QuadraticBounds, best_least: Array, tangent: QuadraticBounds, charts: Charts
+) -> tuple[QuadraticBounds, Array]:
+    """Return the convex combinations of two bounds with the highest minimum, and this minimum.
 
-    The least of the first is the `most` that is known. Shape (P,).
+    Of both, which have the same curvature, those combinations are tried that are level along an axis. `best_least` is
+    the minimum of the first. Shape (P,).
     """
     first = best
     with np.errstate(divide="ignore", invalid="ignore"):
-        shares = np.clip(np.nan_to_num(-first.slope / (other.slope - first.slope)), 0.0, 1.0)
-    for share in (*shares.T, np.ones(len(most))):
-        least = first.least + share * (other.least - first.least)
-        mean = first._replace(least=least, slope=first.slope + share[:, None] * (other.slope - first.slope))
-        low = mean.lowest(charts.low, charts.high)[0]
-        better = low > most
+        shares = np.clip(np.nan_to_num(-first.slope / (tangent.slope - first.slope)), 0.0, 1.0)
+    for share in (*shares.T, np.ones(len(best_least))):
+        least = first.least + share * (tangent.least - first.least)
+        mean = first._replace(least=least, slope=first.slope + share[:, None] * (tangent.slope - first.slope))
+        low = mean.minimum(charts.low, charts.high)[0]
+        better = low > best_least
         slope = np.where(better[:, None], mean.slope, best.slope)
         best = best._replace(least=np.where(better, mean.least, best.least), slope=slope)
-        most = np.maximum(most, low)
-    return best, most
+        best_least = np.maximum(best_least, low)
+    return best, best_least
 
 
-def _pressed(curve: Array, place: Array) -> Array:
-    """t . curve . t / 2. Shape (P,)."""
+def _quadratic(curve: Array, place: Array) -> Array:
+    """Return t . curve . t / 2. Shape (P,)."""
     return np.asarray((place * np.einsum("pab,pb->pa", curve, place)).sum(axis=1) / 2)
 
 
-def _pressed_all(curve: Array, places: list[Array], starts: Indices) -> Array:
-    return np.stack([_pressed(curve, place[starts]) for place in places])
+def _quadratic_at_places(curve: Array, places: list[Array], starts: Indices) -> Array:
+    return np.stack([_quadratic(curve, place[starts]) for place in places])
 
 
-def _tangents(place: Array, values: tuple[Array, Array], curve: Array, common: Array, lean: Array) -> Values:
-    """Below functions less lean . t + t . common . t / 2, of such values and slopes at places, which bend by curve."""
+def _tangent_bounds(
+    places: Array, values: tuple[Array, Array], curve: Array, common: Array, tilt: Array
+) -> QuadraticBounds:
+    """Return tangent bounds of functions at places, less tilt . t + t . common . t / 2."""
     value, slope = values
-    at_origin = value - (place * slope).sum(axis=1) + _pressed(curve, place)
-    return Values(at_origin, slope - np.einsum("pab,pb->pa", curve, place) - lean, curve - common)
+    at_origin = value - (places * slope).sum(axis=1) + _quadratic(curve, places)
+    return QuadraticBounds(at_origin, slope - np.einsum("pab,pb->pa", curve, places) - tilt, curve - common)
 
 
-def _sunk(values: Array, half: Array, curve: Array) -> Array:
-    """How functions in boxes bend down, (M, r, r), by values in the middle, and at each axis' ends.
+def _concavity(values: Array, half: Array, curve: Array) -> Array:
+    """Return the concavity of functions in boxes, (M, r, r), from values in the middle and at the ends of each axis.
 
-    No more than leaves of their curvature none.
+    The total curvature does not become negative by it.
     """
-    bent = (values[1::2] + values[2::2] - 2 * values[0]).T
+    second_differences = (values[1::2] + values[2::2] - 2 * values[0]).T
     with np.errstate(divide="ignore", invalid="ignore"):
-        bent = np.where(half > 0, np.clip(bent / half**2, -np.maximum(np.einsum("paa->pa", curve), 0.0), 0.0), 0.0)
-    return bent[:, :, None] * np.eye(half.shape[1])
+        largest = np.maximum(np.einsum("paa->pa", curve), 0.0)
+        second_differences = np.where(half > 0, np.clip(second_differences / half**2, -largest, 0.0), 0.0)
+    return second_differences[:, :, None] * np.eye(half.shape[1])
 
 
-def _rise(values: list[Array], half: Array) -> Array:
-    """Slopes (M, r) of functions in boxes from values in the middle, and at each axis' ends.
+def _secant_slopes(values: list[Array], half: Array) -> Array:
+    """Return slopes (M, r) of functions in boxes from values in the middle and at the ends of each axis.
 
-    Of one that is bent down, that from end to end; of one that is bent up, the flattest.
+    A concave function gets the slope from end to end, a convex one the flattest slope.
     """
-    rise = np.zeros(half.shape)
+    slopes = np.zeros(half.shape)
     for axis in range(half.shape[1]):
         low, high = values[1 + 2 * axis], values[2 + 2 * axis]
         with np.errstate(divide="ignore", invalid="ignore"):
             first, last = (values[0] - low) / half[:, axis], (high - values[0]) / half[:, axis]
         flat = np.clip(0.0, first, np.maximum(first, last))
-        rise[:, axis] = np.where(half[:, axis] > 0, np.where(first < last, flat, (first + last) / 2), 0.0)
-    return rise
+        slopes[:, axis] = np.where(half[:, axis] > 0, np.where(first < last, flat, (first + last) / 2), 0.0)
+    return slopes
 
 
 PENALTY = 1e6
-"""Cost of a rad or m by which a limit is passed: beyond that of any way."""
+"""Cost per rad or m of a violated limit, beyond the cost of any path."""
 
 
 @dataclass(frozen=True)
-class TightSettings:
-    """How a way is drawn tight.
+class ShorteningSettings:
+    """Settings of `shorten_path`.
 
     Attributes:
-        beside: Postures on either side, by the directions that are free.
-        inside: By so much more than is asked bodies are held apart, m.
-        moves: At most, before the postures come nearer to each other.
-        still: Share of its cost by which a way at the edge has to get cheaper, or the postures come nearer.
+        neighbours: Configurations on either side of the path, by the number of free directions.
+        margin: Distance by which the clearance is exceeded, m.
+        max_moves: Iterations with one spacing.
+        least_gain: Relative cost reduction below which the spacing is reduced though the path runs along the edge.
     """
 
-    beside: tuple[int, int, int] = (0, 5, 2)
-    inside: float = CLEARANCE_TOLERANCE_M
-    moves: int = 10
-    still: float = 1e-4
+    neighbours: tuple[int, int, int] = (0, 5, 2)
+    margin: float = CLEARANCE_TOLERANCE_M
+    max_moves: int = 10
+    least_gain: float = 1e-4
 
 
-def drawn_tight(
+def shorten_path(
     path: Array,
-    instants: Sequence[Instant],
+    samples: Sequence[TimeSample],
     cost: StepCost,
     times: Array,
-    far: Array,
+    limits: Array,
     bounds: tuple[Array, Array],
-    around: CollisionScene | None,
+    scene: CollisionScene | None,
     widths: tuple[float, float],
-    settings: TightSettings = TightSettings(),
+    settings: ShorteningSettings = ShorteningSettings(),
 ) -> Array:
-    """A way beside another one that is cheaper, or keeps limits better. Shape (K, n).
+    """Return a nearby path of lower cost, or one that keeps limits better. Shape (K, n).
 
     Args:
-        path: Joints at the instants, which do the tasks. Shape (K, n).
-        instants: All of one free direction, or all of two; of others the way stays.
-        cost: Of steps. times: Of the instants. Shape (K,), s.
-        far: Limits of the ways of the joints from instant to instant. Shape (K - 1, n).
-        bounds: Of the joints. Shape (n,) each.
-        around: What has to be clear.
-        widths: Distances from one posture to the next, at first and at last, in the metric of the sets.
+        path: Configurations that do the tasks at the samples. Shape (K, n).
+        samples: Manifolds of the samples, all of dimension one or all of two; others leave the path unchanged.
+        cost: Cost of a step.
+        times: Times of the samples, s. Shape (K,).
+        limits: Largest step of each joint. Shape (K - 1, n).
+        bounds: Lower and upper limits of the joints. Shape (n,) each.
+        scene: Collision scene, or None.
+        widths: Initial and final spacing of the configurations, in the metric.
     """
-    joints, (width, last), least, moves = path, widths, np.inf, 0
-    whole = {instant.sets for instant in instants}
-    sizes = {sets.size for sets in whole}
+    joints, (width, finest), best_cost, moves = path, widths, np.inf, 0
+    manifolds = {sample.manifolds for sample in samples}
+    sizes = {manifold.size for manifold in manifolds}
     if sizes not in ({1}, {2}):
         return path
-    size = sizes.pop()
-    own = settings.beside[size]
-    count = (2 * own + 1) ** size
-    shifts = np.array(list(product(np.arange(-own, own + 1.0), repeat=size)))
-    rows = [(sets, np.flatnonzero([instant.sets is sets for instant in instants])) for sets in whole]
-    number = np.array([instant.number for instant in instants])
+    dimension = sizes.pop()
+    count_per_side = settings.neighbours[dimension]
+    count = (2 * count_per_side + 1) ** dimension
+    shifts = np.array(list(product(np.arange(-count_per_side, count_per_side + 1.0), repeat=dimension)))
+    rows = [(manifold, np.flatnonzero([sample.manifolds is manifold for sample in samples])) for manifold in manifolds]
+    indices = np.array([sample.row for sample in samples])
     tangents: dict[int, Array] = {}
-    while width > last:
-        beside, good = np.empty((len(joints), count, joints.shape[1])), np.empty((len(joints), count), bool)
-        for side, (sets, those) in enumerate(rows):
-            tangents[side] = sets.tangents_at(number[those], joints[those], tangents.get(side))
-            flat = joints[those, None] + width * np.einsum("knr,sr->ksn", tangents[side], shifts)
-            on, fine = sets.corrected(np.repeat(number[those], count), flat.reshape(-1, flat.shape[2]))
-            good[those] = fine.reshape(len(those), -1)
-            beside[those] = np.where(good[those][:, :, None], on.reshape(flat.shape), flat)
-        wrong = np.where(good, _passed(beside, times, bounds, around, settings.inside), 1.0)
-        value, back = PENALTY * wrong[0], []
+    while width > finest:
+        candidates, valid = np.empty((len(joints), count, joints.shape[1])), np.empty((len(joints), count), bool)
+        for part, (manifold, those) in enumerate(rows):
+            tangents[part] = manifold.tangents_at(indices[those], joints[those], tangents.get(part))
+            tangent_points = joints[those, None] + width * np.einsum("knr,sr->ksn", tangents[part], shifts)
+            flat = tangent_points.reshape(-1, tangent_points.shape[2])
+            projected, converged = manifold.project(np.repeat(indices[those], count), flat)
+            valid[those] = converged.reshape(len(those), -1)
+            projected = projected.reshape(tangent_points.shape)
+            candidates[those] = np.where(valid[those][:, :, None], projected, tangent_points)
+        violations = np.where(valid, _violation(candidates, times, bounds, scene, settings.margin), 1.0)
+        values, back_pointers = PENALTY * violations[0], []
         for k in range(1, len(joints)):
-            way = beside[k][None] - beside[k - 1][:, None]
-            over = np.maximum(np.abs(way) - far[k - 1], 0.0).sum(axis=2)
-            steps = value[:, None] + cost.of(way, times[k] - times[k - 1]) + PENALTY * over
-            back.append(steps.argmin(axis=0))
-            value = steps.min(axis=0) + PENALTY * wrong[k]
-        seats = [int(value.argmin())]
-        for before in reversed(back):
-            seats.append(int(before[seats[-1]]))
-        joints = beside[np.arange(len(joints)), seats[::-1]]
-        at_edge, now = np.abs(shifts[seats]).max() == own, float(value.min())
+            displacements = candidates[k][None] - candidates[k - 1][:, None]
+            excess = np.maximum(np.abs(displacements) - limits[k - 1], 0.0).sum(axis=2)
+            steps = values[:, None] + cost.evaluate(displacements, times[k] - times[k - 1]) + PENALTY * excess
+            back_pointers.append(steps.argmin(axis=0))
+            values = steps.min(axis=0) + PENALTY * violations[k]
+        choice = [int(values.argmin())]
+        for pointers in reversed(back_pointers):
+            choice.append(int(pointers[choice[-1]]))
+        joints = candidates[np.arange(len(joints)), choice[::-1]]
+        at_edge, current_cost = np.abs(shifts[choice]).max() == count_per_side, float(values.min())
         moves += 1
-        if not (at_edge and now < least * (1 - settings.still) and moves < settings.moves):
+        if not (at_edge and current_cost < best_cost * (1 - settings.least_gain) and moves < settings.max_moves):
             width, moves = width / 2, 0
-        least = min(least, now)
+        best_cost = min(best_cost, current_cost)
     return joints
 
 
-def _passed(
-    beside: Array, times: Array, bounds: tuple[Array, Array], around: CollisionScene | None, inside: float
+def _violation(
+    candidates: Array, times: Array, bounds: tuple[Array, Array], scene: CollisionScene | None, margin: float
 ) -> Array:
-    """By how much postures (K, s, n) about a way pass limits and clearance at times (K,), rad and m. Shape (K, s)."""
-    over = np.maximum(np.maximum(beside - bounds[1], bounds[0] - beside), 0.0).sum(axis=2)
-    if around is None:
-        return np.asarray(over)
-    least, middle, none = around.clearance + inside, beside[:, beside.shape[1] // 2], np.zeros(0)
-    span = np.abs(beside - middle[:, None]).max(axis=1) @ around.levers.joints.T
-    apart = distances_along(around, none, middle, times, least + float(span.max(initial=0.0)))
-    close = np.flatnonzero((apart - span < least).any(axis=1))  # beside the others nothing comes near
-    each, then = beside[close].reshape(-1, beside.shape[2]), np.repeat(times[close], beside.shape[1])
-    apart = distances_along(around, none, each, then, least)
-    over[close] += np.maximum(least - apart, 0.0).max(axis=1, initial=0.0).reshape(len(close), beside.shape[1])
-    return np.asarray(over)
+    """Return how far candidates (K, s, n) around a path violate limits and clearance, rad and m. Shape (K, s)."""
+    excess = np.maximum(np.maximum(candidates - bounds[1], bounds[0] - candidates), 0.0).sum(axis=2)
+    if scene is None:
+        return np.asarray(excess)
+    required, middle, base = scene.clearance + margin, candidates[:, candidates.shape[1] // 2], np.zeros(0)
+    span = np.abs(candidates - middle[:, None]).max(axis=1) @ scene.levers.joints.T
+    distances = distances_along(scene, base, middle, times, required + float(span.max(initial=0.0)))
+    close = np.flatnonzero((distances - span < required).any(axis=1))  # at the other samples all candidates are clear
+    count = candidates.shape[1]
+    joints, repeated_times = candidates[close].reshape(-1, candidates.shape[2]), np.repeat(times[close], count)
+    distances = distances_along(scene, base, joints, repeated_times, required)
+    excess[close] += np.maximum(required - distances, 0.0).max(axis=1, initial=0.0).reshape(len(close), count)
+    return np.asarray(excess)

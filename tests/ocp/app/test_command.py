@@ -262,18 +262,18 @@ def test_what_no_one_motion_does_is_written_in_pieces_and_the_ways_between_them_
     assert status == 0, err
     told = json.loads(out)
     assert len(told["reconfigurations"]) == told["fewest"] == 1
-    first, way, last = (Plan.load(tmp_path / f"line-{number}.npz") for number in (1, 2, 3))
+    first, motion, last = (Plan.load(tmp_path / f"line-{number}.npz") for number in (1, 2, 3))
     names = {f"line-{number}.{kind}" for number in (1, 2, 3) for kind in ("npz", "csv")}
     assert {Path(file).name for file in told["written"]} == names
-    assert told["duration"] == pytest.approx(first.horizon + way.horizon + last.horizon)
+    assert told["duration"] == pytest.approx(first.horizon + motion.horizon + last.horizon)
     assert first.horizon + last.horizon == pytest.approx(2.0)
     assert told["cost"] == pytest.approx(first.cost + last.cost)
-    for before, after in ((first, way), (way, last)):  # each goes on where the one before ends
+    for before, after in ((first, motion), (motion, last)):  # each goes on where the one before ends
         np.testing.assert_allclose(before.at(before.horizon)["joints"], after.at(0.0)["joints"], atol=1e-6)
     assert first.at(0.0)["joints"][2] * last.at(last.horizon)["joints"][2] < 0  # the elbow has changed its side
     for file in told["written"]:
         Path(file).unlink()
-    barred = [replace(one, way=None, why="the way is barred") for one in made[0].reconfigurations]
+    barred = [replace(one, motion=None, failure="the way is barred") for one in made[0].reconfigurations]
     monkeypatch.setattr(
         "ocp.app.run_task.plan_in_segments", lambda *_, **__: replace(made[0], reconfigurations=tuple(barred))
     )

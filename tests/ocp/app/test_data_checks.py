@@ -273,7 +273,7 @@ def test_the_plans_of_the_gallery_are_not_accused(tmp_path: Path, name: str, cle
     made = Plan.load(GALLERY / f"{name}.npz")
     machine, robot = made.machine, made.machine.robot
     sample = made.sampled(np.linspace(0.0, made.horizon, round(made.horizon / 0.01) + 1))
-    more = [sample.accelerations] if made.rated == "velocities" else []
+    more = [sample.accelerations] if made.rate_name == "velocities" else []
     place = {} if machine.base_size else {"translation": machine.translation, "rotation": machine.rotation}  # type: ignore[attr-defined]
     for values in ([sample.joints], [sample.joints, sample.rates], [sample.joints, sample.rates, *more]):
         file = write_table(tmp_path / "m.csv", sample.t, *values, names=made.names)

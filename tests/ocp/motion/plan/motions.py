@@ -28,7 +28,7 @@ HELD = np.array([0.45, 0.35, 0.4])
 
 
 @dataclass(frozen=True)
-class Asked:
+class PlanCase:
     """What is asked of one arm along one path.
 
     Attributes:
@@ -49,10 +49,10 @@ class Asked:
     options: dict[str, Any] = field(default_factory=dict)
 
 
-ASKED: dict[str, Callable[[], Asked]] = {}
+ASKED: dict[str, Callable[[], PlanCase]] = {}
 
 
-def asked(what: Callable[[], Asked]) -> Callable[[], Asked]:
+def asked(what: Callable[[], PlanCase]) -> Callable[[], PlanCase]:
     ASKED[what.__name__] = cache(what)
     return ASKED[what.__name__]
 
@@ -139,64 +139,64 @@ def space_tip() -> tuple[Array, Array]:
 
 
 @asked
-def three_lanes_panda() -> Asked:
+def three_lanes_panda() -> PlanCase:
     path = raster(3)
-    return Asked(panda(), TipTask.along(path, 0.05, direction=DOWN), panda_peer(), path, 0.05, DOWN)
+    return PlanCase(panda(), TipTask.along(path, 0.05, direction=DOWN), panda_peer(), path, 0.05, DOWN)
 
 
 @asked
-def three_lanes_ur5() -> Asked:
+def three_lanes_ur5() -> PlanCase:
     """The tool's axis is that of the last joint, whose roll is free."""
     path = raster(3)
-    return Asked(ur5(), TipTask.along(path, 0.05, direction=DOWN), Arm.of("ur5", "tool0"), path, 0.05, DOWN)
+    return PlanCase(ur5(), TipTask.along(path, 0.05, direction=DOWN), Arm.of("ur5", "tool0"), path, 0.05, DOWN)
 
 
 @asked
-def three_lanes_space_arm() -> Asked:
+def three_lanes_space_arm() -> PlanCase:
     position, rotation = space_tip()
     path, axis = raster(3, position, (0.06, 0.1)), rotation[:, 2]
     task = TipTask.along(path, 0.02, direction=axis)
-    return Asked(floating_manipulator(), task, space_peer(), path, 0.02, axis, options={"start": SPACE_START})
+    return PlanCase(floating_manipulator(), task, space_peer(), path, 0.02, axis, options={"start": SPACE_START})
 
 
 @asked
-def five_lanes_ur5() -> Asked:
+def five_lanes_ur5() -> PlanCase:
     path = raster(5)
-    return Asked(angled_ur5(), TipTask.along(path, 0.05, direction=DOWN), angled_ur5_arm(), path, 0.05, DOWN)
+    return PlanCase(angled_ur5(), TipTask.along(path, 0.05, direction=DOWN), angled_ur5_arm(), path, 0.05, DOWN)
 
 
 @asked
-def seam_ur5() -> Asked:
+def seam_ur5() -> PlanCase:
     path, tilted = bent_seam(), (0.0, 0.3, -1.0)
-    return Asked(angled_ur5(), TipTask.along(path, 0.03, direction=tilted), angled_ur5_arm(), path, 0.03, tilted)
+    return PlanCase(angled_ur5(), TipTask.along(path, 0.03, direction=tilted), angled_ur5_arm(), path, 0.03, tilted)
 
 
 @asked
-def seam_panda() -> Asked:
+def seam_panda() -> PlanCase:
     path, tilted = bent_seam(), (0.0, 0.3, -1.0)
-    return Asked(panda(), TipTask.along(path, 0.03, direction=tilted), panda_peer(), path, 0.03, tilted)
+    return PlanCase(panda(), TipTask.along(path, 0.03, direction=tilted), panda_peer(), path, 0.03, tilted)
 
 
 @asked
-def seam_space_arm() -> Asked:
+def seam_space_arm() -> PlanCase:
     position, rotation = space_tip()
     corners = position + np.array([[0, 0, 0], [0, 0.1, 0.02], [0.06, 0.12, 0.05]])
     path, axis = smooth(Path.through(corners), deviation=0.003), rotation[:, 2]
-    return Asked(floating_manipulator(), TipTask.along(path, 0.01, direction=axis), space_peer(), path, 0.01, axis)
+    return PlanCase(floating_manipulator(), TipTask.along(path, 0.01, direction=axis), space_peer(), path, 0.01, axis)
 
 
 @asked
-def contour_panda() -> Asked:
+def contour_panda() -> PlanCase:
     path = circle((0.5, 0.0, 0.3), 0.1)
     task = TipTask.along(path, 0.1, direction=DOWN)
-    return Asked(panda(), task, panda_peer(), path, 0.1, DOWN, options={"cyclic": True})
+    return PlanCase(panda(), task, panda_peer(), path, 0.1, DOWN, options={"cyclic": True})
 
 
 @asked
-def contour_ur5() -> Asked:
+def contour_ur5() -> PlanCase:
     path = circle((0.5, 0.1, 0.3), 0.08)
     task = TipTask.along(path, 0.1, direction=DOWN)
-    return Asked(angled_ur5(), task, angled_ur5_arm(), path, 0.1, DOWN, options={"cyclic": True})
+    return PlanCase(angled_ur5(), task, angled_ur5_arm(), path, 0.1, DOWN, options={"cyclic": True})
 
 
 def blended_poses() -> SmoothPath:
@@ -207,78 +207,78 @@ def blended_poses() -> SmoothPath:
 
 
 @asked
-def poses_panda() -> Asked:
+def poses_panda() -> PlanCase:
     path = blended_poses()
     task = TipTask.along(path, 0.1, roll="given")
-    return Asked(panda(), task, panda_peer(), path, 0.1, looks="orientation")
+    return PlanCase(panda(), task, panda_peer(), path, 0.1, looks="orientation")
 
 
 @asked
-def poses_ur5() -> Asked:
+def poses_ur5() -> PlanCase:
     """Six rows of six joints: nothing is left but the branch."""
     path = blended_poses()
     task = TipTask.along(path, 0.1, roll="given")
-    return Asked(angled_ur5(), task, angled_ur5_arm(), path, 0.1, looks="orientation")
+    return PlanCase(angled_ur5(), task, angled_ur5_arm(), path, 0.1, looks="orientation")
 
 
 @asked
-def finishing_ur5() -> Asked:
+def finishing_ur5() -> PlanCase:
     path = raster(3)
     task = TipTask.along(path, 0.05, direction=DOWN, within=CONE)
-    return Asked(angled_ur5(), task, angled_ur5_arm(), path, 0.05, DOWN, looks="cone")
+    return PlanCase(angled_ur5(), task, angled_ur5_arm(), path, 0.05, DOWN, looks="cone")
 
 
 @asked
-def finishing_panda() -> Asked:
+def finishing_panda() -> PlanCase:
     path = raster(3)
     task = TipTask.along(path, 0.05, direction=DOWN, within=CONE)
-    return Asked(panda(), task, panda_peer(), path, 0.05, DOWN, looks="cone")
+    return PlanCase(panda(), task, panda_peer(), path, 0.05, DOWN, looks="cone")
 
 
 @asked
-def two_arms() -> Asked:
+def two_arms() -> PlanCase:
     """The left hand holds, the right one moves."""
     path = smooth(Path.through([(0.45, 0.0, 0.4), (0.45, -0.2, 0.4), (0.55, -0.2, 0.4)]), deviation=0.002)
     hold = TipTask(link="left_panda_hand", position=HELD, orientation=quaternion((1, 0, 0), np.pi))
     move = replace(TipTask.along(path, 0.05, direction=(0, 1, 0)), link="right_panda_hand")
     arm = panda_peer(prefix="right_", place=(0.0, -0.3, 0.0))
-    return Asked(pair(), [hold, move], arm, path, 0.05, (0, 1, 0))
+    return PlanCase(pair(), [hold, move], arm, path, 0.05, (0, 1, 0))
 
 
 @asked
-def helix_ur5() -> Asked:
+def helix_ur5() -> PlanCase:
     path = helix((0.5, 0.1, 0.2), 0.06, 0.08, 1.5)
-    return Asked(angled_ur5(), TipTask.along(path, 0.1, direction=DOWN), angled_ur5_arm(), path, 0.1, DOWN)
+    return PlanCase(angled_ur5(), TipTask.along(path, 0.1, direction=DOWN), angled_ur5_arm(), path, 0.1, DOWN)
 
 
 @asked
-def helix_panda() -> Asked:
+def helix_panda() -> PlanCase:
     path = helix((0.45, 0.0, 0.3), 0.06, 0.08, 1.5)
-    return Asked(panda(), TipTask.along(path, 0.1, direction=DOWN), panda_peer(), path, 0.1, DOWN)
+    return PlanCase(panda(), TipTask.along(path, 0.1, direction=DOWN), panda_peer(), path, 0.1, DOWN)
 
 
-def on_board(path: SmoothPath, speed: float, looks: str = "axis", **told: Any) -> Asked:
+def on_board(path: SmoothPath, speed: float, looks: str = "axis", **told: Any) -> PlanCase:
     """The space arm along a path from where its tip is, its tool as it is then but for what is told."""
     axis = space_tip()[1][:, 2]
     direction = None if looks == "orientation" else axis
     task = TipTask.along(path, speed, **({"roll": "given"} if direction is None else {"direction": axis}), **told)
     start = {"start": SPACE_START}
-    return Asked(floating_manipulator(), task, space_peer(), path, speed, direction, looks=looks, options=start)
+    return PlanCase(floating_manipulator(), task, space_peer(), path, speed, direction, looks=looks, options=start)
 
 
 @asked
-def helix_space_arm() -> Asked:
+def helix_space_arm() -> PlanCase:
     return on_board(helix(space_tip()[0] - [0.03, 0.0, 0.0], 0.03, 0.03, 1.0), 0.02)
 
 
 @asked
-def contour_space_arm() -> Asked:
+def contour_space_arm() -> PlanCase:
     """Closed, but for the joints: the base has turned when the tip is back."""
     return on_board(circle(space_tip()[0] - [0.04, 0.0, 0.0], 0.04), 0.02)
 
 
 @asked
-def poses_space_arm() -> Asked:
+def poses_space_arm() -> PlanCase:
     position, rotation = space_tip()
     here = numeric(ca.DM(np.roll(Rotation.from_matrix(rotation).as_quat(), 1))).ravel()
     turns = [here, turned_by(here, (0, 1, 0), 0.3), turned_by(here, (1, 0, 0), 0.3)]
@@ -287,5 +287,5 @@ def poses_space_arm() -> Asked:
 
 
 @asked
-def finishing_space_arm() -> Asked:
+def finishing_space_arm() -> PlanCase:
     return on_board(raster(3, space_tip()[0], (0.04, 0.06)), 0.02, "cone", within=CONE)

@@ -269,7 +269,7 @@ def test_a_start_that_is_too_far_says_by_how_much() -> None:
 LEAVING = smooth(Path.through([(1.0, -1.5, 0.0), (2.6, 0.0, 0.0), (1.0, 1.5, 0.0)]), deviation=0.01)
 
 
-@pytest.mark.parametrize("search", ["start", "postures"])
+@pytest.mark.parametrize("search", ["start", "configurations"])
 def test_a_path_that_leaves_the_reach_on_its_way_says_when_and_where(search: Any) -> None:
     """Out by 0.2 m in the middle of its 4 m, at 4 of 8 s, inside again at the end."""
     task = TipTask.along(LEAVING, 0.5, rows=(3, 4))

@@ -67,7 +67,7 @@ def test_the_plan_is_the_cheapest_of_all_that_pass_and_none_is_solved_that_canno
     assert len(queue.candidates) == times * count
     costs = [cost for cost, passes in zip(known.fine, known.passes, strict=True) if passes]
     if not costs:
-        with pytest.raises(SolveError, match="postures: the audit fails: row 2"):
+        with pytest.raises(SolveError, match="candidates: fails the audit: row 2"):
             queue.plan()
         return
     best: Any = queue.plan()
@@ -87,14 +87,14 @@ def test_where_a_motion_is_rejected_the_next_of_those_that_are_one_goes_on_in_it
     kinds = [one.reason.kind for one in queue.candidates if one.reason is not None]
     assert kinds.count(Rejection.AUDIT) == SETTINGS.max_failures
     assert kinds.count(Rejection.DUPLICATE) == 10 - SETTINGS.max_failures
-    with pytest.raises(SolveError, match="7 of 10 postures: the same as another one"):
+    with pytest.raises(SolveError, match="7 of 10 candidates: the same motion or cost"):
         queue.plan()
 
 
 def test_of_every_motion_that_is_wanted_each_is_told_once_with_its_cost() -> None:
     known = Known([1.0, 1.2, 1.4, 30.0], [1.1, 1.3, 1.5, 31.0], [True] * 4)
     queue = CandidateQueue(known, PlannerSettings())
-    queue.run(seeds([3, 1, 2, 0, 1]), every=True)
+    queue.run(seeds([3, 1, 2, 0, 1]), include_costlier=True)
     told: Any = queue.plan()
     assert [one.cost for one in told if one.stage is Stage.AUDITED] == [1.1, 1.3, 1.5]
     kinds = [one.reason and one.reason.kind for one in told]
@@ -147,7 +147,7 @@ def test_on_the_fine_mesh_a_motion_has_to_be_cheaper_by_more_than_counts_as_the_
 def test_where_all_are_wanted_one_that_costs_what_another_does_is_told_as_that(share: float, kind: Rejection) -> None:
     known = Known([1.0, 1.5], [2.0, 2.0 * (1 + share * SETTINGS.same_cost)], [True, True])
     queue = CandidateQueue(known, SETTINGS)
-    queue.run(seeds([0, 1]), every=True)
+    queue.run(seeds([0, 1]), include_costlier=True)
     told: Any = queue.plan()
     assert [one.reason and one.reason.kind for one in told] == [None, kind]
     assert Stage.FINE in stages_of(known, 1)  # which may change what it costs
@@ -169,7 +169,7 @@ def test_where_all_are_wanted_those_are_that_cost_no_more_than_so_many_times_the
 ) -> None:
     dear = 2.0 * SETTINGS.max_cost_ratio * ratio
     known = Known([2.0, dear], [2.0, dear], [True, True])
-    CandidateQueue(known, SETTINGS).run(seeds([0, 1]), every=True)
+    CandidateQueue(known, SETTINGS).run(seeds([0, 1]), include_costlier=True)
     assert (Stage.REFINED in stages_of(known, 1)) == wanted
 
 
@@ -194,7 +194,7 @@ def test_after_so_many_failures_what_collides_is_no_longer_repaired_and_what_is_
 
 def test_a_reason_is_read_as_it_was_written_and_not_where_it_is_damaged() -> None:
     assert Reason.of_record(FAILS.record()) == FAILS
-    assert str(FAILS) == "the audit fails: row 2"
+    assert str(FAILS) == "fails the audit: row 2"
     plain = Reason(Rejection.DUPLICATE)
     assert Reason.of_record(plain.record()) == plain
     damages: list[dict[str, Any]] = [

@@ -45,7 +45,7 @@ from ocp.motion.local.collisions import distances_along
 from ocp.motion.plan import planner
 from ocp.motion.plan.candidate import Candidate, Rejection
 from ocp.motion.plan.candidate_solver import CandidateSolver
-from ocp.motion.plan.planner import checked_asked
+from ocp.motion.plan.planner import checked_request
 from tests.models.machines.armoured import armoured_arm
 from tests.ocp.motion.plan.motions import DOWN, bent_seam
 from tests.ocp.motion.search.test_charts import planar
@@ -185,14 +185,14 @@ def test_what_no_task_moves_begins_out_of_the_way_of_what_it_would_hinder() -> N
 def test_held_apart_the_barrier_begins_worth_no_more_than_the_motion() -> None:
     """As many limits as the program has, each with the barrier that it begins with, cost what the motion costs."""
     around = CollisionScene(ARM, [POST])
-    asked = checked_asked(ARM, line(), None, START, None, False, None, None, "start", 0, 1.0)
-    solver = CandidateSolver(replace(asked, clearance_constraints=ClearanceConstraints(around)), START, START)
+    required = checked_request(ARM, line(), None, start=START, search="start")
+    solver = CandidateSolver(replace(required, clearance_constraints=ClearanceConstraints(around)), START, START)
     pair = around.labels.index(("link6", "obstacle 0"))
     cost = 0.25
-    separated = Candidate(START, clearance_constraints=ClearanceConstraints(around).holding([pair]))
+    separated = Candidate(START, constraints=ClearanceConstraints(around).holding([pair]))
     prepared = solver.prepared(separated, fine=False, cost=cost)[2]
     bounds = prepared.formulation.bound_values(np.zeros(0))
-    places = [getattr(prepared.transcription, f"{of}_bounds") for of in ("variable", "row")]
+    places = [getattr(prepared.transcription, f"{take}_bounds") for take in ("variable", "row")]
     free = [np.isfinite(side[at][bounds[0][at] < bounds[1][at]]).sum() for at in places for side in bounds]
     begins = prepared._options["mu_init"]
     assert_allclose(begins * sum(free), cost, rtol=0.05)  # the nodes at which the motion begins aside
@@ -298,17 +298,17 @@ def test_what_never_touches_within_limits_is_looked_at_without_them() -> None:
     robot = armoured_arm()
     narrow = replace(robot, joints=tuple(replace(joint, lower=-0.3, upper=0.3) for joint in robot.joints))
     within, beyond = (CollisionScene(FixedBase(narrow), limits=limits) for limits in (True, False))
-    assert within.left["link2", "link6"] == "never in collision"
+    assert within.left["link2", "link6"] == "never touch"
     assert ("link2", "link6") in beyond.labels
     free_of_limits = Limits(joints=False)
-    asked: dict[str, Any] = {"tasks": line(), "start_joints": START, "horizon": SECONDS, "limits": free_of_limits}
+    required: dict[str, Any] = {"tasks": line(), "start_joints": START, "horizon": SECONDS, "limits": free_of_limits}
     around = CollisionScene(ARM)
     with pytest.raises(ProblemError, match="limits=False"):
-        minimum_velocity_problem(ARM, **asked, clearance_constraints=ClearanceConstraints(around))
+        minimum_velocity_problem(ARM, **required, clearance_constraints=ClearanceConstraints(around))
     with pytest.raises(ProblemError, match="limits=False"):
         inverse_kinematics(ARM, TipTask(position=FIRST), limits=False, scene=around)
     free = CollisionScene(ARM, limits=False)
-    assert minimum_velocity_problem(ARM, **asked, clearance_constraints=ClearanceConstraints(free)).declared.apart
+    assert minimum_velocity_problem(ARM, **required, clearance_constraints=ClearanceConstraints(free)).declared.apart
     wide = plan(ARM, line(), start=START, search="start", limits=Limits(joints=False))
     assert wide.audit().passed
 
@@ -319,7 +319,7 @@ def test_a_start_that_touches_names_the_pair_and_the_depth() -> None:
     assert caught.value.name == "link6 and obstacle 0"
     assert caught.value.value < 0
     assert caught.value.time == 0
-    assert re.search(r"clear then, .*: \d+ other postures", str(caught.value))
+    assert re.search(r"; \d+ other configurations? (is|are) collision-free then", str(caught.value))
 
 
 def test_a_target_inside_an_obstacle_names_the_pair_the_time_and_the_depth() -> None:
@@ -329,16 +329,16 @@ def test_a_target_inside_an_obstacle_names_the_pair_the_time_and_the_depth() -> 
     assert caught.value.value < caught.value.limit == 0.01
     assert 1 <= caught.value.time <= SECONDS
     last = str(caught.value).split("\n")[-1]
-    assert last.startswith("the cheapest that touches: link6 and obstacle 0 overlap")
-    assert re.search(r"; no other posture is clear then: each of the \d+ IK solutions is in collision", last)
+    assert last.startswith("the cheapest candidate in collision: link6 and obstacle 0 overlap")
+    assert re.search(r"; no other configuration is collision-free then: each of the \d+ postures found touches", last)
 
 
 def test_where_no_posture_is_clear_no_alternatives_are_searched(monkeypatch: pytest.MonkeyPatch) -> None:
     def alternatives(*_: object) -> None:
         raise AssertionError
 
-    monkeypatch.setattr(planner, "_alternatives", alternatives)
-    with pytest.raises(SolveError, match="; no other posture is clear then: each of the"):
+    monkeypatch.setattr(planner, "_try_alternatives", alternatives)
+    with pytest.raises(SolveError, match="; no other configuration is collision-free then: each of the"):
         plan(ARM, line(), obstacles=[Sphere(0.1, FIRST + WAY)], clearance=0.01)
 
 

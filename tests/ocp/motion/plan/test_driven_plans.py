@@ -13,7 +13,7 @@ from models import FixedBase, FreeFloating, Link, Machine, planar_chain
 from models.arrays import Array
 from ocp import Limits, Plan, ProblemError, SolveError, TipTask, plan
 from ocp.app import main
-from ocp.motion.plan.actuators import Demand
+from ocp.motion.plan.actuators import ActuatorDemand
 from tests.ocp.app.motions import write_robot
 from tests.ocp.app.test_command import TASK
 from tests.ocp.motion.builders.test_dynamics import torques_along
@@ -70,9 +70,9 @@ def test_accelerations_are_within_their_limits_and_told_otherwise() -> None:
     task = smooth_task(FIXED)
     free = plan(FIXED, task, start=START)
     most = np.array([0.85, 9.0, 9.0])
-    demand = Demand.of(free, Limits(acceleration=most))
+    demand = ActuatorDemand.of(free, Limits(acceleration=most))
     assert demand is not None
-    assert (demand.what, demand.joint, demand.allowed, demand.unit) == ("acceleration", "joint1", 0.85, "rad/s^2")
+    assert (demand.quantity, demand.joint, demand.allowed, demand.unit) == ("acceleration", "joint1", 0.85, "rad/s^2")
     made = plan(FIXED, task, start=START, limits=Limits(acceleration=most))
     assert (np.abs(made.sample(0.001).accelerations).max(axis=0) <= most + 1e-5).all()
     assert made.cost > free.cost
@@ -85,7 +85,7 @@ def test_what_no_motion_does_is_named_with_what_it_takes() -> None:
     assert (caught.value.name, caught.value.limit) == ("joint1", 0.05)
     assert caught.value.value > 1.0
     assert 0 < caught.value.time < SECONDS
-    with pytest.raises(ProblemError, match="a free horizon knows no limits of drives"):
+    with pytest.raises(ProblemError, match="actuator limits need a fixed horizon"):
         plan(FIXED, smooth_task(FIXED), "free", start=START, limits=Limits(torque=1.0))
 
 

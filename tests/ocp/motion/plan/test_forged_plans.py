@@ -128,7 +128,7 @@ def test_a_request_that_calls_python_is_said_when_it_is_saved(tmp_path: Path) ->
     changed = replace(seam.request, arguments={**seam.request.arguments, "tasks": (task,)})
     kept, problem.origin = problem.origin, changed
     try:
-        with pytest.warns(StorageWarning, match=r"saved without what was asked, .*'own' of kind CallbackInternal"):
+        with pytest.warns(StorageWarning, match=r"instead of the request: .*'own' of kind CallbackInternal"):
             seam.save(tmp_path / "plan.npz")
     finally:
         problem.origin = kept

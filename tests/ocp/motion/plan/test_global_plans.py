@@ -12,8 +12,8 @@ from models import FixedBase, planar_chain
 from ocp import BoundWarning, Candidate, Plan, ProblemError, TipTask, Unreachable, plan
 from ocp.motion.plan.candidate import Reason, Rejection
 from ocp.motion.plan.candidate_solver import CandidateSolver
-from ocp.motion.search.search import Search, checked_bound
-from ocp.motion.search.task_search import instants_of
+from ocp.motion.search.search import AtlasSearch, checked_bound
+from ocp.motion.search.task_search import choose_samples
 from tests.ocp.motion.search.test_charts import moved, planar
 from tests.ocp.motion.tasks.space_tasks import PANDA_START, UR5_START, panda, ur5
 
@@ -24,14 +24,14 @@ from tests.ocp.motion.tasks.space_tasks import PANDA_START, UR5_START, panda, ur
 def test_the_cheapest_of_all_motions_has_a_bound_near_its_cost(machine, start, rows, tmp_path) -> None:  # type: ignore[no-untyped-def]
     task = moved(machine, start, rows)
     found = plan(machine, task, search="global", clearance=None)
-    others = plan(machine, task, search="postures", clearance=None)
+    others = plan(machine, task, search="configurations", clearance=None)
     assert found.audit().passed
     assert found.bound is not None
     assert 0.98 * found.cost <= found.bound <= found.cost
     assert found.cost <= others.cost * (1 + 1e-6)
     assert found.bound <= others.cost
     assert all(found.bound <= one.cost * (1 + 1e-4) for one in found.candidates if np.isfinite(one.cost))
-    assert f"at least {found.bound:.6g}" in str(found)
+    assert f"lower bound {found.bound:.6g}" in str(found)
     found.save(tmp_path / "plan.npz")
     assert Plan.load(tmp_path / "plan.npz").bound == found.bound
 
@@ -61,7 +61,7 @@ def test_where_the_classes_that_may_be_the_cheapest_fail_every_one_is_followed_u
     machine, start = planar(np.array([0.5, 0.4, 0.3]), 2.5), np.array([0.5, 1.2, -1.4])
     asked, failed = list[bool](), list[Candidate]()
 
-    def followed(search: Search, most: float, every: bool) -> list[np.ndarray]:
+    def followed(search: AtlasSearch, most: float, every: bool) -> list[np.ndarray]:
         asked.append(every)
         return motions(search, most, every)
 
@@ -71,8 +71,8 @@ def test_where_the_classes_that_may_be_the_cheapest_fail_every_one_is_followed_u
         failed.append(candidate)
         return [candidate.rejected(Reason(Rejection.AUDIT, "fails"))]
 
-    motions, advance = Search.motions, CandidateSolver.advance
-    monkeypatch.setattr(Search, "motions", followed)
+    motions, advance = AtlasSearch.class_representatives, CandidateSolver.advance
+    monkeypatch.setattr(AtlasSearch, "class_representatives", followed)
     monkeypatch.setattr(CandidateSolver, "advance", failing)
     found = plan(machine, moved(machine, start, "place"), search="global", clearance=None)
     assert asked == [False, True]
@@ -109,18 +109,18 @@ def test_the_motion_that_the_search_found_is_solved_where_a_coarse_mesh_loses_it
 def test_a_bound_above_the_cost_of_a_motion_is_no_bound_and_warned_of(monkeypatch: pytest.MonkeyPatch) -> None:
     """In use a warning, in these tests, where warnings are errors, a failure."""
 
-    def best(search: Search, most: float) -> tuple[np.ndarray | None, float]:
+    def best(search: AtlasSearch, most: float) -> tuple[np.ndarray | None, float]:
         path, bound = right(search, most)
         return path, 2 * bound
 
-    right = Search.best
+    right = AtlasSearch.solve
     machine, start = planar(np.array([0.5, 0.4, 0.3]), 2.5), np.array([0.5, 1.2, -1.4])
     task = moved(machine, start, "place")
     cost = plan(machine, task, search="global", clearance=None).cost
-    monkeypatch.setattr(Search, "best", best)
+    monkeypatch.setattr(AtlasSearch, "solve", best)
     with pytest.raises(BoundWarning):
         plan(machine, task, search="global", clearance=None)
-    with pytest.warns(BoundWarning, match="less than the bound") as caught:
+    with pytest.warns(BoundWarning, match="less than its lower bound") as caught:
         found = plan(machine, task, search="global", clearance=None)
     assert found.cost == pytest.approx(cost)
     assert found.bound is None
@@ -135,7 +135,7 @@ def test_a_bound_above_the_cost_of_a_motion_is_no_bound_and_warned_of(monkeypatc
 def test_where_the_set_of_postures_is_of_points_branches_are_compared() -> None:
     task = moved(ur5(), UR5_START, "pose")
     found = plan(ur5(), task, search="global", clearance=None)
-    others = plan(ur5(), task, search="postures", clearance=None)
+    others = plan(ur5(), task, search="configurations", clearance=None)
     assert found.cost == pytest.approx(others.cost, rel=1e-6)
     assert found.bound is not None
     assert 0.98 * found.cost <= found.bound <= found.cost
@@ -146,9 +146,9 @@ def test_what_cannot_be_searched_is_refused() -> None:
     loose = TipTask(position=[0.4, 0.0, 0.4], duration=1.0)
     turning = TipTask(velocity=[0.01, 0.0, 0.0], rows=[3, 4, 5], duration=1.0)
     for machine, asked, more, words in (
-        (panda(), loose, {}, "leave 4 directions free"),
+        (panda(), loose, {}, "leave 4 degrees of freedom"),
         (panda(), turning, {"start": PANDA_START}, "needs poses"),
-        (panda(), task, {"horizon": "free"}, "keeps the tasks' own time"),
+        (panda(), task, {"horizon": "free"}, "needs a fixed horizon"),
     ):
         with pytest.raises(ProblemError, match=words):
             plan(machine, asked, search="global", clearance=None, **more)
@@ -159,7 +159,7 @@ def test_what_cannot_be_searched_is_refused() -> None:
 def test_instants_are_left_out_until_steps_miss_a_share_of_the_cost() -> None:
     t = np.linspace(0, 2, 81)
     bent = np.column_stack([np.abs(t - 1), np.where(t < 1, 0.0, 2 * (t - 1))])
-    assert instants_of(t, bent, np.ones(2), 1e-9, 2) == pytest.approx([0, 1, 2])
+    assert choose_samples(t, bent, np.ones(2), 1e-9, 2) == pytest.approx([0, 1, 2])
     round_way = np.column_stack([np.sin(3 * t), np.cos(3 * t)])
     weights = np.array([1.0, 1.0])
 
@@ -168,10 +168,10 @@ def test_instants_are_left_out_until_steps_miss_a_share_of_the_cost() -> None:
         return float((weights * np.diff(at, axis=0) ** 2 / (2 * np.diff(times)[:, None])).sum())
 
     for share in (0.1, 0.01):
-        kept = instants_of(t, round_way, weights, share, 2)
+        kept = choose_samples(t, round_way, weights, share, 2)
         assert cost(kept) >= (1 - share) * cost(t)
         assert len(kept) <= 2 * np.sqrt(3 * 3 * 4 / (24 * share)) + 3
-    assert len(instants_of(t, round_way, weights, 0.9, 10)) == 11
+    assert len(choose_samples(t, round_way, weights, 0.9, 10)) == 11
 
 
 def line(first: np.ndarray, way: tuple[float, float], seconds: float) -> Any:
@@ -197,7 +197,7 @@ def test_stretches_of_time_are_searched_together(case: str) -> None:
         "cyclic": ([closed], {"cyclic": True}),
     }[case]
     found = plan(machine, tasks, search="global", clearance=None, **more)  # type: ignore[arg-type]
-    others = plan(machine, tasks, search="postures", clearance=None, **more)  # type: ignore[arg-type]
+    others = plan(machine, tasks, search="configurations", clearance=None, **more)  # type: ignore[arg-type]
     assert found.bound is not None
     assert found.cost <= others.cost * (1 + 1e-6)
     assert 0.97 * found.cost <= found.bound <= found.cost

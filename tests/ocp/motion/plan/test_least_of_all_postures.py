@@ -21,7 +21,7 @@ APART = 0.3
 @cache
 def cheapest() -> Plan:
     what = ASKED["seam_ur5"]()
-    return plan_bare(what.machine, what.tasks, search="postures")
+    return plan_bare(what.machine, what.tasks, search="configurations")
 
 
 def other_postures() -> list[Array]:

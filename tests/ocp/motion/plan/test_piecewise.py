@@ -15,7 +15,7 @@ from models import CollisionShape, FixedBase, Path, Sphere, smooth
 from models.arrays import Array
 from models.machines.moving_obstacle import MovingObstacle
 from ocp import DeadEnd, ProblemError, TipTask, plan, plan_in_segments
-from ocp.motion.plan.piecewise import _part
+from ocp.motion.plan.piecewise import _task_between
 from tests.ocp.motion.search.test_charts import planar
 from tests.ocp.motion.search.test_reconfigurations import limited
 
@@ -59,11 +59,11 @@ def test_of_two_links_the_pieces_are_the_branches_and_meet_where_that_costs_leas
     made = plan_in_segments(machine, line(reach), clearance=None)
     assert made.fewest == len(made.reconfigurations) == 1
     (where,) = made.reconfigurations
-    assert made.begins == (0.0, where.time)
-    assert made.pieces[0].horizon == where.time
+    assert made.start_times == (0.0, where.time)
+    assert made.segments[0].horizon == where.time
     assert made.horizon == pytest.approx(SECONDS)
     spans = [(0.0, where.time, -1), (where.time, SECONDS, 1)]
-    for piece, (begin, end, elbow) in zip(made.pieces, spans, strict=True):
+    for piece, (begin, end, elbow) in zip(made.segments, spans, strict=True):
         assert piece.audit().passed
         expected = posture(begin + piece.t, reach, elbow)
         assert (np.abs(expected) <= HIGH + 1e-6).all()
@@ -79,21 +79,21 @@ def test_of_two_links_the_pieces_are_the_branches_and_meet_where_that_costs_leas
     assert best * (1 - 1e-5) <= made.cost <= best * 1.002
     np.testing.assert_allclose(where.before, posture(np.array([where.time]), reach, -1)[0], atol=1e-6)
     np.testing.assert_allclose(where.after, posture(np.array([where.time]), reach, 1)[0], atol=1e-6)
-    assert where.way is not None
+    assert where.motion is not None
     assert where.duration == pytest.approx(np.abs(where.after - where.before).max() / 3.0)
     assert made.duration == pytest.approx(SECONDS + where.duration)
-    np.testing.assert_allclose(where.way.at([0.0, where.duration])["joints"], [where.before, where.after], atol=1e-9)
-    assert "1 reconfiguration, none has fewer" in str(made)
+    np.testing.assert_allclose(where.motion.at([0.0, where.duration])["joints"], [where.before, where.after], atol=1e-9)
+    assert "1 reconfiguration, the fewest possible" in str(made)
     assert f"at {where.time:.4g} s the arm reconfigures" in str(made)
-    with pytest.raises(DeadEnd, match="plan_in_pieces") as refused:
+    with pytest.raises(DeadEnd, match="plan_in_segments") as refused:
         plan(machine, line(reach), search="global", clearance=None)
-    assert refused.value.pieces == pickle.loads(pickle.dumps(refused.value)).pieces == 2
+    assert refused.value.segments == pickle.loads(pickle.dumps(refused.value)).segments == 2
 
 
 @pytest.mark.long
 def test_what_one_motion_does_is_one_piece_and_the_plan() -> None:
     made = plan_in_segments(arm(), line(0.1), clearance=None)
-    assert (len(made.pieces), made.reconfigurations, made.fewest) == (1, (), 0)
+    assert (len(made.segments), made.reconfigurations, made.fewest) == (1, (), 0)
     alone = plan(arm(), line(0.1), search="global", clearance=None)
     assert made.cost == pytest.approx(alone.cost, rel=1e-9)
     assert made.duration == made.horizon == SECONDS
@@ -120,11 +120,11 @@ def test_a_reconfiguration_goes_round_what_is_in_the_way(angle: float) -> None:
     machine, ball = with_bodies(), Sphere(0.03, (*place, 0.0))
     made = plan_in_segments(machine, line(0.45), obstacles=[ball], clearance=0.01)
     (where,) = made.reconfigurations
-    assert all(piece.audit().passed for piece in made.pieces)
-    assert where.way is not None, where.why
+    assert all(piece.audit().passed for piece in made.segments)
+    assert where.motion is not None, where.failure
     straight = np.abs(where.after - where.before).max() / 3.0
     assert where.duration > straight
-    joints = where.way.at(np.linspace(0, where.duration, 2001))["joints"]
+    joints = where.motion.at(np.linspace(0, where.duration, 2001))["joints"]
     assert (np.abs(joints) <= HIGH + 1e-6).all()
     assert (np.abs(np.diff(joints, axis=0)) <= 3.0 * where.duration / 2000 * (1 + 1e-5)).all()
     # the ball from the axes of the capsules, by hand
@@ -143,7 +143,7 @@ def test_a_part_of_a_task_asks_for_the_same_at_its_times() -> None:
     task = TipTask.along(path, 0.4, rows=(3, 4), begin=0.5)
     end = task.end
     for first, last in ((0.0, 0.9), (0.9, 1.3), (1.3, end), (0.0, end)):
-        part = _part(task, first, last)
+        part = _task_between(task, first, last)
         assert part is not None
         begin = max(first, 0.5)
         assert [part.begin, part.end] == pytest.approx([begin - first, last - first])
@@ -156,13 +156,13 @@ def test_a_part_of_a_task_asks_for_the_same_at_its_times() -> None:
             np.testing.assert_allclose(one(times - 0.5), other(times - begin), atol=1e-12)
         inside = [t for t in task.begin + np.asarray(task.breaks) if begin < t < last]
         np.testing.assert_allclose(first + part.begin + np.asarray(part.breaks), inside)
-    assert _part(task, 0.0, 0.5) is None
-    assert _part(task, end, end + 1.0) is None
+    assert _task_between(task, 0.0, 0.5) is None
+    assert _task_between(task, end, end + 1.0) is None
 
 
 def test_a_horizon_of_which_the_task_is_no_part_is_refused() -> None:
     for planner in (plan_in_segments, partial(plan, search="global")):
-        with pytest.raises(ProblemError, match="no part") as refused:
+        with pytest.raises(ProblemError, match="no task is active") as refused:
             planner(arm(), line(0.1), 1e12, start=posture(np.zeros(1), 0.1, 1)[0], clearance=None)
         assert refused.value.name == "horizon"
 

@@ -53,7 +53,7 @@ def test_a_limit_of_velocity_leaves_the_rest_to_the_other() -> None:
     assert found.cost == pytest.approx((0.25**2 + 3 * 0.15**2) / 2, rel=1e-6)
 
 
-@pytest.mark.parametrize("search", ["start", "postures", "global"])
+@pytest.mark.parametrize("search", ["start", "configurations", "global"])
 def test_every_search_finds_the_least_cost_from_wherever_the_place_leaves_it(search: Any) -> None:
     found = plan(slides(), placed(SPEED * SECONDS), SECONDS, search=search)
     assert found.audit().passed

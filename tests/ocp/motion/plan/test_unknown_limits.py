@@ -60,7 +60,7 @@ def planned(machine: FixedBase, **options: Any) -> Any:
 
 
 def in_pieces(machine: FixedBase) -> Any:
-    return [piece.cost for piece in plan_in_segments(machine, task(machine)).pieces]
+    return [piece.cost for piece in plan_in_segments(machine, task(machine)).segments]
 
 
 def least_velocities(machine: FixedBase) -> Any:
@@ -78,7 +78,7 @@ def moved(machine: FixedBase, **options: Any) -> Any:
 
 REQUESTS: dict[str, tuple[Callable[[FixedBase], Any], set[str]]] = {
     "start": (partial(planned, search="start", start=START), {"velocity"}),
-    "postures": (planned, {"velocity"}),
+    "configurations": (planned, {"velocity"}),
     "global": (partial(planned, search="global"), {"velocity"}),
     "free horizon": (partial(planned, horizon="free", start=START), {"velocity"}),
     "own velocities": (partial(planned, start=START, limits=Limits(velocity=5.0)), set()),
@@ -121,7 +121,7 @@ def test_waypoints_are_passed_whatever_is_unknown() -> None:
     turns = quaternion_from_rotation(np.array([ca.DM(pose.rotation).full() for pose in poses]))
     way = plan_waypoints(unknown, places, turns, clearance=None)
     assert way.cost == plan_waypoints(machine, places, turns, clearance=None).cost
-    untimed = pytest.raises(ProblemError, match="no joint has a velocity limit")
+    untimed = pytest.raises(ProblemError, match="a joint with a velocity limit")
     with untimed, pytest.warns(ModelWarning, match="velocity"):
         plan_waypoints(unknown, places, turns, clearance=None, cost="time")
     limits = Limits(velocity=machine.robot.velocity)

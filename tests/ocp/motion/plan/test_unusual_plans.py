@@ -19,7 +19,7 @@ from tests.models.robot.trees import numeric
 from tests.ocp.motion.plan.motions import DOWN, angled_ur5, plan_bare
 from tests.ocp.motion.tasks.space_tasks import PANDA_START, floating_panda, panda, pose
 
-Asked = tuple[Machine, Any, dict[str, Any]]
+PlanCase = tuple[Machine, Any, dict[str, Any]]
 
 
 def line(*points: Any, deviation: float = 0.005) -> SmoothPath:
@@ -34,20 +34,20 @@ def in_the_plane(*points: Any, speed: float = 0.1, **given: Any) -> TipTask:
     return TipTask.along(line(*points, **given), speed, rows=(3, 4))
 
 
-def no_freedom_left() -> Asked:
+def no_freedom_left() -> PlanCase:
     return chain(2), in_the_plane((0.5, 0.1, 0), (0.6, 0.5, 0)), {}
 
 
-def through_its_own_foot() -> Asked:
+def through_its_own_foot() -> PlanCase:
     """Two links of one length fold over each other there."""
     return chain(2), in_the_plane((0.5, -0.2, 0), (0, 0, 0), (0.5, 0.2, 0), deviation=0.01), {}
 
 
-def many_joints() -> Asked:
+def many_joints() -> PlanCase:
     return chain(8), in_the_plane((2.0, 0.1, 0), (1.6, 1.7, 0), speed=0.3), {}
 
 
-def slide() -> Asked:
+def slide() -> PlanCase:
     robot = planar_chain([0.5, 0.4, 0.3], [1.0] * 3)
     first, *others = robot.joints
     rail = replace(first, kind="prismatic", axis=(0, 1, 0), lower=-1.0, upper=1.0)
@@ -55,7 +55,7 @@ def slide() -> Asked:
     return machine, in_the_plane((0.7, -0.5, 0), (0.7, 0.6, 0), speed=0.2), {}
 
 
-def kinova() -> Asked:
+def kinova() -> PlanCase:
     package, ending, told = ROBOTS["anymal-kinova"]
     whole = Robot.from_urdf(urdf_file(package, ending), **told)
     machine = FixedBase(lock_joints(whole, {n: 0.0 for n in whole.joint_names if not n.startswith("j2s6")}))
@@ -64,37 +64,37 @@ def kinova() -> Asked:
     return machine, TipTask.along(line(*corners), 0.05, direction=turn[:, 2]), {}
 
 
-def over_the_shoulder() -> Asked:
+def over_the_shoulder() -> PlanCase:
     return angled_ur5(), TipTask.along(line((0.4, 0, 0.5), (-0.4, 0, 0.5)), 0.1, direction=DOWN), {}
 
 
-def momentum_on_board() -> Asked:
+def momentum_on_board() -> PlanCase:
     machine = floating_panda((0.05, -0.03, 0.04, 0.1, -0.2, 0.15))
     _, at = pose(machine, machine.base_home(), PANDA_START)
     return machine, TipTask.along(line(at, at + np.array([0.05, -0.08, 0.06])), 0.05), {"start": PANDA_START}
 
 
-def nothing_until_it_begins() -> Asked:
+def nothing_until_it_begins() -> PlanCase:
     task = TipTask.along(line((0.45, -0.1, 0.3), (0.45, 0.1, 0.3)), 0.1, direction=DOWN, begin=2.0)
     return panda(), task, {"start": PANDA_START}
 
 
-def rest_afterwards() -> Asked:
+def rest_afterwards() -> PlanCase:
     task = TipTask.along(line((0.45, -0.1, 0.3), (0.45, 0.1, 0.3)), 0.1, direction=DOWN)
     return panda(), task, {"horizon": 4.0}
 
 
-def back_to_the_start_afterwards() -> Asked:
+def back_to_the_start_afterwards() -> PlanCase:
     machine, task, options = rest_afterwards()
     return machine, task, {**options, "cyclic": True}
 
 
-def one_begins_while_another_goes_on() -> Asked:
+def one_begins_while_another_goes_on() -> PlanCase:
     first = TipTask.along(line((0.45, -0.1, 0.3), (0.45, 0.1, 0.3)), 0.1)
     return panda(), [first, TipTask(direction=DOWN, begin=1.0, duration=1.0)], {}
 
 
-MOTIONS: list[Callable[[], Asked]] = [
+MOTIONS: list[Callable[[], PlanCase]] = [
     no_freedom_left,
     through_its_own_foot,
     many_joints,
@@ -110,7 +110,7 @@ MOTIONS: list[Callable[[], Asked]] = [
 
 
 @pytest.mark.parametrize("make", MOTIONS)
-def test_the_motion_passes_and_does_its_tasks(make: Callable[[], Asked]) -> None:
+def test_the_motion_passes_and_does_its_tasks(make: Callable[[], PlanCase]) -> None:
     machine, tasks, options = make()
     found = plan_bare(machine, tasks, search="start", **options)
     assert found.audit().passed

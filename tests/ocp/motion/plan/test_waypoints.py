@@ -15,7 +15,7 @@ from models.robot.rebuild import lock_joints
 from models.spatial import quaternion_from_rotation
 from ocp import DeadEnd, Limits, ProblemError, Unreachable, plan_waypoints
 from ocp.motion.local.collisions import distances_along
-from ocp.motion.plan.waypoints import WayCost
+from ocp.motion.plan.waypoints import PathCost
 from tests.ocp.motion.search.test_charts import planar
 from tests.ocp.motion.tasks.space_tasks import PANDA_START, UR5_START, panda, ur5
 from tests.redundancy_benchmark import problem_of
@@ -56,7 +56,7 @@ def test_the_way_back_is_as_long_and_weights_count(machine: FixedBase, start: Ar
     tips = [np.array(ca.DM(machine.tip_pose((), q).position)).ravel() for q in found.joints]
     assert np.array(tips) == pytest.approx(places, abs=1e-8)
     assert (found.steps == np.abs(np.diff(found.joints, axis=0)).max(axis=0)).all()
-    assert "at least" in str(found)
+    assert "lower bound" in str(found)
 
 
 @pytest.mark.long
@@ -77,9 +77,9 @@ def test_the_largest_way_and_the_time_are_least_where_they_are_the_cost() -> Non
     places, turns = poses(panda(), PANDA_START, 21)
     velocity = panda().robot.velocity
     free: dict[str, Any] = {"clearance": None}
-    kinds: tuple[WayCost, ...] = get_args(WayCost)
+    kinds: tuple[PathCost, ...] = get_args(PathCost)
     found = {cost: plan_waypoints(panda(), places, turns, cost=cost, **free) for cost in kinds}
-    measures: dict[WayCost, Callable[[Array], float]] = {
+    measures: dict[PathCost, Callable[[Array], float]] = {
         "length": lambda ways: ways.sum(),
         "largest": lambda ways: ways.max(axis=1).sum(),
         "time": lambda ways: (ways / velocity).max(axis=1).sum(),
@@ -106,13 +106,13 @@ def test_what_stands_in_the_way_makes_it_longer_and_is_kept_clear_of() -> None:
     numbers = np.linspace(0, 20, 2001)
     joints = np.stack([np.interp(numbers, np.arange(21), column) for column in boxed.joints.T], axis=1)
     apart = distances_along(around, np.zeros(0), joints, numbers).min()
-    assert boxed.between is not None
-    worst = boxed.between.worst
+    assert boxed.clearance is not None
+    worst = boxed.clearance.worst
     assert worst is not None
-    assert min(near.least for near in boxed.between.pairs) <= apart + 1e-9
+    assert min(near.least for near in boxed.clearance.pairs) <= apart + 1e-9
     assert apart == pytest.approx(worst.distance, abs=1e-3)
     assert f"{worst.bodies[0]} and {worst.bodies[1]}, {worst.distance:.4g} m apart" in str(boxed)
-    assert plan_waypoints(panda(), places[:6], turns[:6], clearance=None).between is None
+    assert plan_waypoints(panda(), places[:6], turns[:6], clearance=None).clearance is None
 
 
 def test_what_cannot_be_done_is_refused() -> None:
@@ -135,5 +135,5 @@ def test_what_cannot_be_done_is_refused() -> None:
         plan_waypoints(planar(np.array([0.5, 0.4, 0.3])), places, turns)
     with pytest.raises(Unreachable, match="waypoint 0 at"):
         plan_waypoints(panda(), places + 3.0, turns)
-    with pytest.raises(DeadEnd, match=r"none goes on to waypoint 1; .* in one step, 0.0001 at most"):
+    with pytest.raises(DeadEnd, match=r"none continues to waypoint 1; .* in one step, 0.0001 at most"):
         plan_waypoints(panda(), places, turns, step=1e-4, limits=Limits(), clearance=None)

@@ -14,7 +14,7 @@ from models.papers import paper_example
 from ocp import Candidate, Plan, SolveError, TipTask, Unreachable, plan
 from ocp.motion.plan.candidate import Reason, Rejection, Stage
 from ocp.motion.plan.candidate_solver import CandidateSolver
-from ocp.motion.plan.planner import checked_asked
+from ocp.motion.plan.planner import checked_request
 from ocp.motion.search.cells import CellSearch
 from ocp.motion.search.dead_end import DeadEnd
 from ocp.motion.tasks.equations import task_errors
@@ -63,7 +63,7 @@ def farthest_from_center() -> float:
     return float(np.array(far.map(len(grid))(grid.T)).max())
 
 
-@pytest.mark.parametrize("search", ["global", "postures"])
+@pytest.mark.parametrize("search", ["global", "configurations"])
 @pytest.mark.parametrize("told", ["velocity", "place"])
 def test_what_leads_out_of_reach_is_refused_with_the_time_from_which_on_it_does(search: Any, told: str) -> None:
     machine = paper_example()
@@ -85,7 +85,7 @@ def test_what_leads_out_of_reach_is_refused_with_the_time_from_which_on_it_does(
 def test_limits_that_stop_a_motion_are_named() -> None:
     robot = paper_example().robot
     slow = tuple(replace(joint, velocity=0.6) for joint in robot.joints)
-    with pytest.raises(DeadEnd, match=r"can go no faster than -?0\.6") as caught:
+    with pytest.raises(DeadEnd, match=r"is at its rate limit -?0\.6") as caught:
         plan(FreeFloating(replace(robot, joints=slow), base="planar"), example(5.0), start=START, clearance=None)
     assert (caught.value.name, caught.value.limit) in {(joint.name, s) for joint in slow for s in (-0.6, 0.6)}
     narrow = tuple(replace(joint, lower=-1.3, upper=1.3) for joint in robot.joints)
@@ -104,12 +104,12 @@ def test_every_way_does_its_task_keeps_limits_and_moves_the_base_as_momentum_has
     way = np.array([-0.5, -0.5, 0.0])
     place = TipTask(position=lambda t: ca.DM(first) + t * ca.DM(way), rows=[3, 4], duration=4.0)
     task = TipTask(velocity=way[:2], rows=[3, 4], duration=4.0) if told == "velocity" else place
-    asked = checked_asked(machine, task, None, START, None, False, None, None, "global", 0, 1.0)
+    asked = checked_request(machine, task, None, start=START, search="global")
     b, q, u = (ca.SX.sym(name, 3) for name in "bqu")
     center = ca.Function("center", [b, q], [center_of_mass(machine.robot, q, machine.world_from_base(b))])
     rate = ca.Function("rate", [b, q, u], [machine.base_rate(b, q, u)])
     pushed = np.zeros(2) if momentum is None else np.array(momentum[1:]) / robot.total_mass
-    for (found,) in CellSearch(asked, START[None]).followed():
+    for (found,) in CellSearch(asked, START[None]).local_motions():
         count, times = len(found.cost), found.t
         for base, at, rates in zip(found.base, found.joints, found.rates, strict=True):
             assert np.abs(task_errors(machine, place, times, base, at)).max() < 5e-3
@@ -152,8 +152,8 @@ def test_of_ways_that_all_fail_a_few_of_each_search_are_tried_and_the_others_are
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     machine, task, tried = paper_example(), example(4.0), list[float]()
-    asked = checked_asked(machine, task, None, START, None, False, None, None, "postures", 0, 1.0)
-    sizes = [len(ways[0].cost) for ways in CellSearch(asked, START[None]).followed()]
+    asked = checked_request(machine, task, None, start=START)
+    sizes = [len(ways[0].cost) for ways in CellSearch(asked, START[None]).local_motions()]
 
     def fails(solver: CandidateSolver, candidate: Candidate) -> list[Candidate]:
         tried.append(solver.settings.max_refinements)
@@ -165,4 +165,6 @@ def test_of_ways_that_all_fail_a_few_of_each_search_are_tried_and_the_others_are
     count = sum(min(size, 8) for size in sizes)
     assert tried in ([2] * count, [6] + [2] * count)  # the local motion at first
     rest = sum(sizes) - count
-    assert f"{rest} of {len(tried) + rest} postures: not tried: the 8 cheapest of its search fail" in str(caught.value)
+    assert f"{rest} of {len(tried) + rest} candidates: not tried: the 8 cheapest of its search fail" in str(
+        caught.value
+    )

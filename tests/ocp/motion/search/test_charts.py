@@ -12,7 +12,7 @@ import pytest
 from models import FixedBase, Joint, Link, Robot
 from models.arrays import Array
 from ocp import ProblemError, TipTask, inverse_kinematics
-from ocp.motion.search.charts import Charts, SelfMotions
+from ocp.motion.search.charts import Charts, SelfMotionManifolds
 from ocp.motion.search.joint_space import JointSpace
 from ocp.motion.tasks.equations import bind
 from tests.ocp.motion.tasks.space_tasks import PANDA_START, UR5_START, panda, ur5
@@ -61,11 +61,13 @@ def moved(machine: FixedBase, joints: Array, rows: str) -> TipTask:
     )
 
 
-def sets_of(machine: FixedBase, task: TipTask) -> tuple[SelfMotions, Array]:
+def sets_of(machine: FixedBase, task: TipTask) -> tuple[SelfMotionManifolds, Array]:
     equations, times = bind(machine, task), np.linspace(0.0, SECONDS, INSTANTS)
     robot = machine.robot
     space = JointSpace(machine, robot.lower, robot.upper, np.ones(robot.dof))
-    return SelfMotions(space, equations, np.array(equations.target_function().map(INSTANTS)(times[None])).T), times
+    return SelfMotionManifolds(
+        space, equations, np.array(equations.target_function().map(INSTANTS)(times[None])).T
+    ), times
 
 
 def found(machine: FixedBase, task: TipTask, times: Array, starts: int, seed: int) -> tuple[Any, Array]:
@@ -96,7 +98,7 @@ def test_every_posture_that_inverse_kinematics_finds_lies_in_a_chart(case: str) 
     layer, joints = found(machine, task, times, 128, 1000)
     assert sets.size == machine.joint_size - bind(machine, task).size
     assert not sets.lost
-    assert sets.covered(charts, layer, joints).all()
+    assert sets.is_covered(charts, layer, joints).all()
 
 
 @pytest.mark.parametrize("case", ["panda pose", "planar 3", "planar 4"])
@@ -107,16 +109,16 @@ def test_postures_in_a_box_do_the_task_but_for_what_is_told_and_stray_with_the_s
     layer, joints = found(machine, moved(machine, start, rows), times, 16, 0)
     rng = np.random.default_rng(0)
     radii = np.full(len(layer), 0.04)
-    charts, _ = sets.at(layer, joints, radii)
+    charts, _ = sets.charts_at(layer, joints, radii)
     place = rng.uniform(-1, 1, (len(layer), sets.size)) * charts.radii[:, None]
     flat = charts.centers + np.einsum("nir,nr->ni", charts.tangents, place)
-    on, good = sets.corrected(layer, flat)
-    stray = np.linalg.norm(charts.strays, axis=2).max(axis=1)
+    on, good = sets.project(layer, flat)
+    stray = np.linalg.norm(charts.deviations, axis=2).max(axis=1)
     assert good.all()
-    assert np.abs(sets.linearised(layer, on)[0]).max() < 1e-9
+    assert np.abs(sets.linearize(layer, on)[0]).max() < 1e-9
     assert (np.linalg.norm(on - flat, axis=1) <= 1.1 * stray + 1e-9).all()
-    half = sets.at(layer, joints, charts.radii / 2, charts.tangents)[0]
-    ratio = stray / np.linalg.norm(half.strays, axis=2).max(axis=1)
+    half = sets.charts_at(layer, joints, charts.radii / 2, charts.tangents)[0]
+    ratio = stray / np.linalg.norm(half.deviations, axis=2).max(axis=1)
     assert np.median(ratio) == pytest.approx(4.0, rel=0.05)
     orthonormal = np.einsum("nir,nis->nrs", charts.tangents, charts.tangents)
     assert np.abs(orthonormal - np.eye(sets.size)).max() < 1e-12
@@ -129,8 +131,8 @@ def test_halves_cover_what_they_came_from() -> None:
     charts = sets.cover(*found(machine, task, times, 16, 0), 0.07, 50_000)
     layer, joints = found(machine, task, times, 64, 99)
     for _ in range(3):
-        charts = sets.parts(charts).charts
-        assert sets.covered(charts, layer, joints).all()
+        charts = sets.split(charts).charts
+        assert sets.is_covered(charts, layer, joints).all()
     assert np.median(charts.radii) < 0.07 / 8 * 1.1
 
 
@@ -139,14 +141,14 @@ def test_parts_are_of_the_charts_that_they_lie_in() -> None:
     task = TipTask(position=[0.6, 0.2], rows=[3, 4], duration=1.0)
     sets, times = sets_of(machine, task)
     charts = sets.cover(*found(machine, task, times, 16, 0), 0.2, 50_000)
-    parts = sets.parts(charts)
-    owners = charts.of(parts.owners)
+    parts = sets.split(charts)
+    owners = charts.select(parts.owners)
     assert (parts.low >= owners.low).all()
     assert (parts.high <= owners.high).all()
     assert (parts.low <= parts.high).all()
     middle = (parts.low + parts.high) / 2
     flat = owners.centers + np.einsum("knr,kr->kn", owners.tangents, middle)
-    on, good = sets.corrected(owners.layer, flat)
+    on, good = sets.project(owners.layer, flat)
     way = sets.space.difference(on, parts.charts.centers) * sets.space.scale
     place = np.einsum("kn,knr->kr", way, parts.charts.tangents * sets.space.scale[:, None])
     whole = ((owners.low < 0) & (owners.high > 0)).all(axis=1) & (parts.high - parts.low > 0).all(axis=1)
@@ -170,18 +172,18 @@ def test_what_lies_in_a_chart_lies_in_its_parts_which_are_hardly_larger_than_hal
     charts = sets.cover(*found(machine, task, times, 16, 0), radius, 50_000)
     r, scale = charts.tangents.shape[2], sets.space.scale
     wide = replace(charts, low=np.full((len(charts), r), -1e9), high=np.full((len(charts), r), 1e9))
-    parts = sets.parts(wide)
+    parts = sets.split(wide)
     order = np.lexsort((*(parts.high > 1e6).T[::-1], parts.owners))
     whole = np.flatnonzero(np.bincount(parts.owners, minlength=len(charts)) == 2**r)  # no part is beyond the limits
     of_whole = order[np.isin(parts.owners[order], whole)].reshape(len(whole), 2**r)
     assert parts.charts.radii.max() < 0.55 * charts.radii.max()
-    rng, owners, seen = np.random.default_rng(0), charts.of(whole), 0
+    rng, owners, seen = np.random.default_rng(0), charts.select(whole), 0
     for _ in range(10):
         shift = rng.uniform(-1, 1, (len(whole), r)) * owners.radii[:, None]
-        on, good = sets.corrected(owners.layer, owners.centers + np.einsum("knr,kr->kn", owners.tangents, shift))
+        on, good = sets.project(owners.layer, owners.centers + np.einsum("knr,kr->kn", owners.tangents, shift))
         place = np.einsum("kn,knr->kr", (on - owners.centers) * scale, owners.tangents * scale[:, None])
         good &= (np.abs(place) <= owners.radii[:, None]).all(axis=1)
-        own = parts.charts.of(of_whole[np.arange(len(whole)), (place > 0) @ 2 ** np.arange(r)[::-1]])
+        own = parts.charts.select(of_whole[np.arange(len(whole)), (place > 0) @ 2 ** np.arange(r)[::-1]])
         there = np.einsum("kn,knr->kr", (on - own.centers) * scale, own.tangents * scale[:, None])
         assert (np.abs(there) <= own.radii[:, None])[good].all()
         seen += int(good.sum())
@@ -199,7 +201,7 @@ def test_parts_of_a_parabola_reach_its_ends_and_hardly_farther() -> None:
     whole = Charts(np.zeros(1, dtype=np.intp), np.zeros((1, 3)), tangents, np.array([radius]), *ends, strays)
     lean, half = bend * radius / 2, radius / 2
     exact = (half + lean * bend * (radius**2 - half**2) / 2) / np.sqrt(1 + lean**2)
-    for found in sets._half(whole, np.array([[-0.5], [0.5]])):
+    for found in sets._split_radii(whole, np.array([[-0.5], [0.5]])):
         assert exact <= found <= 1.003 * exact
 
 
@@ -209,7 +211,7 @@ def test_boxes_end_at_the_limits_of_the_joints() -> None:
     sets, times = sets_of(machine, task)
     charts = sets.cover(*found(machine, task, times, 16, 0), 0.07, 50_000)
     limits = sets.space.lower, sets.space.upper
-    stray = np.abs(charts.strays).max(axis=1)
+    stray = np.abs(charts.deviations).max(axis=1)
     for end, whole in ((charts.low, -charts.radii[:, None]), (charts.high, charts.radii[:, None])):
         at = charts.centers + np.einsum("nir,nr->ni", charts.tangents, end)
         cut = (end != whole).all(axis=1)
@@ -236,6 +238,6 @@ def test_joints_that_turn_without_end_come_round() -> None:
     assert way[0] == pytest.approx([6 - 2 * np.pi, 6 - 2 * np.pi, 6.0, *[6 - 2 * np.pi] * 3])
     assert space.length(np.ones(6)) == pytest.approx(2 * np.sqrt(6))
     near, _ = space.tree(np.full((1, 6), 3.1)).query(
-        space.placed(np.full((1, 6), 3.1 - 2 * np.pi) * [1, 1, -1, 1, 1, 1])
+        space.tree_points(np.full((1, 6), 3.1 - 2 * np.pi) * [1, 1, -1, 1, 1, 1])
     )
     assert np.isfinite(near).all()

@@ -49,19 +49,19 @@ def test_what_stops_the_motions_is_told_and_what_gives_way_does_all_else(seed: i
     end = refused.value
     assert end.time is not None
     assert 0 <= end.time < end.until <= 2.0
-    first = end.stops[0]
+    first = end.obstructions[0]
     assert (end.name, end.value, end.limit) == (first.name, first.value, first.limit)
     assert first.kind in ("step", "limit")
-    assert [stop.excess for stop in end.stops] == sorted(stop.excess for stop in end.stops)
+    assert [stop.excess for stop in end.obstructions] == sorted(stop.excess for stop in end.obstructions)
     seconds, velocity = end.until - end.time, machine.robot.velocity
-    for stop in end.stops:
+    for stop in end.obstructions:
         assert tip(machine, stop.before) == pytest.approx(wanted(task, end.time), abs=1e-8)
         joint = machine.robot.joint_names.index(stop.name)
         if stop.kind == "step":
             assert abs(stop.after - stop.before)[joint] == pytest.approx(stop.value)
             assert stop.limit == pytest.approx(velocity[joint] * seconds)
             assert stop.value > stop.limit
-    (gives,) = end.gives
+    (gives,) = end.relaxations
     assert gives.kind == "deviation"
     assert (np.abs(gives.joints) <= machine.robot.upper + 1e-9).all()
     assert (np.abs(np.diff(gives.joints, axis=0)) <= velocity * np.diff(gives.times)[:, None] + 1e-7).all()
@@ -71,8 +71,8 @@ def test_what_stops_the_motions_is_told_and_what_gives_way_does_all_else(seed: i
     again = pickle.loads(pickle.dumps(end))
     assert (str(again), again.time, again.until, again.name) == (str(end), end.time, end.until, end.name)
     # no joint is faster than twice what the stop says it would have to be: so much faster there is a motion
-    if all(stop.kind == "step" for stop in end.stops):
-        fast = 2 * max(stop.value / stop.limit for stop in end.stops)
+    if all(stop.kind == "step" for stop in end.obstructions):
+        fast = 2 * max(stop.value / stop.limit for stop in end.obstructions)
         assert plan(machine, task, search="global", clearance=None, limits=Limits(velocity=fast * velocity)).bound
 
 
@@ -95,8 +95,8 @@ def test_a_tool_that_turns_too_fast_may_lean_instead(seed: int) -> None:
     task = TipTask(position=place, orientation=turn, rows=[2, 3, 4], duration=2.0)
     with pytest.raises(DeadEnd) as refused:
         plan(machine, task, search="global", clearance=None)
-    deviation, lean = refused.value.gives
-    assert (deviation.kind, lean.kind) == ("deviation", "lean")
+    deviation, lean = refused.value.relaxations
+    assert (deviation.kind, lean.kind) == ("deviation", "rotation")
     assert f"turned by {np.degrees(lean.amount):.3g} deg" in str(refused.value)
     for give in (deviation, lean):
         off = [tip(machine, q) - wanted(task, t) for t, q in zip(give.times, give.joints, strict=True)]
@@ -113,8 +113,8 @@ def test_of_ways_through_waypoints_the_waypoint_and_the_bodies_are_told() -> Non
     end = refused.value
     assert end.until == int(end.until)
     assert end.time in (end.until - 1, 0.0)
-    assert any(stop.kind == "touch" and "obstacle 0" in stop.name for stop in end.stops)
+    assert any(stop.kind == "collision" and "obstacle 0" in stop.name for stop in end.obstructions)
     assert f"waypoint {end.until:g}" in str(end)
-    (clearance,) = (give for give in end.gives if give.kind == "clearance")
+    (clearance,) = (give for give in end.relaxations if give.kind == "clearance")
     assert clearance.amount < 0
     assert clearance.joints.shape[1] == 7

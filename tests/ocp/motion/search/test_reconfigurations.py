@@ -16,11 +16,11 @@ from models.arrays import Array
 from models.robot.rebuild import lock_joints
 from ocp import DeadEnd, ProblemError, TipTask, inverse_kinematics, plan_waypoints
 from ocp.motion.local.closed_forms import closed_forms
-from ocp.motion.search.charts import Instant, SelfMotions
+from ocp.motion.search.charts import SelfMotionManifolds, TimeSample
 from ocp.motion.search.joint_space import JointSpace
-from ocp.motion.search.reconfigurations import farthest, fewest_pieces
-from ocp.motion.search.search import Search
-from ocp.motion.search.steps import Length
+from ocp.motion.search.reconfigurations import fewest_segments, segment_ends
+from ocp.motion.search.search import AtlasSearch
+from ocp.motion.search.steps import PathLength
 from ocp.motion.tasks.equations import bind
 from tests.ocp.motion.search.test_charts import planar
 from tests.ocp.motion.search.test_values import reached
@@ -28,7 +28,7 @@ from tests.ocp.motion.tasks.space_tasks import ur5
 from tests.redundancy_benchmark import problem_of
 
 COUNT = 9
-TURN = 2 * np.pi
+FULL_TURN = 2 * np.pi
 
 
 def fewest(nodes: list[Array], step: Any, gap: int = 1) -> tuple[int, float]:
@@ -79,10 +79,10 @@ def of_six_joints(seed: int) -> tuple[FixedBase, Array, Array, float, list[Array
     )
     (form,) = closed_forms(machine)
     own, joints = form.solutions(places, turns.as_matrix(), np.zeros((COUNT, 0)))
-    joints = middle + np.remainder(joints - middle + np.pi, TURN) - np.pi  # less than two turns within the limits
+    joints = middle + np.remainder(joints - middle + np.pi, FULL_TURN) - np.pi  # less than two turns within the limits
     more = [joints]
     for j in range(6):
-        more = [part + side * TURN * np.eye(6)[j] for part in more for side in (-1, 0, 1)]
+        more = [part + side * FULL_TURN * np.eye(6)[j] for part in more for side in (-1, 0, 1)]
         more = [np.where((np.abs(part - middle) <= half + 1e-9)[:, [j]], part, np.nan) for part in more]
     nodes = []
     for k in range(COUNT):
@@ -113,7 +113,7 @@ def test_of_six_joints_the_pieces_are_those_of_brute_force(seed: int, count: int
             plan_waypoints(machine, places, quaternions, **told)
 
 
-def search_of(seed: int) -> tuple[Search, list[Array], Array]:
+def search_of(seed: int) -> tuple[AtlasSearch, list[Array], Array]:
     """A planar arm of three joints whose tip goes a bent way, and postures nearly everywhere."""
     rng = np.random.default_rng(seed)
     lengths, limit = rng.uniform(0.25, 0.6, 3), rng.uniform(0.9, 1.5)
@@ -124,10 +124,10 @@ def search_of(seed: int) -> tuple[Search, list[Array], Array]:
     return searched(machine, places, 0.3), [reached(lengths, place, limit, 700) for place in places], np.full(3, 0.3)
 
 
-def searched(machine: FixedBase, places: Array, step: float) -> Search:
+def searched(machine: FixedBase, places: Array, step: float) -> AtlasSearch:
     """Of ways of three joints through places in a plane."""
     space = JointSpace(machine, machine.robot.lower, machine.robot.upper, np.ones(3))
-    sets = SelfMotions(
+    sets = SelfMotionManifolds(
         space,
         bind(machine, TipTask(position=[*places[0]], rows=[3, 4])),
         np.array([np.r_[place, 0.0, 0.0, 0.0, 0.0] for place in places]),
@@ -138,8 +138,8 @@ def searched(machine: FixedBase, places: Array, step: float) -> Search:
         return np.array([one.joints for one in inverse_kinematics(machine, task, starts=16, seed=k)])
 
     far = np.full((len(places) - 1, 3), step)
-    instants, times = [Instant(sets, k) for k in range(len(places))], np.linspace(0, 1, len(places))
-    return Search(space, instants, times, Length(np.ones(3)), far, seeds=seeds)
+    instants, times = [TimeSample(sets, k) for k in range(len(places))], np.linspace(0, 1, len(places))
+    return AtlasSearch(space, instants, times, PathLength(np.ones(3)), far, seeds=seeds)
 
 
 @pytest.mark.parametrize(("reach", "count"), [(0.45, 1), pytest.param(0.1, 0, marks=pytest.mark.long)])
@@ -150,7 +150,7 @@ def test_where_the_way_waits_pieces_meet_at_an_instant_and_none_are_fewer_or_sho
     nodes = [reached(lengths, place, 1.8, 900) for place in places]
     nodes = [own[(np.abs(own) <= high).all(axis=1)] for own in nodes]
     search = searched(machine, places, step)
-    found = fewest_pieces(search, 0)
+    found = fewest_segments(search, 0)
     assert found is not None
     pieces, bound = found
     expected = fewest(nodes, step, 0)
@@ -161,16 +161,16 @@ def test_where_the_way_waits_pieces_meet_at_an_instant_and_none_are_fewer_or_sho
     assert bound <= min(cost, expected[1] + 1e-9)
     assert cost <= 1.002 * expected[1]
     for gap in (0, 1):
-        assert len(farthest(search, gap, ruled_out=bool(gap))) == len(pieces)
+        assert len(segment_ends(search, gap, ruled_out=bool(gap))) == len(pieces)
     first, last = pieces[0].first, pieces[0].last
-    again = fewest_pieces(search, 0, [(first, last)])  # what is barred is no piece, nor what holds it
+    again = fewest_segments(search, 0, [(first, last)])  # what is barred is no piece, nor what holds it
     assert again is None or not any(piece.first <= first and last <= piece.last for piece in again[0])
 
 
 @pytest.mark.parametrize(("seed", "count"), [(2, 1), (18, 1), (26, 8), (35, 1)])
 def test_with_a_free_direction_no_sequence_of_postures_has_fewer_pieces_or_is_shorter(seed: int, count: int) -> None:
     search, nodes, step = search_of(seed)
-    found = fewest_pieces(search)
+    found = fewest_segments(search)
     assert found is not None
     pieces, bound = found
     expected = fewest(nodes, step)
@@ -197,15 +197,15 @@ def test_far_apart_parts_of_a_way_are_pieces_as_cheap_and_as_clear_as_by_themsel
             rows.append(np.array(ca.DM(pose.position)).ravel())
             turns.append(Rotation.from_matrix(np.array(ca.DM(pose.rotation))).as_quat()[[3, 0, 1, 2]])
     told: dict[str, Any] = {"step": 0.12, "obstacles": problem.boxes, "ignored": problem.ignored}
-    alone = [plan_waypoints(machine, rows[k : k + 3], turns[k : k + 3], **told) for k in (0, 3)]
+    exclusive = [plan_waypoints(machine, rows[k : k + 3], turns[k : k + 3], **told) for k in (0, 3)]
     found = plan_waypoints(machine, rows, turns, **told, reconfigurations="counted")
     assert found.reconfigurations == (2,)
-    assert found.cost == pytest.approx(sum(one.cost for one in alone), rel=1e-6)
-    assert found.between is not None
-    assert found.between.worst is not None
-    nearest = [one.between.worst.distance for one in alone if one.between and one.between.worst]
-    assert found.between.worst.distance == pytest.approx(min(nearest), abs=1e-6)
-    assert not 2 < found.between.worst.time < 3
+    assert found.cost == pytest.approx(sum(one.cost for one in exclusive), rel=1e-6)
+    assert found.clearance is not None
+    assert found.clearance.worst is not None
+    nearest = [one.clearance.worst.distance for one in exclusive if one.clearance and one.clearance.worst]
+    assert found.clearance.worst.distance == pytest.approx(min(nearest), abs=1e-6)
+    assert not 2 < found.clearance.worst.time < 3
 
 
 def test_pieces_are_counted_with_one_free_direction_at_most() -> None:

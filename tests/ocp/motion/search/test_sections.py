@@ -17,7 +17,7 @@ from models.robot.rebuild import lock_joints
 from ocp import DeadEnd, ProblemError, SolveError, Unreachable, WaypointPlan, plan_waypoints
 from ocp.motion.plan import waypoints
 from ocp.motion.plan.waypoints import WaypointSettings
-from ocp.motion.search.reconfigurations import SectionSettings, values_of
+from ocp.motion.search.reconfigurations import SectionSettings, section_values
 from ocp.motion.search.search import SearchSettings
 from tests.redundancy_benchmark import problem_of
 
@@ -29,7 +29,7 @@ STEP = 0.1
 def test_values_are_no_farther_apart_than_a_step_and_reach_the_limits(
     slides: bool, low: float, far: float, step: float
 ) -> None:
-    values, most = values_of(slides, low, low + far, step), min(SectionSettings().apart[not slides], step)
+    values, most = section_values(slides, low, low + far, step), min(SectionSettings().spacing[not slides], step)
     ends = np.clip((low, low + far), -np.pi, np.pi)
     gap = float(np.diff(values).max(initial=0.0))
     assert gap <= most * (1 + 1e-9) or len(values) >= SectionSettings().values - 1
@@ -43,7 +43,7 @@ def test_values_are_no_farther_apart_than_a_step_and_reach_the_limits(
 
 @pytest.mark.parametrize("slides", [True, False])
 def test_a_joint_without_limits_is_held_all_round_or_about_where_it_is(slides: bool) -> None:
-    values = values_of(slides, -np.inf, np.inf, np.inf)
+    values = section_values(slides, -np.inf, np.inf, np.inf)
     assert np.abs(values).max() <= np.pi
     assert len(np.unique(np.round(np.remainder(values, 2 * np.pi), 9))) == len(values) - slides
 
@@ -66,7 +66,7 @@ def planned(count: int, **told: Any) -> WaypointPlan:
 def limit_charts(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
     """Memory for so many charts."""
     own = WaypointSettings(search=SearchSettings(charts=count), sections=SectionSettings(charts=count))
-    monkeypatch.setattr(waypoints, "_Ways", partial(waypoints._Ways, settings=own))
+    monkeypatch.setattr(waypoints, "_WaypointPlanner", partial(waypoints._WaypointPlanner, settings=own))
 
 
 def test_a_way_keeps_its_poses_and_steps_and_is_no_dearer_than_with_the_lift_held() -> None:
@@ -119,7 +119,7 @@ def test_where_there_are_more_charts_than_memory_is_for_fewer_waypoints_are_sear
     limit_charts(monkeypatch, 10)
     with pytest.raises(ProblemError) as refused:
         plan_waypoints(machine, *task(40), clearance=None, step=STEP)
-    assert refused.value.name == "postures"
+    assert refused.value.name == "configurations"
 
 
 def test_what_is_in_the_way_is_named_with_the_waypoint() -> None:
@@ -164,9 +164,9 @@ def test_where_nothing_is_clear_at_the_first_waypoint_none_begins() -> None:
 
 
 def test_where_the_joint_is_held_at_no_value_that_does_the_waypoint_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(waypoints, "values_of", lambda *_: np.array([10.0]))
+    monkeypatch.setattr(waypoints, "section_values", lambda *_: np.array([10.0]))
     machine = problem_of("fetch__square").machine
-    with pytest.raises(SolveError, match="none was found at waypoint 0 with 'torso_lift_joint'") as refused:
+    with pytest.raises(SolveError, match="at waypoint 0 on the sections of 'torso_lift_joint'") as refused:
         plan_waypoints(machine, *task(40), clearance=None, step=STEP)
     assert (refused.value.name, refused.value.time) == ("torso_lift_joint", 0.0)
 

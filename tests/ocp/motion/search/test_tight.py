@@ -13,9 +13,9 @@ from numpy.testing import assert_allclose
 from models import CollisionScene, CollisionShape, FixedBase, MovingObstacle, Sphere
 from models.arrays import Array
 from ocp.motion.local.collisions import distances_along
-from ocp.motion.search.charts import Instant
-from ocp.motion.search.steps import Length, Squares
-from ocp.motion.search.value import drawn_tight
+from ocp.motion.search.charts import TimeSample
+from ocp.motion.search.steps import PathLength, SquaredRates
+from ocp.motion.search.value import shorten_path
 from tests.ocp.motion.search.test_charts import moved, planar, sets_of
 
 START = np.array([0.5, 1.2, -1.4])
@@ -36,7 +36,7 @@ def armed() -> FixedBase:
 
 MACHINE = armed()
 SETS, TIMES = sets_of(MACHINE, moved(MACHINE, START, "place"))
-INSTANTS = [Instant(SETS, k) for k in range(len(TIMES))]
+INSTANTS = [TimeSample(SETS, k) for k in range(len(TIMES))]
 
 
 def slid(way: float) -> Array:
@@ -44,7 +44,7 @@ def slid(way: float) -> Array:
     joints, tangents = START, None
     for _ in range(20):
         tangents = SETS.tangents_at(np.array([0]), joints[None], tangents)
-        joints = SETS.corrected(np.array([0]), (joints + way / 20 * tangents[0, :, 0])[None])[0][0]
+        joints = SETS.project(np.array([0]), (joints + way / 20 * tangents[0, :, 0])[None])[0][0]
     return joints
 
 
@@ -52,7 +52,7 @@ def followed(start: Array = START) -> Array:
     """A way that does the task, each posture from the one before."""
     path = [start]
     for k in range(len(TIMES)):
-        joints, good = SETS.corrected(np.array([k]), path[-1][None])
+        joints, good = SETS.project(np.array([k]), path[-1][None])
         assert good.all()
         path.append(joints[0])
     return np.array(path[1:])
@@ -63,8 +63,8 @@ def tight(obstacle: Any = None, later: float = 0.0) -> Array:
     robot = MACHINE.robot
     around = None if obstacle is None else CollisionScene(MACHINE, [obstacle], clearance=CLEARANCE)
     far, bounds = np.full((len(TIMES) - 1, robot.dof), 1.0), (robot.lower, robot.upper)
-    cost = Length(np.ones(robot.dof))
-    return drawn_tight(followed(), INSTANTS, cost, TIMES + later, far, bounds, around, (0.1, 1e-3))
+    cost = PathLength(np.ones(robot.dof))
+    return shorten_path(followed(), INSTANTS, cost, TIMES + later, far, bounds, around, (0.1, 1e-3))
 
 
 def drawn(
@@ -74,8 +74,8 @@ def drawn(
     robot = MACHINE.robot
     steps = np.full((len(TIMES) - 1, robot.dof), far)
     bounds = np.maximum(robot.lower, lower), np.minimum(robot.upper, upper)
-    cost = cost or Length(np.ones(robot.dof))
-    return drawn_tight(followed(start), INSTANTS, cost, times, steps, bounds, None, (0.1, 1e-3))
+    cost = cost or PathLength(np.ones(robot.dof))
+    return shorten_path(followed(start), INSTANTS, cost, times, steps, bounds, None, (0.1, 1e-3))
 
 
 def length(path: Array) -> float:
@@ -90,7 +90,7 @@ def middle_of_the_last_link(joints: Array) -> Array:
 def test_it_is_no_longer_and_does_its_task() -> None:
     found = tight()
     assert length(found) < 0.99 * length(followed())
-    error = SETS.linearised(np.arange(len(TIMES)), found)[0]
+    error = SETS.linearize(np.arange(len(TIMES)), found)[0]
     assert_allclose(error, 0.0, atol=1e-9)
 
 
@@ -103,16 +103,16 @@ def test_from_all_along_a_valley_it_leads_to_its_bottom() -> None:
 
 @pytest.mark.parametrize("weight", [1e-4, 1e4])
 def test_the_unit_of_the_cost_does_not_matter(weight: float) -> None:
-    assert_allclose(drawn(cost=Length(np.full(3, weight))), drawn(), atol=1e-12)
+    assert_allclose(drawn(cost=PathLength(np.full(3, weight))), drawn(), atol=1e-12)
 
 
 def test_when_a_motion_begins_does_not_matter_nor_how_long_it_takes() -> None:
     """With the squares of the rates for cost, which is larger in less time, by the same factor everywhere."""
-    found = drawn(cost=Squares(np.ones(3)))
+    found = drawn(cost=SquaredRates(np.ones(3)))
     energies = [float((np.diff(path, axis=0) ** 2).sum()) for path in (found, drawn(), followed())]
     assert energies[0] < min(energies[1:])
     for times in (TIMES + 1e3, 2.0 * TIMES):
-        assert_allclose(drawn(cost=Squares(np.ones(3)), times=times), found, atol=1e-9)
+        assert_allclose(drawn(cost=SquaredRates(np.ones(3)), times=times), found, atol=1e-9)
 
 
 def test_limits_of_joints_and_of_their_steps_are_kept_and_met() -> None:

@@ -13,11 +13,19 @@ import pytest
 from models import FixedBase
 from models.arrays import Array
 from ocp import TipTask, inverse_kinematics
-from ocp.motion.search.charts import Charts, Instant, SelfMotions, _rim
+from ocp.motion.search.charts import Charts, SelfMotionManifolds, TimeSample, _rim
 from ocp.motion.search.joint_space import JointSpace
-from ocp.motion.search.search import Search
-from ocp.motion.search.steps import Largest, Length, Sheets, Squares, StepCost, Values, least_in_box
-from ocp.motion.search.value import GraphSettings, _below_all, _rise, _whole
+from ocp.motion.search.search import AtlasSearch
+from ocp.motion.search.steps import (
+    CurvedCharts,
+    LargestMotion,
+    PathLength,
+    QuadraticBounds,
+    SquaredRates,
+    StepCost,
+    least_in_box,
+)
+from ocp.motion.search.value import GraphSettings, _bound_charts, _bound_with_rest, _secant_slopes
 from ocp.motion.tasks.equations import bind
 from tests.ocp.motion.search.test_charts import planar
 
@@ -47,7 +55,7 @@ def brute_force(nodes: list[Array], cost: StepCost, seconds: float, limit: Array
     value = np.zeros(len(nodes[-1]))
     for here, there in zip(nodes[-2::-1], nodes[:0:-1], strict=True):
         way = there[None] - here[:, None]
-        steps = np.where((np.abs(way) <= limit).all(axis=2), cost.of(way, seconds), np.inf)
+        steps = np.where((np.abs(way) <= limit).all(axis=2), cost.evaluate(way, seconds), np.inf)
         value = (steps + value).min(axis=1)
     return float(value.min())
 
@@ -69,24 +77,26 @@ def random_case(seed: int) -> tuple[FixedBase, Array, Array, Array]:
     return machine, lengths, places, rng.uniform(0.5, 2.0, 3)
 
 
-def search_of(machine: FixedBase, places: Array, cost: StepCost) -> Search:
+def search_of(machine: FixedBase, places: Array, cost: StepCost) -> AtlasSearch:
     times = np.linspace(0, SECONDS, INSTANTS)
     task = TipTask(position=[*places[0]], rows=[3, 4])
     equations = bind(machine, task)
     targets = np.array([np.r_[place, 0.0, 0.0, 0.0, 0.0] for place in places])
     robot = machine.robot
-    space = JointSpace(machine, robot.lower, robot.upper, cost.weights if isinstance(cost, Squares) else np.ones(3))
-    sets = SelfMotions(space, equations, targets)
+    space = JointSpace(
+        machine, robot.lower, robot.upper, cost.weights if isinstance(cost, SquaredRates) else np.ones(3)
+    )
+    sets = SelfMotionManifolds(space, equations, targets)
 
     def seeds(k: int) -> Array:
         at = TipTask(position=[*places[k]], rows=[3, 4])
         return np.array([one.joints for one in inverse_kinematics(machine, at, starts=16, seed=k)])
 
     limits = robot.velocity * np.diff(times)[:, None]
-    return Search(space, [Instant(sets, k) for k in range(INSTANTS)], times, cost, limits, seeds=seeds)
+    return AtlasSearch(space, [TimeSample(sets, k) for k in range(INSTANTS)], times, cost, limits, seeds=seeds)
 
 
-@pytest.mark.parametrize("kind", [Squares, Length, Largest])
+@pytest.mark.parametrize("kind", [SquaredRates, PathLength, LargestMotion])
 @pytest.mark.parametrize("seed", range(25))
 def test_the_bound_is_below_brute_force_and_near_it(seed: int, kind: Any) -> None:
     machine, lengths, places, weights = random_case(seed)
@@ -95,9 +105,9 @@ def test_the_bound_is_below_brute_force_and_near_it(seed: int, kind: Any) -> Non
     seconds = SECONDS / (INSTANTS - 1)
     least = brute_force(nodes, cost, seconds, machine.robot.velocity * seconds)
     search = search_of(machine, places, cost)
-    path, bound = search.best(np.inf)
+    path, bound = search.solve(np.inf)
     assert path is not None
-    steps = search.steps(path)
+    steps = search.path_cost(path)
     tips = np.array([np.array(ca.DM(machine.tip_pose((), joints).position)).ravel()[:2] for joints in path])
     assert tips == pytest.approx(places, abs=1e-8)
     assert (np.abs(np.diff(path, axis=0)) <= machine.robot.velocity * seconds + 0.1).all()
@@ -108,17 +118,17 @@ def test_the_bound_is_below_brute_force_and_near_it(seed: int, kind: Any) -> Non
 def test_in_charts_that_limits_cut_a_posture_is_found_that_keeps_them() -> None:
     """Where the end of the box lies beyond a limit, as it may where the set bends, nearer to its middle."""
     _, lengths, places, weights = random_case(4)
-    search, beyond = search_of(planar(lengths, 2.0), places, Squares(weights)), 0
+    search, beyond = search_of(planar(lengths, 2.0), places, SquaredRates(weights)), 0
     for k, charts in enumerate(search.layers):
         for i in range(len(charts)):
-            box = charts.of([i])
+            box = charts.select([i])
             for end in (box.low[0], box.high[0]):
                 at = box.centers + (box.tangents @ end[:, None])[:, :, 0]
-                there, good = search.instants[k].sets.corrected(np.array([k]), at)
-                found = search.allowed_in(k, box, end)
+                there, good = search.samples[k].manifolds.project(np.array([k]), at)
+                found = search.project_in_box(k, box, end)
                 if found is not None:
                     assert search.space.within(found)
-                    assert search.instants[k].sets.linearised(np.array([k]), found[None])[0] == pytest.approx(
+                    assert search.samples[k].manifolds.linearize(np.array([k]), found[None])[0] == pytest.approx(
                         0, abs=1e-9
                     )
                 if good[0] and search.space.within(there)[0]:
@@ -132,7 +142,7 @@ def test_in_charts_that_limits_cut_a_posture_is_found_that_keeps_them() -> None:
 def test_what_is_found_and_its_bound_grow_with_the_weights(seed: int) -> None:
     machine, _, places, weights = random_case(seed)
     (path, bound), (other, more) = (
-        search_of(machine, places, Length(own)).best(np.inf) for own in (weights, 100 * weights)
+        search_of(machine, places, PathLength(own)).solve(np.inf) for own in (weights, 100 * weights)
     )
     assert path is not None
     assert other is not None
@@ -143,13 +153,15 @@ def test_what_is_found_and_its_bound_grow_with_the_weights(seed: int) -> None:
 @pytest.mark.parametrize("seed", [5, 10])
 def test_of_every_class_dearer_ones_are_told_beside_those_that_may_be_the_cheapest(seed: int) -> None:
     machine, _, places, weights = random_case(seed)
-    search = search_of(machine, places, Squares(weights))
-    path, _ = search.best(np.inf)
+    search = search_of(machine, places, SquaredRates(weights))
+    path, _ = search.solve(np.inf)
     assert path is not None
-    told, every = ([search.steps(way) for way in search.motions(np.inf, each)] for each in (False, True))
+    told, every = (
+        [search.path_cost(way) for way in search.class_representatives(np.inf, each)] for each in (False, True)
+    )
     assert told == sorted(told)
     assert every == sorted(every)
-    assert told[0] <= 1.02 * search.steps(path)  # one of a few is drawn from chart to chart, not tight
+    assert told[0] <= 1.02 * search.path_cost(path)  # one of a few is drawn from chart to chart, not tight
     assert every[0] <= told[0] * 1.01
     assert len(every) > len(told)
     assert every[-1] > 1.1 * told[-1]
@@ -164,27 +176,29 @@ def flat_charts(rng: np.random.Generator, count: int, scale: Array, free: int, h
     return Charts(none, np.zeros((count, n)), ways, np.full(count, half), -ends[0], ends[1], flat)
 
 
-@pytest.mark.parametrize(("kind", "free"), [(Squares, 1), (Squares, 2), (Length, 1), (Largest, 1)])
+@pytest.mark.parametrize(("kind", "free"), [(SquaredRates, 1), (SquaredRates, 2), (PathLength, 1), (LargestMotion, 1)])
 def test_what_is_below_a_step_is_nowhere_above_it_and_touches_it(kind: Any, free: int) -> None:
     rng = np.random.default_rng(3)
     count, n, seconds, half = 200, 4, 0.7, 0.2
     weights = rng.uniform(0.5, 2.0, n)
-    cost, scale = kind(weights), np.sqrt(weights) if kind is Squares else np.ones(n)
+    cost, scale = kind(weights), np.sqrt(weights) if kind is SquaredRates else np.ones(n)
 
     out, into = (flat_charts(rng, count, scale, free, half) for _ in range(2))
-    curve = rng.normal(size=(count, free, free)) * 0.2 * (kind is Squares)
-    after = Values(rng.normal(size=count), rng.normal(size=(count, free)), curve + curve.transpose(0, 2, 1))
+    curve = rng.normal(size=(count, free, free)) * 0.2 * (kind is SquaredRates)
+    after = QuadraticBounds(rng.normal(size=count), rng.normal(size=(count, free)), curve + curve.transpose(0, 2, 1))
     delta = 0.3 * rng.normal(size=(count, n))
-    steps = cost.below(delta, Sheets(out, *out.bent()), Sheets(into, *into.bent()), after, seconds)
+    steps = cost.lower_bounds(
+        delta, CurvedCharts(out, *out.curvature()), CurvedCharts(into, *into.curvature()), after, seconds
+    )
     grid = np.array(list(product(np.linspace(0, 1, 41 if free > 1 else 1001), repeat=free)))
     there = into.low[:, None] + (into.high - into.low)[:, None] * grid
-    to_come = after.least[:, None] + (after.slope[:, None] * there).sum(axis=2)
-    to_come = to_come + np.einsum("pga,pab,pgb->pg", there, after.curve, there) / 2
+    cost_to_go = after.least[:, None] + (after.slope[:, None] * there).sum(axis=2)
+    cost_to_go = cost_to_go + np.einsum("pga,pab,pgb->pg", there, after.curve, there) / 2
 
     def costs(place: Array) -> Array:
         start = delta - np.einsum("pnr,pr->pn", out.tangents, place)
         ways = start[:, None] + np.einsum("pnr,pgr->pgn", into.tangents, there)
-        return np.asarray((cost.of(ways, seconds) + to_come).min(axis=1))
+        return np.asarray((cost.evaluate(ways, seconds) + cost_to_go).min(axis=1))
 
     def somewhere() -> Array:
         return np.asarray(out.low + (out.high - out.low) * rng.uniform(size=(count, free)))
@@ -196,21 +210,21 @@ def test_what_is_below_a_step_is_nowhere_above_it_and_touches_it(kind: Any, free
         below = value + (slope * way).sum(axis=1) + np.einsum("pa,pab,pb->p", way, steps.curve, way) / 2
         assert (below <= costs(other) + 1e-9).all()
         assert (value <= costs(place) + 1e-9).all()
-        if kind is not Squares:
+        if kind is not SquaredRates:
             assert value == pytest.approx(costs(place), abs=1e-3)
     near = somewhere()
     lower = steps.lower(near, np.zeros((count, free)), np.zeros((count, free, free)))
     assert (steps.at(lower)[0] <= steps.at(near)[0] + 1e-9).all()
 
 
-@pytest.mark.parametrize(("kind", "free"), [(Squares, 1), (Squares, 2), (Length, 1), (Largest, 1)])
+@pytest.mark.parametrize(("kind", "free"), [(SquaredRates, 1), (SquaredRates, 2), (PathLength, 1), (LargestMotion, 1)])
 def test_what_is_below_a_step_is_so_where_the_sets_bend_away_from_their_charts_and_a_cubic_more(
     kind: Any, free: int
 ) -> None:
     rng = np.random.default_rng(5)
     count, n, seconds, half = 100, 4, 0.7, 0.2
     weights = rng.uniform(0.5, 2.0, n)
-    cost, scale = kind(weights), np.sqrt(weights) if kind is Squares else np.ones(n)
+    cost, scale = kind(weights), np.sqrt(weights) if kind is SquaredRates else np.ones(n)
     rim = np.broadcast_to(half * _rim(free), (count, len(_rim(free)), free))
 
     def bent() -> tuple[Charts, Any]:
@@ -221,20 +235,22 @@ def test_what_is_below_a_step_is_so_where_the_sets_bend_away_from_their_charts_a
             cubic = np.einsum("pna,pga->pgn", cubes, (at / half) ** 3)
             return np.asarray(np.einsum("pga,pnab,pgb->pgn", at, bends, at) / 2 + cubic)
 
-        return replace(flat_charts(rng, count, scale, free, half), strays=stray(rim)), stray
+        return replace(flat_charts(rng, count, scale, free, half), deviations=stray(rim)), stray
 
     (out, away), (into, beyond) = bent(), bent()
-    after = Values(rng.normal(size=count), rng.normal(size=(count, free)), np.zeros((count, free, free)))
+    after = QuadraticBounds(rng.normal(size=count), rng.normal(size=(count, free)), np.zeros((count, free, free)))
     delta = 0.3 * rng.normal(size=(count, n))
-    steps = cost.below(delta, Sheets(out, *out.bent()), Sheets(into, *into.bent()), after, seconds)
+    steps = cost.lower_bounds(
+        delta, CurvedCharts(out, *out.curvature()), CurvedCharts(into, *into.curvature()), after, seconds
+    )
     grid = np.array(list(product(np.linspace(0, 1, 31 if free > 1 else 501), repeat=free)))
     there = into.low[:, None] + (into.high - into.low)[:, None] * grid
-    to_come = after.least[:, None] + (after.slope[:, None] * there).sum(axis=2)
+    cost_to_go = after.least[:, None] + (after.slope[:, None] * there).sum(axis=2)
     ends, gaps = np.einsum("pnr,pgr->pgn", into.tangents, there) + beyond(there), []
     for shares in rng.choice([0.0, 0.3, 0.8, 1.0], size=(12, 2, count, free)):
         place, other = out.low + (out.high - out.low) * shares
         start = np.einsum("pnr,pr->pn", out.tangents, other) + away(other[:, None])[:, 0]
-        costs = (cost.of(delta[:, None] + ends - start[:, None], seconds) + to_come).min(axis=1)
+        costs = (cost.evaluate(delta[:, None] + ends - start[:, None], seconds) + cost_to_go).min(axis=1)
         value, slope = steps.at(place)
         way = other - place
         below = value + (slope * way).sum(axis=1) + np.einsum("pa,pab,pb->p", way, steps.curve, way) / 2
@@ -266,17 +282,19 @@ def test_what_is_lost_of_steps_between_sets_that_bend_is_of_higher_order_than_th
             return Charts(none, np.zeros((count, n)), along, box[:, 0], -box, box, stray(rim)), stray
 
         (out, away), (into, beyond) = bent(), bent()
-        after = Values(np.zeros(count), rng.normal(size=(count, free)), np.zeros((count, free, free)))
-        delta, cost = 0.3 * rng.normal(size=(count, n)), Squares(weights)
-        steps = cost.below(delta, Sheets(out, *out.bent()), Sheets(into, *into.bent()), after, seconds)
+        after = QuadraticBounds(np.zeros(count), rng.normal(size=(count, free)), np.zeros((count, free, free)))
+        delta, cost = 0.3 * rng.normal(size=(count, n)), SquaredRates(weights)
+        steps = cost.lower_bounds(
+            delta, CurvedCharts(out, *out.curvature()), CurvedCharts(into, *into.curvature()), after, seconds
+        )
         grid = np.array(list(product(np.linspace(-half, half, 41 if free > 1 else 501), repeat=free)))
         there = np.broadcast_to(grid, (count, *grid.shape))
-        to_come = (after.slope[:, None] * there).sum(axis=2)
+        cost_to_go = (after.slope[:, None] * there).sum(axis=2)
         ends, gaps = np.einsum("pnr,pgr->pgn", along, there) + beyond(there), []
         for shares in rng.choice([-1.0, -0.5, 0.0, 0.4, 1.0], size=(12, count, free)):
             place = half * shares
             start = np.einsum("pnr,pr->pn", along, place) + away(place[:, None])[:, 0]
-            costs = cost.of(delta[:, None] + ends - start[:, None], seconds) + to_come
+            costs = cost.evaluate(delta[:, None] + ends - start[:, None], seconds) + cost_to_go
             gaps.append(costs.min(axis=1) - steps.at(place)[0])
         return np.array(gaps)
 
@@ -287,23 +305,33 @@ def test_what_is_lost_of_steps_between_sets_that_bend_is_of_higher_order_than_th
     assert large.mean() < (8e-6 if free == 1 else 5.5e-5)
 
 
-@pytest.mark.parametrize(("kind", "free"), [(Squares, 1), (Squares, 2), (Length, 1), (Largest, 1)])
+@pytest.mark.parametrize(("kind", "free"), [(SquaredRates, 1), (SquaredRates, 2), (PathLength, 1), (LargestMotion, 1)])
 def test_bounds_on_a_chart_are_above_no_step_from_it_nor_with_what_is_known_of_the_rest(kind: Any, free: int) -> None:
     rng = np.random.default_rng(11)
     groups, each, n, seconds, half = 40, 5, 4, 0.7, 0.2
     count = groups * each
     weights = rng.uniform(0.5, 2.0, n)
-    cost, scale = kind(weights), np.sqrt(weights) if kind is Squares else np.ones(n)
-    out = flat_charts(rng, groups, scale, free, half).of(np.repeat(np.arange(groups), each))
+    cost, scale = kind(weights), np.sqrt(weights) if kind is SquaredRates else np.ones(n)
+    out = flat_charts(rng, groups, scale, free, half).select(np.repeat(np.arange(groups), each))
     into = flat_charts(rng, count, scale, free, half)
-    curve = rng.normal(size=(count, free, free)) * 0.2 * (kind is Squares)
-    after = Values(rng.normal(size=count) / 50, rng.normal(size=(count, free)) / 5, curve + curve.transpose(0, 2, 1))
+    curve = rng.normal(size=(count, free, free)) * 0.2 * (kind is SquaredRates)
+    after = QuadraticBounds(
+        rng.normal(size=count) / 50, rng.normal(size=(count, free)) / 5, curve + curve.transpose(0, 2, 1)
+    )
     delta = np.repeat(0.3 * rng.normal(size=(groups, n)), each, axis=0) + 0.05 * rng.normal(size=(count, n))
-    steps = cost.below(delta, Sheets(out, *out.bent()), Sheets(into, *into.bent()), after, seconds)
+    steps = cost.lower_bounds(
+        delta, CurvedCharts(out, *out.curvature()), CurvedCharts(into, *into.curvature()), after, seconds
+    )
     starts = np.arange(0, count, each)
-    found, boxes, gaps = _below_all(steps, out, starts, np.full(groups, np.inf), GraphSettings()), out.of(starts), []
-    rest = Values(rng.normal(size=count), rng.normal(size=(count, free)), 0.1 * (curve + curve.transpose(0, 2, 1)))
-    whole, corners = _whole(steps, out, rest), np.array(list(product((0.0, 1.0), repeat=free)))
+    found, boxes, gaps = (
+        _bound_charts(steps, out, starts, np.full(groups, np.inf), GraphSettings()),
+        out.select(starts),
+        [],
+    )
+    rest = QuadraticBounds(
+        rng.normal(size=count), rng.normal(size=(count, free)), 0.1 * (curve + curve.transpose(0, 2, 1))
+    )
+    whole, corners = _bound_with_rest(steps, out, rest), np.array(list(product((0.0, 1.0), repeat=free)))
     for share in [*np.repeat(corners[:, None], groups, axis=1), *rng.uniform(size=(50, groups, free))]:
         place = boxes.low + (boxes.high - boxes.low) * share
         places = np.repeat(place, each, axis=0)
@@ -314,44 +342,44 @@ def test_bounds_on_a_chart_are_above_no_step_from_it_nor_with_what_is_known_of_t
     assert np.median(np.min(gaps, axis=0)) < 0.02  # of costs of about 0.4
 
 
-@pytest.mark.parametrize("kind", [Squares, Length])
+@pytest.mark.parametrize("kind", [SquaredRates, PathLength])
 def test_steps_that_are_not_looked_at_change_no_bound(kind: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """All steps to every chart that limits allow, beside those that are thought to be worth it."""
     machine, _, places, weights = random_case(4)
     search = search_of(machine, places, kind(weights))
-    graph = search.whole_graph()
-    some = [graph.to_come(), graph.passed()]
+    graph = search.full_graph()
+    some = [graph.cost_to_go(), graph.cost_to_come()]
     monkeypatch.setattr("ocp.motion.search.value._least_of_groups", lambda high, group: np.full(len(high), np.inf))
-    whole = [graph.to_come(), graph.passed()]
+    whole = [graph.cost_to_go(), graph.cost_to_come()]
     for k in range(INSTANTS):
         for few, every in zip(some, whole, strict=True):
-            assert graph.least(few[k], k) == pytest.approx(graph.least(every[k], k), rel=0.02, abs=1e-9)
-    low = [float(graph.least(each[0][0], 0).min()) for each in (some, whole)]
+            assert graph.minima(few[k], k) == pytest.approx(graph.minima(every[k], k), rel=0.02, abs=1e-9)
+    low = [float(graph.minima(each[0][0], 0).min()) for each in (some, whole)]
     assert low[0] >= low[1] * (1 - 1e-9)
 
 
-@pytest.mark.parametrize("kind", [Squares, Length])
+@pytest.mark.parametrize("kind", [SquaredRates, PathLength])
 @pytest.mark.parametrize("seed", [1, 6])
 def test_with_the_rest_known_the_bounds_hold_for_all_motions_below_a_cost(kind: Any, seed: int) -> None:
     """Cheap motions of a fine grid, each through the charts that its postures lie in."""
     machine, lengths, places, weights = random_case(seed)
     cost, seconds, rng = kind(weights), SECONDS / (INSTANTS - 1), np.random.default_rng(seed)
     search = search_of(machine, places, cost)
-    graph = search.whole_graph()
+    graph = search.full_graph()
     nodes = [reached(lengths, place, float(machine.robot.upper[0]), 400) for place in places]
     value = [np.zeros(len(nodes[-1]))]
     for here, there in zip(nodes[-2::-1], nodes[:0:-1], strict=True):
-        value.insert(0, (cost.of(there[None] - here[:, None], seconds) + value[0]).min(axis=1))
+        value.insert(0, (cost.evaluate(there[None] - here[:, None], seconds) + value[0]).min(axis=1))
     most = 1.3 * float(value[0].min())
-    to_come = graph.to_come(most=most)
-    passed = graph.passed(to_come, most)
-    again = graph.to_come(passed, most)
-    left = sum(int(np.isfinite(graph.through(passed, again, k)).sum()) for k in range(INSTANTS))
+    cost_to_go = graph.cost_to_go(max_cost=most)
+    passed = graph.cost_to_come(cost_to_go, most)
+    again = graph.cost_to_go(passed, most)
+    left = sum(int(np.isfinite(graph.cost_through(passed, again, k)).sum()) for k in range(INSTANTS))
     assert left < sum(map(len, graph.layers))
     for first in rng.permutation(np.flatnonzero(value[0] < most))[:40].tolist():
         path = [first]
         for k in range(INSTANTS - 1):
-            steps = cost.of(nodes[k + 1] - nodes[k][path[-1]], seconds) + value[k + 1]
+            steps = cost.evaluate(nodes[k + 1] - nodes[k][path[-1]], seconds) + value[k + 1]
             path.append(int(steps.argmin()))
         total = float(value[0][first])
         for k, at in enumerate(path):
@@ -377,7 +405,7 @@ def test_a_bound_leans_as_what_it_bounds_from_end_to_end_and_where_that_bends_up
         return np.asarray((places * (slope + bend / 2 * places)).sum(axis=1))
 
     sides = [side * half * np.eye(free)[axis] for axis in range(free) for side in (-1.0, 1.0)]
-    found = _rise([value(place) for place in (np.zeros_like(half), *sides)], half)
+    found = _secant_slopes([value(place) for place in (np.zeros_like(half), *sides)], half)
     # of the lines below a parabola at its ends and its middle the flattest; of one that bends down the chord
     flattest = np.sign(slope) * np.maximum(np.abs(slope) - bend * half / 2, 0.0)
     np.testing.assert_allclose(found, flattest if bend > 0 else slope, atol=1e-12)
