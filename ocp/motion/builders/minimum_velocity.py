@@ -36,9 +36,9 @@ STEPS_OF_GUESS = 64
 def minimum_velocity_problem(
     machine: Machine,
     tasks: TipTask | Sequence[TipTask],
-    start_joints: Any = None,
     horizon: float | None = None,
     *,
+    start: Any = None,
     start_base: Any = None,
     near: Any = None,
     cyclic: bool = False,
@@ -55,9 +55,9 @@ def minimum_velocity_problem(
 
     Args:
         machine, tasks: As of `plan`.
-        start_joints: Shape (joint_size,), rad or m. None: the joints start wherever the tips are where their tasks
-            begin; for a task of velocities, where they are at `near`.
         horizon: Final time, s; that of the tasks if None.
+        start: Joints at the start, shape (joint_size,), rad or m. None: the joints start wherever the tips are where
+            their tasks begin; for a task of velocities, where they are at `near`.
         start_base: Base at the start, shape (base_size,); the machine's base_home() if None.
         near: Joints at which the guess of a start that is free begins; inverse kinematics finds some if None.
         cyclic: Whether the joints end where they started, after a closed task. What of this follows from the task is
@@ -85,26 +85,26 @@ def minimum_velocity_problem(
     bind(machine, given)
     duration = horizon_of(given, horizon)
     limits = Limits() if limits is None else checked_instance("limits", limits, Limits)
-    reference = near if start_joints is None else start_joints
+    reference = near if start is None else start
     if reference is None:
         first = [task for task in given if task.is_pose and task.begin == 0]
         if not first:
-            words = "start_joints are missing; inverse_kinematics(machine, task) finds some for a pose"
-            raise ProblemError(words, name="start_joints")
+            words = "start is missing; inverse_kinematics(machine, task) finds some for a pose"
+            raise ProblemError(words, name="start")
         reference = inverse_kinematics(machine, first, base=start_base, limits=limits.joints)[0].joints
     joints, base = checked_configuration(machine, reference, start_base)
     heavy = checked_weights(weights, machine.joint_size)
     stretches = stretches_of(machine, given, duration)
     for stretch in stretches:
         if stretch.equations is not None:
-            begins = stretch is stretches[0] and start_joints is not None
+            begins = stretch is stretches[0] and start is not None
             checked_tasks(stretch.equations, base, joints, duration, start=begins)
     bounds, names = limits.bounds(machine, ("velocity",)), machine.robot.joint_names
-    joints = inside_limits("start_joints", names, joints, bounds.lower, bounds.upper, "start inside them")
+    joints = inside_limits("start", names, joints, bounds.lower, bounds.upper, "start inside them")
     if clearance_constraints is not None:
         checked_instance("clearance_constraints", clearance_constraints, ClearanceConstraints)
     motion = tool_motion_problem(
-        machine, stretches, base=base, start=None if start_joints is None else joints, reference=joints,
+        machine, stretches, base=base, start=None if start is None else joints, reference=joints,
         cyclic=cyclic, weights=heavy, bounds=bounds, clearance_constraints=clearance_constraints,
     )  # fmt: skip
     _attach_guess(motion, base, joints, heavy, bounds, guess_damping)

@@ -41,8 +41,8 @@ from models.spatial import expression
 from ocp.errors import ProblemError
 from ocp.motion.builders.actuator_limits import Effort, JointFriction
 from ocp.motion.builders.clearance import ClearanceConstraints
-from ocp.motion.builders.dynamics import dynamics_problem
-from ocp.motion.builders.standing.problem import FreeTime, Weights, standing_problem
+from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem
+from ocp.motion.builders.standing.problem import FreeTime, StandingSetup, Weights, standing_problem
 from ocp.motion.builders.tool_motion import ToolMotion, stretches_of, tool_motion_problem
 from ocp.motion.search.configurations import Asked
 from ocp.motion.tasks.limits import Limits
@@ -58,7 +58,10 @@ __all__ = ["MotionRequest", "declared_motion", "request_of", "restored_request",
 
 SHAPES = (Box, Capsule, Cylinder, HalfSpace, Mesh, Sphere)
 PARTS = (Robot, Link, Joint, Mimic, CollisionShape, VisualShape, Support)
-ASKED = (TipTask, Limits, ClearanceConstraints, Effort, JointFriction, Weights, FreeTime, InFoot, Pinned, IndexAtLeast)
+ASKED = (
+    TipTask, Limits, ClearanceConstraints, Effort, JointFriction, Weights, FreeTime, InFoot, Pinned, IndexAtLeast,
+    DynamicsSetup, StandingSetup,
+)  # fmt: skip
 MACHINES = (FixedBase, FreeFloating, Standing)
 KINDS = {kind.__name__: kind for kind in (*MACHINES, *PARTS, *SHAPES, *ASKED, MovingObstacle, Body)}
 SYMBOLS = {"SX": ca.SX, "MX": ca.MX}

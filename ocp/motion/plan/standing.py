@@ -12,8 +12,8 @@ from models import Standing
 from models.arrays import Array
 from ocp.errors import ProblemError, SolveError, checked_flag, checked_instance
 from ocp.motion.builders.clearance import ClearanceConstraints
-from ocp.motion.builders.standing.plan import Asked, plan_standing
-from ocp.motion.builders.standing.problem import Weights
+from ocp.motion.builders.standing.plan import plan_standing
+from ocp.motion.builders.standing.problem import StandingSetup, Weights
 from ocp.motion.local.inverse_kinematics import inverse_kinematics
 from ocp.motion.plan.candidate import Candidate, Reason, Rejection, Stage
 from ocp.motion.plan.candidate_queue import CandidateQueue, Solver
@@ -58,7 +58,7 @@ def plan_to_stand(
     """
     checked_flag("cyclic", cyclic)
     if cyclic:
-        words = "a standing motion is not closed: give plan_standing(..., end_joints=...) the joints at the end"
+        words = "a standing motion is not closed: give plan_standing the joints at the end, StandingSetup(end=...)"
         raise ProblemError(words, name="cyclic", value=cyclic)
     if weights is not None:
         checked_instance("weights", weights, Weights)
@@ -71,11 +71,14 @@ def plan_to_stand(
             )
             raise ProblemError(words, name=f"task {number}", value=(task.begin, task.end), limit=(0.0, duration))
     equations = bind(machine, given)
-    asked: Asked = {"weights": weights, "limits": limits, "symbols": ca.SX if _takes_scalars(equations) else ca.MX}
-    asked["start"], asked["end"] = _rest(equations, 0.0), _rest(equations, duration)
-    queue = CandidateQueue(
-        _StandingSolver(machine, given, duration, clearance_constraints, asked, start is not None), PlannerSettings()
+    setup = StandingSetup(
+        start_velocity=_rest(equations, 0.0),
+        end_velocity=_rest(equations, duration),
+        clearance_constraints=clearance_constraints,
+        symbols=ca.SX if _takes_scalars(equations) else ca.MX,
     )
+    options: dict[str, Any] = {"weights": weights, "limits": limits, "setup": setup}
+    queue = CandidateQueue(_StandingSolver(machine, given, duration, options, start is not None), PlannerSettings())
     seeds = [Candidate(joints) for joints in _postures(machine, given, start, limits, seed)]
     for batch in [[one] for one in seeds] if search == "start" else [seeds]:
         queue.run(batch)
@@ -91,8 +94,7 @@ class _StandingSolver(Solver):
     machine: Standing
     tasks: list[TipTask]
     duration: float
-    clearance_constraints: ClearanceConstraints | None
-    asked: Asked
+    options: dict[str, Any]
     start_given: bool
 
     def advance(self, candidate: Candidate) -> list[Candidate]:
@@ -102,15 +104,7 @@ class _StandingSolver(Solver):
             ProblemError, SolveError: Of the start that was given.
         """
         try:
-            start = candidate.start
-            solution = plan_standing(
-                self.machine,
-                self.tasks,
-                start,
-                self.duration,
-                clearance_constraints=self.clearance_constraints,
-                **self.asked,
-            )
+            solution = plan_standing(self.machine, self.tasks, self.duration, start=candidate.start, **self.options)
         except (ProblemError, SolveError) as error:
             if self.start_given or isinstance(error.__cause__, KeyboardInterrupt):
                 raise

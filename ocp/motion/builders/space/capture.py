@@ -31,7 +31,7 @@ from ocp.direct.collocation import Collocation
 from ocp.errors import ProblemError, checked_instance
 from ocp.motion.builders.actuator_limits import Effort, JointFriction
 from ocp.motion.builders.clearance import ClearanceConstraints
-from ocp.motion.builders.dynamics import dynamics_problem, rates_at
+from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem, end_velocities
 from ocp.motion.builders.dynamics_plan import within_limits
 from ocp.motion.builders.space.grasping import Cone, Grasp, checked_pair, grasp_wrench, motion_of, pair_momentum
 from ocp.motion.builders.space.guess import (
@@ -50,25 +50,25 @@ from ocp.problem.phases import Phases
 from ocp.problem.problem import Problem
 from ocp.solution import Solution
 
-__all__ = ["AskedOfCapture", "capture_problem", "chained_capture", "plan_capture"]
+__all__ = ["CaptureOptions", "capture_problem", "chained_capture", "plan_capture"]
 
 APPROACH, DETUMBLE = "approach", "detumble"
 POINTS = Collocation(8, degree=4, scheme="legendre")
 
 
-class AskedOfCapture(TypedDict, total=False):
-    """The options of `capture_problem`, which says what they are."""
+class CaptureOptions(TypedDict, total=False):
+    """Options of `capture_problem`, described there."""
 
     start_base: Any
     target_base: Any
-    start_velocities: Any
+    start_velocity: Any
     limits: Limits | None
     effort: Effort | None
     friction: JointFriction | None
     cone: Cone | None
     grasp: Grasp | None
     clearance_constraints: ClearanceConstraints | None
-    end_joints: Any
+    end: Any
     rest: bool
 
 
@@ -76,10 +76,11 @@ class AskedOfCapture(TypedDict, total=False):
 def capture_problem(
     chaser: FreeFloating,
     target: FreeFloating,
-    start_joints: Any,
     approach: float | FreeTime,
     detumble: float | FreeTime,
-    **asked: Unpack[AskedOfCapture],
+    *,
+    start: Any,
+    **asked: Unpack[CaptureOptions],
 ) -> Phases:
     """Approach, grasp and detumbling at the least effort of both together.
 
@@ -92,15 +93,15 @@ def capture_problem(
             the wheels that spin, too.
         target: A machine of one link without joints, on the same kind of base, with its momentum; its tip is the frame
             that is grasped, which the chaser's tip meets axis by axis.
-        start_joints: Of the chaser. Shape (n,), rad or m.
-        approach, detumble: How long the phases take, s, or FreeTime(...).
+        approach, detumble: Durations of the phases, s, or FreeTime(...).
+        start: Joints of the chaser. Shape (n,), rad or m.
         asked: start_base, target_base: configurations of both bases at the start; home if None. Shape (base_size,).
-            start_velocities: Of the chaser's joints; at rest if None. Shape (n,), rad/s.
+            start_velocity: Of the chaser's joints; at rest if None. Shape (n,), rad/s.
             limits, effort, friction: As of `dynamics_problem`, of both phases.
             cone: Of the approach. The tip begins at a distance of twice its length or more, or within it.
             grasp: What the hand bears while detumbling.
             clearance_constraints: Of the chaser while approaching, as of `dynamics_problem`; not the target.
-            end_joints: At the end of the detumbling. Shape (n,), nan where free, as those of wheels.
+            end: Joints at the end of the detumbling. Shape (n,), nan where free, as those of wheels.
             rest: Whether joints (but for wheels) and base turn no more at the end; True if not given.
 
     Raises:
@@ -109,7 +110,7 @@ def capture_problem(
             what they take at most, N m s; or "reach": the target is farther off, `value`, than the arm is long,
             `limit`, m.
     """
-    given = _Capture.of(chaser, target, start_joints, (approach, detumble), asked)
+    given = _Capture.of(chaser, target, start, (approach, detumble), asked)
     begin, after = given.approach(approach), given.detumbling(detumble, None)
     given.guess_approach(begin)
     guess_braking(after, given.pair, *_end_of(begin))
@@ -130,19 +131,19 @@ def capture_problem(
 def plan_capture(
     chaser: FreeFloating,
     target: FreeFloating,
-    start_joints: Any,
     approach: float | FreeTime,
     detumble: float | FreeTime,
     *,
+    start: Any,
     method: Collocation | None = None,
     options: Mapping[str, Any] | None = None,
     tolerances: Mapping[str, float] | None = None,
-    **asked: Unpack[AskedOfCapture],
+    **asked: Unpack[CaptureOptions],
 ) -> Solution:
     """Solve `capture_problem` and audit the plan, whose limits hold between the nodes, too, as in `plan_dynamics`.
 
     Args:
-        chaser, target, start_joints, approach, detumble, asked: As of `capture_problem`.
+        chaser, target, approach, detumble, start, asked: As of `capture_problem`.
         method: The first mesh of both phases, controls at the points; 8 Legendre intervals of degree 4 if None.
         options: Of IPOPT. tolerances: Of the audit, by name.
 
@@ -155,8 +156,8 @@ def plan_capture(
     """
 
     def declare(clearance_constraints: ClearanceConstraints | None) -> Problem:
-        kept: AskedOfCapture = {**asked, "clearance_constraints": clearance_constraints}
-        return capture_problem(chaser, target, start_joints, approach, detumble, **kept)
+        kept: CaptureOptions = {**asked, "clearance_constraints": clearance_constraints}
+        return capture_problem(chaser, target, approach, detumble, start=start, **kept)
 
     mesh = POINTS if method is None else method
     driven = {phase: (chaser, asked.get("limits")) for phase in (APPROACH, DETUMBLE)}
@@ -167,14 +168,14 @@ def plan_capture(
 def chained_capture(
     chaser: FreeFloating,
     target: FreeFloating,
-    start_joints: Any,
     approach: float | FreeTime,
     detumble: float | FreeTime,
     *,
+    start: Any,
     method: Collocation | None = None,
     options: Mapping[str, Any] | None = None,
     tolerances: Mapping[str, float] | None = None,
-    **asked: Unpack[AskedOfCapture],
+    **asked: Unpack[CaptureOptions],
 ) -> tuple[Solution, Solution]:
     """The approach at its own least effort, then the detumbling from where that ends; `plan_capture` costs less.
 
@@ -185,7 +186,7 @@ def chained_capture(
     """
     mesh = POINTS if method is None else method
     limits = asked.get("limits")
-    given = _Capture.of(chaser, target, start_joints, (approach, detumble), asked)
+    given = _Capture.of(chaser, target, start, (approach, detumble), asked)
     given.detumbling(detumble, None)  # refused before the approach is solved
 
     def first(clearance_constraints: ClearanceConstraints | None) -> Problem:
@@ -223,22 +224,17 @@ class _Capture:
     base: Array
     target_base: Array
     times: tuple[float | FreeTime, float | FreeTime]
-    asked: AskedOfCapture
+    asked: CaptureOptions
 
     @classmethod
     def of(
-        cls,
-        chaser: FreeFloating,
-        target: FreeFloating,
-        start_joints: Any,
-        times: tuple[Any, Any],
-        asked: AskedOfCapture,
+        cls, chaser: FreeFloating, target: FreeFloating, start: Any, times: tuple[Any, Any], asked: CaptureOptions
     ) -> _Capture:
         robot = checked_pair(chaser, target)
         for what, kind in (("cone", Cone), ("grasp", Grasp), ("limits", Limits)):
             if asked.get(what) is not None:
                 checked_instance(f"capture: {what}", asked.get(what), kind)
-        joints, base = checked_configuration(chaser, start_joints, asked.get("start_base"))
+        joints, base = checked_configuration(chaser, start, asked.get("start_base"))
         _, there = checked_configuration(target, np.zeros(0), asked.get("target_base"))
         carried = np.array(ca.DM(pair_momentum(chaser, target, base, there, joints))).ravel()
         pair = replace(chaser, robot=robot, conserved_momentum=carried)
@@ -258,8 +254,8 @@ class _Capture:
     @property
     def start(self) -> Start:
         """Where it begins, and until when it may take."""
-        given = self.asked.get("start_velocities")
-        rates = rates_at("start_velocities", "rest" if given is None else given, self.chaser.joint_size)
+        given = self.asked.get("start_velocity")
+        rates = end_velocities("start_velocity", "rest" if given is None else given, self.chaser.joint_size)
         latest = [time.upper if isinstance(time, FreeTime) else checked_horizon(time) for time in self.times]
         return Start(self.base, self.joints, rates, self.target_base, *latest)
 
@@ -267,19 +263,23 @@ class _Capture:
     def shared(self) -> dict[str, Any]:
         """Options of both phases."""
         asked: Mapping[str, Any] = self.asked
-        return {name: asked[name] for name in ("limits", "effort", "friction") if name in asked}
+        return {name: asked[name] for name in ("limits", "effort") if name in asked}
 
     def approach(self, duration: float | FreeTime) -> Problem:
         """The first phase: the target's motion, and the grasp at the end."""
         chaser, target, asked = self.chaser, self.target, self.asked
         problem = dynamics_problem(
             chaser,
-            self.joints,
+            (),
             duration,
-            start_base=self.base,
-            end="free",
-            clearance_constraints=asked.get("clearance_constraints"),
-            start=self.start.velocities,
+            start=self.joints,
+            setup=DynamicsSetup(
+                start_velocity=self.start.velocities,
+                end_velocity="free",
+                start_base=self.base,
+                friction=asked.get("friction"),
+                clearance_constraints=asked.get("clearance_constraints"),
+            ),
             **self.shared,
         )
         earliest = duration.lower if isinstance(duration, FreeTime) else duration
@@ -316,14 +316,14 @@ class _Capture:
         wheels = wheels_of(pair.robot)
         rest = asked.get("rest", True)
         still = np.array([np.nan if name in wheels else 0.0 for name in pair.robot.joint_names])
-        ends: dict[str, Any] = {"end_joints": asked.get("end_joints"), "end": still if rest else "free"}
-        if start is None:
-            ends |= {"start": "free", "start_base": np.full(pair.base_size, np.nan)}
-            begin = None
-        else:
-            begin = start["joints"]
-            ends |= {"start": start["velocities"], "start_base": start["base"]}
-        problem = dynamics_problem(pair, begin, duration, **ends, **self.shared)
+        setup = DynamicsSetup(
+            start_velocity="free" if start is None else start["velocities"],
+            end_velocity=still if rest else "free",
+            start_base=np.full(pair.base_size, np.nan) if start is None else start["base"],
+            friction=asked.get("friction"),
+        )
+        begin = None if start is None else start["joints"]
+        problem = dynamics_problem(pair, (), duration, start=begin, end=asked.get("end"), setup=setup, **self.shared)
         grasp = asked.get("grasp") or Grasp()
         for what, value in zip(("force", "moment"), grasp_wrench(pair, self.target, problem), strict=True):
             most = float(getattr(grasp, what))

@@ -1,7 +1,7 @@
 """Plans of machines that stand unfastened on the ground, on one support or on one after the other."""
 
 from ocp.motion.builders.standing.plan import plan_standing, plan_steps
-from ocp.motion.builders.standing.problem import FreeTime, Weights, motion_cost, standing_problem
+from ocp.motion.builders.standing.problem import FreeTime, StandingSetup, Weights, motion_cost, standing_problem
 from ocp.motion.builders.standing.resolved import StepsMotion, resolve_steps, steps_motion
 from ocp.motion.builders.standing.stances import StancePhase, Steps, standing_configuration, walk
 from ocp.motion.builders.standing.steps import StepWeights, steps_problem
@@ -17,6 +17,7 @@ __all__ = [
     "Limits",
     "Pinned",
     "StancePhase",
+    "StandingSetup",
     "StepWeights",
     "Steps",
     "StepsMotion",

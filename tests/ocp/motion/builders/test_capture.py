@@ -17,6 +17,7 @@ from models.machines.machine import with_tip
 from ocp import (
     Collocation,
     Cone,
+    DynamicsSetup,
     Effort,
     Grasp,
     Limits,
@@ -146,7 +147,13 @@ def test_what_the_hand_bears_changes_the_momentum_of_the_target() -> None:
     asked, after = planar_capture(), planar().phase("detumble")
     other = asked["target"]
     pair = FreeFloating(joined(asked["chaser"].robot, other.robot), "planar", conserved_momentum=[0.45, 0, 0])
-    problem = dynamics_problem(pair, None, 1.0, start="free", end="free", start_base=np.full(3, nan))
+    problem = dynamics_problem(
+        pair,
+        (),
+        1.0,
+        start=None,
+        setup=DynamicsSetup(start_velocity="free", end_velocity="free", start_base=np.full(3, nan)),
+    )
     names = ("base", "joints", "velocities", "accelerations")
     variables = problem.declared.states | problem.declared.controls
     force, moment = grasp_wrench(pair, other, problem)
@@ -268,7 +275,7 @@ def test_a_wheel_is_one_wherever_it_stands_among_the_joints() -> None:
     *arm, wheel = asked["chaser"].robot.joints
     asked |= {
         "chaser": replace(asked["chaser"], robot=replace(asked["chaser"].robot, joints=(wheel, *arm))),
-        "start_joints": np.roll(PLANAR_START, 1),
+        "start": np.roll(PLANAR_START, 1),
         "effort": Effort(torque=1.0, acceleration=[0.0] + [1.0] * 3, time=0.05),
     }
     plan = plan_capture(**asked)

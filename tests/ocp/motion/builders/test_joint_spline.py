@@ -147,7 +147,7 @@ def test_a_solution_at_constant_speed_is_scheduled() -> None:
     velocity = (np.array([0.5, 0.35]) - [0.4, 0.2]) / horizon
     start = angles(np.zeros(1), path)[0]
     problem = minimum_velocity_problem(
-        arm(), tasks=TipTask(rows=(3, 5), velocity=velocity), start_joints=start, horizon=horizon
+        arm(), tasks=TipTask(rows=(3, 5), velocity=velocity), start=start, horizon=horizon
     )
     solution = solve(problem, Collocation(intervals=20, degree=4))
     joints = joint_path(arm(), solution, path)
