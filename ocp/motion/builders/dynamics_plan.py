@@ -38,9 +38,9 @@ from ocp.methods import solve
 from ocp.motion.builders.actuator_limits import Effort, Motors, checked_motors
 from ocp.motion.builders.clearance import (
     ClearanceConstraints,
-    Kept,
+    Constraints,
     collision_error,
-    of_clearance,
+    is_clearance,
     solve_with_clearance,
 )
 from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem
@@ -300,8 +300,8 @@ def breaks_of(tasks: TipTask | Sequence[TipTask], horizon: float) -> Sequence[fl
 
 
 def within_limits(
-    declare: Callable[[Kept], Problem],
-    clearance_constraints: Kept,
+    declare: Callable[[Constraints], Problem],
+    clearance_constraints: Constraints,
     method: Collocation | None,
     breaks: Sequence[float],
     options: Mapping[str, Any] | None,
@@ -326,12 +326,12 @@ def within_limits(
         try:
             return _first_within_limits(problem, mesh, settings, tolerances, guess)
         except SolveError as error:
-            in_collision = error.solution if of_clearance(error.name) else None
+            in_collision = error.solution if is_clearance(error.name) else None
             if guess is None or in_collision is not None:
                 raise
         return solve_problem(problem, None)
 
-    def run(clearance_constraints: Kept) -> Solution:
+    def run(clearance_constraints: Constraints) -> Solution:
         return solve_problem(declare(clearance_constraints), in_collision)
 
     try:

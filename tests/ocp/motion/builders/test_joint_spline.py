@@ -135,7 +135,7 @@ def test_a_plan_whose_tasks_do_not_run_along_the_path_is_refused() -> None:
         (TipTask.along(LINE, SPEED, rows=(3, 5)), PATH, r"m off the path at 2 s"),
         (TipTask.along(LINE, slow, rows=(3, 5)), LINE, r"m off the path at"),
         ([held, later], LINE, r"m off the path at"),
-        (later, LINE, "ask for no position at 0 s"),
+        (later, LINE, "have no position at 0 s"),
     ):
         with pytest.raises(ProblemError, match=words) as caught:
             joint_path(arm(), planned(tasks), path)
