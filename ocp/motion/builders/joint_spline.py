@@ -1,7 +1,7 @@
 """Spline of a plan's joints along a path, with the joint torques, for the speed schedule.
 
-The spline has degree 5, so that the third derivative by the distance, which joint jerks need, is continuous. The torques
-are linear in the line's acceleration a and squared speed v^2. With joints q(s), inverse dynamics tau(q, rate,
+The spline has degree 5, so that the third derivative by the distance, which joint jerks need, is continuous. The
+torques are linear in the line's acceleration a and squared speed v^2. With joints q(s), inverse dynamics tau(q, rate,
 acceleration) without gravity, and rest(q) that of gravity alone,
 
     torque = tau(q, 0, q') a + tau(q, q', q'') v^2 + rest(q).
@@ -261,7 +261,7 @@ class _PiecewisePolynomial:
 
 
 class _BatchedFunction:
-    """Casadi SX Function of vectors evaluated for many inputs at once, instruction by instruction on rows of numbers."""
+    """Casadi SX Function evaluated for many inputs at once, each instruction on rows of numbers."""
 
     def __init__(self, function: Any) -> None:
         self.sizes = [function.size1_out(k) for k in range(function.n_out())]
@@ -275,7 +275,11 @@ class _BatchedFunction:
         self.tables: list[tuple[Array, list[tuple[Any, list[Array]]]]] = []
         row: dict[int, int] = {}  # row of each memory location
         for k in range(function.n_instructions()):
-            kind, source, target = function.instruction_id(k), function.instruction_input(k), function.instruction_output(k)
+            kind, source, target = (
+                function.instruction_id(k),
+                function.instruction_input(k),
+                function.instruction_output(k),
+            )
             if kind == ca.OP_INPUT:
                 row[target[0]] = inputs[source[0]] + source[1]
             elif kind == ca.OP_CONST:

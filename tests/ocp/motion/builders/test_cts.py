@@ -12,7 +12,7 @@ from models import Box, Rig, optimal_inverse, reference_rig, reference_tunnel
 from models.cts.clearance import CollisionScene, clearances
 from models.cts.rig import HOME, INCH, inverse
 from ocp import Collocation, ProblemError, Solution, roll_problem, solve, spline_targets
-from ocp.motion.builders.cts import least_course
+from ocp.motion.builders.cts import least_cost_roll
 from tests.models.cts.cts_oracle import index_by_geometry
 
 RIG, TUNNEL = reference_rig(), reference_tunnel()
@@ -91,7 +91,7 @@ def test_the_plan_goes_round_an_obstacle_on_the_way_of_the_free_roll() -> None:
 
 def course(cost: Any, t: Any, **options: Any) -> Any:
     known = {"lower": -np.inf, "upper": np.inf, "start": None, "rate_weight": 1e-4, "acceleration_weight": 0.0}
-    return least_course(lambda k, roll: cost(t[k], roll), t, **{**known, "rate_limit": np.inf, **options})
+    return least_cost_roll(lambda k, roll: cost(t[k], roll), t, **{**known, "rate_limit": np.inf, **options})
 
 
 def test_a_course_winds_as_often_as_it_pays() -> None:

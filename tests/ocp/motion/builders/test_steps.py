@@ -320,7 +320,9 @@ def test_a_step_that_is_too_fast_is_refused_with_the_time_that_it_takes() -> Non
         plan_steps(fast, start=bent(fast), **GROUND)
     error = refusal.value
     assert (error.name, error.limit) == ("2 left", 0.06)
-    assert re.search(r"phase '2 left': 0\.\d+ s, 0\.06 s are asked; at their limits .*(torques|velocities)", str(error))
+    assert re.search(
+        r"phase '2 left': 0\.\d+ s, 0\.06 s are requested; at their limits .*(torques|velocities)", str(error)
+    )
     assert error.value > 1.3 * 0.06
     assert guess_in_time(planar_steps(1, 0.05, 1.05 * error.value), bent(fast), GROUND, {}) is not None
 
