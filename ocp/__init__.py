@@ -9,7 +9,7 @@ from ocp.indirect.method import Indirect
 from ocp.methods import certificate, prepare, solve
 from ocp.motion.builders.actuator_limits import Effort, JointFriction, joint_torques
 from ocp.motion.builders.clearance import ClearanceConstraints
-from ocp.motion.builders.cts import roll_problem, spline_targets
+from ocp.motion.builders.cts import RollObstacles, RollSettings, roll_problem, spline_targets
 from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem
 from ocp.motion.builders.dynamics_plan import Leg, dynamics_phases, plan_dynamics
 from ocp.motion.builders.joint_spline import joint_path
@@ -86,6 +86,8 @@ __all__ = [
     "ProblemError",
     "Reconfiguration",
     "RefinementWarning",
+    "RollObstacles",
+    "RollSettings",
     "SegmentedPlan",
     "Sensitivity",
     "Solution",

@@ -33,7 +33,7 @@ from ocp.direct.guess import Samples
 from ocp.errors import NOT_NUMBERS, ProblemError, checked_instance, checked_positive, floats, real
 from ocp.problem.problem import Problem
 
-__all__ = ["least_cost_roll", "roll_problem", "spline_targets"]
+__all__ = ["RollObstacles", "RollSettings", "least_cost_roll", "roll_problem", "spline_targets"]
 
 Targets = Callable[[Any], Any]
 LARGEST_SINE = 1 - 1e-9  # sine of q4 and cosine of q2, just below the end of the reach
@@ -96,6 +96,82 @@ def spline_targets(times: Any, targets: Any) -> Targets:
     return lambda time: curve(time)
 
 
+@dataclass(frozen=True, eq=False)
+class RollSettings:
+    """Weights and limits of `roll_problem`.
+
+    Attributes:
+        rate_weight, acceleration_weight: w in s^2 and v in s^4; v keeps the control smooth.
+        rate_limit, acceleration_limit: rad/s and rad/s^2.
+        branch: One of the four branches of inverse kinematics.
+        symbols: casadi.MX, or casadi.SX if the targets are plain expressions.
+
+    Raises:
+        ProblemError: A weight or limit is negative, or another value is invalid.
+    """
+
+    rate_weight: float = 0.05
+    acceleration_weight: float = 1e-4
+    rate_limit: float = np.inf
+    acceleration_limit: float = np.inf
+    branch: Branch = HOME
+    symbols: Any = ca.MX
+
+    def __post_init__(self) -> None:
+        for name in ("rate_weight", "acceleration_weight", "rate_limit", "acceleration_limit"):
+            _check_nonnegative(name, getattr(self, name), finite=name.endswith("weight"))
+        try:
+            object.__setattr__(self, "branch", checked_branch(self.branch))
+        except ModelError as error:
+            raise ProblemError(f"roll_problem: {error}", name=error.name, value=error.value) from error
+        if self.symbols not in (ca.SX, ca.MX):
+            words = f"roll_problem: symbols must be casadi.SX or casadi.MX, not {self.symbols!r}"
+            raise ProblemError(words, name="symbols", value=self.symbols)
+
+
+@dataclass(frozen=True, eq=False)
+class RollObstacles:
+    """Obstacles of `roll_problem`, and how the rig avoids them.
+
+    Attributes:
+        scene: Obstacles.
+        clearance: Least distance from the obstacles, m; -inf for no constraint.
+        clearance_weight, clearance_width: Weight and width (m) of the term weight exp(-distance / width) of the index.
+        softness: Width of the smooth minimum of all distances, m, see soft_minimum.
+        radii: Radii of the rig's capsules; None for their defaults.
+
+    Raises:
+        ProblemError: A value is invalid.
+    """
+
+    scene: CollisionScene
+    clearance: float = 0.0
+    clearance_weight: float = 0.0
+    clearance_width: float = 0.05
+    softness: float = 2e-3
+    radii: Radii | None = None
+
+    def __post_init__(self) -> None:
+        checked_instance("roll_problem: scene", self.scene, CollisionScene)
+        _check_nonnegative("clearance_weight", self.clearance_weight, finite=True)
+        checked_positive("roll_problem: clearance_width", self.clearance_width)
+        checked_positive("roll_problem: softness", self.softness)
+        if self.radii is not None:
+            checked_instance("roll_problem: radii", self.radii, Radii)
+        try:
+            checked_clearance(self.clearance)
+        except ModelError as error:
+            raise ProblemError(f"roll_problem: {error}", name=error.name, value=error.value) from error
+
+
+def _check_nonnegative(name: str, value: Any, *, finite: bool) -> None:
+    """Raise ProblemError if a weight or limit is negative, or infinite where it must be finite."""
+    number = real(value)
+    if not number >= 0 or (finite and np.isinf(number)):
+        message = f"roll_problem: {name} must be a number that is not negative, not {value!r}"
+        raise ProblemError(message, name=name, value=value, limit=0.0)
+
+
 @interruptible
 def roll_problem(
     rig: Rig,
@@ -103,20 +179,10 @@ def roll_problem(
     targets: Targets,
     horizon: float,
     *,
-    branch: Branch = HOME,
-    rate_weight: float = 0.05,
-    acceleration_weight: float = 1e-4,
-    rate_limit: float = np.inf,
-    acceleration_limit: float = np.inf,
     start_roll: float | None = None,
     start_rate: float | None = None,
-    scene: CollisionScene | None = None,
-    clearance: float = 0.0,
-    clearance_weight: float = 0.0,
-    clearance_width: float = 0.05,
-    softness: float = 2e-3,
-    radii: Radii | None = None,
-    symbols: Any = ca.MX,
+    settings: RollSettings | None = None,
+    obstacles: RollObstacles | None = None,
 ) -> Problem:
     """Declare the roll over a trajectory of targets with the least integral of I1 + w rate^2 + v acceleration^2.
 
@@ -128,52 +194,29 @@ def roll_problem(
         rig, tunnel: Captive trajectory rig and wind tunnel.
         targets: Function of `problem.time` (s) that returns the target, shape (5, 1): expressions, or spline_targets.
         horizon: Final time, s.
-        branch: One of the four branches of inverse kinematics.
-        rate_weight, acceleration_weight: w in s^2 and v in s^4; v keeps the control smooth.
-        rate_limit, acceleration_limit: rad/s and rad/s^2.
-        start_roll, start_rate: Roll and rate at time 0; free if None.
-        scene: Obstacles; None for none.
-        clearance: Least distance from the obstacles, m; -inf for no constraint.
-        clearance_weight, clearance_width: Weight and width (m) of the term weight exp(-distance / width) of the index.
-        softness: Width of the smooth minimum of all distances, m, see soft_minimum.
-        radii: Radii of the rig's capsules.
-        symbols: casadi.MX, or casadi.SX if the targets are plain expressions.
+        start_roll, start_rate: Roll (rad) and rate (rad/s) at time 0; free if None.
+        settings: Weights and limits; the defaults if None.
+        obstacles: Obstacles; None for none.
 
     Returns:
         The problem. Its guess is the roll of least cost on a grid of rolls and times, see least_cost_roll.
 
     Raises:
-        ProblemError: A weight or limit is negative; the horizon is not positive; no roll reaches one of the targets;
-            the start is outside the limits.
+        ProblemError: The horizon is not positive; no roll reaches one of the targets; the start is outside the limits.
     """
-    weights = {"rate_weight": rate_weight, "acceleration_weight": acceleration_weight, "rate_limit": rate_limit}
-    weights |= {"acceleration_limit": acceleration_limit, "clearance_weight": clearance_weight}
-    for name, value in weights.items():
-        weight = real(value)
-        if not weight >= 0 or (np.isinf(weight) and name.endswith("weight")):
-            message = f"roll_problem: {name} must be a number that is not negative, not {value!r}"
-            raise ProblemError(message, name=name, value=value, limit=0.0)
-    checked_positive("roll_problem: clearance_width", clearance_width)
-    try:
-        checked_clearance(clearance)
-        branch = checked_branch(branch)
-    except ModelError as error:
-        raise ProblemError(f"roll_problem: {error}", name=error.name, value=error.value) from error
     checked_positive("roll_problem: horizon", horizon)
     for name, number in (("start_roll", start_roll), ("start_rate", start_rate)):
         if number is not None and not np.isfinite(real(number)):
             raise ProblemError(f"roll_problem: {name} {number!r} must be a finite number", name=name, value=number)
     checked_instance("roll_problem: rig", rig, Rig)
     checked_instance("roll_problem: tunnel", tunnel, Tunnel)
-    if radii is not None:
-        checked_instance("roll_problem: radii", radii, Radii)
-    checked_positive("roll_problem: softness", softness)
-    if symbols not in (ca.SX, ca.MX):
-        words = f"roll_problem: symbols must be casadi.SX or casadi.MX, not {symbols!r}"
-        raise ProblemError(words, name="symbols", value=symbols)
+    settings = RollSettings() if settings is None else checked_instance("settings", settings, RollSettings)
+    if obstacles is not None:
+        checked_instance("obstacles", obstacles, RollObstacles)
+    symbols, largest, fastest = settings.symbols, settings.acceleration_limit, settings.rate_limit
     x, phi = ca.SX.sym("target", 5), ca.SX.sym("roll")
     c, s = ca.cos(phi), ca.sin(phi)
-    solution = posture_at(rig, x, c, s, branch)
+    solution = posture_at(rig, x, c, s, settings.branch)
     joints = joints_of(rig, x, phi, solution)
     limited_joints = [k for k in range(5) if np.isfinite([rig.lower[k], rig.upper[k]]).any()]
     limited = ca.vertcat(*[joints[k] for k in limited_joints])
@@ -183,14 +226,15 @@ def roll_problem(
     violation = _violation(reach, -LARGEST_SINE, LARGEST_SINE) + _violation(
         limited, rig.lower[limited_joints], rig.upper[limited_joints]
     )
-    if scene is not None:
-        gap = soft_minimum(list(clearances(rig, joints, scene, radii).values()), softness)
-        proximity = nearness(gap, clearance_weight, clearance_width)
-        if np.isfinite(clearance):
-            violation += ca.fmax(clearance + SEARCH.margin * softness - gap, 0)
+    if obstacles is not None:
+        distances = clearances(rig, joints, obstacles.scene, obstacles.radii)
+        gap = soft_minimum(list(distances.values()), obstacles.softness)
+        proximity = nearness(gap, obstacles.clearance_weight, obstacles.clearance_width)
+        if np.isfinite(obstacles.clearance):
+            violation += ca.fmax(obstacles.clearance + SEARCH.margin * obstacles.softness - gap, 0)
     t = np.linspace(0, horizon, SEARCH.times)
     rows = np.array(_curve(targets, symbols).map(len(t))(t[None]))
-    status = np.array(optimal_inverse(rig, tunnel, branch).map(len(t))(rows, np.zeros((1, len(t))))[3])[0]
+    status = np.array(optimal_inverse(rig, tunnel, settings.branch).map(len(t))(rows, np.zeros((1, len(t))))[3])[0]
     if status.any():
         first = int(np.flatnonzero(status)[0])
         message = f"roll_problem: no roll reaches the target at {t[first]:.4g} s; see solve_table"
@@ -204,18 +248,16 @@ def roll_problem(
         lower=rig.limit(6, False),
         upper=rig.limit(6, True),
         start=start_roll,
-        rate_weight=rate_weight,
-        acceleration_weight=acceleration_weight,
-        rate_limit=rate_limit,
+        rate_weight=settings.rate_weight,
+        acceleration_weight=settings.acceleration_weight,
+        rate_limit=settings.rate_limit,
     )
     start, speed = Samples(t, rolls[:, None]), Samples(t, np.gradient(rolls, t)[:, None])
 
     problem = Problem("roll plan", symbols=symbols)
     roll = problem.state("roll", 1, initial=start_roll, lower=rig.lower[5], upper=rig.upper[5], guess=start, unit="rad")
-    rate = problem.state("rate", 1, initial=start_rate, lower=-rate_limit, upper=rate_limit, guess=speed, unit="rad/s")
-    acceleration = problem.control(
-        "acceleration", 1, lower=-acceleration_limit, upper=acceleration_limit, guess=0.0, unit="rad/s^2"
-    )
+    rate = problem.state("rate", 1, initial=start_rate, lower=-fastest, upper=fastest, guess=speed, unit="rad/s")
+    acceleration = problem.control("acceleration", 1, lower=-largest, upper=largest, guess=0.0, unit="rad/s^2")
     problem.horizon(horizon)
     problem.dynamics(roll, rate)
     problem.dynamics(rate, acceleration)
@@ -231,10 +273,11 @@ def roll_problem(
         problem.path(
             "limits", along("joints", limited), rig.lower[limited_joints], rig.upper[limited_joints], unit=unit
         )
-    if scene is not None and np.isfinite(clearance):
-        problem.path("clearance", along("gap", gap), clearance, unit="m")
+    if obstacles is not None and np.isfinite(obstacles.clearance):
+        problem.path("clearance", along("gap", gap), obstacles.clearance, unit="m")
     running = along("index", index + proximity)
-    problem.minimize(running=running + rate_weight * rate**2 + acceleration_weight * acceleration**2)
+    running = running + settings.rate_weight * rate**2 + settings.acceleration_weight * acceleration**2
+    problem.minimize(running=running)
     return problem
 
 

@@ -266,7 +266,7 @@ def plan_dynamics(
     """
     setup = DynamicsSetup() if setup is None else checked_instance("plan_dynamics: setup", setup, DynamicsSetup)
     shared: dict[str, Any] = {"start": start, "limits": limits, "effort": effort}
-    given: Any = tasks
+    tip_tasks: Any = tasks
     if isinstance(tasks, Sequence) and any(isinstance(each, Leg) for each in tasks):
         legs = checked_legs(tasks)
         for name, value in (("horizon", horizon), ("end", end)):
@@ -285,10 +285,10 @@ def plan_dynamics(
 
     def declare(clearance: ClearanceConstraints | None) -> Problem:
         own = replace(setup, clearance_constraints=clearance)
-        return dynamics_problem(machine, given, duration, end=end, setup=own, **shared)
+        return dynamics_problem(machine, tip_tasks, duration, end=end, setup=own, **shared)
 
     duration: float | FreeTime = horizon if isinstance(horizon, FreeTime) else checked_horizon(horizon)
-    at = () if isinstance(duration, FreeTime) else breaks_of(given, duration)
+    at = () if isinstance(duration, FreeTime) else breaks_of(tip_tasks, duration)
     return within_limits(declare, setup.clearance_constraints, method, at, options, tolerances, {"": (machine, limits)})
 
 

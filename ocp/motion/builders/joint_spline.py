@@ -195,8 +195,8 @@ def _samples_of_plan(plan: Any, path: Any, length: float, samples: int) -> tuple
         distance = np.where(fixed, np.linalg.norm(np.nan_to_num(offsets), axis=2), np.inf).min(axis=0)
         worst = int(distance.argmax())
         if fixed.any() and not distance[worst] <= SPLINE.path_tolerance * length:
-            far = f"are {distance[worst]:.3g} m off the path" if distance[worst] < np.inf else "have no position"
-            words = f"the plan's tasks {far} at {t[worst]:.6g} s, but must run along all of it at constant speed; "
+            position = f"are {distance[worst]:.3g} m off the path" if distance[worst] < np.inf else "have no position"
+            words = f"the plan's tasks {position} at {t[worst]:.6g} s, but must run along all of it at constant speed; "
             words += "give (distances, joints) instead of the plan"
             details = {"value": float(distance[worst]), "limit": SPLINE.path_tolerance * length}
             raise ProblemError(words, name="plan", time=float(t[worst]), **details)
@@ -254,10 +254,10 @@ class _PiecewisePolynomial:
 
     def __call__(self, distance: Array) -> Array:
         """Return values and three derivatives at distances (M,). Shape (4, M, n)."""
-        piece = np.clip(np.searchsorted(self.breaks, distance, side="right") - 1, 0, len(self.middle) - 1)
-        x = (distance - self.middle[piece]) / self.unit
+        interval = np.clip(np.searchsorted(self.breaks, distance, side="right") - 1, 0, len(self.middle) - 1)
+        x = (distance - self.middle[interval]) / self.unit
         powers = x[:, None] ** np.arange(DEGREE + 1)
-        return np.asarray((self.weight * powers[:, self.power] @ self.derivatives[piece]).transpose(1, 0, 2))
+        return np.asarray((self.weight * powers[:, self.power] @ self.derivatives[interval]).transpose(1, 0, 2))
 
 
 class _BatchedFunction:

@@ -141,17 +141,16 @@ def stretches_of(machine: Machine, tasks: Sequence[TipTask], horizon: float) -> 
         breaks = breaks[(breaks > begin + slack) & (breaks < end - slack)]
         count = FEEDBACK.intervals
         intervals = np.diff([begin, *breaks, end]) if len(breaks) >= count else np.array([(end - begin) / count])
-        largest = FEEDBACK.decay / float(intervals.max())
-        equations = bind(machine, [_with_gain(tasks[i], largest) for i in active]) if active else None
+        gain = FEEDBACK.decay / float(intervals.max())
+        limited = [  # unless there is a gap to close at the start
+            task if task.gain <= gain or task.start_gap > FEEDBACK.closed_gap else replace(task, gain=gain)
+            for task in (tasks[i] for i in active)
+        ]
+        equations = bind(machine, limited) if active else None
         suffix = f" {len(stretches) + 1}" if len(bounds) > 2 else ""
         new = tuple(i not in before for i in active)
         stretches.append(Stretch(begin, end, active, equations, new, breaks, suffix))
     return tuple(stretches)
-
-
-def _with_gain(task: TipTask, largest: float) -> TipTask:
-    """Return a task with its gain limited (1/s), unless it has a gap to close at its start."""
-    return task if task.gain <= largest or task.start_gap > FEEDBACK.closed_gap else replace(task, gain=largest)
 
 
 def tool_motion_problem(
@@ -165,9 +164,9 @@ def tool_motion_problem(
     weights: Array,
     bounds: JointBounds,
     time_cost: float | None = None,
-    driven: bool = False,
+    actuated: bool = False,
     clearance_constraints: ClearanceConstraints | None = None,
-    held: Array | None = None,
+    fixed_joints: Array | None = None,
 ) -> ToolMotion:
     """Declare a motion along tasks with the least integral of half the weighted squared joint rates.
 
@@ -185,13 +184,13 @@ def tool_motion_problem(
         time_cost: Cost of a second, if the tasks may be executed more slowly. The horizon of the problem is then the
             tasks' own. Its states over it are "joints", "base" and CLOCK, the time; its controls are SLOPES, the
             derivatives of the joints, and PACE, that of the time, at least 1. None keeps the tasks' own time.
-        driven: Whether accelerations (jerks if these are limited) are the control, within the actuator limits. States
+        actuated: Whether accelerations (jerks if these are limited) are the control, within the actuator limits. States
             "velocities" (and "accelerations") with the suffix of each stretch replace the rates, path constraints
             "torques" and "power" are added, and the tasks are constrained by their accelerations. Velocities are
             continuous between stretches, and free at both ends like the rates. A small weight in the cost smooths
             accelerations (jerks), see FeedbackSettings.
         clearance_constraints: Collision avoidance, see `ocp.motion.builders.clearance`; None for none.
-        held: Joints that do not move. Shape (joint_size,), bool.
+        fixed_joints: Joints that do not move. Shape (joint_size,), bool.
 
     Raises:
         ProblemError: A cyclic motion has a task that is not closed, or several stretches with a task in the last; a
@@ -201,21 +200,12 @@ def tool_motion_problem(
     horizon = stretches[-1].end
     problem = Problem("tool motion" if time_cost is None else "tool motion in free time")
     problem.horizon(horizon)
-    if held is not None:
-        bounds = bounds._replace(velocity=np.where(held, 0.0, bounds.velocity))
+    if fixed_joints is not None:
+        bounds = bounds._replace(velocity=np.where(fixed_joints, 0.0, bounds.velocity))
     motion = _Motion(
-        problem,
-        machine,
-        tuple(stretches),
-        bounds,
-        base,
-        start,
-        reference,
-        cyclic,
-        weights,
-        clearance_constraints,
-        driven,
-    )
+        problem, machine, tuple(stretches), bounds, base, start, reference, cyclic, weights, clearance_constraints,
+        actuated,
+    )  # fmt: skip
     if time_cost is not None:
         return _in_free_time(motion, time_cost)
     for stretch in stretches:
@@ -228,7 +218,7 @@ def tool_motion_problem(
         running += cost
         if before is not None:
             here = ca.vertcat(*[problem.at_start(state) for state in states])
-            unit = "" if machine.base_size or driven else machine.robot.unit()
+            unit = "" if machine.base_size or actuated else machine.robot.unit()
             problem.end(f"passage at {stretch.begin:g} s", here - ca.vertcat(*before), 0, 0, unit=unit)
         before, first = states, first or states
     if cyclic and motion.free and before and first:
@@ -253,7 +243,7 @@ class _Motion:
     cyclic: bool
     weights: Array
     clearance_constraints: ClearanceConstraints | None
-    driven: bool
+    actuated: bool
 
     @property
     def horizon(self) -> float:
@@ -309,7 +299,7 @@ def _declare_stretch(motion: _Motion, stretch: Stretch, known: Array | None) -> 
     unit = machine.robot.unit("/s")
     options: dict[str, Any] = {"lower": -bounds.velocity, "upper": bounds.velocity, "unit": unit}
     second, smooth = None, 0
-    if motion.driven:
+    if motion.actuated:
         rates = problem.state(f"velocities{stretch.suffix}", machine.joint_size, **options)
         second, smooth = _declare_actuators(motion, stretch, place, joints, rates)
     else:
@@ -320,7 +310,8 @@ def _declare_stretch(motion: _Motion, stretch: Stretch, known: Array | None) -> 
         required = np.ones(stretch.equations.size, dtype=bool)
         slopes = _slopes(stretch, motion.base, motion.reference)
         if known is not None:
-            required = ~_within(slopes, known)
+            rest = slopes - slopes @ np.linalg.pinv(known, rcond=ROUNDING_SHARE) @ known  # not led there before
+            required = ~(np.linalg.norm(rest, axis=1) <= ROUNDING_SHARE * np.linalg.norm(slopes, axis=1))
         rate_derivatives = None if second is None else (second, machine.base_rate(place, joints, rates))
         free = not begins or motion.free
         _declare_tasks(motion, stretch, (place, joints, rates), pace, slack, free, required, rate_derivatives)
@@ -331,7 +322,7 @@ def _declare_stretch(motion: _Motion, stretch: Stretch, known: Array | None) -> 
     problem.dynamics(joints, pace * rates)
     motion.constrain_clearance(stretch, place, joints, motion.horizon)
     states = [*([place] if machine.base_size else []), joints]
-    if motion.driven:
+    if motion.actuated:
         states += [rates, *([second] if f"jerks{stretch.suffix}" in problem.declared.controls else [])]
     cost = pace * (ca.dot(rates, ca.DM(motion.weights) * rates) / 2 + motion.horizon**2 * smooth)
     return states, cost, ends_at
@@ -374,7 +365,7 @@ def _in_free_time(motion: _Motion, time_cost: float) -> ToolMotion:
     z)) ds, which is convex in q' and z. The tasks, J q' = v(s), and the rate limits, |q'| <= v z, are linear in them.
     """
     machine, problem, stretches, bounds = motion.machine, motion.problem, motion.stretches, motion.bounds
-    if motion.driven:
+    if motion.actuated:
         words = "a free horizon excludes actuator limits; give a horizon in s, or limits of velocity alone"
         raise ProblemError(words, name="horizon")
     if len(stretches) > 1 or stretches[0].equations is None:
@@ -439,16 +430,12 @@ def _declare_tasks(
     required: NDArray[np.bool_] | None = None,
     rate_derivatives: tuple[Any, Any] | None = None,
 ) -> None:
-    """Constrain a stretch to its tasks, over the time of the problem.
+    """Constrain a stretch to its tasks, with base, joints and rates as symbols.
 
-    Args:
-        symbols: Base, joints and joint rates.
-        closure: Deviation of a closed task, see `_closure`.
-        free: Whether tasks that begin here must be at their start poses.
-        required: Rows of which that is required; the stretch before leads the others there. Shape (size,); None for
-            all.
-        rate_derivatives: Joint accelerations and base rate, if accelerations constrain the tasks. Tasks that begin here
-            must then begin with their velocities, too.
+    `closure` is the deviation of a closed task. If `free`, the tasks that begin here must be at their start poses,
+    except in rows that are not `required`, (size,), to which the stretch before leads. With `rate_derivatives`, the
+    joint accelerations and the base rate, accelerations constrain the tasks, and tasks begin with their velocities,
+    too.
     """
     problem, equations, suffix, (base, joints, rates) = motion.problem, stretch.equations, stretch.suffix, symbols
     assert equations is not None
@@ -512,9 +499,3 @@ def _slopes(stretch: Stretch, base: Array, reference: Array) -> Array:
     place = base + rng.normal(size=len(base))
     place[3:] /= np.linalg.norm(place[3:]) if len(base) == 7 else 1.0
     return np.array(slope(place, reference + rng.normal(size=len(reference))))
-
-
-def _within(slopes: Array, known: Array) -> NDArray[np.bool_]:
-    """Return which rows are linear combinations of known rows. Shapes (k, n), (m, n) to (k,)."""
-    left = slopes - slopes @ np.linalg.pinv(known, rcond=ROUNDING_SHARE) @ known
-    return np.asarray(np.linalg.norm(left, axis=1) <= ROUNDING_SHARE * np.linalg.norm(slopes, axis=1))

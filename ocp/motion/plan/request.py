@@ -128,8 +128,8 @@ def declared_motion(
         "cyclic": asked.cyclic,
         "weights": asked.weights,
         "time_cost": asked.time_cost,
-        "driven": limits is not None,
-        "held": asked.held if limits is None else None,
+        "actuated": limits is not None,
+        "fixed_joints": asked.held if limits is None else None,
         "clearance_constraints": clearance_constraints,
     }
     bounds = (limits or asked.limits).bounds(asked.machine)

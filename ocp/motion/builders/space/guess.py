@@ -217,8 +217,8 @@ def guess_braking(problem: Problem, pair: FreeFloating, joints: Array, rates: Ar
         for k in range(GUESS.steps):
             middle = (angles[k] + angles[k + 1]) / 2, (speeds[k] + speeds[k + 1]) / 2
             bases.append(step(times[1], bases[-1], *middle))
-        have, matrix = (np.array(part) for part in momentum_at(bases[-1], angles[-1], last))
-        last[turning] += np.linalg.pinv(matrix) @ (np.asarray(pair.conserved_momentum)[angular] - have.ravel())
+        current, matrix = (np.array(part) for part in momentum_at(bases[-1], angles[-1], last))
+        last[turning] += np.linalg.pinv(matrix) @ (np.asarray(pair.conserved_momentum)[angular] - current.ravel())
     set_guess(problem, duration, _motion(times, angles, speeds, np.array(bases)))
 
 

@@ -76,8 +76,8 @@ class StepsMotion:
 
     def held(self, foot: str) -> NDArray[np.bool_]:
         """Return at which times a foot is held. Shape (M,), bool."""
-        held = np.array([foot in phase.footholds for phase in self.steps.phases], dtype=bool)
-        return np.asarray(held[self.phase.astype(int)], dtype=bool)
+        by_phase = np.array([foot in phase.footholds for phase in self.steps.phases], dtype=bool)
+        return np.asarray(by_phase[self.phase.astype(int)], dtype=bool)
 
     def center_of_pressure(self, foot: str) -> Array:
         """Return the center of pressure in the frame of a sole, (x, y); nan in the air. Shape (M, 2), m."""
@@ -190,8 +190,8 @@ def _function(steps: Steps, stance: Stance) -> tuple[Any, list[str]]:
     """Return a casadi function (q, q', q'', loads) and the names of its outputs."""
     n = stance.joint_size
     q, qd, qdd = (ca.SX.sym(name, n) for name in ("q", "qd", "qdd"))
-    held = {name: ca.SX.sym("load", len(stance.held_rows[name])) for name in stance.others}
-    others = {name: stance.full_load(name, rows) for name, rows in held.items()}
+    rows = {name: ca.SX.sym("load", len(stance.held_rows[name])) for name in stance.others}
+    others = {name: stance.full_load(name, part) for name, part in rows.items()}
     loads = stance.loads(q, qd, qdd, others)
     root = link_frames(stance.robot, q, stance.world_from_base())[steps.robot.root]
     outputs = {
@@ -206,7 +206,7 @@ def _function(steps: Steps, stance: Stance) -> tuple[Any, list[str]]:
         outputs[f"{name} load"] = loads.get(name, ca.DM.zeros(6))
         outputs[f"{name} position"] = frame.position
         outputs[f"{name} rotation"] = ca.vec(frame.rotation)
-    inputs = [q, qd, qdd, ca.vertcat(ca.SX(0, 1), *held.values())]
+    inputs = [q, qd, qdd, ca.vertcat(ca.SX(0, 1), *rows.values())]
     return ca.Function("motion", inputs, [ca.densify(v) for v in outputs.values()], {"cse": True}), list(outputs)
 
 
@@ -290,10 +290,10 @@ def _least_loads(stance: Stance, motion: tuple[Array, Array, Array]) -> dict[str
     if not sizes:
         return {}
     q, qd, qdd = (ca.SX.sym(name, stance.joint_size) for name in ("q", "qd", "qdd"))
-    held = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
-    others = {name: stance.full_load(name, rows) for name, rows in held.items()}
+    rows = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
+    others = {name: stance.full_load(name, part) for name, part in rows.items()}
     every = ca.vertcat(*stance.loads(q, qd, qdd, others).values())
-    free = ca.vertcat(*held.values())
+    free = ca.vertcat(*rows.values())
     slope = ca.jacobian(every, free)
     rest = ca.substitute(every, free, ca.DM.zeros(free.shape))
     least = -ca.solve(ca.mtimes(slope.T, slope), ca.mtimes(slope.T, rest))

@@ -174,12 +174,12 @@ class Steps:
 
         It is the mean of the centers of their soles, or of their footholds if none has a sole. Shape (2,), m.
         """
-        around = self.phases[max(k - 1, 0) : k + 1]
-        held = [name for name in around[0].footholds if all(name in phase.footholds for phase in around)]
-        soles = [name for name in held if self.feet[name].sole is not None] or held
+        phases = self.phases[max(k - 1, 0) : k + 1]
+        feet = [name for name in phases[0].footholds if all(name in phase.footholds for phase in phases)]
+        soles = [name for name in feet if self.feet[name].sole is not None] or feet
         points = []
         for name in soles:
-            foothold, foot = around[0].footholds[name], self.feet[name]
+            foothold, foot = phases[0].footholds[name], self.feet[name]
             center = np.zeros(3) if foot.sole is None else np.append(foot.sole.center, 0.0)
             points.append((np.asarray(foothold.position) + np.asarray(foothold.rotation) @ center)[:2])
         return np.asarray(np.mean(points, axis=0))
@@ -208,16 +208,16 @@ def walk(
     Raises:
         ProblemError: A foot has no foothold at the start, or no foot stays where another moves.
     """
-    held = checked_mapping("walk: start", start)
+    footholds = checked_mapping("walk: start", start)
     steps = checked_each("walk: steps", steps, tuple)
-    phases = [StancePhase(held, shift)]
+    phases = [StancePhase(footholds, shift)]
     for step in steps:
         name, foothold = step if len(step) == 2 else (step, None)
-        if not isinstance(name, str) or name not in held:
-            raise unknown_name("foot", name, held)
-        rest = {each: place for each, place in held.items() if each != name}
-        held = {**rest, name: foothold}
-        phases += [StancePhase(rest, swing), StancePhase(held, shift)]
+        if not isinstance(name, str) or name not in footholds:
+            raise unknown_name("foot", name, footholds)
+        rest = {each: place for each, place in footholds.items() if each != name}
+        footholds = {**rest, name: foothold}
+        phases += [StancePhase(rest, swing), StancePhase(footholds, shift)]
     return tuple(phases)
 
 
@@ -294,7 +294,7 @@ def standing_configuration(stance: Stance, near: Any, over: Any = None) -> Array
     if over is not None:
         wanted = checked_numbers(over, 2, "over", "x and y on the ground")
         cost += CONFIGURATIONS.over * ca.sumsqr(stance.center_of_mass(q)[:2] - wanted)
-    solver = ca.nlpsol("posture", "ipopt", {"x": q, "f": cost, "g": gap}, {"print_time": False, "ipopt": IPOPT})
+    solver = ca.nlpsol("configuration", "ipopt", {"x": q, "f": cost, "g": gap}, {"print_time": False, "ipopt": IPOPT})
     result = solver(x0=begin, lbx=lower, ubx=upper, lbg=0.0, ubg=0.0)
     left = float(np.abs(np.array(result["g"])).max(initial=0.0))
     if not left < CONFIGURATIONS.gap * 1e3:

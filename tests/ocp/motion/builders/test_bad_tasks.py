@@ -97,6 +97,7 @@ from tests.bad_values import (
 )
 from tests.ocp.motion.builders.captures import planar_capture
 from tests.ocp.motion.builders.standing_tasks import with_setup
+from tests.ocp.motion.builders.test_cts import roll_arguments
 
 START = [0.3, 0.6, 0.9]
 CHAIN = planar_chain([1.0, 0.8, 0.6], [1.0] * 3, base=Link("foot", 30.0, inertia=np.eye(3)))
@@ -399,7 +400,7 @@ ROLLS = [
     ),
     Case(
         "roll_problem",
-        roll_problem,
+        lambda **options: roll_problem(**roll_arguments(options)),
         {"rig": RIG, "tunnel": TUNNEL, "targets": falling, "horizon": 10.0},
         {
             "rig": INSTANCE,
@@ -413,7 +414,7 @@ ROLLS = [
             "acceleration_limit": but(LIMIT, "zero") | NOTHING,
             "start_roll": FINITE,
             "start_rate": FINITE,
-            "scene": but(INSTANCE, "None"),
+            "scene": INSTANCE,
             "clearance": but(FINITE, "minus inf") | NOTHING,
             "clearance_weight": NONNEGATIVE | NOTHING,
             "clearance_width": POSITIVE | NOTHING,
