@@ -47,8 +47,7 @@ class FeedbackSettings:
             finer mesh, for errors that are zero if the tasks begin at their poses.
         intervals: Least number of intervals of the mesh in a stretch.
         closed_gap: Pose error at the beginning of a task below which there is no gap to close, m and rad.
-        smoothing: Share of the horizon over which controlled accelerations pass from limit to limit. Without it they
-            would jump.
+        smoothing: Share of the horizon in which controlled accelerations pass from limit to limit instead of jumping.
     """
 
     decay: float = 4.0

@@ -177,7 +177,7 @@ def test_samples_that_are_none_are_named_errors(plan: Any, words: str) -> None:
 def test_torques_need_a_fixed_base() -> None:
     s = np.linspace(0, PATH.length, 50)
     floating = joint_path(FreeFloating(arm().robot, base="spatial"), (s, angles(s)), PATH)
-    with pytest.raises(ProblemError, match="fixed base"):
+    with pytest.raises(ProblemError, match="need a FixedBase"):
         floating.torques(s)
     for wrong in (np.nan, 9.0, "x"):
         with pytest.raises(ProblemError, match="distance"):
