@@ -18,7 +18,9 @@ import numpy as np
 from models import CollisionScene, Footprint, Standing, Wrench, footprint, with_load
 from models.machines.standing import External
 from ocp import ClearanceConstraints, Collocation, Problem, TipTask, resolve_accelerations, solve
-from ocp.motion.builders.standing import InFoot, Limits, StandingSetup, standing_problem
+from ocp.motion.builders.standing.problem import StandingSetup, standing_problem
+from ocp.motion.tasks.limits import Limits
+from ocp.motion.tasks.zmp_rules import InFoot
 from scripts.robots import standing
 from scripts.robots.drawing import animate
 from scripts.robots.mobile_manipulator import StandingExample, save

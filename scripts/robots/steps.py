@@ -20,16 +20,9 @@ from models import Foot, Foothold, FreeFloating, Joint, Link, Robot, VisualShape
 from models.arrays import Array
 from ocp import Audit, Collocation, Limits, Solution
 from ocp.app.view.appearance import frames_along
-from ocp.motion.builders.standing import (
-    StancePhase,
-    Steps,
-    StepsMotion,
-    plan_steps,
-    resolve_steps,
-    standing_configuration,
-    steps_motion,
-    walk,
-)
+from ocp.motion.builders.standing.plan import plan_steps
+from ocp.motion.builders.standing.resolved import StepsMotion, resolve_steps, steps_motion
+from ocp.motion.builders.standing.stances import StancePhase, Steps, standing_configuration, walk
 from scripts.drawing import COLORS
 from scripts.robots.drawing import Scene, animate, page
 

@@ -27,6 +27,7 @@ from ocp.direct.shooting import MultipleShooting
 from ocp.errors import ProblemError, SolveError, checked_instance, checked_mapping, checked_time_limit
 from ocp.methods import solve
 from ocp.motion.builders.clearance import ClearanceConstraints, collision_error, solve_with_clearance
+from ocp.motion.builders.dynamics_plan import breaks_of
 from ocp.motion.builders.standing.problem import FreeTime, StandingSetup, Weights, standing_problem
 from ocp.motion.builders.standing.stances import Steps
 from ocp.motion.builders.standing.steps import StepWeights, steps_problem
@@ -288,7 +289,7 @@ def plan_standing(
     along_parameter = setup.along == "parameter"
     judge = _Judge(tolerances, partial(_pose_error, machine, tasks, along_parameter))
     settings = {**IPOPT, **options}
-    breaks = [] if isinstance(horizon, FreeTime) or along_parameter else _breaks(machine, tasks, horizon)
+    breaks = [] if isinstance(horizon, FreeTime) or along_parameter else breaks_of(tasks, checked_horizon(horizon))
     trials = [
         (level, mesh.with_nodes_at(breaks))
         for level, mesh in _formulations(setup.control, isinstance(horizon, FreeTime), method)
@@ -384,13 +385,6 @@ def _first_accepted(
         "no standing plan passes its audit:\n" + "\n".join(reasons), last, failure.conflicts,
         name=failure.name, value=failure.value, limit=failure.limit, time=failure.time,
     )  # fmt: skip
-
-
-def _breaks(machine: Standing, tasks: TipTask | Sequence[TipTask], horizon: float) -> list[float]:
-    """Return the fractions of the horizon at which the tasks are less smooth."""
-    times = [task.begin + np.asarray(task.breaks) for task in (part.task for part in bind(machine, tasks).bound)]
-    inside = np.unique(np.concatenate(times)) / checked_horizon(horizon)
-    return [float(at) for at in inside if 0 < at < 1]
 
 
 def _formulations(control: str, free_time: bool, method: Collocation | None) -> list[Trial]:

@@ -14,8 +14,9 @@ from models.machines.machine import with_tip
 from models.machines.standing import External, StandingMotion, standing_motion, tip_spring
 from models.paths import rest_to_rest
 from ocp import Problem, Solution, TipTask
-from ocp.motion.builders.standing import FreeTime, Limits, StandingSetup, Weights, standing_problem
+from ocp.motion.builders.standing.problem import FreeTime, StandingSetup, Weights, standing_problem
 from ocp.motion.tasks.equations import task_errors
+from ocp.motion.tasks.limits import Limits
 from tests.models.machines.standing_machines import planar_machine, six_joint_arm, standing_arm, two_armed
 from tests.models.robot.trees import Array
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from models import Foothold
 from ocp import ProblemError
-from ocp.motion.builders.standing import StancePhase, Steps, walk
+from ocp.motion.builders.standing.stances import StancePhase, Steps, walk
 from scripts.robots.steps import planar_biped, planar_feet, planar_steps
 
 FEET = ("left", "right", "hand")

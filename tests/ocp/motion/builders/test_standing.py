@@ -23,20 +23,10 @@ from ocp import (
     solve,
     tighten,
 )
-from ocp.motion.builders.standing import (
-    Anywhere,
-    Following,
-    FreeTime,
-    IndexAtLeast,
-    InFoot,
-    Limits,
-    Pinned,
-    StandingSetup,
-    Weights,
-    motion_cost,
-    standing_problem,
-)
+from ocp.motion.builders.standing.problem import FreeTime, StandingSetup, Weights, motion_cost, standing_problem
 from ocp.motion.local.accelerations import Stabiliser
+from ocp.motion.tasks.limits import Limits
+from ocp.motion.tasks.zmp_rules import Anywhere, Following, IndexAtLeast, InFoot, Pinned
 from tests.families import some
 from tests.models.machines.standing_machines import planar_machine
 from tests.models.robot.trees import numeric

@@ -13,19 +13,12 @@ from models import STANDING_STARTS
 from models.machines.machine import with_tip
 from models.paths import rest_to_rest
 from ocp import Collocation, ProblemError, Solution, SolveError, TipTask, resolve_accelerations, solve
-from ocp.motion.builders.standing import (
-    FreeTime,
-    IndexAtLeast,
-    InFoot,
-    Pinned,
-    StandingSetup,
-    ZmpRule,
-    plan_standing,
-    standing_problem,
-)
+from ocp.motion.builders.standing.plan import plan_standing
+from ocp.motion.builders.standing.problem import FreeTime, StandingSetup, standing_problem
 from ocp.motion.tasks.equations import task_errors
 from ocp.motion.tasks.tip_task import timed
 from ocp.motion.tasks.tracks import pose_line
+from ocp.motion.tasks.zmp_rules import IndexAtLeast, InFoot, Pinned, ZmpRule
 from tests.models.machines.standing_machines import planar_machine
 from tests.ocp.motion.builders.standing_replay import assert_stands
 from tests.ocp.motion.builders.standing_tasks import (

@@ -19,8 +19,10 @@ import pytest
 from models import ModelWarning, Robot, Standing, Wrench, rectangle, simplified, standing_example, with_load
 from models.machines.standing import StandingMotion
 from ocp import Collocation, ProblemError, Solution, resolve_accelerations, solve
-from ocp.motion.builders.standing import Anywhere, Limits, Pinned, standing_problem
+from ocp.motion.builders.standing.problem import standing_problem
 from ocp.motion.tasks.equations import task_errors
+from ocp.motion.tasks.limits import Limits
+from ocp.motion.tasks.zmp_rules import Anywhere, Pinned
 from scripts.robots import pushing
 from scripts.robots import standing as gallery
 from tests.models.robot.pinocchio_robots import Peer, State

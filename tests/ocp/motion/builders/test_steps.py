@@ -15,20 +15,10 @@ import pytest
 
 from models import Foot, Foothold, Joint, Link, Robot, Stance, rectangle
 from ocp import Collocation, Limits, ProblemError, Solution, SolveError, solve
-from ocp.motion.builders.standing import (
-    StancePhase,
-    Steps,
-    StepsMotion,
-    StepWeights,
-    plan_steps,
-    resolve_steps,
-    standing_configuration,
-    steps_motion,
-    steps_problem,
-    walk,
-)
-from ocp.motion.builders.standing.plan import guess_in_time
-from ocp.motion.builders.standing.resolved import motion_of, sample_stance
+from ocp.motion.builders.standing.plan import guess_in_time, plan_steps
+from ocp.motion.builders.standing.resolved import StepsMotion, motion_of, resolve_steps, sample_stance, steps_motion
+from ocp.motion.builders.standing.stances import StancePhase, Steps, standing_configuration, walk
+from ocp.motion.builders.standing.steps import StepWeights, steps_problem
 from ocp.problem.formulation import Formulation
 from scripts.robots.steps import SIDES, bent, planar_biped, planar_feet, planar_steps
 from scripts.robots.talos import talos_steps
