@@ -23,6 +23,7 @@ from typing import Any, Literal
 import numpy as np
 
 from models import FreeFloating, Machine
+from ocp.audit.audit import Audit
 from ocp.console import interruptible
 from ocp.direct.collocation import Collocation
 from ocp.errors import (
@@ -55,7 +56,7 @@ from ocp.solution import Solution
 from ocp.switching import NEAR, at_switches
 from ocp.tightening import exceeded, tighten
 
-__all__ = ["Leg", "breaks_of", "checked_legs", "dynamics_phases", "plan_dynamics", "within_limits"]
+__all__ = ["Leg", "audit_error", "breaks_of", "checked_legs", "dynamics_phases", "plan_dynamics", "within_limits"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -299,6 +300,13 @@ def breaks_of(tasks: TipTask | Sequence[TipTask], horizon: float) -> Sequence[fl
     return [float(at) for at in times / horizon if 0 < at < 1]
 
 
+def audit_error(audit: Audit, solution: Solution) -> SolveError:
+    """Return the error of the largest failure of an audit, relative to its tolerance."""
+    worst = max(audit.failures, key=lambda row: row.value / row.limit if row.limit else np.inf)
+    words = f"the audit fails: {worst.name} {worst.value:.2g}"
+    return SolveError(words, solution, name=worst.name, value=worst.value, limit=worst.limit, time=worst.time)
+
+
 def within_limits(
     declare: Callable[[Constraints], Problem],
     clearance_constraints: Constraints,
@@ -373,10 +381,7 @@ def _first_within_limits(
             guess = last = plan
             feasible += [plan] if audit.feasible else []
             if audit.failures:
-                worst = max(audit.failures, key=lambda row: row.value / row.limit if row.limit else np.inf)
-                details = {"value": worst.value, "limit": worst.limit, "time": worst.time}
-                words = f"the audit fails: {worst.name} {worst.value:.2g}"
-                failure = SolveError(words, plan, name=worst.name, **details)
+                failure = audit_error(audit, plan)
                 reasons.append(f"{name}: {failure}")
         if guess is None or guess is begin:
             break

@@ -27,7 +27,7 @@ from ocp.direct.shooting import MultipleShooting
 from ocp.errors import ProblemError, SolveError, checked_instance, checked_mapping, checked_time_limit
 from ocp.methods import solve
 from ocp.motion.builders.clearance import ClearanceConstraints, collision_error, solve_with_clearance
-from ocp.motion.builders.dynamics_plan import breaks_of
+from ocp.motion.builders.dynamics_plan import audit_error, breaks_of
 from ocp.motion.builders.standing.problem import FreeTime, StandingSetup, Weights, standing_problem
 from ocp.motion.builders.standing.stances import Steps
 from ocp.motion.builders.standing.steps import StepWeights, steps_problem
@@ -456,11 +456,8 @@ class _Judge:
             return Attempt(name, solution, ended)
         audit = solution.audit(tolerances=self.tolerances)
         if not audit.passed and audit.failures:  # a plan of undetermined optimality is accepted
-            worst = max(audit.failures, key=lambda finding: finding.value / finding.limit if finding.limit else np.inf)
             exceeded = all(_is_inequality(problem, finding.name) for finding in audit.failures)
-            details = {"value": worst.value, "limit": worst.limit, "time": worst.time}
-            failure = SolveError(f"the audit fails: {worst.name} {worst.value:.2g}", name=worst.name, **details)
-            return Attempt(name, solution, failure, exceeded, collision_error(audit, solution))
+            return Attempt(name, solution, audit_error(audit, solution), exceeded, collision_error(audit, solution))
         return Attempt(name, solution, self.pose_error(audit))
 
 
