@@ -36,7 +36,7 @@ from ocp.motion.builders.actuator_limits import (
     nonnegative_each,
 )
 from ocp.motion.builders.clearance import ClearanceConstraints
-from ocp.motion.builders.standing.problem import FreeTime
+from ocp.motion.builders.standing.problem import FreeTime, declare_horizon
 from ocp.motion.tasks.checks import (
     check_length,
     check_rest,
@@ -144,11 +144,7 @@ def dynamics_problem(
         ends = ends.ending_with(equations)
 
     problem = Problem("dynamics", setup.symbols)
-    final = (
-        problem.horizon(lower=horizon.lower, upper=horizon.upper, guess=horizon.guess)
-        if isinstance(horizon, FreeTime)
-        else problem.horizon(duration)
-    )
+    final = declare_horizon(problem, horizon)
     motion = _declare_motion(problem, machine, ends, bounds, duration, control)
     if setup.end_base is not None:
         _declare_end_base(problem, machine, motion.base, setup.end_base)

@@ -74,7 +74,7 @@ from ocp.motion.tasks.zmp_rules import (
 )
 from ocp.problem.problem import Problem, remembers_request
 
-__all__ = ["FreeTime", "StandingSetup", "Weights", "motion_cost", "standing_problem"]
+__all__ = ["FreeTime", "StandingSetup", "Weights", "declare_horizon", "motion_cost", "standing_problem"]
 
 
 @dataclass(frozen=True)
@@ -241,7 +241,7 @@ def standing_problem(
     guess = local_guess(machine, equations, begin, duration, along_parameter, external)
 
     problem = Problem("standing plan", symbols=setup.symbols)
-    final = _horizon(problem, horizon)
+    final = declare_horizon(problem, horizon)
     resting: Array | None = None
     if rests[1]:
         rows = ~equations.posed if tip_level == "position" else None
@@ -299,7 +299,8 @@ def _constrain_tips(
         problem.watch(name, **deviation)
 
 
-def _horizon(problem: Problem, horizon: float | FreeTime) -> Any:
+def declare_horizon(problem: Problem, horizon: float | FreeTime) -> Any:
+    """Declare a fixed or free horizon and return it."""
     if isinstance(horizon, FreeTime):
         return problem.horizon(lower=horizon.lower, upper=horizon.upper, guess=horizon.guess)
     return problem.horizon(float(horizon))

@@ -29,16 +29,8 @@ from models.paths import rest_to_rest
 from models.robot.indices import joint_limit_index
 from ocp.console import interruptible
 from ocp.errors import ProblemError, checked_choice, checked_instance, checked_nonnegative
-from ocp.motion.builders.standing.problem import FreeTime
-from ocp.motion.builders.standing.stances import (
-    PLACED,
-    StancePhase,
-    Steps,
-    Swing,
-    check_placed,
-    first_guess,
-    foothold_equations,
-)
+from ocp.motion.builders.standing.problem import FreeTime, declare_horizon
+from ocp.motion.builders.standing.stances import PLACED, Steps, Swing, check_placed, first_guess, foothold_equations
 from ocp.motion.builders.standing.start import start_inside
 from ocp.motion.tasks.checks import checked_numbers, rates_at_rest
 from ocp.motion.tasks.limits import Limits
@@ -183,7 +175,7 @@ def _phase(steps: Steps, k: int, start: Array | None, guess: dict[str, Any], opt
     robot, n, weights = stance.robot, stance.joint_size, options.weights
     bounds = _bounds(steps, stance, options.limits)
     problem = Problem(steps.names[k])
-    final = _horizon(problem, phase)
+    final = declare_horizon(problem, phase.duration)
     none = ca.DM(0, 1)
     equations = (
         foothold_equations(stance, {name: phase.footholds[name] for name in stance.others}) if stance.others else None
@@ -248,12 +240,6 @@ def _bounds(steps: Steps, stance: Stance, limits: Limits) -> dict[str, Array]:
         if explicit is not None and np.size(explicit) != 1:
             bounds[name] = np.asarray(explicit, dtype=float).ravel()[order]
     return bounds
-
-
-def _horizon(problem: Problem, phase: StancePhase) -> Any:
-    if isinstance(phase.duration, FreeTime):
-        return problem.horizon(lower=phase.duration.lower, upper=phase.duration.upper, guess=phase.duration.guess)
-    return problem.horizon(float(phase.duration))
 
 
 def _load(problem: Problem, stance: Stance, name: str) -> Any:
