@@ -192,7 +192,7 @@ class Steps:
 
 
 def walk(
-    start: Mapping[str, Foothold],
+    footholds: Mapping[str, Foothold],
     steps: Sequence[tuple[str, Foothold]],
     *,
     shift: float | FreeTime,
@@ -201,14 +201,14 @@ def walk(
     """Return the phases of consecutive steps: all feet held, all but one, all held, ..., all held.
 
     Args:
-        start: Footholds at the start, by foot.
+        footholds: Footholds at the start, by foot.
         steps: Foot and new foothold of each step.
         shift, swing: Durations of the phases with all feet held, and with one foot in the air.
 
     Raises:
         ProblemError: A foot has no foothold at the start, or no foot stays where another moves.
     """
-    footholds = checked_mapping("walk: start", start)
+    footholds = checked_mapping("walk: footholds", footholds)
     steps = checked_each("walk: steps", steps, tuple)
     phases = [StancePhase(footholds, shift)]
     for step in steps:

@@ -600,9 +600,9 @@ STEPS = [
     Case(
         "walk",
         walk,
-        {"start": {**HERE, "hand": HERE["base"]}, "steps": [("hand", HERE["base"])], "shift": 1.0, "swing": 1.0},
+        {"footholds": {**HERE, "hand": HERE["base"]}, "steps": [("hand", HERE["base"])], "shift": 1.0, "swing": 1.0},
         {
-            "start": MAPPING | {"none": {}, "of words": {"base": "here"}},
+            "footholds": MAPPING | {"none": {}, "of words": {"base": "here"}},
             "steps": SEQUENCE | NOTHING | {"unknown": [("foot", HERE["base"])], "of words": [("base", "here")]},
             "shift": HORIZON,
             "swing": HORIZON,
