@@ -58,8 +58,8 @@ def roll_arguments(options: dict[str, Any]) -> dict[str, Any]:
 
 
 def plan(rig: Rig = RIG, method: Collocation = SMOOTH, **options: Any) -> Solution:
-    settings = RollSettings(symbols=ca.SX, **options)
-    return solve(roll_problem(rig, TUNNEL, falling, HORIZON, settings=settings), method)
+    arguments = roll_arguments({"symbols": ca.SX, **options})
+    return solve(roll_problem(rig, TUNNEL, falling, HORIZON, **arguments), method)
 
 
 def test_without_weights_on_motion_the_plan_is_the_best_roll_of_each_target() -> None:
