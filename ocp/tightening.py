@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ocp.console import interruptible, limited, time_left
-from ocp.direct.assembly import Fragment
+from ocp.direct.assembly import Transcription
 from ocp.direct.mesh import check_meshed
 from ocp.direct.prepared import DirectMethod
 from ocp.errors import SolveError, checked_mapping, checked_time_limit
@@ -96,15 +96,15 @@ def _tightened(
 ) -> Solution:
     """:func:`tighten` inside its time limit."""
     prepared = method.prepare(problem, solver=solver, options=options)
-    form, fragment = prepared.formulation, prepared.fragment
+    form, transcription = prepared.formulation, prepared.transcription
     p = form.parameter_vector(checked_mapping("tighten: parameters", parameters))
     bounds = form.bound_values(p)
     index = np.concatenate([form.bounds.places[kind] for kind in ("state", "control", "path")])
     low, high = bounds[0][index], bounds[1][index]
     with np.errstate(invalid="ignore"):
         most = np.where(np.isfinite(high - low), (high - low) / 2, np.inf)
-    places = _places(form, fragment, shared=method.control == "linear")
-    drawn = np.zeros((2, len(fragment.mesh) - 1, len(index)))
+    places = _places(form, transcription, shared=method.control == "linear")
+    drawn = np.zeros((2, len(transcription.mesh) - 1, len(index)))
     move, before, followed = np.zeros_like(drawn), np.zeros_like(drawn), np.full_like(drawn, SETTINGS.followed)
     best: tuple[Solution, str, dict[str, Any]] | None = None  # a plan, and what it exceeds most
     relaxed = np.inf  # cost of the plan that keeps the bounds at the points alone
@@ -170,7 +170,7 @@ def _worst(form: Formulation, beyond: np.ndarray, times: np.ndarray) -> tuple[st
 
 
 def _places(
-    form: Formulation, fragment: Fragment, shared: bool
+    form: Formulation, transcription: Transcription, shared: bool
 ) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Of variables ("x") and rows ("g"): which state, control or path row, else -1, and the intervals it stands in.
 
@@ -183,13 +183,15 @@ def _places(
         index = form.bounds.places[kind]
         entry_of[index] = offset + np.arange(len(index))
     alone = np.concatenate([np.zeros(form.nx, bool), np.ones(form.nu, bool), form.path.uses_control, [False]]) & ~shared
-    found, last = {}, len(fragment.mesh) - 2
+    found, last = {}, len(transcription.mesh) - 2
     for kind, index, at in (
-        ("x", fragment.variable_bounds, fragment.variable_fraction),
-        ("g", fragment.row_bounds, fragment.row_fractions),
+        ("x", transcription.variable_bounds, transcription.variable_fraction),
+        ("g", transcription.row_bounds, transcription.row_fractions),
     ):
-        left, right = (np.clip(np.searchsorted(fragment.mesh, at + slip) - 1, 0, last) for slip in (-AT_NODE, AT_NODE))
-        own = left if kind == "x" else np.clip(fragment.row_stages, 0, last)
+        left, right = (
+            np.clip(np.searchsorted(transcription.mesh, at + slip) - 1, 0, last) for slip in (-AT_NODE, AT_NODE)
+        )
+        own = left if kind == "x" else np.clip(transcription.row_stages, 0, last)
         entry = entry_of[index]
         found[kind] = entry, np.where(alone[entry], own, left), np.where(alone[entry], own, right)
     return found

@@ -21,7 +21,7 @@ from models.arrays import Array
 from ocp.audit.audit import Audit
 from ocp.audit.clearance import Clearance, Track, clearance_along
 from ocp.errors import ProblemError, SolveError, checked_instance, checked_mapping, checked_nonnegative
-from ocp.motion.local.collisions import Collision, find_collisions, hulls_of
+from ocp.motion.local.collisions import Collision, find_collisions, scene_hulls
 from ocp.problem.declarations import Variable
 from ocp.problem.hulls import frames_of
 from ocp.problem.problem import Problem

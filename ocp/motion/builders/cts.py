@@ -22,8 +22,8 @@ import numpy as np
 from models import ModelError
 from models.arrays import Array
 from models.cts.best_roll import optimal_inverse
-from models.cts.clearance import CollisionScene, Radii, checked_clearance, clearances, nearness
-from models.cts.rig import HOME, Branch, Rig, Tunnel, checked_branch, joints_of, posture_at
+from models.cts.clearance import CollisionScene, Radii, checked_clearance, clearances, proximity_cost
+from models.cts.rig import HOME, Branch, Rig, Tunnel, checked_branch, configuration_at, joints_of
 from models.cts.roll import index_harmonics
 from models.cts.table import checked_targets
 from models.shapes.distance import soft_minimum

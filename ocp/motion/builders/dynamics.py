@@ -43,7 +43,7 @@ from ocp.motion.tasks.checks import (
     checked_configuration,
     checked_horizon,
     checked_tasks,
-    inside_limits,
+    clip_to_limits,
     rates_at_rest,
 )
 from ocp.motion.tasks.equations import TaskEquations, bind

@@ -19,8 +19,8 @@ from ocp.errors import ProblemError, checked_each, checked_flag, checked_instanc
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.tool_motion import ToolMotion, stretches_of, tool_motion_problem
 from ocp.motion.local.inverse_kinematics import inverse_kinematics
-from ocp.motion.local.rates import LocalMotion, follow
-from ocp.motion.tasks.checks import checked_configuration, checked_tasks, checked_weights, horizon_of, inside_limits
+from ocp.motion.local.rates import LocalMotion, track_tasks
+from ocp.motion.tasks.checks import checked_configuration, checked_tasks, checked_weights, clip_to_limits, horizon_of
 from ocp.motion.tasks.equations import bind
 from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.motion.tasks.tip_task import TipTask

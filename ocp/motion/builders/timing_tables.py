@@ -28,7 +28,7 @@ from ocp.motion.schedule.limits import (
     rates_along,
 )
 from ocp.motion.schedule.planner import schedule
-from ocp.motion.schedule.profile import Array, LineMotion, SpeedProfile, piece_of
+from ocp.motion.schedule.profile import Array, LineMotion, SpeedProfile, segment_index
 
 __all__ = [
     "Columns",

@@ -16,7 +16,7 @@ import numpy as np
 
 from models.arrays import Array
 from ocp.audit.audit import Audit, Finding
-from ocp.audit.clearance import Nearest
+from ocp.audit.clearance import ClosestPair
 from ocp.direct.collocation import Collocation
 from ocp.direct.prepared import Prepared
 from ocp.errors import RefinementWarning, SolveError
@@ -309,7 +309,7 @@ class CandidateSolver(Solver):
                 for part, own in zip(stretch.equations.bound, errors, strict=True):
                     if part.task.start_gap <= self.settings.tip_tolerance:  # the feedback closes a larger one
                         worst = np.maximum(worst, np.linalg.norm(own, axis=1))
-                worst = np.maximum(worst, stretch.equations.overhangs(times, base, joints).max(axis=1, initial=0))
+                worst = np.maximum(worst, stretch.equations.cone_violations(times, base, joints).max(axis=1, initial=0))
         return np.asarray(np.maximum(worst[:-1], worst[1:]).reshape(-1, count).max(axis=1))
 
     def _samples(self, solution: Solution) -> Array:
@@ -370,7 +370,7 @@ class CandidateSolver(Solver):
             self._clear[time] = clear_postures(self.request, time)
         return self._clear[time]
 
-    def _collision(self, near: Collision | Nearest, then: str = "") -> Reason:
+    def _collision(self, near: Collision | ClosestPair, then: str = "") -> Reason:
         assert self.request.clearance_constraints is not None
         return collision(near, self.request.clearance_constraints.scene.clearance, then)
 

@@ -1,4 +1,4 @@
-"""Multipliers that lose least: what they lose is what a plan costs more, whatever costates it reports."""
+"""Multipliers with the smallest loss: it equals the excess cost of the plan, whatever costates it reports."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def lost(found: Fit) -> float:
 
 
 def without_costates(plan: Solution) -> Solution:
-    """The same plan, of which nothing is known but its motion."""
+    """Return the plan with zero costates and multipliers."""
     curve = plan.costate_interpolant
     nothing = PiecewisePolynomial(curve.breaks, curve.nodes, np.zeros_like(curve.values))
     return replace(
@@ -117,7 +117,7 @@ def test_units_change_nothing(declare: str, unit: float, second: float) -> None:
 def test_multipliers_push_their_own_way_and_only_where_a_limit_is_near() -> None:
     plan = solve(told("speed limit"), METHODS["radau"])
     found = fitted(plan).adjoint
-    speed = found.standing[:, 1]
+    speed = found.state_multipliers[:, 1]
     assert speed.min() >= -1e-6
     at_limit = plan.state_interpolant(np.repeat(0.5, 1))[0, 1] > 1.2 - 1e-6
     assert at_limit

@@ -13,7 +13,7 @@ from ocp import Collocation, MultipleShooting, Problem, SolveError, prepare, sol
 from ocp.direct.active_set import conditions
 from ocp.direct.nlp import Outcome
 from ocp.direct.prepared import Prepared
-from ocp.direct.scaling import unscaled
+from ocp.direct.scaling import unit_scales
 from tests.ocp.direct.test_nlp import obstacle, soft_lander
 from tests.ocp.problems import FINE, MOVED, SOLVERS, SWING, energy, moved, relative, swing, van_der_pol
 
@@ -35,15 +35,15 @@ def test_what_is_found_is_stationary_and_feasible_in_the_program(name: str, meth
     prepared = prepare(problem(), FINE[method])
     assert isinstance(prepared, Prepared)
     plan = prepared.solve(parameters)
-    form, fragment = prepared.formulation, prepared.fragment
+    form, transcription = prepared.formulation, prepared.transcription
     p = form.parameter_vector(parameters)
     low, high = form.bound_values(p)
     arguments = {"p": p}
-    for kind, index in (("x", fragment.variable_bounds), ("g", fragment.row_bounds)):
+    for kind, index in (("x", transcription.variable_bounds), ("g", transcription.row_bounds)):
         arguments |= {f"lb{kind}": low[index], f"ub{kind}": high[index]}
     rows = np.asarray(prepared.program.values(plan.variables, p)[1].full()).ravel()
     outcome = Outcome(plan.variables, plan.cost, rows, plan.multipliers, plan.status, "", 0, 0.0)
-    at = conditions(prepared.program, outcome, arguments, unscaled(fragment))
+    at = conditions(prepared.program, outcome, arguments, unit_scales(transcription))
     for value, push, lower, upper in (
         (plan.variables, at.of_bounds, arguments["lbx"], arguments["ubx"]),
         (rows, at.of_rows, arguments["lbg"], arguments["ubg"]),
@@ -104,7 +104,7 @@ def test_other_parameters_may_make_equalities_of_limits() -> None:
 
 
 def test_the_ceiling_that_leaves_no_freedom_is_reached() -> None:
-    """Bryson-Denham's, in contact on the nodes: its bound does not push there."""
+    """Bryson-Denham problem with contact at the nodes: the bound has no multiplier there."""
     problem = Problem("Bryson-Denham")
     x, v = problem.state("x", initial=0.0, terminal=0.0, upper=1 / 9), problem.state("v", initial=1.0, terminal=-1.0)
     u = problem.control("u")

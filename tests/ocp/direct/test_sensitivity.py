@@ -105,7 +105,7 @@ def pushing(plan: Solution, bound: float) -> np.ndarray:
 
 
 def test_the_range_ends_where_the_limits_that_push_change() -> None:
-    """Within the range told the same torques stand at their limit; what ends it is named. To first order."""
+    """Within the reported range the active torques stay the same, to first order; the next limit is named."""
     prepared = prepare(loaded(4.0), Collocation(8))
     plan = prepared.solve({"payload": 0.5})
     found = plan.sensitivity("payload")
@@ -151,8 +151,8 @@ def test_what_cannot_tell_how_it_moves_is_refused() -> None:
     for wrong in ("payloat", None, ["payload"], 3):
         with pytest.raises(ProblemError, match="payload"):
             plan.sensitivity(wrong)
-    with pytest.raises(ProblemError, match="only plans of Collocation"):
+    with pytest.raises(ProblemError, match="sensitivities need a plan of Collocation"):
         solve(energy(), Indirect()).sensitivity("x")
     stopped = solve(van_der_pol(), Collocation(4), options={"max_iter": 1}, check=False)
-    with pytest.raises(ProblemError, match="it is no optimum"):
+    with pytest.raises(ProblemError, match="it is not an optimum"):
         stopped.sensitivity("x")

@@ -21,7 +21,7 @@ from models.robot.dynamics import Wrench
 from ocp.direct.guess import Samples
 from ocp.errors import ProblemError
 from ocp.motion.local.accelerations import resolve_accelerations
-from ocp.motion.tasks.checks import inside_limits
+from ocp.motion.tasks.checks import clip_to_limits
 from ocp.motion.tasks.equations import TaskEquations
 from ocp.motion.tasks.limits import JointBounds
 from ocp.motion.tasks.tip_task import timed

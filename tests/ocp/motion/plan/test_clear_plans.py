@@ -192,11 +192,11 @@ def test_held_apart_the_barrier_begins_worth_no_more_than_the_motion() -> None:
     separated = Candidate(START, clearance_constraints=ClearanceConstraints(around).holding([pair]))
     prepared = solver.prepared(separated, fine=False, cost=cost)[2]
     bounds = prepared.formulation.bound_values(np.zeros(0))
-    places = [getattr(prepared.fragment, f"{of}_bounds") for of in ("variable", "row")]
+    places = [getattr(prepared.transcription, f"{of}_bounds") for of in ("variable", "row")]
     free = [np.isfinite(side[at][bounds[0][at] < bounds[1][at]]).sum() for at in places for side in bounds]
-    begins = prepared._own_options["mu_init"]
+    begins = prepared._options["mu_init"]
     assert_allclose(begins * sum(free), cost, rtol=0.05)  # the nodes at which the motion begins aside
-    assert "mu_init" not in solver.prepared(Candidate(START), fine=True)[2]._own_options
+    assert "mu_init" not in solver.prepared(Candidate(START), fine=True)[2]._options
 
 
 def space_arm(panel: bool) -> FreeFloating:
@@ -298,7 +298,7 @@ def test_what_never_touches_within_limits_is_looked_at_without_them() -> None:
     robot = armoured_arm()
     narrow = replace(robot, joints=tuple(replace(joint, lower=-0.3, upper=0.3) for joint in robot.joints))
     within, beyond = (CollisionScene(FixedBase(narrow), limits=limits) for limits in (True, False))
-    assert within.left["link2", "link6"] == "never touch"
+    assert within.left["link2", "link6"] == "never in collision"
     assert ("link2", "link6") in beyond.labels
     free_of_limits = Limits(joints=False)
     asked: dict[str, Any] = {"tasks": line(), "start": START, "horizon": SECONDS, "limits": free_of_limits}
@@ -330,7 +330,7 @@ def test_a_target_inside_an_obstacle_names_the_pair_the_time_and_the_depth() -> 
     assert 1 <= caught.value.time <= SECONDS
     last = str(caught.value).split("\n")[-1]
     assert last.startswith("the cheapest that touches: link6 and obstacle 0 overlap")
-    assert re.search(r"; no other posture is clear then: each of the \d+ postures found touches", last)
+    assert re.search(r"; no other posture is clear then: each of the \d+ IK solutions is in collision", last)
 
 
 def test_where_no_posture_is_clear_no_alternatives_are_searched(monkeypatch: pytest.MonkeyPatch) -> None:
