@@ -134,7 +134,7 @@ class ClearanceConstraints:
         problem.separate(
             f"{CLEARANCE}{suffix}",
             _evaluated(scene.placements, base, joints, time),
-            hulls_of(scene),
+            scene_hulls(scene),
             scene.pairs,
             np.full(len(scene.pairs), scene.clearance),
             levers={name: pair[0] for name, pair in moved.items()},
@@ -204,7 +204,7 @@ def clearance_of(
     separation = Separation(
         CLEARANCE,
         placements,
-        hulls_of(scene),
+        scene_hulls(scene),
         scene.pairs,
         np.full(n, scene.clearance),
         movers={"joints": machine.joint_size},

@@ -216,7 +216,7 @@ def roll_problem(
     symbols, largest, fastest = settings.symbols, settings.acceleration_limit, settings.rate_limit
     x, phi = ca.SX.sym("target", 5), ca.SX.sym("roll")
     c, s = ca.cos(phi), ca.sin(phi)
-    solution = posture_at(rig, x, c, s, settings.branch)
+    solution = configuration_at(rig, x, c, s, settings.branch)
     joints = joints_of(rig, x, phi, solution)
     limited_joints = [k for k in range(5) if np.isfinite([rig.lower[k], rig.upper[k]]).any()]
     limited = ca.vertcat(*[joints[k] for k in limited_joints])
@@ -229,7 +229,7 @@ def roll_problem(
     if obstacles is not None:
         distances = clearances(rig, joints, obstacles.scene, obstacles.radii)
         gap = soft_minimum(list(distances.values()), obstacles.softness)
-        proximity = nearness(gap, obstacles.clearance_weight, obstacles.clearance_width)
+        proximity = proximity_cost(gap, obstacles.clearance_weight, obstacles.clearance_width)
         if np.isfinite(obstacles.clearance):
             violation += ca.fmax(obstacles.clearance + SEARCH.margin * obstacles.softness - gap, 0)
     t = np.linspace(0, horizon, SEARCH.times)

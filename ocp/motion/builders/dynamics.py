@@ -191,11 +191,11 @@ class _Ends:
     ) -> _Ends:
         robot, n, hint = machine.robot, machine.joint_size, "keep within them, or leave that end free with nan"
         first, last = (
-            inside_limits(name, robot.joint_names, _checked_end(name, value, n), bounds.lower, bounds.upper, hint)
+            clip_to_limits(name, robot.joint_names, _checked_end(name, value, n), bounds.lower, bounds.upper, hint)
             for name, value in zip(("start", "end"), joints, strict=True)
         )
         first_rates, last_rates = (
-            inside_limits(
+            clip_to_limits(
                 name, robot.joint_names, end_velocities(name, value, n), -bounds.velocity, bounds.velocity, hint
             )
             for name, value in zip(("start_velocity", "end_velocity"), velocities, strict=True)
@@ -380,5 +380,5 @@ def _declare_tasks(problem: Problem, equations: TaskEquations, ends: _Ends, moti
         problem.start("tip velocity", residual, lower=0, upper=0, unit=equations.unit())
     gap = equations.acceleration(base, joints, rates, second, problem.time)
     problem.path("tip", gap, lower=0, upper=0, unit=equations.unit("/s^2", "/s^2"))
-    for name, deviation in equations.strays(base, joints, rates, targets).items():
+    for name, deviation in equations.deviations(base, joints, rates, targets).items():
         problem.watch(name, **deviation)

@@ -101,7 +101,7 @@ def minimum_velocity_problem(
             begins = stretch is stretches[0] and start is not None
             checked_tasks(stretch.equations, base, joints, duration, start=begins)
     bounds, names = limits.bounds(machine, ("velocity",)), machine.robot.joint_names
-    joints = inside_limits("start", names, joints, bounds.lower, bounds.upper, "start inside them")
+    joints = clip_to_limits("start", names, joints, bounds.lower, bounds.upper, "start inside them")
     if clearance_constraints is not None:
         checked_instance("clearance_constraints", clearance_constraints, ClearanceConstraints)
     motion = tool_motion_problem(
@@ -122,10 +122,10 @@ def _attach_guess(
         steps = max(int(np.ceil(GUESS_STEPS * stretch.duration / motion.horizon)), 1)
         times = np.union1d(np.linspace(stretch.begin, stretch.end, steps + 1), stretch.breaks)
         if stretch.equations is None:
-            motions.append(LocalMotion.resting(times, place, at))
+            motions.append(LocalMotion.stationary(times, place, at))
         else:
             options: dict[str, Any] = {"lower": bounds.lower, "upper": bounds.upper, "weights": weights}
-            motions.append(follow(stretch.equations, at, place, times, damping=damping, **options))
+            motions.append(track_tasks(stretch.equations, at, place, times, damping=damping, **options))
         place, at = motions[-1].base[:, -1], motions[-1].joints[:, -1]
     declared = motion.problem.declared
     for name, guess in motion.guess(motions, 0).items():

@@ -220,7 +220,7 @@ def minimum_time_problem(
     if guess is not None and abs(guess.path.length - path.length) > 1e-9 * path.length:
         message = f"the guess is for a path of {guess.path.length:g} m, but this path has {path.length:g} m"
         raise ProblemError(message, name="guess", value=guess.path.length, limit=path.length)
-    path_columns(path, limits, limited, path.dense())  # raises if anything is not finite
+    path_columns(path, limits, limited, path.sample_distances())  # raises if anything is not finite
     reference = reference_motion(path, limits, limited) if guess is None else guess.profile
     if guess is not None and limited is not None:
         check_smooth(path, limits, limited)  # raises if no motion satisfies the limits, like a schedule
@@ -315,7 +315,7 @@ def _demands(limits: LineLimits, joints: JointPath | None, values: Any, v: Any, 
 def _refinement(profile: SpeedProfile, demand: Array) -> NDArray[np.intp]:
     """Return the parts into which each interval is split; the error falls with the square of the interval."""
     v, a, j, t = profile.speed, profile.acceleration, profile.jerk, np.diff(profile.t)
-    distance, speed, _ = advanced(v[:-1], a[:-1], j, t)
+    distance, speed, _ = integrate_jerk(v[:-1], a[:-1], j, t)
     distance_error, speed_error = distance / np.diff(profile.distance) - 1, (speed - v[1:]) / v.max()
     error = np.maximum(
         (demand - 1) / REFINEMENT.demand, np.maximum(np.abs(distance_error), np.abs(speed_error)) / REFINEMENT.defect

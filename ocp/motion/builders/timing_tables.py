@@ -118,7 +118,7 @@ def table(columns: Columns, breaks: Array) -> Any:
 
 def speed_limit(path: PathLike, limits: LineLimits, s: Array) -> Array:
     """Return the limit of the line speed at distances (M,). Shape (M,), m/s."""
-    return np.asarray(path.by_piece(limits.speed)[piece_of(path.bounds, s)])
+    return np.asarray(path.by_piece(limits.speed)[segment_index(path.bounds, s)])
 
 
 def path_columns(path: PathLike, limits: LineLimits, joints: JointPath | None, s: Array) -> Array:

@@ -315,7 +315,7 @@ def _declare_stretch(motion: _Motion, stretch: Stretch, known: Array | None) -> 
         free = not begins or motion.free
         _declare_tasks(motion, stretch, (place, joints, rates), pace, slack, free, required, rate_derivatives)
         placed = np.concatenate([is_holonomic(part) for part in stretch.equations.bound]).astype(bool)
-        ends_at = slopes[stretch.equations.posed | (placed & (begins | ~required))]
+        ends_at = slopes[stretch.equations.pose_rows | (placed & (begins | ~required))]
     if machine.base_size:
         problem.dynamics(place, pace * machine.base_rate(place, joints, rates))
     problem.dynamics(joints, pace * rates)
@@ -464,16 +464,16 @@ def _declare_tasks(
             problem.start(f"start velocity{suffix}", (residual - closure)[rows], 0, 0, unit=equations.unit())
     elif equations.size:
         problem.path(f"task{suffix}", residual - closure, lower=0, upper=0, unit=equations.unit())
-    largest_lean = equations.most_lean
+    largest_lean = equations.cone_angles
     if largest_lean.size:
-        problem.path(f"lean{suffix}", equations.leans(base, joints, targets), lower=np.cos(largest_lean))
-    for name, deviation in equations.strays(base, joints, rates, targets).items():
+        problem.path(f"lean{suffix}", equations.cone_cosines(base, joints, targets), lower=np.cos(largest_lean))
+    for name, deviation in equations.deviations(base, joints, rates, targets).items():
         if deviation["integral"]:
             deviation = {**deviation, "expression": pace * deviation["expression"]}
         problem.watch(f"{name}{suffix}", **{**deviation, "way": pace * deviation["way"]})
     if not free:
         return
-    error = equations.error(base, joints, targets)[np.flatnonzero(begins & equations.posed).tolist()]
+    error = equations.error(base, joints, targets)[np.flatnonzero(begins & equations.pose_rows).tolist()]
     # a velocity task has no pose: at the start of the motion its tip is where the reference has it
     fixed = [] if stretch.begin else [equations.holding(base, joints, motion.base, motion.reference)]
     if (condition := ca.vertcat(error, *fixed)).numel():
@@ -490,7 +490,7 @@ def _slopes(stretch: Stretch, base: Array, reference: Array) -> Array:
     b, q = ca.SX.sym("base", len(base)), ca.SX.sym("joints", len(reference))
     error = equations.error(b, q, equations.target_function()(stretch.begin))
     fixed, at, rows = equations.holding(b, q, base, reference), 0, []
-    for i, posed in enumerate(equations.posed):
+    for i, posed in enumerate(equations.pose_rows):
         rows.append(error[i] if posed else fixed[at])
         at += not posed
     slope = ca.Function("slope", [b, q], [ca.jacobian(ca.vertcat(*rows), ca.vertcat(b, q))])

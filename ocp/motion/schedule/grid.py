@@ -97,7 +97,7 @@ def make_grid(path: PathLike, limits: LineLimits, joints: JointPath | None) -> G
     kept = np.concatenate([[True], np.diff(bounds)[:-1] > SETTINGS.shortest * path.length, [True]])
     kept[-2] &= len(bounds) == 2 or bounds[-1] - bounds[-2] > SETTINGS.shortest * path.length
     nodes = bounds[kept]
-    dense = path.dense(SETTINGS.cells, max(1, SETTINGS.segments // len(bounds)))
+    dense = path.sample_distances(SETTINGS.cells, max(1, SETTINGS.segments // len(bounds)))
     first = _separate(np.concatenate([dense, nodes]), nodes)
     parts = [
         _halved(path, limits, joints, first[begin : begin + SETTINGS.block + 1], (bounds, requested))
@@ -146,7 +146,7 @@ def _halved(
 def coarse_grid(path: PathLike, limits: LineLimits) -> Grid:
     """Return the first nodes of a path without halving: enough to find where limits are active."""
     bounds = np.asarray(path.bounds, dtype=float)
-    s = np.unique(np.concatenate([path.dense(SETTINGS.cells, 1), bounds]))
+    s = np.unique(np.concatenate([path.sample_distances(SETTINGS.cells, 1), bounds]))
     requested = np.asarray(path.by_piece(limits.speed)[segment_index(bounds, (s[:-1] + s[1:]) / 2)])
     return Grid(path, limits, None, s, requested, np.zeros(0, dtype=np.intp), np.zeros(0))
 

@@ -244,7 +244,7 @@ def standing_problem(
     final = declare_horizon(problem, horizon)
     resting: Array | None = None
     if rests[1]:
-        rows = ~equations.posed if tip_level == "position" else None
+        rows = ~equations.pose_rows if tip_level == "position" else None
         resting = rates_at_rest(equations, (), guess["joints"].values[-1], rows)
     motion, jerks = _motion(problem, machine.robot, bounds, begin, resting, guess, setup)
     joints, velocities, accelerations = motion
@@ -295,7 +295,7 @@ def _constrain_tips(
         problem.start("tip velocity", residual, lower=0, upper=0, unit=equations.unit())
     gap = equations.acceleration(none, joints, velocities, accelerations, *progress)
     problem.path("tip", gap, lower=0, upper=0, unit=equations.unit("/s^2", "/s^2"))
-    for name, deviation in equations.strays(none, joints, velocities, targets).items():
+    for name, deviation in equations.deviations(none, joints, velocities, targets).items():
         problem.watch(name, **deviation)
 
 

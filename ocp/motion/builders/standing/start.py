@@ -63,7 +63,7 @@ def start_inside(machine: Machine, joints: Array, lower: Array, upper: Array) ->
         if not low < high:
             message = f"joint {name!r} cannot move between its limits {low:g} .. {high:g}: lock it there"
             raise ProblemError(message, name=name, value=float(value), limit=(low, high))
-    return inside_limits("start", machine.robot.joint_names, joints, lower, upper, "start inside them")
+    return clip_to_limits("start", machine.robot.joint_names, joints, lower, upper, "start inside them")
 
 
 def check_freedom(
