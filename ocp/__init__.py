@@ -9,15 +9,15 @@ from ocp.indirect.method import Indirect
 from ocp.methods import certificate, prepare, solve
 from ocp.motion.builders.actuator_limits import Effort, JointFriction, joint_torques
 from ocp.motion.builders.clearance import ClearanceConstraints
-from ocp.motion.builders.cts import roll_problem, spline_targets
-from ocp.motion.builders.dynamics import dynamics_problem
+from ocp.motion.builders.cts import RollObstacles, RollSettings, roll_problem, spline_targets
+from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem
 from ocp.motion.builders.dynamics_plan import Leg, dynamics_phases, plan_dynamics
 from ocp.motion.builders.joint_spline import joint_path
 from ocp.motion.builders.minimum_velocity import minimum_velocity_problem
 from ocp.motion.builders.space.capture import capture_problem, chained_capture, plan_capture
 from ocp.motion.builders.space.grasping import Cone, Grasp
 from ocp.motion.builders.standing.plan import plan_standing, plan_steps
-from ocp.motion.builders.standing.problem import FreeTime, Weights, standing_problem
+from ocp.motion.builders.standing.problem import FreeTime, StandingSetup, Weights, standing_problem
 from ocp.motion.builders.standing.resolved import StepsMotion, resolve_steps, steps_motion
 from ocp.motion.builders.standing.stances import StancePhase, Steps, standing_configuration, walk
 from ocp.motion.builders.standing.steps import StepWeights, steps_problem
@@ -65,6 +65,7 @@ __all__ = [
     "Collocation",
     "Cone",
     "DeadEnd",
+    "DynamicsSetup",
     "Effort",
     "Finding",
     "Following",
@@ -85,6 +86,8 @@ __all__ = [
     "ProblemError",
     "Reconfiguration",
     "RefinementWarning",
+    "RollObstacles",
+    "RollSettings",
     "SegmentedPlan",
     "Sensitivity",
     "Solution",
@@ -92,6 +95,7 @@ __all__ = [
     "SolverStatus",
     "Stabiliser",
     "StancePhase",
+    "StandingSetup",
     "StepWeights",
     "Steps",
     "StepsMotion",

@@ -17,7 +17,19 @@ from scipy.spatial.transform import Rotation
 
 from models import FreeFloating, Link, Robot, VisualShape, with_wheels
 from models.arrays import Array
-from ocp import Audit, Collocation, Cone, Effort, FreeTime, Grasp, Limits, Solution, dynamics_problem, plan_capture
+from ocp import (
+    Audit,
+    Collocation,
+    Cone,
+    DynamicsSetup,
+    Effort,
+    FreeTime,
+    Grasp,
+    Limits,
+    Solution,
+    dynamics_problem,
+    plan_capture,
+)
 from ocp.app.view.appearance import Frames, frames_along
 from ocp.motion.builders.space.grasping import grasp_wrench, joined, motion_of, pair_momentum
 from scripts.drawing import COLORS, DASHES
@@ -109,9 +121,9 @@ def asked_for(spin: Any = SPIN) -> dict[str, Any]:
     place = np.concatenate([center, quaternion(turn)])
     momentum = np.concatenate([turn @ moments @ np.asarray(spin), np.zeros(3)])
     return {
-        "chaser": machine, "target": FreeFloating(robot, conserved_momentum=momentum), "start_joints": joints,
+        "chaser": machine, "target": FreeFloating(robot, conserved_momentum=momentum), "start": joints,
         "approach": APPROACH, "detumble": DETUMBLE, "target_base": place, "cone": CONE, "grasp": GRASP,
-        "end_joints": [*START, np.nan, np.nan, np.nan],
+        "end": [*START, np.nan, np.nan, np.nan],
         "limits": Limits(velocity=[RATE] * 7 + [MOMENTUM / WHEEL] * 3, torque=[JOINT_TORQUE] * 7 + [TORQUE] * 3),
         "effort": Effort(torque=[0.01] * 7 + [10.0] * 3, acceleration=[100.0] * 7 + [0.0] * 3, time=0.05),
         "method": METHOD,
@@ -135,7 +147,14 @@ def bearing(example: CaptureExample, along: dict[str, Array]) -> tuple[Array, Ar
     asked = example.asked
     pair = together(example)
     free = np.full(7, np.nan)
-    problem = dynamics_problem(pair, None, 1.0, start="free", end="free", start_base=free, limits=asked["limits"])
+    problem = dynamics_problem(
+        pair,
+        (),
+        1.0,
+        start=None,
+        limits=asked["limits"],
+        setup=DynamicsSetup(start_velocity="free", end_velocity="free", start_base=free),
+    )
     second = problem.declared.controls["accelerations"].symbol
     base, joints, rates = motion_of(problem)
     found = ca.Function("bearing", [base, joints, rates, second], list(grasp_wrench(pair, asked["target"], problem)))
@@ -147,7 +166,7 @@ def bearing(example: CaptureExample, along: dict[str, Array]) -> tuple[Array, Ar
 def together(example: CaptureExample) -> FreeFloating:
     """Both as one machine."""
     one, other = example.asked["chaser"], example.asked["target"]
-    start = (one.base_home(), example.asked["target_base"], example.asked["start_joints"])
+    start = (one.base_home(), example.asked["target_base"], example.asked["start"])
     carried = np.array(ca.DM(pair_momentum(one, other, *start))).ravel()
     return FreeFloating(joined(one.robot, other.robot), conserved_momentum=carried)
 

@@ -67,7 +67,7 @@ def asked_for(spin: float, kind: str) -> dict[str, Any]:
     return {
         "chaser": FreeFloating(robot, "planar", conserved_momentum=carried),
         "target": FreeFloating(target, "planar", conserved_momentum=[INERTIA * spin, 0.0, 0.0]),
-        "start_joints": joints, "approach": DURATION, "detumble": DURATION,
+        "start": joints, "approach": DURATION, "detumble": DURATION,
         "target_base": [*GRASPED, -spin * DURATION], "effort": Effort(torque=1.0, acceleration=weights),
         "limits": Limits(velocity=rates), "method": METHOD,
     }  # fmt: skip

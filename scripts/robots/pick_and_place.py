@@ -160,7 +160,7 @@ def plan(coarse: bool = False) -> PickAndPlace:
     """Both plans, audited; on one mesh only, `coarse` or not."""
     plans, motions, audits = {}, {}, {}
     for name in KINDS:
-        plans[name] = plan_dynamics(arm(), HOME, legs(name == "load known"), effort=EFFORT, method=METHOD)
+        plans[name] = plan_dynamics(arm(), legs(name == "load known"), start=HOME, effort=EFFORT, method=METHOD)
         motions[name], audits[name] = motion_of(plans[name]), plans[name].audit()
     return PickAndPlace(plans, motions, audits)
 

@@ -18,7 +18,9 @@ import numpy as np
 from models import CollisionScene, Footprint, Standing, Wrench, footprint, with_load
 from models.machines.standing import External
 from ocp import ClearanceConstraints, Collocation, Problem, TipTask, resolve_accelerations, solve
-from ocp.motion.builders.standing import InFoot, Limits, standing_problem
+from ocp.motion.builders.standing.problem import StandingSetup, standing_problem
+from ocp.motion.tasks.limits import Limits
+from ocp.motion.tasks.zmp_rules import InFoot
 from scripts.robots import standing
 from scripts.robots.drawing import animate
 from scripts.robots.mobile_manipulator import StandingExample, save
@@ -78,21 +80,20 @@ def task(machine: Standing) -> TipTask:
     return standing.from_rest(reach(machine), SECONDS)
 
 
-def problem(machine: Standing, *, along: Any = "time", **changes: Any) -> Problem:
+def problem(
+    machine: Standing, *, along: Any = "time", clearance_constraints: ClearanceConstraints | None = None, **changes: Any
+) -> Problem:
     """The plan to be made, at a given time law or with the time law left to the plan ("parameter").
 
     Args:
-        changes: Of the options of standing_problem.
+        changes: Of the other arguments of standing_problem.
     """
-    options: dict[str, Any] = {
-        "zmp": InFoot(MARGIN),
-        "limits": Limits(friction=FRICTION),
-        "external": reaction(machine),
-        "tip_level": "acceleration",
-        **changes,
-    }
+    setup = StandingSetup(
+        external=reaction(machine), tip_level="acceleration", along=along, clearance_constraints=clearance_constraints
+    )
     hand = task(machine) if along == "time" else reach(machine)
-    return standing_problem(machine, hand, START, SECONDS, along=along, **options)
+    options: dict[str, Any] = {"zmp": InFoot(MARGIN), "limits": Limits(friction=FRICTION), **changes}
+    return standing_problem(machine, hand, SECONDS, start=START, setup=setup, **options)
 
 
 def plan(coarse: bool = False) -> StandingExample:

@@ -35,7 +35,7 @@ def plan(coarse: bool = False) -> Example:
     line = pose_line((rotation, position), goal, DURATION)
     task = TipTask(position=line.position, orientation=line.orientation)
     local = resolve(machine, tasks=task, start_joints=start, horizon=DURATION, samples=FINE)
-    problem = minimum_velocity_problem(machine, task, start, DURATION)
+    problem = minimum_velocity_problem(machine, task, DURATION, start=start)
     solution = solve(problem, Collocation(intervals=20 if coarse else 50, degree=4))
     facts = {
         "base_turn_local_deg": float(np.degrees(turning_angle(local.base).max())),

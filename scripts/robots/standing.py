@@ -22,8 +22,10 @@ from models.machines.standing import External, StandingMotion, standing_motion
 from models.paths import rest_to_rest
 from ocp import ClearanceConstraints, Collocation, Problem, Solution, TipTask, resolve_accelerations, solve
 from ocp.app.view.appearance import frames_along
-from ocp.motion.builders.standing import InFoot, Limits, Weights, standing_problem
+from ocp.motion.builders.standing.problem import StandingSetup, Weights, standing_problem
+from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.tip_task import timed
+from ocp.motion.tasks.zmp_rules import InFoot
 from scripts.drawing import COLORS, DASHES
 from scripts.robots.drawing import Scene, page
 
@@ -132,15 +134,14 @@ def problem(
     return standing_problem(
         machine,
         from_rest(hand) if along == "time" else hand,
-        START,
         SECONDS,
+        start=START,
         zmp=InFoot(MARGIN),
-        external=rope(machine),
         weights=WEIGHTS,
         limits=Limits(velocity=SHARE * robot.velocity, torque=SHARE * robot.effort, friction=0.6),
-        along=along,
-        tip_level="acceleration",
-        clearance_constraints=clearance_constraints,
+        setup=StandingSetup(
+            external=rope(machine), along=along, tip_level="acceleration", clearance_constraints=clearance_constraints
+        ),
     )
 
 

@@ -20,16 +20,9 @@ from models import Foot, Foothold, FreeFloating, Joint, Link, Robot, VisualShape
 from models.arrays import Array
 from ocp import Audit, Collocation, Limits, Solution
 from ocp.app.view.appearance import frames_along
-from ocp.motion.builders.standing import (
-    StancePhase,
-    Steps,
-    StepsMotion,
-    plan_steps,
-    resolve_steps,
-    standing_configuration,
-    steps_motion,
-    walk,
-)
+from ocp.motion.builders.standing.plan import plan_steps
+from ocp.motion.builders.standing.resolved import StepsMotion, resolve_steps, steps_motion
+from ocp.motion.builders.standing.stances import StancePhase, Steps, standing_configuration, walk
 from scripts.drawing import COLORS
 from scripts.robots.drawing import Scene, animate, page
 
@@ -188,7 +181,7 @@ def plan(coarse: bool = False) -> StepsExample:
     """Both walks, audited; on one mesh only, `coarse` or not."""
     walks = walks_of(planar_steps, KINDS, CLEARANCE)
     steps = walks.motions["as a whole"].steps
-    return StepsExample(**vars(walks), local=resolve_steps(steps, bent(steps), clearance=CLEARANCE))
+    return StepsExample(**vars(walks), local=resolve_steps(steps, start=bent(steps), clearance=CLEARANCE))
 
 
 def walks_of(made: Callable[..., Steps], kinds: dict[str, dict[str, Any]], clearance: float) -> Walks:
@@ -203,9 +196,14 @@ def walks_of(made: Callable[..., Steps], kinds: dict[str, dict[str, Any]], clear
     for name, kind in kinds.items():
         steps = made(2, *kind["times"])
         plans[name] = plan_steps(
-            steps, bent(steps), balance=kind["balance"], margin=kind["margin"], limits=Limits(friction=FRICTION),
-            clearance=clearance, method=METHOD,
-        )  # fmt: skip
+            steps,
+            start=bent(steps),
+            balance=kind["balance"],
+            margin=kind["margin"],
+            limits=Limits(friction=FRICTION),
+            clearance=clearance,
+            method=METHOD,
+        )
         motions[name] = steps_motion(steps, plans[name])
     return Walks(plans, motions, {name: plan.audit() for name, plan in plans.items()})
 

@@ -14,7 +14,8 @@ import numpy as np
 
 from models import Foot, Robot
 from models.arrays import Array
-from ocp.motion.builders.standing import Steps, StepsMotion
+from ocp.motion.builders.standing.resolved import StepsMotion
+from ocp.motion.builders.standing.stances import Steps
 from scripts.drawing import COLORS
 from scripts.robots.drawing import animate, page
 from scripts.robots.robots import TALOS

@@ -110,7 +110,7 @@ def starts(machine: Machine, task: TipTask) -> list[IkSolution]:
 def _planned(
     machine: Machine, task: TipTask, start: IkSolution, method: Collocation, free_start: bool
 ) -> Solution | None:
-    begin: dict[str, Any] = {"near" if free_start else "start_joints": start.joints}
+    begin: dict[str, Any] = {"near" if free_start else "start": start.joints}
     try:
         found = solve(minimum_velocity_problem(machine, task, horizon=DURATION, **begin), method)
     except SolveError:

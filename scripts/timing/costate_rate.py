@@ -86,7 +86,7 @@ def costate_function(machine: FreeFloating, rows: list[int]) -> tuple[Any, Any]:
     start = np.linspace(0.3, 0.6, machine.joint_size)
     velocity = np.full(len(rows), 0.05)
     problem = minimum_velocity_problem(
-        machine, TipTask(rows=rows, velocity=velocity), start, 0.1, limits=Limits(velocity=np.inf, joints=False)
+        machine, TipTask(rows=rows, velocity=velocity), 0.1, start=start, limits=Limits(velocity=np.inf, joints=False)
     )
     ham = Hamiltonian.of(Formulation(problem))
     x, lam = ca.SX.sym("x", ham.sizes[0]), ca.SX.sym("lam", ham.sizes[0])

@@ -44,7 +44,7 @@ def moved(start: Any) -> Any:
 
 
 def planned(start: Any) -> Any:
-    return minimum_velocity_problem(ARM, tasks=FORWARD, start_joints=start, horizon=0.1)
+    return minimum_velocity_problem(ARM, tasks=FORWARD, start=start, horizon=0.1)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from models import FixedBase, Joint, Robot, planar_chain
 from models.arrays import Array
-from ocp import Limits, Problem, ProblemError, TipTask, minimum_velocity_problem, plan, plan_dynamics
+from ocp import DynamicsSetup, Limits, Problem, ProblemError, TipTask, minimum_velocity_problem, plan, plan_dynamics
 from ocp.errors import told_apart
 
 LOW, HIGH = np.array([-0.0175, -2.0]), np.array([3.7525, 2.0])
@@ -40,15 +40,15 @@ def planned(joints: Array) -> float:
 
 
 def moved(joints: Array) -> float:
-    return float(plan_dynamics(MACHINE, joints, 1.0, end_joints=[0.3, 0.9]).at(0.0)["joints"][0])
+    return float(plan_dynamics(MACHINE, (), 1.0, start=joints, end=[0.3, 0.9]).at(0.0)["joints"][0])
 
 
 def arrived(joints: Array) -> float:
-    return float(plan_dynamics(MACHINE, [0.3, 0.9], 1.0, end_joints=joints).at(1.0)["joints"][0])
+    return float(plan_dynamics(MACHINE, (), 1.0, start=[0.3, 0.9], end=joints).at(1.0)["joints"][0])
 
 
 def declared(joints: Array) -> float:
-    problem = minimum_velocity_problem(MACHINE, start_joints=joints, horizon=1.0, tasks=leaving(joints))
+    problem = minimum_velocity_problem(MACHINE, start=joints, horizon=1.0, tasks=leaving(joints))
     return float(np.array(ca.DM(problem.declared.states["joints"].initial)).ravel()[0])
 
 
@@ -62,11 +62,13 @@ def test_a_joint_beyond_its_limit_by_rounding_is_on_it(entry: Callable[[Array], 
 
 
 def test_velocities_beyond_their_limit_by_rounding_are_on_it() -> None:
-    asked: dict[str, Any] = {"end_joints": [1.5, 0.9], "limits": Limits(velocity=1.1)}
-    fast = plan_dynamics(MACHINE, [0.3, 0.9], 2.0, start=[np.nextafter(1.1, 2), 0.0], **asked)
+    asked: dict[str, Any] = {"end": [1.5, 0.9], "limits": Limits(velocity=1.1)}
+    fast = plan_dynamics(
+        MACHINE, (), 2.0, start=[0.3, 0.9], **asked, setup=DynamicsSetup(start_velocity=[np.nextafter(1.1, 2), 0.0])
+    )
     assert fast.at(0.0)["velocities"][0] == pytest.approx(1.1, abs=1e-9)
     with pytest.raises(ProblemError, match=r"'joint1' starts at 1\.1000001, outside its limits -1\.1 \.\. 1\.1;"):
-        plan_dynamics(MACHINE, [0.3, 0.9], 2.0, start=[1.1000001, 0.0], **asked)
+        plan_dynamics(MACHINE, (), 2.0, start=[0.3, 0.9], **asked, setup=DynamicsSetup(start_velocity=[1.1000001, 0.0]))
 
 
 def test_a_declared_value_just_beyond_a_bound_is_told_with_the_digits_that_differ() -> None:

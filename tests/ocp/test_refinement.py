@@ -151,14 +151,17 @@ def chain_in_a_circle() -> Problem:
     arm = FixedBase(planar_chain([1.0, 0.8, 0.6], [1.0] * 3))
     start = np.deg2rad([30.0, 40.0, 50.0])
     return minimum_velocity_problem(
-        arm, TipTask(rows=(3, 4), velocity=lambda t: [-0.5 * ca.sin(2 * t), 0.5 * ca.cos(2 * t)]), start, horizon=3.0
+        arm,
+        TipTask(rows=(3, 4), velocity=lambda t: [-0.5 * ca.sin(2 * t), 0.5 * ca.cos(2 * t)]),
+        start=start,
+        horizon=3.0,
     )
 
 
 def floating_arm() -> Problem:
     """The example of Kim, Kim 2011."""
     return minimum_velocity_problem(
-        paper_example(), TipTask(rows=(3, 4), velocity=(-1.0, -1.0)), np.radians([45.0, 60.0, -60.0]), 5.0
+        paper_example(), TipTask(rows=(3, 4), velocity=(-1.0, -1.0)), 5.0, start=np.radians([45.0, 60.0, -60.0])
     )
 
 

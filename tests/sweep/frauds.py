@@ -135,7 +135,7 @@ def arm(fast: float = 10.0) -> Problem:
     start = np.array([0.0, -0.6, 0.1, -2.2, 0.2, 1.7, 0.7])
     begin = np.array(ca.DM(FixedBase(robot).tip_pose(np.zeros(0), start).position)).ravel()
     task = TipTask.along(smooth(Line.through([begin, begin + np.array([0.1, 0.12, -0.06])]), deviation=1e-3), 0.1)
-    asked: dict[str, Any] = {"start_joints": start, "horizon": task.duration}
+    asked: dict[str, Any] = {"start": start, "horizon": task.duration}
     return minimum_velocity_problem(FixedBase(robot), tasks=task, **asked)
 
 
@@ -148,7 +148,7 @@ def gantry(fast: float = 10.0) -> Problem:
     ]
     machine = FixedBase(Robot(tuple(Link(name, mass=1.0) for name in names), tuple(joints), tip="tool"))
     task = TipTask.along(smooth(Line.through([(0, 0, 0), (10, 2, 0)]), deviation=1e-3), 1.0, gain=0.0)
-    return minimum_velocity_problem(machine, tasks=task, start_joints=np.zeros(4), horizon=task.duration)
+    return minimum_velocity_problem(machine, tasks=task, start=np.zeros(4), horizon=task.duration)
 
 
 LINEAR = MultipleShooting(40, control="linear")

@@ -1,1 +1,1 @@
-"""Ready problems, one module for each family of machines and tasks; `task` holds what they share."""
+"""Problem builders, one module for each family of machines and tasks, and the planners that solve them."""

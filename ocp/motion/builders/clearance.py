@@ -1,9 +1,9 @@
-"""Motions that stay clear of themselves and of their surroundings: what is declared, looked at, and held apart.
+"""Clearance constraints: which pairs of bodies the audit checks, and which ones path constraints separate.
 
-All pairs are declared to be proven apart by the audit. Held apart by the method, as path constraints, are those alone
-that are told: a planner solves, looks which pairs touch, holds these, and solves again, so that a motion that is clear
-anyway costs nothing. The constraint is the distance rounded from below (`models.shapes.distance`), whose gradient has
-no jumps where nearest points do, and a margin for what a constraint at points leaves between them.
+The audit proves the clearance of all declared pairs. Path constraints separate only the pairs that were found too
+close: a planner solves, finds these pairs, adds separation constraints and solves again. A motion that is clear anyway
+has no constraints to pay for. The constrained distance is smoothed from below (`models.shapes.distance`), so that its
+gradient is continuous where the closest points jump, and has a margin for the excess between the points of the grid.
 """
 
 from __future__ import annotations
@@ -36,35 +36,35 @@ __all__ = [
     "MARGIN",
     "ROUNDING",
     "ClearanceConstraints",
-    "Keeping",
-    "Kept",
+    "Constraints",
+    "Separating",
     "clearance_of",
     "collision_error",
-    "of_clearance",
+    "is_clearance",
     "solve_with_clearance",
     "widened",
 ]  # fmt: skip
 
 CLEARANCE, APART = "clearance", "apart"
-"""Names of what the audit proves, and of the constraints, with the suffix of a stretch of time."""
+"""Names of the proven clearances and of the separation constraints, followed by the suffix of a stretch of time."""
 ROUNDING = 3e-3
-"""m: of the distances that are held."""
+"""Smoothing width of the constrained distances, m."""
 LOOKS = 6
-"""Times that a motion is planned anew because bodies come too near."""
+"""Largest number of times that a motion is planned because of collisions."""
 MARGIN = 5e-5
-"""m: that a pair which is held has at least, and by which a margin that was too small grows beside what was missed."""
+"""Least margin of a separated pair, and least increase of a margin that was too small, m."""
 
 
 @dataclass(frozen=True, eq=False)
 class ClearanceConstraints:
-    """What a motion has to stay clear of, and by how much.
+    """Collision scene of a motion, and the pairs that constraints separate.
 
     Attributes:
-        scene: Of the machine, with the clearance of every pair.
-        margins: Pairs that are held apart by constraints, by their places, and by how much more than that, m.
+        scene: Collision scene of the machine, with the clearance of every pair.
+        margins: Separated pairs, by index, with the distance beyond the clearance that they keep, m.
 
     Raises:
-        ProblemError: No surroundings, a pair that there is none of, a margin that is no number.
+        ProblemError: The scene is none, a pair does not exist, or a margin is no number.
     """
 
     scene: CollisionScene
@@ -79,15 +79,15 @@ class ClearanceConstraints:
                 or not isinstance(pair, int | np.integer)
                 or not 0 <= pair < len(self.scene.pairs)
             ):
-                words = f"clearance_constraints: there is no pair {pair!r}, only {len(self.scene.pairs)}"
+                words = f"clearance_constraints: there is no pair {pair!r}; the scene has {len(self.scene.pairs)}"
                 raise ProblemError(words, name="margins", value=pair, limit=len(self.scene.pairs))
 
     def holding(self, pairs: Sequence[int]) -> ClearanceConstraints:
-        """The same with some pairs more held apart."""
+        """Return these constraints with more pairs separated."""
         return replace(self, margins={**{int(pair): MARGIN for pair in pairs}, **self.margins})
 
     def widened(self, proofs: Sequence[Clearance]) -> ClearanceConstraints:
-        """The same with what came too near held apart, farther by what it missed."""
+        """Return these constraints with the violating pairs separated, by their violation more."""
         return replace(self, margins=widened(self.margins, self.scene.labels, proofs))
 
     def declare(
@@ -103,79 +103,85 @@ class ClearanceConstraints:
         pace: float = 1.0,
         horizon: float | None = None,
     ) -> None:
-        """Declare what is proven and what is held, for a machine whose configuration is two states.
+        """Declare the proven clearances and the separation constraints of a machine.
 
         Args:
-            problem: Of SX symbols, with these states.
-            base, joints: Symbols, or numbers where the base stands.
-            base_name, joints_name: Names of the states; "" where the base is none.
-            suffix: Of the names of what is declared.
-            begin, pace: The time of the surroundings is begin + pace times that of the problem.
-            horizon: Of the problem, s; None where it is free, and then nothing may move by itself.
+            problem: Problem of SX symbols with the states below.
+            base, joints: Symbols of the states; numbers for a fixed base.
+            base_name, joints_name: Names of the states; "" if the base is no state.
+            suffix: Suffix of the declared names.
+            begin, pace: The time of the scene is begin + pace times the time of the problem.
+            horizon: Horizon of the problem, s; None if it is free, which excludes moving obstacles.
 
         Raises:
-            ProblemError: A moving obstacle and a free horizon; obstacles whose motion is not
-                defined all the time, or made of operations without bounds.
+            ProblemError: An obstacle moves and the horizon is free; the motion of an obstacle is not defined over the
+                whole horizon, or uses operations without interval bounds.
         """
-        around, time = self.scene, begin + pace * problem.time
-        _check_limits(around, problem.declared.states[joints_name])
+        scene, time = self.scene, begin + pace * problem.time
+        _check_limits(scene, problem.declared.states[joints_name])
         if horizon is not None:
             try:
-                around.check_motions(begin, begin + pace * horizon)
+                scene.check_motions(begin, begin + pace * horizon)
             except ModelError as error:
                 raise ProblemError(str(error), **vars(error)) from error
-        elif around.has_moving_obstacles:
-            words = "an obstacle that moves needs a time that is known; give a horizon in s, or let it stand"
+        elif scene.has_moving_obstacles:
+            words = "a moving obstacle needs a known time; give a horizon in s, or a fixed obstacle"
             raise ProblemError(words, name="obstacles")
-        levers = around.levers
+        levers = scene.levers
         moved = {joints_name: (levers.joints, levers.joint_turns)}
         if base_name:
             moved[base_name] = (levers.base, levers.base_turns)
         problem.separate(
             f"{CLEARANCE}{suffix}",
-            _said(around.placements, base, joints, time),
-            scene_hulls(around),
-            around.pairs,
-            np.full(len(around.pairs), around.clearance),
+            _evaluated(scene.placements, base, joints, time),
+            scene_hulls(scene),
+            scene.pairs,
+            np.full(len(scene.pairs), scene.clearance),
             levers={name: pair[0] for name, pair in moved.items()},
             turns={name: pair[1] for name, pair in moved.items()},
-            covers=around.covers,
-            assumed=around.assumed,
+            covers=scene.covers,
+            assumed=scene.assumed,
         )
         if self.margins:
             pairs = sorted(self.margins)
-            apart = _said(partial(around.distances, pairs=pairs, rounding=ROUNDING), base, joints, time)
-            least = [around.clearance + self.margins[pair] for pair in pairs]
-            problem.path(f"{APART}{suffix}", apart, lower=least, unit="m")
+            distances = _evaluated(partial(scene.distances, pairs=pairs, rounding=ROUNDING), base, joints, time)
+            least = [scene.clearance + self.margins[pair] for pair in pairs]
+            problem.path(f"{APART}{suffix}", distances, lower=least, unit="m")
 
     def find_collisions(self, base: Array, joints: Array, times: Array) -> list[Collision]:
-        """The pairs that come nearer than they may at some samples of a motion, see `local.collisions`."""
+        """Return the pairs closer than the clearance at samples of a motion, see `local.collisions`."""
         return find_collisions(self.scene, base, joints, times)
 
 
-class Keeping(Protocol):
-    """What is held apart, by margins that grow."""
+class Separating(Protocol):
+    """Constraints that separate pairs of bodies by margins."""
 
     def widened(self, proofs: Sequence[Clearance]) -> Self:
-        """The same with what came too near held apart, farther by what it missed."""
+        """Return these constraints with the violating pairs separated, by their violation more."""
 
 
 def widened(
     margins: Mapping[int, float], labels: Sequence[tuple[str, str]], proofs: Sequence[Clearance]
 ) -> dict[int, float]:
-    """Margins of pairs, m, by their places among the labels, grown by what the pairs missed; of other pairs nothing."""
+    """Return margins of pairs, m, increased by their violations.
+
+    Args:
+        margins: Margins by the index of the pair among the labels.
+        labels: Names of the bodies of each pair.
+        proofs: Clearances of an audit; pairs that are no labels are ignored.
+    """
     places = {label: pair for pair, label in enumerate(labels)}
-    found = dict(margins)
+    wider = dict(margins)
     for proof in proofs:
-        for near in proof.pairs:
-            if near.missed > 0 and near.bodies in places:
-                pair = places[near.bodies]
-                found[pair] = margins[pair] + 1.5 * near.missed + MARGIN if pair in margins else MARGIN
-    return found
+        for closest in proof.pairs:
+            if closest.missed > 0 and closest.bodies in places:
+                pair = places[closest.bodies]
+                wider[pair] = margins[pair] + 1.5 * closest.missed + MARGIN if pair in margins else MARGIN
+    return wider
 
 
 def clearance_of(
-    around: CollisionScene,
+    scene: CollisionScene,
     joints: Callable[[Array], Array],
     breaks: Array,
     horizon: float,
@@ -183,97 +189,98 @@ def clearance_of(
     seconds: Array,
     smooth: bool,
 ) -> Clearance:
-    """How near each pair comes at any time of a motion of a machine whose base stands still, and nothing else moves.
+    """Return the proven clearance of each pair over a motion of a machine on a fixed base among fixed obstacles.
 
     Args:
-        joints: From fractions of the horizon (M,) to joints (M, n).
-        breaks, horizon, rates, seconds, smooth: Of the joints, as of `ocp.audit.clearance.Track`.
+        joints: Function of fractions of the horizon (M,) that returns joints (M, n).
+        breaks, horizon, rates, seconds, smooth: Properties of the joints, see `ocp.audit.clearance.Track`.
 
     Raises:
-        ModelError: Joints that slide without limits.
+        ModelError: A prismatic joint has no limits.
     """
-    machine, levers, n = around.machine, around.levers, len(around.pairs)
+    machine, levers, n = scene.machine, scene.levers, len(scene.pairs)
     q = ca.SX.sym("q", machine.joint_size)
-    placements = ca.SX(around.placements(ca.DM(machine.base_home()), q, 0.0))
-    apart = Separation(
+    placements = ca.SX(scene.placements(ca.DM(machine.base_home()), q, 0.0))
+    separation = Separation(
         CLEARANCE,
         placements,
-        scene_hulls(around),
-        around.pairs,
-        np.full(n, around.clearance),
+        scene_hulls(scene),
+        scene.pairs,
+        np.full(n, scene.clearance),
         movers={"joints": machine.joint_size},
         levers=levers.joints,
         turns=levers.joint_turns,
-        covers=around.covers,
-        assumed=around.assumed,
+        covers=scene.covers,
+        assumed=scene.assumed,
     )
     sampler = Sampler([q], [placements])
     frames = Track(breaks, horizon, rates, seconds, smooth, lambda at: frames_of(sampler(joints(at))[0]))
-    return clearance_along(apart, frames)
+    return clearance_along(separation, frames)
 
 
-def _check_limits(around: CollisionScene, joints: Variable) -> None:
-    """Raise where joints may leave the limits by which pairs were left that never touch."""
-    robot = around.machine.robot
-    kept = (constant(joints.lower) >= robot.lower) & (constant(joints.upper) <= robot.upper)
-    if around.limits and not kept.all():
-        name = robot.joint_names[int(np.flatnonzero(~kept)[0])]
+def _check_limits(scene: CollisionScene, joints: Variable) -> None:
+    """Raise ProblemError if joints may leave the limits within which the scene ignores pairs that cannot collide."""
+    robot = scene.machine.robot
+    inside = (constant(joints.lower) >= robot.lower) & (constant(joints.upper) <= robot.upper)
+    if scene.limits and not inside.all():
+        name = robot.joint_names[int(np.flatnonzero(~inside)[0])]
         words = (
-            f"surroundings keep joint {name!r} within its limits, the problem does not: Surroundings(..., limits=False)"
+            f"the collision scene assumes joint {name!r} within its limits, but the problem does not limit it; "
+            "use CollisionScene(..., limits=False)"
         )
         raise ProblemError(words, name=name)
 
 
-Kept = TypeVar("Kept", bound=Keeping | None)
-"""What a planner is told to keep apart, or None."""
+Constraints = TypeVar("Constraints", bound=Separating | None)
+"""Clearance constraints of a planner, or None."""
 
 
-def solve_with_clearance(clearance_constraints: Kept, run: Callable[[Kept], Solution]) -> Solution:
-    """What ``run`` plans, with the bodies held apart that come too near in what it planned before.
+def solve_with_clearance(clearance_constraints: Constraints, run: Callable[[Constraints], Solution]) -> Solution:
+    """Solve repeatedly, and separate the pairs that collide in the solution before.
 
     Args:
-        clearance_constraints: What to stay clear of; None for nothing.
-        run: Solves and audits; raises SolveError that names the clearance where that alone is wrong with its solution.
+        clearance_constraints: Clearance constraints of the first solve; None for none.
+        run: Solves and audits. It raises a SolveError named after a clearance if that is the solution's only failure.
 
     Raises:
-        SolveError: As ``run``; names the bodies that touch, where and when, if they cannot be kept apart.
+        SolveError: As ``run``; or the bodies cannot be separated: names them with place and time.
     """
-    touching: SolveError | None = None
+    collision: SolveError | None = None
     for _ in range(LOOKS):
         try:
             return run(clearance_constraints)
         except SolveError as error:
-            if clearance_constraints is None or error.solution is None or not of_clearance(error.name):
-                if touching is None:
+            if clearance_constraints is None or error.solution is None or not is_clearance(error.name):
+                if collision is None:
                     raise
-                words = f"{touching}; held apart, no motion was found: {error}"
-                found = {"value": touching.value, "limit": touching.limit, "time": touching.time}
-                raise SolveError(words, error.solution, error.conflicts, name=touching.name, **found) from error
-            touching = error
+                words = f"{collision}; with these bodies separated, no motion was found: {error}"
+                details = {"value": collision.value, "limit": collision.limit, "time": collision.time}
+                raise SolveError(words, error.solution, error.conflicts, name=collision.name, **details) from error
+            collision = error
             clearance_constraints = clearance_constraints.widened(list(error.solution.audit().clearances.values()))
-    assert touching is not None
-    raise touching
+    assert collision is not None
+    raise collision
 
 
-def of_clearance(name: Any) -> bool:
-    """Whether that is the name of a clearance, in a phase or without one."""
+def is_clearance(name: Any) -> bool:
+    """Return whether a name, with or without that of a phase, is the name of a clearance."""
     return str(name).rpartition(".")[2].startswith(CLEARANCE)
 
 
 def collision_error(audit: Audit, solution: Solution) -> SolveError | None:
-    """What says that bodies come too near in a solution that is sound otherwise; None where it is not that."""
+    """Return the error that bodies collide in a solution, if that is its only failure, else None."""
     failures = audit.failures
     if not failures or any(finding.name not in audit.clearances for finding in failures):
         return None
     finding = failures[0]
-    words = f"bodies touch: {audit.clearances[finding.name].worst}"
+    words = f"bodies collide: {audit.clearances[finding.name].worst}"
     return SolveError(words, solution, name=finding.name, value=finding.value, limit=finding.limit, time=finding.time)
 
 
-def _said(expression: Callable[..., Any], base: Any, joints: Any, time: Any) -> Any:
-    """An expression of base, joints and time, worked out on scalars where these are MX."""
-    given = [base if isinstance(base, ca.SX | ca.MX) else ca.DM(base), joints, time]
-    if not any(isinstance(value, ca.MX) for value in given):
-        return ca.SX(expression(*given))
-    symbols = [ca.SX.sym("v", value.numel()) for value in given]
-    return ca.Function("said", symbols, [ca.densify(ca.SX(expression(*symbols)))])(*given)
+def _evaluated(expression: Callable[..., Any], base: Any, joints: Any, time: Any) -> Any:
+    """Return an expression of base, joints and time, as an SX function if these are MX."""
+    arguments = [base if isinstance(base, ca.SX | ca.MX) else ca.DM(base), joints, time]
+    if not any(isinstance(value, ca.MX) for value in arguments):
+        return ca.SX(expression(*arguments))
+    symbols = [ca.SX.sym("v", value.numel()) for value in arguments]
+    return ca.Function("expression", symbols, [ca.densify(ca.SX(expression(*symbols)))])(*arguments)

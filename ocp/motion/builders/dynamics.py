@@ -1,23 +1,22 @@
-"""Motions by what drives them: torques, power, accelerations and jerks within limits, at the least effort or time.
+"""Point-to-point and tool motions of fixed and free-floating arms within actuator limits.
 
-For arms on a fixed base and for free-floating ones. Joint accelerations (or jerks) are the control, and the torques are
-those of the inverse dynamics,
+Joint accelerations (or jerks) are the control. The joint torques follow from inverse dynamics,
 
-    tau = M(q) q'' + h(q, q') - (what acts from outside) + d q' + c tanh(q' / w),
+    tau = M(q) q'' + h(q, q') - (external forces) + d q' + c tanh(q' / w),
 
-with viscous friction d and Coulomb friction c, smoothed below the speed w. On a floating base the momentum is kept, the
-base moves as the joints make it move, and the torques are those of the joints alone. So no mass matrix is inverted, and
-limits of torque are path constraints like all others (Featherstone 2008, chapter 5; Betts 2010, section 4.10).
+with viscous friction d and Coulomb friction c, smoothed below the speed w. A floating base conserves momentum: it moves
+as the joints make it move, and the torques are those of the joints alone. No mass matrix is inverted, and torque limits
+are ordinary path constraints (Featherstone 2008, chapter 5; Betts 2010, section 4.10).
 
-A motion goes from point to point, along tasks of the tool, or both; through points on the way and with loads that are
-picked up and put down as :class:`~ocp.problem.phases.Phases` of such problems, whose joints and velocities go on.
+Motions through waypoints, and motions with changing loads, are :class:`~ocp.problem.phases.Phases` of such problems,
+see `ocp.motion.builders.dynamics_plan`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple, TypedDict
+from typing import Any, Literal, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -37,7 +36,7 @@ from ocp.motion.builders.actuator_limits import (
     nonnegative_each,
 )
 from ocp.motion.builders.clearance import ClearanceConstraints
-from ocp.motion.builders.standing.problem import FreeTime
+from ocp.motion.builders.standing.problem import FreeTime, declare_horizon
 from ocp.motion.tasks.checks import (
     check_length,
     check_rest,
@@ -52,119 +51,112 @@ from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.problem import Problem, remembers_request
 
-__all__ = ["AskedOfDrives", "dynamics_problem", "rates_at"]
+__all__ = ["DynamicsSetup", "dynamics_problem", "end_velocities"]
 
 QUINTIC = np.polynomial.Polynomial([0, 0, 0, 10, -15, 6])
 
 
-class AskedOfDrives(TypedDict, total=False):
-    """The options of `dynamics_problem` but what has to stay clear."""
+@dataclass(frozen=True, eq=False)
+class DynamicsSetup:
+    """Settings of `dynamics_problem` that most motions leave at their defaults.
 
-    end_joints: Any
-    tasks: TipTask | Sequence[TipTask]
-    start_base: Any
-    limits: Limits | None
-    effort: Effort | None
-    friction: JointFriction | None
-    wrenches: Sequence[Wrench]
-    gravity: Any
-    control: Literal["acceleration", "jerk"]
-    start: Any
-    end: Any
-    end_base: Any
-    symbols: Any
+    Attributes:
+        start_velocity, end_velocity: "rest", "free", or the joint velocities at that end, nan where free. Shape (n,),
+            rad/s or m/s. Reaction wheels that hold the momentum of a base at rest turn at the end.
+        start_base: Configuration of the base at the start; home if None. All nan leaves it free, in a phase that is
+            joined to another. Shape (base_size,).
+        end_base: Configuration of a floating base at the end, nan where free. A quaternion is given as a whole or not
+            at all. Shape (base_size,).
+        friction, wrenches, gravity: Arguments of `joint_torques`.
+        control: "acceleration", or "jerk" for continuous accelerations, zero at ends at rest.
+        clearance_constraints: Collision avoidance, see `ocp.motion.builders.clearance`; None for none.
+        symbols: casadi.SX, or casadi.MX if a task calls an interpolant.
+    """
+
+    start_velocity: Literal["rest", "free"] | Any = "rest"
+    end_velocity: Literal["rest", "free"] | Any = "rest"
+    start_base: Any = None
+    end_base: Any = None
+    friction: JointFriction | None = None
+    wrenches: Sequence[Wrench] = ()
+    gravity: Any = None
+    control: Literal["acceleration", "jerk"] = "acceleration"
+    clearance_constraints: ClearanceConstraints | None = None
+    symbols: Any = ca.SX
 
 
 @interruptible
 @remembers_request("dynamics")
 def dynamics_problem(
     machine: Motors,
-    start_joints: Any,
+    tasks: TipTask | Sequence[TipTask],
     horizon: float | FreeTime,
     *,
-    end_joints: Any = None,
-    tasks: TipTask | Sequence[TipTask] = (),
-    start_base: Any = None,
+    start: Any,
+    end: Any = None,
     limits: Limits | None = None,
     effort: Effort | None = None,
-    friction: JointFriction | None = None,
-    wrenches: Sequence[Wrench] = (),
-    gravity: Any = None,
-    control: Literal["acceleration", "jerk"] = "acceleration",
-    start: Literal["rest", "free"] | Any = "rest",
-    end: Literal["rest", "free"] | Any = "rest",
-    end_base: Any = None,
-    clearance_constraints: ClearanceConstraints | None = None,
-    symbols: Any = ca.SX,
+    setup: DynamicsSetup | None = None,
 ) -> Problem:
-    """A motion within the limits of the drives, at the least effort, energy or time.
+    """Declare a motion within actuator limits of least effort, energy or time.
 
-    States "joints", "velocities" (and "accelerations" where the jerk is the control), and "base" of a machine that
-    floats; controls "accelerations" or "jerks" (and "power", W, what drives give, where energy costs or power is
-    limited). Path constraints "torques", "power", and "tip" where there are tasks: the derivative of their velocities,
-    with the gaps of their poses fed back, which a start that is free has to begin with.
+    The states are "joints", "velocities", "accelerations" if the jerk is the control, and "base" of a floating machine.
+    The controls are "accelerations" or "jerks", and "power" (W, the positive actuator power) if energy is weighted or
+    power is limited. The path constraints are "torques", "power", and with tasks "tip": the time derivative of the
+    task velocities, with pose errors fed back. A start with free velocity must satisfy the task velocities.
 
     Args:
-        machine: A FixedBase, or a FreeFloating one whose momentum is kept.
-        start_joints: Shape (n,), rad or m; nan where free, and None for all, in a phase that is joined to another.
+        machine: A FixedBase, or a FreeFloating machine, whose momentum is conserved.
+        tasks: A TipTask, or several that are done at once over the whole motion, functions of the time in s. An empty
+            sequence for a motion from point to point.
         horizon: Final time, s, or FreeTime(...).
-        end_joints: Shape (n,), nan where free; all free if None.
-        tasks: A TipTask, or several that are done at once over the whole motion, of the time, s.
-        start_base: Configuration of the base at the start; home if None, and all nan in a phase that is joined to
-            another, where it is free.
-        limits: Of joints, velocities, accelerations, jerks, torques and power; the robot's own if None.
+        start, end: Joints at the start and at the end. Shape (n,), rad or m; nan where free, None if all are free. A
+            start is free only in a phase that is joined to another.
+        limits: Limits of joints, velocities, accelerations, jerks, torques and power; the robot's own if None.
         effort: Weights of the cost; the squared torques if None.
-        friction, wrenches, gravity: As of `joint_torques`.
-        control: "jerk" makes accelerations continuous, zero at ends at rest.
-        start, end: Whether the joints are at rest there, or free to move; or their velocities, nan where free, shape
-            (n,): wheels that hold the momentum of a base at rest turn.
-        end_base: Configuration of a floating base at the end, nan where free; a quaternion is given whole or not at
-            all. Shape (base_size,).
-        clearance_constraints: What the motion has to stay clear of, see `ocp.motion.builders.clearance`.
-        symbols: casadi.SX, or casadi.MX when a task calls an interpolant.
+        setup: Velocities and base at both ends, friction, loads, control and clearance; the defaults if None.
 
     Raises:
-        ProblemError: Sizes or options that do not fit, an end outside the limits, limits of jerk where accelerations
-            are the control, a task that does not begin at its tip or moves where the joints rest, a free horizon with
-            tasks, whose time is theirs.
+        ProblemError: Sizes or options do not match; an end is outside the limits; the jerk is limited but not the
+            control; a task does not begin at its tip, or moves where the joints are at rest; the horizon is free
+            although tasks fix the time.
     """
     checked_motors("dynamics_problem", machine)
     limits = Limits() if limits is None else checked_instance("dynamics_problem: limits", limits, Limits)
     effort = Effort() if effort is None else checked_instance("dynamics_problem: effort", effort, Effort)
-    if friction is not None:
-        checked_instance("dynamics_problem: friction", friction, JointFriction)
-    checked_choice("control", control, ("acceleration", "jerk"))
+    setup = DynamicsSetup() if setup is None else checked_instance("dynamics_problem: setup", setup, DynamicsSetup)
+    for option, kind in (("friction", JointFriction), ("clearance_constraints", ClearanceConstraints)):
+        if getattr(setup, option) is not None:
+            checked_instance(f"dynamics_problem: {option}", getattr(setup, option), kind)
+    control = checked_choice("control", setup.control, ("acceleration", "jerk"))
     bounds = limits.bounds(machine, ("velocity", "torque"))
     if control == "acceleration" and (np.isfinite(bounds.jerk).any() or effort.jerk):
-        words = "jerks are limited or cost, and accelerations are the control; say control='jerk'"
+        words = "the jerk is limited or weighted, but the control is the acceleration; set control='jerk'"
         raise ProblemError(words, name="control", value=control, limit="jerk")
     free = isinstance(horizon, FreeTime)
     duration = checked_horizon(horizon.guess if isinstance(horizon, FreeTime) else horizon)
-    ends = _Ends.of(machine, bounds, (start_joints, end_joints), (start, end), start_base)
-    given = (tasks,) if isinstance(tasks, TipTask) else checked_each("tasks", tasks, TipTask)
-    equations = bind(machine, given) if given else None
+    ends = _Ends.take(machine, bounds, (start, end), (setup.start_velocity, setup.end_velocity), setup.start_base)
+    tasks = (tasks,) if isinstance(tasks, TipTask) else checked_each("tasks", tasks, TipTask)
+    equations = bind(machine, tasks) if tasks else None
     if equations is not None:
         if free:
-            raise ProblemError("tasks say their own time: give a horizon in s", name="horizon")
+            raise ProblemError("tasks fix the time: give a horizon in s, not a free one", name="horizon")
         ends = ends.ending_with(equations)
 
-    problem = Problem("dynamics", symbols)
-    final = (
-        problem.horizon(lower=horizon.lower, upper=horizon.upper, guess=horizon.guess)
-        if isinstance(horizon, FreeTime)
-        else problem.horizon(duration)
-    )
+    problem = Problem("dynamics", setup.symbols)
+    final = declare_horizon(problem, horizon)
     motion = _declare_motion(problem, machine, ends, bounds, duration, control)
-    if end_base is not None:
-        _declare_end_base(problem, machine, motion.base, end_base)
-    torques = joint_torques(machine, *motion[:4], friction=friction, wrenches=wrenches, gravity=gravity)
-    running = _declare_drives(problem, machine, motion, torques, bounds, effort)
+    if setup.end_base is not None:
+        _declare_end_base(problem, machine, motion.base, setup.end_base)
+    torques = joint_torques(
+        machine, *motion[:4], friction=setup.friction, wrenches=setup.wrenches, gravity=setup.gravity
+    )
+    running = _declare_actuators(problem, machine, motion, torques, bounds, effort)
     if equations is not None:
         _declare_tasks(problem, equations, ends, motion, duration)
-    if clearance_constraints is not None:
-        clearance_constraints = checked_instance("dynamics_problem: clear", clearance_constraints, ClearanceConstraints)
+    if setup.clearance_constraints is not None:
         name = "base" if machine.base_size else ""
-        clearance_constraints.declare(
+        setup.clearance_constraints.declare(
             problem, motion.base, motion.joints, base_name=name, horizon=None if free else duration
         )
     problem.minimize(running=running, terminal=effort.time * final)
@@ -173,14 +165,15 @@ def dynamics_problem(
 
 @dataclass(frozen=True, eq=False)
 class _Ends:
-    """Where a motion begins and ends, checked against the limits; nan where that is free.
+    """Boundary conditions of a motion, checked against the limits; nan where free.
 
     Attributes:
-        first, last: Joints. Shape (n,). first_rates, last_rates: Their velocities. Shape (n,).
-        rests: Whether all joints rest at the beginning, and at the end.
-        base: Configuration of the base at the beginning; where it is free, the guess of it.
-        joined: Whether joints or base begin where another phase ends.
-        start: Where the guess of the joints begins. Shape (n,).
+        first, last: Joints at the start and at the end. Shape (n,).
+        first_rates, last_rates: Joint velocities there. Shape (n,).
+        rests: Whether all joints are at rest at the start, and at the end.
+        base: Configuration of the base at the start; its guess where it is free.
+        joined: Whether joints or base continue from another phase.
+        start: Start of the joints' guess. Shape (n,).
     """
 
     first: Array
@@ -193,20 +186,19 @@ class _Ends:
     start: Array
 
     @classmethod
-    def of(
+    def take(
         cls, machine: Motors, bounds: JointBounds, joints: tuple[Any, Any], velocities: tuple[Any, Any], base: Any
     ) -> _Ends:
-        robot, n, hint = machine.robot, machine.joint_size, "keep them, or leave that end free by nan"
+        robot, n, hint = machine.robot, machine.joint_size, "keep within them, or leave that end free with nan"
         first, last = (
-            clip_to_limits(what, robot.joint_names, _ends(what, given, n), bounds.lower, bounds.upper, hint)
-            for what, given in zip(("start_joints", "end_joints"), joints, strict=True)
+            clip_to_limits(name, robot.joint_names, _checked_end(name, value, n), bounds.lower, bounds.upper, hint)
+            for name, value in zip(("start", "end"), joints, strict=True)
         )
         first_rates, last_rates = (
             clip_to_limits(
-                f"{what} velocities", robot.joint_names, rates_at(what, given, n), -bounds.velocity, bounds.velocity,
-                hint,
+                name, robot.joint_names, end_velocities(name, value, n), -bounds.velocity, bounds.velocity, hint
             )
-            for what, given in zip(("start", "end"), velocities, strict=True)
+            for name, value in zip(("start_velocity", "end_velocity"), velocities, strict=True)
         )  # fmt: skip
         known = np.clip(np.where(np.isnan(first), np.nan_to_num(last), first), bounds.lower, bounds.upper)
         free = _is_free(base)
@@ -216,23 +208,23 @@ class _Ends:
 
     @property
     def end(self) -> Array:
-        """Where the guess of the joints ends. Shape (n,)."""
+        """Return the end of the joints' guess. Shape (n,)."""
         return np.where(np.isnan(self.last), self.start, self.last)
 
     def ending_with(self, equations: TaskEquations) -> _Ends:
-        """The same; joints that rest at the end have there the velocities that the tasks ask for."""
+        """Return these ends with the velocities that the tasks require of joints that rest at the end."""
         rates = rates_at_rest(equations, self.base, self.end)
         return replace(self, last_rates=rates) if self.rests[1] else self
 
     def quintic(self, duration: float, order: int) -> Any:
-        """The joints from rest to rest as a function of time, or a derivative of that."""
+        """Return the quintic rest-to-rest motion of the joints, or a derivative, as a function of time."""
         shape = QUINTIC.deriv(order) if order else QUINTIC
         begin = self.start if order == 0 else np.zeros(len(self.start))
         return lambda t: begin + (self.end - self.start) * shape(t / duration) / duration**order
 
 
 class _Motion(NamedTuple):
-    """Symbols of a motion: states, the control, and the rate of the base."""
+    """Symbols of a motion: states, controls, and the rate of the base."""
 
     base: Any
     joints: Any
@@ -245,31 +237,31 @@ class _Motion(NamedTuple):
 def _declare_motion(
     problem: Problem, machine: Motors, ends: _Ends, bounds: JointBounds, duration: float, control: str
 ) -> _Motion:
-    """Declare joints and base with their derivatives, within the limits, from end to end."""
+    """Declare joints and base with their derivatives, limits and boundary conditions."""
     robot, n = machine.robot, machine.joint_size
-    sizes = _wheel_sizes(robot, bounds, duration)
+    scales = _wheel_scales(robot, bounds, duration)
     joints = problem.state(
         "joints", n, initial=ends.first, terminal=ends.last, lower=bounds.lower, upper=bounds.upper,
-        guess=ends.quintic(duration, 0), unit=robot.unit(), scale=sizes[0],
+        guess=ends.quintic(duration, 0), unit=robot.unit(), scale=scales[0],
     )  # fmt: skip
     rates = problem.state(
         "velocities", n, initial=ends.first_rates, terminal=ends.last_rates, lower=-bounds.velocity,
-        upper=bounds.velocity, guess=ends.quintic(duration, 1), unit=robot.unit("/s"), scale=sizes[1],
+        upper=bounds.velocity, guess=ends.quintic(duration, 1), unit=robot.unit("/s"), scale=scales[1],
     )  # fmt: skip
-    push: dict[str, Any] = {
+    options: dict[str, Any] = {
         "lower": -bounds.acceleration, "upper": bounds.acceleration, "guess": ends.quintic(duration, 2),
-        "scale": sizes[2], "unit": robot.unit("/s^2"),
+        "scale": scales[2], "unit": robot.unit("/s^2"),
     }  # fmt: skip
     jerks: Any = ca.DM(0, 1)
     if control == "jerk":
-        still: dict[str, Any] = {"initial": 0.0 * ends.first_rates, "terminal": 0.0 * ends.last_rates}
-        second = problem.state("accelerations", n, **still, **push)
+        rest: dict[str, Any] = {"initial": 0.0 * ends.first_rates, "terminal": 0.0 * ends.last_rates}
+        second = problem.state("accelerations", n, **rest, **options)
         jerks = problem.control(
-            "jerks", n, lower=-bounds.jerk, upper=bounds.jerk, unit=robot.unit("/s^3"), scale=sizes[3]
+            "jerks", n, lower=-bounds.jerk, upper=bounds.jerk, unit=robot.unit("/s^3"), scale=scales[3]
         )
         problem.dynamics(second, jerks)
     else:
-        second = problem.control("accelerations", n, **push)
+        second = problem.control("accelerations", n, **options)
     problem.dynamics(joints, rates)
     problem.dynamics(rates, second)
     base: Any = ca.DM(0, 1)
@@ -281,14 +273,14 @@ def _declare_motion(
     return _Motion(base, joints, rates, second, jerks, base_rate)
 
 
-def _declare_drives(
+def _declare_actuators(
     problem: Problem, machine: Motors, motion: _Motion, torques: Any, bounds: JointBounds, effort: Effort
 ) -> Any:
-    """Declare the limits of torques and power, and return the running cost."""
+    """Declare the limits of torque and power, and return the running cost."""
     n, limited = machine.joint_size, np.flatnonzero(np.isfinite(bounds.torque)).tolist()
     if limited:
-        most = bounds.torque[limited]
-        problem.path("torques", torques[limited], lower=-most, upper=most, unit=machine.robot.effort_unit)
+        largest = bounds.torque[limited]
+        problem.path("torques", torques[limited], lower=-largest, upper=largest, unit=machine.robot.effort_unit)
     running = ca.dot(ca.DM(nonnegative_each("effort: acceleration", effort.acceleration, n)), motion.second**2)
     running += effort.jerk * ca.sumsqr(motion.jerks)
     if effort.turning and isinstance(machine, FreeFloating):
@@ -296,77 +288,77 @@ def _declare_drives(
         running += effort.turning * ca.sumsqr(machine.base_twist(motion.base, motion.joints, motion.rates)[spin])
     running += ca.dot(ca.DM(nonnegative_each("effort: torque", effort.torque, n)), torques**2)
     if effort.energy or np.isfinite(bounds.power).any():
-        given = problem.control("power", n, lower=0.0, upper=bounds.power, unit="W")
-        problem.path("power", given - torques * motion.rates, lower=0.0, unit="W")
-        running += effort.energy * ca.sum1(given)
+        power = problem.control("power", n, lower=0.0, upper=bounds.power, unit="W")
+        problem.path("power", power - torques * motion.rates, lower=0.0, unit="W")
+        running += effort.energy * ca.sum1(power)
     return running
 
 
-def _is_free(given: Any) -> bool:
-    """Whether a configuration of the base is told to be free."""
+def _is_free(base: Any) -> bool:
+    """Return whether a configuration of the base is free: given, and all nan."""
     try:
-        return given is not None and bool(np.isnan(floats(given)).all())
+        return base is not None and bool(np.isnan(floats(base)).all())
     except NOT_NUMBERS:
         return False
 
 
-def _ends(what: str, given: Any, n: int) -> Array:
-    """Joints or their velocities at an end, nan where free. Shape (n,).
+def _checked_end(name: str, value: Any, n: int) -> Array:
+    """Return joints or their velocities at an end, nan where free. Shape (n,).
 
     Raises:
-        ProblemError: Other sizes, or infinite.
+        ProblemError: The value has another size, or is infinite.
     """
-    if given is None:
+    if value is None:
         return np.full(n, np.nan)
     try:
-        found = floats(given).reshape(-1)
+        numbers = floats(value).reshape(-1)
     except NOT_NUMBERS as error:
-        raise ProblemError(f"{what}: {n} numbers are expected, not {given!r}", name=what, value=given) from error
-    if found.shape != (n,) or np.isinf(found).any():
-        words = f"{what}: {n} numbers, nan where free, are expected, not {found.tolist()}"
-        raise ProblemError(words, name=what, value=found, limit=n)
-    return found
+        raise ProblemError(f"{name} must be {n} numbers, not {value!r}", name=name, value=value) from error
+    if numbers.shape != (n,) or np.isinf(numbers).any():
+        words = f"{name} must be {n} numbers, nan where free, not {numbers.tolist()}"
+        raise ProblemError(words, name=name, value=numbers, limit=n)
+    return numbers
 
 
-def _wheel_sizes(robot: Robot, bounds: JointBounds, duration: float) -> Array:
-    """About how large angles, speeds, accelerations and jerks of wheels become, nan of other joints. Shape (4, n).
+def _wheel_scales(robot: Robot, bounds: JointBounds, duration: float) -> Array:
+    """Return typical angles, speeds, accelerations and jerks of reaction wheels, nan for other joints. Shape (4, n).
 
-    Rotors are light and turn fast: a fraction of what they saturate at and of what their motors give, or else what
-    1 N m s and 1 N m make of them.
+    Rotors are light and turn fast. Their scales are a quarter of the saturation speed and of the motor torque, or what
+    1 N m s and 1 N m cause where these are unlimited.
     """
-    found = np.full((4, robot.dof), np.nan)
+    scales = np.full((4, robot.dof), np.nan)
     for name, inertia in find_wheels(robot).items():
         k = robot.joint_names.index(name)
         speed, torque = bounds.velocity[k], bounds.torque[k]
         speed = speed / 4 if np.isfinite(speed) else 1 / inertia
         acceleration = torque / inertia / 4 if np.isfinite(torque) else 1 / inertia
-        found[:, k] = speed * duration / 4, speed, acceleration, 4 * acceleration / duration
-    return found
+        scales[:, k] = speed * duration / 4, speed, acceleration, 4 * acceleration / duration
+    return scales
 
 
-def rates_at(what: str, given: Any, n: int) -> Array:
-    """Velocities at an end, nan where free. Shape (n,).
+def end_velocities(name: str, value: Any, n: int) -> Array:
+    """Return joint velocities at an end, nan where free. Shape (n,).
 
     Raises:
-        ProblemError: Neither "rest" nor "free", nor n numbers.
+        ProblemError: The value is neither "rest" nor "free" nor n numbers.
     """
-    if isinstance(given, str):
-        return np.full(n, 0.0 if checked_choice(what, given, ("rest", "free")) == "rest" else np.nan)
-    if given is None:
-        raise ProblemError(f"{what} must be 'rest', 'free' or velocities, not None", name=what, value=given)
-    return _ends(what, given, n)
+    if isinstance(value, str):
+        return np.full(n, 0.0 if checked_choice(name, value, ("rest", "free")) == "rest" else np.nan)
+    if value is None:
+        raise ProblemError(f"{name} must be 'rest', 'free' or velocities, not None", name=name, value=value)
+    return _checked_end(name, value, n)
 
 
-def _declare_end_base(problem: Problem, machine: Motors, base: Any, given: Any) -> None:
-    """Hold the configuration of the base at the end, its attitude by three equations."""
+def _declare_end_base(problem: Problem, machine: Motors, base: Any, end_base: Any) -> None:
+    """Fix the configuration of the base at the end, its attitude by three equations."""
     if not machine.base_size:
-        raise ProblemError("a fixed base has no end_base", name="end_base", value=given)
-    goal = _ends("end_base", given, machine.base_size)
+        raise ProblemError("a fixed base has no end_base", name="end_base", value=end_base)
+    goal = _checked_end("end_base", end_base, machine.base_size)
     gaps = base - goal
     rows = np.flatnonzero(~np.isnan(goal)).tolist()
     if machine.base_size == 7 and set(rows) & {3, 4, 5, 6}:
         if not abs(np.linalg.norm(goal[3:]) - 1) <= 1e-9:
-            words = f"end_base has the quaternion {goal[3:].tolist()}: all of it is expected, and of unit length"
+            words = f"end_base has the quaternion {goal[3:].tolist()}; give all four entries, of unit length"
             raise ProblemError(words, name="end_base", value=goal[3:])
         turned = quaternion_product(ca.DM([goal[3], *(-goal[4:])]), base[3:7])
         gaps = ca.vertcat(gaps[:3], 2 * turned[1:4])
@@ -376,7 +368,7 @@ def _declare_end_base(problem: Problem, machine: Motors, base: Any, given: Any) 
 
 
 def _declare_tasks(problem: Problem, equations: TaskEquations, ends: _Ends, motion: _Motion, duration: float) -> None:
-    """Hold the tips to their tasks by their accelerations, and watch where they are."""
+    """Constrain the tip accelerations to the tasks, and let the audit watch the pose errors."""
     base, joints, rates, second, *_ = motion
     if not np.isnan(ends.first).any():
         checked_tasks(equations, ends.base, ends.first, duration)
@@ -388,5 +380,5 @@ def _declare_tasks(problem: Problem, equations: TaskEquations, ends: _Ends, moti
         problem.start("tip velocity", residual, lower=0, upper=0, unit=equations.unit())
     gap = equations.acceleration(base, joints, rates, second, problem.time)
     problem.path("tip", gap, lower=0, upper=0, unit=equations.unit("/s^2", "/s^2"))
-    for name, stray in equations.deviations(base, joints, rates, targets).items():
-        problem.watch(name, **stray)
+    for name, deviation in equations.deviations(base, joints, rates, targets).items():
+        problem.watch(name, **deviation)

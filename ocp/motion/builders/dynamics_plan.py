@@ -1,20 +1,15 @@
-"""Motions by their drives, solved and audited: plans that hold their limits everywhere, or the reasons why none does.
+"""Solve and audit motions within actuator limits, of one or several legs.
 
-A smooth plan, of least effort, needs few intervals. One of least time jumps from limit to limit, and has nodes at its
-jumps (`ocp.switching`). Where a plan still goes beyond a limit between its nodes, the limit is drawn in there
-(`ocp.tightening`), which costs little on a mesh that is fine enough; else the mesh is cut: where limits that are drawn
-in cost too much there alone, for a plan that only touches a limit goes beyond it with the square of the width.
+A plan must satisfy its limits between the nodes of the mesh, too. A smooth plan of least effort needs few intervals. A
+plan of least time switches from limit to limit and gets nodes at its switches (`ocp.switching`). Where a limit is still
+exceeded between the nodes, it is tightened there (`ocp.tightening`). If that costs too much, the mesh is refined where
+the tightening is expensive: the excess of a smooth plan decreases with the square of the interval.
 
-Motions of several legs: through points on the way, and with loads that are picked up and put down.
-
-Each leg is a phase of its own, `dynamics_problem` with the machine that moves on it, from where the leg before ended.
-What goes on from one into the next are the joints and how the base lies, the velocities where the machine does not rest
-there, and the accelerations where the jerk is the control.
-
-A load that is picked up or put down changes the machine. It does so at rest: then nothing has to be brought to speed,
-joints and base stay where they are, and the momentum of a machine that floats, which is zero before, is zero after,
-too. A load that is grasped while it moves jumps in velocity, as after an impact; that is a join of `Phases` to be said
-by hand.
+A motion of several legs passes through waypoints, and may pick up and put down loads. Each leg is a phase with its own
+machine, declared by `dynamics_problem`. Joints and base are continuous between legs, so are the velocities if the
+machine does not stop there, and the accelerations if the jerk is the control. A load changes the machine and is picked
+up or put down at rest only: then the momentum is zero before and after. Grasping a moving load is an impact with a
+velocity jump; it needs a join of `Phases` declared by hand.
 """
 
 from __future__ import annotations
@@ -22,12 +17,13 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
-from typing import Any, Literal, Unpack
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
 
 from models import FreeFloating, Machine
+from ocp.audit.audit import Audit
 from ocp.console import interruptible
 from ocp.direct.collocation import Collocation
 from ocp.errors import (
@@ -40,15 +36,15 @@ from ocp.errors import (
     checked_text,
 )
 from ocp.methods import solve
-from ocp.motion.builders.actuator_limits import Motors, checked_motors
+from ocp.motion.builders.actuator_limits import Effort, Motors, checked_motors
 from ocp.motion.builders.clearance import (
     ClearanceConstraints,
-    Kept,
+    Constraints,
     collision_error,
-    of_clearance,
+    is_clearance,
     solve_with_clearance,
 )
-from ocp.motion.builders.dynamics import AskedOfDrives, dynamics_problem
+from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem
 from ocp.motion.builders.standing.problem import FreeTime
 from ocp.motion.tasks.checks import checked_horizon
 from ocp.motion.tasks.limits import Limits
@@ -60,25 +56,25 @@ from ocp.solution import Solution
 from ocp.switching import NEAR, at_switches
 from ocp.tightening import exceeded, tighten
 
-__all__ = ["Leg", "breaks_of", "checked_legs", "dynamics_phases", "plan_dynamics", "within_limits"]
+__all__ = ["Leg", "audit_error", "breaks_of", "checked_legs", "dynamics_phases", "plan_dynamics", "within_limits"]
 
 
 @dataclass(frozen=True, eq=False)
 class Leg:
-    """A part of a motion, to a point at which something changes or that is to be passed.
+    """Part of a motion up to a waypoint, or to a change of load.
 
     Attributes:
-        joints: Where it ends, rad or m, shape (n,); nan where free, None: all are.
-        horizon: How long it takes, s, or FreeTime(...).
-        end: Whether the joints are at rest at its end, or free to move on through it.
-        machine: What moves on it, `with_load` or without; None: as on the leg before.
-        tasks: What the tips do on it, of the time since its beginning, which is at joints that are told.
-        name: Of its phase; "leg 1", "leg 2", ... if "".
+        joints: Joints at its end; nan where free, None if all are free. Shape (n,), rad or m.
+        horizon: Duration, s, or FreeTime(...).
+        end_velocity: "rest", or "free" to pass the end without a stop.
+        machine: Machine on this leg, for example `with_load`; None for that of the leg before.
+        tasks: Tip tasks as functions of the time since the leg's start. They need a leg that starts at known joints.
+        name: Name of the phase; "leg 1", "leg 2", ... if empty.
     """
 
     joints: Any
     horizon: float | FreeTime
-    end: Literal["rest", "free"] = "rest"
+    end_velocity: Literal["rest", "free"] = "rest"
     machine: Motors | None = None
     tasks: TipTask | Sequence[TipTask] = ()
     name: str = ""
@@ -87,76 +83,67 @@ class Leg:
 @interruptible
 def dynamics_phases(
     machine: Motors,
-    start_joints: Any,
     legs: Sequence[Leg],
     *,
+    start: Any,
     total: float | None = None,
-    clearance_constraints: ClearanceConstraints | None = None,
-    **asked: Unpack[AskedOfDrives],
+    limits: Limits | None = None,
+    effort: Effort | None = None,
+    setup: DynamicsSetup | None = None,
 ) -> Phases:
-    """Legs one after the other as one problem, at the least cost of all together.
+    """Declare consecutive legs as the phases of one problem, of least total cost.
 
     Args:
-        machine: On the first leg, unless that says its own.
-        start_joints: Shape (n,), rad or m.
+        machine: Machine of the first leg, unless the leg has its own.
         legs: At least one; all have the joints of the machine.
-        total: Time of all legs together, s, where theirs are free; None: as long as is best.
-        clearance_constraints: What the motion has to stay clear of, on legs whose machine is that of its surroundings.
-        asked: Of all legs, as of `dynamics_problem`; `start` and `start_base` where the first begins, `end_base`
-            where the last ends.
+        start: Joints at the start of the first leg. Shape (n,), rad or m.
+        total: Duration of all legs together, s, if some have a free time; None leaves it free.
+        limits, effort, setup: Arguments of `dynamics_problem` for all legs. `start_velocity` and `start_base` hold
+            where the first leg begins, `end_base` where the last one ends, and clearance on those legs whose machine
+            is that of the collision scene. The legs give their `end_velocity` themselves.
 
     Raises:
-        ProblemError: As `dynamics_problem`; no legs, another number of joints or another kind of base, a machine that
-            changes where it does not rest or carries momentum, a leg with tasks from joints that are not told, a total
-            that the legs cannot have, what a leg says itself.
+        ProblemError: As `dynamics_problem`; there are no legs; their machines differ in the number of joints or in the
+            kind of base; the machine changes while it moves or has momentum; a leg with tasks starts at unknown joints;
+            the legs cannot have this total duration; the setup has an `end_velocity`.
     """
-    given = checked_legs(legs)
-    if clearance_constraints is not None:
-        checked_instance("dynamics_phases: clear", clearance_constraints, ClearanceConstraints)
-    for what in ("end_joints", "tasks", "end"):
-        if what in asked:
-            raise ProblemError(f"{what}: legs say it themselves, Leg({what}=...)", name=what, value=asked.get(what))
-    names = [leg.name or f"leg {k + 1}" for k, leg in enumerate(given)]
+    legs = checked_legs(legs)
+    setup = DynamicsSetup() if setup is None else checked_instance("dynamics_phases: setup", setup, DynamicsSetup)
+    if setup.end_velocity != "rest":
+        words = "end_velocity: every leg has its own; set Leg(end_velocity=...)"
+        raise ProblemError(words, name="end_velocity", value=setup.end_velocity)
+    clearance = setup.clearance_constraints
+    if clearance is not None:
+        checked_instance("dynamics_phases: clearance_constraints", clearance, ClearanceConstraints)
+    names = [leg.name or f"leg {k + 1}" for k, leg in enumerate(legs)]
     if len(set(names)) < len(names):
         raise ProblemError(f"legs: names {names} are not all different", name="legs", value=names)
-    movers, problems = _machines(machine, given, names), {}
-    options: dict[str, Any] = {
-        name: value for name, value in asked.items() if name not in ("start", "start_base", "end_base")
-    }
-    begin: Any = start_joints
-    for k, (name, leg) in enumerate(zip(names, given, strict=True)):
+    machines, problems = _machines(machine, legs, names), {}
+    begin: Any = start
+    for k, (name, leg) in enumerate(zip(names, legs, strict=True)):
         known = begin is not None and not np.isnan(np.asarray(begin, dtype=float)).any()
         if k and not known and not (isinstance(leg.tasks, Sequence) and not leg.tasks):
-            words = f"{name}: its tasks begin where the leg before ends; tell all joints there"
+            words = f"{name}: its tasks begin where {names[k - 1]!r} ends; give all joints there"
             raise ProblemError(words, name=name, value=begin)
-        own: dict[str, Any] = {"start": asked.get("start", "rest") if k == 0 else given[k - 1].end}
-        own["start_base"] = asked.get("start_base") if k == 0 else np.full(movers[k].base_size, np.nan)
-        if k == len(given) - 1:
-            own["end_base"] = asked.get("end_base")
-        kept = (
-            clearance_constraints
-            if clearance_constraints is not None and clearance_constraints.scene.machine is movers[k]
-            else None
+        own = replace(
+            setup,
+            start_velocity=setup.start_velocity if k == 0 else legs[k - 1].end_velocity,
+            end_velocity=leg.end_velocity,
+            start_base=setup.start_base if k == 0 else np.full(machines[k].base_size, np.nan),
+            end_base=setup.end_base if k == len(legs) - 1 else None,
+            clearance_constraints=clearance if clearance and clearance.scene.machine is machines[k] else None,
         )
         problems[name] = dynamics_problem(
-            movers[k],
-            begin,
-            leg.horizon,
-            end_joints=leg.joints,
-            tasks=leg.tasks,
-            end=leg.end,
-            clearance_constraints=kept,
-            **own,
-            **options,
+            machines[k], leg.tasks, leg.horizon, start=begin, end=leg.joints, limits=limits, effort=effort, setup=own
         )
         begin = leg.joints
     phases = Phases("legs", problems)
-    for k in range(1, len(given)):
-        _join(phases, names[k - 1], names[k], given[k - 1])
+    for k in range(1, len(legs)):
+        _join(phases, names[k - 1], names[k], legs[k - 1])
     if total is not None:
         duration = checked_horizon(total)
-        if not any(isinstance(leg.horizon, FreeTime) for leg in given):
-            words = "total: every leg tells its own time; let one of them be free"
+        if not any(isinstance(leg.horizon, FreeTime) for leg in legs):
+            words = "total: every leg has a fixed duration; give one of them FreeTime(...)"
             raise ProblemError(words, name="total", value=total)
         last = phases[names[-1]]
         phases.end("total time", last.begin + last.duration - duration, lower=0.0, upper=0.0, unit="s")
@@ -164,75 +151,75 @@ def dynamics_phases(
 
 
 def checked_legs(legs: Any) -> tuple[Leg, ...]:
-    """Legs as a tuple.
+    """Return the legs as a tuple.
 
     Raises:
-        ProblemError: None, or something else; ends that are neither at rest nor free, a name that is no text.
+        ProblemError: There are none; one is no Leg; an end velocity or a name is invalid.
     """
-    given = checked_each("legs", legs, Leg)
-    if not given:
+    checked = checked_each("legs", legs, Leg)
+    if not checked:
         raise ProblemError("legs: at least one is needed", name="legs", value=legs)
-    for leg in given:
-        checked_choice("leg: end", leg.end, ("rest", "free"))
+    for leg in checked:
+        checked_choice("leg: end_velocity", leg.end_velocity, ("rest", "free"))
         checked_text("leg: name", leg.name)
-    return tuple(given)
+    return tuple(checked)
 
 
 def _machines(machine: Motors, legs: Sequence[Leg], names: Sequence[str]) -> list[Motors]:
-    """What moves on each leg."""
-    found = [checked_motors("dynamics_phases", machine)]
+    """Return the machine of each leg."""
+    machines = [checked_motors("dynamics_phases", machine)]
     for k, (name, leg) in enumerate(zip(names, legs, strict=True)):
-        own = found[-1] if leg.machine is None else checked_motors(name, leg.machine)
-        before = found[-1]
+        before = machines[-1]
+        own = before if leg.machine is None else checked_motors(name, leg.machine)
         if (own.joint_size, own.base_size) != (before.joint_size, before.base_size):
             words = f"{name}: its machine has {own.joint_size} joints and a base of {own.base_size}, the one before "
             words += f"{before.joint_size} and {before.base_size}"
             raise ProblemError(words, name=name, value=own.joint_size, limit=before.joint_size)
         if k and own is not before:
-            if legs[k - 1].end != "rest":
-                words = f"{name}: a load is picked up or put down at rest; say Leg(end='rest') of {names[k - 1]!r}"
-                raise ProblemError(words, name=name, value=legs[k - 1].end, limit="rest")
-            for one in (own, before):
-                if isinstance(one, FreeFloating) and np.any(np.asarray(one.conserved_momentum)):
-                    words = f"{name}: a load that is at rest is picked up by a machine without momentum"
-                    raise ProblemError(words, name="conserved_momentum", value=one.conserved_momentum, limit=0.0)
-        found.append(own)
-    return found[1:]
+            if legs[k - 1].end_velocity != "rest":
+                words = f"{name}: a load is picked up or put down at rest; let {names[k - 1]!r} end at rest"
+                raise ProblemError(words, name=name, value=legs[k - 1].end_velocity, limit="rest")
+            for each in (own, before):
+                if isinstance(each, FreeFloating) and np.any(np.asarray(each.conserved_momentum)):
+                    words = f"{name}: a machine that picks up or puts down a load must have no momentum"
+                    raise ProblemError(words, name="conserved_momentum", value=each.conserved_momentum, limit=0.0)
+        machines.append(own)
+    return machines[1:]
 
 
 def _join(phases: Phases, before: str, after: str, leg: Leg) -> None:
-    """What of one leg goes on in the next: all that is not told at both ends already."""
-    told: dict[str, Any] = {}
+    """Make the states continuous from one leg to the next, except those fixed at both ends anyway."""
+    fixed: dict[str, Any] = {}
     if leg.joints is not None and not np.isnan(np.asarray(leg.joints, dtype=float)).any():
-        told["joints"] = None
-    if leg.end == "rest":
-        told |= {"velocities": None, "accelerations": None}
+        fixed["joints"] = None
+    if leg.end_velocity == "rest":
+        fixed |= {"velocities": None, "accelerations": None}
     states = [name for name in phases.of(after) if f"{after}.{name}" in phases.declared.states and name != DURATION]
-    if any(told.get(name, "joined") is not None for name in states):
-        phases.join(before, after, {name: value for name, value in told.items() if name in states})
+    if any(name not in fixed for name in states):
+        phases.join(before, after, {name: value for name, value in fixed.items() if name in states})
 
 
 POINTS = Collocation(20, degree=5, scheme="legendre")
 IPOPT = {"max_iter": 300}
-ROWS = r"(?P<phase>[^.;:,\n]*?\.)?(?P<what>joints|velocities|accelerations|jerks|torques|power)\[(?P<row>\d+)\]"
-"""Labels of the rows of joints, in a phase or without one."""
+ROWS = r"(?P<phase>[^.;:,\n]*?\.)?(?P<quantity>joints|velocities|accelerations|jerks|torques|power)\[(?P<row>\d+)\]"
+"""Labels of joint rows, with or without the name of a phase."""
 
 
 @dataclass(frozen=True)
 class HoldingSettings:
-    """How limits are made to hold between the nodes of a mesh.
+    """Settings of the search for a plan that satisfies its limits between the nodes.
 
     Attributes:
-        meshes: That are tried, each finer than the one before.
-        pieces: Of an interval in which a tightened limit costs too much: its cost falls to a ninth.
-        held: By how much a limit may be exceeded between the nodes, in its own unit.
-        dearer: Share of its cost that a plan may cost more for tightened limits; nodes where it switches mend more.
+        meshes: Largest number of meshes, each finer than the one before.
+        splits: Parts of an interval whose tightened limit costs too much. With 3, its cost falls to a ninth.
+        excess: Largest excess of a limit between the nodes, in its own unit.
+        cost_increase: Largest relative increase of the cost by tightened limits; above it, switching nodes help more.
     """
 
     meshes: int = 3
-    pieces: int = 3
-    held: float = 1e-5
-    dearer: float = 1e-3
+    splits: int = 3
+    excess: float = 1e-5
+    cost_increase: float = 1e-3
 
 
 HOLDING = HoldingSettings()
@@ -241,225 +228,239 @@ HOLDING = HoldingSettings()
 @interruptible
 def plan_dynamics(
     machine: Motors,
-    start_joints: Any,
-    horizon: float | FreeTime | Sequence[Leg],
+    tasks: TipTask | Sequence[TipTask] | Sequence[Leg],
+    horizon: float | FreeTime | None = None,
     *,
+    start: Any,
+    end: Any = None,
+    limits: Limits | None = None,
+    effort: Effort | None = None,
+    setup: DynamicsSetup | None = None,
     total: float | None = None,
     method: Collocation | None = None,
     options: Mapping[str, Any] | None = None,
     tolerances: Mapping[str, float] | None = None,
-    clearance_constraints: ClearanceConstraints | None = None,
-    **asked: Unpack[AskedOfDrives],
 ) -> Solution:
     """Solve `dynamics_problem`, or the legs of `dynamics_phases`, and audit the plan.
 
-    Its limits hold between the nodes, too, to 1e-5 of their units.
-
-    The first plan that passes its audit is returned; where none does, the cheapest that holds everything: it is not
-    decided to be a minimum, or costs too much, by about its `tightening_cost`. Least time alone,
-    `Effort(torque=0, time=1)`, leaves open what joints do that need not hurry, so that no plan is decided to be the
-    best: a small weight of accelerations or torques beside it says it.
+    The plan satisfies its limits between the nodes, too, to 1e-5 of their units. The first plan that passes its audit
+    is returned. If none passes, the feasible plan of least cost is returned; its optimality is then undetermined, or it
+    costs too much, by about its `tightening_cost`. Least time alone, `Effort(torque=0, time=1)`, leaves the motion of
+    joints that need not hurry undetermined, so that the optimality is undetermined, too. Add a small weight of
+    accelerations or torques.
 
     Args:
-        machine, start_joints, clearance_constraints, asked: As for `dynamics_problem`.
-        horizon: Final time, s, or FreeTime(...); or the legs of the motion, each with its own: the plan has a phase for
-            each then, `plan.phase(name)`. total: Of legs, see `dynamics_phases`.
-        method: The first mesh, controls at the points; 20 Legendre intervals of degree 5 if None, with nodes where
-            the tasks' pieces meet. Up to two more are tried, each twice as fine, or finer where it has to be.
-        options: Of IPOPT. tolerances: Of the audit, by name, see `ocp.audit.audit.audit`.
+        machine, start, end, limits, effort, setup: As for `dynamics_problem`.
+        tasks: Tip tasks as for `dynamics_problem`, or the legs of `dynamics_phases`. The plan has a phase for each leg
+            then, `plan.phase(name)`.
+        horizon: Final time, s, or FreeTime(...); None for legs, which have their own.
+        total: Duration of all legs together, see `dynamics_phases`.
+        method: First mesh, with controls at the points; None for 20 Legendre intervals of degree 5, with nodes at the
+            breaks of the tasks. Up to two more meshes are tried, each twice as fine, or refined where needed.
+        options: IPOPT options.
+        tolerances: Tolerances of the audit by name, see `ocp.audit.audit.audit`.
 
     Raises:
-        SolveError: No plan holds its limits; says what became of each attempt, and names the joint, the time and the
-            limit where one is in the way.
+        SolveError: No plan satisfies its limits. The message has the result of each attempt, and the joint, the time
+            and the limit that is violated.
         ProblemError: As `dynamics_problem` and `dynamics_phases`.
     """
-    if isinstance(horizon, Sequence) and not isinstance(horizon, str):
-        legs = checked_legs(horizon)
-        driven, mover = {}, machine
-        for k, leg in enumerate(legs):
-            mover = leg.machine or mover
-            driven[leg.name or f"leg {k + 1}"] = mover, asked.get("limits")
+    setup = DynamicsSetup() if setup is None else checked_instance("plan_dynamics: setup", setup, DynamicsSetup)
+    shared: dict[str, Any] = {"start": start, "limits": limits, "effort": effort}
+    tip_tasks: Any = tasks
+    if isinstance(tasks, Sequence) and any(isinstance(each, Leg) for each in tasks):
+        legs = checked_legs(tasks)
+        for name, value in (("horizon", horizon), ("end", end)):
+            if value is not None:
+                raise ProblemError(f"{name}: every leg has its own; set it in Leg(...)", name=name, value=value)
+        names = [leg.name or f"leg {k + 1}" for k, leg in enumerate(legs)]
+        limited = {name: (own, limits) for name, own in zip(names, _machines(machine, legs, names), strict=True)}
 
-        def all_legs(clearance_constraints: ClearanceConstraints | None) -> Problem:
-            return dynamics_phases(
-                machine, start_joints, legs, total=total, clearance_constraints=clearance_constraints, **asked
-            )
+        def declare_legs(clearance: ClearanceConstraints | None) -> Problem:
+            own = replace(setup, clearance_constraints=clearance)
+            return dynamics_phases(machine, legs, total=total, setup=own, **shared)
 
-        return within_limits(all_legs, clearance_constraints, method, (), options, tolerances, driven)
+        return within_limits(declare_legs, setup.clearance_constraints, method, (), options, tolerances, limited)
     if total is not None:
-        raise ProblemError("total: of legs alone; the horizon is the whole time", name="total", value=total)
+        raise ProblemError("total is for legs alone; set the horizon instead", name="total", value=total)
 
-    def declare(clearance_constraints: ClearanceConstraints | None) -> Problem:
-        return dynamics_problem(machine, start_joints, horizon, clearance_constraints=clearance_constraints, **asked)
+    def declare(clearance: ClearanceConstraints | None) -> Problem:
+        own = replace(setup, clearance_constraints=clearance)
+        return dynamics_problem(machine, tip_tasks, duration, end=end, setup=own, **shared)
 
-    at = () if isinstance(horizon, FreeTime) else breaks_of(asked.get("tasks", ()), checked_horizon(horizon))
-    return within_limits(
-        declare, clearance_constraints, method, at, options, tolerances, {"": (machine, asked.get("limits"))}
-    )
+    duration: float | FreeTime = horizon if isinstance(horizon, FreeTime) else checked_horizon(horizon)
+    at = () if isinstance(duration, FreeTime) else breaks_of(tip_tasks, duration)
+    return within_limits(declare, setup.clearance_constraints, method, at, options, tolerances, {"": (machine, limits)})
 
 
 def breaks_of(tasks: TipTask | Sequence[TipTask], horizon: float) -> Sequence[float]:
-    """Fractions of a horizon at which tasks are less smooth."""
-    given = (tasks,) if isinstance(tasks, TipTask) else checked_each("tasks", tasks, TipTask)
-    times = np.unique(np.concatenate([np.zeros(0), *(task.begin + np.asarray(task.breaks) for task in given)]))
+    """Return the fractions of a horizon at which tasks are less smooth."""
+    tasks = (tasks,) if isinstance(tasks, TipTask) else checked_each("tasks", tasks, TipTask)
+    times = np.unique(np.concatenate([np.zeros(0), *(task.begin + np.asarray(task.breaks) for task in tasks)]))
     return [float(at) for at in times / horizon if 0 < at < 1]
 
 
+def audit_error(audit: Audit, solution: Solution) -> SolveError:
+    """Return the error of the largest failure of an audit, relative to its tolerance."""
+    worst = max(audit.failures, key=lambda row: row.value / row.limit if row.limit else np.inf)
+    words = f"the audit fails: {worst.name} {worst.value:.2g}"
+    return SolveError(words, solution, name=worst.name, value=worst.value, limit=worst.limit, time=worst.time)
+
+
 def within_limits(
-    declare: Callable[[Kept], Problem],
-    clearance_constraints: Kept,
+    declare: Callable[[Constraints], Problem],
+    clearance_constraints: Constraints,
     method: Collocation | None,
     breaks: Sequence[float],
     options: Mapping[str, Any] | None,
     tolerances: Mapping[str, float] | None,
-    driven: Mapping[str, tuple[Machine, Limits | None]],
+    machines: Mapping[str, tuple[Machine, Limits | None]],
 ) -> Solution:
-    """The plan of a problem that holds its limits between the nodes and passes its audit; see `plan_dynamics`.
+    """Return a plan that satisfies its limits between the nodes and passes its audit; see `plan_dynamics`.
 
     Args:
-        declare: Makes the problem, with what it has to stay clear of.
-        breaks: Fractions of the horizon with nodes.
-        driven: Machine and limits by the name of the phase, "" where there are no phases: to name joints by.
+        declare: Declares the problem under clearance constraints.
+        breaks: Fractions of the horizon that get nodes.
+        machines: Machine and limits by the name of the phase, "" without phases. Messages take joint names from them.
     """
     mesh = POINTS if method is None else checked_instance("method", method, Collocation)
     settings = {**IPOPT, **checked_mapping("options", options)}
     mesh = mesh.with_nodes_at(breaks)
 
-    touching: Solution | None = None  # what was planned before, the bodies not held apart enough
+    in_collision: Solution | None = None  # the last plan, if only its clearance failed
 
-    def planned(problem: Problem, guess: Solution | None) -> Solution:
-        nonlocal touching
+    def solve_problem(problem: Problem, guess: Solution | None) -> Solution:
+        nonlocal in_collision
         try:
-            return _first_that_holds(problem, mesh, settings, tolerances, guess)
+            return _first_within_limits(problem, mesh, settings, tolerances, guess)
         except SolveError as error:
-            touching = error.solution if of_clearance(error.name) else None
-            if guess is None or touching is not None:
+            in_collision = error.solution if is_clearance(error.name) else None
+            if guess is None or in_collision is not None:
                 raise
-        return planned(problem, None)
+        return solve_problem(problem, None)
 
-    def run(clearance_constraints: Kept) -> Solution:
-        return planned(declare(clearance_constraints), touching)
+    def run(clearance_constraints: Constraints) -> Solution:
+        return solve_problem(declare(clearance_constraints), in_collision)
 
     try:
         return solve_with_clearance(clearance_constraints, run)
     except SolveError as error:
-        raise _by_joint(error, driven) from error
+        raise _with_joint_names(error, machines) from error
 
 
-def _first_that_holds(
+def _first_within_limits(
     problem: Problem,
     mesh: Collocation,
     settings: Mapping[str, Any],
     tolerances: Mapping[str, float] | None,
     guess: Solution | None,
 ) -> Solution:
-    """The plan of `within_limits`, of several meshes, from that of the problem with bodies held less apart.
+    """Return the plan of `within_limits` from several meshes, starting from a guess.
 
     Raises:
-        SolveError: As it does; at once where a plan is sound but for bodies that touch.
+        SolveError: As `within_limits`; at once if collisions are all that is wrong with a plan.
     """
     reasons: list[str] = []
-    why, last, begin = SolveError(), None, guess
-    feasible, dear = list[Solution](), list[tuple[Collocation, Solution]]()
+    failure, last, begin = SolveError(), None, guess
+    feasible, costly = list[Solution](), list[tuple[Collocation, Solution]]()
     for _ in range(HOLDING.meshes):
-        for what, plan in _attempts(problem, mesh, settings, guess):
-            name = f"{mesh.intervals} intervals{what}"
+        for variant, plan in _attempts(problem, mesh, settings, guess):
+            name = f"{mesh.intervals} intervals{variant}"
             if isinstance(plan, SolveError):
                 reasons.append(f"{name}: {plan}")
-                why, last = plan, plan.solution or last
+                failure, last = plan, plan.solution or last
                 if plan.solution is not None and plan.solution.success:
                     guess = plan.solution
-                    dear.append((mesh, guess))
+                    costly.append((mesh, guess))
                 continue
             audit = plan.audit(tolerances=tolerances)
             if audit.passed:
                 return plan
-            if touching := collision_error(audit, plan):
-                raise touching
+            if collision := collision_error(audit, plan):
+                raise collision
             guess = last = plan
             feasible += [plan] if audit.feasible else []
             if audit.failures:
-                worst = max(audit.failures, key=lambda row: row.value / row.limit if row.limit else np.inf)
-                details = {"value": worst.value, "limit": worst.limit, "time": worst.time}
-                why = SolveError(f"the audit fails, {worst.name} {worst.value:.2g}", plan, name=worst.name, **details)
-                reasons.append(f"{name}: {why}")
+                failure = audit_error(audit, plan)
+                reasons.append(f"{name}: {failure}")
         if guess is None or guess is begin:
             break
-        mesh = _finer(mesh, guess, why)
-    held = list[Solution]()
-    while dear and not held:  # what no mesh makes cheap is held at its cost, on the last one where that can be
-        finest = dear[-1][0]
-        for plan in [plan for own, plan in dear if own is finest]:
+        mesh = _finer(mesh, guess, failure)
+    tightened = list[Solution]()
+    while costly and not tightened:  # tightened at any cost, on the finest mesh on which that is feasible
+        finest = costly[-1][0]
+        for plan in [plan for own, plan in costly if own is finest]:
             own = finest.with_mesh(plan.control_interpolant.breaks)
             with suppress(SolveError):
-                plan = tighten(problem, own, tolerance=HOLDING.held, options={**NEAR, **settings}, guess=plan)
+                plan = tighten(problem, own, tolerance=HOLDING.excess, options={**NEAR, **settings}, guess=plan)
                 audit = plan.audit(tolerances=tolerances)
-                held += [plan] if audit.feasible else []
-                reasons.append(f"{finest.intervals} intervals, at whatever cost: {audit.sentence}")
-        dear = [each for each in dear if each[0] is not finest]
-    if feasible or held:
-        return min(feasible + held, key=lambda plan: plan.cost)
-    words = "no plan holds its limits and passes its audit:\n" + "\n".join(reasons)
-    details = {"name": why.name, "value": why.value, "limit": why.limit, "time": why.time}
-    raise SolveError(words, last, why.conflicts, **details)
+                tightened += [plan] if audit.feasible else []
+                reasons.append(f"{finest.intervals} intervals, tightened at any cost: {audit.sentence}")
+        costly = [each for each in costly if each[0] is not finest]
+    if feasible or tightened:
+        return min(feasible + tightened, key=lambda plan: plan.cost)
+    words = "no plan satisfies its limits and passes its audit:\n" + "\n".join(reasons)
+    details = {"name": failure.name, "value": failure.value, "limit": failure.limit, "time": failure.time}
+    raise SolveError(words, last, failure.conflicts, **details)
 
 
 def _attempts(
     problem: Problem, mesh: Collocation, settings: Mapping[str, Any], guess: Solution | None
 ) -> Iterator[tuple[str, Solution | SolveError]]:
-    """Plans on a mesh that hold their limits, or why not; whoever takes them stops at the first that is good enough."""
+    """Yield plans on a mesh that satisfy their limits, or the errors; the caller stops when one is good enough."""
     warm = {**NEAR, **settings}
     try:
         plan = solve(problem, mesh, options=warm if guess else settings, guess=guess)
     except SolveError as error:
         yield "", error
         return
-    yield "", _drawn_in(problem, mesh, plan, warm)
+    yield "", _tightened(problem, mesh, plan, warm)
     switched = at_switches(problem, mesh, plan, options=settings)
     if switched is not plan:
-        yield ", with nodes where it switches", _drawn_in(problem, mesh, switched, warm)
+        yield ", with nodes at its switches", _tightened(problem, mesh, switched, warm)
 
 
-def _drawn_in(
+def _tightened(
     problem: Problem, mesh: Collocation, plan: Solution, settings: Mapping[str, Any]
 ) -> Solution | SolveError:
-    """A plan that holds its limits between its nodes, and costs hardly more than one that does not; or why not."""
-    if exceeded(problem, plan) <= HOLDING.held:
+    """Return a plan that satisfies its limits between the nodes at hardly any extra cost, or the error."""
+    if exceeded(problem, plan) <= HOLDING.excess:
         return plan
-    own, most = mesh.with_mesh(plan.control_interpolant.breaks), plan.cost + HOLDING.dearer * abs(plan.cost)
+    own, largest = mesh.with_mesh(plan.control_interpolant.breaks), plan.cost + HOLDING.cost_increase * abs(plan.cost)
     try:
-        drawn = tighten(problem, own, tolerance=HOLDING.held, options=settings, guess=plan, dearest=most)
+        tight = tighten(problem, own, tolerance=HOLDING.excess, options=settings, guess=plan, dearest=largest)
     except SolveError as error:
         return error
-    if drawn.cost <= most:
-        return drawn
-    words = f"limits that are drawn in between the nodes make it cost {drawn.cost:.6g} for {plan.cost:.6g}"
-    return SolveError(words, drawn, name="cost", value=drawn.cost, limit=most)
+    if tight.cost <= largest:
+        return tight
+    words = f"limits tightened between the nodes raise the cost from {plan.cost:.6g} to {tight.cost:.6g}"
+    return SolveError(words, tight, name="cost", value=tight.cost, limit=largest)
 
 
-def _finer(mesh: Collocation, plan: Solution, why: SolveError) -> Collocation:
-    """The next mesh: cut where limits drawn in cost the last plan too much, where that alone is wrong; else halved."""
-    if plan.drawn_in is None or why.solution is not plan or why.name != "cost":
+def _finer(mesh: Collocation, plan: Solution, failure: SolveError) -> Collocation:
+    """Return the next mesh: refined where tightening cost the last plan too much, if only that failed; else halved."""
+    if plan.drawn_in is None or failure.solution is not plan or failure.name != "cost":
         return mesh.halved()
-    nodes, drawn = plan.control_interpolant.breaks, plan.drawn_in.max(axis=(0, 2))
-    return mesh.with_mesh(split(nodes, np.where(drawn > 0, HOLDING.pieces, 1), drawn, HOLDING.pieces * len(drawn)))
+    nodes, amounts = plan.control_interpolant.breaks, plan.drawn_in.max(axis=(0, 2))
+    parts = np.where(amounts > 0, HOLDING.splits, 1)
+    return mesh.with_mesh(split(nodes, parts, amounts, HOLDING.splits * len(amounts)))
 
 
-def _by_joint(error: SolveError, driven: Mapping[str, tuple[Machine, Limits | None]]) -> SolveError:
-    """The same, rows of joints called by the joints' names: "torques of 'elbow'" for "torques[1]"."""
+def _with_joint_names(error: SolveError, machines: Mapping[str, tuple[Machine, Limits | None]]) -> SolveError:
+    """Return the error with joint rows called by the joints' names: "torques of 'elbow'" for "torques[1]"."""
 
-    def called(found: re.Match[str]) -> str:
-        phase, what, row = found["phase"] or "", found["what"], int(found["row"])
-        if phase.removesuffix(".") not in driven:
-            return found[0]
-        machine, limits = driven[phase.removesuffix(".")]
+    def joint_label(label: re.Match[str]) -> str:
+        phase, quantity, row = label["phase"] or "", label["quantity"], int(label["row"])
+        if phase.removesuffix(".") not in machines:
+            return label[0]
+        machine, limits = machines[phase.removesuffix(".")]
         names = list(machine.robot.joint_names)
-        if what == "torques":
+        if quantity == "torques":
             limited = np.isfinite((limits or Limits()).bounds(machine).torque)
             names = [name for name, own in zip(names, limited, strict=True) if own]
-        return f"{phase}{what} of {names[row]!r}" if row < len(names) else found[0]
+        return f"{phase}{quantity} of {names[row]!r}" if row < len(names) else label[0]
 
     rows = re.compile(ROWS)
-    name = None if error.name is None else rows.sub(called, str(error.name))
+    name = None if error.name is None else rows.sub(joint_label, str(error.name))
     details = {"name": name, "value": error.value, "limit": error.limit, "time": error.time}
-    return SolveError(rows.sub(called, str(error)), error.solution, error.conflicts, **details)
+    return SolveError(rows.sub(joint_label, str(error)), error.solution, error.conflicts, **details)

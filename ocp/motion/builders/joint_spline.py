@@ -1,8 +1,8 @@
-"""Joints along a path from any plan, for schedule: a spline through its samples, and the torques of the machine.
+"""Spline of a plan's joints along a path, with the joint torques, for the speed schedule.
 
-The spline has degree 5, so that the third derivative by the distance, which joint jerks need, is continuous. Torques
-are linear in the line's acceleration and squared speed: with joints q(s), inverse dynamics tau(q, rate, acceleration)
-without gravity, and rest that of gravity alone,
+The spline has degree 5, so that the third derivative by the distance, which joint jerks need, is continuous. The
+torques are linear in the line's acceleration a and squared speed v^2. With joints q(s), inverse dynamics tau(q, rate,
+acceleration) without gravity, and rest(q) that of gravity alone,
 
     torque = tau(q, 0, q') a + tau(q, q', q'') v^2 + rest(q).
 """
@@ -28,7 +28,7 @@ __all__ = ["PlannedJoints", "joint_path"]
 
 DEGREE = 5
 DERIVATIVES = 3
-ON_ROWS = {
+ROW_OPERATIONS = {
     ca.OP_ADD: np.add,
     ca.OP_SUB: np.subtract,
     ca.OP_MUL: np.multiply,
@@ -38,29 +38,29 @@ ON_ROWS = {
     ca.OP_SQRT: np.sqrt,
     ca.OP_SIN: np.sin,
     ca.OP_COS: np.cos,
-    ca.OP_TWICE: lambda of, into: np.add(of, of, into),
+    ca.OP_TWICE: lambda operand, out: np.add(operand, operand, out),
 }
-"""Instructions that dynamics consist of, on rows of numbers: of the operands, into the last."""
+"""NumPy functions for the casadi operations of inverse dynamics: operands, then the output array."""
 
 
 @dataclass(frozen=True)
 class SplineSettings:
-    """How the joints of a plan are made a spline.
+    """Settings of the joint spline.
 
     Attributes:
-        on_path: Share of a path's length by which tasks that run along it may be off it.
-        at_once: Places whose torques are computed side by side.
+        path_tolerance: Largest distance of a task from its path, as a share of the path's length.
+        batch: Number of places whose torques are computed together.
     """
 
-    on_path: float = 1e-6
-    at_once: int = 1024
+    path_tolerance: float = 1e-6
+    batch: int = 1024
 
 
 SPLINE = SplineSettings()
 
 
 class _Along(NamedTuple):
-    """Joints and three derivatives by the distance. Shape (M, n) each."""
+    """Joints and their first three derivatives by the distance. Shape (M, n) each."""
 
     position: Array
     first: Array
@@ -69,7 +69,7 @@ class _Along(NamedTuple):
 
 
 class _Torques(NamedTuple):
-    """inertia a + drag v^2 + rest. Shape (M, n) each, Nm or N."""
+    """Coefficients of the torques inertia a + drag v^2 + rest. Shape (M, n) each."""
 
     inertia: Array
     drag: Array
@@ -77,7 +77,7 @@ class _Torques(NamedTuple):
 
 
 class PlanLike(Protocol):
-    """What is asked of a plan of tasks: `ocp.Plan` has it."""
+    """Interface of a plan of tasks, such as `ocp.Plan`."""
 
     @property
     def horizon(self) -> float: ...
@@ -89,44 +89,45 @@ class PlanLike(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class PlannedJoints:
-    """Joints of a machine as functions of the distance along a path. Made by `joint_path`.
+    """Joints of a machine as functions of the distance along a path, from `joint_path`.
 
     Attributes:
-        machine: Whose joints.
-        names: Of the joints.
-        length: Of the path, m.
-        error: Largest difference (rad or m) at the samples between them and a spline through every second one: more
-            than the spline between them errs.
+        machine: Machine of the joints.
+        names: Names of the joints.
+        length: Length of the path, m.
+        error: Upper bound of the interpolation error, rad or m: the largest difference at the samples from a spline
+            through every second one.
     """
 
     machine: Machine
     names: tuple[str, ...]
     length: float
     error: float
-    curves: _Pieces
-    forces: _OnRows | None
+    curves: _PiecewisePolynomial
+    forces: _BatchedFunction | None
 
     def at(self, distance: Any) -> _Along:
-        """Joints and their derivatives at distances from the start. Shape (M,), m.
+        """Return joints and their derivatives at distances from the start. Shape (M,), m.
 
         Raises:
-            ProblemError: nan, or a distance off the path by more than rounding.
+            ProblemError: A distance is nan, or off the path by more than rounding.
         """
         return _Along(*self.curves(self._checked(distance)))
 
     def torques(self, distance: Any) -> _Torques:
-        """Torques at distances from the start, as a linear form of the line's motion. Shape (M,), m.
+        """Return the coefficients of the torques at distances from the start. Shape (M,), m.
 
         Raises:
-            ProblemError: A machine whose base moves; distances as in `at`.
+            ProblemError: The base of the machine moves, or distances are invalid, see `at`.
         """
         if self.forces is None:
-            message = f"torques along a path need a machine on a fixed base, not a {type(self.machine).__name__}"
+            message = f"torques along a path need a FixedBase, not a {type(self.machine).__name__}"
             raise ProblemError(message, name="machine", value=self.machine)
         along = self.at(distance)
         return _Torques(*self.forces(along.position, along.first, along.second))
 
     def _checked(self, distance: Any) -> Array:
+        """Return distances clipped to the path; raise ProblemError if they are off it."""
         try:
             s = np.atleast_1d(floats(distance))
         except NOT_NUMBERS as error:
@@ -134,7 +135,7 @@ class PlannedJoints:
         slack = 1e-9 * self.length
         wrong = s[~((s >= -slack) & (s <= self.length + slack))]
         if s.ndim != 1 or wrong.size:
-            message = f"distance {s.ravel()[:3].tolist()} m is no row on the path, which is {self.length:g} m long"
+            message = f"distance must be a row on the path of {self.length:g} m, not {s.ravel()[:3].tolist()} m"
             raise ProblemError(message, name="distance", value=distance, limit=self.length)
         return np.asarray(np.clip(s, 0.0, self.length))
 
@@ -147,31 +148,31 @@ def joint_path(
     samples: int = 400,
     names: Sequence[str] | None = None,
 ) -> PlannedJoints:
-    """Joints along a path from a plan that runs it at constant speed, or from samples over the distance.
+    """Return joints along a path, from a plan at constant speed or from samples over the distance.
 
     Args:
-        machine: Whose joints they are.
-        plan: What `plan` made of tasks that run along the path at one speed from its begin to its end, in one part or
-            several, its horizon free or not; or a solution with states "joints", the path's distance in proportion to
-            its time; or (distances (M,), joints (M, n)), the first distance 0 and the last the path's length.
-        path: What the tool runs along.
-        samples: Of a plan or a solution, evenly in time.
-        names: Of the joints; the robot's if None.
+        machine: Machine of the joints.
+        plan: A `Plan` of tasks that run along the whole path at constant speed, in one part or several, with a fixed or
+            free horizon. Or a solution with states "joints" at distances proportional to time. Or a tuple of distances
+            (M,) from 0 to the path's length and joints (M, n).
+        path: Path of the tool.
+        samples: Number of samples of a plan or a solution, evenly spaced in time.
+        names: Names of the joints; the robot's if None.
 
     Raises:
-        ProblemError: A plan without joints, or whose tasks do not run along the path at one speed; samples of other
-            shapes, too few, not increasing or not from end to end.
+        ProblemError: The plan has no joints, or its tasks do not run along the path at constant speed; the samples have
+            other shapes, are too few, do not increase, or do not reach both ends.
     """
     checked_count("samples", samples, 2 * DEGREE + 3)
-    for part in ("robot", "joint_size"):
-        if isinstance(machine, type) or not hasattr(machine, part):
-            raise ProblemError(f"{machine!r} is no machine; it has no {part}", name="machine", value=machine)
+    for attribute in ("robot", "joint_size"):
+        if isinstance(machine, type) or not hasattr(machine, attribute):
+            raise ProblemError(f"{machine!r} is no machine; it has no {attribute}", name="machine", value=machine)
     length = getattr(path, "length", None)
     if not isinstance(length, float | int) or not length > 0:
         raise ProblemError(f"the path {path!r} has no length", name="path", value=path)
     if hasattr(plan, "task_share"):
-        plan = _planned(plan, path, float(length), samples)
-    s, joints = _samples(plan, float(length), samples, machine.joint_size)
+        plan = _samples_of_plan(plan, path, float(length), samples)
+    s, joints = _checked_samples(plan, float(length), samples, machine.joint_size)
     own = checked_each("joints along a path: names", machine.robot.joint_names if names is None else names, str)
     if len(own) != machine.joint_size:
         message = f"{len(own)} names for {machine.joint_size} joints"
@@ -184,27 +185,27 @@ def joint_path(
     return PlannedJoints(machine, own, float(length), error, curves, _forces(machine))
 
 
-def _planned(plan: Any, path: Any, length: float, samples: int) -> tuple[Array, Array]:
-    """Return distances (M,) and joints (M, n) of a plan, whose tasks are seen to run along the path at one speed."""
+def _samples_of_plan(plan: Any, path: Any, length: float, samples: int) -> tuple[Array, Array]:
+    """Return distances (M,) and joints (M, n) of a plan; check that its tasks run along the path at constant speed."""
     if plan.targets and hasattr(path, "at"):
         t = plan.targets[0].t
         along = path.at(np.clip(length * plan.task_share(t), 0.0, length)).position
-        apart = np.array([one.position - along for one in plan.targets])
-        asked = np.isfinite(apart).any(axis=2)
-        off = np.where(asked, np.linalg.norm(np.nan_to_num(apart), axis=2), np.inf).min(axis=0)
-        worst = int(off.argmax())
-        if asked.any() and not off[worst] <= SPLINE.on_path * length:
-            found = f"are {off[worst]:.3g} m off the path" if off[worst] < np.inf else "ask for no position"
-            words = f"the plan's tasks {found} at {t[worst]:.6g} s: they do not run along all of it at one speed; "
+        offsets = np.array([target.position - along for target in plan.targets])
+        fixed = np.isfinite(offsets).any(axis=2)
+        distance = np.where(fixed, np.linalg.norm(np.nan_to_num(offsets), axis=2), np.inf).min(axis=0)
+        worst = int(distance.argmax())
+        if fixed.any() and not distance[worst] <= SPLINE.path_tolerance * length:
+            position = f"are {distance[worst]:.3g} m off the path" if distance[worst] < np.inf else "have no position"
+            words = f"the plan's tasks {position} at {t[worst]:.6g} s, but must run along all of it at constant speed; "
             words += "give (distances, joints) instead of the plan"
-            told = {"value": float(off[worst]), "limit": SPLINE.on_path * length, "time": float(t[worst])}
-            raise ProblemError(words, name="plan", **told)
+            details = {"value": float(distance[worst]), "limit": SPLINE.path_tolerance * length}
+            raise ProblemError(words, name="plan", time=float(t[worst]), **details)
     times = np.linspace(0.0, plan.horizon, samples)
     return length * plan.task_share(times), plan.at(times)["joints"]
 
 
-def _samples(plan: Any, length: float, samples: int, size: int) -> tuple[Array, Array]:
-    """Distances (M,) and joints (M, n) of a plan, checked."""
+def _checked_samples(plan: Any, length: float, samples: int, size: int) -> tuple[Array, Array]:
+    """Return checked distances (M,) and joints (M, n) of a solution, or of given samples."""
     if isinstance(plan, tuple):
         try:
             s, joints = (floats(part) for part in plan)
@@ -232,13 +233,14 @@ def _samples(plan: Any, length: float, samples: int, size: int) -> tuple[Array, 
     return s, joints
 
 
-class _Pieces:
-    """A spline as one polynomial a piece, about its middle.
+class _PiecewisePolynomial:
+    """Spline as one polynomial per interval, about its middle.
 
     Args:
-        breaks: Where pieces meet. Shape (K + 1,), m.
-        derivatives: Of order 0 to DEGREE in the middle of each piece, by `unit`. Shape (DEGREE + 1, K, n).
-        unit: m.
+        breaks: Ends of the intervals. Shape (K + 1,), m.
+        derivatives: Derivatives of order 0 to DEGREE in the middle of each interval, by distance over `unit`. Shape
+            (DEGREE + 1, K, n).
+        unit: Unit of the distance, m.
     """
 
     def __init__(self, breaks: Array, derivatives: Array, unit: float) -> None:
@@ -251,68 +253,72 @@ class _Pieces:
         self.weight /= unit ** np.arange(DERIVATIVES + 1)[:, None]
 
     def __call__(self, distance: Array) -> Array:
-        """Values and three derivatives at distances (M,). Shape (4, M, n)."""
-        piece = np.clip(np.searchsorted(self.breaks, distance, side="right") - 1, 0, len(self.middle) - 1)
-        x = (distance - self.middle[piece]) / self.unit
+        """Return values and three derivatives at distances (M,). Shape (4, M, n)."""
+        interval = np.clip(np.searchsorted(self.breaks, distance, side="right") - 1, 0, len(self.middle) - 1)
+        x = (distance - self.middle[interval]) / self.unit
         powers = x[:, None] ** np.arange(DEGREE + 1)
-        return np.asarray((self.weight * powers[:, self.power] @ self.derivatives[piece]).transpose(1, 0, 2))
+        return np.asarray((self.weight * powers[:, self.power] @ self.derivatives[interval]).transpose(1, 0, 2))
 
 
-class _OnRows:
-    """A casadi SX Function of vectors at many places at once: each of its instructions works on a row of numbers."""
+class _BatchedFunction:
+    """Casadi SX Function evaluated for many inputs at once, each instruction on rows of numbers."""
 
     def __init__(self, function: Any) -> None:
         self.sizes = [function.size1_out(k) for k in range(function.n_out())]
         # rows: the function's own memory, its inputs, its outputs, its constants
         size = [function.size1_in(k) for k in range(function.n_in())]
-        seats = np.cumsum([function.sz_w(), *size, *self.sizes]).tolist()
-        inputs, outputs, self.rows = seats[: len(size)], seats[len(size) : -1], seats[-1]
+        offsets = np.cumsum([function.sz_w(), *size, *self.sizes]).tolist()
+        inputs, outputs, self.rows = offsets[: len(size)], offsets[len(size) : -1], offsets[-1]
         self.inputs, self.outputs = slice(inputs[0], outputs[0]), slice(outputs[0], self.rows)
         self.constants: list[float] = []
         self.steps: list[tuple[Any, ...]] = []
         self.tables: list[tuple[Array, list[tuple[Any, list[Array]]]]] = []
-        seat: dict[int, int] = {}  # the row of what each place of the memory holds
+        row: dict[int, int] = {}  # row of each memory location
         for k in range(function.n_instructions()):
-            kind, of, into = function.instruction_id(k), function.instruction_input(k), function.instruction_output(k)
+            kind, source, target = (
+                function.instruction_id(k),
+                function.instruction_input(k),
+                function.instruction_output(k),
+            )
             if kind == ca.OP_INPUT:
-                seat[into[0]] = inputs[of[0]] + of[1]
+                row[target[0]] = inputs[source[0]] + source[1]
             elif kind == ca.OP_CONST:
-                seat[into[0]] = self.rows + len(self.constants)
+                row[target[0]] = self.rows + len(self.constants)
                 self.constants.append(function.instruction_constant(k))
             elif kind == ca.OP_OUTPUT:
-                self.steps.append((np.copyto, outputs[into[0]] + into[1], seat[of[0]]))
+                self.steps.append((np.copyto, outputs[target[0]] + target[1], row[source[0]]))
             else:
-                self.steps.append((ON_ROWS[kind], *(seat[place] for place in of), into[0]))
-                seat[into[0]] = into[0]
+                self.steps.append((ROW_OPERATIONS[kind], *(row[place] for place in source), target[0]))
+                row[target[0]] = target[0]
 
     def __call__(self, *inputs: Array) -> list[Array]:
-        """Its outputs at inputs, shape (M, n) each."""
-        given = np.concatenate([value.T for value in inputs])
-        count = given.shape[1]
-        found = np.empty((sum(self.sizes), count))
+        """Return the outputs at inputs of shape (M, n) each."""
+        columns = np.concatenate([value.T for value in inputs])
+        count = columns.shape[1]
+        results = np.empty((sum(self.sizes), count))
         try:
             table, steps = self.tables.pop()
-        except IndexError:  # the first call, or another thread has it
+        except IndexError:  # first call, or in use by another thread
             table, steps = self._table()
-        for first in range(0, count, SPLINE.at_once):
-            here = min(SPLINE.at_once, count - first)
-            table[self.inputs, :here] = given[:, first : first + here]
+        for first in range(0, count, SPLINE.batch):
+            here = min(SPLINE.batch, count - first)
+            table[self.inputs, :here] = columns[:, first : first + here]
             for operation, places in steps:
                 operation(*places)
-            found[:, first : first + here] = table[self.outputs, :here]
+            results[:, first : first + here] = table[self.outputs, :here]
         self.tables.append((table, steps))
-        return [part.T for part in np.split(found, np.cumsum(self.sizes)[:-1])]
+        return [part.T for part in np.split(results, np.cumsum(self.sizes)[:-1])]
 
     def _table(self) -> tuple[Array, list[tuple[Any, list[Array]]]]:
-        """Rows of numbers, and the instructions on them."""
-        table = np.zeros((self.rows + len(self.constants), SPLINE.at_once))
+        """Return rows of numbers, and the instructions on them."""
+        table = np.zeros((self.rows + len(self.constants), SPLINE.batch))
         table[self.rows :] = np.array(self.constants).reshape(-1, 1)
         rows = list(table)
         return table, [(step[0], [rows[place] for place in step[1:]]) for step in self.steps]
 
 
-def _spline(s: Array, joints: Array) -> _Pieces:
-    """The spline through samples."""
+def _spline(s: Array, joints: Array) -> _PiecewisePolynomial:
+    """Return the spline through samples."""
     # in units of the length, which keeps the derivatives of the fit in range
     unit = float(s[-1])
     fit = ca.interpolant("fit", "bspline", [(s / unit).tolist()], joints.ravel().tolist(), {"degree": [DEGREE]})
@@ -320,12 +326,12 @@ def _spline(s: Array, joints: Array) -> _Pieces:
     values = [fit(place)]
     for _ in range(DEGREE):
         values.append(ca.jacobian(values[-1], place))
-    found = ca.Function("joints", [place], values).map(len(s) - 1)(((s[:-1] + s[1:]) / 2 / unit)[None])
-    return _Pieces(s, np.array([value.full().T for value in found]), unit)
+    derivatives = ca.Function("joints", [place], values).map(len(s) - 1)(((s[:-1] + s[1:]) / 2 / unit)[None])
+    return _PiecewisePolynomial(s, np.array([value.full().T for value in derivatives]), unit)
 
 
-def _forces(machine: Machine) -> _OnRows | None:
-    """(q, q', q'') -> inertia, drag and rest; None where the base is not fixed."""
+def _forces(machine: Machine) -> _BatchedFunction | None:
+    """Return the function (q, q', q'') -> (inertia, drag, rest); None if the base is not fixed."""
     if not isinstance(machine, FixedBase):
         return None
     q, first, second = (ca.SX.sym(name, machine.joint_size) for name in ("q", "first", "second"))
@@ -335,8 +341,8 @@ def _forces(machine: Machine) -> _OnRows | None:
         base = machine.world_from_base(ca.DM(0, 1))
         return inverse_dynamics(machine.robot, q, rate, acceleration, gravity=gravity, world_from_base=base)
 
-    # what gravity asks is the same in all three: without it the first two are less work
+    # gravity in the third alone makes the first two cheaper
     values = ca.cse(
         [ca.densify(each) for each in (torque(still, first), torque(first, second), torque(still, still, GRAVITY))]
     )
-    return _OnRows(ca.Function("torques", [q, first, second], values))
+    return _BatchedFunction(ca.Function("torques", [q, first, second], values))

@@ -1,15 +1,16 @@
-"""Minimum time along a given path under all limits, as an optimal control problem on the path parameter.
+"""Minimum time along a given path under all limits, as an optimal control problem over the path parameter.
 
-The reference for schedule, which plans by construction. The independent variable is a path parameter theta: the
-time (s) at which a reference motion, usually a schedule of the same path, passes a place. Its distance, its speed
-w(theta), curvature and joints are known functions of theta, smooth between the joints of the path, where the mesh has
-nodes. With line speed v, acceleration a and jerk j,
+This is the reference for `schedule`, which plans by construction. The independent variable is a path parameter theta:
+the time (s) at which a reference motion, usually a schedule of the same path, passes a place. The distance, speed
+w(theta), curvature and joints of the reference are known functions of theta. They are smooth between the joins of the
+path's segments, where the mesh has nodes. With line speed v, acceleration a and jerk j,
 
     dv/dtheta = a w/v,   da/dtheta = j w/v,   time = integral of w/v dtheta.
 
-From rest the jerk is constant over a first short distance d (and over a last one, mirrored): there v = j t^2/2,
-a = j t, d = j t^3/6, so that a = 2 v^2/(3 d), j = a v/(3 d), t = 3 d/v. The problem begins where this ends, v stays
-positive, and it is regular for every method. Held jerks on the mesh given here contain the reference itself.
+From rest the jerk is constant over a first short distance d (and over a last one, mirrored): there v = j t^2/2, a = j
+t, d = j t^3/6, so that a = 2 v^2/(3 d), j = a v/(3 d), t = 3 d/v. The problem begins at the end of this distance, so
+that v stays positive and the problem is regular for every method. Held jerks on the mesh of the problem contain the
+reference.
 """
 
 from __future__ import annotations
@@ -26,12 +27,12 @@ from ocp.direct.collocation import Collocation
 from ocp.errors import ProblemError, checked_count, checked_instance, checked_mapping
 from ocp.methods import solve
 from ocp.motion.builders.timing_tables import (
-    cut,
-    demand_of_pieces,
+    demand_of_intervals,
     distinct,
     path_columns,
     reference_mesh,
     reference_motion,
+    subdivide,
     table,
 )
 from ocp.motion.schedule.limits import JointPath, LineLimits, PathLike, check_line, check_smooth
@@ -46,13 +47,13 @@ IPOPT = {"tol": 1e-9, "constr_viol_tol": 1e-9, "max_iter": 1000}
 
 
 @dataclass(frozen=True)
-class CutSettings:
-    """Which intervals of the mesh of a fastest motion are cut.
+class RefinementSettings:
+    """Settings of the mesh refinement.
 
     Attributes:
-        demand: Share by which a limit may be passed in an interval.
-        defect: Share of the distance and of the top speed by which states may not follow from their jerk.
-        parts: Into which an interval is cut at most.
+        demand: Largest relative excess of a limit in an interval.
+        defect: Largest error of integration in an interval, relative to its distance and to the top speed.
+        parts: Largest number of parts of an interval in one refinement.
     """
 
     demand: float = 2e-4
@@ -60,20 +61,20 @@ class CutSettings:
     parts: int = 8
 
 
-CUTS = CutSettings()
+REFINEMENT = RefinementSettings()
 
 
 @dataclass(frozen=True, eq=False)
 class TimingProblem:
-    """Minimum time along a path, and what belongs to it.
+    """Minimum-time problem along a path, with its mesh and reference motion.
 
     Attributes:
-        problem: States "speed" and "acceleration", control "jerk" in `units`; its time is theta less its start, and
-            its cost the time (s).
-        mesh: Fractions of the horizon with nodes at every place where the path's derivatives jump, and at the
-            reference's changes of jerk.
-        units: Of speed, acceleration and jerk: the reference's largest, m/s, m/s^2, m/s^3.
-        reference: The motion whose time is theta.
+        problem: Problem with states "speed" and "acceleration" and control "jerk" in `units`. Its time is theta less
+            the start of the span, and its cost the time, s.
+        mesh: Nodes as fractions of the horizon, among them the jumps of the path's derivatives and of the reference's
+            jerk.
+        units: Largest speed, acceleration and jerk of the reference, m/s, m/s^2, m/s^3.
+        reference: Motion whose time is theta.
         span: First and last theta of the problem, s. Before and after, the jerk is constant.
     """
 
@@ -85,14 +86,14 @@ class TimingProblem:
 
     @property
     def method(self) -> Collocation:
-        """Collocation with one jerk an interval: no overshoot between its points, at no change of the jerk."""
+        """Return collocation with one jerk per interval, without overshoot between the points."""
         return Collocation(len(self.mesh) - 1, 3, scheme="legendre", control="held", mesh=self.mesh)
 
     def profile(self, solution: Solution) -> SpeedProfile:
-        """The motion of a solution, as pieces of constant jerk.
+        """Return the motion of a solution, with constant jerk in each interval.
 
         Raises:
-            ProblemError: A solution whose jerk is not held.
+            ProblemError: The jerk of the solution is not constant in its intervals.
         """
         curve = solution.control_interpolant
         if curve.values.shape[1] != 1:
@@ -119,18 +120,19 @@ class TimingProblem:
 
     @property
     def ends(self) -> tuple[float, float]:
-        """Distances (m) at both ends over which the jerk is constant."""
+        """Return the distances at both ends over which the jerk is constant, m."""
         return _ends(self.reference, self.span)
 
 
 @dataclass(frozen=True, eq=False)
 class Fastest:
-    """The fastest motion found.
+    """Fastest motion along a path.
 
     Attributes:
-        schedule: The motion, without dips listed; as that of ocp.motion.schedule.
-        solution: Of the last problem solved. timing: That problem.
-        demand: Largest demand over its limit at ten times the grid, the largest of all kinds; 1 is at the limit.
+        schedule: Motion as from ocp.motion.schedule, without a list of dips.
+        solution: Solution on the last mesh.
+        timing: Problem with that mesh.
+        demand: Largest demand over its limit, on a grid ten times finer; 1 is at the limit.
     """
 
     schedule: Schedule
@@ -140,7 +142,7 @@ class Fastest:
 
     @property
     def duration(self) -> float:
-        """s."""
+        """Return the duration, s."""
         return self.schedule.duration
 
 
@@ -155,34 +157,35 @@ def plan_minimum_time(
     rounds: int = 6,
     options: dict[str, Any] | None = None,
 ) -> Fastest:
-    """Fastest motion along a path from rest to rest under all limits.
+    """Plan the fastest motion along a path from rest to rest under all limits.
 
-    A motion that keeps them, hence an upper bound of the least time: jerks held over intervals cannot follow a limit
-    exactly, which costs time in proportion to their width (about 0.2 % of the example's with joint limits at 200).
-    The audit of its solution finds the motion feasible, but no optimum, for the time that is lost.
+    The duration is an upper bound of the least time. Jerks held over intervals cannot follow a limit exactly, which
+    costs time in proportion to the interval (about 0.2 % in the example with joint limits and 200 intervals). Because
+    of this loss the audit finds the motion feasible, but not optimal.
 
     Args:
-        path, limits, joints: As of `ocp.motion.schedule.schedule`.
-        guess: A schedule of the same path to start from; planned here if None.
-        intervals: Least number of intervals, beside those at the path's joints and the guess's changes of jerk.
-        rounds: How often intervals in which a limit is passed between the points are cut, at most.
-        options: Of ipopt.
+        path, limits, joints: As for `ocp.motion.schedule.schedule`.
+        guess: Schedule of the same path to start from; planned here if None.
+        intervals: Least number of intervals, besides nodes at the path's joins and the guess's changes of jerk.
+        rounds: Largest number of mesh refinements where a limit is exceeded between the points.
+        options: IPOPT options.
 
     Raises:
-        ProblemError: As minimum_time_problem. SolveError: the solver failed, naming the worst residuals.
+        ProblemError: As `minimum_time_problem`.
+        SolveError: The solver failed; names the worst residuals.
     """
     checked_count("rounds", rounds, 0)
-    own = checked_mapping("options", options)
+    options = checked_mapping("options", options)
     timing = minimum_time_problem(path, limits, joints, guess=guess, intervals=intervals)
     solution: Solution | None = None
     for number in range(rounds + 1):
-        solution = solve(timing.problem, timing.method, guess=solution, options={**IPOPT, **own})
+        solution = solve(timing.problem, timing.method, guess=solution, options={**IPOPT, **options})
         profile = timing.profile(solution)
-        demand = demand_of_pieces(path, limits, joints, profile)
-        parts = _parts(profile, demand)
+        demand = demand_of_intervals(path, limits, joints, profile)
+        parts = _refinement(profile, demand)
         if number == rounds or parts.max() == 1:
             break
-        mesh = tuple(cut(np.array(timing.mesh), parts).tolist())
+        mesh = tuple(subdivide(np.array(timing.mesh), parts).tolist())
         timing = TimingProblem(timing.problem, mesh, timing.units, timing.reference, timing.span)
     assert solution is not None
     return Fastest(Schedule(path, limits, profile, (), joints), solution, timing, float(demand.max()))
@@ -197,26 +200,30 @@ def minimum_time_problem(
     guess: Schedule | None = None,
     intervals: int = 200,
 ) -> TimingProblem:
-    """The problem of `plan_minimum_time`, for any method to solve.
+    """Declare the problem of `plan_minimum_time`, for any method to solve.
 
-    Path constraints "asked speed", "centripetal acceleration", "joint velocity", "joint acceleration" and "joint jerk"
-    (those that are limited), each over its limit; "start at rest" and "end at rest", "start jerk" and "end jerk".
+    The path constraints are "asked speed" (the line speed's limit), "centripetal acceleration", "joint velocity",
+    "joint acceleration" and "joint jerk", each over its limit and only if limited. The boundary constraints are "start
+    at rest" and "end at rest", "start jerk" and "end jerk".
+
+    Args:
+        path, limits, joints, guess, intervals: As for `plan_minimum_time`.
 
     Raises:
-        ProblemError: Joint limits without joints; a joint jerk limit on a path whose curvature jumps; curvature or
-            joints that are not finite; a guess for another path; fewer than 10 intervals.
+        ProblemError: Joint limits are given without joints; the joint jerk is limited on a path whose curvature jumps;
+            curvature or joints are not finite; the guess is for another path; there are fewer than 10 intervals.
     """
     checked_count("intervals", intervals, 10)
     limited = check_line(path, limits, joints)
     if guess is not None:
         checked_instance("guess", guess, Schedule)
     if guess is not None and abs(guess.path.length - path.length) > 1e-9 * path.length:
-        message = f"the guess is for a path of {guess.path.length:g} m, this one has {path.length:g} m"
+        message = f"the guess is for a path of {guess.path.length:g} m, but this path has {path.length:g} m"
         raise ProblemError(message, name="guess", value=guess.path.length, limit=path.length)
-    path_columns(path, limits, limited, path.sample_distances())  # refuses what is not finite
+    path_columns(path, limits, limited, path.sample_distances())  # raises if anything is not finite
     reference = reference_motion(path, limits, limited) if guess is None else guess.profile
     if guess is not None and limited is not None:
-        check_smooth(path, limits, limited)  # refuses what no motion keeps, as a schedule does
+        check_smooth(path, limits, limited)  # raises if no motion satisfies the limits, like a schedule
     whole = reference.duration
     phases = np.diff(reference.t)
     span = (min(phases[0], whole / intervals), whole - min(phases[-1], whole / intervals))
@@ -244,26 +251,27 @@ def _declared(
     units: tuple[float, ...],
     along: Any,
 ) -> Problem:
-    """The problem over a span of the reference's time, in units; `along`: reference speed and path_columns of theta."""
+    """Declare the problem over a span of theta, in units; `along` gives the reference speed and path_columns."""
     problem = Problem("minimum time along a path", symbols=ca.MX)
-    top, most, sharp = units
-    asked = np.asarray(path.by_piece(limits.speed))
+    v_unit, a_unit, j_unit = units
+    speeds = np.asarray(path.by_piece(limits.speed))
 
-    def guessed(kind: str, unit: float) -> Any:
-        return lambda theta: float(getattr(reference.at([span[0] + float(theta)]), kind)[0]) / unit
+    def guess_of(quantity: str, unit: float) -> Any:
+        return lambda theta: float(getattr(reference.at([span[0] + float(theta)]), quantity)[0]) / unit
 
     slowest = 1e-3 * float(reference.at(list(span)).speed.min())
-    fast, steep = float(asked.max()) / top, limits.acceleration / most
-    speed = problem.state("speed", lower=slowest / top, upper=fast, guess=guessed("speed", top))
-    rate = problem.state("acceleration", lower=-steep, upper=steep, guess=guessed("acceleration", most))
-    bend = problem.control("jerk", lower=-limits.jerk / sharp, upper=limits.jerk / sharp, guess=guessed("jerk", sharp))
+    fastest, largest = float(speeds.max()) / v_unit, limits.acceleration / a_unit
+    speed = problem.state("speed", lower=slowest / v_unit, upper=fastest, guess=guess_of("speed", v_unit))
+    rate = problem.state("acceleration", lower=-largest, upper=largest, guess=guess_of("acceleration", a_unit))
+    jerks = limits.jerk / j_unit
+    control = problem.control("jerk", lower=-jerks, upper=jerks, guess=guess_of("jerk", j_unit))
     problem.horizon(span[1] - span[0])
-    v, a, j = top * speed, most * rate, sharp * bend
+    v, a, j = v_unit * speed, a_unit * rate, j_unit * control
     values = along(span[0] + problem.time)
     pace = values[0] / v
-    problem.dynamics(speed, a * pace / top)
-    problem.dynamics(rate, j * pace / most)
-    if asked.min() < asked.max():
+    problem.dynamics(speed, a * pace / v_unit)
+    problem.dynamics(rate, j * pace / a_unit)
+    if speeds.min() < speeds.max():
         problem.path("asked speed", v / values[1], upper=1)
     for name, rows in _demands(limits, joints, values, v, a, j).items():
         problem.path(name, rows, lower=-1, upper=1)
@@ -271,25 +279,25 @@ def _declared(
     first, last = _ends(reference, span)
     starts, stops = ("start", 1.0, first, problem.start), ("end", -1.0, last, problem.end)
     for (where, sign, distance, ends), rest, bound in ((starts, 0.0, span[0]), (stops, reference.duration, span[1])):
-        ends(f"{where} at rest", (sign * a - 2 * v**2 / (3 * distance)) / most, 0, 0)
+        ends(f"{where} at rest", (sign * a - 2 * v**2 / (3 * distance)) / a_unit, 0, 0)
         jerk = sign * a * v / (3 * distance)
-        # the jerk, and with it the joints', at rest and where the problem begins
+        # the jerk of the line, and those of the joints at rest and at the bound of the span
         rows = [jerk / limits.jerk]
         if joints is not None:
             for theta, v_, a_ in ((rest, 0.0, 0.0), (bound, v, a)):
                 rows += [_demands(limits, joints, ca.DM(along(theta)), v_, a_, jerk).get("joint jerk", ca.MX(0, 1))]
         ends(f"{where} jerk", ca.vertcat(*rows), -1, 1)
-    problem.minimize(running=pace, terminal=3 * first / (problem.at_start(speed) * top) + 3 * last / v)
+    problem.minimize(running=pace, terminal=3 * first / (problem.at_start(speed) * v_unit) + 3 * last / v)
     return problem
 
 
 def _demands(limits: LineLimits, joints: JointPath | None, values: Any, v: Any, a: Any, j: Any) -> dict[str, Any]:
-    """Everything limited along the path over its limit, by name; `values`: reference speed, then path_columns."""
-    found: dict[str, Any] = {}
+    """Return the limited quantities over their limits, by name; `values` are the reference speed and path_columns."""
+    demands: dict[str, Any] = {}
     if np.isfinite(limits.centripetal):
-        found["centripetal acceleration"] = v**2 * values[2] / limits.centripetal
+        demands["centripetal acceleration"] = v**2 * values[2] / limits.centripetal
     if joints is None:
-        return found
+        return demands
     number = len(joints.names)
     q1, q2, q3 = (values[3 + k * number : 3 + (k + 1) * number] for k in range(3))
     kinds = {
@@ -300,22 +308,24 @@ def _demands(limits: LineLimits, joints: JointPath | None, values: Any, v: Any, 
     for (name, value), bound in zip(kinds.items(), limits.of_joints(number), strict=True):
         rows = np.flatnonzero(np.isfinite(bound))
         if rows.size:
-            found[name] = value[rows.tolist()] / ca.DM(bound[rows])
-    return found
+            demands[name] = value[rows.tolist()] / ca.DM(bound[rows])
+    return demands
 
 
-def _parts(profile: SpeedProfile, demand: Array) -> NDArray[np.intp]:
-    """Into how many each interval of the problem is to be cut; the error falls with the square of their width."""
+def _refinement(profile: SpeedProfile, demand: Array) -> NDArray[np.intp]:
+    """Return the parts into which each interval is split; the error falls with the square of the interval."""
     v, a, j, t = profile.speed, profile.acceleration, profile.jerk, np.diff(profile.t)
-    way, speed, _ = integrate_jerk(v[:-1], a[:-1], j, t)
-    covered, gained = way / np.diff(profile.distance) - 1, (speed - v[1:]) / v.max()
-    error = np.maximum((demand - 1) / CUTS.demand, np.maximum(np.abs(covered), np.abs(gained)) / CUTS.defect)[1:-1]
+    distance, speed, _ = integrate_jerk(v[:-1], a[:-1], j, t)
+    distance_error, speed_error = distance / np.diff(profile.distance) - 1, (speed - v[1:]) / v.max()
+    error = np.maximum(
+        (demand - 1) / REFINEMENT.demand, np.maximum(np.abs(distance_error), np.abs(speed_error)) / REFINEMENT.defect
+    )[1:-1]
     parts = np.ceil(np.sqrt(np.maximum(error, 1.0)) * 1.2).astype(np.intp)
-    return np.where(error > 1, np.minimum(parts, CUTS.parts), 1)
+    return np.where(error > 1, np.minimum(parts, REFINEMENT.parts), 1)
 
 
 def _ends(reference: SpeedProfile, span: tuple[float, float]) -> tuple[float, float]:
-    """Distances (m) before and after a span of the reference's time."""
-    # the reference's jerk is constant there; from the cube, which keeps its digits near the end
+    """Return the distances before and after a span of the reference's time, m."""
+    # the jerk is constant there; the cube is accurate near the end, a difference of distances is not
     left = reference.duration - span[1]
     return float(reference.jerk[0] * span[0] ** 3 / 6), float(reference.jerk[-1] * left**3 / 6)

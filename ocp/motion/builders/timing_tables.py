@@ -1,8 +1,8 @@
-"""What the minimum time along a path is declared with: a reference motion, the mesh over it, and tables of the path.
+"""Reference motion, mesh and path tables of the minimum-time problem in builders.timing.
 
-The time of the reference motion is the path parameter of builders.timing. What the path asks of speed becomes a
-smooth casadi function of it, polynomials between the path's corners: everything is sampled between the places where a
-derivative of the path jumps, never across one, and cells are halved until their polynomials agree with the path to
+The time of the reference motion is the path parameter of builders.timing. The quantities of the path that limit the
+speed become smooth casadi functions of it, polynomials between the joins of the path. Samples lie between the places
+where a derivative of the path jumps, and cells are halved until their polynomials agree with the path to
 `TABLES.accuracy`.
 """
 
@@ -32,33 +32,33 @@ from ocp.motion.schedule.profile import Array, LineMotion, SpeedProfile, segment
 
 __all__ = [
     "Columns",
-    "asked_speed",
-    "cut",
-    "demand_of_pieces",
+    "demand_of_intervals",
     "distinct",
     "largest_demand",
     "path_columns",
     "reference_mesh",
     "reference_motion",
+    "speed_limit",
+    "subdivide",
     "table",
 ]
 
 Columns = Callable[[Array], Array]
-"""Times (M,) to values (M, m)."""
+"""Function of times (M,) that returns values (M, m)."""
 
 
 @dataclass(frozen=True)
 class TableSettings:
-    """How exact the tables of a path are, and where its mesh has nodes.
+    """Settings of the path tables and of the mesh.
 
     Attributes:
-        degree: Of the polynomials of a table.
+        degree: Degree of the polynomials of a table.
         accuracy: Largest error of a column, relative to its largest value.
-        smallest_cell: Cells below this share of the whole are not halved further.
-        halvings: Of a cell at most.
-        points: Of a piece at which demands are looked at: ten times those of the collocation and the node.
-        beside_jump: How far before and after a jump of the path's derivatives nodes stand, over the whole time.
-        one_node: Nodes closer than this over the whole time count as one.
+        smallest_cell: Width of a cell that is not halved further, relative to the whole.
+        halvings: Largest number of halvings of a cell.
+        points: Points of an interval at which demands are evaluated, ten times those of the collocation and the node.
+        beside_jump: Distance of nodes from a jump of the path's derivatives, relative to the whole time.
+        same_node: Distance of nodes that count as one, relative to the whole time.
     """
 
     degree: int = 7
@@ -67,24 +67,24 @@ class TableSettings:
     halvings: int = 40
     points: int = 40
     beside_jump: float = 1e-6
-    one_node: float = 1e-7
+    same_node: float = 1e-7
 
 
 TABLES = TableSettings()
 
 
 def table(columns: Columns, breaks: Array) -> Any:
-    """casadi Function time -> values (m, 1), polynomials of degree 7 on cells that have all `breaks` among their ends.
+    """Return a casadi Function time -> values (m, 1), with polynomials of degree 7 on cells between `breaks`.
 
     At a break its value is that of the cell that begins there.
     """
     nodes = (
         1 - np.cos(np.pi * (np.arange(TABLES.degree + 1) + 0.5) / (TABLES.degree + 1))
-    ) / 2  # inside: no break is touched
+    ) / 2  # inside the cell, off the breaks
     between = (nodes[1:] + nodes[:-1]) / 2
     fit = np.linalg.inv(_bernstein(nodes))
     start, width = breaks[:-1], np.diff(breaks)
-    done: list[tuple[Array, Array]] = []
+    finished: list[tuple[Array, Array]] = []
     scale: Array | None = None
     for number in range(TABLES.halvings):
         if not start.size:
@@ -99,54 +99,54 @@ def table(columns: Columns, breaks: Array) -> Any:
             width < TABLES.smallest_cell * (breaks[-1] - breaks[0])
         )
         fine |= number == TABLES.halvings - 1
-        done.append((start[fine], coefficients[fine]))
+        finished.append((start[fine], coefficients[fine]))
         half = width[~fine] / 2
         start = np.stack([start[~fine], start[~fine] + half], axis=1).ravel()
         width = np.repeat(half, 2)
-    starts, pieces = (np.concatenate(parts) for parts in zip(*done, strict=True))
+    starts, cells = (np.concatenate(parts) for parts in zip(*finished, strict=True))
     order = np.argsort(starts)
-    pieces = pieces[order]
-    # a constant cell behind the end, which would belong to none
-    pieces = np.concatenate([pieces, np.repeat(pieces[-1:, -1:], TABLES.degree + 1, axis=1)])
+    cells = cells[order]
+    # a constant cell behind the end, which belongs to no other cell
+    cells = np.concatenate([cells, np.repeat(cells[-1:, -1:], TABLES.degree + 1, axis=1)])
     ends = np.concatenate([starts[order], [breaks[-1], 2 * breaks[-1] - breaks[0]]])
     knots = np.repeat(ends, TABLES.degree + 1).tolist()
-    flat = pieces.reshape(-1, pieces.shape[2])
+    flat = cells.reshape(-1, cells.shape[2])
     time = ca.MX.sym("time")
     value = ca.bspline(time, ca.DM(flat.ravel()), [knots], [TABLES.degree], flat.shape[1], {"lookup_mode": ["binary"]})
     return ca.Function("along", [time], [value])
 
 
-def asked_speed(path: PathLike, limits: LineLimits, s: Array) -> Array:
-    """Asked line speed at distances (M,)."""
+def speed_limit(path: PathLike, limits: LineLimits, s: Array) -> Array:
+    """Return the limit of the line speed at distances (M,). Shape (M,), m/s."""
     return np.asarray(path.by_piece(limits.speed)[segment_index(path.bounds, s)])
 
 
 def path_columns(path: PathLike, limits: LineLimits, joints: JointPath | None, s: Array) -> Array:
-    """Asked speed, curvature, and three derivatives of the joints by the distance, at distances (M,). Shape (M, m).
+    """Return speed limit, curvature, and three derivatives of the joints by the distance, at distances (M,).
 
-    Zero curvature where centripetal acceleration is not limited; no joints if None.
+    The curvature is zero if the centripetal acceleration is not limited. Shape (M, m).
 
     Raises:
-        ProblemError: A curvature or a joint that is not finite, joints of a wrong shape.
+        ProblemError: A curvature or a joint is not finite, or the joints have a wrong shape.
     """
     limited = np.isfinite(limits.centripetal)
-    found = [asked_speed(path, limits, s), curvature_along(path, s) if limited else np.zeros(len(s))]
+    columns = [speed_limit(path, limits, s), curvature_along(path, s) if limited else np.zeros(len(s))]
     if joints is None:
-        return np.column_stack(found)
+        return np.column_stack(columns)
     rates = rates_along(joints, s)
-    return np.column_stack([*found, rates.first, rates.second, rates.third])
+    return np.column_stack([*columns, rates.first, rates.second, rates.third])
 
 
 def largest_demand(path: PathLike, limits: LineLimits, joints: JointPath | None, motion: LineMotion) -> Array:
-    """The largest of speed, acceleration, jerk, centripetal acceleration and joint demands over its limit. Shape (M,).
+    """Return the largest ratio of speed, acceleration, jerk, centripetal and joint demands to their limits. Shape (M,).
 
-    Values of the path's derivatives where they jump are those after the jump.
+    Where the path's derivatives jump, the values after the jump count.
     """
     s = motion.distance
     rates = joints.at(s) if joints is not None and limits.joints is not None else None
     curvature = np.asarray(path.curvature(s)) if np.isfinite(limits.centripetal) else np.zeros(len(s))
     steady, power = line_demands(limits, curvature, rates)
-    rows = [motion.speed / asked_speed(path, limits, s), steady[0] * motion.speed**2]
+    rows = [motion.speed / speed_limit(path, limits, s), steady[0] * motion.speed**2]
     rows += [np.abs(motion.acceleration) / limits.acceleration, np.abs(motion.jerk) / limits.jerk]
     if rates is not None:
         velocities = steady[1:][power[1:] == 1]
@@ -155,10 +155,9 @@ def largest_demand(path: PathLike, limits: LineLimits, joints: JointPath | None,
 
 
 def line_demands(limits: LineLimits, curvature: Array | None, rates: JointRates | None) -> tuple[Array, Array]:
-    """Demand over limit at unit, steady line speed, and the power of the speed it grows with.
+    """Return the demands over their limits at unit line speed, and the powers p of the speed: v^p demand <= 1.
 
-    Of centripetal acceleration, then of velocity, acceleration and jerk of each joint: v^p demand <= 1. Shape (C, M)
-    and (C,).
+    The rows are the centripetal acceleration, then velocity, acceleration and jerk of each joint. Shapes (C, M), (C,).
     """
     count = 0 if rates is None else len(rates.first)
     rows = [np.zeros((1, count)) if curvature is None else curvature[None] / limits.centripetal]
@@ -173,42 +172,42 @@ def line_demands(limits: LineLimits, curvature: Array | None, rates: JointRates 
 
 
 def joint_demands(limits: LineLimits, rates: JointRates, motion: LineMotion) -> Array:
-    """Joint acceleration and jerk over their limits during a motion: q'' v^2 + q' a, q''' v^3 + 3 q'' v a + q' j.
+    """Return joint acceleration and jerk over their limits: q'' v^2 + q' a and q''' v^3 + 3 q'' v a + q' j.
 
     Shape (2 n, M).
     """
     v, a, j = (value[:, None] for value in (motion.speed, motion.acceleration, motion.jerk))
-    _, most, jerks = limits.of_joints(rates.first.shape[1])
-    accelerations = (rates.second * v**2 + rates.first * a) / most
+    _, largest, jerks = limits.of_joints(rates.first.shape[1])
+    accelerations = (rates.second * v**2 + rates.first * a) / largest
     jerk = (rates.third * v**3 + 3 * rates.second * v * a + rates.first * j) / jerks
     return np.asarray(np.abs(np.concatenate([accelerations.T, jerk.T])))
 
 
-def demand_of_pieces(path: PathLike, limits: LineLimits, joints: JointPath | None, profile: SpeedProfile) -> Array:
-    """Largest demand inside each piece of a profile, from either side where the path jumps. Shape (K,)."""
+def demand_of_intervals(path: PathLike, limits: LineLimits, joints: JointPath | None, profile: SpeedProfile) -> Array:
+    """Return the largest demand inside each interval of a profile, from either side of a jump. Shape (K,)."""
     inside = (np.arange(TABLES.points) + 0.5) / TABLES.points
     inside[0], inside[-1] = 1e-9, 1 - 1e-9
     motion = profile.at((profile.t[:-1, None] + np.diff(profile.t)[:, None] * inside).ravel())
     distance = np.clip(motion.distance, 0.0, path.length)
-    found = largest_demand(path, limits, joints, motion._replace(distance=distance))
-    return np.asarray(found.reshape(-1, TABLES.points).max(axis=1))
+    demand = largest_demand(path, limits, joints, motion._replace(distance=distance))
+    return np.asarray(demand.reshape(-1, TABLES.points).max(axis=1))
 
 
 def _bernstein(x: Array) -> Array:
-    """Values of the Bernstein polynomials of the degree of a table at x. Shape (len(x), degree + 1)."""
+    """Return the Bernstein polynomials of a table's degree at x. Shape (len(x), degree + 1)."""
     return np.stack(
         [comb(TABLES.degree, i) * x**i * (1 - x) ** (TABLES.degree - i) for i in range(TABLES.degree + 1)], axis=1
     )
 
 
 def reference_motion(path: PathLike, limits: LineLimits, joints: JointPath | None) -> SpeedProfile:
-    """A schedule's motion; where none is found, an even slower one that surely keeps all limits."""
+    """Return a schedule's motion; if there is none, a slower one that surely satisfies all limits."""
     try:
         return schedule(path, limits, joints=joints).profile
     except ProblemError:
-        check_smooth(path, limits, joints)  # what no motion keeps is refused here
+        check_smooth(path, limits, joints)  # raises if no motion satisfies the limits
     quick = schedule(path, LineLimits(limits.speed, limits.acceleration, limits.jerk)).profile
-    # slower by a factor in time: velocities shrink with it, accelerations with its square, jerks with its cube
+    # slowed down by a factor: velocities shrink with it, accelerations with its square, jerks with its cube
     fractions = np.linspace(0, 1, 2001)
     motion = quick.at(quick.duration * fractions)
     rates = None if joints is None else joints.at(motion.distance)
@@ -222,41 +221,42 @@ def reference_motion(path: PathLike, limits: LineLimits, joints: JointPath | Non
     return SpeedProfile(quick.t * c, quick.distance, quick.speed / c, quick.acceleration / c**2, quick.jerk / c**3)
 
 
-def distinct(values: Array, apart: float) -> Array:
-    """Sorted, without those that follow another one closer than that; the last one stays."""
-    kept = np.sort(values)
-    kept = kept[np.concatenate([[True], np.diff(kept) > apart])]
-    kept[-1] = values.max()
-    return np.asarray(kept)
+def distinct(values: Array, tolerance: float) -> Array:
+    """Return sorted values without those closer than a tolerance to the one before; the last one stays."""
+    ordered = np.sort(values)
+    ordered = ordered[np.concatenate([[True], np.diff(ordered) > tolerance])]
+    ordered[-1] = values.max()
+    return np.asarray(ordered)
 
 
 def reference_mesh(reference: SpeedProfile, joins: Array, span: tuple[float, float], intervals: int) -> Array:
-    """Fractions of a span of the reference's time, at least `intervals` over all of it, none longer than the others.
+    """Return nodes as fractions of a span of the reference's time, with at least `intervals` over the whole time.
 
     Args:
-        reference: Changes of its jerk become nodes.
-        joins: Its times where the path's derivatives jump: nodes stand on both sides. Shape (B,), s.
-        span: s.
+        reference: Reference motion; the changes of its jerk become nodes.
+        joins: Times at which the path's derivatives jump; nodes are placed on both sides. Shape (B,), s.
+        span: Span of the problem, s.
+        intervals: Least number of intervals over the whole time.
     """
     whole, (begin, end) = reference.duration, span
-    just = TABLES.beside_jump * whole
-    joins = joins[(joins > begin + 2 * just) & (joins < end - 2 * just)]
-    sides = np.concatenate([joins - just, joins + just])
+    beside = TABLES.beside_jump * whole
+    joins = joins[(joins > begin + 2 * beside) & (joins < end - 2 * beside)]
+    sides = np.concatenate([joins - beside, joins + beside])
     changes = reference.t[
-        (reference.t > begin + TABLES.one_node * whole) & (reference.t < end - TABLES.one_node * whole)
+        (reference.t > begin + TABLES.same_node * whole) & (reference.t < end - TABLES.same_node * whole)
     ]
     if sides.size:
-        changes = changes[np.abs(changes[:, None] - sides).min(axis=1) > 2 * just]
-    nodes = distinct(np.concatenate([[begin, end], sides, changes]), TABLES.one_node * whole)
+        changes = changes[np.abs(changes[:, None] - sides).min(axis=1) > 2 * beside]
+    nodes = distinct(np.concatenate([[begin, end], sides, changes]), TABLES.same_node * whole)
     parts = np.maximum(np.ceil(np.diff(nodes) / (whole / intervals) - 1e-9), 1).astype(int)
-    mesh = cut(nodes, parts)
+    mesh = subdivide(nodes, parts)
     fractions = (mesh - begin) / (end - begin)
     fractions[0], fractions[-1] = 0.0, 1.0
     return np.asarray(fractions)
 
 
-def cut(nodes: Array, parts: NDArray[np.intp]) -> Array:
-    """Nodes (N + 1,) with each interval cut into equal parts (N,)."""
+def subdivide(nodes: Array, parts: NDArray[np.intp]) -> Array:
+    """Return nodes (N + 1,) with each interval divided into equal parts (N,)."""
     first = np.cumsum(parts) - parts
     step = np.arange(parts.sum()) - np.repeat(first, parts)
     return np.append(np.repeat(nodes[:-1], parts) + np.repeat(np.diff(nodes) / parts, parts) * step, nodes[-1])

@@ -41,8 +41,8 @@ from models.spatial import expression
 from ocp.errors import ProblemError
 from ocp.motion.builders.actuator_limits import Effort, JointFriction
 from ocp.motion.builders.clearance import ClearanceConstraints
-from ocp.motion.builders.dynamics import dynamics_problem
-from ocp.motion.builders.standing.problem import FreeTime, Weights, standing_problem
+from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem
+from ocp.motion.builders.standing.problem import FreeTime, StandingSetup, Weights, standing_problem
 from ocp.motion.builders.tool_motion import ToolMotion, stretches_of, tool_motion_problem
 from ocp.motion.search.configurations import PlanRequest
 from ocp.motion.tasks.limits import Limits
@@ -58,8 +58,8 @@ __all__ = ["MotionRequest", "declared_motion", "request_of", "restored_request",
 
 SHAPES = (Box, Capsule, Cylinder, HalfSpace, Mesh, Sphere)
 PARTS = (Robot, Link, Joint, Mimic, CollisionShape, VisualShape, Support)
-STANDING = (Weights, FreeTime, InFoot, Pinned, IndexAtLeast)
-ARGUMENTS = (TipTask, Limits, ClearanceConstraints, Effort, JointFriction, *STANDING)
+STANDING = (Weights, FreeTime, InFoot, Pinned, IndexAtLeast, StandingSetup)
+ARGUMENTS = (TipTask, Limits, ClearanceConstraints, Effort, JointFriction, DynamicsSetup, *STANDING)
 MACHINES = (FixedBase, FreeFloating, Standing)
 KINDS = {kind.__name__: kind for kind in (*MACHINES, *PARTS, *SHAPES, *ARGUMENTS, MovingObstacle, Body)}
 SYMBOLS = {"SX": ca.SX, "MX": ca.MX}
@@ -127,8 +127,8 @@ def declared_motion(
         "cyclic": request.cyclic,
         "weights": request.weights,
         "time_cost": request.time_cost,
-        "driven": limits is not None,
-        "held": request.fixed_joints if limits is None else None,
+        "actuated": limits is not None,
+        "fixed_joints": request.fixed_joints if limits is None else None,
         "clearance_constraints": constraints,
     }
     bounds = (limits or request.limits).bounds(request.machine)

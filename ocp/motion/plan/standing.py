@@ -12,8 +12,8 @@ from models import Standing
 from models.arrays import Array
 from ocp.errors import ProblemError, SolveError, checked_flag, checked_instance
 from ocp.motion.builders.clearance import ClearanceConstraints
-from ocp.motion.builders.standing.plan import Asked, plan_standing
-from ocp.motion.builders.standing.problem import Weights
+from ocp.motion.builders.standing.plan import plan_standing
+from ocp.motion.builders.standing.problem import StandingSetup, Weights
 from ocp.motion.local.inverse_kinematics import inverse_kinematics
 from ocp.motion.plan.candidate import Candidate, Reason, Rejection, Stage
 from ocp.motion.plan.candidate_queue import CandidateQueue, Solver
@@ -60,7 +60,7 @@ def plan_to_stand(
     """
     checked_flag("cyclic", cyclic)
     if cyclic:
-        words = "a standing motion cannot be cyclic; give the joints at the end with plan_standing(..., end_joints=...)"
+        words = "a standing motion cannot be cyclic; give plan_standing the joints at the end, StandingSetup(end=...)"
         raise ProblemError(words, name="cyclic", value=cyclic)
     if weights is not None:
         checked_instance("weights", weights, Weights)
@@ -71,10 +71,14 @@ def plan_to_stand(
             words = f"task {number} lasts from {task.begin:g} to {task.end:g} s, not for the whole standing motion"
             raise ProblemError(words, name=f"task {number}", value=(task.begin, task.end), limit=(0.0, duration))
     equations = bind(machine, all_tasks)
-    options: Asked = {"weights": weights, "limits": limits, "symbols": ca.SX if _takes_scalars(equations) else ca.MX}
-    options["start"], options["end"] = _rest(equations, 0.0), _rest(equations, duration)
-    solver = _StandingSolver(machine, all_tasks, duration, clearance_constraints, options, start is not None)
-    queue = CandidateQueue(solver, PlannerSettings())
+    setup = StandingSetup(
+        start_velocity=_rest(equations, 0.0),
+        end_velocity=_rest(equations, duration),
+        clearance_constraints=clearance_constraints,
+        symbols=ca.SX if _takes_scalars(equations) else ca.MX,
+    )
+    options: dict[str, Any] = {"weights": weights, "limits": limits, "setup": setup}
+    queue = CandidateQueue(_StandingSolver(machine, all_tasks, duration, options, start is not None), PlannerSettings())
     seeds = [Candidate(joints) for joints in _start_configurations(machine, all_tasks, start, limits, seed)]
     for batch in [[candidate] for candidate in seeds] if search == "start" else [seeds]:
         queue.run(batch)
@@ -90,8 +94,7 @@ class _StandingSolver(Solver):
     machine: Standing
     tasks: list[TipTask]
     duration: float
-    clearance_constraints: ClearanceConstraints | None
-    options: Asked
+    options: dict[str, Any]
     start_given: bool
 
     def advance(self, candidate: Candidate) -> list[Candidate]:
@@ -101,15 +104,7 @@ class _StandingSolver(Solver):
             ProblemError, SolveError: Errors of a given start.
         """
         try:
-            start = candidate.start
-            solution = plan_standing(
-                self.machine,
-                self.tasks,
-                start,
-                self.duration,
-                clearance_constraints=self.clearance_constraints,
-                **self.options,
-            )
+            solution = plan_standing(self.machine, self.tasks, self.duration, start=candidate.start, **self.options)
         except (ProblemError, SolveError) as error:
             if self.start_given or isinstance(error.__cause__, KeyboardInterrupt):
                 raise

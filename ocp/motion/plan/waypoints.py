@@ -287,13 +287,13 @@ class _WaypointPlanner:
         rates = np.abs(np.diff(joints, axis=0))
         rates[list(breaks)] = 0.0
 
-        def path_tracks(fractions: Array) -> Array:
+        def joints_at(fractions: Array) -> Array:
             places = fractions * last
             waiting = np.isin(np.floor(places), breaks)  # a break lasts until the next waypoint
             places = np.where(waiting, np.floor(places), places)
             return np.stack([np.interp(places, numbers, column) for column in joints.T], axis=1)
 
-        return clearance_of(self.scene, path_tracks, numbers / last, last, rates, np.zeros_like(rates), False)
+        return clearance_of(self.scene, joints_at, numbers / last, last, rates, np.zeros_like(rates), False)
 
     # ---- searched waypoints ------------------------------------------------------------------------------------------
 

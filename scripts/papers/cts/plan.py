@@ -14,7 +14,7 @@ from models.arrays import Array
 from models.cts.clearance import CollisionScene, clearances
 from models.cts.rig import INCH, inverse
 from models.cts.roll import index_harmonics
-from ocp import Collocation, Problem, roll_problem, solve
+from ocp import Collocation, Problem, RollObstacles, RollSettings, roll_problem, solve
 from scripts.drawing import ASSUMING, COLORS, DASHES, sheet
 
 HORIZON = 10.0  # s, the paper's sweep
@@ -69,13 +69,14 @@ def sweep_problem(rig: Rig, tunnel: Tunnel) -> Problem:
         tunnel,
         targets,
         HORIZON,
-        rate_weight=RATE_WEIGHT,
-        acceleration_weight=ACCELERATION_WEIGHT,
-        rate_limit=RATE_LIMIT,
-        acceleration_limit=ACCELERATION_LIMIT,
-        scene=obstacle(),
-        clearance=CLEARANCE,
-        symbols=ca.SX,
+        settings=RollSettings(
+            rate_weight=RATE_WEIGHT,
+            acceleration_weight=ACCELERATION_WEIGHT,
+            rate_limit=RATE_LIMIT,
+            acceleration_limit=ACCELERATION_LIMIT,
+            symbols=ca.SX,
+        ),
+        obstacles=RollObstacles(obstacle(), clearance=CLEARANCE),
     )
 
 

@@ -35,7 +35,7 @@ def problem(horizon: float = HORIZON, *, machine: Machine | None = None, guess_d
         guess_damping: 0.001 to 0.02 lead to J = 1.7351, 0.03 to J = 1.7467.
     """
     machine = machine or paper_example()
-    found = minimum_velocity_problem(machine, TASK, START_JOINTS, horizon)
+    found = minimum_velocity_problem(machine, TASK, horizon, start=START_JOINTS)
     local = damped_motion(machine, horizon, guess_damping)
     _begin_from(found, local, {"rates": local.joint_rates})
     return found

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from models import STANDING_STARTS, Standing, standing_example
 from models.machines.standing import External, StandingMotion, tip_spring
 from ocp import TipTask, resolve_accelerations
-from ocp.motion.builders.standing import motion_cost
+from ocp.motion.builders.standing.problem import motion_cost
 from ocp.motion.local.accelerations import Layer, Stabiliser
 from scripts.papers.run import Row
 from scripts.papers.standing.printed import printed_law

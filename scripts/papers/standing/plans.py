@@ -12,18 +12,10 @@ import numpy as np
 from models import STANDING_STARTS
 from models.machines.standing import StandingMotion, standing_motion
 from ocp import Audit, Collocation, MultipleShooting, Problem, Solution, TipTask, solve, tighten
-from ocp.motion.builders.standing import (
-    Anywhere,
-    FreeTime,
-    IndexAtLeast,
-    InFoot,
-    Limits,
-    Pinned,
-    Weights,
-    ZmpRule,
-    standing_problem,
-)
+from ocp.motion.builders.standing.problem import FreeTime, StandingSetup, Weights, standing_problem
 from ocp.motion.tasks.equations import task_errors
+from ocp.motion.tasks.limits import Limits
+from ocp.motion.tasks.zmp_rules import Anywhere, IndexAtLeast, InFoot, Pinned, ZmpRule
 from scripts.papers.run import Row, progress
 from scripts.papers.standing.cases import HORIZON, ROWS, Array, led, machine, spring, start_tip, table_task
 
@@ -170,13 +162,13 @@ def plan_problem(request: Request) -> Problem:
 
 @cache  # the same for every mesh
 def _problem(task: Task, rule: ZmpRule, tip_level: Literal["position", "acceleration"]) -> Problem:
-    settings: dict[str, Any] = {"zmp": rule, "tip_level": tip_level}
+    start, tips = STANDING_STARTS[2 if task == "table2" else 1], task_of(task)
     if task == "minimum_time":
-        settings |= {"limits": LIFT_LIMITS, "weights": LIFT_WEIGHTS, "along": "parameter"}
-        return standing_problem(machine(), task_of(task), STANDING_STARTS[1], FreeTime(0.2, 3.0, 1.0), **settings)
-    table = 1 if task == "table1" else 2
-    settings |= {"limits": LIMITS, "external": spring() if table == 2 else None}
-    return standing_problem(machine(), task_of(task), STANDING_STARTS[table], HORIZON, **settings)
+        setup = StandingSetup(tip_level=tip_level, along="parameter")
+        options: dict[str, Any] = {"zmp": rule, "limits": LIFT_LIMITS, "weights": LIFT_WEIGHTS, "setup": setup}
+        return standing_problem(machine(), tips, FreeTime(0.2, 3.0, 1.0), start=start, **options)
+    setup = StandingSetup(tip_level=tip_level, external=spring() if task == "table2" else None)
+    return standing_problem(machine(), tips, HORIZON, start=start, zmp=rule, limits=LIMITS, setup=setup)
 
 
 def method(transcription: Transcription, intervals: int) -> Any:

@@ -100,8 +100,8 @@ def test_what_has_no_joints_is_asked_for_none() -> None:
     task = TipTask(position=(0.5, 0.0, 0.1))
     for ask in (
         lambda: inverse_kinematics(machine, task),
-        lambda: minimum_velocity_problem(machine, tasks=task, start_joints=[], horizon=1.0),
-        lambda: dynamics_problem(machine, [], 1.0),
+        lambda: minimum_velocity_problem(machine, tasks=task, start=[], horizon=1.0),
+        lambda: dynamics_problem(machine, (), 1.0, start=[]),
     ):
         with pytest.raises(ProblemError, match="joint") as caught:
             ask()

@@ -153,7 +153,7 @@ def plans(machines: dict[str, Machine]) -> dict[str, Plan]:
 
 
 def planned(machine: Machine, **more: Any) -> Plan:
-    problem = minimum_velocity_problem(machine, TipTask(rows=(3, 4), velocity=(0.1, -0.1)), START, 1.5, **more)
+    problem = minimum_velocity_problem(machine, TipTask(rows=(3, 4), velocity=(0.1, -0.1)), 1.5, start=START, **more)
     solution = solve(problem, Collocation(intervals=6, degree=3))
     return Plan(machine, solution, (Part(0.0, 1.5, ""),))
 
@@ -364,8 +364,8 @@ def test_the_nearest_bodies_are_those_of_the_plan_at_every_time(tmp_path: Path) 
     problem = minimum_velocity_problem(
         machine,
         TipTask(rows=(3, 4, 5), velocity=(0.0, 0.1, 0.0)),
-        start,
         1.0,
+        start=start,
         clearance_constraints=clearance_constraints,
     )
     plan = Plan(machine, solve(problem, Collocation(intervals=6, degree=3)), (Part(0.0, 1.0, ""),))
@@ -402,8 +402,8 @@ def test_obstacles_that_move_are_shown_where_they_are_at_every_time_and_half_spa
     problem = minimum_velocity_problem(
         machine,
         TipTask(rows=(3, 4, 5), velocity=(0.0, 0.1, 0.0)),
-        start,
         1.0,
+        start=start,
         clearance_constraints=clearance_constraints,
     )
     plan = Plan(machine, solve(problem, Collocation(intervals=6, degree=3)), (Part(0.0, 1.0, ""),))

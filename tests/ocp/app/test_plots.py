@@ -174,7 +174,7 @@ def test_a_solution_without_its_problem_is_drawn_without_bounds_and_beside_anoth
 
 
 def test_a_solution_is_compared_with_the_pseudo_inverse_in_what_both_have() -> None:
-    problem = minimum_velocity_problem(arm(), tasks=TASK, start_joints=START, horizon=1.0)
+    problem = minimum_velocity_problem(arm(), tasks=TASK, start=START, horizon=1.0)
     solution = solve(problem, Collocation(intervals=8, degree=3))
     figure = solution.plot(local())
     assert f"that of the other {local().cost[-1]:.6g}" in figure.get_suptitle()

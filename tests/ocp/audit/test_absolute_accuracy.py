@@ -36,7 +36,7 @@ def along(length: float, tolerance: tuple[float, float] | None = None) -> Soluti
     speed = path.length / SECONDS
     told: dict[str, Any] = {} if tolerance is None else {"tolerance": tolerance}
     task = TipTask.along(path, speed, gain=0.0, **told)
-    problem = minimum_velocity_problem(gantry(length), tasks=task, start_joints=np.zeros(4), horizon=task.duration)
+    problem = minimum_velocity_problem(gantry(length), tasks=task, start=np.zeros(4), horizon=task.duration)
     return solve(problem, Collocation(12, 4).with_nodes_at(np.asarray(task.breaks) / task.duration))
 
 

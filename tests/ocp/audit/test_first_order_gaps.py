@@ -212,7 +212,7 @@ def test_the_pseudo_inverse_is_no_optimum_of_the_whole_motion(size: float, motio
     local = resolve(machine, task, start, 2.0)
     assert local.stopped is None
     for bound in (None, 99.0):
-        problem = minimum_velocity_problem(machine, task, start, 2.0)
+        problem = minimum_velocity_problem(machine, task, 2.0, start=start)
         if bound:  # never active
             problem.path("far", problem.declared.states["joints"].symbol[0], -bound, bound)
         optimum = solve(problem, Collocation(20))

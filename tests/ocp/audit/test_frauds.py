@@ -44,7 +44,7 @@ def panda() -> Solution:
     robot = Robot.from_urdf(urdf, tip="panda_hand_tcp", lock={"panda_finger_joint1": 0.02})
     start = [0.0, -0.6, 0.1, -2.2, 0.2, 1.7, 0.7]
     task = TipTask(rows=(3, 4, 5), velocity=[0.1, 0.12, -0.06])
-    return solve(minimum_velocity_problem(FixedBase(robot), task, start, 2.0), Collocation(8, 4))
+    return solve(minimum_velocity_problem(FixedBase(robot), task, 2.0, start=start), Collocation(8, 4))
 
 
 def bounded() -> Solution:

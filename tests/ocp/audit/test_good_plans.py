@@ -197,7 +197,7 @@ def test_pendulums_of_any_length_pass(method: str, length: float) -> None:
 def test_arms_of_any_size_pass(size: float) -> None:
     machine = arm(size)
     task = replace(circle(machine, size / 5, 2.0), tolerance=(2e-4 * size, 1e-3))
-    problem = minimum_velocity_problem(machine, tasks=task, start_joints=START, horizon=2.0)
+    problem = minimum_velocity_problem(machine, tasks=task, start=START, horizon=2.0)
     holds(solve(problem, Collocation(20)).audit())
 
 
@@ -339,7 +339,7 @@ def test_a_swing_up_with_little_torque_is_found(method: str) -> None:
 
 def test_a_refined_plan_says_that_it_is_reached_only_where_its_audit_passes() -> None:
     machine = arm()
-    problem = minimum_velocity_problem(machine, tasks=circle(machine, 0.4, 2.0), start_joints=START, horizon=2.0)
+    problem = minimum_velocity_problem(machine, tasks=circle(machine, 0.4, 2.0), start=START, horizon=2.0)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         for method in (Collocation(4), MultipleShooting(8), Collocation(6, 2, control="held")):

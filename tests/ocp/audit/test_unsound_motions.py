@@ -105,7 +105,7 @@ def circle(machine: FixedBase, radius: float, period: float) -> TipTask:
 def test_one_lap_does_not_pass_for_two() -> None:
     machine = arm()
     one, two = (
-        minimum_velocity_problem(machine, tasks=circle(machine, 0.2, 2.0), start_joints=START, horizon=time)
+        minimum_velocity_problem(machine, tasks=circle(machine, 0.2, 2.0), start=START, horizon=time)
         for time in (2.0, 4.0)
     )
     plan = solve(one, Collocation(20))
@@ -189,7 +189,7 @@ def test_an_arm_that_never_moves_does_no_task_however_small_it_is(size: float) -
     """Links of a size draw a circle of a fifth of it."""
     machine = arm(size)
     task = replace(circle(machine, size / 5, 2.0), tolerance=(2e-4 * size, 1e-3))
-    problem = minimum_velocity_problem(machine, tasks=task, start_joints=START, horizon=2.0)
+    problem = minimum_velocity_problem(machine, tasks=task, start=START, horizon=2.0)
     holds(solve(problem, Collocation(20)).audit())
     still = {"joints": START.tolist()}
     does_not_do_what_is_asked(drawn(problem, still, {"rates": 0 * START}, {"joints": 0 * START}, 2.0).audit())
@@ -203,9 +203,9 @@ def test_a_tip_that_drifts_from_its_task_is_found(size: float, drift: float) -> 
     velocity = np.array([0.05, -0.02]) * size
     aside = drift * np.array([0.02, 0.05]) * size
     task, wrong = (TipTask(rows=(3, 4), velocity=each) for each in (velocity, velocity + aside))
-    problem = minimum_velocity_problem(machine, task, START, 3.0)
+    problem = minimum_velocity_problem(machine, task, 3.0, start=START)
     holds(solve(problem, Collocation(20)).audit())
-    drifting = solve(minimum_velocity_problem(machine, wrong, START, 3.0), Collocation(20))
+    drifting = solve(minimum_velocity_problem(machine, wrong, 3.0, start=START), Collocation(20))
     does_not_do_what_is_asked(of(drifting, problem).audit())
 
 
@@ -474,7 +474,7 @@ def test_no_rule_lets_the_zero_moment_point_leave_the_foot() -> None:
         try:
             rule = IndexAtLeast(value)
             problem = standing_problem(
-                machine, TipTask(velocity=lambda t: [0.0 * t, 0.1 + 0.0 * t], rows=(4, 5)), start, 1.0, zmp=rule
+                machine, TipTask(velocity=lambda t: [0.0 * t, 0.1 + 0.0 * t], rows=(4, 5)), 1.0, start=start, zmp=rule
             )
         except ProblemError:
             continue

@@ -180,8 +180,8 @@ def test_spatial_arms_agree_with_collocation(machine: Machine, horizon: float, s
     problem = minimum_velocity_problem(
         machine,
         TipTask(rows=[3, 4, 5], velocity=[0.1, 0.1, -0.05]),
-        ARM_START,
         horizon,
+        start=ARM_START,
         limits=Limits(velocity=np.inf, joints=False),
     )
     direct = solve(problem, Collocation(20, 3, "legendre"))

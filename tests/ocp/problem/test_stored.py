@@ -62,7 +62,7 @@ def mapped() -> Problem:
 
 def moved() -> Problem:
     arm, start = papers.paper_example(), [0.7, 0.6, 0.9]
-    return ocp.minimum_velocity_problem(arm, TipTask(rows=(3, 4), velocity=(-1.0, -1.0)), start, 0.5)
+    return ocp.minimum_velocity_problem(arm, TipTask(rows=(3, 4), velocity=(-1.0, -1.0)), 0.5, start=start)
 
 
 PROBLEMS: dict[str, tuple[Callable[[], Problem], dict[str, Any]]] = {

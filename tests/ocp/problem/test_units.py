@@ -74,17 +74,17 @@ def slide_and_turn() -> Robot:
 def planar() -> Problem:
     task = TipTask(velocity=[0.1, 0.0], rows=(3, 4))
     chain = FreeFloating(planar_chain([1.0, 0.8, 0.6], [1.0] * 3, base=Link("hull", 9.0, inertia=np.eye(3))), "planar")
-    return minimum_velocity_problem(chain, tasks=task, start_joints=[0.3, 0.6, 0.9], horizon=1.0)
+    return minimum_velocity_problem(chain, tasks=task, start=[0.3, 0.6, 0.9], horizon=1.0)
 
 
 def mixed() -> Problem:
     task = TipTask(velocity=[0.1, 0.2], rows=(2, 3))
-    return minimum_velocity_problem(FixedBase(slide_and_turn()), tasks=task, start_joints=[0.1, 0.2], horizon=1.0)
+    return minimum_velocity_problem(FixedBase(slide_and_turn()), tasks=task, start=[0.1, 0.2], horizon=1.0)
 
 
 def standing() -> Problem:
     limits = Limits(torque=80.0, friction=0.5)
-    return standing_problem(standing_arm(), arm_task(), ARM_START, ARM_HORIZON, limits=limits)
+    return standing_problem(standing_arm(), arm_task(), ARM_HORIZON, start=ARM_START, limits=limits)
 
 
 def roll() -> Problem:

@@ -105,7 +105,7 @@ def planar() -> FixedBase:
 def test_the_builders_watch_where_the_tips_are() -> None:
     machine, start = planar(), [0.3, 0.8, 0.9]
     place = np.array(ca.DM(machine.tip_pose((), np.array(start)).position)).ravel()
-    asked: dict[str, Any] = {"start_joints": start, "horizon": 1.0}
+    asked: dict[str, Any] = {"start": start, "horizon": 1.0}
     moving = TipTask(position=lambda t: [place[0] - 0.1 * t, place[1]], rows=(3, 4))
     for task, names in (
         (moving, ("task position",)),

@@ -1,18 +1,18 @@
-"""Capture of a body that tumbles: approach, grasp and detumbling, two phases of one problem.
+"""Capture of a tumbling body: approach, grasp and detumbling, two phases of one problem.
 
-Chaser and target both float. The target has no joints and nothing acts on it, so that its pose alone is a state,
+Chaser and target both float. The target has no joints and no external forces act on it. Its pose alone is a state,
 
     R' = [R I^-1 R^T L x] R,    c' = P / m,
 
-and its tip is the frame that is grasped. The chaser's tip reaches that frame with the same twist, at a time that may be
-free. From there on both are one machine, the target a link on the chaser's tip: base and joints go on as they were, and
-the momentum is that of both (`space.grasping`), a constant that is known before anything is planned. At the end
-neither joints nor base turn: the momentum is in the wheels then, which have to be able to hold it
-(`ocp.motion.builders.space.guess`). Rest is relative to the centre of mass of the pair, which goes on at P / m.
+and its tip is the grasped frame. The chaser's tip reaches that frame with the same twist, at a time that may be free.
+From then on both are one machine, with the target a link on the chaser's tip. Base and joints are continuous, and the
+momentum is that of both (`space.grasping`), a constant known in advance. At the end neither joints nor base turn. The
+wheels then hold the momentum, and must be able to (`ocp.motion.builders.space.guess`). Rest is relative to the centre
+of mass of the pair, which moves on at P / m.
 
-Virgili-Llop and Romano 2019 (Frontiers in Robotics and AI 6:14) plan both objectives at once, too, without wheels: the
-chaser brings the momentum against that of the target, which is `conserved_momentum` here. Each phase at its own least
-effort, one after the other, is `chained_capture`.
+Virgili-Llop and Romano 2019 (Frontiers in Robotics and AI 6:14) also plan both objectives together, but without wheels:
+there the chaser's momentum, `conserved_momentum` here, cancels that of the target. `chained_capture` plans each phase
+at its own least effort, one after the other.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ from ocp.direct.collocation import Collocation
 from ocp.errors import ProblemError, checked_instance
 from ocp.motion.builders.actuator_limits import Effort, JointFriction
 from ocp.motion.builders.clearance import ClearanceConstraints
-from ocp.motion.builders.dynamics import dynamics_problem, rates_at
+from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem, end_velocities
 from ocp.motion.builders.dynamics_plan import within_limits
 from ocp.motion.builders.space.grasping import Cone, Grasp, checked_pair, grasp_wrench, motion_of, pair_momentum
 from ocp.motion.builders.space.guess import (
     Start,
     guess_approach,
     guess_braking,
-    guessed,
-    held_by_wheels,
+    guessed_horizon,
+    require_capacity,
     require_reach,
-    require_room,
+    wheel_capacity,
 )
 from ocp.motion.builders.standing.problem import FreeTime
 from ocp.motion.tasks.checks import checked_configuration, checked_horizon
@@ -50,25 +50,25 @@ from ocp.problem.phases import Phases
 from ocp.problem.problem import Problem
 from ocp.solution import Solution
 
-__all__ = ["AskedOfCapture", "capture_problem", "chained_capture", "plan_capture"]
+__all__ = ["CaptureOptions", "capture_problem", "chained_capture", "plan_capture"]
 
 APPROACH, DETUMBLE = "approach", "detumble"
 POINTS = Collocation(8, degree=4, scheme="legendre")
 
 
-class AskedOfCapture(TypedDict, total=False):
-    """The options of `capture_problem`, which says what they are."""
+class CaptureOptions(TypedDict, total=False):
+    """Options of `capture_problem`, described there."""
 
     start_base: Any
     target_base: Any
-    start_velocities: Any
+    start_velocity: Any
     limits: Limits | None
     effort: Effort | None
     friction: JointFriction | None
     cone: Cone | None
     grasp: Grasp | None
     clearance_constraints: ClearanceConstraints | None
-    end_joints: Any
+    end: Any
     rest: bool
 
 
@@ -76,53 +76,54 @@ class AskedOfCapture(TypedDict, total=False):
 def capture_problem(
     chaser: FreeFloating,
     target: FreeFloating,
-    start_joints: Any,
     approach: float | FreeTime,
     detumble: float | FreeTime,
-    **asked: Unpack[AskedOfCapture],
+    *,
+    start: Any,
+    **options: Unpack[CaptureOptions],
 ) -> Phases:
-    """Approach, grasp and detumbling at the least effort of both together.
+    """Declare approach, grasp and detumbling of least total effort.
 
-    Phases "approach" and "detumble", with the states and controls of `dynamics_problem`; the configuration of the
-    target is the state "target" of the first, and follows from that of the chaser in the second. Angles of wheels are
-    counted from the start of each phase.
+    The phases "approach" and "detumble" have the states and controls of `dynamics_problem`. The configuration of the
+    target is the state "target" of the first, and follows from that of the chaser in the second. Wheel angles count
+    from the start of each phase.
 
     Args:
-        chaser: With its arm, and wheels among its joints (`models.with_wheels`); its momentum is that at the start, of
-            the wheels that spin, too.
-        target: A machine of one link without joints, on the same kind of base, with its momentum; its tip is the frame
-            that is grasped, which the chaser's tip meets axis by axis.
-        start_joints: Of the chaser. Shape (n,), rad or m.
-        approach, detumble: How long the phases take, s, or FreeTime(...).
-        asked: start_base, target_base: configurations of both bases at the start; home if None. Shape (base_size,).
-            start_velocities: Of the chaser's joints; at rest if None. Shape (n,), rad/s.
-            limits, effort, friction: As of `dynamics_problem`, of both phases.
-            cone: Of the approach. The tip begins at a distance of twice its length or more, or within it.
-            grasp: What the hand bears while detumbling.
-            clearance_constraints: Of the chaser while approaching, as of `dynamics_problem`; not the target.
-            end_joints: At the end of the detumbling. Shape (n,), nan where free, as those of wheels.
-            rest: Whether joints (but for wheels) and base turn no more at the end; True if not given.
+        chaser: Chaser with its arm, and wheels among its joints (`models.with_wheels`). Its momentum is that at the
+            start, spinning wheels included.
+        target: Machine of one link without joints, on the same kind of base, with its momentum. Its tip is the grasped
+            frame, which the chaser's tip meets axis by axis.
+        approach, detumble: Durations of the phases, s, or FreeTime(...).
+        start: Joints of the chaser at the start. Shape (n,), rad or m.
+        options: start_base, target_base: Configurations of both bases at the start; home if None. Shape (base_size,).
+            start_velocity: Velocities of the chaser's joints at the start; at rest if None. Shape (n,), rad/s.
+            limits, effort, friction: Arguments of `dynamics_problem` for both phases.
+            cone: Approach cone. The tip starts at twice its length or farther, or inside it.
+            grasp: Load limits of the hand during detumbling.
+            clearance_constraints: Collision avoidance of the chaser during the approach, without the target.
+            end: Joints at the end of the detumbling. Shape (n,), nan where free, for example for wheels.
+            rest: Whether base and joints, except wheels, are at rest at the end; True by default.
 
     Raises:
-        ProblemError: Machines that are none, a target with joints, sizes and values as of `dynamics_problem`; or
-            "momentum": rest is asked for, and the wheels cannot take the momentum of both: `value` is its size, `limit`
-            what they take at most, N m s; or "reach": the target is farther off, `value`, than the arm is long,
-            `limit`, m.
+        ProblemError: Machines, sizes or values are invalid, see `dynamics_problem`, or the target has joints. Or with
+            name "momentum": the wheels cannot hold the momentum of both at rest; `value` is its norm and `limit` the
+            largest that they hold, N m s. Or with name "reach": `value` is the distance of the target and `limit` the
+            reach of the arm, m.
     """
-    given = _Capture.of(chaser, target, start_joints, (approach, detumble), asked)
-    begin, after = given.approach(approach), given.detumbling(detumble, None)
-    given.guess_approach(begin)
-    guess_braking(after, given.pair, *_end_of(begin))
-    problem = Phases("capture", {APPROACH: begin, DETUMBLE: after})
-    one, other = problem[APPROACH], problem[DETUMBLE]
-    end = {name: one.at_end(name) for name in ("base", "target", "joints")}
-    base, joints, rates = (other.at_start(name) for name in ("base", "joints", "velocities"))
-    begins = {
-        "joints": ca.DM(given.arm) * end["joints"], "velocities": one.at_end("velocities"),
-        "base": given.base_after(end["base"], end["joints"], one.duration),
+    capture = _Capture.take(chaser, target, start, (approach, detumble), options)
+    first, second = capture.approach(approach), capture.detumbling(detumble, None)
+    capture.guess_approach(first)
+    guess_braking(second, capture.pair, *_end_of(first))
+    problem = Phases("capture", {APPROACH: first, DETUMBLE: second})
+    before, after = problem[APPROACH], problem[DETUMBLE]
+    end = {name: before.at_end(name) for name in ("base", "target", "joints")}
+    base, joints, rates = (after.at_start(name) for name in ("base", "joints", "velocities"))
+    start_times = {
+        "joints": ca.DM(capture.arm) * end["joints"], "velocities": before.at_end("velocities"),
+        "base": capture.base_after(end["base"], end["joints"], before.duration),
     }  # fmt: skip
-    problem.join(APPROACH, DETUMBLE, begins)
-    given.grasp(problem, base, joints, rates, end["target"])
+    problem.join(APPROACH, DETUMBLE, start_times)
+    capture.grasp(problem, base, joints, rates, end["target"])
     return problem
 
 
@@ -130,91 +131,90 @@ def capture_problem(
 def plan_capture(
     chaser: FreeFloating,
     target: FreeFloating,
-    start_joints: Any,
     approach: float | FreeTime,
     detumble: float | FreeTime,
     *,
+    start: Any,
     method: Collocation | None = None,
     options: Mapping[str, Any] | None = None,
     tolerances: Mapping[str, float] | None = None,
-    **asked: Unpack[AskedOfCapture],
+    **capture_options: Unpack[CaptureOptions],
 ) -> Solution:
-    """Solve `capture_problem` and audit the plan, whose limits hold between the nodes, too, as in `plan_dynamics`.
+    """Solve `capture_problem` and audit the plan; the limits hold between the nodes, too, as in `plan_dynamics`.
 
     Args:
-        chaser, target, start_joints, approach, detumble, asked: As of `capture_problem`.
-        method: The first mesh of both phases, controls at the points; 8 Legendre intervals of degree 4 if None.
-        options: Of IPOPT. tolerances: Of the audit, by name.
+        chaser, target, approach, detumble, start, capture_options: As for `capture_problem`.
+        method: First mesh of both phases, with controls at the points; 8 Legendre intervals of degree 4 if None.
+        options: IPOPT options.
+        tolerances: Tolerances of the audit by name.
 
     Returns:
         The plan; `plan.phase("approach")` and `plan.phase("detumble")` are its phases over their own times.
 
     Raises:
-        ProblemError: As of `capture_problem`.
-        SolveError: As of `plan_dynamics`.
+        ProblemError: As `capture_problem`.
+        SolveError: As `plan_dynamics`.
     """
 
-    def declare(clearance_constraints: ClearanceConstraints | None) -> Problem:
-        kept: AskedOfCapture = {**asked, "clearance_constraints": clearance_constraints}
-        return capture_problem(chaser, target, start_joints, approach, detumble, **kept)
+    def declare(clearance: ClearanceConstraints | None) -> Problem:
+        own: CaptureOptions = {**capture_options, "clearance_constraints": clearance}
+        return capture_problem(chaser, target, approach, detumble, start=start, **own)
 
     mesh = POINTS if method is None else method
-    driven = {phase: (chaser, asked.get("limits")) for phase in (APPROACH, DETUMBLE)}
-    return within_limits(declare, asked.get("clearance_constraints"), mesh, (), options, tolerances, driven)
+    machines = {phase: (chaser, capture_options.get("limits")) for phase in (APPROACH, DETUMBLE)}
+    clearance = capture_options.get("clearance_constraints")
+    return within_limits(declare, clearance, mesh, (), options, tolerances, machines)
 
 
 @interruptible
 def chained_capture(
     chaser: FreeFloating,
     target: FreeFloating,
-    start_joints: Any,
     approach: float | FreeTime,
     detumble: float | FreeTime,
     *,
+    start: Any,
     method: Collocation | None = None,
     options: Mapping[str, Any] | None = None,
     tolerances: Mapping[str, float] | None = None,
-    **asked: Unpack[AskedOfCapture],
+    **capture_options: Unpack[CaptureOptions],
 ) -> tuple[Solution, Solution]:
-    """The approach at its own least effort, then the detumbling from where that ends; `plan_capture` costs less.
+    """Plan the approach at its own least effort, then the detumbling from its end; `plan_capture` costs less.
 
-    Args, Raises: As of `plan_capture`.
+    Args, Raises: As for `plan_capture`.
 
     Returns:
-        Both plans, each audited by itself.
+        Both plans, each with its own audit.
     """
     mesh = POINTS if method is None else method
-    limits = asked.get("limits")
-    given = _Capture.of(chaser, target, start_joints, (approach, detumble), asked)
-    given.detumbling(detumble, None)  # refused before the approach is solved
+    limits = capture_options.get("limits")
+    capture = _Capture.take(chaser, target, start, (approach, detumble), capture_options)
+    capture.detumbling(detumble, None)  # raises before the approach is solved
 
-    def first(clearance_constraints: ClearanceConstraints | None) -> Problem:
-        problem = replace(given, asked={**asked, "clearance_constraints": clearance_constraints}).approach(approach)
-        given.grasp(problem, *motion_of(problem), problem.declared.states["target"].symbol)
-        given.guess_approach(problem)
+    def declare_approach(clearance: ClearanceConstraints | None) -> Problem:
+        own: CaptureOptions = {**capture_options, "clearance_constraints": clearance}
+        problem = replace(capture, options=own).approach(approach)
+        capture.grasp(problem, *motion_of(problem), problem.declared.states["target"].symbol)
+        capture.guess_approach(problem)
         return problem
 
-    one = within_limits(
-        first, asked.get("clearance_constraints"), mesh, (), options, tolerances, {"": (chaser, limits)}
-    )
-    end = dict(one.at_fraction(1.0))
-    end["joints"] = given.arm * end["joints"]
+    clearance = capture_options.get("clearance_constraints")
+    first = within_limits(declare_approach, clearance, mesh, (), options, tolerances, {"": (chaser, limits)})
+    end = dict(first.at_fraction(1.0))
+    end["joints"] = capture.arm * end["joints"]
     end["base"] = np.array(ca.DM(_of_unit_length(chaser, end["base"]))).ravel()
 
-    def second(_: ClearanceConstraints | None) -> Problem:
-        problem = given.detumbling(detumble, end)
-        guess_braking(problem, given.pair, end["joints"], end["velocities"], end["base"])
+    def declare_detumbling(_: ClearanceConstraints | None) -> Problem:
+        problem = capture.detumbling(detumble, end)
+        guess_braking(problem, capture.pair, end["joints"], end["velocities"], end["base"])
         return problem
 
-    return one, within_limits(second, None, mesh, (), options, tolerances, {"": (given.pair, limits)})
-
-
-# ---- inside ------------------------------------------------------------------------------------------------------
+    return first, within_limits(declare_detumbling, None, mesh, (), options, tolerances, {"": (capture.pair, limits)})
 
 
 @dataclass(frozen=True, eq=False)
 class _Capture:
-    """What is asked, checked. `pair` is both as one machine, with their momentum at the start."""
+    """Checked arguments of a capture; `pair` is both bodies as one machine, with their momentum at the start."""
 
     chaser: FreeFloating
     target: FreeFloating
@@ -223,63 +223,62 @@ class _Capture:
     base: Array
     target_base: Array
     times: tuple[float | FreeTime, float | FreeTime]
-    asked: AskedOfCapture
+    options: CaptureOptions
 
     @classmethod
-    def of(
-        cls,
-        chaser: FreeFloating,
-        target: FreeFloating,
-        start_joints: Any,
-        times: tuple[Any, Any],
-        asked: AskedOfCapture,
+    def take(
+        cls, chaser: FreeFloating, target: FreeFloating, start: Any, times: tuple[Any, Any], options: CaptureOptions
     ) -> _Capture:
         robot = checked_pair(chaser, target)
-        for what, kind in (("cone", Cone), ("grasp", Grasp), ("limits", Limits)):
-            if asked.get(what) is not None:
-                checked_instance(f"capture: {what}", asked.get(what), kind)
-        joints, base = checked_configuration(chaser, start_joints, asked.get("start_base"))
-        _, there = checked_configuration(target, np.zeros(0), asked.get("target_base"))
-        carried = np.array(ca.DM(pair_momentum(chaser, target, base, there, joints))).ravel()
-        pair = replace(chaser, robot=robot, conserved_momentum=carried)
-        found = cls(chaser, target, pair, joints, base, there, times, asked)
-        if asked.get("rest", True):
-            bounds = (asked.get("limits") or Limits()).bounds(chaser)
-            held = held_by_wheels(chaser, bounds, found.start, asked.get("friction") is None)
-            require_room(chaser, carried, held)
-        return found
+        for name, kind in (("cone", Cone), ("grasp", Grasp), ("limits", Limits)):
+            if options.get(name) is not None:
+                checked_instance(f"capture: {name}", options.get(name), kind)
+        joints, base = checked_configuration(chaser, start, options.get("start_base"))
+        _, there = checked_configuration(target, np.zeros(0), options.get("target_base"))
+        momentum = np.array(ca.DM(pair_momentum(chaser, target, base, there, joints))).ravel()
+        pair = replace(chaser, robot=robot, conserved_momentum=momentum)
+        capture = cls(chaser, target, pair, joints, base, there, times, options)
+        if options.get("rest", True):
+            bounds = (options.get("limits") or Limits()).bounds(chaser)
+            capacity = wheel_capacity(chaser, bounds, capture.start, options.get("friction") is None)
+            require_capacity(chaser, momentum, capacity)
+        return capture
 
     @property
     def arm(self) -> Array:
-        """1 of joints, 0 of wheels, whose angles do not matter: each phase counts them from zero. Shape (n,)."""
+        """Return 1 for joints and 0 for wheels, whose angles each phase counts from zero. Shape (n,)."""
         wheels = find_wheels(self.chaser.robot)
         return np.array([float(name not in wheels) for name in self.chaser.robot.joint_names])
 
     @property
     def start(self) -> Start:
-        """Where it begins, and until when it may take."""
-        given = self.asked.get("start_velocities")
-        rates = rates_at("start_velocities", "rest" if given is None else given, self.chaser.joint_size)
+        """Return the state at the start, and the longest durations."""
+        value = self.options.get("start_velocity")
+        rates = end_velocities("start_velocity", "rest" if value is None else value, self.chaser.joint_size)
         latest = [time.upper if isinstance(time, FreeTime) else checked_horizon(time) for time in self.times]
         return Start(self.base, self.joints, rates, self.target_base, *latest)
 
     @property
     def shared(self) -> dict[str, Any]:
-        """Options of both phases."""
-        asked: Mapping[str, Any] = self.asked
-        return {name: asked[name] for name in ("limits", "effort", "friction") if name in asked}
+        """Return the arguments of both phases."""
+        options: Mapping[str, Any] = self.options
+        return {name: options[name] for name in ("limits", "effort") if name in options}
 
     def approach(self, duration: float | FreeTime) -> Problem:
-        """The first phase: the target's motion, and the grasp at the end."""
-        chaser, target, asked = self.chaser, self.target, self.asked
+        """Declare the first phase, with the target's motion and the approach cone."""
+        chaser, target, options = self.chaser, self.target, self.options
         problem = dynamics_problem(
             chaser,
-            self.joints,
+            (),
             duration,
-            start_base=self.base,
-            end="free",
-            clearance_constraints=asked.get("clearance_constraints"),
-            start=self.start.velocities,
+            start=self.joints,
+            setup=DynamicsSetup(
+                start_velocity=self.start.velocities,
+                end_velocity="free",
+                start_base=self.base,
+                friction=options.get("friction"),
+                clearance_constraints=options.get("clearance_constraints"),
+            ),
             **self.shared,
         )
         earliest = duration.lower if isinstance(duration, FreeTime) else duration
@@ -292,50 +291,50 @@ class _Capture:
         problem.dynamics(goal, target.base_rate(goal, none, none))
         tip, grasped = chaser.tip_pose(base, joints), target.tip_pose(goal, none)
         place = ca.mtimes(grasped.rotation.T, tip.position - grasped.position)
-        cone = asked.get("cone")
+        cone = options.get("cone")
         if cone is not None:
             self._require_inside(cone)
             problem.path("cone", cone.inside(place), lower=0.0, unit="m")
         return problem
 
     def _require_inside(self, cone: Cone) -> None:
-        """Raise where the tip starts near the grasp and not in the cone."""
+        """Raise ProblemError if the tip starts near the grasp but outside the cone."""
         tip, grasped = self.chaser.tip_pose(self.base, self.joints), self.target.tip_pose(self.target_base, ca.DM(0, 1))
         place = np.array(ca.DM(ca.mtimes(grasped.rotation.T, tip.position - grasped.position)))
         inside = float(cone.inside(ca.DM(place)))
         if inside < 0:
             words = (
                 f"capture: the tip starts {np.linalg.norm(place):.4g} m from the grasp and {-inside:.4g} m outside the "
-                f"cone, which opens to all directions at {2 * cone.length:.4g} m; start farther away or within it"
+                f"cone, which is open to all directions at {2 * cone.length:.4g} m; start farther away or inside it"
             )
             raise ProblemError(words, name="cone", value=inside, limit=0.0)
 
     def detumbling(self, duration: float | FreeTime, start: Mapping[str, Array] | None) -> Problem:
-        """The second phase, from the end of an approach, or free to be joined to one."""
-        pair, asked = self.pair, self.asked
+        """Declare the second phase, from the end of an approach, or free to be joined to one."""
+        pair, options = self.pair, self.options
         wheels = find_wheels(pair.robot)
-        rest = asked.get("rest", True)
+        rest = options.get("rest", True)
         still = np.array([np.nan if name in wheels else 0.0 for name in pair.robot.joint_names])
-        ends: dict[str, Any] = {"end_joints": asked.get("end_joints"), "end": still if rest else "free"}
-        if start is None:
-            ends |= {"start": "free", "start_base": np.full(pair.base_size, np.nan)}
-            begin = None
-        else:
-            begin = start["joints"]
-            ends |= {"start": start["velocities"], "start_base": start["base"]}
-        problem = dynamics_problem(pair, begin, duration, **ends, **self.shared)
-        grasp = asked.get("grasp") or Grasp()
-        for what, value in zip(("force", "moment"), grasp_wrench(pair, self.target, problem), strict=True):
-            most = float(getattr(grasp, what))
-            if np.isfinite(most):
-                problem.path(f"grasp {what}", ca.sumsqr(value) / most**2, upper=1.0)
+        setup = DynamicsSetup(
+            start_velocity="free" if start is None else start["velocities"],
+            end_velocity=still if rest else "free",
+            start_base=np.full(pair.base_size, np.nan) if start is None else start["base"],
+            friction=options.get("friction"),
+        )
+        begin = None if start is None else start["joints"]
+        problem = dynamics_problem(pair, (), duration, start=begin, end=options.get("end"), setup=setup, **self.shared)
+        grasp = options.get("grasp") or Grasp()
+        for name, value in zip(("force", "moment"), grasp_wrench(pair, self.target, problem), strict=True):
+            largest = float(getattr(grasp, name))
+            if np.isfinite(largest):
+                problem.path(f"grasp {name}", ca.sumsqr(value) / largest**2, upper=1.0)
         if rest and wheels:
             angular = [k for k, row in enumerate(pair.twist_rows) if row < 3]
             problem.end("base turns", pair.base_twist(*motion_of(problem))[angular], 0.0, 0.0, unit="rad/s")
         return problem
 
     def grasp(self, problem: Problem, base: Any, joints: Any, rates: Any, goal: Any) -> None:
-        """The tip of a chaser in some state on the frame that is grasped, with the same twist, when a problem ends."""
+        """Constrain the tip to the grasped frame with the same twist at the end of a problem."""
         chaser, target, none = self.chaser, self.target, ca.DM(0, 1)
         tip, grasped = chaser.tip_pose(base, joints), target.tip_pose(goal, none)
         turned = ca.mtimes(grasped.rotation.T, tip.rotation)
@@ -343,15 +342,15 @@ class _Capture:
         place = ca.mtimes(grasped.rotation.T, tip.position - grasped.position)
         rows = chaser.twist_rows
         problem.end("grasp pose", ca.vertcat(half, place)[rows], 0.0, 0.0, unit="rad, m")
-        problem.end("grasp side", ca.trace(turned), lower=1.0)  # and not half a turn off
+        problem.end("grasp side", ca.trace(turned), lower=1.0)  # excludes half a turn
         twist = chaser.tip_twist(base, joints, rates) - target.tip_twist(goal, none, none)
         problem.end("grasp twist", twist[rows], 0.0, 0.0, unit="rad/s, m/s")
 
     def base_after(self, base: Any, joints: Any, time: Any) -> Any:
-        """The base at a time by its attitude and the joints alone: nothing pushes the chaser's centre of mass.
+        """Return the base at a time from its attitude and the joints alone, because no force acts on the chaser.
 
-        A plan keeps that, and the length of a quaternion, up to its own error. Told once more at the grasp, they would
-        be conditions that no control moves, but for that error, and beside which no curvature is decided.
+        The position of the centre of mass and the norm of the quaternion are conserved by the dynamics. Continuity of
+        them would be a condition that no control influences, and would leave the second-order conditions undetermined.
         """
         chaser, size = self.chaser, len(self.chaser.twist_rows) // 2 + (self.chaser.base == "planar")
         attitude = base[size:] if chaser.base == "planar" else base[size:] / ca.norm_2(base[size:])
@@ -362,30 +361,22 @@ class _Capture:
         return ca.vertcat(place, attitude)
 
     def guess_approach(self, problem: Problem) -> None:
-        cone = self.asked.get("cone")
+        """Set the guess of an approach."""
+        cone = self.options.get("cone")
         out = np.zeros(3) if cone is None else cone.length * cone.direction
-        guess_approach(
-            problem,
-            self.chaser,
-            self.target,
-            self.joints,
-            np.nan_to_num(self.start.velocities),
-            self.base,
-            self.target_base,
-            out,
-        )
+        guess_approach(problem, self.chaser, self.target, self.start, out)
 
 
 def _end_of(problem: Problem) -> tuple[Array, Array, Array]:
-    """Joints, velocities and base where the guess of an approach ends."""
-    end = np.array([guessed(problem)])
+    """Return joints, velocities and base at the end of the guess of an approach."""
+    end = np.array([guessed_horizon(problem)])
     guesses = [problem.declared.states[name].guess for name in ("joints", "velocities", "base")]
     joints, rates, base = (np.asarray(guess(end)).ravel() for guess in guesses)
     return joints, rates, base
 
 
 def _of_unit_length(machine: FreeFloating, base: Any) -> Any:
-    """The configuration, its quaternion a unit one."""
+    """Return the configuration with a unit quaternion."""
     if machine.base == "planar":
         return base
     return ca.vertcat(base[:3], base[3:] / ca.norm_2(base[3:]))

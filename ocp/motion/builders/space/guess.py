@@ -1,14 +1,13 @@
-"""Where a capture begins to be looked for: motions that obey the dynamics and end in the grasp, or at rest.
+"""First guess of a capture, and bounds that refuse impossible ones.
 
-The target's motion is known, whatever the chaser does. Towards it the tip goes by the pseudo-inverse of the generalized
-Jacobian, damped, from its own start onto the way of the frame that is grasped, beside it at first, along the axis of
-the approach at last. After the grasp the arm slows down evenly while the wheels take the momentum.
+The target's motion is known, whatever the chaser does. The guess moves the tip by the damped pseudo-inverse of the
+generalized Jacobian from its start onto the path of the grasped frame, first beside it, at last along the approach
+axis. After the grasp the arm slows down evenly while the wheels take the momentum. The guesses obey the dynamics.
 
-Why there is no capture, said before one is planned: bounds that hold whatever the chaser does.
-
-The grasp may be farther off than the arm reaches. And both may have more momentum than the wheels hold: a wheel holds
-h a along its axis a, |h| <= I w, and no more than its motor gives it in the time. Turned, the base brings the momentum
-along any axis of its own: what counts is the largest sum of all h a.
+Two bounds hold for any motion of the chaser. The grasp may be out of reach of the arm. And the momentum of both may
+exceed what the wheels hold: a wheel holds h a along its axis a with |h| <= I w, and no more than its motor gives it in
+the time. The base can turn to align the momentum with any of its axes; hence the largest norm of the sum of all h a
+counts.
 """
 
 from __future__ import annotations
@@ -33,46 +32,46 @@ __all__ = [
     "free_motion",
     "guess_approach",
     "guess_braking",
-    "guessed",
-    "held_by_wheels",
+    "guessed_horizon",
+    "require_capacity",
     "require_reach",
-    "require_room",
+    "wheel_capacity",
 ]
 
 Guesses = dict[str, Any]
-"""Functions of the time, by the names of states and controls."""
+"""Functions of time by the names of states and controls."""
 
 
 @dataclass(frozen=True)
 class GuessSettings:
-    """How a capture's first guess is made.
+    """Settings of the first guess of a capture.
 
     Attributes:
-        steps: Of a motion.
-        durations: Of a free time: that many are tried, evenly spread by their logarithms.
-        reached: How near the tip has to come, m and rad.
-        met: Fraction of the approach after which the tip moves with the target.
-        nearing: Fraction of the approach after which the tip comes nearer to the grasp.
-        damping: Of the pseudo-inverse, m and 1.
-        rounds: Newton steps for the speeds of the wheels at the end, which the attitude depends on.
+        steps: Integration steps of a motion.
+        durations: Number of durations tried if the time is free, evenly spaced in their logarithms.
+        tolerance: Distance to the grasp that counts as reached, m and rad.
+        meeting: Fraction of the approach after which the tip moves with the target.
+        closing: Fraction of the approach after which the tip approaches the grasp along the axis.
+        damping: Damping of the pseudo-inverse, m and 1.
+        newton_steps: Newton steps for the final wheel speeds, which depend on the final attitude.
     """
 
     steps: int = 200
     durations: int = 9
-    reached: float = 1e-3
-    met: float = 0.75
-    nearing: float = 0.5
+    tolerance: float = 1e-3
+    meeting: float = 0.75
+    closing: float = 0.5
     damping: float = 0.05
-    rounds: int = 4
+    newton_steps: int = 4
 
 
 GUESS = GuessSettings()
 
 
 def free_motion(target: FreeFloating, base: Array, times: Array) -> Array:
-    """Configurations (M, base_size) of a body that nothing acts on, at evenly spaced times (M,), s.
+    """Return the configurations of a free body at evenly spaced times, by Runge-Kutta of order four.
 
-    By Runge and Kutta's rule of order four.
+    Shape (M, base_size) at times (M,), s.
     """
     b, step, none = ca.SX.sym("b", target.base_size), times[1] - times[0], ca.DM(0, 1)
     rate = ca.Function("rate", [b], [target.base_rate(b, none, none)])
@@ -85,39 +84,37 @@ def free_motion(target: FreeFloating, base: Array, times: Array) -> Array:
     return np.vstack([base, np.array(moved).T])
 
 
-def guess_approach(
-    problem: Problem, chaser: FreeFloating, target: FreeFloating, joints: Array, rates: Array, base: Array,
-    target_base: Array, out: Array,
-) -> None:  # fmt: skip
-    """Give an approach its guess, and a free time that of some which ends in the grasp, or nearest to it.
+def guess_approach(problem: Problem, chaser: FreeFloating, target: FreeFloating, start: Start, out: Array) -> None:
+    """Set the guess of an approach; a free time gets the first duration that ends in the grasp, or the closest to it.
 
     Args:
-        joints, rates, base, target_base: At the start.
-        out: From where the tip comes to the grasp at last, in the frame that is grasped. Shape (3,), m.
+        start: Start of the capture; free velocities are guessed as zero.
+        out: Offset of the tip from the grasp before the final approach, in the grasped frame. Shape (3,), m.
     """
+    joints, base = start.joints, start.base
     horizon = problem.declared.horizon
     assert horizon is not None
-    first = guessed(problem)
-    tries = [first]
+    first = guessed_horizon(problem)
+    durations = [first]
     if not horizon.fixed:
-        spread = np.geomspace(constant(horizon.lower)[0], constant(horizon.upper)[0], GUESS.durations)
-        tries += sorted(spread, key=lambda duration: abs(np.log(duration / first)))
+        trials = np.geomspace(constant(horizon.lower)[0], constant(horizon.upper)[0], GUESS.durations)
+        durations += sorted(trials, key=lambda duration: abs(np.log(duration / first)))
     nearest = np.inf
-    walker = _Walker(problem, chaser, rates)
-    for duration in tries:
+    tracker = _TipTracker(problem, chaser, np.nan_to_num(start.velocities))
+    for duration in durations:
         times = np.linspace(0.0, duration, GUESS.steps + 1)
-        bases = free_motion(target, target_base, times)
-        way = _way_of_tip(chaser, target, times, bases, (joints, base), out)
-        gap, guesses = walker.along(times, way, joints, base)
+        bases = free_motion(target, start.target_base, times)
+        path = _tip_path(chaser, target, times, bases, (joints, base), out)
+        gap, guesses = tracker.follow(times, path, joints, base)
         if gap < nearest:
             nearest = gap
-            tell(problem, duration, {**guesses, "target": _curve(times, bases)})
-        if gap < GUESS.reached:
+            set_guess(problem, duration, {**guesses, "target": _curve(times, bases)})
+        if gap < GUESS.tolerance:
             return
 
 
-class _Walker:
-    """Takes the tip of a machine along a way, step by step."""
+class _TipTracker:
+    """Moves the tip of a machine along a path, step by step."""
 
     def __init__(self, problem: Problem, machine: FreeFloating, rates: Array) -> None:
         n, robot = machine.joint_size, machine.robot
@@ -128,66 +125,66 @@ class _Walker:
         b, q, v = (ca.SX.sym("z", size) for size in (machine.base_size, n, n))
         tip = machine.tip_pose(b, q)
         jacobian, drift = machine.tip_jacobian(b, q)[self.rows, self.arm], machine.tip_twist(b, q, v)[self.rows]
-        self.look = ca.Function("look", [b, q, v], [tip.position, tip.rotation, jacobian, drift])
+        self.kinematics = ca.Function("kinematics", [b, q, v], [tip.position, tip.rotation, jacobian, drift])
         self.step = _stepper(machine)
         states = problem.declared.states
         self.low, self.high = (constant(getattr(states["joints"], side)) for side in ("lower", "upper"))
         self.fastest = constant(states["velocities"].upper)
 
-    def along(self, times: Array, way: tuple[Array, Array], joints: Array, base: Array) -> tuple[float, Guesses]:
-        """How far from the end of the way the tip comes, m and rad, and the guesses; wheels turn as they do."""
-        places, turns = way
+    def follow(self, times: Array, path: tuple[Array, Array], joints: Array, base: Array) -> tuple[float, Guesses]:
+        """Return the distance of the tip from the end of the path, m and rad, and the guesses; wheel speeds stay."""
+        places, turns = path
         step = times[1]
         speed = self.rates.copy()
         speed[self.arm] = 0.0
         drifting = speed
-        found, moving = [(joints, base)], []
+        configurations, speeds = [(joints, base)], []
         for k in range(GUESS.steps):
-            at, home = found[-1]
-            position, rotation, matrix, drift = (np.array(part) for part in self.look(home, at, drifting))
+            at, home = configurations[-1]
+            position, rotation, matrix, drift = (np.array(part) for part in self.kinematics(home, at, drifting))
             gap = _gap(places[k + 1], turns[k + 1], position, rotation)[self.rows]
             square = matrix @ matrix.T + GUESS.damping**2 * np.eye(len(self.rows))
             speed = drifting.copy()
             speed[self.arm] = matrix.T @ np.linalg.solve(square, gap / step - drift.ravel())
             speed = np.clip(speed, -self.fastest, self.fastest)
             speed = (np.clip(at + step * speed, self.low, self.high) - at) / step
-            moving.append(speed)
-            found.append((at + step * speed, self.step(step, home, at, speed)))
-        at, home = found[-1]
-        position, rotation, *_ = (np.array(part) for part in self.look(home, at, drifting))
+            speeds.append(speed)
+            configurations.append((at + step * speed, self.step(step, home, at, speed)))
+        at, home = configurations[-1]
+        position, rotation, *_ = (np.array(part) for part in self.kinematics(home, at, drifting))
         left = _gap(places[-1], turns[-1], position, rotation)[self.rows]
-        angles, poses = (np.array(part) for part in zip(*found, strict=True))
-        return float(np.abs(left).max()), _motion(times, angles, np.array([self.rates, *moving]), poses)
+        angles, poses = (np.array(part) for part in zip(*configurations, strict=True))
+        return float(np.abs(left).max()), _motion(times, angles, np.array([self.rates, *speeds]), poses)
 
 
 def _gap(place: Array, turn: Array, position: Array, rotation: Array) -> Array:
-    """(Turn, way) from one pose to another, world axes. Shape (6,)."""
+    """Return rotation vector and translation from one pose to another, in world axes. Shape (6,)."""
     return np.concatenate([Rotation.from_matrix(turn @ rotation.T).as_rotvec(), place - position.ravel()])
 
 
-def _way_of_tip(
+def _tip_path(
     chaser: FreeFloating, target: FreeFloating, times: Array, bases: Array, start: tuple[Array, Array], out: Array
 ) -> tuple[Array, Array]:
-    """Places (M, 3) and axes (M, 3, 3) of the tip: from rest where it is onto the frame that is grasped."""
+    """Return positions (M, 3) and rotations (M, 3, 3) of the tip, from rest onto the grasped frame."""
     b = ca.SX.sym("b", target.base_size)
     pose = target.tip_pose(b, ca.DM(0, 1))
-    look = ca.Function("look", [b], [pose.position, ca.vec(pose.rotation)])
+    pose_at = ca.Function("pose", [b], [pose.position, ca.vec(pose.rotation)])
 
     def frames(configurations: Array) -> tuple[Array, Rotation]:
-        place, turn = (np.array(part).T for part in look.map(len(configurations))(configurations.T))
+        place, turn = (np.array(part).T for part in pose_at.map(len(configurations))(configurations.T))
         return place, Rotation.from_matrix(turn.reshape(-1, 3, 3).transpose(0, 2, 1))
 
     share = times / times[-1]
     meeting, nearer = (
-        QUINTIC(np.clip(share / GUESS.met, 0, 1)),
-        QUINTIC(np.clip((share - GUESS.nearing) / (1 - GUESS.nearing), 0, 1)),
+        QUINTIC(np.clip(share / GUESS.meeting, 0, 1)),
+        QUINTIC(np.clip((share - GUESS.closing) / (1 - GUESS.closing), 0, 1)),
     )
     grasped, turned = frames(bases)
     own = chaser.tip_pose(start[1], start[0])
     first, axes = np.array(ca.DM(own.position)).ravel(), Rotation.from_matrix(np.array(ca.DM(own.rotation)))
     beside = grasped + (1 - nearer[:, None]) * turned.apply(out)
     places = first + meeting[:, None] * (beside - first)
-    # onto the attitude at the end, and with it as it was a while before, which is none at last
+    # turn to the final attitude, composed with the target's turn since an earlier time, which vanishes at the end
     before = times[-1] - meeting * (times[-1] - times)
     then = frames(np.column_stack([np.interp(before, times, column) for column in bases.T]))[1]
     vector = (axes.inv() * turned[-1]).as_rotvec()
@@ -196,37 +193,37 @@ def _way_of_tip(
 
 
 def guess_braking(problem: Problem, pair: FreeFloating, joints: Array, rates: Array, base: Array) -> None:
-    """Give a detumbling its guess from where it starts: the arm slows down evenly, wheels take the momentum.
+    """Set the guess of a detumbling from its start: the arm slows down evenly, and the wheels take the momentum.
 
-    Which speeds of the wheels hold it follows by Newton's method: the attitude at the end depends on them.
+    The final wheel speeds follow from Newton's method, because the final attitude depends on them.
     """
-    robot, duration = pair.robot, guessed(problem)
+    robot, duration = pair.robot, guessed_horizon(problem)
     times = np.linspace(0.0, duration, GUESS.steps + 1)
     share = times[:, None] / duration
     slowing = 1 - 3 * share**2 + 2 * share**3
-    way = (share - share**3 + share**4 / 2) * duration
+    distance = (share - share**3 + share**4 / 2) * duration
     names, wheels = robot.joint_names, find_wheels(robot)
     turning = [k for k, name in enumerate(names) if name in wheels]
     angular = [k for k, row in enumerate(pair.twist_rows) if row < 3]
     b, q, v = (ca.SX.sym("z", size) for size in (pair.base_size, len(joints), len(joints)))
-    held = ca.mtimes(pair.momentum_matrices(b, q)[1], v)[angular]
-    look = ca.Function("look", [b, q, v], [held, ca.jacobian(held, v)[:, turning]])
+    momentum = ca.mtimes(pair.momentum_matrices(b, q)[1], v)[angular]
+    momentum_at = ca.Function("momentum", [b, q, v], [momentum, ca.jacobian(momentum, v)[:, turning]])
     last = np.zeros(len(joints))
     step = _stepper(pair)
-    for _ in range(GUESS.rounds if wheels else 1):
+    for _ in range(GUESS.newton_steps if wheels else 1):
         speeds = last + slowing * (rates - last)
-        angles = joints + last * times[:, None] + way * (rates - last)
-        found = [base]
+        angles = joints + last * times[:, None] + distance * (rates - last)
+        bases = [base]
         for k in range(GUESS.steps):
             middle = (angles[k] + angles[k + 1]) / 2, (speeds[k] + speeds[k + 1]) / 2
-            found.append(step(times[1], found[-1], *middle))
-        have, matrix = (np.array(part) for part in look(found[-1], angles[-1], last))
-        last[turning] += np.linalg.pinv(matrix) @ (np.asarray(pair.conserved_momentum)[angular] - have.ravel())
-    tell(problem, duration, _motion(times, angles, speeds, np.array(found)))
+            bases.append(step(times[1], bases[-1], *middle))
+        current, matrix = (np.array(part) for part in momentum_at(bases[-1], angles[-1], last))
+        last[turning] += np.linalg.pinv(matrix) @ (np.asarray(pair.conserved_momentum)[angular] - current.ravel())
+    set_guess(problem, duration, _motion(times, angles, speeds, np.array(bases)))
 
 
 def _stepper(machine: FreeFloating) -> Any:
-    """The configuration of the base after a step of Heun's rule with joints and rates as they are."""
+    """Return a function that steps the base by Heun's rule, with constant joints and rates."""
     b, q, v = (ca.SX.sym("z", size) for size in (machine.base_size, machine.joint_size, machine.joint_size))
     step = ca.SX.sym("step")
     rate = ca.Function("rate", [b, q, v], [machine.base_rate(b, q, v)])
@@ -235,28 +232,30 @@ def _stepper(machine: FreeFloating) -> Any:
     if machine.base == "spatial":
         after = ca.vertcat(after[:3], after[3:] / ca.norm_2(after[3:]))
     function = ca.Function("after", [step, b, q, v], [after])
-    return lambda *given: np.array(function(*given)).ravel()
+    return lambda *arguments: np.array(function(*arguments)).ravel()
 
 
 def _motion(times: Array, joints: Array, velocities: Array, base: Array) -> Guesses:
+    """Return the guesses of a sampled motion."""
     second = np.gradient(velocities, times, axis=0)
-    found = {"joints": joints, "velocities": velocities, "accelerations": second, "base": base}
-    return {name: _curve(times, samples) for name, samples in found.items()}
+    tables = {"joints": joints, "velocities": velocities, "accelerations": second, "base": base}
+    return {name: _curve(times, samples) for name, samples in tables.items()}
 
 
 def _curve(times: Array, samples: Array) -> Any:
+    """Return the linear interpolant of samples."""
     return lambda t: np.column_stack([np.interp(t, times, column) for column in samples.T])
 
 
-def guessed(problem: Problem) -> float:
-    """The horizon, or what is guessed of it, s."""
+def guessed_horizon(problem: Problem) -> float:
+    """Return the horizon, or its guess if it is free, s."""
     horizon = problem.declared.horizon
     assert horizon is not None
     return float(constant(horizon.lower)[0]) if horizon.guess is None else float(horizon.guess)
 
 
-def tell(problem: Problem, duration: float, guesses: Guesses) -> None:
-    """Give a problem the guess of its horizon, where that is free, and those of states and controls, by name."""
+def set_guess(problem: Problem, duration: float, guesses: Guesses) -> None:
+    """Set the guesses of states and controls by name, and that of a free horizon."""
     declared = problem.declared
     assert declared.horizon is not None
     if not declared.horizon.fixed:
@@ -268,16 +267,16 @@ def tell(problem: Problem, duration: float, guesses: Guesses) -> None:
 
 
 ROUNDING = 1e-9
-"""Relative; and N m s of a momentum."""
+"""Relative tolerance, and tolerance of a momentum, N m s."""
 
 
 class Start(NamedTuple):
-    """Where a capture begins, and until when it may take.
+    """Start of a capture, and its longest durations.
 
     Attributes:
-        base, joints, velocities: Of the chaser; velocities that are free are nan.
+        base, joints, velocities: State of the chaser; nan for free velocities.
         target_base: Configuration of the target.
-        approach, detumble: How long the phases last at most, s.
+        approach, detumble: Longest durations of the phases, s.
     """
 
     base: Array
@@ -288,16 +287,16 @@ class Start(NamedTuple):
     detumble: float
 
 
-def held_by_wheels(machine: FreeFloating, bounds: JointBounds, start: Start, drives_alone: bool = True) -> float:
-    """The largest angular momentum that the wheels of a chaser hold while its base rests, N m s.
+def wheel_capacity(machine: FreeFloating, bounds: JointBounds, start: Start, frictionless: bool = True) -> float:
+    """Return the largest angular momentum that the wheels of a chaser can hold while its base rests, N m s.
 
     Args:
-        bounds: Of its joints.
-        start: Of the capture.
-        drives_alone: Whether nothing but its motor turns a wheel about its axis: there is no friction.
+        bounds: Limits of its joints.
+        start: Start of the capture.
+        frictionless: Whether only its motor acts on a wheel about its axis.
     """
     robot, time = machine.robot, start.approach + start.detumble
-    known = drives_alone and not np.isnan(start.velocities).any()
+    known = frictionless and not np.isnan(start.velocities).any()
     spin = np.zeros(6)
     if known:
         twist = np.array(ca.DM(machine.base_twist(start.base, start.joints, start.velocities))).ravel()
@@ -307,7 +306,7 @@ def held_by_wheels(machine: FreeFloating, bounds: JointBounds, start: Start, dri
     for name, inertia in find_wheels(robot).items():
         wheel, k = robot.joint(name), robot.joint_names.index(name)
         size = inertia * bounds.velocity[k]
-        if any(joint.moves for joint in robot.path_to(wheel.parent)):  # the arm turns it to any side
+        if any(joint.moves for joint in robot.path_to(wheel.parent)):  # the arm can turn it to any direction
             free += size
             continue
         axis = np.array(ca.DM(frames[wheel.parent].rotation)) @ np.asarray(wheel.rotation) @ np.asarray(wheel.axis)
@@ -320,47 +319,49 @@ def held_by_wheels(machine: FreeFloating, bounds: JointBounds, start: Start, dri
     return float(free + np.linalg.norm(sides, axis=1).max())
 
 
-def require_room(machine: FreeFloating, momentum: Array, held: float) -> None:
-    """Raise where wheels cannot hold the angular momentum, whatever the attitude of the base at the end.
+def require_capacity(machine: FreeFloating, momentum: Array, capacity: float) -> None:
+    """Raise ProblemError if the wheels cannot hold the angular momentum in any final attitude of the base.
 
     Args:
-        momentum: Of both, at the start, as of `pair_momentum`.
-        held: What the wheels hold at most, N m s.
+        momentum: Momentum of both bodies, see `pair_momentum`.
+        capacity: Largest angular momentum that the wheels can hold, N m s.
     """
     angular = [k for k, row in enumerate(machine.twist_rows) if row < 3]
     size = float(np.linalg.norm(np.asarray(momentum)[angular]))
-    if size > held * (1 + ROUNDING) + ROUNDING:
+    if size > capacity * (1 + ROUNDING) + ROUNDING:
         words = (
-            f"capture: the pair has an angular momentum of {size:.6g} N m s, of which the wheels hold {held:.6g} at "
-            f"most: {size - held:.6g} N m s are missing for it to come to rest. Other wheels, more time, momentum of "
-            "the chaser against that of the target, or rest=False help"
+            f"capture: the pair has an angular momentum of {size:.6g} N m s, of which the wheels hold at most "
+            f"{capacity:.6g}: {size - capacity:.6g} N m s are missing for rest. Use other wheels, more time, a "
+            "momentum of the chaser against that of the target, or rest=False"
         )
-        raise ProblemError(words, name="momentum", value=size, limit=held)
+        raise ProblemError(words, name="momentum", value=size, limit=capacity)
 
 
 def require_reach(chaser: FreeFloating, target: FreeFloating, start: Start, earliest: float) -> None:
-    """Raise where the grasp is too far off for the arm at any time.
+    """Raise ProblemError if the grasp is out of reach of the arm at all times.
 
-    Both centres of mass go on as they do, w + v t. The tip is no farther from the chaser's centre of mass than all
-    joints in a line take it.
+    Both centres of mass drift uniformly. The tip is never farther from the chaser's centre of mass than with the arm
+    stretched.
 
     Args:
-        start: With the latest time of the grasp. earliest: The earliest, s.
+        start: Start of the capture, with the latest time of the grasp.
+        earliest: Earliest time of the grasp, s.
     """
-    arm = _arm(chaser, target)
-    way, drift = _apart(chaser, target, start)
-    nearest = -(way @ drift) / (drift @ drift) if drift.any() else earliest
-    off = float(np.linalg.norm(way + drift * np.clip(nearest, earliest, start.approach)))
-    if off > arm * (1 + ROUNDING):
+    reach = _reach(chaser, target)
+    offset, drift = _offset(chaser, target, start)
+    closest = -(offset @ drift) / (drift @ drift) if drift.any() else earliest
+    distance = float(np.linalg.norm(offset + drift * np.clip(closest, earliest, start.approach)))
+    if distance > reach * (1 + ROUNDING):
         words = (
-            f"capture: the centres of mass of chaser and target are {off:.4g} m apart or more, and the arm reaches "
-            f"{arm:.4g} m at most: {off - arm:.4g} m are missing. Start nearer, or let them drift together"
+            f"capture: the centres of mass of chaser and target are at least {distance:.4g} m apart, and the arm "
+            f"reaches at most {reach:.4g} m: {distance - reach:.4g} m are missing. Start nearer, or let them drift "
+            "together"
         )
-        raise ProblemError(words, name="reach", value=off, limit=arm)
+        raise ProblemError(words, name="reach", value=distance, limit=reach)
 
 
-def _apart(chaser: FreeFloating, target: FreeFloating, start: Start) -> tuple[Array, Array]:
-    """From the chaser's centre of mass to the target's, m, and how fast that changes. Shape (3,) each."""
+def _offset(chaser: FreeFloating, target: FreeFloating, start: Start) -> tuple[Array, Array]:
+    """Return the vector from the chaser's centre of mass to the target's, m, and its rate, m/s. Shape (3,) each."""
     centers, speeds = [], []
     for machine, base, joints in ((target, start.target_base, np.zeros(0)), (chaser, start.base, start.joints)):
         center = center_of_mass(machine.robot, ca.DM(joints), machine.world_from_base(ca.DM(base)))
@@ -370,18 +371,18 @@ def _apart(chaser: FreeFloating, target: FreeFloating, start: Start) -> tuple[Ar
     return centers[0] - centers[1], speeds[0] - speeds[1]
 
 
-def _arm(chaser: FreeFloating, target: FreeFloating) -> float:
-    """How far apart the centres of mass of both are at most while the tip holds the grasp, m."""
+def _reach(chaser: FreeFloating, target: FreeFloating) -> float:
+    """Return an upper bound of the distance of both centres of mass while the tip is at the grasp, m."""
     robot, body = chaser.robot, target.robot
     middle = sum(link.mass * _longest(robot, link.name, link.center_of_mass) for link in robot.links if link.mass)
-    arm = _longest(robot, str(robot.tip_link), robot.tip_translation) + middle / robot.total_mass
-    return arm + float(np.linalg.norm(np.subtract(body.tip_translation, body.links[0].center_of_mass)))
+    reach = _longest(robot, str(robot.tip_link), robot.tip_translation) + middle / robot.total_mass
+    return reach + float(np.linalg.norm(np.subtract(body.tip_translation, body.links[0].center_of_mass)))
 
 
 def _longest(robot: Robot, link: str, point: object) -> float:
-    """How far a point of a link is from the root's origin at most, m; inf beyond a slide without limits."""
-    found = float(np.linalg.norm(np.asarray(point, dtype=float)))
+    """Return an upper bound of a point's distance from the root, m; inf beyond an unlimited prismatic joint."""
+    length = float(np.linalg.norm(np.asarray(point, dtype=float)))
     for joint in robot.path_to(link):
         slides = max(abs(joint.lower), abs(joint.upper)) if joint.kind == "prismatic" else 0.0
-        found += float(np.linalg.norm(joint.translation)) + slides
-    return found
+        length += float(np.linalg.norm(joint.translation)) + slides
+    return length

@@ -1,29 +1,28 @@
-"""Whole motions of a machine that stands on the ground: do tasks of its tips, do not tip over, spend the freedom well.
+"""Least-cost motions of a machine that stands on the ground, does tasks with its tips, and must not tip over.
 
-The global counterpart of local.accelerations (Yoo et al. 2004), for any Standing machine, planar or spatial, and
-any task of `tip_task`: positions, orientations, free tool axes, several arms.
+This is the planned counterpart of local.accelerations (Yoo et al. 2004), for any Standing machine, planar or spatial,
+and any tasks: positions, orientations, free tool axes, several arms. Joint accelerations (or jerks) are the control.
+The tips are kept to their tasks in one of two ways:
 
-Joint accelerations (or jerks) are the control. Two ways to keep the tips to their tasks:
-
-tip_level "position": for controls held over intervals, or linear in them: `MultipleShooting(..., control="held")` or
-    `"linear"`, `Collocation(..., control="held")`. The tip is on its path at the nodes; what the ground and the joints
-    bear is constrained at both ends of every interval; a pinned zero moment point is where it should be at the start
-    of every interval. Held controls converge with the first order of the interval where a constraint of the ground is
-    active: the audit then finds the motion feasible, and more of the cost lost than an optimum may lose. Linear ones
-    are nearer to plans that switch; take `ocp.tighten` with them.
+tip_level "position": for controls held over intervals or linear in them, that is `MultipleShooting(...,
+    control="held")` or `"linear"`, and `Collocation(..., control="held")`. The tip is on its path at the nodes. Loads
+    of ground and joints are constrained at both ends of every interval, a pinned zero moment point at the start of
+    every interval. Held controls converge with first order in the interval where a constraint of the ground is active.
+    The audit then finds the motion feasible, but its cost above the tolerance for an optimum. Linear controls are
+    closer to plans that switch; solve with `ocp.tighten`.
 tip_level "acceleration": for controls at the collocation points, `Collocation(...)`, Legendre rather than Radau. The
-    tip's acceleration is that of the path, so that its position follows as well as the dynamics are integrated. Far
-    nearer to the optimum for the same number of intervals, and certified by the audit. The one to take where slides
-    move the tip in straight lines: there a tip on its path at the nodes alone swings between them, or comes to no rest
-    on the grid (try one interval more). Not for plans that switch, as
-    those of least time do: between the points of an interval with a switch the polynomials swing far.
+    tip's acceleration is that of the path, and its position follows as accurately as the dynamics are integrated. For
+    the same number of intervals it is much closer to the optimum, and certified by the audit. Choose it where prismatic
+    joints move the tip along straight lines: with "position" the tip oscillates between the nodes there, or does not
+    come to rest on the grid (try one interval more). It does not suit plans that switch, such as those of least time,
+    since the polynomials oscillate within an interval that contains a switch.
 
-Either way limits hold at the points of the grid; `ocp.tighten(problem, method)` in place of `solve` makes those of
-joints and ground hold between the points as well. Both ways have the tip within 1e-5 m of its path between the points
-where the grid is fine enough: 40 intervals with collocation, 80 with held controls, for tasks such as those of the
-paper. There a zero moment point that is pinned or follows a reference is within 1 mm of it by the second way, and by
-the first with the jerk as control; with held accelerations it strays 5 mm, for it jumps with them.
-`ocp.motion.builders.standing.plan` chooses among all this.
+Limits hold at the points of the grid; `ocp.tighten(problem, method)` instead of `solve` enforces those of joints and
+ground between the points as well. With a fine enough grid both ways keep the tip within 1e-5 m of its path between the
+points: 40 intervals for collocation and 80 for held controls in the paper's tasks. A zero moment point that is pinned
+or follows a reference is then within 1 mm of it with "acceleration", and with "position" if the jerk is the control.
+With held accelerations it deviates by 5 mm, because it jumps with them. `ocp.motion.builders.standing.plan` chooses
+among all this.
 """
 
 from __future__ import annotations
@@ -75,18 +74,18 @@ from ocp.motion.tasks.zmp_rules import (
 )
 from ocp.problem.problem import Problem, remembers_request
 
-__all__ = ["FreeTime", "Weights", "motion_cost", "standing_problem"]
+__all__ = ["FreeTime", "StandingSetup", "Weights", "declare_horizon", "motion_cost", "standing_problem"]
 
 
 @dataclass(frozen=True)
 class Weights:
-    """Of the parts of the cost, an integral over the motion plus `time` times a free final time.
+    """Weights of the cost, an integral over the motion plus `time` times a free final time.
 
     Attributes:
-        acceleration, velocity, jerk: Of the sums of squares over the joints.
-        joint_limits: Of the joint-limit index p1 (23).
-        manipulability: Of minus the manipulability p2 (27) of the tasks' rows.
-        time: Of a free final time, 1/s.
+        acceleration, velocity, jerk: Weights of the sums of squares over the joints.
+        joint_limits: Weight of the joint-limit index p1 (23).
+        manipulability: Weight of minus the manipulability p2 (27) of the tasks' rows.
+        time: Weight of a free final time, 1/s.
     """
 
     acceleration: float = 0.01
@@ -97,23 +96,64 @@ class Weights:
     time: float = 0.0
 
     def __post_init__(self) -> None:
-        for what, value in vars(self).items():
-            checked_nonnegative(f"weights: {what}", value)
+        for name, value in vars(self).items():
+            checked_nonnegative(f"weights: {name}", value)
+
+
+@dataclass(frozen=True, eq=False)
+class StandingSetup:
+    """Settings of `standing_problem` that most motions leave at their defaults.
+
+    Attributes:
+        start_velocity, end_velocity: Whether the joints are at "rest" there, or "free" to move.
+        end: Joints at the end, nan where free; all are free if None. Shape (n,), rad or m.
+        external: External wrenches as a function of time and tip position, for example `tip_spring`.
+        control: "acceleration" or "jerk".
+        along: Argument of the tasks: "time", or "parameter" from 0 to 1 with velocities per unit of it. A free final
+            time needs "parameter", or tasks that suit any horizon.
+        tip_level: What the path constraint "tip" holds. "position": the poses (m; sines of angles), and the velocities
+            of velocity tasks. "acceleration": the derivative of the velocities (m/s^2, rad/s^2), which alone can close
+            a gap at the start; what is left of the gap at the end still moves the joints.
+        clearance_constraints: Collision avoidance, see `ocp.motion.builders.clearance`; None for none.
+        symbols: casadi.SX, or casadi.MX if a task, `external` or a reference calls an interpolant.
+    """
+
+    start_velocity: Literal["rest", "free"] = "rest"
+    end_velocity: Literal["rest", "free"] = "rest"
+    end: Any = None
+    external: External | None = None
+    control: Literal["acceleration", "jerk"] = "acceleration"
+    along: Literal["time", "parameter"] = "time"
+    tip_level: Literal["position", "acceleration"] = "position"
+    clearance_constraints: ClearanceConstraints | None = None
+    symbols: Any = ca.SX
+
+    def __post_init__(self) -> None:
+        for option, choices in (
+            ("control", ("acceleration", "jerk")),
+            ("along", ("time", "parameter")),
+            ("tip_level", ("position", "acceleration")),
+            ("start_velocity", ("rest", "free")),
+            ("end_velocity", ("rest", "free")),
+        ):
+            checked_choice(option, getattr(self, option), choices)
+        if self.clearance_constraints is not None:
+            checked_instance("clearance_constraints", self.clearance_constraints, ClearanceConstraints)
 
 
 @dataclass(frozen=True)
 class FreeTime:
-    """A final time that is found: between lower and upper, with a first guess, s."""
+    """Free final time between a lower and an upper bound, with a first guess, s."""
 
     lower: float
     upper: float
     guess: float
 
     def __post_init__(self) -> None:
-        given = (self.lower, self.guess, self.upper)
-        if not (all(map(is_finite, given)) and 0 < self.lower <= self.guess <= self.upper):
-            message = "FreeTime: 0 < lower <= guess <= upper is needed, not " + ", ".join(map(repr, given))
-            raise ProblemError(message, name="FreeTime", value=given)
+        times = (self.lower, self.guess, self.upper)
+        if not (all(map(is_finite, times)) and 0 < self.lower <= self.guess <= self.upper):
+            message = "FreeTime: 0 < lower <= guess <= upper is needed, not " + ", ".join(map(repr, times))
+            raise ProblemError(message, name="FreeTime", value=times)
 
 
 @remembers_request("standing")
@@ -121,115 +161,100 @@ class FreeTime:
 def standing_problem(
     machine: Standing,
     tasks: TipTask | Sequence[TipTask],
-    start_joints: Any,
     horizon: float | FreeTime,
     *,
+    start: Any,
     zmp: ZmpRule | None = None,
-    external: External | None = None,
     weights: Weights | None = None,
     limits: Limits | None = None,
-    control: Literal["acceleration", "jerk"] = "acceleration",
-    along: Literal["time", "parameter"] = "time",
-    tip_level: Literal["position", "acceleration"] = "position",
-    start: Literal["rest", "free"] = "rest",
-    end: Literal["rest", "free"] = "rest",
-    end_joints: Any = None,
-    clearance_constraints: ClearanceConstraints | None = None,
-    symbols: Any = ca.SX,
+    setup: StandingSetup | None = None,
 ) -> Problem:
-    """Do the tasks while the machine stands, at the least cost.
+    """Declare a standing motion of least cost along tip tasks.
 
-    States "joints", "velocities" (and "accelerations" where the jerk is the control); controls "accelerations" or
-    "jerks". Where the tasks are functions of a parameter, states "path" 0..1 and "path_rate" >= 0, control
-    "path_acceleration". Path constraints "tip"; "zero moment point" (m; inside a foot the distance from its edges, less
-    the margin); "foot", the distance from edges that another rule leaves open; "vertical force", N; "friction", the
-    square of the force the ground holds less that it gives, over the squared weight; "torques".
+    The states are "joints", "velocities", and "accelerations" if the jerk is the control. The controls are
+    "accelerations" or "jerks". With tasks along a parameter there are the states "path" from 0 to 1 and "path_rate" >=
+    0, and the control "path_acceleration". The path constraints are
+
+    - "tip", see `StandingSetup.tip_level`;
+    - "zero moment point", m; with InFoot the distance from the edges of the foot less the margin;
+    - "foot", the distance from edges that another rule leaves open, m;
+    - "vertical force", N;
+    - "friction", squared friction limit less squared tangential force, over the squared weight;
+    - "torques".
 
     Args:
-        machine: What stands.
-        tasks: A TipTask, or several that are done at once, of the time, s, or of the path parameter.
-        start_joints: Shape (n,), rad or m.
+        machine: Standing machine.
+        tasks: A TipTask, or several that are done at once, functions of the time in s or of the path parameter.
         horizon: Final time, s, or FreeTime(...).
+        start: Joints at the start. Shape (n,), rad or m.
         zmp: Where the zero moment point may be: InFoot(margin) (the default, margin 0), IndexAtLeast(value),
             Pinned(point), Following(reference) or Anywhere().
-        external: Wrenches from outside as a function of time and tip position, for example `tip_spring`.
-        weights: Of the parts of the cost. limits: Of joints and ground.
-        control: What is held over an interval of the plan.
-        along: What the tasks are functions of; "parameter" from 0 to 1, velocities per unit of it. A free final time
-            needs "parameter", or tasks that suit any horizon.
-        tip_level: Whether the path constraint "tip" is that the poses are as wanted (m; sines of angles), and the
-            velocities of tasks that are such, or the derivative of the velocities (m/s^2, rad/s^2), by which alone a
-            gap at the start can be closed; what is left of it at the end still moves the joints.
-        start, end: Whether the joints are at rest there, or free to move.
-        end_joints: Joint positions at the end, nan where free; all free if None. Shape (n,).
-        clearance_constraints: What the motion has to stay clear of, see `ocp.motion.builders.clearance`.
-        symbols: casadi.SX, or casadi.MX when a task, external or a reference calls an interpolant.
+        weights: Weights of the parts of the cost.
+        limits: Limits of joints and ground.
+        setup: Both ends, external wrenches, control, formulation and clearance; the defaults if None.
 
     Returns:
         The problem, with a local motion as its guess.
 
     Raises:
-        ProblemError: Sizes, rows or options that do not fit, a start outside the limits, a task that does not begin
-            at its tip, is longer than the arm, or moves where the joints are to rest; a start from rest at which
-            torques, vertical force or zero moment point are beyond what may be whatever the joints do; a zero moment
-            point that is asked out of the support; no freedom left to come to rest; a singular start whose
-            manipulability the cost would need.
+        ProblemError: Sizes, rows or options do not fit; the start is outside the limits; a task does not begin at its
+            tip, is longer than the arm, or moves where the joints must be at rest; no joint accelerations satisfy the
+            limits of torque, vertical force and zero moment point at a start from rest; the zero moment point is to
+            leave the support; no freedom is left to come to rest; the start is singular while the cost contains the
+            manipulability.
     """
     zmp = InFoot() if zmp is None else zmp
     weights = Weights() if weights is None else checked_instance("standing_problem: weights", weights, Weights)
     limits = Limits() if limits is None else checked_instance("standing_problem: limits", limits, Limits)
     checked_instance("standing_problem: machine", machine, Standing)
     if limits.power is not None:
-        words = "limits: standing plans know no power; limit the torques"
+        words = "limits: standing plans have no limit of power; limit the torques"
         raise ProblemError(words, name="power", value=limits.power)
-    checked_choice("control", control, ("acceleration", "jerk"))
-    checked_choice("along", along, ("time", "parameter"))
-    checked_choice("tip_level", tip_level, ("position", "acceleration"))
-    checked_choice("start", start, ("rest", "free"))
-    checked_choice("end", end, ("rest", "free"))
-    if tip_level == "acceleration" and control == "jerk":
+    setup = StandingSetup() if setup is None else checked_instance("standing_problem: setup", setup, StandingSetup)
+    tip_level, along_parameter, external = setup.tip_level, setup.along == "parameter", setup.external
+    if tip_level == "acceleration" and setup.control == "jerk":
         message = "tip_level 'acceleration' goes with control 'acceleration', not with 'jerk'"
-        raise ProblemError(message, name="control", value=control, limit="acceleration")
+        raise ProblemError(message, name="control", value=setup.control, limit="acceleration")
+    rests = setup.start_velocity == "rest", setup.end_velocity == "rest"
     equations = bind(machine, tasks)
     duration = checked_horizon(horizon.guess if isinstance(horizon, FreeTime) else horizon)
-    begin, base = checked_configuration(machine, start_joints, None)
+    begin, base = checked_configuration(machine, start, None)
     bounds = limits.bounds(machine, ("velocity", "torque"))
     begin = start_inside(machine, begin, bounds.lower, bounds.upper)
     check_rule(machine, zmp, duration)
-    last = 1.0 if along == "parameter" else duration
+    last = 1.0 if along_parameter else duration
     checked_tasks(equations, base, begin, last)
-    check_freedom(machine, equations.size, zmp, along, tip_level, end)
+    check_freedom(
+        machine, equations.size, zmp, along_parameter=along_parameter, tip_level=tip_level, ends_at_rest=rests[1]
+    )
     if weights.manipulability:
         check_slope(equations, begin)
     check_length(equations, base, last)
-    if along == "time":
-        check_rest(equations, 0.0 if start == "rest" else None, last if end == "rest" else None)
-    if start == "rest":
+    if not along_parameter:
+        check_rest(equations, 0.0 if rests[0] else None, last if rests[1] else None)
+    if rests[0]:
         tip = np.array(ca.DM(machine.tip_pose((), begin).position))
         acting = wrenches_at(external, ca.DM(0.0), ca.DM(tip))
-        held = tip_level == "acceleration"  # else the tip is on its path at the nodes alone
-        demand = task_demand(equations, begin, along == "parameter") if held else None
+        # with tip_level "position" the tip is on its path at the nodes alone
+        demand = task_demand(equations, begin, along_parameter) if tip_level == "acceleration" else None
         check_loads(machine, begin, acting, zmp, limits.least_force(machine), bounds, demand)
-    guess = local_guess(machine, equations, begin, duration, along == "parameter", external)
+    guess = local_guess(machine, equations, begin, duration, along_parameter, external)
 
-    problem = Problem("standing plan", symbols=symbols)
-    final = _horizon(problem, horizon)
-    resting = (
-        None
-        if end == "free"
-        else rates_at_rest(
-            equations, (), guess["joints"].values[-1], ~equations.pose_rows if tip_level == "position" else None
-        )
-    )
-    motion, jerks = _motion(problem, machine.robot, bounds, begin, start, resting, end_joints, control, guess)
+    problem = Problem("standing plan", symbols=setup.symbols)
+    final = declare_horizon(problem, horizon)
+    resting: Array | None = None
+    if rests[1]:
+        rows = ~equations.pose_rows if tip_level == "position" else None
+        resting = rates_at_rest(equations, (), guess["joints"].values[-1], rows)
+    motion, jerks = _motion(problem, machine.robot, bounds, begin, resting, guess, setup)
     joints, velocities, accelerations = motion
     progress: tuple[Any, ...] = (problem.time,)
-    if along == "parameter":
-        progress = _progress(problem, start, end, guess)
-    _hold_tips(problem, equations, motion, progress, tip_level, start == "free")
+    if along_parameter:
+        progress = _progress(problem, rests, guess)
+    _constrain_tips(problem, equations, motion, progress, tip_level, not rests[0])
 
     wrenches = wrenches_at(external, problem.time, machine.tip_pose((), joints).position)
-    _ground(problem, machine, motion, wrenches, zmp, limits)
+    _constrain_ground(problem, machine, motion, wrenches, zmp, limits)
     effort = bounds.torque
     if np.isfinite(effort).any():
         limited = np.flatnonzero(np.isfinite(effort)).tolist()
@@ -237,11 +262,9 @@ def standing_problem(
         problem.path("torques", torques, lower=-effort[limited], upper=effort[limited], unit=machine.robot.effort_unit)
 
     none = ca.DM(0, 1)
-    if clearance_constraints is not None:
+    if setup.clearance_constraints is not None:
         known = None if isinstance(horizon, FreeTime) else duration
-        checked_instance("standing_problem: clear", clearance_constraints, ClearanceConstraints).declare(
-            problem, none, joints, horizon=known
-        )
+        setup.clearance_constraints.declare(problem, none, joints, horizon=known)
     running = weights.acceleration * ca.sumsqr(accelerations) + weights.velocity * ca.sumsqr(velocities)
     if weights.joint_limits:
         running += weights.joint_limits * joint_limit_index(machine.robot, joints)
@@ -252,7 +275,7 @@ def standing_problem(
     return problem
 
 
-def _hold_tips(
+def _constrain_tips(
     problem: Problem,
     equations: TaskEquations,
     motion: tuple[Any, Any, Any],
@@ -260,7 +283,7 @@ def _hold_tips(
     tip_level: str,
     moving: bool,
 ) -> None:
-    """Hold the tips to their tasks: by their poses, or by accelerations, from a start at rest or `moving`."""
+    """Constrain the tips to their tasks, by poses or by accelerations, from a start at rest or `moving`."""
     none, (joints, velocities, accelerations) = ca.DM(0, 1), motion
     targets = equations.targets(*progress[:2])
     if tip_level == "position":
@@ -272,11 +295,12 @@ def _hold_tips(
         problem.start("tip velocity", residual, lower=0, upper=0, unit=equations.unit())
     gap = equations.acceleration(none, joints, velocities, accelerations, *progress)
     problem.path("tip", gap, lower=0, upper=0, unit=equations.unit("/s^2", "/s^2"))
-    for name, stray in equations.deviations(none, joints, velocities, targets).items():
-        problem.watch(name, **stray)
+    for name, deviation in equations.deviations(none, joints, velocities, targets).items():
+        problem.watch(name, **deviation)
 
 
-def _horizon(problem: Problem, horizon: float | FreeTime) -> Any:
+def declare_horizon(problem: Problem, horizon: float | FreeTime) -> Any:
+    """Declare a fixed or free horizon and return it."""
     if isinstance(horizon, FreeTime):
         return problem.horizon(lower=horizon.lower, upper=horizon.upper, guess=horizon.guess)
     return problem.horizon(float(horizon))
@@ -287,49 +311,47 @@ def _motion(
     robot: Robot,
     bounds: JointBounds,
     begin: Array,
-    start: str,
     resting: Array | None,
-    end_joints: Any,
-    control: str,
     guess: Mapping[str, Any],
+    setup: StandingSetup,
 ) -> tuple[tuple[Any, Any, Any], Any]:
-    """The states and controls of the joints: (positions, velocities, accelerations), and jerks, nothing if not one."""
+    """Declare the joints and return (positions, velocities, accelerations), and jerks, empty if not a control."""
     n = len(begin)
     joints = problem.state(
-        "joints", n, initial=begin, terminal=end_joints, lower=bounds.lower, upper=bounds.upper, guess=guess["joints"],
+        "joints", n, initial=begin, terminal=setup.end, lower=bounds.lower, upper=bounds.upper, guess=guess["joints"],
         unit=robot.unit(),
     )  # fmt: skip
-    fast, push, rough = bounds.velocity, bounds.acceleration, bounds.jerk
     velocities = problem.state(
-        "velocities", n, initial=0.0 if start == "rest" else None, terminal=resting, lower=-fast, upper=fast,
-        guess=guess["velocities"], unit=robot.unit("/s"),
+        "velocities", n, initial=0.0 if setup.start_velocity == "rest" else None, terminal=resting,
+        lower=-bounds.velocity, upper=bounds.velocity, guess=guess["velocities"], unit=robot.unit("/s"),
     )  # fmt: skip
     jerks: Any = ca.DM(0, 1)
-    declare: Any = problem.state if control == "jerk" else problem.control
+    declare: Any = problem.state if setup.control == "jerk" else problem.control
     accelerations = declare(
-        "accelerations", n, lower=-push, upper=push, guess=guess["accelerations"], unit=robot.unit("/s^2")
-    )
-    if control == "jerk":
-        jerks = problem.control("jerks", n, lower=-rough, upper=rough, unit=robot.unit("/s^3"))
+        "accelerations", n, lower=-bounds.acceleration, upper=bounds.acceleration, guess=guess["accelerations"],
+        unit=robot.unit("/s^2"),
+    )  # fmt: skip
+    if setup.control == "jerk":
+        jerks = problem.control("jerks", n, lower=-bounds.jerk, upper=bounds.jerk, unit=robot.unit("/s^3"))
         problem.dynamics(accelerations, jerks)
     problem.dynamics(joints, velocities)
     problem.dynamics(velocities, accelerations)
     return (joints, velocities, accelerations), jerks
 
 
-def _progress(problem: Problem, start: str, end: str, guess: Mapping[str, Any]) -> tuple[Any, Any, Any]:
-    """The path parameter, from 0 to 1, its rate and the rate of that."""
+def _progress(problem: Problem, rests: tuple[bool, bool], guess: Mapping[str, Any]) -> tuple[Any, Any, Any]:
+    """Declare and return the path parameter from 0 to 1, its rate and its acceleration."""
     at = problem.state("path", initial=0.0, terminal=1.0, lower=0.0, upper=1.0, guess=guess["path"])
-    first, last = (0.0 if side == "rest" else None for side in (start, end))
+    first, last = (0.0 if rest else None for rest in rests)
     rate = problem.state("path_rate", lower=0.0, guess=guess["path_rate"], initial=first, terminal=last, unit="1/s")
-    push = problem.control("path_acceleration", guess=guess["path_acceleration"], unit="1/s^2")
+    acceleration = problem.control("path_acceleration", guess=guess["path_acceleration"], unit="1/s^2")
     problem.dynamics(at, rate)
-    problem.dynamics(rate, push)
-    return at, rate, push
+    problem.dynamics(rate, acceleration)
+    return at, rate, acceleration
 
 
 def motion_cost(motion: StandingMotion, weights: Weights | None = None) -> float:
-    """The cost of standing_problem for a sampled motion, by the trapezoidal rule; without the weight of jerks."""
+    """Return the cost of standing_problem for a sampled motion, by the trapezoidal rule and without jerks."""
     w = weights or Weights()
     running = w.acceleration * (motion.joint_accelerations**2).sum(axis=1)
     running += w.velocity * (motion.joint_velocities**2).sum(axis=1)
@@ -337,7 +359,7 @@ def motion_cost(motion: StandingMotion, weights: Weights | None = None) -> float
     return float(np.trapezoid(running, motion.t) + w.time * motion.t[-1])
 
 
-def _ground(
+def _constrain_ground(
     problem: Problem,
     machine: Standing,
     motion: tuple[Any, Any, Any],
@@ -345,13 +367,13 @@ def _ground(
     zmp: ZmpRule,
     limits: Limits,
 ) -> None:
-    """The path constraints on what the ground bears."""
+    """Declare the path constraints on the ground reaction."""
     reaction = machine.ground_reaction(*motion, wrenches)
     force = reaction[3:6]
     problem.path("vertical force", force[2], lower=limits.least_force(machine), unit="N")
     if np.isfinite(limits.friction):
-        room = ((limits.friction * force[2]) ** 2 - ca.sumsqr(force[:2])) / machine.weight**2
-        problem.path("friction", room, lower=0)
+        reserve = ((limits.friction * force[2]) ** 2 - ca.sumsqr(force[:2])) / machine.weight**2
+        problem.path("friction", reserve, lower=0)
     point = center_of_pressure(reaction)
     if isinstance(zmp, IndexAtLeast):
         low, high = zmp.region(machine)

@@ -1,9 +1,9 @@
-"""Steps as the pseudo-inverse takes them, beside plans: each foot on its way, the least joint rates at every instant.
+"""Motions over changing support at sampled times, planned or resolved by the pseudo-inverse.
 
-Nothing looks at what the ground can bear. With all feet held nothing moves; where the zero moment point leaves the
-soles, or a sole would have to pull, the machine falls.
-
-What a motion over changing support asks of the feet, the ground and the joints, at sampled times.
+`StepsMotion` has the loads of the feet, the zero moment point and the joint torques of a motion. `steps_motion` samples
+a plan of `steps_problem`. `resolve_steps` tracks the same footholds with the least joint rates at every instant, as a
+baseline: it ignores what the ground can bear. The machine falls where the zero moment point leaves the soles, or where
+a sole would have to pull.
 """
 
 from __future__ import annotations
@@ -37,21 +37,24 @@ SAMPLES = 101
 
 @dataclass(frozen=True, eq=False)
 class StepsMotion:
-    """A motion of a machine over its stances at M times; where a phase meets the next both sides are there.
+    """Motion of a machine over its stances at M times; a time at which two phases meet occurs twice.
+
+    The loads of all feet but the first are given, for example planned. The first foot bears the rest.
 
     Attributes:
-        steps: The machine and its stances.
-        t: Times. Shape (M,), s. phase: Which phase each belongs to. Shape (M,).
+        steps: Machine and its stances.
+        t: Times. Shape (M,), s.
+        phase: Index of the phase of each time. Shape (M,).
         joints, joint_velocities, joint_accelerations, joint_torques: In the robot's order. Shape (M, n).
-        root_position, root_rotation: Frame of the robot's root link in the world. Shapes (M, 3), m, and (M, 3, 3).
-        center_of_mass: Shape (M, 3), m.
-        loads: By foot, (moment about the origin of its sole's frame, force), world axes; zero in the air. (M, 6).
-        sole_position, sole_rotation: By foot, of its sole's frame. Shapes (M, 3), m, and (M, 3, 3).
-        zero_moment_point: Of the sum of the loads, (x, y). Shape (M, 2), m.
-        margin: Its distance from the edge of the hull of the soles, positive inside; nan with a grip. Shape (M,), m.
-        balance: The same of the center of mass. Shape (M,), m.
-
-    Loads besides the first foot's are given, those planned say; the first bears the rest.
+        root_position, root_rotation: Frame of the robot's root link in world. Shapes (M, 3), m, and (M, 3, 3).
+        center_of_mass: In world. Shape (M, 3), m.
+        loads: By foot: moment about the origin of its sole's frame, and force, in world axes; zero in the air. Shape
+            (M, 6), N m and N.
+        sole_position, sole_rotation: By foot: frame of its sole in world. Shapes (M, 3), m, and (M, 3, 3).
+        zero_moment_point: (x, y) of the sum of the loads. Shape (M, 2), m.
+        margin: Distance of the zero moment point from the edge of the hull of the soles, positive inside; nan with a
+            grip. Shape (M,), m.
+        balance: The same distance of the center of mass. Shape (M,), m.
     """
 
     steps: Steps
@@ -72,12 +75,12 @@ class StepsMotion:
     balance: Array
 
     def held(self, foot: str) -> NDArray[np.bool_]:
-        """When a foot is held. Shape (M,), bool."""
-        held = np.array([foot in phase.footholds for phase in self.steps.phases], dtype=bool)
-        return np.asarray(held[self.phase.astype(int)], dtype=bool)
+        """Return at which times a foot is held. Shape (M,), bool."""
+        by_phase = np.array([foot in phase.footholds for phase in self.steps.phases], dtype=bool)
+        return np.asarray(by_phase[self.phase.astype(int)], dtype=bool)
 
     def center_of_pressure(self, foot: str) -> Array:
-        """In the plane of the sole, x and y of its frame; nan in the air. Shape (M, 2), m."""
+        """Return the center of pressure in the frame of a sole, (x, y); nan in the air. Shape (M, 2), m."""
         turn, load = self.sole_rotation[foot], self.loads[foot]
         moment, force = (np.einsum("kji,kj->ki", turn, part) for part in (load[:, :3], load[:, 3:]))
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -86,18 +89,18 @@ class StepsMotion:
         return np.asarray(points)
 
     def _force(self, foot: str) -> Array:
-        """On a foot, in the axes of its sole. Shape (M, 3), N."""
+        """Return the force on a foot in the axes of its sole. Shape (M, 3), N."""
         return np.asarray(np.einsum("kji,kj->ki", self.sole_rotation[foot], self.loads[foot][:, 3:]))
 
     def friction(self, foot: str) -> Array:
-        """Force along the sole over that which presses it: the coefficient it takes; nan in the air. Shape (M,)."""
+        """Return the needed friction coefficient, tangential over normal force; nan in the air. Shape (M,)."""
         force = self._force(foot)
         with np.errstate(divide="ignore", invalid="ignore"):
             needed = np.linalg.norm(force[:, :2], axis=1) / force[:, 2]
         return np.asarray(np.where(self.held(foot), needed, np.nan))
 
     def summary(self) -> dict[str, float]:
-        """The extremes, by name."""
+        """Return the extreme values by name."""
         soles = [name for name, foot in self.steps.feet.items() if foot.sole is not None]
         return {
             "duration_s": float(self.t[-1]),
@@ -111,15 +114,15 @@ class StepsMotion:
 
 
 def steps_motion(steps: Steps, solution: Solution, samples: int = SAMPLES) -> StepsMotion:
-    """A plan of `steps_problem`, sampled.
+    """Sample a plan of `steps_problem`.
 
     Args:
-        steps: What it was planned for.
-        solution: The plan.
-        samples: In each phase, both of its ends among them.
+        steps: Steps of the plan.
+        solution: Plan.
+        samples: Samples of each phase, both ends included.
 
     Raises:
-        ProblemError: A plan of other phases.
+        ProblemError: The plan has other phases.
     """
     checked_instance("steps_motion: steps", steps, Steps)
     checked_instance("steps_motion: solution", solution, Solution)
@@ -133,30 +136,37 @@ def steps_motion(steps: Steps, solution: Solution, samples: int = SAMPLES) -> St
     for k, name in enumerate(steps.names):
         stance = steps.stances[k]
         values = solution.phase(name).at_fraction(share)
-        others = {foot: values[f"{foot} load"] for foot in stance.other_feet}
+        other_feet = {foot: values[f"{foot} load"] for foot in stance.other_feet}
         motion = tuple(values[part] for part in ("joints", "velocities", "accelerations"))
-        found = sampled(steps, stance, motion, others)
+        quantities = sample_stance(steps, stance, motion, other_feet)
         begin, end = times[name]
-        parts.append({"t": begin + (end - begin) * share, "phase": np.full(count, float(k)), **found})
+        parts.append({"t": begin + (end - begin) * share, "phase": np.full(count, float(k)), **quantities})
     return motion_of(steps, parts)
 
 
 def motion_of(steps: Steps, parts: Sequence[Mapping[str, Array]]) -> StepsMotion:
-    """The whole of what `sampled` found in the phases, with "t" and "phase"."""
+    """Return the motion of all phases, from values of `sample_stance` with "t" and "phase"."""
     whole = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
-    def feet(what: str) -> dict[str, Array]:
-        return {foot: whole.pop(f"{foot} {what}") for foot in steps.feet}
+    def by_foot(quantity: str) -> dict[str, Array]:
+        return {foot: whole.pop(f"{foot} {quantity}") for foot in steps.feet}
 
-    loads, places, turns = feet("load"), feet("position"), feet("rotation")
+    loads, places, turns = by_foot("load"), by_foot("position"), by_foot("rotation")
     return StepsMotion(steps, loads=loads, sole_position=places, sole_rotation=turns, **whole)
 
 
-def sampled(steps: Steps, stance: Stance, motion: tuple[Array, ...], others: Mapping[str, Array]) -> dict[str, Array]:
-    """What a motion (q, q', q'') in one stance takes, in its order; `others` in the rows that are held. (M, ...)."""
+def sample_stance(
+    steps: Steps, stance: Stance, motion: tuple[Array, ...], other_feet: Mapping[str, Array]
+) -> dict[str, Array]:
+    """Return the quantities of `StepsMotion` for a motion in one stance, by name. Shape (M, ...) each.
+
+    Args:
+        motion: q, q', q'' in the stance's order. Shape (M, n) each.
+        other_feet: Loads of the feet besides the first, in their held rows. Shape (M, k) each.
+    """
     q, qd, qdd = motion
     function, names = _function(steps, stance)
-    stacked = np.column_stack([np.zeros((len(q), 0)), *others.values()])
+    stacked = np.column_stack([np.zeros((len(q), 0)), *other_feet.values()])
     outputs = function.map(len(q))(q.T, qd.T, qdd.T, stacked.T)
     values = {name: np.array(ca.DM(value)).T for name, value in zip(names, outputs, strict=True)}
     order = steps.order(stance)
@@ -177,14 +187,15 @@ def sampled(steps: Steps, stance: Stance, motion: tuple[Array, ...], others: Map
 
 
 def _function(steps: Steps, stance: Stance) -> tuple[Any, list[str]]:
+    """Return a casadi function (q, q', q'', loads) and the names of its outputs."""
     n = stance.joint_size
     q, qd, qdd = (ca.SX.sym(name, n) for name in ("q", "qd", "qdd"))
-    given = {name: ca.SX.sym("load", len(stance.load_rows[name])) for name in stance.other_feet}
-    others = {name: stance.full_load(name, rows) for name, rows in given.items()}
-    loads = stance.loads(q, qd, qdd, others)
+    rows = {name: ca.SX.sym("load", len(stance.load_rows[name])) for name in stance.other_feet}
+    other_feet = {name: stance.full_load(name, part) for name, part in rows.items()}
+    loads = stance.loads(q, qd, qdd, other_feet)
     root = link_frames(stance.robot, q, stance.world_from_base())[steps.robot.root]
     outputs = {
-        "joint_torques": stance.joint_torques(q, qd, qdd, others),
+        "joint_torques": stance.joint_torques(q, qd, qdd, other_feet),
         "root_position": root.position,
         "root_rotation": ca.vec(root.rotation),
         "center_of_mass": stance.center_of_mass(q),
@@ -195,45 +206,45 @@ def _function(steps: Steps, stance: Stance) -> tuple[Any, list[str]]:
         outputs[f"{name} load"] = loads.get(name, ca.DM.zeros(6))
         outputs[f"{name} position"] = frame.position
         outputs[f"{name} rotation"] = ca.vec(frame.rotation)
-    inputs = [q, qd, qdd, ca.vertcat(ca.SX(0, 1), *given.values())]
+    inputs = [q, qd, qdd, ca.vertcat(ca.SX(0, 1), *rows.values())]
     return ca.Function("motion", inputs, [ca.densify(v) for v in outputs.values()], {"cse": True}), list(outputs)
 
 
-def resolve_steps(steps: Steps, start_joints: Any, *, clearance: float = 0.02, samples: int = SAMPLES) -> StepsMotion:
-    """Take the stances one after the other with the least joint rates at every instant (`resolve`).
+def resolve_steps(steps: Steps, *, start: Any, clearance: float = 0.02, samples: int = SAMPLES) -> StepsMotion:
+    """Take steps with the least joint rates at every instant, by `resolve`.
 
-    A foot that is lifted goes to its next foothold from rest to rest, straight when it is seen from above, raised by
-    64 s^3 (1 - s)^3 of the clearance at the share s of its way; one that lands nowhere goes where the others take it.
-    Feet that hold share the load by the least squares of their loads.
+    A lifted foot moves to its next foothold from rest to rest. Seen from above its path is straight; at the share s of
+    the path it is raised by 64 s^3 (1 - s)^3 times the clearance. A foot without a next foothold follows the others.
+    The held feet share the load so that the sum of the squared loads is least.
 
     Args:
-        steps: The robot and its stances; a duration that is free is taken as guessed.
-        start_joints: In the robot's order, with the feet on their footholds. Shape (n,).
-        clearance: Height of a sole above its way in the middle, m.
-        samples: In each phase, both of its ends among them.
+        steps: Robot and its stances; a free duration takes its guess.
+        start: Joints in the robot's order, with the feet on their footholds. Shape (n,), rad or m.
+        clearance: Height of a sole above the line between its footholds, halfway, m.
+        samples: Samples of each phase, both ends included.
 
     Raises:
-        ProblemError: Sizes or values that do not fit, a start off the footholds.
-        SolveError: The motion breaks down, at a leg that is stretched say; names the phase and the time in it.
+        ProblemError: Sizes or values do not fit, or a foot is off its foothold at the start.
+        SolveError: The motion breaks down, for example at a stretched leg; names the phase and the time in it.
     """
     checked_instance("resolve_steps: steps", steps, Steps)
     height = checked_nonnegative("resolve_steps: clearance", clearance)
     count = checked_count("resolve_steps: samples", samples, least=2)
-    joints = checked_numbers(start_joints, steps.robot.dof, "start_joints", "one entry for each joint")
+    joints = checked_numbers(start, steps.robot.dof, "start", "one entry for each joint")
     check_placed(steps.stances[0], joints[steps.order(steps.stances[0])])
     parts, begin = [], 0.0
     for k, stance in enumerate(steps.stances):
         t = np.linspace(0.0, steps.phases[k].seconds, count)
         motion = _phase(steps, k, joints[steps.order(stance)], t, height)
-        found = sampled(steps, stance, motion, _shared(stance, motion))
-        joints = found["joints"][-1]
-        parts.append({"t": begin + t, "phase": np.full(count, float(k)), **found})
+        values = sample_stance(steps, stance, motion, _least_loads(stance, motion))
+        joints = values["joints"][-1]
+        parts.append({"t": begin + t, "phase": np.full(count, float(k)), **values})
         begin += t[-1]
     return motion_of(steps, parts)
 
 
 def _phase(steps: Steps, k: int, joints: Array, t: Array, clearance: float) -> tuple[Array, Array, Array]:
-    """Joints, their rates and accelerations in the order of the stance of phase k, (M, n) each."""
+    """Return joints, rates and accelerations of phase k in the order of its stance. Shape (M, n) each."""
     stance = steps.stances[k]
     swings = [swing for swing in steps.swings(k) if swing.lifted is not None and swing.landing is not None]
     if not swings:
@@ -244,16 +255,16 @@ def _phase(steps: Steps, k: int, joints: Array, t: Array, clearance: float) -> t
         for name, place in stance.footholds.items()
         if name in stance.other_feet
     ]
-    tasks += [_on_its_way(stance, swing, t[-1], clearance) for swing in swings]
-    found = resolve(stance, tasks=tasks, start_joints=joints, horizon=t[-1], samples=t)
-    if found.stopped is not None:
-        words = f"phase {steps.names[k]!r}: the pseudo-inverse breaks down at {found.t[-1]:.4g} s: {found.stopped}"
-        raise SolveError(words, name=steps.names[k], time=float(found.t[-1]))
-    return found.joints, found.joint_rates, CubicSpline(t, found.joint_rates).derivative()(t)
+    tasks += [_swing_task(stance, swing, t[-1], clearance) for swing in swings]
+    local = resolve(stance, tasks=tasks, start_joints=joints, horizon=t[-1], samples=t)
+    if local.stopped is not None:
+        words = f"phase {steps.names[k]!r}: the pseudo-inverse breaks down at {local.t[-1]:.4g} s: {local.stopped}"
+        raise SolveError(words, name=steps.names[k], time=float(local.t[-1]))
+    return local.joints, local.joint_rates, CubicSpline(t, local.joint_rates).derivative()(t)
 
 
-def _on_its_way(stance: Stance, swing: Swing, seconds: float, clearance: float) -> TipTask:
-    """A foot from where it lifts to where it lands, from rest to rest."""
+def _swing_task(stance: Stance, swing: Swing, seconds: float, clearance: float) -> TipTask:
+    """Return the task of a foot from one foothold to the next, from rest to rest."""
     assert swing.lifted is not None
     assert swing.landing is not None
     lifted, landing = swing.lifted, swing.landing
@@ -264,8 +275,10 @@ def _on_its_way(stance: Stance, swing: Swing, seconds: float, clearance: float) 
 
     def position(t: Any) -> Any:
         s = t / seconds
-        way = rest_to_rest(s) * ca.DM(np.asarray(landing.position) - np.asarray(lifted.position))
-        return ca.DM(np.asarray(lifted.position)) + way + 64 * (s * (1 - s)) ** 3 * clearance * ca.DM(last[:, 2])
+        displacement = rest_to_rest(s) * ca.DM(np.asarray(landing.position) - np.asarray(lifted.position))
+        return (
+            ca.DM(np.asarray(lifted.position)) + displacement + 64 * (s * (1 - s)) ** 3 * clearance * ca.DM(last[:, 2])
+        )
 
     def orientation(t: Any) -> Any:
         return ca.mtimes(rotation(ca.DM(axis), angle * rest_to_rest(t / seconds)), ca.DM(first))
@@ -273,16 +286,16 @@ def _on_its_way(stance: Stance, swing: Swing, seconds: float, clearance: float) 
     return foot_task(stance, swing.name, position, orientation if angle else last, duration=seconds)
 
 
-def _shared(stance: Stance, motion: tuple[Array, Array, Array]) -> dict[str, Array]:
-    """Loads of the feet besides the first, in the rows that are held, (M, k): the least squares of all of them."""
+def _least_loads(stance: Stance, motion: tuple[Array, Array, Array]) -> dict[str, Array]:
+    """Return least-squares loads of the feet besides the first, in their held rows. Shape (M, k) each."""
     sizes = {name: len(stance.load_rows[name]) for name in stance.other_feet}
     if not sizes:
         return {}
     q, qd, qdd = (ca.SX.sym(name, stance.joint_size) for name in ("q", "qd", "qdd"))
-    given = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
-    others = {name: stance.full_load(name, rows) for name, rows in given.items()}
-    every = ca.vertcat(*stance.loads(q, qd, qdd, others).values())
-    free = ca.vertcat(*given.values())
+    rows = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
+    other_feet = {name: stance.full_load(name, part) for name, part in rows.items()}
+    every = ca.vertcat(*stance.loads(q, qd, qdd, other_feet).values())
+    free = ca.vertcat(*rows.values())
     slope = ca.jacobian(every, free)
     rest = ca.substitute(every, free, ca.DM.zeros(free.shape))
     least = -ca.solve(ca.mtimes(slope.T, slope), ca.mtimes(slope.T, rest))

@@ -1,8 +1,8 @@
-"""A machine and the stances that it takes one after the other: which feet are held where, and for how long.
+"""Stances of a legged machine, configurations that stand in them, and a first guess of steps.
 
-Postures of a stance: feet on their footholds, the center of mass where it is wanted, the joints near to others.
-
-A first guess of steps is made of them: from posture to posture, at rest in each.
+A stance is a set of feet held on footholds. `Steps` is a sequence of stances, each for some time.
+`standing_configuration` finds joints with the feet on their footholds and the center of mass over a point, near given
+joints. The first guess of steps interpolates between such configurations, at rest in each.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ __all__ = [
     "check_placed",
     "first_guess",
     "foot_task",
-    "hold",
+    "foothold_equations",
     "standing_configuration",
     "walk",
 ]
@@ -43,38 +43,44 @@ __all__ = [
 
 @dataclass(frozen=True, eq=False)
 class StancePhase:
-    """For how long which feet are held where.
+    """Feet held on footholds for some time.
 
     Attributes:
-        footholds: By the names of the feet; the machine is rooted at the first.
+        footholds: Footholds by the names of the feet; the machine is rooted at the first.
         duration: s, or FreeTime(...).
 
     Raises:
-        ProblemError: No footholds, a duration that is none.
+        ProblemError: There are no footholds, or the duration is invalid.
     """
 
     footholds: Mapping[str, Foothold]
     duration: float | FreeTime
 
     def __post_init__(self) -> None:
-        held = checked_mapping("stance phase: footholds", self.footholds)
-        if not held:
-            raise ProblemError("stance phase: footholds are missing: nothing stands on nothing", name="footholds")
-        for name, place in held.items():
-            checked_instance(f"stance phase: foothold of {name!r}", place, Foothold)
+        footholds = checked_mapping("stance phase: footholds", self.footholds)
+        if not footholds:
+            raise ProblemError("stance phase: footholds are missing; hold at least one foot", name="footholds")
+        for name, foothold in footholds.items():
+            checked_instance(f"stance phase: foothold of {name!r}", foothold, Foothold)
         if not isinstance(self.duration, FreeTime):
             checked_horizon(self.duration)
-        object.__setattr__(self, "footholds", held)
+        object.__setattr__(self, "footholds", footholds)
 
     @property
     def seconds(self) -> float:
-        """The duration, or the guess of it."""
+        """Return the duration, or its guess if it is free, s."""
         return self.duration.guess if isinstance(self.duration, FreeTime) else float(self.duration)
 
 
 @dataclass(frozen=True, eq=False)
 class Swing:
-    """A foot in the air during a phase: where it lifted, and where it lands at the end; None where it does not."""
+    """Foot in the air during a phase.
+
+    Attributes:
+        name: Name of the foot.
+        lifted: Foothold that it left; None if it was never held before.
+        landing: Foothold on which it lands at the end of the phase; None if it does not land then.
+    """
 
     name: str
     lifted: Foothold | None
@@ -83,17 +89,17 @@ class Swing:
 
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """A robot, its feet, and the stances that it takes.
+    """Robot, its feet, and the sequence of its stances.
 
     Attributes:
-        robot: Rooted anywhere; joint vectors are in its order.
-        feet: By name.
-        phases: One after the other; a foot held in two phases in a row stays where it is, and so must its foothold.
+        robot: Robot, rooted anywhere; joint vectors are in its order.
+        feet: Feet by name.
+        phases: Consecutive stances. The foothold of a foot that is held in two consecutive phases must not change.
         gravity: m/s^2, downwards.
 
     Raises:
-        ProblemError: No phases, an unknown foot, a foot whose foothold moves while it is held, no foot that is held in
-            two phases in a row; what Stance.on refuses.
+        ProblemError: There are no phases; a foot is unknown; a foothold moves while its foot is held; no foot is held
+            from a phase to the next; `Stance.on` refuses a stance.
     """
 
     robot: Robot
@@ -119,8 +125,8 @@ class Steps:
                 words = f"steps: no foot is held from phase {k} to phase {k + 1}: the machine would leap"
                 raise ProblemError(words, name="phases", value=k)
             for name in both:
-                one, other = before.footholds[name], after.footholds[name]
-                if np.any(one.position != other.position) or np.any(one.rotation != other.rotation):
+                first, second = before.footholds[name], after.footholds[name]
+                if np.any(first.position != second.position) or np.any(first.rotation != second.rotation):
                     words = f"steps: foot {name!r} is held from phase {k} to phase {k + 1}, but its foothold moves"
                     raise ProblemError(words, name=name, value=k)
         object.__setattr__(self, "feet", feet)
@@ -132,123 +138,122 @@ class Steps:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Of the phases: their number, from 1, and the feet that are held."""
+        """Return the names of the phases: their number, from 1, and the feet that are held."""
         return tuple(f"{k + 1} {' + '.join(phase.footholds)}" for k, phase in enumerate(self.phases))
 
     @cached_property
     def stances(self) -> tuple[Stance, ...]:
-        """The machine of each phase, rooted at the first of its feet."""
+        """Return the machine of each phase, rooted at the first of its feet."""
         return tuple(Stance.on(self.robot, self.feet, phase.footholds, self.gravity) for phase in self.phases)
 
     def order(self, stance: Stance) -> NDArray[np.intp]:
-        """Where the entries of a stance's joint vectors are in those of the robot: q_stance = q[order]."""
+        """Return the indices of a stance's joints among those of the robot: q_stance = q[order]. Shape (n,)."""
         return np.array([self.robot.joint_names.index(name) for name in stance.robot.joint_names], dtype=np.intp)
 
     def swings(self, k: int) -> tuple[Swing, ...]:
-        """The feet in the air during phase k that were or will be held."""
-        found = []
+        """Return the feet in the air during phase k that were held before or land at its end."""
+        swings = []
         for name in self.feet:
             if name in self.phases[k].footholds:
                 continue
             past = [phase.footholds[name] for phase in self.phases[:k] if name in phase.footholds]
             after = self.phases[k + 1].footholds.get(name) if k + 1 < len(self.phases) else None
             if past or after is not None:
-                found.append(Swing(name, past[-1] if past else None, after))
-        return tuple(found)
+                swings.append(Swing(name, past[-1] if past else None, after))
+        return tuple(swings)
 
     def standing(self, k: int) -> Stance:
-        """The stance at the beginning of phase k, at the end for the number of phases: all feet that touch there."""
-        around = self.phases[max(k - 1, 0) : k + 1]
-        held: dict[str, Foothold] = {}
-        for phase in around:
-            held |= phase.footholds
-        return Stance.on(self.robot, self.feet, held, self.gravity)
+        """Return the stance of all feet held just before or just after the start of phase k (or the end)."""
+        footholds: dict[str, Foothold] = {}
+        for phase in self.phases[max(k - 1, 0) : k + 1]:
+            footholds |= phase.footholds
+        return Stance.on(self.robot, self.feet, footholds, self.gravity)
 
     def balanced(self, k: int) -> Array:
-        """Where a center of mass at the beginning of phase k is well placed: over the feet held before and after. (2,).
+        """Return a good place of the center of mass at the start of phase k: between the feet held before and after.
 
-        The middle of their soles, m; of the footholds themselves where none has one.
+        It is the mean of the centers of their soles, or of their footholds if none has a sole. Shape (2,), m.
         """
-        around = self.phases[max(k - 1, 0) : k + 1]
-        held = [name for name in around[0].footholds if all(name in phase.footholds for phase in around)]
-        soles = [name for name in held if self.feet[name].sole is not None] or held
+        phases = self.phases[max(k - 1, 0) : k + 1]
+        feet = [name for name in phases[0].footholds if all(name in phase.footholds for phase in phases)]
+        soles = [name for name in feet if self.feet[name].sole is not None] or feet
         points = []
         for name in soles:
-            place, foot = around[0].footholds[name], self.feet[name]
-            middle = np.zeros(3) if foot.sole is None else np.append(foot.sole.center, 0.0)
-            points.append((np.asarray(place.position) + np.asarray(place.rotation) @ middle)[:2])
+            foothold, foot = phases[0].footholds[name], self.feet[name]
+            center = np.zeros(3) if foot.sole is None else np.append(foot.sole.center, 0.0)
+            points.append((np.asarray(foothold.position) + np.asarray(foothold.rotation) @ center)[:2])
         return np.asarray(np.mean(points, axis=0))
 
     def in_order(self, stance: Stance, values: Array) -> Array:
-        """Joint vectors of a stance in the robot's order. Shape (M, n)."""
-        found = np.empty_like(values)
-        found[:, self.order(stance)] = values
-        return found
+        """Return joint vectors of a stance in the robot's order. Shape (M, n)."""
+        reordered = np.empty_like(values)
+        reordered[:, self.order(stance)] = values
+        return reordered
 
 
 def walk(
-    start: Mapping[str, Foothold],
+    footholds: Mapping[str, Foothold],
     steps: Sequence[tuple[str, Foothold]],
     *,
     shift: float | FreeTime,
     swing: float | FreeTime,
 ) -> tuple[StancePhase, ...]:
-    """The phases of steps, one foot after the other: all held, all but one, all held, ..., all held.
+    """Return the phases of consecutive steps: all feet held, all but one, all held, ..., all held.
 
     Args:
-        start: Where the feet are.
-        steps: Which foot goes where, one after the other.
-        shift, swing: Durations of the phases in which all feet are held, and in which one is in the air.
+        footholds: Footholds at the start, by foot.
+        steps: Foot and new foothold of each step.
+        shift, swing: Durations of the phases with all feet held, and with one foot in the air.
 
     Raises:
-        ProblemError: A foot that has no foothold at the start; none that stays where another goes.
+        ProblemError: A foot has no foothold at the start, or no foot stays where another moves.
     """
-    held = checked_mapping("walk: start", start)
+    footholds = checked_mapping("walk: footholds", footholds)
     steps = checked_each("walk: steps", steps, tuple)
-    found = [StancePhase(held, shift)]
+    phases = [StancePhase(footholds, shift)]
     for step in steps:
-        name, place = step if len(step) == 2 else (step, None)
-        if not isinstance(name, str) or name not in held:
-            raise unknown_name("foot", name, held)
-        rest = {other: at for other, at in held.items() if other != name}
-        held = {**rest, name: place}
-        found += [StancePhase(rest, swing), StancePhase(held, shift)]
-    return tuple(found)
+        name, foothold = step if len(step) == 2 else (step, None)
+        if not isinstance(name, str) or name not in footholds:
+            raise unknown_name("foot", name, footholds)
+        rest = {each: place for each, place in footholds.items() if each != name}
+        footholds = {**rest, name: foothold}
+        phases += [StancePhase(rest, swing), StancePhase(footholds, shift)]
+    return tuple(phases)
 
 
 PLACED = 1e-6
-"""Gap between a foot and its foothold that a start may have, m or rad."""
+"""Largest gap between a foot and its foothold at the start, m or rad."""
 IPOPT = {"print_level": 0, "sb": "yes", "max_iter": 200, "tol": 1e-10}
 
 
 @dataclass(frozen=True)
 class ConfigurationSettings:
-    """How a standing posture near another is looked for.
+    """Settings of the search for a standing configuration.
 
     Attributes:
-        near: Weight of a joint's square distance from where it was, 1/rad^2.
-        over: Weight of the center of mass's, 1/m^2: a centimetre as a tenth of a radian and less.
-        kept: Gap between a foot and its foothold, m or rad, that a posture may have.
-        steps: Of the guess of a step.
+        near: Weight of a joint's squared distance from its initial value, 1/rad^2.
+        over: Weight of the squared distance of the center of mass, 1/m^2: 1 cm costs less than a tenth of a radian.
+        gap: Largest gap between a foot and its foothold, m or rad.
+        steps: Steps in the guess of a phase.
     """
 
     near: float = 1.0
     over: float = 300.0
-    kept: float = 1e-9
+    gap: float = 1e-9
     steps: int = 40
 
 
-POSTURES = ConfigurationSettings()
+CONFIGURATIONS = ConfigurationSettings()
 
 
-def hold(stance: Stance, places: dict[str, Foothold]) -> TaskEquations:
-    """Equations that hold feet besides the first on footholds: in all directions that the joints can move them."""
-    tasks = [foot_task(stance, name, place.position, place.rotation) for name, place in places.items()]
+def foothold_equations(stance: Stance, footholds: dict[str, Foothold]) -> TaskEquations:
+    """Return equations that hold feet other than the first on footholds, in their movable directions."""
+    tasks = [foot_task(stance, name, foothold.position, foothold.rotation) for name, foothold in footholds.items()]
     return bind(stance, tasks)
 
 
-def foot_task(stance: Stance, name: str, position: Any, rotation: Any, **asked: Any) -> TipTask:
-    """A foot besides the first, its sole's frame at a place, or on a way, in all directions that it can be moved."""
+def foot_task(stance: Stance, name: str, position: Any, rotation: Any, **options: Any) -> TipTask:
+    """Return the task of a foot other than the first: the pose of its sole's frame, constant or a function of time."""
     foot = stance.feet[name]
     back = np.asarray(foot.rotation).T
     turn = (lambda t: ca.mtimes(rotation(t), back)) if callable(rotation) else np.asarray(rotation) @ back
@@ -258,113 +263,112 @@ def foot_task(stance: Stance, name: str, position: Any, rotation: Any, **asked: 
         orientation=turn,
         link=foot.link,
         point=foot.translation,
-        **asked,
+        **options,
     )
 
 
 def standing_configuration(stance: Stance, near: Any, over: Any = None) -> Array:
-    """The posture nearest to another that has all feet on their footholds and the center of mass where it is wanted.
+    """Return the nearest configuration with all feet on their footholds and the center of mass over a point.
 
     Args:
-        stance: Which feet are held where.
-        near: Joints, in the stance's order. Shape (n,), rad or m.
-        over: (x, y) that the center of mass is wanted over, as near as the joints allow; anywhere if None. m.
+        stance: Feet and their footholds.
+        near: Joints from which the distance is measured, in the stance's order. Shape (n,), rad or m.
+        over: Wanted (x, y) of the center of mass, approached as far as the joints allow; None for anywhere. m.
 
     Returns:
         Joints within their limits. Shape (n,).
 
     Raises:
-        ProblemError: No posture within the limits puts the feet there.
+        ProblemError: No configuration within the limits puts the feet there.
     """
-    checked_instance("standing_posture: stance", stance, Stance)
+    checked_instance("standing_configuration: stance", stance, Stance)
     begin = checked_numbers(near, stance.joint_size, "near", "one entry for each joint")
     lower, upper = stance.robot.lower, stance.robot.upper
     begin = np.clip(begin, lower, upper)
     q, none = ca.SX.sym("q", stance.joint_size), ca.DM(0, 1)
     gap: Any = none
     if stance.other_feet:
-        equations = hold(stance, {name: stance.footholds[name] for name in stance.other_feet})
+        equations = foothold_equations(stance, {name: stance.footholds[name] for name in stance.other_feet})
         gap = equations.error(none, q, ca.DM(equations.target_function()(0.0)))
-    cost = POSTURES.near * ca.sumsqr(q - begin)
+    cost = CONFIGURATIONS.near * ca.sumsqr(q - begin)
     if over is not None:
         wanted = checked_numbers(over, 2, "over", "x and y on the ground")
-        cost += POSTURES.over * ca.sumsqr(stance.center_of_mass(q)[:2] - wanted)
-    solver = ca.nlpsol("posture", "ipopt", {"x": q, "f": cost, "g": gap}, {"print_time": False, "ipopt": IPOPT})
-    found = solver(x0=begin, lbx=lower, ubx=upper, lbg=0.0, ubg=0.0)
-    left = float(np.abs(np.array(found["g"])).max(initial=0.0))
-    if not left < POSTURES.kept * 1e3:
+        cost += CONFIGURATIONS.over * ca.sumsqr(stance.center_of_mass(q)[:2] - wanted)
+    solver = ca.nlpsol("configuration", "ipopt", {"x": q, "f": cost, "g": gap}, {"print_time": False, "ipopt": IPOPT})
+    result = solver(x0=begin, lbx=lower, ubx=upper, lbg=0.0, ubg=0.0)
+    left = float(np.abs(np.array(result["g"])).max(initial=0.0))
+    if not left < CONFIGURATIONS.gap * 1e3:
         words = (
-            f"no posture within the joint limits puts the feet {list(stance.footholds)} on their footholds: the "
-            f"nearest that was found is {left:.3g} m or rad away; put them nearer, or start from another posture"
+            f"no configuration within the joint limits puts the feet {list(stance.footholds)} on their footholds: the "
+            f"nearest one is {left:.3g} m or rad away; move the footholds, or start from other joints"
         )
-        raise ProblemError(words, name="footholds", value=left, limit=POSTURES.kept)
-    return np.asarray(np.clip(np.array(found["x"]).ravel(), lower, upper))
+        raise ProblemError(words, name="footholds", value=left, limit=CONFIGURATIONS.gap)
+    return np.asarray(np.clip(np.array(result["x"]).ravel(), lower, upper))
 
 
 def check_placed(stance: Stance, joints: Array) -> None:
-    """Raise ProblemError where joints of a start, in the stance's order, have a foot off its foothold."""
+    """Raise ProblemError if a foot is off its foothold at the start joints, given in the stance's order."""
     if not stance.other_feet:
         return
-    equations = hold(stance, {name: stance.footholds[name] for name in stance.other_feet})
-    found = np.array(ca.DM(equations.error(ca.DM(0, 1), joints, equations.target_function()(0.0))))
-    gap = float(np.abs(found).max())
+    equations = foothold_equations(stance, {name: stance.footholds[name] for name in stance.other_feet})
+    errors = np.array(ca.DM(equations.error(ca.DM(0, 1), joints, equations.target_function()(0.0))))
+    gap = float(np.abs(errors).max())
     if gap > PLACED:
         words = (
-            f"start_joints: a foot is {gap:.3g} (m or rad) away from its foothold; standing_posture(stance, near) "
-            "finds joints that put it there"
+            f"start: a foot is {gap:.3g} (m or rad) away from its foothold; "
+            "standing_configuration(stance, near) finds joints that put it there"
         )
-        raise ProblemError(words, name="start_joints", value=gap, limit=PLACED)
+        raise ProblemError(words, name="start", value=gap, limit=PLACED)
 
 
 def first_guess(steps: Steps, start: Array, lift: float) -> list[dict[str, Any]]:
-    """Guesses of joints, velocities and accelerations of each phase, in the orders of their stances.
+    """Return guesses of joints, velocities and accelerations of each phase, in the orders of their stances.
 
     Args:
         start: Joints at the start, in the robot's order.
-        lift: How far above its way a foot is lifted in the middle, m.
+        lift: Height of a foot above the line between its footholds, halfway, m.
     """
-    keys, found = [start], []
+    ends, guesses = [start], []
     for k in range(1, len(steps.phases) + 1):
-        keys.append(_keyed(steps, steps.standing(k), keys[-1], steps.balanced(k)))
+        ends.append(_configuration(steps, steps.standing(k), ends[-1], steps.balanced(k)))
     for k, phase in enumerate(steps.phases):
-        stance = steps.stances[k]
-        order = steps.order(stance)
-        postures = [keys[k], keys[k + 1]]
+        order = steps.order(steps.stances[k])
+        configurations = [ends[k], ends[k + 1]]
         if raised := _raised(steps.swings(k), lift):
             middle = Stance.on(steps.robot, steps.feet, {**phase.footholds, **raised}, steps.gravity)
-            aim = (steps.balanced(k) + steps.balanced(k + 1)) / 2
-            postures.insert(1, _keyed(steps, middle, (keys[k] + keys[k + 1]) / 2, aim))
-        found.append(_through(np.array(postures)[:, order], phase.seconds))
-    return found
+            over = (steps.balanced(k) + steps.balanced(k + 1)) / 2
+            configurations.insert(1, _configuration(steps, middle, (ends[k] + ends[k + 1]) / 2, over))
+        guesses.append(_interpolated(np.array(configurations)[:, order], phase.seconds))
+    return guesses
 
 
-def _keyed(steps: Steps, stance: Stance, near: Array, over: Array) -> Array:
-    """A posture in the robot's order."""
-    order = steps.order(stance)
-    return np.asarray(steps.in_order(stance, standing_configuration(stance, near[order], over)[None])[0])
+def _configuration(steps: Steps, stance: Stance, near: Array, over: Array) -> Array:
+    """Return a standing configuration in the robot's order."""
+    joints = standing_configuration(stance, near[steps.order(stance)], over)
+    return np.asarray(steps.in_order(stance, joints[None])[0])
 
 
 def _raised(swings: tuple[Swing, ...], lift: float) -> dict[str, Foothold]:
-    """Places of feet in the middle of their way."""
-    found = {}
+    """Return the poses of swinging feet halfway between their footholds."""
+    raised = {}
     for swing in swings:
         if swing.lifted is None or swing.landing is None:
             continue
         ends = np.array([swing.lifted.position, swing.landing.position])
         middle = np.append(ends[:, :2].mean(axis=0), ends[:, 2].max())
-        found[swing.name] = Foothold(middle + lift * np.asarray(swing.landing.rotation)[:, 2], swing.landing.rotation)
-    return found
+        raised[swing.name] = Foothold(middle + lift * np.asarray(swing.landing.rotation)[:, 2], swing.landing.rotation)
+    return raised
 
 
-def _through(postures: Array, seconds: float) -> dict[str, Any]:
-    """From posture to posture over a time: quintics from rest to rest, of two pieces a cubic through the middle."""
-    share = np.linspace(0.0, 1.0, POSTURES.steps + 1)
-    first, last = postures[0], postures[-1]
+def _interpolated(configurations: Array, seconds: float) -> dict[str, Any]:
+    """Return a quintic rest-to-rest motion through 2 or 3 configurations."""
+    share = np.linspace(0.0, 1.0, CONFIGURATIONS.steps + 1)
+    first, last = configurations[0], configurations[-1]
     values = first + (last - first) * rest_to_rest(share)[:, None]
-    if len(postures) == 3:
+    if len(configurations) == 3:
         bump = 64 * (share * (1 - share)) ** 3
         middle = first + (last - first) * rest_to_rest(0.5)
-        values = values + (postures[1] - middle) * bump[:, None]
+        values = values + (configurations[1] - middle) * bump[:, None]
     times = share * seconds
     rates = np.gradient(values, times, axis=0)
     second = np.gradient(rates, times, axis=0)

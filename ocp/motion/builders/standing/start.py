@@ -1,6 +1,7 @@
-"""Where a standing plan starts: whether the machine can start there at all, and a first guess of the motion from there.
+"""Check whether a standing machine can start a motion, and guess the motion.
 
-Limits of the joints, and what the ground bears; the guess is the task done locally, with the spare freedom damped.
+The checks are of joint limits and of what the ground and the joints can bear at the start. The guess is the local
+motion along the task, with the null-space velocities damped.
 """
 
 from __future__ import annotations
@@ -32,68 +33,70 @@ __all__ = ["check_freedom", "check_loads", "check_slope", "local_guess", "start_
 
 @dataclass(frozen=True)
 class StartSettings:
-    """How a start at rest is judged, and a standing motion guessed.
+    """Settings of the check of a start at rest, and of the guess.
 
     Attributes:
-        missed: Share of a limit by which it has to be missed to count as missed.
-        far: Greatest acceleration that is thought of, rad/s^2 or m/s^2.
-        damping: 1/s, of the joint velocities in the null space of the guess.
-        steps: Of the guess.
-        racing: rad/s or m/s, of a local motion near a singularity, at which the guess stops.
+        violation: Relative violation of a limit that is tolerated.
+        largest_acceleration: Bound of unlimited accelerations, rad/s^2 or m/s^2.
+        damping: Damping of null-space velocities in the guess, 1/s.
+        steps: Steps of the guess.
+        largest_speed: Speed of a local motion near a singularity at which the guess stops, rad/s or m/s.
     """
 
-    missed: float = 1e-6
-    far: float = 1e6
+    violation: float = 1e-6
+    largest_acceleration: float = 1e6
     damping: float = 2.0
     steps: int = 400
-    racing: float = 100.0
+    largest_speed: float = 100.0
 
 
 STARTS = StartSettings()
 
 
 def start_inside(machine: Machine, joints: Array, lower: Array, upper: Array) -> Array:
-    """The start, moved onto the limits where rounding has it beyond them. Shape (n,).
+    """Return the start joints, moved onto limits that rounding has exceeded. Shape (n,).
 
     Raises:
-        ProblemError: A joint that starts outside its limits or has no room between them.
+        ProblemError: A joint starts outside its limits, or has no range between them.
     """
     for name, value, low, high in zip(machine.robot.joint_names, joints, lower, upper, strict=True):
         if not low < high:
             message = f"joint {name!r} cannot move between its limits {low:g} .. {high:g}: lock it there"
             raise ProblemError(message, name=name, value=float(value), limit=(low, high))
-    return clip_to_limits("start_joints", machine.robot.joint_names, joints, lower, upper, "start inside them")
+    return clip_to_limits("start", machine.robot.joint_names, joints, lower, upper, "start inside them")
 
 
-def check_freedom(machine: Standing, size: int, zmp: ZmpRule, along: str, tip_level: str, end: str) -> None:
-    """Raise ProblemError where tasks and zero moment point ask for all joints, and these are to come to rest besides.
+def check_freedom(
+    machine: Standing, size: int, zmp: ZmpRule, *, along_parameter: bool, tip_level: str, ends_at_rest: bool
+) -> None:
+    """Raise ProblemError if tasks, zero moment point and rest at the end need more freedom than the joints have.
 
     Args:
         size: Rows of all tasks.
     """
     pinned = len(machine.moving_directions) if isinstance(zmp, Pinned | Following) else 0
-    left = machine.joint_size - (size + pinned - (along == "parameter"))
-    follows = tip_level == "acceleration" and not pinned  # joints that the tip takes along to its rest
-    if left < 0 or (left == 0 and end == "rest" and not follows):
-        asked = f"the tip's {size} rows" + (f" and {pinned} of the zero moment point" if pinned else "")
-        message = f"{asked} are more than {machine.joint_size} joints can do; ask for less"
+    left = machine.joint_size - (size + pinned - along_parameter)
+    follows = tip_level == "acceleration" and not pinned  # the joints come to rest with the tip
+    if left < 0 or (left == 0 and ends_at_rest and not follows):
+        rows = f"the tip's {size} rows" + (f" and {pinned} of the zero moment point" if pinned else "")
+        message = f"{rows} are more than {machine.joint_size} joints can satisfy; constrain fewer rows"
         if left == 0:
-            message = f"{asked} leave the {machine.joint_size} joints no freedom to come to rest at the end; "
+            message = f"{rows} leave the {machine.joint_size} joints no freedom to come to rest at the end; "
             freer = "pin the point less" if pinned else "tip_level='acceleration'"
-            message += f"say end='free', or {freer}"
+            message += f"set end_velocity='free', or {freer}"
         raise ProblemError(message, name="tip", value=size + pinned, limit=machine.joint_size)
 
 
 def check_slope(equations: TaskEquations, joints: Array) -> None:
-    """Raise ProblemError where the manipulability, which the cost needs, has no slope at the start."""
+    """Raise ProblemError if the manipulability, part of the cost, has no finite gradient at the start."""
     q = ca.SX.sym("q", len(joints))
     slope = ca.Function("slope", [q], [ca.gradient(equations.manipulability(ca.DM(0, 1), q), q)])
     if not np.isfinite(np.array(slope(joints))).all():
         message = (
-            f"start_joints {np.round(joints, 4).tolist()}: the task's rows are singular there, and the manipulability "
-            "in the cost has no slope; start elsewhere, or say Weights(manipulability=0)"
+            f"start {np.round(joints, 4).tolist()}: the task's rows are singular there, so that the "
+            "manipulability in the cost has no gradient; start elsewhere, or set Weights(manipulability=0)"
         )
-        raise ProblemError(message, name="start_joints", value=joints)
+        raise ProblemError(message, name="start", value=joints)
 
 
 def check_loads(
@@ -105,14 +108,15 @@ def check_loads(
     bounds: JointBounds,
     demand: tuple[Array, Array] | None,
 ) -> None:
-    """Raise ProblemError where no joint accelerations at all would do at the start, from rest.
+    """Raise ProblemError if no joint accelerations satisfy the limits at the start, from rest.
 
-    Torques, vertical force and zero moment point are linear in them: a linear program finds those that miss the least.
+    Torques, vertical force and zero moment point are linear in the accelerations. A linear program finds the least
+    violation.
 
     Args:
-        machine, joints, wrenches: At the start.
-        zmp, least_force, bounds: What may be, see standing_problem.
-        demand: Rows T and values a of what the tasks ask of them, T q'' = a; None where they ask nothing.
+        machine, joints, wrenches: Machine, joints and external wrenches at the start.
+        zmp, least_force, bounds: Limits, see standing_problem.
+        demand: Rows T and values a of the tasks' accelerations, T q'' = a; None without.
     """
     n, rest = machine.joint_size, np.zeros(machine.joint_size)
     qdd = ca.SX.sym("qdd", n)
@@ -137,37 +141,37 @@ def check_loads(
     values = ca.vertcat(*(value for value, _ in rows))
     function = ca.Function("start", [qdd], [ca.densify(values), ca.densify(ca.jacobian(values, qdd))])
     at_rest, slopes = (np.array(part) for part in function(rest))
-    missed = _least_missed(at_rest.ravel(), slopes, np.array(low), np.array(high), bounds.acceleration, demand)
-    if missed is None or missed.max(initial=0.0) <= STARTS.missed:
+    violations = _least_violations(at_rest.ravel(), slopes, np.array(low), np.array(high), bounds.acceleration, demand)
+    if violations is None or violations.max(initial=0.0) <= STARTS.violation:
         return
     words = [
-        f"{what}, by {100 * share:.3g} %"
-        for (_, what), share in zip(rows, missed, strict=True)
-        if share > STARTS.missed
+        f"{limit}, by {100 * share:.3g} %"
+        for (_, limit), share in zip(rows, violations, strict=True)
+        if share > STARTS.violation
     ]
     message = (
-        f"start_joints {np.round(joints, 4).tolist()}: whatever the joints do there, limits are missed: "
-        f"{'; '.join(words)}; start elsewhere, load the tip less, or allow for more"
+        f"start {np.round(joints, 4).tolist()}: no joint accelerations satisfy the limits there: "
+        f"{'; '.join(words)}; start elsewhere, load the tip less, or relax the limits"
     )
-    raise ProblemError(message, name="start_joints", value=joints)
+    raise ProblemError(message, name="start", value=joints)
 
 
 def task_demand(equations: TaskEquations, joints: Array, along_parameter: bool) -> tuple[Array, Array]:
-    """Rows and values of the accelerations that the tasks ask for at their start, from rest.
+    """Return rows and values of the accelerations that the tasks require at their start, from rest.
 
-    Along a parameter the tip may move along the path's direction as fast as it likes: what remains is across it.
+    Along a parameter the acceleration in the path's direction is free, and only the rows across it remain.
     """
     n = len(joints)
 
-    def made(symbols: Any) -> Any:
+    def function_of(symbols: Any) -> Any:
         q, qd, time = symbols.sym("q", n), symbols.sym("qd", n), symbols.sym("time")
         pace, change = symbols.sym("pace"), symbols.sym("change")
         rates = (pace, change) if along_parameter else (1, 0)
-        asked = -equations.acceleration(ca.DM(0, 1), q, qd, ca.DM(n, 1), time, *rates)
-        return ca.Function("asked", [q, qd, time, pace, change], [asked])
+        required = -equations.acceleration(ca.DM(0, 1), q, qd, ca.DM(n, 1), time, *rates)
+        return ca.Function("required", [q, qd, time, pace, change], [required])
 
-    jacobian, asked = np.array(ca.DM(equations.jacobian(ca.DM(0, 1), joints))), on_symbols(made)
-    wanted, pushed = (np.array(asked(joints, 0, 0, 0, change)).ravel() for change in (0, 1))
+    jacobian, function = np.array(ca.DM(equations.jacobian(ca.DM(0, 1), joints))), on_symbols(function_of)
+    wanted, pushed = (np.array(function(joints, 0, 0, 0, change)).ravel() for change in (0, 1))
     slope = pushed - wanted
     length = np.linalg.norm(slope)
     direction = slope / length if length > 0 else slope
@@ -176,7 +180,7 @@ def task_demand(equations: TaskEquations, joints: Array, along_parameter: bool) 
 
 
 def _edges(machine: Standing, zmp: ZmpRule) -> list[tuple[Array, float]]:
-    """Inward normals and offsets of the half-planes that the zero moment point has to be in."""
+    """Return inward normals and offsets of the half-planes that must contain the zero moment point."""
     edges = list(zip(*foot_edges(machine, zmp), strict=True))
     unit = np.eye(2)
     if isinstance(zmp, IndexAtLeast):
@@ -191,10 +195,10 @@ def _edges(machine: Standing, zmp: ZmpRule) -> list[tuple[Array, float]]:
     return edges
 
 
-def _least_missed(
-    at_rest: Array, slopes: Array, low: Array, high: Array, most: Array, demand: tuple[Array, Array] | None
+def _least_violations(
+    at_rest: Array, slopes: Array, low: Array, high: Array, largest: Array, demand: tuple[Array, Array] | None
 ) -> Array | None:
-    """By how much each row is missed, the sum being least; None where the tasks' demand cannot be met anyway."""
+    """Return the violations of the rows, of least sum; None if the tasks' demand cannot be met anyway."""
     m, n = slopes.shape
     inside = (at_rest >= low) & (at_rest <= high)
     if inside.all() and (demand is None or not np.any(demand[1])):
@@ -202,18 +206,18 @@ def _least_missed(
     rows, wanted = (np.zeros((0, n)), np.zeros(0)) if demand is None else demand
     matrix = np.block([[slopes, np.eye(m), -np.eye(m)], [rows, np.zeros((len(rows), 2 * m))]])
     lower, upper = np.concatenate([low - at_rest, wanted]), np.concatenate([high - at_rest, wanted])
-    reach = np.minimum(most, STARTS.far)
+    reach = np.minimum(largest, STARTS.largest_acceleration)
     sizes = np.concatenate([np.zeros(n), np.ones(2 * m)])
     settings = {"error_on_fail": False, "highs": {"output_flag": False}}
     shape = {"a": ca.DM(matrix).sparsity(), "h": ca.Sparsity(n + 2 * m, n + 2 * m)}
     solver = ca.conic("start", "highs", shape, settings)
-    found = solver(
+    result = solver(
         a=ca.DM(matrix), g=sizes, lba=lower, uba=upper,
         lbx=np.concatenate([-reach, np.zeros(2 * m)]), ubx=np.concatenate([reach, np.full(2 * m, np.inf)]),
     )  # fmt: skip
     if not solver.stats()["success"]:
         return None
-    slack = np.array(found["x"]).ravel()[n:]
+    slack = np.array(result["x"]).ravel()[n:]
     return np.asarray(slack[:m] + slack[m:])
 
 
@@ -225,24 +229,24 @@ def local_guess(
     by_parameter: bool,
     external: External | None,
 ) -> dict[str, Any]:
-    """Guesses by name; where the local motion breaks down or races, the last posture before that is kept."""
+    """Return guesses by name; from where the local motion breaks down or becomes too fast, its last joints."""
     tasks = [part.task for part in equations.bound]
     if by_parameter:
         tasks = [timed(task, lambda time: rest_to_rest(time / horizon)) for task in tasks]
     times, still = np.zeros(1), np.zeros((1, joints.size))
     parts = [joints[None, :], still, still]
     try:
-        found = resolve_accelerations(
+        local = resolve_accelerations(
             machine, tasks, joints, horizon, null_damping=STARTS.damping, external=external,
-            step=horizon / STARTS.steps, stop_at_lift_off=False, speed_limit=STARTS.racing,
+            step=horizon / STARTS.steps, stop_at_lift_off=False, speed_limit=STARTS.largest_speed,
         ).motion  # fmt: skip
-    except ProblemError:  # the task and the start are checked: the start is singular, which a plan may still leave
+    except ProblemError:  # task and start were checked: the start is singular, and a plan may still leave it
         pass
     else:
-        racing = np.asarray((np.abs(found.joint_velocities) > STARTS.racing / 2).any(axis=1))
-        sound = int(racing.argmax()) if racing.any() else len(racing)
-        times = found.t[:sound]
-        parts = [part[:sound] for part in (found.joints, found.joint_velocities, found.joint_accelerations)]
+        fast = np.asarray((np.abs(local.joint_velocities) > STARTS.largest_speed / 2).any(axis=1))
+        count = int(fast.argmax()) if fast.any() else len(fast)
+        times = local.t[:count]
+        parts = [part[:count] for part in (local.joints, local.joint_velocities, local.joint_accelerations)]
     if times[-1] < horizon * (1 - 1e-9):
         parts = [np.vstack([part, more]) for part, more in zip(parts, (parts[0][-1:], still, still), strict=True)]
         times = np.append(times, times[-1] + horizon / STARTS.steps)

@@ -1,17 +1,17 @@
-"""Machines whose support changes: steps of legs, bases that dock; each foot holds where it stands, at the least cost.
+"""Least-cost motions of machines whose support changes: steps of legs, bases that dock.
 
-A motion is a sequence of stances (`models.machines.stance`), one phase each, whose joints and velocities go on from one
-to the next. A foot that is held does not move: its acceleration is zero, with gaps fed back. What it bears is a
-control, and the first foot, at which the machine is rooted, bears the rest,
+A motion is a sequence of stances (`models.machines.stance`), one phase each. Joints and velocities are continuous
+between phases. A held foot does not move: its acceleration is zero, with position errors fed back. The load of each
+held foot but the first is a control. The first foot, at which the machine is rooted, bears the rest,
 
-    rate of momentum = weight + sum of loads (Newton-Euler),   each load on its own sole: it presses, its center of
-    pressure is in the sole, it is in the friction cone,
+    rate of momentum = weight + sum of loads (Newton-Euler).
 
-so that the zero moment point lies in the hull of the soles that are held, and how they share the load is shown. A foot
-lands on its foothold at rest: there is no impact. Between lifting and landing its sole is kept above the ground.
+Each load must press on its own sole, its center of pressure must lie in the sole, and it must lie in the friction cone.
+So the zero moment point lies in the hull of the held soles, and the distribution of the load is part of the plan. A
+foot lands at rest on its foothold, without an impact. Its sole stays above the ground from lifting to landing.
 
-balance "dynamic" asks no more. "static" also keeps the center of mass over the support, the hull of the soles that are
-held, so that the machine stands wherever it is stopped, if softly: quasi-static steps.
+With balance "static" the center of mass, too, stays over the support, the hull of the held soles. The machine can then
+be stopped softly anywhere: quasi-static steps.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from models.paths import rest_to_rest
 from models.robot.indices import joint_limit_index
 from ocp.console import interruptible
 from ocp.errors import ProblemError, checked_choice, checked_instance, checked_nonnegative
-from ocp.motion.builders.standing.problem import FreeTime
-from ocp.motion.builders.standing.stances import PLACED, StancePhase, Steps, Swing, check_placed, first_guess, hold
+from ocp.motion.builders.standing.problem import FreeTime, declare_horizon
+from ocp.motion.builders.standing.stances import PLACED, Steps, Swing, check_placed, first_guess, foothold_equations
 from ocp.motion.builders.standing.start import start_inside
 from ocp.motion.tasks.checks import checked_numbers, rates_at_rest
 from ocp.motion.tasks.limits import Limits
@@ -39,19 +39,21 @@ from ocp.problem.problem import Problem
 
 __all__ = ["StepWeights", "steps_problem"]
 
-GRAZED = 0.01  # share of the clearance that a sole may be below the ground where it lifts and lands
-LIFTED = 1.5  # height of a foot in the middle of its way in the guess, over the clearance
+GROUND_TOLERANCE = 0.01  # share of the clearance that a sole may be below the ground where it lifts and lands
+GUESSED_LIFT = 1.5  # height of a foot halfway in the guess, over the clearance
 
 
 @dataclass(frozen=True)
 class StepWeights:
-    """Of the parts of the cost, an integral over the motion plus `time` times the durations that are free.
+    """Weights of the cost, an integral over the motion plus `time` times the free durations.
 
     Attributes:
-        acceleration, velocity: Of the sums of squares over the joints. torque: Of that of their torques, 1/(N m)^2/s.
-        joint_limits: Of the joint-limit index p1 (23).
-        load: Of the squared loads of the feet, over the weight (and 1 m): which makes them share it.
-        time: Of the durations that are free, 1/s.
+        acceleration, velocity: Weights of the sums of squares over the joints.
+        torque: Weight of the sum of squared joint torques, 1/(N m)^2/s.
+        joint_limits: Weight of the joint-limit index p1 (23).
+        load: Weight of the squared loads of the feet, in units of the machine's weight (and 1 m). It distributes the
+            load.
+        time: Weight of the free durations, 1/s.
     """
 
     acceleration: float = 0.01
@@ -62,13 +64,13 @@ class StepWeights:
     time: float = 0.0
 
     def __post_init__(self) -> None:
-        for what, value in vars(self).items():
-            checked_nonnegative(f"step weights: {what}", value)
+        for name, value in vars(self).items():
+            checked_nonnegative(f"step weights: {name}", value)
 
 
 @dataclass(frozen=True)
-class _Asked:
-    """What is asked of every phase."""
+class _Options:
+    """Options of all phases."""
 
     balance: str
     margin: float
@@ -80,41 +82,46 @@ class _Asked:
 @interruptible
 def steps_problem(
     steps: Steps,
-    start_joints: Any,
     *,
+    start: Any,
     balance: Literal["dynamic", "static"] = "dynamic",
     margin: float = 0.0,
     clearance: float = 0.02,
     weights: StepWeights | None = None,
     limits: Limits | None = None,
 ) -> Phases:
-    """Take the stances one after the other from rest to rest, at the least cost.
+    """Declare a motion through consecutive stances, from rest to rest, of least cost.
 
-    The phases bear the names of `Steps.names`; joint vectors in a phase are in its stance's order. States "joints",
-    "velocities"; controls "accelerations", and "FOOT load" of every foot that is held besides the first, in the rows
-    `Stance.load_rows`. Path constraints "feet" (they do not move); "FOOT pressure", N; "FOOT center of pressure", its
-    distance from the edges of the sole times its share of the weight, m; "FOOT friction", squares over the squared
-    weight; "torques"; "FOOT clearance" of a foot in the air, m. At the end of a phase "FOOT landing", and at the end of
-    all "balance", the center of mass over the support, m.
+    The phases have the names `Steps.names`; joint vectors of a phase are in its stance's order. The states are "joints"
+    and "velocities". The controls are "accelerations", and "FOOT load" of each held foot but the first, in the rows
+    `Stance.load_rows`. The path constraints are
+
+    - "feet": the held feet do not move;
+    - "FOOT pressure": normal force, N;
+    - "FOOT center of pressure": distance from the edges of the sole times its share of the weight, m;
+    - "FOOT friction": difference of squared forces over the squared weight;
+    - "torques", and "FOOT clearance" of a foot in the air, m.
+
+    A phase ends with "FOOT landing", and the motion with "balance", the center of mass over the support, m.
 
     Args:
-        steps: The robot and its stances.
-        start_joints: In the robot's order, with the feet on their footholds; `standing_configuration` finds some. (n,).
-        balance: "static" asks for "balance" all the way; not in stances with a grip.
-        margin: By which centers of pressure, and the center of mass where it is asked, stay inside, m. It has to cover
-            by how much the machine leans out where ground and joints give, which are rigid here; most where it stays
-            near an edge, and at corners of a sole, as in a walk in balance.
-        clearance: Height of a sole above the ground in the middle of its way, m; 64 s^3 (1 - s)^3 of it at the share s.
-            Ground that is higher at the end of the way rises in its first half, lower ground falls in the second.
-        weights: Of the parts of the cost.
-        limits: Of joints and ground. `vertical_force` is the least of any sole that is held, N; nothing if None.
+        steps: Robot and its stances.
+        start: Joints in the robot's order, with the feet on their footholds, see `standing_configuration`. Shape (n,).
+        balance: "static" requires "balance" at all times, except in stances with a grip.
+        margin: Distance by which centers of pressure, and a constrained center of mass, stay inside the edges, m. It
+            must cover how far the machine leans out on compliant ground and joints, which are rigid here. It needs the
+            largest value for motions near edges and corners of a sole, as in a balanced walk.
+        clearance: Height of a sole above the ground halfway, m; at the share s of the path 64 s^3 (1 - s)^3 of it.
+            Higher ground at the landing rises in the first half of the path, lower ground falls in the second half.
+        weights: Weights of the cost.
+        limits: Limits of joints and ground. `vertical_force` is the least normal force of a held sole, N; 0 if None.
 
     Returns:
-        The problem, with a guess from posture to posture.
+        The problem, with a guess that interpolates between standing configurations.
 
     Raises:
-        ProblemError: Sizes or values that do not fit, a start outside the limits, off the footholds or out of balance,
-            footholds that no posture reaches, a margin that leaves no room, limits of what is not limited here.
+        ProblemError: Sizes or values do not fit; the start is outside the limits, off the footholds or out of balance;
+            no configuration reaches the footholds; the margin leaves no room; power or jerk is limited.
     """
     checked_instance("steps_problem: steps", steps, Steps)
     limits = Limits() if limits is None else checked_instance("steps_problem: limits", limits, Limits)
@@ -122,92 +129,96 @@ def steps_problem(
         weights = StepWeights()
     checked_instance("steps_problem: weights", weights, StepWeights)
     checked_choice("balance", balance, ("dynamic", "static"))
-    for what, value in (("margin", margin), ("clearance", clearance)):
-        checked_nonnegative(f"steps_problem: {what}", value)
-    for what in ("power", "jerk"):
-        if getattr(limits, what) is not None:
-            words = f"limits: steps know no {what}; limit torques and accelerations"
-            raise ProblemError(words, name=what, value=getattr(limits, what))
-    begin = checked_numbers(start_joints, steps.robot.dof, "start_joints", "one entry for each joint")
-    asked = _Asked(balance, float(margin), float(clearance), weights, limits)
+    for name, value in (("margin", margin), ("clearance", clearance)):
+        checked_nonnegative(f"steps_problem: {name}", value)
+    for name in ("power", "jerk"):
+        if getattr(limits, name) is not None:
+            words = f"limits: steps have no limit of {name}; limit torques and accelerations"
+            raise ProblemError(words, name=name, value=getattr(limits, name))
+    begin = checked_numbers(start, steps.robot.dof, "start", "one entry for each joint")
+    options = _Options(balance, float(margin), float(clearance), weights, limits)
     first = steps.stances[0]
     own = start_inside(first, begin[steps.order(first)], first.robot.lower, first.robot.upper)
-    _check_start(first, own, asked)
+    _check_start(first, own, options)
     begin = steps.in_order(first, own[None])[0]
-    guesses = first_guess(steps, begin, LIFTED * clearance)
+    guesses = first_guess(steps, begin, GUESSED_LIFT * clearance)
     problems = {}
     for k, name in enumerate(steps.names):
         try:
-            problems[name] = _phase(steps, k, own if k == 0 else None, guesses[k], asked)
+            problems[name] = _phase(steps, k, own if k == 0 else None, guesses[k], options)
         except ModelError as error:
             raise ProblemError(f"phase {name!r}: {error}", **vars(error)) from error
     whole = Phases("steps", problems)
     for k, (before, after) in enumerate(zip(steps.names[:-1], steps.names[1:], strict=True)):
-        one, other = steps.order(steps.stances[k]), steps.order(steps.stances[k + 1])
-        places = [int(np.flatnonzero(one == index)[0]) for index in other]
+        old, new = steps.order(steps.stances[k]), steps.order(steps.stances[k + 1])
+        places = [int(np.flatnonzero(old == index)[0]) for index in new]
         whole.join(before, after, {part: whole[before].at_end(part)[places] for part in ("joints", "velocities")})
     return whole
 
 
-def _check_start(stance: Stance, joints: Array, asked: _Asked) -> None:
-    """Raise ProblemError where a foot is not on its foothold, or the center of mass not over the support."""
+def _check_start(stance: Stance, joints: Array, options: _Options) -> None:
+    """Raise ProblemError if a foot is off its foothold, or the center of mass is not over the support."""
     check_placed(stance, joints)
     if stance.support is not None:
-        left = float(stance.support.margin(stance.center_of_mass(joints)[:2])) - asked.margin
+        left = float(stance.support.margin(stance.center_of_mass(joints)[:2])) - options.margin
         if left < -PLACED:
             words = (
-                f"start_joints: the center of mass is {-left:.3g} m outside the support, less its margin; "
-                "standing_posture(stance, near, over=...) finds a posture in balance"
+                f"start: the center of mass is {-left:.3g} m outside the support, less its margin; "
+                "standing_configuration(stance, near, over=...) finds joints in balance"
             )
-            raise ProblemError(words, name="start_joints", value=-left, limit=0.0)
+            raise ProblemError(words, name="start", value=-left, limit=0.0)
 
 
-def _phase(steps: Steps, k: int, start: Array | None, guess: dict[str, Any], asked: _Asked) -> Problem:
-    """The problem of a phase."""
+def _phase(steps: Steps, k: int, start: Array | None, guess: dict[str, Any], options: _Options) -> Problem:
+    """Declare the problem of a phase."""
     phase, stance, last = steps.phases[k], steps.stances[k], k + 1 == len(steps.phases)
-    robot, n, weights = stance.robot, stance.joint_size, asked.weights
-    bounds = _bounds(steps, stance, asked.limits)
+    robot, n, weights = stance.robot, stance.joint_size, options.weights
+    bounds = _bounds(steps, stance, options.limits)
     problem = Problem(steps.names[k])
-    final = _horizon(problem, phase)
+    final = declare_horizon(problem, phase.duration)
     none = ca.DM(0, 1)
-    equations = hold(stance, {name: phase.footholds[name] for name in stance.other_feet}) if stance.other_feet else None
+    equations = (
+        foothold_equations(stance, {name: phase.footholds[name] for name in stance.other_feet})
+        if stance.other_feet
+        else None
+    )
 
-    resting: Any = None
+    stationary: Any = None
     if last:
-        resting = np.zeros(n) if equations is None else rates_at_rest(equations, (), guess["joints"].values[-1])
+        stationary = np.zeros(n) if equations is None else rates_at_rest(equations, (), guess["joints"].values[-1])
     joints = problem.state(
         "joints", n, initial=start, lower=bounds["lower"], upper=bounds["upper"], guess=guess["joints"],
         unit=robot.unit(),
     )  # fmt: skip
     rates = problem.state(
-        "velocities", n, initial=None if start is None else 0.0, terminal=resting, lower=-bounds["velocity"],
+        "velocities", n, initial=None if start is None else 0.0, terminal=stationary, lower=-bounds["velocity"],
         upper=bounds["velocity"], guess=guess["velocities"], unit=robot.unit("/s"),
     )  # fmt: skip
-    push = bounds["acceleration"]
+    largest = bounds["acceleration"]
     second = problem.control(
-        "accelerations", n, lower=-push, upper=push, guess=guess["accelerations"], unit=robot.unit("/s^2")
+        "accelerations", n, lower=-largest, upper=largest, guess=guess["accelerations"], unit=robot.unit("/s^2")
     )
     problem.dynamics(joints, rates)
     problem.dynamics(rates, second)
     if equations is not None:
         gap = equations.acceleration(none, joints, rates, second, problem.time)
         problem.path("feet", gap, lower=0, upper=0, unit=equations.unit("/s^2", "/s^2"))
-        for name, stray in equations.deviations(none, joints, rates, equations.targets(problem.time)).items():
-            problem.watch(name.replace("task", "feet"), **stray)
+        for name, deviation in equations.deviations(none, joints, rates, equations.targets(problem.time)).items():
+            problem.watch(name.replace("task", "feet"), **deviation)
     for swing in steps.swings(k):
-        _swing(problem, stance, swing, (joints, rates), problem.time / final, asked.clearance)
+        _swing(problem, stance, swing, (joints, rates), problem.time / final, options.clearance)
     over = _over_support(stance, joints)
     if over.numel():
-        if asked.balance == "static":
-            problem.path("balance", over, lower=asked.margin, unit="m")
+        if options.balance == "static":
+            problem.path("balance", over, lower=options.margin, unit="m")
         elif last:
-            problem.end("balance", over, lower=asked.margin, unit="m")
+            problem.end("balance", over, lower=options.margin, unit="m")
 
-    others = {name: _load(problem, stance, name) for name in stance.other_feet}
-    loads = stance.loads(joints, rates, second, others)
+    other_feet = {name: _load(problem, stance, name) for name in stance.other_feet}
+    loads = stance.loads(joints, rates, second, other_feet)
     for name, load in loads.items():
-        _bear(problem, stance, name, load, asked)
-    torques = stance.joint_torques(joints, rates, second, others)
+        _limit_load(problem, stance, name, load, options)
+    torques = stance.joint_torques(joints, rates, second, other_feet)
     effort = bounds["torque"]
     limited = np.flatnonzero(np.isfinite(effort)).tolist()
     if limited:
@@ -223,24 +234,18 @@ def _phase(steps: Steps, k: int, start: Array | None, guess: dict[str, Any], ask
 
 
 def _bounds(steps: Steps, stance: Stance, limits: Limits) -> dict[str, Array]:
-    """Limits of the joints in the order of a stance; those that are given are in the robot's."""
+    """Return the joint limits in the order of a stance; explicit limits are in the robot's order."""
     order = steps.order(stance)
-    own = limits.bounds(stance, ("velocity", "torque"))
-    found = {}
-    for what, value in own._asdict().items():
-        given = getattr(limits, what, None) if what not in ("lower", "upper") else None
-        found[what] = value if given is None or np.size(given) == 1 else np.asarray(given, dtype=float).ravel()[order]
-    return found
-
-
-def _horizon(problem: Problem, phase: StancePhase) -> Any:
-    if isinstance(phase.duration, FreeTime):
-        return problem.horizon(lower=phase.duration.lower, upper=phase.duration.upper, guess=phase.duration.guess)
-    return problem.horizon(float(phase.duration))
+    bounds = limits.bounds(stance, ("velocity", "torque"))._asdict()
+    for name in bounds:
+        explicit = getattr(limits, name, None) if name not in ("lower", "upper") else None
+        if explicit is not None and np.size(explicit) != 1:
+            bounds[name] = np.asarray(explicit, dtype=float).ravel()[order]
+    return bounds
 
 
 def _load(problem: Problem, stance: Stance, name: str) -> Any:
-    """The load of a foot besides the first, a control in the rows that are resisted. Shape (6, 1)."""
+    """Return the load of a foot other than the first, a control in its held rows. Shape (6, 1)."""
     rows = stance.load_rows[name]
     share = stance.weight / len(stance.footholds)
     guess = [share * (row == 5) for row in rows]
@@ -248,40 +253,40 @@ def _load(problem: Problem, stance: Stance, name: str) -> Any:
     return stance.full_load(name, problem.control(f"{name} load", len(rows), guess=guess, unit=unit))
 
 
-def _bear(problem: Problem, stance: Stance, name: str, load: Any, asked: _Asked) -> None:
-    """What a foot's sole can bear; nothing of a grip."""
+def _limit_load(problem: Problem, stance: Stance, name: str, load: Any, options: _Options) -> None:
+    """Constrain a foot's load to what its sole can bear; a grip bears any load."""
     if stance.feet[name].sole is None:
         return
-    least = 0.0 if asked.limits.vertical_force is None else float(asked.limits.vertical_force)
+    least = 0.0 if options.limits.vertical_force is None else float(options.limits.vertical_force)
     problem.path(f"{name} pressure", stance.pressure(name, load), lower=least, unit="N")
-    inside = stance.edge_moments(name, load, asked.margin) / stance.weight
+    inside = stance.edge_moments(name, load, options.margin) / stance.weight
     if inside.numel():
         problem.path(f"{name} center of pressure", inside, lower=0.0, unit="m")
-    if np.isfinite(asked.limits.friction):
-        room = stance.friction_margin(name, load, asked.limits.friction) / stance.weight**2
-        problem.path(f"{name} friction", room, lower=0.0)
+    if np.isfinite(options.limits.friction):
+        reserve = stance.friction_margin(name, load, options.limits.friction) / stance.weight**2
+        problem.path(f"{name} friction", reserve, lower=0.0)
 
 
 def _swing(
     problem: Problem, stance: Stance, swing: Swing, motion: tuple[Any, Any], share: Any, clearance: float
 ) -> None:
-    """A foot in the air: its sole above the ground on the way, on its foothold and at rest where it lands."""
+    """Keep the sole of a swinging foot above the ground, and land it at rest on its foothold."""
     joints, rates = motion
     none = ca.DM(0, 1)
     foot = stance.feet[swing.name]
     if foot.sole is not None and swing.lifted is not None:
         before = float(np.asarray(swing.lifted.position)[2])
         after = before if swing.landing is None else float(np.asarray(swing.landing.position)[2])
-        way = 64 * (share * (1 - share)) ** 3 if swing.landing is not None else share**2 * (3 - 2 * share)
-        # over the higher of both in the middle: where the ground rises in between is not told
+        height = 64 * (share * (1 - share)) ** 3 if swing.landing is not None else share**2 * (3 - 2 * share)
+        # above the higher of both footholds in the middle: where the ground rises in between is unknown
         risen = ca.fmin(2 * share, 1) if after > before else ca.fmax(2 * share - 1, 0)
         ground = before + (after - before) * rest_to_rest(risen)
-        least = clearance * ((1 + GRAZED) * way - GRAZED)
+        least = clearance * ((1 + GROUND_TOLERANCE) * height - GROUND_TOLERANCE)
         heights = stance.sole_corners(swing.name, joints)[2, :].T - ground - least
-        rows = _apart(heights, joints)
+        rows = _distinct_rows(heights, joints)
         problem.path(f"{swing.name} clearance", heights[rows], lower=0.0, unit="m")
     if swing.landing is not None:
-        equations = hold(stance, {swing.name: swing.landing})
+        equations = foothold_equations(stance, {swing.name: swing.landing})
         targets = ca.DM(equations.target_function()(0.0))
         gap = equations.error(none, joints, targets)
         problem.end(f"{swing.name} landing", gap, lower=0.0, upper=0.0, unit=equations.unit(""))
@@ -289,21 +294,21 @@ def _swing(
         problem.end(f"{swing.name} landing speed", speed, lower=0.0, upper=0.0, unit=equations.unit())
 
 
-def _apart(rows: Any, joints: Any) -> list[int]:
-    """The rows that are not the same as an earlier one whatever the joints, as corners beside each other in a plane."""
+def _distinct_rows(rows: Any, joints: Any) -> list[int]:
+    """Return the rows that differ from all earlier ones; soles of planar machines have coinciding corners."""
     rng = np.random.default_rng(0)
-    others = [
+    other_feet = [
         symbol for symbol in ca.symvar(rows) if not any(ca.is_equal(symbol, each) for each in ca.vertsplit(joints))
     ]
-    inputs = [joints, ca.vertcat(ca.DM(0, 1), *others)]
+    inputs = [joints, ca.vertcat(ca.DM(0, 1), *other_feet)]
     function = ca.Function("rows", inputs, [rows])
-    drawn = [function(rng.normal(size=joints.numel()), rng.uniform(size=len(others))) for _ in range(3)]
-    values = np.column_stack([np.array(value).ravel() for value in drawn])
+    samples = [function(rng.normal(size=joints.numel()), rng.uniform(size=len(other_feet))) for _ in range(3)]
+    values = np.column_stack([np.array(value).ravel() for value in samples])
     return [i for i in range(len(values)) if not any(np.allclose(values[i], values[j]) for j in range(i))]
 
 
 def _over_support(stance: Stance, joints: Any) -> Any:
-    """Distances of the center of mass from the edges of the support that the joints can change. Shape (k, 1), m."""
+    """Return the center of mass' distances from those support edges on which the joints act. Shape (k, 1), m."""
     if stance.support is None:
         return ca.DM(0, 1)
     distances = ca.densify(stance.support.distances(stance.center_of_mass(joints)[:2]))

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from models import Foot, Foothold, Robot, Support
-from ocp.motion.builders.standing import StancePhase, Steps
+from ocp.motion.builders.standing.stances import StancePhase, Steps
 from scripts.robots.steps import SIDES
 
 FRICTION = 0.6

@@ -38,7 +38,7 @@ def planar_target(spin: float = 0.15, inertia: float = 3.0, velocity: Any = (0.0
 def planar_capture() -> dict[str, Any]:
     """What is asked in the plane."""
     return {
-        "chaser": planar_chaser(), "target": planar_target(), "start_joints": PLANAR_START, "approach": FREE,
+        "chaser": planar_chaser(), "target": planar_target(), "start": PLANAR_START, "approach": FREE,
         "detumble": FREE, "target_base": [1.9, 0.3, 0.0], "cone": CONE, "grasp": GRASP,
         "effort": Effort(torque=1.0, acceleration=[1.0] * 3 + [0.0], time=0.05),
     }  # fmt: skip
@@ -78,7 +78,7 @@ def target(spin: Any, inertia: Any = (5.0, 8.0, 6.0)) -> FreeFloating:
 def capture(spin: Any, inertia: Any = (5.0, 8.0, 6.0)) -> dict[str, Any]:
     """What is asked in space."""
     return {
-        "chaser": chaser(), "target": target(spin, inertia), "start_joints": START, "approach": FREE,
+        "chaser": chaser(), "target": target(spin, inertia), "start": START, "approach": FREE,
         "detumble": FREE, "target_base": [2.5, 0.2, 0.6, 1.0, 0.0, 0.0, 0.0], "cone": CONE, "grasp": GRASP,
         "effort": Effort(torque=1.0, acceleration=[1.0] * 6 + [0.0] * 3, time=0.05),
     }  # fmt: skip

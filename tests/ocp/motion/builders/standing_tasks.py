@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from functools import cache
 from typing import Any, cast
 
@@ -13,8 +14,9 @@ from models.machines.machine import with_tip
 from models.machines.standing import External, StandingMotion, standing_motion, tip_spring
 from models.paths import rest_to_rest
 from ocp import Problem, Solution, TipTask
-from ocp.motion.builders.standing import FreeTime, Limits, Weights, standing_problem
+from ocp.motion.builders.standing.problem import FreeTime, StandingSetup, Weights, standing_problem
 from ocp.motion.tasks.equations import task_errors
+from ocp.motion.tasks.limits import Limits
 from tests.models.machines.standing_machines import planar_machine, six_joint_arm, standing_arm, two_armed
 from tests.models.robot.trees import Array
 
@@ -60,10 +62,18 @@ def spring() -> External:
     return tip_spring(machine(), (0, 150, 0), tip_at(machine(), STANDING_STARTS[2]))
 
 
+def with_setup(options: dict[str, Any]) -> dict[str, Any]:
+    """Arguments of standing_problem, those that belong to its setup collected there."""
+    names = {field.name for field in fields(StandingSetup)}
+    rest = {name: value for name, value in options.items() if name not in names}
+    return {**rest, "setup": StandingSetup(**{name: options[name] for name in names & options.keys()})}
+
+
 @cache
 def table_plan(table: int, zmp: Any, **changes: Any) -> Problem:
-    settings = {"zmp": zmp, "limits": LIMITS, "external": spring() if table == 2 else None, **changes}
-    return standing_problem(machine(), table_task(table), STANDING_STARTS[table], HORIZON, **settings)
+    settings = with_setup({"external": spring() if table == 2 else None, **changes})
+    settings = {"zmp": zmp, "limits": LIMITS, "start": STANDING_STARTS[table], **settings}
+    return standing_problem(machine(), table_task(table), HORIZON, **settings)
 
 
 def straight(forward: float, up: float) -> TipTask:
@@ -75,9 +85,9 @@ def straight(forward: float, up: float) -> TipTask:
 @cache
 def lift_plan(zmp: Any, **changes: Any) -> Problem:
     """The tip 0.8 m straight up in the least time."""
-    settings = {"limits": LIFT_LIMITS, "weights": LIFT_WEIGHTS, "along": "parameter", **changes}
+    settings = with_setup({"limits": LIFT_LIMITS, "weights": LIFT_WEIGHTS, "along": "parameter", **changes})
     horizon = settings.pop("horizon", FreeTime(0.2, 3.0, 1.0))
-    return standing_problem(machine(), straight(0.0, 0.8), STANDING_STARTS[1], horizon, zmp=zmp, **settings)
+    return standing_problem(machine(), straight(0.0, 0.8), horizon, start=STANDING_STARTS[1], zmp=zmp, **settings)
 
 
 def moved_task(standing: Standing, start: Array, by: Any, seconds: float, **fields: Any) -> TipTask:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import Any
 
 import casadi as ca
@@ -23,6 +24,7 @@ from models import (
 from ocp import (
     Collocation,
     Cone,
+    DynamicsSetup,
     Effort,
     Following,
     FreeTime,
@@ -35,6 +37,7 @@ from ocp import (
     Leg,
     Limits,
     Pinned,
+    Problem,
     Stabiliser,
     StancePhase,
     Steps,
@@ -93,6 +96,8 @@ from tests.bad_values import (
     panel,
 )
 from tests.ocp.motion.builders.captures import planar_capture
+from tests.ocp.motion.builders.standing_tasks import with_setup
+from tests.ocp.motion.builders.test_cts import roll_arguments
 
 START = [0.3, 0.6, 0.9]
 CHAIN = planar_chain([1.0, 0.8, 0.6], [1.0] * 3, base=Link("foot", 30.0, inertia=np.eye(3)))
@@ -147,6 +152,7 @@ ASKED: dict[str, Bad] = {
     "start_base": but(BASE, "empty"),
 }
 GIVEN = {"machine": ARM, "tasks": FORWARD, "start_joints": START, "horizon": 1.0}
+BUILT = {"machine": ARM, "tasks": FORWARD, "start": START, "horizon": 1.0}
 STOOD = {"machine": STANDING, "tasks": STILL, "start_joints": UP, "horizon": 0.2}
 EACH: Bad = LIMIT | {"one of them zero": [1.0, 0.0, 1.0], "table of words": [["a"]]}
 
@@ -296,9 +302,9 @@ VELOCITIES = [
     Case(
         "minimum_velocity_problem",
         minimum_velocity_problem,
-        GIVEN,
+        BUILT,
         {
-            **ASKED,
+            **{"start" if name == "start_joints" else name: bad for name, bad in ASKED.items()},
             "tasks": TASK,
             "cyclic": FLAG,
             "limits": but(INSTANCE, "None"),
@@ -333,12 +339,12 @@ STANDINGS = [
     ),
     Case(
         "standing_problem",
-        standing_problem,
-        STOOD,
+        lambda **options: standing_problem(**with_setup(options)),
+        {"machine": STANDING, "tasks": STILL, "start": UP, "horizon": 0.2},
         {
             "machine": ASKED["machine"] | {"bolted": ARM},
             "tasks": TASK,
-            "start_joints": array(3) | NOTHING,
+            "start": array(3) | NOTHING,
             "horizon": HORIZON,
             "zmp": but(INSTANCE, "None")
             | {
@@ -355,20 +361,21 @@ STANDINGS = [
             "control": CHOICE,
             "along": CHOICE,
             "tip_level": CHOICE,
-            "start": CHOICE,
-            "end": CHOICE,
-            "end_joints": but(array(3), "nan"),
+            "start_velocity": CHOICE,
+            "end_velocity": CHOICE,
+            "end": but(array(3), "nan"),
             "symbols": SYMBOLS,
         },
     ),
     Case(
         "plan_standing",
         plan_standing,
-        STOOD,
+        {"machine": STANDING, "tasks": STILL, "start": UP, "horizon": 0.2},
         {
             "machine": ASKED["machine"] | {"bolted": ARM},
             "tasks": TASK,
-            "start_joints": array(3) | NOTHING,
+            "setup": but(INSTANCE, "None"),
+            "start": array(3) | NOTHING,
             "horizon": HORIZON,
             "method": but(INSTANCE, "None") | {"indirect": Indirect()},
             "options": MAPPING,
@@ -393,7 +400,7 @@ ROLLS = [
     ),
     Case(
         "roll_problem",
-        roll_problem,
+        lambda **options: roll_problem(**roll_arguments(options)),
         {"rig": RIG, "tunnel": TUNNEL, "targets": falling, "horizon": 10.0},
         {
             "rig": INSTANCE,
@@ -407,7 +414,7 @@ ROLLS = [
             "acceleration_limit": but(LIMIT, "zero") | NOTHING,
             "start_roll": FINITE,
             "start_rate": FINITE,
-            "scene": but(INSTANCE, "None"),
+            "scene": INSTANCE,
             "clearance": but(FINITE, "minus inf") | NOTHING,
             "clearance_weight": NONNEGATIVE | NOTHING,
             "clearance_width": POSITIVE | NOTHING,
@@ -417,6 +424,16 @@ ROLLS = [
         },
     ),
 ]
+MOVED: dict[str, Any] = {"machine": ARM, "tasks": (), "start": [0.1, 0.2, 0.3], "horizon": 1.0}
+
+
+def moved(**options: Any) -> Problem:
+    """`dynamics_problem` with the fields of its setup beside its arguments."""
+    names = {field.name for field in fields(DynamicsSetup)}
+    own = {name: options.pop(name) for name in names & options.keys()}
+    return dynamics_problem(**({"setup": DynamicsSetup(**own)} | options))
+
+
 FRICTION = {"negative": -1.0, "nan": NAN, "inf": INF, "text": "much", "empty": []}
 DYNAMICS = [
     Case("JointFriction", JointFriction, {}, {"viscous": FRICTION, "coulomb": FRICTION, "slip": POSITIVE}),
@@ -435,48 +452,49 @@ DYNAMICS = [
     ),
     Case(
         "dynamics_problem",
-        dynamics_problem,
-        {"machine": ARM, "start_joints": [0.1, 0.2, 0.3], "horizon": 1.0, "end_joints": [0.3, 0.2, 0.1]},
+        moved,
+        {**MOVED, "end": [0.3, 0.2, 0.1]},
         {
             "machine": INSTANCE | {"standing": STANDING},
-            "start_joints": but(array(3), "nan"),
+            "start": but(array(3), "nan"),
             "horizon": HORIZON,
-            "end_joints": but(array(3), "nan"),
+            "setup": but(INSTANCE, "None"),
+            "end": but(array(3), "nan"),
             "limits": but(INSTANCE, "None") | {"of two": Limits(torque=[1.0, 2.0]), "jerk": Limits(jerk=1.0)},
             "effort": but(INSTANCE, "None") | {"of two": Effort(torque=[1.0, 2.0]), "jerk": Effort(jerk=1.0)},
             "friction": but(INSTANCE, "None") | {"of two": JointFriction([1.0, 2.0])},
             "control": CHOICE,
-            "start": CHOICE,
-            "end": CHOICE,
+            "start_velocity": CHOICE,
+            "end_velocity": CHOICE,
             "clearance_constraints": but(INSTANCE, "None"),
             "symbols": SYMBOLS,
         },
     ),
     Case(
         "dynamics_problem of a floating machine",
-        dynamics_problem,
-        {"machine": FLOATING, "start_joints": [0.1, 0.2, 0.3], "horizon": 1.0},
-        {"start": but(array(3), "nan"), "end": but(array(3), "nan"), "end_base": but(array(3), "nan")},
+        moved,
+        {**MOVED, "machine": FLOATING},
+        dict.fromkeys(("start_velocity", "end_velocity", "end_base"), but(array(3), "nan")),
     ),
     Case(
         "dynamics_phases",
         dynamics_phases,
-        {"machine": ARM, "start_joints": [0.1, 0.2, 0.3], "legs": [Leg([0.3, 0.2, 0.1], 1.0)]},
+        {"machine": ARM, "start": [0.1, 0.2, 0.3], "legs": [Leg([0.3, 0.2, 0.1], 1.0)]},
         {
             "machine": INSTANCE | {"standing": STANDING},
             "legs": SEQUENCE | {"empty": [], "horizon": [Leg([0.3, 0.2, 0.1], -1.0)]},
             "total": but(HORIZON, "None"),
-            "clearance_constraints": but(INSTANCE, "None"),
+            "setup": but(INSTANCE, "None"),
         },
     ),
     Case(
         "Leg of dynamics_phases",
-        lambda **leg: dynamics_phases(ARM, [0.1, 0.2, 0.3], [Leg(**leg)]),
+        lambda **leg: dynamics_phases(ARM, [Leg(**leg)], start=[0.1, 0.2, 0.3]),
         {"joints": [0.3, 0.2, 0.1], "horizon": 1.0},
         {
             "joints": but(array(3), "nan"),
             "horizon": POSITIVE,
-            "end": CHOICE,
+            "end_velocity": CHOICE,
             "machine": but(INSTANCE, "None"),
             "tasks": but(INSTANCE, "list", "dictionary"),
             "name": TEXT | {"with a dot": "leg.1"},
@@ -501,7 +519,7 @@ DYNAMICS = [
         {
             "chaser": INSTANCE | {"fixed": ARM},
             "target": INSTANCE | {"with joints": FLOATING},
-            "start_joints": array(4),
+            "start": array(4),
             "approach": HORIZON,
             "detumble": HORIZON,
             "start_base": but(array(3), "None"),
@@ -522,12 +540,12 @@ DYNAMICS = [
     Case(
         "plan_dynamics",
         plan_dynamics,
-        {"machine": ARM, "start_joints": [0.1, 0.2, 0.3], "horizon": 1.0, "end_joints": [0.3, 0.2, 0.1]},
+        {**MOVED, "end": [0.3, 0.2, 0.1]},
         {
             "total": but(HORIZON, "None"),
             "machine": INSTANCE | {"standing": STANDING},
             "horizon": HORIZON,
-            "end_joints": but(array(3), "nan"),
+            "end": but(array(3), "nan"),
             "tasks": but(INSTANCE, "list", "dictionary"),
             "method": but(INSTANCE, "None") | {"indirect": Indirect()},
             "options": MAPPING,
@@ -545,10 +563,10 @@ FEET = {"base": Foot("base", rectangle((-1.0, 1.0), (-1.0, 1.0)))}
 HERE = {"base": Foothold((0.0, 0.0, 0.0))}
 ARM_ON_FOOT = planar_chain([0.4, 0.4, 0.3], [2.0, 1.5, 1.0])
 STEPPING = Steps(ARM_ON_FOOT, FEET, [StancePhase(HERE, 1.0)])
-STEPPED: dict[str, Any] = {"steps": STEPPING, "start_joints": [0.3, 0.4, 0.5]}
+STEPPED: dict[str, Any] = {"steps": STEPPING, "start": [0.3, 0.4, 0.5]}
 STEP_OPTIONS: dict[str, Bad] = {
     "steps": INSTANCE,
-    "start_joints": array(3) | NOTHING,
+    "start": array(3) | NOTHING,
     "balance": CHOICE,
     "margin": NONNEGATIVE | NOTHING | {"wide": 9.0},
     "clearance": NONNEGATIVE | NOTHING,
@@ -582,9 +600,9 @@ STEPS = [
     Case(
         "walk",
         walk,
-        {"start": {**HERE, "hand": HERE["base"]}, "steps": [("hand", HERE["base"])], "shift": 1.0, "swing": 1.0},
+        {"footholds": {**HERE, "hand": HERE["base"]}, "steps": [("hand", HERE["base"])], "shift": 1.0, "swing": 1.0},
         {
-            "start": MAPPING | {"none": {}, "of words": {"base": "here"}},
+            "footholds": MAPPING | {"none": {}, "of words": {"base": "here"}},
             "steps": SEQUENCE | NOTHING | {"unknown": [("foot", HERE["base"])], "of words": [("base", "here")]},
             "shift": HORIZON,
             "swing": HORIZON,
@@ -603,7 +621,7 @@ STEPS = [
         },
     ),
     Case(
-        "standing_posture",
+        "standing_configuration",
         standing_configuration,
         {"stance": STEPPING.stances[0], "near": [0.3, 0.4, 0.5]},
         {"stance": INSTANCE, "near": array(3) | NOTHING, "over": array(2)},
@@ -611,10 +629,10 @@ STEPS = [
     Case(
         "resolve_steps",
         resolve_steps,
-        {"steps": STEPPING, "start_joints": STEPPED["start_joints"], "clearance": 0.02, "samples": 5},
+        {"steps": STEPPING, "start": STEPPED["start"], "clearance": 0.02, "samples": 5},
         {
             "steps": INSTANCE,
-            "start_joints": array(3) | NOTHING,
+            "start": array(3) | NOTHING,
             "clearance": NONNEGATIVE | NOTHING,
             "samples": COUNT | NOTHING | {"one": 1},
         },

@@ -17,6 +17,7 @@ from models.machines.machine import with_tip
 from ocp import (
     Collocation,
     Cone,
+    DynamicsSetup,
     Effort,
     Grasp,
     Limits,
@@ -28,7 +29,7 @@ from ocp import (
     plan_capture,
 )
 from ocp.motion.builders.space.grasping import grasp_wrench, joined, pair_momentum
-from ocp.motion.builders.space.guess import Start, held_by_wheels, require_reach
+from ocp.motion.builders.space.guess import Start, require_reach, wheel_capacity
 from tests.models.robot.trees import Array
 from tests.ocp.motion.builders.captures import (
     CONE,
@@ -146,7 +147,13 @@ def test_what_the_hand_bears_changes_the_momentum_of_the_target() -> None:
     asked, after = planar_capture(), planar().phase("detumble")
     other = asked["target"]
     pair = FreeFloating(joined(asked["chaser"].robot, other.robot), "planar", conserved_momentum=[0.45, 0, 0])
-    problem = dynamics_problem(pair, None, 1.0, start="free", end="free", start_base=np.full(3, nan))
+    problem = dynamics_problem(
+        pair,
+        (),
+        1.0,
+        start=None,
+        setup=DynamicsSetup(start_velocity="free", end_velocity="free", start_base=np.full(3, nan)),
+    )
     names = ("base", "joints", "velocities", "accelerations")
     variables = problem.declared.states | problem.declared.controls
     force, moment = grasp_wrench(pair, other, problem)
@@ -268,7 +275,7 @@ def test_a_wheel_is_one_wherever_it_stands_among_the_joints() -> None:
     *arm, wheel = asked["chaser"].robot.joints
     asked |= {
         "chaser": replace(asked["chaser"], robot=replace(asked["chaser"].robot, joints=(wheel, *arm))),
-        "start_joints": np.roll(PLANAR_START, 1),
+        "start": np.roll(PLANAR_START, 1),
         "effort": Effort(torque=1.0, acceleration=[0.0] + [1.0] * 3, time=0.05),
     }
     plan = plan_capture(**asked)
@@ -317,7 +324,7 @@ def test_wheels_about_any_axes_hold_their_farthest_sum(count: int) -> None:
     sides = most[:, None] * axes / np.linalg.norm(axes, axis=1)[:, None]
     farthest = max(float(np.linalg.norm(signs @ sides)) for signs in product((-1.0, 1.0), repeat=count))
     start = Start(machine.base_home(), np.zeros(count), np.full(count, nan), machine.base_home(), 5.0, 5.0)
-    assert held_by_wheels(machine, Limits().bounds(machine), start) == pytest.approx(farthest)
+    assert wheel_capacity(machine, Limits().bounds(machine), start) == pytest.approx(farthest)
 
 
 def test_a_wheel_on_the_arm_holds_its_momentum_to_any_side() -> None:
@@ -325,7 +332,7 @@ def test_a_wheel_on_the_arm_holds_its_momentum_to_any_side() -> None:
     robot = with_wheels(asked["chaser"].robot, [[1, 0, 0]], 0.02, momentum=2.0, link="link2", prefix="far")
     machine, size = FreeFloating(robot), robot.dof
     start = Start(machine.base_home(), np.zeros(size), np.zeros(size), machine.base_home(), 50.0, 50.0)
-    assert held_by_wheels(machine, Limits().bounds(machine), start) == pytest.approx(4.0 * np.sqrt(3.0) + 2.0)
+    assert wheel_capacity(machine, Limits().bounds(machine), start) == pytest.approx(4.0 * np.sqrt(3.0) + 2.0)
 
 
 def test_wheels_hold_no_more_than_their_motors_give_them_in_the_time() -> None:
@@ -335,9 +342,9 @@ def test_wheels_hold_no_more_than_their_motors_give_them_in_the_time() -> None:
     rates = np.array([3.0])
     start = Start(np.zeros(3), np.zeros(1), rates, np.zeros(3), 12.0, 8.0)
     spin = float(np.array(ca.DM(machine.base_twist(np.zeros(3), np.zeros(1), rates)))[0, 0])
-    held = held_by_wheels(machine, Limits().bounds(machine), start)
+    held = wheel_capacity(machine, Limits().bounds(machine), start)
     assert held == pytest.approx(0.02 * (3.0 + spin) + 0.01 * 20.0)
-    assert held_by_wheels(machine, Limits().bounds(machine), start, False) == np.inf
+    assert wheel_capacity(machine, Limits().bounds(machine), start, False) == np.inf
 
 
 def test_what_cannot_be_captured_is_refused_by_name() -> None:

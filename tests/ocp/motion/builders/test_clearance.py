@@ -231,7 +231,7 @@ def test_what_cannot_be_kept_clear_names_who_touches_first() -> None:
             raise SolveError("no way", name="solver")
         raise touching(around, least=-0.01)
 
-    with pytest.raises(SolveError, match=r"bodies touch.*held apart, no motion was found: no way") as caught:
+    with pytest.raises(SolveError, match=r"bodies collide.*separated, no motion was found: no way") as caught:
         solve_with_clearance(ClearanceConstraints(around), stuck)
     assert (caught.value.name, caught.value.time) == ("clearance", 0.5)
 
@@ -245,7 +245,7 @@ def test_what_cannot_be_kept_clear_names_who_touches_first() -> None:
     def loose(clearance_constraints: ClearanceConstraints | None) -> Any:
         raise touching(around)
 
-    with pytest.raises(SolveError, match="bodies touch"):
+    with pytest.raises(SolveError, match="bodies collide"):
         solve_with_clearance(None, loose)
 
 

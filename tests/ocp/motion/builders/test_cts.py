@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import Any
 
 import casadi as ca
@@ -11,8 +12,8 @@ import pytest
 from models import Box, Rig, optimal_inverse, reference_rig, reference_tunnel
 from models.cts.clearance import CollisionScene, clearances
 from models.cts.rig import HOME, INCH, inverse
-from ocp import Collocation, ProblemError, Solution, roll_problem, solve, spline_targets
-from ocp.motion.builders.cts import least_course
+from ocp import Collocation, ProblemError, RollObstacles, RollSettings, Solution, roll_problem, solve, spline_targets
+from ocp.motion.builders.cts import least_cost_roll
 from tests.models.cts.cts_oracle import index_by_geometry
 
 RIG, TUNNEL = reference_rig(), reference_tunnel()
@@ -45,8 +46,20 @@ def least_gaps(around: CollisionScene, joints: Any) -> Any:
     return np.array(gaps.map(joints.shape[1])(joints))
 
 
+def roll_arguments(options: dict[str, Any]) -> dict[str, Any]:
+    """Arguments of roll_problem, those of its settings and obstacles collected there."""
+    options, arguments = dict(options), {}
+    for name, kind in (("settings", RollSettings), ("obstacles", RollObstacles)):
+        names = {field.name for field in fields(kind)} & options.keys()
+        values = {each: options.pop(each) for each in names}
+        if values:
+            arguments[name] = kind(**({"scene": CollisionScene()} if name == "obstacles" else {}) | values)
+    return arguments | options
+
+
 def plan(rig: Rig = RIG, method: Collocation = SMOOTH, **options: Any) -> Solution:
-    return solve(roll_problem(rig, TUNNEL, falling, HORIZON, symbols=ca.SX, **options), method)
+    arguments = roll_arguments({"symbols": ca.SX, **options})
+    return solve(roll_problem(rig, TUNNEL, falling, HORIZON, **arguments), method)
 
 
 def test_without_weights_on_motion_the_plan_is_the_best_roll_of_each_target() -> None:
@@ -83,7 +96,9 @@ def test_the_plan_goes_round_an_obstacle_on_the_way_of_the_free_roll() -> None:
     around = CollisionScene(solids=(Box(INCH * np.array([6.0, 4.0, 6.0]), INCH * np.array([80.0, -4.0, 0.0])),))
     free = optimal_inverse(RIG, TUNNEL).map(101)(targets_at(np.linspace(0, HORIZON, 101)), np.zeros((1, 101)))[0]
     assert least_gaps(around, free).min() < -0.02  # in its midst
-    problem = roll_problem(RIG, TUNNEL, falling, HORIZON, symbols=ca.SX, scene=around, clearance=0.01)
+    problem = roll_problem(
+        RIG, TUNNEL, falling, HORIZON, settings=RollSettings(symbols=ca.SX), obstacles=RollObstacles(around, 0.01)
+    )
     found = solve(problem, SMOOTH)
     assert least_gaps(around, joints_along(RIG, found, found.t)).min() >= 0.01 - 1e-6
     assert found.cost <= solve(problem, SMOOTH, guess={"roll": [-1.0]}).cost * (1 + 1e-6)  # the other way round
@@ -91,7 +106,7 @@ def test_the_plan_goes_round_an_obstacle_on_the_way_of_the_free_roll() -> None:
 
 def course(cost: Any, t: Any, **options: Any) -> Any:
     known = {"lower": -np.inf, "upper": np.inf, "start": None, "rate_weight": 1e-4, "acceleration_weight": 0.0}
-    return least_course(lambda k, roll: cost(t[k], roll), t, **{**known, "rate_limit": np.inf, **options})
+    return least_cost_roll(lambda k, roll: cost(t[k], roll), t, **{**known, "rate_limit": np.inf, **options})
 
 
 def test_a_course_winds_as_often_as_it_pays() -> None:
@@ -162,7 +177,7 @@ def test_a_table_of_targets_is_followed_through_its_spline() -> None:
 def test_what_cannot_be_planned_is_named(options: dict[str, Any], message: str) -> None:
     asked = {"targets": falling, "horizon": HORIZON, "symbols": ca.SX, **options}
     with pytest.raises(ProblemError, match=message) as caught:
-        roll_problem(RIG, TUNNEL, **asked)
+        roll_problem(RIG, TUNNEL, **roll_arguments(asked))
     assert (caught.value.name or "unnamed") in str(caught.value)
 
 

@@ -13,6 +13,7 @@ import pytest
 from models import FixedBase, FreeFloating, Joint, Link, Robot, planar_chain, with_load
 from ocp import (
     Collocation,
+    DynamicsSetup,
     Effort,
     FreeTime,
     JointFriction,
@@ -112,7 +113,7 @@ def test_friction_is_against_the_motion() -> None:
 @pytest.mark.parametrize("horizon", [1.0, 2.0])
 def test_the_least_effort_of_a_mass_is_known(horizon: float) -> None:
     """12 m^2 d^2 / T^3 from rest to rest, with a force that is linear in time."""
-    problem = dynamics_problem(slider(), [0.0], horizon, end_joints=[WAY])
+    problem = dynamics_problem(slider(), (), horizon, start=[0.0], end=[WAY])
     plan = solve(problem, Collocation(10, 3))
     assert plan.cost == pytest.approx(12 * MASS**2 * WAY**2 / horizon**3, rel=1e-8)
     assert plan.audit().passed
@@ -122,7 +123,7 @@ def test_the_least_time_of_a_mass_is_known() -> None:
     """2 sqrt(m d / F), full on and then full off."""
     limits = Limits(torque=5.0)
     problem = dynamics_problem(
-        slider(), [0.0], FreeTime(0.1, 9.0, 2.0), end_joints=[WAY], limits=limits, effort=Effort(torque=0, time=1.0)
+        slider(), (), FreeTime(0.1, 9.0, 2.0), start=[0.0], end=[WAY], limits=limits, effort=Effort(torque=0, time=1.0)
     )
     plan = solve(problem, Collocation(20, 3, control="held"))
     assert plan.horizon == pytest.approx(2 * np.sqrt(MASS * WAY / 5.0), rel=1e-6)
@@ -134,9 +135,15 @@ def test_power_is_limited_and_braking_is_free() -> None:
     """With a power P alone a mass is at d no sooner than (3 d / 2)^(2/3) (m / 2 P)^(1/3)."""
     power = 4.0
     problem = dynamics_problem(
-        slider(), [0.0], FreeTime(0.1, 9.0, 1.5), end_joints=[WAY], end="free",
-        limits=Limits(torque=200.0, power=power), effort=Effort(torque=1e-7, time=1.0),
-    )  # fmt: skip
+        slider(),
+        (),
+        FreeTime(0.1, 9.0, 1.5),
+        start=[0.0],
+        end=[WAY],
+        limits=Limits(torque=200.0, power=power),
+        effort=Effort(torque=1e-7, time=1.0),
+        setup=DynamicsSetup(end_velocity="free"),
+    )
     plan = solve(problem, Collocation(40, 3))
     least = (1.5 * WAY) ** (2 / 3) * (MASS / (2 * power)) ** (1 / 3)
     assert least < plan.horizon < 1.01 * least
@@ -146,7 +153,9 @@ def test_power_is_limited_and_braking_is_free() -> None:
 
 
 def test_jerks_that_are_limited_make_a_mass_start_softly() -> None:
-    problem = dynamics_problem(slider(), [0.0], 2.0, end_joints=[WAY], control="jerk", limits=Limits(jerk=8.0))
+    problem = dynamics_problem(
+        slider(), (), 2.0, start=[0.0], end=[WAY], limits=Limits(jerk=8.0), setup=DynamicsSetup(control="jerk")
+    )
     plan = solve(problem, Collocation(20, 3))
     assert plan["accelerations"][[0, -1]] == pytest.approx(0.0, abs=1e-9)
     assert np.abs(plan["jerks"]).max() <= 8.0 * (1 + 1e-6)
@@ -161,7 +170,9 @@ def test_what_drives_give_is_kept_or_lost_in_friction() -> None:
     friction = JointFriction(0.4)
     machine = FixedBase(arm())
     still = [0.3, -0.4, 0.5]
-    problem = dynamics_problem(machine, still, 1.0, end_joints=[1.0, 0.2, -0.3], end="free", friction=friction)
+    problem = dynamics_problem(
+        machine, (), 1.0, start=still, end=[1.0, 0.2, -0.3], setup=DynamicsSetup(end_velocity="free", friction=friction)
+    )
     plan = solve(problem, Collocation(30, 4))
     assert plan.audit().feasible
     q, qd, qdd = (ca.SX.sym("z", 3) for _ in range(3))
@@ -184,7 +195,7 @@ def test_energy_costs_what_drives_give_alone() -> None:
     """A mass that is pushed to v, coasts and is braked, which gives nothing back: m v^2 / 2, d = v T - v^2 m / F."""
     push, horizon = 40.0, 2.0
     problem = dynamics_problem(
-        slider(), [0.0], horizon, end_joints=[WAY], limits=Limits(torque=push), effort=Effort(torque=0.0, energy=1.0)
+        slider(), (), horizon, start=[0.0], end=[WAY], limits=Limits(torque=push), effort=Effort(torque=0.0, energy=1.0)
     )
     plan = solve(problem, Collocation(80, 2))
     a = push / MASS
@@ -202,10 +213,10 @@ def test_a_task_is_done_within_the_torques() -> None:
         return ca.DM(first) + (10 * s**3 - 15 * s**4 + 6 * s**5) * ca.DM([-0.3, 0.2, 0.0])
 
     task = TipTask(position=where, rows=(3, 4))
-    free = solve(dynamics_problem(machine, start, 1.5, tasks=task), Collocation(15, 4))
+    free = solve(dynamics_problem(machine, task, 1.5, start=start), Collocation(15, 4))
     most = 0.8 * np.abs(torques_along(machine, free)).max(axis=0)
     most[1:] = np.inf
-    problem = dynamics_problem(machine, start, 1.5, tasks=task, limits=Limits(torque=most))
+    problem = dynamics_problem(machine, task, 1.5, start=start, limits=Limits(torque=most))
     plan = tighten(problem, Collocation(15, 4))
     audit = plan.audit()
     assert audit.feasible
@@ -220,8 +231,11 @@ def test_a_floating_arm_costs_less_than_a_fixed_one_and_keeps_its_momentum() -> 
     robot = planar_chain([0.5, 0.4], [2.0, 1.5], base=Link("base", 8.0, (0, 0, 0), 0.5 * np.eye(3)))
     machine = FreeFloating(robot, "planar")
     start, end = [0.2, 0.5], [1.2, -0.4]
-    plan = solve(dynamics_problem(machine, start, 1.0, end_joints=end), Collocation(15, 4))
-    held = solve(dynamics_problem(FixedBase(robot), start, 1.0, end_joints=end, gravity=(0, 0, 0)), Collocation(15, 4))
+    plan = solve(dynamics_problem(machine, (), 1.0, start=start, end=end), Collocation(15, 4))
+    held = solve(
+        dynamics_problem(FixedBase(robot), (), 1.0, start=start, end=end, setup=DynamicsSetup(gravity=(0, 0, 0))),
+        Collocation(15, 4),
+    )
     assert plan.audit().passed
     assert plan.cost < held.cost
     for t in (0.2, 0.5, 0.9):
@@ -238,8 +252,8 @@ def test_a_load_is_picked_up_and_put_down() -> None:
     places = [0.0, 0.4, 0.3], [1.0, -0.3, 0.6]
     effort, limits = Effort(torque=0.02, acceleration=2e-3, time=1.0), Limits(torque=6.0)
     free = FreeTime(0.1, 8.0, 2.0)
-    reach = dynamics_problem(FixedBase(robot), places[0], free, end_joints=places[1], effort=effort, limits=limits)
-    carry = dynamics_problem(loaded, None, free, end_joints=places[0], effort=effort, limits=limits)
+    reach = dynamics_problem(FixedBase(robot), (), free, start=places[0], end=places[1], effort=effort, limits=limits)
+    carry = dynamics_problem(loaded, (), free, start=None, end=places[0], effort=effort, limits=limits)
     phases = Phases("pick and place", {"reach": reach, "carry": carry})
     phases.join("reach", "carry", {"velocities": None})  # both rest there
     plan = solve(phases, Collocation(20, 4))

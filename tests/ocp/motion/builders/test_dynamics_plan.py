@@ -27,6 +27,7 @@ from models import (
 from models.arrays import Array
 from ocp import (
     Collocation,
+    DynamicsSetup,
     Effort,
     FreeTime,
     Leg,
@@ -86,7 +87,7 @@ def least_time_along(s: Array, at: Array) -> float:
 
 @pytest.fixture(scope="module")
 def fastest() -> Solution:
-    return plan_dynamics(MACHINE, START, SOON, end_joints=END, limits=Limits(torque=MOST), effort=LEAST_TIME)
+    return plan_dynamics(MACHINE, (), SOON, start=START, end=END, limits=Limits(torque=MOST), effort=LEAST_TIME)
 
 
 def fine(plan: Solution, times: int = 4001) -> Array:
@@ -135,11 +136,11 @@ def test_limits_that_no_mesh_holds_at_little_cost_are_held_at_what_it_takes(
     mesh: tuple[int, int], most: float, tmp_path: Path
 ) -> None:
     """Three meshes of low degree are too coarse; what the plan costs too much is told, about as a fine one finds it."""
-    asked: dict[str, Any] = {"end_joints": END, "limits": Limits(torque=MOST, velocity=most)}
+    asked: dict[str, Any] = {"end": END, "limits": Limits(torque=MOST, velocity=most)}
     effort = Effort(torque=1e-4, time=1.0)
-    best = plan_dynamics(MACHINE, START, SOON, effort=effort, **asked)
+    best = plan_dynamics(MACHINE, (), SOON, start=START, effort=effort, **asked)
     method = Collocation(mesh[0], degree=mesh[1], scheme="legendre")
-    plan = plan_dynamics(MACHINE, START, SOON, effort=effort, method=method, **asked)
+    plan = plan_dynamics(MACHINE, (), SOON, start=START, effort=effort, method=method, **asked)
     audit = plan.audit()
     assert audit.feasible
     assert not audit.passed
@@ -152,9 +153,9 @@ def test_limits_that_no_mesh_holds_at_little_cost_are_held_at_what_it_takes(
 
 
 def test_mixtures_lie_between_their_parts(fastest: Solution) -> None:
-    asked: dict[str, Any] = {"end_joints": END, "limits": Limits(torque=MOST)}
-    mixed = plan_dynamics(MACHINE, START, SOON, effort=Effort(torque=1e-3, time=1.0), **asked)
-    easy = plan_dynamics(MACHINE, START, mixed.horizon, effort=Effort(torque=1e-3), **asked)
+    asked: dict[str, Any] = {"end": END, "limits": Limits(torque=MOST)}
+    mixed = plan_dynamics(MACHINE, (), SOON, start=START, effort=Effort(torque=1e-3, time=1.0), **asked)
+    easy = plan_dynamics(MACHINE, (), mixed.horizon, start=START, effort=Effort(torque=1e-3), **asked)
     assert mixed.audit().passed
     assert mixed.horizon > fastest.horizon
     assert fine(mixed).max() <= 1 + 1e-5
@@ -163,7 +164,7 @@ def test_mixtures_lie_between_their_parts(fastest: Solution) -> None:
 
 def test_what_is_too_much_is_named() -> None:
     with pytest.raises(SolveError, match="torques of 'joint1' would have to go") as caught:
-        plan_dynamics(MACHINE, START, 0.4, end_joints=END, limits=Limits(torque=MOST), options={"max_iter": 60})
+        plan_dynamics(MACHINE, (), 0.4, start=START, end=END, limits=Limits(torque=MOST), options={"max_iter": 60})
     assert str(caught.value.name).startswith("torques of 'joint")
     assert caught.value.time is not None
 
@@ -173,8 +174,8 @@ def test_what_is_too_much_is_named() -> None:
 
 def test_a_point_that_is_passed_is_passed_without_a_stop() -> None:
     """A mass that passes 0.5 m at a free time on its way to 0.8 m: no dearer than straight on, which does so too."""
-    legs = [Leg([0.5], FreeTime(0.1, 1.0, 0.6), end="free"), Leg([0.8], FreeTime(0.1, 1.0, 0.4))]
-    plan = plan_dynamics(slider(), [0.0], legs, total=1.0)
+    legs = [Leg([0.5], FreeTime(0.1, 1.0, 0.6), end_velocity="free"), Leg([0.8], FreeTime(0.1, 1.0, 0.4))]
+    plan = plan_dynamics(slider(), legs, start=[0.0], total=1.0)
     assert plan.cost == pytest.approx(12 * MASS**2 * WAY**2, rel=1e-7)
     first, second = plan.phase("leg 1"), plan.phase("leg 2")
     assert first.horizon + second.horizon == pytest.approx(1.0, abs=1e-9)
@@ -189,7 +190,7 @@ def test_a_floating_machine_that_picks_up_a_load_at_rest_keeps_its_momentum() ->
     alone = FreeFloating(robot, "planar")
     loaded = FreeFloating(with_load(robot, robot.tip_link, 2.0, (0.4, 0, 0)), "planar")
     legs = [Leg([1.2, -0.4], 1.0, name="reach"), Leg([0.2, 0.5], 1.5, machine=loaded, name="carry")]
-    plan = plan_dynamics(alone, [0.2, 0.5], legs)
+    plan = plan_dynamics(alone, legs, start=[0.2, 0.5])
     assert plan.audit().passed
     reach, carry = plan.phase("reach"), plan.phase("carry")
     assert carry["base"][0] == pytest.approx(reach["base"][-1], abs=1e-8)
@@ -213,14 +214,14 @@ def test_legs_that_do_not_fit_are_refused() -> None:
     heavy = FixedBase(with_load(MACHINE.robot, MACHINE.robot.tip_link, 1.0))
     for legs, more, words in (
         ([], {}, "at least one"),
-        ([Leg(END, 1.0, end="free"), Leg(START, 1.0, machine=heavy)], {}, "at rest"),
+        ([Leg(END, 1.0, end_velocity="free"), Leg(START, 1.0, machine=heavy)], {}, "at rest"),
         ([rest, Leg([0.0], 1.0, machine=other)], {}, "1 joints"),
         ([rest, Leg(START, 1.0, name="leg 1")], {}, "not all different"),
-        ([rest], {"total": 1.0}, "tells its own time"),
-        ([rest], {"end_joints": END}, "legs say it themselves"),
+        ([rest], {"total": 1.0}, "has a fixed duration"),
+        ([rest], {"setup": DynamicsSetup(end_velocity="free")}, "every leg has its own"),
     ):
         with pytest.raises(ProblemError, match=words):
-            dynamics_phases(MACHINE, START, legs, **more)
+            dynamics_phases(MACHINE, legs, start=START, **more)
 
 
 def test_what_touches_on_a_leg_is_held_apart_there() -> None:
@@ -229,16 +230,16 @@ def test_what_touches_on_a_leg_is_held_apart_there() -> None:
     shape = CollisionShape("sphere", (sizes - ball,), translation=tip)
     links = [replace(link, collisions=(shape,)) if link.name == "link2" else link for link in chain.links]
     machine = FixedBase(replace(chain, links=tuple(links)))
-    legs = [Leg([0.6, 0.3], 1.0, end="free"), Leg(START, 1.0)]
+    legs = [Leg([0.6, 0.3], 1.0, end_velocity="free"), Leg(START, 1.0)]
 
     def way(clearance_constraints: ClearanceConstraints | None) -> Array:
         """Of the tip, there and back. Shape (402, 3)."""
         plan = plan_dynamics(
             machine,
-            START,
             legs,
-            clearance_constraints=clearance_constraints,
+            start=START,
             method=Collocation(6, 4, scheme="legendre"),
+            setup=DynamicsSetup(clearance_constraints=clearance_constraints),
         )
         assert plan.audit().passed
         both = [plan.phase(name).at_fraction(np.linspace(0, 1, 201))["joints"] for name in ("leg 1", "leg 2")]

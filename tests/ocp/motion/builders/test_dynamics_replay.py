@@ -26,7 +26,7 @@ def test_what_the_torques_do_is_the_energy_that_mujoco_finds(name: str) -> None:
     make, start, horizon, effort, intervals = MACHINES[name]
     machine = make()
     end = start + np.resize(MOVED, len(start)) * (0.5 if machine.base_size else 1.0)
-    problem = dynamics_problem(machine, start, horizon, end_joints=end, effort=effort)
+    problem = dynamics_problem(machine, (), horizon, start=start, end=end, effort=effort)
     found = replay(machine, solve(problem, Collocation(intervals, degree=5, scheme="legendre")))
     size = np.ptp(found.energy)
     assert size > 1e-3

@@ -13,6 +13,7 @@ import models
 from models import FixedBase, FreeFloating, Joint, Link, Machine, Robot, paper_example, planar_chain
 from ocp import Collocation, Limits, Problem, ProblemError, Solution, TipTask, minimum_velocity_problem, resolve, solve
 from ocp.motion.builders import minimum_velocity
+from ocp.motion.local.rates import LocalSolution
 from tests.models.robot.trees import numeric, seven_joint_arm
 from tests.ocp.motion.local.test_rates import ASKED, PAPER_START, REFUSED
 
@@ -24,11 +25,16 @@ LEGENDRE = Collocation(intervals=50, degree=3, scheme="legendre")
 
 
 def paper_problem() -> Problem:
-    return minimum_velocity_problem(paper_example(), TASK, PAPER_START, 5.0)
+    return minimum_velocity_problem(paper_example(), TASK, 5.0, start=PAPER_START)
 
 
 def chain() -> FixedBase:
     return FixedBase(planar_chain([1.0, 0.8, 0.6], [1.0] * 3))
+
+
+def resolved(machine: Machine, *, start: Any, **asked: Any) -> LocalSolution:
+    """The local motion under arguments of `minimum_velocity_problem`."""
+    return resolve(machine, start_joints=start, **asked)
 
 
 def audited(machine: Machine, method: Collocation, /, **asked: Any) -> Solution:
@@ -111,7 +117,7 @@ def test_the_papers_optimum_satisfies_the_minimum_principle() -> None:
 def test_an_arm_on_a_fixed_base_does_better_than_instantly() -> None:
     machine = chain()
     task = TipTask(rows=(3, 4), velocity=lambda t: [-0.3 * ca.cos(t), 0.3 * ca.sin(2 * t)])
-    solution = audited(machine, Collocation(intervals=20, degree=3), tasks=task, start_joints=CHAIN_START, horizon=3.0)
+    solution = audited(machine, Collocation(intervals=20, degree=3), tasks=task, start=CHAIN_START, horizon=3.0)
     assert list(solution.states) == ["joints"]
     assert_does_its_task(machine, solution, lambda t: [-0.3 * np.cos(t), 0.3 * np.sin(2 * t)], [3, 4])
     assert solution.cost < resolve(machine, task, CHAIN_START, 3.0).cost[-1] - 1e-5
@@ -122,17 +128,19 @@ def test_an_arm_on_a_fixed_base_does_better_than_instantly() -> None:
 def test_a_spatial_seven_joint_arm_on_a_floating_base_is_planned(rows: tuple[int, ...], horizon: float) -> None:
     machine = FreeFloating(seven_joint_arm(), "spatial")
     velocity = np.array([0.02, -0.03, 0.04, 0.1, -0.1, 0.05])[list(rows)]
-    asked: dict[str, Any] = {"start_joints": ARM_START, "horizon": horizon}
+    asked: dict[str, Any] = {"start": ARM_START, "horizon": horizon}
     asked["tasks"] = TipTask(rows=rows, velocity=velocity)
     solution = audited(machine, replace(LEGENDRE, intervals=12), **asked)
     assert_does_its_task(machine, solution, lambda _: velocity, list(rows))
     np.testing.assert_allclose(np.linalg.norm(solution["base"][:, 3:], axis=1), 1.0, atol=1e-9)
-    assert solution.cost < resolve(machine, **asked).cost[-1]
+    assert solution.cost < resolved(machine, **asked).cost[-1]
 
 
 def test_two_slides_share_the_way() -> None:
     """Closed form: each moves at v / 2; cost = integral of v^2 / 4."""
-    problem = minimum_velocity_problem(slides(), TipTask(rows=(3,), velocity=lambda t: [ca.sin(t)]), (0.0, 0.0), 2.0)
+    problem = minimum_velocity_problem(
+        slides(), TipTask(rows=(3,), velocity=lambda t: [ca.sin(t)]), 2.0, start=(0.0, 0.0)
+    )
     solution = solve(problem, replace(LEGENDRE, intervals=10))
     at = collocated(solution)
     np.testing.assert_allclose(solution["rates"][at], np.sin(solution.t[at])[:, None] / 2 * [1.0, 1.0], atol=1e-8)
@@ -144,7 +152,9 @@ def test_two_slides_share_the_way() -> None:
 def test_limits_of_the_robot_bound_the_plan(limit: dict[str, float], share: float) -> None:
     """v = 1 for 2 s: a slide stopped at 0.5 m moves at 1/4, one held to 0.3 m/s at 0.3; constant shares are optimal."""
     task, none = TipTask(rows=(3,), velocity=(1.0,)), Limits(velocity=np.inf, joints=False)
-    problems = [minimum_velocity_problem(slides(**limit), task, (0.0, 0.0), 2.0, limits=each) for each in (None, none)]
+    problems = [
+        minimum_velocity_problem(slides(**limit), task, 2.0, start=(0.0, 0.0), limits=each) for each in (None, none)
+    ]
     bound, free = (solve(problem, Collocation(intervals=10, degree=3)) for problem in problems)
     assert bound.cost == pytest.approx(share**2 + (1 - share) ** 2, abs=1e-6)
     assert (bound["joints"][:, 0] <= 2 * share + 1e-6).all()
@@ -154,7 +164,7 @@ def test_limits_of_the_robot_bound_the_plan(limit: dict[str, float], share: floa
 def test_a_velocity_from_an_interpolant_is_met() -> None:
     knots = np.linspace(0, 2, 21)
     table = ca.interpolant("table", "bspline", [knots], np.sin(knots))
-    problem = minimum_velocity_problem(slides(), TipTask(rows=(3,), velocity=lambda t: table(t)), (0.0, 0.0), 2.0)
+    problem = minimum_velocity_problem(slides(), TipTask(rows=(3,), velocity=lambda t: table(t)), 2.0, start=(0.0, 0.0))
     solution = solve(problem, Collocation(intervals=10, degree=3))
     assert solution.cost == pytest.approx((2.0 - np.sin(4.0) / 2) / 8, abs=1e-5)
 
@@ -165,7 +175,7 @@ def test_the_guess_is_the_local_motion_in_steps_of_first_order(monkeypatch: pyte
     local = resolve(machine, TASK, PAPER_START, 5.0)
     for steps in (64, 256, 1024):
         monkeypatch.setattr(minimum_velocity, "STEPS_OF_GUESS", steps)
-        states = minimum_velocity_problem(machine, TASK, PAPER_START, 5.0, guess_damping=1e-4).declared.states
+        states = minimum_velocity_problem(machine, TASK, 5.0, start=PAPER_START, guess_damping=1e-4).declared.states
         apart = [
             np.abs(states[name].guess(time) - local.at(time)[name]).max()
             for time in (0.0, 0.5, 1.0)
@@ -180,7 +190,7 @@ def test_where_the_local_motion_breaks_down_the_guess_is_whole() -> None:
     """The tip moves 3 m in x; with 2 m of arm it is out of reach after 1.3 s."""
     machine = FixedBase(planar_chain([1.0, 0.5, 0.5], [1.0] * 3))
     task = TipTask(rows=(3, 4), velocity=(1.0, 0.0))
-    declared = minimum_velocity_problem(machine, task, np.deg2rad([60.0, -100.0, -20.0]), 3.0).declared
+    declared = minimum_velocity_problem(machine, task, 3.0, start=np.deg2rad([60.0, -100.0, -20.0])).declared
     for variable in (declared.states["joints"], declared.controls["rates"]):
         assert np.isfinite([variable.guess(time) for time in np.linspace(0, 3, 31)]).all()
 
@@ -189,7 +199,8 @@ def test_tasks_may_begin_and_end_on_the_way() -> None:
     """Nothing is asked from 1 s on: the joints stand still, and the cost is that of the task alone."""
     task = TipTask(rows=(3, 4), velocity=(-0.2, 0.1), duration=1.0)
     costs = [
-        solve(minimum_velocity_problem(chain(), task, CHAIN_START, horizon), LEGENDRE).cost for horizon in (1.0, 2.5)
+        solve(minimum_velocity_problem(chain(), task, horizon, start=CHAIN_START), LEGENDRE).cost
+        for horizon in (1.0, 2.5)
     ]
     assert costs[0] == pytest.approx(costs[1], rel=1e-8)
 
@@ -198,13 +209,14 @@ def test_a_singular_start_is_planned() -> None:
     """A stretched arm can swing sideways: v is in the range of G although G has lost rank."""
     machine = FixedBase(planar_chain([1.0, 1.0, 1.0], [1.0] * 3))
     task = TipTask(rows=(3, 4), velocity=lambda t: [-3 * ca.sin(t), 3 * ca.cos(t)])
-    assert minimum_velocity_problem(machine, task, np.zeros(3), 0.2).declared.path["task"].size == 2
+    assert minimum_velocity_problem(machine, task, 0.2, start=np.zeros(3)).declared.path["task"].size == 2
 
 
 @pytest.mark.parametrize(("changes", "message"), [*REFUSED, ({"guess_damping": 0.0}, "guess_damping must be positive")])
 def test_requests_that_cannot_be_right_are_refused(changes: dict[str, Any], message: str) -> None:
+    asked = {"start" if name == "start_joints" else name: value for name, value in {**ASKED, **changes}.items()}
     with pytest.raises(ProblemError, match=message) as caught:
-        minimum_velocity_problem(paper_example(), **{**ASKED, **changes})
+        minimum_velocity_problem(paper_example(), **asked)
     assert (caught.value.name or "unnamed") in str(caught.value)
 
 
@@ -213,7 +225,11 @@ def test_a_start_outside_the_limits_is_refused_by_the_joints_name() -> None:
     second = replace(robot.joints[1], lower=-1.0, upper=1.0)
     machine = FixedBase(replace(robot, joints=(robot.joints[0], second)))
     with pytest.raises(ProblemError, match=r"'joint2' starts at 1.5, outside its limits -1 .. 1"):
-        minimum_velocity_problem(machine, TipTask(rows=(3,), velocity=(0.1,)), (0.3, 1.5), 1.0)
+        minimum_velocity_problem(machine, TipTask(rows=(3,), velocity=(0.1,)), 1.0, start=(0.3, 1.5))
     minimum_velocity_problem(
-        machine, TipTask(rows=(3,), velocity=(0.1,)), (0.3, 1.5), 1.0, limits=Limits(velocity=np.inf, joints=False)
+        machine,
+        TipTask(rows=(3,), velocity=(0.1,)),
+        1.0,
+        start=(0.3, 1.5),
+        limits=Limits(velocity=np.inf, joints=False),
     )

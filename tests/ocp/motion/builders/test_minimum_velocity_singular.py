@@ -36,7 +36,7 @@ def grazing(size: int, seed: int) -> tuple[FixedBase, dict[str, Any], Array]:
     foot = near * np.array([np.cos(angle), np.sin(angle), 0.0])
     speed = 1.7 * (foot - first) / HORIZON
     task = TipTask(position=lambda t: ca.DM(first) + t * ca.DM(speed), rows=(3, 4), tolerance=FINE)
-    return machine, {"tasks": task, "start_joints": start, "horizon": HORIZON}, speed
+    return machine, {"tasks": task, "start": start, "horizon": HORIZON}, speed
 
 
 def floating(pose: bool) -> tuple[FreeFloating, dict[str, Any], Array]:
@@ -46,12 +46,12 @@ def floating(pose: bool) -> tuple[FreeFloating, dict[str, Any], Array]:
     first = numeric(machine.tip_pose(machine.base_home(), start).position).ravel()
     line = TipTask(position=lambda t: ca.DM(first) + t * ca.DM(speed), tolerance=FINE)
     task = line if pose else TipTask(rows=(3, 4, 5), velocity=speed, tolerance=FINE)
-    return machine, {"tasks": task, "start_joints": start, "horizon": 5.0}, speed
+    return machine, {"tasks": task, "start": start, "horizon": 5.0}, speed
 
 
 def check(machine: Machine, asked: dict[str, Any], speed: Array, intervals: int) -> tuple[Solution, LocalSolution]:
     """The plan passes its audit, stays on its line and has no jump, and one on a finer mesh costs the same."""
-    local = resolve(machine, **asked, samples=401)
+    local = resolve(machine, asked["tasks"], asked["start"], asked["horizon"], samples=401)
     assert local.stopped is not None or local.manipulability.min() < 0.03 * local.manipulability[0]
     problem = minimum_velocity_problem(machine, **asked)
     plan = refine(problem, Collocation(intervals=intervals, degree=4))

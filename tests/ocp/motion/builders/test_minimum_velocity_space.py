@@ -11,11 +11,11 @@ import pytest
 
 from models import FreeFloating, Path, center_of_mass, paper_example, smooth
 from models.machines.machine import with_tip
-from ocp import Collocation, ProblemError, TipTask, minimum_velocity_problem, resolve, solve
+from ocp import Collocation, ProblemError, TipTask, minimum_velocity_problem, solve
 from ocp.motion.tasks.equations import bind
 from ocp.motion.tasks.tracks import path_tracks
 from tests.models.robot.trees import numeric
-from tests.ocp.motion.builders.test_minimum_velocity import audited, chain
+from tests.ocp.motion.builders.test_minimum_velocity import audited, chain, resolved
 from tests.ocp.motion.local.test_rates import PAPER_START
 from tests.ocp.motion.tasks.space_tasks import (
     BASE,
@@ -45,24 +45,24 @@ def test_a_space_manipulator_follows_a_pose_line_optimally(momentum: Any) -> Non
     machine = FreeFloating(floating_manipulator().robot, conserved_momentum=momentum)
     line = line_from(machine, BASE, MANIPULATOR_START, (0.1, -0.1, 0.05), (1, 2, 0.5), 0.3, 10.0)
     task = TipTask(position=line.position, orientation=line.orientation)
-    asked: dict[str, Any] = {"tasks": task, "start_joints": MANIPULATOR_START, "horizon": 10.0, "start_base": BASE}
+    asked: dict[str, Any] = {"tasks": task, "start": MANIPULATOR_START, "horizon": 10.0, "start_base": BASE}
     solution = audited(machine, FINE, **asked)
     assert sum(values.shape[1] for values in solution.states.values()) == 14
     assert largest_error(machine, task, solution) < 1e-6
     scale = np.linalg.norm(momentum) if momentum else machine.robot.total_mass * np.abs(solution["rates"]).max()
     assert largest_momentum_error(machine, solution) < 1e-9 * scale
     np.testing.assert_allclose(np.linalg.norm(solution["base"][:, 3:], axis=1), 1.0, atol=1e-9)
-    assert solution.cost < resolve(machine, **asked).cost[-1]
+    assert solution.cost < resolved(machine, **asked).cost[-1]
 
 
 def test_a_light_satellite_gains_by_planning_ahead() -> None:
     machine = floating_panda((0.05, -0.03, 0.04, 0.1, -0.2, 0.15))
     line = line_from(machine, BASE, PANDA_START, (0.1, -0.15, 0.1), (1, 2, 0.5), 0.5, 10.0)
     task = TipTask(position=line.position, direction=lambda time: line.orientation(time)[:, 2])
-    start: dict[str, Any] = {"start_joints": PANDA_START, "horizon": 10.0, "start_base": BASE}
+    start: dict[str, Any] = {"start": PANDA_START, "horizon": 10.0, "start_base": BASE}
     solution = audited(machine, Collocation(intervals=30, degree=4), tasks=task, **start)
     assert largest_error(machine, task, solution) < 1e-6
-    local = resolve(machine, tasks=task, **start)
+    local = resolved(machine, tasks=task, **start)
     assert local.stopped is None
     assert solution.cost < 0.95 * local.cost[-1]
 
@@ -72,22 +72,22 @@ def test_a_cyclic_plan_closes_the_joints_of_an_arm(kind: str) -> None:
     rotation, position = pose(panda(), (), PANDA_START)
     aims: dict[str, Any] = {"direction": {"direction": rotation[:, 2]}, "orientation": {"orientation": rotation}}
     task = TipTask(position=circle(position, 0.1, 6.0), **aims.get(kind, {}))
-    start: dict[str, Any] = {"tasks": task, "start_joints": PANDA_START, "horizon": 6.0}
+    start: dict[str, Any] = {"tasks": task, "start": PANDA_START, "horizon": 6.0}
     solution = audited(panda(), FINE, cyclic=True, **start)
     assert np.abs(solution["joints"][-1] - solution["joints"][0]).max() <= 1e-8
     assert largest_error(panda(), task, solution) < 1e-6
     assert np.abs(solution["closure"]).max() < 1e-8  # what the task gave way
-    local = resolve(panda(), **start)
+    local = resolved(panda(), **start)
     assert np.abs(local.joints[-1] - PANDA_START).max() > 0.05
 
 
 def test_a_cyclic_plan_may_choose_where_to_start() -> None:
     _, position = pose(panda(), (), PANDA_START)
     task = TipTask(position=circle(position, 0.1, 6.0))
-    start: dict[str, Any] = {"tasks": task, "start_joints": PANDA_START, "horizon": 6.0, "cyclic": True}
+    start: dict[str, Any] = {"tasks": task, "start": PANDA_START, "horizon": 6.0, "cyclic": True}
     method = Collocation(intervals=30, degree=4)
     fixed = solve(minimum_velocity_problem(panda(), **start), method)
-    free = audited(panda(), method, **(start | {"start_joints": None, "near": PANDA_START}))
+    free = audited(panda(), method, **(start | {"start": None, "near": PANDA_START}))
     assert free.cost < fixed.cost - 1e-4
     np.testing.assert_allclose(pose(panda(), (), free["joints"][0])[1], position, atol=1e-9)
     assert np.abs(free["joints"][-1] - free["joints"][0]).max() <= 1e-8
@@ -103,7 +103,7 @@ def test_a_free_start_is_found_by_inverse_kinematics_and_a_velocity_holds_its_po
     machine, start = chain(), np.deg2rad([30.0, 40.0, 50.0])
     asked: dict[str, Any] = {"tasks": TipTask(rows=(3, 4), velocity=(-0.2, 0.1)), "horizon": 3.0}
     costs = []
-    for begin in ({"start_joints": start}, {"near": start}):
+    for begin in ({"start": start}, {"near": start}):
         plan = audited(machine, Collocation(intervals=15), **begin, **asked)
         np.testing.assert_allclose(pose(machine, (), plan["joints"][0])[1], pose(machine, (), start)[1], atol=1e-8)
         costs.append(plan.cost)
@@ -137,7 +137,7 @@ def test_a_floating_arm_returns_to_its_start_on_a_closed_path() -> None:
     machine = floating_panda()
     _, position = pose(machine, BASE, PANDA_START)
     task = TipTask(position=circle(position, 0.05, 6.0))
-    start: dict[str, Any] = {"tasks": task, "start_joints": PANDA_START, "horizon": 6.0, "start_base": BASE}
+    start: dict[str, Any] = {"tasks": task, "start": PANDA_START, "horizon": 6.0, "start_base": BASE}
     solution = audited(machine, Collocation(intervals=20, degree=4), cyclic=True, **start)
     assert np.abs(solution["joints"][-1] - PANDA_START).max() <= 1e-8
     assert largest_error(machine, task, solution) < 1e-6
@@ -146,7 +146,7 @@ def test_a_floating_arm_returns_to_its_start_on_a_closed_path() -> None:
 def test_a_drifting_machine_cannot_return_in_the_world_but_relative_to_its_base() -> None:
     machine = floating_panda((0.0, 0.0, 0.0, 1.0, 0.0, 0.0))
     _, position = pose(machine, BASE, PANDA_START)
-    asked: dict[str, Any] = {"start_joints": PANDA_START, "horizon": 4.0, "start_base": BASE, "cyclic": True}
+    asked: dict[str, Any] = {"start": PANDA_START, "horizon": 4.0, "start_base": BASE, "cyclic": True}
     with pytest.raises(ProblemError, match="the linear momentum moves the centre of mass"):
         minimum_velocity_problem(machine, tasks=TipTask(position=circle(position, 0.05, 4.0)), **asked)
     frame = machine.world_from_base(BASE)
@@ -159,7 +159,7 @@ def test_a_drifting_machine_cannot_return_in_the_world_but_relative_to_its_base(
 
 def test_cyclic_tasks_that_are_open_are_refused() -> None:
     rotation, position = pose(panda(), (), PANDA_START)
-    asked: dict[str, Any] = {"start_joints": PANDA_START, "horizon": 2.0, "cyclic": True}
+    asked: dict[str, Any] = {"start": PANDA_START, "horizon": 2.0, "cyclic": True}
     open_path = TipTask(position=lambda time: ca.vertcat(position[0], position[1], position[2] + 0.01 * time))
     straight, turned = TipTask(velocity=(0.1,), rows=(4,)), TipTask(velocity=(0, 0, 0.3), rows=(0, 1, 2))
     for task, gap in ((open_path, r"0\.02"), (straight, r"0\.2"), (turned, r"0\.6")):
@@ -180,11 +180,11 @@ def test_two_arms_carry_one_thing_while_the_base_stands() -> None:
         TipTask(position=turn.T @ (there - place), link="right_panda_hand", relative_to="left_panda_hand"),
         TipTask(rows=(0, 1, 2), velocity=(0, 0, 0), link="satellite"),
     ]
-    asked: dict[str, Any] = {"tasks": task, "start_joints": start, "horizon": 3.0}
+    asked: dict[str, Any] = {"tasks": task, "start": start, "horizon": 3.0}
     solution = audited(machine, Collocation(intervals=10, degree=4), **asked)
     assert largest_error(machine, task, solution) < 1e-6
     np.testing.assert_allclose(solution["base"][:, 3:], np.tile(home[3:], (len(solution.t), 1)), atol=1e-8)
-    assert solution.cost < resolve(machine, **asked).cost[-1] + 1e-9
+    assert solution.cost < resolved(machine, **asked).cost[-1] + 1e-9
 
 
 def test_the_free_roll_of_a_tool_is_planned_along_a_raster_without_a_jump() -> None:
@@ -193,8 +193,8 @@ def test_the_free_roll_of_a_tool_is_planned_along_a_raster_without_a_jump() -> N
     path = smooth(Path.through(corners), deviation=0.008)
     task = TipTask(position=path_tracks(path, 0.1).position, direction=rotation[:, 2])
     horizon = path.length / 0.1
-    asked: dict[str, Any] = {"tasks": task, "start_joints": UR5_START, "horizon": horizon}
-    local = resolve(ur5(), **asked)
+    asked: dict[str, Any] = {"tasks": task, "start": UR5_START, "horizon": horizon}
+    local = resolved(ur5(), **asked)
     assert list(minimum_velocity_problem(ur5(), **asked).declared.signals) == ["targets"]
     edges = np.asarray(path.bounds) / path.length
     pieces = [np.linspace(a, b, 7)[:-1] for a, b in pairwise(edges)]
@@ -209,9 +209,9 @@ def test_the_free_roll_of_a_tool_is_planned_along_a_raster_without_a_jump() -> N
 
 def test_weights_and_momentum_cost_less_than_instantly() -> None:
     machine = FreeFloating(paper_example().robot, "planar", conserved_momentum=(5.0, -4.0, 2.0))
-    asked: dict[str, Any] = {"tasks": TipTask(rows=(3, 4), velocity=(-0.4, -0.3)), "start_joints": PAPER_START}
+    asked: dict[str, Any] = {"tasks": TipTask(rows=(3, 4), velocity=(-0.4, -0.3)), "start": PAPER_START}
     asked |= {"horizon": 2.0, "weights": (1.0, 3.0, 0.5)}
     solution = audited(machine, Collocation(intervals=20, degree=4), **asked)
-    assert solution.cost < resolve(machine, **asked).cost[-1]
+    assert solution.cost < resolved(machine, **asked).cost[-1]
     with pytest.raises(ProblemError, match="must be positive"):
         minimum_velocity_problem(machine, **{**asked, "weights": (1.0, 0.0, 1.0)})

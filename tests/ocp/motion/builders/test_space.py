@@ -12,6 +12,7 @@ from models import FreeFloating, Link, Robot, Wrench, mass_matrix, planar_chain,
 from models.spatial import quaternion_about
 from ocp import (
     Collocation,
+    DynamicsSetup,
     Effort,
     ProblemError,
     Solution,
@@ -47,7 +48,7 @@ def body(momentum: Array | None = None) -> FreeFloating:
 def test_a_wheel_turns_its_carrier_at_the_least_effort_that_is_known() -> None:
     """The motor turns the carrier alone: 12 J^2 a^2 / T^3, whatever the rotor; the rotor winds on the other way."""
     machine, angle, horizon = hub(), 0.7, 5.0
-    problem = dynamics_problem(machine, [0.0], horizon, end_base=[nan, nan, angle])
+    problem = dynamics_problem(machine, (), horizon, start=[0.0], setup=DynamicsSetup(end_base=[nan, nan, angle]))
     plan = solve(problem, Collocation(8, 4))
     assert plan.cost == pytest.approx(12 * INERTIA**2 * angle**2 / horizon**3, rel=1e-8)
     assert plan["joints"][-1, 0] == pytest.approx(-angle * (INERTIA + ROTOR) / ROTOR, rel=1e-8)
@@ -60,7 +61,9 @@ def test_momentum_that_is_given_is_kept_by_wheels() -> None:
     momentum = np.array([1.0, -2.0, 1.5, 0.0, 0.0, 0.0])
     machine = body(momentum)
     horizon = 30.0
-    problem = dynamics_problem(machine, np.zeros(3), horizon, start=np.zeros(3), end="free")
+    problem = dynamics_problem(
+        machine, (), horizon, start=np.zeros(3), setup=DynamicsSetup(start_velocity=np.zeros(3), end_velocity="free")
+    )
     states = {name: v.symbol for name, v in problem.declared.states.items()}
     problem.end("spin", machine.base_twist(states["base"], states["joints"], states["velocities"])[:3], 0, 0)
     plan = solve(problem, Collocation(8, 4))
@@ -111,7 +114,7 @@ def null_space(machine: FreeFloating, start: Array, shift: Any, method: Collocat
     at = np.array(ca.DM(machine.tip_pose(machine.base_home(), start).position)).ravel()
     reach = TipTask(position=along(at[: len(shift)], shift), rows=(3, 4, 5)[: len(shift)])
     still = TipTask(link=machine.robot.root, rows=(0, 1, 2), velocity=np.zeros(3))
-    held = solve(minimum_velocity_problem(machine, tasks=[reach, still], start_joints=start, horizon=20.0), method)
+    held = solve(minimum_velocity_problem(machine, tasks=[reach, still], start=start, horizon=20.0), method)
     assert turned(held) < 1e-9
     end = np.array(ca.DM(machine.tip_pose(held["base"][-1], held["joints"][-1]).position)).ravel()
     assert end[: len(shift)] == pytest.approx(at[: len(shift)] + shift, abs=1e-4)
@@ -131,8 +134,8 @@ def test_wheels_hold_the_attitude_while_the_arm_works() -> None:
     machine = FreeFloating(wheeled(1))
     start, goal = [0.2, -0.4, 0.9, *[0.0] * 4], [0.9, 0.3, 0.1, *[nan] * 4]
     attitude = TipTask(link="hub", orientation=(1.0, 0.0, 0.0, 0.0))
-    asked: dict[str, Any] = {"end_joints": goal, "end": [0.0] * 3 + [nan] * 4}
-    held = solve(dynamics_problem(machine, start, 20.0, tasks=attitude, **asked), Collocation(20, 5))
+    asked: dict[str, Any] = {"end": goal, "setup": DynamicsSetup(end_velocity=[0.0] * 3 + [nan] * 4)}
+    held = solve(dynamics_problem(machine, attitude, 20.0, start=start, **asked), Collocation(20, 5))
     assert turned(held) < 1e-9
     assert held.audit().feasible
 
@@ -140,10 +143,10 @@ def test_wheels_hold_the_attitude_while_the_arm_works() -> None:
 def test_turning_that_costs_is_less() -> None:
     chain = planar_chain([0.8, 0.6], [4.0, 3.0], base=Link("hub", 40.0, (0, 0, 0), 4.0 * np.eye(3)))
     machine = FreeFloating(with_wheels(chain, [[0, 0, 1]], 0.02), "planar")
-    asked: dict[str, Any] = {"end_joints": [1.2, 0.3, nan], "end": [0.0, 0.0, nan]}
+    asked: dict[str, Any] = {"end": [1.2, 0.3, nan], "setup": DynamicsSetup(end_velocity=[0.0, 0.0, nan])}
 
     def most(effort: Effort | None) -> float:
-        plan = solve(dynamics_problem(machine, [0.2, -0.9, 0.0], 10.0, effort=effort, **asked), SHORT)
+        plan = solve(dynamics_problem(machine, (), 10.0, start=[0.2, -0.9, 0.0], effort=effort, **asked), SHORT)
         return float(np.abs(plan["base"][:, 2]).max())
 
     assert most(Effort(turning=1e4)) < 0.1 * most(None)
@@ -154,7 +157,9 @@ def test_an_attitude_is_held_at_the_end_whatever_the_sign_of_its_quaternion() ->
     goal = np.array(ca.DM(quaternion_about((0.6, 0.0, 0.8), 0.4))).ravel()
     plans = []
     for sign in (1.0, -1.0):
-        problem = dynamics_problem(machine, np.zeros(3), 20.0, end_base=[nan, nan, nan, *(sign * goal)])
+        problem = dynamics_problem(
+            machine, (), 20.0, start=np.zeros(3), setup=DynamicsSetup(end_base=[nan, nan, nan, *(sign * goal)])
+        )
         plans.append(solve(problem, SHORT))
     for plan in plans:
         assert plan["base"][-1, 3:] == pytest.approx(goal, abs=1e-8)
@@ -166,9 +171,9 @@ def test_what_does_not_fit_a_spacecraft_is_refused_by_name() -> None:
     wrong: list[tuple[dict[str, Any], str]] = [
         ({"end_base": [0.0, 0.0]}, "end_base"),
         ({"wrenches": [Wrench("hub", (1, 0, 0))]}, "wrenches"),
-        ({"start": [0.0, 1.0]}, "start"),
+        ({"start_velocity": [0.0, 1.0]}, "start_velocity"),
     ]
     for told, name in wrong:
         with pytest.raises(ProblemError) as caught:
-            dynamics_problem(machine, [0.0], 5.0, **told)
+            dynamics_problem(machine, (), 5.0, start=[0.0], setup=DynamicsSetup(**told))
         assert caught.value.name == name

@@ -23,19 +23,10 @@ from ocp import (
     solve,
     tighten,
 )
-from ocp.motion.builders.standing import (
-    Anywhere,
-    Following,
-    FreeTime,
-    IndexAtLeast,
-    InFoot,
-    Limits,
-    Pinned,
-    Weights,
-    motion_cost,
-    standing_problem,
-)
+from ocp.motion.builders.standing.problem import FreeTime, StandingSetup, Weights, motion_cost, standing_problem
 from ocp.motion.local.accelerations import Stabiliser
+from ocp.motion.tasks.limits import Limits
+from ocp.motion.tasks.zmp_rules import Anywhere, Following, IndexAtLeast, InFoot, Pinned
 from tests.families import some
 from tests.models.machines.standing_machines import planar_machine
 from tests.models.robot.trees import numeric
@@ -67,6 +58,7 @@ from tests.ocp.motion.builders.standing_tasks import (
     tip_at,
     tip_error,
     tool,
+    with_setup,
 )
 
 pytestmark = pytest.mark.xdist_group("standing problems")  # one process, so that every plan is solved once
@@ -247,11 +239,11 @@ def test_jerk_as_control_keeps_the_accelerations_continuous() -> None:
 
 def test_free_ends_cost_less_than_rest_and_a_given_end_posture_more() -> None:
     rest = points(table_plan(1, IN_RANGE, tip_level="acceleration"), 12)
-    free = points(table_plan(1, IN_RANGE, tip_level="acceleration", end="free"), 12)
-    loose = points(table_plan(1, IN_RANGE, tip_level="acceleration", start="free", end="free"), 12)
+    free = points(table_plan(1, IN_RANGE, tip_level="acceleration", end_velocity="free"), 12)
+    loose = points(table_plan(1, IN_RANGE, tip_level="acceleration", start_velocity="free", end_velocity="free"), 12)
     assert loose.cost < free.cost < rest.cost
     posture = (*(rest["joints"][-1, :2] + [0.05, -0.05]), np.nan, np.nan, np.nan)
-    given = held(table_plan(1, IN_RANGE, end_joints=posture), 30)
+    given = held(table_plan(1, IN_RANGE, end=posture), 30)
     np.testing.assert_allclose(given["joints"][-1, :2], posture[:2], atol=1e-8)
     assert given.cost > held(table_plan(1, IN_RANGE), 30).cost
 
@@ -261,9 +253,10 @@ def test_mx_symbols_take_an_interpolant_and_give_the_same_plan() -> None:
     rise = ca.interpolant("rise", "bspline", [knots], 0.4 * (1 - np.cos(knots)))
     _, y, z = tip_at(machine(), STANDING_STARTS[1])
     task = led(lambda t: ca.vertcat(y, z + rise(t) - float(rise(0.0))))
-    settings: dict[str, Any] = {"zmp": IN_RANGE, "limits": LIMITS, "end": "free", "start": "free"}
-    problem = standing_problem(machine(), task, STANDING_STARTS[1], HORIZON, symbols=ca.MX, **settings)
-    exact = table_plan(1, IN_RANGE, start="free", end="free")
+    settings: dict[str, Any] = {"zmp": IN_RANGE, "limits": LIMITS}
+    setup = StandingSetup(symbols=ca.MX, start_velocity="free", end_velocity="free")
+    problem = standing_problem(machine(), task, HORIZON, start=STANDING_STARTS[1], **settings, setup=setup)
+    exact = table_plan(1, IN_RANGE, start_velocity="free", end_velocity="free")
     assert held(problem, 20).cost == pytest.approx(held(exact, 20).cost, abs=1e-4)
 
 
@@ -282,8 +275,15 @@ def test_a_spatial_arm_stands_where_the_local_method_tips(
     assert not local.stands
     assert local.index.min() < index
     limits = Limits(friction=0.7, acceleration=100.0)
-    settings: dict[str, Any] = {"zmp": InFoot(0.005), "external": external, "limits": limits}
-    problem = standing_problem(standing, task, start, horizon, tip_level="acceleration", **settings)
+    settings: dict[str, Any] = {"zmp": InFoot(0.005), "limits": limits}
+    problem = standing_problem(
+        standing,
+        task,
+        horizon,
+        start=start,
+        **settings,
+        setup=StandingSetup(tip_level="acceleration", external=external),
+    )
     assert problem.declared.path["zero moment point"].size == 4  # both coordinates
     motion = sampled(standing, points(problem, 12), external, (3, 4, 5))
     assert motion.stands
@@ -321,8 +321,8 @@ def excess(standing: Standing, solution: Solution, limits: Limits, external: Any
 def test_other_machines_hold_tip_and_zero_moment_point_between_the_points(size: int) -> None:
     standing, task = planar_machine(size), planar_task(size)
     for method, level in ((MultipleShooting(80), "position"), (Collocation(30, scheme="legendre"), "acceleration")):
-        settings: dict[str, Any] = {"zmp": InFoot(0.01), "tip_level": level}
-        problem = standing_problem(standing, task, planar_start(size), PLANAR_HORIZON, **settings)
+        settings = with_setup({"zmp": InFoot(0.01), "tip_level": level})
+        problem = standing_problem(standing, task, PLANAR_HORIZON, start=planar_start(size), **settings)
         solution = solve(problem, method)
         found = excess(standing, solution, Limits())
         assert found.pop("foot") < -0.01 + MILLIMETRE
@@ -355,8 +355,13 @@ FREELY = Weights(joint_limits=0.0)  # nothing but the limits keeps the joints fr
 def test_a_tightened_plan_holds_its_limits_between_the_points(
     standing: Standing, limits: Limits, weights: Any, level: Any
 ) -> None:
-    settings: dict[str, Any] = {"zmp": IN_RANGE, "limits": limits, "weights": weights, "tip_level": level}
-    problem = standing_problem(standing, table_task(1), STANDING_STARTS[1], HORIZON, **settings)
+    settings: dict[str, Any] = {
+        "zmp": IN_RANGE,
+        "limits": limits,
+        "weights": weights,
+        "setup": StandingSetup(tip_level=level),
+    }
+    problem = standing_problem(standing, table_task(1), HORIZON, start=STANDING_STARTS[1], **settings)
     method = MultipleShooting(40) if level == "position" else Collocation(20, scheme="legendre")
     solution = tighten(problem, method)
     found = excess(standing, solution, limits)
@@ -388,7 +393,7 @@ def test_the_plan_stands_in_a_contact_simulation_and_the_pseudo_inverse_falls() 
 def test_another_machine_stands_by_plan_and_tips_by_pseudo_inverse_in_a_contact_simulation() -> None:
     standing, task = planar_machine(5), planar_task(5, 0.75, -0.2)
     start, zmp = planar_start(5), InFoot(0.02)
-    plan = sampled(standing, held(standing_problem(standing, task, start, PLANAR_HORIZON, zmp=zmp), 60))
+    plan = sampled(standing, held(standing_problem(standing, task, PLANAR_HORIZON, start=start, zmp=zmp), 60))
     assert_stands(standing, plan)
     local = resolve_accelerations(standing, task, start, PLANAR_HORIZON, step=5e-3).motion
     assert not local.stands
@@ -406,8 +411,8 @@ def misses(problem: Any, method: Any) -> list[tuple[str, float, float]]:
 
 def lean(horizon: Any, forward: float = 0.9, up: float = 0.5, **changes: Any) -> Any:
     """The tip led straight forward and up."""
-    settings: dict[str, Any] = {"zmp": IN_RANGE, "limits": LIMITS, "along": "parameter", **changes}
-    return standing_problem(machine(), straight(forward, up), STANDING_STARTS[1], horizon, **settings)
+    settings = with_setup({"zmp": IN_RANGE, "limits": LIMITS, "along": "parameter", **changes})
+    return standing_problem(machine(), straight(forward, up), horizon, start=STANDING_STARTS[1], **settings)
 
 
 @pytest.mark.parametrize("horizon", [3.0, FreeTime(0.5, 3.0, 2.0)], ids=["fixed", "free"])
@@ -423,8 +428,8 @@ def test_the_foot_that_the_error_asks_for_is_enough() -> None:
     problem = lean(3.0)
     _, amount, _ = misses(problem, MultipleShooting(20))[0]
     longer = replace(machine(), support=rectangle((-0.05, 0.05), (-0.1, 0.2 + amount + 0.02)))
-    settings: dict[str, Any] = {"zmp": IN_RANGE, "limits": LIMITS, "along": "parameter"}
-    problem = standing_problem(longer, straight(0.9, 0.5), STANDING_STARTS[1], 3.0, **settings)
+    settings: dict[str, Any] = {"zmp": IN_RANGE, "limits": LIMITS, "setup": StandingSetup(along="parameter")}
+    problem = standing_problem(longer, straight(0.9, 0.5), 3.0, start=STANDING_STARTS[1], **settings)
     assert held(problem, 20).success
 
 
@@ -477,20 +482,20 @@ def test_a_pushed_machine_is_asked_to_stand_where_a_time_dependent_force_lets_it
     ("changes", "message"),
     [
         ({"tasks": led(lambda t: [0.0, 0.5])}, "the frame of 'link5' is .* away from where its task begins"),
-        ({"start_joints": np.deg2rad([20.0, 160, 240, 200, 50])}, "'joint1' starts at 0.349.*outside its limits"),
+        ({"start": np.deg2rad([20.0, 160, 240, 200, 50])}, "'joint1' starts at 0.349.*outside its limits"),
         ({"tasks": TipTask(velocity=(0.0, 0.0), rows=(1, 4))}, r"no joint moves the tip in rows \[1\]"),
         ({"tasks": TipTask(velocity=(0.1,), rows=(4,))}, "'link5' moves at .* 0 s, where the joints are to be at rest"),
         ({"horizon": -1.0}, "horizon must be positive and finite"),
         ({"control": "force"}, "control must be 'acceleration' or 'jerk'"),
         ({"along": "arc"}, "along must be 'time' or 'parameter'"),
-        ({"end": "soft"}, "end must be 'rest' or 'free'"),
+        ({"end_velocity": "soft"}, "end_velocity must be 'rest' or 'free'"),
         ({"control": "jerk", "tip_level": "acceleration"}, "goes with control 'acceleration'"),
         ({"zmp": "foot"}, "zmp must be InFoot, .* not 'foot'"),
         ({"zmp": InFoot(0.15)}, "margin 0.15 m is too large"),
         ({"limits": 3}, "limits must be a Limits, not "),
         ({"zmp": Following(lambda t: t)}, "Following: the reference must be two numbers"),
         ({"zmp": Pinned("here")}, "Pinned: point must be two numbers"),
-        ({"end_joints": np.deg2rad([140.0, 90, 240, 200, 50])}, "joints.*terminal.*2.44.*outside"),
+        ({"end": np.deg2rad([140.0, 90, 240, 200, 50])}, "joints.*terminal.*2.44.*outside"),
         ({"zmp": Pinned((0.0,))}, "Pinned: point must be two numbers"),
         ({"zmp": Following(lambda t: [t])}, "Following: the reference must be two numbers"),
         ({"limits": Limits(velocity=(1.0, 2.0))}, "velocity must be positive, one number or 5"),
@@ -498,9 +503,9 @@ def test_a_pushed_machine_is_asked_to_stand_where_a_time_dependent_force_lets_it
     ],
 )
 def test_requests_that_cannot_be_right_are_refused(changes: dict[str, Any], message: str) -> None:
-    arguments = {"tasks": table_task(1), "start_joints": STANDING_STARTS[1], "horizon": HORIZON, **changes}
+    arguments = {"tasks": table_task(1), "start": STANDING_STARTS[1], "horizon": HORIZON, **changes}
     with pytest.raises(ProblemError, match=message) as caught:
-        standing_problem(machine(), **arguments)
+        standing_problem(machine(), **with_setup(arguments))
     assert (caught.value.name or "unnamed") in str(caught.value)
 
 
@@ -508,14 +513,21 @@ def test_a_margin_wider_than_a_triangular_foot_is_refused() -> None:
     """Inscribed circle of 0.0828 m, though the bounding box is 0.3 m wide."""
     triangle = replace(arm(), support=Support([(-0.1, -0.1), (0.2, -0.1), (-0.1, 0.1828427)]))
     settings: dict[str, Any] = {"zmp": InFoot(0.09)}
-    with pytest.raises(ProblemError, match=r"margin 0.09 m is too large .* 0.08\d"):
-        standing_problem(triangle, arm_task(), ARM_START, ARM_HORIZON, **settings)
+    with pytest.raises(ProblemError, match=r"margin 0.09 m leaves no room .* 0.08\d"):
+        standing_problem(triangle, arm_task(), ARM_HORIZON, start=ARM_START, **settings)
 
 
 def test_a_path_longer_than_the_arm_is_refused() -> None:
     message = r"leads .* m away from the first joint .* at most 1.84 m long"
     with pytest.raises(ProblemError, match=message):
-        standing_problem(machine(), straight(2.0, 0.0), STANDING_STARTS[1], 3.0, along="parameter", limits=LIMITS)
+        standing_problem(
+            machine(),
+            straight(2.0, 0.0),
+            3.0,
+            start=STANDING_STARTS[1],
+            limits=LIMITS,
+            setup=StandingSetup(along="parameter"),
+        )
 
 
 @pytest.mark.parametrize(

@@ -12,18 +12,10 @@ from scipy.spatial.transform import Rotation
 from models import Standing, Support, rectangle
 from models.paths import rest_to_rest
 from ocp import Collocation, ProblemError, Solution, TipTask, resolve_accelerations, solve
-from ocp.motion.builders.standing import (
-    Anywhere,
-    Following,
-    IndexAtLeast,
-    InFoot,
-    Limits,
-    Pinned,
-    Weights,
-    standing_problem,
-)
+from ocp.motion.builders.standing.problem import StandingSetup, Weights, standing_problem
 from ocp.motion.local.accelerations import Law
-from ocp.motion.tasks.zmp_rules import ZmpRule
+from ocp.motion.tasks.limits import Limits
+from ocp.motion.tasks.zmp_rules import Anywhere, Following, IndexAtLeast, InFoot, Pinned, ZmpRule
 from tests.models.machines.standing_machines import planar_machine
 from tests.models.robot.trees import Array, numeric
 from tests.ocp.motion.builders.standing_tasks import (
@@ -34,6 +26,7 @@ from tests.ocp.motion.builders.standing_tasks import (
     planar_task,
     sampled,
     tip_at,
+    with_setup,
 )
 
 SIZE = 5
@@ -73,8 +66,8 @@ def resting_point(machine: Standing) -> Array:
 
 
 def planned(machine: Standing, task: TipTask, zmp: ZmpRule, **settings: Any) -> Solution:
-    options = {"zmp": zmp, "weights": WEIGHTS, "tip_level": "acceleration", **settings}
-    problem = standing_problem(machine, task, START, PLANAR_HORIZON, **options)
+    options = with_setup({"zmp": zmp, "weights": WEIGHTS, "tip_level": "acceleration", **settings})
+    problem = standing_problem(machine, task, PLANAR_HORIZON, start=START, **options)
     return solve(problem, Collocation(10, degree=3, scheme="legendre"))
 
 
@@ -123,7 +116,15 @@ def test_what_pushes_a_planar_machine_sideways_is_felt(zmp: ZmpRule) -> None:
     assert motion.foot_margin.min() > -1e-3
     with pytest.raises(ProblemError, match="zero moment point"):
         planned(machine, TASK, rule, external=push(60.0), limits=limits)
-    standing_problem(machine, TASK, START, PLANAR_HORIZON, zmp=Anywhere(), external=push(60.0), limits=limits)
+    standing_problem(
+        machine,
+        TASK,
+        PLANAR_HORIZON,
+        start=START,
+        zmp=Anywhere(),
+        limits=limits,
+        setup=StandingSetup(external=push(60.0)),
+    )
 
 
 @pytest.mark.parametrize("start", ["rest", "free"])
@@ -133,7 +134,7 @@ def test_a_foot_beside_the_machine_is_refused(start: Any, zmp: ZmpRule) -> None:
         planar_machine(SIZE), support=rectangle((0.05, 0.2), (-0.12, 0.2)), most_stable_point=None, half_widths=None
     )
     with pytest.raises(ProblemError, match="zero moment point"):
-        planned(beside, TASK, zmp, start=start)
+        planned(beside, TASK, zmp, start_velocity=start)
 
 
 @pytest.mark.parametrize(
@@ -147,25 +148,26 @@ def test_a_foot_beside_the_machine_is_refused(start: Any, zmp: ZmpRule) -> None:
     ],
 )
 def test_a_reference_that_leaves_the_foot_is_refused(zmp: ZmpRule, message: str | None) -> None:
-    arguments = (planar_machine(SIZE), TASK, START, PLANAR_HORIZON)
+    arguments = (planar_machine(SIZE), TASK, PLANAR_HORIZON)
+    setup = StandingSetup(tip_level="acceleration")
     if message is None:
-        assert standing_problem(*arguments, zmp=zmp, tip_level="acceleration").name == "standing plan"
+        assert standing_problem(*arguments, start=START, zmp=zmp, setup=setup).name == "standing plan"
         return
     with pytest.raises(ProblemError, match=message) as caught:
-        standing_problem(*arguments, zmp=zmp)
+        standing_problem(*arguments, start=START, zmp=zmp)
     assert (caught.value.name or "unnamed") in str(caught.value)
 
 
 def test_joints_that_tip_and_zero_moment_point_use_up_cannot_be_asked_to_rest() -> None:
     machine, start = planar_machine(3), planar_start(3)
-    arguments = (machine, planar_task(3, 0.02, -0.02), start, PLANAR_HORIZON)
+    task, setup = planar_task(3, 0.02, -0.02), StandingSetup(tip_level="acceleration")
     with pytest.raises(ProblemError, match=r"2 rows and 1 of the zero moment point leave the 3 joints no freedom"):
-        standing_problem(*arguments, zmp=Pinned(), tip_level="acceleration")
+        standing_problem(machine, task, PLANAR_HORIZON, start=start, zmp=Pinned(), setup=setup)
     two, begin = planar_machine(2), planar_start(3)[:2]
     ahead = moved_task(two, begin, (0.1, -0.1), PLANAR_HORIZON)
     with pytest.raises(ProblemError, match=r"2 rows leave the 2 joints no freedom .* tip_level='acceleration'"):
-        standing_problem(two, ahead, begin, PLANAR_HORIZON, zmp=Anywhere())
-    plan = standing_problem(two, ahead, begin, PLANAR_HORIZON, zmp=Anywhere(), tip_level="acceleration")
+        standing_problem(two, ahead, PLANAR_HORIZON, start=begin, zmp=Anywhere())
+    plan = standing_problem(two, ahead, PLANAR_HORIZON, start=begin, zmp=Anywhere(), setup=setup)
     solution = solve(plan, Collocation(10, degree=3, scheme="legendre"))
     np.testing.assert_allclose(solution["velocities"][-1], 0, atol=1e-5)
 
@@ -174,5 +176,5 @@ def test_a_singular_start_is_named_where_the_cost_needs_a_slope() -> None:
     machine = planar_machine(SIZE)
     straight = np.zeros(SIZE)
     task = moved_task(machine, straight, (-0.1, 0.1), PLANAR_HORIZON)
-    with pytest.raises(ProblemError, match=r"start_joints \[0.0, .* singular there"):
-        standing_problem(machine, task, straight, PLANAR_HORIZON)
+    with pytest.raises(ProblemError, match=r"start \[0.0, .* singular there"):
+        standing_problem(machine, task, PLANAR_HORIZON, start=straight)

@@ -13,18 +13,12 @@ from models import STANDING_STARTS
 from models.machines.machine import with_tip
 from models.paths import rest_to_rest
 from ocp import Collocation, ProblemError, Solution, SolveError, TipTask, resolve_accelerations, solve
-from ocp.motion.builders.standing import (
-    FreeTime,
-    IndexAtLeast,
-    InFoot,
-    Pinned,
-    ZmpRule,
-    plan_standing,
-    standing_problem,
-)
+from ocp.motion.builders.standing.plan import plan_standing
+from ocp.motion.builders.standing.problem import FreeTime, StandingSetup, standing_problem
 from ocp.motion.tasks.equations import task_errors
 from ocp.motion.tasks.tip_task import timed
 from ocp.motion.tasks.tracks import pose_line
+from ocp.motion.tasks.zmp_rules import IndexAtLeast, InFoot, Pinned, ZmpRule
 from tests.models.machines.standing_machines import planar_machine
 from tests.ocp.motion.builders.standing_replay import assert_stands
 from tests.ocp.motion.builders.standing_tasks import (
@@ -49,6 +43,7 @@ from tests.ocp.motion.builders.standing_tasks import (
     tool,
     two,
     two_tasks,
+    with_setup,
 )
 from tests.ocp.motion.tasks.space_tasks import pose, turned
 
@@ -59,8 +54,8 @@ SWING, ASIDE = 1.5, (0.2, 0.15, -0.05)  # s; m, of the arm with a load at its ti
 
 
 def table_request(**changes: Any) -> Solution:
-    settings: dict[str, Any] = {"zmp": IN_RANGE, "limits": LIMITS, **changes}
-    return plan_standing(machine(), table_task(1), STANDING_STARTS[1], HORIZON, **settings)
+    settings = with_setup({"zmp": IN_RANGE, "limits": LIMITS, **changes})
+    return plan_standing(machine(), table_task(1), HORIZON, start=STANDING_STARTS[1], **settings)
 
 
 @pytest.mark.parametrize(
@@ -87,9 +82,10 @@ def test_the_formulation_that_works_is_found(
 
 
 def test_the_fastest_lift_is_planned_with_linear_accelerations() -> None:
-    settings: dict[str, Any] = {"limits": LIFT_LIMITS, "weights": LIFT_WEIGHTS, "along": "parameter", "zmp": IN_RANGE}
+    settings: dict[str, Any] = {"limits": LIFT_LIMITS, "weights": LIFT_WEIGHTS, "zmp": IN_RANGE}
+    settings["setup"] = StandingSetup(along="parameter")
     horizon = FreeTime(0.2, 3.0, 1.0)
-    solution = plan_standing(machine(), straight(0.0, 0.8), STANDING_STARTS[1], horizon, **settings)
+    solution = plan_standing(machine(), straight(0.0, 0.8), horizon, start=STANDING_STARTS[1], **settings)
     audit = solution.audit()
     assert audit.feasible
     assert not audit.failures
@@ -110,8 +106,8 @@ def test_a_failure_says_what_became_of_every_attempt() -> None:
     assert str(caught.value).count("\n") == 3
     assert (caught.value.name or "unnamed") in str(caught.value)
     assert caught.value.solution is not None
-    with pytest.raises(ProblemError, match="end must be 'rest' or 'free'"):
-        table_request(end="middle")
+    with pytest.raises(ProblemError, match="end_velocity must be 'rest' or 'free'"):
+        table_request(end_velocity="middle")
 
 
 @pytest.mark.parametrize("kind", ["orientation", "direction"])
@@ -122,7 +118,7 @@ def test_an_arm_holds_its_hand_level_where_the_local_method_tips(kind: str) -> N
     task = moved_task(arm(), ARM_START, ASIDE, SWING, **turning)
     local = resolve_accelerations(arm(), task, ARM_START, SWING, step=5e-3, external=tool).motion
     assert not local.stands
-    solution = plan_standing(arm(), task, ARM_START, SWING, zmp=InFoot(0.005), external=tool)
+    solution = plan_standing(arm(), task, SWING, start=ARM_START, zmp=InFoot(0.005), setup=StandingSetup(external=tool))
     assert solution.audit().passed
     motion = sampled(arm(), solution, tool)
     assert motion.foot_margin.min() > 0.004
@@ -141,7 +137,7 @@ def test_two_arms_stand_where_the_local_method_tips() -> None:
     local = resolve_accelerations(two(), tasks, TWO_START, TWO_HORIZON, step=5e-3)
     assert local.tip_error.max() < 1e-8
     assert not local.motion.stands
-    solution = plan_standing(two(), tasks, TWO_START, TWO_HORIZON, zmp=InFoot(0.005))
+    solution = plan_standing(two(), tasks, TWO_HORIZON, start=TWO_START, zmp=InFoot(0.005))
     assert solution.audit().passed
     motion = sampled(two(), solution)
     assert motion.foot_margin.min() > 0.004
@@ -165,8 +161,8 @@ def test_a_velocity_says_the_same_as_the_position_it_leads_to(
     level: Any, method: Collocation, cost: float, stray: float
 ) -> None:
     tasks = (table_task(1), TipTask(velocity=lambda t: [0.0, 0.4 * ca.sin(t)], rows=(4, 5), gain=0.0))
-    settings: dict[str, Any] = {"zmp": IN_RANGE, "limits": LIMITS, "tip_level": level}
-    problems = [standing_problem(machine(), task, STANDING_STARTS[1], HORIZON, **settings) for task in tasks]
+    settings: dict[str, Any] = {"zmp": IN_RANGE, "limits": LIMITS, "setup": StandingSetup(tip_level=level)}
+    problems = [standing_problem(machine(), task, HORIZON, start=STANDING_STARTS[1], **settings) for task in tasks]
     led, driven = (solve(problem, method) for problem in problems)
     assert driven.cost == pytest.approx(led.cost, abs=cost)
     assert tip_error(machine(), sampled(machine(), driven), tasks[0]) < stray
@@ -182,7 +178,8 @@ def test_a_hand_that_turns_on_its_way_costs_less_with_its_time_law_free() -> Non
     given = timed(task, lambda t: rest_to_rest(t / PLANAR_HORIZON))
     cost = {}
     for along, what in (("time", given), ("parameter", task)):
-        found = plan_standing(standing, what, start, PLANAR_HORIZON, zmp=InFoot(0.01), along=along)  # type: ignore[arg-type]
+        setup = StandingSetup(along=along)  # type: ignore[arg-type]
+        found = plan_standing(standing, what, PLANAR_HORIZON, start=start, zmp=InFoot(0.01), setup=setup)
         cost[along] = found.cost
         for ours, theirs in zip(pose(standing, (), found["joints"][-1]), goal, strict=True):
             np.testing.assert_allclose(ours, theirs, atol=1e-5)
@@ -194,6 +191,6 @@ def test_a_plan_closes_a_gap_at_its_start_critically_damped() -> None:
     standing, start = planar_machine(5), planar_start(5)
     _, y, z = tip_at(standing, start)
     task = TipTask(position=(y + 0.003, z - 0.004), rows=(4, 5), gain=4.0, start_gap=0.01)
-    plan = plan_standing(standing, task, start, PLANAR_HORIZON, zmp=InFoot(0.01))
+    plan = plan_standing(standing, task, PLANAR_HORIZON, start=start, zmp=InFoot(0.01))
     errors = np.linalg.norm(task_errors(standing, task, plan.t, None, plan["joints"]), axis=1)
     np.testing.assert_allclose(errors, 0.005 * (1 + 4 * plan.t) * np.exp(-4 * plan.t), atol=1e-6)

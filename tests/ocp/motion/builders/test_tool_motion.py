@@ -142,7 +142,7 @@ def test_accelerations_hold_a_velocity_that_changes_in_each_stretch_of_the_time(
         cyclic=False,
         weights=np.ones(2),
         bounds=Limits(acceleration=50.0).bounds(machine),
-        driven=True,
+        actuated=True,
     )
     found = solve(motion.problem, Collocation(8), options={"max_iter": 60})
     for stretch in motion.stretches:

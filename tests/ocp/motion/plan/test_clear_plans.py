@@ -301,7 +301,7 @@ def test_what_never_touches_within_limits_is_looked_at_without_them() -> None:
     assert within.left["link2", "link6"] == "never touch"
     assert ("link2", "link6") in beyond.labels
     free_of_limits = Limits(joints=False)
-    required: dict[str, Any] = {"tasks": line(), "start_joints": START, "horizon": SECONDS, "limits": free_of_limits}
+    required: dict[str, Any] = {"tasks": line(), "start": START, "horizon": SECONDS, "limits": free_of_limits}
     around = CollisionScene(ARM)
     with pytest.raises(ProblemError, match="limits=False"):
         minimum_velocity_problem(ARM, **required, clearance_constraints=ClearanceConstraints(around))
@@ -368,7 +368,9 @@ def test_a_local_motion_tells_how_near_it_comes() -> None:
 @pytest.mark.long
 def test_builders_take_what_to_stay_clear_of() -> None:
     around = CollisionScene(ARM, [POST])
-    problem = minimum_velocity_problem(ARM, line(), START, SECONDS, clearance_constraints=ClearanceConstraints(around))
+    problem = minimum_velocity_problem(
+        ARM, line(), SECONDS, start=START, clearance_constraints=ClearanceConstraints(around)
+    )
     touching = solve(problem, Collocation(16, 4)).audit()
     assert not touching["clearance"].passed
     assert not touching.feasible

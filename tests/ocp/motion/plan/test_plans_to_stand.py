@@ -14,7 +14,7 @@ import pytest
 from models import Standing, Support, rectangle
 from models.paths import rest_to_rest
 from ocp import Limits, ProblemError, TipTask
-from ocp.motion.builders.standing import Weights
+from ocp.motion.builders.standing.problem import Weights
 from ocp.motion.plan import Plan, plan
 from tests.models.machines.standing_machines import planar_machine
 from tests.models.robot.trees import Array

@@ -65,14 +65,12 @@ def in_pieces(machine: FixedBase) -> Any:
 
 def least_velocities(machine: FixedBase) -> Any:
     velocity = np.array([-0.2, 0.15])
-    problem = minimum_velocity_problem(
-        machine, tasks=TipTask(rows=(3, 4), velocity=velocity), start_joints=START, horizon=1.0
-    )
+    problem = minimum_velocity_problem(machine, tasks=TipTask(rows=(3, 4), velocity=velocity), start=START, horizon=1.0)
     return solve(problem, Collocation(5)).cost
 
 
 def moved(machine: FixedBase, **options: Any) -> Any:
-    solution = plan_dynamics(machine, START, 1.0, end_joints=END, **options)
+    solution = plan_dynamics(machine, (), 1.0, start=START, end=END, **options)
     return solution.cost
 
 
