@@ -27,16 +27,16 @@ from ocp.status import SolverStatus
 
 __all__ = [
     "LOG",
-    "OutOfTime",
+    "FatropMonitor",
     "Progress",
-    "Watch",
+    "TimeLimitReached",
+    "casadi_silenced",
     "check_time",
     "interruptible",
-    "limited",
-    "listening",
-    "quiet",
     "reason_to_stop",
+    "stop_requests_polled",
     "time_left",
+    "time_limited",
 ]
 
 LOG = logging.getLogger("ocp")
@@ -140,7 +140,7 @@ def interruptible(function: Callable[P, T]) -> Callable[P, T]:
 
 
 @contextmanager
-def listening() -> Iterator[None]:
+def stop_requests_polled() -> Iterator[None]:
     """Inside, the loop at work asks :func:`reason_to_stop` again and again, and ends by itself."""
     call = _CALL.get()
     if call is None:
@@ -166,7 +166,7 @@ def reason_to_stop() -> SolverStatus | None:
 
 
 @contextmanager
-def limited(seconds: float | None) -> Iterator[None]:
+def time_limited(seconds: float | None) -> Iterator[None]:
     """Solves inside end after so many seconds in all, or after what an outer limit leaves; None for no limit."""
     before = _DEADLINE.get()
     token = _DEADLINE.set(before if seconds is None else min(before, time.monotonic() + seconds))
@@ -181,14 +181,14 @@ def time_left() -> float:
     return _DEADLINE.get() - time.monotonic()
 
 
-class OutOfTime(Exception):
+class TimeLimitReached(Exception):
     """What has no word of its own for it is behind its time limit; who set the limit says what was found."""
 
 
 def check_time() -> None:
     """Raise OutOfTime behind the time limit."""
     if time_left() <= 0:
-        raise OutOfTime(str(SolverStatus.TIME_LIMIT))
+        raise TimeLimitReached(str(SolverStatus.TIME_LIMIT))
 
 
 # ---- progress ----------------------------------------------------------------------------------------------------
@@ -245,7 +245,7 @@ class Progress(ca.Callback):  # type: ignore[misc]
             self.bar.close()
 
 
-class Watch(ca.Callback):  # type: ignore[misc]
+class FatropMonitor(ca.Callback):  # type: ignore[misc]
     """The function of an iterate that is 1 while a solver may go on and 0 when it must end; keeps the iterate.
 
     For fatrop's plugin, which has no iteration callback.
@@ -310,7 +310,7 @@ _HUSHING = threading.Lock()
 
 
 @contextmanager
-def quiet() -> Iterator[None]:
+def casadi_silenced() -> Iterator[None]:
     """Swallow what CasADi writes to ``sys.stderr`` from this thread where a function breaks down and that is expected.
 
     It would print the function's inputs; no option of its functions keeps it from that.

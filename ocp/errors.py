@@ -17,17 +17,16 @@ from models.arrays import NOT_NUMBERS, check_entries, floats
 from models.input_files import INPUT_LIMITS
 
 __all__ = [
-    "MOST",
+    "MAX_COUNT",
     "NOT_NUMBERS",
     "AuditError",
     "BoundWarning",
-    "Detailed",
+    "DetailedError",
     "Interrupted",
     "ProblemError",
     "RefinementWarning",
     "SolveError",
     "StorageWarning",
-    "about",
     "check_entries",
     "checked_choice",
     "checked_count",
@@ -39,19 +38,20 @@ __all__ = [
     "checked_positive",
     "checked_text",
     "checked_time_limit",
+    "error_names",
     "floats",
+    "format_distinct",
     "real",
     "sample_times",
-    "told_apart",
     "unknown_name",
 ]
 
-MOST = 1_000_000
+MAX_COUNT = 1_000_000
 """Of what is counted: more than these take longer than anybody waits."""
 _Kind = TypeVar("_Kind")
 
 
-class Detailed(Exception):
+class DetailedError(Exception):
     """An exception that carries what its message says; it is pickled with all of it.
 
     Attributes:
@@ -71,11 +71,11 @@ class Detailed(Exception):
         return type(self), self.args, {key: _pickled(value) for key, value in self.__dict__.items()}
 
 
-class ProblemError(Detailed, ValueError):
+class ProblemError(DetailedError, ValueError):
     """A problem, a method or an argument that cannot be right, found before anything is solved."""
 
 
-class SolveError(Detailed, RuntimeError):
+class SolveError(DetailedError, RuntimeError):
     """A solve that ended without an optimum.
 
     Attributes:
@@ -100,28 +100,28 @@ class Interrupted(KeyboardInterrupt):
         self.solution = solution
 
 
-class AuditError(Detailed, RuntimeError):
+class AuditError(DetailedError, RuntimeError):
     """An audit that cannot be made, for example of a loaded solution without its problem."""
 
 
-class RefinementWarning(Detailed, UserWarning):
+class RefinementWarning(DetailedError, UserWarning):
     """A refinement that stopped where the audit does not pass; ``value`` is the share of its limit that a row is at."""
 
 
-class StorageWarning(Detailed, UserWarning):
+class StorageWarning(DetailedError, UserWarning):
     """A part that a file cannot hold as data, such as a problem that calls a function of Python's."""
 
 
-class BoundWarning(Detailed, UserWarning):
+class BoundWarning(DetailedError, UserWarning):
     """A motion that costs less, ``value``, than the lower bound of all, ``limit``: a fault of this package."""
 
 
 @contextmanager
-def about(name: str) -> Iterator[None]:
+def error_names(name: str) -> Iterator[None]:
     """What is raised inside, and names nothing itself, is about ``name``."""
     try:
         yield
-    except Detailed as error:
+    except DetailedError as error:
         error.name = name if error.name is None else error.name
         raise
 
@@ -157,7 +157,7 @@ def checked_choice(what: str, value: Any, choices: Sequence[str]) -> str:
 def checked_count(what: str, value: Any, least: int = 1, most: int | None = None) -> int:
     """``value`` as a plain integer, or ProblemError unless it is a whole number from ``least`` to ``most``."""
     whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
-    if not whole or value < least or value > (MOST if most is None else most):
+    if not whole or value < least or value > (MAX_COUNT if most is None else most):
         kind = "a positive integer" if least == 1 else f"a whole number, at least {least}"
         kind = kind if most is None else f"{least} to {most}"
         raise ProblemError(f"{what} must be {kind}, not {value!r}", name=_last(what), value=value, limit=(least, most))
@@ -182,7 +182,7 @@ def checked_positive(what: str, value: Any, below: float = np.inf) -> float:
     return kept
 
 
-def told_apart(*numbers: float) -> list[str]:
+def format_distinct(*numbers: float) -> list[str]:
     """Numbers for a message, in six digits, or in as many more as tell those apart that differ."""
     told = [[f"{number:.{digits}g}" for number in numbers] for digits in range(6, 18)]
     return next((each for each in told if len({*each}) == len({repr(number) for number in numbers})), told[-1])

@@ -26,9 +26,9 @@ from typing import Any
 import casadi as ca
 
 from models import cache
-from ocp.console import LOG, check_time, quiet
+from ocp.console import LOG, casadi_silenced, check_time
 
-__all__ = ["CompilerError", "Library", "built", "code", "generated"]
+__all__ = ["CompilerError", "Library", "build_library", "generate_c", "generate_code"]
 
 VERSION = "1"  # of what is made of contents
 FLAGS = ("-fPIC", "-shared", "-w", "-ffp-contract=off", *(("-Wl,-z,defs",) if sys.platform == "linux" else ()))
@@ -89,16 +89,16 @@ class Library:
         return cache.key_of(VERSION, *machine, *compiler(), *FLAGS, LINK, *self.contents)
 
 
-def code(functions: Iterable[Any]) -> str:
+def generate_code(functions: Iterable[Any]) -> str:
     """C of casadi Functions, each by its name.
 
     Raises:
         CompilerError: One of them has no C.
     """
-    return generated(functions, "unit", header=False)[0]
+    return generate_c(functions, "unit", header=False)[0]
 
 
-def generated(functions: Iterable[Any], name: str, *, header: bool = True) -> list[str]:
+def generate_c(functions: Iterable[Any], name: str, *, header: bool = True) -> list[str]:
     """The texts NAME.c and NAME.h of casadi Functions.
 
     Raises:
@@ -106,7 +106,7 @@ def generated(functions: Iterable[Any], name: str, *, header: bool = True) -> li
     """
     files = [f"{name}.c", f"{name}.h"] if header else [f"{name}.c"]
     try:
-        with tempfile.TemporaryDirectory() as place, quiet():
+        with tempfile.TemporaryDirectory() as place, casadi_silenced():
             generator = ca.CodeGenerator(files[0], {"with_header": header})
             for function in functions:
                 generator.add(function)
@@ -120,12 +120,12 @@ def generated(functions: Iterable[Any], name: str, *, header: bool = True) -> li
     return [text.replace("0+ i*0", "0") for text in texts]
 
 
-def built(library: Library) -> Path:
+def build_library(library: Library) -> Path:
     """A library, compiled where it is not kept. It is waited for; Ctrl-C and time limits end that.
 
     Raises:
         CompilerError: There is no compiler, or it takes the C for wrong.
-        OutOfTime: The time limit is over.
+        TimeLimitReached: The time limit is over.
     """
     key = library.key
     found = _OWN.get(key) or cache.kept_library(key)
@@ -231,7 +231,7 @@ def wait(process: subprocess.Popen[bytes]) -> int:
             return process.wait(0.05)
 
 
-def serialised(function: Any) -> str:
+def function_key(function: Any) -> str:
     """The text of a casadi Function, by which it is known again; a name for this process where it has none."""
     try:
         return SERIALISED + str(function.serialize())
@@ -240,6 +240,6 @@ def serialised(function: Any) -> str:
 
 
 @lru_cache
-def notice(words: str) -> None:
+def warn_interpreted(words: str) -> None:
     """Say once why functions are interpreted."""
     LOG.warning("functions are interpreted, which is slower: %s", words)

@@ -19,7 +19,7 @@ from ocp.audit import certificate as comparison
 from ocp.audit.certificate import Certificate
 from ocp.audit.curvature import Curvature
 from ocp.audit.optimality import optimality
-from ocp.console import interruptible, limited
+from ocp.console import interruptible, time_limited
 from ocp.direct.collocation import Collocation
 from ocp.direct.guess import Samples
 from ocp.direct.shooting import MultipleShooting
@@ -156,13 +156,13 @@ def solve(
             there is none either.
     """
     checked_flag("solve: check", check)
-    with limited(checked_time_limit(time_limit)):
+    with time_limited(checked_time_limit(time_limit)):
         prepared = prepare(problem, method, solver=solver, options=options, scaling=scaling)
         solution = prepared.solve(parameters, guess, check)
-        return lowered(prepared, solution) if check and solution.regularised else solution
+        return descend(prepared, solution) if check and solution.regularised else solution
 
 
-def lowered(prepared: PreparedProblem, solution: Solution) -> Solution:
+def descend(prepared: PreparedProblem, solution: Solution) -> Solution:
     """The plan, or a cheaper one beside it where its cost can be lowered along a feasible variation.
 
     Raises:
@@ -178,7 +178,7 @@ def lowered(prepared: PreparedProblem, solution: Solution) -> Solution:
         if not found.least < -FLAT_SHARE:
             break
         others = [
-            prepared.solve(solution.parameters, beside(form, solution, found, bounds, sign), check=False)
+            prepared.solve(solution.parameters, displaced_guess(form, solution, found, bounds, sign), check=False)
             for sign in (1.0, -1.0)
         ]
         plans = [other for other in others if other.success]
@@ -200,7 +200,9 @@ def lowered(prepared: PreparedProblem, solution: Solution) -> Solution:
     return solution
 
 
-def beside(form: Formulation, solution: Solution, found: Curvature, bounds: Bounds, sign: float) -> dict[str, Any]:
+def displaced_guess(
+    form: Formulation, solution: Solution, found: Curvature, bounds: Bounds, sign: float
+) -> dict[str, Any]:
     """A guess: the plan moved along the variation that lowers its cost, as far as is visible in its own size.
 
     Where the cost falls but no variation is told, all controls are pushed by seeded random amounts.

@@ -12,17 +12,17 @@ import numpy as np
 
 from ocp.audit.audit import Audit, Finding
 from ocp.audit.audit import audit as judge
-from ocp.console import OutOfTime, limited, time_left
+from ocp.console import TimeLimitReached, time_left, time_limited
 from ocp.direct.mesh import check_meshed
 from ocp.direct.prepared import DirectMethod
 from ocp.errors import (
     ProblemError,
     RefinementWarning,
     SolveError,
-    about,
     checked_count,
     checked_mapping,
     checked_time_limit,
+    error_names,
     unknown_name,
 )
 from ocp.methods import solve
@@ -33,7 +33,7 @@ from ocp.solution import ByName, Guess, Refinement, Solution, stack
 from ocp.status import SolverStatus
 from ocp.tolerances import ROUNDING_SHARE, SOLVER_SHARE
 
-__all__ = ["refine", "refined", "split"]
+__all__ = ["refine", "refine_from", "split"]
 
 LIMITS = [name for name, given in signature(judge).parameters.items() if given.kind is Parameter.KEYWORD_ONLY]
 KINDS = ("integration", "equalities", "limits", "cost", "other")
@@ -130,12 +130,12 @@ def refine(
             limit=method.intervals,
         )
     given = {"parameters": parameters, "solver": solver, "options": options}
-    with limited(time_limit):
+    with time_limited(time_limit):
         first = _first(problem, method, {**given, "guess": guess}, settings, time_limit)
         return _refined(problem, method, first, tolerance, given, settings, max_intervals)[0]
 
 
-def refined(
+def refine_from(
     problem: Problem, method: DirectMethod, solution: Solution, audit: Audit, options: ByName = None, check: bool = True
 ) -> tuple[Solution, Audit]:
     """As `refine`, from a plan that was solved on the method's mesh and audited already; with the last one's audit.
@@ -203,7 +203,7 @@ def _shortfall(
             hint = "finer intervals do not lower it" + ("; draw it in (tighten)" if worst.kind == "limits" else "")
         words = f"{stopped} with {worst.name!r} at {worst.value:.2e} of its limit; {hint}"
         return RefinementWarning(words, name=worst.name, value=worst.value, limit=1.0)
-    if touching := [each for each in audit.failures if each.name in form.apart]:
+    if touching := [each for each in audit.failures if each.name in form.separations]:
         words = f"{stopped}; finer intervals keep no bodies apart, add constraints that do: {touching[0].note}"
         return RefinementWarning(words, name=touching[0].name, value=touching[0].value, limit=1.0)
     if not audit.passed:
@@ -223,7 +223,7 @@ def _first(
     solution = solve(problem, method, **given)
     try:
         return solution, judge(problem, solution, **settings)
-    except OutOfTime as error:
+    except TimeLimitReached as error:
         words = f"{SolverStatus.TIME_LIMIT}: raise time_limit"
         raise SolveError(
             f"refinement of {problem.name!r} ended in the audit of its first plan with {words}",
@@ -248,7 +248,7 @@ def _next(
         if not solution.success:
             raise SolveError(f"refinement of {problem.name!r} failed: {solution.status}", solution)
         return solution, judge(problem, solution, **settings)
-    except (SolveError, OutOfTime) as error:
+    except (SolveError, TimeLimitReached) as error:
         if isinstance(error, SolveError) and time_left() > 0:
             raise
         return None
@@ -304,7 +304,7 @@ def _rows(
         parts[name] = _Parts("equalities" if equal else "limits", misses, order)
     rows = []
     for finding in (asked, *audit.findings):
-        if finding.limit is None or finding.name in form.apart:  # no finer interval keeps bodies apart
+        if finding.limit is None or finding.name in form.separations:  # no finer interval keeps bodies apart
             continue
         value = 0.0 if finding.value == 0 else finding.value / finding.limit if finding.limit > 0 else np.inf
         value = np.inf if np.isnan(value) else float(value)
@@ -374,7 +374,7 @@ def split(mesh: np.ndarray, pieces: np.ndarray, bad: np.ndarray, most: int) -> n
 
 def _fractions(form: Formulation, p: np.ndarray, breaks: Sequence[float]) -> np.ndarray:
     """Times of a fixed horizon as fractions of it."""
-    with about("breaks"):
+    with error_names("breaks"):
         times = numeric("refine: breaks", breaks)
     if not times.size:
         return times

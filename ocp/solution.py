@@ -19,48 +19,48 @@ from ocp.errors import NOT_NUMBERS, AuditError, ProblemError, StorageWarning, fl
 from ocp.problem.formulation import Formulation
 from ocp.problem.phases import own_of
 from ocp.problem.problem import Problem
-from ocp.problem.stored import DAMAGED, NUMBERS, packed, unpacked
+from ocp.problem.stored import ARRAY_NAMES, RECORD_ERRORS, pack_record, unpack_record
 from ocp.registry import call_registered
 from ocp.solution_data import (
-    AT_NODE,
     HEAD,
     INTERPOLANTS,
-    MOST_HEAD,
+    MAX_HEAD_BYTES,
+    NODE_TOLERANCE,
     PARTS,
     PLAIN,
     POOLS,
     Refinement,
     Sample,
     Sensitivity,
-    by_name,
-    check_belongs,
     check_finite,
     check_structure,
-    drawn_in_at,
-    in_order_of,
+    check_variables_match,
+    entry_named,
+    match_order,
     plain,
     read_head,
     read_status,
     stack,
+    tightening_at,
     unstack,
 )
 from ocp.status import SolverStatus
 from ocp.storage import read_arrays, write_arrays
 
 __all__ = [
-    "AT_NODE",
+    "NODE_TOLERANCE",
     "ByName",
     "Guess",
     "Refinement",
     "Sample",
     "Sensitivity",
     "Solution",
-    "check_belongs",
     "check_structure",
-    "drawn_in_at",
-    "in_order_of",
+    "check_variables_match",
+    "match_order",
     "read_head",
     "stack",
+    "tightening_at",
     "unstack",
 ]
 
@@ -92,8 +92,8 @@ class Solution:
         seconds: Wall time of ``build`` and ``solve``.
         problem: The problem, or None where it could not be written to a file. problem_lost: Why, or "".
         refinement: How the mesh came about, or None.
-        drawn_in: By how much the lower and the upper bounds were drawn in, interval by interval, in the order states,
-            controls, path rows of the problem. What two intervals share at a node, which is all but a control that may
+        bound_tightening: By how much the lower and the upper bounds were drawn in, interval by interval, in the order
+            states, controls, path rows of the problem. What two intervals share at a node, which is all but a control that may
             jump there and what contains it, is drawn in by the larger of both; equalities are not. None where the plan
             was solved under the problem's own bounds. Shape (2, N, nx + nu + path rows).
         tightening_cost: Of the cost what the bounds drawn in take, beside the plan of the same mesh that keeps them at
@@ -127,7 +127,7 @@ class Solution:
     problem: Any = field(default=None, compare=False, repr=False)
     problem_lost: str = field(default="", compare=False, repr=False)
     refinement: Refinement | None = None
-    drawn_in: np.ndarray | None = None
+    bound_tightening: np.ndarray | None = None
     tightening_cost: float = 0.0
     start: str = "guess"
     regularised: bool = False
@@ -135,7 +135,7 @@ class Solution:
 
     def __getitem__(self, name: str) -> np.ndarray:
         """Values of a state or control at the reported times. Shape (M, n)."""
-        return by_name("state or control", name, {**self.states, **self.controls})
+        return entry_named("state or control", name, {**self.states, **self.controls})
 
     def __repr__(self) -> str:
         return (
@@ -193,7 +193,7 @@ class Solution:
 
     def costate(self, name: str) -> np.ndarray:
         """Costate of a state at the reported times: d(optimal cost)/d(state). Shape (M, n)."""
-        return by_name("state", name, self.costates)
+        return entry_named("state", name, self.costates)
 
     @interruptible
     def sensitivity(self, name: str) -> Sensitivity:
@@ -211,7 +211,7 @@ class Solution:
 
     def cost_gradient(self, name: str) -> np.ndarray:
         """Derivative of the optimal cost in a parameter, from the multipliers. Shape (n,)."""
-        return by_name("parameter", name, self.cost_gradients)
+        return entry_named("parameter", name, self.cost_gradients)
 
     def at(self, time: Any) -> Sample:
         """States and controls at a time (each (n,)) or at times (M,) (each (M, n)), by the method's own interpolant.
@@ -225,7 +225,7 @@ class Solution:
             raise ProblemError(
                 f"a time or an array of times is expected, not {time!r}", name="time", value=time
             ) from error
-        slack = AT_NODE * self.horizon
+        slack = NODE_TOLERANCE * self.horizon
         if not np.all((times >= -slack) & (times <= self.horizon + slack)):
             words = f"time {time!r} is outside the plan, 0 to {self.horizon:g} s"
             raise ProblemError(words, name="time", value=time, limit=(0.0, self.horizon), time=time)
@@ -235,7 +235,7 @@ class Solution:
         """As :meth:`at`, at fractions 0..1 of the horizon."""
         try:
             at = floats(fraction)
-            inside = bool(((at >= -AT_NODE) & (at <= 1 + AT_NODE)).all())
+            inside = bool(((at >= -NODE_TOLERANCE) & (at <= 1 + NODE_TOLERANCE)).all())
         except NOT_NUMBERS:
             inside = False
         if not inside:
@@ -268,7 +268,7 @@ class Solution:
             ProblemError: There is no such phase.
         """
         times = self.phases
-        begin, end = by_name("phase", name, times)
+        begin, end = entry_named("phase", name, times)
         parts: dict[str, Any] = {pool: own_of(name, getattr(self, pool)) for pool in ("states", "controls", "costates")}
         for pool, kind in zip(("states", "controls", "costates"), INTERPOLANTS, strict=True):
             columns = [each.startswith(f"{name}.") for each in getattr(self, pool)]
@@ -294,14 +294,14 @@ class Solution:
             problem=None,
             problem_lost=f"phase {name!r} of {self.name!r} is audited with the whole",
             refinement=None,
-            drawn_in=None,
+            bound_tightening=None,
             tightening_cost=0.0,
         )
 
     def _sampled(self, expressions: list[Any], fractions: np.ndarray) -> list[np.ndarray]:
         """Expressions of what its problem declares, at fractions (M,) of the plan; each (M, n)."""
         form = Formulation.of(self.problem)
-        plan = in_order_of(form, self)
+        plan = match_order(form, self)
         x, u = plan.state_interpolant(fractions), plan.control_interpolant(fractions)
         p = form.parameter_vector(self.parameters)
         first = (form.x0, plan.state_interpolant(np.zeros(1))[0]), (form.u0, plan.control_interpolant(np.zeros(1))[0])
@@ -333,10 +333,10 @@ class Solution:
             ProblemError: The problem is damaged, or has other states or controls.
         """
         try:
-            check_belongs(Formulation.of(problem), self)
+            check_variables_match(Formulation.of(problem), self)
         except ProblemError:
             raise
-        except DAMAGED as error:
+        except RECORD_ERRORS as error:
             raise ProblemError(f"the problem that was written is damaged: {error}", name="problem") from error
         return self.with_problem(problem)
 
@@ -381,18 +381,18 @@ class Solution:
         head["order"] = {k: list(getattr(self, k)) for k in POOLS}
         if self.refinement is not None:
             head["refinement"] = self.refinement.__dict__
-        if self.drawn_in is not None:
-            arrays["drawn_in"] = self.drawn_in
+        if self.bound_tightening is not None:
+            arrays["bound_tightening"] = self.bound_tightening
         written, head["problem_lost"] = (None, why_none) if why_none else self._written_problem()
         if written is None and self.problem is not None and not why_none:
             words = f"{path} is saved without its problem, so that nobody can audit it: {head['problem_lost']}"
             warnings.warn(StorageWarning(words), stacklevel=3)
-        head["problem"], numbers = packed(written)
+        head["problem"], numbers = pack_record(written)
         arrays |= {f"problem/{name}": values for name, values in numbers.items()}
         arrays["head"] = np.frombuffer(json.dumps(head, default=plain).encode(), dtype=np.uint8)
-        if arrays["head"].nbytes > MOST_HEAD:
-            words = f"{path}: the settings of the plan take more than the {MOST_HEAD:.3g} bytes that are read"
-            raise ProblemError(words, name="head", value=arrays["head"].nbytes, limit=MOST_HEAD)
+        if arrays["head"].nbytes > MAX_HEAD_BYTES:
+            words = f"{path}: the settings of the plan take more than the {MAX_HEAD_BYTES:.3g} bytes that are read"
+            raise ProblemError(words, name="head", value=arrays["head"].nbytes, limit=MAX_HEAD_BYTES)
         return arrays
 
     @classmethod
@@ -435,10 +435,10 @@ class Solution:
                 errors = past["errors"] if isinstance(past["errors"], dict) else {"integration": past["errors"]}
                 rounds = tuple(past["intervals"]), {kind: tuple(values) for kind, values in errors.items()}
                 fields["refinement"] = Refinement(*rounds, past["tolerance"], past["reached"])
-            fields["drawn_in"] = arrays.pop("drawn_in", None)
+            fields["bound_tightening"] = arrays.pop("bound_tightening", None)
             fields |= {name: arrays.pop(name) for name in PLAIN}
-            numbers = {name: arrays.pop(f"problem/{name}") for name in NUMBERS}
-            written = unpacked(head.pop("problem"), numbers)
+            numbers = {name: arrays.pop(f"problem/{name}") for name in ARRAY_NAMES}
+            written = unpack_record(head.pop("problem"), numbers)
             parts = [name for name in arrays if "/" in name]  # what else stands in the file is somebody else's
             if parts:
                 words = f"{path} holds {', '.join(parts)}, which no plan has"
@@ -447,7 +447,7 @@ class Solution:
             solution = cls(**head, **fields)
             check_structure(solution)
             check_finite(solution)
-            return solution if written is None else solution.tied_to(Problem.restored(written))
+            return solution if written is None else solution.tied_to(Problem.from_record(written))
         except ProblemError:
             raise
         except Exception as error:  # what JSON and wrong types say is of many kinds
@@ -472,7 +472,7 @@ class Solution:
     def __setstate__(self, state: dict[str, Any]) -> None:
         """The same of what :meth:`__getstate__` gave."""
         problem = state["problem"]
-        self.__dict__.update({**state, "problem": None if problem is None else Problem.restored(problem)})
+        self.__dict__.update({**state, "problem": None if problem is None else Problem.from_record(problem)})
 
     def __copy__(self) -> Solution:
         """A solution of the same arrays and the same problem."""

@@ -14,31 +14,31 @@ from ocp.status import SolverStatus
 from ocp.tolerances import ROUNDING_SHARE
 
 __all__ = [
-    "AT_NODE",
     "HEAD",
     "INTERPOLANTS",
-    "MOST_HEAD",
+    "MAX_HEAD_BYTES",
+    "NODE_TOLERANCE",
     "PARTS",
     "PLAIN",
     "POOLS",
     "Refinement",
     "Sample",
     "Sensitivity",
-    "by_name",
-    "check_belongs",
     "check_finite",
     "check_structure",
-    "drawn_in_at",
-    "in_order_of",
+    "check_variables_match",
+    "entry_named",
+    "match_order",
     "plain",
     "read_head",
     "read_status",
     "stack",
+    "tightening_at",
     "unstack",
 ]
 
 T = TypeVar("T")
-MOST_HEAD = 2**24  # bytes of its text: a mesh of half a million intervals
+MAX_HEAD_BYTES = 2**24  # bytes of its text: a mesh of half a million intervals
 HEAD = {
     "name": str,
     "method": dict,
@@ -55,7 +55,7 @@ HEAD = {
     "tightening_cost": float,
 }
 POOLS = ("states", "controls", "costates", "parameters", "cost_gradients")
-AT_NODE = 1e-12  # of the horizon: a fraction nearer to a node is the node
+NODE_TOLERANCE = 1e-12  # of the horizon: a fraction nearer to a node is the node
 PLAIN = ("t", "variables", "multipliers")
 PARTS = ("breaks", "nodes", "values")  # of an interpolant
 INTERPOLANTS = ("state_interpolant", "control_interpolant", "costate_interpolant")
@@ -113,7 +113,7 @@ class Sensitivity:
 
     def __getitem__(self, name: str) -> np.ndarray:
         """Derivative of a state or control at the reported times. Shape (M, n, k)."""
-        return by_name("state or control", name, {**self.states, **self.controls})
+        return entry_named("state or control", name, {**self.states, **self.controls})
 
     def __str__(self) -> str:
         """The valid range of each entry, a line each."""
@@ -133,9 +133,9 @@ def read_head(path: Any, text: np.ndarray) -> Any:
 
     JSON takes up to thirty times its length when it is read.
     """
-    if text.nbytes > MOST_HEAD:
-        words = f"{path} is not a saved solution: its head has {text.nbytes:.3g} bytes, {MOST_HEAD:.3g} at most"
-        raise ProblemError(words, name="head", value=text.nbytes, limit=MOST_HEAD)
+    if text.nbytes > MAX_HEAD_BYTES:
+        words = f"{path} is not a saved solution: its head has {text.nbytes:.3g} bytes, {MAX_HEAD_BYTES:.3g} at most"
+        raise ProblemError(words, name="head", value=text.nbytes, limit=MAX_HEAD_BYTES)
     return json.loads(text.tobytes().decode())
 
 
@@ -146,7 +146,7 @@ def read_status(path: Any, word: Any) -> SolverStatus:
     return SolverStatus(word)
 
 
-def by_name(kind: str, name: Any, pool: Mapping[str, T]) -> T:
+def entry_named(kind: str, name: Any, pool: Mapping[str, T]) -> T:
     """An entry of a pool; ProblemError, which lists the near ones, where nothing bears the name."""
     if not isinstance(name, str) or name not in pool:
         raise unknown_name(kind, name, pool)
@@ -182,7 +182,7 @@ class Places(Protocol):
     controls: dict[str, slice]
 
 
-def check_belongs(form: Places, solution: Any) -> None:
+def check_variables_match(form: Places, solution: Any) -> None:
     """Raise ProblemError unless the states and controls of a plan are those of a problem, in whatever order."""
     for what in ("states", "controls"):
         have = {name: values.shape[1] for name, values in getattr(solution, what).items()}
@@ -192,7 +192,7 @@ def check_belongs(form: Places, solution: Any) -> None:
             raise ProblemError(words, name=what, value=have, limit=want)
 
 
-def in_order_of(form: Places, solution: Any) -> Any:
+def match_order(form: Places, solution: Any) -> Any:
     """The same plan with its states and controls, which interpolants hold by position, in the order of a problem."""
     orders = {"states": list(form.states), "costates": list(form.states), "controls": list(form.controls)}
     changes: dict[str, Any] = {}
@@ -205,21 +205,21 @@ def in_order_of(form: Places, solution: Any) -> Any:
         curve = getattr(solution, interpolant)
         changes[pool] = {name: own[name] for name in names}
         changes[interpolant] = replace(curve, values=curve.values[:, :, columns])
-        if solution.drawn_in is not None and pool != "costates":
+        if solution.bound_tightening is not None and pool != "costates":
             first = 0 if pool == "states" else sum(values.shape[1] for values in solution.states.values())
-            drawn = changes.setdefault("drawn_in", solution.drawn_in.copy())
-            drawn[:, :, first : first + len(columns)] = solution.drawn_in[:, :, first + columns]
+            drawn = changes.setdefault("bound_tightening", solution.bound_tightening.copy())
+            drawn[:, :, first : first + len(columns)] = solution.bound_tightening[:, :, first + columns]
     return replace(solution, **changes) if changes else solution
 
 
-def drawn_in_at(drawn_in: np.ndarray, mesh: np.ndarray, at: np.ndarray) -> np.ndarray:
+def tightening_at(bound_tightening: np.ndarray, mesh: np.ndarray, at: np.ndarray) -> np.ndarray:
     """By how much bounds that are drawn in (2, N, m) on a mesh (N + 1,) are so at fractions ``at`` (M,).
 
     At a node between two intervals the larger of both, as holds for what they share. Shape (2, M, m).
     """
     last = len(mesh) - 2
-    sides = (np.clip(np.searchsorted(mesh, at + slip) - 1, 0, last) for slip in (-AT_NODE, AT_NODE))
-    left, right = (drawn_in[:, side] for side in sides)
+    sides = (np.clip(np.searchsorted(mesh, at + slip) - 1, 0, last) for slip in (-NODE_TOLERANCE, NODE_TOLERANCE))
+    left, right = (bound_tightening[:, side] for side in sides)
     return np.asarray(np.maximum(left, right))
 
 
@@ -245,7 +245,7 @@ def check_structure(solution: Any) -> None:
                 raise _refused(solution, f"{pool[:-1]} {name!r}", f"has {len(values)} rows for {t.size} times")
             columns += values.shape[1]
         _check_interpolant(solution, interpolant, columns)
-    if solution.drawn_in is not None:
+    if solution.bound_tightening is not None:
         _check_drawn_in(solution)
 
 
@@ -290,10 +290,10 @@ def _check_interpolant(solution: Any, name: str, columns: int) -> None:
     breaks, nodes = (_real(solution, f"{name}.{part}", getattr(curve, part), 1) for part in ("breaks", "nodes"))
     values = _real(solution, f"{name}.values", curve.values, 3)
     rising = breaks.size >= 2 and (np.diff(breaks) > 0).all()
-    if not rising or abs(breaks[0]) > AT_NODE or abs(breaks[-1] - 1) > AT_NODE:
+    if not rising or abs(breaks[0]) > NODE_TOLERANCE or abs(breaks[-1] - 1) > NODE_TOLERANCE:
         raise _refused(solution, f"{name}.breaks", "do not increase from 0 to 1")
     rising = nodes.size > 0 and np.isfinite(nodes).all() and (np.diff(nodes) > 0).all()
-    if not rising or nodes[0] < -AT_NODE or nodes[-1] > 1 + AT_NODE:
+    if not rising or nodes[0] < -NODE_TOLERANCE or nodes[-1] > 1 + NODE_TOLERANCE:
         raise _refused(solution, f"{name}.nodes", "do not increase within 0 to 1")
     shape = (breaks.size - 1, nodes.size, columns)
     if values.shape != shape:
@@ -302,12 +302,12 @@ def _check_interpolant(solution: Any, name: str, columns: int) -> None:
 
 def _check_drawn_in(solution: Any) -> None:
     """Raise ProblemError unless what the bounds are drawn in by has an entry for each of them, zero or above."""
-    drawn = _real(solution, "drawn_in", solution.drawn_in, 3)
+    drawn = _real(solution, "bound_tightening", solution.bound_tightening, 3)
     entries = sum(values.shape[1] for pool in (solution.states, solution.controls) for values in pool.values())
     shape = (2, len(solution.control_interpolant.breaks) - 1, entries)
     if drawn.shape[:2] != shape[:2] or drawn.shape[2] < entries or not (drawn >= 0).all() or np.isinf(drawn).any():
         words = f"is no array of finite numbers, zero or above, of shape {shape} or with path rows behind"
-        raise _refused(solution, "drawn_in", words)
+        raise _refused(solution, "bound_tightening", words)
 
 
 def check_finite(solution: Any) -> None:

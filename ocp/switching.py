@@ -22,7 +22,7 @@ from ocp.problem.problem import Problem
 from ocp.solution import ByName, Solution
 from ocp.tolerances import LIMIT_SHARE, RESOLVED_SHARE
 
-__all__ = ["NEAR", "at_switches", "switches"]
+__all__ = ["WARM_START_OPTIONS", "solve_at_switches", "switches"]
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class SwitchingSettings:
 
 
 SETTINGS = SwitchingSettings()
-NEAR = {"mu_init": 1e-4}
+WARM_START_OPTIONS = {"mu_init": 1e-4}
 """Of IPOPT, from a plan that is nearly right: it stays the same plan."""
 
 
@@ -112,7 +112,7 @@ def _pushed(
 
 
 @interruptible
-def at_switches(
+def solve_at_switches(
     problem: Problem, method: Collocation, plan: Solution, *, parameters: ByName = None, options: ByName = None
 ) -> Solution:
     """The plan solved again with nodes where it switches, which are found better each time.
@@ -131,7 +131,7 @@ def at_switches(
         if len(found) == len(known) and np.abs(found - known).max(initial=0.0) < SETTINGS.same:
             break
         mesh = method.with_mesh(_mesh(method.fractions, found))
-        given: dict[str, Any] = {"parameters": parameters, "options": {**NEAR, **(options or {})}}
+        given: dict[str, Any] = {"parameters": parameters, "options": {**WARM_START_OPTIONS, **(options or {})}}
         again = solve(problem, mesh, guess=plan, check=False, **given)
         won = (plan.cost - again.cost) / max(abs(plan.cost), abs(again.cost), np.finfo(float).tiny)
         if not again.success or won < -SETTINGS.other:

@@ -11,17 +11,17 @@ from typing import Any
 
 import numpy as np
 
-from ocp.console import interruptible, limited, time_left
+from ocp.console import interruptible, time_left, time_limited
 from ocp.direct.assembly import Fragment
 from ocp.direct.mesh import check_meshed
 from ocp.direct.prepared import DirectMethod
 from ocp.errors import SolveError, checked_mapping, checked_time_limit
 from ocp.problem.formulation import Formulation
-from ocp.solution import AT_NODE, ByName, Guess, Solution
+from ocp.solution import NODE_TOLERANCE, ByName, Guess, Solution
 from ocp.status import SolverStatus
 from ocp.tolerances import SOLVER_SHARE
 
-__all__ = ["exceeded", "tighten"]
+__all__ = ["largest_excess", "tighten"]
 
 
 @dataclass(frozen=True)
@@ -55,14 +55,14 @@ def tighten(
     options: ByName = None,
     guess: Guess = None,
     time_limit: float | None = None,
-    dearest: float = np.inf,
+    max_cost: float = np.inf,
 ) -> Solution:
     """Solve so that every inequality holds between the points of the grid as well.
 
     The plan is the optimum under bounds that are drawn in where it would have exceeded them, so it costs a little more
     than that of :func:`ocp.methods.solve`, by ``Solution.tightening_cost``; finer grids close the gap. Equalities are
-    not touched: refine for them. The plan keeps the bounds that it was solved under, ``Solution.drawn_in``: it is an
-    optimum under those alone.
+    not touched: refine for them. The plan keeps the bounds that it was solved under, ``Solution.bound_tightening``: it is
+    an optimum under those alone.
 
     Args:
         problem, parameters, solver, options, guess: As for :func:`ocp.methods.solve`.
@@ -70,7 +70,7 @@ def tighten(
         tolerance: By how much a bound of a state or control or a path inequality may be exceeded, each in its own unit.
         time_limit: After so many seconds, the build and all solves included, the solver is stopped between two
             iterations, which counts as a failure. None for no limit.
-        dearest: Cost above which it gives up: what is drawn in adds to it.
+        max_cost: Cost above which it gives up: what is drawn in adds to it.
 
     Raises:
         ProblemError: tolerance not positive, another method, a time limit that is none.
@@ -79,8 +79,8 @@ def tighten(
             ``time_limit`` and carries, as an unsuccessful one, the plan that exceeds its bounds least.
     """
     check_meshed("tighten", method, tolerance)
-    with limited(checked_time_limit(time_limit)):
-        return _tightened(problem, method, tolerance, parameters, solver, options, guess, time_limit, dearest)
+    with time_limited(checked_time_limit(time_limit)):
+        return _tightened(problem, method, tolerance, parameters, solver, options, guess, time_limit, max_cost)
 
 
 def _tightened(
@@ -92,7 +92,7 @@ def _tightened(
     options: ByName,
     guess: Guess,
     time_limit: float | None,
-    dearest: float,
+    max_cost: float,
 ) -> Solution:
     """:func:`tighten` inside its time limit."""
     prepared = method.prepare(problem, solver=solver, options=options)
@@ -125,15 +125,15 @@ def _tightened(
             raise SolveError(told, plan, name="time_limit", value=time_limit) from error
         beyond, times = _excess(form, solution, p, low, high)
         if drawn.any():
-            solution = replace(solution, drawn_in=drawn, tightening_cost=max(solution.cost - relaxed, 0.0))
+            solution = replace(solution, bound_tightening=drawn, tightening_cost=max(solution.cost - relaxed, 0.0))
         else:
             relaxed = solution.cost
         if beyond.max(initial=0.0) <= tolerance:
             return solution
         remains, details = _worst(form, beyond, times)
-        if solution.cost > dearest:
+        if solution.cost > max_cost:
             told = f"problem {form.name!r}: bounds drawn in cost {solution.cost:.6g} already, and {remains}"
-            raise SolveError(told, solution, name="cost", value=solution.cost, limit=dearest)
+            raise SolveError(told, solution, name="cost", value=solution.cost, limit=max_cost)
         if best is None or details["value"] < best[2]["value"]:
             best = solution, remains, details
         # as in the secant method, each bound by itself; one that its neighbours moved says nothing
@@ -150,7 +150,7 @@ def _tightened(
     raise SolveError(told, solution, limit=tolerance, **details)
 
 
-def exceeded(problem: Any, solution: Solution) -> float:
+def largest_excess(problem: Any, solution: Solution) -> float:
     """By how much a plan goes beyond a bound or inequality between the points of its grid, in the unit of that one."""
     form = Formulation.of(problem)
     p = form.parameter_vector(solution.parameters)
@@ -188,7 +188,10 @@ def _places(
         ("x", fragment.variable_bounds, fragment.variable_fraction),
         ("g", fragment.row_bounds, fragment.row_fractions),
     ):
-        left, right = (np.clip(np.searchsorted(fragment.mesh, at + slip) - 1, 0, last) for slip in (-AT_NODE, AT_NODE))
+        left, right = (
+            np.clip(np.searchsorted(fragment.mesh, at + slip) - 1, 0, last)
+            for slip in (-NODE_TOLERANCE, NODE_TOLERANCE)
+        )
         own = left if kind == "x" else np.clip(fragment.row_stages, 0, last)
         entry = entry_of[index]
         found[kind] = entry, np.where(alone[entry], own, left), np.where(alone[entry], own, right)

@@ -12,7 +12,7 @@ from models import FixedBase
 from ocp.app.files import write_mcap
 from ocp.app.files.outputs import MARK, SUFFIXES, checked_output
 from ocp.app.files.task_file import Task
-from ocp.errors import MOST, ProblemError, checked_instance, checked_positive
+from ocp.errors import MAX_COUNT, ProblemError, checked_instance, checked_positive
 from ocp.motion.plan import Plan, SegmentedPlan, plan, plan_in_segments
 from ocp.storage import write_text
 
@@ -146,9 +146,9 @@ def export(made: Plan, file: Path, period: float, force: bool = False) -> None:
 def check_period(made: Plan, period: float) -> None:
     """Raise ProblemError for a period that is not positive, or gives more than MOST samples."""
     checked_positive("period", period)
-    if made.horizon / period > MOST:
-        words = f"a period of {period:g} s gives {made.horizon / period:.3g} samples, at most {MOST} are written"
-        raise ProblemError(words, name="period", value=period, limit=made.horizon / MOST)
+    if made.horizon / period > MAX_COUNT:
+        words = f"a period of {period:g} s gives {made.horizon / period:.3g} samples, at most {MAX_COUNT} are written"
+        raise ProblemError(words, name="period", value=period, limit=made.horizon / MAX_COUNT)
 
 
 def _yaml(made: Plan, file: Path, period: float) -> None:

@@ -58,7 +58,7 @@ class AccessoryProblem:
         self._switch()
 
     def _obstacle(self) -> str:
-        return str(self.along.form.kept("obstacle", lambda: obstacle(self.along.form)))
+        return str(self.along.form.cached("obstacle", lambda: obstacle(self.along.form)))
 
     def _units(self) -> None:
         """Units in which a sweep is well conditioned: they judge nothing.
@@ -101,7 +101,7 @@ class AccessoryProblem:
             return [ca.hessian(total, along.y)[0], ca.diag(ca.hessian(cost, form.x)[0])]
 
         more = (lam, self.adjoint.costate), (mu, multipliers)
-        hessian, self._cost_curves = form.sampled(outputs, *along.here, *more, kept="second derivatives")
+        hessian, self._cost_curves = form.sampled(outputs, *along.here, *more, cache_as="second derivatives")
         ny = self.nx + 1 + self.nu
         hessian = hessian.reshape(m, ny, ny)
         self.curved = hessian[:, self.nx + 1 :, self.nx + 1 :]
@@ -250,7 +250,7 @@ def end_conditions(accessory: AccessoryProblem) -> tuple[np.ndarray, np.ndarray,
     form, solution, (low, high) = along.form, along.solution, along.bounds
     places, nx = form.bounds.places, accessory.nx
     x0, x1 = (solution.state_interpolant(np.array([end]))[0] for end in (0.0, 1.0))
-    second = form.kept("curvature of the ends", lambda: curved_ends(form))
+    second = form.cached("curvature of the ends", lambda: curved_ends(form))
     found = second(x1, x0, solution.horizon, along.p, ends.end, ends.start)
     end_curved, start_curved = (np.asarray(v.full()) for v in found)
     order = [*range(nx), 2 * nx, *range(nx, 2 * nx)]  # of (x, T, x0) in (x, x0, T)

@@ -24,7 +24,7 @@ from ocp.audit.sizes import FineGrid, Sizes, changes, integral
 from ocp.console import check_time
 from ocp.curves import dormand_prince_step, newton_coefficients
 from ocp.problem.formulation import Bounds, Formulation
-from ocp.problem.values import in_blocks
+from ocp.problem.values import evaluate_in_blocks
 from ocp.tolerances import LIMIT_SHARE, SOLVER_SHARE
 
 __all__ = ["Reintegration", "Violation", "integrated", "reintegrate", "violations"]
@@ -153,7 +153,7 @@ class Flow:
         self._columns = np.column_stack([differences, curve.breaks[:-1], np.diff(curve.breaks)])
         self._tolerance = SETTINGS.tolerance * np.append(sizes.state, sizes.cost)
         name = "steps", curve.nodes.tobytes()
-        self._step = form.kept(name, lambda: step_function(form, curve.nodes).mapaccum("steps", SETTINGS.block))
+        self._step = form.cached(name, lambda: step_function(form, curve.nodes).mapaccum("steps", SETTINGS.block))
         self._intervals = len(curve.values)
 
     def integrate(self, chain: np.ndarray, starts: np.ndarray, steps: Steps | None = None) -> tuple[np.ndarray, Steps]:
@@ -210,7 +210,7 @@ class Flow:
         for at in range(0, whole, SETTINGS.blocks * SETTINGS.block):
             check_time()
             part = slice(at, at + SETTINGS.blocks * SETTINGS.block)
-            in_blocks(self._step, SETTINGS.block, data[part], [after[part], errors[part]], now)
+            evaluate_in_blocks(self._step, SETTINGS.block, data[part], [after[part], errors[part]], now)
         return after[:count], np.abs(errors[:count])
 
 
@@ -299,7 +299,7 @@ def violations(
     whole = slice(None)
     here = states, again.controls, again.t, horizon, p, (form.x0, begin[0]), (form.u0, begin[1])
     outputs = [form.path.expression, form.watch.expression]
-    along = dict(zip(("path", "watch"), form.sampled(outputs, *here, kept="rows along a plan"), strict=True))
+    along = dict(zip(("path", "watch"), form.sampled(outputs, *here, cache_as="rows along a plan"), strict=True))
     for kind, at in (("path", whole), ("start", first), ("end", last), ("watch", whole)):
         rows, size = getattr(form, kind), getattr(sizes, kind)
         if len(rows) == 0:
@@ -309,11 +309,11 @@ def violations(
             g = along[kind]
         else:
             starts = (form.x0, begin[0]), (form.u0, begin[1])
-            g = form.sampled([rows.expression], x, u, t, horizon, p, *starts, kept=(kind, "from the start"))[0]
+            g = form.sampled([rows.expression], x, u, t, horizon, p, *starts, cache_as=(kind, "from the start"))[0]
         over = beyond(_integrated(form, kind, g, t), lower[rows.bounds], upper[rows.bounds])
         limited = np.isfinite(rows.tolerance)
         if kind in along and limited.any():
-            told = form.sampled(outputs, reported, *here[1:], kept="rows along a plan")[kind == "watch"]
+            told = form.sampled(outputs, reported, *here[1:], cache_as="rows along a plan")[kind == "watch"]
             missed = beyond(_integrated(form, kind, told, t), lower[rows.bounds], upper[rows.bounds])
             over = np.where(limited, np.maximum(over, missed), over)
         size = np.tile(size, (len(t), 1))

@@ -126,7 +126,9 @@ def sizes_along(form: Formulation, grid: FineGrid, horizon: float, p: np.ndarray
     control, acts = _sizes_of(grid.controls, declared, [], np.zeros(form.nu, dtype=bool))
     entries = np.concatenate([state, control]), np.concatenate([moves, acts])
     here = grid.states, grid.controls, grid.t, horizon, p, (form.x0, grid.states[0]), (form.u0, grid.controls[0])
-    running, rows, way = form.sampled([form.running, form.path.expression, form.watch_way], *here, kept="along a plan")
+    running, rows, way = form.sampled(
+        [form.running, form.path.expression, form.watch_reference_rate], *here, cache_as="along a plan"
+    )
     path = _rows_of(form, "path", grid, horizon, p, bounds, entries, rows)
     start, end, watch = (_rows_of(form, k, grid, horizon, p, bounds, entries) for k in ("start", "end", "watch"))
     parts = np.where(np.isfinite(running), np.abs(running), 0.0)[:, 0]
@@ -302,7 +304,7 @@ def changes(
     x, u, t = samples
     both, count = form.nx + form.nu, len(t)
     expression = getattr(form, kind) if kind in COSTS else getattr(form, kind).expression
-    tied = form.kept((kind, "tied"), lambda: ca.depends_on(expression, ca.vertcat(form.x0, form.u0)))
+    tied = form.cached((kind, "tied"), lambda: ca.depends_on(expression, ca.vertcat(form.x0, form.u0)))
     used = 2 * both if tied else both
     steps = np.vstack([np.zeros(2 * both), *(s * np.diag(np.concatenate([moves, moves]))[:used] for s in (1.0, -1.0))])
     at = np.tile(np.arange(count), len(steps))
@@ -310,7 +312,7 @@ def changes(
     columns = np.hstack([x[at], u[at], first]) + np.repeat(steps, count, axis=0)
     x, u, x0, u0 = np.split(columns, np.cumsum([form.nx, form.nu, form.nx]), axis=1)
     starts = (form.x0, x0), (form.u0, u0)
-    found = form.sampled([expression], x, u, t[at], horizon, p, *starts, kept=(kind, "from the start"))[0]
+    found = form.sampled([expression], x, u, t[at], horizon, p, *starts, cache_as=(kind, "from the start"))[0]
     g = found.reshape(len(steps), count, -1)
     change = np.abs(np.where(np.isfinite(g[1:] - g[0]), g[1:] - g[0], 0.0))
     return g[0], change.reshape(2, used, count, -1).max(axis=0)

@@ -329,7 +329,7 @@ def assemble(fragment: Fragment, parameters: int, functions: Sequence[Derivative
     """The program of a fragment, from the derivatives of its blocks, which are made where they are not given.
 
     Raises:
-        OutOfTime: The time limit is over.
+        TimeLimitReached: The time limit is over.
     """
     blocks = fragment.blocks
     if functions is None:

@@ -32,7 +32,16 @@ import numpy as np
 from ocp.direct import assembly
 from ocp.direct.assembly import SIZES, Derivatives, Fragment, assemble, derivatives, gather
 from ocp.errors import ProblemError
-from ocp.libraries import SERIALISED, CompilerError, Library, built, code, generated, notice, serialised
+from ocp.libraries import (
+    SERIALISED,
+    CompilerError,
+    Library,
+    build_library,
+    function_key,
+    generate_c,
+    generate_code,
+    warn_interpreted,
+)
 from ocp.problem.formulation import Formulation
 from ocp.storage import write_text
 
@@ -82,7 +91,7 @@ def write_controller(form: Formulation, fragment: Fragment, guess: np.ndarray, f
         OSError: The folder cannot be written.
     """
     try:
-        plan = generated(controller_functions(form, fragment, guess), "plan")
+        plan = generate_c(controller_functions(form, fragment, guess), "plan")
     except CompilerError as error:
         raise ProblemError(f"problem {form.name!r} has no C: {error}", name="method", value=form.name) from error
     texts = dict(zip(("plan.c", "plan.h"), plan, strict=True))
@@ -270,9 +279,9 @@ def block_derivatives(fragment: Fragment, compiled: bool) -> list[Derivatives]:
         compiled: Whether they are compiled. What cannot be is interpreted, and a warning says once why.
 
     Raises:
-        OutOfTime: The time limit is over.
+        TimeLimitReached: The time limit is over.
     """
-    texts = [serialised(block.function) for block in fragment.blocks]
+    texts = [function_key(block.function) for block in fragment.blocks]
     found: dict[str, Derivatives] = {}
     for text, block in zip(texts, fragment.blocks, strict=True):
         if text not in found:
@@ -290,8 +299,8 @@ def _is_worth_it(function: Any, text: str) -> bool:
 def _compiled(function: Any, text: str) -> Derivatives:
     """Return the derivatives of a function of this text from a library, interpreted where there can be none."""
     try:
-        path = built(Library((RECIPE, text), lambda: code(derivatives(function))))
+        path = build_library(Library((RECIPE, text), lambda: generate_code(derivatives(function))))
         return Derivatives(*(ca.external(name, str(path)) for name in Derivatives._fields))
     except (CompilerError, RuntimeError) as error:
-        notice(str(error))
+        warn_interpreted(str(error))
         return derivatives(function)

@@ -15,7 +15,7 @@ from typing import Any, Protocol
 import casadi as ca
 import numpy as np
 
-from ocp.console import Progress, listening, time_left
+from ocp.console import Progress, stop_requests_polled, time_left
 from ocp.direct.assembly import Fragment, Program, sparse
 from ocp.direct.nlp import Outcome
 from ocp.direct.scaling import SCALING, Scales
@@ -271,7 +271,7 @@ def elastic_plan(
     progress.open(lower, upper)
     try:
         solver = ca.nlpsol("elastic", "ipopt", {"x": x, "p": p, "f": f, "g": g}, options)
-        with listening():
+        with stop_requests_polled():
             result = solver(
                 x0=np.concatenate([own["x0"], np.zeros(k)]),
                 p=own["p"],

@@ -14,7 +14,7 @@ import numpy as np
 
 from ocp.curves import rk4_step
 from ocp.direct.assembly import Fragment
-from ocp.errors import ProblemError, about, unknown_name
+from ocp.errors import ProblemError, error_names, unknown_name
 from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.values import numeric, table
 from ocp.solution import Guess, Solution
@@ -50,7 +50,7 @@ def initial_point(form: Formulation, fragment: Fragment, guess: Guess, bounds: B
         words = f"guess must be a Solution, a dictionary or None, not {type(guess).__name__}"
         raise ProblemError(words, name="guess", value=guess)
     if "horizon" in given:
-        with about("horizon"):
+        with error_names("horizon"):
             number = numeric("guess of the horizon", given.pop("horizon"))
         if not (number.size == 1 and np.isfinite(number[0]) and number[0] > 0):
             words = f"guess of the horizon must be one positive finite number, not {number.tolist()} s"
@@ -73,9 +73,9 @@ def initial_point(form: Formulation, fragment: Fragment, guess: Guess, bounds: B
             elif value is None:
                 curve = default(form, role, place, bounds)
             else:
-                with about(name):
+                with error_names(name):
                     curve = trajectory(name, value, place.stop - place.start, horizon, times)
-            with about(name):
+            with error_names(name):
                 table[:, place] = curve(where)
             for i in np.flatnonzero(~np.isfinite(table[:, place]).all(axis=1)):
                 words = f"guess of {name!r} is not finite at {where[i] * horizon:g} s: {table[i, place]}"

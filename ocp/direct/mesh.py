@@ -9,7 +9,7 @@ from typing import Any, Self
 import numpy as np
 
 from ocp.direct.assembly import Fragment
-from ocp.errors import NOT_NUMBERS, ProblemError, about, checked_count, checked_positive, floats
+from ocp.errors import NOT_NUMBERS, ProblemError, checked_count, checked_positive, error_names, floats
 from ocp.problem.formulation import Formulation
 from ocp.problem.values import numeric
 from ocp.tolerances import ROUNDING_SHARE
@@ -76,7 +76,7 @@ class MeshedMethod(ABC):
             ProblemError: Fractions that are no numbers from 0 to 1.
         """
         told: dict[str, Any] = {"name": "fractions", "value": fractions}
-        with about("fractions"):
+        with error_names("fractions"):
             asked = numeric("with_nodes_at: fractions", fractions)
         if not np.all((asked >= 0.0) & (asked <= 1.0)):
             raise ProblemError(f"with_nodes_at: fractions must be numbers from 0 to 1, not {fractions!r}", **told)

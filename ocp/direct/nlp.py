@@ -14,7 +14,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ocp.console import LOG, Progress, Watch, listening, quiet
+from ocp.console import LOG, FatropMonitor, Progress, casadi_silenced, stop_requests_polled
 from ocp.curves import PiecewisePolynomial
 from ocp.direct.assembly import Fragment, Program, Stages
 from ocp.errors import ProblemError, SolveError
@@ -103,7 +103,7 @@ class Outcome:
 
 def build_solver(
     program: Program, solver: str, options: dict[str, Any], stages: Stages | None, title: str
-) -> tuple[Any, Progress | Watch]:
+) -> tuple[Any, Progress | FatropMonitor]:
     """The casadi solver of a program, and what ends it where it must end.
 
     Raises:
@@ -116,7 +116,7 @@ def build_solver(
     if not own.get("print_level", 0) and "max_iter" in own:
         settings["show_eval_warnings"] = False
     nlp = program.nlp
-    progress: Progress | Watch
+    progress: Progress | FatropMonitor
     if solver in ("ipopt", "sleqp"):
         progress = Progress(n, m, n_p, title, not own["print_level"])
         settings["iteration_callback"] = progress
@@ -130,7 +130,7 @@ def build_solver(
     else:
         assert stages is not None
         nlp = {**nlp, "f": finite(nlp["f"]), "g": finite(nlp["g"])}
-        progress = Watch(n, title)
+        progress = FatropMonitor(n, title)
         # this interface has no options for ready-made derivatives; it looks for them in its cache under these names
         settings |= {
             "cache": fatrop_functions(program, progress),
@@ -165,7 +165,7 @@ def check_loaded(solver: str) -> None:
         raise SolveError(f"{solver} cannot be loaded: {why}", name="solver", value=solver) from error
 
 
-def fatrop_functions(program: Program, watch: Watch) -> dict[str, Any]:
+def fatrop_functions(program: Program, watch: FatropMonitor) -> dict[str, Any]:
     """The derivatives of a program with the signatures that casadi's fatrop interface uses.
 
     The interface raises where the next state does not stand with factor 1 in the rows that close gaps: so a Jacobian of
@@ -205,7 +205,7 @@ def finite(expression: Any) -> Any:
     return ca.MX(expression.sparsity(), ca.fmax(ca.fmin(expression.nz[:], 1e20), -1e20))
 
 
-def call_solver(solver: Any, progress: Progress | Watch, arguments: dict[str, np.ndarray]) -> Outcome:
+def call_solver(solver: Any, progress: Progress | FatropMonitor, arguments: dict[str, np.ndarray]) -> Outcome:
     """Run a solver; Ctrl-C and a time limit stop it between two iterations, at its last iterate."""
     began = time.monotonic()
     kind = KINDS[solver.class_name()]
@@ -214,7 +214,7 @@ def call_solver(solver: Any, progress: Progress | Watch, arguments: dict[str, np
     tell(f"solving {progress.title!r}: {arguments['lbx'].size} variables, {arguments['lbg'].size} rows")
     try:
         # SLEQP tells of each subproblem that it gives up
-        with listening(), quiet() if kind == "sleqp" else nullcontext():
+        with stop_requests_polled(), casadi_silenced() if kind == "sleqp" else nullcontext():
             result = solver(**(tightened(arguments) if kind == "fatrop" else arguments))
     except RuntimeError as error:
         words = str(error).lower()
@@ -245,7 +245,7 @@ def call_solver(solver: Any, progress: Progress | Watch, arguments: dict[str, np
     return Outcome(*found, status, message, iterations, seconds, regularised(stats), kind)
 
 
-def stopped(solver: Any, at: Progress | Watch, arguments: dict[str, np.ndarray], began: float) -> Outcome:
+def stopped(solver: Any, at: Progress | FatropMonitor, arguments: dict[str, np.ndarray], began: float) -> Outcome:
     """The iterate at which a solver stopped, or was stopped, that returned nothing; its multipliers are not known."""
     cost, rows = (np.asarray(v.full()).reshape(-1) for v in solver.oracle()(at.iterate, arguments["p"]))
     unknown, seconds = np.full(rows.shape, np.nan), time.monotonic() - began

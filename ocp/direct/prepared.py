@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ocp.console import OutOfTime, check_time, interruptible, limited
+from ocp.console import TimeLimitReached, check_time, interruptible, time_limited
 from ocp.direct.active_set import Newton, held_by
 from ocp.direct.assembly import Program, assemble
 from ocp.direct.controller import block_derivatives, write_controller
@@ -71,7 +71,7 @@ class DirectMethod(MeshedMethod):
         """
         try:
             return Prepared(problem, self, solver, options, compiled, scaling)
-        except OutOfTime as error:
+        except TimeLimitReached as error:
             words = f"problem {problem.name!r} was still being built: {SolverStatus.TIME_LIMIT}: raise time_limit"
             raise SolveError(words, name="time_limit") from error
 
@@ -159,7 +159,7 @@ class Prepared:
         if ahead and not (self._fits(guess) and self.method.mesh is None):
             words = "solve: shift asks for a plan of this very problem, method and mesh, of equal intervals, as guess"
             raise ProblemError(words, name="shift", value=shift)
-        with limited(checked_time_limit(time_limit)), self._lock:
+        with time_limited(checked_time_limit(time_limit)), self._lock:
             return self._solve(parameters, guess, check, tighter, ahead)
 
     @interruptible

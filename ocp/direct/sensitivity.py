@@ -153,7 +153,7 @@ def program_of(solution: Solution) -> Built:
             f"{what}: only plans of Collocation(...) and MultipleShooting(...), with their problem, tell how they move"
         )
         raise ProblemError(words, name="method", value=kind)
-    if not solution.success or solution.drawn_in is not None:
+    if not solution.success or solution.bound_tightening is not None:
         words = f"{what}: it is no optimum under the bounds of its problem"
         raise ProblemError(words, name="solution", value=solution.message)
     form = Formulation.of(solution.problem)

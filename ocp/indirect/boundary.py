@@ -12,7 +12,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ocp.console import listening, quiet, reason_to_stop
+from ocp.console import casadi_silenced, reason_to_stop, stop_requests_polled
 from ocp.curves import integrator
 from ocp.errors import ProblemError
 from ocp.indirect.hamiltonian import Hamiltonian, numeric_bounds
@@ -21,7 +21,7 @@ from ocp.problem.formulation import Formulation
 from ocp.problem.values import symbols_of
 from ocp.status import SolverStatus
 
-__all__ = ["LOBATTO", "BoundaryProblem", "Found", "newton"]
+__all__ = ["LOBATTO", "BoundaryProblem", "NewtonResult", "newton"]
 
 LOBATTO = 0.5 - 0.5 * np.cos(np.pi * np.arange(10) / 9)  # Chebyshev-Lobatto nodes of a reported piece, 0..1
 
@@ -170,7 +170,7 @@ class BoundaryProblem:
     def integrate(self, segment: Any, y: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """States (2 nx, places) and integrals (2,); nan where the integration breaks down."""
         try:
-            with quiet():
+            with casadi_silenced():
                 states, spent = segment(y, q)
             return np.asarray(states.full()), np.asarray(spent.full()).reshape(-1)
         except RuntimeError:
@@ -200,7 +200,7 @@ class BoundaryProblem:
             nodes, _ = self._chain(*symbols, arcs, total)
             chain = ca.Function("chain", symbols, [ca.horzcat(*reversed(nodes))])
             try:
-                with quiet():
+                with casadi_silenced():
                     y = np.asarray(chain(z, data).full())
             except RuntimeError:  # the integration broke down
                 y = np.full((2 * form.nx, total + 1), np.nan)
@@ -284,7 +284,7 @@ class NewtonSettings:
 
 
 @dataclass(frozen=True)
-class Found:
+class NewtonResult:
     """Where Newton's method ended."""
 
     unknowns: np.ndarray
@@ -306,13 +306,13 @@ def newton(
     scale: float,
     tolerance: float,
     settings: NewtonSettings = NewtonSettings(),
-) -> Found:
+) -> NewtonResult:
     """Damped Newton's method on a sparse system; the step is halved until the residual falls."""
     residual, jacobian = system
 
     def evaluate(z: np.ndarray) -> np.ndarray:
         try:
-            with quiet():
+            with casadi_silenced():
                 return np.asarray(residual(z, data).full()).reshape(-1)
         except RuntimeError:  # the integration broke down: as bad as can be
             return np.full(z.size, np.inf)
@@ -322,23 +322,23 @@ def newton(
         words = f"the boundary value problem has {value.size} conditions for {start.size} unknowns"
         raise ProblemError(words, name="conditions", value=value.size, limit=start.size)
     polished, stopped = False, None
-    with listening():
+    with stop_requests_polled():
         for steps in range(settings.steps + 1):
             size = float(np.max(np.abs(value), initial=0.0))
             if not np.isfinite(size):
-                return Found(z, size, steps, SolverStatus.NOT_FINITE, "the integration broke down at the seed")
+                return NewtonResult(z, size, steps, SolverStatus.NOT_FINITE, "the integration broke down at the seed")
             if size <= tolerance * scale and polished:
-                return Found(z, size, steps, SolverStatus.SOLVED, f"Converged in {steps} Newton steps")
+                return NewtonResult(z, size, steps, SolverStatus.SOLVED, f"Converged in {steps} Newton steps")
             polished = size <= tolerance * scale  # one more step: it costs little and gains digits
             stopped = reason_to_stop()
             if stopped or steps == settings.steps:
                 break
             try:
-                with quiet():
+                with casadi_silenced():
                     slopes = jacobian(z, data)
             except RuntimeError:
                 status = SolverStatus.SOLVED if polished else SolverStatus.NOT_FINITE
-                return Found(z, size, steps, status, "the integration of the sensitivities broke down")
+                return NewtonResult(z, size, steps, status, "the integration of the sensitivities broke down")
             try:
                 step = np.asarray(ca.solve(slopes, ca.DM(-value), "qr").full()).reshape(-1)
             except RuntimeError:
@@ -346,8 +346,10 @@ def newton(
             if not np.all(np.isfinite(step)):
                 word = "Newton's matrix is singular: the plan is not determined"
                 if polished:
-                    return Found(z, size, steps, SolverStatus.SOLVED, f"Converged in {steps} Newton steps; {word}")
-                return Found(z, size, steps, SolverStatus.STEP_FAILED, word)
+                    return NewtonResult(
+                        z, size, steps, SolverStatus.SOLVED, f"Converged in {steps} Newton steps; {word}"
+                    )
+                return NewtonResult(z, size, steps, SolverStatus.STEP_FAILED, word)
             length = 1.0
             for _ in range(settings.halvings):
                 trial = z + length * step
@@ -357,10 +359,10 @@ def newton(
                 length *= 0.5
             else:
                 words = "no step along Newton's direction makes the residual smaller"
-                return Found(z, size, steps, SolverStatus.STEP_FAILED, words)
+                return NewtonResult(z, size, steps, SolverStatus.STEP_FAILED, words)
             if polished and np.max(np.abs(new)) > size:
-                return Found(z, size, steps, SolverStatus.SOLVED, f"Converged in {steps} Newton steps")
+                return NewtonResult(z, size, steps, SolverStatus.SOLVED, f"Converged in {steps} Newton steps")
             z, value = trial, new
     if stopped is not None:
-        return Found(z, size, steps, stopped, str(stopped))
-    return Found(z, size, steps, SolverStatus.ITERATION_LIMIT, f"not converged in {settings.steps} Newton steps")
+        return NewtonResult(z, size, steps, stopped, str(stopped))
+    return NewtonResult(z, size, steps, SolverStatus.ITERATION_LIMIT, f"not converged in {settings.steps} Newton steps")

@@ -12,7 +12,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ocp.errors import ProblemError, about
+from ocp.errors import ProblemError, error_names
 from ocp.problem.formulation import Formulation
 from ocp.problem.values import symbols_of
 from ocp.tolerances import ROUNDING_SHARE
@@ -216,7 +216,7 @@ def check_constraints(form: Formulation) -> None:
             )
     path = form.path
     for owner, label, equality, uses in zip(path.owners, path.labels, path.equality, path.uses_control, strict=True):
-        with about(owner):
+        with error_names(owner):
             if not equality:
                 raise ProblemError(
                     f"the indirect method cannot take the path inequality {label!r}; drop it or use a direct method"
@@ -232,7 +232,7 @@ def check_constraints(form: Formulation) -> None:
     controls = ca.vertcat(form.u, form.u0)
     for kind, rows in (("start", form.start), ("end", form.end)):
         for i, (owner, label, equality) in enumerate(zip(rows.owners, rows.labels, rows.equality, strict=True)):
-            with about(owner):
+            with error_names(owner):
                 if not equality:
                     raise ProblemError(f"the indirect method cannot take the {kind} inequality {label!r}")
                 if form.nu and ca.depends_on(rows.expression[i], controls):

@@ -22,7 +22,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ocp.console import interruptible, limited
+from ocp.console import interruptible, time_limited
 from ocp.curves import PiecewisePolynomial
 from ocp.direct.collocation import Collocation
 from ocp.direct.nlp import SOLVERS
@@ -36,22 +36,22 @@ from ocp.errors import (
     checked_positive,
     checked_time_limit,
 )
-from ocp.indirect.boundary import LOBATTO, BoundaryProblem, Found, newton
+from ocp.indirect.boundary import LOBATTO, BoundaryProblem, NewtonResult, newton
 from ocp.indirect.hamiltonian import Hamiltonian
 from ocp.indirect.seed import ControlArcs, read_arcs, read_unknowns
 from ocp.indirect.sensitivity import Extremal, cost_gradient
 from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.invariants import bounds_to_solve
 from ocp.problem.problem import Problem
-from ocp.problem.values import at_samples
-from ocp.solution import ByName, Guess, Solution, check_belongs
+from ocp.problem.values import evaluate_at_samples
+from ocp.solution import ByName, Guess, Solution, check_variables_match
 from ocp.status import SolverStatus
 from ocp.tolerances import FLAT_SHARE, ROUNDING_SHARE, SOLVER_SHARE
 
-__all__ = ["Indirect", "PreparedIndirect", "not_least"]
+__all__ = ["Indirect", "PreparedIndirect", "hamiltonian_defect"]
 
 
-def not_least(ham: Hamiltonian, path: Extremal, p: np.ndarray, bounds: Bounds) -> str:
+def hamiltonian_defect(ham: Hamiltonian, path: Extremal, p: np.ndarray, bounds: Bounds) -> str:
     """What keeps the controls of an extremal from making the Hamiltonian least, or "".
 
     Each sample must be stationary in the free controls, push those at a bound outwards, and not curve downwards.
@@ -211,7 +211,7 @@ class PreparedIndirect:
         Raises:
             ProblemError: Wrong parameters or guess. SolveError: Newton failed, or a control has a singular arc.
         """
-        with limited(checked_time_limit(time_limit)), self._lock:
+        with time_limited(checked_time_limit(time_limit)), self._lock:
             return self._solve(parameters, guess, check)
 
     def _solve(self, parameters: ByName, guess: Guess, check: bool) -> Solution:
@@ -221,7 +221,7 @@ class PreparedIndirect:
         note = ""
         if isinstance(guess, Solution):
             seed = guess
-            check_belongs(form, seed)
+            check_variables_match(form, seed)
             missing = [name for name in form.states if name not in seed.costates]
             if missing:
                 words = f"the guess, plan {seed.name!r}, has no costates of {', '.join(missing)}"
@@ -271,7 +271,7 @@ class PreparedIndirect:
 
     # ---- before and after ------------------------------------------------------------------------------------
 
-    def _check_order(self, found: Found, arcs: ControlArcs, bounds: Bounds) -> Found:
+    def _check_order(self, found: NewtonResult, arcs: ControlArcs, bounds: Bounds) -> NewtonResult:
         """A root whose switches are out of order, or whose horizon is beyond its bounds, is no plan."""
         if self.method.shooting == "backward" or not found.success:
             return found
@@ -297,7 +297,7 @@ class PreparedIndirect:
 
     def _solution(
         self,
-        found: Found,
+        found: NewtonResult,
         arcs: ControlArcs,
         data: np.ndarray,
         p: np.ndarray,
@@ -320,7 +320,7 @@ class PreparedIndirect:
         flat = dense.reshape(count, -1)
         arguments = self.boundary.arguments(flat.T, times.reshape(1, -1), horizon, np.repeat(q, len(LOBATTO), axis=1))
         columns = [value.T if np.ndim(value) else value for value in arguments]
-        control, multiplier = at_samples(self.boundary.outputs, *columns)[:2]
+        control, multiplier = evaluate_at_samples(self.boundary.outputs, *columns)[:2]
         ends = flat[-1, : form.nx], flat[0, : form.nx], np.zeros(form.nu)
         cost += form.terminal_cost(*ends, horizon, p)
 
@@ -330,7 +330,7 @@ class PreparedIndirect:
         u, mu = control.reshape(*shape, form.nu), multiplier.reshape(*shape, len(form.path))
         extremal = Extremal(LOBATTO, q[1], times, x, lam, u, mu, horizon, nu_start, nu_end)
         if found.success:
-            reason = not_least(ham, extremal, p, bounds)
+            reason = hamiltonian_defect(ham, extremal, p, bounds)
             if reason:
                 found = dataclasses.replace(found, status=SolverStatus.REJECTED, message=reason)
         by_parameter = cost_gradient(ham, extremal, p, bounds) if form.np else np.zeros(0)

@@ -14,7 +14,7 @@ import numpy as np
 from ocp.errors import ProblemError, SolveError
 from ocp.indirect.hamiltonian import Hamiltonian
 from ocp.problem.formulation import Bounds, Formulation
-from ocp.problem.values import at_samples
+from ocp.problem.values import evaluate_at_samples
 from ocp.solution import Solution
 from ocp.tolerances import RESOLVED_SHARE, SOLVER_SHARE
 
@@ -86,7 +86,7 @@ def read_arcs(
         for pool, places in ((seed.states, form.states), (seed.costates, form.states), (seed.controls, form.controls))
     )
     guess = np.hstack([u[:, list(ham.smooth)], np.zeros((len(u), len(form.path)))])
-    slope = at_samples(outputs, x, lam, seed.t[:, None], seed.horizon, p, u[:, index_of], guess)[3]
+    slope = evaluate_at_samples(outputs, x, lam, seed.t[:, None], seed.horizon, p, u[:, index_of], guess)[3]
     own_low, own_high = own_bounds(form, seed, bounds)
     check_singular(ham, seed, own_low[index_of], own_high[index_of])
 

@@ -28,7 +28,7 @@ import casadi as ca
 import numpy as np
 
 from ocp.errors import ProblemError
-from ocp.problem.hulls import Covered
+from ocp.problem.hulls import CoveredPairs
 from ocp.problem.intervals import RULES, Interval, check_instructions, constant, decided, evaluate, multiple_of
 from ocp.problem.separation import WORLD, Separation
 from ocp.problem.values import identity, table
@@ -264,7 +264,7 @@ class PrescribedMotion:
         rows = [_of_time(f"{what}: frame {k}", parts[k], time, parameters, values) for k in frames]
         self._enclosures = Enclosures(ca.vertcat(*rows), time, what) if rows else None
         hulls = list(apart.hulls.values())
-        covered = Covered(apart.pairs, apart.covers)
+        covered = CoveredPairs(apart.pairs, apart.covers)
         for one, other, seen in covered.rows:
             if seen != WORLD and {seen, hulls[one].frame, hulls[other].frame} & set(frames):
                 words = f"{what}: bodies on a frame that time moves have to be seen from the world, -1, not from {seen}"

@@ -14,7 +14,7 @@ from typing import Any, TypeAlias
 import casadi as ca
 import numpy as np
 
-from ocp.errors import ProblemError, about, unknown_name
+from ocp.errors import ProblemError, error_names, unknown_name
 from ocp.problem.declarations import Constraint, Declarations, Signal, Variable
 from ocp.problem.problem import Problem, checked_problem
 from ocp.problem.values import Sampler, check_finite, check_horizon, check_inside, check_order, constant, numeric
@@ -112,7 +112,7 @@ class Formulation:
         path, start, end: Constraint rows. watch: Rows that the audit judges and no method holds.
         apart: Placements of the bodies that have to stay apart, by the name of the separation. Shape (12 F, 1) each.
         watch_integral: Which of these mean the integral over time. Shape (rows,), bool.
-        watch_way: Rates of the ways that they are judged against, zero where none is. Shape (rows, 1).
+        watch_reference_rate: Rates of the ways that they are judged against, zero where none is. Shape (rows, 1).
         states, controls, parameters: Slices of the vectors by name. state_labels,
             control_labels: A name for every entry.
         units: Of states, controls and constraints by name, as declared; empty where none is, or where a constraint
@@ -169,11 +169,11 @@ class Formulation:
         self.start = self._rows("start", declared.start, 0.0)
         self.end = self._rows("end", declared.end, 1.0)
         self.watch = self._rows("watch", declared.watch)
-        self.apart = {name: self.flat(each.placements) for name, each in declared.apart.items()}
+        self.separations = {name: self.flat(each.placements) for name, each in declared.apart.items()}
         watched = declared.watch.values()
         self.watch_integral = np.array([w.integral for w in watched for _ in range(w.size)], dtype=bool)
         ways = [problem.symbols(w.size, 1) if w.way is None else w.way for w in watched]
-        self.watch_way = self.flat(ca.vertcat(problem.symbols(0, 1), *ways))
+        self.watch_reference_rate = self.flat(ca.vertcat(problem.symbols(0, 1), *ways))
         inner = ca.vertcat(self.f, self.running, self.path.expression)
         self.autonomous = not ca.depends_on(inner, ca.vertcat(self.t, self.w))
         self.initial_is_fixed = ~np.concatenate([is_free(s.initial) for s in declared.states.values()])
@@ -193,7 +193,7 @@ class Formulation:
             kept = problem.formulated = cls(problem)
         return kept
 
-    def kept(self, name: Any, make: Callable[[], Any]) -> Any:
+    def cached(self, name: Any, make: Callable[[], Any]) -> Any:
         """What is made once of the problem, by a name."""
         if name not in self._kept:
             self._kept[name] = make()
@@ -208,7 +208,7 @@ class Formulation:
         at = [ca.MX.sym(symbol, part.numel()) for symbol, part in zip(of, inputs, strict=True)]
         return ca.Function(name, at, inner.call([*at, self._signal(at[2])]), of, names)
 
-    def moments(self, fractions: np.ndarray) -> np.ndarray:
+    def point_data(self, fractions: np.ndarray) -> np.ndarray:
         """What of the time a point function needs at fractions (K,): these, and the signals. Shape (1 + nw, K)."""
         return np.vstack([np.reshape(fractions, (1, -1)), self.signals_at(np.ravel(fractions) * self.duration).T])
 
@@ -227,7 +227,7 @@ class Formulation:
                 value = ca.jacobian(value, t)
             return Sampler([t], [ca.densify(value)])
 
-        sampler: Sampler = self.kept(f"signals, order {order}", make)
+        sampler: Sampler = self.cached(f"signals, order {order}", make)
         return sampler(np.frombuffer(times)[:, None])[0]
 
     @property
@@ -244,7 +244,7 @@ class Formulation:
         horizon: Any,
         p: Any,
         *more: tuple[Any, Any],
-        kept: Any = None,
+        cache_as: Any = None,
     ) -> list[np.ndarray]:
         """Expressions of (x, u, t, T, p) and of ``more`` symbols at M samples; each output (M, its number of entries).
 
@@ -261,7 +261,7 @@ class Formulation:
         def make() -> Sampler:
             return self.sampler(outputs() if callable(outputs) else outputs, *(symbol for symbol, _ in more))
 
-        function = make() if kept is None else self.kept(kept, make)
+        function = make() if cache_as is None else self.cached(cache_as, make)
         times = np.reshape(t, (-1, 1))
         values = (value for _, value in more)
         return list(function(x, u, times, horizon, p, self.signals_at(times), *values))
@@ -275,7 +275,7 @@ class Formulation:
     def terminal_cost(self, x: np.ndarray, x0: np.ndarray, u0: np.ndarray, horizon: float, p: np.ndarray) -> float:
         """The terminal cost of a final state, and of the state and controls at the start."""
         symbols = [self.x, self.x0, self.u0, self.t, self.T, self.p]
-        function = self.kept("terminal", lambda: ca.Function("terminal", symbols, [self.terminal]))
+        function = self.cached("terminal", lambda: ca.Function("terminal", symbols, [self.terminal]))
         return float(function(x, x0, u0, horizon, horizon, p))
 
     def horizon_at(self, p: Any) -> Any:
@@ -286,7 +286,7 @@ class Formulation:
         """A block function of one point, (v, d, p) -> (cost, g), with v = [x; u; T where free].
 
         ``cost`` and ``g`` are expressions of x, u, t, T, p, w and of the data ``d``, whose first entries are what
-        :meth:`moments` says of the fraction s.
+        :meth:`point_data` says of the fraction s.
         """
         v = self.sym("v", self.nx + self.nu + self.horizon_is_free)
         inside = slice(self.nx, self.nx + self.nu)
@@ -309,7 +309,7 @@ class Formulation:
         vector = np.zeros(self.np)
         for name, place in self.parameters.items():
             what, size = f"parameter {name!r}", place.stop - place.start
-            with about(name):
+            with error_names(name):
                 if name not in given:
                     raise ProblemError(f"{what} has no value; give parameters={{{name!r}: ...}}")
                 value = numeric(what, given[name])
@@ -329,7 +329,7 @@ class Formulation:
         for kind, pool in (("state", self.states), ("control", self.controls)):
             for name, part in pool.items():
                 index = places[kind][part]
-                with about(name):
+                with error_names(name):
                     check_order(f"{where}: {kind} {name!r}", lower[index], upper[index])
                     for end in ("initial", "terminal") if kind == "state" else ():
                         fixed = places[end][part]
@@ -337,10 +337,10 @@ class Formulation:
                         check_inside(f"{where}: {kind} {name!r}: {end}", values, lower[index], upper[index])
         for rows in (self.path, self.start, self.end, self.watch):
             for owner, label, index in zip(rows.owners, rows.labels, rows.bounds, strict=True):
-                with about(owner):
+                with error_names(owner):
                     check_order(f"{where}: constraint {label!r}", lower[[index]], upper[[index]])
         index = places["horizon"]
-        with about("horizon"):
+        with error_names("horizon"):
             check_horizon(f"{where}: horizon", lower[index])
             check_order(f"{where}: horizon", lower[index], upper[index])
         if np.any(np.isnan(lower)) or np.any(np.isnan(upper)):

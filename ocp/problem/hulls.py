@@ -17,7 +17,7 @@ from models.shapes.hull import gap_along, is_box, nearest_directions
 from ocp.errors import ProblemError
 from ocp.problem.values import check_finite, table
 
-__all__ = ["Covered", "Facing", "Frames", "Hull", "HullPairs", "PairsOfBodies", "frames_of", "grouped"]
+__all__ = ["BodyPairs", "CoveredPairs", "Frames", "Hull", "HullPairs", "SeparatingDirections", "frames_of", "grouped"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +134,7 @@ class HullPairs:
         return np.asarray(gap_along(along, *self.points(frames, at, row)) - self.radii[row])
 
 
-class Covered:
+class CoveredPairs:
     """Pairs of bodies, and those that cover some of them.
 
     What covers a pair holds its two bodies between them: both say from below how far it is apart, so that it is as far
@@ -175,8 +175,8 @@ class Covered:
         return found
 
 
-class Facing(NamedTuple):
-    """Along what the rows of K pairs of bodies are nearest, see `Covered.of`.
+class SeparatingDirections(NamedTuple):
+    """Along what the rows of K pairs of bodies are nearest, see `CoveredPairs.of`.
 
     Attributes:
         place, row: Shape (R,). along: Unit vectors from the first body to the other, seen from where they are. (R, 3).
@@ -186,17 +186,17 @@ class Facing(NamedTuple):
     row: np.ndarray
     along: np.ndarray
 
-    def of(self, some: np.ndarray) -> Facing:
+    def of(self, some: np.ndarray) -> SeparatingDirections:
         """Of some pairs alone. Shape (K,), whether."""
         kept = some[self.place]
-        return Facing((np.cumsum(some) - 1)[self.place[kept]], self.row[kept], self.along[kept])
+        return SeparatingDirections((np.cumsum(some) - 1)[self.place[kept]], self.row[kept], self.along[kept])
 
 
-class PairsOfBodies:
-    """Pairs of bodies, what covers them, and how far they are apart; see `Covered`."""
+class BodyPairs:
+    """Pairs of bodies, what covers them, and how far they are apart; see `CoveredPairs`."""
 
     def __init__(self, hulls: Sequence[Hull], pairs: np.ndarray, covers: Mapping[int, np.ndarray]) -> None:
-        self._covered = Covered(pairs, covers)
+        self._covered = CoveredPairs(pairs, covers)
         self._kinds = grouped(hulls, self._covered.rows)
         self._one, self._other = pairs[:, 0], pairs[:, 1]
         self._riding = np.array([hull.frame for hull in hulls], dtype=int)
@@ -232,7 +232,9 @@ class PairsOfBodies:
         apart[at, pair] = gap[self._covered.decisive(place, gap, count)]
         return np.where(np.isfinite(apart), apart, -np.inf)
 
-    def nearest(self, frames: Frames, at: np.ndarray, pair: np.ndarray) -> tuple[Facing, np.ndarray, np.ndarray]:
+    def nearest(
+        self, frames: Frames, at: np.ndarray, pair: np.ndarray
+    ) -> tuple[SeparatingDirections, np.ndarray, np.ndarray]:
         """Along what the bodies of pairs are nearest at samples, shape (K,) each, how far they are apart (K,), m, and
         the nearest points of what the radii swell (K, 2, 3), m, seen from where they are."""
         place, rows = self._covered.of(pair)
@@ -240,9 +242,9 @@ class PairsOfBodies:
         for kind, chosen, row in self._by_kind(rows):
             along[chosen], gap[chosen], points[chosen] = kind.nearest(frames, at[place[chosen]], row)
         told = self._covered.decisive(place, gap, len(pair))
-        return Facing(place, rows, along), gap[told], points[told]
+        return SeparatingDirections(place, rows, along), gap[told], points[told]
 
-    def chords(self, facing: Facing, frames: Frames, ends: Sequence[np.ndarray]) -> np.ndarray:
+    def chords(self, facing: SeparatingDirections, frames: Frames, ends: Sequence[np.ndarray]) -> np.ndarray:
         """How far the bodies of pairs are apart along what others told, the less of both ends of a time. Shape (K,), m.
 
         What says so is one and the same at both: that a pair is apart at one and what covers it at the other says

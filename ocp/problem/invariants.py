@@ -119,7 +119,9 @@ def sampled_rates(form: Formulation, count: int) -> tuple[np.ndarray, np.ndarray
     x, u, t = (rng.normal(size=(count, n)) for n in (form.nx, form.nu, 1))
     horizon, p = 1.0, np.exp(0.3 * rng.normal(size=form.np))
     duration = float(form.horizon_at(p)) if form.signals else horizon
-    (rates,) = form.sampled([form.f], x, u, duration * (0.5 + np.arctan(t) / np.pi), duration, p, kept="rates alone")
+    (rates,) = form.sampled(
+        [form.f], x, u, duration * (0.5 + np.arctan(t) / np.pi), duration, p, cache_as="rates alone"
+    )
     good = np.isfinite(rates).all(axis=1)
     return x[good], rates[good]
 
@@ -131,7 +133,7 @@ def bounds_to_solve(form: Formulation, p: np.ndarray) -> Bounds:
     largest entry. It is left a leeway. Raises as `Formulation.bound_values`.
     """
     lower, upper = form.bound_values(p)
-    integrals = form.kept("first integrals", lambda: FirstIntegrals(form))
+    integrals = form.cached("first integrals", lambda: FirstIntegrals(form))
     if not len(integrals.factors):
         return lower, upper
     low, high = lower.copy(), upper.copy()
@@ -148,7 +150,7 @@ def implied(form: Formulation, integrals: FirstIntegrals, bounds: Bounds, p: np.
     equal, last = low == high, nx + len(form.start)
     if not equal[last:].any():
         return []
-    rows = form.kept("rows of both ends", lambda: rows_of_ends(form))
+    rows = form.cached("rows of both ends", lambda: rows_of_ends(form))
     # a point that meets all conditions, by Newton's method from a random one
     z = np.random.default_rng(0).normal(size=2 * nx + 1)
     z[-1] = 1.0 if form.horizon_is_free else float(form.horizon_at(p))

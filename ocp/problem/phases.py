@@ -26,7 +26,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ocp.errors import ProblemError, about, checked_text, unknown_name
+from ocp.errors import ProblemError, checked_text, error_names, unknown_name
 from ocp.problem.declarations import Constraint, PhaseTimes, Variable
 from ocp.problem.problem import Problem, checked_problem
 from ocp.problem.separation import Separation
@@ -154,7 +154,7 @@ class Phases(Problem):
             what = f"{label}: {name}"
             if any(what in pool for pool in (self.declared.start, self.declared.end)):
                 raise ProblemError(f"{what} is joined twice", name=name)
-            with about(name):
+            with error_names(name):
                 expression = self._reader.expression(what, value, [*known, *self.declared.at_start.values()])
             if expression.numel() not in (1, begins[name].size):
                 words = f"{what} has {expression.numel()} entries, the state has {begins[name].size}"
@@ -183,7 +183,7 @@ class Phases(Problem):
         Raises:
             ProblemError: ``running`` is given: it belongs to the problem of a phase.
         """
-        with about("running"):
+        with error_names("running"):
             nothing = not is_symbolic(running) and not numeric("running cost", running).any()
         if not nothing:
             words = f"problem {self.name!r}: a running cost belongs to the problem of a phase"

@@ -15,13 +15,13 @@ from typing import Any, ParamSpec, TypeVar, cast
 import casadi as ca
 import numpy as np
 
-from ocp.errors import ProblemError, about, checked_count, checked_text, unknown_name
+from ocp.errors import ProblemError, checked_count, checked_text, error_names, unknown_name
 from ocp.problem.declarations import ENDS, Constraint, Declarations, Guess, Horizon, PhaseTimes, Signal, Variable
 from ocp.problem.enclosures import PrescribedMotion
 from ocp.problem.expressions import ExpressionReader, Value, check_guess, number_of_entries, read_scale, signal_function
 from ocp.problem.hulls import Hull
-from ocp.problem.separation import Separation, index_rows, motion_by_pair
-from ocp.problem.stored import restored, stored
+from ocp.problem.separation import Separation, index_rows, stack_motion_bounds
+from ocp.problem.stored import from_record, stored
 from ocp.problem.values import check_inside, constant, identity
 
 __all__ = ["Problem", "checked_problem", "remembers_request"]
@@ -35,7 +35,7 @@ def _about_its_name(method: Declare) -> Declare:
 
     @wraps(method)
     def declare(self: Any, name: Any, *args: Any, **values: Any) -> Any:
-        with about(name if isinstance(name, str) and name else "name"):
+        with error_names(name if isinstance(name, str) and name else "name"):
             return method(self, name, *args, **values)
 
     return cast(Declare, declare)
@@ -105,12 +105,12 @@ class Problem:
             ProblemError: The record is damaged.
         """
         kinds = (Variable, Signal, Constraint, Horizon, PhaseTimes, Declarations, Separation, Hull)
-        self.name, self.symbols, self.time, self.declared = restored(state, kinds)
+        self.name, self.symbols, self.time, self.declared = from_record(state, kinds)
         self.declared.check(self.symbols)
         self.formulated = self.origin = None
 
     @classmethod
-    def restored(cls, state: dict[str, Any]) -> Problem:
+    def from_record(cls, state: dict[str, Any]) -> Problem:
         """Return the problem of which :meth:`__getstate__` returned the state."""
         problem = cls.__new__(cls)
         problem.__setstate__(state)
@@ -260,7 +260,7 @@ class Problem:
         A free horizon starts at 0 excluded: ``lower`` must be positive (default 1e-6 s).
         """
         what = f"problem {self.name!r}: horizon"
-        with about("horizon"):
+        with error_names("horizon"):
             if self.declared.horizon is not None:
                 raise ProblemError(f"{what} is declared twice")
             self.declared.horizon = self._reader.horizon(what, value, lower, upper, guess)
@@ -281,7 +281,7 @@ class Problem:
         if found.name in self.declared.dynamics:
             raise ProblemError(f"state {found.name!r}: dynamics declared twice", name=found.name)
         what = f"dynamics of {found.name!r}"
-        with about(found.name):
+        with error_names(found.name):
             expression = self._reader.expression(what, derivative, self._inner())
             if expression.numel() != found.size:
                 raise ProblemError(f"{what} has {expression.numel()} entries, the state has {found.size}")
@@ -390,7 +390,7 @@ class Problem:
         what = f"separation {name!r}"
         count = len(index_rows(what, "pairs", pairs, 3))
         parts: dict[str, Any] = {
-            label: motion_by_pair(f"{what}: {label}", given, movers, count)
+            label: stack_motion_bounds(f"{what}: {label}", given, movers, count)
             for label, given in (("levers", levers), ("turns", turns))
         }
         parameters = self._reader.parameters
@@ -409,7 +409,7 @@ class Problem:
         ends += [*self.declared.at_start.values(), self.time, *self._horizon_symbol()]
         costs = {}
         for label, cost, known in (("running", running, self._inner()), ("terminal", terminal, ends)):
-            with about(label):
+            with error_names(label):
                 costs[label] = self._reader.expression(f"{label} cost", cost, known)
                 if (size := costs[label].numel()) != 1:
                     raise ProblemError(f"{label} cost must be a scalar, it has {size} entries", value=size, limit=1)

@@ -25,10 +25,10 @@ from typing import Any
 import numpy as np
 
 from ocp.errors import ProblemError, checked_mapping, checked_text
-from ocp.problem.hulls import Covered, Hull
+from ocp.problem.hulls import CoveredPairs, Hull
 from ocp.problem.values import check_finite, table
 
-__all__ = ["Separation", "index_rows", "motion_by_pair"]
+__all__ = ["Separation", "index_rows", "stack_motion_bounds"]
 
 WORLD = -1
 """In the place of a frame: the world."""
@@ -95,7 +95,7 @@ class Separation:
                 raise ProblemError(words, name=label)
         if not all(WORLD <= frame < frames for frame in [*(hull.frame for hull in hulls), *self.pairs[:, 2]]):
             raise ProblemError(f"{what}: a frame is none of the {frames} placed", name="frame", limit=frames)
-        rows = Covered(self.pairs, self.covers).rows
+        rows = CoveredPairs(self.pairs, self.covers).rows
         if any(hulls[k].normal.size and hulls[k].frame != seen for *bodies, seen in rows for k in bodies):
             words = f"{what}: a half-space has to be seen from the frame that it rides on, where it stands still"
             raise ProblemError(words, name="pairs")
@@ -158,7 +158,7 @@ def index_rows(what: str, label: str, values: Any, count: int) -> np.ndarray:
     return found.astype(int).reshape(-1, count)
 
 
-def motion_by_pair(what: str, given: Mapping[str, Any], movers: Mapping[str, int], count: int) -> np.ndarray:
+def stack_motion_bounds(what: str, given: Mapping[str, Any], movers: Mapping[str, int], count: int) -> np.ndarray:
     """Levers or turns by the name of a state, side by side for all movers; zero of those that are not given.
 
     Args:

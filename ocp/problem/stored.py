@@ -13,16 +13,16 @@ from ocp.errors import ProblemError
 from ocp.problem.function_reader import FunctionReader
 from ocp.problem.function_writer import FunctionWriter
 
-__all__ = ["DAMAGED", "NUMBERS", "packed", "restored", "stored", "unpacked"]
+__all__ = ["ARRAY_NAMES", "RECORD_ERRORS", "from_record", "pack_record", "stored", "unpack_record"]
 
 SYMBOLS = {"SX": ca.SX, "MX": ca.MX}
-DAMAGED = (
+RECORD_ERRORS = (
     AttributeError, IndexError, KeyError, NotImplementedError, OverflowError, RecursionError, RuntimeError, TypeError,
     ValueError,
 )  # fmt: skip
 """What it raises to build something of data that has another form than was written."""
 ARRAYS = {"i": "integers", "f": "numbers"}
-NUMBERS = tuple(ARRAYS.values())
+ARRAY_NAMES = tuple(ARRAYS.values())
 """Names of the arrays that a record is packed into."""
 
 
@@ -78,7 +78,7 @@ def stored(name: str, symbols: Any, time: Any, declared: Any) -> dict[str, Any]:
     return {**record, "functions": writer.records}
 
 
-def restored(record: Mapping[str, Any], kinds: Sequence[type]) -> tuple[str, Any, Any, Any]:
+def from_record(record: Mapping[str, Any], kinds: Sequence[type]) -> tuple[str, Any, Any, Any]:
     """Return the name, the kind of symbols, the symbol of time and all declarations, with new symbols.
 
     Args:
@@ -90,7 +90,7 @@ def restored(record: Mapping[str, Any], kinds: Sequence[type]) -> tuple[str, Any
     """
     try:
         return _restored(record, {kind.__name__: kind for kind in kinds})
-    except (*DAMAGED, ProblemError) as error:
+    except (*RECORD_ERRORS, ProblemError) as error:
         raise ProblemError(f"the problem that was written is damaged: {error}", name="problem") from error
 
 
@@ -142,9 +142,9 @@ def symbol_name(symbol: Any) -> str:
 # ---- records in files of arrays ----------------------------------------------------------------------------------
 
 
-def packed(record: Any) -> tuple[Any, dict[str, np.ndarray]]:
+def pack_record(record: Any) -> tuple[Any, dict[str, np.ndarray]]:
     """Return what JSON can hold of a record, and its arrays, one behind the other, by the kind of their numbers."""
-    gathered: dict[str, list[np.ndarray]] = {name: [] for name in NUMBERS}
+    gathered: dict[str, list[np.ndarray]] = {name: [] for name in ARRAY_NAMES}
     lengths = dict.fromkeys(gathered, 0)
 
     def pack(value: Any) -> Any:
@@ -162,18 +162,18 @@ def packed(record: Any) -> tuple[Any, dict[str, np.ndarray]]:
     return told, {name: np.concatenate([empty[name], *parts]) for name, parts in gathered.items()}
 
 
-def unpacked(told: Any, arrays: Mapping[str, np.ndarray]) -> Any:
-    """Return the record of which :func:`packed` returned these parts.
+def unpack_record(told: Any, arrays: Mapping[str, np.ndarray]) -> Any:
+    """Return the record of which :func:`pack_record` returned these parts.
 
     Raises:
         ValueError, KeyError, TypeError: They are damaged.
     """
-    if isinstance(told, dict) and told.get("array") in NUMBERS:
+    if isinstance(told, dict) and told.get("array") in ARRAY_NAMES:
         shape, begin = [int(size) for size in told["shape"]], int(told["begin"])
         size = int(np.prod(shape, dtype=object))
         if begin < 0 or min(shape, default=0) < 0 or begin + size > arrays[told["array"]].size:
             raise ValueError("an array lies outside the numbers of the file")
         return arrays[told["array"]][begin : begin + size].reshape(shape)
     if isinstance(told, dict):
-        return {key: unpacked(part, arrays) for key, part in told.items()}
-    return [unpacked(part, arrays) for part in told] if isinstance(told, list) else told
+        return {key: unpack_record(part, arrays) for key, part in told.items()}
+    return [unpack_record(part, arrays) for part in told] if isinstance(told, list) else told

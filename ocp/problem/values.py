@@ -10,18 +10,18 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ocp.errors import NOT_NUMBERS, ProblemError, floats, told_apart
+from ocp.errors import NOT_NUMBERS, ProblemError, floats, format_distinct
 
 __all__ = [
     "Sampler",
-    "at_samples",
     "check_finite",
     "check_horizon",
     "check_inside",
     "check_order",
     "constant",
+    "evaluate_at_samples",
+    "evaluate_in_blocks",
     "identity",
-    "in_blocks",
     "is_symbolic",
     "numeric",
     "stacked",
@@ -91,7 +91,7 @@ def check_order(what: str, lower: np.ndarray, upper: np.ndarray) -> None:
     for i, (low, high) in enumerate(zip(lower, upper, strict=True)):
         given: dict[str, Any] = {"value": float(low), "limit": float(high)}
         if low > high:
-            least, most = told_apart(float(low), float(high))
+            least, most = format_distinct(float(low), float(high))
             raise ProblemError(f"{what}: lower bound {least} is above upper bound {most} (entry {i})", **given)
         if low == np.inf or high == -np.inf:
             raise ProblemError(f"{what}: bounds [{low:g}, {high:g}] exclude everything (entry {i})", **given)
@@ -104,7 +104,7 @@ def check_inside(what: str, value: np.ndarray, lower: np.ndarray, upper: np.ndar
         if np.isinf(number):
             raise ProblemError(f"{what} is not finite: {number} (entry {i}); use nan to leave it free", **given)
         if number < low or number > high:
-            told, least, most = told_apart(float(number), float(low), float(high))
+            told, least, most = format_distinct(float(number), float(low), float(high))
             words = f"{what} value {told} is outside the bounds [{least}, {most}] (entry {i})"
             raise ProblemError(words, **given)
 
@@ -155,14 +155,14 @@ class Sampler:
             end = whole - (whole - at) % size
             if end > at:
                 block = self._maps.get(size) or self._maps.setdefault(size, self._function.map(size))
-                in_blocks(block, size, given[at:end], [filled[at:end]])
+                evaluate_in_blocks(block, size, given[at:end], [filled[at:end]])
             at = end
         found = np.zeros((whole, sum(self._outputs)))
         found[:, self._filled] = filled
         return np.split(found[:m], np.cumsum(self._outputs[:-1]), axis=1)
 
 
-def in_blocks(
+def evaluate_in_blocks(
     function: Any, size: int, given: np.ndarray, outputs: list[np.ndarray], state: np.ndarray | None = None
 ) -> None:
     """Call a casadi function of ``size`` columns side by side block by block.
@@ -186,7 +186,7 @@ def in_blocks(
             state[:] = outputs[0][at + size - 1]
 
 
-def at_samples(function: Any, *columns: Any) -> list[np.ndarray]:
+def evaluate_at_samples(function: Any, *columns: Any) -> list[np.ndarray]:
     """A casadi function of dense columns at M samples, see :class:`Sampler`."""
     symbols = [ca.MX.sym(f"input{i}", function.numel_in(i)) for i in range(function.n_in())]
     return Sampler(symbols, list(function.call(symbols)))(*columns)

@@ -85,7 +85,7 @@ def test_the_tolerance_is_reached(method: str) -> None:
 def test_from_a_plan_that_is_audited_already_it_goes_the_same_way(method: str) -> None:
     """As from its first solve; and the audit that comes with it is that of the plan."""
     first = solve(van_der_pol(), START[method])
-    found, audit = refinement.refined(first.problem, START[method], first, first.audit())
+    found, audit = refinement.refine_from(first.problem, START[method], first, first.audit())
     whole = refined(method)
     assert found.refinement is not None
     assert whole.refinement is not None
@@ -109,7 +109,7 @@ def test_a_round_that_fails_is_begun_elsewhere_only_where_that_is_asked(
 
     monkeypatch.setattr(refinement, "solve", briefly)
     with pytest.raises(SolveError, match="from the guess: " if check else "^refinement of .* failed: ") as failed:
-        refinement.refined(first.problem, method, first, first.audit(), {"max_iter": 1}, check)
+        refinement.refine_from(first.problem, method, first, first.audit(), {"max_iter": 1}, check)
     assert asked == [check]
     assert failed.value.solution is not None
     assert not failed.value.solution.success

@@ -436,8 +436,11 @@ WRONG: list[tuple[str, Callable[[dict[str, Any], dict[str, np.ndarray]], Any]]] 
     ("iterations", lambda h, a: h.update(iterations=True)),
     ("start", lambda h, a: h.update(start=0)),
     ("regularised", lambda h, a: h.update(regularised=1)),
-    ("drawn_in", lambda h, a: a.update(drawn_in=np.ones(3))),
-    ("drawn_in", lambda h, a: a.update(drawn_in=np.full((2, len(a["control_interpolant/breaks"]) - 1, 9), -1.0))),
+    ("bound_tightening", lambda h, a: a.update(bound_tightening=np.ones(3))),
+    (
+        "bound_tightening",
+        lambda h, a: a.update(bound_tightening=np.full((2, len(a["control_interpolant/breaks"]) - 1, 9), -1.0)),
+    ),
     ("horizon", lambda h, a: h.update(horizon=float("inf"))),
     ("horizon", lambda h, a: h.update(horizon=[1.0])),
     ("seconds", lambda h, a: h.update(seconds=1.0)),

@@ -30,8 +30,8 @@ def npy(array: np.ndarray) -> bytes:
     return stream.getvalue()
 
 
-def archive(path: Path, members: dict[str, bytes], packed: int = zipfile.ZIP_DEFLATED) -> Path:
-    with zipfile.ZipFile(path, "w", packed, compresslevel=1) as file:
+def archive(path: Path, members: dict[str, bytes], pack_record: int = zipfile.ZIP_DEFLATED) -> Path:
+    with zipfile.ZipFile(path, "w", pack_record, compresslevel=1) as file:
         for name, data in members.items():
             file.writestr(name, data)
     return path

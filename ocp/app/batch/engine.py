@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 
 from models.errors import ModelError
 from ocp.app.batch.content import Parcel, digest_of, packed, text_of, unpacked
-from ocp.errors import Detailed, ProblemError, SolveError
+from ocp.errors import DetailedError, ProblemError, SolveError
 
 __all__ = [
     "Broken",
@@ -107,7 +107,7 @@ def failed(status: str, error: str, message: str) -> Parcel:
 def message_of(error: BaseException) -> str:
     """Its message; of what is no error of the package, which may be a mistake in the function, with its place."""
     words = str(error).encode("utf-8", "replace").decode()
-    if isinstance(error, Detailed | ModelError):
+    if isinstance(error, DetailedError | ModelError):
         return words
     steps = [step for step in traceback.extract_tb(error.__traceback__) if step.filename != __file__]
     place = f" ({os.path.basename(steps[-1].filename)}, line {steps[-1].lineno})" if steps else ""
@@ -142,7 +142,7 @@ def kept(make: Function, *arguments: Any) -> Any:
             try:
                 _KEPT[key] = make(*arguments), inputs
             except Exception as error:
-                if isinstance(error, Detailed | ModelError) or getattr(error, "errno", None) in FULL:
+                if isinstance(error, DetailedError | ModelError) or getattr(error, "errno", None) in FULL:
                     raise
                 call = f"{key[0][0]}({', '.join(map(repr, arguments))})"
                 words = f"kept: {call} raised {type(error).__name__}: {message_of(error)}"

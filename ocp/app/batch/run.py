@@ -20,7 +20,7 @@ from ocp.app.batch.content import Parcel, digest_of, key_of, neighbours, text_of
 from ocp.app.batch.engine import Engine, Function, Job, checked_cluster, failed
 from ocp.app.batch.ledger import ENDS, Ledger
 from ocp.app.batch.table import Batch, Result, row_of
-from ocp.errors import MOST, NOT_NUMBERS, ProblemError, check_entries, checked_choice, checked_count, checked_text
+from ocp.errors import MAX_COUNT, NOT_NUMBERS, ProblemError, check_entries, checked_choice, checked_count, checked_text
 
 __all__ = ["run_batch"]
 
@@ -232,8 +232,8 @@ def texts_of(tasks: Any) -> dict[str, str]:
     try:
         check_entries(tasks)
         for i, task in enumerate(tasks):
-            if i >= MOST:
-                raise ProblemError(f"tasks: at most {MOST} at a time", name="tasks", limit=MOST)
+            if i >= MAX_COUNT:
+                raise ProblemError(f"tasks: at most {MAX_COUNT} at a time", name="tasks", limit=MAX_COUNT)
             text = text_of(task, f"tasks[{i}]")
             found[key_of(text)] = text
     except ProblemError:

@@ -57,8 +57,8 @@ from ocp.problem.phases import DURATION, Phases
 from ocp.problem.problem import Problem
 from ocp.refinement import split
 from ocp.solution import Solution
-from ocp.switching import NEAR, at_switches
-from ocp.tightening import exceeded, tighten
+from ocp.switching import WARM_START_OPTIONS, solve_at_switches
+from ocp.tightening import largest_excess, tighten
 
 __all__ = ["Leg", "breaks_of", "checked_legs", "dynamics_phases", "plan_dynamics", "within_limits"]
 
@@ -392,7 +392,9 @@ def _first_that_holds(
         for plan in [plan for own, plan in dear if own is finest]:
             own = finest.with_mesh(plan.control_interpolant.breaks)
             with suppress(SolveError):
-                plan = tighten(problem, own, tolerance=HOLDING.held, options={**NEAR, **settings}, guess=plan)
+                plan = tighten(
+                    problem, own, tolerance=HOLDING.held, options={**WARM_START_OPTIONS, **settings}, guess=plan
+                )
                 audit = plan.audit(tolerances=tolerances)
                 held += [plan] if audit.feasible else []
                 reasons.append(f"{finest.intervals} intervals, at whatever cost: {audit.sentence}")
@@ -408,14 +410,14 @@ def _attempts(
     problem: Problem, mesh: Collocation, settings: Mapping[str, Any], guess: Solution | None
 ) -> Iterator[tuple[str, Solution | SolveError]]:
     """Plans on a mesh that hold their limits, or why not; whoever takes them stops at the first that is good enough."""
-    warm = {**NEAR, **settings}
+    warm = {**WARM_START_OPTIONS, **settings}
     try:
         plan = solve(problem, mesh, options=warm if guess else settings, guess=guess)
     except SolveError as error:
         yield "", error
         return
     yield "", _drawn_in(problem, mesh, plan, warm)
-    switched = at_switches(problem, mesh, plan, options=settings)
+    switched = solve_at_switches(problem, mesh, plan, options=settings)
     if switched is not plan:
         yield ", with nodes where it switches", _drawn_in(problem, mesh, switched, warm)
 
@@ -424,11 +426,11 @@ def _drawn_in(
     problem: Problem, mesh: Collocation, plan: Solution, settings: Mapping[str, Any]
 ) -> Solution | SolveError:
     """A plan that holds its limits between its nodes, and costs hardly more than one that does not; or why not."""
-    if exceeded(problem, plan) <= HOLDING.held:
+    if largest_excess(problem, plan) <= HOLDING.held:
         return plan
     own, most = mesh.with_mesh(plan.control_interpolant.breaks), plan.cost + HOLDING.dearer * abs(plan.cost)
     try:
-        drawn = tighten(problem, own, tolerance=HOLDING.held, options=settings, guess=plan, dearest=most)
+        drawn = tighten(problem, own, tolerance=HOLDING.held, options=settings, guess=plan, max_cost=most)
     except SolveError as error:
         return error
     if drawn.cost <= most:
@@ -439,9 +441,9 @@ def _drawn_in(
 
 def _finer(mesh: Collocation, plan: Solution, why: SolveError) -> Collocation:
     """The next mesh: cut where limits drawn in cost the last plan too much, where that alone is wrong; else halved."""
-    if plan.drawn_in is None or why.solution is not plan or why.name != "cost":
+    if plan.bound_tightening is None or why.solution is not plan or why.name != "cost":
         return mesh.halved()
-    nodes, drawn = plan.control_interpolant.breaks, plan.drawn_in.max(axis=(0, 2))
+    nodes, drawn = plan.control_interpolant.breaks, plan.bound_tightening.max(axis=(0, 2))
     return mesh.with_mesh(split(nodes, np.where(drawn > 0, HOLDING.pieces, 1), drawn, HOLDING.pieces * len(drawn)))
 
 

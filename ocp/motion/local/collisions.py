@@ -21,7 +21,7 @@ import numpy as np
 from models import CollisionScene, Machine
 from models.arrays import Array
 from ocp.errors import ProblemError, checked_instance
-from ocp.problem.hulls import Hull, PairsOfBodies, frames_of
+from ocp.problem.hulls import BodyPairs, Hull, frames_of
 from ocp.problem.values import Sampler
 
 __all__ = ["Collision", "checked_collision_scene", "distances_along", "find_collisions", "hulls_of", "slid"]
@@ -87,16 +87,16 @@ def find_collisions(scene: CollisionScene, base: Array, joints: Array, times: Ar
     return sorted(found, key=lambda touch: touch.distance)
 
 
-def _prepared(scene: CollisionScene) -> tuple[Sampler, PairsOfBodies]:
+def _prepared(scene: CollisionScene) -> tuple[Sampler, BodyPairs]:
     """Of base, joints and time the placements, and all pairs; kept with the surroundings."""
-    kept: tuple[Sampler, PairsOfBodies] | None = scene.__dict__.get("_prepared")
+    kept: tuple[Sampler, BodyPairs] | None = scene.__dict__.get("_prepared")
     if kept is None:
         machine = scene.machine
         base, joints = ca.SX.sym("base", machine.base_size), ca.SX.sym("q", machine.joint_size)
         time = ca.SX.sym("time")
         placements = Sampler([base, joints, time], [ca.SX(scene.placements(base, joints, time))])
         hulls = tuple(hulls_of(scene).values())
-        kept = placements, PairsOfBodies(hulls, scene.pairs, scene.covers)
+        kept = placements, BodyPairs(hulls, scene.pairs, scene.covers)
         scene.__dict__["_prepared"] = kept
     return kept
 

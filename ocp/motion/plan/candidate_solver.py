@@ -32,7 +32,7 @@ from ocp.motion.plan.motion import Plan, parts_of
 from ocp.motion.plan.request import declared_motion
 from ocp.motion.search.configurations import OUT_OF_REACH, Asked, clear_postures, others_told
 from ocp.problem.values import constant
-from ocp.refinement import refined, split
+from ocp.refinement import refine_from, split
 from ocp.solution import Solution
 
 __all__ = ["CandidateSolver"]
@@ -270,7 +270,7 @@ class CandidateSolver(Solver):
                 warnings.simplefilter("ignore", RefinementWarning)
                 same = _mesh_of(mesh, solution)
                 options = self._options(motion, same, solution.cost, self.settings.fine_options)
-                solution, audit = refined(motion.problem, same, solution, audit, options, check)
+                solution, audit = refine_from(motion.problem, same, solution, audit, options, check)
             if not _mendable(audit) and (finer := self._on_task(motion, mesh, solution, check)) is not solution:
                 solution, audit = finer, finer.audit()
         return solution, audit

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from ocp import Problem
 from ocp.indirect.hamiltonian import Hamiltonian
-from ocp.indirect.method import not_least, null_space
+from ocp.indirect.method import hamiltonian_defect, null_space
 from ocp.indirect.sensitivity import Extremal
 from ocp.problem.formulation import Formulation
 from tests.ocp.problems import Array
@@ -107,7 +107,7 @@ def verdict(
         np.zeros(0),
     )
     p = form.parameter_vector({})
-    return not_least(ham, path, p, form.bound_values(p))
+    return hamiltonian_defect(ham, path, p, form.bound_values(p))
 
 
 units = pytest.mark.parametrize(("cost", "unit"), [(1.0, 1.0), (1e8, 1.0), (1e-8, 1.0), (1.0, 1e5), (1.0, 1e-5)])

@@ -21,7 +21,7 @@ import numpy as np
 
 from models.machines.standing import External, Standing
 from ocp.audit.audit import Audit
-from ocp.console import interruptible, limited, time_left
+from ocp.console import interruptible, time_left, time_limited
 from ocp.direct.collocation import Collocation
 from ocp.direct.shooting import MultipleShooting
 from ocp.errors import ProblemError, SolveError, checked_instance, checked_mapping, checked_time_limit
@@ -353,7 +353,7 @@ def plan_steps(
     settings = {**IPOPT, **checked_mapping("options", options)}
     trials: list[Trial] = [(None, method or STEPS)]
     judge = _Judge(tolerances, lambda _: None)
-    with limited(checked_time_limit(time_limit)):
+    with time_limited(checked_time_limit(time_limit)):
         guess = guess_in_time(steps, start_joints, asked, settings)
         return _first_that_holds(lambda _: steps_problem(steps, start_joints, **asked), trials, settings, judge, guess)
 
@@ -441,8 +441,8 @@ def _attempts(
         if attempt.solution is None or not attempt.solution.success or time_left() <= 0:
             return
         if attempt.exceeded:
-            drawn_in = partial(tighten, problem, mesh, options=settings, guess=guess)
-            yield judge(f"{name}, tightened", problem, drawn_in)
+            bound_tightening = partial(tighten, problem, mesh, options=settings, guess=guess)
+            yield judge(f"{name}, tightened", problem, bound_tightening)
         mesh = mesh.halved()
 
 
