@@ -395,7 +395,7 @@ def cost_gradient(
     for index, force in ((fragment.variable_bounds, lam_x), (fragment.row_bounds, lam)):
         np.add.at(push[0], index, np.minimum(force, 0.0))  # at a lower bound
         np.add.at(push[1], index, np.maximum(force, 0.0))
-    return np.asarray(direct - form.bounds.pull(p, push))
+    return np.asarray(direct - form.bounds.pullback(p, push))
 
 
 def costate_interpolant(fragment: Fragment, costates: np.ndarray) -> PiecewisePolynomial:

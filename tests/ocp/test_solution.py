@@ -376,9 +376,9 @@ def edited(path: Path, edit: Callable[[dict[str, Any], dict[str, np.ndarray]], A
 @pytest.mark.parametrize(
     ("edit", "message"),
     [
-        (lambda h, a: h.update(version=2), "another version of the format .2, not 3."),
-        (lambda h, a: h.update(version="1"), "another version"),
-        (lambda h, a: h.update(version=None), "another version"),
+        (lambda h, a: h.update(version=2), "format version 2, but this package reads version 3"),
+        (lambda h, a: h.update(version="1"), "this package reads version 3"),
+        (lambda h, a: h.update(version=None), "this package reads version 3"),
         (lambda h, a: h.pop("version"), "is not a saved solution"),
         (lambda h, a: h.pop("cost"), "is not a saved solution"),
         (lambda h, a: h.update(colour="red"), "is not a saved solution"),
@@ -416,7 +416,7 @@ def test_a_plan_that_lost_its_problem_is_audited_with_it(tmp_path: Path) -> None
     solution = solve(van_der_pol(), Collocation(10))
     solution.with_problem(None).save(tmp_path / "plan.npz")
     loaded = Solution.load(tmp_path / "plan.npz")
-    with pytest.raises(AuditError, match=r"'van der Pol' comes without its problem; call audit\(problem\)"):
+    with pytest.raises(AuditError, match=r"'van der Pol' has no problem; call audit\(problem\)"):
         loaded.audit()
     assert str(loaded.audit(van_der_pol())) == str(solution.audit())
     assert loaded.with_problem(van_der_pol()).audit().passed

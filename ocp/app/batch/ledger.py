@@ -24,7 +24,7 @@ from typing import Any
 from ocp.app.batch.content import Parcel, key_of, text_of, unpacked
 from ocp.console import LOG
 from ocp.errors import ProblemError
-from ocp.storage import END, checked_path, open_unlinked, write_whole
+from ocp.storage import END_RECORD, checked_path, open_unlinked, write_whole
 
 __all__ = ["ENDS", "Ledger"]
 
@@ -176,7 +176,7 @@ class Ledger:
                     if stream.seek(0, os.SEEK_END) != told["bytes"]:
                         return None
                     stream.seek(-22, os.SEEK_END)  # of a zip archive; it was not written to its end without
-                    if stream.read(4) != END:
+                    if stream.read(4) != END_RECORD:
                         return None
         except (FileNotFoundError, NotADirectoryError, ValueError, AttributeError, KeyError, TypeError, RecursionError):
             return None
