@@ -1,13 +1,12 @@
-"""Where a page says `<!-- numbers of the papers -->`: every number that they print beside ours, out of results/."""
+"""Tables of the numbers that the papers print beside ours, in place of `<!-- numbers of the papers -->`."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from itertools import groupby
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from scripts.papers.reproduced import Printed, read
+from scripts.papers.reproduced import read_tables
 
 __all__ = ["MARK", "listed", "setup"]
 
@@ -15,20 +14,19 @@ MARK = "<!-- numbers of the papers -->"
 RESULTS = Path(__file__).resolve().parents[1] / "results"
 
 
-def listed(found: Sequence[Printed]) -> str:
-    """Markdown: how many are reproduced, and for each paper a table and, below it, why what differs does."""
-    count = sum(one.reproduced for one in found)
-    parts = [f"**{count} of {len(found)} numbers are reproduced.**\n"]
-    for paper, group in groupby(found, key=lambda one: one.paper):
-        numbers = [*group]
-        reasons = list(dict.fromkeys(one.why for one in numbers if not one.reproduced))
+def listed(tables: Mapping[str, Sequence[Mapping[str, str]]]) -> str:
+    """Markdown of the tables of all papers: the number of reproduced values, the values, and reasons of differences."""
+    compared = [row for rows in tables.values() for row in rows if row["ours"]]
+    count = sum(row["reproduced"] == "yes" for row in compared)
+    parts = [f"**{count} of {len(compared)} numbers are reproduced.** Durations are not listed.\n"]
+    for paper, rows in tables.items():
+        reasons = list(dict.fromkeys(row["why"] for row in rows if row["why"]))
         parts.append(f"### {paper}\n\n| | | printed | ours | reproduced |\n|---|---|---:|---:|---|")
-        for one in numbers:
-            verdict = "yes" if one.reproduced else f"no ({reasons.index(one.why) + 1})"
-            parts.append(f"| {one.place} | {one.quantity} | {one.printed:.6g} | {one.ours:.4g} | {verdict} |")
-        parts.append("")
-        parts += [f"{number}. {why}." for number, why in enumerate(reasons, 1)]
-        parts.append("")
+        for row in rows:
+            verdict = f"{row['reproduced']} ({reasons.index(row['why']) + 1})" if row["why"] else row["reproduced"]
+            cells = (row["place"], row["quantity"], row["printed"], row["ours"], verdict.strip())
+            parts.append(f"| {' | '.join(cells)} |")
+        parts += ["", *(f"{number}. {why}." for number, why in enumerate(reasons, 1)), ""]
     return "\n".join(parts)
 
 
@@ -37,10 +35,7 @@ def setup(app: Any) -> dict[str, bool]:
 
     def fill(app: Any, name: str, content: list[str]) -> None:
         if MARK in content[0]:
-            found, missing = read(RESULTS)
-            if missing:
-                raise RuntimeError(f"{name}: {'; '.join(missing)}")
-            content[0] = content[0].replace(MARK, listed(found))
+            content[0] = content[0].replace(MARK, listed(read_tables(RESULTS)))
 
     app.connect("source-read", fill)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ocp.console import interruptible, time_left, time_limited
-from ocp.direct.assembly import Fragment
+from ocp.direct.assembly import Transcription
 from ocp.direct.mesh import check_meshed
 from ocp.direct.prepared import DirectMethod
 from ocp.errors import SolveError, checked_mapping, checked_time_limit
@@ -82,15 +82,15 @@ def tighten(
     check_meshed("tighten", method, tolerance)
     with time_limited(checked_time_limit(time_limit)):
         prepared = method.prepare(problem, solver=solver, options=options)
-        form, fragment = prepared.formulation, prepared.fragment
+        form, transcription = prepared.formulation, prepared.transcription
         p = form.parameter_vector(checked_mapping("tighten: parameters", parameters))
         bounds = form.bound_values(p)
         index = np.concatenate([form.bounds.places[kind] for kind in ("state", "control", "path")])
         low, high = bounds[0][index], bounds[1][index]
         with np.errstate(invalid="ignore"):
             max_tightening = np.where(np.isfinite(high - low), (high - low) / 2, np.inf)
-        places = _places(form, fragment, shared=method.control == "linear")
-        tightening = np.zeros((2, len(fragment.mesh) - 1, len(index)))
+        places = _places(form, transcription, shared=method.control == "linear")
+        tightening = np.zeros((2, len(transcription.mesh) - 1, len(index)))
         move, previous = np.zeros_like(tightening), np.zeros_like(tightening)
         followed = np.full_like(tightening, SETTINGS.followed)
         best: tuple[Solution, str, dict[str, Any]] | None = None  # a plan, and its largest excess
@@ -158,7 +158,7 @@ def _worst(form: Formulation, beyond: np.ndarray, times: np.ndarray) -> tuple[st
 
 
 def _places(
-    form: Formulation, fragment: Fragment, shared: bool
+    form: Formulation, transcription: Transcription, shared: bool
 ) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Map variables ("x") and rows ("g") to states, controls or path rows (else -1) and to their intervals.
 
@@ -173,16 +173,16 @@ def _places(
     unshared = (
         np.concatenate([np.zeros(form.nx, bool), np.ones(form.nu, bool), form.path.uses_control, [False]]) & ~shared
     )
-    places, last = {}, len(fragment.mesh) - 2
+    places, last = {}, len(transcription.mesh) - 2
     for kind, index, at in (
-        ("x", fragment.variable_bounds, fragment.variable_fraction),
-        ("g", fragment.row_bounds, fragment.row_fractions),
+        ("x", transcription.variable_bounds, transcription.variable_fraction),
+        ("g", transcription.row_bounds, transcription.row_fractions),
     ):
         left, right = (
-            np.clip(np.searchsorted(fragment.mesh, at + shift) - 1, 0, last)
+            np.clip(np.searchsorted(transcription.mesh, at + shift) - 1, 0, last)
             for shift in (-NODE_TOLERANCE, NODE_TOLERANCE)
         )
-        own = left if kind == "x" else np.clip(fragment.row_stages, 0, last)
+        own = left if kind == "x" else np.clip(transcription.row_stages, 0, last)
         entry = entry_of[index]
         places[kind] = entry, np.where(unshared[entry], own, left), np.where(unshared[entry], own, right)
     return places

@@ -1,7 +1,7 @@
 """Every paper script, one after the other: `python scripts/reproduce.py [--out results] [--only free_floating]`.
 
 A script that fails does not stop the others; the exit status is 1 when any failed. Ends with every number that the
-papers print of their results, ours, and why those differ that do; it is also OUT/reproduced.csv.
+papers print of their results, ours, and why those differ that do; of each paper they are also OUT/PAPER/numbers.csv.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     outcomes = [reproduce(name, PAPERS[name], options.out) for name in progress(options.only or PAPERS, "papers")]
     print("\n" + text_table(outcomes, digits=3))
     found, missing = reproduced.read(options.out, options.only or [*PAPERS])
-    reproduced.write_table(options.out, found)
+    reproduced.write_tables(options.out, found)
     if found or missing:
         print("\n" + reproduced.text(found, missing) + "\n")
     failed = [outcome["paper"] for outcome in outcomes if outcome["status"] != "ok"]

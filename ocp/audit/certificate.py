@@ -1,4 +1,4 @@
-"""One certificate for several solutions of one problem: do independent methods agree?"""
+"""Certificate: do several solutions of one problem, by independent methods, agree?"""
 
 from __future__ import annotations
 
@@ -22,15 +22,20 @@ __all__ = ["Certificate", "Comparison", "certificate"]
 
 @dataclass(frozen=True)
 class Comparison:
-    """A solution against the reference, each difference relative to the size of the reference's own.
+    """Differences of a solution from the reference, relative to the size of the reference.
 
-    The Hamiltonian is judged by the size of its parts, the cost by that of the running cost too: both may vanish.
+    The Hamiltonian is judged by the size of its parts, and the cost also by that of the running cost, since both may
+    vanish.
 
     Attributes:
-        name: The solution. passed: Whether its audit passed.
-        cost, horizon: Values. cost_difference, horizon_difference: relative.
-        state, costate: Largest difference over time. control: its mean over time, for where a control jumps two
-            solutions that switch a moment apart differ by the whole jump. hamiltonian: mean over time.
+        name: Name of the solution.
+        passed: Whether its audit passed.
+        cost, horizon: Values.
+        cost_difference, horizon_difference: Relative differences.
+        state, costate: Largest difference over time.
+        control: Mean difference over time: at a jump, solutions with slightly different switching times differ by the
+            full jump.
+        hamiltonian: Mean difference over time.
     """
 
     name: str
@@ -53,12 +58,13 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Certificate:
-    """What comparing several solutions of one problem found.
+    """Comparison of several solutions of one problem.
 
     Attributes:
-        problem: Its name. reference: Name of the solution that the others are compared with.
+        problem: Name of the problem.
+        reference: Name of the solution that the others are compared with.
         comparisons: One for each solution, the reference first.
-        tolerance: Largest difference, relative, at which solutions agree.
+        tolerance: Largest relative difference at which solutions agree.
         audits: The audit of each solution by name.
     """
 
@@ -70,18 +76,21 @@ class Certificate:
 
     @property
     def passed(self) -> bool:
-        """Whether all solutions agree and every one passed its audit."""
+        """Whether all solutions agree and every audit passed."""
         return all(c.passed and c.worst <= self.tolerance for c in self.comparisons)
 
     @property
     def verdict(self) -> str:
-        """One sentence."""
-        apart = [c.name for c in self.comparisons if not c.worst <= self.tolerance]
+        """The result in one sentence."""
+        different = [c.name for c in self.comparisons if not c.worst <= self.tolerance]
         failed = [c.name for c in self.comparisons if not c.passed]
         if self.passed:
             return f"{len(self.comparisons)} solutions agree to {self.tolerance:g}, and each passed its audit"
-        parts = [f"{', '.join(apart)} differ from {self.reference} by more than {self.tolerance:g}"] if apart else []
-        parts += [f"the audit of {', '.join(failed)} failed"] if failed else []
+        parts = []
+        if different:
+            parts.append(f"{', '.join(different)} differ from {self.reference} by more than {self.tolerance:g}")
+        if failed:
+            parts.append(f"the audit of {', '.join(failed)} failed")
         return "; ".join(parts)
 
     def __repr__(self) -> str:
@@ -108,12 +117,12 @@ def certificate(
 
     Args:
         problem: The problem that all of them solve.
-        solutions: By name, or a sequence named after their methods. The reference is the first indirect one, else the
-            first.
-        tolerance: Largest relative difference at which they agree.
+        solutions: By name, or a sequence named after the methods. The reference is the first indirect solution, else
+            the first.
+        tolerance: Largest relative difference at which solutions agree.
 
     Raises:
-        ProblemError: Fewer than two solutions, one of another problem, or solved at other parameters.
+        ProblemError: Fewer than two solutions, a solution of another problem, or different parameters.
     """
     checked_positive("certificate: tolerance", tolerance)
     named = checked_solutions(solutions)
@@ -131,15 +140,16 @@ def certificate(
             raise ProblemError(f"plans {reference!r} and {name!r} were solved at different parameters", name=name)
     audits = {name: audit(problem, named[name]) for name in order}
     first = named[reference]
-    spread = (np.arange(400) + 0.5) / 400
+    fractions = (np.arange(400) + 0.5) / 400
     comparisons = []
     for name in order:
         solution = named[name]
-        own = solution.t[:-1] / solution.horizon  # costates are best where they are reported
-        (mine, _, _), (other, parts, running) = (sample(form, plan, p, spread, own) for plan in (solution, first))
-        off = [difference(a, b) for a, b in zip(mine[:3], other[:3], strict=True)]
-        off.append(np.abs(mine[3] - other[3]) / (parts or 1.0))
-        size = max(abs(first.cost), running * first.horizon) or 1.0
+        reported = solution.t[:-1] / solution.horizon  # costates are best where they are reported
+        values, _, _ = sample(form, solution, p, fractions, reported)
+        expected, hamiltonian_size, running_size = sample(form, first, p, fractions, reported)
+        differences = [difference(a, b) for a, b in zip(values[:3], expected[:3], strict=True)]
+        differences.append(np.abs(values[3] - expected[3]) / (hamiltonian_size or 1.0))
+        size = max(abs(first.cost), running_size * first.horizon) or 1.0
         comparisons.append(
             Comparison(
                 name,
@@ -148,17 +158,17 @@ def certificate(
                 solution.horizon,
                 abs(solution.cost - first.cost) / size,
                 abs(solution.horizon - first.horizon) / first.horizon,
-                float(np.max(off[0], initial=0.0)),
-                float(np.max(np.mean(off[1], axis=0), initial=0.0)),
-                float(np.max(off[2], initial=0.0)),
-                float(np.mean(off[3])),
+                float(np.max(differences[0], initial=0.0)),
+                float(np.max(np.mean(differences[1], axis=0), initial=0.0)),
+                float(np.max(differences[2], initial=0.0)),
+                float(np.mean(differences[3])),
             )
         )
     return Certificate(problem.name, reference, tuple(comparisons), tolerance, audits)
 
 
 def checked_solutions(solutions: Any) -> dict[str, Solution]:
-    """Solutions by name, those of a sequence by their methods; ProblemError where something else is among them."""
+    """Return solutions by name, those of a sequence by their methods; raise ProblemError for anything else."""
     if not isinstance(solutions, Mapping):
         return name_by_method(checked_each("certificate: solutions", solutions, Solution))
     named = checked_mapping("certificate: solutions", solutions)
@@ -167,16 +177,16 @@ def checked_solutions(solutions: Any) -> dict[str, Solution]:
 
 
 def name_by_method(solutions: Sequence[Solution]) -> dict[str, Solution]:
-    """Names such as ``Collocation legendre-3, 50``, numbered where they repeat."""
+    """Return names such as ``Collocation legendre-3, 50``, numbered if they repeat."""
     named: dict[str, Solution] = {}
     for solution in solutions:
-        m = solution.method
+        method = solution.method
         detail = {
-            "Collocation": f" {m.get('scheme')}-{m.get('degree')}, {m.get('intervals')}",
-            "MultipleShooting": f" {m.get('integrator')} {m.get('control')}, {m.get('intervals')}",
-            "Indirect": f" {m.get('shooting')}, {m.get('segments')}",
-        }.get(m["type"], "")
-        name = base = m["type"] + detail
+            "Collocation": f" {method.get('scheme')}-{method.get('degree')}, {method.get('intervals')}",
+            "MultipleShooting": f" {method.get('integrator')} {method.get('control')}, {method.get('intervals')}",
+            "Indirect": f" {method.get('shooting')}, {method.get('segments')}",
+        }.get(method["type"], "")
+        name = base = method["type"] + detail
         count = 1
         while name in named:
             count += 1
@@ -186,25 +196,25 @@ def name_by_method(solutions: Sequence[Solution]) -> dict[str, Solution]:
 
 
 def sample(
-    form: Formulation, solution: Solution, p: np.ndarray, spread: np.ndarray, own: np.ndarray
+    form: Formulation, solution: Solution, p: np.ndarray, fractions: np.ndarray, reported: np.ndarray
 ) -> tuple[list[np.ndarray], float, float]:
-    """States and controls at fractions ``spread``, costates and Hamiltonian at fractions ``own``, and two sizes.
+    """Return states and controls at ``fractions``, costates and Hamiltonian at ``reported`` fractions, and two sizes.
 
-    The sizes are the largest sum of the sizes of the Hamiltonian's parts, for H itself vanishes where the horizon is
-    free, and the mean size of the running cost, for the cost may vanish as well.
+    The sizes are the largest sum of the absolute parts of the Hamiltonian, which itself vanishes for a free horizon,
+    and the mean absolute running cost.
     """
-    lam = solution.costate_interpolant(own)
+    lam = solution.costate_interpolant(reported)
     symbol = form.sym("lam", form.nx)
-    x, u = solution.state_interpolant(own), solution.control_interpolant(own)
-    parts = [ca.vertcat(form.running, symbol * form.f)]
-    found = form.sampled(parts, x, u, own * solution.horizon, solution.horizon, p, (symbol, lam))[0]
-    hamiltonian, size = found.sum(axis=1), float(np.max(np.abs(found).sum(axis=1), initial=0.0))
-    x, u = solution.state_interpolant(spread), solution.control_interpolant(spread)
-    running = form.sampled([form.running], x, u, spread * solution.horizon, solution.horizon, p)[0]
+    x, u = solution.state_interpolant(reported), solution.control_interpolant(reported)
+    expressions = [ca.vertcat(form.running, symbol * form.f)]
+    values = form.sampled(expressions, x, u, reported * solution.horizon, solution.horizon, p, (symbol, lam))[0]
+    hamiltonian, size = values.sum(axis=1), float(np.max(np.abs(values).sum(axis=1), initial=0.0))
+    x, u = solution.state_interpolant(fractions), solution.control_interpolant(fractions)
+    running = form.sampled([form.running], x, u, fractions * solution.horizon, solution.horizon, p)[0]
     return [x, u, lam, hamiltonian], size, float(np.mean(np.abs(running)))
 
 
 def difference(values: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """Differences relative to the largest entry of the reference."""
+    """Return differences relative to the largest entry of the reference."""
     size = float(np.max(np.abs(reference), initial=0.0))
     return np.asarray(np.abs(values - reference) / (size if size > 0 else 1.0))

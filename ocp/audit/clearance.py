@@ -1,14 +1,15 @@
-"""Proof that bodies stay apart at every time, between the samples of a plan too.
+"""Verified clearance: lower bounds of the distances of bodies along a motion at all times, also between samples.
 
-For a fixed direction n the gap of two hulls is the least of the gaps of their points, each of which bends over time by
-no more than the points' acceleration (:mod:`ocp.problem.separation`). Between two times h apart it is hence at least
+For a fixed direction n the gap between two convex hulls is the smallest gap between their points, and the curvature of
+each point's gap over time is bounded by the acceleration of the point (:mod:`ocp.problem.separation`). On an interval
+of length h the gap is therefore at least
 
-    min(gap at the one, gap at the other) - h^2 / 8 acceleration,
+    min(gap at the start, gap at the end) - h^2 / 8 acceleration,
 
-and the distance is no less than the gap. The direction is that in which the bodies are nearest in the middle. Of a pair
-that others cover the same is said of each of them, and the least of it is as good. Where the bound does not settle it,
-the time between is halved. The plan's own polynomials say how fast its states change. What moves by time alone is
-bounded over the interval itself, kinks and jumps included (:mod:`ocp.problem.enclosures`).
+and the distance is at least the gap. The direction n is that of the closest points at the middle of the interval. A
+mesh that several hulls cover is treated pair by pair, and the smallest distance counts. An interval that the bound
+leaves undetermined is halved. The polynomials of the plan bound the rates of its states. Motion prescribed as a
+function of time is bounded over each whole interval, kinks and jumps included (:mod:`ocp.problem.enclosures`).
 """
 
 from __future__ import annotations
@@ -31,31 +32,29 @@ from ocp.solution import Solution, check_variables_match, match_order
 
 __all__ = [
     "Clearance",
-    "Nearest",
-    "ProofSettings",
+    "ClosestPair",
     "Track",
     "clearance",
     "clearance_along",
-    "nearest_along",
-    "nearest_at",
-    "placements_along",
+    "closest_pairs_along",
+    "separation_frames",
 ]
 
-SHOWN = 4
-"""Pairs left out by assumption that are named in a line; all are in `Clearance.assumed`."""
+MAX_PRINTED = 4
+"""Number of pairs left out by assumption that a line of text names; `Clearance.assumed` holds all."""
 
 
 @dataclass(frozen=True)
 class ProofSettings:
-    """How far the halving of intervals goes.
+    """Resolution and limits of the interval halving.
 
     Attributes:
-        share: Of what the least distance is more or less than is asked: it is known to so much.
-        finest: A distance is known to so much where less is asked, m.
-        halvings: Of an interval of the mesh: 1 s becomes 15 ns.
-        most_intervals: Of pairs that are bounded, beyond which what is left is not proven.
-        first_blocks: Intervals of the whole time that are bounded first, at most: of finer pieces several together.
-        first_times: At which the balls about bodies are compared first, at most.
+        share: Relative accuracy of the difference between the smallest and the required distance.
+        finest: Absolute accuracy of a distance, m, where that difference is smaller.
+        halvings: Largest number of halvings of a mesh interval: 1 s becomes 15 ns.
+        most_intervals: Largest number of pair intervals that are bounded. The remaining ones are not proven.
+        first_blocks: Largest number of intervals in the first pass. Finer meshes are combined in blocks.
+        first_times: Largest number of times at which bounding balls are compared in the first pass.
     """
 
     share: float = 0.02
@@ -67,15 +66,16 @@ class ProofSettings:
 
 
 @dataclass(frozen=True)
-class Nearest:
-    """How near two bodies come.
+class ClosestPair:
+    """The closest approach of two bodies.
 
     Attributes:
-        bodies: Their names.
-        least: A lower bound of their distance at all times, m; negative where they overlap.
-        distance: The least found, at a time. m. time: That time, s.
-        points: There, in world, the nearest points of what the radii swell. Shape (2, 3), m.
-        asked: How far they have to be apart, m.
+        bodies: Names of the two bodies.
+        least: Lower bound of their distance at all times, m; negative if they overlap.
+        distance: Smallest distance computed at a time, m.
+        time: That time, s.
+        points: Closest points of the two hull cores at that time, in world. Shape (2, 3), m.
+        required: Required distance, m.
     """
 
     bodies: tuple[str, str]
@@ -83,30 +83,30 @@ class Nearest:
     distance: float
     time: float
     points: np.ndarray
-    asked: float
+    required: float
 
     @property
     def missed(self) -> float:
-        """By how much more the bodies may come near each other than they are allowed to, m."""
-        return max(self.asked - self.least, 0.0)
+        """Largest possible shortfall of the distance below the required one, m."""
+        return max(self.required - self.least, 0.0)
 
     def __str__(self) -> str:
-        one, other = self.bodies
-        how = f"{self.distance:.4g} m apart" if self.distance >= 0 else f"overlap by {-self.distance:.4g} m"
-        return f"{one} and {other} {'are ' if self.distance >= 0 else ''}{how} at {self.time:.4g} s"
+        first, second = self.bodies
+        distance = f"{self.distance:.4g} m apart" if self.distance >= 0 else f"overlap by {-self.distance:.4g} m"
+        return f"{first} and {second} {'are ' if self.distance >= 0 else ''}{distance} at {self.time:.4g} s"
 
 
 class Track(NamedTuple):
-    """How bodies move.
+    """The motion of the frames that carry the bodies.
 
     Attributes:
-        breaks: Where its N pieces begin and end, from 0 to 1, fractions of the horizon. Shape (N + 1,).
-        horizon: s.
-        rates, seconds: Bounds of the sizes of the first and second derivatives in time of what moves the bodies, in
-            every piece. Shape (N, k).
-        smooth: Whether the rates do not jump from piece to piece.
-        frames: Fractions (M,) to the frames there.
-        prescribed: What time alone moves; None where that is nothing.
+        breaks: Ends of the N polynomial segments, as fractions of the horizon from 0 to 1. Shape (N + 1,).
+        horizon: Duration, s.
+        rates, seconds: Bounds of the absolute first and second time derivatives of the states that move the bodies, for
+            each segment. Shape (N, k).
+        smooth: Whether the rates are continuous from segment to segment.
+        frames: Function from fractions (M,) to the frames there.
+        prescribed: Motion that depends on time alone, or None.
     """
 
     breaks: np.ndarray
@@ -120,29 +120,29 @@ class Track(NamedTuple):
 
 @dataclass(frozen=True)
 class Clearance:
-    """What was proven of a separation.
+    """Result of a clearance proof.
 
     Attributes:
-        name: Of the separation.
-        pairs: How near each pair comes: those that miss what is asked, or may, the worst first; then by what was found,
-            the nearest to what is allowed first. Of that one the bound is close, of others it says that they are no
-            nearer than that one.
-        settled: Whether every pair's least distance was told from what is asked, one way or the other.
-        looked: Number of intervals of pairs that were looked at.
-        reason: Why it is not settled, where a motion that time prescribes jumps or has no bound; else empty.
-        assumed: Pairs of bodies that were not looked at, by an assumption of the separation, and why.
+        name: Name of the separation.
+        pairs: Closest approach of each pair. Pairs that violate the required distance, or may, come first, the worst
+            one first. The others follow by their margin. The bound of the first pair is tight; those of the others only
+            show that they are no closer to their required distance.
+        settled: Whether the proof is conclusive for every pair.
+        n_intervals: Number of intervals of pairs that were checked.
+        reason: Why the proof is inconclusive, if a prescribed motion jumps or has no bound; else empty.
+        assumed: Pairs of bodies that the separation leaves out by assumption, with the reason.
     """
 
     name: str
-    pairs: tuple[Nearest, ...]
+    pairs: tuple[ClosestPair, ...]
     settled: bool
-    looked: int
+    n_intervals: int
     reason: str = ""
     assumed: Mapping[str, str] = field(default_factory=dict)
 
     @property
-    def worst(self) -> Nearest | None:
-        """The pair that comes nearest to what it is allowed, or is beyond it; None where there are no pairs."""
+    def worst(self) -> ClosestPair | None:
+        """The pair with the smallest margin; None if there are no pairs."""
         return self.pairs[0] if self.pairs else None
 
     def __str__(self) -> str:
@@ -154,44 +154,39 @@ class Clearance:
 
     @property
     def _assumptions(self) -> list[str]:
-        """What was not looked at, in words; nothing where all was."""
-        some = [f"{pair} ({why})" for pair, why in list(self.assumed.items())[:SHOWN]]
-        more = [f"{len(self.assumed) - SHOWN} more"] if len(self.assumed) > SHOWN else []
-        return [f"left out by assumption: {', '.join([*some, *more])}"] if some else []
+        """Return a text on the pairs left out by assumption, in a list; empty if there are none."""
+        first = [f"{pair} ({why})" for pair, why in list(self.assumed.items())[:MAX_PRINTED]]
+        more = [f"{len(self.assumed) - MAX_PRINTED} more"] if len(self.assumed) > MAX_PRINTED else []
+        return [f"left out by assumption: {', '.join([*first, *more])}"] if first else []
 
 
 def clearance(form: Formulation, apart: Separation, solution: Solution, p: np.ndarray) -> Clearance:
-    """How near each pair of bodies comes along a plan, at any time.
+    """Bound the distance of each pair of bodies along a plan at all times.
 
     Args:
-        form: Of the problem. apart: A separation of it. solution: The plan, its states in the order of the problem.
+        form: Formulation of the problem.
+        apart: One of its separations.
+        solution: The plan, with its states in the order of the problem.
         p: Parameters. Shape (np,).
     """
-    return clearance_along(apart, _track_of(form, apart, solution, p)) if len(apart) else clearance_along(apart, None)
+    return clearance_along(apart, _track_of(form, apart, solution, p) if len(apart) else None)
 
 
 def clearance_along(apart: Separation, track: Track | None, settings: ProofSettings = ProofSettings()) -> Clearance:
-    """How near each pair of bodies comes along any track, at any time; no track is needed where there are no pairs."""
+    """Bound the distance of each pair of bodies along a track at all times; without pairs the track may be None."""
     if not len(apart) or track is None:
         return Clearance(apart.name, (), True, 0, assumed=apart.assumed)
     return _Search(apart, track, settings).run()
 
 
-def nearest_at(problem: Problem, solution: Solution, time: float) -> Nearest | None:
-    """The two bodies of a plan that are nearest to each other at a time (s); None where none have to stay apart.
-
-    Raises:
-        ProblemError: The plan does not belong to the problem.
-    """
-    found = nearest_along(problem, solution, [time])
-    return found[0] if found else None
-
-
-def nearest_along(problem: Problem, solution: Solution, times: Iterable[float], suffix: str = "") -> list[Nearest]:
-    """As `nearest_at` at several times; nothing where none have to stay apart.
+def closest_pairs_along(
+    problem: Problem, solution: Solution, times: Iterable[float], suffix: str = ""
+) -> list[ClosestPair]:
+    """Return the closest pair of bodies of a plan at each of the times (s); empty if the problem separates no bodies.
 
     Args:
-        suffix: That the names of the states have which move the bodies: of a plan whose parts stand side by side, one.
+        suffix: Suffix of the names of the states that move the bodies: selects one part of a plan whose parts are
+            stored side by side.
 
     Raises:
         ProblemError: The plan does not belong to the problem.
@@ -200,17 +195,17 @@ def nearest_along(problem: Problem, solution: Solution, times: Iterable[float], 
     if not searches:
         return []
     return [
-        min((near for search in searches for near in search.at(time)), key=lambda near: near.distance) for time in times
+        min((pair for search in searches for pair in search.at(time)), key=lambda pair: pair.distance) for time in times
     ]
 
 
-def placements_along(
+def separation_frames(
     problem: Problem, solution: Solution, times: np.ndarray, suffix: str = ""
 ) -> list[tuple[Separation, Frames]]:
-    """Where the frames are at times (K,), s, on which bodies ride that have to stay apart, of each separation.
+    """Return each separation of a problem with the frames of its bodies at times (K,), s.
 
     Args:
-        suffix: As of `nearest_along`.
+        suffix: As in `closest_pairs_along`.
 
     Raises:
         ProblemError: The plan does not belong to the problem.
@@ -220,16 +215,16 @@ def placements_along(
 
 
 def _tracks(problem: Problem, solution: Solution, suffix: str) -> list[tuple[Separation, Track]]:
-    """Of all separations whose movers' names end so, that have pairs."""
+    """Return the separations that have pairs and whose moving states end with a suffix, each with its track."""
     form = Formulation.of(problem)
     check_variables_match(form, solution)
     solution, p = match_order(form, solution), form.parameter_vector(solution.parameters)
-    moved = [one for one in problem.declared.apart.values() if all(name.endswith(suffix) for name in one.movers)]
-    return [(one, _track_of(form, one, solution, p)) for one in moved if len(one)]
+    moving = [each for each in problem.declared.apart.values() if all(name.endswith(suffix) for name in each.movers)]
+    return [(each, _track_of(form, each, solution, p)) for each in moving if len(each)]
 
 
 def _track_of(form: Formulation, apart: Separation, solution: Solution, p: np.ndarray) -> Track:
-    """Of a plan."""
+    """Return the motion of the bodies of a separation along a plan."""
     columns = [k for name in apart.movers for k in range(*form.states[name].indices(form.nx))]
     curve, horizon = solution.state_interpolant, solution.horizon
     outputs, kept = [form.separations[apart.name]], ("placements", apart.name)
@@ -239,14 +234,14 @@ def _track_of(form: Formulation, apart: Separation, solution: Solution, p: np.nd
         return frames_of(form.sampled(outputs, curve(at), controls, at * horizon, horizon, p, cache_as=kept)[0])
 
     prescribed = PrescribedMotion(apart, form.separations[apart.name], form.t, [form.p], [p])
-    return Track(curve.breaks, horizon, *_fastest(curve, columns, horizon), False, frames, prescribed)
+    return Track(curve.breaks, horizon, *_rate_bounds(curve, columns, horizon), False, frames, prescribed)
 
 
 class _Search:
-    """The halving of intervals of pairs until each is settled.
+    """Bisection of the time intervals of all pairs until each is decided.
 
-    At a level l >= 0 an interval is a block of 2^l pieces, below it a share 2^l of one: begin and end are numbers of
-    pieces, index 2^l and (index + 1) 2^l.
+    At level l >= 0 an interval is a block of 2^l segments; at level l < 0 it is the share 2^l of one segment. The
+    interval ``index`` begins at segment index 2^l and ends at (index + 1) 2^l.
     """
 
     def __init__(self, apart: Separation, track: Track, settings: ProofSettings = ProofSettings()) -> None:
@@ -256,7 +251,7 @@ class _Search:
         self.top = max(0, int(np.ceil(np.log2(self.pieces / self.settings.first_blocks))))
         self.fastest = [(track.rates, track.seconds)]
         for level in range(self.top):
-            rates, seconds = (_of_two(values) for values in self.fastest[level])
+            rates, seconds = (_pairwise_maximum(values) for values in self.fastest[level])
             self.fastest.append((rates, seconds if track.smooth else np.full_like(seconds, np.inf)))
         self.bodies = BodyPairs(tuple(apart.hulls.values()), apart.pairs, apart.covers)
         n = len(apart)
@@ -264,59 +259,59 @@ class _Search:
 
     def run(self) -> Clearance:
         n, level = len(self.apart), self.top
-        self._look_where_balls_are_nearest()
+        self._evaluate_at_closest_balls()
         blocks = np.arange(-(-self.pieces >> level) if level else self.pieces)
         pair, block = (part.ravel() for part in np.meshgrid(np.arange(n), blocks, indexing="ij"))
-        lower, looked, settled = self.best.copy(), n, True
+        lower, checked, settled = self.best.copy(), n, True
         while True:
             check_time()
-            looked += len(pair)
-            bound, enough = self._bounds(pair, block, level)
-            left = ~(bound >= enough[pair])
-            last = level == -self.settings.halvings or looked + 2 * left.sum() > self.settings.most_intervals
-            told = np.ones_like(left) if last else ~left
-            np.minimum.at(lower, pair[told], bound[told])
-            settled = not left.any()
+            checked += len(pair)
+            bound, sufficient = self._bounds(pair, block, level)
+            undecided = ~(bound >= sufficient[pair])
+            last = level == -self.settings.halvings or checked + 2 * undecided.sum() > self.settings.most_intervals
+            final = np.ones_like(undecided) if last else ~undecided
+            np.minimum.at(lower, pair[final], bound[final])
+            settled = not undecided.any()
             if settled or last:
                 break
             level -= 1
-            pair, block = np.tile(pair[left], 2), np.concatenate([2 * block[left], 2 * block[left] + 1])
+            pair, block = np.tile(pair[undecided], 2), np.concatenate([2 * block[undecided], 2 * block[undecided] + 1])
             if level >= 0:
                 inside = block << level < self.pieces
                 pair, block = pair[inside], block[inside]
-        found = self._found(np.minimum(lower, self.best))
-        found.sort(key=lambda one: (-one.missed, one.distance - one.asked))
-        reason = "" if settled else self._reason(pair[left], block[left], level)
-        return Clearance(self.apart.name, tuple(found), settled, looked, reason, self.apart.assumed)
+        closest = self._closest(np.minimum(lower, self.best))
+        closest.sort(key=lambda pair: (-pair.missed, pair.distance - pair.required))
+        reason = "" if settled else self._reason(pair[undecided], block[undecided], level)
+        return Clearance(self.apart.name, tuple(closest), settled, checked, reason, self.apart.assumed)
 
     def _reason(self, pair: np.ndarray, block: np.ndarray, level: int) -> str:
-        """What is told of intervals that are left, where a motion that time prescribes is why."""
+        """Return why intervals stay undecided, if a prescribed motion is the cause; else an empty text."""
         begin, end = (self._fraction(block + k, level) * self.track.horizon for k in (0, 1))
         if self.track.prescribed is None:
             return ""
-        stray, _ = self.track.prescribed.bounds(pair, begin, end)
-        k = int(stray.argmax())
-        if not stray[k] > self.settings.finest:
+        jump, _ = self.track.prescribed.bounds(pair, begin, end)
+        k = int(jump.argmax())
+        if not jump[k] > self.settings.finest:
             return ""
         names = " and ".join(self.apart.labels[pair[k]])
-        how = f"jumps by up to {stray[k]:.3g} m" if np.isfinite(stray[k]) else "has no bound"
-        return f"the prescribed motion between {names} {how} at {begin[k]:.6g} s"
+        cause = f"jumps by up to {jump[k]:.3g} m" if np.isfinite(jump[k]) else "has no bound"
+        return f"the prescribed motion between {names} {cause} at {begin[k]:.6g} s"
 
-    def at(self, time: float) -> list[Nearest]:
-        """Each pair at one time, s."""
+    def at(self, time: float) -> list[ClosestPair]:
+        """Return the distance of each pair at one time, s."""
         self.best[:] = np.inf
-        self._look(np.full(len(self.apart), np.clip(time / self.track.horizon, 0.0, 1.0)))
-        return self._found(self.best)
+        self._evaluate(np.full(len(self.apart), np.clip(time / self.track.horizon, 0.0, 1.0)))
+        return self._closest(self.best)
 
-    def _found(self, least: np.ndarray) -> list[Nearest]:
-        """What was found of each pair, with lower bounds of the distances."""
+    def _closest(self, bounds: np.ndarray) -> list[ClosestPair]:
+        """Return the closest approach of each pair computed so far, with the given lower bounds (n,), m."""
         rotations, positions = self.track.frames(self.when)
-        each, seen = np.arange(len(self.apart)), self.apart.pairs[:, 2]
-        points = np.einsum("nij,nkj->nki", rotations[each, seen], self.points) + positions[each, seen][:, None]
+        each, frame = np.arange(len(self.apart)), self.apart.pairs[:, 2]
+        points = np.einsum("nij,nkj->nki", rotations[each, frame], self.points) + positions[each, frame][:, None]
         return [
-            Nearest(
+            ClosestPair(
                 bodies,
-                float(least[i]),
+                float(bounds[i]),
                 float(self.best[i]),
                 float(self.when[i] * self.track.horizon),
                 points[i],
@@ -325,86 +320,90 @@ class _Search:
             for i, bodies in enumerate(self.apart.labels)
         ]
 
-    def _look_where_balls_are_nearest(self) -> None:
-        """At each pair at the node, or middle of an interval, where the balls about its bodies are nearest."""
+    def _evaluate_at_closest_balls(self) -> None:
+        """Evaluate each pair at the node or interval middle where the bounding balls of its bodies are closest."""
         times = np.union1d(self.breaks, (self.breaks[:-1] + self.breaks[1:]) / 2)
         times = times[:: -(-len(times) // self.settings.first_times)]
         n, frames = len(self.apart), self.track.frames(times)
         pair, at = (part.ravel() for part in np.meshgrid(np.arange(n), np.arange(len(times)), indexing="ij"))
-        self._look(times[self.bodies.balls(frames, at, pair).reshape(n, -1).argmin(axis=1)])
+        self._evaluate(times[self.bodies.balls(frames, at, pair).reshape(n, -1).argmin(axis=1)])
 
-    def _look(self, when: np.ndarray) -> None:
-        """At each pair at one time (n,), a fraction of the horizon."""
+    def _evaluate(self, when: np.ndarray) -> None:
+        """Evaluate the distance of each pair at one time of its own (n,), as a fraction of the horizon."""
         pair = np.arange(len(self.apart))
         _, gap, points = self.bodies.nearest(self.track.frames(when), pair, pair)
         self._keep(pair, gap, when, points)
 
-    def _enough(self) -> np.ndarray:
-        """Lower bounds of each pair's distance with which it is settled. Shape (n,), m.
+    def _sufficient_bounds(self) -> np.ndarray:
+        """Return the lower bound at which each pair counts as decided. Shape (n,), m.
 
-        The least is known to a share of itself of the pair that is nearest to what is asked, or nearer; of others it is
-        known that they are no nearer than that pair.
+        The pair with the smallest margin is resolved to a relative accuracy. For the others it suffices that their
+        margins are no smaller.
         """
-        spare = self.best - self.apart.least
-        least = max(float(spare.min()), 0.0)
+        margin = self.best - self.apart.least
+        smallest = max(float(margin.min()), 0.0)
         share, finest = self.settings.share, self.settings.finest
-        missing = self.best - np.maximum(share * np.abs(spare), finest)
-        return np.where(spare >= 0, self.apart.least + max(least - max(share * least, finest), 0.0), missing)
+        reduced = self.best - np.maximum(share * np.abs(margin), finest)
+        return np.where(margin >= 0, self.apart.least + max(smallest - max(share * smallest, finest), 0.0), reduced)
 
     def _bounds(self, pair: np.ndarray, block: np.ndarray, level: int) -> tuple[np.ndarray, np.ndarray]:
-        """Lower bounds of the distances of pairs in intervals of a level (K,), and what is enough of each pair's (n,).
+        """Return lower bounds of the distances of pairs on intervals of a level (K,), and the sufficient bounds (n,).
 
-        What the balls about two bodies do not settle is looked at in the middle. The least distances found are kept.
+        Pairs that the bounding balls leave undecided are evaluated at the middle of the interval. Smallest distances
+        are kept.
         """
         begin, end = self._fraction(block, level), self._fraction(block + 1, level)
         width = (end - begin) * self.track.horizon
-        times, where = np.unique(np.concatenate([begin, (begin + end) / 2, end]), return_inverse=True)
-        first, middle, last = np.split(where, 3)
+        times, index = np.unique(np.concatenate([begin, (begin + end) / 2, end]), return_inverse=True)
+        first, middle, last = np.split(index, 3)
         frames = self.track.frames(times)
         sway, bow = self._moves(pair, block, level, width)
         if self.track.prescribed is not None:
             more = self.track.prescribed.bounds(pair, begin * self.track.horizon, end * self.track.horizon)
             sway, bow = sway + more[0], bow + more[1]
-        enough = self._enough()[pair]
+        sufficient = self._sufficient_bounds()[pair]
         bound = self.bodies.balls(frames, middle, pair) - sway
-        chosen = np.flatnonzero(bound < enough)
-        if not chosen.size:
-            return bound, self._enough()
-        facing, gap, points = self.bodies.nearest(frames, middle[chosen], pair[chosen])
-        self._keep(pair[chosen], gap, times[middle[chosen]], points)
-        bound[chosen] = np.maximum(bound[chosen], gap - sway[chosen])
-        near = (bound[chosen] < enough[chosen]) & np.isfinite(bow[chosen])
-        chosen, facing = chosen[near], facing.of(near)
-        if chosen.size:
-            chord = self.bodies.chords(facing, frames, (first[chosen], last[chosen]))
-            bound[chosen] = np.maximum(bound[chosen], chord - bow[chosen])
-        return bound, self._enough()
+        close = np.flatnonzero(bound < sufficient)
+        if not close.size:
+            return bound, self._sufficient_bounds()
+        facing, gap, points = self.bodies.nearest(frames, middle[close], pair[close])
+        self._keep(pair[close], gap, times[middle[close]], points)
+        bound[close] = np.maximum(bound[close], gap - sway[close])
+        candidate = (bound[close] < sufficient[close]) & np.isfinite(bow[close])
+        close, facing = close[candidate], facing.of(candidate)
+        if close.size:
+            chord = self.bodies.chords(facing, frames, (first[close], last[close]))
+            bound[close] = np.maximum(bound[close], chord - bow[close])
+        return bound, self._sufficient_bounds()
 
     def _fraction(self, place: np.ndarray, level: int) -> np.ndarray:
-        """Fractions of the horizon where the intervals of a level begin, by their numbers (K,)."""
+        """Return the fractions of the horizon at which the intervals ``place`` (K,) of a level begin."""
         if level >= 0:
             return np.asarray(self.breaks[np.minimum(place << level, self.pieces)])
-        piece = place >> -level
-        share = (place - (piece << -level)) * 2.0**level
-        left, right = self.breaks[piece], self.breaks[np.minimum(piece + 1, self.pieces)]
+        segment = place >> -level
+        share = (place - (segment << -level)) * 2.0**level
+        left, right = self.breaks[segment], self.breaks[np.minimum(segment + 1, self.pieces)]
         return np.asarray(left + share * (right - left))
 
     def _moves(
         self, pair: np.ndarray, block: np.ndarray, level: int, width: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """By how much pairs may come nearer than in the middle of intervals (s wide), and than a chord. (K,), m."""
+        """Return how far the distances of pairs can fall within intervals of ``width`` s.
+
+        Below the value at the middle, and below the chord between the ends. Shape (K,) each, m.
+        """
         apart = self.apart
         rates, seconds = self.fastest[max(level, 0)]
-        piece = block >> max(-level, 0)
+        segment = block >> max(-level, 0)
         levers = apart.levers[pair]
-        moves = (rates[piece] * levers).sum(axis=1)
-        turns = (rates[piece] * apart.turns[pair]).sum(axis=1)
-        with np.errstate(invalid="ignore"):  # nothing that moves a pair, times no bound
-            bends = np.where(levers > 0, seconds[piece] * levers, 0.0).sum(axis=1)
+        moves = (rates[segment] * levers).sum(axis=1)
+        turns = (rates[segment] * apart.turns[pair]).sum(axis=1)
+        with np.errstate(invalid="ignore"):  # 0 times inf: a state that does not move the pair, without a bound
+            bends = np.where(levers > 0, seconds[segment] * levers, 0.0).sum(axis=1)
         return moves * width / 2, (bends + 2 * turns * moves) * width**2 / 8
 
     def _keep(self, pair: np.ndarray, distance: np.ndarray, at: np.ndarray, points: np.ndarray) -> None:
-        """Keep what is nearer than what was found before."""
+        """Store distances that are smaller than those found before."""
         order = np.lexsort((distance, pair))
         first = order[np.unique(pair[order], return_index=True)[1]]
         first = first[distance[first] < self.best[pair[first]]]
@@ -412,22 +411,23 @@ class _Search:
         self.best[i], self.when[i], self.points[i] = distance[first], at[first], points[first]
 
 
-def _of_two(values: np.ndarray) -> np.ndarray:
-    """The larger of each two rows, the last by itself where they are odd. (N, k) to (ceil(N / 2), k)."""
+def _pairwise_maximum(values: np.ndarray) -> np.ndarray:
+    """Return the maximum of each two successive rows; an odd last row stays. (N, k) to (ceil(N / 2), k)."""
     even = np.concatenate([values, values[-1:]]) if len(values) % 2 else values
     return np.asarray(np.maximum(even[::2], even[1::2]))
 
 
-def _fastest(curve: PiecewisePolynomial, columns: list[int], horizon: float) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds of the first and the second derivatives in time of states in every piece of a curve. Shapes (N, k).
+def _rate_bounds(curve: PiecewisePolynomial, columns: list[int], horizon: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return bounds of the first and second time derivatives of states on each segment of a curve. Shapes (N, k).
 
-    Of a polynomial on an interval its Bernstein coefficients are bounds.
+    The Bernstein coefficients of a polynomial bound it on its interval.
     """
     first = curve.derivative()
-    found = []
-    for one in (first, first.derivative()):
-        degree = len(one.nodes) - 1
-        basis = np.array([comb(degree, i) * one.nodes**i * (1 - one.nodes) ** (degree - i) for i in range(degree + 1)])
-        coefficients = np.einsum("ij,kjn->kin", np.linalg.inv(basis.T), one.values[:, :, columns])
-        found.append(np.abs(coefficients).max(axis=1))
-    return found[0] / horizon, found[1] / horizon**2
+    bounds = []
+    for rate in (first, first.derivative()):
+        degree = len(rate.nodes) - 1
+        s, indices = rate.nodes, range(degree + 1)
+        basis = np.array([comb(degree, i) * s**i * (1 - s) ** (degree - i) for i in indices])
+        coefficients = np.einsum("ij,kjn->kin", np.linalg.inv(basis.T), rate.values[:, :, columns])
+        bounds.append(np.abs(coefficients).max(axis=1))
+    return bounds[0] / horizon, bounds[1] / horizon**2

@@ -1,8 +1,8 @@
-"""A plan and the first derivatives of its problem at Gauss points of its intervals, whatever method made it.
+"""First derivatives of a problem along a plan, at Gauss points of its intervals, independent of the method of the plan.
 
-What looks for the plan's multipliers (:mod:`ocp.audit.principle`, :mod:`ocp.audit.costates`) and at its second
-variation (:mod:`ocp.audit.accessory`) reads the problem here. Everything runs over the fraction s of the horizon, so
-that dx/ds = T f, and a change of the horizon T is a change of the integrands.
+The search for multipliers (:mod:`ocp.audit.principle`, :mod:`ocp.audit.costates`) and the second variation
+(:mod:`ocp.audit.accessory`) use these. The independent variable is the fraction s of the horizon, so that dx/ds = T f
+and a variation of the horizon T is a variation of the integrands.
 """
 
 from __future__ import annotations
@@ -14,32 +14,32 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ocp.audit.sizes import Sizes, as_others, nearest_bound
+from ocp.audit.sizes import Sizes, nearest_bound, share_sizes
 from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.values import Sampler
 from ocp.solution import Solution, stack
 from ocp.tolerances import NEAR_LIMIT_SHARE, RESOLVED_SHARE, SOLVER_SHARE, TIGHTENED_SHARE
 
-__all__ = ["Limits", "Linearisation", "gauss", "integrals"]
+__all__ = ["Limits", "Linearisation", "quadrature"]
 
-LEAST_POINTS, MOST_POINTS, ENOUGH_POINTS = 3, 5, 150
-"""Gauss points of an interval, and those of a plan from which on the least are enough: few intervals are wide ones."""
-MOST_DERIVATIVES = 3
-"""Of a limit of the states, looked at for a control."""
+MIN_POINTS, MAX_POINTS, ENOUGH_POINTS = 3, 5, 150
+"""Smallest and largest number of Gauss points in an interval; number in a plan at which the smallest suffices."""
+MAX_DERIVATIVES = 3
+"""Largest number of time derivatives of a state constraint that are searched for the controls."""
 
 
 class Limits:
-    """What may hold a plan at some points: limits on either side of some quantities, and how near they are.
+    """Limits that may be active at some points of a plan: lower and upper limits of quantities, and distances to them.
 
-    A limit that was slightly tightened when the plan was solved may push where the plan rests on it. The price of a
-    push is the distance to the declared limit: the multiplier times that distance is what the plan costs too much, to
-    first order, and an upper bound of it where the problem is convex (weak duality).
+    A limit that was slightly tightened when the plan was solved may be active where the plan rests on it. The price of
+    its multiplier is the distance to the declared limit. Multiplier times distance is the excess cost of the plan to
+    first order, and an upper bound of it for a convex problem (weak duality).
 
     Attributes:
         below, above: Distance to the declared lower and upper limit, at least 0. Shape (M, m).
-        gap: Distance to the nearer of both as they were when the plan was solved. Shape (M, m).
-        lower, upper: Which may push. Shape (M, m), bool. Both at equalities.
-        equal: Which are equalities. Shape (m,).
+        gap: Distance to the nearer limit as it was when the plan was solved. Shape (M, m).
+        lower, upper: Whether the limit may be active; both at equalities. Shape (M, m), bool.
+        equal: Which limits are equalities. Shape (m,).
     """
 
     def __init__(
@@ -59,27 +59,27 @@ class Limits:
         self.lower, self.upper = (equal | (gap <= NEAR_LIMIT_SHARE * size) for gap in gaps)
 
     def at(self, points: slice) -> Limits:
-        """The same at some of the points."""
+        """Return the limits at some of the points."""
         part = copy(self)
         for name in ("below", "above", "gap", "lower", "upper"):
             setattr(part, name, getattr(self, name)[points])
         return part
 
     def extend(self, count: int) -> None:
-        """Add as many equalities, which the plan meets."""
+        """Add equalities that the plan satisfies."""
         m = len(self.below)
         self.equal = np.append(self.equal, np.ones(count, bool))
-        none = np.zeros((m, count))
-        self.below, self.above, self.gap = (np.hstack([part, none]) for part in (self.below, self.above, self.gap))
+        zeros = np.zeros((m, count))
+        self.below, self.above, self.gap = (np.hstack([part, zeros]) for part in (self.below, self.above, self.gap))
         self.lower, self.upper = (np.hstack([part, np.ones((m, count), bool)]) for part in (self.lower, self.upper))
 
     @property
     def near(self) -> np.ndarray:
-        """Which may push on either side. Shape (M, m), bool."""
+        """Whether either side may be active. Shape (M, m), bool."""
         return np.asarray(self.lower | self.upper)
 
     def charge(self, multipliers: np.ndarray) -> np.ndarray:
-        """What multipliers (M, m) win over the gaps to their limits: at least zero. Shape (M, m)."""
+        """Return the product of multipliers (M, m) and the gaps to their limits: at least zero. Shape (M, m)."""
         gap = np.where(multipliers > 0, self.above, self.below)
         return np.asarray(np.where(multipliers != 0, gap, 0.0) * np.abs(multipliers))
 
@@ -88,24 +88,30 @@ class Linearisation:
     """First derivatives along a plan.
 
     Attributes:
-        width, weight, places: Of the N intervals (N,) and of the Gauss points in one, (q,) each. matrix: Runge-Kutta
-            matrix of these. shape: (N, q).
-        s, t: Fractions of the horizon and times of the M = N q points, s. Shape (M,).
-        nodal: Whether the plan is reported at the ends of its intervals alone.
+        width: Widths of the N intervals. Shape (N,).
+        weight, places: Quadrature weights and positions of the Gauss points in an interval. Shape (q,).
+        matrix: Runge-Kutta matrix of these points. Shape (q, q).
+        shape: (N, q).
+        s, t: Fractions of the horizon and times (s) of the M = N q points. Shape (M,).
+        nodal: Whether the plan is reported only at the ends of the intervals.
         x, u, costate: The plan at the points, as it reports them. Shape (M, n).
         cost_y, rate_y: Derivatives of T L and T f in y = (x, T, u). Shapes (M, ny), (M, nx, ny).
-        row, row_y: The path rows, (M, r), and their derivatives, (M, r, ny).
-        sizes: Of all named things along the plan. state_size: Of the states, by which costates are judged. Shape (nx,).
-        control_size: Of the controls, by which they are near their limits. Shape (nu,).
-        end_row, end_y: The end and start rows, in this order, and their derivatives in (x, x0, T), (m,), (m, 2 nx + 1).
-        final_y, final_yy: First and second derivatives of the terminal cost in these, (2 nx + 1,) and
-            (2 nx + 1, 2 nx + 1).
-        hold: Limits of the controls, of path rows with a control (``mixed``) and of arcs along equalities of states,
-            in this order. Shape (M, nu + r + a). hold_u: Their derivatives in the controls. Shape (M, nu + r + a, nu).
-        stand, stand_x: Limits of the states and of path rows without a control (``still``), in this order, and their
-            derivatives in (x, T), (M, nx + r', nx + 1). node_stand, node_stand_x: The same at the N + 1 ends.
-        low, high: Limits of the controls at the points. Shape (M, nu).
-        inverses: What :func:`ocp.audit.principle.inverse_of` found.
+        row, row_y: Path rows and their derivatives. Shapes (M, r), (M, r, ny).
+        sizes: Sizes of all quantities along the plan.
+        state_size: Sizes of the states by which costates are judged. Shape (nx,).
+        control_size: Sizes of the controls by which distances to their limits are judged. Shape (nu,).
+        end_row, end_y: End rows, then start rows, and their derivatives in (x, x0, T). Shapes (m,), (m, 2 nx + 1).
+        final_y, final_yy: First and second derivatives of the terminal cost in these. Shapes (2 nx + 1,), (2 nx + 1, 2
+            nx + 1).
+        control_limits: Limits of the controls, of path rows with a control (``mixed``) and of arcs along state
+            equalities, in this order. Shape (M, nu + r + a).
+        control_limits_u: Their derivatives in the controls. Shape (M, nu + r + a, nu).
+        state_limits: Limits of the states and of path rows without a control (``still``), in this order. Shape (M, nx +
+            r').
+        state_limits_x: Their derivatives in (x, T). Shape (M, nx + r', nx + 1).
+        node_limits, node_limits_x: The same at the N + 1 ends of the intervals.
+        low, high: Bounds of the controls at the points. Shape (M, nu).
+        pseudo_inverses: Cache of :func:`ocp.audit.principle.pseudo_inverse_of`.
     """
 
     def __init__(self, form: Formulation, solution: Solution, p: np.ndarray, bounds: Bounds, sizes: Sizes) -> None:
@@ -113,9 +119,9 @@ class Linearisation:
         mesh = solution.control_interpolant.breaks
         self.mesh, self.width = mesh, np.diff(mesh)
         n = len(self.width)
-        pieces = (len(solution.state_interpolant.breaks) - 1) / n
+        segments = (len(solution.state_interpolant.breaks) - 1) / n
         degree = max(len(solution.control_interpolant.nodes), solution.state_interpolant.values.shape[1] - 1)
-        q = MOST_POINTS if pieces > 1 else int(np.clip(max(degree, ENOUGH_POINTS / n), LEAST_POINTS, MOST_POINTS))
+        q = MAX_POINTS if segments > 1 else int(np.clip(max(degree, ENOUGH_POINTS / n), MIN_POINTS, MAX_POINTS))
         self.shape = n, q
         self.places = np.array(ca.collocation_points(q, "legendre"))
         self.matrix, self.weight = gauss(self.places)
@@ -125,7 +131,7 @@ class Linearisation:
         self.x = solution.state_interpolant(self.s)
         self.u = solution.control_interpolant.within(np.repeat(np.arange(n), q), np.tile(self.places, n))
         self.costate = solution.costate_interpolant(self.s)
-        self.inverses: dict[bytes, np.ndarray] = {}
+        self.pseudo_inverses: dict[bytes, np.ndarray] = {}
         self._differentiate()
         self._at_ends()
         self.state_size = self._state_sizes()
@@ -141,32 +147,32 @@ class Linearisation:
         def outputs() -> list[Any]:
             return [self.scaled[2], *(ca.jacobian(part, self.y) for part in self.scaled)]
 
-        self.row, self.cost_y, rate_y, row_y = form.sampled(outputs, *self.here, cache_as="first derivatives")
+        self.row, self.cost_y, rate_y, row_y = form.sampled(outputs, *self.point, cache_as="first derivatives")
         ny = form.nx + 1 + form.nu
         self.rate_y = rate_y.reshape(m, ny, form.nx).transpose(0, 2, 1)
         self.row_y = row_y.reshape(m, ny, len(form.path)).transpose(0, 2, 1)
 
     @property
-    def here(self) -> tuple[Any, ...]:
-        """The arguments of :meth:`Formulation.sampled` at the points, the fraction included."""
+    def point(self) -> tuple[Any, ...]:
+        """Arguments of :meth:`Formulation.sampled` at the points, the fraction included."""
         fraction = (self.fraction, self.s[:, None])
         return self.x, self.u, self.t, self.solution.horizon, self.p, fraction
 
     @property
     def finite(self) -> bool:
-        """Whether the plan and the derivatives along it are numbers."""
-        parts = self.x, self.u, self.costate, self.cost_y, self.rate_y, self.row, self.row_y, self.node_stand_x
+        """Whether the plan and the derivatives along it are finite."""
+        parts = self.x, self.u, self.costate, self.cost_y, self.rate_y, self.row, self.row_y, self.node_limits_x
         return all(bool(np.isfinite(part).all()) for part in parts)
 
     @property
-    def several(self) -> bool:
-        """Whether inequalities are near enough to push, so that more than one set of multipliers may fit the plan."""
-        sides = (self.hold, self.stand, self.node_stand)
+    def may_be_degenerate(self) -> bool:
+        """Whether inequalities may be active, so that the multipliers of the plan may not be unique."""
+        sides = (self.control_limits, self.state_limits, self.node_limits)
         return any(bool(limits.near[:, ~limits.equal].any()) for limits in sides)
 
     @property
     def slope_size(self) -> float:
-        """What the running cost changes by over the sizes of states and controls, to first order, in units of cost."""
+        """Change of the running cost, to first order, over the sizes of states and controls, in units of cost."""
         unit = np.concatenate([self.state_size, [0.0], self.sizes.control])
         return float(self.share @ (np.abs(self.cost_y) @ unit))
 
@@ -184,48 +190,49 @@ class Linearisation:
         self.end_row, self.end_y, self.final_y, self.final_yy = found[0][:, 0], found[1], found[2][:, 0], found[3]
 
     def _state_sizes(self) -> np.ndarray:
-        """Sizes of the states. Shape (nx,).
+        """Return the sizes of the states. Shape (nx,).
 
-        What stands still shows none. Where it is for the plan to choose, a length of a tool kept as a state say, its
-        size is the least that moves something else by its size, or the cost by itself to second order.
+        A state that is constant along the plan has no spread. If its value is free, such as a tool length that is
+        stored as a state, its size is the smallest change that changes another quantity by its size, or the cost by
+        itself to second order.
         """
         form, sizes, nx = self.form, self.sizes, self.form.nx
         low, high = self.bounds
         first, last = form.bounds.places["initial"], form.bounds.places["terminal"]
-        chosen = (low[first] < high[first]) & (low[last] < high[last])
-        still = np.flatnonzero(chosen & (np.ptp(self.x, axis=0) < sizes.state / 2))
-        if not still.size:
+        is_free = (low[first] < high[first]) & (low[last] < high[last])
+        constant = np.flatnonzero(is_free & (np.ptp(self.x, axis=0) < sizes.state / 2))
+        if not constant.size:
             return sizes.state
         rows = np.concatenate([sizes.end, sizes.start])[:, None]
-        speed = [np.abs(self.rate_y[:, :, still]).max(axis=0) / sizes.state[:, None]]
-        speed.append(np.abs(self.row_y[:, :, still]).max(axis=0, initial=0.0) / sizes.path[:, None])
-        speed += [np.abs(self.end_y[:, k]) / rows for k in (still, nx + still)]
+        rates = [np.abs(self.rate_y[:, :, constant]).max(axis=0) / sizes.state[:, None]]
+        rates.append(np.abs(self.row_y[:, :, constant]).max(axis=0, initial=0.0) / sizes.path[:, None])
+        rates += [np.abs(self.end_y[:, k]) / rows for k in (constant, nx + constant)]
         lam = form.sym("lam", nx)
         slopes = ca.gradient(self.scaled[0] + ca.dot(lam, self.scaled[1]), form.x)
-        bends = ca.vertcat(*[ca.jacobian(slopes[k], form.x[k]) for k in still.tolist()])
-        bent = self.share @ form.sampled([bends], *self.here, (lam, self.costate))[0]
-        bent = bent + sum(np.diag(self.final_yy)[k] for k in (still, nx + still))
-        speed.append(np.sqrt(np.abs(bent[None]) / 2 / (abs(self.solution.cost) or 1.0)))
-        fastest = np.vstack(speed).max(axis=0)
-        found = sizes.state.copy()
-        with np.errstate(divide="ignore"):  # what moves nothing but by rounding is as large as its floor says
-            found[still] = np.minimum(1.0 / fastest, found[still] / SOLVER_SHARE)
-        return found
+        diagonal = ca.vertcat(*[ca.jacobian(slopes[k], form.x[k]) for k in constant.tolist()])
+        curvature = self.share @ form.sampled([diagonal], *self.point, (lam, self.costate))[0]
+        curvature = curvature + sum(np.diag(self.final_yy)[k] for k in (constant, nx + constant))
+        rates.append(np.sqrt(np.abs(curvature[None]) / 2 / (abs(self.solution.cost) or 1.0)))
+        largest_rate = np.vstack(rates).max(axis=0)
+        result = sizes.state.copy()
+        with np.errstate(divide="ignore"):  # a state without an effect keeps its floor
+            result[constant] = np.minimum(1.0 / largest_rate, result[constant] / SOLVER_SHARE)
+        return result
 
     def _control_sizes(self) -> np.ndarray:
-        """Sizes of the controls, by which they are near their limits. Shape (nu,).
+        """Return the sizes of the controls by which distances to their limits are judged. Shape (nu,).
 
-        One that is never used rests on a limit but for the solver's tolerance, and shows no size but that: it is as
-        large as others of its unit; where none of these is used, as its nearest bound, one SI unit at most.
+        An unused control rests on a limit but for the solver's tolerance, so that its spread is no size. It takes the
+        size of other controls of its unit; if all of these are unused, the nearest bound, at most one SI unit.
         """
         form, own = self.form, self.sizes.control
         low, high = (side[form.bounds.places["control"]] for side in self.bounds)
-        others = own.copy()
-        as_others(others, form.controls, form.problem.declared.controls, RESOLVED_SHARE)
+        by_unit = own.copy()
+        share_sizes(by_unit, form.controls, form.problem.declared.controls, RESOLVED_SHARE)
         bound = np.minimum(1.0, nearest_bound((low, high)))
-        whole = np.where(others <= RESOLVED_SHARE * bound, bound, others)
-        off = np.minimum(np.abs(self.u - low), np.abs(self.u - high)).max(axis=0, initial=0.0)
-        return np.asarray(np.where(off <= RESOLVED_SHARE * whole, whole, own))
+        full = np.where(by_unit <= RESOLVED_SHARE * bound, bound, by_unit)
+        distance = np.minimum(np.abs(self.u - low), np.abs(self.u - high)).max(axis=0, initial=0.0)
+        return np.asarray(np.where(distance <= RESOLVED_SHARE * full, full, own))
 
     def _limits(self) -> None:
         form, sizes, (n, q) = self.form, self.sizes, self.shape
@@ -235,25 +242,26 @@ class Linearisation:
         kinds = ("state", "control", "path")
         index = np.concatenate([form.bounds.places[kind] for kind in kinds])
         low, high = (side[index] for side in self.bounds)
-        drawn = np.zeros((2, n, len(index)))
-        if self.solution.bound_tightening is not None:  # one put together by hand may lack the path rows
-            drawn[:, :, : self.solution.bound_tightening.shape[2]] = self.solution.bound_tightening[:, :, : len(index)]
+        tightening = np.zeros((2, n, len(index)))
+        amounts = self.solution.bound_tightening
+        if amounts is not None:  # a plan assembled by hand may lack the path rows
+            tightening[:, :, : amounts.shape[2]] = amounts[:, :, : len(index)]
         equal = np.concatenate([np.zeros(nx + nu, bool), form.path.equality])
         equal |= low == high
         size = np.concatenate([sizes.state, self.control_size, sizes.path])
-        hold = np.concatenate([np.arange(nx, nx + nu), nx + nu + self.mixed])
-        stand = np.concatenate([np.arange(nx), nx + nu + self.still])
+        controls = np.concatenate([np.arange(nx, nx + nu), nx + nu + self.mixed])
+        states = np.concatenate([np.arange(nx), nx + nu + self.still])
         value = np.hstack([self.x, self.u, self.row])
-        by_point = np.repeat(drawn, q, axis=1)
-        self.hold, self.stand = (
-            Limits(value[:, k], low[k], high[k], equal[k], size[k], by_point[:, :, k]) for k in (hold, stand)
+        by_point = np.repeat(tightening, q, axis=1)
+        self.control_limits, self.state_limits = (
+            Limits(value[:, k], low[k], high[k], equal[k], size[k], by_point[:, :, k]) for k in (controls, states)
         )
         self.low, self.high = (np.tile(side[nx : nx + nu], (n * q, 1)) for side in (low, high))
         eye = np.broadcast_to(np.eye(nu), (n * q, nu, nu))
-        self.hold_u = np.concatenate([eye, self.row_y[:, self.mixed, nx + 1 :]], axis=1)
-        self.stand_x = np.zeros((n * q, len(stand), nx + 1))
-        self.stand_x[:, :nx, :nx] = np.eye(nx)
-        self.stand_x[:, nx:] = self.row_y[:, self.still, : nx + 1]
+        self.control_limits_u = np.concatenate([eye, self.row_y[:, self.mixed, nx + 1 :]], axis=1)
+        self.state_limits_x = np.zeros((n * q, len(states), nx + 1))
+        self.state_limits_x[:, :nx, :nx] = np.eye(nx)
+        self.state_limits_x[:, nx:] = self.row_y[:, self.still, : nx + 1]
 
         at = self.mesh
 
@@ -262,58 +270,65 @@ class Linearisation:
             return [rows, ca.jacobian(rows, ca.vertcat(form.x, form.T))]
 
         x, u, horizon = self.solution.state_interpolant(at), np.zeros((n + 1, nu)), self.solution.horizon
-        here = x, u, at * horizon, horizon, self.p, (self.fraction, at[:, None])
-        row, row_y = form.sampled(still, *here, cache_as="rows of the states")
+        point = x, u, at * horizon, horizon, self.p, (self.fraction, at[:, None])
+        row, row_y = form.sampled(still, *point, cache_as="rows of the states")
         before, after = np.maximum(np.arange(n + 1) - 1, 0), np.minimum(np.arange(n + 1), n - 1)
-        at_nodes = np.maximum(drawn[:, before], drawn[:, after])[:, :, stand]
-        self.node_stand = Limits(np.hstack([x, row]), low[stand], high[stand], equal[stand], size[stand], at_nodes)
-        self.node_stand_x = np.zeros((n + 1, len(stand), nx + 1))
-        self.node_stand_x[:, :nx, :nx] = np.eye(nx)
-        self.node_stand_x[:, nx:] = row_y.reshape(n + 1, nx + 1, len(self.still)).transpose(0, 2, 1)
+        at_nodes = np.maximum(tightening[:, before], tightening[:, after])[:, :, states]
+        self.node_limits = Limits(np.hstack([x, row]), low[states], high[states], equal[states], size[states], at_nodes)
+        self.node_limits_x = np.zeros((n + 1, len(states), nx + 1))
+        self.node_limits_x[:, :nx, :nx] = np.eye(nx)
+        self.node_limits_x[:, nx:] = row_y.reshape(n + 1, nx + 1, len(self.still)).transpose(0, 2, 1)
 
     def _arcs(self) -> None:
-        """Equalities of the states hold the controls too, by the first derivative in time that has one.
+        """Add state equalities as limits of the controls, through their first time derivative that contains a control.
 
-        A transcription that holds them at points knows the costates up to multiples of the gradients of such a row and
-        of its derivatives (Hartl, Sethi, Vickson 1995, section 4), and so the slope of the Hamiltonian up to those of
-        the last derivative.
+        A transcription that imposes such a row at points determines the costates up to multiples of the gradients of
+        the row and of its derivatives (Hartl, Sethi, Vickson 1995, section 4). The slope of the Hamiltonian is then
+        determined up to multiples of the gradient of the last derivative.
         """
         form, equal = self.form, np.flatnonzero(self.form.path.equality[self.still])
         arcs = np.zeros((len(self.s), len(equal), form.nu))
         for which, slopes in form.cached("arcs", lambda: arcs_of(form, self.still[equal])):
-            rates = [form.signals_at(self.t, order) for order in range(MOST_DERIVATIVES + 1 if form.signals else 1)]
-            found = slopes(*self.here[:2], self.t[:, None], *self.here[3:5], *rates)[0]
-            arcs[:, which] = found.reshape(len(self.s), form.nu, len(which)).transpose(0, 2, 1)
-        self.hold_u = np.concatenate([self.hold_u, arcs], axis=1)
-        self.hold.extend(len(equal))
+            rates = [form.signals_at(self.t, order) for order in range(MAX_DERIVATIVES + 1 if form.signals else 1)]
+            values = slopes(*self.point[:2], self.t[:, None], *self.point[3:5], *rates)[0]
+            arcs[:, which] = values.reshape(len(self.s), form.nu, len(which)).transpose(0, 2, 1)
+        self.control_limits_u = np.concatenate([self.control_limits_u, arcs], axis=1)
+        self.control_limits.extend(len(equal))
 
 
 def arcs_of(form: Formulation, rows: np.ndarray) -> list[tuple[np.ndarray, Sampler]]:
-    """Which of some path rows contain the controls first in one same derivative in time, and its slopes in these."""
-    at, left, found = form.path.expression[rows.tolist()], np.arange(len(rows)), list[tuple[np.ndarray, Sampler]]()
-    rates = [form.sym("w_rate", form.w.numel()) for _ in range(MOST_DERIVATIVES)] if form.signals else []
-    for _ in range(MOST_DERIVATIVES):
-        if not left.size or not form.nu:
+    """Group path rows by the order of the first time derivative that contains a control.
+
+    Returns:
+        For each order the indices of its rows, and a sampler of the derivatives of these in the controls.
+    """
+    at, remaining, arcs = form.path.expression[rows.tolist()], np.arange(len(rows)), list[tuple[np.ndarray, Sampler]]()
+    rates = [form.sym("w_rate", form.w.numel()) for _ in range(MAX_DERIVATIVES)] if form.signals else []
+    for _ in range(MAX_DERIVATIVES):
+        if not remaining.size or not form.nu:
             break
-        moving = [ca.mtimes(ca.jacobian(at, w), rate) for w, rate in pairwise([form.w, *rates])]
-        at = ca.mtimes(ca.jacobian(at, form.x), form.f) + ca.jacobian(at, form.t) + sum(moving)
+        by_signals = [ca.mtimes(ca.jacobian(at, w), rate) for w, rate in pairwise([form.w, *rates])]
+        at = ca.mtimes(ca.jacobian(at, form.x), form.f) + ca.jacobian(at, form.t) + sum(by_signals)
         in_control = ca.jacobian(at, form.u)
         seen = np.array(ca.DM(in_control.sparsity(), 1).full().any(axis=1), bool)
         if seen.any():
-            found.append((left[seen], form.sampler([in_control[np.flatnonzero(seen).tolist(), :]], *rates)))
-            at, left = at[np.flatnonzero(~seen).tolist()], left[~seen]
-    return found
+            arcs.append((remaining[seen], form.sampler([in_control[np.flatnonzero(seen).tolist(), :]], *rates)))
+            at, remaining = at[np.flatnonzero(~seen).tolist()], remaining[~seen]
+    return arcs
 
 
 def over_fraction(form: Formulation) -> list[Any]:
-    """The fraction of the horizon, a symbol, and T L, T f and the path rows as expressions of it."""
+    """Return the symbol of the fraction of the horizon, and T L, T f and the path rows as expressions of it."""
     fraction = form.sym("s")
     parts = [form.T * form.running, form.T * form.f, form.path.expression]
     return [fraction, *ca.substitute(parts, [form.t], [fraction * form.T])]
 
 
 def ends_of(form: Formulation) -> Any:
-    """A Function (x, x0, u, u0, T, p) of the ends: rows, their derivatives, both of the terminal cost."""
+    """Return a Function (x, x0, u, u0, T, p) of the conditions at the ends.
+
+    Its outputs are the rows, their derivatives, and the gradient and Hessian of the terminal cost.
+    """
     begin = ca.substitute([form.start.expression], [form.x, form.u, form.t], [form.x0, form.u0, 0])[0]
     end, final = ca.substitute([form.end.expression, form.terminal], [form.t], [form.T])
     rows, y = ca.vertcat(end, begin), ca.vertcat(form.x, form.x0, form.T)
@@ -324,15 +339,15 @@ def ends_of(form: Formulation) -> Any:
 
 
 def gauss(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Runge-Kutta matrix (q, q) and weights (q,) of collocation at ``places``."""
-    found = integrals(places, np.append(places, 1.0))
-    return found[:-1], found[-1]
+    """Return the Runge-Kutta matrix (q, q) and weights (q,) of collocation at ``places``."""
+    weights = quadrature(places, np.append(places, 1.0))
+    return weights[:-1], weights[-1]
 
 
-def integrals(places: np.ndarray, ends: np.ndarray, degree: int | None = None) -> np.ndarray:
-    """What integrates values at ``places`` (q,) from 0 to each of ``ends`` (m,). Shape (m, q).
+def quadrature(places: np.ndarray, ends: np.ndarray, degree: int | None = None) -> np.ndarray:
+    """Return the quadrature weights at ``places`` (q,) for integrals from 0 to each of ``ends`` (m,). Shape (m, q).
 
-    By the polynomial of a degree that fits them best; by default of the one that takes them.
+    The integrand is the least-squares polynomial of the given degree; by default the interpolating one.
     """
     degree = len(places) - 1 if degree is None else degree
     legendre = np.polynomial.legendre.legvander

@@ -1,12 +1,11 @@
-"""Whether a plan is a local minimum: its costates and multipliers found anew, what it loses, how the cost curves.
+"""First and second order optimality of a plan: its multipliers, the cost it loses, and the curvature of the cost.
 
-The multipliers that fit a plan best: a convex program dual to the plan's own linearisation.
-
-Where controls rest on their limits the costates are not given by the plan alone: one that switches from limit to limit
-where its mesh allows it fits a whole set of them, and a solver reports some point of it, whose switching functions need
-not have their zeros where the plan switches. What a plan loses is the least over all multipliers that meet the costate
-equation and the conditions at the ends (weak duality): what they win over the gaps to their limits, and what is left of
-the slope of the Hamiltonian, by its square over the curvature.
+Where controls rest on their limits, the plan alone does not determine the costates. A plan that switches between limits
+where its mesh allows it fits a whole set of costates. A solver reports one of them, whose switching functions need not
+vanish where the plan switches. The loss of a plan is therefore the minimum over all multipliers that satisfy the
+costate equation and the conditions at the ends (weak duality). It has two parts: multipliers times the gaps to their
+limits, and the squared remaining slope of the Hamiltonian over its curvature. The minimum is a convex program, dual to
+the linearised problem of the plan.
 """
 
 from __future__ import annotations
@@ -18,19 +17,19 @@ import casadi as ca
 import numpy as np
 
 from ocp.audit.accessory import AccessoryProblem
-from ocp.audit.costates import Adjoint, EndLimits, Ends, adjoint, end_limits, ends_of_intervals
+from ocp.audit.costates import Adjoint, EndLimits, Ends, adjoint, end_limits, interval_end_costates
 from ocp.audit.curvature import Curvature, curvature
 from ocp.audit.linearisation import Limits, Linearisation
-from ocp.audit.principle import Hamiltonian, hamiltonian, lost, reduced_slope, turning
+from ocp.audit.principle import Hamiltonian, control_loss, hamiltonian, reduced_slope, switching_loss
 from ocp.audit.sizes import sizes
 from ocp.problem.formulation import Bounds, Formulation
 from ocp.solution import Solution
 from ocp.tolerances import FLAT_SHARE, LIMIT_SHARE, RESOLVED_SHARE
 
-__all__ = ["Fit", "Optimality", "best_multipliers", "optimality"]
+__all__ = ["Optimality", "optimality"]
 
-NEARNESS = 1e-5
-"""Weight of the mean square distance from the costates reported, by their size, among multipliers that lose as much."""
+PROXIMITY_WEIGHT = 1e-5
+"""Weight of the relative mean square distance from the reported costates: selects among equally good multipliers."""
 SOLVER = {
     "ipopt.print_level": 0,
     "ipopt.sb": "yes",
@@ -44,13 +43,13 @@ SOLVER = {
 
 
 class Fit(NamedTuple):
-    """Multipliers that lose least.
+    """The multipliers with the smallest loss.
 
     Attributes:
-        lost: What the plan loses by them in each interval, its ends apart, in units of cost. Shape (N,).
-        adjoint: The multipliers. Errors are those of the costates reported, as they were.
-        distance: Of the costates reported from these, largest of all nodes, in units of cost; 0 beside equalities of
-            the states, where costates are known up to multiples of the gradients of these.
+        lost: Loss of the plan in each interval without its ends, in units of cost. Shape (N,).
+        adjoint: The multipliers. The errors remain those of the reported costates.
+        distance: Largest distance of the reported costates from these at a node, in units of cost. 0 for state
+            equalities, which determine costates only up to multiples of their gradients.
     """
 
     lost: np.ndarray
@@ -59,12 +58,13 @@ class Fit(NamedTuple):
 
 
 def best_multipliers(along: Linearisation, known: Adjoint, curved: np.ndarray, cost: float) -> Fit | None:
-    """The multipliers of a plan that lose least; None where none are found.
+    """Return the multipliers of a plan with the smallest loss; None if the program has no solution.
 
     Args:
-        along: The plan. known: Multipliers that are known already.
-        curved: T H_uu of these. Shape (M, nu, nu).
-        cost: A size of the cost.
+        along: Linearisation of the plan.
+        known: Multipliers computed before.
+        curved: T H_uu at these. Shape (M, nu, nu).
+        cost: Size of the cost.
     """
     dual = _Dual(along, curved, cost)
     x = dual.program.solve()
@@ -72,7 +72,7 @@ def best_multipliers(along: Linearisation, known: Adjoint, curved: np.ndarray, c
 
 
 class _Program:
-    """A sparse program: least price . x + weight . x^2 / 2 where rows x = right and low <= x."""
+    """A sparse program: minimise price . x + weight . x^2 / 2 subject to rows x = right and low <= x."""
 
     def __init__(self) -> None:
         self._variables: list[np.ndarray] = []  # low, price and weight of each, (3, count)
@@ -80,47 +80,49 @@ class _Program:
         self._entries: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
 
     def variables(self, count: int, low: Any = -np.inf, price: Any = 0.0, weight: Any = 0.0) -> np.ndarray:
-        """Indices of so many more."""
+        """Add variables and return their indices."""
         first = sum(part.shape[1] for part in self._variables)
         self._variables.append(np.array([np.broadcast_to(value, (count,)) for value in (low, price, weight)], float))
         return np.arange(first, first + count)
 
     def equations(self, right: np.ndarray) -> np.ndarray:
-        """Indices of more, in the shape of their right sides."""
+        """Add equations and return their indices, in the shape of their right sides."""
         first = sum(part.size for part in self._right)
         self._right.append(right)
         return np.arange(first, first + right.size).reshape(right.shape)
 
     def add(self, rows: Any, columns: Any, values: Any) -> None:
-        """Entries, of arrays that are broadcast to one shape."""
+        """Add entries; the three arrays are broadcast to one shape."""
         rows, columns, values = np.broadcast_arrays(rows, columns, values)
         keep = values.ravel() != 0
         self._entries.append((rows.ravel()[keep], columns.ravel()[keep], values.ravel()[keep]))
 
     def solve(self) -> np.ndarray | None:
-        """The best x; None where there is none."""
+        """Return the optimal x, or None."""
         rows, columns, values = (np.concatenate(part) for part in zip(*self._entries, strict=True))
         low, price, weight = np.hstack(self._variables)
         right = np.concatenate([part.ravel() for part in self._right])
         matrix = ca.DM.triplet(rows.tolist(), columns.tolist(), ca.DM(values), len(right), len(low))
         x = ca.MX.sym("x", len(low))
-        paid = ca.dot(ca.DM(price), x) + ca.dot(ca.DM(weight), x**2) / 2
-        solver = ca.nlpsol("dual", "ipopt", {"x": x, "f": paid, "g": ca.mtimes(matrix, x)}, SOLVER)
-        found = solver(x0=np.where(np.isfinite(low), 1e-2, 0.0), lbx=low, ubx=np.inf, lbg=right, ubg=right)
+        objective = ca.dot(ca.DM(price), x) + ca.dot(ca.DM(weight), x**2) / 2
+        solver = ca.nlpsol("dual", "ipopt", {"x": x, "f": objective, "g": ca.mtimes(matrix, x)}, SOLVER)
+        result = solver(x0=np.where(np.isfinite(low), 1e-2, 0.0), lbx=low, ubx=np.inf, lbg=right, ubg=right)
         if not solver.stats()["success"]:
             return None
-        return np.asarray(np.maximum(found["x"].full().ravel(), low))
+        return np.asarray(np.maximum(result["x"].full().ravel(), low))
 
 
 @dataclass
-class _Pushes:
-    """Multipliers of limits, at least zero, each priced by the gap to its limit.
+class _Multipliers:
+    """Nonnegative multipliers of limits, each priced by the gap to its limit.
 
     Attributes:
-        point, limit: Where each is, and of what. sign: 1 at an upper limit, -1 at a lower one. Shape (K,) each.
-        slope: Of what is limited, times the sign, over ``reach``. Shape (K, n).
-        reach: What a multiplier of one moves, in units of cost. price: Gap over reach. Shape (K,) each.
-        index: In the program. Shape (K,).
+        point, limit: Point and index of each limit. Shape (K,).
+        sign: 1 for an upper limit, -1 for a lower one. Shape (K,).
+        slope: Gradient of the limit, times the sign, over ``reach``. Shape (K, n).
+        reach: Effect of a multiplier of one, in units of cost. Shape (K,).
+        price: Gap over reach. Shape (K,).
+        index: Variable of the program. Shape (K,).
     """
 
     point: np.ndarray
@@ -133,10 +135,10 @@ class _Pushes:
 
     @classmethod
     def of(cls, program: _Program, limits: Limits, chosen: np.ndarray, slopes: np.ndarray, size: np.ndarray,
-           share: Any = 1.0) -> _Pushes:  # fmt: skip
-        """Both sides of ``chosen`` limits (M, m), bool, with their derivatives (M, m, n) in what has these sizes (n,).
+           share: Any = 1.0) -> _Multipliers:  # fmt: skip
+        """Add both sides of ``chosen`` limits (M, m), bool, with derivatives (M, m, n) in variables of sizes (n,).
 
-        Those per unit of s cost their gap times the ``share`` (M,) of their point.
+        A multiplier per unit of s costs its gap times the ``share`` (M,) of its point.
         """
         reach = (np.abs(slopes) * size).sum(axis=2)
         sides = []
@@ -144,159 +146,166 @@ class _Pushes:
             point, limit = np.nonzero(chosen & np.isfinite(gap) & (reach > 0))
             sides.append((point, limit, np.full(len(point), sign), gap[point, limit]))
         point, limit, signs, gaps = (np.concatenate(part) for part in zip(*sides, strict=True))
-        moved = reach[point, limit]
-        price = np.broadcast_to(share, len(slopes))[point] * gaps / moved
-        slope = slopes[point, limit] * (signs / moved)[:, None]
-        return cls(point, limit, signs, slope, moved, price, program.variables(len(point), 0.0, price))
+        effect = reach[point, limit]
+        price = np.broadcast_to(share, len(slopes))[point] * gaps / effect
+        slope = slopes[point, limit] * (signs / effect)[:, None]
+        return cls(point, limit, signs, slope, effect, price, program.variables(len(point), 0.0, price))
 
     def table(self, x: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-        """Multipliers with their signs. Shape (M, m)."""
-        found = np.zeros(shape)
-        np.add.at(found, (self.point, self.limit), self.sign * x[self.index] / self.reach)
-        return found
+        """Return the signed multipliers. Shape (M, m)."""
+        values = np.zeros(shape)
+        np.add.at(values, (self.point, self.limit), self.sign * x[self.index] / self.reach)
+        return values
 
 
 class _Dual:
-    """The program for the multipliers of a plan; costates times the sizes of their states, all in units of cost."""
+    """The dual program for the multipliers of a plan; costates times the sizes of their states, in units of cost."""
 
     def __init__(self, along: Linearisation, curved: np.ndarray, cost: float) -> None:
         self.along, self.cost, self.program = along, cost, _Program()
         (n, q), nx, nu = along.shape, along.form.nx, along.form.nu
         self.interval = np.arange(n * q) // q
         self.costate = self.program.variables(n * q * nx).reshape(n * q, nx)
-        first, last = ends_of_intervals(along)
-        self.told = np.vstack([first, last[-1:]]) * along.state_size
-        near = NEARNESS / (n + 1) / max(1.0, float(np.abs(self.told).max()) / cost)
-        price = -near * self.told.ravel() / cost
-        self.nodes = self.program.variables(self.told.size, price=price, weight=near).reshape(n + 1, nx)
+        first, last = interval_end_costates(along)
+        self.reported = np.vstack([first, last[-1:]]) * along.state_size
+        weight = PROXIMITY_WEIGHT / (n + 1) / max(1.0, float(np.abs(self.reported).max()) / cost)
+        price = -weight * self.reported.ravel() / cost
+        self.nodes = self.program.variables(self.reported.size, price=price, weight=weight).reshape(n + 1, nx)
 
-        # a step no shorter than the way between limits leaves it to their gaps to say what it costs
+        # with a step of the full range between limits, their gaps alone determine the price
         width = (along.high - along.low).max(axis=0, initial=0.0)
         self.step = np.where(np.isfinite(width), np.maximum(width, along.sizes.control), along.sizes.control)
-        driven = np.einsum("k,kij,j->i", along.share, np.abs(along.rate_y[:, :, nx + 1 :]), self.step)
-        self.far = max(1.0, float((driven / along.state_size).max(initial=0.0)))
-        # what pushes along arcs of the states is among their own limits
-        held = along.hold.near & (np.arange(along.hold_u.shape[1]) < nu + len(along.mixed))
-        held[:, :nu] = True
-        self.hold = _Pushes.of(self.program, along.hold, held, along.hold_u, self.step, along.share)
-        wide = np.append(along.state_size, 0.0)
-        self.stand = _Pushes.of(self.program, along.stand, along.stand.near, along.stand_x, wide)
-        inner = along.node_stand.near & (along.nodal | ~along.node_stand.equal)
-        inner[[0, -1]] = False  # the conditions at the ends have their own
-        self.node = _Pushes.of(self.program, along.node_stand, inner, along.node_stand_x, wide)
-        self.beside = np.zeros((len(self.hold.point), nx + 1))  # derivatives of path rows that hold controls, in (x, T)
-        path = self.hold.limit >= nu
-        row = along.mixed[self.hold.limit[path] - nu]
-        self.beside[path] = along.row_y[self.hold.point[path], row, : nx + 1]
-        self.beside *= (self.hold.sign / self.hold.reach)[:, None]
+        reachable = np.einsum("k,kij,j->i", along.share, np.abs(along.rate_y[:, :, nx + 1 :]), self.step)
+        self.end_price = max(1.0, float((reachable / along.state_size).max(initial=0.0)))
+        # arcs of the states are among the state limits
+        chosen = along.control_limits.near & (np.arange(along.control_limits_u.shape[1]) < nu + len(along.mixed))
+        chosen[:, :nu] = True
+        self.control_limits = _Multipliers.of(
+            self.program, along.control_limits, chosen, along.control_limits_u, self.step, along.share
+        )
+        scales = np.append(along.state_size, 0.0)
+        self.state_limits = _Multipliers.of(
+            self.program, along.state_limits, along.state_limits.near, along.state_limits_x, scales
+        )
+        interior = along.node_limits.near & (along.nodal | ~along.node_limits.equal)
+        interior[[0, -1]] = False  # the conditions at the ends are separate
+        self.node = _Multipliers.of(self.program, along.node_limits, interior, along.node_limits_x, scales)
+        self.path_slope = np.zeros((len(self.control_limits.point), nx + 1))  # of path rows, in (x, T)
+        path = self.control_limits.limit >= nu
+        row = along.mixed[self.control_limits.limit[path] - nu]
+        self.path_slope[path] = along.row_y[self.control_limits.point[path], row, : nx + 1]
+        self.path_slope *= (self.control_limits.sign / self.control_limits.reach)[:, None]
         self._costate_equation()
         self._stationarity(curved)
         self._ends()
 
     def _costate_equation(self) -> None:
-        """lambda' = -dH/dx over every interval, backwards from behind its last node to behind its first."""
-        along, program, hold, stand, node = self.along, self.program, self.hold, self.stand, self.node
+        """Add lambda' = -dH/dx over every interval, backwards from behind its last node to behind its first."""
+        along, program, node = self.along, self.program, self.node
+        controls, states = self.control_limits, self.state_limits
         (n, q), nx, size = along.shape, along.form.nx, along.state_size
-        fed = (along.rate_y[:, :, :nx] * size / size[:, None]).transpose(0, 2, 1)
-        given = (along.cost_y[:, :nx] * size / self.cost).reshape(n, q, nx)
-        before = node.point - 1  # the interval in front of a node meets its push too
+        feedback = (along.rate_y[:, :, :nx] * size / size[:, None]).transpose(0, 2, 1)
+        source = (along.cost_y[:, :nx] * size / self.cost).reshape(n, q, nx)
+        previous = node.point - 1  # the multiplier of a node also acts on the interval before it
         steps = [(self.costate.reshape(n, q, nx)[:, i], along.weight - along.matrix[i]) for i in range(q)]
-        for left, weight in [*steps, (self.nodes[:-1], along.weight)]:
-            rows = program.equations(along.width[:, None] * np.einsum("j,kja->ka", weight, given))
-            program.add(rows, left, 1.0)
+        for start, weight in [*steps, (self.nodes[:-1], along.weight)]:
+            rows = program.equations(along.width[:, None] * np.einsum("j,kja->ka", weight, source))
+            program.add(rows, start, 1.0)
             program.add(rows, self.nodes[1:], -1.0)
-            program.add(rows[before], node.index[:, None], -node.slope[:, :nx] * size)
-            by_point, at_once = np.outer(along.width, weight).ravel(), np.tile(weight / along.weight, n)
-            mine = rows[self.interval]
-            program.add(mine[:, :, None], self.costate[:, None, :], -by_point[:, None, None] * fed)
-            force = by_point[hold.point, None] * self.beside[:, :nx] * size
-            program.add(mine[hold.point], hold.index[:, None], -force)
-            force = at_once[stand.point, None] * stand.slope[:, :nx] * size
-            program.add(mine[stand.point], stand.index[:, None], -force)
+            program.add(rows[previous], node.index[:, None], -node.slope[:, :nx] * size)
+            densities, atoms = np.outer(along.width, weight).ravel(), np.tile(weight / along.weight, n)
+            rows_of_point = rows[self.interval]
+            program.add(rows_of_point[:, :, None], self.costate[:, None, :], -densities[:, None, None] * feedback)
+            force = densities[controls.point, None] * self.path_slope[:, :nx] * size
+            program.add(rows_of_point[controls.point], controls.index[:, None], -force)
+            force = atoms[states.point, None] * states.slope[:, :nx] * size
+            program.add(rows_of_point[states.point], states.index[:, None], -force)
 
     def _stationarity(self, curved: np.ndarray) -> None:
-        """dH/du is what is left of it: paid by its square where the Hamiltonian curves, else for a step.
+        """Add dH/du with its residual: the price is quadratic where the Hamiltonian curves, else linear in a step.
 
-        A step is as large as the control is along the plan, or, where it has limits, as the way between them.
+        The step is the size of the control along the plan or, if the control has limits, the range between them.
         """
-        along, program, hold = self.along, self.program, self.hold
+        along, program, controls = self.along, self.program, self.control_limits
         nx, unit, share = along.form.nx, self.step, along.share[:, None]
         rows = program.equations(-along.cost_y[:, nx + 1 :] * unit / self.cost)
         rate = along.rate_y[:, :, nx + 1 :] * unit / along.state_size[:, None]
         program.add(rows[:, :, None], self.costate[:, None, :], rate.transpose(0, 2, 1))
-        program.add(rows[hold.point], hold.index[:, None], hold.slope * unit)
-        bends, vectors = np.linalg.eigh(curved * unit * unit[:, None] / self.cost)
-        solid = bends > FLAT_SHARE * float(np.abs(bends).max(initial=0.0))
-        self.price = np.where(solid, 0.0, share)
-        self.weight = np.where(solid, share / np.where(solid, bends, 1.0), 0.0)
-        self.left = []
+        program.add(rows[controls.point], controls.index[:, None], controls.slope * unit)
+        eigenvalues, vectors = np.linalg.eigh(curved * unit * unit[:, None] / self.cost)
+        is_curved = eigenvalues > FLAT_SHARE * float(np.abs(eigenvalues).max(initial=0.0))
+        self.price = np.where(is_curved, 0.0, share)
+        self.weight = np.where(is_curved, share / np.where(is_curved, eigenvalues, 1.0), 0.0)
+        self.residual = []
         for sign in (-1.0, 1.0):
             part = program.variables(rows.size, 0.0, self.price.ravel(), self.weight.ravel()).reshape(rows.shape)
             program.add(rows[:, :, None], part[:, None, :], sign * vectors)
-            self.left.append(part)
+            self.residual.append(part)
 
     def _ends(self) -> None:
-        """What is left of the conditions at the ends is paid for a step as far as controls could drive the states."""
+        """Add the conditions at the ends; a residual is priced by the distance that controls could drive the states."""
         along, program, nx = self.along, self.program, self.along.form.nx
         form, (low, high), horizon = along.form, along.bounds, along.solution.horizon
         places, share = form.bounds.places, along.share
-        given = [low[places[k]] == high[places[k]] for k in ("terminal", "initial")]
-        self.free = ~np.append(np.concatenate(given), not form.horizon_is_free)
+        fixed = [low[places[k]] == high[places[k]] for k in ("terminal", "initial")]
+        self.free = ~np.append(np.concatenate(fixed), not form.horizon_is_free)
         self.scale = np.concatenate([along.state_size, along.state_size, [horizon]])
         self.ends: EndLimits = end_limits(along)
         self.reach = np.abs(self.ends.slope) @ self.scale
-        self.grip = program.variables(
+        self.end_index = program.variables(
             len(self.reach), np.where(self.ends.equal, -np.inf, 0.0), self.ends.gap / self.reach
         )
         right = along.final_y * self.scale / self.cost
         right[-1] += horizon / self.cost * float(share @ along.cost_y[:, nx])
         rows = np.full(2 * nx + 1, -1)
         rows[self.free] = program.equations(right[self.free])
-        own = np.flatnonzero(self.free[:-1])
+        states = np.flatnonzero(self.free[:-1])
         at_ends = np.concatenate([self.nodes[-1], self.nodes[0]])
-        program.add(rows[own], at_ends[own], np.where(own < nx, 1.0, -1.0))
+        program.add(rows[states], at_ends[states], np.where(states < nx, 1.0, -1.0))
         slope = self.ends.slope * (self.ends.sign / self.reach)[:, None] * self.scale
-        program.add(rows[self.free], self.grip[:, None], -slope[:, self.free])
+        program.add(rows[self.free], self.end_index[:, None], -slope[:, self.free])
         if form.horizon_is_free:
             program.add(rows[-1], self.costate, -horizon * share[:, None] * along.rate_y[:, :, nx] / along.state_size)
-            program.add(rows[-1], self.hold.index, -horizon * share[self.hold.point] * self.beside[:, nx])
-            for pushes in (self.stand, self.node):
-                program.add(rows[-1], pushes.index, -horizon * pushes.slope[:, nx])
-        self.missed = []
+            force = horizon * share[self.control_limits.point] * self.path_slope[:, nx]
+            program.add(rows[-1], self.control_limits.index, -force)
+            for limits in (self.state_limits, self.node):
+                program.add(rows[-1], limits.index, -horizon * limits.slope[:, nx])
+        self.end_residual = []
         for sign in (-1.0, 1.0):
-            self.missed.append(program.variables(int(self.free.sum()), 0.0, self.far))
-            program.add(rows[self.free], self.missed[-1], sign)
+            self.end_residual.append(program.variables(int(self.free.sum()), 0.0, self.end_price))
+            program.add(rows[self.free], self.end_residual[-1], sign)
 
     def fit(self, x: np.ndarray, known: Adjoint) -> Fit:
-        """What a solution of the program, in units of cost, says."""
+        """Return the multipliers of a solution of the program, in units of cost."""
         along, (n, q), nx, size = self.along, self.along.shape, self.along.form.nx, self.along.state_size
         lost = np.zeros(n)
-        for part in self.left:
+        for part in self.residual:
             paid = self.price * x[part] + self.weight * x[part] ** 2 / (2 * self.cost)
             np.add.at(lost, self.interval, paid.sum(axis=1))
-        for pushes, place in ((self.hold, self.interval), (self.stand, self.interval), (self.node, np.arange(-1, n))):
-            np.add.at(lost, place[pushes.point], pushes.price * x[pushes.index])
-        standing = self.stand.table(x, along.stand.lower.shape) / along.share[:, None]
-        at_nodes = self.node.table(x, along.node_stand.lower.shape)
-        standing.reshape(n, q, -1)[:, -1] += at_nodes[1:] / along.share.reshape(n, q)[:, -1:]
+        for limits in (self.control_limits, self.state_limits):
+            np.add.at(lost, self.interval[limits.point], limits.price * x[limits.index])
+        np.add.at(lost, self.node.point - 1, self.node.price * x[self.node.index])
+        state_multipliers = self.state_limits.table(x, along.state_limits.lower.shape) / along.share[:, None]
+        at_nodes = self.node.table(x, along.node_limits.lower.shape)
+        state_multipliers.reshape(n, q, -1)[:, -1] += at_nodes[1:] / along.share.reshape(n, q)[:, -1:]
         slope = np.zeros(2 * nx + 1)
-        slope[self.free] = (x[self.missed[1]] - x[self.missed[0]]) / self.scale[self.free]
-        end, start = self.ends.table(x[self.grip] / self.reach)
-        charge = float(self.ends.gap / self.reach @ x[self.grip])
-        behind = x[self.nodes]
-        before = behind.copy()
+        slope[self.free] = (x[self.end_residual[1]] - x[self.end_residual[0]]) / self.scale[self.free]
+        end, start = self.ends.table(x[self.end_index] / self.reach)
+        charge = float(self.ends.gap / self.reach @ x[self.end_index])
+        after = x[self.nodes]
+        before = after.copy()
         np.add.at(before, self.node.point, self.node.slope[:, :nx] * size * x[self.node.index, None])
-        off = np.minimum(np.abs(self.told - behind), np.abs(self.told - before))[:-1].sum(axis=1)
+        distances = np.minimum(np.abs(self.reported - after), np.abs(self.reported - before))[:-1].sum(axis=1)
         return Fit(
             lost,
             replace(
                 known,
                 costate=x[self.costate] / size,
-                holding=self.hold.table(x, along.hold.lower.shape),
-                standing=standing,
+                control_multipliers=self.control_limits.table(x, along.control_limits.lower.shape),
+                state_multipliers=state_multipliers,
                 ends=known.ends._replace(slope=slope[nx:], charge=charge, end=end, start=start),
             ),
-            0.0 if along.stand.equal.any() else float(off.max()),
+            0.0 if along.state_limits.equal.any() else float(distances.max()),
         )
 
 
@@ -305,16 +314,21 @@ class Optimality:
     """First and second order conditions along a plan.
 
     Attributes:
-        lost: What the plan could cost less, to second order, in each interval; those at its ends in the first. (N,)
-        cost_size: What it is judged against, in units of cost: the cost, or where that is next to nothing what
-            changes of the controls that are just told apart would cost.
-        error_size: What errors of the costates are judged against, in units of cost. They cost by their square.
-        stationarity: Largest slope of the Hamiltonian that nothing holds at the Gauss points, relative to the sizes
-            of its parts. t: their times, s. Both (N q,).
-        known_to: Share of the cost up to which a transcription that loses as much in its controls knows its costates.
-        unfit: Error of the costates reported, as a share of the cost, where others fit the plan better: their distance
-            from these, or what they lose more, by its root. flat: Whether H does not curve along some control.
-        adjoint: Costates and multipliers. hamiltonian: Along the plan. curvature: The second variation.
+        lost: Cost that the plan could save in each interval, to second order; that of the ends is in the first. Shape
+            (N,).
+        cost_size: Reference of the loss, in units of cost: the cost or, if it is negligible, the cost of the smallest
+            control changes that are resolved.
+        error_size: Reference of the costate errors, in units of cost. The cost is quadratic in these errors.
+        t: Times of the Gauss points, s. Shape (N q,).
+        stationarity: Largest remaining slope of the Hamiltonian at these, relative to the sizes of its parts. Shape (N
+            q,).
+        adjoint: Costates and multipliers.
+        hamiltonian: The Hamiltonian along the plan.
+        curvature: The second variation.
+        costate_accuracy: Relative accuracy of the costates of a transcription whose controls lose as much cost.
+        costate_error: Error of the reported costates as a share of the cost, if other costates fit the plan better:
+            their distance from these, or the root of the additional loss.
+        has_linear_control: Whether the Hamiltonian is linear in some control.
     """
 
     lost: np.ndarray
@@ -325,9 +339,9 @@ class Optimality:
     adjoint: Adjoint
     hamiltonian: Hamiltonian
     curvature: Curvature
-    known_to: float
-    unfit: float
-    flat: bool
+    costate_accuracy: float
+    costate_error: float
+    has_linear_control: bool
 
 
 def optimality(
@@ -338,82 +352,82 @@ def optimality(
     along: Linearisation | None = None,
     allowed: float = LIMIT_SHARE,
 ) -> Optimality:
-    """Look for the multipliers of a plan, for what it loses and for how the cost curves.
+    """Compute the multipliers of a plan, the cost it loses, and the curvature of the cost.
 
     Args:
-        form, p, bounds: The problem, its parameters and its bounds at these.
-        solution: The plan. along: Its first derivatives, where they are known already.
-        allowed: Share of the cost from which on it is worth looking for multipliers that fit the plan better than the
-            costates reported.
+        form, p, bounds: The problem, its parameters, and its bounds at these.
+        solution: The plan.
+        along: Its linearisation, if known.
+        allowed: Share of the cost above which multipliers are searched that fit better than the reported costates.
     """
     along = along or Linearisation(form, solution, p, bounds, sizes(form, solution, p, bounds))
     if not (along.finite and np.isfinite(solution.cost)):
         return undefined(along, hamiltonian(form, solution, p))
     cost = abs(solution.cost) or along.slope_size or 1.0
-    curved = _curved(along)
+    curved = _control_curvature(along)
     first = adjoint(along, curved, cost)
-    if first.lumps.any():
-        found, told = first, _told(along, first, curved)
-        for _ in range(4):  # each finds pushes at single nodes better by the width of an interval
-            found = adjoint(along, curved, cost, found.lumps)
-            now = _told(along, found, curved)
-            if now >= told:
+    if first.node_shifts.any():
+        candidate, loss = first, _misfit(along, first, curved)
+        for _ in range(4):  # each pass resolves atoms at single nodes better by the width of an interval
+            candidate = adjoint(along, curved, cost, candidate.node_shifts)
+            loss_found = _misfit(along, candidate, curved)
+            if loss_found >= loss:
                 break
-            first, told = found, now
+            first, loss = candidate, loss_found
     accessory = AccessoryProblem(along, first)
-    spread = accessory.spread
-    cost = max(abs(solution.cost), LIMIT_SHARE * accessory.price, LIMIT_SHARE**2 * along.slope_size)
+    spread = accessory.hamiltonian_scale
+    cost = max(abs(solution.cost), LIMIT_SHARE * accessory.cost_scale, LIMIT_SHARE**2 * along.slope_size)
     cost = cost if cost > 0 else 1.0
-    total = lost(along, first.costate, first.holding, accessory.curved)
+    total = control_loss(along, first.costate, first.control_multipliers, accessory.curved)
     total, best = np.maximum(total, 0.0) + first.charge, first
-    told, unfit = _won(total, first), 0.0
-    several = along.several or bool(accessory.flat.any())
-    if told > allowed * cost and several:
+    loss, costate_error = _total_loss(total, first), 0.0
+    is_degenerate = along.may_be_degenerate or bool(accessory.linear_controls.any())
+    if loss > allowed * cost and is_degenerate:
         fit = best_multipliers(along, first, accessory.curved, cost)
-        if fit is not None and _won(fit.lost, fit.adjoint) < told:
+        if fit is not None and _total_loss(fit.lost, fit.adjoint) < loss:
             best = fit.adjoint
-            total = np.maximum(fit.lost + turning(along, best.costate, accessory.curved), 0.0)
-            unfit = min(fit.distance / cost, float(np.sqrt((told - _won(total, best)) / cost)))
+            total = np.maximum(fit.lost + switching_loss(along, best.costate, accessory.curved), 0.0)
+            costate_error = min(fit.distance / cost, float(np.sqrt((loss - _total_loss(total, best)) / cost)))
             accessory = AccessoryProblem(along, best)
     total[0] += best.ends.charge
-    loses = float(total.sum()) if unfit else told
-    known_to = float(np.sqrt(loses / cost)) if np.isfinite(loses) else 0.0
-    second = curvature(accessory)
-    if second.upwards and second.won is not None:  # near a conjugate point states that follow win more
-        more = float(second.won.sum() - total.sum())
-        total += max(more, 0.0) * second.won / (float(second.won.sum()) or 1.0)
-    total[0] += second.lost(accessory.start_slope)
+    total_loss = float(total.sum()) if costate_error else loss
+    costate_accuracy = float(np.sqrt(total_loss / cost)) if np.isfinite(total_loss) else 0.0
+    second_order = curvature(accessory)
+    if second_order.upwards and second_order.gain is not None:  # near a conjugate point moving states add to the loss
+        additional = float(second_order.gain.sum() - total.sum())
+        total += max(additional, 0.0) * second_order.gain / (float(second_order.gain.sum()) or 1.0)
+    total[0] += second_order.lost(accessory.start_slope)
     return Optimality(
         total,
         cost,
-        max(float(np.sqrt(cost * max(cost, spread))), RESOLVED_SHARE**2 * accessory.magnitude),
+        max(float(np.sqrt(cost * max(cost, spread))), RESOLVED_SHARE**2 * accessory.control_scale),
         along.t,
-        reduced_slope(along, best.costate, best.holding),
+        reduced_slope(along, best.costate, best.control_multipliers),
         best,
         hamiltonian(form, solution, p),
-        second,
-        known_to,
-        unfit,
-        bool(accessory.flat.any()),
+        second_order,
+        costate_accuracy,
+        costate_error,
+        bool(accessory.linear_controls.any()),
     )
 
 
-def _won(by_interval: np.ndarray, multipliers: Adjoint) -> float:
-    """What a plan loses with these multipliers but for its start, in units of cost."""
+def _total_loss(by_interval: np.ndarray, multipliers: Adjoint) -> float:
+    """Return the loss of a plan with these multipliers without that of its start, in units of cost."""
     return float(by_interval.sum() + multipliers.ends.charge)
 
 
-def _told(along: Linearisation, found: Adjoint, curved: np.ndarray | None) -> float:
-    """What a plan loses and errs by with these multipliers, in units of cost."""
+def _misfit(along: Linearisation, found: Adjoint, curved: np.ndarray | None) -> float:
+    """Return the loss and the costate errors of a plan with these multipliers, in units of cost."""
     assert curved is not None
-    won = lost(along, found.costate, found.holding, curved).sum() + found.charge.sum() + found.ends.charge
-    return float(won + found.total + found.ends.transversality)
+    loss = control_loss(along, found.costate, found.control_multipliers, curved).sum()
+    return float(loss + found.charge.sum() + found.ends.charge + found.total + found.ends.transversality)
 
 
-def _curved(along: Linearisation) -> np.ndarray | None:
-    """T H_uu at the points but for its path constraints, (M, nu, nu), where what pushes at single points needs it."""
+def _control_curvature(along: Linearisation) -> np.ndarray | None:
+    """Return T H_uu at the points without path constraints, (M, nu, nu), if limits may be active at single points."""
     form = along.form
-    near = along.stand.near.any() or along.node_stand.near.any()
+    near = along.state_limits.near.any() or along.node_limits.near.any()
     single = along.nodal and (along.mixed.size > 0 or near)
     if form.path.equality[along.mixed].all() and not single:
         return None
@@ -422,31 +436,19 @@ def _curved(along: Linearisation) -> np.ndarray | None:
     def outputs() -> list[Any]:
         return [ca.hessian(along.scaled[0] + ca.dot(lam, along.scaled[1]), form.u)[0]]
 
-    (curved,) = form.sampled(outputs, *along.here, (lam, along.costate), cache_as="curvature in the controls")
+    (curved,) = form.sampled(outputs, *along.point, (lam, along.costate), cache_as="curvature in the controls")
     return np.asarray(curved.reshape(-1, form.nu, form.nu))
 
 
 def undefined(along: Linearisation, values: Hamiltonian) -> Optimality:
-    """What is found where the problem is not a number along the plan: nothing that would pass."""
-    (n, _), m = along.shape, len(along.s)
-    nothing, form = np.full(n, np.inf), along.form
-    ends = Ends(
-        np.inf, np.inf, np.full(form.nx + 1, np.nan), np.inf, np.zeros(len(form.end)), np.zeros(len(form.start))
-    )
-    t = along.mesh * along.solution.horizon
-    shapes = form.nx, along.hold_u.shape[1], along.stand_x.shape[1]
-    costate, holding, standing = (np.full((m, k), np.nan) for k in shapes)
+    """Return the result for a plan along which the problem is not finite: it passes no check."""
+    (n, _), m, form = along.shape, len(along.s), along.form
+    infinite, t = np.full(n, np.inf), along.mesh * along.solution.horizon
+    rows = np.zeros(len(form.end)), np.zeros(len(form.start))
+    ends = Ends(np.inf, np.inf, np.full(form.nx + 1, np.nan), np.inf, *rows)
+    counts = form.nx, along.control_limits_u.shape[1], along.state_limits_x.shape[1]
+    costate, of_controls, of_states = (np.full((m, count), np.nan) for count in counts)
+    shifts = np.zeros((n + 1, form.nx))
+    known = Adjoint(t, costate, of_controls, of_states, infinite, np.inf, infinite, infinite, shifts, ends)
     curved = Curvature(np.nan, None, "the problem is not a number along the plan", None, along.t)
-    return Optimality(
-        nothing,
-        1.0,
-        1.0,
-        along.t,
-        np.full(m, np.inf),
-        Adjoint(t, costate, holding, standing, nothing, np.inf, nothing, nothing, np.zeros((n + 1, form.nx)), ends),
-        values,
-        curved,
-        0.0,
-        0.0,
-        False,
-    )
+    return Optimality(infinite, 1.0, 1.0, along.t, np.full(m, np.inf), known, values, curved, 0.0, 0.0, False)

@@ -1,9 +1,10 @@
-"""The minimum principle along a plan: does any admissible control have a smaller Hamiltonian, and what would it win?
+"""The minimum principle along a plan: does an admissible control lower the Hamiltonian, and by how much would it lower
+the cost?
 
-Nothing here trusts the multipliers of a solver: at each point those of the limits that hold the controls are found
-anew, by least squares with the signs that the minimum principle demands (Bryson, Ho 1975, chapter 3). What is left of
-the Hamiltonian's slope is judged by what it loses: the least of H_u du + du H_uu du / 2 over the controls within their
-limits, integrated over the plan, in units of cost.
+The multipliers of the solver are not used. At each point the multipliers of the limits of the controls are computed by
+least squares, with the signs that the minimum principle demands (Bryson, Ho 1975, chapter 3). The remaining slope of
+the Hamiltonian is judged by the cost it loses: the minimum of H_u du + du H_uu du / 2 over the controls within their
+limits, integrated over the plan.
 """
 
 from __future__ import annotations
@@ -19,17 +20,15 @@ from ocp.tolerances import FLAT_SHARE, MACHINE_SHARE, ROUNDING_SHARE, SOLVER_SHA
 
 __all__ = [
     "Hamiltonian",
-    "balance",
+    "control_loss",
+    "find_control_multipliers",
     "groups",
     "hamiltonian",
-    "holders",
-    "inverse_of",
-    "inverses",
-    "lost",
-    "nonnegative",
+    "nnls",
+    "pseudo_inverse_of",
     "reduced_slope",
     "slope",
-    "turning",
+    "switching_loss",
 ]
 
 
@@ -38,8 +37,9 @@ class Hamiltonian:
     """The Hamiltonian along a plan.
 
     Attributes:
-        t: Reported times of the plan, s. values: L + costate . f there, in cost per second. Both (M,).
-        scale: Largest of |L| + sum |costate_i f_i|.
+        t: Reported times of the plan, s. Shape (M,).
+        values: L + costate . f at these times, in cost per second. Shape (M,).
+        scale: Largest value of |L| + sum |costate_i f_i|.
     """
 
     t: np.ndarray
@@ -53,162 +53,164 @@ class Hamiltonian:
 
 
 def hamiltonian(form: Formulation, solution: Solution, p: np.ndarray) -> Hamiltonian:
-    """The Hamiltonian at the reported times of a plan."""
+    """Return the Hamiltonian at the reported times of a plan."""
     pools = (solution.states, solution.controls, solution.costates)
     x, u, costate = (stack(pool, len(solution.t)) for pool in pools)
     lam = form.sym("lam", form.nx)
-    here = x, u, solution.t, solution.horizon, p, (lam, costate)
-    parts = form.sampled(lambda: [form.running, lam * form.f], *here, cache_as="Hamiltonian")
-    running, products = parts
+    point = x, u, solution.t, solution.horizon, p, (lam, costate)
+    running, products = form.sampled(lambda: [form.running, lam * form.f], *point, cache_as="Hamiltonian")
     scale = float(np.max(np.abs(running[:, 0]) + np.abs(products).sum(axis=1), initial=0.0))
     return Hamiltonian(solution.t, running[:, 0] + products.sum(axis=1), scale or 1.0)
 
 
-def holders(
+def find_control_multipliers(
     along: Linearisation, costate: np.ndarray, curved: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Multipliers of the limits that hold the controls, for costates (M, nx) at the points.
+    """Return the multipliers of the limits of the controls for costates (M, nx) at the points.
 
-    Those that make T H most nearly stationary, controls in units of their sizes. What a plan meets at single points of
-    an interval only, as with held controls, pushes over the gap elsewhere, where that loses less than the slope does.
+    They minimise the slope of T H, with controls in units of their sizes. A limit that a plan reaches only at single
+    points of an interval, as for piecewise constant controls, may be active across a gap elsewhere, where that loses
+    less than the slope.
 
     Args:
-        along: The plan. costate: (M, nx).
-        curved: T H_uu, (M, nu, nu); None where it is not known yet, and nothing pushes over a gap.
+        along: The plan.
+        costate: Shape (M, nx).
+        curved: T H_uu, shape (M, nu, nu); None if unknown. Limits are then inactive across gaps.
 
     Returns:
         multipliers: Per unit of s. Shape (M, nu + r + a).
-        across: At which points some push over a gap. Shape (M,), bool.
+        across: Whether a limit is active across a gap. Shape (M,), bool.
     """
-    unit, hold, mixed = along.control_size, along.hold, along.mixed.size
-    gradient, directions = slope(along, costate) * unit, along.hold_u * unit
-    inverse = inverse_of(along, hold.near)
-    found = balance(gradient, directions, hold.lower, hold.upper, inverse)
-    across = np.zeros(len(found), bool)
+    unit, control_limits, mixed = along.control_size, along.control_limits, along.mixed.size
+    gradient, directions = slope(along, costate) * unit, along.control_limits_u * unit
+    inverse = pseudo_inverse_of(along, control_limits.near)
+    multipliers = balance(gradient, directions, control_limits.lower, control_limits.upper, inverse)
+    across = np.zeros(len(multipliers), bool)
     if curved is None or along.form.path.equality[along.mixed].all():
-        return found, across
-    left = np.abs(gradient + np.einsum("kmu,km->ku", directions, found)).max(axis=1)
-    steep = float(np.abs(gradient).max())
-    for k in np.flatnonzero(left > SOLVER_SHARE * steep):
-        bend = curved[k] * unit * unit[:, None]
-        values, vectors = np.linalg.eigh((bend + bend.T) / 2)
-        least = FLAT_SHARE * (np.abs(gradient[k]).max() + np.abs(values).max())
-        root = vectors / np.sqrt(np.maximum(values, least))
+        return multipliers, across
+    residual = np.abs(gradient + np.einsum("kmu,km->ku", directions, multipliers)).max(axis=1)
+    largest_slope = float(np.abs(gradient).max())
+    for k in np.flatnonzero(residual > SOLVER_SHARE * largest_slope):
+        hessian = curved[k] * unit * unit[:, None]
+        values, vectors = np.linalg.eigh((hessian + hessian.T) / 2)
+        floor = FLAT_SHARE * (np.abs(gradient[k]).max() + np.abs(values).max())
+        root = vectors / np.sqrt(np.maximum(values, floor))
         sides = []
-        for i in range(len(found[k])):
-            both = hold.lower[k, i] and hold.upper[k, i]
-            if both:
+        for i in range(len(multipliers[k])):
+            is_equality = control_limits.lower[k, i] and control_limits.upper[k, i]
+            if is_equality:
                 sides.append((i, 1.0, 0.0, True))
             elif i < len(unit) + mixed:
-                sides += [(i, 1.0, hold.above[k, i], False), (i, -1.0, hold.below[k, i], False)]
+                sides += [(i, 1.0, control_limits.above[k, i], False), (i, -1.0, control_limits.below[k, i], False)]
         sides = [side for side in sides if np.isfinite(side[2]) and np.abs(directions[k, side[0]]).max() > 0]
         which, sign, gap, free = (np.array(part) for part in zip(*sides, strict=True))
         rows = directions[k, which] * sign[:, None]
         size = np.abs(rows).max(axis=1)
-        pushed = nonnegative((rows / size[:, None] @ root).T, -gradient[k] @ root, gap / size, free.astype(bool))
-        found[k] = 0.0
-        np.add.at(found[k], which, sign * pushed / size)
+        magnitudes = nnls((rows / size[:, None] @ root).T, -gradient[k] @ root, gap / size, free.astype(bool))
+        multipliers[k] = 0.0
+        np.add.at(multipliers[k], which, sign * magnitudes / size)
         across[k] = True
-    return found, across
+    return multipliers, across
 
 
 def slope(along: Linearisation, costate: np.ndarray) -> np.ndarray:
-    """Derivative of T (L + costate . f) in the controls at the points. Shape (M, nu)."""
-    of = along.form.nx + 1
-    return np.asarray(along.cost_y[:, of:] + np.einsum("kiu,ki->ku", along.rate_y[:, :, of:], costate))
+    """Return the derivative of T (L + costate . f) in the controls at the points. Shape (M, nu)."""
+    first = along.form.nx + 1
+    return np.asarray(along.cost_y[:, first:] + np.einsum("kiu,ki->ku", along.rate_y[:, :, first:], costate))
 
 
-def inverse_of(along: Linearisation, held: np.ndarray) -> np.ndarray:
-    """Pseudo-inverse of the derivatives of the limits that hold, (M, m) bool, in controls in units of their sizes.
+def pseudo_inverse_of(along: Linearisation, active: np.ndarray) -> np.ndarray:
+    """Return the pseudo-inverse of the derivatives of ``active`` limits (M, m), bool, with controls in units of size.
 
-    Shape (M, nu, m). It is kept with the plan, for the same limits hold it whatever its costates.
+    Shape (M, nu, m). It is cached with the plan, since it does not depend on the costates.
     """
-    key = np.packbits(held).tobytes()
-    if key not in along.inverses:
-        along.inverses[key] = inverses(along.hold_u * along.control_size, held)
-    return along.inverses[key]
+    key = np.packbits(active).tobytes()
+    if key not in along.pseudo_inverses:
+        along.pseudo_inverses[key] = pseudo_inverses(along.control_limits_u * along.control_size, active)
+    return along.pseudo_inverses[key]
 
 
-def inverses(rows: np.ndarray, held: np.ndarray) -> np.ndarray:
-    """Pseudo-inverses (M, n, m) of those of the rows (M, m, n) that are ``held`` (M, m), bool; zero for the others."""
+def pseudo_inverses(rows: np.ndarray, active: np.ndarray) -> np.ndarray:
+    """Return pseudo-inverses (M, n, m) of the ``active`` (M, m) rows, bool, of (M, m, n); zero for the other rows."""
     m, count, n = rows.shape
-    found = np.zeros((m, n, count))
-    for pattern, members in groups(held):
+    inverses = np.zeros((m, n, count))
+    for pattern, members in groups(active):
         if pattern.any():
             inverse = np.linalg.pinv(rows[members][:, pattern], rcond=ROUNDING_SHARE)
-            found[members[:, None], :, np.flatnonzero(pattern)] = inverse.transpose(0, 2, 1)
-    return found
+            inverses[members[:, None], :, np.flatnonzero(pattern)] = inverse.transpose(0, 2, 1)
+    return inverses
 
 
 def balance(
     gradient: np.ndarray, directions: np.ndarray, lower: np.ndarray, upper: np.ndarray, inverse: np.ndarray
 ) -> np.ndarray:
-    """Multipliers (M, m) of limits that make gradient (M, n) + directions (M, m, n)' multipliers least at each point.
+    """Return the multipliers (M, m) that minimise |gradient (M, n) + directions (M, m, n)' multipliers| at each point.
 
-    At least zero where only ``upper`` (M, m) may push, at most zero where only ``lower`` may, free where both may.
-    ``inverse`` is that of the directions which may push, (M, n, m).
+    Multipliers are at least zero for ``upper`` limits (M, m), at most zero for ``lower`` limits and free for both.
+    ``inverse`` (M, n, m) is the pseudo-inverse of the directions of these limits.
     """
     multipliers = -np.einsum("knm,kn->km", inverse, gradient)
     sign, free, active = np.where(upper, 1.0, -1.0), lower & upper, lower | upper
-    wrong = (sign * multipliers < 0) & active & ~free
-    for k in np.flatnonzero(wrong.any(axis=1)):  # the signs hold some of them back
-        own = np.flatnonzero(active[k])
-        columns = (directions[k, own] * sign[k, own, None]).T
-        multipliers[k, own] = sign[k, own] * nonnegative(columns, -gradient[k], np.zeros(len(own)), free[k, own])
+    wrong_sign = (sign * multipliers < 0) & active & ~free
+    for k in np.flatnonzero(wrong_sign.any(axis=1)):  # solve again with the sign constraints
+        index = np.flatnonzero(active[k])
+        columns = (directions[k, index] * sign[k, index, None]).T
+        multipliers[k, index] = sign[k, index] * nnls(columns, -gradient[k], np.zeros(len(index)), free[k, index])
     return np.asarray(multipliers)
 
 
 def reduced_slope(along: Linearisation, costate: np.ndarray, multipliers: np.ndarray) -> np.ndarray:
-    """Largest entry of the Hamiltonian's slope that no multiplier explains, relative to the parts of it. (M,)."""
+    """Return the largest entry of the remaining slope of T H, relative to its parts. Shape (M,)."""
     form = along.form
     if not form.nu:
         return np.zeros(len(along.s))
-    unit, of = along.control_size, form.nx + 1
-    left = (slope(along, costate) + np.einsum("kmu,km->ku", along.hold_u, multipliers)) * unit
-    parts = np.abs(along.cost_y[:, of:]) + np.einsum("kiu,ki->ku", np.abs(along.rate_y[:, :, of:]), np.abs(costate))
+    unit, first = along.control_size, form.nx + 1
+    residual = (slope(along, costate) + np.einsum("kmu,km->ku", along.control_limits_u, multipliers)) * unit
+    rates = np.abs(along.rate_y[:, :, first:])
+    parts = np.abs(along.cost_y[:, first:]) + np.einsum("kiu,ki->ku", rates, np.abs(costate))
     size = float((parts * unit).max(initial=0.0)) or 1.0
-    return np.asarray(np.abs(left).max(axis=1, initial=0.0) / size)
+    return np.asarray(np.abs(residual).max(axis=1, initial=0.0) / size)
 
 
-def nonnegative(matrix: np.ndarray, target: np.ndarray, price: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """The y (m,) of least |matrix y - target|^2 / 2 + price . y, at least zero but where it is ``free`` (m,), bool.
+def nnls(matrix: np.ndarray, target: np.ndarray, price: np.ndarray, free: np.ndarray) -> np.ndarray:
+    """Return the y (m,) that minimises |matrix y - target|^2 / 2 + price . y, at least zero unless ``free`` (m,), bool.
 
-    By active sets (Lawson, Hanson 1974, chapter 23); of the free ones the least that do it.
+    Active-set method (Lawson, Hanson 1974, chapter 23). Free entries have minimal norm.
     """
     y = np.zeros(matrix.shape[1])
     bound = ~free
     if free.any():
         inverse = np.linalg.pinv(matrix[:, free], rcond=ROUNDING_SHARE)
         rest = matrix[:, bound] - matrix[:, free] @ (inverse @ matrix[:, bound])
-        left = target - matrix[:, free] @ (inverse @ target)
-        y[bound] = nonnegative(rest, left, price[bound], np.zeros(int(bound.sum()), bool))
+        rest_of_target = target - matrix[:, free] @ (inverse @ target)
+        y[bound] = nnls(rest, rest_of_target, price[bound], np.zeros(int(bound.sum()), bool))
         y[free] = inverse @ (target - matrix[:, bound] @ y[bound])
         return y
     normal, right = matrix.T @ matrix, matrix.T @ target - price
     passive = np.zeros(len(y), bool)
-    small = 1e-13 * max(float(np.abs(right).max(initial=0.0)), float(np.finfo(float).tiny))
+    tolerance = 1e-13 * max(float(np.abs(right).max(initial=0.0)), float(np.finfo(float).tiny))
     for _ in range(3 * len(y)):
-        pull = np.where(passive, -np.inf, right - normal @ y)
-        if pull.max() <= small:
+        gradient = np.where(passive, -np.inf, right - normal @ y)
+        if gradient.max() <= tolerance:
             break
-        passive[np.argmax(pull)] = True
+        passive[np.argmax(gradient)] = True
         while True:
             index = np.flatnonzero(passive)
             best = np.linalg.lstsq(normal[np.ix_(index, index)], right[index], rcond=1e-12)[0]
-            falling = best <= 0
-            if not falling.any():
+            negative = best <= 0
+            if not negative.any():
                 y[index] = best
                 break
-            ratio = y[index][falling] / np.maximum(y[index][falling] - best[falling], np.finfo(float).tiny)
+            ratio = y[index][negative] / np.maximum(y[index][negative] - best[negative], np.finfo(float).tiny)
             y[index] += float(np.clip(ratio.min(), 0.0, 1.0)) * (best - y[index])
-            drop = index[falling & (y[index] <= 1e-15 * np.abs(y).max())]
-            drop = drop if drop.size else index[falling][:1]
+            drop = index[negative & (y[index] <= 1e-15 * np.abs(y).max())]
+            drop = drop if drop.size else index[negative][:1]
             y[drop], passive[drop] = 0.0, False
     return y
 
 
 def groups(patterns: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Distinct rows of patterns (M, m), bool, each with the indices of its members."""
+    """Return the distinct rows of patterns (M, m), bool, each with the indices of its members."""
     if not patterns.size:
         return [(np.zeros(patterns.shape[1], bool), np.arange(len(patterns)))] if len(patterns) else []
     packed = np.ascontiguousarray(np.packbits(patterns, axis=1))
@@ -217,99 +219,102 @@ def groups(patterns: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
     keys = packed.view(np.dtype((np.void, packed.shape[1]))).ravel()
     _, first, member = np.unique(keys, return_index=True, return_inverse=True)
     order = np.argsort(member, kind="stable")
-    cuts = np.searchsorted(member[order], np.arange(1, len(first)))
-    return list(zip(patterns[first], np.split(order, cuts), strict=True))
+    splits = np.searchsorted(member[order], np.arange(1, len(first)))
+    return list(zip(patterns[first], np.split(order, splits), strict=True))
 
 
-def lost(along: Linearisation, costate: np.ndarray, multipliers: np.ndarray, curved: np.ndarray) -> np.ndarray:
-    """What the controls could win in each interval within their limits, to second order, in units of cost. (N,).
+def control_loss(along: Linearisation, costate: np.ndarray, multipliers: np.ndarray, curved: np.ndarray) -> np.ndarray:
+    """Return the cost that the controls could save in each interval within their limits, to second order. Shape (N,).
+
+    A control moves within its limits, and at most by its size if the Hamiltonian does not curve along it. Rows with
+    multipliers stay active.
 
     Args:
-        along: The plan. costate: (M, nx).
-        multipliers: Of the limits of the controls, (M, nu + r + a). What these win over the gaps to their limits
-            counts.
+        along: The plan.
+        costate: Shape (M, nx).
+        multipliers: Of the limits of the controls; their products with the gaps count. Shape (M, nu + r + a).
         curved: T H_uu. Shape (M, nu, nu).
-
-    A control moves within its limits, and by its size at most where the Hamiltonian does not curve along it. Rows that
-    push stay where they are.
     """
     nu, n = along.form.nu, along.shape[0]
     if not nu:
         return np.zeros(n)
     unit = along.control_size
-    won = along.hold.charge(multipliers).sum(axis=1)
-    gradient = slope(along, costate) + np.einsum("kmu,km->ku", along.hold_u, multipliers)
+    by_gaps = along.control_limits.charge(multipliers).sum(axis=1)
+    gradient = slope(along, costate) + np.einsum("kmu,km->ku", along.control_limits_u, multipliers)
     gradient, curved_u, curved = gradient * unit, curved, curved * (unit * unit[:, None])
     low, high = (np.clip((side - along.u) / unit, -1e3, 1e3) for side in (along.low, along.high))
     low, high = np.minimum(low, 0.0), np.maximum(high, 0.0)
     scale = float(np.abs(curved).max(initial=0.0)) or 1.0
-    size = np.abs(along.hold_u * unit).max(axis=2)
-    pushes = (np.abs(multipliers) * size > FLAT_SHARE * np.abs(multipliers * size).max(initial=0.0)) | along.hold.equal
-    fixed = pushes | (along.hold.lower & along.hold.upper & (size > 0))
-    best = np.zeros(len(won))
-    while True:  # a control that rests on its limit and would go beyond stays: at most nu rounds
-        blocked, inverse = fixed.copy(), inverse_of(along, fixed)
-        for pattern, members in groups(fixed):
-            rows = along.hold_u[members][:, pattern] * unit
+    size = np.abs(along.control_limits_u * unit).max(axis=2)
+    force = np.abs(multipliers) * size
+    active = (force > FLAT_SHARE * np.abs(multipliers * size).max(initial=0.0)) | along.control_limits.equal
+    active = active | (along.control_limits.lower & along.control_limits.upper & (size > 0))
+    gain = np.zeros(len(by_gaps))
+    while True:  # fix controls at limits that the step would violate: at most nu rounds
+        blocked, inverse = active.copy(), pseudo_inverse_of(along, active)
+        for pattern, members in groups(active):
+            rows = along.control_limits_u[members][:, pattern] * unit
             projector = np.eye(nu) - inverse[members][:, :, pattern] @ rows
             step = _step(gradient[members], curved[members], projector, scale)
             with np.errstate(divide="ignore", invalid="ignore"):
-                room = np.where(step > 0, high[members] / step, np.where(step < 0, low[members] / step, np.inf))
-            step = np.clip(room.min(axis=1, initial=1.0), 0.0, 1.0)[:, None] * step
+                ratio = np.where(step > 0, high[members] / step, np.where(step < 0, low[members] / step, np.inf))
+            step = np.clip(ratio.min(axis=1, initial=1.0), 0.0, 1.0)[:, None] * step
             change = np.einsum("ku,ku->k", gradient[members], step)
             change += np.einsum("ku,kuv,kv->k", step, curved[members], step) / 2
-            best[members] = np.maximum(best[members], -change)
-            blocked[members, :nu] |= room <= ROUNDING_SHARE
-        if (blocked == fixed).all():
+            gain[members] = np.maximum(gain[members], -change)
+            blocked[members, :nu] |= ratio <= ROUNDING_SHARE
+        if (blocked == active).all():
             break
-        fixed = blocked
-    return np.asarray(((won + best) * along.share).reshape(n, -1).sum(axis=1) + turning(along, costate, curved_u))
+        active = blocked
+    by_interval = ((by_gaps + gain) * along.share).reshape(n, -1).sum(axis=1)
+    return np.asarray(by_interval + switching_loss(along, costate, curved_u))
 
 
-def turning(along: Linearisation, costate: np.ndarray, curved: np.ndarray) -> np.ndarray:
-    """What a quadrature misses of intervals in which the slope along a control that does not curve turns. Shape (N,).
+def switching_loss(along: Linearisation, costate: np.ndarray, curved: np.ndarray) -> np.ndarray:
+    """Return the loss that the quadrature misses where the slope along a linear control changes its sign. Shape (N,).
 
-    The loss there is that of max(slope, 0) and max(-slope, 0) times the ways to both limits. Args as of `lost`.
+    The integrand is max(slope, 0) and max(-slope, 0) times the distances to both limits. Args as in `control_loss`.
     """
     (n, q), unit = along.shape, along.control_size
-    pull, bends = slope(along, costate) * unit, curved * (unit * unit[:, None])
-    largest = max(float(np.abs(bends).max(initial=0.0)), float(np.abs(pull).max(initial=0.0)))
-    flat = np.abs(bends).max(axis=(0, 2), initial=0.0) <= FLAT_SHARE * largest
-    if along.mixed.size or not flat.any():
+    gradient, hessian = slope(along, costate) * unit, curved * (unit * unit[:, None])
+    largest = max(float(np.abs(hessian).max(initial=0.0)), float(np.abs(gradient).max(initial=0.0)))
+    linear = np.abs(hessian).max(axis=(0, 2), initial=0.0) <= FLAT_SHARE * largest
+    if along.mixed.size or not linear.any():
         return np.zeros(n)
-    m, pull = int(flat.sum()), pull[:, flat].reshape(n, q, -1)
+    m, gradient = int(linear.sum()), gradient[:, linear].reshape(n, q, -1)
     down, up = (
-        np.maximum(sign * (side - along.u) / unit, 0.0)[:, flat] for sign, side in ((-1, along.low), (1, along.high))
+        np.maximum(sign * (side - along.u) / unit, 0.0)[:, linear] for sign, side in ((-1, along.low), (1, along.high))
     )
-    turns = (pull.min(axis=1) < 0) & (pull.max(axis=1) > 0)
-    off = along.places - along.weight @ along.places
-    steep = np.einsum("j,kjm->km", along.weight * off, pull) / (along.weight @ off**2)
-    mean = np.einsum("j,kjm->km", along.weight, pull)
-    line = mean[:, None] + steep[:, None] * off[:, None]
-    first, last = mean + steep * (0.0 - along.weight @ along.places), mean + steep * (1.0 - along.weight @ along.places)
+    changes_sign = (gradient.min(axis=1) < 0) & (gradient.max(axis=1) > 0)
+    centred = along.places - along.weight @ along.places
+    rate = np.einsum("j,kjm->km", along.weight * centred, gradient) / (along.weight @ centred**2)
+    mean = np.einsum("j,kjm->km", along.weight, gradient)
+    line = mean[:, None] + rate[:, None] * centred[:, None]
+    first, last = mean + rate * (0.0 - along.weight @ along.places), mean + rate * (1.0 - along.weight @ along.places)
     missed = np.zeros((n, m))
     with np.errstate(divide="ignore", invalid="ignore"):
-        for sign, room in ((1.0, down), (-1.0, up)):
+        for sign, distance in ((1.0, down), (-1.0, up)):
             a, b = np.maximum(sign * first, 0.0), np.maximum(sign * last, 0.0)
             exact = (b**2 - a**2) / (2 * sign * (last - first))
-            seen = np.einsum("j,kjm->km", along.weight, np.maximum(sign * line, 0.0))
-            width = np.minimum(room.reshape(n, q, m).mean(axis=1), 1.0)
-            missed += np.where(turns, width * (exact - seen), 0.0)
+            quadrature = np.einsum("j,kjm->km", along.weight, np.maximum(sign * line, 0.0))
+            width = np.minimum(distance.reshape(n, q, m).mean(axis=1), 1.0)
+            missed += np.where(changes_sign, width * (exact - quadrature), 0.0)
     return np.asarray(along.width * missed.sum(axis=1))
 
 
 def _step(gradient: np.ndarray, curved: np.ndarray, projector: np.ndarray, scale: float) -> np.ndarray:
-    """The least of gradient . d + d curved d / 2 over projected d at each point; |d| about 1 where it does not curve.
+    """Return the minimiser d of gradient . d + d curved d / 2 over projected d at each point; |d| is about 1 without
+    curvature.
 
-    Shapes (k, nu), (k, nu, nu), (k, nu, nu). ``scale``: the largest curvature.
+    Shapes (k, nu), (k, nu, nu), (k, nu, nu). ``scale`` is the largest curvature.
     """
     nu = gradient.shape[1]
-    pull = np.einsum("kuv,kv->ku", projector, gradient)
-    # held directions are as stiff as the stiffest, so that rounding does not move along them
-    inside = projector @ curved @ projector + scale * (np.eye(nu) - projector)
-    values, vectors = np.linalg.eigh((inside + inside.transpose(0, 2, 1)) / 2)
-    along = np.einsum("kuv,ku->kv", vectors, pull)
-    solid = values > FLAT_SHARE * scale
-    step = np.where(solid, -along / np.where(solid, values, 1.0), -np.sign(along))
-    step = np.where(np.abs(along) > MACHINE_SHARE * np.abs(gradient).max(axis=1, keepdims=True), step, 0.0)
+    projected = np.einsum("kuv,kv->ku", projector, gradient)
+    # fixed directions get the largest curvature, so that rounding does not move along them
+    reduced = projector @ curved @ projector + scale * (np.eye(nu) - projector)
+    values, vectors = np.linalg.eigh((reduced + reduced.transpose(0, 2, 1)) / 2)
+    component = np.einsum("kuv,ku->kv", vectors, projected)
+    is_curved = values > FLAT_SHARE * scale
+    step = np.where(is_curved, -component / np.where(is_curved, values, 1.0), -np.sign(component))
+    step = np.where(np.abs(component) > MACHINE_SHARE * np.abs(gradient).max(axis=1, keepdims=True), step, 0.0)
     return np.asarray(projector @ np.einsum("kuv,kv->ku", vectors, step)[..., None])[..., 0]

@@ -1,25 +1,21 @@
-"""A plan solved again beside itself: Newton's method on the conditions of first order, with the limits held that push.
+"""Newton's method on the first-order conditions near a known plan, with its active limits held.
 
-With the limits known that push, an optimum is the root of a smooth system, and the plan beside it is a good start: one
-factorization and a few back-substitutions, which are Newton's steps with its matrix kept while they still gain. The
-matrix is the Hessian with what misses the limits at a price (Hestenes 1969, Powell 1969, method of multipliers): it
-is a narrow band, limits that repeat each other are no matter, and where it is positive definite the cost curves upwards
-along all that the limits leave free, so what is found is a plan and no saddle.
+If the active limits are known, an optimum is the root of a smooth system, and a neighbouring plan is a good start: one
+factorisation and a few back-substitutions, Newton steps whose matrix is kept while they converge well. The matrix is
+the Hessian plus a penalty on the active constraints (method of multipliers: Hestenes 1969, Powell 1969). It is a narrow
+band, and dependent limits are harmless. If it is positive definite, the cost curves upwards along all free directions,
+so that the result is a minimum and no saddle point.
 
-The conditions of first order at an optimum as a linear system: which limits push.
-
-Nocedal, Wright 2006, Numerical Optimization, chapters 12 and 16.
-
-Symmetric matrices that are a band but for a few variables, and whether they are positive definite.
-
-Stages couple only to their neighbours; what all of them share, such as a free horizon, and one end of what is tied at
-both ends, stand last, as a border.
+The module also holds the first-order conditions as a linear system (Nocedal, Wright 2006, Numerical Optimization,
+chapters 12 and 16) and the Cholesky factorisation of banded matrices with a border. Stages couple only to their
+neighbours. Variables that all of them share, such as a free horizon, and one end of periodic constraints form the
+border.
 """
 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -27,30 +23,19 @@ import scipy.sparse as sp
 from scipy.linalg import LinAlgError, cho_solve_banded, cholesky, cholesky_banded, solve_triangular
 
 from ocp.console import reason_to_stop
-from ocp.direct.assembly import Fragment, Program
+from ocp.direct.assembly import Program, Transcription
 from ocp.direct.nlp import SOLVER_RESIDUAL, Outcome
 from ocp.direct.scaling import Scales
 from ocp.status import SolverStatus
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = [
-    "RESOLVED",
-    "Bordered",
-    "Cholesky",
-    "Conditions",
-    "Newton",
-    "Sides",
-    "conditions",
-    "corrected",
-    "held_by",
-    "scaled",
-]
+__all__ = ["RESOLVED", "Conditions", "Newton", "active_sides", "conditions"]
 
 Sides: TypeAlias = dict[str, np.ndarray]
-"""On which side each variable (x) and row (g) is held: -1 below, 1 above, 0 at none."""
+"""Active side of each variable (x) and row (g): -1 lower limit, 1 upper limit, 0 none."""
 RESOLVED = 10 * SOLVER_RESIDUAL
-"""In units of the solver: the largest slope along what no limit holds, a plan costs the square of it too much; the
-distance to a limit at which it is touched though it does not push; and what a linear system may be missed by."""
+"""Tolerance in units of the solver: of slopes along free directions, whose square is the excess cost; of the distance
+to a limit that is active without a multiplier, and of the residual of linear systems."""
 
 
 @dataclass(frozen=True)
@@ -58,9 +43,10 @@ class Conditions:
     """First and second derivatives of a program at a plan, in units of the solver.
 
     Attributes:
-        hessian: Of the Lagrangian, both halves. Shape (n, n). jacobian: Of the rows. Shape (m, n).
-        of_bounds: Multipliers of the bounds of the variables (n,). of_rows: Of the rows (m,).
-        held, fixed: Which rows and which variables stand at a limit that pushes, or are given.
+        hessian: Hessian of the Lagrangian, both triangles. Shape (n, n).
+        jacobian: Jacobian of the rows. Shape (m, n).
+        of_bounds, of_rows: Multipliers of the bounds of the variables (n,) and of the rows (m,).
+        held, fixed: Which rows (m,) and variables (n,) are equalities or at a limit with a multiplier.
     """
 
     hessian: sp.csc_array
@@ -72,7 +58,7 @@ class Conditions:
 
 
 def conditions(program: Program, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales) -> Conditions:
-    """The conditions at what a solver found under these arguments (p and bounds)."""
+    """Return the first-order conditions at the result of a solver under these arguments (p and bounds)."""
     v, lam, p = outcome.variables, outcome.multipliers, arguments["p"]
     a, b, c = scales.variables, scales.rows, scales.cost
     slope, jacobian = program.numbers.first(v, p)
@@ -86,77 +72,80 @@ def conditions(program: Program, outcome: Outcome, arguments: dict[str, np.ndarr
     return Conditions(sp.csc_array(hessian), sp.csr_array(jacobian), of_bounds, of_rows, held, fixed)
 
 
-def pushes(program: Program, outcome: Outcome, p: np.ndarray, scales: Scales) -> tuple[np.ndarray, np.ndarray]:
-    """Multipliers of the bounds of the variables (n,) and of the rows (m,), in units of the solver."""
-    v, lam = outcome.variables, outcome.multipliers
+def scaled_values(
+    program: Program, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales
+) -> dict[str, tuple[np.ndarray, ...]]:
+    """Return value, lower limit, upper limit and multiplier of variables (x) and rows (g), in units of the solver."""
+    v, lam, p = outcome.variables, outcome.multipliers, arguments["p"]
+    result: dict[str, tuple[np.ndarray, ...]] = {}
     slope, jacobian = program.numbers.first(v, p)
-    return -(slope + jacobian.T @ lam) * scales.variables / scales.cost, lam * scales.rows / scales.cost
+    of_bounds, of_rows = -(slope + jacobian.T @ lam) * scales.variables / scales.cost, lam * scales.rows / scales.cost
+    for kind, value, unit, multiplier in (
+        ("x", v, scales.variables, of_bounds),
+        ("g", outcome.rows, scales.rows, of_rows),
+    ):
+        result[kind] = value / unit, arguments[f"lb{kind}"] / unit, arguments[f"ub{kind}"] / unit, multiplier
+    return result
 
 
-def held_by(program: Program, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales) -> Sides:
-    """On which side each variable (x) and row (g) stands at a limit that pushes: -1 below, 1 above, 0 at none."""
-    push = dict(zip("xg", pushes(program, outcome, arguments["p"], scales), strict=True))
-    values, units = {"x": outcome.variables, "g": outcome.rows}, {"x": scales.variables, "g": scales.rows}
+def active_sides(program: Program, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales) -> Sides:
+    """Return the active side of each variable (x) and row (g): -1 lower limit, 1 upper limit, 0 none."""
     sides = {}
-    for kind, unit in units.items():
-        low, high = arguments[f"lb{kind}"] / unit, arguments[f"ub{kind}"] / unit
-        held = at_limit(values[kind] / unit, low, high, push[kind])
-        sides[kind] = np.where(held & (low < high), np.sign(push[kind]), 0.0)
+    for kind, (value, low, high, multiplier) in scaled_values(program, outcome, arguments, scales).items():
+        active = at_limit(value, low, high, multiplier)
+        sides[kind] = np.where(active & (low < high), np.sign(multiplier), 0.0)
     return sides
 
 
-def corrected(
+def next_active_set(
     program: Program, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales, sides: Sides, tolerance: float
 ) -> Sides | None:
-    """Which limits to hold next, after some were held and the others let go: those that push, and those missed.
+    """Return the active sides for the next iteration: limits with a multiplier of the right sign, and violated limits.
 
-    Where these are the same as before, what was found is right. None where the cost still falls along what is free,
-    as where rounding ended the solve too early. Hintermueller, Ito, Kunisch 2002, The primal-dual
-    active set strategy as a semismooth Newton method.
+    The active set is right if it does not change. None if the cost still falls along free directions, as when rounding
+    ended the solve too early. Primal-dual active set strategy (Hintermueller, Ito, Kunisch 2002).
     """
-    push = dict(zip("xg", pushes(program, outcome, arguments["p"], scales), strict=True))
-    values, units = {"x": outcome.variables, "g": outcome.rows}, {"x": scales.variables, "g": scales.rows}
+    values = scaled_values(program, outcome, arguments, scales)
     free = (sides["x"] == 0) & (arguments["lbx"] < arguments["ubx"])
-    if not np.all(np.abs(push["x"][free]) <= RESOLVED):  # nor where it is no number
+    if not np.all(np.abs(values["x"][3][free]) <= RESOLVED):  # also for nan
         return None
-    found = {}
-    for kind, unit in units.items():
-        value, side = values[kind] / unit, sides[kind]
-        low, high = arguments[f"lb{kind}"] / unit, arguments[f"ub{kind}"] / unit
-        room = tolerance * np.maximum(1.0, np.abs(value))
-        kept = np.where(push[kind] * side > SOLVER_RESIDUAL, side, 0.0)  # the others pull, or more do their work
-        missed = np.where(low < high, 1.0 * (value > high + room) - (value < low - room), 0.0)
-        found[kind] = np.where(missed != 0, missed, kept)
-    return found
+    result = {}
+    for kind, (value, low, high, multiplier) in values.items():
+        slack = tolerance * np.maximum(1.0, np.abs(value))
+        # others have the wrong sign or are redundant
+        remaining = np.where(multiplier * sides[kind] > SOLVER_RESIDUAL, sides[kind], 0.0)
+        violated = np.where(low < high, 1.0 * (value > high + slack) - (value < low - slack), 0.0)
+        result[kind] = np.where(violated != 0, violated, remaining)
+    return result
 
 
-def at_limit(value: np.ndarray, lower: np.ndarray, upper: np.ndarray, push: np.ndarray) -> np.ndarray:
-    """Which values are given, or held by a limit that pushes more than it is away."""
+def at_limit(value: np.ndarray, lower: np.ndarray, upper: np.ndarray, multipliers: np.ndarray) -> np.ndarray:
+    """Return which values are equalities, or at a limit whose multiplier exceeds the distance to it."""
     with np.errstate(invalid="ignore"):
-        below = (push < -SOLVER_RESIDUAL) & (value - lower < -push)
-        above = (push > SOLVER_RESIDUAL) & (upper - value < push)
+        below = (multipliers < -SOLVER_RESIDUAL) & (value - lower < -multipliers)
+        above = (multipliers > SOLVER_RESIDUAL) & (upper - value < multipliers)
     return np.asarray((lower == upper) | below | above)
 
 
 def scaled(matrix: sp.csc_array, rows: np.ndarray, columns: np.ndarray) -> sp.csc_array:
-    """A matrix with its rows and its columns times factors."""
-    by = rows[matrix.indices] * np.repeat(columns, np.diff(matrix.indptr))
-    return sp.csc_array((matrix.data * by, matrix.indices, matrix.indptr), shape=matrix.shape)
+    """Return a matrix with its rows and columns multiplied by factors."""
+    factors = rows[matrix.indices] * np.repeat(columns, np.diff(matrix.indptr))
+    return sp.csc_array((matrix.data * factors, matrix.indices, matrix.indptr), shape=matrix.shape)
 
 
 @dataclass(frozen=True)
 class NewtonSettings:
-    """When Newton's method has ended, and when it gives up.
+    """Convergence and termination of Newton's method.
 
     Attributes:
-        tolerance: Of slopes, relative to the largest multiplier over ``multipliers``, of rows, relative to the largest
-            variable, and of the cost, by what rows are missed; all relative to 1 at least.
-        multipliers: By which ipopt, too, divides the largest multiplier to judge slopes (its s_max).
-        sets: The most sets of limits that are held in turn.
-        steps: The most steps in all: more, and an interior point from the guess is as quick.
-        exact: Share of what a step misses in its linear system that is left, unless a pass gains less than ``gain``.
-        gain: Share of what is missed that each step leaves at most: else the matrix is made anew.
-        price: Of what misses the limits, against the largest curvature: as much as rounding allows.
+        tolerance: Of slopes, relative to the largest multiplier over ``multipliers``; of rows, relative to the largest
+            variable; of the cost, for the violation of the rows. References are at least 1.
+        multipliers: Divisor of the largest multiplier when slopes are judged, as s_max of ipopt.
+        sets: Largest number of active sets.
+        steps: Largest number of steps in all. Beyond it an interior-point method from the guess is as fast.
+        exact: Relative residual of a step in its linear system, unless a pass gains less than ``gain``.
+        gain: Largest ratio of successive residuals for which the matrix is kept.
+        price: Penalty relative to the largest curvature: as large as rounding allows.
     """
 
     tolerance: float = 1e-10
@@ -169,15 +158,17 @@ class NewtonSettings:
 
 
 class Newton:
-    """Newton's method for one program, its matrix in an order in which it is a band.
+    """Newton's method for one program, with its matrix in a banded order.
 
     Args:
-        program, fragment: What is solved.
+        program, transcription: The program.
     """
 
-    def __init__(self, program: Program, fragment: Fragment, settings: NewtonSettings = NewtonSettings()) -> None:
+    def __init__(
+        self, program: Program, transcription: Transcription, settings: NewtonSettings = NewtonSettings()
+    ) -> None:
         self._program, self._settings = program, settings
-        n, m = fragment.size, fragment.n_rows
+        n, m = transcription.size, transcription.n_rows
         row, column = (np.array(part, dtype=np.int64) for part in program.jacobian.sparsity_out(1).get_triplet())
         first, second = (np.array(part, dtype=np.int64) for part in program.hessian.sparsity_out(0).get_triplet())
         self._row, self._column, self._first, self._second = row, column, first, second
@@ -186,83 +177,82 @@ class Newton:
         self._order = Bordered(np.concatenate([both.row, first]), np.concatenate([both.col, second]), n)
         place = self._order.place
         i, j = place[first], place[second]
-        self._of_hessian = self._order.at(np.maximum(i, j), np.minimum(i, j))
-        self._of_diagonal = self._order.at(place, place)
-        # the rows' slopes in this order, row by row and column by column
+        self._hessian_at = self._order.at(np.maximum(i, j), np.minimum(i, j))
+        self._diagonal_at = self._order.at(place, place)
+        # the Jacobian in this order, by rows and by columns
         at = place[column]
         self._by_row, self._by_column = np.lexsort((at, row)), np.lexsort((row, at))
         self._starts = tuple(np.searchsorted(np.sort(each), np.arange(k + 1)) for each, k in ((row, m), (at, n)))
         self._within = at[self._by_row], row[self._by_column]
 
-    def beside(self, start: Outcome, sides: Sides, arguments: dict[str, np.ndarray], scales: Scales) -> Outcome | None:
-        """The optimum near a plan, of other parameters or bounds; None where it is not found at once.
+    def solve_near(
+        self, start: Outcome, sides: Sides, arguments: dict[str, np.ndarray], scales: Scales
+    ) -> Outcome | None:
+        """Return the optimum near a plan for other parameters or bounds; None if the method does not converge.
 
-        First the limits are held that push in the plan, and the others let go; then what comes out of it says which
-        (Hintermueller, Ito, Kunisch 2002).
+        The active limits of the plan are held first. The result determines the next active set (Hintermueller, Ito,
+        Kunisch 2002).
 
         Args:
             start: The plan: its variables and multipliers.
-            sides: On which side each variable (x) and row (g) is held: -1 below, 1 above, 0 at none.
-            arguments: p and the bounds. scales: By which misses and multipliers are judged.
+            sides: Active side of each variable (x) and row (g).
+            arguments: p and the bounds.
+            scales: Units in which residuals and multipliers are judged.
         """
-        began, tried, steps = time.monotonic(), list[Sides](), 0
-        while len(tried) < self._settings.sets and not any(_same(sides, each) for each in tried):
-            tried.append(sides)
-            at = self._root(start, sides, arguments, scales, self._settings.steps - steps)
-            if at is None:
+        began, earlier, steps = time.monotonic(), list[Sides](), 0
+        while len(earlier) < self._settings.sets and not any(_same(sides, each) for each in earlier):
+            earlier.append(sides)
+            root = self._root(start, sides, arguments, scales, self._settings.steps - steps)
+            if root is None:
                 return None
-            steps += at.steps
-            start = Outcome(at.v, 0.0, at.rows, at.lam, SolverStatus.SOLVED, "", steps, 0.0, False, "newton")
-            after = corrected(self._program, start, arguments, scales, sides, ROUNDING_SHARE)
-            if after is None:
+            steps, start = steps + root.iterations, root
+            next_sides = next_active_set(self._program, root, arguments, scales, sides, ROUNDING_SHARE)
+            if next_sides is None:
                 return None
-            if _same(after, sides):
-                cost, _ = self._program.numbers.values(at.v, arguments["p"])
-                which = _held(sides, arguments)
-                if self._matrix(at.v, arguments["p"], at.lam, which, scales, local=True) is None:  # it is a saddle
+            if _same(next_sides, sides):
+                v, lam, p = root.variables, root.multipliers, arguments["p"]
+                if self._matrix(v, p, lam, _held(sides, arguments), scales, local=True) is None:  # a saddle point
                     return None
-                seconds = time.monotonic() - began
-                return Outcome(
-                    at.v, cost, at.rows, at.lam, start.status, str(start.status), steps, seconds, False, "newton"
-                )
-            sides = after
+                return replace(root, iterations=steps, seconds=time.monotonic() - began)
+            sides = next_sides
         return None
 
     def _root(
         self, start: Outcome, sides: Sides, arguments: dict[str, np.ndarray], scales: Scales, most: int
-    ) -> _Root | None:
-        """``most`` of Newton's steps, with some limits held and the others let go; None where they lead nowhere."""
-        a, b, c, p, own = scales.variables, scales.rows, scales.cost, arguments["p"], self._settings
+    ) -> Outcome | None:
+        """Take at most ``most`` Newton steps with a fixed active set; None if they do not converge."""
+        a, b, c, p, settings = scales.variables, scales.rows, scales.cost, arguments["p"], self._settings
         fixed, held = _held(sides, arguments)
-        goal = np.where(sides["x"] > 0, arguments["ubx"], arguments["lbx"])
-        aim = np.where(sides["g"] > 0, arguments["ubg"], arguments["lbg"])
-        v, lam = np.where(fixed, goal, start.variables), np.where(held, start.multipliers, 0.0)
+        target = np.where(sides["x"] > 0, arguments["ubx"], arguments["lbx"])
+        row_target = np.where(sides["g"] > 0, arguments["ubg"], arguments["lbg"])
+        v, lam = np.where(fixed, target, start.variables), np.where(held, start.multipliers, 0.0)
         before, is_new, matrix = np.inf, False, None
         for step in range(most + 1):
             slope, jacobian = self._program.numbers.first(v, p)
             cost, rows = self._program.numbers.values(v, p)
             along = np.bincount(self._column, jacobian.data * lam[self._row], minlength=len(v))
-            falls = np.where(fixed, 0.0, (slope + along) * (a / c))
-            gaps = np.where(held, rows - aim, 0.0) / b
-            push = np.abs(lam * b / c)
-            missed = max(
-                np.abs(falls).max(initial=0.0) / max(1.0, push.max(initial=0.0) / own.multipliers),
-                np.abs(gaps).max(initial=0.0) / np.abs(v / a).max(initial=1.0),
-                float(push @ np.abs(gaps)) / max(1.0, abs(cost / c)),  # what the gaps are worth
+            gradient = np.where(fixed, 0.0, (slope + along) * (a / c))
+            residual = np.where(held, rows - row_target, 0.0) / b
+            multipliers = np.abs(lam * b / c)
+            error = max(
+                np.abs(gradient).max(initial=0.0) / max(1.0, multipliers.max(initial=0.0) / settings.multipliers),
+                np.abs(residual).max(initial=0.0) / np.abs(v / a).max(initial=1.0),
+                float(multipliers @ np.abs(residual)) / max(1.0, abs(cost / c)),  # the cost of the row residuals
             )
-            stalls = is_new and own.gain * before < missed <= SOLVER_RESIDUAL  # rounding leaves no more
-            if missed <= own.tolerance or stalls:
-                return _Root(step, v, rows, lam)
-            if step == most or not missed < np.inf or (is_new and missed > before and step > 1) or reason_to_stop():
+            stalls = is_new and settings.gain * before < error <= SOLVER_RESIDUAL  # limited by rounding
+            if error <= settings.tolerance or stalls:
+                status = SolverStatus.SOLVED
+                return Outcome(v, cost, rows, lam, status, str(status), step, 0.0, False, "newton")
+            if step == most or not error < np.inf or (is_new and error > before and step > 1) or reason_to_stop():
                 return None
-            is_new = matrix is None or missed > own.gain * before
+            is_new = matrix is None or error > settings.gain * before
             if is_new:
                 matrix = self._matrix(v, p, lam, (fixed, held), scales)
             if matrix is None:
                 return None
-            before = missed
-            of_x, of_g = matrix.step(falls, gaps)
-            v, lam = v + of_x * a, lam + of_g * (c / b)
+            before = error
+            step_x, step_g = matrix.step(gradient, residual)
+            v, lam = v + step_x * a, lam + step_g * (c / b)
         return None
 
     def _matrix(
@@ -274,55 +264,55 @@ class Newton:
         scales: Scales,
         local: bool = False,
     ) -> _Matrix | None:
-        """Newton's matrix, of scaled variables and rows; None where it is not positive definite.
+        """Return Newton's matrix for scaled variables and rows; None if it is not positive definite.
 
-        ``which`` variables are fixed and which rows held. ``local``: The price of a row is against the curvature of its
-        own variables alone: so rounding hides nothing of those that are small.
-
-        That it is so exactly if the cost curves upwards along what is free, once the price is high enough, is Finsler's
-        lemma.
+        ``which`` variables are fixed and which rows held. With ``local`` the penalty of a row is relative to the
+        curvature of its own variables, so that rounding does not hide small variables. For a sufficient penalty the
+        matrix is positive definite exactly if the cost curves upwards along the free directions (Finsler's lemma).
         """
         a, b, c = scales.variables, scales.rows, scales.cost
         fixed, held = which
         free = np.where(fixed, 0.0, a)
-        curves = self._program.numbers.second(v, p, 1.0 / c, lam / c).data * free[self._first] * free[self._second]
+        curvature = self._program.numbers.second(v, p, 1.0 / c, lam / c).data * free[self._first] * free[self._second]
         slopes = (
             self._program.numbers.first(v, p)[1].data * np.where(held, 1.0 / b, 0.0)[self._row] * free[self._column]
         )
-        if not np.all(np.isfinite(curves)) or not np.all(np.isfinite(slopes)):
+        if not np.all(np.isfinite(curvature)) or not np.all(np.isfinite(slopes)):
             return None
         size = np.sqrt(np.bincount(self._row, slopes**2, minlength=len(b)))
         n, m = len(a), len(b)
-        own, among = np.zeros(n), np.zeros(m)
+        of_variable, of_row = np.zeros(n), np.zeros(m)
         for index in (self._first, self._second):
-            np.maximum.at(own, index, np.abs(curves))
-        largest = float(own.max(initial=0.0)) or 1.0
+            np.maximum.at(of_variable, index, np.abs(curvature))
+        largest = float(of_variable.max(initial=0.0)) or 1.0
         if local:
-            np.maximum.at(among, self._row, np.where(slopes != 0, own[self._column], 0.0))
-        weight = np.divide(np.sqrt(np.where(among > 0, among / largest, 1.0)), size, out=np.zeros(m), where=size > 0)
+            np.maximum.at(of_row, self._row, np.where(slopes != 0, of_variable[self._column], 0.0))
+        weight = np.divide(np.sqrt(np.where(of_row > 0, of_row / largest, 1.0)), size, out=np.zeros(m), where=size > 0)
         slopes *= weight[self._row]
-        price = self._settings.price * largest
+        penalty = self._settings.price * largest
         by_row = sp.csr_array((slopes[self._by_row], self._within[0], self._starts[0]), shape=(m, n))
         by_column = sp.csr_array((slopes[self._by_column], self._within[1], self._starts[1]), shape=(n, m))
-        missing = by_column @ by_row
-        i, j = np.repeat(np.arange(n), np.diff(missing.indptr)), missing.indices.astype(np.int64)
+        penalty_matrix = by_column @ by_row
+        i, j = np.repeat(np.arange(n), np.diff(penalty_matrix.indptr)), penalty_matrix.indices.astype(np.int64)
         lower = np.flatnonzero(i >= j)
         values = np.zeros(self._order.length)
-        values[self._order.at(i[lower], j[lower])] = price * missing.data[lower]
-        values[self._of_hessian] += curves
-        values[self._of_diagonal] *= 1.0 + 4 * np.finfo(float).eps  # what is as flat may be rounding
-        values[self._of_diagonal[fixed]] = 1.0
+        values[self._order.at(i[lower], j[lower])] = penalty * penalty_matrix.data[lower]
+        values[self._hessian_at] += curvature
+        values[self._diagonal_at] *= 1.0 + 4 * np.finfo(float).eps  # curvature at this level may be rounding
+        values[self._diagonal_at[fixed]] = 1.0
         factors = self._order.cholesky(values)
-        return None if factors is None else _Matrix(factors, by_row, by_column, weight, price, self._settings)
+        return None if factors is None else _Matrix(factors, by_row, by_column, weight, penalty, self._settings)
 
 
 @dataclass(frozen=True)
 class _Matrix:
-    """Newton's matrix at a point: that of its conditions, in which missing the limits has a price.
+    """Newton's matrix at a point, factorised, with a penalty on the active constraints.
 
     Attributes:
-        factors: Of the Hessian and the price times what is missed. price: Of rows of unit length.
-        by_row, by_column: Slopes of the rows, (m, n) and (n, m), in the factors' order. weight: Of each row (m,).
+        factors: Factors of the Hessian plus penalty.
+        by_row, by_column: Jacobian of the rows, (m, n) and (n, m), in the order of the factors.
+        weight: Scaling of each row to unit length (m,).
+        price: Penalty of rows of unit length.
     """
 
     factors: Cholesky
@@ -332,86 +322,74 @@ class _Matrix:
     price: float
     settings: NewtonSettings
 
-    def step(self, falls: np.ndarray, gaps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Newton's step of variables and multipliers, scaled.
-
-        Each pass pays the price for what the last one missed.
-        """
-        place, gaps = self.factors.place, self.weight * gaps
-        right = np.empty_like(falls)
-        right[place] = falls
-        push, goal, last = np.zeros_like(gaps), 0.0, np.inf
+    def step(self, gradient: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return Newton's step of variables and multipliers, scaled, by passes of the method of multipliers."""
+        place, residual = self.factors.place, self.weight * residual
+        side = np.empty_like(gradient)
+        side[place] = gradient
+        multipliers, tolerance, last = np.zeros_like(residual), 0.0, np.inf
         while True:
-            move = -self.factors.solve(right + self.by_column @ (push + self.price * gaps))
-            missed = self.by_row @ move + gaps
-            push = push + self.price * missed
-            worst = float(np.abs(missed).max(initial=0.0))
-            goal = goal or self.settings.exact * max(worst, float(np.abs(gaps).max(initial=0.0)))
-            if not goal < worst < (1 - self.settings.gain) * last:
+            move = -self.factors.solve(side + self.by_column @ (multipliers + self.price * residual))
+            violation = self.by_row @ move + residual
+            multipliers = multipliers + self.price * violation
+            largest = float(np.abs(violation).max(initial=0.0))
+            tolerance = tolerance or self.settings.exact * max(largest, float(np.abs(residual).max(initial=0.0)))
+            if not tolerance < largest < (1 - self.settings.gain) * last:
                 break
-            last = worst
-        return move[place], self.weight * push
-
-
-@dataclass(frozen=True)
-class _Root:
-    """Where Newton's steps ended at a root: after how many, its variables, rows and multipliers."""
-
-    steps: int
-    v: np.ndarray
-    rows: np.ndarray
-    lam: np.ndarray
+            last = largest
+        return move[place], self.weight * multipliers
 
 
 def _held(sides: Sides, arguments: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Which variables (n,) and rows (m,) are given, or held at a limit."""
+    """Return which variables (n,) and rows (m,) are equalities or held at a limit."""
     fixed, held = ((arguments[f"lb{kind}"] == arguments[f"ub{kind}"]) | (sides[kind] != 0) for kind in "xg")
     return fixed, held
 
 
 def _same(sides: Sides, others: Sides) -> bool:
-    """Whether the same limits are held."""
+    """Return whether two active sets are the same."""
     return all(np.array_equal(side, others[kind]) for kind, side in sides.items())
 
 
 class Bordered:
-    """An order of variables in which entries lie near the diagonal, but for those of the last ones.
+    """An order of variables in which a symmetric matrix is a band with a border of a few last variables.
 
     Attributes:
-        place: Where each variable stands. Shape (n,). inner: How many stand before the border.
-        width: Of the band below the diagonal.
+        place: Position of each variable. Shape (n,).
+        inner: Number of variables before the border.
+        width: Width of the band below the diagonal.
 
     Args:
-        row, column: Where entries may be, in the order in which variables are declared; both halves or one.
+        row, column: Positions of nonzeros in the order of declaration; one triangle or both.
         size: Number of variables n.
     """
 
     def __init__(self, row: np.ndarray, column: np.ndarray, size: int) -> None:
-        apart = np.abs(row - column)
-        last = _border(row, column, apart, size)
-        self.inner = size - len(last)
+        distance = np.abs(row - column)
+        border = _border(row, column, distance, size)
+        self.inner = size - len(border)
         self.place = np.empty(size, dtype=np.int64)
-        self.place[np.concatenate([np.setdiff1d(np.arange(size), last), last])] = np.arange(size)
+        self.place[np.concatenate([np.setdiff1d(np.arange(size), border), border])] = np.arange(size)
         i, j = self.place[row], self.place[column]
         self.width = int(np.abs(i - j)[np.maximum(i, j) < self.inner].max(initial=0))
         self._size = size
 
     def at(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        """Where :meth:`cholesky` asks for the entries at these places of the order, whose first is not before."""
+        """Return the index for :meth:`cholesky` of entries at these positions; ``first`` is not before ``second``."""
         band = second * self.width + first
         below = (self.width + 1) * self.inner + (first - self.inner) * self._size + second
         return np.asarray(np.where(first < self.inner, band, below))
 
     @property
     def length(self) -> int:
-        """Of the values that :meth:`cholesky` asks for."""
+        """Number of values that :meth:`cholesky` takes."""
         return (self.width + 1) * self.inner + (self._size - self.inner) * self._size
 
     def cholesky(self, values: np.ndarray) -> Cholesky | None:
-        """The factors of a matrix; None where it is not positive definite, or no number.
+        """Return the factors of a matrix; None if it is not positive definite or not finite.
 
         Args:
-            values: Of its lower half, each where :meth:`at` says, and 0 elsewhere. Overwritten.
+            values: Lower triangle, each entry at the index of :meth:`at`, and 0 elsewhere. Overwritten.
         """
         if not np.all(np.isfinite(values)):
             return None
@@ -429,11 +407,14 @@ class Bordered:
 
 @dataclass(frozen=True)
 class Cholesky:
-    """Factors of a positive definite matrix: of its band, and of what its border (k) adds.
+    """Factors of a positive definite matrix with a band and a border of k variables.
 
     Attributes:
-        place: Where each variable stands. lower: Of the band, as LAPACK keeps it. below: Rows of the border (k, n).
-        solved: The band's solutions for them (n, k). corner: Lower factor of what is left of the border (k, k).
+        place: Position of each variable.
+        lower: Factor of the band, in LAPACK's layout.
+        below: Rows of the border (k, n).
+        solved: Solutions of the band for these (n, k).
+        corner: Lower factor of the Schur complement of the border (k, k).
     """
 
     place: np.ndarray
@@ -443,29 +424,29 @@ class Cholesky:
     corner: np.ndarray
 
     def solve(self, right: np.ndarray) -> np.ndarray:
-        """For a right side (n,), both in the order of :class:`Bordered`."""
+        """Solve for a right side (n,), both in the order of :class:`Bordered`."""
         n = self.below.shape[1]
-        found = cho_solve_banded((self.lower, True), right[:n], check_finite=False) if n else right[:n]
+        inner = cho_solve_banded((self.lower, True), right[:n], check_finite=False) if n else right[:n]
         if not len(self.below):
-            return np.asarray(found)
-        half = solve_triangular(self.corner, right[n:] - self.below @ found, lower=True, check_finite=False)
+            return np.asarray(inner)
+        half = solve_triangular(self.corner, right[n:] - self.below @ inner, lower=True, check_finite=False)
         last = solve_triangular(self.corner, half, trans=1, lower=True, check_finite=False)
-        return np.concatenate([found - self.solved @ last, last])
+        return np.concatenate([inner - self.solved @ last, last])
 
 
-def _border(row: np.ndarray, column: np.ndarray, apart: np.ndarray, size: int) -> np.ndarray:
-    """The variables that stand last: those with most entries of what reaches far, so many that the work is least."""
+def _border(row: np.ndarray, column: np.ndarray, distance: np.ndarray, size: int) -> np.ndarray:
+    """Return the border variables: those with the most entries far from the diagonal, as many as minimise the work."""
     degree = np.bincount(row, minlength=size) + np.bincount(column, minlength=size)
-    out, chosen, least, count = np.zeros(size, dtype=bool), list[int](), np.inf, 0
-    for k in np.argsort(-apart, kind="stable"):
+    is_border, border, least_work, count = np.zeros(size, dtype=bool), list[int](), np.inf, 0
+    for k in np.argsort(-distance, kind="stable"):
         i, j = row[k], column[k]
-        if out[i] or out[j]:
+        if is_border[i] or is_border[j]:
             continue
-        # the work is that of (width + 2 of the border)^2
-        if apart[k] + 2 * len(chosen) < least:
-            least, count = apart[k] + 2 * len(chosen), len(chosen)
-        if 2 * len(chosen) >= least:
+        # the work is proportional to (width + 2 border)^2
+        if distance[k] + 2 * len(border) < least_work:
+            least_work, count = distance[k] + 2 * len(border), len(border)
+        if 2 * len(border) >= least_work:
             break
-        chosen.append(int(i if degree[i] >= degree[j] else j))
-        out[chosen[-1]] = True
-    return np.sort(np.array(chosen[:count], dtype=np.int64))
+        border.append(int(i if degree[i] >= degree[j] else j))
+        is_border[border[-1]] = True
+    return np.sort(np.array(border[:count], dtype=np.int64))

@@ -1,23 +1,22 @@
-"""A prepared problem as C for controllers: its functions, a plan, and a small program that reads and writes numbers.
+"""Export of a prepared problem as C for controllers, and compiled derivatives of its blocks.
 
-The C needs a compiler and the mathematics library, no Python and no memory of its own. What is in the folder:
+The exported C needs a compiler and the mathematics library; it uses no Python and allocates no memory. The folder
+contains:
 
-    plan.c, plan.h  functions by CasADi, called (arg, res, iw, w, 0) as its manual says; x are the plan's variables:
+    plan.c, plan.h  functions by CasADi, called (arg, res, iw, w, 0) as in its manual; x are the plan's variables:
                     plan_objective (x, p) -> cost, gradient
                     plan_constraints (x, p) -> rows, Jacobian
-                    plan_hessian (x, p, lam_f, lam_g) -> upper triangle of that of the Lagrangian
-                    plan_bounds (p) -> lowest and highest x, lowest and highest rows
+                    plan_hessian (x, p, lam_f, lam_g) -> upper triangle of the Hessian of the Lagrangian
+                    plan_bounds (p) -> lower and upper bounds of x, of the rows
                     plan_guess (p) -> x
                     plan_curves (x, p) -> horizon, states, controls
-    curves.h        states and controls at a time, from what plan_curves returned
-    problem.h       sizes, names, and where the curves are cut
-    main.c          a program: parameters, and x where it is given, to a table of states and controls over time
-    Makefile        `make` builds it
+    curves.h        states and controls at a time, from the output of plan_curves
+    problem.h       sizes, names, and breaks of the curves
+    main.c          a program that turns parameters, and optionally x, into a table of states and controls over time
+    Makefile        builds it with `make`
 
-The derivatives of the blocks of a program, interpreted or compiled.
-
-Libraries are those of :mod:`ocp.libraries`, kept between runs; compiled functions return the very numbers that
-interpreted ones do.
+Compiled derivatives are libraries of :mod:`ocp.libraries`, cached between runs. They return exactly the numbers of the
+interpreted functions.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ import casadi as ca
 import numpy as np
 
 from ocp.direct import assembly
-from ocp.direct.assembly import SIZES, Derivatives, Fragment, assemble, derivatives, gather
+from ocp.direct.assembly import SIZES, Derivatives, Transcription, assemble, derivatives, gather
 from ocp.errors import ProblemError
 from ocp.libraries import (
     SERIALISED,
@@ -45,25 +44,25 @@ from ocp.libraries import (
 from ocp.problem.formulation import Formulation
 from ocp.storage import write_text
 
-__all__ = ["block_derivatives", "controller_functions", "write_controller"]
+__all__ = ["block_derivatives", "write_controller"]
 
 
-def controller_functions(form: Formulation, fragment: Fragment, guess: np.ndarray) -> list[Any]:
-    """The functions that are written, in the units of the problem.
+def controller_functions(form: Formulation, transcription: Transcription, guess: np.ndarray) -> list[Any]:
+    """Return the exported functions, in the units of the problem.
 
     Args:
-        guess: Values of the variables that `plan_guess` moves inside the bounds at its parameters. Shape (size,).
+        guess: Variables that `plan_guess` clips to the bounds at its parameters. Shape (size,).
     """
-    program = assemble(fragment, form.np)
-    x, p = ca.MX.sym("x", fragment.size), ca.MX.sym("p", form.np)
-    sigma, lam = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", fragment.n_rows)
+    program = assemble(transcription, form.np)
+    x, p = ca.MX.sym("x", transcription.size), ca.MX.sym("p", form.np)
+    sigma, lam = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", transcription.n_rows)
     lower, upper = form.bounds.function(p)
-    at_x, at_g = fragment.variable_bounds.tolist(), fragment.row_bounds.tolist()
+    at_x, at_g = transcription.variable_bounds.tolist(), transcription.row_bounds.tolist()
     bounds = [ca.densify(ca.vec(side)[at]) for at in (at_x, at_g) for side in (lower, upper)]
     start = ca.fmin(ca.fmax(ca.DM(guess), bounds[0]), bounds[1])
 
-    curves = fragment.interpolants
-    horizon = ca.MX(form.horizon_at(p)) if fragment.horizon is None else x[fragment.horizon]
+    curves = transcription.interpolants
+    horizon = ca.MX(form.horizon_at(p)) if transcription.horizon is None else x[transcription.horizon]
     states = gather(x, curves.variables)
     if curves.values is not None:
         states = curves.mapped(states, ca.DM(curves.data), horizon, p)
@@ -78,41 +77,42 @@ def controller_functions(form: Formulation, fragment: Fragment, guess: np.ndarra
         ("curves", {"x": x, "p": p}, dict(zip(("horizon", "states", "controls"), outputs, strict=True))),
     ]
     return [
-        ca.Function(f"plan_{name}", [*given.values()], [*made.values()], [*given], [*made])
-        for name, given, made in functions
+        ca.Function(f"plan_{name}", [*arguments.values()], [*results.values()], [*arguments], [*results])
+        for name, arguments, results in functions
     ]
 
 
-def write_controller(form: Formulation, fragment: Fragment, guess: np.ndarray, folder: Path) -> Path:
-    """Write the folder that the head of this module tells of; each file whole or not at all.
+def write_controller(form: Formulation, transcription: Transcription, guess: np.ndarray, folder: Path) -> Path:
+    """Write the folder described in this module; each file is written completely or not at all.
 
     Raises:
-        ProblemError: Something of the problem has no C, such as an integrator of variable step.
+        ProblemError: Some part of the problem has no C, such as an integrator of variable step.
         OSError: The folder cannot be written.
     """
     try:
-        plan = generate_c(controller_functions(form, fragment, guess), "plan")
+        plan = generate_c(controller_functions(form, transcription, guess), "plan")
     except CompilerError as error:
         raise ProblemError(f"problem {form.name!r} has no C: {error}", name="method", value=form.name) from error
     texts = dict(zip(("plan.c", "plan.h"), plan, strict=True))
-    texts |= {"problem.h": problem_header(form, fragment), "curves.h": CURVES, "main.c": MAIN, "Makefile": MAKEFILE}
+    texts |= {"curves.h": CURVES, "main.c": MAIN, "Makefile": MAKEFILE}
+    texts["problem.h"] = problem_header(form, transcription)
     folder.mkdir(parents=True, exist_ok=True)
     for name, text in texts.items():
         write_text(folder / name, text)
     return folder
 
 
-def problem_header(form: Formulation, fragment: Fragment) -> str:
-    """Sizes, names, and breaks and nodes of the curves."""
-    curves = fragment.interpolants
+def problem_header(form: Formulation, transcription: Transcription) -> str:
+    """Return problem.h: sizes, names, and breaks and nodes of the curves."""
+    curves = transcription.interpolants
     labels = [
         f"{name}[{i}]" if s.stop - s.start > 1 else name
         for name, s in form.parameters.items()
         for i in range(s.stop - s.start)
     ]
     sizes = {
-        "VARIABLES": fragment.size,
-        "ROWS": fragment.n_rows,
+        "VARIABLES": transcription.size,
+        "ROWS": transcription.n_rows,
         "PARAMETERS": form.np,
         "STATES": form.nx,
         "CONTROLS": form.nu,
@@ -131,12 +131,12 @@ def problem_header(form: Formulation, fragment: Fragment) -> str:
 
 
 def comment(text: str) -> str:
-    """A text that may stand in a comment of C."""
+    """Return a text as the content of a C comment."""
     return quoted(text).replace("*/", "* /")
 
 
 def quoted(text: str) -> str:
-    """A text as C writes it; what is not ASCII in the bytes of UTF-8."""
+    """Return a text as a C string literal, with the UTF-8 bytes of non-ASCII characters escaped."""
     plain = "".join(
         chr(byte) if 32 <= byte < 127 and chr(byte) not in '"\\?' else f"\\{byte:03o}" for byte in text.encode()
     )
@@ -268,36 +268,36 @@ plan: main.c plan.c plan.h curves.h problem.h
 
 
 RECIPE = hashlib.sha256(Path(assembly.__file__).read_bytes()).hexdigest()
-"""What tells how derivatives are made of a block: the text that does it."""
+"""Hash of the code that derives block functions: part of the key of a compiled library."""
 
 
-def block_derivatives(fragment: Fragment, compiled: bool) -> list[Derivatives]:
-    """Return the derivatives of each block of a fragment; blocks of one function share theirs.
+def block_derivatives(transcription: Transcription, compiled: bool) -> list[Derivatives]:
+    """Return the derivatives of each block; blocks with the same function share them.
 
     Args:
-        fragment: Whose blocks.
-        compiled: Whether they are compiled. What cannot be is interpreted, and a warning says once why.
+        transcription: The program.
+        compiled: Whether to compile. Functions that cannot be compiled are interpreted, with one warning.
 
     Raises:
         TimeLimitReached: The time limit is over.
     """
-    texts = [function_key(block.function) for block in fragment.blocks]
-    found: dict[str, Derivatives] = {}
-    for text, block in zip(texts, fragment.blocks, strict=True):
-        if text not in found:
-            is_compiled = compiled and _is_worth_it(block.function, text)
-            found[text] = _compiled(block.function, text) if is_compiled else derivatives(block.function)
-    return [found[text] for text in texts]
+    texts = [function_key(block.function) for block in transcription.blocks]
+    by_text: dict[str, Derivatives] = {}
+    for text, block in zip(texts, transcription.blocks, strict=True):
+        if text not in by_text:
+            is_compiled = compiled and _can_be_compiled(block.function, text)
+            by_text[text] = _compiled(block.function, text) if is_compiled else derivatives(block.function)
+    return [by_text[text] for text in texts]
 
 
-def _is_worth_it(function: Any, text: str) -> bool:
-    """Whether a function has a text, so that it can be known again, and does more than it takes to call it."""
+def _can_be_compiled(function: Any, text: str) -> bool:
+    """Return whether a function can be identified by its text and is long enough to compile."""
     is_short = function.is_a("SXFunction") and function.n_instructions() <= SIZES.called
     return text.startswith(SERIALISED) and not is_short
 
 
 def _compiled(function: Any, text: str) -> Derivatives:
-    """Return the derivatives of a function of this text from a library, interpreted where there can be none."""
+    """Return the derivatives of a function from a compiled library, or interpreted if compilation fails."""
     try:
         path = build_library(Library((RECIPE, text), lambda: generate_code(derivatives(function))))
         return Derivatives(*(ca.external(name, str(path)) for name in Derivatives._fields))

@@ -1,9 +1,9 @@
-"""What went wrong where a solver failed: what cannot hold together, where, and by how much.
+"""Diagnosis of failed solves: which constraints conflict, where, and by how much.
 
-A solver that fails leaves its last iterate, whose residuals are spread over constraints and dynamics alike. So an
-elastic program is solved: the dynamics and the given ends hold, and every constraint and bound may be missed by an
-amount of its own, the same at all times. The plan with the least sum of these amounts, each relative to the size of its
-constraint, names the least that would have to give way.
+The residuals of a failed solver's last iterate are spread over constraints and dynamics alike. Therefore an elastic
+program is solved: dynamics and fixed ends hold, and each constraint and bound may be violated by an amount that is
+constant in time. The plan with the smallest sum of these amounts, each relative to the size of its constraint,
+identifies the smallest relaxation that makes the problem feasible.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 
 from ocp.console import Progress, stop_requests_polled, time_left
-from ocp.direct.assembly import Fragment, Program, sparse
+from ocp.direct.assembly import Program, Transcription, sparse
 from ocp.direct.nlp import Outcome
 from ocp.direct.scaling import SCALING, Scales
 from ocp.errors import Interrupted, SolveError
@@ -25,7 +25,7 @@ from ocp.problem.problem import Problem
 from ocp.status import SolverStatus
 from ocp.tolerances import RESOLVED_SHARE, SOLVER_SHARE
 
-__all__ = ["Conflict", "Elastic", "diagnosis", "elastic_plan", "variable_names"]
+__all__ = ["Elastic", "diagnosis", "elastic_plan", "variable_names"]
 
 ELASTIC_IPOPT = {"tol": 1e-6, "max_iter": 300, "print_level": 0, "sb": "yes"}
 REMEDY = "leave scaling on, give ends, bounds and a guess of the right size, or choose units in which they are near 1"
@@ -33,12 +33,12 @@ REMEDY = "leave scaling on, give ends, bounds and a guess of the right size, or 
 
 @dataclass(frozen=True)
 class ElasticSettings:
-    """What an elastic plan costs, and how much is said of it.
+    """Cost of an elastic plan, and length of the report.
 
     Attributes:
-        cost: Share of the problem's own cost, which makes the plan unique.
-        equality: How much dearer it is to miss an equality, which is what is asked for, than a limit.
-        lines: The most of one kind.
+        cost: Weight of the problem's own cost, which makes the plan unique.
+        equality: Price of the violation of an equality relative to that of a limit.
+        lines: Largest number of lines of one kind.
     """
 
     cost: float = 1e-3
@@ -50,16 +50,16 @@ SETTINGS = ElasticSettings()
 
 
 class Built(Protocol):
-    """What was built of a problem; ``scaled`` is its program as it is solved."""
+    """The parts of a prepared problem that a diagnosis uses."""
 
     problem: Problem
     formulation: Formulation
-    fragment: Fragment
+    transcription: Transcription
     program: Program
 
     @property
     def scaled(self) -> Program:
-        """The program as it is solved."""
+        """The scaled program."""
         ...
 
 
@@ -73,24 +73,25 @@ def diagnosis(
     attempts: Sequence[str],
     badly_scaled: str,
 ) -> SolveError:
-    """The error that says what cannot hold together, and the worst residuals by constraint, state and time.
+    """Return the error that reports conflicting constraints and the largest residuals by constraint, state and time.
 
     Args:
         outcome, arguments, horizon, solution: Of the first attempt, or of the one in which the time ran out.
-        elastic: The plan that misses the constraints least, or None where there is none.
-        attempts: What became of every start, one line each. badly_scaled: What is, or "".
+        elastic: The plan with the smallest violation, or None.
+        attempts: Result of every start, one line each.
+        badly_scaled: Description of bad scaling, or "".
     """
-    labels, at, value, miss = residuals(built, outcome.variables, arguments)
+    labels, fractions, value, violation = residuals(built, outcome.variables, arguments)
     message = outcome.message
-    found = () if elastic is None or badly_scaled else elastic.conflicts
+    conflicts = () if elastic is None or badly_scaled else elastic.conflicts
     if badly_scaled:
         message = f"{outcome.status}: badly scaled: {badly_scaled}; {REMEDY}"
-    elif elastic is not None and not found:  # it is not the constraints
+    elif elastic is not None and not conflicts:  # the constraints are not the reason
         message = str(outcome.status)
     lines = [f"problem {built.problem.name!r}: {outcome.solver} ended with {message}"]
-    if found:
+    if conflicts:
         lines.append("not all constraints can hold together near the guess; with the dynamics and the given ends held,")
-        lines += [f"  {conflict}" for conflict in found[: SETTINGS.lines]]
+        lines += [f"  {conflict}" for conflict in conflicts[: SETTINGS.lines]]
     elif elastic is not None and not badly_scaled:
         lines.append(
             "all constraints can hold together at the points of this grid, but for some 1e-5 of their sizes: take "
@@ -100,44 +101,46 @@ def diagnosis(
         lines += attempts
     lines.append(f"after {outcome.iterations} iterations, cost {outcome.cost:.6g}, horizon {horizon:.6g} s")
     worst: list[dict[str, Any]] = [
-        {"name": c.label, "value": c.amount, "limit": c.bound, "time": c.time} for c in found[:1]
+        {"name": c.label, "value": c.amount, "limit": c.bound, "time": c.time} for c in conflicts[:1]
     ]
-    broken = np.flatnonzero(~np.isfinite(value))
-    for i in broken[: SETTINGS.lines]:
-        lines.append(f"  {labels[i]} is not finite at {at[i] * horizon:.4g} s")
-        worst.append({"name": labels[i], "value": float(value[i]), "time": float(at[i] * horizon)})
-    seen: set[str] = set()
-    for i in np.argsort(-np.where(np.isfinite(miss), miss, -np.inf)):
-        if len(seen) == SETTINGS.lines or not miss[i] > 1e-8:
+    undefined = np.flatnonzero(~np.isfinite(value))
+    for i in undefined[: SETTINGS.lines]:
+        lines.append(f"  {labels[i]} is not finite at {fractions[i] * horizon:.4g} s")
+        worst.append({"name": labels[i], "value": float(value[i]), "time": float(fractions[i] * horizon)})
+    reported: set[str] = set()
+    for i in np.argsort(-np.where(np.isfinite(violation), violation, -np.inf)):
+        if len(reported) == SETTINGS.lines or not violation[i] > 1e-8:
             break
-        if labels[i] not in seen:
-            seen.add(labels[i])
-            lines.append(f"  {labels[i]} is missed by {miss[i]:.3g} at {at[i] * horizon:.4g} s")
-            worst.append({"name": labels[i], "value": float(miss[i]), "limit": 0.0, "time": float(at[i] * horizon)})
+        if labels[i] not in reported:
+            reported.add(labels[i])
+            lines.append(f"  {labels[i]} is missed by {violation[i]:.3g} at {fractions[i] * horizon:.4g} s")
+            worst.append(
+                {"name": labels[i], "value": float(violation[i]), "limit": 0.0, "time": float(fractions[i] * horizon)}
+            )
     lines += at_bounds(built, outcome.variables, arguments, horizon)
-    if not seen and not broken.size:
+    if not reported and not undefined.size:
         lines.append("  all constraints are met; the plan is feasible but not optimal")
-    return SolveError("\n".join(lines), solution, found, **(worst[0] if worst else {}))
+    return SolveError("\n".join(lines), solution, conflicts, **(worst[0] if worst else {}))
 
 
 def at_bounds(built: Built, values: np.ndarray, arguments: dict[str, np.ndarray], horizon: float) -> list[str]:
-    """Which states and controls sit at their bounds, and for how much of the plan."""
-    form, fragment = built.formulation, built.fragment
+    """Return lines on which states and controls are at their bounds, and for which share of the plan."""
+    form, transcription = built.formulation, built.transcription
     lines = []
     for role, labels in (("state", form.state_labels), ("control", form.control_labels)):
         for i, label in enumerate(labels):
-            mine = (fragment.variable_role == role) & (fragment.variable_entry == i)
-            mine &= arguments["lbx"] < arguments["ubx"]  # not what is given
+            chosen = (transcription.variable_role == role) & (transcription.variable_entry == i)
+            chosen &= arguments["lbx"] < arguments["ubx"]  # not fixed variables
             for side, key in (("lower", "lbx"), ("upper", "ubx")):
-                bound = arguments[key][mine]
+                bound = arguments[key][chosen]
                 with np.errstate(invalid="ignore"):
-                    at = np.abs(values[mine] - bound) <= 1e-6 * np.maximum(1.0, np.abs(bound))
+                    at = np.abs(values[chosen] - bound) <= 1e-6 * np.maximum(1.0, np.abs(bound))
                 at &= np.isfinite(bound)
                 if np.any(at):
-                    where = fragment.variable_fraction[mine][at]
+                    fractions = transcription.variable_fraction[chosen][at]
                     lines.append(
                         f"  {role} {label} is at its {side} bound {bound[at][0]:.4g} at {np.mean(at):.0%} of its "
-                        f"points, from {where.min() * horizon:.4g} to {where.max() * horizon:.4g} s"
+                        f"points, from {fractions.min() * horizon:.4g} to {fractions.max() * horizon:.4g} s"
                     )
     return lines
 
@@ -145,51 +148,52 @@ def at_bounds(built: Built, values: np.ndarray, arguments: dict[str, np.ndarray]
 def residuals(
     built: Built, v: np.ndarray, arguments: dict[str, np.ndarray]
 ) -> tuple[list[str], np.ndarray, np.ndarray, np.ndarray]:
-    """Label, fraction, value and miss of every row and of the bounds of every variable, evaluated anew."""
-    form, fragment = built.formulation, built.fragment
+    """Return label, fraction, value and violation of every row and of the bounds of every variable."""
+    form, transcription = built.formulation, built.transcription
     try:
         g = np.asarray(built.program.values(v, arguments["p"])[1].full()).reshape(-1)
-    except RuntimeError:  # an integrator breaks down
-        g = np.full(fragment.n_rows, np.nan)
+    except RuntimeError:  # an integrator fails
+        g = np.full(transcription.n_rows, np.nan)
     value = np.concatenate([g, v])
     lower, upper = both_bounds(arguments)
-    at = np.concatenate([fragment.row_fractions, fragment.variable_fraction])
-    labels = [*fragment.row_labels, *(f"bound of {name}" for name in variable_names(form, fragment))]
-    return labels, at, value, np.maximum(lower - value, value - upper)
+    fractions = np.concatenate([transcription.row_fractions, transcription.variable_fraction])
+    labels = [*transcription.row_labels, *(f"bound of {name}" for name in variable_names(form, transcription))]
+    return labels, fractions, value, np.maximum(lower - value, value - upper)
 
 
 def both_bounds(arguments: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper bounds of the rows, then of the variables."""
+    """Return lower and upper bounds of the rows, then of the variables."""
     low, high = (np.concatenate([arguments[f"{side}g"], arguments[f"{side}x"]]) for side in ("lb", "ub"))
     return low, high
 
 
-def variable_labels(form: Formulation, fragment: Fragment) -> list[str]:
-    """Name of the state, control or horizon that each variable is; "" of a copy that a stage carries."""
+def variable_labels(form: Formulation, transcription: Transcription) -> list[str]:
+    """Return the name of the state, control or horizon of each variable; "" for undeclared variables of stages."""
     names = {"state": form.state_labels, "control": form.control_labels, "horizon": ("horizon",)}
     return [
         names[role][entry] if role else ""
-        for role, entry in zip(fragment.variable_role, fragment.variable_entry, strict=True)
+        for role, entry in zip(transcription.variable_role, transcription.variable_entry, strict=True)
     ]
 
 
-def variable_names(form: Formulation, fragment: Fragment) -> list[str]:
-    """The same with what it is before it, "state q[2]"; "a stage variable" of a copy that a stage carries."""
+def variable_names(form: Formulation, transcription: Transcription) -> list[str]:
+    """Return the labels with their role, such as "state q[2]", or "a stage variable" for an undeclared variable."""
     return [
         f"{'' if role == 'horizon' else role + ' '}{name}" if role else "a stage variable"
-        for role, name in zip(fragment.variable_role, variable_labels(form, fragment), strict=True)
+        for role, name in zip(transcription.variable_role, variable_labels(form, transcription), strict=True)
     ]
 
 
 @dataclass(frozen=True)
 class Conflict:
-    """A constraint that has to give way.
+    """A constraint that must be relaxed.
 
     Attributes:
-        label: Of the constraint, or of the state or control whose bound it is.
-        amount: By how much, in its own unit. bound: The bound that is missed, and its side, ``lower`` or ``upper``.
-        fraction: Of the horizon where it is missed most.
-        horizon: Of the plan, s.
+        label: Of the constraint, or of the state or control with the bound.
+        amount: Required relaxation, in its own unit.
+        bound, side: The violated bound, and its side, ``lower`` or ``upper``.
+        fraction: Fraction of the horizon with the largest violation.
+        horizon: Duration of the plan, s.
     """
 
     label: str
@@ -201,7 +205,7 @@ class Conflict:
 
     @property
     def time(self) -> float | None:
-        """When it is missed most, s; None of the horizon itself."""
+        """Time of the largest violation, s; None for the horizon itself."""
         return None if self.label == "horizon" else self.fraction * self.horizon
 
     def __str__(self) -> str:
@@ -211,7 +215,7 @@ class Conflict:
 
 @dataclass(frozen=True)
 class Elastic:
-    """The plan that misses the constraints least: its variables (n,), and what it misses, the largest share first."""
+    """The plan with the smallest violation: its variables (n,), and its conflicts, the largest share first."""
 
     plan: np.ndarray
     conflicts: tuple[Conflict, ...]
@@ -220,46 +224,47 @@ class Elastic:
 def elastic_plan(
     built: Built, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales, horizon: float
 ) -> Elastic | None:
-    """The plan with the dynamics and the given ends held that misses the constraints least.
+    """Return the plan that satisfies dynamics and fixed ends and violates the other constraints least.
 
-    None where the last iterate misses nothing or is not finite, so that it is not the constraints that are in the way,
-    and where no plan is found in the time that is left.
+    None if the last iterate violates nothing or is not finite, so that the constraints are not the reason for the
+    failure, and if no plan is found in the remaining time.
 
     Args:
-        outcome: Of the solver that failed.
-        arguments: Of the solver: x0, p and the bounds lbx, ubx, lbg, ubg. scales: What the program is scaled by.
-        horizon: The fixed final time, s; not used where it is free.
+        outcome: Result of the failed solver.
+        arguments: Arguments of the solver: x0, p and the bounds lbx, ubx, lbg, ubg.
+        scales: Scales of the program.
+        horizon: The fixed final time, s; not used if it is free.
 
     Raises:
         Interrupted: Ctrl-C.
     """
-    _, _, value, miss = residuals(built, outcome.variables, arguments)
-    if time_left() <= 0 or not (np.all(np.isfinite(value)) and np.any(miss > SOLVER_SHARE)):
+    _, _, value, violation = residuals(built, outcome.variables, arguments)
+    if time_left() <= 0 or not (np.all(np.isfinite(value)) and np.any(violation > SOLVER_SHARE)):
         return None
-    form, fragment, program = built.formulation, built.fragment, built.scaled
-    own = scales.inside(arguments)
-    soft = _Soft(form, fragment, own)
-    n, m, k = fragment.size, fragment.n_rows, len(soft.labels)
+    form, transcription, program = built.formulation, built.transcription, built.scaled
+    scaled = scales.inside(arguments)
+    soft = _Soft(form, transcription, scaled)
+    n, m, k = transcription.size, transcription.n_rows, len(soft.labels)
     x, p = ca.MX.sym("x", n + k), program.nlp["p"]
     v, slack = x[:n], x[n:]
-    rows, columns = soft.picks(n, m, k)
+    rows, columns = soft.matrices(n, m, k)
     with np.errstate(all="ignore"):
-        size = float(program.values(own["x0"], own["p"])[0])
-    share = SETTINGS.cost / max(1.0 if scales.cost <= 1 else SCALING.usual, abs(size)) if np.isfinite(size) else 0.0
+        size = float(program.values(scaled["x0"], scaled["p"])[0])
+    weight = SETTINGS.cost / max(1.0 if scales.cost <= 1 else SCALING.usual, abs(size)) if np.isfinite(size) else 0.0
     lam, sigma = ca.MX.sym("lam", rows.shape[0]), ca.MX.sym("sigma")
     cost, slope = program.gradient(v, p)
     values, jacobian = program.jacobian(v, p)
-    f = share * cost + ca.dot(ca.DM(soft.prices), slack)
+    f = weight * cost + ca.dot(ca.DM(soft.prices), slack)
     g = ca.mtimes(rows, values) + ca.mtimes(columns, x)
     jac = ca.horzcat(ca.mtimes(rows, jacobian), ca.DM(rows.shape[0], k)) + columns
-    curved = program.hessian(v, p, share * sigma, ca.mtimes(rows.T, lam))
-    title = f"what is in conflict in {built.problem.name}"
+    hessian = program.hessian(v, p, weight * sigma, ca.mtimes(rows.T, lam))
+    title = f"conflicts in {built.problem.name}"
     progress = Progress(n + k, rows.shape[0], p.numel(), title, show=True)
     options = {
-        "grad_f": ca.Function("g", [x, p], [f, ca.vertcat(share * slope, soft.prices)], ["x", "p"], ["f", "g"]),
+        "grad_f": ca.Function("g", [x, p], [f, ca.vertcat(weight * slope, soft.prices)], ["x", "p"], ["f", "g"]),
         "jac_g": ca.Function("j", [x, p], [g, jac], ["x", "p"], ["g", "j"]),
-        "hess_lag": ca.Function("h", [x, p, sigma, lam], [ca.diagcat(curved, ca.DM(k, k))]),
-        "no_nlp_grad": True,  # compiled functions have no derivatives but those that are ready
+        "hess_lag": ca.Function("h", [x, p, sigma, lam], [ca.diagcat(hessian, ca.DM(k, k))]),
+        "no_nlp_grad": True,  # compiled functions only have the given derivatives
         "calc_lam_p": False,
         "print_time": False,
         "error_on_fail": False,
@@ -267,50 +272,52 @@ def elastic_plan(
         "ipopt": ELASTIC_IPOPT,
         "iteration_callback": progress,
     }
-    lower, upper = soft.limits(own)
+    lower, upper = soft.limits(scaled)
     progress.open(lower, upper)
     try:
         solver = ca.nlpsol("elastic", "ipopt", {"x": x, "p": p, "f": f, "g": g}, options)
         with stop_requests_polled():
             result = solver(
-                x0=np.concatenate([own["x0"], np.zeros(k)]),
-                p=own["p"],
+                x0=np.concatenate([scaled["x0"], np.zeros(k)]),
+                p=scaled["p"],
                 lbx=np.concatenate([soft.low, np.zeros(k)]),
                 ubx=np.concatenate([soft.high, np.full(k, np.inf)]),
                 lbg=lower,
                 ubg=upper,
             )
-    except RuntimeError:  # an integrator breaks down
+    except RuntimeError:  # an integrator fails
         return None
     finally:
         progress.close()
     if progress.stopped is SolverStatus.INTERRUPTED:
-        raise Interrupted(f"problem {built.problem.name!r}: interrupted while looking for what is in conflict")
+        raise Interrupted(f"problem {built.problem.name!r}: interrupted during the search for conflicts")
     if not solver.stats()["success"]:
         return None
     plan = np.asarray(result["x"].full()).ravel()[:n]
-    found = np.asarray(program.values(plan, own["p"])[1].full()).ravel()
+    rows_of_plan = np.asarray(program.values(plan, scaled["p"])[1].full()).ravel()
     plan_of_problem = plan * scales.variables
-    end = horizon if fragment.horizon is None else float(plan_of_problem[fragment.horizon])
+    duration = horizon if transcription.horizon is None else float(plan_of_problem[transcription.horizon])
     units = np.concatenate([scales.rows, scales.variables])
-    return Elastic(plan_of_problem, tuple(soft.read(np.concatenate([found, plan]), own, end, units)))
+    return Elastic(
+        plan_of_problem, tuple(soft.conflicts(np.concatenate([rows_of_plan, plan]), scaled, duration, units))
+    )
 
 
 class _Soft:
-    """Which rows and bounds may be missed: all but the dynamics, the given ends and the least horizon.
+    """Rows and bounds that may be violated: all but the dynamics, the fixed ends and the smallest horizon.
 
-    Rows are numbered before variables. Those of one label share a slack.
+    Rows are numbered before variables. Those with one label share a slack variable.
     """
 
-    def __init__(self, form: Formulation, fragment: Fragment, arguments: dict[str, np.ndarray]) -> None:
+    def __init__(self, form: Formulation, transcription: Transcription, arguments: dict[str, np.ndarray]) -> None:
         places = form.bounds.places
-        owner = np.array([*fragment.row_labels, *variable_labels(form, fragment)])
+        owner = np.array([*transcription.row_labels, *variable_labels(form, transcription)])
         low, high = both_bounds(arguments)
         declared = np.concatenate([places[kind] for kind in ("path", "start", "end")])
-        is_soft = np.concatenate([np.isin(fragment.row_bounds, declared), arguments["lbx"] < arguments["ubx"]])
+        is_soft = np.concatenate([np.isin(transcription.row_bounds, declared), arguments["lbx"] < arguments["ubx"]])
         self.lower = np.flatnonzero(is_soft & np.isfinite(low) & (owner != "horizon"))
         self.upper = np.flatnonzero(is_soft & np.isfinite(high))
-        self.hard = np.flatnonzero(~is_soft[: fragment.n_rows])
+        self.hard = np.flatnonzero(~is_soft[: transcription.n_rows])
         self.labels, index = np.unique(owner[np.concatenate([self.lower, self.upper])], return_inverse=True)
         self.slack_of_lower, self.slack_of_upper = index[: len(self.lower)], index[len(self.lower) :]
         with np.errstate(invalid="ignore"):
@@ -321,14 +328,14 @@ class _Soft:
         np.minimum.at(self.sizes, index, size[np.concatenate([self.lower, self.upper])])
         self.prices = 1 / self.sizes
         self.prices[index[(low == high)[np.concatenate([self.lower, self.upper])]]] *= SETTINGS.equality
-        relaxed = is_soft[fragment.n_rows :]
-        horizon = fragment.variable_role == "horizon"
+        relaxed = is_soft[transcription.n_rows :]
+        horizon = transcription.variable_role == "horizon"
         self.low = np.where(relaxed & ~horizon, -np.inf, arguments["lbx"])
         self.high = np.where(relaxed, np.inf, arguments["ubx"])
-        self.fractions = np.concatenate([fragment.row_fractions, fragment.variable_fraction])
+        self.fractions = np.concatenate([transcription.row_fractions, transcription.variable_fraction])
 
-    def picks(self, n: int, m: int, k: int) -> tuple[Any, Any]:
-        """Constant matrices R, C: the elastic rows are R g(v) + C (v, slack)."""
+    def matrices(self, n: int, m: int, k: int) -> tuple[Any, Any]:
+        """Return constant matrices R, C: the elastic rows are R g(v) + C (v, slack)."""
         chosen = np.concatenate([self.hard, self.lower, self.upper])
         number = np.arange(len(chosen))
         of_rows = chosen < m
@@ -340,31 +347,34 @@ class _Soft:
         return rows, sparse(at, columns, signs, (len(chosen), n + k))
 
     def limits(self, arguments: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """Bounds of the elastic rows."""
+        """Return the bounds of the elastic rows."""
         low, high = both_bounds(arguments)
         free = np.full(max(len(self.lower), len(self.upper)), np.inf)
         lower = np.concatenate([low[self.hard], low[self.lower], -free[: len(self.upper)]])
         return lower, np.concatenate([high[self.hard], free[: len(self.lower)], high[self.upper]])
 
-    def read(
+    def conflicts(
         self, values: np.ndarray, arguments: dict[str, np.ndarray], horizon: float, units: np.ndarray
     ) -> list[Conflict]:
-        """What is missed, the largest share first, in ``units`` of rows and variables."""
+        """Return the conflicts, the largest share first, in ``units`` of rows and variables."""
         low, high = both_bounds(arguments)
-        found: dict[int, Conflict] = {}
-        by: dict[int, float] = {}
+        by_slack: dict[int, Conflict] = {}
+        unit_of: dict[int, float] = {}
         for side, index, slack in (
             ("lower", self.lower, self.slack_of_lower),
             ("upper", self.upper, self.slack_of_upper),
         ):
             bound = (low if side == "lower" else high)[index]
-            miss = bound - values[index] if side == "lower" else values[index] - bound
-            for i in np.argsort(-miss):
+            violation = bound - values[index] if side == "lower" else values[index] - bound
+            for i in np.argsort(-violation):
                 j = int(slack[i])
-                if miss[i] <= RESOLVED_SHARE * self.sizes[j]:
+                if violation[i] <= RESOLVED_SHARE * self.sizes[j]:
                     break
-                if j not in found or miss[i] > found[j].amount:
-                    at, by[j] = float(self.fractions[index[i]]), float(units[index[i]])
-                    found[j] = Conflict(str(self.labels[j]), float(miss[i]), float(bound[i]), side, at, horizon)
-        order = sorted(found, key=lambda j: -found[j].amount / self.sizes[j])
-        return [replace(found[j], amount=found[j].amount * by[j], bound=found[j].bound * by[j]) for j in order]
+                if j not in by_slack or violation[i] > by_slack[j].amount:
+                    fraction, unit_of[j] = float(self.fractions[index[i]]), float(units[index[i]])
+                    by_slack[j] = Conflict(
+                        str(self.labels[j]), float(violation[i]), float(bound[i]), side, fraction, horizon
+                    )
+        order = sorted(by_slack, key=lambda j: -by_slack[j].amount / self.sizes[j])
+        conflicts = [(by_slack[j], unit_of[j]) for j in order]
+        return [replace(each, amount=each.amount * unit, bound=each.bound * unit) for each, unit in conflicts]

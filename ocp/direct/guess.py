@@ -1,6 +1,7 @@
-"""Where the solver starts: guesses of every kind, evaluated at the variables of a transcription.
+"""Initial points of a solver: guesses of every kind evaluated at the variables of a transcription, and alternative
+starts.
 
-Where else a solver may start when it fails from the guess: zeros, and a roll-out of the dynamics.
+If the solver fails from the guess, it may start from zeros or from a roll-out of the dynamics.
 """
 
 from __future__ import annotations
@@ -13,112 +14,118 @@ import casadi as ca
 import numpy as np
 
 from ocp.curves import rk4_step
-from ocp.direct.assembly import Fragment
+from ocp.direct.assembly import Transcription
 from ocp.errors import ProblemError, error_names, unknown_name
 from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.values import numeric, table
 from ocp.solution import Guess, Solution
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = ["ELASTIC", "GUESS", "STARTS", "Samples", "initial_point", "later", "names_told", "other_starts"]
+__all__ = ["STARTS", "Samples", "alternative_starts", "guessed_names", "initial_point", "shifted_indices"]
 
 Trajectory = Callable[[np.ndarray], np.ndarray]  # fractions of the horizon (M,) -> values (M, n)
 
 
-def initial_point(form: Formulation, fragment: Fragment, guess: Guess, bounds: Bounds) -> np.ndarray:
-    """Values of all variables to start from. Shape (size,).
+def initial_point(form: Formulation, transcription: Transcription, guess: Guess, bounds: Bounds) -> np.ndarray:
+    """Return the initial values of all variables. Shape (size,).
 
-    What ``guess`` says comes first, then the guess declared with the variable, then a straight line between the given
-    ends or the middle of the bounds. A solution of another grid or method is read over fractions of its horizon.
+    ``guess`` takes precedence over the guess declared with a variable. Without either the values follow a straight line
+    between the fixed ends, or the middle of the bounds. A solution on another grid or by another method is read over
+    fractions of its horizon.
 
     Raises:
-        ProblemError: An unknown name, a wrong size, a number that is not finite.
+        ProblemError: An unknown name, a wrong size, or a number that is not finite.
     """
-    entries = dict(form.guesses)
+    guesses = dict(form.guesses)
     horizon = default_horizon(form, bounds)
-    given: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     curves: dict[str, Trajectory] = {}
     if isinstance(guess, Solution):
         curves, horizon = from_solution(form, guess), guess.horizon
     elif isinstance(guess, Mapping):
-        given = {name: value for name, value in guess.items() if name != "t"}
+        values = {name: value for name, value in guess.items() if name != "t"}
         known = [*form.states, *form.controls, "horizon", "t"]
-        for name in given:
+        for name in values:
             if name not in known:
                 raise unknown_name("variable in guess", name, known)
     elif guess is not None:
-        words = f"guess must be a Solution, a dictionary or None, not {type(guess).__name__}"
-        raise ProblemError(words, name="guess", value=guess)
-    if "horizon" in given:
+        text = f"guess must be a Solution, a dictionary or None, not {type(guess).__name__}"
+        raise ProblemError(text, name="guess", value=guess)
+    if "horizon" in values:
         with error_names("horizon"):
-            number = numeric("guess of the horizon", given.pop("horizon"))
+            number = numeric("guess of the horizon", values.pop("horizon"))
         if not (number.size == 1 and np.isfinite(number[0]) and number[0] > 0):
-            words = f"guess of the horizon must be one positive finite number, not {number.tolist()} s"
-            raise ProblemError(words, name="horizon", value=number.tolist())
+            text = f"guess of the horizon must be one positive finite number, not {number.tolist()} s"
+            raise ProblemError(text, name="horizon", value=number.tolist())
         horizon = float(number[0])
-    entries.update(given)
+    guesses.update(values)
     times = None if guess is None or isinstance(guess, Solution) else guess.get("t")
 
-    point = np.zeros(fragment.size)
-    point[fragment.variable_role == "horizon"] = horizon
-    for role, pool in (("state", form.states), ("control", form.controls)):
-        mine = fragment.variable_role == role
-        where, slot = np.unique(fragment.variable_fraction[mine], return_inverse=True)
-        size = max((place.stop for place in pool.values()), default=0)
-        table = np.zeros((len(where), size))
-        for name, place in pool.items():
-            value = entries.get(name)
+    point = np.zeros(transcription.size)
+    point[transcription.variable_role == "horizon"] = horizon
+    for role, declared in (("state", form.states), ("control", form.controls)):
+        chosen = transcription.variable_role == role
+        fractions, slot = np.unique(transcription.variable_fraction[chosen], return_inverse=True)
+        size = max((entries.stop for entries in declared.values()), default=0)
+        table = np.zeros((len(fractions), size))
+        for name, entries in declared.items():
+            value = guesses.get(name)
             if name in curves:
                 curve = curves[name]
             elif value is None:
-                curve = default(form, role, place, bounds)
+                curve = default(form, role, entries, bounds)
             else:
                 with error_names(name):
-                    curve = trajectory(name, value, place.stop - place.start, horizon, times)
+                    curve = trajectory(name, value, entries.stop - entries.start, horizon, times)
             with error_names(name):
-                table[:, place] = curve(where)
-            for i in np.flatnonzero(~np.isfinite(table[:, place]).all(axis=1)):
-                words = f"guess of {name!r} is not finite at {where[i] * horizon:g} s: {table[i, place]}"
-                raise ProblemError(words, name=name, value=table[i, place], time=float(where[i] * horizon))
-        point[mine] = table[slot, fragment.variable_entry[mine]]
+                table[:, entries] = curve(fractions)
+            for i in np.flatnonzero(~np.isfinite(table[:, entries]).all(axis=1)):
+                text = f"guess of {name!r} is not finite at {fractions[i] * horizon:g} s: {table[i, entries]}"
+                raise ProblemError(text, name=name, value=table[i, entries], time=float(fractions[i] * horizon))
+        point[chosen] = table[slot, transcription.variable_entry[chosen]]
     return point
 
 
-def names_told(form: Formulation, guess: Guess) -> set[str]:
-    """Names of states, controls and ``horizon`` of which a guess, or the problem's own, says something."""
-    told = {name for name, value in form.guesses.items() if value is not None}
+def guessed_names(form: Formulation, guess: Guess) -> set[str]:
+    """Return the names of states, controls and ``horizon`` for which the guess or the problem declares a value."""
+    names = {name for name, value in form.guesses.items() if value is not None}
     if form.horizon_guess is not None:
-        told.add("horizon")
+        names.add("horizon")
     if isinstance(guess, Solution):
-        return told | {*guess.states, *guess.controls, "horizon"}
-    return told | {*(guess or {})}
+        return names | {*guess.states, *guess.controls, "horizon"}
+    return names | {*(guess or {})}
 
 
-def later(fragment: Fragment, intervals: int) -> tuple[np.ndarray, np.ndarray]:
-    """For each variable and each row of a program, the one of the same meaning so many equal intervals later.
+def shifted_indices(transcription: Transcription, intervals: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return, for each variable and each row, the index of its counterpart a number of equal intervals later.
 
-    Itself where the horizon ends before.
+    The index itself where the horizon ends earlier.
     """
-    step = intervals / (len(fragment.mesh) - 1)
-    meanings = [f"{role} {entry}" for role, entry in zip(fragment.variable_role, fragment.variable_entry, strict=True)]
-    found = []
-    for words, fractions in ((meanings, fragment.variable_fraction), (fragment.row_labels, fragment.row_fractions)):
-        _, label = np.unique(words, return_inverse=True)
+    step = intervals / (len(transcription.mesh) - 1)
+    meanings = [
+        f"{role} {entry}" for role, entry in zip(transcription.variable_role, transcription.variable_entry, strict=True)
+    ]
+    indices = []
+    for kinds, fractions in (
+        (meanings, transcription.variable_fraction),
+        (transcription.row_labels, transcription.row_fractions),
+    ):
+        _, label = np.unique(kinds, return_inverse=True)
         order = np.lexsort((fractions, label))
-        at = label[order] + fractions[order] / 2  # one meaning after the other, in time
-        there = np.searchsorted(at, label + (fractions + step - ROUNDING_SHARE) / 2)
-        other = order[np.minimum(there, len(order) - 1)]
-        fits = (label[other] == label) & (np.abs(fractions[other] - fractions - step) < ROUNDING_SHARE)
-        found.append(np.where(fits, other, np.arange(len(label))))
-    return found[0], found[1]
+        key = label[order] + fractions[order] / 2  # sorted by meaning, then by time
+        position = np.searchsorted(key, label + (fractions + step - ROUNDING_SHARE) / 2)
+        counterpart = order[np.minimum(position, len(order) - 1)]
+        exists = (label[counterpart] == label) & (np.abs(fractions[counterpart] - fractions - step) < ROUNDING_SHARE)
+        indices.append(np.where(exists, counterpart, np.arange(len(label))))
+    return indices[0], indices[1]
 
 
 def trajectory(name: str, value: Any, size: int, horizon: float, times: Any) -> Trajectory:
-    """A guess as a function of the fraction: from a function of time, samples (M, n) over ``times``, or a value."""
+    """Return a guess as a function of the fraction: from a function of time, from samples (M, n) or from a value."""
     if isinstance(value, Samples) and value.values.shape[1] == size:
         return lambda at: value.over(at * horizon)
     if callable(value):
-        return lambda at: np.array([fitted(name, asked(name, value, float(s) * horizon), size) for s in at])
+        return lambda at: np.array([evaluate_guess(name, value, float(s) * horizon, size) for s in at])
     array = table(f"guess of {name!r}", value)
     if array.ndim == 2 and array.shape[0] > 1 and array.shape != (size, 1):
         rows = len(array)
@@ -130,22 +137,23 @@ def trajectory(name: str, value: Any, size: int, horizon: float, times: Any) -> 
             raise ProblemError(f"guess of {name!r}: its times 't' must be finite and increase", name=name)
         sampled = Samples(at, array)
         return lambda s: sampled.over(s * horizon)
-    constant = fitted(name, value, size)
+    constant = broadcast_guess(name, value, size)
     return lambda s: np.tile(constant, (len(s), 1))
 
 
-def asked(name: str, function: Callable[[float], Any], time: float) -> Any:
-    """What a guess that is a function says at a time, s; ProblemError where it fails."""
+def evaluate_guess(name: str, function: Callable[[float], Any], time: float, size: int) -> np.ndarray:
+    """Return the ``size`` entries of a guess function at a time, s; raise ProblemError if it fails."""
     try:
-        return function(time)
-    except Exception as error:  # of the function's own
+        value = function(time)
+    except Exception as error:  # any error of the user's function
         words = f"guess of {name!r}: the function fails at {time:g} s: {error!r}"
         raise ProblemError(words, name=name, value=function, time=time) from error
+    return broadcast_guess(name, value, size)
 
 
 @dataclass(frozen=True)
 class Samples:
-    """A guess sampled over time: a function of time that can be asked for many times at once.
+    """A guess sampled over time, callable at one time or at many.
 
     Attributes:
         t: Times, s, increasing. Shape (M,).
@@ -156,25 +164,25 @@ class Samples:
     values: np.ndarray
 
     def over(self, times: np.ndarray) -> np.ndarray:
-        """Values at ``times`` (K,), linear between samples, constant beyond them. Shape (K, n)."""
+        """Return values at ``times`` (K,): linear between samples, constant beyond them. Shape (K, n)."""
         return np.column_stack([np.interp(times, self.t, column) for column in self.values.T])
 
     def __call__(self, time: float) -> np.ndarray:
-        """Value at one time. Shape (n,)."""
+        """Return the value at one time. Shape (n,)."""
         return np.asarray(self.over(np.array([time]))[0])
 
 
 def from_solution(form: Formulation, guess: Solution) -> dict[str, Trajectory]:
-    """Curves of an earlier solution, for every state and control that it shares with the problem."""
+    """Return the curves of an earlier solution for every state and control that it shares with the problem."""
     shared: dict[str, Trajectory] = {}
-    for name, place in {**form.states, **form.controls}.items():
-        pool = guess.states if name in guess.states else guess.controls
-        if name not in pool:
+    for name, entries in {**form.states, **form.controls}.items():
+        values = guess.states if name in guess.states else guess.controls
+        if name not in values:
             continue
-        have, size = pool[name].shape[1], place.stop - place.start
-        if have != size:
+        actual, size = values[name].shape[1], entries.stop - entries.start
+        if actual != size:
             raise ProblemError(
-                f"guess of {name!r} has {have} entries, {size} expected", name=name, value=have, limit=size
+                f"guess of {name!r} has {actual} entries, {size} expected", name=name, value=actual, limit=size
             )
         shared[name] = lambda s, name=name: guess.at_fraction(s)[name]  # type: ignore[misc]
     if not shared:
@@ -183,7 +191,8 @@ def from_solution(form: Formulation, guess: Solution) -> dict[str, Trajectory]:
     return shared
 
 
-def fitted(name: str, value: Any, size: int) -> np.ndarray:
+def broadcast_guess(name: str, value: Any, size: int) -> np.ndarray:
+    """Return a guess as an array of ``size`` entries."""
     array = numeric(f"guess of {name!r}", value)
     if array.size not in (1, size):
         words = f"guess of {name!r} has {array.size} entries, {size} expected"
@@ -192,7 +201,7 @@ def fitted(name: str, value: Any, size: int) -> np.ndarray:
 
 
 def default_horizon(form: Formulation, bounds: Bounds) -> float:
-    """The declared guess, or a value inside the bounds."""
+    """Return the declared guess of the horizon, or a value inside its bounds."""
     place = form.bounds.places["horizon"][0]
     low, high = bounds[0][place], bounds[1][place]
     if form.horizon_guess is not None:
@@ -201,7 +210,7 @@ def default_horizon(form: Formulation, bounds: Bounds) -> float:
 
 
 def default(form: Formulation, role: str, place: slice, bounds: Bounds) -> Trajectory:
-    """A straight line between given ends, else the nearest point of the bounds to zero or their middle."""
+    """Return a straight line between fixed ends, else the middle of the bounds or their nearest point to zero."""
 
     def middle(kind: str) -> tuple[np.ndarray, np.ndarray]:
         index = form.bounds.places[kind][place]
@@ -221,17 +230,14 @@ def default(form: Formulation, role: str, place: slice, bounds: Bounds) -> Traje
     return lambda s: np.outer(1.0 - s, start) + np.outer(s, end)
 
 
-GUESS, ELASTIC = "guess", "elastic plan"
-
-
 @dataclass(frozen=True)
 class StartSettings:
-    """Where and for how long a solver starts anew.
+    """Alternative starts of a solver.
 
     Attributes:
-        horizon: Zeros begin with a free horizon so many times the guessed one: a long horizon has a plan in it, too
-            short a one none.
-        iterations: The most from each start: the solver failed already from another one.
+        horizon: Factor on the guess of a free horizon when starting from zeros: a long horizon contains a feasible
+            plan, one that is too short does not.
+        iterations: Largest number of iterations from each start.
     """
 
     horizon: float = 4.0
@@ -241,52 +247,57 @@ class StartSettings:
 STARTS = StartSettings()
 
 
-def other_starts(
-    form: Formulation, fragment: Fragment, point: np.ndarray, p: np.ndarray, bounds: tuple[np.ndarray, np.ndarray]
+def alternative_starts(
+    form: Formulation,
+    transcription: Transcription,
+    point: np.ndarray,
+    p: np.ndarray,
+    bounds: tuple[np.ndarray, np.ndarray],
 ) -> Iterator[tuple[str, np.ndarray]]:
-    """Name and values of all variables of each start after the guess ``point``, made when it is asked for.
+    """Yield the name and the variables of each alternative start, computed on demand.
 
     Args:
-        bounds: Of the variables, which the starts are moved into.
+        point: Variables of the guess.
+        bounds: Bounds of the variables, to which the starts are clipped.
     """
-    zeros = np.where(fragment.variable_role == "horizon", STARTS.horizon * point, 0.0)
+    zeros = np.where(transcription.variable_role == "horizon", STARTS.horizon * point, 0.0)
     yield "zeros", np.clip(zeros, *bounds)
-    yield "roll-out", np.clip(roll_out(form, fragment, point, p), *bounds)
+    yield "roll-out", np.clip(roll_out(form, transcription, point, p), *bounds)
 
 
-def roll_out(form: Formulation, fragment: Fragment, point: np.ndarray, p: np.ndarray) -> np.ndarray:
-    """The controls of a start with the states that they lead to from its initial state. Shape (size,).
+def roll_out(form: Formulation, transcription: Transcription, point: np.ndarray, p: np.ndarray) -> np.ndarray:
+    """Return a start with the states that follow from its initial state and its controls. Shape (size,).
 
-    Classical Runge-Kutta from each fraction at which a state stands to the next; from where the states are no longer
-    finite they stand still.
+    Classical Runge-Kutta steps between the fractions of the states. From the first state that is not finite on, the
+    states are constant.
     """
-    state, control = (fragment.variable_role == role for role in ("state", "control"))
-    where, slot = np.unique(fragment.variable_fraction[state], return_inverse=True)
-    horizon = float(form.horizon_at(p) if fragment.horizon is None else point[fragment.horizon])
+    state, control = (transcription.variable_role == role for role in ("state", "control"))
+    fractions, slot = np.unique(transcription.variable_fraction[state], return_inverse=True)
+    horizon = float(form.horizon_at(p) if transcription.horizon is None else point[transcription.horizon])
     # controls at the beginning, middle and end of every step
-    places = np.concatenate([where[:-1], (where[:-1] + where[1:]) / 2, where[1:]])
+    places = np.concatenate([fractions[:-1], (fractions[:-1] + fractions[1:]) / 2, fractions[1:]])
     values = np.zeros((form.nu, len(places)))
     for i in range(form.nu):
-        mine = np.flatnonzero(control & (fragment.variable_entry == i))
-        at, first = np.unique(fragment.variable_fraction[mine], return_index=True)
-        values[i] = np.interp(places, at, point[mine][first])
-    steps = len(where) - 1
-    inputs = np.vstack([*np.split(values, 3, axis=1), where[:-1] * horizon, np.diff(where) * horizon])
+        entries = np.flatnonzero(control & (transcription.variable_entry == i))
+        times, first = np.unique(transcription.variable_fraction[entries], return_index=True)
+        values[i] = np.interp(places, times, point[entries][first])
+    steps = len(fractions) - 1
+    inputs = np.vstack([*np.split(values, 3, axis=1), fractions[:-1] * horizon, np.diff(fractions) * horizon])
 
     rate = form.function("rate", [form.f], ["f"])
     x, d = ca.MX.sym("x", form.nx), ca.MX.sym("d", 3 * form.nu + 2)
 
-    def slope(place: float, here: ca.MX) -> ca.MX:
-        third = round(2 * place) * form.nu
-        return rate(here, d[third : third + form.nu], d[-2] + place * d[-1], horizon, p)
+    def slope(place: float, state_here: ca.MX) -> ca.MX:
+        offset = round(2 * place) * form.nu
+        return rate(state_here, d[offset : offset + form.nu], d[-2] + place * d[-1], horizon, p)
 
     step = ca.Function("step", [x, d], [rk4_step(slope, x, d[-1])])
-    start = point[fragment.start]
-    found = np.asarray(step.mapaccum("roll_out", steps)(start, inputs).full()) if steps else np.zeros((form.nx, 0))
-    states = np.column_stack([start, found])
-    broken = ~np.isfinite(states).all(axis=0)
-    if broken.any():
-        states[:, np.argmax(broken) :] = states[:, [np.argmax(broken) - 1]]
-    rolled = point.copy()
-    rolled[state] = states[fragment.variable_entry[state], slot]
-    return rolled
+    start = point[transcription.start]
+    trajectory = np.asarray(step.mapaccum("roll_out", steps)(start, inputs).full()) if steps else np.zeros((form.nx, 0))
+    states = np.column_stack([start, trajectory])
+    invalid = ~np.isfinite(states).all(axis=0)
+    if invalid.any():
+        states[:, np.argmax(invalid) :] = states[:, [np.argmax(invalid) - 1]]
+    result = point.copy()
+    result[state] = states[transcription.variable_entry[state], slot]
+    return result

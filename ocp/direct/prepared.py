@@ -1,4 +1,4 @@
-"""Direct methods, and a problem built once for such a method and a solver, to be solved many times."""
+"""Direct methods, and problems prepared once for a method and a solver, to be solved many times."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 
 from ocp.console import TimeLimitReached, check_time, interruptible, time_limited
-from ocp.direct.active_set import Newton, held_by
+from ocp.direct.active_set import Newton, active_sides
 from ocp.direct.assembly import Program, assemble
 from ocp.direct.controller import block_derivatives, write_controller
 from ocp.direct.diagnosis import Elastic, diagnosis, elastic_plan
-from ocp.direct.guess import ELASTIC, GUESS, STARTS, initial_point, later, names_told, other_starts
+from ocp.direct.guess import STARTS, alternative_starts, guessed_names, initial_point, shifted_indices
 from ocp.direct.mesh import MeshedMethod
 from ocp.direct.nlp import (
     SOLVERS,
@@ -28,10 +28,19 @@ from ocp.direct.nlp import (
     build_solver,
     call_solver,
     horizon_of,
-    largest_number_of_iterations,
+    iteration_limit,
     solution_of,
 )
-from ocp.direct.scaling import Known, Pattern, Scales, badness, fitting_scales, scaled_program, sizes_along, unscaled
+from ocp.direct.scaling import (
+    Pattern,
+    Predetermined,
+    Scales,
+    compute_scales,
+    scaled_program,
+    scaling_fault,
+    sizes_along,
+    unit_scales,
+)
 from ocp.errors import (
     Interrupted,
     ProblemError,
@@ -52,7 +61,7 @@ __all__ = ["DirectMethod", "Prepared"]
 
 
 class DirectMethod(MeshedMethod):
-    """A direct method: a problem is prepared for it once, to be solved many times."""
+    """A direct method, for which a problem is prepared once and solved many times."""
 
     @interruptible
     def prepare(
@@ -64,10 +73,10 @@ class DirectMethod(MeshedMethod):
         compiled: bool = False,
         scaling: bool = True,
     ) -> Prepared:
-        """Build a problem once, to be solved many times; see :func:`ocp.methods.prepare`.
+        """Prepare a problem for repeated solution; see :func:`ocp.methods.prepare`.
 
         Raises:
-            SolveError: The time limit of a call that this is part of is over.
+            SolveError: The time limit of an enclosing call is over.
         """
         try:
             return Prepared(problem, self, solver, options, compiled, scaling)
@@ -77,12 +86,13 @@ class DirectMethod(MeshedMethod):
 
 
 class Prepared:
-    """A problem built once for a method and a solver, to be solved many times, by one thread at a time.
+    """A problem prepared for a method and a solver, to be solved many times, by one thread at a time.
 
     Attributes:
-        formulation, fragment, program: What was built.
-        solver_name: The solver.
-        seconds: Wall time of the build.
+        problem, method: What was prepared.
+        formulation, transcription, program: The parts that were built.
+        solver_name: Name of the solver.
+        seconds: Wall time of the preparation.
     """
 
     def __init__(
@@ -99,34 +109,34 @@ class Prepared:
         self.formulation = Formulation.of(problem)
         checked_choice("solver", solver, SOLVERS)
         own = checked_mapping("options", options)
-        self._own_options, self._scaling = own, scaling
+        self._options, self._scaling = own, scaling
         self.solver_name = solver
-        self.fragment = method.transcribe(self.formulation, staged=solver == "fatrop")
-        # sleqp asks for products with the Hessian, which compiled functions do not have
-        blocks = block_derivatives(self.fragment, compiled and solver != "sleqp")
-        self.program = assemble(self.fragment, self.formulation.np, blocks)
+        self.transcription = method.transcribe(self.formulation, staged=solver == "fatrop")
+        # sleqp uses products with the Hessian, which compiled functions do not provide
+        blocks = block_derivatives(self.transcription, compiled and solver != "sleqp")
+        self.program = assemble(self.transcription, self.formulation.np, blocks)
         check_time()
         self._solver, self._progress = self._built_solver(own)
         check_time()
-        self._pattern = Pattern(self.formulation, self.fragment, self.program)
-        self._known = Known(self.formulation, self.fragment, self.program)
-        self._most = largest_number_of_iterations(self.solver_name, own)
-        self._made_of = problem, method, solver, options, compiled, scaling
-        self._lock = threading.RLock()  # casadi's functions take one caller at a time
+        self._pattern = Pattern(self.formulation, self.transcription, self.program)
+        self._known = Predetermined(self.formulation, self.transcription, self.program)
+        self._max_iterations = iteration_limit(self.solver_name, own)
+        self._arguments = problem, method, solver, options, compiled, scaling
+        self._lock = threading.RLock()  # casadi functions are not reentrant
         self.seconds = time.monotonic() - began
 
     @cached_property
     def scaled(self) -> Program:
-        """The program as it is solved, see :func:`ocp.direct.scaling.scaled_program`."""
+        """The scaled program, see :func:`ocp.direct.scaling.scaled_program`."""
         return scaled_program(self.program)
 
     def _built_solver(self, options: dict[str, Any]) -> tuple[Any, Any]:
-        """The solver with some options, and what ends it where it must end."""
-        return build_solver(self.scaled, self.solver_name, options, self.fragment.stages, self.problem.name)
+        """Build the solver with options, and the callback that stops it."""
+        return build_solver(self.scaled, self.solver_name, options, self.transcription.stages, self.problem.name)
 
     def __reduce__(self) -> Any:
-        """Pickled and copied as what it was prepared of, to be prepared again."""
-        return type(self), self._made_of
+        """Pickle and copy as the arguments, to be prepared again."""
+        return type(self), self._arguments
 
     @interruptible
     def solve(
@@ -139,235 +149,231 @@ class Prepared:
         *,
         shift: int = 0,
     ) -> Solution:
-        """Solve with these parameters from this guess; see :func:`ocp.methods.solve`. Another thread's solve is
-        waited for.
+        """Solve with these parameters from this guess, after solves in other threads; see :func:`ocp.methods.solve`.
 
-        With ``check`` other starts are tried where the guess fails. Without it the solver runs once, from the guess,
-        and its last iterate is returned whatever it is: for loops that solve often and look at ``success``.
-        From a plan of this problem, method and mesh, the limits that push there are held first, and the others let go,
-        which takes a few steps of Newton's; then those that come out of it (:mod:`ocp.direct.active_set`;
-        ``Solution.solver`` is ``newton``). Where that ends nowhere, ipopt begins from the guess as ever.
-        ``tighter`` says how far each bound of the program (lbx, ubx, lbg, ubg) that is no equality is drawn in.
-        ``shift`` is by how many intervals a receding horizon has moved on since such a plan: each interval then begins
-        from what the plan has so many intervals later, its limits and multipliers too, and the last ones from their
-        own. The mesh must be of equal intervals.
+        If the guess is a plan of this problem, method and mesh, its active limits are held first, and a few Newton
+        steps determine the solution (:mod:`ocp.direct.active_set`; ``Solution.solver`` is ``newton``). If they do not
+        converge, ipopt starts from the guess as usual.
+
+        Args:
+            parameters, guess: Values by name, and the start.
+            check: Try alternative starts if the solver fails from the guess, and raise an error if all fail. Otherwise
+                run the solver once and return its last iterate in any case, for loops that check ``success``.
+            tighter: Amount by which each inequality bound of the program (lbx, ubx, lbg, ubg) is tightened.
+            time_limit: Wall time, s.
+            shift: Number of intervals by which a receding horizon has advanced since the guess, a plan on equal
+                intervals. Each interval starts from the values, limits and multipliers of the plan so many intervals
+                later; the last ones from their own.
 
         Raises:
-            ProblemError: Wrong arguments. SolveError: There is no plan, and why.
+            ProblemError: Wrong arguments.
+            SolveError: No plan was found, with the reasons.
         """
         ahead = checked_count("solve: shift", shift, least=0, most=self.method.intervals - 1)
-        if ahead and not (self._fits(guess) and self.method.mesh is None):
-            words = "solve: shift asks for a plan of this very problem, method and mesh, of equal intervals, as guess"
+        if ahead and not (self._is_own_plan(guess) and self.method.mesh is None):
+            words = "solve: shift requires as guess a plan of this problem, method and mesh, with equal intervals"
             raise ProblemError(words, name="shift", value=shift)
         with time_limited(checked_time_limit(time_limit)), self._lock:
             return self._solve(parameters, guess, check, tighter, ahead)
 
     @interruptible
     def to_c(self, folder: str | os.PathLike[str], parameters: ByName = None, guess: Guess = None) -> Path:
-        """Write the problem's functions as C, with a plan and a program of it; see :mod:`ocp.direct.controller`.
+        """Write the problem's functions as C, with a plan and a program that uses it; see :mod:`ocp.direct.controller`.
 
         Args:
-            folder: Is made, and returned; files of the same names are replaced.
+            folder: Folder that is created and returned; files of the same names are replaced.
             parameters: Values at which the guess is evaluated.
-            guess: As of :meth:`solve`; a solution of this problem prepared, to have its very plan in the C.
+            guess: As of :meth:`solve`. A solution of this prepared problem is written as it is.
 
         Raises:
-            ProblemError: Wrong arguments, or something of the problem has no C, such as cvodes.
+            ProblemError: Wrong arguments, or a part of the problem has no C, such as cvodes.
             OSError: The folder cannot be written.
         """
-        form, fragment = self.formulation, self.fragment
+        form, transcription = self.formulation, self.transcription
         place = Path(checked_path(folder))
         bounds = form.bound_values(form.parameter_vector(checked_mapping("parameters", parameters)))
         with self._lock:
-            point = initial_point(form, fragment, guess, bounds)
+            point = initial_point(form, transcription, guess, bounds)
             if isinstance(guess, Solution) and guess.method == self.method.settings:
-                # of this very grid; a layout in stages has more variables than one without
+                # on this grid; a staged layout has more variables than a plain one
                 point = guess.variables if guess.variables.size == point.size else point
-            return write_controller(form, fragment, point, place)
+            return write_controller(form, transcription, point, place)
 
     def _solve(
-        self, parameters: ByName, guess: Guess, check: bool, tighter: Mapping[str, np.ndarray] | None, ahead: int
+        self, parameters: ByName, guess: Guess, check: bool, tighter: Mapping[str, np.ndarray] | None, shift: int
     ) -> Solution:
-        form, fragment = self.formulation, self.fragment
+        """Solve from the plan given as guess, from the guess, from alternative starts, then from the elastic plan."""
+        form, transcription = self.formulation, self.transcription
         p = form.parameter_vector(checked_mapping("parameters", parameters))
         bounds = form.bound_values(p)
-        arguments = fragment.arguments(p, bounds_to_solve(form, p))
+        arguments = transcription.arguments(p, bounds_to_solve(form, p))
         if tighter is not None:
-            draw_in(arguments, tighter)
-        again = self._again(guess, arguments, bounds, ahead)
-        if again is not None:
-            return again
-        point = initial_point(form, fragment, guess, bounds)
-        if ahead and isinstance(guess, Solution):
-            point = guess.variables[later(fragment, ahead)[0]]
-        told = names_told(form, guess)
-        first = self._attempt(GUESS, point, told, arguments, bounds)
+            tighten_bounds(arguments, tighter)
+        nearby = self._nearby(guess, arguments, bounds, shift)
+        if nearby is not None:
+            return nearby
+        point = initial_point(form, transcription, guess, bounds)
+        if shift and isinstance(guess, Solution):
+            point = guess.variables[shifted_indices(transcription, shift)[0]]
+        names = guessed_names(form, guess)
+        first = self._attempt("guess", point, names, arguments, bounds)
         if first.solution is not None and (first.outcome.success or not check):
             return first.solution
-        attempts: list[Attempt] = [first, *(self._attempts_elsewhere(first, arguments, bounds) if check else ())]
-        if attempts[-1].found is not None:
-            return attempts[-1].found
+        attempts: list[Attempt] = [first, *(self._alternative_attempts(first, arguments, bounds) if check else ())]
+        if attempts[-1].plan is not None:
+            return attempts[-1].plan
         elastic = None if attempts[-1].is_final else self._elastic(first)
-        left = self._most - sum(attempt.outcome.iterations for attempt in attempts[1:])
-        if elastic is not None and check and left > 0:
-            solver = self._solver_of_other_starts
-            attempts.append(self._attempt(ELASTIC, elastic.plan, self._all_names, arguments, bounds, solver))
-            if attempts[-1].found is not None:
-                return attempts[-1].found
-        told_of = attempts[-1] if attempts[-1].is_final else first
+        remaining = self._max_iterations - sum(attempt.outcome.iterations for attempt in attempts[1:])
+        if elastic is not None and check and remaining > 0:
+            everything = self._all_names
+            attempts.append(
+                self._attempt("elastic plan", elastic.plan, everything, arguments, bounds, self._short_solver)
+            )
+            if attempts[-1].plan is not None:
+                return attempts[-1].plan
+        decisive = attempts[-1] if attempts[-1].is_final else first
         raise diagnosis(
             self,
-            told_of.outcome,
-            told_of.arguments,
-            horizon_of(form, fragment, told_of.outcome, p),
-            told_of.solution,
+            decisive.outcome,
+            decisive.arguments,
+            horizon_of(form, transcription, decisive.outcome, p),
+            decisive.solution,
             elastic,
             [str(attempt) for attempt in attempts],
-            self._badness(told_of, bounds),
-        ) from told_of.error
+            self._scaling_fault(decisive, bounds),
+        ) from decisive.error
 
-    def _attempts_elsewhere(self, first: Attempt, arguments: dict[str, np.ndarray], bounds: Bounds) -> list[Attempt]:
-        """What became of the starts beside the guess, one after the other until one succeeds or the time is over.
+    def _alternative_attempts(self, first: Attempt, arguments: dict[str, np.ndarray], bounds: Bounds) -> list[Attempt]:
+        """Run the solver from each start other than the guess until one succeeds or the time is over.
 
-        They take as many iterations together as the first attempt may. Where no function is ever finite it is not a
-        matter of the start.
+        Together they take at most the iterations of the first attempt. If no function is ever finite, the start does
+        not matter.
         """
-        attempts, left, x0 = list[Attempt](), self._most, first.arguments["x0"]
+        attempts, remaining, x0 = list[Attempt](), self._max_iterations, first.arguments["x0"]
         if first.is_final:
             return attempts
-        starts = other_starts(self.formulation, self.fragment, x0, arguments["p"], (arguments["lbx"], arguments["ubx"]))
-        for start, point in starts:
-            if left <= 0 or np.array_equal(point, x0):
+        limits = arguments["lbx"], arguments["ubx"]
+        for start, point in alternative_starts(self.formulation, self.transcription, x0, arguments["p"], limits):
+            if remaining <= 0 or np.array_equal(point, x0):
                 continue
-            solver = self._solver_of_other_starts
-            attempts.append(self._attempt(start, point, first.told, arguments, bounds, solver))
+            attempts.append(self._attempt(start, point, first.names, arguments, bounds, self._short_solver))
             if attempts[-1].is_final or all(attempt.is_broken for attempt in (first, *attempts)):
                 break
-            left -= attempts[-1].outcome.iterations
+            remaining -= attempts[-1].outcome.iterations
         return attempts
 
     def _elastic(self, first: Attempt) -> Elastic | None:
-        """The plan that misses the constraints least; Ctrl-C carries the last iterate of the first attempt."""
-        horizon = horizon_of(self.formulation, self.fragment, first.outcome, first.arguments["p"])
+        """Return the plan with the smallest violation; Ctrl-C raises with the last iterate of the first attempt."""
+        horizon = horizon_of(self.formulation, self.transcription, first.outcome, first.arguments["p"])
         try:
             return elastic_plan(self, first.outcome, first.arguments, first.scales, horizon)
         except Interrupted as error:
             raise Interrupted(str(error), first.solution) from error
 
-    def _fits(self, guess: Guess) -> bool:
-        """Whether a guess is a plan of this very program, by its method, mesh, sizes and parameters."""
+    def _is_own_plan(self, guess: Guess) -> bool:
+        """Return whether a guess is a plan of this program, by its method, mesh, sizes and parameters."""
         if not isinstance(guess, Solution) or guess.method != self.method.settings:
             return False
         sizes = guess.variables.shape, guess.multipliers.shape, set(guess.parameters)
-        return sizes == ((self.fragment.size,), (self.fragment.n_rows,), set(self.formulation.parameters))
+        return sizes == ((self.transcription.size,), (self.transcription.n_rows,), set(self.formulation.parameters))
 
-    def _again(self, guess: Guess, arguments: dict[str, np.ndarray], bounds: Bounds, ahead: int) -> Solution | None:
-        """The plan beside the guess, moved on by ``ahead`` intervals; None where it is not found near it."""
+    def _nearby(self, guess: Guess, arguments: dict[str, np.ndarray], bounds: Bounds, shift: int) -> Solution | None:
+        """Return the plan near the guess, shifted by ``shift`` intervals; None if there is none."""
         form = self.formulation
-        if not isinstance(guess, Solution) or not self._fits(guess) or self.solver_name != "ipopt":
+        if not isinstance(guess, Solution) or not self._is_own_plan(guess) or self.solver_name != "ipopt":
             return None
         if guess.regularised or not guess.success:
             return None
         try:
             p = form.parameter_vector(guess.parameters)
-            before = self._known.relaxed(self.fragment.arguments(p, bounds_to_solve(form, p)))
+            limits_of_guess = self._known.relaxed(self.transcription.arguments(p, bounds_to_solve(form, p)))
             v, lam = guess.variables, guess.multipliers
             scales = self._scales(v, self._all_names, bounds, arguments["p"])
             cost, rows = self.program.numbers.values(v, p)
             start = Outcome(v, cost, rows, lam, guess.status, "", 0, 0.0)
-            sides = held_by(self.program, start, before, scales)
-            if ahead:
-                of_x, of_g = later(self.fragment, ahead)
-                start = dataclasses.replace(start, variables=v[of_x], multipliers=lam[of_g])
-                sides = {"x": sides["x"][of_x], "g": sides["g"][of_g]}
-            outcome = self._newton.beside(start, sides, self._known.relaxed(arguments), scales)
+            sides = active_sides(self.program, start, limits_of_guess, scales)
+            if shift:
+                index_x, index_g = shifted_indices(self.transcription, shift)
+                start = dataclasses.replace(start, variables=v[index_x], multipliers=lam[index_g])
+                sides = {"x": sides["x"][index_x], "g": sides["g"][index_g]}
+            outcome = self._newton.solve_near(start, sides, self._known.relaxed(arguments), scales)
             if outcome is not None:
                 outcome = self._known.checked(outcome, arguments, scales)
             if outcome is None or not outcome.success:
                 return None
-            return self._solution(outcome, arguments["p"], GUESS)
-        except (ProblemError, RuntimeError):  # parameters that this problem refuses; an integrator that breaks down
+            return self._solution(outcome, arguments["p"], "guess")
+        except (ProblemError, RuntimeError):  # parameters that this problem rejects; an integrator that fails
             return None
 
     @cached_property
     def _newton(self) -> Newton:
-        """What solves beside a plan."""
-        return Newton(self.program, self.fragment)
+        """Newton's method near a plan."""
+        return Newton(self.program, self.transcription)
 
     @cached_property
-    def _solver_of_other_starts(self) -> tuple[Any, Any]:
-        """The solver with fewer iterations, for what is tried where it failed already; and its progress."""
-        return self._built_solver({**self._own_options, "max_iter": min(STARTS.iterations, self._most)})
+    def _short_solver(self) -> tuple[Any, Any]:
+        """The solver with fewer iterations, for alternative starts, and its progress."""
+        return self._built_solver({**self._options, "max_iter": min(STARTS.iterations, self._max_iterations)})
 
     def _attempt(
         self,
         start: str,
         point: np.ndarray,
-        told: set[str],
+        names: set[str],
         limits: dict[str, np.ndarray],
         bounds: Bounds,
         solver: tuple[Any, Any] | None = None,
     ) -> Attempt:
-        """Run a solver, its own for None, once from a start, scaled by the sizes along it.
-
-        See :func:`sizes_along` for ``told``.
-        """
+        """Run a solver, by default the own one, from a start, scaled by the sizes along it; see :func:`sizes_along`."""
         arguments = {**limits, "x0": np.clip(point, limits["lbx"], limits["ubx"])}
         p, x0 = arguments["p"], arguments["x0"]
-        scales = self._scales(x0, told, bounds, p)
+        scales = self._scales(x0, names, bounds, p)
         relaxed = self._known.relaxed(arguments)
-        own = scales.inside(relaxed)
-        run, progress = solver or (self._solver, self._progress)
+        scaled = scales.inside(relaxed)
+        function, progress = solver or (self._solver, self._progress)
         try:
-            outcome = call_solver(run, progress, own)
+            outcome = call_solver(function, progress, scaled)
         except RuntimeError as error:
-            outcome = broken_down(run, own, error)
+            outcome = broken_down(function, scaled, error)
         outcome = scales.outside(outcome)
         outcome = self._known.checked(outcome, arguments, scales)
         try:
             solution = self._solution(outcome, p, start)
-        except RuntimeError as error:  # an integrator breaks down at the last iterate, which is no plan
+        except RuntimeError as error:  # an integrator fails at the last iterate, which is no plan
             if outcome.status is SolverStatus.INTERRUPTED:
                 raise Interrupted(f"problem {self.problem.name!r}: interrupted") from error
-            return Attempt(start, arguments, told, scales, outcome, None, error)
+            return Attempt(start, arguments, names, scales, outcome, None, error)
         if outcome.status is SolverStatus.INTERRUPTED:
-            words = f"problem {self.problem.name!r}: interrupted after {outcome.iterations} iterations"
-            raise Interrupted(words, solution)
-        return Attempt(start, arguments, told, scales, outcome, solution)
+            text = f"problem {self.problem.name!r}: interrupted after {outcome.iterations} iterations"
+            raise Interrupted(text, solution)
+        return Attempt(start, arguments, names, scales, outcome, solution)
 
-    def _scales(self, point: np.ndarray, told: set[str], bounds: Bounds, p: np.ndarray) -> Scales:
-        """What fits the sizes along a start; see :func:`sizes_along` for ``told``."""
+    def _scales(self, point: np.ndarray, names: set[str], bounds: Bounds, p: np.ndarray) -> Scales:
+        """Return the scales for the sizes along a start; see :func:`sizes_along` for ``names``."""
         if not self._scaling:
-            return unscaled(self.fragment)
-        scales = fitting_scales(self._pattern, sizes_along(self._pattern, point, told, bounds, p), point, p)
+            return unit_scales(self.transcription)
+        scales = compute_scales(self._pattern, sizes_along(self._pattern, point, names, bounds, p), point, p)
         if getattr(self.method, "integrator", "") == "cvodes":
-            # its tolerances are absolute: what it integrates backwards is not made larger
+            # its tolerances are absolute: do not enlarge the adjoint variables
             return dataclasses.replace(scales, cost=max(scales.cost, 1.0))
         return scales
 
-    def _badness(self, attempt: Attempt, bounds: Bounds) -> str:
-        """What was badly scaled to the solver, in words; "" where nothing was."""
+    def _scaling_fault(self, attempt: Attempt, bounds: Bounds) -> str:
+        """Return a description of bad scaling for the solver, or ""."""
         x0, p = attempt.arguments["x0"], attempt.arguments["p"]
-        sizes = sizes_along(self._pattern, x0, attempt.told, bounds, p)
-        return badness(self._pattern, x0, p, attempt.scales, sizes)
+        sizes = sizes_along(self._pattern, x0, attempt.names, bounds, p)
+        return scaling_fault(self._pattern, x0, p, attempt.scales, sizes)
 
     @property
     def _all_names(self) -> set[str]:
-        """Names of all that a plan says the values of, see :func:`sizes_along`."""
+        """Names of all variables, as a plan has values for them, see :func:`sizes_along`."""
         return {*self.formulation.states, *self.formulation.controls, "horizon"}
 
     def _solution(self, outcome: Outcome, p: np.ndarray, start: str) -> Solution:
+        """Return the solution that belongs to an outcome."""
         seconds = {"build": self.seconds, "solve": outcome.seconds}
-        return solution_of(
-            self.formulation,
-            self.fragment,
-            self.program,
-            outcome,
-            p,
-            method=self.method.settings,
-            seconds=seconds,
-            start=start,
-        )
+        fields = {"method": self.method.settings, "seconds": seconds, "start": start}
+        return solution_of(self.formulation, self.transcription, self.program, outcome, p, **fields)
 
 
 @dataclass(frozen=True)
@@ -375,44 +381,47 @@ class Attempt:
     """One run of the solver.
 
     Attributes:
-        start: Where it started from. arguments: x0, p and the bounds. told: What the start says something of.
-        scales: What it was scaled by. outcome: What the solver returned.
-        solution: The same as a plan; None where it is none, because of ``error``.
+        start: Name of the start.
+        arguments: x0, p and the bounds.
+        names: Names of the variables with intended values in the start.
+        scales: Scales of the program.
+        outcome: Result of the solver.
+        solution: The same as a solution; None if it cannot be evaluated, because of ``error``.
     """
 
     start: str
     arguments: dict[str, np.ndarray]
-    told: set[str]
+    names: set[str]
     scales: Scales
     outcome: Outcome
     solution: Solution | None
     error: RuntimeError | None = None
 
     @property
-    def found(self) -> Solution | None:
-        """The plan, where the solver succeeded."""
+    def plan(self) -> Solution | None:
+        """The plan, if the solver succeeded."""
         return self.solution if self.outcome.success else None
 
     @property
     def is_final(self) -> bool:
-        """Whether no other start is to be tried: it succeeded, or there is no time left."""
-        return self.found is not None or self.outcome.status is SolverStatus.TIME_LIMIT
+        """Whether no other start is tried: the solver succeeded, or the time is over."""
+        return self.plan is not None or self.outcome.status is SolverStatus.TIME_LIMIT
 
     @property
     def is_broken(self) -> bool:
-        """Whether a function was not finite, or an integrator broke down."""
+        """Whether a function was not finite, or an integrator failed."""
         return self.outcome.status is SolverStatus.NOT_FINITE
 
     def __str__(self) -> str:
         return f"from the {self.start}: {self.outcome.status} after {self.outcome.iterations} iterations"
 
 
-def draw_in(arguments: dict[str, np.ndarray], by: Mapping[str, np.ndarray]) -> None:
-    """Move lower bounds up and upper ones down, to their middle at most; leave equalities."""
+def tighten_bounds(arguments: dict[str, np.ndarray], amounts: Mapping[str, np.ndarray]) -> None:
+    """Move lower bounds up and upper bounds down, at most to their middle; equalities stay."""
     for kind in ("x", "g"):
         low, high = arguments[f"lb{kind}"], arguments[f"ub{kind}"]
-        room = low < high
+        is_range = low < high
         with np.errstate(invalid="ignore"):
-            middle = np.where(room & np.isfinite(high - low), (low + high) / 2, np.nan)
-        arguments[f"lb{kind}"] = np.where(room, np.fmin(low + by[f"lb{kind}"], middle), low)
-        arguments[f"ub{kind}"] = np.where(room, np.fmax(high - by[f"ub{kind}"], middle), high)
+            middle = np.where(is_range & np.isfinite(high - low), (low + high) / 2, np.nan)
+        arguments[f"lb{kind}"] = np.where(is_range, np.fmin(low + amounts[f"lb{kind}"], middle), low)
+        arguments[f"ub{kind}"] = np.where(is_range, np.fmax(high - amounts[f"ub{kind}"], middle), high)

@@ -1,8 +1,8 @@
-"""How a plan moves with a parameter, from the conditions of first order at the plan.
+"""Sensitivity of a plan to a parameter, from the first-order conditions at the plan.
 
-They hold at every parameter nearby, so their derivative is a linear system in the derivatives of variables and
-multipliers, with the limits that push held (Fiacco 1976; Buskens, Maurer 2000, doi 10.1016/S0377-0427(00)00308-9):
-one factorization of it, and one back-substitution for each entry of the parameter.
+The conditions hold at every nearby parameter. Their derivative is a linear system for the derivatives of variables and
+multipliers, with the active limits held (Fiacco 1976; Buskens, Maurer 2000, doi 10.1016/S0377-0427(00)00308-9): one
+factorisation, and one back-substitution for each entry of the parameter.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ import scipy.sparse as sp
 import scipy.sparse.linalg as sla
 
 from ocp.direct.active_set import RESOLVED, Conditions, conditions
-from ocp.direct.assembly import Fragment, Program, assemble
+from ocp.direct.assembly import Program, Transcription, assemble
 from ocp.direct.collocation import Collocation
 from ocp.direct.diagnosis import variable_names
 from ocp.direct.nlp import Outcome, controls_at
-from ocp.direct.scaling import Pattern, fitting_scales, sizes_along
+from ocp.direct.scaling import Pattern, compute_scales, sizes_along
 from ocp.direct.shooting import MultipleShooting
 from ocp.errors import ProblemError, unknown_name
 from ocp.problem.formulation import Formulation
@@ -34,148 +34,135 @@ METHODS = {"Collocation": Collocation, "MultipleShooting": MultipleShooting}
 
 @dataclass(frozen=True)
 class SystemSettings:
-    """How the linear system is solved.
+    """Solution of the linear system.
 
     Attributes:
-        softening: By which rows that others imply may be missed, relative to their own size and to the curvature.
-        refinements: Passes that make up for it.
+        softening: Regularisation of dependent rows, relative to their size and to the curvature.
+        refinements: Passes of iterative refinement that correct for it.
     """
 
     softening: float = 1e-11
     refinements: int = 4
 
 
-@dataclass(frozen=True)
-class Built:
-    """The program that a plan is a solution of, and what is known there."""
-
-    form: Formulation
-    fragment: Fragment
-    program: Program
-    v: np.ndarray
-    p: np.ndarray
-    lower: np.ndarray
-    upper: np.ndarray
-
-
 def sensitivity(solution: Solution, name: str) -> Sensitivity:
-    """How a plan of a direct method moves with the parameter ``name``; see :meth:`ocp.solution.Solution.sensitivity`.
+    """Return the derivatives of a plan in the parameter ``name``; see :meth:`ocp.solution.Solution.sensitivity`.
 
     Raises:
-        ProblemError: An unknown parameter; a plan that is none of a direct method under the bounds of its problem, or
-            no optimum; or limits that contradict each other when the parameter moves.
+        ProblemError: An unknown parameter; a plan that is not an optimum of a direct method under the bounds of its
+            problem; or active limits that contradict each other when the parameter changes.
     """
-    built = program_of(solution)
-    form, fragment, p = built.form, built.fragment, built.p
+    form, transcription, program = program_of(solution)
     if not isinstance(name, str) or name not in form.parameters:
         raise unknown_name("parameter", name, form.parameters)
     place = form.parameters[name]
     columns = list(range(place.start, place.stop))
-    v, lam = built.v, solution.multipliers
-    bounds = built.lower, built.upper
-    arguments = fragment.arguments(p, bounds)
-    pattern = Pattern(form, fragment, built.program)
-    told = {*form.states, *form.controls, "horizon"}
-    scales = fitting_scales(pattern, sizes_along(pattern, v, told, bounds, p), v, p)
+    v, lam, p = solution.variables, solution.multipliers, form.parameter_vector(solution.parameters)
+    bounds = bounds_to_solve(form, p)
+    arguments = transcription.arguments(p, bounds)
+    pattern = Pattern(form, transcription, program)
+    names = {*form.states, *form.controls, "horizon"}
+    scales = compute_scales(pattern, sizes_along(pattern, v, names, bounds, p), v, p)
     a, b, c = scales.variables, scales.rows, scales.cost
-    rows = np.asarray(built.program.values(v, p)[1].full()).ravel()
+    rows = np.asarray(program.values(v, p)[1].full()).ravel()
     outcome = Outcome(v, solution.cost, rows, lam, solution.status, solution.message, 0, 0.0)
-    at = conditions(built.program, outcome, arguments, scales)
+    at = conditions(program, outcome, arguments, scales)
 
-    slope, change = by_parameters(fragment, v, p, lam, columns)
+    slope, change = by_parameters(transcription, v, p, lam, columns)
     slope, change = slope * a[:, None] / c, change / b[:, None]
     q = ca.MX.sym("p", len(p))
     moves = ca.Function("moves", [q], [ca.jacobian(side, q)[:, columns] for side in form.bounds.function(q)])(p)
     low, high = (np.asarray(move.full()) for move in moves)
-    low_x, high_x = (side[fragment.variable_bounds] / a[:, None] for side in (low, high))
-    low_g, high_g = (side[fragment.row_bounds] / b[:, None] for side in (low, high))
+    low_x, high_x = (side[transcription.variable_bounds] / a[:, None] for side in (low, high))
+    low_g, high_g = (side[transcription.row_bounds] / b[:, None] for side in (low, high))
     at_x = np.where((at.of_bounds > 0)[:, None], high_x, low_x)
     at_g = np.where((at.of_rows > 0)[:, None], high_g, low_g)
-    dv, of_rows, of_bounds = moved(at, slope, change, at_x, at_g)
+    dv, of_rows, of_bounds = solve_system(at, slope, change, at_x, at_g)
 
-    # what is at no limit comes to one; what pushes no more
+    # distance to the next limit, and of multipliers to zero
     dg = at.jacobian @ dv + change
     values = np.concatenate([v / a, rows / b])
     rates = np.vstack([dv, dg])
     sides = [np.concatenate([arguments[f"{s}x"] / a, arguments[f"{s}g"] / b]) for s in ("lb", "ub")]
     side_rates = [np.vstack([low_x, low_g]), np.vstack([high_x, high_g])]
     held = np.concatenate([at.fixed, at.held])
-    push, push_rates = np.concatenate([at.of_bounds, at.of_rows]), np.vstack([of_bounds, of_rows])
-    given = sides[0] == sides[1]
-    names = [*variable_names(form, fragment), *fragment.row_labels]
-    now = p[place]
+    multipliers, multiplier_rates = np.concatenate([at.of_bounds, at.of_rows]), np.vstack([of_bounds, of_rows])
+    is_equality = sides[0] == sides[1]
+    labels = [*variable_names(form, transcription), *transcription.row_labels]
+    value = p[place]
     ends = np.tile([[-np.inf], [np.inf]], (1, len(columns)))
-    words = [["", ""] for _ in columns]
+    limit_names = [["", ""] for _ in columns]
     with np.errstate(invalid="ignore"):
-        loose = [
+        distances = [
             (np.where(held, np.inf, values - sides[0]), rates - side_rates[0]),
             (np.where(held, np.inf, sides[1] - values), side_rates[1] - rates),
-            (np.where(held & ~given, np.abs(push), np.inf), np.sign(push)[:, None] * push_rates),
+            (
+                np.where(held & ~is_equality, np.abs(multipliers), np.inf),
+                np.sign(multipliers)[:, None] * multiplier_rates,
+            ),
         ]
-    for room, rate in loose:
-        some = np.flatnonzero(np.isfinite(room))
-        size = np.where(room[some] < RESOLVED, 0.0, room[some])
+    for distance, rate in distances:
+        finite = np.flatnonzero(np.isfinite(distance))
+        distances_left = np.where(distance[finite] < RESOLVED, 0.0, distance[finite])
         for k in range(len(columns)):
             for side, sign in ((0, -1.0), (1, 1.0)):
-                toward = -sign * rate[some, k]
-                nearer = np.flatnonzero(toward > RESOLVED * np.abs(rate[some, k]).max(initial=0.0))
-                if not nearer.size:
+                speed = -sign * rate[finite, k]
+                approaching = np.flatnonzero(speed > RESOLVED * np.abs(rate[finite, k]).max(initial=0.0))
+                if not approaching.size:
                     continue
-                reach = size[nearer] / toward[nearer]
-                first = int(np.argmin(reach))
-                if reach[first] < abs(ends[side, k]):
-                    ends[side, k] = sign * reach[first]
-                    words[k][side] = names[some[nearer[first]]]
+                steps = distances_left[approaching] / speed[approaching]
+                first = int(np.argmin(steps))
+                if steps[first] < abs(ends[side, k]):
+                    ends[side, k] = sign * steps[first]
+                    limit_names[k][side] = labels[finite[approaching[first]]]
 
-    index = fragment.horizon
+    state_rates = (a[:, None] * dv)[transcription.report_states]
+    input_rates = control_rates(transcription, solution, p, a[:, None] * dv)
+    index = transcription.horizon
     by_time = high[form.bounds.places["horizon"][0]] if index is None else dv[index] * a[index]
     return Sensitivity(
         name=name,
-        value=now,
+        value=value,
         t=solution.t,
-        states=split(form.states, (a[:, None] * dv)[fragment.report_states]),
-        controls=split(form.controls, control_rates(built, solution, a[:, None] * dv)),
+        states={name: state_rates[:, place] for name, place in form.states.items()},
+        controls={name: input_rates[:, place] for name, place in form.controls.items()},
         horizon=np.asarray(by_time, dtype=float),
         cost=solution.cost_gradients[name],
-        lower=now + ends[0],
-        upper=now + ends[1],
-        limits=tuple((below, above) for below, above in words),
+        lower=value + ends[0],
+        upper=value + ends[1],
+        limits=tuple((below, above) for below, above in limit_names),
     )
 
 
-def program_of(solution: Solution) -> Built:
-    """The program that a plan is a solution of."""
-    what = f"plan {solution.name!r}"
+def program_of(solution: Solution) -> tuple[Formulation, Transcription, Program]:
+    """Return the program that a plan is a solution of."""
+    plan = f"plan {solution.name!r}"
     settings = dict(solution.method)
-    kind = settings.pop("type")
-    if kind not in METHODS or solution.problem is None:
-        words = (
-            f"{what}: only plans of Collocation(...) and MultipleShooting(...), with their problem, tell how they move"
-        )
-        raise ProblemError(words, name="method", value=kind)
+    method_name = settings.pop("type")
+    if method_name not in METHODS or solution.problem is None:
+        text = f"{plan}: sensitivities need a plan of Collocation(...) or MultipleShooting(...) with its problem"
+        raise ProblemError(text, name="method", value=method_name)
     if not solution.success or solution.bound_tightening is not None:
-        words = f"{what}: it is no optimum under the bounds of its problem"
-        raise ProblemError(words, name="solution", value=solution.message)
+        text = f"{plan}: it is not an optimum under the bounds of its problem"
+        raise ProblemError(text, name="solution", value=solution.message)
     form = Formulation.of(solution.problem)
-    method = METHODS[kind](**settings)
+    method = METHODS[method_name](**settings)
     for staged in (False, True):
-        fragment = method.transcribe(form, staged=staged)
-        if (fragment.size, fragment.n_rows) == (len(solution.variables), len(solution.multipliers)):
+        transcription = method.transcribe(form, staged=staged)
+        if (transcription.size, transcription.n_rows) == (len(solution.variables), len(solution.multipliers)):
             break
     else:
-        words = f"{what}: it is no solution of its problem by its method"
-        raise ProblemError(words, name="variables", value=len(solution.variables), limit=fragment.size)
-    p = form.parameter_vector(solution.parameters)
-    program = assemble(fragment, form.np)
-    return Built(form, fragment, program, solution.variables, p, *bounds_to_solve(form, p))
+        text = f"{plan}: it is not a solution of its problem by its method"
+        raise ProblemError(text, name="variables", value=len(solution.variables), limit=transcription.size)
+    return form, transcription, assemble(transcription, form.np)
 
 
 def by_parameters(
-    fragment: Fragment, v: np.ndarray, p: np.ndarray, lam: np.ndarray, columns: list[int]
+    transcription: Transcription, v: np.ndarray, p: np.ndarray, lam: np.ndarray, columns: list[int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Derivatives in some parameters of the slope of the Lagrangian (n, k) and of the rows (m, k)."""
-    slope, change = np.zeros((fragment.size, len(columns))), np.zeros((fragment.n_rows, len(columns)))
-    for block in fragment.blocks:
+    """Return derivatives in some parameters of the gradient of the Lagrangian (n, k) and of the rows (m, k)."""
+    slope, change = np.zeros((transcription.size, len(columns))), np.zeros((transcription.n_rows, len(columns)))
+    for block in transcription.blocks:
         function = block.function
         symbol = symbols_of(function).sym
         inner, d, q = (symbol(name, function.numel_in(i)) for i, name in enumerate(("v", "d", "p")))
@@ -184,14 +171,14 @@ def by_parameters(
         lagrangian = ca.gradient(cost + ca.dot(mu, g), inner)
         outputs = [ca.densify(ca.jacobian(part, q)[:, columns]) for part in (lagrangian, ca.vec(g))]
         count = block.variables.shape[1]
-        many = ca.Function("by_parameters", [inner, d, q, mu], outputs).map(count)
-        found = many(v[block.variables], block.data, np.tile(p[:, None], (1, count)), lam[block.rows])
-        for where, part, total in zip((block.variables, block.rows), found, (slope, change), strict=True):
-            np.add.at(total, where, np.asarray(part.full()).reshape(len(where), count, len(columns)))
+        function_of_all = ca.Function("by_parameters", [inner, d, q, mu], outputs).map(count)
+        values = function_of_all(v[block.variables], block.data, np.tile(p[:, None], (1, count)), lam[block.rows])
+        for indices, part, total in zip((block.variables, block.rows), values, (slope, change), strict=True):
+            np.add.at(total, indices, np.asarray(part.full()).reshape(len(indices), count, len(columns)))
     return slope, change
 
 
-def moved(
+def solve_system(
     at: Conditions,
     slope: np.ndarray,
     change: np.ndarray,
@@ -199,58 +186,53 @@ def moved(
     at_g: np.ndarray,
     settings: SystemSettings = SystemSettings(),
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Derivatives of the variables (n, k) and of the multipliers of rows (m, k) and bounds (n, k), scaled.
+    """Return derivatives of the variables (n, k) and of the multipliers of rows (m, k) and bounds (n, k), scaled.
 
     Args:
-        slope, change: Of the slope of the Lagrangian and of the rows, the variables held.
-        at_x, at_g: Of the limits at which variables and rows stand.
+        slope, change: Of the gradient of the Lagrangian and of the rows, with fixed variables.
+        at_x, at_g: Of the limits of active variables and rows.
     """
     fixed, free, held = (np.flatnonzero(which) for which in (at.fixed, ~at.fixed, at.held))
     dv = np.zeros_like(slope)
     dv[fixed] = at_x[fixed]
     hessian, rows = at.hessian, at.jacobian[held]
     largest = max(float(np.abs(hessian.data).max(initial=0.0)), 1e-300)
-    own = rows[:, free]
-    size = np.sqrt(np.asarray(own.multiply(own).sum(axis=1)).ravel())
+    active_rows = rows[:, free]
+    size = np.sqrt(np.asarray(active_rows.multiply(active_rows).sum(axis=1)).ravel())
     weight = largest / np.where(size > 0, size, 1.0)
-    own = sp.diags_array(weight) @ own
-    right = np.vstack([-(slope + hessian @ dv)[free], weight[:, None] * (at_g - change - at.jacobian @ dv)[held]])
+    active_rows = sp.diags_array(weight) @ active_rows
+    sides = np.vstack([-(slope + hessian @ dv)[free], weight[:, None] * (at_g - change - at.jacobian @ dv)[held]])
     n, m = len(free), len(held)
-    system = (
-        sp.block_array([[hessian[free][:, free], own.T], [own, None]], format="csc") if m else hessian[free][:, free]
-    )
+    system = hessian[free][:, free]
+    if m:
+        system = sp.block_array([[system, active_rows.T], [active_rows, None]], format="csc")
     softened = system - sp.diags_array(np.concatenate([np.zeros(n), np.full(m, settings.softening * largest)]))
     solve = sla.splu(sp.csc_array(softened))
-    found = solve.solve(right)
+    solution = solve.solve(sides)
     for _ in range(settings.refinements):
-        found += solve.solve(right - system @ found)
-    missed = float(np.abs(right - system @ found).max(initial=0.0))
-    # more, and the limits that push contradict each other
-    if not missed <= RESOLVED * max(float(np.abs(right).max(initial=0.0)), 1e-300):
-        words = "the limits at which the plan stands contradict each other, or leave it open, when the parameter moves"
-        raise ProblemError(words, name="parameters", value=missed)
-    dv[free] = found[:n]
+        solution += solve.solve(sides - system @ solution)
+    residual = float(np.abs(sides - system @ solution).max(initial=0.0))
+    # a larger residual means that active limits contradict each other
+    if not residual <= RESOLVED * max(float(np.abs(sides).max(initial=0.0)), 1e-300):
+        text = "the active limits contradict each other, or do not determine the plan, when the parameter changes"
+        raise ProblemError(text, name="parameters", value=residual)
+    dv[free] = solution[:n]
     of_rows = np.zeros((at.jacobian.shape[0], slope.shape[1]))
-    of_rows[held] = weight[:, None] * found[n:]
+    of_rows[held] = weight[:, None] * solution[n:]
     of_bounds = np.zeros_like(dv)
     of_bounds[fixed] = -(slope + hessian @ dv + at.jacobian.T @ of_rows)[fixed]
     return dv, of_rows, of_bounds
 
 
-def control_rates(built: Built, solution: Solution, dv: np.ndarray) -> np.ndarray:
-    """Derivatives of the controls at the reported times (M, nu, k): controls are linear in their variables."""
-    piece, place = built.fragment.report
-    columns = []
+def control_rates(transcription: Transcription, solution: Solution, p: np.ndarray, dv: np.ndarray) -> np.ndarray:
+    """Return derivatives of the controls at the reported times (M, nu, k); controls are linear in their variables."""
+    interval, place = transcription.report
+    v, columns = solution.variables, []
     for direction in dv.T:
-        step = max(1.0, float(np.abs(built.v).max())) / max(float(np.abs(direction).max()), 1e-300)
+        step = max(1.0, float(np.abs(v).max())) / max(float(np.abs(direction).max()), 1e-300)
         curves = [
-            built.fragment.interpolants(built.v + sign * step * direction, built.p, solution.horizon)[1]
-            for sign in (1.0, -1.0)
+            transcription.interpolants(v + sign * step * direction, p, solution.horizon)[1] for sign in (1.0, -1.0)
         ]
-        up, down = (controls_at(curve, built.fragment, piece, place) for curve in curves)
+        up, down = (controls_at(curve, transcription, interval, place) for curve in curves)
         columns.append((up - down) / (2 * step))
     return np.stack(columns, axis=-1)
-
-
-def split(places: dict[str, slice], values: np.ndarray) -> dict[str, np.ndarray]:
-    return {name: values[:, place] for name, place in places.items()}

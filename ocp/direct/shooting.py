@@ -1,4 +1,4 @@
-"""Direct multiple shooting: every interval is integrated from its own start, and its end must meet the next one.
+"""Direct multiple shooting: every interval is integrated from its own start, and its end must meet the next start.
 
 Bock, Plitt 1984. The multipliers of these continuity conditions are the costates at the nodes.
 """
@@ -12,9 +12,9 @@ import casadi as ca
 import numpy as np
 
 from ocp.curves import integrator, rk4_step
-from ocp.direct.assembly import SIZES, Block, Fragment, Interpolants
+from ocp.direct.assembly import SIZES, Block, Interpolants, Transcription
 from ocp.direct.prepared import DirectMethod
-from ocp.direct.transcription import FragmentBuilder
+from ocp.direct.transcription import TranscriptionBuilder
 from ocp.errors import checked_choice
 from ocp.problem.formulation import Formulation
 from ocp.problem.values import symbols_of
@@ -32,9 +32,9 @@ class MultipleShooting(DirectMethod):
         intervals: Number of intervals.
         integrator: ``rk4`` (classical Runge-Kutta, ``steps`` equal steps) or ``cvodes`` (variable step and order,
             tolerance 1e-10; for stiff dynamics; slow second derivatives).
-        steps: Integration steps an interval; for cvodes the number of pieces of the reported interpolant.
+        steps: Integration steps per interval; for cvodes the number of segments of the reported interpolant.
         control: ``held`` (constant on an interval) or ``linear`` (linear between nodes, continuous).
-        mesh: Fractions 0..1 where intervals begin and end, N + 1 of them; None for equal intervals.
+        mesh: Ends of the intervals as fractions 0..1, N + 1 of them; None for equal intervals.
 
     Raises:
         ProblemError: For a value outside these.
@@ -47,7 +47,7 @@ class MultipleShooting(DirectMethod):
     mesh: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
-        self._settle("steps")
+        self._check_mesh("steps")
         checked_choice("MultipleShooting: integrator", self.integrator, ("rk4", "cvodes"))
         checked_choice("MultipleShooting: control", self.control, ("held", "linear"))
 
@@ -59,24 +59,25 @@ class MultipleShooting(DirectMethod):
     def control_order(self) -> int:
         return 1 if self.control == "held" else 2
 
-    def transcribe(self, form: Formulation, *, staged: bool = False) -> Fragment:
+    def transcribe(self, form: Formulation, *, staged: bool = False) -> Transcription:
         return transcribe(self, form, staged)
 
 
-def transcribe(method: MultipleShooting, form: Formulation, staged: bool) -> Fragment:
+def transcribe(method: MultipleShooting, form: Formulation, staged: bool) -> Transcription:
+    """Transcribe a problem by multiple shooting."""
     nx, nu = form.nx, form.nu
     mesh = method.fractions
     n, width = len(mesh) - 1, np.diff(mesh)
     stages = np.arange(n)
     linear = method.control == "linear"
-    build = FragmentBuilder(form, mesh, nu if linear else 0, 0 if linear else nu, staged)
-    lay = build.layout
-    first, last = lay.node[:nx, :-1], lay.node_end[:nx]
+    build = TranscriptionBuilder(form, mesh, nu if linear else 0, 0 if linear else nu, staged)
+    layout = build.layout
+    first, last = layout.node[:nx, :-1], layout.node_end[:nx]
     if linear:
-        controls = np.stack([lay.node[nx:, :-1], lay.node_end[nx:]])  # at both ends of the interval, (2, nu, n)
+        controls = np.stack([layout.node[nx:, :-1], layout.node_end[nx:]])  # at both ends of the interval, (2, nu, n)
     else:
-        build.variables("control", lay.interval, mesh[:-1] + 0.5 * width, "control")
-        controls = lay.interval[None]
+        build.variables("control", layout.interval, mesh[:-1] + 0.5 * width, "control")
+        controls = layout.interval[None]
 
     # the end of every interval: x_end - F(x, u) = 0
     rows = build.rows(tuple(f"continuity of {name}" for name in form.state_labels), None, stages, mesh[1:])
@@ -86,46 +87,49 @@ def transcribe(method: MultipleShooting, form: Formulation, staged: bool) -> Fra
     build.blocks.append(Block(interval_function(form, method), variables, data, rows))
 
     # path constraints: at both ends of an interval where they contain a control, else at the nodes
-    free = ~form.path.uses_control
+    without_control = ~form.path.uses_control
     if linear:
-        build.node_rows(form.path, lay.node[nx:])
+        build.node_rows(form.path, layout.node[nx:])
         ends = (np.ones(1), np.ones(1))
-        build.ends(ends, lay.node[nx:, 0][None], lay.node[nx:, -1][None], at_nodes=True)
+        build.ends(ends, layout.node[nx:, 0][None], layout.node[nx:, -1][None], at_nodes=True)
     else:
-        held = lay.interval
-        build.path_rows(form.path.select(~free), first, held, stages, mesh[:-1])
-        build.path_rows(form.path.select(~free & ~form.path.equality), last, held, stages, mesh[1:])
-        build.node_rows(form.path.select(free), np.column_stack([held, held[:, -1]]))
-        build.ends((np.ones(1), np.ones(1)), held[:, 0][None], held[:, -1][None], at_nodes=False)
+        controls_inside = layout.interval
+        build.path_rows(form.path.select(~without_control), first, controls_inside, stages, mesh[:-1])
+        build.path_rows(
+            form.path.select(~without_control & ~form.path.equality), last, controls_inside, stages, mesh[1:]
+        )
+        build.node_rows(form.path.select(without_control), np.column_stack([controls_inside, controls_inside[:, -1]]))
+        build.ends((np.ones(1), np.ones(1)), controls_inside[:, 0][None], controls_inside[:, -1][None], at_nodes=False)
 
     report = (np.concatenate([stages, [n - 1]]), np.concatenate([np.zeros(n), [1.0]]))
     costate_rows = np.vstack([np.full((1, nx), -1), rows.T])
     costate_scale = np.concatenate([[1.0], np.full(n, -1.0)])
     breaks = np.append((mesh[:-1, None] + width[:, None] * np.arange(method.steps) / method.steps).ravel(), 1.0)
-    read, placed = np.vstack([first, *controls]), np.array([0.0, 1.0] if linear else [0.5])
+    inputs, control_nodes = np.vstack([first, *controls]), np.array([0.0, 1.0] if linear else [0.5])
     dense = dense_function(form, method)
-    interpolants = Interpolants(breaks, THIRDS, read, mesh, placed, np.vstack([*controls]), data, dense)
+    interpolants = Interpolants(breaks, THIRDS, inputs, mesh, control_nodes, np.vstack([*controls]), data, dense)
     nodes = np.arange(n + 1)
-    return build.finish(report, lay.node[:nx].T, costate_rows, nodes, costate_scale, interpolants)
+    return build.finish(report, layout.node[:nx].T, costate_rows, nodes, costate_scale, interpolants)
 
 
 # ---- integration of one interval -----------------------------------------------------------------------------
 
 
-def controls_of(form: Formulation, method: MultipleShooting) -> int:
+def n_controls_of(form: Formulation, method: MultipleShooting) -> int:
+    """Return the number of control variables that act in an interval."""
     return form.nu * (2 if method.control == "linear" else 1)
 
 
 def control_at(form: Formulation, method: MultipleShooting, w: Any, place: Any) -> Any:
-    """The control at ``place`` 0..1 of an interval, from its control variables ``w``."""
+    """Return the control at ``place`` 0..1 of an interval from its control variables ``w``."""
     if method.control == "held":
         return w
     return (1 - place) * w[: form.nu] + place * w[form.nu :]
 
 
 def interval_function(form: Formulation, method: MultipleShooting) -> Any:
-    """Block (v = [x; controls; T where free], d = [s, h], p) -> (integral of the running cost, -F(x, controls))."""
-    nw = controls_of(form, method)
+    """Return the block (v = [x; controls; T if free], d = [s, h], p) -> (running cost, -F(x, controls))."""
+    nw = n_controls_of(form, method)
     step, flat = step_function(form, method)
     sym = (ca.SX if flat else ca.MX).sym
     v, d = sym("v", form.nx + nw + form.horizon_is_free), sym("d", 2)
@@ -133,20 +137,20 @@ def interval_function(form: Formulation, method: MultipleShooting) -> Any:
     horizon = v[form.nx + nw] if form.horizon_is_free else form.horizon_at(p)
     x, w = v[: form.nx], v[form.nx : form.nx + nw, :]
     cost: Any = 0
-    pieces = method.steps if method.integrator == "rk4" else 1
-    for i in range(pieces):
-        x, part = step(x, w, d, i, horizon, p)
-        cost = cost + part
+    calls = method.steps if method.integrator == "rk4" else 1
+    for i in range(calls):
+        x, added = step(x, w, d, i, horizon, p)
+        cost = cost + added
     return ca.Function("interval", [v, d, p], [cost, -x])
 
 
 def step_function(form: Formulation, method: MultipleShooting) -> tuple[Any, bool]:
-    """One integration step (x, w, d, number of the step, T, p) -> (x, cost), and whether to inline all into SX."""
+    """Return an integration step (x, w, d, step number, T, p) -> (x, cost), and whether to inline all into SX."""
     if method.integrator == "cvodes":
         return cvodes(form, method, [1.0]), False
     function = form.function("f", [form.f, form.running], ["f", "running"])
-    sym = symbols_of(function).sym  # of MX where the dynamics need signals
-    x, w, d, i = sym("x", form.nx), sym("w", controls_of(form, method)), sym("d", 2), sym("i")
+    sym = symbols_of(function).sym  # MX if the dynamics need signals
+    x, w, d, i = sym("x", form.nx), sym("w", n_controls_of(form, method)), sym("d", 2), sym("i")
     horizon, p = sym("T"), sym("p", form.np)
     h = d[1] * horizon / method.steps
 
@@ -155,32 +159,32 @@ def step_function(form: Formulation, method: MultipleShooting) -> tuple[Any, boo
         time = (d[0] + d[1] * within) * horizon
         return ca.vertcat(*function(state[: form.nx], control_at(form, method, w, within), time, horizon, p))
 
-    after = rk4_step(slope, ca.vertcat(x, 0), h)
-    outputs = [after[: form.nx], after[form.nx]]
+    result = rk4_step(slope, ca.vertcat(x, 0), h)
+    outputs = [result[: form.nx], result[form.nx]]
     step = ca.Function("step", [x, w, d, i, horizon, p], outputs)
     flat = step.is_a("SXFunction") and step.n_instructions() * method.steps < SIZES.inlined
     return step, flat
 
 
 def cvodes(form: Formulation, method: MultipleShooting, places: list[float]) -> Any:
-    """(x, w, d, _, T, p) -> (states at ``places`` of the interval side by side, cost)."""
+    """Return (x, w, d, _, T, p) -> (states at ``places`` of the interval side by side, cost)."""
     sym = form.sym
-    nw = controls_of(form, method)
+    nw = n_controls_of(form, method)
     x, place, q = sym("x", form.nx), sym("place"), sym("q", nw + 3 + form.np)
     w, s, h, horizon, p = (q[:nw], q[nw], q[nw + 1], q[nw + 2], q[nw + 3 :])
     function = form.function("f", [form.f, form.running], ["f", "running"])
     rate, cost = function(x, control_at(form, method, w, place), (s + h * place) * horizon, horizon, p)
     dae = {"x": x, "t": place, "p": q, "ode": h * horizon * rate, "quad": h * horizon * cost}
-    whole = integrator("cvodes", dae, places, smooth=False)
+    integrate = integrator("cvodes", dae, places, smooth=False)
     x, w, d, i = ca.MX.sym("x", form.nx), ca.MX.sym("w", nw), ca.MX.sym("d", 2), ca.MX.sym("i")
     horizon, p = ca.MX.sym("T"), ca.MX.sym("p", form.np)
-    result = whole(x0=x, p=ca.vertcat(w, d, horizon, p))
+    result = integrate(x0=x, p=ca.vertcat(w, d, horizon, p))
     return ca.Function("step", [x, w, d, i, horizon, p], [result["xf"], result["qf"]])
 
 
 def dense_function(form: Formulation, method: MultipleShooting) -> Any:
-    """([x; w], d, T, p) -> values at THIRDS of the cubic Hermite curve through each step of an interval, (nx, .)."""
-    v, d = ca.MX.sym("v", form.nx + controls_of(form, method)), ca.MX.sym("d", 2)
+    """Return ([x; w], d, T, p) -> values at THIRDS of the cubic Hermite curve through each step of an interval."""
+    v, d = ca.MX.sym("v", form.nx + n_controls_of(form, method)), ca.MX.sym("d", 2)
     x, w = v[: form.nx], v[form.nx :]
     horizon, p = ca.MX.sym("T"), ca.MX.sym("p", form.np)
     if method.integrator == "cvodes":

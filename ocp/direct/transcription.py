@@ -1,7 +1,7 @@
-"""What every transcription shares: the nonlinear program of one phase, collected piece by piece.
+"""Common parts of all transcriptions: the layout of variables, and the construction of the nonlinear program.
 
-:class:`Layout` says where the variables of a phase stand in the vector of the program; :class:`FragmentBuilder`
-collects variables, rows and blocks, imposes what is asked at nodes and at both ends, and numbers the rows.
+:class:`Layout` holds the positions of the variables of a phase in the program. :class:`TranscriptionBuilder` collects
+variables, rows and blocks, imposes conditions at nodes and ends, and numbers the rows.
 """
 
 from __future__ import annotations
@@ -12,30 +12,30 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ocp.direct.assembly import Block, Fragment, Interpolants, Stages
+from ocp.direct.assembly import Block, Interpolants, Stages, Transcription
 from ocp.errors import ProblemError
 from ocp.problem.formulation import Formulation, Rows
 
-__all__ = ["FragmentBuilder", "Layout"]
+__all__ = ["TranscriptionBuilder"]
 
 
 @dataclass(frozen=True)
 class Layout:
     """Indices of the variables of one phase with N intervals.
 
-    Nodes stand between intervals. In the plain layout the end of interval k *is* node k + 1 and the horizon is one
-    variable. In the staged layout (for structure-exploiting solvers) each stage owns its copies of the end of its
-    interval, of the horizon and of the start, and linear rows tie them to the next node.
+    Nodes lie between intervals. In the plain layout the end of interval k *is* node k + 1, and the horizon is one
+    variable. In the staged layout, for structure-exploiting solvers, each stage has copies of the end of its interval,
+    of the horizon and of the start, and linear rows tie them to the next node.
 
     Attributes:
         size: Number of variables.
         node: Variables of each node. Shape (n, N + 1).
         node_end: Variables at the end of each interval. Shape (n, N).
         interval: Variables inside each interval. Shape (m, N).
-        horizon: The horizon as each node sees it, or None where it is fixed. Shape (N + 1,).
-        initial: Node variables at the start as the first and the last node see them. Shape (n, 2).
+        horizon: Horizon variable of each node, or None if it is fixed. Shape (N + 1,).
+        initial: Variables of the start in the copies of the first and of the last node. Shape (n, 2).
         joins: (next node, its source in the stage before), each of shape (carried, N); None in the plain layout.
-        stage_controls: Number of variables of a stage that are not its node. 0 in the plain layout.
+        stage_controls: Number of variables of a stage other than its node. 0 in the plain layout.
     """
 
     size: int
@@ -49,7 +49,7 @@ class Layout:
 
 
 def plain_layout(intervals: int, node_size: int, interval_size: int, free_horizon: bool) -> Layout:
-    """Node 0, interval 0, node 1, ..., node N, horizon."""
+    """Return the layout node 0, interval 0, node 1, ..., node N, horizon."""
     stride = node_size + interval_size
     grid = np.arange(intervals * stride).reshape(intervals, stride).T
     node = np.column_stack([grid[:node_size], intervals * stride + np.arange(node_size)])
@@ -60,36 +60,36 @@ def plain_layout(intervals: int, node_size: int, interval_size: int, free_horizo
 
 
 def staged_layout(intervals: int, node_size: int, interval_size: int, free_horizon: bool, keep_initial: bool) -> Layout:
-    """Stage k: node k with its copies of horizon and start, then interval k with the copy of its end."""
+    """Return the layout by stages: node k, copies of horizon and start, interval k, copy of its end."""
     carried = node_size + free_horizon + node_size * keep_initial
     inputs = interval_size + node_size
     stride = carried + inputs
     grid = np.arange(intervals * stride).reshape(intervals, stride).T
-    full = np.column_stack([grid[:carried], intervals * stride + np.arange(carried)])
+    nodes = np.column_stack([grid[:carried], intervals * stride + np.arange(carried)])
     node_end = grid[carried + interval_size :]
-    own = full[node_size + free_horizon :] if keep_initial else full[:node_size]
+    start = nodes[node_size + free_horizon :] if keep_initial else nodes[:node_size]
     return Layout(
         intervals * stride + carried,
-        full[:node_size],
+        nodes[:node_size],
         node_end,
         grid[carried : carried + interval_size],
-        full[node_size] if free_horizon else None,
-        own[:, [0, -1]],
-        (full[:, 1:], np.vstack([node_end, full[node_size:, :-1]])),
+        nodes[node_size] if free_horizon else None,
+        start[:, [0, -1]],
+        (nodes[:, 1:], np.vstack([node_end, nodes[node_size:, :-1]])),
         inputs,
     )
 
 
 @dataclass
-class FragmentBuilder:
-    """Collects variables, rows and blocks of one phase; :meth:`finish` numbers the rows stage by stage.
+class TranscriptionBuilder:
+    """Builder of the nonlinear program of one phase; :meth:`finish` numbers the rows stage by stage.
 
     Args:
         formulation: The problem.
-        mesh: Fractions of the horizon where intervals begin and end. Shape (N + 1,).
-        node_controls: Number of control entries that stand at nodes (behind the states) rather than inside intervals.
+        mesh: Ends of the intervals as fractions of the horizon. Shape (N + 1,).
+        node_controls: Number of control entries at the nodes, after the states, rather than inside intervals.
         interval_size: Number of variables inside an interval.
-        staged: Whether to lay the program out stage by stage for a structure-exploiting solver.
+        staged: Whether to order the program by stages for a structure-exploiting solver.
     """
 
     formulation: Formulation
@@ -123,7 +123,7 @@ class FragmentBuilder:
     # ---- variables -------------------------------------------------------------------------------------------
 
     def variables(self, role: str, index: np.ndarray, at: np.ndarray, bounds: str | None) -> None:
-        """Variables ``index`` (n, K) are the entries of ``role`` at fractions ``at`` (K,), bounded as a place says."""
+        """Declare variables ``index`` (n, K) as entries of ``role`` at fractions ``at`` (K,), with named bounds."""
         self.variable_role[index] = role
         self.variable_entry[index] = np.arange(index.shape[0])[:, None]
         self.variable_fraction[index] = at[None, :]
@@ -131,32 +131,33 @@ class FragmentBuilder:
             self.variable_bounds[index] = self.formulation.bounds.places[bounds][:, None]
 
     def _nodes(self) -> None:
-        nx, lay, mesh = self.formulation.nx, self.layout, self.mesh
-        both = np.array([0.0, 0.0])
+        """Declare the variables at the nodes and, in the staged layout, the rows that join stages."""
+        nx, layout, mesh = self.formulation.nx, self.layout, self.mesh
+        start = np.array([0.0, 0.0])
         for role, part, bounds in (("state", slice(0, nx), "state"), ("control", slice(nx, None), "control")):
-            self.variables(role, lay.initial[part], both, None)
-            self.variables(role, lay.node_end[part], mesh[1:], None)
+            self.variables(role, layout.initial[part], start, None)
+            self.variables(role, layout.node_end[part], mesh[1:], None)
             if role == "state" or self.node_controls:
-                self.variables(role, lay.node[part], mesh, bounds)
-        self.variables("state", lay.node[:nx, :1], mesh[:1], "initial")
-        self.variables("state", lay.node[:nx, -1:], mesh[-1:], "terminal")
-        if lay.horizon is not None:
-            self.variables("horizon", lay.horizon[None, :], mesh, None)
-            self.variables("horizon", lay.horizon[None, :1], mesh[:1], "horizon")
-        if lay.joins is not None:
-            target, source = lay.joins
+                self.variables(role, layout.node[part], mesh, bounds)
+        self.variables("state", layout.node[:nx, :1], mesh[:1], "initial")
+        self.variables("state", layout.node[:nx, -1:], mesh[-1:], "terminal")
+        if layout.horizon is not None:
+            self.variables("horizon", layout.horizon[None, :], mesh, None)
+            self.variables("horizon", layout.horizon[None, :1], mesh[:1], "horizon")
+        if layout.joins is not None:
+            target, source = layout.joins
             names = tuple(f"stage variable {i}" for i in range(len(target)))
             rows = self.rows(names, None, np.arange(self.intervals), mesh[1:], joins=True)
             self.linear(rows, target, 1.0)
             self.linear(rows, source, -1.0)
             if self.formulation.ties_ends:
-                n = len(lay.initial)
+                n = len(layout.initial)
                 ties = self.rows(tuple(f"start {i}" for i in range(n)), None, np.zeros(1, int), mesh[:1], ends=True)
-                self.linear(ties, lay.initial[:, :1], 1.0)
-                self.linear(ties, lay.node[:, :1], -1.0)
+                self.linear(ties, layout.initial[:, :1], 1.0)
+                self.linear(ties, layout.node[:, :1], -1.0)
 
     def point(self, states: np.ndarray, controls: np.ndarray, stages: np.ndarray) -> np.ndarray:
-        """Variables [x; u; T where free] of K points, from states (nx, K), controls (nu, K), stages (K,)."""
+        """Return the variables [x; u; T if free] of K points from states (nx, K), controls (nu, K) and stages (K,)."""
         horizon = [] if self.layout.horizon is None else [self.layout.horizon[stages][None, :]]
         return np.vstack([states, controls, *horizon])
 
@@ -172,9 +173,11 @@ class FragmentBuilder:
         joins: bool = False,
         ends: bool = False,
     ) -> np.ndarray:
-        """Allocate rows ``labels`` (m) at K places; bounds None means equal to zero. Returns indices (m, K).
+        """Allocate rows ``labels`` (m) at K places and return their indices (m, K); bounds None means equal to zero.
 
-        ``joins``: they tie a stage to the next. ``ends``: they belong to the ends of the horizon, not to its inside.
+        Args:
+            joins: Whether the rows tie a stage to the next.
+            ends: Whether the rows belong to the ends of the horizon rather than to its inside.
         """
         m, places = len(labels), len(stages)
         zero = self.formulation.bounds.places["zero"][0]
@@ -188,13 +191,13 @@ class FragmentBuilder:
 
     def linear(self, rows: np.ndarray, columns: np.ndarray, values: np.ndarray | float) -> None:
         """Add ``values * variable[columns]`` to ``rows``; the three are broadcast together."""
-        at, which, filled = np.broadcast_arrays(rows, columns, values)
-        self._linear.append((at.ravel(), which.ravel(), filled.ravel().astype(float)))
+        targets, variables, entries = np.broadcast_arrays(rows, columns, values)
+        self._linear.append((targets.ravel(), variables.ravel(), entries.ravel().astype(float)))
 
     def path_rows(
         self, rows: Rows, states: np.ndarray, controls: np.ndarray, stages: np.ndarray, at: np.ndarray
     ) -> None:
-        """Impose path rows at K points of fractions ``at``: states (nx, K), controls (nu, K)."""
+        """Impose path rows at K points with fractions ``at``, states (nx, K) and controls (nu, K)."""
         if len(rows) == 0 or len(at) == 0:
             return
         point_data = self.formulation.point_data(at)
@@ -204,15 +207,15 @@ class FragmentBuilder:
         self.blocks.append(Block(function, self.point(states, controls, stages), point_data, index))
 
     def node_rows(self, rows: Rows, controls: np.ndarray, *, first_only: bool = False) -> None:
-        """Impose rows at every node; at the first one only where it is not settled by fixed initial states.
+        """Impose rows at every node; at the first node only those that fixed initial states do not determine.
 
-        ``controls`` (nu, N + 1) are the variables to read there; rows free of controls may be given any.
+        ``controls`` (nu, N + 1) are the variables read there; they do not matter for rows without controls.
         """
         nodes = np.arange(self.intervals + 1)
         states = self.layout.node[: self.formulation.nx]
-        loose = (rows.uses_state & ~self.formulation.initial_is_fixed).any(axis=1) | rows.uses_control
+        undetermined = (rows.uses_state & ~self.formulation.initial_is_fixed).any(axis=1) | rows.uses_control
         first = nodes[:1]
-        self.path_rows(rows.select(loose), states[:, first], controls[:, first], first, self.mesh[first])
+        self.path_rows(rows.select(undetermined), states[:, first], controls[:, first], first, self.mesh[first])
         if not first_only:
             self.path_rows(rows, states[:, 1:], controls[:, 1:], nodes[1:], self.mesh[1:])
 
@@ -222,18 +225,19 @@ class FragmentBuilder:
         """Impose start and end constraints and the terminal cost.
 
         Args:
-            basis: Weights (c,) that make the control at the start (at the end) from those of the first (last) interval.
-            first, last: Their variables, in the first and the last interval. Shape (c, nu).
+            basis: Weights (c,) of the control values of the first (last) interval that give the control at the start
+                (end).
+            first, last: Control variables of the first and the last interval. Shape (c, nu).
             at_nodes: Whether the controls are node variables.
         """
-        form, lay, nx = self.formulation, self.layout, self.formulation.nx
+        form, layout, nx = self.formulation, self.layout, self.formulation.nx
         if len(form.start):
-            self._end_block(form.start, 0, lay.node[:nx, 0], (basis[0], first), None, 0)
-        needs = ca.vertcat(form.end.expression, form.terminal)
-        if self.staged and not at_nodes and (ca.depends_on(needs, form.u) or ca.depends_on(needs, form.u0)):
-            words = "a stage-ordered program cannot constrain the control at the end; use ipopt"
-            raise ProblemError(words, name="control")
-        self._end_block(form.end, form.terminal, lay.node[:nx, -1], (basis[1], last), (basis[0], first), 1)
+            self._end_block(form.start, 0, layout.node[:nx, 0], (basis[0], first), None, 0)
+        conditions = ca.vertcat(form.end.expression, form.terminal)
+        if self.staged and not at_nodes and (ca.depends_on(conditions, form.u) or ca.depends_on(conditions, form.u0)):
+            text = "a stage-ordered program cannot constrain the control at the end; use ipopt"
+            raise ProblemError(text, name="control")
+        self._end_block(form.end, form.terminal, layout.node[:nx, -1], (basis[1], last), (basis[0], first), 1)
 
     def _end_block(
         self,
@@ -244,31 +248,31 @@ class FragmentBuilder:
         initial: tuple[np.ndarray, np.ndarray] | None,
         place: int,
     ) -> None:
-        """One block at the start (place 0) or the end (place 1) of v = [x, controls, T, x0, controls at the start]."""
-        form, lay = self.formulation, self.layout
+        """Add the block at the start (place 0) or end (place 1) with v = [x, controls, T, x0, start controls]."""
+        form, layout = self.formulation, self.layout
         sym, nx, nu = form.sym, form.nx, form.nu
         stage = self.intervals if place else 0
         used = ca.vertcat(rows.expression, cost)
-        # symbol of the problem, the variables that make it, and their weights
-        pieces = [(form.x, states, np.ones(1))]
+        # symbol of the problem, its variables, and their weights
+        inputs = [(form.x, states, np.ones(1))]
         if nu and ca.depends_on(used, form.u):
-            pieces.append((form.u, controls[1], controls[0]))
+            inputs.append((form.u, controls[1], controls[0]))
         if initial is not None and ca.depends_on(used, form.x0):
-            pieces.append((form.x0, lay.initial[:nx, place], np.ones(1)))
+            inputs.append((form.x0, layout.initial[:nx, place], np.ones(1)))
         if initial is not None and nu and ca.depends_on(used, form.u0):
-            own = (lay.initial[nx:, place], np.ones(1)) if self.node_controls else initial[::-1]
-            pieces.append((form.u0, *own))
-        if lay.horizon is not None:
-            pieces.append((form.T, lay.horizon[[stage]], np.ones(1)))
-        variables = np.concatenate([index.ravel() for _, index, _ in pieces])
+            start_controls = (layout.initial[nx:, place], np.ones(1)) if self.node_controls else initial[::-1]
+            inputs.append((form.u0, *start_controls))
+        if layout.horizon is not None:
+            inputs.append((form.T, layout.horizon[[stage]], np.ones(1)))
+        variables = np.concatenate([index.ravel() for _, index, _ in inputs])
         v, d, offset = sym("v", len(variables)), sym("d", 1), 0
         old, new = [], []
-        for symbol, index, weights in pieces:
+        for symbol, index, weights in inputs:
             local = ca.reshape(v[offset : offset + index.size], symbol.numel(), len(weights))
             old.append(symbol)
             new.append(ca.mtimes(local, ca.DM(weights)))
             offset += index.size
-        if lay.horizon is None:
+        if layout.horizon is None:
             old.append(form.T)
             new.append(form.horizon_value)
         old.append(form.t)
@@ -279,7 +283,7 @@ class FragmentBuilder:
         function = ca.Function("end" if place else "start", [v, d, form.p], outputs)
         self.blocks.append(Block(function, variables[:, None], at[None, :], labels, ends=True))
 
-    # ---- the whole -------------------------------------------------------------------------------------------
+    # ---- result -------------------------------------------------------------------------------------------
 
     def finish(
         self,
@@ -289,23 +293,23 @@ class FragmentBuilder:
         costate_nodes: np.ndarray,
         costate_scale: np.ndarray,
         interpolants: Interpolants,
-    ) -> Fragment:
-        """Number the rows stage by stage and return the fragment."""
+    ) -> Transcription:
+        """Number the rows stage by stage and return the transcription."""
         order = np.concatenate(self._order)
         sequence = np.argsort(order, kind="stable")
         number = np.empty_like(sequence)
         number[sequence] = np.arange(len(sequence))
         blocks = tuple(Block(b.function, b.variables, b.data, number[b.rows], b.ends) for b in self.blocks)
         rows, columns, values = (np.concatenate(part) for part in zip(*self._linear, strict=True))
-        nx, lay = self.formulation.nx, self.layout
+        nx, layout = self.formulation.nx, self.layout
         stages = None
-        if lay.joins is not None:
-            carried, n = len(lay.joins[0]), self.intervals
+        if layout.joins is not None:
+            carried, n = len(layout.joins[0]), self.intervals
             counts = np.bincount(order[order % 2 == 1] // 2, minlength=n + 1)
-            stages = Stages((carried,) * (n + 1), (lay.stage_controls,) * n + (0,), tuple(counts.tolist()))
-        return Fragment(
+            stages = Stages((carried,) * (n + 1), (layout.stage_controls,) * n + (0,), tuple(counts.tolist()))
+        return Transcription(
             mesh=self.mesh,
-            size=lay.size,
+            size=layout.size,
             variable_bounds=self.variable_bounds,
             row_bounds=np.concatenate(self._row_bounds)[sequence],
             variable_role=self.variable_role,
@@ -315,9 +319,9 @@ class FragmentBuilder:
             row_fractions=np.concatenate(self._fractions)[sequence],
             blocks=blocks,
             linear=(number[rows], columns, values),
-            nodes=lay.node[:nx],
+            nodes=layout.node[:nx],
             row_stages=np.where(np.concatenate(self._inside), order // 2, -1)[sequence],
-            horizon=None if lay.horizon is None else int(lay.horizon[0]),
+            horizon=None if layout.horizon is None else int(layout.horizon[0]),
             report=report,
             report_states=report_states,
             costate_rows=np.where(costate_rows < 0, -1, number[costate_rows]),

@@ -1,12 +1,13 @@
-"""Every number that the papers print of their results, beside ours, out of the summaries that the scripts write.
+"""Every number that the papers print of their results, beside ours, read from the summaries that the scripts write.
 
-A number counts as reproduced where ours is within 1 % of it, or within a unit of its last printed digit. Where it is
-not, the row says why. Inputs that a paper prints, and its figures without numbers, are not counted; of figures that
-show a motion to its end the time of that end is.
+A number counts as reproduced if ours is within 1 % of it or within a unit of its last printed digit. Otherwise the row
+gives the reason. Inputs that a paper prints and figures without numbers are not counted; of figures that show a motion
+to its end, the time of that end is.
 """
 
 from __future__ import annotations
 
+import csv
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from typing import Any
 from scripts.papers.blend.example import PAPER_GAMMA, PAPER_SPEED_ERROR, PAPER_TIMES
 from scripts.papers.run import Row, Table, text_table, write
 
-__all__ = ["READERS", "SHARE", "Printed", "read", "table", "text", "write_table"]
+__all__ = ["READERS", "SHARE", "Printed", "committed", "read", "read_tables", "table", "text", "write_tables"]
 
 SHARE = 0.01
 """Of a printed number, by which ours may differ."""
@@ -29,9 +30,13 @@ class Printed:
     """A number of a paper and ours.
 
     Attributes:
-        paper: Its script. place: Table or figure. quantity: What it is, with its unit.
-        printed, ours: The values. decimals: That it is printed with.
-        why: Why ours differs; said only where it is not reproduced.
+        paper: Name of the paper's script.
+        place: Table or figure.
+        quantity: Description of the number, with its unit.
+        printed, ours: The values.
+        decimals: Number of decimals that the paper prints.
+        why: Reason of the difference, reported if the number is not reproduced.
+        timed: Whether ours is a measured duration, which differs from run to run.
     """
 
     paper: str
@@ -41,6 +46,7 @@ class Printed:
     ours: float
     decimals: int
     why: str = ""
+    timed: bool = False
 
     @property
     def reproduced(self) -> bool:
@@ -110,15 +116,11 @@ def _cts(told: Mapping[str, Any]) -> Iterator[Printed]:
     printed, ours = told["paper"]["table6_s"], told["arithmetic_seconds_of_200_targets"]
     why = "the time of another computer; ours is arithmetic alone, compiled"
     for name, mine in (("jacobian", "jacobian, gain 20"), ("combined", "combined")):
-        yield Printed("cts", "Table 6", f"200 targets, {name}, s", printed[name], ours[mine], 4, why)
-    why = (
-        "neither link lengths nor the gain of the null term are printed, and the iterations depend on both: "
-        f"{told['time_ratio_jacobian_over_combined']:.3g} with gain 20 (shown), "
-        f"{told['time_ratio_jacobian_over_combined_gain_1']:.3g} with gain 1, "
-        f"{told['time_ratio_in_python']:.3g} with calls from Python"
-    )
+        yield Printed("cts", "Table 6", f"200 targets, {name}, s", printed[name], ours[mine], 4, why, timed=True)
+    why = "neither link lengths nor the gain of the null term are printed, and the iterations depend on both"
     ratio = told["time_ratio_jacobian_over_combined"]
-    yield Printed("cts", "Table 6", "times of both, ratio", printed["jacobian"] / printed["combined"], ratio, 2, why)
+    quotient = printed["jacobian"] / printed["combined"]
+    yield Printed("cts", "Table 6", "times of both, ratio", quotient, ratio, 2, why, timed=True)
 
 
 READERS: Mapping[str, Callable[[Mapping[str, Any]], Iterator[Printed]]] = {
@@ -179,7 +181,35 @@ def text(found: Sequence[Printed], missing: Sequence[str]) -> str:
     return "\n".join(lines)
 
 
-def write_table(out: Path, found: Sequence[Printed]) -> None:
-    """Write the rows to `out`/reproduced.csv, where there are any."""
-    if found:
-        write(out / "reproduced.csv", Table(table(found), digits=6))
+def committed(numbers: Sequence[Printed]) -> list[dict[str, str]]:
+    """Return the rows of a paper's table in the repository: rounded as the paper rounds, and without durations."""
+    return [
+        {
+            "place": number.place,
+            "quantity": number.quantity,
+            "printed": f"{number.printed:.{number.decimals}f}",
+            "ours": "" if number.timed else f"{round(number.ours, number.decimals) + 0.0:.{number.decimals}f}",
+            "reproduced": "" if number.timed else "yes" if number.reproduced else "no",
+            "why": "" if number.reproduced and not number.timed else number.why,
+        }
+        for number in numbers
+    ]
+
+
+def write_tables(out: Path, numbers: Sequence[Printed]) -> None:
+    """Write the rows of each paper to `out`/PAPER/numbers.csv."""
+    for paper in dict.fromkeys(number.paper for number in numbers):
+        write(out / paper / "numbers.csv", Table(committed([n for n in numbers if n.paper == paper])))
+
+
+def read_tables(out: Path) -> dict[str, list[dict[str, str]]]:
+    """Return the rows of OUT/PAPER/numbers.csv by paper.
+
+    Raises:
+        OSError: A table is missing.
+    """
+    tables = {}
+    for paper in READERS:
+        with (out / paper / "numbers.csv").open(encoding="utf-8", newline="") as stream:
+            tables[paper] = list(csv.DictReader(stream))
+    return tables

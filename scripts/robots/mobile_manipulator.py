@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ocp import Audit, TipTask
-from ocp.audit.clearance import Nearest
+from ocp.audit.clearance import ClosestPair
 from ocp.motion.tasks.equations import task_errors
 from scripts.robots import standing
 from scripts.robots.drawing import animate
@@ -37,7 +37,7 @@ class StandingExample:
     tolerances: Mapping[str, float] = field(default_factory=dict)
 
     @property
-    def nearest(self) -> Nearest:
+    def nearest(self) -> ClosestPair:
         """The two bodies of the robot that come nearest to each other along the plan."""
         return min(self.audit.clearances["clearance"].pairs, key=lambda pair: pair.distance)
 

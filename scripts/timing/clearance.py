@@ -53,7 +53,7 @@ def proofs(repeats: int) -> list[dict[str, Any]]:
     rows = []
     for seed in range(SEEDS):
         spent, found = least(partial(proven, around, *swing(around.machine.robot, seed)), repeats)
-        row = {"seed": seed, "pairs": len(around.pairs), "looked": found.looked, "proof_s": spent}
+        row = {"seed": seed, "pairs": len(around.pairs), "looked": found.n_intervals, "proof_s": spent}
         rows.append({**row, "settled": found.settled, "least_m": found.worst.least})
     return rows
 

@@ -17,7 +17,7 @@ from docs.executed import blocks, executed
 from docs.numbers import MARK, listed
 from docs.players import command
 from ocp.app.command import parser
-from scripts.papers.reproduced import read
+from scripts.papers.reproduced import read_tables
 
 SITE = Path(__file__).resolve().parents[2] / "docs"
 PAGES = sorted(SITE.rglob("*.md"))
@@ -130,18 +130,19 @@ def test_docstrings_mean_nothing_but_what_they_say() -> None:
 
 
 def test_every_number_of_the_papers_stands_on_its_page_with_its_reason() -> None:
-    found, _ = read(SITE.parent / "results")
-    told = listed(found)
-    assert f"**{sum(one.reproduced for one in found)} of {len(found)} numbers" in told
-    for paper, part in zip(dict.fromkeys(one.paper for one in found), told.split("### ")[1:], strict=True):
+    tables = read_tables(SITE.parent / "results")
+    page = listed(tables)
+    rows = [row for part in tables.values() for row in part if row["ours"]]
+    assert f"**{sum(row['reproduced'] == 'yes' for row in rows)} of {len(rows)} numbers" in page
+    for (paper, numbers), part in zip(tables.items(), page.split("### ")[1:], strict=True):
         assert part.startswith(f"{paper}\n")
-        for one in (one for one in found if one.paper == paper):
-            (line,) = (line for line in part.splitlines() if f"| {one.place} | {one.quantity} |" in line)
-            if one.reproduced:
+        for row in numbers:
+            (line,) = (line for line in part.splitlines() if f"| {row['place']} | {row['quantity']} |" in line)
+            if row["reproduced"] == "yes":
                 assert line.endswith("| yes |")
             else:
-                number = int(line.partition("no (")[2].partition(")")[0])
-                assert f"\n{number}. {one.why}.\n" in part
+                number = int(line.rpartition("(")[2].partition(")")[0])
+                assert f"\n{number}. {row['why']}.\n" in part
     assert sum(MARK in page.read_text(encoding="utf-8") for page in PAGES) == 1
 
 

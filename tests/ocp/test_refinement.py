@@ -270,7 +270,7 @@ def hurried() -> tuple[Problem, float, float]:
     ],
     ids=str,
 )
-@pytest.mark.filterwarnings("ignore:.*not decided:ocp.errors.RefinementWarning")
+@pytest.mark.filterwarnings("ignore:.*undetermined:ocp.errors.RefinementWarning")
 def test_the_mesh_clusters_at_a_switch(method: Method) -> None:
     problem, horizon, switch = hurried()
     solution = refine(problem, method)
@@ -330,7 +330,7 @@ def test_what_finer_intervals_do_not_mend_is_not_reached_and_named() -> None:
 def test_what_the_audit_does_not_decide_is_not_reached_though_every_row_holds() -> None:
     """Where a control enters the conditions at the end, the second order is not known."""
     problem = swing(control_ties=True)
-    with pytest.warns(RefinementWarning, match="not decided: the control") as told:
+    with pytest.warns(RefinementWarning, match="undetermined: the control") as told:
         solution = refine(problem, Collocation(10), tolerance=1e-4, parameters=SWING)
     assert solution.refinement is not None
     assert not solution.refinement.reached
@@ -455,7 +455,7 @@ def test_the_cost_that_is_lost_falls_with_twice_the_order_of_the_controls(method
     """
     past = refined(method).refinement
     assert past is not None
-    assert past.intervals[1] == SETTINGS.pieces * past.intervals[0]
+    assert past.intervals[1] == SETTINGS.max_parts * past.intervals[0]
     assert order(1 / np.array(past.intervals[:2]), np.array(past.errors["cost"][:2])) > least
 
 

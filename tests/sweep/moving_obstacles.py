@@ -215,7 +215,7 @@ def result(robot: str, seed: int) -> Row:
         return row | {"seconds": time.process_time() - begun, "said": "refused", "why": str(error)}
     worst = found.worst
     assert worst is not None
-    row |= {"seconds": time.process_time() - begun, "looked": found.looked}
+    row |= {"seconds": time.process_time() - begun, "looked": found.n_intervals}
     known = least_by_coal(robot, given, around)
     above = [near.bodies for near in found.pairs if not near.least <= max(known[near.bodies], 0.0) + EXACT]
     least = min(near.least for near in found.pairs)

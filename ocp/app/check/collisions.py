@@ -76,31 +76,31 @@ def clearance_rows(around: CollisionScene, motion: Motion, bases: Array | None) 
     start = float(motion.t[0])
     rows, faults = [], []
     proven = min(near.least for near in found.pairs)
-    for near in sorted(found.pairs, key=lambda near: near.distance - near.asked)[:SHOWN]:
+    for near in sorted(found.pairs, key=lambda near: near.distance - near.required)[:SHOWN]:
         one, other = near.bodies
         time = start + near.time
-        if near.distance < near.asked - CLEARANCE_TOLERANCE_M:
+        if near.distance < near.required - CLEARANCE_TOLERANCE_M:
             verdict, note = RowVerdict.FAILED, "touching" if near.distance < 0 else "too near"
             between = "" if np.isclose(motion.t, time, rtol=0, atol=1e-12).any() else ", between two samples"
             how = f"overlap by {-near.distance:.4g} m" if near.distance < 0 else f"are {near.distance:.4g} m apart"
-            text = f"{how} at {time:.6g} s{between}, at least {near.asked:g} m asked"
-            faults.append(Fault("clearance", f"{one} and {other}", text, time, None, near.distance, near.asked, "m"))
+            text = f"{how} at {time:.6g} s{between}, at least {near.required:g} m asked"
+            faults.append(Fault("clearance", f"{one} and {other}", text, time, None, near.distance, near.required, "m"))
         elif near.missed > CLEARANCE_TOLERANCE_M:
             verdict, note = RowVerdict.UNDECIDED, f"at least {near.least:.4g} m is proven"
         else:
             least = "" if faults else f": at no time are any two nearer than {proven:.4g} m"
             verdict, note = RowVerdict.OK, f"proven{least}"
-        rows.append(Row(f"clearance of {one} and {other}", near.distance, near.asked, "m", time, verdict, note))
+        rows.append(Row(f"clearance of {one} and {other}", near.distance, near.required, "m", time, verdict, note))
         if verdict == "ok":
             break  # what is farther is proven as well, or told as not decided
     shown = {row.name for row in rows}
     faults = _with_beginnings(around, motion, faults)
     for near in found.pairs:
         name = f"clearance of {near.bodies[0]} and {near.bodies[1]}"
-        find_collisions = near.distance < near.asked - CLEARANCE_TOLERANCE_M
+        find_collisions = near.distance < near.required - CLEARANCE_TOLERANCE_M
         if near.missed > CLEARANCE_TOLERANCE_M and not find_collisions and name not in shown:
             note = f"at least {near.least:.4g} m is proven"
-            rows.append(Row(name, near.distance, near.asked, "m", start + near.time, RowVerdict.UNDECIDED, note))
+            rows.append(Row(name, near.distance, near.required, "m", start + near.time, RowVerdict.UNDECIDED, note))
     return [*rows, *told], faults
 
 

@@ -31,7 +31,7 @@ from ocp.app.view.appearance import (
     part_of,
 )
 from ocp.app.view.rendering import PICTURE_STYLE, Camera, Floor, Layer, placed, render, tube
-from ocp.audit.clearance import placements_along
+from ocp.audit.clearance import separation_frames
 from ocp.motion.plan import Plan
 from ocp.motion.tasks.limits import JointBounds
 from ocp.problem.problem import Problem
@@ -130,7 +130,7 @@ def obstacles_of(solution: Solution, parts: Sequence[tuple[str, Array]]) -> list
                     still[name] = Obstacle(hull.core, hull.radius, hull.normal if hull.normal.size else None)
                 elif hull.frame in riding:
                     if placed is None:
-                        placed = placements_along(problem, solution, times, suffix)
+                        placed = separation_frames(problem, solution, times, suffix)
                     frames = next(frames for one, frames in placed if one is apart)
                     at = frames.rotations[:, hull.frame], frames.positions[:, hull.frame]
                     moving.setdefault(name, []).append((hull, *at))

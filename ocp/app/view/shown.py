@@ -26,7 +26,7 @@ from ocp.app.check.verdict import bounds_of
 from ocp.app.files import RawTrajectory
 from ocp.app.view.pictures import Obstacle, looks_of, obstacles_of
 from ocp.audit.audit import Audit
-from ocp.audit.clearance import nearest_along
+from ocp.audit.clearance import closest_pairs_along
 from ocp.errors import ProblemError, unknown_name
 from ocp.motion.builders.tool_motion import CLOCK
 from ocp.motion.plan import Plan
@@ -332,7 +332,7 @@ def shown_solution(
     about |= _audited(solution, lambda: solution.audit(**settings))
     if solution.problem is not None:
         looks = np.linspace(0.0, solution.horizon, PAGE_SETTINGS.near)
-        about["near"] = _joined(looks, nearest_along(solution.problem, solution, looks))
+        about["near"] = _joined(looks, closest_pairs_along(solution.problem, solution, looks))
     smooth = _torque_like(solution, joints)
     told = _told(solution, fractions, times)
     return _shown(name, machine, times, place, q, v, a if smooth else None, moves, told, **about)
@@ -474,7 +474,7 @@ def _near(plan: Plan) -> Near | None:
     looks = np.linspace(0.0, plan.horizon, PAGE_SETTINGS.near)
     found = []
     for suffix, times in looks_of(plan, looks):
-        found += nearest_along(problem, plan.solution, times, suffix)
+        found += closest_pairs_along(problem, plan.solution, times, suffix)
     return _joined(looks, found)
 
 
@@ -482,6 +482,6 @@ def _joined(t: Array, found: Sequence[Any]) -> Near | None:
     if len(found) < len(t):
         return None
     points, distances, asked = (
-        np.array([getattr(one, what) for one in found]) for what in ("points", "distance", "asked")
+        np.array([getattr(one, what) for one in found]) for what in ("points", "distance", "required")
     )
     return Near(t, points, distances, asked, tuple(one.bodies for one in found))

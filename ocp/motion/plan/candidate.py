@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from models.arrays import Array
-from ocp.audit.clearance import Nearest
+from ocp.audit.clearance import ClosestPair
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.local.collisions import Collision
 from ocp.motion.local.rates import LocalMotion
@@ -93,7 +93,7 @@ class Reason:
         return cls(kind, str(error).split("\n")[0], None if name is None else str(name), **given)
 
 
-def collision(near: Collision | Nearest, limit: float, then: str = "") -> Reason:
+def collision(near: Collision | ClosestPair, limit: float, then: str = "") -> Reason:
     """That two bodies come nearer than a limit, m."""
     return Reason(Rejection.COLLISION, str(near), " and ".join(near.bodies), near.distance, limit, near.time, then)
 

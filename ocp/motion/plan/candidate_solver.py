@@ -16,7 +16,7 @@ import numpy as np
 
 from models.arrays import Array
 from ocp.audit.audit import Audit, Finding
-from ocp.audit.clearance import Nearest
+from ocp.audit.clearance import ClosestPair
 from ocp.direct.collocation import Collocation
 from ocp.direct.prepared import Prepared
 from ocp.errors import RefinementWarning, SolveError
@@ -370,7 +370,7 @@ class CandidateSolver(Solver):
             self._clear[time] = clear_postures(self.request, time)
         return self._clear[time]
 
-    def _collision(self, near: Collision | Nearest, then: str = "") -> Reason:
+    def _collision(self, near: Collision | ClosestPair, then: str = "") -> Reason:
         assert self.request.clearance_constraints is not None
         return collision(near, self.request.clearance_constraints.scene.clearance, then)
 

@@ -60,6 +60,6 @@ class WaypointPlan:
         if self.between is not None and self.between.worst is not None:
             near = self.between.worst
             how = "too near" if near.missed else "proven clear, the nearest"
-            apart = f"{near.distance:.4g} m apart, {near.asked:g} m asked, at waypoint {near.time:.4g}"
+            apart = f"{near.distance:.4g} m apart, {near.required:g} m asked, at waypoint {near.time:.4g}"
             lines.append(f"  straight between waypoints {how}: {' and '.join(near.bodies)}, {apart}")
         return "\n".join(lines + [f"  {cost:10.6g}  {why or 'the plan'}" for cost, why in self.ways])

@@ -16,7 +16,7 @@ from numpy.testing import assert_allclose
 
 from models.shapes.hull import gap_along, nearest_directions
 from ocp import Collocation, MultipleShooting, Problem, ProblemError, Solution, solve
-from ocp.audit.clearance import Clearance, ProofSettings, Track, clearance_along, nearest_at
+from ocp.audit.clearance import Clearance, ProofSettings, Track, clearance_along, closest_pairs_along
 from ocp.problem.hulls import Frames, Hull, frames_of
 from ocp.problem.separation import Separation
 
@@ -78,7 +78,7 @@ def test_the_nearest_two_at_a_time() -> None:
     problem = flight([0, 0, 0], [1, 0, 0], {"ball": BALL, **posts}, [[0, 1, -1], [2, 0, 0]], 0.1)
     solution = solve(problem, Collocation(6, 3))  # the second pair is seen from the ball
     for time in (0.0, 0.3, 0.7, 1.0):
-        found, x = nearest_at(problem, solution, time), float(solution.at(time)["q"][0])
+        (found,), x = closest_pairs_along(problem, solution, [time]), float(solution.at(time)["q"][0])
         assert found is not None
         assert set(found.bodies) == {"ball", "post 0" if time < 0.5 else "post 1"}
         assert_allclose(found.distance, np.hypot(x - (0.2 if time < 0.5 else 0.8), 0.3) - 0.15, atol=1e-9)
@@ -89,7 +89,7 @@ def test_the_nearest_two_at_a_time() -> None:
     free.dynamics(q, free.control("u"))
     free.horizon(1.0)
     free.minimize(q**2)
-    assert nearest_at(free, solve(free, Collocation(3, 2)), 0.5) is None
+    assert closest_pairs_along(free, solve(free, Collocation(3, 2)), [0.5]) == []
 
 
 def test_the_pair_that_misses_most_of_what_is_asked_of_it_is_the_worst() -> None:
@@ -224,7 +224,7 @@ def test_what_flies_through_a_hollow_is_as_far_off_as_what_covers_it() -> None:
         assert found.worst.bodies == ("ball", "frame")
         assert_allclose(found.worst.distance, 0.15, atol=1e-9)
         assert found.worst.least == pytest.approx(0.15, abs=1.1e-3)
-        assert found.looked < 2000  # the bound of second order holds for what covers, too
+        assert found.n_intervals < 2000  # the bound of second order holds for what covers, too
         ball, bar = found.worst.points
         assert_allclose(bar, [min(max(ball[0], 0.2), 0.8), np.copysign(0.3, bar[1]), 0.0], atol=1e-9)
 
@@ -374,7 +374,7 @@ def test_the_pieces_of_a_track_do_not_matter(smooth: bool) -> None:
         assert found.settled
         assert found.worst is not None
         assert 1.0 - 0.02 * 0.5 <= found.worst.least <= 1.0 <= found.worst.distance <= 1.01
-        assert found.looked < 3 * max(pieces, 20)
+        assert found.n_intervals < 3 * max(pieces, 20)
 
 
 @pytest.mark.parametrize("pieces", [1, 5, 129, 300, 1001])
@@ -419,7 +419,7 @@ def test_the_unit_of_a_state_does_not_matter(unit: float) -> None:
         assert found.worst is not None
         assert (found.worst.missed > 0) == (asked > 1)
         assert found.worst.least <= 1.0
-        assert found.looked < 60
+        assert found.n_intervals < 60
 
 
 def test_the_least_distance_is_known_to_two_hundredths_and_no_better_than_need_be() -> None:
@@ -430,7 +430,7 @@ def test_the_least_distance_is_known_to_two_hundredths_and_no_better_than_need_b
         for k, each in enumerate(spare):
             worst = swinging(0.2 + 0.04 * k, asked=-each).worst
             assert worst is not None
-            shares.append((worst.distance - worst.least) / abs(worst.distance - worst.asked))
+            shares.append((worst.distance - worst.least) / abs(worst.distance - worst.required))
         assert 0.01 < max(shares) <= 0.02 + 1e-9
     worst = swinging(0.3137, asked=1e-5).worst
     assert worst is not None
@@ -442,7 +442,7 @@ def test_what_would_take_too_long_is_not_proven() -> None:
     assert swinging(0.3137, asked=-1e-5).settled
     short = swinging(0.3137, asked=-1e-5, settings=ProofSettings(most_intervals=12))
     assert not short.settled
-    assert short.looked <= 12
+    assert short.n_intervals <= 12
     assert short.worst is not None
     assert short.worst.least <= 1.0
     assert short.worst.missed > 0

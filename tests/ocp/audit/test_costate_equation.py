@@ -94,8 +94,8 @@ def test_the_integrated_costates_are_the_closed_form() -> None:
     assert adjoint.between == pytest.approx(0, abs=1e-8)
     assert adjoint.ends.transversality == pytest.approx(0, abs=1e-8)
     assert adjoint.ends.horizon == 0
-    assert not adjoint.holding.any()
-    assert not adjoint.standing.any()
+    assert not adjoint.control_multipliers.any()
+    assert not adjoint.state_multipliers.any()
 
 
 @every_method
@@ -247,7 +247,7 @@ def test_the_costate_equation_is_looked_at_beside_path_constraints(upper: float)
     audit = plan.audit()
     assert audit.passed, str(audit)
     adjoint = audit.optimality.adjoint
-    pushes = adjoint.standing[:, -1]  # of the corridor, after those of the bounds of both states
+    pushes = adjoint.state_multipliers[:, -1]  # of the corridor, after those of the bounds of both states
     assert (pushes >= 0).all()
     assert pushes.any() == (upper < 1.5)
     np.testing.assert_allclose(adjoint.costate[:, 1], -plan.control_interpolant(audit.optimality.t)[:, 0], atol=0.02)

@@ -17,7 +17,7 @@ from ocp.audit.accessory import AccessoryProblem
 from ocp.audit.costates import adjoint
 from ocp.audit.curvature import Curvature, curvature
 from ocp.audit.linearisation import Linearisation
-from ocp.audit.principle import balance, inverses
+from ocp.audit.principle import balance, pseudo_inverses
 from ocp.audit.sizes import sizes
 from ocp.problem.formulation import Formulation
 from tests.ocp.audit.drawn import drawn
@@ -82,10 +82,10 @@ def reduced_hessian(problem: Problem) -> np.ndarray:
     """Eigenvalues of the program's Hessian along its equalities and active bounds, densely: an independent answer."""
     built = Collocation(intervals=8, degree=3).prepare(problem)
     solution = built.solve()
-    v, fragment, program = solution.variables, built.fragment, built.program
+    v, transcription, program = solution.variables, built.transcription, built.program
     hessian = np.array(ca.triu2symm(program.hessian(v, [], 1.0, solution.multipliers)).full())
     low, high = built.formulation.bound_values(np.zeros(0))
-    rows, columns = (low == high)[fragment.row_bounds], (low == high)[fragment.variable_bounds]
+    rows, columns = (low == high)[transcription.row_bounds], (low == high)[transcription.variable_bounds]
     active = np.vstack([np.array(program.jacobian(v, [])[1].full())[rows], np.eye(len(v))[columns]])
     _, sizes, directions = np.linalg.svd(active)
     basis = directions[int((sizes > 1e-10 * sizes[0]).sum()) :].T
@@ -246,7 +246,7 @@ def test_multipliers_have_the_sign_of_the_bound_that_they_hold() -> None:
     lower = np.array([[False, False], [True, True], [True, True]])
     upper = np.array([[True, True], [False, False], [True, True]])
     expected = [[2.0, 0.0], [0.0, -3.0], [2.0, -3.0]]  # an upper bound pushes back only
-    np.testing.assert_allclose(balance(gradient, eye, lower, upper, inverses(eye, lower | upper)), expected)
+    np.testing.assert_allclose(balance(gradient, eye, lower, upper, pseudo_inverses(eye, lower | upper)), expected)
 
 
 def test_multipliers_leave_the_least_that_their_signs_allow() -> None:
@@ -254,7 +254,7 @@ def test_multipliers_leave_the_least_that_their_signs_allow() -> None:
     rng = np.random.default_rng(5)
     gradient, rows = rng.normal(size=(200, 3)), rng.normal(size=(200, 2, 3))
     upper = rng.random((200, 2)) < 0.7
-    found = balance(gradient, rows, np.zeros_like(upper), upper, inverses(rows, upper))
+    found = balance(gradient, rows, np.zeros_like(upper), upper, pseudo_inverses(rows, upper))
     assert (found >= 0).all()
     assert (found[~upper] == 0).all()
     for k in range(200):

@@ -117,7 +117,7 @@ def test_units_change_nothing(declare: str, unit: float, second: float) -> None:
 def test_multipliers_push_their_own_way_and_only_where_a_limit_is_near() -> None:
     plan = solve(told("speed limit"), METHODS["radau"])
     found = fitted(plan).adjoint
-    speed = found.standing[:, 1]
+    speed = found.state_multipliers[:, 1]
     assert speed.min() >= -1e-6
     at_limit = plan.state_interpolant(np.repeat(0.5, 1))[0, 1] > 1.2 - 1e-6
     assert at_limit

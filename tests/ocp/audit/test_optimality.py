@@ -52,7 +52,7 @@ def test_what_is_lost_is_what_it_costs_more(size: float) -> None:
     plan, excess = swerved(size)
     found = looked_at(plan)
     assert found.lost.sum() == pytest.approx(excess, rel=1e-6)
-    assert found.known_to == pytest.approx(np.sqrt(excess / (6 + excess)), rel=1e-6)
+    assert found.costate_accuracy == pytest.approx(np.sqrt(excess / (6 + excess)), rel=1e-6)
 
 
 def test_units_of_the_cost_scale_what_is_lost_and_change_no_share() -> None:
@@ -67,7 +67,7 @@ def test_units_of_the_cost_scale_what_is_lost_and_change_no_share() -> None:
     assert one.lost.sum() > 1e-6
     np.testing.assert_allclose(other.lost, 1e3 * one.lost, rtol=1e-3, atol=1e-9)
     assert other.cost_size == pytest.approx(1e3 * one.cost_size)
-    assert other.known_to == pytest.approx(one.known_to, rel=1e-3)
+    assert other.costate_accuracy == pytest.approx(one.costate_accuracy, rel=1e-3)
 
 
 @pytest.mark.parametrize(("horizon", "least"), [(3.0, True), (3.3, False)])

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from ocp import Collocation, MultipleShooting, Problem, Solution, solve
-from ocp.audit.correction import corrected
+from ocp.audit.correction import corrected_motion
 from ocp.audit.linearisation import Linearisation
-from ocp.audit.reintegration import Reintegration, integrated, reintegrate
+from ocp.audit.reintegration import Reintegration, integrated_motion, reintegrate
 from ocp.audit.sizes import FineGrid, fine_grid, sizes
 from ocp.problem.formulation import Formulation
 from tests.ocp.audit.drawn import drawn, of
@@ -69,13 +69,13 @@ def test_states_are_those_of_the_closed_form(rate: Any, exact: Callable[[Array],
     problem, plan = driven(rate, control=1.0)
     found = again(problem, plan)
     np.testing.assert_allclose(found.states[:, 0], exact(found.t), atol=1e-9)
-    assert found.broke_down is None
+    assert found.breakdown_time is None
 
 
 def test_a_motion_that_leaves_for_infinity_breaks_down_where_it_does() -> None:
     problem, plan = driven(lambda x, u, t: 1 + (2 * x) ** 2)  # x = tan(2 t) / 2
     found = again(problem, plan)
-    assert found.broke_down == pytest.approx(np.pi / 4, abs=4e-3)
+    assert found.breakdown_time == pytest.approx(np.pi / 4, abs=4e-3)
     assert np.isfinite(found.states[found.t < np.pi / 4 - 4e-3]).all()
     assert not plan.audit().feasible
 
@@ -106,7 +106,7 @@ def test_the_running_cost_is_integrated_along(method: str) -> None:
 @every_method
 def test_corrections_of_a_plan_lead_where_its_integration_does(method: str) -> None:
     along, grid = linearised(van_der_pol(), solve(van_der_pol(), METHODS[method]))
-    near, exact = corrected(along, grid), integrated(along, grid)
+    near, exact = corrected_motion(along, grid), integrated_motion(along, grid)
     assert near is not None
     for name in ("local", "states"):
         np.testing.assert_allclose(getattr(near, name), getattr(exact, name), rtol=0, atol=2e-10)
@@ -120,7 +120,7 @@ def test_a_wrong_plan_is_corrected_or_left_to_the_integration(share: float) -> N
     curve = plan.control_interpolant
     wrong = replace(plan, control_interpolant=replace(curve, values=(1 + share) * curve.values))
     along, grid = linearised(van_der_pol(), wrong)
-    exact, found = integrated(along, grid), again(van_der_pol(), wrong)
+    exact, found = integrated_motion(along, grid), again(van_der_pol(), wrong)
     np.testing.assert_allclose(found.states, exact.states.reshape(found.states.shape), rtol=0, atol=2e-10)
     np.testing.assert_allclose(found.local, exact.local.reshape(found.local.shape), rtol=0, atol=2e-10)
     assert found.cost == pytest.approx(exact.cost, rel=1e-9)
@@ -131,7 +131,7 @@ def test_jumps_of_the_plan_are_carried_on_by_its_dynamics() -> None:
     curve = plan.state_interpolant
     values = curve.values + 1e-4 * np.sin(np.arange(20))[:, None, None]
     along, grid = linearised(van_der_pol(), replace(plan, state_interpolant=replace(curve, values=values)))
-    near, exact = corrected(along, grid), integrated(along, grid)
+    near, exact = corrected_motion(along, grid), integrated_motion(along, grid)
     assert near is not None
     np.testing.assert_allclose(near.states, exact.states, rtol=0, atol=2e-10)
     np.testing.assert_allclose(near.local, exact.local, rtol=0, atol=2e-10)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ocp import Collocation, MultipleShooting, Problem, ProblemError, prepare
-from ocp.direct.guess import later
+from ocp.direct.guess import shifted_indices
 from ocp.direct.prepared import Prepared
 from tests.ocp.problems import FINE, MOVED, SOLVERS, Method, moved, relative, van_der_pol
 
@@ -223,13 +223,13 @@ def test_a_horizon_that_recedes_goes_on_from_the_plan_moved_on(method: Method) -
 @pytest.mark.parametrize("method", FINE)
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_what_is_later_stands_for_the_same_so_many_intervals_later(method: str, solver: str) -> None:
-    fragment = ready(van_der_pol(), FINE[method], solver).fragment
-    n = len(fragment.mesh) - 1
-    of_x, of_g = later(fragment, 3)
-    labels = np.array(fragment.row_labels)
+    transcription = ready(van_der_pol(), FINE[method], solver).transcription
+    n = len(transcription.mesh) - 1
+    of_x, of_g = shifted_indices(transcription, 3)
+    labels = np.array(transcription.row_labels)
     for index, fractions, meanings in (
-        (of_x, fragment.variable_fraction, (fragment.variable_role, fragment.variable_entry)),
-        (of_g, fragment.row_fractions, (labels,)),
+        (of_x, transcription.variable_fraction, (transcription.variable_role, transcription.variable_entry)),
+        (of_g, transcription.row_fractions, (labels,)),
     ):
         for meaning in meanings:
             assert np.array_equal(meaning[index], meaning)

@@ -162,19 +162,19 @@ def test_collocation_rows_are_the_textbook_equations(scheme: str, control: str) 
     horizon = problem.horizon(lower=0.1, upper=9.0)
     problem.dynamics(x, ca.vertcat(x[1] * ca.cos(u) + problem.time, p * x[0] - u**2 / horizon))
     problem.minimize(running=x[0] ** 2 + u * problem.time, terminal=horizon * x[1])
-    fragment = Collocation(2, degree, scheme, control, tuple(mesh.tolist())).transcribe(Formulation(problem))
+    transcription = Collocation(2, degree, scheme, control, tuple(mesh.tolist())).transcribe(Formulation(problem))
     rng = np.random.default_rng(7)
-    values, parameter = rng.normal(size=fragment.size), 0.7
-    assert fragment.horizon is not None
-    total = float(values[fragment.horizon])
-    cost, rows = (np.asarray(v.full()).ravel() for v in assemble(fragment, 1).values(values, [parameter]))
+    values, parameter = rng.normal(size=transcription.size), 0.7
+    assert transcription.horizon is not None
+    total = float(values[transcription.horizon])
+    cost, rows = (np.asarray(v.full()).ravel() for v in assemble(transcription, 1).values(values, [parameter]))
 
-    states, controls = fragment.interpolants(values, np.array([parameter]), total)
+    states, controls = transcription.interpolants(values, np.array([parameter]), total)
     points = np.array(ca.collocation_points(degree, scheme))
     nodes = np.concatenate([[0.0], points])
     gauss, weight = np.polynomial.legendre.leggauss(degree)
     weights = 0.5 * weight @ lagrange(points, 0.5 * (gauss + 1))
-    expected_cost, equations, joints = total * values[fragment.end[1]], [], []
+    expected_cost, equations, joints = total * values[transcription.end[1]], [], []
     for k, h in enumerate(np.diff(mesh)):
         y = states.values[k]
         w = controls.values[k, :, 0] if control == "points" else np.repeat(controls.values[k, 0, 0], degree)
@@ -182,8 +182,8 @@ def test_collocation_rows_are_the_textbook_equations(scheme: str, control: str) 
         rate = np.column_stack([y[1:, 1] * np.cos(w) + t, parameter * y[1:, 0] - w**2 / total])
         equations.append(differentiation_matrix(nodes)[1:] @ y - h * total * rate)
         expected_cost += h * total * weights @ (y[1:, 0] ** 2 + w * t)
-        joints.append(values[fragment.nodes[:, k + 1]] - lagrange(nodes, np.array([1.0]))[0] @ y)
-    labels = np.array([label.split()[0] for label in fragment.row_labels])
+        joints.append(values[transcription.nodes[:, k + 1]] - lagrange(nodes, np.array([1.0]))[0] @ y)
+    labels = np.array([label.split()[0] for label in transcription.row_labels])
     np.testing.assert_allclose(rows[labels == "dynamics"], np.ravel(equations), atol=1e-12)
     np.testing.assert_allclose(rows[labels == "continuity"], np.ravel(joints)[: 4 * (scheme == "legendre")], atol=1e-12)
     assert cost[0] == pytest.approx(expected_cost, rel=1e-12)

@@ -151,8 +151,8 @@ def slope(solution: Solution, mesh: Array, points: Array) -> Array:
 
 def imposed(method: Any, label: str, problem: Problem, *, staged: bool = False) -> Array:
     """Fractions of the horizon at which a constraint has a row, sorted."""
-    fragment = method.transcribe(Formulation(problem), staged=staged)
-    at = [s for name, s in zip(fragment.row_labels, fragment.row_fractions, strict=True) if name == label]
+    transcription = method.transcribe(Formulation(problem), staged=staged)
+    at = [s for name, s in zip(transcription.row_labels, transcription.row_fractions, strict=True) if name == label]
     return np.sort(np.array(at))
 
 

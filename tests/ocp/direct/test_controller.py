@@ -79,8 +79,8 @@ def test_the_program_tells_the_plan_and_its_functions_are_those_solved_with(case
         for ours, theirs in zip(made_of(name, *given), function.call([ca.DM(each) for each in given]), strict=True):
             np.testing.assert_array_equal(ours, theirs.full())
     lower, upper = prepared.formulation.bound_values(p)
-    fragment = prepared.fragment
-    expected = [side[at] for at in (fragment.variable_bounds, fragment.row_bounds) for side in (lower, upper)]
+    transcription = prepared.transcription
+    expected = [side[at] for at in (transcription.variable_bounds, transcription.row_bounds) for side in (lower, upper)]
     for ours, theirs in zip(made_of("bounds", p), expected, strict=True):
         np.testing.assert_array_equal(ours.ravel(), theirs)
 

@@ -33,14 +33,14 @@ def free_time(guess: float | None = None) -> Problem:
 def start(problem: Problem, method: Method, guess: Any, *, staged: bool = False) -> tuple[Any, Array]:
     """The fragment and the values that the solver starts from."""
     form = Formulation(problem)
-    fragment = method.transcribe(form, staged=staged)
-    return fragment, initial_point(form, fragment, guess, form.bound_values(np.zeros(form.np)))
+    transcription = method.transcribe(form, staged=staged)
+    return transcription, initial_point(form, transcription, guess, form.bound_values(np.zeros(form.np)))
 
 
-def entries(fragment: Any, point: Array, role: str, entry: int) -> tuple[Array, Array]:
+def entries(transcription: Any, point: Array, role: str, entry: int) -> tuple[Array, Array]:
     """Fractions and values of one entry of the states or controls."""
-    mine = (fragment.variable_role == role) & (fragment.variable_entry == entry)
-    return fragment.variable_fraction[mine], point[mine]
+    mine = (transcription.variable_role == role) & (transcription.variable_entry == entry)
+    return transcription.variable_fraction[mine], point[mine]
 
 
 # ---- what a guess means -----------------------------------------------------------------------------------------
@@ -54,16 +54,16 @@ def test_functions_of_time_are_read_at_every_variable(
     method: str, staged: bool, horizon: float, level: float, slope: float
 ) -> None:
     guess = {"x": lambda t: [level + slope * t, t**2], "u": lambda t: np.sin(t), "horizon": horizon}
-    fragment, point = start(free_time(), METHODS[method], guess, staged=staged)
+    transcription, point = start(free_time(), METHODS[method], guess, staged=staged)
     for role, entry, curve in (
         ("state", 0, lambda t: level + slope * t),
         ("state", 1, lambda t: t**2),
         ("control", 0, np.sin),
     ):
-        s, values = entries(fragment, point, role, entry)
+        s, values = entries(transcription, point, role, entry)
         np.testing.assert_allclose(values, curve(s * horizon), atol=1e-12)
-    assert np.all(point[fragment.variable_role == "horizon"] == horizon)
-    assert set(fragment.variable_role) == {"state", "control", "horizon"}  # nothing is left to chance
+    assert np.all(point[transcription.variable_role == "horizon"] == horizon)
+    assert set(transcription.variable_role) == {"state", "control", "horizon"}  # nothing is left to chance
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -71,41 +71,41 @@ def test_samples_are_interpolated_over_their_times(method: str) -> None:
     t = np.array([0.0, 0.3, 1.1, 2.0])
     samples = np.column_stack([np.cos(t), t])
     guess = {"t": t, "x": samples, "u": np.array([[1.0], [2.0], [0.0], [1.0]]), "horizon": 2.0}
-    fragment, point = start(free_time(), METHODS[method], guess)
+    transcription, point = start(free_time(), METHODS[method], guess)
     for role, entry, column in (("state", 0, samples[:, 0]), ("state", 1, t), ("control", 0, [1.0, 2.0, 0.0, 1.0])):
-        s, values = entries(fragment, point, role, entry)
+        s, values = entries(transcription, point, role, entry)
         np.testing.assert_allclose(values, np.interp(2.0 * s, t, column), atol=1e-12)
 
 
 def test_samples_without_times_are_spread_over_the_horizon() -> None:
-    fragment, point = start(free_time(), Collocation(3), {"x": np.array([[0.0, 1.0], [2.0, 3.0], [8.0, 5.0]])})
-    s, values = entries(fragment, point, "state", 0)
+    transcription, point = start(free_time(), Collocation(3), {"x": np.array([[0.0, 1.0], [2.0, 3.0], [8.0, 5.0]])})
+    s, values = entries(transcription, point, "state", 0)
     np.testing.assert_allclose(values, np.interp(s, [0.0, 0.5, 1.0], [0.0, 2.0, 8.0]), atol=1e-12)
 
 
 @pytest.mark.parametrize("value", [[2.0, 3.0], np.array([2.0, 3.0]), np.array([[2.0], [3.0]]), ca.DM([2, 3])])
 def test_values_of_every_kind_are_held(value: Any) -> None:
-    fragment, point = start(free_time(), Collocation(3), {"x": value})
+    transcription, point = start(free_time(), Collocation(3), {"x": value})
     for entry, expected in ((0, 2.0), (1, 3.0)):
-        assert np.all(entries(fragment, point, "state", entry)[1] == expected)
+        assert np.all(entries(transcription, point, "state", entry)[1] == expected)
 
 
 def test_what_is_not_guessed_is_a_line_between_the_ends_or_the_middle_of_the_bounds() -> None:
-    fragment, point = start(free_time(guess=3.0), Collocation(4), None)
-    s, values = entries(fragment, point, "state", 0)
+    transcription, point = start(free_time(guess=3.0), Collocation(4), None)
+    s, values = entries(transcription, point, "state", 0)
     np.testing.assert_allclose(values, s, atol=1e-14)
-    assert np.all(entries(fragment, point, "control", 0)[1] == 1.0)
-    assert point[fragment.horizon] == 3.0
+    assert np.all(entries(transcription, point, "control", 0)[1] == 1.0)
+    assert point[transcription.horizon] == 3.0
 
 
 def test_the_guess_of_the_call_comes_before_the_declared_one() -> None:
     problem = free_time()
     problem.state("z", guess=7.0)
     problem.dynamics("z", 0.0)
-    fragment, point = start(problem, Collocation(2), None)
-    assert np.all(entries(fragment, point, "state", 2)[1] == 7.0)
-    fragment, point = start(problem, Collocation(2), {"z": -1.0, "u": None})
-    assert np.all(entries(fragment, point, "state", 2)[1] == -1.0)
+    transcription, point = start(problem, Collocation(2), None)
+    assert np.all(entries(transcription, point, "state", 2)[1] == 7.0)
+    transcription, point = start(problem, Collocation(2), {"z": -1.0, "u": None})
+    assert np.all(entries(transcription, point, "state", 2)[1] == -1.0)
 
 
 @pytest.mark.parametrize(
@@ -113,8 +113,8 @@ def test_the_guess_of_the_call_comes_before_the_declared_one() -> None:
 )
 def test_bounded_variables_start_inside_their_bounds(lower: Any, upper: Any, expected: float) -> None:
     problem = van_der_pol(lower=lower, upper=upper)
-    fragment, point = start(problem, Collocation(2), None)
-    assert np.all(entries(fragment, point, "control", 0)[1] == expected)
+    transcription, point = start(problem, Collocation(2), None)
+    assert np.all(entries(transcription, point, "control", 0)[1] == expected)
 
 
 # ---- earlier solutions ------------------------------------------------------------------------------------------
@@ -139,21 +139,21 @@ def test_a_solution_of_any_method_is_a_guess_for_any_other(first: str, second: s
 @pytest.mark.parametrize("method", METHODS)
 def test_a_solution_is_its_own_best_guess(method: str) -> None:
     solution = solve(free_time(), METHODS[method], options={"max_iter": 60})
-    fragment, point = start(free_time(), METHODS[method], solution)
-    np.testing.assert_allclose(point[fragment.nodes], solution.variables[fragment.nodes], atol=1e-9)
+    transcription, point = start(free_time(), METHODS[method], solution)
+    np.testing.assert_allclose(point[transcription.nodes], solution.variables[transcription.nodes], atol=1e-9)
     again = solve(free_time(), METHODS[method], guess=solution)
     assert again.cost == pytest.approx(solution.cost, abs=1e-8)
 
 
 def test_a_solution_is_stretched_over_another_horizon_and_started_from_its_own() -> None:
     solution = solve(van_der_pol(horizon=2.0), Collocation(10))
-    fragment, point = start(van_der_pol(horizon=3.0), MultipleShooting(5), solution)
-    s, values = entries(fragment, point, "state", 0)
+    transcription, point = start(van_der_pol(horizon=3.0), MultipleShooting(5), solution)
+    s, values = entries(transcription, point, "state", 0)
     np.testing.assert_allclose(values, solution.at(2.0 * s)["x"][:, 0], atol=1e-12)
 
     free = solve(free_time(), Collocation(6))
-    fragment, point = start(free_time(guess=7.0), Collocation(3), free)
-    assert point[fragment.horizon] == pytest.approx(free.horizon)
+    transcription, point = start(free_time(guess=7.0), Collocation(3), free)
+    assert point[transcription.horizon] == pytest.approx(free.horizon)
 
 
 def test_a_solution_of_another_problem_gives_what_it_shares() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ocp import Collocation, MultipleShooting, Problem, SolveError, solve
-from ocp.direct.scaling import self_running
+from ocp.direct.scaling import uncontrolled_states
 from ocp.problem.formulation import Formulation
 
 METHODS: dict[str, Any] = {
@@ -75,4 +75,4 @@ def test_states_that_run_by_themselves_are_those_that_no_control_reaches() -> No
     for state, rate in zip((a, b, c, d, e), rates, strict=True):
         problem.dynamics(state, rate)
     problem.horizon(1.0)
-    np.testing.assert_array_equal(self_running(Formulation(problem)), [True, True, False, False, False])
+    np.testing.assert_array_equal(uncontrolled_states(Formulation(problem)), [True, True, False, False, False])

@@ -13,7 +13,7 @@ from ocp import Collocation, MultipleShooting, Problem, SolveError, prepare, sol
 from ocp.direct.active_set import conditions
 from ocp.direct.nlp import Outcome
 from ocp.direct.prepared import Prepared
-from ocp.direct.scaling import unscaled
+from ocp.direct.scaling import unit_scales
 from tests.ocp.direct.test_nlp import obstacle, soft_lander
 from tests.ocp.problems import FINE, MOVED, SOLVERS, SWING, energy, moved, relative, swing, van_der_pol
 
@@ -35,15 +35,15 @@ def test_what_is_found_is_stationary_and_feasible_in_the_program(name: str, meth
     prepared = prepare(problem(), FINE[method])
     assert isinstance(prepared, Prepared)
     plan = prepared.solve(parameters)
-    form, fragment = prepared.formulation, prepared.fragment
+    form, transcription = prepared.formulation, prepared.transcription
     p = form.parameter_vector(parameters)
     low, high = form.bound_values(p)
     arguments = {"p": p}
-    for kind, index in (("x", fragment.variable_bounds), ("g", fragment.row_bounds)):
+    for kind, index in (("x", transcription.variable_bounds), ("g", transcription.row_bounds)):
         arguments |= {f"lb{kind}": low[index], f"ub{kind}": high[index]}
     rows = np.asarray(prepared.program.values(plan.variables, p)[1].full()).ravel()
     outcome = Outcome(plan.variables, plan.cost, rows, plan.multipliers, plan.status, "", 0, 0.0)
-    at = conditions(prepared.program, outcome, arguments, unscaled(fragment))
+    at = conditions(prepared.program, outcome, arguments, unit_scales(transcription))
     for value, push, lower, upper in (
         (plan.variables, at.of_bounds, arguments["lbx"], arguments["ubx"]),
         (rows, at.of_rows, arguments["lbg"], arguments["ubg"]),

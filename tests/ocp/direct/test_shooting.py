@@ -115,13 +115,13 @@ def test_continuity_rows_are_runge_kutta_steps(
     mesh = np.concatenate([[0.0], np.sort(rng.uniform(0.05, 0.95, intervals - 1)), [1.0]])
     method = MultipleShooting(intervals, steps=steps, control=control, mesh=tuple(mesh.tolist()))
     form = Formulation(problem)
-    fragment = method.transcribe(form)
-    values, parameter = rng.normal(size=fragment.size), rng.normal()
-    total = float(values[fragment.horizon]) if fragment.horizon is not None else width
-    cost, rows = (np.asarray(v.full()).ravel() for v in assemble(fragment, 1).values(values, [parameter]))
+    transcription = method.transcribe(form)
+    values, parameter = rng.normal(size=transcription.size), rng.normal()
+    total = float(values[transcription.horizon]) if transcription.horizon is not None else width
+    cost, rows = (np.asarray(v.full()).ravel() for v in assemble(transcription, 1).values(values, [parameter]))
 
-    states = values[fragment.nodes].T  # (N + 1, 2)
-    role, at = fragment.variable_role, fragment.variable_fraction
+    states = values[transcription.nodes].T  # (N + 1, 2)
+    role, at = transcription.variable_role, transcription.variable_fraction
     controls = values[role == "control"].reshape(-1, 2)
     assert list(at[role == "control"]) == sorted(at[role == "control"])
 
@@ -134,7 +134,7 @@ def test_continuity_rows_are_runge_kutta_steps(
         end, part = runge_kutta(rate, states[k], ends, mesh[k] * total, (mesh[k + 1] - mesh[k]) * total, steps)
         expected_cost += part
         expected.append(states[k + 1] - end)
-    continuity = [label.startswith("continuity") for label in fragment.row_labels]
+    continuity = [label.startswith("continuity") for label in transcription.row_labels]
     np.testing.assert_allclose(rows[continuity], np.ravel(expected), rtol=1e-9, atol=1e-9)
     assert cost[0] == pytest.approx(expected_cost, rel=1e-9, abs=1e-9)
 

@@ -107,12 +107,12 @@ def test_a_roll_out_obeys_the_dynamics(method: str) -> None:
     problem, x, u = plant("relaxing", initial=0.0, u={"guess": 1.0}, horizon=0.5)
     problem.dynamics(x, u - x)
     built = EVERY_METHOD[method].prepare(problem)
-    fragment = built.fragment
-    point = np.where(fragment.variable_role == "control", 1.0, 0.3)
-    point[fragment.start] = 0.0
-    rolled = roll_out(built.formulation, fragment, point, np.zeros(0))
-    state = fragment.variable_role == "state"
-    np.testing.assert_allclose(rolled[state], 1 - np.exp(-0.5 * fragment.variable_fraction[state]), atol=2e-5)
+    transcription = built.transcription
+    point = np.where(transcription.variable_role == "control", 1.0, 0.3)
+    point[transcription.start] = 0.0
+    rolled = roll_out(built.formulation, transcription, point, np.zeros(0))
+    state = transcription.variable_role == "state"
+    np.testing.assert_allclose(rolled[state], 1 - np.exp(-0.5 * transcription.variable_fraction[state]), atol=2e-5)
     np.testing.assert_array_equal(rolled[~state], point[~state])
 
 
@@ -120,5 +120,5 @@ def test_a_roll_out_that_breaks_down_stands_still_from_there() -> None:
     problem, x, u = plant("blow-up", initial=1.0, horizon=60.0)
     problem.dynamics(x, x**3 + u)
     built = Collocation(30).prepare(problem)
-    rolled = roll_out(built.formulation, built.fragment, np.ones(built.fragment.size), np.zeros(0))
+    rolled = roll_out(built.formulation, built.transcription, np.ones(built.transcription.size), np.zeros(0))
     assert np.isfinite(rolled).all()

@@ -534,4 +534,4 @@ def test_a_plan_that_nothing_determines_is_an_extremal_with_a_word() -> None:
     problem.minimize(running=u**2 / 2)
     solution = solve(problem, Indirect())
     assert solution.cost == pytest.approx(0, abs=1e-12)
-    assert "not determined" in solution.message
+    assert "not unique" in solution.message

@@ -376,11 +376,11 @@ def test_what_cannot_be_joined_is_named() -> None:
         "has 3 entries": lambda: apart.join("first", "wide", {"x": [1.0, 2.0, 3.0]}),
         "phases itself": lambda: Phases("twice", {"all": phases}),
         "without a dot": lambda: Phases("dot", {"a.b": regulator(1.0)}),
-        "are expected": lambda: Phases("none", {}),
+        "must not be empty": lambda: Phases("none", {}),
         "a Problem is expected": lambda: Phases("no problem", {"a": 1}),  # type: ignore[dict-item]
         "has no horizon": lambda: Phases("half", {"a": _half()}),
         "in one phase, 3 in another": lambda: Phases("sizes", {"a": other, "b": another}),
-        "need a horizon that is a number": lambda: Phases("signals", {"a": signalled}),
+        "needs a horizon that is a number": lambda: Phases("signals", {"a": signalled}),
         "belongs to the problem of a phase": lambda: phases.minimize(running=second.at_end("x")),
     }
     for words, call in refused.items():

@@ -17,9 +17,19 @@ from unittest.mock import patch
 import numpy as np
 from PIL import Image
 
+from scripts.papers.reproduced import READERS, committed, read_tables
 from scripts.papers.run import Paper
 
-__all__ = ["Run", "Sample", "Summary", "Table", "assert_whole_picture", "column", "run_script"]
+__all__ = [
+    "Run",
+    "Sample",
+    "Summary",
+    "Table",
+    "assert_committed_numbers",
+    "assert_whole_picture",
+    "column",
+    "run_script",
+]
 
 Results = TypeVar("Results")
 Table: TypeAlias = list[dict[str, str]]
@@ -51,6 +61,12 @@ class Run(Generic[Results]):
         """Of the files that were written, but for what lies beside each picture: the SVG and the caption."""
         beside = (".svg", ".caption.txt")
         return {path.name for path in self.folder.iterdir() if not path.name.endswith(beside)}
+
+
+def assert_committed_numbers(paper: str, summary: Summary) -> None:
+    """The numbers in the repository's table of a paper are those of this run."""
+    results = Path(__file__).resolve().parents[3] / "results"
+    assert committed(list(READERS[paper](summary))) == read_tables(results)[paper]
 
 
 def run_script(paper: Paper[Results], out: Path, sample: Sample) -> Run[Results]:

@@ -23,7 +23,7 @@ from scripts.papers.blend.example import (
     example,
 )
 from scripts.papers.blend.results import Results
-from tests.scripts.papers.script_run import Run, Summary, assert_whole_picture
+from tests.scripts.papers.script_run import Run, Summary, assert_committed_numbers, assert_whole_picture
 
 PAPER = blend.PAPER
 pytestmark = pytest.mark.xdist_group("blend")
@@ -292,3 +292,8 @@ def test_the_examples_time_depends_on_its_length_alone() -> None:
     straight = smooth(TaskPath.through([(0, 0, 0), (1.6688250069032047, 0, 0)]), REMAINING)
     acceleration = 5.857864376269049  # 200 (0.2 - sqrt(0.2^2 - 4/200)) / 2: ramp of 0.2 s at 200 m/s^3 to 1 m/s
     assert schedule(straight, LineLimits(SPEED, acceleration, JERK)).duration == pytest.approx(1.868825, abs=1e-6)
+
+
+@pytest.mark.long
+def test_the_committed_numbers_are_those_of_the_run(summary: Summary) -> None:
+    assert_committed_numbers("blend", summary)

@@ -18,7 +18,7 @@ from models.cts.table import export, rig_functions
 from scripts import cts
 from scripts.papers.cts.results import Results
 from tests.models.cts.cts_oracle import random_targets
-from tests.scripts.papers.script_run import Run, Summary, assert_whole_picture
+from tests.scripts.papers.script_run import Run, Summary, assert_committed_numbers, assert_whole_picture
 
 PAPER = cts.PAPER
 pytestmark = pytest.mark.xdist_group("cts")  # one process, so that the script runs once
@@ -134,3 +134,8 @@ def test_export_refuses_what_is_no_c_file(tmp_path: Path, functions: dict[str, A
         export(functions, tmp_path / "rig.cpp")
     with pytest.raises(ModelError, match="no function"):
         export([], tmp_path / "rig.c")
+
+
+@pytest.mark.long
+def test_the_committed_numbers_are_those_of_the_run(summary: Summary) -> None:
+    assert_committed_numbers("cts", summary)

@@ -18,7 +18,7 @@ from scripts.papers.free_floating.false_optima import FALSE, Trial
 from scripts.papers.free_floating.formulations import ROWS, START_JOINTS, TIP_VELOCITY, problem
 from scripts.papers.free_floating.motion import laws, momentum, motion_of_local, total_center_of_mass
 from scripts.papers.free_floating.results import Results
-from tests.scripts.papers.script_run import Run, assert_whole_picture, column
+from tests.scripts.papers.script_run import Run, Summary, assert_committed_numbers, assert_whole_picture, column
 
 PAPER = free_floating.PAPER
 pytestmark = [pytest.mark.xdist_group("free_floating"), pytest.mark.long]  # one process, so that the script runs once
@@ -348,3 +348,8 @@ def test_animation_shows_the_whole_motion_in_real_time(run: Run[Results]) -> Non
             seen.add(animation.convert("RGB").tobytes())
     assert len(seen) == frames == 101
     assert seconds == pytest.approx(5.0, abs=1.1)  # and a moment at the end
+
+
+@pytest.mark.long
+def test_the_committed_numbers_are_those_of_the_run(summary: Summary) -> None:
+    assert_committed_numbers("free_floating", summary)

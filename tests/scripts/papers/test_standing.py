@@ -24,7 +24,7 @@ from scripts.papers.standing.plans import FINER, HELD, PLANS, Plan, fine_motion,
 from scripts.papers.standing.printed import printed_law
 from scripts.papers.standing.results import Results
 from scripts.papers.standing.tables import CAVEATS, sound
-from tests.scripts.papers.script_run import Run, Summary, assert_whole_picture
+from tests.scripts.papers.script_run import Run, Summary, assert_committed_numbers, assert_whole_picture
 
 PAPER = standing.PAPER
 CONVERGING = (("table1", "optimal_range"), ("table2", "optimal_spring"), ("minimum_time", "in_foot"))
@@ -401,3 +401,8 @@ def test_animations_show_the_whole_motion_and_mark_where_it_fails(
             orange.append(int(((pixels[..., 0] > 150) & (pixels[..., 1] < 130) & (pixels[..., 2] < 90)).sum()))
     assert lasting == pytest.approx(seconds, abs=0.3)
     assert orange[-1] > orange[0] + 300  # the arm of a motion that has failed
+
+
+@pytest.mark.long
+def test_the_committed_numbers_are_those_of_the_run(summary: Summary) -> None:
+    assert_committed_numbers("standing", summary)

@@ -27,7 +27,7 @@ from models import (
 )
 from ocp import ClearanceConstraints, Collocation, Problem, ProblemError, SolveError, solve
 from ocp.audit.audit import Finding
-from ocp.audit.clearance import Clearance, Nearest
+from ocp.audit.clearance import Clearance, ClosestPair
 from ocp.motion.builders.clearance import LOOKS, MARGIN, ROUNDING, clearance_of, collision_error, solve_with_clearance
 from ocp.motion.local.collisions import distances_along
 from ocp.problem.values import constant
@@ -44,8 +44,8 @@ def crane() -> FixedBase:
     return FixedBase(Robot((Link("foot"), Link("boom", collisions=(ball,))), (turn,)))
 
 
-def nearest(around: CollisionScene, pair: int, least: float, asked: float = 0.02) -> Nearest:
-    return Nearest(around.labels[pair], least, least, 0.5, np.zeros((2, 3)), asked)
+def nearest(around: CollisionScene, pair: int, least: float, asked: float = 0.02) -> ClosestPair:
+    return ClosestPair(around.labels[pair], least, least, 0.5, np.zeros((2, 3)), asked)
 
 
 def test_what_came_too_near_is_held_and_what_is_held_farther_by_what_it_missed() -> None:

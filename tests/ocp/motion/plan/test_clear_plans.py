@@ -192,11 +192,11 @@ def test_held_apart_the_barrier_begins_worth_no_more_than_the_motion() -> None:
     separated = Candidate(START, clearance_constraints=ClearanceConstraints(around).holding([pair]))
     prepared = solver.prepared(separated, fine=False, cost=cost)[2]
     bounds = prepared.formulation.bound_values(np.zeros(0))
-    places = [getattr(prepared.fragment, f"{of}_bounds") for of in ("variable", "row")]
+    places = [getattr(prepared.transcription, f"{of}_bounds") for of in ("variable", "row")]
     free = [np.isfinite(side[at][bounds[0][at] < bounds[1][at]]).sum() for at in places for side in bounds]
-    begins = prepared._own_options["mu_init"]
+    begins = prepared._options["mu_init"]
     assert_allclose(begins * sum(free), cost, rtol=0.05)  # the nodes at which the motion begins aside
-    assert "mu_init" not in solver.prepared(Candidate(START), fine=True)[2]._own_options
+    assert "mu_init" not in solver.prepared(Candidate(START), fine=True)[2]._options
 
 
 def space_arm(panel: bool) -> FreeFloating:
