@@ -1,16 +1,16 @@
-"""Inverse kinematics of the rig with the globally best roll, in a bounded number of operations.
+"""Inverse kinematics of the rig with the globally optimal roll, in a bounded number of operations.
 
-The best roll on a set of arcs is a stationary point of the index inside an arc, or an end of an arc. The stationary
-points come first, in closed form for I1 (trigonometric.least_point); for I2, the index with the squared change of roll,
-by Newton steps on intervals where it is convex. Where the best of them is within reach and limits that is all.
+The optimal roll on a set of arcs is a stationary point of the index inside an arc, or an end of an arc. Stationary
+points come first: in closed form for I1 (`trigonometric.least_point`), and by Newton's method on intervals of convexity
+for I2, which adds the squared change of roll. If the best of them is within reach and limits, it is optimal.
 
-Else the ends matter, and `Search` says which to look at, in what order, and when no more can matter. Ends by joints 4
-to 6 and by the reach of the pitch link are cheap and are all compared. The others are first known roughly: one is
-polished and checked only where the index there is below the best found so far. Walking downhill-to-uphill from a roll
-that meets all but a limit of joint 1, the first roll that meets that limit too sits on it: so the ends by a limit of
-joint 1, which cost most, are looked for only where a roll better than the best breaks that very limit.
+Otherwise the ends of the arcs matter, and `Search` evaluates them in order until no other can improve. Ends by joints
+4 to 6 and by the reach of the pitch link are cheap and all compared. The others are first approximated; one is polished
+and checked only if a lower bound of the index near it is below the incumbent's. On the way uphill from a roll that
+violates a limit of joint 1 alone, the first feasible roll lies on that limit. The ends by a limit of joint 1, which are
+the most expensive, are therefore computed only if a roll better than the incumbent violates that limit.
 
-What the functions of the search hand to each other are records of scalars, one column each.
+The functions of the search exchange records of scalars, one column each.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ import casadi as ca
 import numpy as np
 
 from models.arrays import checked_flag, checked_instance
-from models.cts.rig import HOME, Branch, Rig, RigConfiguration, Tunnel, checked_branch, joints_of, posture_at
+from models.cts.rig import HOME, Branch, Rig, RigConfiguration, Tunnel, checked_branch, configuration_at, joints_of
 from models.cts.roll import (
     Candidate,
+    check_constraints,
     checked_gain,
+    closed_form_ends,
     convex_minima,
     index_harmonics,
+    infeasibility_code,
     inside_limit,
     level_points,
     limit_code,
-    sharp_level,
-    sharp_point,
-    simple_ends,
+    polish_to_level,
+    polish_to_value,
     slide_points,
-    unrolled,
-    verdict,
-    why_no_roll,
+    unwrap_roll,
     yaw_chart,
     yaw_levels,
 )
@@ -50,14 +50,14 @@ from models.spatial import Expression
 _Record = TypeVar("_Record")
 
 
-class Best(NamedTuple):
-    """The best roll so far.
+class Incumbent(NamedTuple):
+    """The best feasible roll so far.
 
     Attributes:
-        cost: Its index, inf where there is none yet.
+        cost: Its index, inf if there is none yet.
         c, s: Its cosine and sine.
-        code: Of the constraint it sits on, in roll.ACTIVE.
-        below, above: Least cost of any roll that meets everything but the lower, or upper, limit of joint 1.
+        code: Code of the constraint it lies on, in roll.ACTIVE.
+        below, above: Least cost of any roll that satisfies all constraints but the lower, or upper, limit of joint 1.
     """
 
     cost: Expression
@@ -68,15 +68,15 @@ class Best(NamedTuple):
     above: Expression
 
 
-class Rough(NamedTuple):
-    """A point near a roll that may be the best one.
+class RoughRoll(NamedTuple):
+    """An approximate point of a roll that may be optimal.
 
     Attributes:
-        bound: No cost near the point is below it; inf where the roll cannot be.
+        bound: Lower bound of the cost near the point; inf if the roll is infeasible.
         c, s: Cosine and sine.
-        value: What cos q2, or q1, takes at the roll it is polished to; at a stationary point cos q2 as it is.
-        code: Of the constraint that the roll sits on.
-        side: 1 where that constraint is met above the value, -1 where it is met below.
+        value: Value of cos q2, or q1, at the polished roll; at a stationary point, the present cos q2.
+        code: Code of the constraint that the roll lies on.
+        side: 1 if the constraint holds above the value, -1 if below.
     """
 
     bound: Expression
@@ -87,15 +87,15 @@ class Rough(NamedTuple):
     side: Expression
 
 
-class Seen(NamedTuple):
-    """A roll that was looked at: its cost, inf where joints 4 to 6 do not allow it, and cos q2."""
+class Evaluation(NamedTuple):
+    """An evaluated roll: its cost, inf if joints 4 to 6 do not allow it, and cos q2."""
 
     cost: Expression
     cos2: Expression
 
 
-class Suspect(NamedTuple):
-    """A roll.Level that may matter: no cost on it is below `bound`; `side` as of Rough."""
+class LevelBound(NamedTuple):
+    """An `ArcEndLevel` with a lower bound of the cost of rolls on it; `side` as in RoughRoll."""
 
     bound: Expression
     cosine: Expression
@@ -104,12 +104,12 @@ class Suspect(NamedTuple):
     side: Expression
 
 
-BEST_SIZE, ANSWER_SIZE = len(Best._fields), 9
-NOTHING = Best(ca.inf, 1, 0, 0, ca.inf, ca.inf)
-NOWHERE = Rough(ca.inf, 1, 0, 0, 0, 0)
+INCUMBENT_SIZE, SOLUTION_SIZE = len(Incumbent._fields), 9
+NO_INCUMBENT = Incumbent(ca.inf, 1, 0, 0, ca.inf, ca.inf)
+NO_ROLL = RoughRoll(ca.inf, 1, 0, 0, 0, 0)
 
 
-class Answer(NamedTuple):
+class RigSolution(NamedTuple):
     """Joints, shape (6, 1), and index of a roll, nan unless the status is 0; codes in roll.ACTIVE and roll.STATUS."""
 
     joints: Expression
@@ -118,13 +118,13 @@ class Answer(NamedTuple):
     status: Expression
 
 
-def stacked(kind: Any, records: Sequence[Any]) -> Expression:
-    """Records of one kind as the columns of a matrix. Shape (fields, records)."""
+def stack(kind: Any, records: Sequence[Any]) -> Expression:
+    """Return records of one kind as the columns of a matrix. Shape (fields, records)."""
     return ca.horzcat(*[ca.vertcat(*record) for record in records]) if records else ca.SX(len(kind._fields), 0)
 
 
-def unstacked(kind: Callable[..., _Record], matrix: Expression) -> list[_Record]:
-    """The records that are the columns of a matrix."""
+def unstack(kind: Callable[..., _Record], matrix: Expression) -> list[_Record]:
+    """Return the records of one kind from the columns of a matrix."""
     return [kind(*ca.vertsplit(column)) for column in ca.horzsplit(matrix)]
 
 
@@ -132,31 +132,31 @@ def _record(kind: Callable[..., _Record], column: Expression) -> _Record:
     return kind(*ca.vertsplit(column))
 
 
-def _given(symbols: Any) -> tuple[Any, Any]:
+def _inputs(symbols: Any) -> tuple[Any, Any]:
     return symbols.sym("target", 5), symbols.sym("previous")
 
 
 def optimal_inverse(
     rig: Rig, tunnel: Tunnel, branch: Branch = HOME, *, rate_weight: float = 0.0, limits: bool = True
 ) -> Any:
-    """Function (target, previous) -> (joints, cost, active, status): the joints with the roll of least index.
+    """Return the Function (target, previous) -> (joints, cost, active, status) of the joints with the optimal roll.
 
     Args:
-        rig: Lengths and joint limits.
+        rig: Dimensions and joint limits.
         tunnel: Centre, ranges and weights of the index.
-        branch: Which of the four joint sets.
+        branch: Branch of inverse kinematics.
         rate_weight: w4 of I2 = I1 + w4 / (2 pi) (roll - previous)^2, (37); 0 for I1.
-        limits: Whether reach and joint limits bound the roll. Without them the stationary point of least index is
-            taken, in closed form only, and the status tells whether the pose is in reach and within limits.
+        limits: Whether reach and joint limits constrain the roll. Without them the minimum of the index is returned, in
+            closed form, and the status says whether the pose is within reach and limits.
 
     Returns:
-        A casadi Function. Inputs: target (x, y, z, yaw, pitch), shape (5,); previous roll, rad. Outputs: joints,
-        shape (6,), nan unless the status is 0; the index; code of the active constraint in roll.ACTIVE; code in
-        roll.STATUS. The roll is given in the turn nearest to the previous one that the limits of joint 6 allow,
-        or, where they allow less than a turn, in theirs.
+        A casadi Function. Inputs: target (x, y, z, yaw, pitch), shape (5,); previous roll, rad. Outputs: joints, shape
+        (6,), nan unless the status is 0; the index; code of the active constraint in roll.ACTIVE; code in roll.STATUS.
+        The roll is given in the turn nearest to the previous one that the limits of joint 6 allow or, if they allow
+        less than a turn, in theirs.
 
     Raises:
-        ModelError: A negative or non-finite rate weight; limits=False with a rate weight.
+        ModelError: The rate weight is negative or not finite, or limits=False has a rate weight.
     """
     checked_instance(rig, Rig, "rig", "rig")
     checked_instance(tunnel, Tunnel, "rig", "tunnel")
@@ -165,26 +165,28 @@ def optimal_inverse(
     if gain and not limits:
         message = "limits=False is for the closed form of I1; with a rate weight leave limits on"
         raise ModelError(message, name="limits", value=limits)
-    return _built(rig, tunnel, branch, gain, limits)
+    return _build_inverse(rig, tunnel, branch, gain, limits)
 
 
-@lru_cache(maxsize=32)  # rig and tunnel are frozen; a function asked for again is the same
-def _built(rig: Rig, tunnel: Tunnel, branch: Branch, gain: float, limits: bool) -> Any:
+@lru_cache(maxsize=32)
+def _build_inverse(rig: Rig, tunnel: Tunnel, branch: Branch, gain: float, limits: bool) -> Any:
     search = Search(rig, tunnel, branch, gain)
-    target, previous = _given(ca.MX)
+    target, previous = _inputs(ca.MX)
     direct = search.direct()
-    result, done, best, seen = direct(target, previous)
+    result, done, best, evaluations = direct(target, previous)
     if limits:
-        thorough = search.thorough(direct.size2_out(3))
-        result = choose(thorough, (ANSWER_SIZE, 1))(done, result, target, previous, best, seen)
+        search_ends = search.search_ends(direct.size2_out(3))
+        result = evaluate_unless(search_ends, (SOLUTION_SIZE, 1))(done, result, target, previous, best, evaluations)
     name = f"optimal_inverse_{'i2' if gain else 'i1'}{'' if limits else '_free'}"
-    outputs = Answer(*ca.vertsplit(result, [0, 6, 7, 8, 9]))
-    return ca.Function(name, [target, previous], list(outputs), ["target", "previous"], list(Answer._fields))
+    outputs = RigSolution(*ca.vertsplit(result, [0, 6, 7, 8, 9]))
+    return ca.Function(name, [target, previous], list(outputs), ["target", "previous"], list(RigSolution._fields))
 
 
 @dataclass(frozen=True)
 class Search:
-    """The steps of the search as casadi Functions. Their `best` is a Best, `seen` a row of Seen, `rough` of Rough.
+    """The steps of the search as casadi Functions.
+
+    Their argument `best` is an Incumbent, `evaluations` a row of Evaluation, `rough` columns of RoughRoll.
 
     Attributes:
         gain: w4 / (2 pi) of I2; 0 for I1.
@@ -196,264 +198,270 @@ class Search:
     gain: float
 
     def direct(self) -> Any:
-        """Function (target, previous) -> (answer, done, best, seen): the stationary point of least index.
+        """Return the Function (target, previous) -> (answer, done, best, evaluations) of the best stationary point.
 
-        `done` says that it settles the matter: it is within reach and limits, or the input is no number.
+        `done` says that the answer is final: it is within reach and limits, or the input is not finite.
         """
         if self.gain:
             return self._direct_by_descent()
-        target, previous = _given(ca.SX)
+        target, previous = _inputs(ca.SX)
         f = self._index(target)
         c, s = least_point(f)
-        meets = verdict(self.rig, target, self._posture(target, c, s), c, s)
-        best, seen, _ = self._compare(target, previous, [Candidate(c, s, 0)], NOTHING)
-        status = ca.if_else(ca.logic_and(meets.slide(), meets.angles()), 0, 4)
-        status = ca.if_else(meets.pitch, ca.if_else(meets.yaw, status, 3), 2)
-        status = ca.if_else(_number(target, previous), status, 1)
-        result = self._answer(target, previous, NOTHING._replace(cost=f.value(c, s), c=c, s=s), status)
-        outputs = [result, status <= 1, ca.vertcat(*best), stacked(Seen, seen)]
+        check = check_constraints(self.rig, target, self._configuration(target, c, s), c, s)
+        best, evaluations, _ = self._compare(target, previous, [Candidate(c, s, 0)], NO_INCUMBENT)
+        status = ca.if_else(ca.logic_and(check.slide(), check.angles()), 0, 4)
+        status = ca.if_else(check.pitch, ca.if_else(check.yaw, status, 3), 2)
+        status = ca.if_else(_is_finite(target, previous), status, 1)
+        result = self._solution(target, previous, NO_INCUMBENT._replace(cost=f.value(c, s), c=c, s=s), status)
+        outputs = [result, status <= 1, ca.vertcat(*best), stack(Evaluation, evaluations)]
         return ca.Function("direct", [target, previous], ca.cse(outputs))
 
     def _direct_by_descent(self) -> Any:
-        target, previous = _given(ca.SX)
+        target, previous = _inputs(ca.SX)
         rolls = ca.SX.sym("rolls", 5)
         points = [Candidate(ca.cos(rolls[k]), ca.sin(rolls[k]), 0) for k in range(5)]
-        if np.isfinite(self.rig.limit(6, False)):  # the penalty may push against a limit that the index does not feel
+        if np.isfinite(self.rig.limit(6, False)):  # the penalty on the change may drive the roll to a limit of joint 6
             for upper in (False, True):
                 angle = inside_limit(self.rig, 6, upper)
                 points.append(Candidate(np.cos(angle), np.sin(angle), limit_code(6, upper)))
-        best, seen, least = self._compare(target, previous, points, NOTHING)
-        number = _number(target, previous)
-        result = self._answer(target, previous, best, ca.if_else(number, 0, 1))
+        best, evaluations, least = self._compare(target, previous, points, NO_INCUMBENT)
+        number = _is_finite(target, previous)
+        result = self._solution(target, previous, best, ca.if_else(number, 0, 1))
         done = ca.logic_or(ca.logic_and(least >= best.cost, best.cost < ca.inf), ca.logic_not(number))
-        outputs = [result, done, ca.vertcat(*best), stacked(Seen, seen)]
+        outputs = [result, done, ca.vertcat(*best), stack(Evaluation, evaluations)]
         settle = ca.Function("settle", [target, previous, rolls], ca.cse(outputs))
-        x, before = _given(ca.MX)
+        x, before = _inputs(ca.MX)
         settled = settle(x, before, convex_minima(self.rig, self.tunnel, self.gain)(x, before))
         return ca.Function("direct", [x, before], list(settled))
 
-    def thorough(self, count: int) -> Any:
-        """Function (target, previous, best, seen) -> answer, from the ends of the arcs; `count` rolls were seen."""
-        target, previous = _given(ca.MX)
-        first, seen = ca.MX.sym("best", BEST_SIZE), ca.MX.sym("seen", len(Seen._fields), count)
-        best, more = self._simple()(target, previous, first)
-        known = [seen, more]
+    def search_ends(self, count: int) -> Any:
+        """Return the Function (target, previous, best, `count` evaluations) -> answer from the arc ends."""
+        target, previous = _inputs(ca.MX)
+        first, evaluations = ca.MX.sym("best", INCUMBENT_SIZE), ca.MX.sym("seen", len(Evaluation._fields), count)
+        best, more = self._cheap_ends()(target, previous, first)
+        columns = [evaluations, more]
         chart = yaw_chart(self.rig, self.branch)
         if not self.gain:
             rough = self._rough_stationary()(target)
-            best = self._gates(self._sharpen(self._stationary), 4)(target, previous, rough, best)
-            known.append(stacked(Seen, [Seen(point.bound, point.value) for point in unstacked(Rough, rough)]))
-        seen = ca.horzcat(*known)
-        best = self._levels(chart, seen.shape[1])(target, previous, seen, best)
+            best = self._improve(self._stationary, 4)(target, previous, rough, best)
+            points = [Evaluation(point.bound, point.value) for point in unstack(RoughRoll, rough)]
+            columns.append(stack(Evaluation, points))
+        evaluations = ca.horzcat(*columns)
+        best = self._yaw_level_ends(chart, evaluations.shape[1])(target, previous, evaluations, best)
         for upper in (False, True):
             if np.isfinite(self.rig.limit(1, upper)):
-                now = _record(Best, best)
-                settled = (now.above if upper else now.below) >= now.cost
-                best = choose(self._slide(chart, upper), (BEST_SIZE, 1))(settled, best, target, previous, best)
-        found = self._finish()(target, previous, best)
-        result = choose(self._nowhere(), (ANSWER_SIZE, 1))(_record(Best, best).cost < ca.inf, found, target)
-        return ca.Function("thorough", [target, previous, first, known[0]], [result])
+                incumbent = _record(Incumbent, best)
+                settled = (incumbent.above if upper else incumbent.below) >= incumbent.cost
+                best = evaluate_unless(self._slide_ends(chart, upper))(settled, best, target, previous, best)
+        answer, solved = self._finish()(target, previous, best), _record(Incumbent, best).cost < ca.inf
+        result = evaluate_unless(self._infeasible(), (SOLUTION_SIZE, 1))(solved, answer, target)
+        return ca.Function("thorough", [target, previous, first, columns[0]], [result])
 
     # ---- candidates ------------------------------------------------------------------------------------------
 
-    def _simple(self) -> Any:
-        """Function (target, previous, best) -> (best, seen), with the ends that are known to rounding."""
-        target, previous = _given(ca.SX)
-        first = ca.SX.sym("best", BEST_SIZE)
-        ends = simple_ends(self.rig, target, self.branch)
-        best, seen, _ = self._compare(target, previous, ends, _record(Best, first))
-        return ca.Function("simple", [target, previous, first], ca.cse([ca.vertcat(*best), stacked(Seen, seen)]))
+    def _cheap_ends(self) -> Any:
+        """Return the Function (target, previous, best) -> (best, evaluations), with the ends known to rounding."""
+        target, previous = _inputs(ca.SX)
+        first = ca.SX.sym("best", INCUMBENT_SIZE)
+        ends = closed_form_ends(self.rig, target, self.branch)
+        best, evaluations, _ = self._compare(target, previous, ends, _record(Incumbent, first))
+        return ca.Function(
+            "simple", [target, previous, first], ca.cse([ca.vertcat(*best), stack(Evaluation, evaluations)])
+        )
 
     def _rough_stationary(self) -> Any:
-        """Function (target) -> points near the minima of I1; nowhere where it certainly has one minimum only.
+        """Return the Function (target) -> points near the minima of I1; NO_ROLL if it certainly has only one minimum.
 
-        In the axes of trigonometric.least_point there are two stationary points alone outside the astroid
+        In the axes of trigonometric.least_point there are only two stationary points outside the astroid
         |p|^(2/3) + |q|^(2/3) = (4 r)^(2/3), which the circle hypot(p, q) = 4 r encloses.
         """
-        target, _ = _given(ca.SX)
-        rough, f = self._rough(target), self._index(target)
+        target, _ = _inputs(ca.SX)
+        rough, f = self._approximation(target), self._index(target)
         points = [rough(c, s) for c, s in roots(f.derivative(), steps=0)]
-        near = ca.Function("rough", [target], ca.cse([stacked(Rough, points)]))
+        approximate = ca.Function("rough", [target], ca.cse([stack(RoughRoll, points)]))
         first, second = ca.sqrt(f.a1**2 + f.b1**2), ca.sqrt(f.a2**2 + f.b2**2)
         one_minimum = ca.Function("one_minimum", [target], [first > 4 * second])
-        x, nowhere = ca.MX.sym("target", 5), stacked(Rough, [NOWHERE] * len(points))
-        found = choose(near, nowhere.shape)(one_minimum(x), nowhere, x)
-        return ca.Function("rough_stationary", [x], [found])
+        x, no_points = ca.MX.sym("target", 5), stack(RoughRoll, [NO_ROLL] * len(points))
+        answer = evaluate_unless(approximate, no_points.shape)(one_minimum(x), no_points, x)
+        return ca.Function("rough_stationary", [x], [answer])
 
-    def _levels(self, chart: Any, count: int) -> Any:
-        """Function (target, previous, seen, best) -> best, with the ends by joints 2 and 3 and the yaw link's reach.
+    def _yaw_level_ends(self, chart: Any, count: int) -> Any:
+        """Return the Function (target, previous, evaluations, best) -> best, by the levels of cos q2.
 
-        A level is looked at where a roll that was seen, better than the best, is on its wrong side; all are where one
-        breaks a limit of joint 1 alone, since the arc that it is on may end before that limit is met.
+        A level is searched if an evaluated roll better than the incumbent is on its infeasible side. All levels are
+        searched if one violates a limit of joint 1 alone, since its arc may end before that limit is satisfied.
         """
-        target, _ = _given(ca.SX)
-        rolls, suspect = ca.SX.sym("seen", len(Seen._fields), count), ca.SX.sym("suspect", len(Suspect._fields))
-        suspects, (_, slack) = [], self._slack()
+        target, _ = _inputs(ca.SX)
+        rolls = ca.SX.sym("seen", len(Evaluation._fields), count)
+        levels, (_, slack) = [], self._slack()
         for level in yaw_levels(self.rig, target, self.branch):
             bound = ca.SX(ca.inf)
-            for roll in unstacked(Seen, rolls):
+            for roll in unstack(Evaluation, rolls):
                 over = roll.cos2 - level.cosine if level.above else level.cosine - roll.cos2
                 bound = ca.fmin(bound, ca.if_else(over < slack, roll.cost, ca.inf))
             bound = ca.if_else(level.relevant, bound, ca.inf)
-            suspects.append(Suspect(bound, level.cosine, level.code, level.relevant, 1 if level.above else -1))
-        needed = ca.Function("levels", [target, rolls], ca.cse([stacked(Suspect, suspects)]))
+            levels.append(LevelBound(bound, level.cosine, level.code, level.relevant, 1 if level.above else -1))
+        needed = ca.Function("levels", [target, rolls], ca.cse([stack(LevelBound, levels)]))
 
-        (_, cosine, code, _, side), rough = _record(Suspect, suspect), self._rough(target)
+        suspect, rough = ca.SX.sym("suspect", len(LevelBound._fields)), self._approximation(target)
+        _, cosine, code, _, side = _record(LevelBound, suspect)
         ends = level_points(self.rig, target, cosine)
         points = [rough(c, s, cosine, code, side, about=(cosine, slack)) for c, s in ends]
-        near_level = ca.Function("rough", [target, suspect], ca.cse([stacked(Rough, points)]))
+        near_level = ca.Function("rough", [target, suspect], ca.cse([stack(RoughRoll, points)]))
 
-        def polished(at: Expression, end: Rough) -> Point:
-            return sharp_level(self.rig, chart, at, end.value, end.side, (end.c, end.s))
+        def polished(at: Expression, end: RoughRoll) -> Point:
+            return polish_to_level(self.rig, chart, at, end.value, end.side, (end.c, end.s))
 
-        x, before = _given(ca.MX)
-        first, column = ca.MX.sym("best", BEST_SIZE), ca.MX.sym("suspect", len(Suspect._fields))
-        found = self._gates(self._sharpen(polished), len(points))(x, before, near_level(x, column), first)
-        one = choose(ca.Function("level", [x, before, column, first], [found]), (BEST_SIZE, 1))
-        seen = ca.MX.sym("seen", *rolls.shape)
+        x, before = _inputs(ca.MX)
+        first, column = ca.MX.sym("best", INCUMBENT_SIZE), ca.MX.sym("suspect", len(LevelBound._fields))
+        answer = self._improve(polished, len(points))(x, before, near_level(x, column), first)
+        search_level = evaluate_unless(ca.Function("level", [x, before, column, first], [answer]))
+        evaluations = ca.MX.sym("seen", *rolls.shape)
         best = first
-        for level in ca.horzsplit(needed(x, seen)):
-            best = one(_record(Suspect, level).bound >= _record(Best, best).cost, best, x, before, level, best)
+        for level in ca.horzsplit(needed(x, evaluations)):
+            settled = _record(LevelBound, level).bound >= _record(Incumbent, best).cost
+            best = search_level(settled, best, x, before, level, best)
         if np.isfinite([self.rig.limit(1, False), self.rig.limit(1, True)]).any():
-            for level in ca.horzsplit(needed(x, seen)):
-                now, relevant = _record(Best, best), _record(Suspect, level).relevant
-                settled = ca.logic_or(ca.fmin(now.below, now.above) >= now.cost, ca.logic_not(relevant))
-                best = one(settled, best, x, before, level, best)
-        return ca.Function("levels", [x, before, seen, first], [best])
+            for level in ca.horzsplit(needed(x, evaluations)):
+                incumbent, relevant = _record(Incumbent, best), _record(LevelBound, level).relevant
+                cannot_improve = ca.fmin(incumbent.below, incumbent.above) >= incumbent.cost
+                settled = ca.logic_or(cannot_improve, ca.logic_not(relevant))
+                best = search_level(settled, best, x, before, level, best)
+        return ca.Function("levels", [x, before, evaluations, first], [best])
 
-    def _slide(self, chart: Any, upper: bool) -> Any:
-        """Function (target, previous, best) -> best, with the ends by one limit of joint 1."""
+    def _slide_ends(self, chart: Any, upper: bool) -> Any:
+        """Return the Function (target, previous, best) -> best, with the ends by one limit of joint 1."""
         target, points = ca.SX.sym("target", 5), ca.SX.sym("points", 2, 8)
-        rough, reach = self._rough(target), (0, 1 + self._slack()[1])
+        rough, reach = self._approximation(target), (0, 1 + self._slack()[1])
         datum = inside_limit(self.rig, 1, upper), limit_code(1, upper)
         ends = [rough(points[0, k], points[1, k], *datum, about=reach) for k in range(8)]
-        near_limit = ca.Function("rough", [target, points], ca.cse([stacked(Rough, ends)]))
+        near_limit = ca.Function("rough", [target, points], ca.cse([stack(RoughRoll, ends)]))
 
-        def polished(at: Expression, end: Rough) -> Point:
-            return sharp_point(chart, at, 2, end.value, (end.c, end.s))
+        def polished(at: Expression, end: RoughRoll) -> Point:
+            return polish_to_value(chart, at, 2, end.value, (end.c, end.s))
 
-        x, before = _given(ca.MX)
-        best = ca.MX.sym("best", BEST_SIZE)
-        found = near_limit(x, slide_points(self.rig, upper)(x))
-        gates = self._gates(self._sharpen(polished), len(ends))
-        return ca.Function("slide", [x, before, best], [gates(x, before, found, best)])
+        x, before = _inputs(ca.MX)
+        best = ca.MX.sym("best", INCUMBENT_SIZE)
+        answer = self._improve(polished, len(ends))(x, before, near_limit(x, slide_points(self.rig, upper)(x)), best)
+        return ca.Function("slide", [x, before, best], [answer])
 
     def _slack(self) -> tuple[float, float]:
-        """Return bounds of the changes of sin q4 and cos q2 within ROOTS.reach of a roll."""
+        """Return bounds of the changes of sin q4 and cos q2 within ROOTS.root_tolerance of a roll."""
         rig = self.rig
-        sin4 = ROOTS.reach * rig.goose_neck / rig.pitch_link
+        sin4 = ROOTS.root_tolerance * rig.goose_neck / rig.pitch_link
         cos4 = float(np.sqrt(2 * sin4)) + sin4
-        return sin4, (ROOTS.reach * rig.goose_neck + rig.pitch_link * cos4) / rig.yaw_link_1
+        return sin4, (ROOTS.root_tolerance * rig.goose_neck + rig.pitch_link * cos4) / rig.yaw_link_1
 
-    def _rough(self, target: Expression) -> Callable[..., Rough]:
-        """Maker of a Rough from all but its bound; cos q2 must be within (middle, half) where they are given."""
+    def _approximation(self, target: Expression) -> Callable[..., RoughRoll]:
+        """Return a function that makes a RoughRoll; cos q2 must be within about = (middle, half width)."""
         f, (slack4, _) = self._index(target), self._slack()
-        slack = ROOTS.reach * (ca.fabs(f.a1) + ca.fabs(f.b1) + 2 * (ca.fabs(f.a2) + ca.fabs(f.b2)))
+        slack = ROOTS.root_tolerance * (ca.fabs(f.a1) + ca.fabs(f.b1) + 2 * (ca.fabs(f.a2) + ca.fabs(f.b2)))
 
         def rough(
             c: Expression, s: Expression, value: Expression = None, code: Any = 0, side: Any = 0, about: Any = None
-        ) -> Rough:
-            posture = self._posture(target, c, s)
-            near = ca.fabs(posture.sin4) < 1 + slack4
+        ) -> RoughRoll:
+            configuration = self._configuration(target, c, s)
+            is_near = ca.fabs(configuration.sin4) < 1 + slack4
             if about is not None:
-                near = ca.logic_and(near, ca.fabs(posture.cos2 - about[0]) < about[1])
-            bound = ca.if_else(near, f.value(c, s) - slack, ca.inf)
-            return Rough(bound, c, s, posture.cos2 if value is None else value, code, side)
+                is_near = ca.logic_and(is_near, ca.fabs(configuration.cos2 - about[0]) < about[1])
+            bound = ca.if_else(is_near, f.value(c, s) - slack, ca.inf)
+            return RoughRoll(bound, c, s, configuration.cos2 if value is None else value, code, side)
 
         return rough
 
-    def _gates(self, sharpen: Any, count: int) -> Any:
-        """Function (target, previous, rough, best) -> best: points one by one, those that may matter sharpened."""
-        target, previous = _given(ca.MX)
-        first, rough = ca.MX.sym("best", BEST_SIZE), ca.MX.sym("rough", len(Rough._fields), count)
-        gate, best = choose(sharpen, (BEST_SIZE, 1)), first
+    def _improve(self, polished: Callable[[Expression, RoughRoll], Point], count: int) -> Any:
+        """Return the Function (target, previous, rough, best) -> best: polishes and compares `count` points in turn.
+
+        Points whose bound is not below the cost of the incumbent are skipped.
+        """
+        target, previous = _inputs(ca.SX)
+        rough, first = ca.SX.sym("rough", len(RoughRoll._fields)), ca.SX.sym("best", INCUMBENT_SIZE)
+        point = _record(RoughRoll, rough)
+        candidate = Candidate(*polished(target, point), point.code)
+        best, _, _ = self._compare(target, previous, [candidate], _record(Incumbent, first))
+        sharpen = ca.Function("sharpen", [target, previous, rough, first], ca.cse([ca.vertcat(*best)]))
+
+        target, previous = _inputs(ca.MX)
+        first, rough = ca.MX.sym("best", INCUMBENT_SIZE), ca.MX.sym("rough", len(RoughRoll._fields), count)
+        gate, column = evaluate_unless(sharpen), first
         for point in ca.horzsplit(rough):
-            settled = _record(Rough, point).bound >= _record(Best, best).cost
-            best = gate(settled, best, target, previous, point, best)
-        return ca.Function("gates", [target, previous, rough, first], [best])
+            settled = _record(RoughRoll, point).bound >= _record(Incumbent, column).cost
+            column = gate(settled, column, target, previous, point, column)
+        return ca.Function("gates", [target, previous, rough, first], [column])
 
-    def _sharpen(self, polished: Callable[[Expression, Rough], Point]) -> Any:
-        """Function (target, previous, rough, best) -> best: one point polished and compared."""
-        target, previous = _given(ca.SX)
-        rough, first = ca.SX.sym("rough", len(Rough._fields)), ca.SX.sym("best", BEST_SIZE)
-        point = _record(Rough, rough)
-        sharp = Candidate(*polished(target, point), point.code)
-        best, _, _ = self._compare(target, previous, [sharp], _record(Best, first))
-        return ca.Function("sharpen", [target, previous, rough, first], ca.cse([ca.vertcat(*best)]))
-
-    def _stationary(self, target: Expression, rough: Rough) -> Point:
-        """The stationary point of I1 near a point."""
+    def _stationary(self, target: Expression, rough: RoughRoll) -> Point:
+        """Return the stationary point of I1 near a point."""
         slope = self._index(target).derivative()
         bend = slope.derivative()
         return polish((rough.c, rough.s), lambda c, s: (slope.value(c, s), bend.value(c, s)))
 
     def _compare(
-        self, target: Expression, previous: Expression, points: Sequence[Candidate], best: Best
-    ) -> tuple[Best, list[Seen], Expression]:
-        """The best with more rolls looked at, these rolls, and the least cost of any, feasible or not."""
+        self, target: Expression, previous: Expression, points: Sequence[Candidate], best: Incumbent
+    ) -> tuple[Incumbent, list[Evaluation], Expression]:
+        """Return the incumbent after comparing more rolls, these rolls, and the least cost of any, feasible or not."""
         f = self._index(target)
         cost, c, s, code, below, above = best
-        least, seen = ca.SX(ca.inf), []
+        least, evaluations = ca.SX(ca.inf), []
         for point in points:
             value = f.value(point.c, point.s)
             if self.gain:
-                value += self.gain * (unrolled(self.rig, point.c, point.s, previous) - previous) ** 2
-            posture = self._posture(target, point.c, point.s)
-            meets = verdict(self.rig, target, posture, point.c, point.s)
-            relaxed = meets.relaxed()
-            better = ca.logic_and(ca.logic_and(relaxed, meets.slide()), value < cost)
+                value += self.gain * (unwrap_roll(self.rig, point.c, point.s, previous) - previous) ** 2
+            configuration = self._configuration(target, point.c, point.s)
+            check = check_constraints(self.rig, target, configuration, point.c, point.s)
+            all_but_slide = check.all_but_slide()
+            better = ca.logic_and(ca.logic_and(all_but_slide, check.slide()), value < cost)
             least = ca.fmin(least, value)
-            seen.append(Seen(ca.if_else(meets.pitch_side(), value, ca.inf), posture.cos2))
-            over = ca.if_else(relaxed, value, ca.inf)
-            below = ca.fmin(below, ca.if_else(meets.slide_lower, ca.inf, over))
-            above = ca.fmin(above, ca.if_else(meets.slide_upper, ca.inf, over))
+            evaluations.append(Evaluation(ca.if_else(check.pitch_joints(), value, ca.inf), configuration.cos2))
+            over = ca.if_else(all_but_slide, value, ca.inf)
+            below = ca.fmin(below, ca.if_else(check.slide_lower, ca.inf, over))
+            above = ca.fmin(above, ca.if_else(check.slide_upper, ca.inf, over))
             cost = ca.if_else(better, value, cost)
             c, s = ca.if_else(better, point.c, c), ca.if_else(better, point.s, s)
             code = ca.if_else(better, point.code, code)
-        return Best(cost, c, s, code, below, above), seen, least
+        return Incumbent(cost, c, s, code, below, above), evaluations, least
 
     def _index(self, target: Expression) -> Harmonics:
         return index_harmonics(self.rig, self.tunnel, target)
 
-    def _posture(self, target: Expression, c: Expression, s: Expression) -> RigConfiguration:
-        return posture_at(self.rig, target, c, s, self.branch)
+    def _configuration(self, target: Expression, c: Expression, s: Expression) -> RigConfiguration:
+        return configuration_at(self.rig, target, c, s, self.branch)
 
     # ---- answers ---------------------------------------------------------------------------------------------
 
     def _finish(self) -> Any:
-        """Function (target, previous, best) -> answer with the best roll."""
-        target, previous = _given(ca.SX)
-        best = ca.SX.sym("best", BEST_SIZE)
-        found = self._answer(target, previous, _record(Best, best), 0)
-        return ca.Function("finish", [target, previous, best], ca.cse([found]))
+        """Return the Function (target, previous, best) -> answer for the incumbent."""
+        target, previous = _inputs(ca.SX)
+        best = ca.SX.sym("best", INCUMBENT_SIZE)
+        answer = self._solution(target, previous, _record(Incumbent, best), 0)
+        return ca.Function("finish", [target, previous, best], ca.cse([answer]))
 
-    def _nowhere(self) -> Any:
-        """Function (target) -> answer where no roll will do: without joints, with the status that tells why."""
+    def _infeasible(self) -> Any:
+        """Return the Function (target) -> answer without joints, with the status of an infeasible target."""
         target = ca.SX.sym("target", 5)
-        result = Answer(ca.DM.ones(6) * np.nan, np.nan, 0, why_no_roll(self.rig, target, self.branch))
-        return ca.Function("nowhere", [target], ca.cse([ca.vertcat(*result)]))
+        result = RigSolution(ca.DM.ones(6) * np.nan, np.nan, 0, infeasibility_code(self.rig, target, self.branch))
+        return ca.Function("infeasible", [target], ca.cse([ca.vertcat(*result)]))
 
-    def _answer(self, target: Expression, previous: Expression, best: Best, status: Expression) -> Expression:
-        """The Answer with the best roll. Shape (9, 1)."""
-        roll = unrolled(self.rig, best.c, best.s, previous)
-        joints = joints_of(self.rig, target, roll, self._posture(target, best.c, best.s))
+    def _solution(self, target: Expression, previous: Expression, best: Incumbent, status: Expression) -> Expression:
+        """Return the RigSolution of the incumbent. Shape (9, 1)."""
+        roll = unwrap_roll(self.rig, best.c, best.s, previous)
+        joints = joints_of(self.rig, target, roll, self._configuration(target, best.c, best.s))
         spoilt = ca.if_else(ca.SX(status) == 0, 0, np.nan)
-        return ca.vertcat(*Answer(joints + spoilt, best.cost + spoilt, best.code, status))
+        return ca.vertcat(*RigSolution(joints + spoilt, best.cost + spoilt, best.code, status))
 
 
-def _number(target: Expression, previous: Expression) -> Expression:
-    """Whether the input is finite."""
+def _is_finite(target: Expression, previous: Expression) -> Expression:
+    """Return whether the input is finite."""
     total = ca.sum1(target) + previous
     return ca.fabs(total) < ca.inf
 
 
-def choose(other: Any, shape: tuple[int, int]) -> Any:
-    """Function (settled, known, arguments) -> known, of that shape, or else other(arguments), which only then runs.
+def evaluate_unless(alternative: Any, shape: tuple[int, int] = (INCUMBENT_SIZE, 1)) -> Any:
+    """Return the Function (settled, known, arguments) -> `known`, of a shape, if settled, else alternative(arguments).
 
-    Made by hand because casadi.if_else would evaluate again whatever its arguments depend on.
+    The alternative is only evaluated if needed. casadi.if_else would also evaluate what its arguments depend on.
     """
     known = ca.MX.sym("known", *shape)
-    inputs = [ca.MX.sym(f"x{i}", other.sparsity_in(i)) for i in range(other.n_in())]
+    inputs = [ca.MX.sym(f"x{i}", alternative.sparsity_in(i)) for i in range(alternative.n_in())]
     keep = ca.Function("keep", [known, *inputs], [known])
-    call = ca.Function("call", [known, *inputs], other.call(inputs))
+    call = ca.Function("call", [known, *inputs], alternative.call(inputs))
     return ca.Function.if_else("choose", keep, call)

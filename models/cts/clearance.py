@@ -1,14 +1,13 @@
-"""Roll of least index that keeps clear of the surroundings: clearance as a constraint, in the index, or both.
+"""Collision-free inverse kinematics of the rig: clearance as a constraint, as a term of the index, or both.
 
-With links and obstacles in it the index has no closed form any more. The rolls of a fixed grid are compared, those that
-fall short of the clearance with a penalty, and the least minima among them, together with the best roll of the closed
-form, are refined by a pattern search whose step shrinks: a fixed number of operations. A minimum that no roll of the
-grid is drawn to may be missed; a finer grid finds it.
+With clearances the index has no closed form. The rolls of a fixed grid are compared, with a penalty on insufficient
+clearance. The lowest local minima of the grid, and the best roll of the closed form, are refined by a pattern search
+with shrinking steps. The number of operations is fixed. A minimum between the grid points may be missed; a finer grid
+finds it.
 
-Gaps between the links of the rig and what stands around it, as casadi expressions.
-
-They are the rig's own, apart from `models.shapes.distance`: its tunnel is a box without ends, seen from inside. Gaps
-are signed: negative where bodies overlap (as far as noted), and their derivative is that of the nearest pair of points.
+The distances between the links and the scene are casadi expressions of their own, apart from `models.shapes.distance`,
+because the tunnel is an infinite box seen from inside. They are negative for overlapping bodies unless noted; their
+derivative is that of the closest pair of points.
 """
 
 from __future__ import annotations
@@ -22,50 +21,50 @@ import numpy as np
 
 from models.arrays import checked_count, checked_each, checked_instance, checked_nonnegative, checked_number
 from models.cts.best_roll import optimal_inverse
-from models.cts.rig import HOME, INCH, Branch, Rig, Tunnel, checked_branch, dh_frames, joints_of, posture_at
-from models.cts.roll import ACTIVE, STATUS, checked_gain, index_harmonics, unrolled, verdict
+from models.cts.rig import HOME, INCH, Branch, Rig, Tunnel, checked_branch, configuration_at, dh_frames, joints_of
+from models.cts.roll import ACTIVE, STATUS, check_constraints, checked_gain, index_harmonics, unwrap_roll
 from models.errors import ModelError
 from models.robot.kinematics import checked_vector
 from models.shapes.distance import soft_minimum
 from models.shapes.shapes import Box, Capsule
 from models.spatial import FULL_TURN, Expression, expression
 
-KINK = 1e-12  # m; rounds off the kink of a distance at zero
+KINK = 1e-12
+"""Length that smooths the kink of a distance at zero, m."""
 
 
 class LinkCapsule(NamedTuple):
-    """All points within `radius` (m) of the segment from `start` to `end`, expressions in world. Shapes (3, 1), m."""
+    """A capsule of a link; radius in m, ends of the segment as expressions in world. Shape (3, 1), m."""
 
     radius: float
     start: Expression
     end: Expression
 
 
-def _local(point: Expression, box: Box) -> Expression:
-    """Coordinates of a world point in the axes of the box, of its finite axes only."""
+def _finite_axes(point: Expression, box: Box) -> Expression:
+    """Return the coordinates of a world point along the finite axes of a box."""
     inside = ca.mtimes(ca.DM(box.rotation).T, expression(point) - ca.DM(box.position))
     return ca.vertcat(*[inside[k] for k in range(3) if np.isfinite(box.size[k])])
 
 
-def _half(box: Box) -> Expression:
-    """Half of the finite edges, m."""
+def _half_size(box: Box) -> Expression:
+    """Return half of the finite edges of a box, m."""
     return ca.DM(box.size[np.isfinite(box.size)] / 2)
 
 
 def box_distance(point: Expression, box: Box) -> Expression:
-    """Distance of a point to a box, negative inside: there minus the way to the nearest face. Convex. Shape (1, 1)."""
-    over = ca.fabs(_local(point, box)) - _half(box)
+    """Return the signed distance of a point to a box, which is convex. Shape (1, 1), m."""
+    over = ca.fabs(_finite_axes(point, box)) - _half_size(box)
     outside = ca.fmax(over, 0)
     deepest = reduce(ca.fmax, ca.vertsplit(over))
     return _length(outside) + ca.fmin(deepest, 0)
 
 
 def capsule_to_box(capsule: LinkCapsule | Capsule, box: Box) -> Expression:
-    """Distance of a capsule to a solid box. Shape (1, 1), m.
+    """Return the distance of a capsule to a solid box. Shape (1, 1), m.
 
-    The distance of a box is convex along the segment: a golden-section search of fixed length finds the nearest
-    point, good to 1e-8 of the segment. Its place is piecewise constant to differentiation, as the theorem of the
-    envelope wants it.
+    The distance to a box is convex along the segment. A golden-section search of fixed length finds the closest point
+    to 1e-8 of the segment. Its position is constant to differentiation, by the envelope theorem.
     """
     a, b, radius = expression(capsule.start), expression(capsule.end), capsule.radius
 
@@ -78,31 +77,30 @@ def capsule_to_box(capsule: LinkCapsule | Capsule, box: Box) -> Expression:
     for _ in range(40):  # 0.618^40 = 4e-9
         lower = f_left < f_right
         low, high = ca.if_else(lower, low, left), ca.if_else(lower, right, high)
-        fresh = ca.if_else(lower, high - golden * (high - low), low + golden * (high - low))
-        value = at(fresh)
+        new = ca.if_else(lower, high - golden * (high - low), low + golden * (high - low))
+        value = at(new)
         left, right, f_left, f_right = (
-            ca.if_else(lower, fresh, right),
-            ca.if_else(lower, left, fresh),
+            ca.if_else(lower, new, right),
+            ca.if_else(lower, left, new),
             ca.if_else(lower, value, f_right),
             ca.if_else(lower, f_left, value),
         )
-    best = ca.fmin(at((low + high) / 2), ca.fmin(at(0.0), at(1.0)))
-    return best - radius
+    return ca.fmin(at((low + high) / 2), ca.fmin(at(0.0), at(1.0))) - radius
 
 
 def capsule_in_box(capsule: LinkCapsule | Capsule, walls: Box) -> Expression:
-    """Distance of a capsule inside a hollow box to its nearest wall, negative beyond it. Shape (1, 1), m."""
-    gaps = [_half(walls) - ca.fabs(_local(end, walls)) for end in (capsule.start, capsule.end)]
+    """Return the distance of a capsule inside a hollow box to the nearest wall, negative beyond it. Shape (1, 1), m."""
+    gaps = [_half_size(walls) - ca.fabs(_finite_axes(end, walls)) for end in (capsule.start, capsule.end)]
     return reduce(ca.fmin, ca.vertsplit(ca.vertcat(*gaps))) - capsule.radius
 
 
-def capsule_to_capsule(one: LinkCapsule | Capsule, other: LinkCapsule | Capsule) -> Expression:
-    """Distance of two capsules; of overlapping ones minus the overlap of radii. Shape (1, 1), m.
+def capsule_to_capsule(first: LinkCapsule | Capsule, second: LinkCapsule | Capsule) -> Expression:
+    """Return the distance of two capsules; if their axes cross, minus the sum of the radii. Shape (1, 1), m.
 
-    Nearest points of two segments in closed form (Ericson, Real-Time Collision Detection, 2005, 5.1.9).
+    Closest points of two segments in closed form (Ericson, Real-Time Collision Detection, 2005, 5.1.9).
     """
-    p, q = expression(one.start), expression(other.start)
-    u, v = expression(one.end) - p, expression(other.end) - q
+    p, q = expression(first.start), expression(second.start)
+    u, v = expression(first.end) - p, expression(second.end) - q
     gap = p - q
     a, e, b = ca.dot(u, u) + KINK**2, ca.dot(v, v) + KINK**2, ca.dot(u, v)
     c, f = ca.dot(u, gap), ca.dot(v, gap)
@@ -110,12 +108,12 @@ def capsule_to_capsule(one: LinkCapsule | Capsule, other: LinkCapsule | Capsule)
     s = _clip(ca.if_else(slack > 1e-12 * a * e, (b * f - c * e) / (slack + 1e-300), 0.0))
     t = _clip((b * s + f) / e)
     s = _clip((b * t - c) / a)
-    apart = gap + s * u - t * v
-    return _length(apart) - one.radius - other.radius
+    difference = gap + s * u - t * v
+    return _length(difference) - first.radius - second.radius
 
 
 def _length(vector: Expression) -> Expression:
-    """Euclidean norm, its kink at zero rounded off."""
+    """Return the Euclidean norm, smoothed at zero."""
     return ca.sqrt(ca.dot(vector, vector) + KINK**2) - KINK
 
 
@@ -125,22 +123,22 @@ def _clip(x: Expression) -> Expression:
 
 @dataclass(frozen=True)
 class ClearanceSearch:
-    """Settings of the search for a roll that keeps clear.
+    """Settings of the search for a collision-free roll.
 
     Attributes:
-        basins: Minima of the grid that are refined.
-        steps, shrink: Of the pattern search, and ratio of its steps: 0.62^44 = 7e-10 of a grid's step.
-        shortfall_price: Of a clearance that falls short, in what the search compares, 1/m.
-        inset: How far inside the least clearance the search aims, m.
-        at_limit: Nearer to the least clearance than this counts as held by it, m.
+        minima: Number of local minima of the grid that are refined.
+        steps, shrink: Number of steps of the pattern search, and ratio of their sizes: 0.62^44 = 7e-10 of the grid's.
+        penalty: Penalty on missing clearance in the merit function, 1/m.
+        inset: Distance beyond the least clearance that the search aims for, m.
+        active_tolerance: Distance from the least clearance below which the constraint counts as active, m.
     """
 
-    basins: int = 4
+    minima: int = 4
     steps: int = 44
     shrink: float = 0.62
-    shortfall_price: float = 1e3
+    penalty: float = 1e3
     inset: float = 1e-10
-    at_limit: float = 1e-6
+    active_tolerance: float = 1e-6
 
 
 SEARCH = ClearanceSearch()
@@ -161,12 +159,12 @@ class Radii:
 
 @dataclass(frozen=True)
 class CollisionScene:
-    """What the rig must not touch.
+    """Obstacles of the rig.
 
     Attributes:
-        walls: The tunnel, hollow; its floor is a wall. None for no walls.
-        solids: The floor's fittings, the parent aircraft, ... as boxes.
-        capsules: The same as capsules, in world.
+        walls: The hollow tunnel; its floor is a wall. None for no walls.
+        solids: Boxes, such as fittings of the floor and the parent aircraft.
+        capsules: Capsules in world.
     """
 
     walls: Box | None = None
@@ -181,7 +179,7 @@ class CollisionScene:
 
 
 def rig_capsules(rig: Rig, q: Expression, radii: Radii | None = None) -> dict[str, LinkCapsule]:
-    """Links of the rig as capsules, by name, from joint 2 to the store."""
+    """Return the links of the rig as capsules, by name, from joint 2 to the store."""
     checked_instance(rig, Rig, "rig", "rig")
     radii = Radii() if radii is None else checked_instance(radii, Radii, "rig", "radii")
     frames = dh_frames(rig, checked_vector(q, 6, "q", "one entry for each joint of the rig"))
@@ -202,31 +200,31 @@ def rig_capsules(rig: Rig, q: Expression, radii: Radii | None = None) -> dict[st
 def clearances(
     rig: Rig, q: Expression, scene: CollisionScene, radii: Radii | None = None
 ) -> dict[tuple[str, str], Expression]:
-    """Distance of every link to everything around it, by (link, thing). Each of shape (1, 1), m.
+    """Return the distance of every link to every obstacle, by (link, obstacle). Each of shape (1, 1), m.
 
     Raises:
-        ModelError: Nothing around.
+        ModelError: The scene is empty.
     """
     checked_instance(scene, CollisionScene, "clearances", "scene")
-    found: dict[tuple[str, str], Expression] = {}
+    distances: dict[tuple[str, str], Expression] = {}
     for name, capsule in rig_capsules(rig, q, radii).items():
         if scene.walls is not None:
-            found[name, "walls"] = capsule_in_box(capsule, scene.walls)
+            distances[name, "walls"] = capsule_in_box(capsule, scene.walls)
         for k, box in enumerate(scene.solids):
-            found[name, f"solid {k}"] = capsule_to_box(capsule, box)
-        for k, other in enumerate(scene.capsules):
-            found[name, f"capsule {k}"] = capsule_to_capsule(capsule, other)
-    if not found:
-        message = "clearances: the surroundings are empty; give walls, solids or capsules"
+            distances[name, f"solid {k}"] = capsule_to_box(capsule, box)
+        for k, obstacle in enumerate(scene.capsules):
+            distances[name, f"capsule {k}"] = capsule_to_capsule(capsule, obstacle)
+    if not distances:
+        message = "clearances: the scene is empty; give walls, solids or capsules"
         raise ModelError(message, name="scene", value=scene)
-    return found
+    return distances
 
 
-def nearness(gap: Expression, weight: float, width: float) -> Expression:
-    """Term of the index that grows as the rig comes near: weight exp(-gap / width), gap and width in m.
+def proximity_cost(gap: Expression, weight: float, width: float) -> Expression:
+    """Return the term weight exp(-gap / width) of the index, which grows as the gap closes; gap and width in m.
 
     Raises:
-        ModelError: A weight that is negative or not finite, a width that is not positive.
+        ModelError: The weight is negative or not finite, or the width is not positive.
     """
     checked_nonnegative(weight, "clearance", "weight")
     checked_number(width, "clearance", "width", positive=True, unit="m")
@@ -234,14 +232,14 @@ def nearness(gap: Expression, weight: float, width: float) -> Expression:
 
 
 def checked_clearance(clearance: float) -> float:
-    """`clearance` itself, m; ModelError unless it is a finite distance or -inf for none."""
+    """Return `clearance` itself, m; raise a ModelError unless it is a finite distance or -inf for none."""
     if checked_number(clearance, "rig", "clearance", finite=False) == np.inf:
         message = f"clearance {clearance} m must be a finite distance or -inf for none"
         raise ModelError(message, name="clearance", value=clearance)
     return clearance
 
 
-def clear_inverse(
+def collision_free_inverse(
     rig: Rig,
     tunnel: Tunnel,
     scene: CollisionScene,
@@ -255,23 +253,23 @@ def clear_inverse(
     softness: float = 2e-3,
     radii: Radii | None = None,
 ) -> Any:
-    """Function (target, previous) -> (joints, cost, active, status, gap): optimal_inverse among obstacles.
+    """Return the Function (target, previous) -> (joints, cost, active, status, gap): `optimal_inverse` among obstacles.
 
     Args:
-        clearance: Least distance of the rig from its surroundings, m; -inf for no constraint.
+        clearance: Least distance of the rig from the scene, m; -inf for no constraint.
         weight, width: Of the term weight exp(-gap / width) of the index.
         rate_weight: w4 of I2; 0 for I1.
         samples: Rolls of the grid, at least 8.
-        softness: Width of the smooth minimum of all distances, m; see soft_minimum.
-        radii: Of the rig's capsules.
+        softness: Width of the smooth minimum of all distances, m; see `soft_minimum`.
+        radii: Radii of the rig's capsules.
 
     Returns:
-        A casadi Function as optimal_inverse, and the smooth least distance, m. `active` is "clearance"
-        where it holds the roll; where the closed form has the best roll it is that of the closed form, else "free".
-        The status "clearance" says that the target is reached within limits, but by no roll clear of everything.
+        A casadi Function with the outputs of `optimal_inverse` and the smooth least distance, m. `active` is
+        "clearance" if this constraint is active, else that of the closed form if its roll is best, else "free". The
+        status "clearance" means that a roll reaches the target within limits, but none without collision.
 
     Raises:
-        ModelError: A weight, width, clearance or number of samples that cannot be.
+        ModelError: A weight, width, clearance or number of samples is out of range.
     """
     gain = checked_gain(rate_weight)
     checked_instance(rig, Rig, "rig", "rig")
@@ -281,80 +279,84 @@ def clear_inverse(
     checked_count(samples, "rig", "samples", 8)
     target, previous, angle = ca.SX.sym("target", 5), ca.SX.sym("previous"), ca.SX.sym("angle")
     c, s = ca.cos(angle), ca.sin(angle)
-    posture = posture_at(rig, target, c, s, branch)
-    roll = unrolled(rig, c, s, previous)
-    joints = joints_of(rig, target, roll, posture)
+    configuration = configuration_at(rig, target, c, s, branch)
+    roll = unwrap_roll(rig, c, s, previous)
+    joints = joints_of(rig, target, roll, configuration)
     gap = soft_minimum(list(clearances(rig, joints, scene, radii).values()), softness)
     cost = index_harmonics(rig, tunnel, target).value(c, s) + gain * (roll - previous) ** 2
-    cost += nearness(gap, weight, width)
-    meets = verdict(rig, target, posture, c, s)
-    held = ca.logic_and(meets.relaxed(), meets.slide())
-    fine = ca.logic_and(held, gap >= clearance)
-    given = [target, previous, angle]
-    value = ca.Function("value", given, ca.cse([ca.if_else(fine, cost, ca.inf)]))
+    cost += proximity_cost(gap, weight, width)
+    check = check_constraints(rig, target, configuration, c, s)
+    within_limits = ca.logic_and(check.all_but_slide(), check.slide())
+    feasible = ca.logic_and(within_limits, gap >= clearance)
+    inputs = [target, previous, angle]
+    value = ca.Function("value", inputs, ca.cse([ca.if_else(feasible, cost, ca.inf)]))
     short: Any = ca.fmax(clearance + SEARCH.inset - gap, 0) if np.isfinite(clearance) else 0.0
-    merit = ca.Function("merit", given, ca.cse([ca.if_else(held, cost + SEARCH.shortfall_price * short, ca.inf)]))
-    place = ca.Function("place", given, ca.cse([joints, gap]))
+    penalised = ca.if_else(within_limits, cost + SEARCH.penalty * short, ca.inf)
+    merit = ca.Function("merit", inputs, ca.cse([penalised]))
+    joints_and_gap = ca.Function("joints_and_gap", inputs, ca.cse([joints, gap]))
 
     x, before = ca.MX.sym("target", 5), ca.MX.sym("previous")
     closed, _, closed_active, closed_status = optimal_inverse(rig, tunnel, branch, rate_weight=rate_weight)(x, before)
     reached = closed_status == 0
-    free = ca.if_else(reached, closed[5], 0.0)
+    closed_roll = ca.if_else(reached, closed[5], 0.0)
     grid = ca.DM(np.linspace(-np.pi, np.pi, samples, endpoint=False)).T
-    starts = ca.Function("starts", *_starts(samples))(merit.map(samples)(x, before, grid))
-    states = ca.horzcat(starts, ca.vertcat(free, merit(x, before, free), FULL_TURN / samples))
-    refined = _pattern(merit)(states, ca.repmat(ca.vertcat(x, before), 1, SEARCH.basins + 1))
-    angles = ca.horzcat(free, refined[0, :])
-    values = value.map(SEARCH.basins + 2)(x, before, angles)
-    best, least, from_closed = ca.Function("choice", *_choice(SEARCH.basins + 2))(angles, values)
-    q, distance = place(x, before, best)
+    starts = ca.Function("starts", *_grid_minima(samples))(merit.map(samples)(x, before, grid))
+    states = ca.horzcat(starts, ca.vertcat(closed_roll, merit(x, before, closed_roll), FULL_TURN / samples))
+    refined = _pattern_search(merit)(states, ca.repmat(ca.vertcat(x, before), 1, SEARCH.minima + 1))
+    angles = ca.horzcat(closed_roll, refined[0, :])
+    values = value.map(SEARCH.minima + 2)(x, before, angles)
+    best, least, from_closed = ca.Function("choice", *_least_value(SEARCH.minima + 2))(angles, values)
+    q, distance = joints_and_gap(x, before, best)
     status = ca.if_else(reached, ca.if_else(least < ca.inf, 0, STATUS.index("clearance")), closed_status)
-    spoilt = ca.if_else(status == 0, 0, np.nan)
+    invalid = ca.if_else(status == 0, 0, np.nan)
     active = ca.if_else(from_closed, closed_active, 0)
-    active = ca.if_else(distance - clearance < SEARCH.at_limit, ACTIVE.index("clearance"), active)
-    outputs = [q + spoilt, least + spoilt, active, status, distance + spoilt]
+    active = ca.if_else(distance - clearance < SEARCH.active_tolerance, ACTIVE.index("clearance"), active)
+    outputs = [q + invalid, least + invalid, active, status, distance + invalid]
     labels = ["target", "previous"], ["joints", "cost", "active", "status", "gap"]
-    return ca.Function("clear_inverse", [x, before], outputs, *labels)
+    return ca.Function("collision_free_inverse", [x, before], outputs, *labels)
 
 
-def _starts(samples: int) -> tuple[list[Any], list[Any]]:
-    """Inputs and outputs of the function (merits of the grid) -> columns (angle, merit, step) of its least minima."""
+def _grid_minima(samples: int) -> tuple[list[Any], list[Any]]:
+    """Return inputs and outputs of the function (grid merits) -> columns (angle, merit, step) of the lowest minima."""
     merits = ca.SX.sym("merits", 1, samples)
     angles = np.linspace(-np.pi, np.pi, samples, endpoint=False)
-    left = []
+    remaining = []
     for k in range(samples):
-        low = ca.logic_and(merits[k] <= merits[k - 1], merits[k] <= merits[(k + 1) % samples])
-        left.append(ca.if_else(low, merits[k], ca.inf))
+        is_minimum = ca.logic_and(merits[k] <= merits[k - 1], merits[k] <= merits[(k + 1) % samples])
+        remaining.append(ca.if_else(is_minimum, merits[k], ca.inf))
     columns = []
-    for _ in range(SEARCH.basins):
-        at, least = ca.SX(0), ca.SX(ca.inf)
-        for angle, merit in zip(angles, left, strict=True):
-            at, least = ca.if_else(merit < least, angle, at), ca.fmin(merit, least)
-        left = [ca.if_else(at == angle, ca.inf, merit) for angle, merit in zip(angles, left, strict=True)]
-        columns.append(ca.vertcat(at, least, FULL_TURN / samples))
+    for _ in range(SEARCH.minima):
+        best, least = ca.SX(0), ca.SX(ca.inf)
+        for angle, merit in zip(angles, remaining, strict=True):
+            best, least = ca.if_else(merit < least, angle, best), ca.fmin(merit, least)
+        remaining = [ca.if_else(best == angle, ca.inf, merit) for angle, merit in zip(angles, remaining, strict=True)]
+        columns.append(ca.vertcat(best, least, FULL_TURN / samples))
     return [merits], [ca.horzcat(*columns)]
 
 
-def _choice(count: int) -> tuple[list[Any], list[Any]]:
-    """Inputs and outputs of (angles, values) -> (angle of the least, the least, whether it is the first)."""
+def _least_value(count: int) -> tuple[list[Any], list[Any]]:
+    """Return inputs and outputs of (angles, values) -> (angle of the least, the least, whether it is the first)."""
     angles, values = ca.SX.sym("angles", 1, count), ca.SX.sym("values", 1, count)
-    at, least, first = angles[0], values[0], ca.SX(1)
+    best, least, is_first = angles[0], values[0], ca.SX(1)
     for k in range(1, count):
         better = values[k] < least
-        at, least = ca.if_else(better, angles[k], at), ca.fmin(values[k], least)
-        first = ca.if_else(better, 0, first)
-    return [angles, values], [at, least, first]
+        best, least = ca.if_else(better, angles[k], best), ca.fmin(values[k], least)
+        is_first = ca.if_else(better, 0, is_first)
+    return [angles, values], [best, least, is_first]
 
 
-def _pattern(merit: Any) -> Any:
-    """Function (states, given) -> states: a search about each state (angle, merit, step); given target, previous."""
-    state, given = ca.MX.sym("state", 3), ca.MX.sym("given", 6)
+def _pattern_search(merit: Any) -> Any:
+    """Return the Function (states, inputs) -> states after a pattern search about each state (angle, merit, step).
+
+    Inputs are target and previous roll.
+    """
+    state, inputs = ca.MX.sym("state", 3), ca.MX.sym("inputs", 6)
     angle, least, step = ca.vertsplit(state)
     for side in (-0.5, 0.5):
-        at = state[0] + side * step
-        found = merit(given[:5], given[5], at)
-        better = found < least
-        angle, least = ca.if_else(better, at, angle), ca.if_else(better, found, least)
-    once = ca.Function("once", [state, given], [ca.vertcat(angle, least, step * SEARCH.shrink)])
-    all_steps = once.mapaccum(SEARCH.steps)(state, ca.repmat(given, 1, SEARCH.steps))[:, -1]
-    return ca.Function("pattern", [state, given], [all_steps]).map(SEARCH.basins + 1)
+        trial = state[0] + side * step
+        value = merit(inputs[:5], inputs[5], trial)
+        better = value < least
+        angle, least = ca.if_else(better, trial, angle), ca.if_else(better, value, least)
+    once = ca.Function("once", [state, inputs], [ca.vertcat(angle, least, step * SEARCH.shrink)])
+    last = once.mapaccum(SEARCH.steps)(state, ca.repmat(inputs, 1, SEARCH.steps))[:, -1]
+    return ca.Function("pattern", [state, inputs], [last]).map(SEARCH.minima + 1)

@@ -1,9 +1,8 @@
-"""Grid mode: a table of poses in, a table of joints out, rows that cannot be held marked with the reason.
+"""Batch inverse kinematics of the rig, its feasible rolls, and export of its functions as C.
 
-For controllers without Python: the rig's functions by name, and any functions as C.
-
-The C needs nothing but the mathematics library: what is left of a search after its fixed number of operations is
-straight-line code and a few branches, so that its time has a bound.
+`solve_table` converts a table of targets to a table of joints; rows without a solution have the reason as their status.
+`rig_functions` and `export` serve controllers without Python. The generated C needs only the mathematics library. It is
+straight-line code with a few branches, so its computing time is bounded.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ from models.arrays import (
     warn_of_degrees,
 )
 from models.cts.best_roll import optimal_inverse
-from models.cts.clearance import CollisionScene, clear_inverse
+from models.cts.clearance import CollisionScene, collision_free_inverse
 from models.cts.rig import (
     BRANCHES,
     HOME,
@@ -38,12 +37,12 @@ from models.cts.rig import (
     Rig,
     Tunnel,
     checked_branch,
+    configuration_at,
     forward,
     goose_neck_corner,
     inverse,
-    posture_at,
 )
-from models.cts.roll import ACTIVE, STATUS, angle_ends, limit_code, slide_ends, verdict
+from models.cts.roll import ACTIVE, STATUS, arc_ends, check_constraints, limit_code, slide_ends
 from models.errors import ModelError
 from models.spatial import FULL_TURN
 
@@ -54,12 +53,11 @@ class Table:
 
     Attributes:
         targets: Shape (samples, 5), m and rad.
-        joints: Shape (samples, 6), m and rad; nan in the rows that are not ok.
-        cost: Index of the roll, nan in the rows that are not ok. Shape (samples,).
-        status: One of roll.STATUS for each row: "ok", or why there are no joints.
-        active: One of roll.ACTIVE for each row: the constraint that holds the roll, "free" where none does, ""
-            where the row is not ok.
-        branch: The branch of each row, None where the row is not ok.
+        joints: Shape (samples, 6), m and rad; nan in rows that are not ok.
+        cost: Index of the roll, nan in rows that are not ok. Shape (samples,).
+        status: "ok" or the reason why there are no joints, for each row; one of roll.STATUS.
+        active: Active constraint of each row, one of roll.ACTIVE; "free" if there is none, "" in rows that are not ok.
+        branch: Branch of each row, None in rows that are not ok.
     """
 
     targets: Array
@@ -71,7 +69,7 @@ class Table:
 
     @property
     def ok(self) -> Any:
-        """Which rows have joints. Shape (samples,), bool."""
+        """Whether each row has joints. Shape (samples,), bool."""
         return np.array([status == "ok" for status in self.status])
 
 
@@ -89,56 +87,56 @@ def solve_table(
     clearance_weight: float = 0.0,
     clearance_width: float = 0.05,
 ) -> Table:
-    """Joints of least index for every target; a bad row is marked and does not touch the others.
+    """Return the joints of least index for every target; rows without a solution do not affect the others.
 
     Args:
         targets: Shape (samples, 5), m and rad; rows may hold nan.
-        branches: The joint sets to choose from: of those that hold the target the one of least index, the first of
-            equals.
-        previous: Roll before each target, rad, shape (samples,) or one for all; with in_sequence before the first.
-        in_sequence: Whether each row's roll is the previous one of the next, as in a motion; rows that are not ok are
-            passed over.
+        branches: Branches to choose from; the one of least index is taken, the first of equals.
+        previous: Roll before each target, rad, shape (samples,) or one for all; with in_sequence, before the first.
+        in_sequence: Whether each row's roll is the previous one of the next, as in a motion; rows without a solution
+            are skipped.
         rate_weight: w4 of I2; 0 for I1.
-        scene: What to keep clear of, None for nothing, by at least `clearance`, m, or by a term
-            clearance_weight exp(-distance / clearance_width) of the index; see clear_inverse.
+        scene: Obstacles, None for none. The least distance is `clearance`, m, and the index has a term
+            clearance_weight exp(-distance / clearance_width); see `collision_free_inverse`.
 
     Raises:
-        ModelError: An empty table, another shape, no branch, an unknown branch, a previous roll that is not finite.
+        ModelError: The table is empty or has a wrong shape, there is no branch or an unknown one, or a previous roll is
+            not finite.
     """
     checked_instance(rig, Rig, "rig", "rig")
     checked_instance(tunnel, Tunnel, "rig", "tunnel")
     checked_flag(in_sequence, "table", "in_sequence")
     rows = checked_targets(targets, finite=False)
-    chosen = [checked_branch(branch) for branch in checked_each(branches, Branch, "table", "branches")]
-    if not chosen:
-        raise ModelError("branches is empty; give at least one, for example (HOME,)", name="branches", value=branches)
+    branches = tuple(checked_branch(branch) for branch in checked_each(branches, Branch, "table", "branches"))
+    if not branches:
+        message = "table: branches is empty; give at least one, for example (HOME,)"
+        raise ModelError(message, name="branches", value=branches)
     count = len(rows)
     before = one_for_each(previous, count, "table", "previous", "targets")
     if scene is None:
-        functions = [optimal_inverse(rig, tunnel, branch, rate_weight=rate_weight) for branch in chosen]
+        functions = [optimal_inverse(rig, tunnel, branch, rate_weight=rate_weight) for branch in branches]
     else:
-        asked: dict[str, Any] = {"clearance": clearance, "weight": clearance_weight, "width": clearance_width}
-        asked["rate_weight"] = rate_weight
-        functions = [clear_inverse(rig, tunnel, scene, branch, **asked) for branch in chosen]
+        options: dict[str, Any] = {"clearance": clearance, "weight": clearance_weight, "width": clearance_width}
+        options["rate_weight"] = rate_weight
+        functions = [collision_free_inverse(rig, tunnel, scene, branch, **options) for branch in branches]
     if in_sequence:
-        roll, steps = float(before[0]), []
+        roll, results = float(before[0]), []
         for row in rows:
-            steps.append(_best([f(row, roll) for f in functions]))
-            if steps[-1][9] == 0:
-                roll = float(steps[-1][5])
-        found = np.array(steps)
+            results.append(_best_branch([f(row, roll) for f in functions])[0])
+            if results[-1][9] == 0:
+                roll = float(results[-1][5])
+        best = np.array(results)
     else:
-        found = _best([f.map(count)(rows.T, before[None]) for f in functions])
-        found = found.reshape(count, -1)
-    status = tuple(STATUS[int(code)] for code in found[:, 9])
-    fine = found[:, 9] == 0
-    active = tuple(ACTIVE[int(code)] if good else "" for code, good in zip(found[:, 8], fine, strict=True))
-    branch = tuple(chosen[int(i)] if good else None for i, good in zip(found[:, 7], fine, strict=True))
-    return Table(rows, found[:, :6], found[:, 6], status, active, branch)
+        best = _best_branch([f.map(count)(rows.T, before[None]) for f in functions])
+    solved = best[:, 9] == 0
+    status = tuple(STATUS[int(code)] for code in best[:, 9])
+    active = tuple(ACTIVE[int(code)] if ok else "" for code, ok in zip(best[:, 8], solved, strict=True))
+    branch = tuple(branches[int(i)] if ok else None for i, ok in zip(best[:, 7], solved, strict=True))
+    return Table(rows, best[:, :6], best[:, 6], status, active, branch)
 
 
-def _best(results: list[Any]) -> Array:
-    """Of the branches' results the best, per row: joints, cost, branch number, active, status. Shape (samples, 10)."""
+def _best_branch(results: list[Any]) -> Array:
+    """Return the best of the branches' results: joints, cost, branch number, active, status. Shape (samples, 10)."""
     best: Array | None = None
     for number, (joints, cost, active, status, *_) in enumerate(results):
         columns = [np.array(part, dtype=float) for part in (joints, cost, active, status)]
@@ -146,36 +144,38 @@ def _best(results: list[Any]) -> Array:
         if best is None:
             best = rows
             continue
-        solved, known = rows[:, 9] == 0, best[:, 9] == 0
-        better = solved & (~known | (rows[:, 6] < best[:, 6] - 1e-12))
-        nearer = ~solved & ~known & (rows[:, 9] > best[:, 9])  # the branch that came furthest names the reason
-        best = np.where((better | nearer)[:, None], rows, best)
+        solved, best_solved = rows[:, 9] == 0, best[:, 9] == 0
+        better = solved & (~best_solved | (rows[:, 6] < best[:, 6] - 1e-12))
+        further = (
+            ~solved & ~best_solved & (rows[:, 9] > best[:, 9])
+        )  # the branch that satisfies most tests names the reason
+        best = np.where((better | further)[:, None], rows, best)
     assert best is not None
-    return best if len(best) > 1 else best[0]
+    return best
 
 
 @dataclass(frozen=True)
 class RollInterval:
-    """A range of rolls that reach within all limits.
+    """An interval of rolls within reach and all limits.
 
     Attributes:
-        start, end: rad, end >= start; a whole turn is -pi .. pi.
-        holds: Constraints (of roll.ACTIVE) at start and end; ("free", "free") for a whole turn.
+        start, end: rad, end >= start; a full turn is -pi .. pi.
+        constraints: Active constraints (of roll.ACTIVE) at start and end; ("free", "free") for a full turn.
     """
 
     start: float
     end: float
-    holds: tuple[str, str]
+    constraints: tuple[str, str]
 
 
 def reachable_rolls(rig: Rig, target: ArrayInput, branch: Branch = HOME) -> list[RollInterval]:
-    """All rolls, modulo a turn, that hold a target within reach and joint limits, start in [-pi, pi).
+    """Return all rolls, modulo a turn, that reach a target within joint limits, with start in [-pi, pi).
 
     Args:
         target: Shape (5,), m and rad.
 
     Raises:
-        ModelError: A target of another shape or not finite.
+        ModelError: The target has a wrong shape or is not finite.
     """
     checked_instance(rig, Rig, "rig", "rig")
     row = checked_targets([target])[0]
@@ -190,7 +190,7 @@ def reachable_rolls(rig: Rig, target: ArrayInput, branch: Branch = HOME) -> list
     inside = np.array(feasible.map(len(middles))(row, middles[None])).ravel() > 0
     if inside.all():
         return [RollInterval(-np.pi, np.pi, ("free", "free"))]
-    found = []
+    intervals = []
     count = len(turns)
     for k in np.flatnonzero(inside & ~np.roll(inside, 1)):
         last = int(k)
@@ -198,65 +198,64 @@ def reachable_rolls(rig: Rig, target: ArrayInput, branch: Branch = HOME) -> list
             last += 1
         stop = (last + 1) % count
         end = float(turns[stop] + (FULL_TURN if turns[stop] <= turns[k] else 0.0))
-        found.append(RollInterval(float(turns[k]), end, (ACTIVE[codes[k]], ACTIVE[codes[stop]])))
-    return found
+        intervals.append(RollInterval(float(turns[k]), end, (ACTIVE[codes[k]], ACTIVE[codes[stop]])))
+    return intervals
 
 
-@lru_cache(maxsize=16)  # a rig is frozen; one asked again is the same
+@lru_cache(maxsize=16)
 def roll_interval_functions(rig: Rig, branch: Branch = HOME) -> tuple[Any, Any]:
-    """Functions (target) -> points that hold all ends of arcs, rows cosine, sine, code; (target, roll) -> 1 or 0."""
+    """Return Functions (target) -> points with all arc ends, rows cosine, sine, code; (target, roll) -> feasible."""
     target, roll = ca.SX.sym("target", 5), ca.SX.sym("roll")
-    angle = ca.horzcat(*[ca.vertcat(*candidate) for candidate in angle_ends(rig, target, branch)])
+    angle = ca.horzcat(*[ca.vertcat(*candidate) for candidate in arc_ends(rig, target, branch)])
     x = ca.MX.sym("target", 5)
     parts = [ca.Function("angle_ends", [target], [angle])(x)]
     for upper in (False, True):
         if np.isfinite(rig.limit(1, upper)):
-            found = slide_ends(rig, branch, upper)(x)
-            parts.append(ca.vertcat(found, ca.DM.ones(1, 8) * limit_code(1, upper)))
+            parts.append(ca.vertcat(slide_ends(rig, branch, upper)(x), ca.DM.ones(1, 8) * limit_code(1, upper)))
     ends = ca.Function("arc_ends", [x], [ca.horzcat(*parts)], ["target"], ["points"])
     c, s = ca.cos(roll), ca.sin(roll)
-    meets = verdict(rig, target, posture_at(rig, target, c, s, branch), c, s)
-    inside = ca.logic_and(meets.relaxed(), meets.slide())
+    meets = check_constraints(rig, target, configuration_at(rig, target, c, s, branch), c, s)
+    inside = ca.logic_and(meets.all_but_slide(), meets.slide())
     return ends, ca.Function("feasible", [target, roll], [inside], ["target", "roll"], ["feasible"])
 
 
 def all_joint_sets(rig: Rig, target: ArrayInput, roll: float) -> list[tuple[Branch, Array]]:
-    """Every branch that reaches a target with a given roll, and its joints, shape (6,); joint limits are not asked.
+    """Return every branch that reaches a target with a given roll, and its joints, shape (6,), without joint limits.
 
     Raises:
-        ModelError: A target or roll that is not finite; a pose that no branch reaches, naming the link.
+        ModelError: The target or roll is not finite, or no branch reaches the pose (names the link).
     """
     checked_instance(rig, Rig, "rig", "rig")
     row = checked_targets([target])[0]
     checked_number(roll, "rig", "roll")
-    found, short = [], []
+    solutions, margins = [], []
     for branch in BRANCHES:
         joints, reach = inverse(rig, ca.DM(row), ca.DM(roll), branch)
-        margin = np.array(reach).ravel()
-        short.append(margin)
-        if (margin >= 0).all():
-            found.append((branch, np.array(joints).ravel()))
-    if not found:
-        pitch, yaw = np.max(short, axis=0)
-        link, by = ("pitch", pitch * rig.pitch_link) if pitch < 0 else ("yaw", yaw * rig.yaw_link_1)
-        message = f"target {row.tolist()} with roll {roll} rad: the {link} link is {-by:.4g} m too short"
-        raise ModelError(message, name=f"{link} link", value=-by, limit=0.0)
-    return found
+        margins.append(np.array(reach).ravel())
+        if (margins[-1] >= 0).all():
+            solutions.append((branch, np.array(joints).ravel()))
+    if not solutions:
+        pitch, yaw = np.max(margins, axis=0)
+        link, shortage = ("pitch", -pitch * rig.pitch_link) if pitch < 0 else ("yaw", -yaw * rig.yaw_link_1)
+        message = f"target {row.tolist()} with roll {roll} rad: the {link} link is {shortage:.4g} m too short"
+        raise ModelError(message, name=f"{link} link", value=shortage, limit=0.0)
+    return solutions
 
 
 def checked_targets(targets: ArrayInput, finite: bool = True) -> Array:
-    """Targets (x, y, z, yaw, pitch), at least one, shape (samples, 5); ModelError naming the first wrong row."""
+    """Return targets (x, y, z, yaw, pitch), shape (samples, 5); raise a ModelError for the first wrong row."""
     rows = checked_array(targets, ("samples", 5), "table", "targets", finite=finite, nan=not finite)
     warn_of_degrees(rows[:, 3:], "table", "targets", "yaw or pitch")
     return rows
 
 
 def rig_functions(rig: Rig, tunnel: Tunnel, branch: Branch = HOME, rate_weight: float = 5.0) -> dict[str, Any]:
-    """All functions of a rig, by name; each can be mapped over a table with `.map(samples)`.
+    """Return all functions of a rig, by name; `.map(samples)` applies one to a table.
 
-    forward: (joints) -> (pose). inverse: (target, roll) -> (joints, reach), see rig.inverse. corner: (target, roll)
-    -> (P_G). arc_ends, feasible: see table.roll_interval_functions. optimal_inverse_i1_free, optimal_inverse_i1,
-    optimal_inverse_i2: (target, previous) -> (joints, cost, active, status), see best_roll; I2 with `rate_weight`.
+    forward: (joints) -> (pose). inverse: (target, roll) -> (joints, reach), see `rig.inverse`. corner: (target, roll)
+    -> (P_G). arc_ends, feasible: see `roll_interval_functions`. optimal_inverse_i1_free, optimal_inverse_i1,
+    optimal_inverse_i2: (target, previous) -> (joints, cost, active, status), see `best_roll.optimal_inverse`; I2 with
+    `rate_weight`.
     """
     q, target, roll = ca.SX.sym("joints", 6), ca.SX.sym("target", 5), ca.SX.sym("roll")
     functions = [
@@ -272,23 +271,23 @@ def rig_functions(rig: Rig, tunnel: Tunnel, branch: Branch = HOME, rate_weight: 
 
 
 def export(functions: dict[str, Any] | Iterable[Any], path: Path) -> Path:
-    """Write functions as one C file with its header, with no dependency but the C mathematics library.
+    """Write functions as one C file with its header, which depends only on the C mathematics library.
 
     Args:
         functions: casadi Functions, or a dictionary of them.
-        path: The C file; its folder is made.
+        path: Path of the C file; its folder is created.
 
     Raises:
-        ModelError: No function, or a path that does not end in .c.
+        ModelError: There is no function, or the path does not end in .c.
     """
-    chosen = list(functions.values()) if isinstance(functions, dict) else list(functions)
-    if not chosen:
+    exported = list(functions.values()) if isinstance(functions, dict) else list(functions)
+    if not exported:
         raise ModelError("export: there is no function to write", name="functions", value=functions)
     if path.suffix != ".c":
         raise ModelError(f"export: {path.name!r} must end in .c", name="path", value=path, limit=".c")
     path.parent.mkdir(parents=True, exist_ok=True)
     code = ca.CodeGenerator(path.name, {"with_header": True, "casadi_int": "long long int"})
-    for function in chosen:
+    for function in exported:
         code.add(function)
-    code.generate(os.path.join(path.parent.resolve(), ""))  # casadi joins folder and name as text
+    code.generate(os.path.join(path.parent.resolve(), ""))  # casadi concatenates folder and name
     return path

@@ -1,8 +1,8 @@
-"""Where a trigonometric polynomial of one angle vanishes or is least, in a bounded number of operations.
+"""Roots and minima of trigonometric polynomials of one angle, in a bounded number of operations.
 
-Points of the unit circle are pairs (cosine, sine), so that nothing here calls a trigonometric function of the angle.
-Polynomials of two harmonics are solved in closed form and without branches, those of any degree by a simultaneous
-iteration on all their roots.
+Points of the unit circle are pairs (cosine, sine), so no trigonometric function of the angle is evaluated. Polynomials
+of two harmonics are solved in closed form without branches, those of any degree by a simultaneous iteration on all
+roots.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Point = tuple[Expression, Expression]
 """A point of the unit circle: (cosine, sine) of an angle."""
 
 Slope = Callable[[Expression, Expression], tuple[Expression, Expression]]
-"""A function of a point of the circle that gives a value and its derivative by the angle."""
+"""A function of a point of the circle that returns a value and its derivative by the angle."""
 
 SMALLEST_DIVISOR = 1e-300
 """Added to divisors that may be zero; it changes no other number."""
@@ -28,37 +28,37 @@ SMALLEST_DIVISOR = 1e-300
 
 @dataclass(frozen=True)
 class RootSettings:
-    """Settings of the root finding, whose number of operations is bounded.
+    """Settings of the root finding, which bound its number of operations.
 
     Attributes:
-        least_second: Second harmonic, relative, that the pencil of conics is given at least; the polish takes the
-            difference out again.
-        least_square: Second harmonic whose square is still a number.
+        min_second_harmonic: Smallest relative second harmonic in the pencil of conics; a smaller one is raised, and the
+            polish removes the difference.
+        min_square_harmonic: Smallest second harmonic whose square does not underflow.
         cubic_steps, polish_steps, least_steps: Newton or Halley steps to the root of the pencil, to a root, and to the
-            least point: what rounding leaves no more to do after.
-        polish_reach: Of a step of the polish, rad.
-        reach: How far a root that is not polished may be from the one that it is polished to, rad.
-        stages: Steps to all roots at once: after each stage but the last only those that still move by more than `near`
-            go on.
-        near: Relative.
+            minimum, after which only rounding errors are left.
+        max_polish_step: Largest step of the polish, rad.
+        root_tolerance: Largest distance of an approximate root from its polished root, rad.
+        stages: Steps on all roots; after each stage but the last, the iteration ends if all roots move by less than
+            `step_tolerance`.
+        step_tolerance: Relative.
     """
 
-    least_second: float = 1e-6
-    least_square: float = 1e-100
+    min_second_harmonic: float = 1e-6
+    min_square_harmonic: float = 1e-100
     cubic_steps: int = 2
     polish_steps: int = 3
     least_steps: int = 4
-    polish_reach: float = 0.05
-    reach: float = 0.01
+    max_polish_step: float = 0.05
+    root_tolerance: float = 0.01
     stages: tuple[int, ...] = (6, 1, 1, 1, 1, 2, 4, 8, 16)
-    near: float = 1e-5
+    step_tolerance: float = 1e-5
 
 
 ROOTS = RootSettings()
 
 
 class Harmonics(NamedTuple):
-    """f = a0 + a1 cos + b1 sin + a2 cos 2 + b2 sin 2 of an angle; scalar expressions or numbers."""
+    """The function f = a0 + a1 cos + b1 sin + a2 cos 2 + b2 sin 2 of an angle; scalar expressions or numbers."""
 
     a0: Expression
     a1: Expression
@@ -67,58 +67,58 @@ class Harmonics(NamedTuple):
     b2: Expression
 
     def value(self, c: Expression, s: Expression) -> Expression:
-        """f at the angle whose cosine and sine are c and s."""
+        """Return f at the angle with cosine c and sine s."""
         return self.a0 + self.a1 * c + self.b1 * s + self.a2 * (c * c - s * s) + 2 * self.b2 * c * s
 
     def derivative(self) -> Harmonics:
-        """df / d angle."""
+        """Return df / d angle."""
         return Harmonics(0.0, self.b1, -self.a1, 2 * self.b2, -2 * self.a2)
 
     def slope_bound(self) -> Expression:
-        """Upper bound of |f''|: hypot(a1, b1) + 4 hypot(a2, b2)."""
+        """Return an upper bound of |f''|: hypot(a1, b1) + 4 hypot(a2, b2)."""
         return ca.sqrt(self.a1**2 + self.b1**2) + 4 * ca.sqrt(self.a2**2 + self.b2**2)
 
 
-def first_square(a0: Expression, a1: Expression, b1: Expression) -> Harmonics:
-    """(a0 + a1 cos + b1 sin)^2."""
+def square_of_first_harmonic(a0: Expression, a1: Expression, b1: Expression) -> Harmonics:
+    """Return (a0 + a1 cos + b1 sin)^2."""
     mean = a0 * a0 + (a1 * a1 + b1 * b1) / 2
     return Harmonics(mean, 2 * a0 * a1, 2 * a0 * b1, (a1 * a1 - b1 * b1) / 2, a1 * b1)
 
 
-def minus(f: Harmonics, g: Harmonics) -> Harmonics:
-    """f - g."""
+def subtract_harmonics(f: Harmonics, g: Harmonics) -> Harmonics:
+    """Return f - g."""
     return Harmonics(*(a - b for a, b in zip(f, g, strict=True)))
 
 
-def scaled(f: Harmonics, factor: Expression) -> Harmonics:
-    """factor f."""
+def scale_harmonics(f: Harmonics, factor: Expression) -> Harmonics:
+    """Return factor f."""
     return Harmonics(*(factor * a for a in f))
 
 
-def roots(f: Harmonics, sharper: Slope | None = None, steps: int = ROOTS.polish_steps) -> list[Point]:
-    """Four points of the circle, among which are all roots of f; where f has fewer, the others mean nothing.
+def roots(f: Harmonics, polish_function: Slope | None = None, steps: int = ROOTS.polish_steps) -> list[Point]:
+    """Return four points of the circle that include all roots of f; if f has fewer, the others are meaningless.
 
-    The unit circle is cut by the conic f = 0: turned so that the second harmonic is r (x^2 - y^2), the pencil
-    f + l (x^2 + y^2 - 1) holds a pair of real lines for a root l in [-r, r] of a cubic that always has one there.
-    The lines meet the circle in the roots, which Newton steps then polish. Roots are good to rounding where they are
-    simple. Where they are double a step does no more than halve what the lines leave, mostly the square root of
-    rounding.
+    The roots are the intersections of the unit circle with the conic f = 0, in axes with the second harmonic r (x^2 -
+    y^2). The pencil f + l (x^2 + y^2 - 1) contains a pair of real lines for a root l in [-r, r] of a cubic, which
+    always has one. The lines intersect the circle in the roots, which Newton steps then polish. Simple roots are
+    accurate to rounding. At double roots a step only halves the error of the lines, typically the square root of the
+    machine precision.
 
     Args:
         f: The polynomial.
-        sharper: Function to polish with in place of f: one that shares the roots that matter and has them simple.
-        steps: Newton steps of the polish; with none, simple roots are good to about 1e-6.
+        polish_function: Function to polish with instead of f, with the same relevant roots, but simple ones.
+        steps: Newton steps of the polish; without any, simple roots are accurate to about 1e-6.
     """
     size = ca.fabs(f.a1) + ca.fabs(f.b1) + ca.fabs(f.a2) + ca.fabs(f.b2) + SMALLEST_DIVISOR
     f = Harmonics(f.a0 / size, f.a1 / size, f.b1 / size, f.a2 / size, f.b2 / size)
-    a0 = ca.fmin(ca.fmax(f.a0, -3.0), 3.0)  # beyond there is no root, only lost digits
-    plain = f.a2 * f.a2 + f.b2 * f.b2 < ROOTS.least_second**2
-    turn_c, turn_s, p, q, r = _axes(f, ca.if_else(plain, 2 * ROOTS.least_second, 0.0))
+    a0 = ca.fmin(ca.fmax(f.a0, -3.0), 3.0)  # beyond there is no root; larger values would only lose digits
+    first_only = f.a2 * f.a2 + f.b2 * f.b2 < ROOTS.min_second_harmonic**2
+    turn_c, turn_s, p, q, r = _axes(f, ca.if_else(first_only, 2 * ROOTS.min_second_harmonic, 0.0))
 
     t = _pencil(a0, p, q, r)
     wide, narrow = ca.sqrt(r * (1 + t)), ca.sqrt(r * (1 - t))
     p_direct, q_direct = ca.fabs(p) / (2 * wide + SMALLEST_DIVISOR), ca.fabs(q) / (2 * narrow + SMALLEST_DIVISOR)
-    direct = t >= 0  # divide by the larger of the two square roots, take the other part from the pencil
+    direct = t >= 0  # divide by the larger of the two square roots, and take the other part from the pencil
     p_part = ca.if_else(direct, p_direct, ca.sqrt(ca.fmax(0.0, a0 - r * t + q_direct * q_direct)))
     q_part = ca.if_else(direct, ca.sqrt(ca.fmax(0.0, r * t - a0 + p_direct * p_direct)), q_direct)
     outer = p_part + q_part
@@ -138,16 +138,16 @@ def roots(f: Harmonics, sharper: Slope | None = None, steps: int = ROOTS.polish_
             x, y = d * nx - end * h * ny, d * ny + end * h * nx
             points.append((x * turn_c - y * turn_s, x * turn_s + y * turn_c))
     slope = f.derivative()
-    sharp = sharper or (lambda c, s: (f.value(c, s), slope.value(c, s)))
-    # f has size 1: of a slope below the square root of rounding nothing but rounding is left, as at a double root
-    floor = SMALLEST_DIVISOR if sharper else np.finfo(float).eps
+    sharp = polish_function or (lambda c, s: (f.value(c, s), slope.value(c, s)))
+    # f has size 1: a slope below the square root of the machine precision is a rounding error, as at a double root
+    floor = SMALLEST_DIVISOR if polish_function else np.finfo(float).eps
     return [polish(point, sharp, steps, floor=floor) for point in points]
 
 
 def _axes(f: Harmonics, shift: Expression) -> tuple[Expression, Expression, Expression, Expression, Expression]:
-    """Cosine and sine of the turn to axes x, y in which f = a0 + p x + q y + r (x^2 - y^2); p, q and r > 0.
+    """Return cosine and sine of the rotation to axes with f = a0 + p x + q y + r (x^2 - y^2), and p, q and r > 0.
 
-    `shift` is added to a2, so that there is a second harmonic to turn to.
+    `shift` is added to a2, so that the second harmonic has a direction.
     """
     a2 = f.a2 + shift
     r = ca.sqrt(a2 * a2 + f.b2 * f.b2)
@@ -159,15 +159,15 @@ def _axes(f: Harmonics, shift: Expression) -> tuple[Expression, Expression, Expr
 
 
 def least_point(f: Harmonics) -> Point:
-    """The point of the circle where f is least of all.
+    """Return the point of the circle where f has its global minimum.
 
-    In axes where f = a0 + p x + q y + r (x^2 - y^2), r > 0, mirroring x or y changes the terms p x and q y only: the
-    least is in the quadrant where neither is positive. There f has one stationary point and no more, the root of
-    P / cos - Q / sin - 4 r, with P = |p|, Q = |q|, which grows from one end of the quadrant to the other. Halley steps
-    start from the larger of two lower bounds of the angle, or, by the cusp P = 4 r, Q = 0 where three roots meet,
-    from the cube root that leads there: four of them and one of Newton are good to rounding for all P, Q, r >= 0.
+    In axes with f = a0 + p x + q y + r (x^2 - y^2), r > 0, mirroring x or y only changes the terms p x and q y, so the
+    minimum is in the quadrant where neither is positive. There f has exactly one stationary point, the root of
+    P / cos - Q / sin - 4 r with P = |p|, Q = |q|, which is monotone over the quadrant. Halley steps start from the
+    larger of two lower bounds of the angle. Near the cusp P = 4 r, Q = 0, where three roots meet, they start from the
+    cube root that leads there. Three of them and one Newton step reach rounding accuracy for all P, Q, r >= 0.
     """
-    turn_c, turn_s, p, q, r = _axes(f, ca.if_else(f.a2 >= 0, ROOTS.least_square, -ROOTS.least_square))
+    turn_c, turn_s, p, q, r = _axes(f, ca.if_else(f.a2 >= 0, ROOTS.min_square_harmonic, -ROOTS.min_square_harmonic))
     big_p, big_q = ca.fabs(p), ca.fabs(q)
     scale = 1 / (big_p + big_q + 4 * r)
     big_p, big_q, big_r = big_p * scale, big_q * scale, 4 * r * scale
@@ -175,8 +175,8 @@ def least_point(f: Harmonics) -> Point:
     widest = ca.fmax(big_p, big_r)
     c = big_p / ca.fmax(hypot, big_r)
     s_cusp = ca.fmin(1.0, 2 * big_q / widest) ** (1 / 3)
-    near = ca.fabs(big_r - big_p) * s_cusp < big_q
-    c = ca.if_else(near, ca.fmin(c, ca.sqrt((1 - s_cusp) * (1 + s_cusp))), c)
+    step_tolerance = ca.fabs(big_r - big_p) * s_cusp < big_q
+    c = ca.if_else(step_tolerance, ca.fmin(c, ca.sqrt((1 - s_cusp) * (1 + s_cusp))), c)
     s = ca.sqrt(ca.fmax((1 - c) * (1 + c), 0.0))
     for k in range(ROOTS.least_steps):
         pc, ps, qc, qs, rc, rs = big_p * c, big_p * s, big_q * c, big_q * s, big_r * c, big_r * s
@@ -190,7 +190,7 @@ def least_point(f: Harmonics) -> Point:
             step = -value / slope
             c, s = c - step * s, s + step * c
         size = c * c + s * s
-        norm = 1.5 - 0.5 * size if k == ROOTS.least_steps - 2 else 1 / ca.sqrt(size)  # that step is small already
+        norm = 1.5 - 0.5 * size if k == ROOTS.least_steps - 2 else 1 / ca.sqrt(size)  # the last step but one is small
         c, s = c * norm, s * norm
     x, y = -_sign(p) * c, -_sign(q) * s
     return x * turn_c - y * turn_s, x * turn_s + y * turn_c
@@ -200,18 +200,19 @@ def polish(
     point: Point,
     function: Slope,
     steps: int = ROOTS.polish_steps,
-    reach: float = ROOTS.polish_reach,
+    max_polish_step: float = ROOTS.max_polish_step,
     floor: float = SMALLEST_DIVISOR,
 ) -> Point:
-    """Newton steps of at most `reach` rad on the circle; `function` gives value and derivative by the angle.
+    """Return a point after Newton steps of limited size (rad) on the circle.
 
-    Where the square of the derivative is below `floor` the steps vanish.
+    `function` returns value and derivative by the angle. If the square of the derivative is below `floor` the steps
+    vanish.
     """
     c, s = point
     for _ in range(steps):
         value, slope = function(c, s)
         step = -value * slope / (slope * slope + floor)
-        step = ca.fmin(ca.fmax(step, -reach), reach)
+        step = ca.fmin(ca.fmax(step, -max_polish_step), max_polish_step)
         c, s = c - step * s, s + step * c
         shrink = 1.5 - 0.5 * (c * c + s * s)  # 1 / norm to first order
         c, s = c * shrink, s * shrink
@@ -224,7 +225,7 @@ def _sign(x: Expression) -> Expression:
 
 
 def _pencil(a0: Expression, p: Expression, q: Expression, r: Expression) -> Expression:
-    """The root t = l / r in [-1, 1] of 4 r (r t - a0) (t^2 - 1) + p^2 (t - 1) + q^2 (t + 1)."""
+    """Return the root t = l / r in [-1, 1] of 4 r (r t - a0) (t^2 - 1) + p^2 (t - 1) + q^2 (t + 1)."""
     b2 = -a0 / r
     b1 = (p * p + q * q) / (4 * r * r) - 1
     b0 = a0 / r + (q * q - p * p) / (4 * r * r)
@@ -237,7 +238,7 @@ def _pencil(a0: Expression, p: Expression, q: Expression, r: Expression) -> Expr
     third = ca.acos(ca.fmin(ca.fmax(big_r / (root_q * root_q * root_q + SMALLEST_DIVISOR), -1.0), 1.0)) / 3
     least = -2 * root_q * ca.cos(third) - b2 / 3
     greatest = root_q * (ca.cos(third) + 3**0.5 * ca.sin(third)) - b2 / 3
-    # of three real roots an odd number lies in [-1, 1]: the least does, or else the greatest
+    # an odd number of the three real roots lies in [-1, 1]: the least root, or else the greatest
     t = ca.if_else(excess >= 0, lone, ca.if_else(least >= -1 - 1e-9, least, greatest))
     t = ca.fmin(ca.fmax(t, -1.0), 1.0)
     for _ in range(ROOTS.cubic_steps):
@@ -252,8 +253,8 @@ Series = list[tuple[Expression, Expression]]
 """Coefficients (a_k, b_k) of cos k and sin k of an angle, k = 0, 1, ...; b_0 is 0."""
 
 
-def product(f: Series, g: Series) -> Series:
-    """f g."""
+def multiply_series(f: Series, g: Series) -> Series:
+    """Return f g."""
     total = [[0.0, 0.0] for _ in range(len(f) + len(g) - 1)]
     for i, (a, b) in enumerate(f):
         for k, (c, d) in enumerate(g):
@@ -265,8 +266,8 @@ def product(f: Series, g: Series) -> Series:
     return [(a, 0.0 if k == 0 else b) for k, (a, b) in enumerate(total)]
 
 
-def added(f: Series, g: Series, factor: float = 1) -> Series:
-    """f + factor g."""
+def add_series(f: Series, g: Series, factor: float = 1) -> Series:
+    """Return f + factor g."""
     zero: Series = [(0.0, 0.0)]
     size = max(len(f), len(g))
     longer = [f + zero * (size - len(f)), g + zero * (size - len(g))]
@@ -274,14 +275,15 @@ def added(f: Series, g: Series, factor: float = 1) -> Series:
 
 
 def series_roots(degree: int) -> Any:
-    """Function of the coefficients of a Series -> points of the circle, among which are its simple roots.
+    """Return the Function of the coefficients of a Series -> points of the circle that include its simple roots.
 
     Input (2, degree + 1), rows a and b; output (2, 2 degree), rows cosine and sine. The roots z = exp(i angle) of the
-    polynomial z^degree f are found all at once (Aberth 1973) in at most sum(ROOTS.stages) steps, and those off the
-    circle are drawn to it, where they mean nothing. Good to a few digits; polish them with the function at hand.
+    polynomial z^degree f are points simultaneously (Aberth 1973) in at most sum(ROOTS.stages) steps. Roots off the
+    circle are projected to it and meaningless. The result has a few correct digits; polish it with the function at
+    hand.
     """
     n = 2 * degree
-    given = ca.SX.sym("coefficients", 2, degree + 1)
+    coefficients = ca.SX.sym("coefficients", 2, degree + 1)
     unit = ca.SX.sym("scaled", 2, degree + 1)
     z = ca.SX.sym("z", 2, n)
     real: list[Expression] = [0] * (n + 1)
@@ -290,67 +292,69 @@ def series_roots(degree: int) -> Any:
         a, b = (unit[0, k], unit[1, k]) if k else (2 * unit[0, 0], 0)
         real[degree + k], imaginary[degree + k] = a, -b
         real[degree - k], imaginary[degree - k] = a, b
-    apart: dict[tuple[int, int], Point] = {}
+    inverse_differences: dict[tuple[int, int], Point] = {}
     for i in range(n):
         for k in range(i):
-            part = _over((1, 0), (z[0, i] - z[0, k], z[1, i] - z[1, k]))
-            apart[i, k], apart[k, i] = part, (-part[0], -part[1])
-    moved = []
+            part = _divide((1, 0), (z[0, i] - z[0, k], z[1, i] - z[1, k]))
+            inverse_differences[i, k], inverse_differences[k, i] = part, (-part[0], -part[1])
+    iterates = []
     for i in range(n):
         x, y = z[0, i], z[1, i]
         value, slope = (real[n], imaginary[n]), (0, 0)
         for k in reversed(range(n)):
-            slope = _times(slope, (x, y))
+            slope = _multiply(slope, (x, y))
             slope = (slope[0] + value[0], slope[1] + value[1])
-            value = _times(value, (x, y))
+            value = _multiply(value, (x, y))
             value = (value[0] + real[k], value[1] + imaginary[k])
-        newton = _over(value, slope)
-        push: Point = (0, 0)
+        newton = _divide(value, slope)
+        repulsion: Point = (0, 0)
         for k in range(n):
             if k != i:
-                push = (push[0] + apart[i, k][0], push[1] + apart[i, k][1])
-        drawn = _times(newton, push)
-        step = _over(newton, (1 - drawn[0], -drawn[1]))
+                repulsion = (repulsion[0] + inverse_differences[i, k][0], repulsion[1] + inverse_differences[i, k][1])
+        correction = _multiply(newton, repulsion)
+        step = _divide(newton, (1 - correction[0], -correction[1]))
         length = ca.hypot(step[0], step[1])
-        calm = 1 / ca.fmax(1.0, length / (2 * (1 + ca.hypot(x, y))))
-        moved.append(ca.vertcat(x - calm * step[0], y - calm * step[1]))
+        damping = 1 / ca.fmax(1.0, length / (2 * (1 + ca.hypot(x, y))))
+        iterates.append(ca.vertcat(x - damping * step[0], y - damping * step[1]))
     longest = ca.SX(0)
     for i in range(n):
-        longest = ca.fmax(longest, ca.norm_1(moved[i] - z[:, i]) - ROOTS.near * ca.norm_1(moved[i]))
-    step_function = ca.Function("aberth", [z, unit], [ca.horzcat(*moved), longest])
+        longest = ca.fmax(longest, ca.norm_1(iterates[i] - z[:, i]) - ROOTS.step_tolerance * ca.norm_1(iterates[i]))
+    step_function = ca.Function("aberth", [z, unit], [ca.horzcat(*iterates), longest])
 
     symbol = ca.MX.sym("coefficients", 2, degree + 1)
-    norm = ca.Function("norm", [given], [given / (ca.norm_1(ca.vec(given)) + SMALLEST_DIVISOR)])(symbol)
+    norm = ca.Function("norm", [coefficients], [coefficients / (ca.norm_1(ca.vec(coefficients)) + SMALLEST_DIVISOR)])(
+        symbol
+    )
     angles = [0.37 + 2 * ca.pi * i / n for i in range(n)]
     # off the circle the roots are in pairs z, 1 / conj z: one half starts inside, the other outside
     radii = [3.0 if i % 2 else 1 / 3.0 for i in range(n)]
-    at = list(zip(angles, radii, strict=True))
-    found: Any = ca.DM([[r * ca.cos(a) for a, r in at], [r * ca.sin(a) for a, r in at]])
+    polar = list(zip(angles, radii, strict=True))
+    points: Any = ca.DM([[r * ca.cos(a) for a, r in polar], [r * ca.sin(a) for a, r in polar]])
     moving = None
     for count in ROOTS.stages:
         stage = _steps(step_function, count)
         if moving is None:
-            found, moving = stage(found, norm)
+            points, moving = stage(points, norm)
             continue
         keep = ca.Function("keep", [z, unit], [z, 0])
-        found, moving = ca.Function.if_else("aberth", stage, keep)(moving > 0, found, norm)
+        points, moving = ca.Function.if_else("aberth", stage, keep)(moving > 0, points, norm)
     circle = ca.Function("circle", [z], [z / ca.repmat(ca.sqrt(ca.sum1(z * z) + SMALLEST_DIVISOR), 2, 1)])
-    return ca.Function("series_roots", [symbol], [circle(found)], ["coefficients"], ["points"])
+    return ca.Function("series_roots", [symbol], [circle(points)], ["coefficients"], ["points"])
 
 
 def _steps(step: Any, count: int) -> Any:
-    """Function (z, coefficients) -> (z after some steps, whether it still moves)."""
+    """Return the Function (z, coefficients) -> (z after some steps, whether it still moves)."""
     z, unit = ca.MX.sym("z", *step.size_in(0)), ca.MX.sym("scaled", *step.size_in(1))
-    moved, longest = z, None
+    iterates, longest = z, None
     for _ in range(count):
-        moved, longest = step(moved, unit)
-    return ca.Function("steps", [z, unit], [moved, longest])
+        iterates, longest = step(iterates, unit)
+    return ca.Function("steps", [z, unit], [iterates, longest])
 
 
-def _times(a: Point, b: Point) -> Point:
+def _multiply(a: Point, b: Point) -> Point:
     return a[0] * b[0] - a[1] * b[1], a[0] * b[1] + a[1] * b[0]
 
 
-def _over(a: Point, b: Point) -> Point:
+def _divide(a: Point, b: Point) -> Point:
     scale = 1 / (b[0] * b[0] + b[1] * b[1] + SMALLEST_DIVISOR)
     return (a[0] * b[0] + a[1] * b[1]) * scale, (a[1] * b[0] - a[0] * b[1]) * scale

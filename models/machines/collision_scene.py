@@ -23,9 +23,9 @@ from models.machines.moving_obstacle import MovingObstacle
 from models.machines.pair_gradients import WORLD, Placed, distance_gradients
 from models.robot.kinematics import link_frames
 from models.robot.robot import Robot
-from models.shapes.bodies import Body, LinkMesh, MissingRule, RigidParts, arms, bodies_of
+from models.shapes.bodies import Body, LinkMesh, MissingRule, RigidParts, collision_bodies, lever_arms
 from models.shapes.distance import COLUMNS, column, distance, pair_function, soft_minimum
-from models.shapes.pairs import ASSUMED, COVERED, SRDF, STILL, TOLD, Reason, checked_pairs
+from models.shapes.pairs import ASSUMED, COVERED, IGNORED, IMMOBILE, SRDF, Reason, checked_pairs
 from models.shapes.shapes import KINDS, Box, Shape, checked_shape
 from models.spatial import Expression, Frame, expression
 
@@ -63,7 +63,7 @@ class CollisionScene:
         folders: Where meshes are looked for.
         missing: "raise" where a mesh is missing; "skip" goes on without it, and warns.
         limits: Whether the joints keep to the robot's position limits, by which pairs are left that never touch.
-        covered: Bodies that stand for the meshes of links, as of `models.shapes.bodies.bodies_of`; from the files of
+        covered: Bodies that stand for the meshes of links, as of `models.shapes.bodies.collision_bodies`; from files of
             the meshes if None, and in either case told afterwards.
         bodies: All that is looked at: of the links, obstacles, hulls of meshes.
         pairs: Of each pair the two bodies and the frame that they are seen from, -1 for the world. Shape (n, 3).
@@ -110,7 +110,9 @@ class CollisionScene:
         if not isinstance(robot, Robot):
             message = f"scene: machine must be a FixedBase(robot) or another machine, not {self.machine!r}"
             raise ModelError(message, name="machine", value=self.machine)
-        own = bodies_of(robot, folders=_listed(self.folders, "folders"), missing=self.missing, covered=self.covered)
+        own = collision_bodies(
+            robot, folders=_listed(self.folders, "folders"), missing=self.missing, covered=self.covered
+        )
         object.__setattr__(self, "covered", _by_mesh(robot, own))
         links, around = self._told()
         reach: dict[str, Any] = (
@@ -141,9 +143,9 @@ class CollisionScene:
             name = f"obstacle {number}"
             for i, body in enumerate(own):
                 if {(body.link, name), (name, body.link)} & told:
-                    left[body.link, name] = TOLD
+                    left[body.link, name] = IGNORED
                 elif not self._moves(body.link) and not isinstance(one, MovingObstacle):
-                    left[body.link, name] = STILL
+                    left[body.link, name] = IMMOBILE
                 else:
                     pairs.append((i, number))
         return pairs, left
@@ -188,7 +190,7 @@ class CollisionScene:
 
     def _seen_from(self, one: Body, other: Body) -> str:
         """The link that two bodies are seen from: the last rigid part that carries both."""
-        return self._parts.meeting(*(self._parts.of_link[body.link] for body in (one, other)))
+        return self._parts.common_part(*(self._parts.of_link[body.link] for body in (one, other)))
 
     @property
     def labels(self) -> tuple[tuple[str, str], ...]:
@@ -364,7 +366,9 @@ class CollisionScene:
         way = parts.path(parts.of_link[above], parts.of_link[link])[1]
         endless = np.full(robot.dof, np.inf)
         low, high = (robot.lower, robot.upper) if self.limits else (-endless, endless)
-        own, reach = arms(robot, [(step, True) for step in way], placed.shape.placed(*parts.place[link]), low, high)
+        own, reach = lever_arms(
+            robot, [(step, True) for step in way], placed.shape.placed(*parts.pose[link]), low, high
+        )
         for (joint, *_), arm in zip(way, own, strict=True):
             column, ratio, _ = robot.drives[joint.name]
             slides = joint.kind == "prismatic"

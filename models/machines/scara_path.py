@@ -78,7 +78,7 @@ def scara_along(scara: Scara, path: SmoothPath, elbow: Elbow = "left", *, cleara
     checked_nonnegative(clearance, "scara", "clearance", "m")
     _check_reach(scara, path, clearance)
     rates = scara.inverse_rates(elbow)
-    s = path.dense(8, 16)
+    s = path.sample_distances(8, 16)
     turn = path.turn(s)
     tilt = np.abs(turn.quaternion[:, 1:3]).max(axis=1)
     if tilt.max() > 1e-9:
@@ -146,7 +146,7 @@ def _check_reach(scara: Scara, path: SmoothPath, clearance: float) -> None:
     """Refuse a path beyond the reach, or too near to its ends."""
     if checked_number(clearance, "scara", "clearance") < 0:
         raise ModelError(f"scara: clearance {clearance!r} m is negative", name="clearance", value=clearance, limit=0.0)
-    s = path.dense(8, 32)
+    s = path.sample_distances(8, 32)
 
     def radius(places: Array) -> Array:
         return np.asarray(np.linalg.norm((path.at(places).position - scara.mount)[:, :2], axis=1))

@@ -1,11 +1,11 @@
-"""Task paths: lines, arcs and helices with tool orientation, rounded at their corners, as functions of the distance."""
+"""Task paths of lines, arcs and helices with tool orientation and rounded corners, as functions of the distance."""
 
-from models.paths.blends import end_curvature, gamma, middle_curvature, peak_curvature, rest_to_rest
+from models.paths.blends import gamma, rest_to_rest
 from models.paths.functions import gauss_newton, march, path_function, predictor_corrector, turn_function
-from models.paths.path import Path, chains
+from models.paths.path import Path, split_at_reversals
 from models.paths.rounding import smooth
 from models.paths.segments import Arc, Helix, Line, Segment
-from models.paths.smooth_path import Blend, Place, SmoothPath, Turn
+from models.paths.smooth_path import Blend, PathPoint, SmoothPath, Turn
 
 __all__ = [
     "Arc",
@@ -13,20 +13,17 @@ __all__ = [
     "Helix",
     "Line",
     "Path",
-    "Place",
+    "PathPoint",
     "Segment",
     "SmoothPath",
     "Turn",
-    "chains",
-    "end_curvature",
     "gamma",
     "gauss_newton",
     "march",
-    "middle_curvature",
     "path_function",
-    "peak_curvature",
     "predictor_corrector",
     "rest_to_rest",
     "smooth",
+    "split_at_reversals",
     "turn_function",
 ]

@@ -1,8 +1,9 @@
 """Arc length of blends, to rounding, and its inverse.
 
-A blend's speed |dr/du| is analytic but nearly singular in the middle of a sharp corner, so each curve is cut into cells
-in which the 10-point Gauss-Legendre rule is exact to rounding: cells shrink where the corner is sharp. They also shrink
-until the cubic Hermite guess of the inverse is monotone, from which Chebyshev's method converges.
+The speed |dr/du| of a blend is analytic but nearly singular in the middle of a sharp corner. Each curve is therefore
+split into cells in which the 10-point Gauss-Legendre rule is exact to rounding; cells are smaller near sharp corners.
+They are also small enough for the cubic Hermite guess of the inverse to be monotone, from which Chebyshev's method
+converges.
 """
 
 from __future__ import annotations
@@ -19,17 +20,17 @@ __all__ = ["GAUSS_NODES", "GAUSS_WEIGHTS", "Cells", "arc_length", "cells", "gaus
 
 
 def gauss_rule(count: int) -> tuple[Array, Array]:
-    """Nodes and weights of the rule of Gauss and Legendre on 0 to 1."""
+    """Return nodes and weights of the Gauss-Legendre rule on 0 to 1."""
     nodes, weights = np.polynomial.legendre.leggauss(count)
     return (nodes + 1) / 2, weights / 2
 
 
 GAUSS_NODES, GAUSS_WEIGHTS = gauss_rule(10)
-MOST_STEPS = 4
+MAX_STEPS = 4
 
 
 class Cells(NamedTuple):
-    """Cells of polynomial curves, curve by curve, in the order of u.
+    """Cells of polynomial curves, sorted by curve and u.
 
     Attributes:
         curve: Index of the curve. Shape (C,).
@@ -44,12 +45,12 @@ class Cells(NamedTuple):
 
 
 def speed(coefficients: Array, u: Array) -> Array:
-    """|dr/du|. Shapes (M, 6, 3), (M,) to (M,), m."""
+    """Return the speed |dr/du| at u. Shapes (M, 6, 3), (M,) to (M,), m."""
     return _speed(_derivative(coefficients), u)
 
 
 def _derivative(coefficients: Array) -> Array:
-    # (M, 6, 3) to (3, 5, M), samples last: numpy's inner loops are then long
+    # (M, 6, 3) to (3, 5, M), with the samples last for long inner loops
     columns = np.ascontiguousarray(np.transpose(coefficients, (2, 1, 0)))
     return np.asarray(columns[:, 1:] * np.arange(1.0, 6.0)[:, None])
 
@@ -68,8 +69,8 @@ def _speed(derivative: Array, u: Array) -> Array:
     return np.asarray(np.sqrt(total, out=total))
 
 
-def _change(derivative: Array, u: Array) -> Array:
-    """Half the derivative of the squared speed by u. Shapes (3, 5, M), (M,) to (M,)."""
+def _half_square_slope(derivative: Array, u: Array) -> Array:
+    """Return half the derivative of the squared speed by u. Shapes (3, 5, M), (M,) to (M,)."""
     total: Array = np.zeros(np.shape(u))
     for terms in derivative:
         value, slope = terms[4] * u + terms[3], terms[4].copy()
@@ -86,10 +87,10 @@ def _lengths(derivative: Array, start: Array, width: Array) -> Array:
 
 
 def cells(coefficients: Array) -> Cells:
-    """Cut curves into cells. `coefficients` as in models.paths.blends, shape (B, 6, 3).
+    """Split curves into cells. `coefficients` as in models.paths.blends, shape (B, 6, 3).
 
     Raises:
-        ModelError: A curve that stops on its way (a cusp), where no finite number of cells is enough.
+        ModelError: A curve has a cusp, which no finite number of cells resolves.
     """
     curve = np.arange(len(coefficients))
     start, width = np.zeros(len(curve)), np.ones(len(curve))
@@ -101,10 +102,10 @@ def cells(coefficients: Array) -> Cells:
         if not curve.size:
             break
         half = width / 2
-        mine = slopes[:, :, curve]
-        left, right = _lengths(mine, start, half), _lengths(mine, start + half, half)
-        fine = np.abs(whole - left - right) <= 1e-13 * scale[curve]  # rounding of twenty terms
-        slowest = np.minimum(_speed(mine, start), _speed(mine, start + width))
+        own_slopes = slopes[:, :, curve]
+        left, right = _lengths(own_slopes, start, half), _lengths(own_slopes, start + half, half)
+        fine = np.abs(whole - left - right) <= 1e-13 * scale[curve]  # rounding error of twenty terms
+        slowest = np.minimum(_speed(own_slopes, start), _speed(own_slopes, start + width))
         # the cubic of u between the ends is monotone up to slopes of 3 over the mean (Fritsch & Carlson 1980)
         fine &= left + right <= 3 * width * slowest
         done.append((curve[fine], start[fine], width[fine], (left + right)[fine]))
@@ -115,18 +116,19 @@ def cells(coefficients: Array) -> Cells:
         whole = np.stack([left[rough], right[rough]], axis=1).ravel()
     else:
         name = f"vertex {int(curve[0]) + 1}"
-        message = f"the blend at {name} stops at u = {start[0]:.6g}, a cusp"
-        raise ModelError(f"{message}; take a smaller shape factor or remaining distance", name=name, value=start[0])
-    found = [np.concatenate(parts) for parts in zip(*done, strict=True)] if done else [np.zeros(0)] * 4
-    order = np.lexsort((found[1], found[0]))
-    return Cells(found[0][order].astype(np.intp), found[1][order], found[2][order], found[3][order])
+        message = f"the blend at {name} has a cusp at u = {start[0]:.6g}"
+        raise ModelError(f"{message}; use a smaller shape factor or remaining distance", name=name, value=start[0])
+    columns = [np.concatenate(parts) for parts in zip(*done, strict=True)] if done else [np.zeros(0)] * 4
+    order = np.lexsort((columns[1], columns[0]))
+    return Cells(columns[0][order].astype(np.intp), *(column[order] for column in columns[1:]))
 
 
 def parameter(coefficients: Array, start: Array, width: Array, length: Array, distance: Array) -> Array:
-    """u at which the arc length from the cell's start is `distance`.
+    """Return the u at which the arc length from the cell's start is `distance`.
 
-    Shapes: coefficients (M, 6, 3), all others (M,). Cubic Hermite guess from the cell's ends, then Chebyshev's steps,
-    whose error is that before cubed, on the 10-point rule: to rounding, for any distance from 0 to the cell's length.
+    Shapes: coefficients (M, 6, 3), all others (M,). A cubic Hermite guess from the cell's ends is refined by Chebyshev
+    iterations, which converge cubically, with the 10-point rule. The result is accurate to rounding for distances from
+    0 to the cell's length.
     """
     slopes = _derivative(coefficients)
     begin, end = _speed(slopes, start), _speed(slopes, start + width)
@@ -135,22 +137,22 @@ def parameter(coefficients: Array, start: Array, width: Array, length: Array, di
     slope0, slope1 = length / (width * begin), length / (width * end)
     guess = x * (slope0 + x * (3 - 2 * slope0 - slope1 + x * (slope0 + slope1 - 2)))
     u = start + width * np.clip(guess, 0, 1)
-    for _ in range(MOST_STEPS):
+    for _ in range(MAX_STEPS):
         excess = _lengths(slopes, start, u - start) - distance
         rate = _speed(slopes, u)
         step = excess / rate
-        step *= 1 + step * _change(slopes, u) / (2 * rate**2)
+        step *= 1 + step * _half_square_slope(slopes, u) / (2 * rate**2)
         u = np.clip(u - step, start, start + width)
-        if not excess.size or np.abs(excess / length).max() < 1e-6:  # the step just made cubes it
+        if not excess.size or np.abs(excess / length).max() < 1e-6:  # the last step has cubed it
             break
     return np.asarray(u)
 
 
 def arc_length(coefficients: Array, u: Array) -> Array:
-    """Arc length from 0 to u of one curve, shape (6, 3). Shapes (M,) to (M,), m."""
+    """Return the arc length from 0 to u of one curve, shape (6, 3). Shapes (M,) to (M,), m."""
     curve = coefficients[None]
     parts = cells(curve)
-    at = np.clip(np.searchsorted(parts.start, u, side="right") - 1, 0, len(parts.start) - 1)
-    before = np.concatenate([[0.0], np.cumsum(parts.length)])[at]
-    start = parts.start[at]
-    return np.asarray(before + _lengths(_derivative(curve[np.zeros(len(at), dtype=int)]), start, u - start))
+    index = np.clip(np.searchsorted(parts.start, u, side="right") - 1, 0, len(parts.start) - 1)
+    before = np.concatenate([[0.0], np.cumsum(parts.length)])[index]
+    start = parts.start[index]
+    return np.asarray(before + _lengths(_derivative(curve[np.zeros(len(index), dtype=int)]), start, u - start))

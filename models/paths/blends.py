@@ -1,25 +1,25 @@
-"""Curves that round the corner between two segments, and their closed forms at a corner of two lines.
+"""Curves that round the corner between two segments, their closed forms between lines, and the best shape factor.
 
-Lee, Ryu, Cheong 2006, eqs (1)-(9): a cubic with end tangents alpha n1, alpha n2, alpha = shape * remaining (9). With 3
-its end curvature between lines is exactly zero for every angle; next to an arc it is not that of the arc. The
-quintic prescribes the second derivative as well and so matches the curvature of every neighbour.
+The cubic of Lee, Ryu, Cheong 2006, eqs (1)-(9), has the end tangents alpha n1, alpha n2 with alpha = shape * remaining
+(9). With the shape factor 3 its end curvature between lines is exactly zero for every angle; next to an arc it differs
+from that of the arc. The quintic prescribes the second derivative as well and so matches the curvature of every
+neighbour.
 
-Polynomials are ascending: r(u) = sum_k coefficients[k] u^k, u in [0, 1]. Shape (..., 6, 3), a cubic filled with zeros.
+Polynomials are ascending: r(u) = sum_k coefficients[k] u^k, u in [0, 1]. Shape (..., 6, 3), a cubic padded with zeros.
 `angle` is the interior angle at the vertex: pi for a straight line, small for a sharp corner.
 
-The shape factor that suits a corner: the one whose quintic bends least at its sharpest place.
-
-A steady speed v is permitted up to v^2 curvature = centripetal limit, so of all shapes at one remaining distance that
-of least peak curvature is run fastest. A small factor bends near the ends, a large one in the middle: between them the
-peak has one lowest place, and where a neighbour's own curvature is the peak a whole stretch of them. It is found by a
-search along one line, coarse and then by the golden section. Between two lines it is a function of the angle alone,
-kept in a table; next to arcs it depends on their curvatures times the remaining distance too.
-
-A tangent joint of line and arc is left at the arc's own curvature: 1 of its speed, where the factor 1.5 permits 0.79.
+The best shape factor has the least peak curvature of the quintic. A constant speed v is limited by v^2 curvature =
+centripetal limit, so this blend is the fastest of all with the same remaining distance. A small factor concentrates
+the curvature near the ends, a large one in the middle. The peak therefore has one minimum in between, or an interval
+of minima if a neighbour's own curvature is the peak. A coarse grid and a golden-section search find it. Between two
+lines it depends on the angle alone and is tabulated; next to arcs it also depends on their curvatures times the
+remaining distance. A tangent joint of line and arc keeps the arc's own curvature and full speed, where the factor 1.5
+permits 0.79 of it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal, TypeAlias, get_args
@@ -35,55 +35,49 @@ __all__ = [
     "PAPER_SHAPE",
     "BlendKind",
     "best_shape",
-    "by_arc_length",
     "checked_shape",
     "corner_shape",
     "cubic",
     "curvature",
-    "end_curvature",
+    "derivatives_by_arc_length",
     "gamma",
-    "middle_curvature",
-    "peak_curvature",
     "polynomial",
     "quintic",
     "rest_to_rest",
 ]
 
 BlendKind: TypeAlias = Literal["cubic", "quintic"]
+Ends: TypeAlias = tuple[Array, Array, Array, Array, Array, Array]
 PAPER_SHAPE = 3.0
-"""Of the cubic, whose curvature is then continuous between lines."""
+"""Shape factor of the cubic in the paper, for continuous curvature between lines."""
 LARGEST_SHAPE: dict[str, float] = {"cubic": 6.0, "quintic": 30 / 7}
-"""At these the curve between two lines stops in its middle: a cusp."""
-# value and derivative at the middle of the corner: F = Lr (n2 - n1) (1/2 - a shape), F' = Lr (n1 + n2) (b - c shape),
-# F'' = Lr (n2 - n1) d shape
-MIDDLE: dict[str, tuple[float, float, float, float]] = {
-    "cubic": (1 / 8, 3 / 2, 1 / 4, 1.0),
-    "quintic": (5 / 32, 15 / 8, 7 / 16, 3 / 2),
-}
+"""Shape factors at which the curve between two lines has a cusp in its middle."""
+MIDDLE_FACTORS: dict[str, float] = {"cubic": 1 / 4, "quintic": 5 / 16}
+"""Factors of the shape in the distance from the vertex at u = 1/2, (8)."""
 
 
 def checked_shape(shape: ArrayInput, kind: str, count: int = 1) -> Array:
-    """Shape factors of some vertices, one or one for each given.
-
-    Shape (count,).
+    """Return the shape factors of vertices, from one for all or one for each. Shape (count,).
 
     Raises:
-        ModelError: A factor that is not above zero and below that of the cusp (cubic 6, quintic 30/7), an unknown kind.
+        ModelError: A factor is not positive or reaches that of the cusp (cubic 6, quintic 30/7), or the kind is
+            unknown.
     """
     checked_choice(kind, get_args(BlendKind), "blend", "kind")
     cusp = LARGEST_SHAPE[kind]
     factors = one_for_each(shape, count, f"{kind} blend", "shape factor", "vertices", positive=True)
     if (factors >= cusp).any():
-        worst = float(factors.max())
-        message = f"shape factor {worst:g} of a {kind} blend must be below {cusp:.6g}, where the curve has a cusp"
-        raise ModelError(message, name="shape", value=worst, limit=cusp)
+        largest = float(factors.max())
+        message = f"shape factor {largest:g} of a {kind} blend must be below {cusp:.6g}, where the curve has a cusp"
+        raise ModelError(message, name="shape", value=largest, limit=cusp)
     return factors
 
 
 def rest_to_rest(s: Expression) -> Expression:
-    """Share of a way after the share s of its time, from rest to rest: 10 s^3 - 15 s^4 + 6 s^5, s in [0, 1].
+    """Return the minimum-jerk time scaling 10 s^3 - 15 s^4 + 6 s^5 of the share s of the duration, s in [0, 1].
 
-    The polynomial of least degree whose speed and acceleration are zero at both ends. Numbers, arrays and expressions.
+    It is the polynomial of least degree whose velocity and acceleration are zero at both ends. Accepts numbers, arrays
+    and expressions.
     """
     if not isinstance(s, ca.SX | ca.MX | ca.DM):
         s = checked_numbers(s, "rest_to_rest", "s")
@@ -91,7 +85,7 @@ def rest_to_rest(s: Expression) -> Expression:
 
 
 def cubic(start: Array, start_rate: Array, end: Array, end_rate: Array) -> Array:
-    """Cubic with given ends and derivatives by u, eqs (1)-(7). Shapes (..., 3) to (..., 6, 3)."""
+    """Return the cubic with given ends and derivatives by u, eqs (1)-(7). Shapes (..., 3) to (..., 6, 3)."""
     chord = end - start
     zero = np.zeros_like(chord)
     second = 3 * chord - 2 * start_rate - end_rate
@@ -102,7 +96,7 @@ def cubic(start: Array, start_rate: Array, end: Array, end_rate: Array) -> Array
 def quintic(
     start: Array, start_rate: Array, start_second: Array, end: Array, end_rate: Array, end_second: Array
 ) -> Array:
-    """Quintic with given ends, first and second derivatives by u. Shapes (..., 3) to (..., 6, 3)."""
+    """Return the quintic with given ends, first and second derivatives by u. Shapes (..., 3) to (..., 6, 3)."""
     value = end - start - start_rate - start_second / 2
     rate = end_rate - start_rate - start_second
     bend = end_second - start_second
@@ -120,93 +114,43 @@ def quintic(
 
 
 def polynomial(coefficients: Array, u: Array, order: int = 0) -> Array:
-    """Derivative of some order of polynomials at u. Shapes (..., 6, 3), (...) to (..., 3)."""
-    powers = _falling(order)
-    last = coefficients[..., 5, :] * powers[5]
+    """Return a derivative of polynomials at u. Shapes (..., 6, 3), (...) to (..., 3)."""
+    factors = _falling_factorials(order)
+    value = coefficients[..., 5, :] * factors[5]
     u = np.asarray(u, dtype=float)[..., None]
     for k in range(4, order - 1, -1):
-        last = last * u + coefficients[..., k, :] * powers[k]
-    return np.asarray(last)
+        value = value * u + coefficients[..., k, :] * factors[k]
+    return np.asarray(value)
 
 
-def _falling(order: int) -> list[float]:
+def _falling_factorials(order: int) -> list[float]:
     # k (k - 1) ... (k - order + 1)
     return [float(np.prod(np.arange(k - order + 1, k + 1))) if k >= order else 0.0 for k in range(6)]
 
 
-def _check_corner(shape: float, angle: float, remaining: float = 1.0) -> None:
-    for what, value in (("shape factor", shape), ("angle", angle), ("remaining distance", remaining)):
-        checked_number(value, "corner", what, positive=True)
-    if angle > np.pi:
-        raise ModelError(f"corner: angle {angle:g} rad is above pi", name="angle", value=angle, limit=np.pi)
-
-
-def _middle(kind: str) -> tuple[float, float, float, float]:
-    return MIDDLE[checked_choice(kind, get_args(BlendKind), "blend", "kind")]
-
-
 def gamma(shape: float, angle: float, kind: str = "cubic") -> float:
-    """Distance vertex to curve over the remaining distance, eq. (8), between two lines.
+    """Return the distance of the blend from the vertex over the remaining distance, eq. (8), between two lines.
 
     |1 - shape/4| cos(angle/2) for the cubic, |1 - 5 shape/16| cos(angle/2) for the quintic: the distance at u = 1/2,
-    which is the nearest point for shapes up to 4 (cubic) and 3.2 (quintic).
+    which is the closest point for shapes up to 4 (cubic) and 3.2 (quintic).
     """
-    _check_corner(shape, angle)
-    a = _middle(kind)[0]
-    return float(abs(1 - 2 * a * shape) * np.cos(angle / 2))
-
-
-def end_curvature(shape: float, angle: float, remaining: float) -> float:
-    """Curvature (1/m) of the cubic where it leaves a line: |6 - 2 shape| sin(angle) / (shape^2 remaining)."""
-    _check_corner(shape, angle, remaining)
-    return float(abs(6 - 2 * shape) * np.sin(angle) / (shape**2 * remaining))
-
-
-def middle_curvature(shape: float, angle: float, remaining: float, kind: str = "cubic") -> float:
-    """Curvature (1/m) at u = 1/2 between two lines.
-
-    For the cubic shape cos(angle/2) / [2 (1.5 - shape/4)^2 sin^2(angle/2) remaining], the largest of the curve near
-    shape 3; a flatter shape bends more at its ends, see `peak_curvature`.
-    """
-    _check_corner(shape, angle, remaining)
-    _, b, c, d = _middle(kind)
-    half = angle / 2
-    return float(d * shape * np.cos(half) / (2 * (b - c * shape) ** 2 * np.sin(half) ** 2 * remaining))
-
-
-def peak_curvature(shape: float, angle: float, remaining: float, kind: str = "cubic") -> float:
-    """Largest curvature (1/m) of the blend between two lines, wherever it lies.
-
-    Taken on a grid that is refined about its largest value, 1e-8 relative.
-    """
-    _check_corner(shape, angle, remaining)
-    checked_shape(shape, kind)
-    n1, n2 = np.array([1.0, 0.0, 0.0]), np.array([-np.cos(angle), np.sin(angle), 0.0])
-    rate, zero = shape * remaining, np.zeros(3)
-    start, end = -remaining * n1, remaining * n2
-    if kind == "cubic":
-        curve = cubic(start, rate * n1, end, rate * n2)
-    else:
-        curve = quintic(start, rate * n1, zero, end, rate * n2, zero)
-    low, high, best = 0.0, 1.0, 0.0
-    for _ in range(5):
-        u = np.linspace(low, high, 2001)
-        bend = curvature(curve, u)
-        at = int(bend.argmax())
-        best = float(bend[at])
-        low, high = u[max(at - 2, 0)], u[min(at + 2, len(u) - 1)]
-    return best
+    for name, value in (("shape factor", shape), ("angle", angle)):
+        checked_number(value, "corner", name, positive=True)
+    if angle > np.pi:
+        raise ModelError(f"corner: angle {angle:g} rad is above pi", name="angle", value=angle, limit=np.pi)
+    factor = MIDDLE_FACTORS[checked_choice(kind, get_args(BlendKind), "blend", "kind")]
+    return float(abs(1 - factor * shape) * np.cos(angle / 2))
 
 
 def curvature(coefficients: Array, u: Array) -> Array:
-    """|F' x F''| / |F'|^3 of curves at u. Shapes (..., 6, 3), (...) to (...), 1/m."""
+    """Return the curvature |F' x F''| / |F'|^3 of curves at u. Shapes (..., 6, 3), (...) to (...), 1/m."""
     first, second = polynomial(coefficients, u, 1), polynomial(coefficients, u, 2)
     bend = np.linalg.norm(np.cross(first, second), axis=-1)
     return np.asarray(bend / np.linalg.norm(first, axis=-1) ** 3)
 
 
-def by_arc_length(coefficients: Array, u: Array) -> tuple[Array, Array, Array, Array]:
-    """Position and derivatives by the distance from derivatives by u: the chain rule with d/ds = (1/|F'|) d/du."""
+def derivatives_by_arc_length(coefficients: Array, u: Array) -> tuple[Array, Array, Array, Array]:
+    """Return position and three derivatives by the distance, by the chain rule with d/ds = (1/|F'|) d/du."""
     position, first, second, third = (polynomial(coefficients, u, order) for order in range(4))
     rate = np.linalg.norm(first, axis=-1, keepdims=True)
     rate_u = (first * second).sum(axis=-1, keepdims=True) / rate
@@ -218,17 +162,19 @@ def by_arc_length(coefficients: Array, u: Array) -> tuple[Array, Array, Array, A
 
 @dataclass(frozen=True)
 class ShapeSearch:
-    """How the best shape factor is looked for.
+    """Settings of the search for the best shape factor.
 
     Attributes:
-        narrowest, widest: Of the factor times remaining distance over the chord: between two lines the best lies from
-            0.885 to 2.44.
-        below_cusp: Share of the factor at which a blend has a cusp.
-        coarse: Factors compared first. steps: Of the golden section between the neighbours of the best.
-        samples: Of a blend whose peak is looked for.
+        narrowest, widest: Range of the factor times remaining distance over the chord; between two lines the best lies
+            from 0.885 to 2.44.
+        below_cusp: Upper limit of the factor, relative to that of the cusp.
+        coarse: Factors of the coarse grid.
+        steps: Golden-section steps between the neighbours of the best.
+        samples: Samples of a blend for its peak curvature.
         table_angles, table_samples: Corners of the table, and samples of each.
-        least_angle: Of the table, rad; below, the best factor over sine of half the angle is constant.
-        block: Corners handled at once, which bounds the memory.
+        least_angle: Smallest angle of the table, rad; below, the best factor over the sine of half the angle is
+            constant.
+        block: Corners processed at once, which bounds the memory.
     """
 
     narrowest: float = 0.5
@@ -247,54 +193,44 @@ SEARCH = ShapeSearch()
 
 
 def corner_shape(angle: Array) -> Array:
-    """Best factors at corners between two lines, of interior angles (rad). Shapes (V,) to (V,)."""
-    angles, over_chord = _table()
-    return np.asarray(2 * np.sin(angle / 2) * np.interp(angle, angles, over_chord))
+    """Return the best factors at corners between two lines with interior angles (rad). Shapes (V,) to (V,)."""
+    angles, shape_over_chord = _table()
+    return np.asarray(2 * np.sin(angle / 2) * np.interp(angle, angles, shape_over_chord))
 
 
 @lru_cache(maxsize=1)
 def _table() -> tuple[Array, Array]:
-    """Interior angles, rad, and the best factor over the chord at remaining distance 1."""
+    """Return interior angles, rad, and the best factor over the chord for a remaining distance of 1."""
     angles = np.linspace(SEARCH.least_angle, np.pi, SEARCH.table_angles)
     zero = np.zeros((SEARCH.table_angles, 3))
     before = np.column_stack([np.ones(SEARCH.table_angles), zero[:, :2]])
     after = np.column_stack([-np.cos(angles), np.sin(angles), zero[:, 0]])
     nearly = angles.copy()
-    nearly[-1] = (angles[-1] + angles[-2]) / 2  # where all is straight any factor will do: the limit counts
+    nearly[-1] = (angles[-1] + angles[-2]) / 2  # on a straight line every factor is best: take the limit
     after[-1] = [-np.cos(nearly[-1]), np.sin(nearly[-1]), 0.0]
-    found = best_shape(-before, before, zero, after, after, zero, np.ones(SEARCH.table_angles), SEARCH.table_samples)
-    return angles, found / (2 * np.sin(nearly / 2))
+    ends = -before, before, zero, after, after, zero
+    shapes = best_shape(ends, np.ones(SEARCH.table_angles), SEARCH.table_samples)
+    return angles, shapes / (2 * np.sin(nearly / 2))
 
 
-def best_shape(
-    start: Array,
-    start_tangent: Array,
-    start_bend: Array,
-    end: Array,
-    end_tangent: Array,
-    end_bend: Array,
-    remaining: Array,
-    samples: int = SEARCH.samples,
-) -> Array:
-    """Factors of least peak curvature of quintic blends between given ends.
+def best_shape(ends: Ends, remaining: Array, samples: int = SEARCH.samples) -> Array:
+    """Return the shape factors of least peak curvature of quintic blends between given ends.
 
     Args:
-        start, end: Shape (V, 3), m.
-        start_tangent, end_tangent: Unit. Shape (V, 3).
-        start_bend, end_bend: Curvature vectors. Shape (V, 3), 1/m.
-        remaining: Distance from the vertex at either end. Shape (V,), m.
-        samples: Of a blend whose peak is looked for.
+        ends: Point (m), unit tangent and curvature vector (1/m) at the start, and the same at the end. Shape (V, 3)
+            each.
+        remaining: Distance of both ends from the vertex. Shape (V,), m.
+        samples: Samples of a blend for its peak curvature.
 
     Returns:
         Shape (V,).
     """
-    ends = start, start_tangent, start_bend, end, end_tangent, end_bend
-    parts = [slice(first, first + SEARCH.block) for first in range(0, len(remaining), SEARCH.block)]
-    found = [_searched(tuple(each[part] for each in ends), remaining[part], samples) for part in parts]
-    return np.concatenate(found) if found else np.zeros(0)
+    blocks = [slice(first, first + SEARCH.block) for first in range(0, len(remaining), SEARCH.block)]
+    shapes = [_search_shapes([each[block] for each in ends], remaining[block], samples) for block in blocks]
+    return np.concatenate(shapes) if shapes else np.zeros(0)
 
 
-def _searched(ends: tuple[Array, ...], remaining: Array, samples: int) -> Array:
+def _search_shapes(ends: Sequence[Array], remaining: Array, samples: int) -> Array:
     start, tangent, bend, end, end_tangent, end_bend = ends
     u = np.linspace(0, 1, samples)
 

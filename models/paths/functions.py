@@ -1,9 +1,9 @@
-"""A smooth path as casadi Functions, for expressions and for generated C.
+"""Smooth paths as casadi Functions, for expressions and for generated C.
 
-`path_function` and `turn_function` take any distance. In real time it is enough to step along a blend from one sample
-to the next: `predictor_corrector` and `gauss_newton` map steps of the distance to the curve parameter. Both continue
-from the sample before: state (u_(n-1), u_n) and steps (L_n - L_(n-1), L_(n+1) - L_n) give (u_n, u_(n+1)). At the first
-sample inside a blend the state is (0, 0) and the steps are (0, distance from its start).
+`path_function` and `turn_function` accept any distance. A real-time controller only steps along a blend from one
+sample to the next: `predictor_corrector` and `gauss_newton` map steps of the distance to the curve parameter. Both
+continue from the sample before: state (u_(n-1), u_n) and steps (L_n - L_(n-1), L_(n+1) - L_n) give (u_n, u_(n+1)). At
+the first sample inside a blend the state is (0, 0) and the steps are (0, distance from its start).
 """
 
 from __future__ import annotations
@@ -31,63 +31,63 @@ from models.paths.smooth_path import SmoothPath
 
 __all__ = ["gauss_newton", "march", "path_function", "predictor_corrector", "turn_function"]
 
-MOST_TERMS = 100
-"""Corrections, or nodes, of a mapping, whose expression grows with them."""
+MAX_TERMS = 100
+"""Largest number of corrections, or nodes, of a mapping, whose expression grows with them."""
 
 
 def path_function(path: SmoothPath) -> Any:
-    """Function distance (m) -> position (3, m), tangent (3), curvature (3, 1/m), its derivative (3, 1/m^2).
+    """Return the Function distance (m) -> position (3, m), tangent (3), curvature (3, 1/m), its derivative (3, 1/m^2).
 
-    MX, with the tables of the path in it; distances outside are those of the ends. The same arithmetic as
-    `SmoothPath.at`, on a binary search for the cell, so that `generate` writes C without any library. Derivatives are
-    those of the last three outputs' own formulas: casadi differentiates inside a cell only.
+    It is an MX function with the tables of the path in it; distances outside the path are clamped to it. It computes
+    the same as `SmoothPath.at`, with a binary search for the cell, so that `generate` writes C without any library.
+    casadi differentiates inside a cell only.
     """
-    knots, columns = _table(checked_instance(path, SmoothPath, "path_function", "path"))
+    knots, columns = _cell_table(checked_instance(path, SmoothPath, "path_function", "path"))
     s = ca.MX.sym("distance")
-    inside = _inside(s, path.length)
-    cell = ca.low(ca.DM(knots), inside, {"lookup_mode": "binary"}) if len(knots) > 2 else ca.MX(0)
-    outputs = _in_cell()(ca.MX(ca.DM(columns))[:, cell], inside)
+    clamped = _clamp(s, path.length)
+    cell = ca.low(ca.DM(knots), clamped, {"lookup_mode": "binary"}) if len(knots) > 2 else ca.MX(0)
+    outputs = _cell_function()(ca.MX(ca.DM(columns))[:, cell], clamped)
     return ca.Function("path", [s], list(outputs), ["distance"], ["position", "tangent", "curvature", "curvature_rate"])
 
 
 def turn_function(path: SmoothPath) -> Any:
-    """Function distance (m) -> quaternion (4), rate (3, rad/m), acceleration (3, rad/m^2), jerk (3, rad/m^3).
+    """Return the Function distance (m) -> quaternion (4) and rate, acceleration, jerk (3, rad/m, rad/m^2, rad/m^3).
 
-    Tool orientation in world and its rates, as of `SmoothPath.turn`; MX with the tables in it, made as path_function.
+    Tool orientation in world and its rates, as `SmoothPath.turn`; an MX function like `path_function`.
     """
     reference, theta = checked_instance(path, SmoothPath, "turn_function", "path").charts
     columns = np.column_stack([reference, theta.reshape(-1, 18), path.piece_lengths, path.bounds[:-1]]).T
     s = ca.MX.sym("distance")
-    inside = _inside(s, path.length)
-    piece = ca.low(ca.DM(path.bounds), inside, {"lookup_mode": "binary"}) if len(path.bounds) > 2 else ca.MX(0)
+    clamped = _clamp(s, path.length)
+    piece = ca.low(ca.DM(path.bounds), clamped, {"lookup_mode": "binary"}) if len(path.bounds) > 2 else ca.MX(0)
     column = ca.MX(ca.DM(columns))[:, piece]
-    outputs = orientation_function()(column[:4], column[4:22], column[22], (inside - column[23]) / column[22])
+    outputs = orientation_function()(column[:4], column[4:22], column[22], (clamped - column[23]) / column[22])
     return ca.Function("turn", [s], list(outputs), ["distance"], ["quaternion", "rate", "acceleration", "jerk"])
 
 
-def _inside(distance: Any, length: float) -> Any:
-    """The nearest distance on the path, whose derivative is 1 at both ends too."""
+def _clamp(distance: Any, length: float) -> Any:
+    """Return the distance clamped to the path, with the derivative 1 at both ends too."""
     return ca.if_else(distance > length, length, ca.if_else(distance < 0, 0.0, distance))
 
 
 @lru_cache(maxsize=1)
-def _in_cell() -> Any:
+def _cell_function() -> Any:
     row, s = ca.SX.sym("row", 38), ca.SX.sym("s")
-    start, climb, ahead, inward, rate, powers, cell = ca.vertsplit(row, [0, 3, 6, 9, 12, 13, 31, 38])
+    start, axial, tangential, inward, rate, powers, cell = ca.vertsplit(row, [0, 3, 6, 9, 12, 13, 31, 38])
     coefficients = ca.reshape(powers, 3, 6)
     first_s, length, curved, first_u, width, speed0, speed1 = ca.vertsplit(cell)
     distance = s - first_s
 
-    # segment; a line has the rate 0: then sin(rate s)/rate is s
+    # on a segment; a line has the rate 0, where sin(rate s)/rate is s
     safe = rate + (rate == 0)
     along = ca.if_else(rate == 0, distance, ca.sin(rate * distance) / safe)
     across = ca.if_else(rate == 0, 0, 2 * ca.sin(rate * distance / 2) ** 2 / safe)
     cosine, sine = ca.cos(rate * distance), ca.sin(rate * distance)
-    turning = cosine * ahead + sine * inward
+    turning = cosine * tangential + sine * inward
     on_segment = [
-        start + distance * climb + along * ahead + across * inward,
-        climb + turning,
-        rate * (cosine * inward - sine * ahead),
+        start + distance * axial + along * tangential + across * inward,
+        axial + turning,
+        rate * (cosine * inward - sine * tangential),
         -(rate**2) * turning,
     ]
 
@@ -99,25 +99,24 @@ def _in_cell() -> Any:
     rate_of = ca.Function("rate", [row, u], [rate])
     x = distance / length
     slope0, slope1 = length / (width * speed0), length / (width * speed1)
-    at: Any = first_u + width * x * (slope0 + x * (3 - 2 * slope0 - slope1 + x * (slope0 + slope1 - 2)))
-    for _ in range(3):  # from an interpolation, which errs little
-        step = at - first_u
+    guess: Any = first_u + width * x * (slope0 + x * (3 - 2 * slope0 - slope1 + x * (slope0 + slope1 - 2)))
+    for _ in range(3):  # the interpolation is already close
+        step = guess - first_u
         mean = sum(
             float(w) * rate_of(row, first_u + float(n) * step) for n, w in zip(GAUSS_NODES, GAUSS_WEIGHTS, strict=True)
         )
-        at = at - (step * mean - distance) / rate_of(row, at)
+        guess = guess - (step * mean - distance) / rate_of(row, guess)
     rate_u = ca.dot(first, second) / rate
     rate_uu = (ca.dot(second, second) + ca.dot(first, third) - rate_u**2) / rate
     bend = (second - first * rate_u / rate) / rate**2
     change = (third - 3 * second * rate_u / rate + first * (3 * rate_u**2 / rate**2 - rate_uu / rate)) / rate**3
     curve = ca.Function("curve", [row, u], [_horner(coefficients, u), first / rate, bend, change])
-    on_blend = curve(row, at)
-    outputs = [ca.if_else(curved, b, a) for a, b in zip(on_segment, on_blend, strict=True)]
+    outputs = [ca.if_else(curved, b, a) for a, b in zip(on_segment, curve(row, guess), strict=True)]
     return ca.Function("in_cell", [row, s], ca.cse(outputs))
 
 
 def _derivative(columns: Any) -> Any:
-    """Coefficients of the derivative, one column less."""
+    """Return the coefficients of the derivative, one column less."""
     return ca.horzcat(*[power * columns[:, power] for power in range(1, columns.shape[1])])
 
 
@@ -128,11 +127,12 @@ def _horner(columns: Any, u: Any) -> Any:
     return value
 
 
-def _table(path: SmoothPath) -> tuple[Array, Array]:
-    """Where cells begin and the path ends, and a column for each cell: what `_in_cell` takes apart.
+def _cell_table(path: SmoothPath) -> tuple[Array, Array]:
+    """Return the start distances of the cells, then the length, and a column of data per cell (see `_cell_function`).
 
-    Of a segment its start, the parts along, round and towards the axis of its screw, and its rate of turning; the
-    coefficients of a curve, three a power; distance, length, whether on a blend; u at the start, width in u, speeds.
+    For a segment: its start point, the axial, tangential and inward vectors of its screw, and its rotation rate. For a
+    blend: the coefficients, three a power. For both: distance, length, whether it is a blend; u at the start, width in
+    u, speeds at both ends.
     """
     on_segment = np.flatnonzero(path.piece_segment >= 0)
     count, segment, task, cells = len(on_segment), path.piece_segment[on_segment], path.path, path.cells
@@ -141,7 +141,7 @@ def _table(path: SmoothPath) -> tuple[Array, Array]:
     k = task.curvature[segment]
     normal = bend / np.where(k == 0, 1.0, k)[:, None]
     screw = screw_axes(tangent, normal, k, task.torsion[segment])
-    # any regular curve will do where none is used: its speed must not be zero
+    # a segment needs some regular curve, of nonzero speed, which is not used
     unused = np.tile([0, 0, 0, 1, 0, 0] + [0] * 12, (count, 1))
     begin, length, none, one = path.bounds[on_segment], path.piece_lengths[on_segment], np.zeros(count), np.ones(count)
     segments = np.column_stack([position, *screw, unused, begin, length, none, none, one, length, length])
@@ -157,19 +157,19 @@ def _table(path: SmoothPath) -> tuple[Array, Array]:
 
 
 def predictor_corrector(degree: int = 3, corrections: int = 3) -> Any:
-    """The paper's mapping: predictor (15), then `corrections` times the corrector (13).
+    """Return the paper's mapping: predictor (15), then `corrections` times the corrector (13).
 
-    It is blind to its own error: the trapezoid rule (12) lets the sample drift off its distance.
+    It does not control its error: with the trapezoid rule (12) the sample drifts from its distance.
 
     Args:
-        degree: Of the blend: 3 or 5.
-        corrections: Number of corrections; the paper takes 3.
+        degree: Degree of the blend, 3 or 5.
+        corrections: Number of corrections; the paper uses 3.
 
     Returns:
         casadi Function (state (2), coefficients (3 (degree + 1)), steps (2, m)) -> state (2). Coefficients are in
         ascending order, three entries a power: the first rows of `Blend.coefficients`, flattened.
     """
-    number = checked_count(corrections, "mapping", "corrections", 0, MOST_TERMS)
+    number = checked_count(corrections, "mapping", "corrections", 0, MAX_TERMS)
     return _predictor_corrector(checked_choice(degree, (3, 5), "blend", "degree"), number)
 
 
@@ -177,25 +177,24 @@ def predictor_corrector(degree: int = 3, corrections: int = 3) -> Any:
 def _predictor_corrector(degree: int, corrections: int) -> Any:
     state, coefficients, steps, rate = _symbols(degree)
     u, step = state[1], steps[1]
-    here = rate(u)
-    guess = _predicted(state, steps, here)
+    start_rate = rate(u)
+    guess = _predicted(state, steps, start_rate)
     for _ in range(corrections):
-        guess = u + 2 * step / (here + rate(guess))
+        guess = u + 2 * step / (start_rate + rate(guess))
     return ca.Function("predictor_corrector", [state, coefficients, steps], [ca.cse(ca.vertcat(u, guess))])
 
 
 def gauss_newton(degree: int = 3, nodes: tuple[int, ...] = (2, 3, 4, 8)) -> Any:
-    """The default mapping: the same predictor, then Newton steps on the arc length by Gauss-Legendre quadrature.
+    """Return the default mapping: the same predictor, then Newton steps on the arc length by Gauss-Legendre quadrature.
 
-    Arguments and results as of predictor_corrector, but for `nodes`: of the quadrature over one control step, for each
-    Newton step. The first ones need few, since they only lead near; the last one decides the drift.
+    Arguments and result as for `predictor_corrector`, except `nodes`: the number of quadrature nodes over one control
+    step, for each Newton step. The first steps need few nodes; the last one determines the drift.
     """
     numbers = tuple(
-        checked_count(n, "mapping", "nodes", 1, MOST_TERMS) for n in checked_each(nodes, int, "mapping", "nodes")
+        checked_count(n, "mapping", "nodes", 1, MAX_TERMS) for n in checked_each(nodes, int, "mapping", "nodes")
     )
     if not numbers:
-        message = "mapping: nodes are empty; give one number for each Newton step"
-        raise ModelError(message, name="nodes", value=nodes)
+        raise ModelError("mapping: nodes is empty; give one number for each Newton step", name="nodes", value=nodes)
     return _gauss_newton(checked_choice(degree, (3, 5), "blend", "degree"), numbers)
 
 
@@ -212,37 +211,36 @@ def _gauss_newton(degree: int, nodes: tuple[int, ...]) -> Any:
 
 
 def march(mapping: Any, coefficients: Array, distances: ArrayInput) -> Array:
-    """Parameters at increasing distances (m) from the start of a blend, each from the one before. Shape (M,).
+    """Return the parameters at increasing distances (m) from the start of a blend, step by step. Shape (M,).
 
     Args:
-        mapping: Of predictor_corrector or gauss_newton.
+        mapping: Result of `predictor_corrector` or `gauss_newton`.
         coefficients: Of one blend. Shape (6, 3).
         distances: Shape (M,), m.
 
     Raises:
-        ModelError: Wrong shapes, nan, distances that do not increase from 0.
+        ModelError: A shape is wrong, an entry is nan, or the distances do not increase from 0.
     """
     checked_instance(mapping, ca.Function, "march", "mapping")
-    places = checked_array(distances, ("samples",), "march", "distances", least=0)
-    given = np.diff(places, prepend=0.0)
-    if (given < 0).any():
-        worst = float(places[int((given < 0).argmax())])
-        raise ModelError(f"march: distances must increase from 0, not to {worst:g} m", name="distances", value=worst)
+    s = checked_array(distances, ("samples",), "march", "distances", least=0)
+    increments = np.diff(s, prepend=0.0)
+    if (increments < 0).any():
+        wrong = float(s[int((increments < 0).argmax())])
+        raise ModelError(f"march: distances must increase from 0, not to {wrong:g} m", name="distances", value=wrong)
     curve = checked_array(coefficients, (6, 3), "blend", "coefficients")
-    if not places.size:
-        return places
+    count = len(s)
+    if not count:
+        return s
     entries = curve.ravel()[: mapping.numel_in(1)]
-    steps = np.stack([np.concatenate([[0.0], given[:-1]]), given])
-    along = mapping.mapaccum(len(given))
-    states = along(np.zeros(2), np.repeat(entries[:, None], len(given), axis=1), steps)
+    steps = np.stack([np.concatenate([[0.0], increments[:-1]]), increments])
+    states = mapping.mapaccum(count)(np.zeros(2), np.repeat(entries[:, None], count, axis=1), steps)
     return np.asarray(np.array(states)[1])
 
 
 def _symbols(degree: int) -> tuple[Any, Any, Any, Any]:
     sizes = {"state": 2, "coefficients": 3 * (degree + 1), "steps": 2}
     state, coefficients, steps = (ca.SX.sym(name, size) for name, size in sizes.items())
-    columns = ca.reshape(coefficients, 3, degree + 1)
-    derivative = _derivative(columns)
+    derivative = _derivative(ca.reshape(coefficients, 3, degree + 1))
     return state, coefficients, steps, lambda u: ca.norm_2(_horner(derivative, u))
 
 

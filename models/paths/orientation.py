@@ -1,8 +1,9 @@
 """Tool orientation along a path: rotation vectors in a chart, blended like positions.
 
-Along a piece the orientation is q(s) = reference exp(theta(s)), theta being a polynomial in the distance. A segment
-that turns evenly about a fixed axis is linear in this chart, seen from its start as well as from the vertex that it
-leads to; so a quintic in the chart of the vertex joins two segments with continuous rate and acceleration.
+On each piece of a path the orientation is q(s) = reference exp(theta(s)) with a polynomial theta of the distance. A
+segment that turns at a constant rate about a fixed axis is linear in this chart, whether the reference is its start or
+the vertex at its end. A quintic in the chart of a vertex therefore joins two segments with continuous rate and
+acceleration.
 """
 
 from __future__ import annotations
@@ -30,12 +31,12 @@ __all__ = [
 ]
 
 LARGEST_TURN = np.pi - 1e-3
-"""Two orientations further apart (rad) have no shorter way between them that one would guess."""
+"""Largest angle (rad) between two orientations; near pi the shorter rotation between them is ambiguous."""
 SERIES_TERMS = 18
 
 
 def unit_quaternion(value: ArrayInput, what: str) -> Array:
-    """`value` as a read-only unit quaternion [w, x, y, z]; ModelError if its norm is not within 1e-6 of one."""
+    """Return `value` as a read-only unit quaternion [w, x, y, z]; raise a ModelError if its norm is not 1."""
     quaternion = checked_array(value, (4,), what, "quaternion")
     norm = float(np.linalg.norm(quaternion))
     if abs(norm - 1) > 1e-6:
@@ -45,12 +46,14 @@ def unit_quaternion(value: ArrayInput, what: str) -> Array:
 
 
 def rotation_vector(first: ArrayInput, second: ArrayInput, owner: str = "orientation") -> Array:
-    """Turn in the axes of `first` that leads to `second`: second = first exp(vector), the shorter way. Shape (3,), rad.
+    """Return the shorter rotation from `first` to `second`, in the axes of `first`: second = first exp(vector).
+
+    Shape (3,), rad.
 
     Raises:
-        ModelError: The two are (nearly) half a turn apart, where the way is ambiguous.
+        ModelError: The orientations differ by nearly half a turn, so the shorter rotation is ambiguous.
     """
-    # in plain numbers: a path has many, and numpy is slow on three entries
+    # plain floats: a path has many segments, and numpy is slow for three entries
     p0, p1, p2, p3 = np.asarray(first, dtype=float).tolist()
     q0, q1, q2, q3 = np.asarray(second, dtype=float).tolist()
     scalar = p0 * q0 + p1 * q1 + p2 * q2 + p3 * q3
@@ -63,16 +66,16 @@ def rotation_vector(first: ArrayInput, second: ArrayInput, owner: str = "orienta
     angle = 2 * atan2(norm, scalar)
     if angle > LARGEST_TURN:
         message = (
-            f"{owner}: the tool turns by {np.degrees(angle):.4g} deg in one segment, whose sense is ambiguous; "
-            "split the segment"
+            f"{owner}: the tool turns by {np.degrees(angle):.4g} deg in one segment, so the sense of rotation is "
+            "ambiguous; split the segment"
         )
         raise ModelError(message, name=owner, value=angle, limit=LARGEST_TURN)
-    over = angle / norm if norm > 0 else 2.0
-    return np.array([x * over, y * over, z * over])
+    factor = angle / norm if norm > 0 else 2.0
+    return np.array([x * factor, y * factor, z * factor])
 
 
 def product(first: ArrayInput, second: ArrayInput) -> Array:
-    """Quaternion product of rows or of one each: `second` in the axes of `first`. Shape (..., 4)."""
+    """Return the quaternion product of rows or single quaternions: `second` in axes of `first`. Shape (..., 4)."""
     p, q = np.asarray(first, dtype=float), np.asarray(second, dtype=float)
     scalar = p[..., :1] * q[..., :1] - (p[..., 1:] * q[..., 1:]).sum(axis=-1, keepdims=True)
     vector = p[..., :1] * q[..., 1:] + q[..., :1] * p[..., 1:] + np.cross(p[..., 1:], q[..., 1:])
@@ -80,7 +83,7 @@ def product(first: ArrayInput, second: ArrayInput) -> Array:
 
 
 def rotation_matrix(quaternion: ArrayInput) -> Array:
-    """Rotation matrix of a unit quaternion; its columns are the axes. Shape (3, 3)."""
+    """Return the rotation matrix of a unit quaternion; its columns are the axes. Shape (3, 3)."""
     w, x, y, z = np.asarray(quaternion, dtype=float)
     return np.array(
         [
@@ -92,9 +95,10 @@ def rotation_matrix(quaternion: ArrayInput) -> Array:
 
 
 def exponential(vector: Any) -> Any:
-    """Unit quaternion of a rotation vector (rad), a casadi expression. Shape (4, 1).
+    """Return the unit quaternion of a rotation vector (rad), a casadi expression. Shape (4, 1).
 
-    Power series in the squared angle, without a branch or a root, to rounding for angles up to 2 pi: smooth at zero.
+    A power series in the squared angle, without branches or roots, which is smooth at zero and accurate to rounding for
+    angles up to 2 pi.
     """
     square = ca.dot(vector, vector) / 4
     cosine: Any = 0
@@ -106,10 +110,10 @@ def exponential(vector: Any) -> Any:
 
 
 def along_piece(reference: Array, theta: Array, length: Array, fraction: Array) -> tuple[Array, Array, Array, Array]:
-    """As orientation_function, in numpy, for M samples.
+    """Return the same as `orientation_function`, in numpy, for M samples.
 
     omega = theta' + B theta x theta' + C theta x (theta x theta'), with B = (1 - cos a)/a^2, C = (a - sin a)/a^3 and
-    a = |theta|, in the axes of the reference; B and C are entire functions of a^2.
+    a = |theta|, in the axes of the reference. B and C are entire functions of a^2.
 
     Args:
         reference: Shape (M, 4).
@@ -151,7 +155,7 @@ def _dot(a: Array, b: Array) -> Array:
 
 
 def _series(start: int, square: Array) -> tuple[Array, Array, Array]:
-    # sum of (-x)^k / (2 k + start)! and its two derivatives by x
+    """Return the sum of (-x)^k / (2 k + start)! and its two derivatives by x."""
     value, first, second = (np.zeros_like(square) for _ in range(3))
     for k in reversed(range(SERIES_TERMS)):
         second = second * square + 2 * first
@@ -162,11 +166,11 @@ def _series(start: int, square: Array) -> tuple[Array, Array, Array]:
 
 @lru_cache(maxsize=1)
 def orientation_function() -> Any:
-    """Orientation along a piece and its rates, for any number of samples as columns.
+    """Return the casadi Function of the orientation on a piece and its rates, for any number of samples as columns.
 
-    Inputs: reference (4), theta (3, 6) as 18 entries column by column, ascending powers of distance over length,
-    length (m), distance over length. Outputs: unit quaternion (4); in world axes the angular rate per metre (3, rad/m),
-    its first and second derivatives by the distance (rad/m^2, rad/m^3).
+    Inputs: reference (4); theta (3, 6) as 18 entries column by column, ascending powers of distance over length; length
+    (m); distance over length. Outputs: unit quaternion (4); in world axes the angular rate per metre (3, rad/m), its
+    first and second derivatives by the distance (rad/m^2, rad/m^3).
     """
     reference, theta = ca.SX.sym("reference", 4), ca.SX.sym("theta", 18)
     length, fraction = ca.SX.sym("length"), ca.SX.sym("fraction")

@@ -1,9 +1,8 @@
-"""A task path: segments one after the other, checked.
+"""Task paths: connected segments, and what to do where they reverse their direction.
 
-Segments that turn back the way they came: nothing smooth rounds that, so the path is split there, or given width.
-
-The width is that of a light bulb of three arcs of 60, 300 and 60 degrees, which leaves the vertex as it was reached
-and comes back to it the other way round, without a corner. It passes the vertex by 1.37 of its width.
+No smooth curve rounds a reversal (a corner of 180 deg). `split_at_reversals` ends the path there, or inserts a bulb
+turn of three arcs of 60, 300 and 60 degrees. The bulb leaves the vertex in the direction of arrival and returns to it
+in the opposite direction, without a corner. It extends beyond the vertex by 1.37 times its width.
 """
 
 from __future__ import annotations
@@ -31,29 +30,30 @@ from models.errors import ModelError
 from models.paths.orientation import product, rotation_matrix, rotation_vector, unit_quaternion
 from models.paths.segments import Arc, Helix, Line, Segment, screw
 
-__all__ = ["Path", "Reversal", "chains"]
+__all__ = ["Path", "Reversal", "split_at_reversals"]
 
 SMALLEST_ANGLE = 1e-6
-"""Interior angle (rad) below which a corner counts as a reversal: its blend would bend with 4e12 / remaining."""
+"""Interior angle (rad) below which a corner is a reversal: its blend would have the curvature 4e12 / remaining."""
 FRAME = ("start", "tangent", "normal", "curvature", "torsion")
 NO_ROTATION = np.array([1.0, 0.0, 0.0, 0.0])
 
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """A chain of lines, arcs and helices, each starting where the one before ends.
+    """A chain of lines, arcs and helices, each starting at the end of the one before.
 
     Attributes:
         segments: At least one.
-        lengths: Of the segments. Shape (n,), m.
-        start, tangent, normal: Of each segment, at its start, in world. Shape (n, 3), m and unit vectors.
+        lengths: Lengths of the segments. Shape (n,), m.
+        start, tangent, normal: Start point and frame of each segment at its start, in world. Shape (n, 3), m and unit
+            vectors.
         curvature, torsion: Of each segment; zero for a line, the torsion for an arc too. Shape (n,), 1/m.
         orientation: Tool orientation at the start of each segment, unit quaternion. Shape (n, 4).
-        turn: Rotation vector of each segment in the axes of its start orientation. Shape (n, 3), rad.
+        turn: Rotation vector of the tool along each segment, in the axes of its start orientation. Shape (n, 3), rad.
 
     Raises:
-        ModelError: No segment, something that is none, a gap in position or orientation, a corner that goes back the
-            way it came (180 deg).
+        ModelError: There is no segment, or an entry is no segment; position or orientation has a gap; or a corner
+            reverses the direction (180 deg).
     """
 
     segments: tuple[Segment, ...]
@@ -78,11 +78,11 @@ class Path:
 
     @classmethod
     def through(cls, points: ArrayInput, orientations: ArrayInput | None = None) -> Path:
-        """Straight lines from point to point.
+        """Return the path of straight lines through points.
 
         Args:
             points: In world, at least two. Shape (n, 3), m.
-            orientations: At the points, unit quaternions; none turns if None. Shape (n, 4).
+            orientations: Unit quaternions at the points; None: the tool does not turn. Shape (n, 4).
         """
         corners = checked_array(points, ("points", 3), "path", "points", least=2)
         if orientations is None:
@@ -93,22 +93,21 @@ class Path:
 
     @property
     def length(self) -> float:
-        """Sum of the segments, before any blend. m."""
+        """Sum of the segments' lengths before any blending, m."""
         return float(self.lengths.sum())
 
     @property
     def turns(self) -> bool:
-        """Whether the tool's orientation changes anywhere."""
+        """Whether the tool's orientation changes along the path."""
         return bool(np.any(self.turn != 0))
 
     @property
     def oriented(self) -> bool:
-        """Whether the tool's orientation is given anywhere."""
-        given = (orientation for s in self.segments for orientation in (s.start_orientation, s.end_orientation))
-        return any(orientation is not None for orientation in given)
+        """Whether any segment specifies a tool orientation."""
+        return any(s.start_orientation is not None or s.end_orientation is not None for s in self.segments)
 
     def at(self, index: Any, distance: ArrayInput) -> tuple[Array, Array, Array, Array]:
-        """Position and three derivatives by the distance, at a distance (m) along segments.
+        """Return position and its first three derivatives by the distance, at a distance (m) along segments.
 
         Shapes: index (M,) of int, distance (M,), each result (M, 3).
         """
@@ -118,34 +117,35 @@ class Path:
         return screw(*frame, self.curvature[index], self.torsion[index], along)
 
     def corner_angles(self) -> Array:
-        """Interior angle at each vertex, pi where the tangent goes on. Shape (n - 1,), rad."""
+        """Return the interior angle at each vertex, pi for a continuous tangent. Shape (n - 1,), rad."""
         index = np.arange(len(self.segments) - 1)
         return _angles(self.at(index, self.lengths[:-1])[1], self.tangent[1:])
 
     def placed(self, position: ArrayInput = (0.0, 0.0, 0.0), orientation: ArrayInput = (1.0, 0.0, 0.0, 0.0)) -> Path:
-        """The path seen from a world in which its own axes have a pose; the tool is turned with it.
+        """Return the path in a world in which its own axes have a given pose; the tool turns with it.
 
         Args:
-            position: Of the path's origin in that world. Shape (3,), m.
-            orientation: Of the path's axes in that world, unit quaternion. Shape (4,).
+            position: Origin of the path's axes in that world. Shape (3,), m.
+            orientation: Orientation of the path's axes in that world, unit quaternion. Shape (4,).
         """
         origin = checked_array(position, (3,), "path", "position")
-        turned = unit_quaternion(orientation, "path: orientation")
-        matrix = rotation_matrix(turned)
-        made: list[Segment] = []
+        rotation = unit_quaternion(orientation, "path: orientation")
+        matrix = rotation_matrix(rotation)
+        moved_segments: list[Segment] = []
         for i, segment in enumerate(self.segments):
-            changed: dict[str, Any] = {"start": origin + matrix @ segment.start}
-            for what in ("end",) if isinstance(segment, Line) else ("center",):
-                changed[what] = origin + matrix @ getattr(segment, what)
-            if not isinstance(segment, Line):
-                changed["axis"] = matrix @ segment.axis
-            for what in ("start_orientation", "end_orientation"):
-                given = getattr(segment, what)
-                if given is None and i == 0 and what == "start_orientation":
-                    given = NO_ROTATION
-                changed[what] = None if given is None else product(turned, given)
-            made.append(replace(segment, **changed))
-        return Path(tuple(made))
+            fields: dict[str, Any] = {"start": origin + matrix @ segment.start}
+            if isinstance(segment, Line):
+                fields["end"] = origin + matrix @ segment.end
+            else:
+                fields["center"] = origin + matrix @ segment.center
+                fields["axis"] = matrix @ segment.axis
+            for name in ("start_orientation", "end_orientation"):
+                own = getattr(segment, name)
+                if own is None and i == 0 and name == "start_orientation":
+                    own = NO_ROTATION
+                fields[name] = None if own is None else product(rotation, own)
+            moved_segments.append(replace(segment, **fields))
+        return Path(tuple(moved_segments))
 
     def _check_gaps(self) -> None:
         ends = self.at(np.arange(len(self.segments)), self.lengths)[0]
@@ -154,7 +154,7 @@ class Path:
             i = int(gaps.argmax())
             message = (
                 f"segment {i} ends at {ends[i].tolist()} m, segment {i + 1} starts at {self.start[i + 1].tolist()} m: "
-                f"a gap of {gaps[i]:.3g} m; join them by a Line"
+                f"a gap of {gaps[i]:.3g} m; connect them by a Line"
             )
             raise ModelError(message, name=f"segment {i}", value=float(gaps[i]), limit=ROUNDING)
 
@@ -164,7 +164,7 @@ class Path:
             i = int(angles.argmin())
             message = (
                 f"at vertex {i + 1}, {self.start[i + 1].tolist()} m, the path turns by 180 deg (interior angle "
-                f"{np.degrees(angles[i]):.3g} deg): nothing smooth rounds a reversal; make two paths, or give it width"
+                f"{np.degrees(angles[i]):.3g} deg), and no smooth curve rounds a reversal; use split_at_reversals"
             )
             raise ModelError(message, name=f"vertex {i + 1}", value=float(angles[i]), limit=SMALLEST_ANGLE)
 
@@ -182,7 +182,7 @@ class Path:
                     )
                     raise ModelError(message, name=f"vertex {i}", value=gap, limit=ROUNDING)
             if begin @ current < 0 and i:
-                begin = -begin  # the same orientation: the sign goes on from segment to segment
+                begin = -begin  # the same orientation, with a sign that is continuous from segment to segment
             starts.append(begin)
             if segment.end_orientation is None:
                 turns.append(np.zeros(3))
@@ -196,24 +196,24 @@ class Path:
 
 
 def checked_segments(segments: Any) -> tuple[Segment, ...]:
-    """`segments` as a tuple; ModelError unless they are Lines, Arcs and Helices, one at least."""
+    """Return `segments` as a tuple; raise a ModelError unless they are Lines, Arcs and Helices, at least one."""
     try:
         check_entries(segments)
-        each = tuple(segments)
+        checked = tuple(segments)
     except NOT_NUMBERS as error:
         message = f"the path {segments!r} is no sequence of segments"
         raise ModelError(message, name="segments", value=segments) from error
-    if not each:
+    if not checked:
         raise ModelError("the path has no segment; give at least one Line, Arc or Helix", name="segments", value=())
-    for i, segment in enumerate(each):
+    for i, segment in enumerate(checked):
         if not isinstance(segment, Line | Arc | Helix):
-            message = f"segment {i} is {segment!r}; a path is made of Line, Arc and Helix"
+            message = f"segment {i} is {segment!r}; a path consists of Line, Arc and Helix"
             raise ModelError(message, name=f"segment {i}", value=segment)
-    return each
+    return checked
 
 
 def interior_angles(segments: Sequence[Segment]) -> Array:
-    """Interior angle between each segment and the next, as of `Path.corner_angles`. Shape (n - 1,), rad."""
+    """Return the interior angle between each segment and the next, as `Path.corner_angles`. Shape (n - 1,), rad."""
     start, tangent, normal, k, w, length = (
         np.array([getattr(each, name) for each in segments]) for name in (*FRAME, "length")
     )
@@ -221,28 +221,31 @@ def interior_angles(segments: Sequence[Segment]) -> Array:
 
 
 def _angles(before: Array, after: Array) -> Array:
-    # exact near 0 and pi, where the arc cosine is not
+    # accurate near 0 and pi, unlike the arc cosine
     return np.asarray(2 * np.arctan2(np.linalg.norm(before + after, axis=1), np.linalg.norm(before - after, axis=1)))
 
 
 Reversal: TypeAlias = Literal["split"] | float
-"""What becomes of a reversal: the path ends there, or turns round in a bulb of some width, m."""
+"""Treatment of a reversal: "split" ends the path there; a width (m) inserts a bulb turn."""
 
 
-def chains(segments: Sequence[Segment], reversal: Reversal = "split") -> tuple[tuple[Path, NDArray[np.intp]], ...]:
-    """Paths of segments that follow each other, which may turn back.
+def split_at_reversals(
+    segments: Sequence[Segment], reversal: Reversal = "split"
+) -> tuple[tuple[Path, NDArray[np.intp]], ...]:
+    """Return the paths of connected segments that may reverse their direction.
 
     Args:
-        segments: At least one; each starts where the one before ends.
-        reversal: "split" ends a path at a reversal and begins another; a width (m) puts a bulb there.
+        segments: At least one; each starts at the end of the one before.
+        reversal: "split" ends a path at a reversal and begins another; a width (m) inserts a bulb turn.
 
     Returns:
-        Each path, and for each of its segments the index of the one given; a bulb has that of the one before it.
+        Each path, and for each of its segments the index of the input segment; a bulb has that of the segment before
+        it.
 
     Raises:
-        ModelError: As of Path, but for reversals; a width that is not positive.
+        ModelError: As for Path, except reversals; or the width is not positive.
     """
-    each = checked_segments(segments)
+    segments = checked_segments(segments)
     width = 0.0
     if isinstance(reversal, str):
         if reversal != "split":
@@ -250,24 +253,24 @@ def chains(segments: Sequence[Segment], reversal: Reversal = "split") -> tuple[t
             raise ModelError(message, name="reversal", value=reversal, limit=("split",))
     else:
         width = checked_number(reversal, "path", "reversal", positive=True, unit="m")
-    back = np.flatnonzero(interior_angles(each) < SMALLEST_ANGLE) + 1
+    reversals = (np.flatnonzero(interior_angles(segments) < SMALLEST_ANGLE) + 1).tolist()
     if not width:
-        parts = [np.arange(first, last) for first, last in pairwise([0, *back.tolist(), len(each)])]
-        return tuple((Path(tuple(each[i] for i in part)), part) for part in parts)
-    made: list[Segment] = []
+        parts = [np.arange(first, last) for first, last in pairwise([0, *reversals, len(segments)])]
+        return tuple((Path(tuple(segments[i] for i in part)), part) for part in parts)
+    joined: list[Segment] = []
     index: list[int] = []
-    turns = set(back.tolist())
-    for i, segment in enumerate(each):
-        if i in turns:
-            made += bulb(each[i - 1], width)
+    reversal_starts = set(reversals)
+    for i, segment in enumerate(segments):
+        if i in reversal_starts:
+            joined += bulb_turn(segments[i - 1], width)
             index += [i - 1] * 3
-        made.append(segment)
+        joined.append(segment)
         index.append(i)
-    return ((Path(tuple(made)), np.array(index)),)
+    return ((Path(tuple(joined)), np.array(index)),)
 
 
-def bulb(segment: Segment, width: float) -> tuple[Arc, Arc, Arc]:
-    """Arcs that turn round at the end of a segment, in a plane that is level unless the segment is upright."""
+def bulb_turn(segment: Segment, width: float) -> tuple[Arc, Arc, Arc]:
+    """Return the arcs of a bulb turn at the end of a segment, in a horizontal plane unless the segment is vertical."""
     frame = np.asarray(segment.start), segment.tangent, segment.normal, segment.curvature, segment.torsion
     _, ahead, bend, _ = screw(*frame, segment.length)
     vertex = np.asarray(segment.end)

@@ -1,4 +1,4 @@
-"""Rounding every corner of a path: how large each blend is, by distances given or by a tolerance, without overlaps."""
+"""Rounding of every corner of a path: sizes of the blends, from distances or from a tolerance, without overlaps."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from models.paths.arc_length import cells
 from models.paths.blends import (
     PAPER_SHAPE,
     BlendKind,
+    Ends,
     best_shape,
     checked_shape,
     corner_shape,
@@ -34,39 +35,40 @@ Overlap: TypeAlias = Literal["shrink", "refuse"]
 
 @dataclass(frozen=True)
 class RoundingSettings:
-    """How corners are rounded.
+    """Settings of the rounding of corners.
 
     Attributes:
-        samples: Of a blend whose deviation is looked for, of the neighbourhood of its extreme, and of a turn of a helix
-            on which a nearest place is looked for.
-        kept_back: Share of the tolerance kept back for what lies between the samples.
-        trials: Of remaining distances, and rounds in which neighbours that overlap shrink, at most.
-        newton_steps: To a nearest place on a helix.
-        gentlest: Slope of the condition for it below which a step is not trusted: near the axis of the helix.
-        block: Corners handled at once, which bounds the memory.
-        shortest: Rests of a segment between two blends that are shorter, over the segment, are dropped: rounding.
-        shown: Vertices named in a warning.
+        samples: Samples of a blend for its deviation, of the neighbourhood of the maximum, and of one turn of a helix
+            for its closest point.
+        reserve: Share of the tolerance reserved for what lies between the samples.
+        iterations: Largest number of remaining distances tried, and of rounds that shrink overlapping blends.
+        newton_iterations: Newton iterations to the closest point of a helix.
+        least_slope: Slope of the condition of the closest point below which a step is damped: near the helix axis.
+        block: Corners processed at once, which bounds the memory.
+        shortest: Length, relative to its segment, below which the rest between two blends is a rounding error and
+            dropped.
+        named: Largest number of vertices named in a warning.
     """
 
     samples: int = 33
-    kept_back: float = 1e-3
-    trials: int = 60
-    newton_steps: int = 4
-    gentlest: float = 0.1
+    reserve: float = 1e-3
+    iterations: int = 60
+    newton_iterations: int = 4
+    least_slope: float = 0.1
     block: int = 500
     shortest: float = 1e-12
-    shown: int = 12
+    named: int = 12
 
 
 SETTINGS = RoundingSettings()
 
 
 class _Corners(NamedTuple):
-    """Some vertices of a path, and what kind of blends are to round them.
+    """Vertices of a path and the kind of blends that round them.
 
     Attributes:
         shape: Shape factors. Shape (V,).
-        vertices: 0 being the end of the first segment. Shape (V,).
+        vertices: Indices; 0 is the end of the first segment. Shape (V,).
     """
 
     path: Path
@@ -74,192 +76,197 @@ class _Corners(NamedTuple):
     shape: Array
     vertices: NDArray[np.intp]
 
-    def some(self, chosen: NDArray[np.intp] | slice) -> _Corners:
-        """Those of some indices."""
+    def subset(self, chosen: NDArray[np.intp] | slice) -> _Corners:
+        """Return the corners of some indices."""
         return self._replace(shape=self.shape[chosen], vertices=self.vertices[chosen])
 
     @property
-    def bent(self) -> NDArray[np.intp]:
-        """Indices of those with an arc or a helix on either side."""
-        curved = self.path.curvature > 0
-        return np.flatnonzero(curved[self.vertices] | curved[self.vertices + 1])
+    def curved(self) -> NDArray[np.intp]:
+        """Indices of the corners with an arc or a helix on either side."""
+        segments = self.path.curvature > 0
+        return np.flatnonzero(segments[self.vertices] | segments[self.vertices + 1])
 
-    def ends(self, remaining: Array) -> tuple[Array, Array, Array, Array, Array, Array]:
-        """Position, tangent and curvature vector at the start and at the end of the blends. Shape (V, 3) each."""
+    def ends(self, remaining: Array) -> Ends:
+        """Return position, tangent and curvature vector at the start and end of the blends. Shape (V, 3) each."""
         before = self.vertices
         p0, n0, k0, _ = self.path.at(before, self.path.lengths[before] - remaining)
         p1, n1, k1, _ = self.path.at(before + 1, remaining)
         return p0, n0, k0, p1, n1, k1
 
     def blends(self, remaining: Array) -> Array:
-        """Polynomials of the blends with some remaining distances, (V,). Shape (V, 6, 3)."""
+        """Return the polynomials of the blends with remaining distances (V,). Shape (V, 6, 3)."""
         p0, n0, k0, p1, n1, k1 = self.ends(remaining)
         rate = (self.shape * remaining)[:, None]
         if self.kind == "cubic":
             return cubic(p0, rate * n0, p1, rate * n1)
         return quintic(p0, rate * n0, rate**2 * k0, p1, rate * n1, rate**2 * k1)
 
-    def shaped(self, remaining: Array) -> _Corners:
-        """The same with the shape that suits each best."""
-        shape, bent = corner_shape(self.path.corner_angles()[self.vertices]), self.bent
-        some = self.some(bent)
-        shape[bent] = best_shape(*some.ends(remaining[bent]), remaining[bent])
+    def with_best_shape(self, remaining: Array) -> _Corners:
+        """Return the corners with the shape factor that is best for each."""
+        shape, curved = corner_shape(self.path.corner_angles()[self.vertices]), self.curved
+        subset = self.subset(curved)
+        shape[curved] = best_shape(subset.ends(remaining[curved]), remaining[curved])
         return self._replace(shape=shape)
 
 
-def _sized(
+def _remaining_distances(
     corners: _Corners, remaining: ArrayInput | None, deviation: ArrayInput | None, overlap: Overlap, free: bool
 ) -> tuple[_Corners, Array]:
-    """The corners, shaped if that is free, and their remaining distances, (n - 1,), m. Arguments as of `smooth`."""
+    """Return the corners, with the best shapes if these are free, and their remaining distances, (n - 1,), m.
+
+    Arguments as for `smooth`.
+    """
     checked_choice(overlap, get_args(Overlap), "path", "overlap")
     if (remaining is None) == (deviation is None):
-        message = "give either the remaining distance or the deviation, not both and not neither"
+        message = "give either the remaining distance or the deviation, and not both"
         raise ModelError(message, name="deviation", value=deviation)
     path, count = corners.path, len(corners.vertices)
     if remaining is not None:
-        wanted = one_for_each(remaining, count, "path", "remaining", "vertices", positive=True, unit="m")
-        found = _without_overlap(path, wanted, overlap)
-        _warn_of_smaller(path, wanted, found)
-        return corners.shaped(found) if free else corners, found
+        requested = one_for_each(remaining, count, "path", "remaining", "vertices", positive=True, unit="m")
+        distances = _without_overlap(path, requested, overlap)
+        _warn_if_smaller(path, requested, distances)
+        return corners.with_best_shape(distances) if free else corners, distances
     tolerance = one_for_each(deviation, count, "path", "deviation", "vertices", positive=True, unit="m")
-    found = _within(corners, tolerance, overlap)
-    if free and corners.bent.size:
-        corners = corners.shaped(found)
-        found = _within(corners, tolerance, overlap)
-    return corners, found
+    distances = _within_tolerance(corners, tolerance, overlap)
+    if free and corners.curved.size:
+        corners = corners.with_best_shape(distances)
+        distances = _within_tolerance(corners, tolerance, overlap)
+    return corners, distances
 
 
-def _within(corners: _Corners, tolerance: Array, overlap: Overlap) -> Array:
-    """Remaining distances whose blends stay within the tolerance. Shape (V,), m."""
+def _within_tolerance(corners: _Corners, tolerance: Array, overlap: Overlap) -> Array:
+    """Return the largest remaining distances within a tolerance. Shape (V,), m."""
     path = corners.path
-    # never longer than a segment, so that every trial is a curve that exists
+    # at most the segment length, so that every trial curve exists
     longest = np.minimum(path.lengths[:-1], path.lengths[1:])
-    found = _without_overlap(path, _from_deviation(corners, tolerance, longest), overlap)
-    # next to an arc the vertex need not be the farthest point, nor a smaller blend the nearer one
-    bent = corners.bent
-    aim = tolerance * (1 - SETTINGS.kept_back)
-    for _ in range(SETTINGS.trials):
-        some = corners.some(bent)
-        over = np.maximum(_from_blend(some, found[bent]), _deviations(some, found[bent])[1]) / tolerance[bent]
-        bent, over = bent[over > 1], over[over > 1]
-        if not bent.size:
+    distances = _without_overlap(path, _initial_distances(corners, tolerance, longest), overlap)
+    # next to an arc the vertex need not be the farthest point, nor a smaller blend the closer one
+    curved = corners.curved
+    aim = tolerance * (1 - SETTINGS.reserve)
+    for _ in range(SETTINGS.iterations):
+        subset = corners.subset(curved)
+        over = (
+            np.maximum(_task_to_blend(subset, distances[curved]), _deviations(subset, distances[curved])[1])
+            / tolerance[curved]
+        )
+        curved, over = curved[over > 1], over[over > 1]
+        if not curved.size:
             break
-        aim[bent] *= (1 - SETTINGS.kept_back) / over
-        found[bent] = _fitted(corners.some(bent), aim[bent], found[bent])
-    return found
+        aim[curved] *= (1 - SETTINGS.reserve) / over
+        distances[curved] = _solve_distances(corners.subset(curved), aim[curved], distances[curved])
+    return distances
 
 
-def _warn_of_smaller(path: Path, wanted: Array, found: Array) -> None:
-    smaller = np.flatnonzero(found < wanted * (1 - 1e-12))
+def _warn_if_smaller(path: Path, requested: Array, distances: Array) -> None:
+    smaller = np.flatnonzero(distances < requested * (1 - 1e-12))
     if smaller.size:
-        worst = int((found / wanted).argmin())
+        worst = int((distances / requested).argmin())
         vertices = tuple((smaller + 1).tolist())
-        shown = ", ".join(str(vertex) for vertex in vertices[: SETTINGS.shown])
-        shown += f" and {len(vertices) - SETTINGS.shown} more" if len(vertices) > SETTINGS.shown else ""
+        names = ", ".join(str(vertex) for vertex in vertices[: SETTINGS.named])
+        names += f" and {len(vertices) - SETTINGS.named} more" if len(vertices) > SETTINGS.named else ""
+        size = float(distances[worst])
         message = (
-            f"overlap='shrink': blends are smaller than asked at vertices {shown}; at vertex {worst + 1} "
-            f"{found[worst]:g} of {wanted[worst]:g} m, between segments {path.lengths[worst]:g} and "
+            f"overlap='shrink': blends are smaller than requested at vertices {names}; at vertex {worst + 1} "
+            f"{size:g} of {requested[worst]:g} m, between segments {path.lengths[worst]:g} and "
             f"{path.lengths[worst + 1]:g} m long"
         )
-        warn(ModelWarning(message, name=f"vertex {worst + 1}", value=vertices, limit=float(found[worst])), stacklevel=4)
+        warn(ModelWarning(message, name=f"vertex {worst + 1}", value=vertices, limit=size), stacklevel=4)
 
 
-def _without_overlap(path: Path, wanted: Array, overlap: Overlap) -> Array:
-    if not wanted.size:
-        return wanted
-    padded = np.concatenate([[0.0], wanted, [0.0]])
+def _without_overlap(path: Path, requested: Array, overlap: Overlap) -> Array:
+    if not requested.size:
+        return requested
+    padded = np.concatenate([[0.0], requested, [0.0]])
     demand = padded[:-1] + padded[1:]  # of each segment
-    # rounding, for example of 0.1 + 0.2 against 0.3, is no overlap
+    # rounding errors, such as of 0.1 + 0.2 against 0.3, are no overlap
     factor = np.where(demand > path.lengths * (1 + 1e-12), path.lengths / demand, 1.0)
     if overlap == "refuse" and factor.min() < 1:
         i = int(factor.argmin())
-        raise ModelError(
-            f"segment {i}, {path.lengths[i]:g} m long, has no room for the blends at its ends, which take "
-            f"{demand[i]:g} m; take a smaller remaining distance or overlap='shrink'",
-            name=f"segment {i}",
-            value=float(demand[i]),
-            limit=float(path.lengths[i]),
+        length = float(path.lengths[i])
+        message = (
+            f"segment {i}, {length:g} m long, is shorter than the blends at its ends, which take {demand[i]:g} m; "
+            "use a smaller remaining distance or overlap='shrink'"
         )
-    return np.asarray(wanted * np.minimum(factor[:-1], factor[1:]))
+        raise ModelError(message, name=f"segment {i}", value=float(demand[i]), limit=length)
+    return np.asarray(requested * np.minimum(factor[:-1], factor[1:]))
 
 
-def _from_deviation(corners: _Corners, tolerance: Array, longest: Array) -> Array:
-    found, arcs = longest.copy(), corners.bent
-    # between two lines the deviation is proportional to the remaining distance: one trial tells the ratio
+def _initial_distances(corners: _Corners, tolerance: Array, longest: Array) -> Array:
+    distances, arcs = longest.copy(), corners.curved
+    # between two lines the deviation is proportional to the remaining distance, so one trial suffices
     lines = np.setdiff1d(np.arange(len(longest)), arcs, assume_unique=True)
     if lines.size:
-        some = corners.some(lines)
-        corner, legs = _deviations(some, longest[lines])
-        largest = np.maximum(corner, legs * (1 + SETTINGS.kept_back))
+        subset = corners.subset(lines)
+        corner, legs = _deviations(subset, longest[lines])
+        largest = np.maximum(corner, legs * (1 + SETTINGS.reserve))
         with np.errstate(divide="ignore"):
-            found[lines] = longest[lines] * np.minimum(1.0, tolerance[lines] / largest)
+            distances[lines] = longest[lines] * np.minimum(1.0, tolerance[lines] / largest)
     if arcs.size:
-        found[arcs] = _fitted(corners.some(arcs), tolerance[arcs] * (1 - SETTINGS.kept_back), longest[arcs])
-    return found
+        distances[arcs] = _solve_distances(
+            corners.subset(arcs), tolerance[arcs] * (1 - SETTINGS.reserve), longest[arcs]
+        )
+    return distances
 
 
-def _fitted(corners: _Corners, tolerance: Array, longest: Array) -> Array:
-    """Remaining distances, at most `longest`, whose deviation is the tolerance, or less at the longest."""
+def _solve_distances(corners: _Corners, tolerance: Array, longest: Array) -> Array:
+    """Return remaining distances, at most `longest`, whose deviation is the tolerance, or less at the longest."""
     low, high, trial = np.zeros_like(longest), longest.copy(), longest.copy()
     todo = np.arange(len(longest))
-    for number in range(SETTINGS.trials):
-        found = np.maximum(*_deviations(corners.some(todo), trial[todo]))
-        ratio = found / tolerance[todo]
+    for number in range(SETTINGS.iterations):
+        ratio = np.maximum(*_deviations(corners.subset(todo), trial[todo])) / tolerance[todo]
         fits = ratio <= 1
         low[todo] = np.where(fits, trial[todo], low[todo])
         high[todo] = np.where(fits, high[todo], trial[todo])
-        going = (~fits | (ratio < 1 - SETTINGS.kept_back)) & (trial[todo] < longest[todo]) | ~fits
-        # nearly proportional; halving where that leads out of the bracket, or does not settle
-        aim = trial[todo] * (1 - SETTINGS.kept_back / 2) / np.maximum(ratio, 1e-12)
+        unsettled = (~fits | (ratio < 1 - SETTINGS.reserve)) & (trial[todo] < longest[todo]) | ~fits
+        # the deviation is nearly proportional; bisect if that leaves the bracket, and in every fourth iteration
+        aim = trial[todo] * (1 - SETTINGS.reserve / 2) / np.maximum(ratio, 1e-12)
         inside = (aim > low[todo]) & (aim < high[todo]) & (number % 4 != 3)
         trial[todo] = np.where(inside, aim, (low[todo] + high[todo]) / 2)
-        todo = todo[going]
+        todo = todo[unsettled]
         if not todo.size:
             break
     if (low <= 0).any():
         i = int((low <= 0).argmax())
         name = f"vertex {corners.vertices[i] + 1}"
-        message = f"{name}: no blend stays within the deviation; take a larger one"
+        message = f"{name}: no blend stays within the deviation of {tolerance[i]:g} m; use a larger one"
         raise ModelError(message, name=name, limit=float(tolerance[i]))
     return low
 
 
 def _deviations(corners: _Corners, remaining: Array) -> tuple[Array, Array]:
-    """Distance of the vertex from its blend, and largest distance of the blend from the two segments.
+    """Return the distance of the vertex from its blend, and the largest distance of the blend from its two segments.
 
-    Between them they bound how far the smooth path strays from the task and the task from the smooth path. Sampled
-    evenly and again about the extreme: the first is never below the truth, the second by at most 0.1 %. Shape (V,), m.
+    Together they bound the deviation between smooth path and task in both directions. They are sampled uniformly and
+    again about the maximum. The first is never below the true value, the second by at most 0.1 %. Shape (V,), m.
     """
     path, vertices, curves = corners.path, corners.vertices, corners.blends(remaining)
     u = np.linspace(0, 1, SETTINGS.samples)
     points = polynomial(curves[:, None], u[None, :])
     tip = path.start[vertices + 1][:, None]
     corner = np.linalg.norm(points - tip, axis=-1)
-    near = _from_segments(path, vertices, points, remaining)
+    to_task = _blend_to_task(path, vertices, points, remaining)
 
     def about(extreme: NDArray[np.intp]) -> Array:
-        places = u[np.clip(extreme, 1, SETTINGS.samples - 2)][:, None] + np.linspace(-1, 1, SETTINGS.samples) / (
-            SETTINGS.samples - 1
-        )
-        return polynomial(curves[:, None], places)
+        offsets = np.linspace(-1, 1, SETTINGS.samples) / (SETTINGS.samples - 1)
+        return polynomial(curves[:, None], u[np.clip(extreme, 1, SETTINGS.samples - 2)][:, None] + offsets)
 
     closest = np.linalg.norm(about(corner.argmin(axis=1)) - tip, axis=-1)
-    # there is a kink where the other segment gets nearer
-    farthest = _from_segments(path, vertices, about(near.argmax(axis=1)), remaining)
-    return (np.minimum(corner.min(axis=1), closest.min(axis=1)), np.maximum(near.max(axis=1), farthest.max(axis=1)))
+    # the distance to the task has a kink where the closer segment changes
+    farthest = _blend_to_task(path, vertices, about(to_task.argmax(axis=1)), remaining)
+    return (np.minimum(corner.min(axis=1), closest.min(axis=1)), np.maximum(to_task.max(axis=1), farthest.max(axis=1)))
 
 
-def _from_blend(corners: _Corners, remaining: Array) -> Array:
-    """Largest distance of the two stretches that each blend replaces from the blend. Shape (V,), m."""
+def _task_to_blend(corners: _Corners, remaining: Array) -> Array:
+    """Return the largest distance from each blend of the two stretches that it replaces. Shape (V,), m."""
     path, result = corners.path, np.empty(len(remaining))
     u, v = np.linspace(0, 1, 4 * SETTINGS.samples), np.linspace(0, 1, SETTINGS.samples)
     for first in range(0, len(remaining), SETTINGS.block):
         part = slice(first, first + SETTINGS.block)
-        some, away = corners.some(part), remaining[part]
-        index = some.vertices
+        subset, distances = corners.subset(part), remaining[part]
+        index = subset.vertices
         tip = path.start[index + 1][:, None]
-        points = polynomial(some.blends(away)[:, None], u) - tip
-        flat, along = np.repeat(index, len(v)), away[:, None] * v
+        points = polynomial(subset.blends(distances)[:, None], u) - tip
+        flat, along = np.repeat(index, len(v)), distances[:, None] * v
         before = path.at(flat, (path.lengths[index][:, None] - along).ravel())[0]
         after = path.at(flat + 1, along.ravel())[0]
         task = np.concatenate([x.reshape(len(index), len(v), 3) for x in (before, after)], axis=1) - tip
@@ -267,8 +274,8 @@ def _from_blend(corners: _Corners, remaining: Array) -> Array:
         nearest = np.clip(square.argmin(axis=2), 1, len(u) - 2)
         row = np.arange(len(index))[:, None]
         distance = np.full(nearest.shape, np.inf)
-        for one, other in ((-1, 0), (0, 1)):
-            start, end = points[row, nearest + one], points[row, nearest + other]
+        for i, j in ((-1, 0), (0, 1)):
+            start, end = points[row, nearest + i], points[row, nearest + j]
             chord, offset = end - start, task - start
             part_of = np.clip((offset * chord).sum(axis=-1) / (chord**2).sum(axis=-1), 0, 1)
             distance = np.minimum(distance, np.linalg.norm(offset - part_of[..., None] * chord, axis=-1))
@@ -276,58 +283,58 @@ def _from_blend(corners: _Corners, remaining: Array) -> Array:
     return result
 
 
-def _from_segments(path: Path, vertices: NDArray[np.intp], points: Array, remaining: Array) -> Array:
-    # distance of points (V, S, 3) from the nearer of the two stretches that a blend replaces
+def _blend_to_task(path: Path, vertices: NDArray[np.intp], points: Array, remaining: Array) -> Array:
+    """Return the distance of points (V, S, 3) from the closer of the two stretches that each blend replaces."""
     return np.minimum(
-        _distance(path, vertices, points, path.lengths[vertices] - remaining, path.lengths[vertices]),
-        _distance(path, vertices + 1, points, np.zeros(len(vertices)), remaining),
+        _distance_to_segment(path, vertices, points, path.lengths[vertices] - remaining, path.lengths[vertices]),
+        _distance_to_segment(path, vertices + 1, points, np.zeros(len(vertices)), remaining),
     )
 
 
-def _distance(path: Path, index: NDArray[np.intp], points: Array, first: Array, last: Array) -> Array:
-    # of points (V, S, 3) from the stretch first..last of a segment each
-    screwed = np.flatnonzero(path.torsion[index] != 0)
-    if screwed.size:
+def _distance_to_segment(path: Path, index: NDArray[np.intp], points: Array, first: Array, last: Array) -> Array:
+    """Return the distance of points (V, S, 3) from the stretch first..last of one segment each."""
+    helices = np.flatnonzero(path.torsion[index] != 0)
+    if helices.size:
         result, others = np.empty(points.shape[:2]), np.flatnonzero(path.torsion[index] == 0)
         if others.size:
-            result[others] = _distance(path, index[others], points[others], first[others], last[others])
-        result[screwed] = _from_helix(path, index[screwed], points[screwed], first[screwed], last[screwed])
+            result[others] = _distance_to_segment(path, index[others], points[others], first[others], last[others])
+        result[helices] = _distance_to_helix(path, index[helices], points[helices], first[helices], last[helices])
         return result
     offset = points - path.start[index][:, None]
     along = np.einsum("vsi,vi->vs", offset, path.tangent[index])
     across = np.einsum("vsi,vi->vs", offset, path.normal[index])
     k = path.curvature[index][:, None]
-    # angle about the center, from the start; in the branch of the stretch's middle
+    # angle about the center from the start, in the turn of the stretch's middle
     middle = (first + last)[:, None] / 2
     angle = np.arctan2(k * along, 1 - k * across)
     angle = k * middle + (angle - k * middle + np.pi) % (2 * np.pi) - np.pi
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = np.where(k > 0, angle / k, along)
     s = np.clip(distance, first[:, None], last[:, None])
-    # what screw says of the position, without its derivatives
+    # the position by `screw`, without its derivatives
     turned = k * s / np.pi
     offset -= (s * np.sinc(turned))[..., None] * path.tangent[index][:, None]
     offset -= (k * s**2 / 2 * np.sinc(turned / 2) ** 2)[..., None] * path.normal[index][:, None]
     return np.asarray(np.sqrt(np.einsum("vsi,vsi->vs", offset, offset)))
 
 
-def _from_helix(path: Path, index: NDArray[np.intp], points: Array, first: Array, last: Array) -> Array:
-    # as _distance: the nearest of some places, and Newton steps from there to where the offset is square to the tangent
+def _distance_to_helix(path: Path, index: NDArray[np.intp], points: Array, first: Array, last: Array) -> Array:
+    """Return the same as `_distance_to_segment` for helices, by Newton iterations from the closest sample."""
     if len(index) > SETTINGS.block:
         parts = [slice(k, k + SETTINGS.block) for k in range(0, len(index), SETTINGS.block)]
-        return np.concatenate([_from_helix(path, index[p], points[p], first[p], last[p]) for p in parts])
+        return np.concatenate([_distance_to_helix(path, index[p], points[p], first[p], last[p]) for p in parts])
     frame = path.start[index][:, None], path.tangent[index][:, None], path.normal[index][:, None]
     bends = path.curvature[index][:, None], path.torsion[index][:, None]
     turns = float((np.hypot(*bends)[:, 0] * (last - first)).max()) / FULL_TURN
     share = np.linspace(0, 1, int(SETTINGS.samples * (1 + turns)))
     places = first[:, None] + (last - first)[:, None] * share
-    there = screw(*frame, *bends, places)[0] - frame[0]
-    square = (there**2).sum(axis=-1)[:, None] - 2 * (points - frame[0]) @ there.transpose(0, 2, 1)
+    curve_points = screw(*frame, *bends, places)[0] - frame[0]
+    square = (curve_points**2).sum(axis=-1)[:, None] - 2 * (points - frame[0]) @ curve_points.transpose(0, 2, 1)
     s = np.take_along_axis(places, square.argmin(axis=2), axis=1)
-    for _ in range(SETTINGS.newton_steps):
+    for _ in range(SETTINGS.newton_iterations):
         at, tangent, bend, _ = screw(*frame, *bends, s)
         slope = 1 + ((at - points) * bend).sum(axis=-1)
-        s = s - ((at - points) * tangent).sum(axis=-1) / np.maximum(slope, SETTINGS.gentlest)
+        s = s - ((at - points) * tangent).sum(axis=-1) / np.maximum(slope, SETTINGS.least_slope)
         s = np.clip(s, first[:, None], last[:, None])
     return np.asarray(np.linalg.norm(screw(*frame, *bends, s)[0] - points, axis=-1))
 
@@ -345,32 +352,32 @@ def smooth(
 
     Args:
         path: The task.
-        remaining: Distance (m) from a vertex at which its blend leaves the segments, measured along them: one for all
-            vertices, or one for each.
-        deviation: Instead of `remaining`: how far (m) the smooth path may stray from the task and the task from the
-            smooth path; the blends are as large as that and the segments allow.
+        remaining: Distance (m) along the segments from a vertex to both ends of its blend, one for all vertices or one
+            for each.
+        deviation: Instead of `remaining`, the largest distance (m) between smooth path and task, in both directions.
+            The blends are as large as it and the segments allow.
         kind: "quintic", whose curvature is continuous everywhere, or the paper's "cubic", whose curvature is continuous
-            between lines only, and only at shape 3.
-        shape: End tangents over the remaining distance, lambda of eq. (9), one for all or one for each vertex. If
-            None, the paper's 3 for a cubic, and for a quintic that of least peak curvature at each vertex, which is
-            run fastest: see models.paths.blends.
-        overlap: What happens to blends that would overlap on a segment: "shrink" makes both smaller, "refuse" raises.
+            between lines only, and only with shape 3.
+        shape: Shape factor, lambda of eq. (9): end tangents over the remaining distance; one for all vertices or one
+            for each. None: the paper's 3 for a cubic; for a quintic the factor of least peak curvature at each vertex,
+            which is the fastest, see `models.paths.blends`.
+        overlap: "shrink" makes blends that would overlap on a segment smaller, "refuse" raises.
 
     Raises:
-        ModelError: A distance, deviation or shape that is not positive; blends that overlap, if refused; a cusp.
+        ModelError: A distance, deviation or shape is not positive, blends overlap and are refused, or a blend has a
+            cusp.
 
     Warns:
-        ModelWarning: Blends that were made smaller than `remaining` asks, their vertices being its `value`. A
-            `deviation` is kept by smaller ones too, and nothing is said.
+        ModelWarning: Blends are smaller than `remaining`; `value` has their vertices. With a `deviation` there is no
+            warning, since smaller blends keep it too.
     """
     count = len(checked_instance(path, Path, "smooth", "path").segments)
     checked_choice(kind, get_args(BlendKind), "blend", "kind")
     free = shape is None and kind == "quintic"
     angles = path.corner_angles()
     factors = corner_shape(angles) if free else checked_shape(PAPER_SHAPE if shape is None else shape, kind, count - 1)
-    corners, distances = _sized(
-        _Corners(path, kind, factors, np.arange(count - 1)), remaining, deviation, overlap, free
-    )
+    corners = _Corners(path, kind, factors, np.arange(count - 1))
+    corners, distances = _remaining_distances(corners, remaining, deviation, overlap, free)
     coefficients = corners.blends(distances)
     curve_cells = cells(coefficients)
     blend_lengths = np.bincount(curve_cells.curve, curve_cells.length, minlength=len(distances))
@@ -379,11 +386,20 @@ def smooth(
     lengths, segment, blend = np.empty(2 * count - 1), np.full(2 * count - 1, -1), np.full(2 * count - 1, -1)
     lengths[::2], lengths[1::2] = rests, blend_lengths
     segment[::2], blend[1::2] = np.arange(count), np.arange(count - 1)
-    kept = np.ones(2 * count - 1, dtype=bool)
-    kept[::2] = rests > SETTINGS.shortest * path.lengths
-    bounds = np.concatenate([[0.0], np.cumsum(lengths[kept])])
-    made = path, kind, distances, corners.shape, coefficients, bounds, segment[kept], blend[kept], curve_cells
-    smoothed = SmoothPath(*made)
+    long_enough = np.ones(2 * count - 1, dtype=bool)
+    long_enough[::2] = rests > SETTINGS.shortest * path.lengths
+    bounds = np.concatenate([[0.0], np.cumsum(lengths[long_enough])])
+    smoothed = SmoothPath(
+        path,
+        kind,
+        distances,
+        corners.shape,
+        coefficients,
+        bounds,
+        segment[long_enough],
+        blend[long_enough],
+        curve_cells,
+    )
     if path.turns:
         _check_turns(smoothed)
     return smoothed
@@ -399,6 +415,6 @@ def _check_turns(smoothed: SmoothPath) -> None:
         if angle.max() > FULL_TURN:
             message = (
                 f"the tool turns by {np.degrees(angle.max()):.4g} deg in the blend at "
-                f"{bounds[int(angle.argmax())]:g} m; turn less or take a smaller remaining distance"
+                f"{bounds[int(angle.argmax())]:g} m; turn less or use a smaller remaining distance"
             )
             raise ModelError(message, name="orientation", value=float(angle.max()), limit=FULL_TURN)

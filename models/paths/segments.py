@@ -1,18 +1,18 @@
-"""Segments of a task path: straight lines, circular arcs and helices in space, tool orientation carried along.
+"""Segments of a task path: straight lines, circular arcs and helices in space, with tool orientations.
 
-All are curves of constant curvature k and torsion w, and one formula, with the arc length s from the start and
-T, N, B = T x N there, serves them all. With o = sqrt(k^2 + w^2), d = (w T + k B)/o and e = (k T - w B)/o
+All are curves of constant curvature k and torsion w. With the arc length s, the Frenet frame T, N, B = T x N at the
+start, o = sqrt(k^2 + w^2), d = (w T + k B)/o and e = (k T - w B)/o, they are
 
-    r(s) = start + w/o d s + k/o [e sin(o s) + N (1 - cos(o s))]/o:
+    r(s) = start + w/o d s + k/o [e sin(o s) + N (1 - cos(o s))]/o,
 
-the way along the axis d of the screw, and the way round it. An arc has w = 0, a line k = 0 as well.
+a translation along the screw axis d and a rotation about it. An arc has w = 0, a line k = 0 as well.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from models.spatial import FULL_TURN
 __all__ = ["Arc", "Helix", "Line", "Segment", "screw", "screw_axes"]
 
 SHORTEST_SEGMENT = 1e-9
-"""Segments below this length (m) count as points."""
+"""Shortest length of a segment, m."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,33 +33,36 @@ class Line:
 
     Attributes:
         start, end: In world. Shape (3,), m.
-        start_orientation, end_orientation: Tool orientation in world at both ends, unit quaternion [w, x, y, z],
-            turned between them about a fixed axis, the shorter way, evenly with the distance. Shape (4,); None takes
-            what the segment before ends with (the first one: no rotation), or for the end, that of the start.
+        start_orientation, end_orientation: Tool orientation in world at both ends, unit quaternion [w, x, y, z]. Shape
+            (4,). Between them the tool turns about a fixed axis, by the shorter way, in proportion to the distance. A
+            start of None continues the segment before (the first one: no rotation); an end of None equals the start.
+        curvature, torsion: Zero, 1/m.
 
     Raises:
-        ModelError: nan, a zero length, a quaternion that is none.
+        ModelError: An entry is not finite, the length is zero, or a quaternion is not normalised.
     """
 
     start: ArrayInput
     end: ArrayInput
     start_orientation: ArrayInput | None = None
     end_orientation: ArrayInput | None = None
+    curvature: ClassVar[float] = 0.0
+    torsion: ClassVar[float] = 0.0
 
     def __post_init__(self) -> None:
-        for what in ("start", "end"):
-            object.__setattr__(self, what, checked_array(getattr(self, what), (3,), "line", what))
+        for name in ("start", "end"):
+            object.__setattr__(self, name, checked_array(getattr(self, name), (3,), "line", name))
         _set_orientations(self, "line")
         if self.length <= SHORTEST_SEGMENT:
             message = (
                 f"line from {self.start.tolist()} to {self.end.tolist()} m has the length {self.length:g} m; "
-                "drop it, or turn the tool along a segment that moves"
+                "remove it, or turn the tool along a segment that moves"
             )
             raise ModelError(message, name="length", value=self.length, limit=SHORTEST_SEGMENT)
 
     @cached_property
     def length(self) -> float:
-        """m."""
+        """Length, m."""
         return float(np.linalg.norm(self.end - self.start))
 
     @property
@@ -69,33 +72,48 @@ class Line:
 
     @property
     def normal(self) -> Array:
-        """Unit normal at the start; zero, since a line has none. Shape (3,)."""
+        """Zero, since a line has no normal. Shape (3,)."""
         return np.zeros(3)
 
-    @property
-    def curvature(self) -> float:
-        """1/m."""
-        return 0.0
+
+class _Circular:
+    """Properties that an arc and a helix share."""
+
+    start: ArrayInput
+    center: ArrayInput
 
     @property
-    def torsion(self) -> float:
-        """1/m."""
-        return 0.0
+    def radius(self) -> float:
+        """Radius of the circle, or of the cylinder that the helix lies on, m."""
+        return float(np.linalg.norm(self.start - self.center))
+
+    @property
+    def normal(self) -> Array:
+        """Unit normal at the start, towards the axis. Shape (3,)."""
+        return np.asarray((self.center - self.start) / self.radius)
+
+    @property
+    def end(self: Any) -> Array:
+        """End point in world. Shape (3,), m."""
+        frame = self.start, self.tangent, self.normal
+        return np.asarray(screw(*frame, self.curvature, self.torsion, self.length)[0])
 
 
 @dataclass(frozen=True, eq=False)
-class Arc:
-    """A circular arc in any plane, up to a full circle. Make it by `Arc.through` or `Arc.about`.
+class Arc(_Circular):
+    """A circular arc in any plane, up to a full circle. `Arc.through` and `Arc.about` construct it.
 
     Attributes:
         start: In world. Shape (3,), m.
         center: In world. Shape (3,), m.
         axis: Unit vector about which the arc turns, right-handed. Shape (3,).
-        sweep: Angle turned, rad, in (0, 2 pi].
-        start_orientation, end_orientation: As of a Line.
+        sweep: Angle of rotation, rad, in (0, 2 pi].
+        start_orientation, end_orientation: As for a Line.
+        torsion: Zero, 1/m.
 
     Raises:
-        ModelError: nan, no radius, an axis that is zero or not perpendicular to the radius, a sweep out of range.
+        ModelError: An entry is not finite, the radius is zero, the axis is zero or not perpendicular to the radius, or
+            the sweep is out of range.
     """
 
     start: ArrayInput
@@ -104,6 +122,7 @@ class Arc:
     sweep: float
     start_orientation: ArrayInput | None = None
     end_orientation: ArrayInput | None = None
+    torsion: ClassVar[float] = 0.0
 
     def __post_init__(self) -> None:
         radius = _set_circle(self, "arc")
@@ -111,7 +130,7 @@ class Arc:
         if not 0 < sweep <= FULL_TURN * (1 + 1e-12) or radius * sweep <= SHORTEST_SEGMENT:
             message = (
                 f"arc: sweep {sweep:g} rad is outside (0, 2 pi] or its length {radius * sweep:g} m is zero; "
-                "turn the axis round for the other sense, take a Helix for several turns"
+                "reverse the axis for the other sense, use a Helix for several turns"
             )
             raise ModelError(message, name="sweep", value=sweep, limit=(0.0, FULL_TURN))
         object.__setattr__(self, "sweep", sweep)
@@ -127,7 +146,7 @@ class Arc:
         start_orientation: ArrayInput | None = None,
         end_orientation: ArrayInput | None = None,
     ) -> Arc:
-        """Arc from `start` round `center` by `sweep` rad about `axis`; a negative sweep turns the other way."""
+        """Return the arc from `start` around `center`, turning by `sweep` rad about `axis`; negative: the other way."""
         turn = checked_number(sweep, "arc", "sweep")
         vector = checked_array(axis, (3,), "arc", "axis")
         return cls(start, center, vector if turn >= 0 else -vector, abs(turn), start_orientation, end_orientation)
@@ -141,10 +160,10 @@ class Arc:
         start_orientation: ArrayInput | None = None,
         end_orientation: ArrayInput | None = None,
     ) -> Arc:
-        """Arc from `start` over `via` to `end`. Shape (3,) each, m.
+        """Return the arc from `start` over `via` to `end`. Shape (3,) each, m.
 
         Raises:
-            ModelError: Points that coincide or lie on a line.
+            ModelError: Points coincide or are collinear.
         """
         points = {"start": start, "via": via, "end": end}
         a, b, c = (checked_array(point, (3,), "arc", what) for what, point in points.items())
@@ -154,7 +173,7 @@ class Arc:
         if area <= 1e-9 * size or np.linalg.norm(c - b) <= SHORTEST_SEGMENT:
             message = f"arc through {a.tolist()}, {b.tolist()}, {c.tolist()}: the points lie on a line or coincide"
             raise ModelError(f"{message}; use a Line, or Arc.about for a full circle", name="points", value=(a, b, c))
-        # to rounding for flat arcs too, whose center is far away: all is built upon the chord and the angle at `via`
+        # built upon the chord and the angle at `via`: accurate to rounding for flat arcs too, whose center is far away
         chord = float(np.linalg.norm(ac))
         along, axis = ac / chord, axis / area
         axis = axis - (axis @ along) * along
@@ -164,19 +183,9 @@ class Arc:
         return cls(a, center, axis, sweep, start_orientation, end_orientation)
 
     @property
-    def radius(self) -> float:
-        """m."""
-        return float(np.linalg.norm(self.start - self.center))
-
-    @property
     def length(self) -> float:
-        """m."""
+        """Length, m."""
         return self.radius * self.sweep
-
-    @property
-    def normal(self) -> Array:
-        """Unit vector at the start towards the center. Shape (3,)."""
-        return np.asarray((self.center - self.start) / self.radius)
 
     @property
     def tangent(self) -> Array:
@@ -185,35 +194,25 @@ class Arc:
 
     @property
     def curvature(self) -> float:
-        """1/m."""
+        """Curvature, 1/m."""
         return 1 / self.radius
-
-    @property
-    def torsion(self) -> float:
-        """1/m."""
-        return 0.0
-
-    @property
-    def end(self) -> Array:
-        """End point in world. Shape (3,), m."""
-        return np.asarray(screw(self.start, self.tangent, self.normal, self.curvature, 0.0, self.length)[0])
 
 
 @dataclass(frozen=True, eq=False)
-class Helix:
-    """A circular helix, or a circle of several turns: of constant curvature and torsion.
+class Helix(_Circular):
+    """A circular helix, or a circle of several turns: a curve of constant curvature and torsion.
 
     Attributes:
         start: In world. Shape (3,), m.
-        center: Of the circle that the helix starts on, in world. Shape (3,), m.
+        center: Center of the circle that the helix starts on, in world. Shape (3,), m.
         axis: Unit vector about which the helix turns, right-handed. Shape (3,).
-        sweep: Angle turned, rad: any number of turns, above zero.
-        rise: Way along the axis meanwhile, m; below zero it screws left-handed, at zero it stays in its plane.
-        start_orientation, end_orientation: As of a Line.
+        sweep: Angle of rotation, rad; positive, any number of turns.
+        rise: Displacement along the axis, m; negative for a left-handed screw, zero for a planar curve.
+        start_orientation, end_orientation: As for a Line.
 
     Raises:
-        ModelError: nan, no radius, an axis that is zero or not perpendicular to the radius, a sweep that is not above
-            zero.
+        ModelError: An entry is not finite, the radius is zero, the axis is zero or not perpendicular to the radius, or
+            the sweep is not positive.
     """
 
     start: ArrayInput
@@ -230,45 +229,30 @@ class Helix:
         object.__setattr__(self, "sweep", sweep)
         object.__setattr__(self, "rise", checked_number(self.rise, "helix", "rise"))
         if self.length <= SHORTEST_SEGMENT:
-            message = f"helix: sweep {sweep:g} rad at the radius {radius:g} m has the length {self.length:g} m; drop it"
+            message = f"helix: sweep {sweep:g} rad at radius {radius:g} m has the length {self.length:g} m; remove it"
             raise ModelError(message, name="sweep", value=sweep, limit=SHORTEST_SEGMENT)
         _set_orientations(self, "helix")
 
     @property
-    def radius(self) -> float:
-        """Of the cylinder that it lies on, m."""
-        return float(np.linalg.norm(self.start - self.center))
-
-    @property
     def length(self) -> float:
-        """m."""
+        """Length, m."""
         return float(np.hypot(self.radius * self.sweep, self.rise))
-
-    @property
-    def normal(self) -> Array:
-        """Unit vector at the start towards the axis. Shape (3,)."""
-        return np.asarray((self.center - self.start) / self.radius)
 
     @property
     def tangent(self) -> Array:
         """Unit tangent at the start. Shape (3,)."""
-        round_the_axis = self.radius * self.sweep * np.cross(self.normal, self.axis)
-        return np.asarray((round_the_axis + self.rise * self.axis) / self.length)
+        tangential = self.radius * self.sweep * np.cross(self.normal, self.axis)
+        return np.asarray((tangential + self.rise * self.axis) / self.length)
 
     @property
     def curvature(self) -> float:
-        """1/m."""
+        """Curvature, 1/m."""
         return self.radius * (self.sweep / self.length) ** 2
 
     @property
     def torsion(self) -> float:
-        """1/m; above zero where it screws right-handed."""
+        """Torsion, 1/m; positive for a right-handed screw."""
         return self.rise * self.sweep / self.length**2
-
-    @property
-    def end(self) -> Array:
-        """End point in world. Shape (3,), m."""
-        return np.asarray(screw(self.start, self.tangent, self.normal, self.curvature, self.torsion, self.length)[0])
 
 
 Segment: TypeAlias = Line | Arc | Helix
@@ -282,7 +266,7 @@ def screw(
     torsion: float | Array,
     distance: float | Array,
 ) -> tuple[Array, Array, Array, Array]:
-    """Point at `distance` along a line, an arc or a helix, and its first three derivatives by the distance.
+    """Return the point at `distance` along a line, an arc or a helix, and its first three derivatives by the distance.
 
     Args:
         start, tangent, normal: At distance 0. Shape (..., 3), m and unit vectors.
@@ -292,23 +276,23 @@ def screw(
     Returns:
         Position (m), unit tangent, curvature vector (1/m), its derivative (1/m^2). Shape (..., 3) each.
     """
-    climb, ahead, inward, rate = screw_axes(tangent, normal, curvature, torsion)
+    axial, tangential, inward, rate = screw_axes(tangent, normal, curvature, torsion)
     rate, s = rate[..., None], np.asarray(distance, dtype=float)[..., None]
     angle = rate * s
     sine, cosine = np.sin(angle), np.cos(angle)
     along = s * np.sinc(angle / np.pi)
     across = rate * s**2 / 2 * np.sinc(angle / (2 * np.pi)) ** 2
-    position = start + s * climb + along * ahead + across * inward
-    turning = cosine * ahead + sine * inward
-    return position, climb + turning, rate * (cosine * inward - sine * ahead), -(rate**2) * turning
+    position = start + s * axial + along * tangential + across * inward
+    turning = cosine * tangential + sine * inward
+    return position, axial + turning, rate * (cosine * inward - sine * tangential), -(rate**2) * turning
 
 
 def screw_axes(
     tangent: Array, normal: Array, curvature: float | Array, torsion: float | Array
 ) -> tuple[Array, Array, Array, Array]:
-    """The tangent's part along the axis of the screw and that round it, the part towards it, and the rate of turning.
+    """Return the tangent's axial and tangential components, the vector towards the screw axis and the rotation rate.
 
-    Shape (..., 3) three times; (...), rad/m. Arguments as of `screw`.
+    Shape (..., 3) three times; (...), rad/m. Arguments as for `screw`.
     """
     k, w = np.asarray(curvature, dtype=float), np.asarray(torsion, dtype=float)
     if not np.any(w):
@@ -317,37 +301,37 @@ def screw_axes(
     safe = np.where(rate == 0, 1.0, rate)
     level, steep = np.where(rate == 0, 1.0, k / safe)[..., None], (w / safe)[..., None]
     binormal = np.cross(tangent, normal)
-    climb = steep * (steep * tangent + level * binormal)
-    return climb, level * (level * tangent - steep * binormal), level * normal, rate
+    axial = steep * (steep * tangent + level * binormal)
+    return axial, level * (level * tangent - steep * binormal), level * normal, rate
 
 
 def _set_circle(segment: Any, owner: str) -> float:
-    """Check start, center and axis, and set them. Returns the radius, m."""
-    for what in ("start", "center", "axis"):
-        object.__setattr__(segment, what, checked_array(getattr(segment, what), (3,), owner, what))
+    """Check and set start, center and axis. Return the radius, m."""
+    for name in ("start", "center", "axis"):
+        object.__setattr__(segment, name, checked_array(getattr(segment, name), (3,), owner, name))
     norm = float(np.linalg.norm(segment.axis))
     if norm == 0:
-        message = f"{owner}: axis [0, 0, 0] has no direction; give the one that it turns about"
+        message = f"{owner}: axis [0, 0, 0] has no direction; give the axis of rotation"
         raise ModelError(message, name="axis", value=segment.axis)
     object.__setattr__(segment, "axis", segment.axis / norm)
     radius = float(np.linalg.norm(segment.start - segment.center))
     if radius <= SHORTEST_SEGMENT:
-        message = f"{owner}: start {segment.start.tolist()} is its center; its radius {radius:g} m is no circle"
+        message = f"{owner}: start {segment.start.tolist()} coincides with the center; the radius {radius:g} m is zero"
         raise ModelError(message, name="radius", value=radius, limit=SHORTEST_SEGMENT)
     slope = abs(float(segment.axis @ (segment.start - segment.center))) / radius
-    most = 1e-6
-    if slope > most:
+    tolerance = 1e-6
+    if slope > tolerance:
         message = (
             f"{owner}: axis {segment.axis.tolist()} is not perpendicular to the radius from {segment.center.tolist()} "
             f"to {segment.start.tolist()} (cosine {slope:.3g}); move the center along the axis to the start's height"
         )
-        raise ModelError(message, name="axis", value=slope, limit=most)
+        raise ModelError(message, name="axis", value=slope, limit=tolerance)
     return radius
 
 
 def _set_orientations(segment: Segment, owner: str) -> None:
-    for what in ("start_orientation", "end_orientation"):
-        if getattr(segment, what) is not None:
-            object.__setattr__(segment, what, unit_quaternion(getattr(segment, what), f"{owner}: {what}"))
+    for name in ("start_orientation", "end_orientation"):
+        if getattr(segment, name) is not None:
+            object.__setattr__(segment, name, unit_quaternion(getattr(segment, name), f"{owner}: {name}"))
     if segment.start_orientation is not None and segment.end_orientation is not None:
         rotation_vector(segment.start_orientation, segment.end_orientation, owner)  # refuses half turns

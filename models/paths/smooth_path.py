@@ -1,4 +1,4 @@
-"""A path whose corners are rounded, as a function of the distance along it."""
+"""Paths with rounded corners as functions of the distance along them."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from numpy.typing import NDArray
 from models.arrays import Array, ArrayInput, checked_array, checked_count, one_for_each
 from models.errors import ModelError
 from models.paths.arc_length import Cells, parameter
-from models.paths.blends import BlendKind, by_arc_length, curvature, quintic
+from models.paths.blends import BlendKind, curvature, derivatives_by_arc_length, quintic
 from models.paths.orientation import along_piece
 from models.paths.path import Path
 
-__all__ = ["Blend", "Place", "SmoothPath", "Turn"]
+__all__ = ["Blend", "PathPoint", "SmoothPath", "Turn"]
 
-SAMPLES_AT_ONCE = 50_000
-"""Samples handled at once, so that memory does not grow with them."""
+BLOCK_SIZE = 50_000
+"""Number of samples processed at once, which bounds the memory."""
 
 
-class Place(NamedTuple):
-    """Where a path is at M distances, and its derivatives by the distance.
+class PathPoint(NamedTuple):
+    """Position on a path and its derivatives by the distance, at M distances.
 
     Attributes:
         position: In world. Shape (M, 3), m.
-        tangent: Unit. Shape (M, 3).
+        tangent: Unit tangent. Shape (M, 3).
         curvature: Curvature vector. Shape (M, 3), 1/m.
-        curvature_rate: Its derivative. Shape (M, 3), 1/m^2.
+        curvature_rate: Derivative of the curvature vector. Shape (M, 3), 1/m^2.
     """
 
     position: Array
@@ -40,12 +40,12 @@ class Place(NamedTuple):
 
 
 class Turn(NamedTuple):
-    """How the tool is turned at M distances.
+    """Tool orientation and its rates at M distances.
 
     Attributes:
         quaternion: Tool orientation in world. Shape (M, 4).
         rate: Angular velocity at unit line speed, in world axes. Shape (M, 3), rad/m.
-        acceleration, jerk: Its derivatives by the distance. Shape (M, 3), rad/m^2 and rad/m^3.
+        acceleration, jerk: Derivatives of the rate by the distance. Shape (M, 3), rad/m^2 and rad/m^3.
     """
 
     quaternion: Array
@@ -61,9 +61,9 @@ class Blend:
     Attributes:
         vertex: The corner in world. Shape (3,), m.
         angle: Interior angle, rad.
-        remaining: Distance (m) from the vertex, along either segment, at which the blend leaves it.
+        remaining: Distance (m) from the vertex to both ends of the blend, along the segments.
         shape: Shape factor.
-        start, end: Distances along the smooth path at which the blend begins and ends, m.
+        start, end: Distances of the blend's ends along the smooth path, m.
         coefficients: Ascending polynomial in u of [0, 1]. Shape (6, 3), m.
     """
 
@@ -77,22 +77,25 @@ class Blend:
 
     @property
     def length(self) -> float:
-        """m."""
+        """Length, m."""
         return self.end - self.start
 
 
 @dataclass(frozen=True, eq=False)
 class SmoothPath:
-    """Pieces of segments and the blends between them, parametrised by the distance from the start. Made by `smooth`.
+    """A path with rounded corners, parametrised by the distance from its start. `smooth` constructs it.
+
+    Its pieces are the remaining parts of the segments and the blends between them.
 
     Attributes:
-        path: The task, before the corners were rounded.
+        path: The task before its corners were rounded.
         kind: "cubic" or "quintic".
         remaining, shape: Of each vertex. Shape (V,), m and 1.
         coefficients: Of the blends. Shape (V, 6, 3), m.
-        bounds: Distances at which the pieces begin, and the length at last. Shape (P + 1,), m.
-        piece_segment: Segment that a piece is part of, -1 for a blend. Shape (P,).
-        piece_blend: Vertex of the blend that a piece is, -1 for a part of a segment. Shape (P,).
+        bounds: Distances at which the pieces begin, and finally the length. Shape (P + 1,), m.
+        piece_segment: Segment of each piece, -1 for a blend. Shape (P,).
+        piece_blend: Vertex of each blend, -1 for a part of a segment. Shape (P,).
+        cells: Quadrature cells of the blends.
     """
 
     path: Path
@@ -107,12 +110,12 @@ class SmoothPath:
 
     @property
     def length(self) -> float:
-        """m."""
+        """Length, m."""
         return float(self.bounds[-1])
 
     @property
     def piece_lengths(self) -> Array:
-        """Shape (P,), m."""
+        """Lengths of the pieces. Shape (P,), m."""
         return np.diff(self.bounds)
 
     @cached_property
@@ -125,12 +128,12 @@ class SmoothPath:
         """Distance at which each cell of each blend begins. Shape (C,), m."""
         before = np.cumsum(self.cells.length) - self.cells.length
         first = np.searchsorted(self.cells.curve, np.arange(len(self.coefficients)))
-        # the first cell's bound must be that of its blend to the last bit, or a place there falls into the blend before
+        # to the last bit, the bound of a blend's first cell must equal the blend's own, or points fall before the blend
         inside = before - before[first][self.cells.curve]
         return np.asarray(self.bounds[self.blend_starts][self.cells.curve] + inside)
 
     def blend(self, vertex: int) -> Blend:
-        """The blend at a vertex, 0 being the end of the first segment; ModelError when there is none."""
+        """Return the blend at a vertex, 0 being the end of the first segment; raise a ModelError if there is none."""
         count = len(self.remaining)
         if not isinstance(vertex, int | np.integer) or isinstance(vertex, bool) or not 0 <= vertex < count:
             message = f"vertex {vertex!r} does not exist; the path has {count}"
@@ -146,43 +149,43 @@ class SmoothPath:
             self.coefficients[vertex],
         )
 
-    def at(self, distance: ArrayInput) -> Place:
-        """Position, tangent, curvature and its derivative at distances from the start. Shape (M,), m.
+    def at(self, distance: ArrayInput) -> PathPoint:
+        """Return position, tangent, curvature and its derivative at distances from the start. Shape (M,), m.
 
         Raises:
-            ModelError: nan, or a distance off the path by more than rounding.
+            ModelError: A distance is nan, or outside the path by more than rounding.
         """
-        return Place(*_in_parts(self._at, self.checked_distance(distance), (3, 3, 3, 3)))
+        return PathPoint(*_in_blocks(self._at, self.checked_distance(distance), (3, 3, 3, 3)))
 
     def curvature(self, distance: ArrayInput) -> Array:
-        """Curvature at distances from the start. Shape (M,), 1/m."""
-        return _in_parts(self._curvature, self.checked_distance(distance), (1,))[0][:, 0]
+        """Return the curvature at distances from the start. Shape (M,), 1/m."""
+        return _in_blocks(self._curvature, self.checked_distance(distance), (1,))[0][:, 0]
 
     def turn(self, distance: ArrayInput) -> Turn:
-        """Tool orientation and its rates at distances from the start. Shape (M,), m.
+        """Return tool orientation and its rates at distances from the start. Shape (M,), m.
 
-        Continuous up to `acceleration`.
+        They are continuous up to the acceleration.
         """
         s = self.checked_distance(distance)
         if not self.path.turns:
-            still = np.zeros((len(s), 3))
-            return Turn(np.repeat(self.path.orientation[:1], len(s), axis=0), still, still, still)
-        return Turn(*_in_parts(self._turn, s, (4, 3, 3, 3)))
+            zero = np.zeros((len(s), 3))
+            return Turn(np.repeat(self.path.orientation[:1], len(s), axis=0), zero, zero, zero)
+        return Turn(*_in_blocks(self._turn, s, (4, 3, 3, 3)))
 
     def parameter(self, distance: ArrayInput) -> Array:
-        """u of the blend at distances from the start; nan on segments. Shape (M,)."""
+        """Return the parameter u of the blend at distances from the start; nan on segments. Shape (M,)."""
         s = self.checked_distance(distance)
         u, curved = np.full(len(s), np.nan), self.piece_blend[self._piece(s)] >= 0
-        u[curved] = _in_parts(lambda at: (self._parameter(at)[1][:, None],), s[curved], (1,))[0][:, 0]
+        u[curved] = _in_blocks(lambda at: (self._parameter(at)[1][:, None],), s[curved], (1,))[0][:, 0]
         return u
 
-    def dense(self, per_cell: int = 16, per_segment: int = 2) -> Array:
-        """Distances that resolve every piece: evenly in each cell of a blend and in each part of a segment.
+    def sample_distances(self, per_cell: int = 16, per_segment: int = 2) -> Array:
+        """Return distances that resolve every piece: uniform in each cell of a blend and in each part of a segment.
 
         Shape (M,), m.
         """
-        for what, number in (("per_cell", per_cell), ("per_segment", per_segment)):
-            checked_count(number, "path", what)
+        for name, number in (("per_cell", per_cell), ("per_segment", per_segment)):
+            checked_count(number, "path", name)
         on_segment = np.flatnonzero(self.piece_segment >= 0)
         starts = np.concatenate([self.bounds[on_segment], self.cell_bounds])
         lengths = np.concatenate([self.piece_lengths[on_segment], self.cells.length])
@@ -195,12 +198,12 @@ class SmoothPath:
         return np.append(inside, self.length)
 
     def by_piece(self, of_segments: ArrayInput) -> Array:
-        """A speed for each segment (or one for all) as one for each piece; a blend takes its neighbours' lower one.
+        """Return the speed of each piece from that of each segment (or one for all); blends take the lower neighbour.
 
         Shape (P,).
 
         Raises:
-            ModelError: A number of values that is not that of the segments.
+            ModelError: The number of values differs from the number of segments.
         """
         count = len(self.path.segments)
         values = one_for_each(of_segments, count, "path", "speed", "segments", finite=False)
@@ -208,17 +211,17 @@ class SmoothPath:
         return np.where(self.piece_blend >= 0, blends, values[self.piece_segment])
 
     def curvature_jumps(self) -> Array:
-        """Jump of the curvature vector at each inner bound between pieces. Shape (P - 1,), 1/m."""
-        left, right = self._ends(1.0)[:-1], self._ends(0.0)[1:]
+        """Return the jump of the curvature vector at each bound between pieces. Shape (P - 1,), 1/m."""
+        left, right = self._end_curvatures(1.0)[:-1], self._end_curvatures(0.0)[1:]
         return np.asarray(np.linalg.norm(right - left, axis=1))
 
     def checked_distance(self, distance: ArrayInput) -> Array:
-        """`distance` as an array within the path; ModelError when it is not."""
+        """Return `distance` as an array within the path; raise a ModelError if it is outside."""
         s = checked_array(distance, ("distances",), "path", "distance", finite=False, nan=True, least=0)
         slack = 1e-9 * self.length
         wrong = s[~((s >= -slack) & (s <= self.length + slack))]
         if wrong.size:
-            message = f"distance {wrong[:3].tolist()} m is off the path, which is {self.length:g} m long"
+            message = f"distance {wrong[:3].tolist()} m is outside the path, which is {self.length:g} m long"
             raise ModelError(message, name="distance", value=float(wrong[0]), limit=self.length)
         return np.asarray(np.clip(s, 0.0, self.length))
 
@@ -238,24 +241,24 @@ class SmoothPath:
         results = tuple(np.empty((len(s), 3)) for _ in range(4))
         straight = np.flatnonzero(self.piece_segment[piece] >= 0)
         if straight.size:
-            which = piece[straight]
-            segment = self.piece_segment[which]
-            for result, value in zip(results, self._on_segment(segment, s[straight] - self.bounds[which]), strict=True):
+            pieces = piece[straight]
+            values = self._on_segment(self.piece_segment[pieces], s[straight] - self.bounds[pieces])
+            for result, value in zip(results, values, strict=True):
                 result[straight] = value
         curved = np.flatnonzero(self.piece_blend[piece] >= 0)
         if curved.size:
             curve, u = self._parameter(s[curved])
-            for result, value in zip(results, by_arc_length(self.coefficients[curve], u), strict=True):
+            for result, value in zip(results, derivatives_by_arc_length(self.coefficients[curve], u), strict=True):
                 result[curved] = value
         return results
 
     def _curvature(self, s: Array) -> tuple[Array]:
         piece = self._piece(s)
-        found = np.abs(self.path.curvature[self.piece_segment[piece]])
+        values = np.abs(self.path.curvature[self.piece_segment[piece]])
         curved = np.flatnonzero(self.piece_blend[piece] >= 0)
         curve, u = self._parameter(s[curved])
-        found[curved] = curvature(self.coefficients[curve], u)
-        return (found[:, None],)
+        values[curved] = curvature(self.coefficients[curve], u)
+        return (values[:, None],)
 
     def _turn(self, s: Array) -> tuple[Array, ...]:
         piece, (reference, theta) = self._piece(s), self.charts
@@ -263,17 +266,17 @@ class SmoothPath:
         return along_piece(reference[piece], theta[piece], length, (s - self.bounds[piece]) / length)
 
     def _on_segment(self, segment: NDArray[np.intp], distance: Array) -> tuple[Array, ...]:
-        # distance from where the blend before it has ended
-        skipped = np.concatenate([[0.0], self.remaining])[segment]
-        return self.path.at(segment, skipped + distance)
+        """Return position and derivatives at distances from the end of the blend before each segment."""
+        start_offset = np.concatenate([[0.0], self.remaining])[segment]
+        return self.path.at(segment, start_offset + distance)
 
-    def _ends(self, u: float) -> Array:
-        # curvature vector of each piece at its start (u = 0) or end (u = 1), seen from inside the piece
+    def _end_curvatures(self, u: float) -> Array:
+        """Return the one-sided curvature vector of each piece at its start (u = 0) or end (u = 1)."""
         result = np.empty((len(self.piece_segment), 3))
         parts = np.flatnonzero(self.piece_segment >= 0)
         result[parts] = self._on_segment(self.piece_segment[parts], u * self.piece_lengths[parts])[2]
         blends = np.flatnonzero(self.piece_blend >= 0)
-        result[blends] = by_arc_length(self.coefficients, np.full(len(blends), u))[2]
+        result[blends] = derivatives_by_arc_length(self.coefficients, np.full(len(blends), u))[2]
         return result
 
     @cached_property
@@ -281,13 +284,13 @@ class SmoothPath:
         """Reference quaternion (P, 4) and rotation vector polynomials (P, 6, 3) of the pieces, by distance/length."""
         path, lengths = self.path, self.piece_lengths
         rate = path.turn / path.lengths[:, None]
-        skipped = np.concatenate([[0.0], self.remaining])
+        start_offset = np.concatenate([[0.0], self.remaining])
         reference = np.empty((len(lengths), 4))
         theta = np.zeros((len(lengths), 6, 3))
         parts = np.flatnonzero(self.piece_segment >= 0)
         segment = self.piece_segment[parts]
         reference[parts] = path.orientation[segment]
-        theta[parts, 0] = rate[segment] * skipped[segment][:, None]
+        theta[parts, 0] = rate[segment] * start_offset[segment][:, None]
         theta[parts, 1] = rate[segment] * lengths[parts][:, None]
         blends = np.flatnonzero(self.piece_blend >= 0)
         reference[blends] = path.orientation[1:]
@@ -298,11 +301,11 @@ class SmoothPath:
         return reference, theta
 
 
-def _in_parts(function: Callable[[Array], tuple[Array, ...]], s: Array, widths: tuple[int, ...]) -> list[Array]:
-    """Rows of a function of distances, which is given some of them at a time. Shapes (M,) to (M, width) each."""
+def _in_blocks(function: Callable[[Array], tuple[Array, ...]], s: Array, widths: tuple[int, ...]) -> list[Array]:
+    """Return the rows of a function of distances, evaluated in blocks. Shapes (M,) to (M, width) each."""
     results = [np.empty((len(s), width)) for width in widths]
-    for first in range(0, len(s), SAMPLES_AT_ONCE):
-        part = slice(first, first + SAMPLES_AT_ONCE)
+    for first in range(0, len(s), BLOCK_SIZE):
+        part = slice(first, first + BLOCK_SIZE)
         for result, values in zip(results, function(s[part]), strict=True):
             result[part] = values
     return results

@@ -1,8 +1,8 @@
 """Signed distances of points, segments and boxes as expressions: the cores of shapes.
 
-Where cores are apart it is the root of the least square over the places on them; where they overlap it is the largest
-of the gaps along the directions that may separate them, minus their depth. Every formula takes scalars or columns of
-scalars, and can be rounded from below for methods that build on second derivatives, see `distance`.
+Separated cores have the distance of their closest points, the root of a minimum over positions on them. Overlapping
+cores have minus their penetration depth, the largest gap along the candidate separating axes. Every formula accepts
+scalars or columns of scalars, and has a smooth lower bound for second-order methods, see `models.shapes.distance`.
 """
 
 from __future__ import annotations
@@ -18,32 +18,32 @@ import casadi as ca
 from models.spatial import Expression
 
 Triple: TypeAlias = tuple[Expression, Expression, Expression]
-"""A vector as three scalars or columns, floats where they are known: products with zeros and ones vanish."""
-Hold: TypeAlias = Callable[[Expression], Expression]
-"""Takes a value for a constant where a distance is differentiated (`Held`), or does nothing."""
+"""A vector as three scalars or columns; constants are floats, so that products with zero and one vanish."""
+StopGradient: TypeAlias = Callable[[Expression], Expression]
+"""Makes a value constant to differentiation (`StoppedGradients`), or returns it unchanged."""
 
 KINK = 1e-12
-"""m: what rounds off the kink of an exact distance at zero."""
-NO_EDGE = 1e-18
-"""Squared sine of an angle: edges at less span no direction that could separate."""
+"""Length that smooths the kink of an exact distance at zero, m."""
+PARALLEL = 1e-18
+"""Squared sine of the angle between edges below which they span no separating direction."""
 
 
-class Rod(NamedTuple):
-    """Core of a sphere or a capsule: one point or two."""
+class SegmentCore(NamedTuple):
+    """Core of a sphere or a capsule: one or two points."""
 
     points: tuple[Triple, ...]
 
 
-class Block(NamedTuple):
-    """Core of a box: its centre, its axes, half of its edges."""
+class BoxCore(NamedTuple):
+    """Core of a box: its centre, axes and half edges."""
 
     centre: Triple
     axes: tuple[Triple, ...]
     half: Triple
 
 
-def free(value: Expression) -> Expression:
-    """Hold nothing."""
+def no_stop(value: Expression) -> Expression:
+    """Return the value unchanged, with its derivative."""
     return value
 
 
@@ -51,6 +51,7 @@ def free(value: Expression) -> Expression:
 
 
 def triple(entries: Iterable[Expression]) -> Triple:
+    """Return three entries as a vector."""
     x, y, z = entries
     return x, y, z
 
@@ -75,8 +76,8 @@ def along(a: Triple, step: Expression, direction: Triple) -> Triple:
     return triple(a[k] + step * direction[k] for k in range(3))
 
 
-def into(vector: Triple, axes: Sequence[Triple]) -> Triple:
-    """A vector of world by its shares along three axes."""
+def in_axes(vector: Triple, axes: Sequence[Triple]) -> Triple:
+    """Return the components of a vector along three axes."""
     return triple(dot(axis, vector) for axis in axes)
 
 
@@ -88,129 +89,136 @@ def _clip(x: Expression, low: Expression = 0.0, high: Expression = 1.0) -> Expre
 
 
 def _root(square: Expression, excess: float = 0.0) -> Expression:
-    """A lower bound of d where d^2 <= square <= d^2 + excess; for no excess d itself."""
+    """Return a lower bound of d for d^2 <= square <= d^2 + excess; d itself if the excess is zero."""
     root = ca.sqrt(square + (excess or KINK**2))
     return (square - excess) * (1 / root) if excess else root - KINK
 
 
 def _negative_part(gap: Expression, rounding: float) -> Expression:
-    """min(gap, 0), or a smooth lower bound of it, at most rounding/4 below; from a gap of `rounding` on it is zero."""
+    """Return min(gap, 0), or a smooth lower bound at most rounding/4 below; zero for gaps of at least `rounding`."""
     if rounding == 0:
         return ca.fmin(gap, 0)
     return ca.fmin(gap + rounding, 0) - _clip(rounding - gap, 0.0, 2 * rounding) ** 2 * (0.25 / rounding)
 
 
 def _positive_part(gap: Expression, rounding: float) -> Expression:
-    """A smooth lower bound of max(gap, 0), at most rounding/2 below; up to a gap of zero it is zero."""
+    """Return a smooth lower bound of max(gap, 0), at most rounding/2 below; zero for negative gaps."""
     return ca.fmax(gap - rounding, 0) + _clip(gap, 0.0, rounding) ** 2 * (0.5 / rounding)
 
 
-def highest(gaps: Sequence[Expression], rounding: float, hold: Hold) -> Expression:
-    """The largest of gaps, or a smooth lower bound of it, at most `rounding` below."""
-    most = reduce(ca.fmax, gaps)
+def largest_of(gaps: Sequence[Expression], rounding: float, stop_gradient: StopGradient) -> Expression:
+    """Return the largest gap, or a smooth lower bound, at most `rounding` below."""
+    largest = reduce(ca.fmax, gaps)
     if rounding == 0 or len(gaps) == 1:
-        return most
-    most, width = hold(most), rounding / log(len(gaps))
-    return most + width * ca.log(sum(ca.exp((gap - most) * (1 / width)) for gap in gaps)) - rounding
+        return largest
+    largest, width = stop_gradient(largest), rounding / log(len(gaps))
+    return largest + width * ca.log(sum(ca.exp((gap - largest) * (1 / width)) for gap in gaps)) - rounding
 
 
 # ---- points and segments --------------------------------------------------------------------------------------------
 
 
-def between_rods(one: Rod, other: Rod, rounding: float, hold: Hold) -> Expression:
-    """Distance of points and segments; that of crossing segments is 0, which is their depth."""
-    if len(one.points) < len(other.points):
-        one, other = other, one
-    p, q = one.points[0], other.points[0]
+def distance_of_segments(
+    first: SegmentCore, second: SegmentCore, rounding: float, stop_gradient: StopGradient
+) -> Expression:
+    """Return the distance of points and segments; zero, which is minus the depth, for crossing segments."""
+    if len(first.points) < len(second.points):
+        first, second = second, first
+    p, q = first.points[0], second.points[0]
     gap = subtract(p, q)
-    if len(one.points) == 1:
+    if len(first.points) == 1:
         return _root(dot(gap, gap))
-    u = subtract(one.points[1], p)
-    if len(other.points) == 1:
-        apart = along(gap, hold(_clip(-dot(u, gap) / (dot(u, u) + KINK**2))), u)
-        return _root(dot(apart, apart))
+    u = subtract(first.points[1], p)
+    if len(second.points) == 1:
+        difference = along(gap, stop_gradient(_clip(-dot(u, gap) / (dot(u, u) + KINK**2))), u)
+        return _root(dot(difference, difference))
     weight = rounding**2
-    return _root(_segments(gap, u, subtract(other.points[1], q), weight, hold), weight / 2)
+    return _root(_segments_square(gap, u, subtract(second.points[1], q), weight, stop_gradient), weight / 2)
 
 
-def _segments(gap: Triple, u: Triple, v: Triple, weight: float, hold: Hold) -> Expression:
-    """Least over s, t in 0..1 of |gap + s u - t v|^2 + weight ((s - 1/2)^2 + (t - 1/2)^2).
+def _segments_square(gap: Triple, u: Triple, v: Triple, weight: float, stop_gradient: StopGradient) -> Expression:
+    """Return the minimum over s, t in 0..1 of |gap + s u - t v|^2 + weight ((s - 1/2)^2 + (t - 1/2)^2).
 
-    s of the whole plane, cut to 0..1; then the best t for it, cut; then the best s for that (Ericson, Real-Time
-    Collision Detection, 2005, 5.1.9).
+    The unconstrained s is clipped to 0..1, then t is optimised for it and clipped, then s for that t (Ericson,
+    Real-Time Collision Detection, 2005, 5.1.9).
     """
     a, e, b = dot(u, u) + weight + KINK**2, dot(v, v) + weight + KINK**2, dot(u, v)
     c, f = dot(u, gap) - weight / 2, dot(v, gap) + weight / 2
-    # less than 1e-13 of the squared sine counts as parallel, which costs at most 3e-7 of the length
+    # a squared sine below 1e-13 counts as parallel; the error is at most 3e-7 of the length
     s = _clip((b * f - c * e) / ca.fmax(a * e - b * b, 1e-13 * a * e))
     t = _clip((b * s + f) / e)
     s = _clip((b * t - c) / a)
-    s, t = hold(s), hold(t)
-    apart = along(along(gap, s, u), -t, v)
-    square = dot(apart, apart)
+    s, t = stop_gradient(s), stop_gradient(t)
+    difference = along(along(gap, s, u), -t, v)
+    square = dot(difference, difference)
     return square + weight * ((s - 0.5) ** 2 + (t - 0.5) ** 2) if weight else square
 
 
 # ---- beside a box ---------------------------------------------------------------------------------------------------
 
 
-def beside_block(core: Rod | Block, block: Block, rounding: float, hold: Hold) -> Expression:
-    """Distance of a point, a segment or a box to a box: the root of the least square, where the cores are apart, and
-    minus their depth, the largest gap along the directions that may separate them.
+def distance_to_box(
+    core: SegmentCore | BoxCore, box: BoxCore, rounding: float, stop_gradient: StopGradient
+) -> Expression:
+    """Return the signed distance of a point, a segment or a box to a box.
 
-    Rounded, which an interior-point method differentiates twice at every point of a motion, that of two boxes is a
-    bound without the squares, in a fifth of the operations: each box, too, beside the box around the other along its
-    axes.
+    It is the root of the smallest square for separated cores and minus the penetration depth, the largest gap along the
+    candidate separating axes, for overlapping ones. The rounded distance of two boxes, which an interior-point method
+    differentiates twice at every point of a motion, is a bound without these squares at a fifth of the cost. It also
+    uses the distance of each box to the bounding box of the other along its own axes.
     """
-    middle, axes, halves = _in_axes_of(core, block)
+    middle, axes, halves = _in_box_axes(core, box)
     if not axes:
-        gap = highest([ca.fabs(x) - h for x, h in zip(middle, block.half, strict=True)], 0.0, hold)
-        return _root(_outside(middle, block.half, hold)) + _negative_part(gap, 0.0)
+        gap = largest_of([ca.fabs(x) - h for x, h in zip(middle, box.half, strict=True)], 0.0, stop_gradient)
+        return _root(_point_box_square(middle, box.half, stop_gradient)) + _negative_part(gap, 0.0)
     boxes, smooth = len(axes) == 3, rounding > 0
-    slack = rounding / sum((*halves, *block.half)) if boxes and smooth else 0.0
-    gaps = _gaps_beside_block(middle, axes, halves, block.half, slack)
-    gap = highest(gaps, rounding if boxes else 0.0, hold)
+    slack = rounding / sum((*halves, *box.half)) if boxes and smooth else 0.0
+    gaps = _separating_gaps(middle, axes, halves, box.half, slack)
+    gap = largest_of(gaps, rounding if boxes else 0.0, stop_gradient)
     if boxes and smooth:
-        away = [_positive_part(gap, rounding)]
+        distances = [_positive_part(gap, rounding)]
         for faces in (gaps[:3], gaps[3:6]):
             square = sum(_positive_part(each, rounding) ** 2 for each in faces)
-            away.append(ca.sqrt(square + rounding**2) - rounding)
-        return highest(away, rounding, hold) + _negative_part(gap, rounding)
-    squares = [_segment_box(middle, axes[0], block.half, rounding**2, hold)] if not boxes else []
-    if isinstance(core, Block):
-        squares = [*_edges_beside(middle, axes, halves, block.half, hold), *_corners_beside(block, core, hold)]
+            distances.append(ca.sqrt(square + rounding**2) - rounding)
+        return largest_of(distances, rounding, stop_gradient) + _negative_part(gap, rounding)
+    squares = [_segment_box_square(middle, axes[0], box.half, rounding**2, stop_gradient)] if not boxes else []
+    if isinstance(core, BoxCore):
+        squares = [
+            *_edge_squares(middle, axes, halves, box.half, stop_gradient),
+            *_corner_squares(box, core, stop_gradient),
+        ]
     square = reduce(ca.fmin, squares)
-    # what the rounding of numbers leaves of it has slopes where they overlap
+    # for overlapping cores rounding errors leave a small square with large slopes: set it to zero
     square = square if smooth else square * (gap > 0)
     return _root(square, rounding**2 / 4) + _negative_part(gap, rounding)
 
 
-def _in_axes_of(core: Rod | Block, block: Block) -> tuple[Triple, list[Triple], Sequence[Expression]]:
-    """Middle, axes and half extents along these of a point (no axis), a segment or a box, in a box's axes."""
-    if isinstance(core, Block):
-        centre = into(subtract(core.centre, block.centre), block.axes)
-        return centre, [into(axis, block.axes) for axis in core.axes], core.half
-    ends = [into(subtract(point, block.centre), block.axes) for point in core.points]
+def _in_box_axes(core: SegmentCore | BoxCore, box: BoxCore) -> tuple[Triple, list[Triple], Sequence[Expression]]:
+    """Return centre, axes and half extents of a point (no axis), a segment or a box, in the axes of a box."""
+    if isinstance(core, BoxCore):
+        centre = in_axes(subtract(core.centre, box.centre), box.axes)
+        return centre, [in_axes(axis, box.axes) for axis in core.axes], core.half
+    ends = [in_axes(subtract(point, box.centre), box.axes) for point in core.points]
     if len(ends) == 1:
         return ends[0], [], []
     u = subtract(ends[1], ends[0])
     return along(ends[0], 0.5, u), [u], [0.5]
 
 
-def _gaps_beside_block(
+def _separating_gaps(
     middle: Triple, axes: list[Triple], halves: Sequence[Expression], half: Triple, slack: Expression
 ) -> list[Expression]:
-    """Gaps of a segment or a box to a box along its faces' normals, along those of the other, and across an edge of
-    each (Gottschalk, Lin & Manocha 1996).
+    """Return the gaps of a segment or a box to a box along the separating axes (Gottschalk, Lin & Manocha 1996).
 
-    With slack the sizes of cosines, which have kinks where boxes are aligned, are rounded up by as much at most.
+    These are the face normals of both and the cross products of their edges. The absolute values of cosines have kinks
+    at aligned boxes; a positive slack replaces them by smooth upper bounds, at most the slack above.
     """
-    sizes = [triple(size_of(share, slack) for share in axis) for axis in axes]
+    sizes = [triple(smooth_abs(share, slack) for share in axis) for axis in axes]
     sums = [sum(h * size[i] for h, size in zip(halves, sizes, strict=True)) for i in range(3)]
-    found = [ca.fabs(middle[i]) - half[i] - sums[i] for i in range(3)]
+    gaps = [ca.fabs(middle[i]) - half[i] - sums[i] for i in range(3)]
     if boxes := len(axes) == 3:
-        found += [ca.fabs(dot(middle, axes[j])) - halves[j] - dot(half, sizes[j]) for j in range(3)]
-    least = NO_EDGE if boxes else NO_EDGE * dot(axes[0], axes[0])
+        gaps += [ca.fabs(dot(middle, axes[j])) - halves[j] - dot(half, sizes[j]) for j in range(3)]
+    least = PARALLEL if boxes else PARALLEL * dot(axes[0], axes[0])
     for i, j in product(range(3), range(len(axes))):
         i1, i2, j1, j2 = (i + 1) % 3, (i + 2) % 3, (j + 1) % 3, (j + 2) % 3
         reach = half[i1] * sizes[j][i2] + half[i2] * sizes[j][i1]
@@ -218,83 +226,89 @@ def _gaps_beside_block(
             reach += halves[j1] * sizes[j2][i] + halves[j2] * sizes[j1][i]
         across = ca.fabs(middle[i2] * axes[j][i1] - middle[i1] * axes[j][i2]) - reach
         square = axes[j][i1] ** 2 + axes[j][i2] ** 2
-        none = square <= least  # no direction, which separates nothing
-        found.append(across / ca.sqrt(square + none) - none * (1 / NO_EDGE))
-    return found
+        parallel = square <= least  # no direction of separation
+        gaps.append(across / ca.sqrt(square + parallel) - parallel * (1 / PARALLEL))
+    return gaps
 
 
-def size_of(x: Expression, slack: Expression) -> Expression:
-    """|x|, or a smooth upper bound of it, at most the slack above."""
+def smooth_abs(x: Expression, slack: Expression) -> Expression:
+    """Return |x|, or a smooth upper bound, at most the slack above."""
     return ca.fabs(x) if isinstance(slack, float) and slack == 0 else ca.sqrt(x * x + slack * slack)
 
 
-def _outside(x: Triple, half: Triple, hold: Hold) -> Expression:
-    """Square of the distance of a point to a box, in the box's axes."""
-    away = triple(part - hold(_clip(part, -h, h)) for part, h in zip(x, half, strict=True))
+def _point_box_square(x: Triple, half: Triple, stop_gradient: StopGradient) -> Expression:
+    """Return the squared distance of a point to a box, in the box's axes."""
+    away = triple(part - stop_gradient(_clip(part, -h, h)) for part, h in zip(x, half, strict=True))
     return dot(away, away)
 
 
-def _segment_box(middle: Triple, u: Triple, half: Triple, weight: float, hold: Hold) -> Expression:
-    """Least over s in -1/2..1/2 of the squared distance of middle + s u to a box plus weight s^2, in the box's axes.
+def _segment_box_square(
+    middle: Triple, u: Triple, half: Triple, weight: float, stop_gradient: StopGradient
+) -> Expression:
+    """Return the minimum over s in -1/2..1/2 of the squared distance of middle + s u to a box plus weight s^2.
 
-    Half of its derivative is weight s and of each axis u_k (x_k - what x_k is cut to by the box), which is zero while
-    x_k is within the box and straight before and after. First the axis is added that is farthest in s from there where
-    s = 0; then that of the others that is farthest where the first leads to; then the last, if it is beyond where these
-    lead to. What is added later pulls no farther than an axis that was added is straight: the least is found in three
-    steps. Derivatives do not go through the places on the way.
+    All is in the box's axes. Half the derivative is weight s plus a term for each axis, u_k times the excess of x_k
+    over the box. A term is zero while x_k is inside the box and linear outside. The axes enter one by one: first the
+    one with the largest excess over |u_k| at s = 0; then, of the others, the largest at the minimum of the first; then
+    the last, if its excess is nonzero at the minimum of these. Because an axis that enters later never moves s out of
+    the linear range of an earlier one, three steps find the minimum. Derivatives do not pass through the intermediate
+    positions.
     """
     sizes, squares = triple(ca.fabs(part) + KINK for part in u), triple(part * part for part in u)
     s, pull, rise = 0.0, 0.0, weight + KINK**2
-    left: Sequence[Expression] = (1.0, 1.0, 1.0)
+    remaining: Sequence[Expression] = (1.0, 1.0, 1.0)
     for step in range(3):
         x = along(middle, s, u)
         nearest = triple(_clip(part, -h, h) for part, h in zip(x, half, strict=True))
-        over = triple(keep * (part - near) for keep, part, near in zip(left, x, nearest, strict=True))
-        added = _farthest(over, sizes) if step < 2 else (1.0, 1.0, 1.0)
+        over = triple(keep * (part - clipped) for keep, part, clipped in zip(remaining, x, nearest, strict=True))
+        added = _largest_indicator(over, sizes) if step < 2 else (1.0, 1.0, 1.0)
         for k in range(3):
             taken = added[k] * (over[k] != 0) if step else added[k]
             pull, rise = pull + taken * (u[k] * (middle[k] - nearest[k])), rise + taken * squares[k]
-        left = [keep * (1 - taken) for keep, taken in zip(left, added, strict=True)]
+        remaining = [keep * (1 - taken) for keep, taken in zip(remaining, added, strict=True)]
         s = _clip(-pull / rise, -0.5, 0.5)
-        s = _placed(s) if step < 2 else hold(s)
-    square = _outside(along(middle, s, u), half, hold)
+        s = _without_derivative(s) if step < 2 else stop_gradient(s)
+    square = _point_box_square(along(middle, s, u), half, stop_gradient)
     return square + weight * s**2 if weight else square
 
 
-def _placed(s: Expression) -> Expression:
-    """A place along a segment, -1/2..1/2, without derivatives: whole numbers of 2^-53, which hold all but tiny ones."""
+def _without_derivative(s: Expression) -> Expression:
+    """Return a position along a segment, -1/2..1/2, rounded to multiples of 2^-53, which removes its derivative."""
     return ca.floor(s * 2.0**53) / 2.0**53
 
 
-def _farthest(over: Triple, sizes: Triple) -> list[Expression]:
-    """1 for one of three with the largest |over| / size, 0 for the others."""
+def _largest_indicator(over: Triple, sizes: Triple) -> list[Expression]:
+    """Return 1 for the component with the largest |over| / size and 0 for the others."""
     a, b, c = (ca.fabs(x) for x in over)
     first = (a * sizes[1] >= b * sizes[0]) * (a * sizes[2] >= c * sizes[0])
     second = (1 - first) * (b * sizes[2] >= c * sizes[1])
     return [first, second, 1 - first - second]
 
 
-def _edges_beside(
-    middle: Triple, axes: list[Triple], halves: Sequence[Expression], half: Triple, hold: Hold
+def _edge_squares(
+    middle: Triple, axes: list[Triple], halves: Sequence[Expression], half: Triple, stop_gradient: StopGradient
 ) -> list[Expression]:
-    """Squares of the distances of the edges of a box to another. With those of the other's corners they suffice: from
-    a nearest point within a face one gets, along that face, to a corner or to an edge."""
+    """Return the squared distances of the edges of a box to another box.
+
+    Together with the corners of the other box they suffice: from a closest point inside a face one can slide along the
+    face, at constant distance, to a corner or an edge.
+    """
     reaches = [triple(h * part for part in axis) for axis, h in zip(axes, halves, strict=True)]
-    found = []
+    squares = []
     for k, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
         direction = triple(2 * part for part in reaches[k])
         for side, back in product((-1.0, 1.0), repeat=2):
             centre = along(along(middle, side, reaches[i]), back, reaches[j])
-            found.append(_segment_box(centre, direction, half, 0.0, hold))
-    return found
+            squares.append(_segment_box_square(centre, direction, half, 0.0, stop_gradient))
+    return squares
 
 
-def _corners_beside(one: Block, other: Block, hold: Hold) -> list[Expression]:
-    """Squares of the distances of the corners of one box to another."""
-    centre, axes, halves = _in_axes_of(one, other)
+def _corner_squares(first: BoxCore, second: BoxCore, stop_gradient: StopGradient) -> list[Expression]:
+    """Return the squared distances of the corners of one box to another."""
+    centre, axes, halves = _in_box_axes(first, second)
     reaches = [triple(h * part for part in axis) for axis, h in zip(axes, halves, strict=True)]
-    found = []
+    squares = []
     for signs in product((-1.0, 1.0), repeat=3):
-        corner = reduce(lambda point, way: along(point, *way), zip(signs, reaches, strict=True), centre)
-        found.append(_outside(corner, other.half, hold))
-    return found
+        corner = reduce(lambda point, step: along(point, *step), zip(signs, reaches, strict=True), centre)
+        squares.append(_point_box_square(corner, second.half, stop_gradient))
+    return squares

@@ -1,10 +1,11 @@
-"""A mesh covered by a few capsules, or by one box: what distances are cheap and exact for.
+"""Covers of a mesh by a few capsules or by one box, whose distances are exact and fast.
 
-One capsule of least volume is fitted to the mesh. Then the mesh is cut across where that lowers the volume of what is
-covered most, each side gets a capsule of its own, and so on up to a few parts; as many are kept as are worth it. A
-box is taken instead where it is clearly smaller: distances of boxes take many times longer.
-Every triangle, cut at the planes, lies in the capsule of its part, and so do all points that a closed surface encloses:
-from a point between two planes of a cut a line parallel to the planes meets the surface between them.
+First, one capsule of least volume is fitted to the mesh. Then the mesh is split across the plane that lowers the
+covered volume most, each side gets its own capsule, and so on up to a few parts. The number of parts weighs volume
+against cost. A box replaces the capsules where it is clearly smaller, because distances of boxes cost many times more.
+
+Every triangle, split at the planes, lies in the capsule of its part. So do all points that a closed surface encloses:
+from a point between two planes of a split, a line parallel to the planes meets the surface between them.
 """
 
 from __future__ import annotations
@@ -25,24 +26,26 @@ from models.shapes.shapes import Box, Capsule
 
 @dataclass(frozen=True)
 class CoverSettings:
-    """How far covers are searched. Lengths and volumes are relative to those of the mesh, whose largest extent is 1.
+    """Settings of the search for covers. Lengths and volumes are relative to a mesh whose largest extent is 1.
 
     Attributes:
-        parts: Capsules at most: distances of more of them cost more than their tighter fit saves.
-        worth_a_part: By how much the volume covered must fall for each part more; by less where the largest overhang
-            falls, too, of which the fourth root counts.
-        worth_a_box: Share of the volume covered by capsules below which a box is taken, whose distances cost more.
-        cuts: Where cuts are tried, shares of the extent along an axis; the best is then moved by halves of the first.
-        growth: By which covers are larger than the fit: more than rounding takes away.
-        thinnest: Thickness of a box at least, which must not be zero.
-        directions: Axes at which capsules begin, on half a sphere.
-        extremes: Directions in which a point that is farthest takes part in a fit, a multiple of 32.
-        simplex: The first steps of a search: two slopes of the axis, its place across, root of the excess radius.
-        parameter_tolerance, volume_tolerance: Of these parameters, and share of the volume, at which it ends.
-        radii: Radii at which a search may begin, of that of the cylinder around all.
-        sifted: Triangles that cuts are tried on: the largest, and the corners that are farthest out.
-        grid: Points, of which those in a cover tell its volume, to about a hundredth.
-        samples: Points of a cover's surface at which its overhang is measured.
+        parts: Largest number of capsules. The distances of more would cost more than their tighter fit saves.
+        worth_a_part: Factor by which the covered volume must fall for each additional part. A lower overhang counts
+            too, by its fourth root.
+        worth_a_box: Volume of the box over that of the capsules below which the box is taken.
+        cuts: Positions of the planes that are tried, relative to the extent along an axis; the best is refined by steps
+            of half and a quarter of the first.
+        growth: Margin added to covers, larger than rounding errors.
+        thinnest: Smallest thickness of a box, which must not be zero.
+        directions: Initial directions of capsule axes on a hemisphere.
+        extremes: Directions whose extreme points take part in a fit, a multiple of 32.
+        simplex: Initial steps of the simplex search: two slopes of the axis, its position across, root of the excess
+            radius.
+        parameter_tolerance, volume_tolerance: Termination tolerances of these parameters and of the relative volume.
+        radii: Initial radii, relative to the enclosing cylinder's.
+        max_triangles: Number of triangles that splits are tried on: the largest ones and the extreme vertices.
+        grid: Number of points that estimate the covered volume, to about one percent.
+        samples: Number of surface points at which the overhang of a cover is measured.
     """
 
     parts: int = 3
@@ -57,14 +60,14 @@ class CoverSettings:
     parameter_tolerance: float = 4e-3
     volume_tolerance: float = 4e-4
     radii: tuple[float, ...] = (1.0, 1.02, 1.06, 1.15, 1.3)
-    sifted: int = 1500
+    max_triangles: int = 1500
     grid: int = 6000
     samples: int = 150
 
 
 SETTINGS = CoverSettings()
 
-Covering: TypeAlias = Capsule | Box
+CoverShape: TypeAlias = Capsule | Box
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,24 +76,24 @@ class Cover:
 
     Attributes:
         shape: Capsule or box in the frame of the mesh.
-        overhang: How far it stands out of the convex hull of the mesh, m: at some points of its surface.
+        overhang: Largest distance of sampled surface points of the shape from the convex hull of the mesh, m.
     """
 
-    shape: Covering
+    shape: CoverShape
     overhang: float
 
 
 def cover(vertices: ArrayInput, faces: ArrayInput) -> tuple[Cover, ...]:
-    """Capsules, or a box, in which every point of a mesh lies.
+    """Return capsules, or one box, that together contain every point of a mesh.
 
-    The same mesh has the same cover. It is fitted once and kept in a file by its content, see `models.cache`.
+    The result is deterministic. It is cached in a file by the content of the mesh, see `models.cache`.
 
     Args:
         vertices: Shape (n, 3), m.
-        faces: Triangles of vertices. Shape (m, 3).
+        faces: Triangles as indices of vertices. Shape (m, 3).
 
     Raises:
-        ModelError: Wrong shapes, something that is not finite, faces of no vertices, no triangle.
+        ModelError: A shape is wrong, an entry is not finite, a face has an unknown vertex, or there is no triangle.
     """
     points = checked_array(vertices, ("vertices", 3), "cover", "vertices")
     corners = checked_indices(faces, len(points), "cover", "faces")
@@ -99,49 +102,52 @@ def cover(vertices: ArrayInput, faces: ArrayInput) -> tuple[Cover, ...]:
         raise ModelError(message, name="faces", value=faces, limit=("m", 3))
     triangles = points[corners]
     key = key_of(version_of(__name__), "cover", triangles)
-    known = _read(kept(key), triangles.reshape(-1, 3))
+    known = _from_json(kept(key), triangles.reshape(-1, 3))
     if known is None:
-        known = fitted(triangles)
-        keep(key, [_written(each) for each in known])
+        known = fit_cover(triangles)
+        keep(key, [_to_json(each) for each in known])
     return known
 
 
-def fitted(triangles: Array) -> tuple[Cover, ...]:
-    """The cover of triangles, shape (m, 3, 3), m, whether it is kept or not."""
-    middle, size = _middle(triangles.reshape(-1, 3))
+def fit_cover(triangles: Array) -> tuple[Cover, ...]:
+    """Return the cover of triangles, shape (m, 3, 3), m, without using the cache."""
+    middle, size = _centre_and_size(triangles.reshape(-1, 3))
     unit = (triangles - middle) / size
     points = _points(unit)
-    hull = _hull_corners(points)
-    outermost = points[_farthest(points, _principal(points))]
-    grid, room = _grid(points)
-    parts, capsules = [unit], [_capsule(points)]
-    choices: list[tuple[float, int, list[Covering]]] = []
-    whole = far = 1.0
+    hull = _hull_vertices(points)
+    extreme_points = points[_extreme_indices(points, _principal_axes(points))]
+    grid, box_volume = _grid(points)
+    parts, capsules = [unit], [_fit_capsule(points)]
+    choices: list[tuple[float, list[CoverShape]]] = []
+    first_volume = first_overhang = 1.0
     while True:
-        shapes: list[Covering] = [_grown(each, _points(part)) for each, part in zip(capsules, parts, strict=True)]
-        volume, out = _covered(shapes, grid), max(_overhang(each, hull) for each in shapes)
-        whole, far = (whole, far) if choices else (max(volume, 1e-12), max(out, 1e-12))
-        score = volume / whole * min(1.0, out / far) ** 0.25 * SETTINGS.worth_a_part ** (len(parts) - 1)
-        choices.append((score, len(parts), shapes))
+        shapes: list[CoverShape] = [
+            _enclosing_capsule(each, _points(part)) for each, part in zip(capsules, parts, strict=True)
+        ]
+        volume, overhang = _covered_share(shapes, grid), max(_overhang(each, hull) for each in shapes)
+        if not choices:
+            first_volume, first_overhang = max(volume, 1e-12), max(overhang, 1e-12)
+        score = volume / first_volume * min(1.0, overhang / first_overhang) ** 0.25
+        choices.append((score * SETTINGS.worth_a_part ** (len(parts) - 1), shapes))
         if len(parts) == SETTINGS.parts:
             break
         others = [capsules[:k] + capsules[k + 1 :] for k in range(len(parts))]
-        found = [_best_cut(part, others[k], capsules[k], grid) for k, part in enumerate(parts)]
-        least, k = min((cut[0], k) for k, cut in enumerate(found))
+        splits = [_best_split(part, others[k], capsules[k], grid) for k, part in enumerate(parts)]
+        least, k = min((split[0], k) for k, split in enumerate(splits))
         if not np.isfinite(least):
             break
-        _, parts[k : k + 1], capsules[k : k + 1] = found[k]
-    shapes = min(choices, key=lambda each: each[0])[2]
-    box = _box(points, outermost)
-    if float(np.prod(box.size)) < SETTINGS.worth_a_box * room * _covered(shapes, grid):
-        shapes = [_grown_box(box, points)]
-    return tuple(Cover(_scaled(each, middle, size), size * _overhang(each, hull)) for each in shapes)
+        _, parts[k : k + 1], capsules[k : k + 1] = splits[k]
+    shapes = min(choices, key=lambda each: each[0])[1]
+    box = _fit_box(points, extreme_points)
+    if float(np.prod(box.size)) < SETTINGS.worth_a_box * box_volume * _covered_share(shapes, grid):
+        shapes = [_enclosing_box(box, points)]
+    return tuple(Cover(_to_mesh_units(each, middle, size), size * _overhang(each, hull)) for each in shapes)
 
 
-def inside(shape: Covering, points: Array) -> Array:
-    """By how much points lie outside of a capsule or box: zero or below for those inside. Shape (n,), m."""
+def exceedance(shape: CoverShape, points: Array) -> Array:
+    """Return by how much points lie outside a capsule or box; zero or negative inside. Shape (n,), m."""
     if isinstance(shape, Capsule):
-        return np.asarray(_to_segment(points, np.asarray(shape.start), np.asarray(shape.end)) - shape.radius)
+        return np.asarray(_segment_distances(points, np.asarray(shape.start), np.asarray(shape.end)) - shape.radius)
     own = np.abs((points - shape.position) @ shape.rotation) - shape.size / 2
     return np.asarray(own.max(axis=1))
 
@@ -149,17 +155,17 @@ def inside(shape: Covering, points: Array) -> Array:
 # ------------------------------------------------------------------------------------------------- one capsule
 
 
-def _capsule(points: Array) -> Capsule:
-    """The capsule of least volume around points, as far as the search finds it; those farthest out tell it."""
-    frame = _principal(points)
-    few = points[_farthest(points, frame)]
-    bases = _bases(np.concatenate([frame.T, _sphere(SETTINGS.directions, half=True) @ frame.T]))
-    volumes, centres, excess = _quick(few, bases)
-    found = []
+def _fit_capsule(points: Array) -> Capsule:
+    """Return a capsule of nearly least volume around points, fitted to the extreme ones."""
+    frame = _principal_axes(points)
+    extreme_points = points[_extreme_indices(points, frame)]
+    bases = _bases(np.concatenate([frame.T, _sphere_points(SETTINGS.directions, half=True) @ frame.T]))
+    volumes, centres, excess = _approximate_capsules(extreme_points, bases)
+    fits = []
     for k in np.argsort(volumes, kind="stable")[:2]:
-        own, start = few @ bases[k], np.array([0.0, 0.0, *centres[k], np.sqrt(excess[k])])
+        own, start = extreme_points @ bases[k], np.array([0.0, 0.0, *centres[k], np.sqrt(excess[k])])
         result = minimize(
-            lambda x, own=own: float(_measured(own, x[None])[0][0]),
+            lambda x, own=own: float(_evaluate_capsules(own, x[None])[0][0]),
             start,
             method="Nelder-Mead",
             options={
@@ -168,16 +174,16 @@ def _capsule(points: Array) -> Capsule:
                 "fatol": SETTINGS.volume_tolerance * float(volumes[k]),
             },
         )
-        found.append((float(result.fun), int(k), result.x))
-    _, k, best = min(found, key=lambda each: each[:2])
-    return _grown(_capsule_of(few, best, bases[k]), points)
+        fits.append((float(result.fun), int(k), result.x))
+    _, k, best = min(fits, key=lambda each: each[:2])
+    return _enclosing_capsule(_capsule_from_parameters(extreme_points, best, bases[k]), points)
 
 
-def _measured(points: Array, parameters: Array) -> tuple[Array, Array, Array, Array, Array, Array]:
-    """Capsules about axes near z: volume, radius, both ends along the axis, the axis, a point on it.
+def _evaluate_capsules(points: Array, parameters: Array) -> tuple[Array, Array, Array, Array, Array, Array]:
+    """Return volume, radius, both ends along the axis, the axis and a point on it for capsules with axes near z.
 
-    Parameters are the slopes of the axis, its place across, and what makes the radius larger than it need be: a radius
-    beyond that of the cylinder around all lets the caps end earlier. Shape (k, 5).
+    The parameters, shape (k, 5), are two slopes of the axis, its position across, and the root of the excess radius. A
+    radius larger than the enclosing cylinder's lets the caps begin earlier.
     """
     a, b, x, y, fat = parameters.T
     one, none = np.ones_like(a), np.zeros_like(a)
@@ -190,56 +196,53 @@ def _measured(points: Array, parameters: Array) -> tuple[Array, Array, Array, Ar
     caps = np.sqrt(np.maximum(radius[:, None] ** 2 - across, 0))
     low, high = (along + caps).min(axis=1), (along - caps).max(axis=1)
     middle = (low + high) / 2
-    low, high = np.where(low > high, middle, low), np.where(low > high, middle, high)  # a ball holds them all
+    low, high = np.where(low > high, middle, low), np.where(low > high, middle, high)  # a ball encloses all points
     volume = np.pi * radius**2 * (high - low + 4 / 3 * radius)
     return volume, radius, low, high, axis, side * x[:, None] + other * y[:, None]
 
 
-def _quick(points: Array, bases: Array) -> tuple[Array, Array, Array]:
-    """Volumes of capsules about the last axes of bases, their places across, and the share added to the radius.
-
-    Bases: shape (k, 3, 3), as of `_bases`.
-    """
+def _approximate_capsules(points: Array, bases: Array) -> tuple[Array, Array, Array]:
+    """Return the volumes of capsules about the last axes of bases (k, 3, 3), positions across and excess radii."""
     own = np.einsum("pi,kij->kpj", points, bases)
     across, along = own[:, :, :2], own[:, :, 2]
     centres = (across.min(axis=1) + across.max(axis=1)) / 2
     rows = np.arange(len(bases))
-    for k in range(24):  # towards the farthest point by less and less: the least circle (Badoiu & Clarkson 2003)
+    for k in range(24):  # shrinking steps towards the farthest point: smallest circle (Badoiu & Clarkson 2003)
         farthest = ((across - centres[:, None]) ** 2).sum(axis=2).argmax(axis=1)
         centres = centres + (across[rows, farthest] - centres) / (k + 4)
     distances = ((across - centres[:, None]) ** 2).sum(axis=2)
-    volumes = []
+    by_factor = []
     for factor in SETTINGS.radii:
         radius = np.sqrt(distances.max(axis=1)) * factor
         caps = np.sqrt(np.maximum(radius[:, None] ** 2 - distances, 0))
         length = np.maximum((along - caps).max(axis=1) - (along + caps).min(axis=1), 0)
-        volumes.append(np.pi * radius**2 * (length + 4 / 3 * radius))
-    found = np.array(volumes)
-    best = found.argmin(axis=0)
-    return found[best, rows], centres, np.array(SETTINGS.radii)[best] - 1
+        by_factor.append(np.pi * radius**2 * (length + 4 / 3 * radius))
+    volumes = np.array(by_factor)
+    best = volumes.argmin(axis=0)
+    return volumes[best, rows], centres, np.array(SETTINGS.radii)[best] - 1
 
 
-def _quick_capsule(points: Array, bases: Array) -> Capsule:
-    """The best capsule about any of the last axes of some bases."""
-    volumes, centres, excess = _quick(points, bases)
+def _approximate_capsule(points: Array, bases: Array) -> Capsule:
+    """Return the best capsule about any of the last axes of bases."""
+    volumes, centres, excess = _approximate_capsules(points, bases)
     k = int(volumes.argmin())
     start = np.array([[0.0, 0.0, *centres[k], np.sqrt(excess[k])]])
-    return _capsule_of(points, start[0], bases[k])
+    return _capsule_from_parameters(points, start[0], bases[k])
 
 
-def _capsule_of(points: Array, parameters: Array, basis: Array) -> Capsule:
-    _, radius, low, high, axis, place = (each[0] for each in _measured(points @ basis, parameters[None]))
+def _capsule_from_parameters(points: Array, parameters: Array, basis: Array) -> Capsule:
+    _, radius, low, high, axis, place = (each[0] for each in _evaluate_capsules(points @ basis, parameters[None]))
     return Capsule(float(radius) + SETTINGS.growth, basis @ (place + low * axis), basis @ (place + high * axis))
 
 
-def _grown(capsule: Capsule, points: Array) -> Capsule:
-    """The capsule with a radius that every point is proven to lie in, and a little more."""
+def _enclosing_capsule(capsule: Capsule, points: Array) -> Capsule:
+    """Return the capsule with its radius increased so that it certainly contains every point."""
     start, end = np.asarray(capsule.start), np.asarray(capsule.end)
-    radius = max(capsule.radius, float(_to_segment(points, start, end).max())) + SETTINGS.growth
+    radius = max(capsule.radius, float(_segment_distances(points, start, end).max())) + SETTINGS.growth
     return Capsule(radius, start, end)
 
 
-def _to_segment(points: Array, start: Array, end: Array) -> Array:
+def _segment_distances(points: Array, start: Array, end: Array) -> Array:
     along = end - start
     share = np.clip((points - start) @ along / max(float(along @ along), 1e-300), 0, 1)
     return np.asarray(np.linalg.norm(points - start - share[:, None] * along, axis=1))
@@ -248,55 +251,54 @@ def _to_segment(points: Array, start: Array, end: Array) -> Array:
 # ------------------------------------------------------------------------------------------------------- cuts
 
 
-def _best_cut(
+def _best_split(
     part: Array, others: list[Capsule], capsule: Capsule, grid: Array
 ) -> tuple[float, list[Array], list[Capsule]]:
-    """The plane across an axis by which a part's two capsules and the others cover least.
+    """Return the split of a part, by a plane across an axis, whose two capsules and the others cover least.
 
     Returns:
-        The share of the grid that is covered, the two sides and their capsules; inf and the part itself where no plane
-        cuts it.
+        The share of the grid that is covered, the two sides and their capsules; inf and the part itself if no plane
+        splits it.
     """
     points = _points(part)
-    frame = _principal(points)
+    frame = _principal_axes(points)
     axes = list(frame.T)
     along = np.asarray(capsule.end) - np.asarray(capsule.start)
     along = along / max(float(np.linalg.norm(along)), 1e-300)
     if 0 < np.abs(along @ frame).max() < 0.98:
         axes.append(along)
-    bases = _bases(np.concatenate([frame.T, _sphere(SETTINGS.directions // 2, half=True) @ frame.T]))
-    sifted = _sifted(part, frame)
-    free = grid[np.min([inside(each, grid) for each in others], axis=0) > 0] if others else grid
+    bases = _bases(np.concatenate([frame.T, _sphere_points(SETTINGS.directions // 2, half=True) @ frame.T]))
+    triangles = _representative_triangles(part, frame)
+    free = grid[np.min([exceedance(each, grid) for each in others], axis=0) > 0] if others else grid
 
     def covered(fits: list[Capsule]) -> float:
-        return 1 - (1 - _covered(fits, free)) * len(free) / len(grid)
+        return 1 - (1 - _covered_share(fits, free)) * len(free) / len(grid)
 
-    def tried(k: int, level: float) -> float:
-        sides = [_points(side) for side in cut(sifted, axes[k], level) if len(side)]
+    def share_of_split(k: int, level: float) -> float:
+        sides = [_points(side) for side in split_triangles(triangles, axes[k], level) if len(side)]
         if len(sides) < 2:
             return np.inf
-        return covered([_quick_capsule(side[_farthest(side, frame)], bases) for side in sides])
+        return covered([_approximate_capsule(side[_extreme_indices(side, frame)], bases) for side in sides])
 
     spans = [(float((points @ axis).min()), float(np.ptp(points @ axis))) for axis in axes]
     levels = [(k, low + share * span) for k, (low, span) in enumerate(spans) for share in SETTINGS.cuts]
-    _, k, level = min((tried(k, level), k, level) for k, level in levels)
+    _, k, level = min((share_of_split(k, level), k, level) for k, level in levels)
     for share in (SETTINGS.cuts[0] / 2, SETTINGS.cuts[0] / 4):
         step = share * spans[k][1]
-        _, level = min((tried(k, each), each) for each in (level - step, level, level + step))
-    sides = [side for side in cut(part, axes[k], level) if len(side)]
+        _, level = min((share_of_split(k, each), each) for each in (level - step, level, level + step))
+    sides = [side for side in split_triangles(part, axes[k], level) if len(side)]
     if len(sides) < 2:
         return np.inf, [part], [capsule]
-    fits = [_capsule(_points(side)) for side in sides]
+    fits = [_fit_capsule(_points(side)) for side in sides]
     return covered(fits), sides, fits
 
 
 def _grid(points: Array) -> tuple[Array, float]:
-    """Points spread evenly in a box half as large again as some points, which holds their covers but for a little.
+    """Return points that fill a box 1.5 times as large as the extent of some points, and the volume of the box.
 
-    Returns:
-        The points, shape (k, 3), and the volume of the box.
+    The box contains nearly all of their covers. Shape (k, 3).
     """
-    frame = _principal(points)
+    frame = _principal_axes(points)
     low, high = (points @ frame).min(axis=0), (points @ frame).max(axis=0)
     # The additive recurrence of the generalised golden ratio in three dimensions, the root of x^4 = x + 1.
     shares = (np.arange(1, SETTINGS.grid + 1)[:, None] / 1.2207440846057596 ** np.arange(1, 4) + 0.5) % 1
@@ -304,56 +306,56 @@ def _grid(points: Array) -> tuple[Array, float]:
     return np.asarray(((low + high) / 2 + (shares - 0.5) * wide) @ frame.T), float(np.prod(wide))
 
 
-def _covered(shapes: Sequence[Covering], grid: Array) -> float:
-    """Share of the points of a grid that some shape holds."""
+def _covered_share(shapes: Sequence[CoverShape], grid: Array) -> float:
+    """Return the share of grid points that lie in some shape."""
     if not len(grid):
         return 0.0
-    return float((np.min([inside(each, grid) for each in shapes], axis=0) <= 0).sum() / len(grid))
+    return float((np.min([exceedance(each, grid) for each in shapes], axis=0) <= 0).sum() / len(grid))
 
 
-def _sifted(triangles: Array, frame: Array) -> Array:
-    """The triangles, or where they are many the largest of them and the farthest corners, as triangles of no size."""
-    if len(triangles) <= SETTINGS.sifted:
+def _representative_triangles(triangles: Array, frame: Array) -> Array:
+    """Return the triangles or, of many, the largest ones and the extreme vertices as degenerate triangles."""
+    if len(triangles) <= SETTINGS.max_triangles:
         return triangles
     length = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2).max(axis=1)
-    largest = triangles[np.argsort(-length, kind="stable")[: SETTINGS.sifted]]
+    largest = triangles[np.argsort(-length, kind="stable")[: SETTINGS.max_triangles]]
     points = _points(triangles)
-    return np.concatenate([largest, np.repeat(points[_farthest(points, frame)][:, None], 3, axis=1)])
+    return np.concatenate([largest, np.repeat(points[_extreme_indices(points, frame)][:, None], 3, axis=1)])
 
 
-def cut(triangles: Array, axis: Array, level: float) -> tuple[Array, Array]:
-    """Triangles cut by the plane axis x = level: what lies below and what above. Shapes (m, 3, 3)."""
+def split_triangles(triangles: Array, axis: Array, level: float) -> tuple[Array, Array]:
+    """Return the parts of triangles below and above the plane axis x = level. Shapes (m, 3, 3)."""
     heights = triangles @ axis - level
     below = heights <= 0
     count = below.sum(axis=1)
     low, high = [triangles[count == 3]], [triangles[count == 0]]
-    for lone, one, two in ((below, low, high), (~below, high, low)):
-        which = np.flatnonzero(lone.sum(axis=1) == 1)
-        first = lone[which].argmax(axis=1)
+    for lone, one_side, other_side in ((below, low, high), (~below, high, low)):
+        rows = np.flatnonzero(lone.sum(axis=1) == 1)
+        first = lone[rows].argmax(axis=1)
         order = (first[:, None] + np.arange(3)) % 3
-        corners = triangles[which[:, None], order]
-        height = heights[which[:, None], order]
+        corners = triangles[rows[:, None], order]
+        height = heights[rows[:, None], order]
         a, b, c = (corners[:, k] for k in range(3))
         h = height[:, :1]
         ab, ac = a + (b - a) * (h / (h - height[:, 1:2])), a + (c - a) * (h / (h - height[:, 2:]))
-        one.append(np.stack([a, ab, ac], axis=1))
-        two += [np.stack([ab, b, c], axis=1), np.stack([ab, c, ac], axis=1)]
+        one_side.append(np.stack([a, ab, ac], axis=1))
+        other_side += [np.stack([ab, b, c], axis=1), np.stack([ab, c, ac], axis=1)]
     return np.concatenate(low), np.concatenate(high)
 
 
 # ------------------------------------------------------------------------------------------------------- a box
 
 
-def _box(points: Array, outermost: Array) -> Box:
-    """A box around points of nearly the least volume.
+def _fit_box(points: Array, extreme_points: Array) -> Box:
+    """Return a box of nearly least volume around points.
 
-    One of its faces lies along a face of the hull of the outermost points, one of its edges along an edge.
+    One of its faces lies along a face of the hull of the extreme points, one of its edges along an edge.
     """
-    frames = [_principal(points)]
+    frames = [_principal_axes(points)]
     try:
-        hull = convex_hull(outermost)
+        hull = convex_hull(extreme_points)
     except ModelError:  # flat: the principal frame has its normal
-        normals, corners = frames[0].T[2:], outermost
+        normals, corners = frames[0].T[2:], extreme_points
         edges = corners[1:] - corners[:-1]
     else:
         a, b, c = (hull.vertices[hull.faces[:, k]] for k in range(3))
@@ -379,33 +381,33 @@ def _box(points: Array, outermost: Array) -> Box:
     return Box(np.maximum(high - low, SETTINGS.thinnest), frame @ ((low + high) / 2), frame)
 
 
-def _grown_box(box: Box, points: Array) -> Box:
-    """The box with edges that every point is proven to lie in, and a little more."""
+def _enclosing_box(box: Box, points: Array) -> Box:
+    """Return the box with its edges lengthened so that it certainly contains every point."""
     return Box(
-        box.size + 2 * max(0.0, float(inside(box, points).max())) + 2 * SETTINGS.growth, box.position, box.rotation
+        box.size + 2 * max(0.0, float(exceedance(box, points).max())) + 2 * SETTINGS.growth, box.position, box.rotation
     )
 
 
 # --------------------------------------------------------------------------------------------------- overhang
 
 
-def _overhang(shape: Covering, hull: Array) -> float:
-    """Largest distance of points of a shape's surface from the hull of some points."""
-    around = _sphere(SETTINGS.samples)
+def _overhang(shape: CoverShape, hull: Array) -> float:
+    """Return the largest distance of sampled surface points of a shape from the hull of some points."""
+    around = _sphere_points(SETTINGS.samples)
     if isinstance(shape, Capsule):
         along = np.asarray(shape.end) - np.asarray(shape.start)
         ends = np.where((around @ along > 0)[:, None], shape.end, shape.start)
-        samples = ends + shape.radius * around  # the farthest points of a capsule from a convex set are on its caps
+        samples = ends + shape.radius * around  # the points of a capsule farthest from a convex set lie on its caps
     else:
         samples = shape.core
     _, inner, outer = nearest_directions(np.broadcast_to(hull, (len(samples), *hull.shape)), samples[:, None])
     return float(np.linalg.norm(outer - inner, axis=1).max())
 
 
-def _hull_corners(points: Array) -> Array:
-    """Of a large mesh those of its outermost points alone: their hull is no larger, so that an overhang is not less."""
-    if len(points) > SETTINGS.sifted:
-        points = points[_farthest(points, _principal(points), 2 * SETTINGS.extremes)]
+def _hull_vertices(points: Array) -> Array:
+    """Return the hull's vertices; of a large mesh, only those of its extreme points, which overestimates overhangs."""
+    if len(points) > SETTINGS.max_triangles:
+        points = points[_extreme_indices(points, _principal_axes(points), 2 * SETTINGS.extremes)]
     try:
         return convex_hull(points).vertices
     except ModelError:  # flat: no hull with a volume
@@ -419,13 +421,13 @@ def _points(triangles: Array) -> Array:
     return triangles.reshape(-1, 3)
 
 
-def _middle(points: Array) -> tuple[Array, float]:
+def _centre_and_size(points: Array) -> tuple[Array, float]:
     low, high = points.min(axis=0), points.max(axis=0)
     return (low + high) / 2, max(float((high - low).max()), 1e-12)
 
 
-def _principal(points: Array) -> Array:
-    """Axes of points, the longest extent first, as columns of a rotation."""
+def _principal_axes(points: Array) -> Array:
+    """Return the principal axes of points, longest extent first, as columns of a rotation."""
     centred = points - points.mean(axis=0)
     _, axes = np.linalg.eigh(centred.T @ centred)
     axes = axes[:, ::-1]
@@ -434,15 +436,15 @@ def _principal(points: Array) -> Array:
 
 
 def _bases(axes: Array) -> Array:
-    """Rotations whose last columns are unit axes. Shape (k, 3, 3)."""
+    """Return rotations whose last columns are given unit axes. Shape (k, 3, 3)."""
     side = np.eye(3)[np.abs(axes).argmin(axis=1)]
     side = side - (side * axes).sum(axis=1, keepdims=True) * axes
     side = side / np.linalg.norm(side, axis=1, keepdims=True)
     return np.stack([side, np.cross(axes, side), axes], axis=2)
 
 
-def _sphere(count: int, half: bool = False) -> Array:
-    """Unit vectors spread evenly on the sphere or on a half of it, by the golden angle. Shape (count, 3)."""
+def _sphere_points(count: int, half: bool = False) -> Array:
+    """Return unit vectors spread evenly over a sphere or hemisphere by the golden angle. Shape (count, 3)."""
     k = np.arange(count) + 0.5
     z = 1 - k / count if half else 1 - 2 * k / count
     angle = np.pi * (3 - np.sqrt(5)) * k
@@ -450,41 +452,38 @@ def _sphere(count: int, half: bool = False) -> Array:
     return np.stack([flat * np.cos(angle), flat * np.sin(angle), z], axis=1)
 
 
-def _farthest(points: Array, frame: Array, count: int = SETTINGS.extremes) -> Any:
-    """Indices of the points that are farthest in some of `count` directions, a multiple of 32."""
+def _extreme_indices(points: Array, frame: Array, count: int = SETTINGS.extremes) -> Any:
+    """Return the indices of points that are extreme in some of `count` directions, a multiple of 32."""
     if len(points) <= count:
         return np.arange(len(points))
-    directions = np.split(_sphere(count) @ frame.T, count // 32)  # in turn: a large mesh fills the memory
+    directions = np.split(_sphere_points(count) @ frame.T, count // 32)  # in blocks, which bounds the memory
     return np.unique(np.concatenate([(points @ each.T).argmax(axis=0) for each in directions]))
 
 
-def _scaled(shape: Covering, middle: Array, size: float) -> Covering:
-    """Back where the mesh is, larger by what rounding may take there."""
-    more = 16 * float(np.finfo(float).eps * (np.abs(middle).max() + size))
+def _to_mesh_units(shape: CoverShape, middle: Array, size: float) -> CoverShape:
+    """Return the shape in the units of the mesh, enlarged by a bound of the rounding errors."""
+    margin = 16 * float(np.finfo(float).eps * (np.abs(middle).max() + size))
     if isinstance(shape, Capsule):
-        return Capsule(shape.radius * size + more, middle + size * shape.start, middle + size * shape.end)
-    return Box(shape.size * size + 2 * more, middle + size * shape.position, shape.rotation)
+        return Capsule(shape.radius * size + margin, middle + size * shape.start, middle + size * shape.end)
+    return Box(shape.size * size + 2 * margin, middle + size * shape.position, shape.rotation)
 
 
-def _written(each: Cover) -> dict[str, Any]:
-    if isinstance(each.shape, Capsule):
-        own: dict[str, Any] = {"radius": each.shape.radius}
-        own |= {what: np.asarray(getattr(each.shape, what)).tolist() for what in ("start", "end")}
-    else:
-        own = {what: np.asarray(getattr(each.shape, what)).tolist() for what in ("size", "position", "rotation")}
-    return own | {"overhang": each.overhang}
+def _to_json(each: Cover) -> dict[str, Any]:
+    names = ("radius", "start", "end") if isinstance(each.shape, Capsule) else ("size", "position", "rotation")
+    entries = {name: np.asarray(getattr(each.shape, name)).tolist() for name in names}
+    return entries | {"overhang": each.overhang}
 
 
-def _read(value: Any, points: Array) -> tuple[Cover, ...] | None:
-    """Covers that were kept, where they are whole and hold the mesh's points still."""
+def _from_json(value: Any, points: Array) -> tuple[Cover, ...] | None:
+    """Return cached covers, or None if the entry is invalid or does not contain the mesh's points."""
     if not isinstance(value, list) or not 0 < len(value) <= SETTINGS.parts:
         return None
     try:
-        found = []
+        covers = []
         for each in value:
-            own = {what: entry for what, entry in each.items() if what != "overhang"}
-            found.append(Cover(Capsule(**own) if "radius" in own else Box(**own), float(each["overhang"])))
+            fields = {name: entry for name, entry in each.items() if name != "overhang"}
+            covers.append(Cover(Capsule(**fields) if "radius" in fields else Box(**fields), float(each["overhang"])))
     except (AttributeError, KeyError, TypeError, ValueError):  # a ModelError is a ValueError
         return None
-    held = np.min([inside(each.shape, points) for each in found], axis=0) <= 0
-    return tuple(found) if held.all() else None
+    enclosed = np.min([exceedance(each.shape, points) for each in covers], axis=0) <= 0
+    return tuple(covers) if enclosed.all() else None

@@ -1,13 +1,13 @@
-"""Signed distance of two shapes as an expression, for constraints, indices and reports.
+"""Signed distance of two shapes as an expression, for constraints, performance indices and reports.
 
-Between spheres, capsules, boxes and half-spaces it is exact: the distance of the nearest points, and where the shapes
-overlap minus the least translation that parts them. With meshes and cylinders it is a bound from below, the largest gap
-along the normals of their faces and half-way between those that meet in a sharp edge or corner.
+The distance is exact for spheres, capsules, boxes and half-spaces: the distance of the closest points or, for
+overlapping shapes, minus the penetration depth. For meshes and cylinders it is a lower bound, the largest gap along
+the normals of their faces and along the bisectors of normals that meet at a sharp edge or corner.
 
-A shape is a core of points, swelled. Where cores are apart by d their distance is d; where they overlap it is the
-largest of the gaps along the directions that may separate them (faces, edge by edge), which is then negative and the
-depth of polytopes. That gap is never more than d, and positive exactly where the cores are apart, so d + min(gap, 0) is
-both.
+A shape is a convex core swept by a sphere. Separated cores have the distance d of their closest points. Overlapping
+cores have the largest gap along the candidate separating axes (face normals and cross products of edges), which is
+negative and equals minus the penetration depth of polytopes. That gap never exceeds d and is positive exactly for
+separated cores, so d + min(gap, 0) covers both cases.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from models.arrays import Array, checked_array, checked_instance, checked_nonneg
 from models.errors import ModelError
 from models.input_files import INPUT_LIMITS
 from models.shapes.cores import (
-    Block,
-    Hold,
-    Rod,
+    BoxCore,
+    SegmentCore,
+    StopGradient,
     Triple,
     add,
-    beside_block,
-    between_rods,
     cross,
+    distance_of_segments,
+    distance_to_box,
     dot,
-    free,
-    highest,
-    into,
-    size_of,
+    in_axes,
+    largest_of,
+    no_stop,
+    smooth_abs,
     subtract,
     triple,
 )
@@ -45,83 +45,89 @@ from models.shapes.shapes import Box, Capsule, Cylinder, HalfSpace, Mesh, Shape,
 from models.spatial import Expression, Frame, expression, on_scalars
 
 
-class Solid(NamedTuple):
-    """Core of a mesh or a cylinder: a hull in axes of its own."""
+class HullCore(NamedTuple):
+    """Core of a mesh or a cylinder: a convex hull in its own axes."""
 
     centre: Triple
     axes: tuple[Triple, ...]
     hull: Hull
 
 
-class Plane(NamedTuple):
-    """A half-space."""
+class PlaneCore(NamedTuple):
+    """Boundary plane of a half-space."""
 
     point: Triple
     normal: Triple
 
 
-Core: TypeAlias = Rod | Block | Solid | Plane
+Core: TypeAlias = SegmentCore | BoxCore | HullCore | PlaneCore
 
 COLUMNS: dict[type[Shape], int] = {Sphere: 4, Capsule: 7, Box: 15, HalfSpace: 6}
-"""Entries of the column of a shape of each kind that has one."""
+"""Number of entries of a shape's column (`column`), for the kinds that have one."""
 VECTORS: dict[type[Shape], tuple[int, int]] = {Sphere: (1, 0), Capsule: (2, 0), Box: (1, 3), HalfSpace: (1, 1)}
-"""How many points a column begins with, and how many directions follow these."""
+"""Numbers of points and of directions that a column begins with."""
 
 
 def distance(
-    one: Shape, other: Shape, one_frame: Frame | None = None, other_frame: Frame | None = None, *, rounding: float = 0.0
+    first: Shape,
+    second: Shape,
+    first_frame: Frame | None = None,
+    second_frame: Frame | None = None,
+    *,
+    rounding: float = 0.0,
 ) -> Expression:
-    """Signed distance of two shapes, m. Shape (1, 1). Negative where they overlap; its gradient leads apart.
+    """Return the signed distance of two shapes as an expression, m. Shape (1, 1).
 
-    Without rounding it is exact for spheres, capsules, boxes and half-spaces, and for a mesh or a cylinder (as its
-    prism) beside a half-space; other pairs with a mesh or a cylinder get the largest gap along the normals of their
-    faces, which is never more than the distance.
+    The distance is negative for overlapping shapes; its gradient points out of the overlap. Without rounding it is
+    exact for spheres, capsules, boxes and half-spaces, and for a mesh or a cylinder (as its prism) beside a half-space.
+    Other pairs with a mesh or a cylinder get a lower bound, the largest gap along the normals of their faces.
 
-    The exact distance of capsules and boxes has a gradient with kinks: where segments are parallel the nearest points
-    jump from end to end, and a method that builds on second derivatives goes back and forth there. With rounding e > 0
-    it is a bound from below that such a method, an interior-point one, converges on: the form that planners use. The
-    squared distance is minimised over places s, t in 0..1 along the segments with e^2 ((s - 1/2)^2 + (t - 1/2)^2) added
-    to it. That is strictly convex, so places and gradient are Lipschitz. The added term is at most c = e^2/2, or e^2/4
-    with one segment: the minimum M lies in d^2..d^2 + c, and (M - c)/sqrt(M + c) is at most d, smooth, and without the
-    infinite slope of sqrt(M - c). For capsules the bound is short of the distance by at most 0.84 e, and by at most
-    e^2/d where their cores, segments and boxes, are d apart; beside a mesh, a cylinder or a half-space it is at most
-    3 e lower than without. Of two boxes it is at most 4 e lower than the largest of their gaps along 15 directions and
-    of the distances of either one to the box around the other along its axes: than the distance itself where they are
-    aligned, overlap, or are nearest with a face or across two edges. Kinks are rounded off over heights of about e^2/d,
-    so an e of a fifth of the radii is good and a hundredth is none. Where d is less than 2 e directions swap as without
-    rounding. Spheres beside spheres, capsules and boxes need none and get none.
+    The exact distance of capsules and boxes has kinks: near parallel segments the closest points jump from end to end,
+    and second-order methods zigzag there. With rounding e > 0 the result is a smooth lower bound on which an
+    interior-point method converges; planners use this form. It minimises the squared distance over positions s, t in
+    0..1 along the segments with e^2 ((s - 1/2)^2 + (t - 1/2)^2) added. This problem is strictly convex, so positions
+    and gradient are Lipschitz. The added term is at most c = e^2/2, or e^2/4 with one segment. The minimum M lies in
+    d^2..d^2 + c, so (M - c)/sqrt(M + c) is at most d and smooth, without the infinite slope of sqrt(M - c).
+
+    For capsules the bound is below the distance by at most 0.84 e, and by at most e^2/d for cores (segments and boxes)
+    a distance d apart. Beside a mesh, a cylinder or a half-space it is at most 3 e below the unrounded result. For two
+    boxes it is at most 4 e below the largest of their gaps along 15 axes and of the distances of either one to the
+    bounding box of the other in its own axes. That is the distance itself for boxes that are aligned, overlap, or are
+    closest at a face or across two edges. Kinks are smoothed over a length of about e^2/d, so a fifth of the radii is a
+    good e and a hundredth has no effect. At d less than 2 e directions jump as without rounding. Spheres beside
+    spheres, capsules and boxes are smooth already and ignore the rounding.
 
     Args:
-        one, other: In world, or in the frames.
-        one_frame, other_frame: Where the frames of the two are. Numbers, SX or MX; None for world. Many pairs of the
-            same frames share much: ca.cse takes it out of the graph.
+        first, second: Shapes in world, or in the frames.
+        first_frame, second_frame: Poses of the shapes' frames in world; numbers, SX or MX. None: world. Pairs that
+            share a frame have common subexpressions, which ca.cse extracts.
         rounding: e, m.
 
     Raises:
-        ModelError: Something that is no shape, two half-spaces, a box without ends, a frame that is none, a rounding
-            that is negative.
+        ModelError: An argument is no shape, both are half-spaces, a box is infinite, a frame is invalid, or the
+            rounding is negative.
     """
-    checked_shape(one, "distance", "one")
-    checked_shape(other, "distance", "other")
-    if {type(one), type(other)} <= COLUMNS.keys():
-        function = pair_function(type(one), type(other), rounding)
-        return function(column(one, one_frame), column(other, other_frame))
+    checked_shape(first, "distance", "first")
+    checked_shape(second, "distance", "second")
+    if {type(first), type(second)} <= COLUMNS.keys():
+        function = pair_function(type(first), type(second), rounding)
+        return function(column(first, first_frame), column(second, second_frame))
     checked_nonnegative(rounding, "distance", "rounding", "m")
-    places = [*_placement(one_frame, "one_frame"), *_placement(other_frame, "other_frame")]
-    return expression(_with_hulls(*places, one=one, other=other, rounding=float(rounding)))
+    places = [*_placement(first_frame, "first_frame"), *_placement(second_frame, "second_frame")]
+    return expression(_distance_with_hull(*places, first=first, second=second, rounding=float(rounding)))
 
 
 def column(shape: Shape, frame: Frame | None = None) -> Expression:
-    """A sphere, capsule, box or half-space in world as a column of numbers or expressions, for `pair_function`.
+    """Return a sphere, capsule, box or half-space in world as a column of numbers or expressions, for `pair_function`.
 
     Sphere: position, radius. Capsule: start, end, radius. Box: position, its three axes, half of its edges. Half-space:
     point, normal. Shapes (4, 1), (7, 1), (15, 1), (6, 1).
 
     Raises:
-        ModelError: A mesh or a cylinder, which have none; what distance does not take.
+        ModelError: The shape is a mesh or a cylinder, which have no column, or is invalid for `distance`.
     """
     checked_shape(shape, "column", "shape")
-    _checked_simple(type(shape), "shape")
+    _check_kind(type(shape), "shape")
     turn, place = _placement(frame, "frame")
     if isinstance(shape, Sphere | Capsule):
         return ca.vertcat(*(place + ca.mtimes(turn, ca.DM(point)) for point in shape.core), shape.radius)
@@ -134,61 +140,62 @@ def column(shape: Shape, frame: Frame | None = None) -> Expression:
     )
 
 
-def pair_function(one: type[Shape], other: type[Shape], rounding: float = 0.0) -> Any:
-    """Function (column of one, column of other) -> `distance` of two shapes of these kinds.
+def pair_function(first: type[Shape], second: type[Shape], rounding: float = 0.0) -> Any:
+    """Return the casadi Function (first column, second column) -> `distance` for two kinds of shapes.
 
-    Many pairs are many columns side by side: `pair_function(Capsule, Box).map(n)`. One small function that is called
-    often is several times faster, compiled and to compile, than all pairs written out in one graph.
+    `pair_function(Capsule, Box).map(n)` evaluates n pairs, side by side as columns. One small function that is called
+    often evaluates and compiles several times faster than one graph of all pairs.
 
     Raises:
-        ModelError: A mesh or a cylinder, two half-spaces, a rounding that is negative.
+        ModelError: A kind is Mesh or Cylinder, both are HalfSpace, or the rounding is negative.
     """
-    for what, kind in (("one", one), ("other", other)):
-        _checked_simple(kind, what)
+    for what, kind in (("first", first), ("second", second)):
+        _check_kind(kind, what)
     checked_nonnegative(rounding, "distance", "rounding", "m")
-    if one is HalfSpace and other is HalfSpace:
-        raise ModelError("distance: two half-spaces have none", name="other", value=other)
-    return _pair_function((one, other), float(rounding))
+    if first is HalfSpace and second is HalfSpace:
+        raise ModelError("distance: two half-spaces have no distance", name="second", value=second)
+    return _pair_function((first, second), float(rounding))
 
 
-def pair_wrenches(one: type[Shape], other: type[Shape], rounding: float, count: int) -> Any:
-    """Function (columns of ones, columns of others) -> distances of n pairs side by side, and their wrenches.
+def pair_wrenches(first: type[Shape], second: type[Shape], rounding: float, count: int) -> Any:
+    """Return the casadi Function (first columns, second columns) -> distances of n pairs and their wrenches.
 
-    Of the columns, one pair a row, shapes (n, COLUMNS[kind]), distances (n, 1), m, and wrenches (n, 6): (moment about
-    the world's origin, force) w, with which a distance grows at the rate w . (twist of one - twist of other), twists
-    being (angular, linear at the world's origin). Nearest points move along the shapes without changing the distance,
-    so that only the places of points of the shapes are differentiated (envelope theorem). The operations are those of
-    columns as wholes, which an interpreter does several times faster than pair after pair.
+    Pairs are rows: columns have shapes (n, COLUMNS[kind]), distances (n, 1), m, and wrenches (n, 6). A wrench w is
+    (moment about the world's origin, force); the distance changes at the rate w . (first twist - second twist), with
+    twists (angular, linear at the world's origin). The closest points slide along the shapes without changing the
+    distance, so only the positions of the shapes are differentiated (envelope theorem). All pairs are evaluated by
+    vectorised operations, several times faster in an interpreter than one pair after the other.
 
     Args:
-        one, other, rounding: As of `pair_function`. count: n.
+        first, second, rounding: As for `pair_function`.
+        count: Number of pairs n.
 
     Raises:
-        ModelError: As of `pair_function`.
+        ModelError: As for `pair_function`.
     """
-    pair_function(one, other, rounding)
-    return _pair_wrenches((one, other), float(rounding), count)
+    pair_function(first, second, rounding)
+    return _pair_wrenches((first, second), float(rounding), count)
 
 
 @cache
 def _pair_function(kinds: tuple[Any, Any], rounding: float) -> Any:
     columns = [ca.SX.sym(kind.__name__, COLUMNS[kind]) for kind in kinds]
-    gap = _of_columns(kinds, list(map(ca.vertsplit, columns)), rounding, free)
+    gap = _distance_of_columns(kinds, list(map(ca.vertsplit, columns)), rounding, no_stop)
     return ca.Function("_".join(kind.__name__ for kind in kinds), columns, [ca.cse(gap)])
 
 
 @cache
 def _pair_wrenches(kinds: tuple[Any, Any], rounding: float, count: int) -> Any:
-    given = [ca.MX.sym(kind.__name__, count, COLUMNS[kind]) for kind in kinds]
-    # the derivative by the shape of fewer numbers tells the wrench
+    columns = [ca.MX.sym(kind.__name__, count, COLUMNS[kind]) for kind in kinds]
+    # differentiate with respect to the shape with fewer entries
     side = 0 if COLUMNS[kinds[0]] <= COLUMNS[kinds[1]] else 1
     points, directions = VECTORS[kinds[side]]
-    rows = [ca.horzsplit(each) for each in given]
-    hold = Held()
-    vectors = hold(given[side][:, : 3 * (points + directions)])
+    rows = [ca.horzsplit(each) for each in columns]
+    stop_gradient = StoppedGradients()
+    vectors = stop_gradient(columns[side][:, : 3 * (points + directions)])
     own = ca.horzsplit(vectors)
     rows[side][: len(own)] = own
-    gap = _of_columns(kinds, rows, rounding, hold)
+    gap = _distance_of_columns(kinds, rows, rounding, stop_gradient)
     slopes = ca.horzsplit(ca.gradient(ca.sum1(gap), vectors))
     moment, force = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     for k in range(points + directions):
@@ -196,13 +203,14 @@ def _pair_wrenches(kinds: tuple[Any, Any], rounding: float, count: int) -> Any:
         moment = add(moment, cross(arm, slope))
         force = add(force, slope) if k < points else force
     wrench = ca.horzcat(*(part if side == 0 else -part for part in (*moment, *force)))
-    return ca.Function("wrenches", given, ca.cse(hold.released([gap, wrench])))
+    return ca.Function("wrenches", columns, ca.cse(stop_gradient.restore([gap, wrench])))
 
 
-class Held:
-    """Numbers that a derivative takes for constants: symbols, until they are released.
+class StoppedGradients:
+    """Values that differentiation treats as constants: symbols until they are restored.
 
-    Where a distance is the least over places, or the largest over directions, these do not move it (envelope theorem).
+    A distance is a minimum over positions or a maximum over directions, whose motion does not change it to first order
+    (envelope theorem).
     """
 
     def __init__(self) -> None:
@@ -210,26 +218,26 @@ class Held:
         self._values: list[Expression] = []
 
     def __call__(self, value: Expression) -> Expression:
-        """A symbol in the place of a value, which may hold other symbols."""
+        """Return a symbol that stands for a value, which may contain other symbols."""
         if not isinstance(value, ca.MX) or value.is_constant():
             return value
-        self._symbols.append(ca.MX.sym("held", value.shape))
+        self._symbols.append(ca.MX.sym("stopped", value.shape))
         self._values.append(value)
         return self._symbols[-1]
 
-    def released(self, expressions: list[Expression]) -> list[Expression]:
-        """Expressions with the values in the places of the symbols."""
+    def restore(self, expressions: list[Expression]) -> list[Expression]:
+        """Return the expressions with the values substituted for the symbols."""
         return list(ca.substitute_inplace(self._symbols, self._values, expressions)[1])
 
 
 def soft_minimum(values: Sequence[Expression], width: float) -> Expression:
-    """A smooth lower bound of the least of n values, at most width log(n) below it. Shape (1, 1).
+    """Return a smooth lower bound of the smallest of n values, at most width log(n) below it. Shape (1, 1).
 
     Raises:
-        ModelError: No value, or a width that is not positive.
+        ModelError: There is no value, or the width is not positive.
     """
     if not isinstance(values, list | tuple) or not 0 < len(values) <= INPUT_LIMITS.count:
-        message = f"soft_minimum of no values, or not of a list of at most {INPUT_LIMITS.count}: {repr(values)[:80]}"
+        message = f"soft_minimum: values must be a list of 1 to {INPUT_LIMITS.count} numbers, not {repr(values)[:80]}"
         raise ModelError(message, name="values", value=values, limit=INPUT_LIMITS.count)
     checked_number(width, "soft_minimum", "width", positive=True)
     for value in values:
@@ -256,7 +264,7 @@ def _placement(frame: Frame | None, what: str) -> tuple[Expression, Expression]:
     return parts
 
 
-def _checked_simple(kind: Any, what: str) -> None:
+def _check_kind(kind: Any, what: str) -> None:
     if not isinstance(kind, type) or kind not in COLUMNS:
         names = ", ".join(known.__name__ for known in COLUMNS)
         raise ModelError(f"distance: {what} must be one of {names}, not {kind!r}", name=what, value=kind, limit=names)
@@ -265,106 +273,109 @@ def _checked_simple(kind: Any, what: str) -> None:
 # ---- cores --------------------------------------------------------------------------------------------------------
 
 
-def _of_columns(kinds: tuple[Any, Any], entries: Sequence[Sequence[Expression]], rounding: float, hold: Hold) -> Any:
-    """Signed distance of two shapes of these kinds, written as columns, entry by entry."""
-    one, other = map(_core_of, kinds, entries)
-    swelling = sum(own[-1] for kind, own in zip(kinds, entries, strict=True) if kind in (Sphere, Capsule))
-    if isinstance(one, Plane):
-        gap = _lowest(other, one.normal, one.point, rounding)
-    elif isinstance(other, Plane):
-        gap = _lowest(one, other.normal, other.point, rounding)
-    elif isinstance(one, Rod) and isinstance(other, Rod):
-        gap = between_rods(one, other, rounding, hold)
+def _distance_of_columns(
+    kinds: tuple[Any, Any], entries: Sequence[Sequence[Expression]], rounding: float, stop_gradient: StopGradient
+) -> Any:
+    """Return the signed distance of two shapes of these kinds, given as columns."""
+    first, second = map(_core_of_column, kinds, entries)
+    swept_radius = sum(own[-1] for kind, own in zip(kinds, entries, strict=True) if kind in (Sphere, Capsule))
+    if isinstance(first, PlaneCore):
+        gap = _least_height(second, first.normal, first.point, rounding)
+    elif isinstance(second, PlaneCore):
+        gap = _least_height(first, second.normal, second.point, rounding)
+    elif isinstance(first, SegmentCore) and isinstance(second, SegmentCore):
+        gap = distance_of_segments(first, second, rounding, stop_gradient)
     else:
-        core, block = (one, other) if isinstance(other, Block) else (other, one)
-        assert isinstance(core, Rod | Block)
-        assert isinstance(block, Block)
-        gap = beside_block(core, block, rounding, hold)
-    return gap - swelling
+        core, box = (first, second) if isinstance(second, BoxCore) else (second, first)
+        assert isinstance(core, SegmentCore | BoxCore)
+        assert isinstance(box, BoxCore)
+        gap = distance_to_box(core, box, rounding, stop_gradient)
+    return gap - swept_radius
 
 
 @on_scalars
-def _with_hulls(*places: Expression, one: Shape, other: Shape, rounding: float) -> Expression:
-    """Signed distance of two shapes, one of them a mesh or a cylinder, in frames (turn, place, turn, place)."""
-    first, second = _core(one, *places[:2]), _core(other, *places[2:])
-    if isinstance(first, Plane):
-        gap = _lowest(second, first.normal, first.point, rounding)
-    elif isinstance(second, Plane):
-        gap = _lowest(first, second.normal, second.point, rounding)
+def _distance_with_hull(*poses: Expression, first: Shape, second: Shape, rounding: float) -> Expression:
+    """Return the signed distance of two shapes, one of them a mesh or a cylinder. `poses`: two rotations, positions."""
+    one, other = _core_in_frame(first, *poses[:2]), _core_in_frame(second, *poses[2:])
+    if isinstance(one, PlaneCore):
+        gap = _least_height(other, one.normal, one.point, rounding)
+    elif isinstance(other, PlaneCore):
+        gap = _least_height(one, other.normal, other.point, rounding)
     else:
-        gap = highest([*_gaps(first, second, rounding), *_gaps(second, first, rounding)], rounding, free)
-    return gap - (one.swelling + other.swelling)
+        gap = largest_of([*_face_gaps(one, other, rounding), *_face_gaps(other, one, rounding)], rounding, no_stop)
+    return gap - (first.swept_radius + second.swept_radius)
 
 
-def _core(shape: Shape, turn: Expression, place: Expression) -> Core:
+def _core_in_frame(shape: Shape, turn: Expression, place: Expression) -> Core:
     if type(shape) in COLUMNS:
-        return _core_of(type(shape), list(map(_number, ca.vertsplit(column(shape, Frame(turn, place))))))
+        return _core_of_column(type(shape), list(map(_as_number, ca.vertsplit(column(shape, Frame(turn, place))))))
     assert isinstance(shape, Mesh | Cylinder)
     axes = ca.horzsplit(ca.mtimes(turn, ca.DM(shape.rotation)))
-    return Solid(_scalars(place + ca.mtimes(turn, ca.DM(shape.position))), tuple(map(_scalars, axes)), shape.hull)
+    return HullCore(_scalars(place + ca.mtimes(turn, ca.DM(shape.position))), tuple(map(_scalars, axes)), shape.hull)
 
 
-def _core_of(kind: type[Shape], entries: Sequence[Expression]) -> Core:
-    """The core of a shape of this kind that is written as a column, entry by entry."""
+def _core_of_column(kind: type[Shape], entries: Sequence[Expression]) -> Core:
+    """Return the core of a shape of this kind that is given as a column."""
     parts = [triple(entries[3 * k : 3 * k + 3]) for k in range(len(entries) // 3)]
     if kind is Box:
-        return Block(parts[0], tuple(parts[1:4]), parts[4])
-    return Plane(parts[0], parts[1]) if kind is HalfSpace else Rod(tuple(parts))
+        return BoxCore(parts[0], tuple(parts[1:4]), parts[4])
+    return PlaneCore(parts[0], parts[1]) if kind is HalfSpace else SegmentCore(tuple(parts))
 
 
 def _scalars(vector: Expression) -> Triple:
-    return triple(_number(expression(vector)[k]) for k in range(3))
+    return triple(_as_number(expression(vector)[k]) for k in range(3))
 
 
-def _number(entry: Expression) -> Expression:
-    """A scalar, as a float where it is known."""
+def _as_number(entry: Expression) -> Expression:
+    """Return a scalar, as a float if it is constant."""
     return float(entry) if entry.is_constant() else entry
 
 
 # ---- half-spaces and hulls ------------------------------------------------------------------------------------------
 
 
-def _lowest(core: Core, normal: Triple, point: Triple, rounding: float) -> Expression:
-    """Least height of a core above a plane, or a smooth lower bound, at most `rounding` below."""
-    if isinstance(core, Rod):
+def _least_height(core: Core, normal: Triple, point: Triple, rounding: float) -> Expression:
+    """Return the least height of a core above a plane, or a smooth lower bound, at most `rounding` below."""
+    if isinstance(core, SegmentCore):
         heights = [dot(normal, subtract(end, point)) for end in core.points]
         middle, reaches = sum(heights) / len(heights), [(heights[-1] - heights[0]) / 2][: len(heights) - 1]
     else:
-        assert not isinstance(core, Plane)
-        middle, shares = dot(normal, subtract(core.centre, point)), into(normal, core.axes)
-        if isinstance(core, Solid):
-            return middle + _least([dot(shares, _scalars(vertex)) for vertex in core.hull.vertices], rounding)
+        assert not isinstance(core, PlaneCore)
+        middle, shares = dot(normal, subtract(core.centre, point)), in_axes(normal, core.axes)
+        if isinstance(core, HullCore):
+            return middle + _smooth_minimum([dot(shares, _scalars(vertex)) for vertex in core.hull.vertices], rounding)
         reaches = [h * share for h, share in zip(core.half, shares, strict=True)]
     slack = rounding / len(reaches) if reaches else 0.0
-    return middle - sum(size_of(reach, slack) for reach in reaches)
+    return middle - sum(smooth_abs(reach, slack) for reach in reaches)
 
 
-def _least(values: Sequence[Expression], rounding: float) -> Expression:
-    """The least of values, or a smooth lower bound of it, at most `rounding` below."""
+def _smooth_minimum(values: Sequence[Expression], rounding: float) -> Expression:
+    """Return the smallest value, or a smooth lower bound, at most `rounding` below."""
     if rounding == 0 or len(values) == 1:
         return reduce(ca.fmin, values)
     return soft_minimum(values, rounding / log(len(values)))
 
 
-def _gaps(one: Core, other: Core, rounding: float) -> list[Expression]:
-    """Gaps along the outward normals of one's faces, from one to the other; none of a rod."""
-    if isinstance(one, Block):
-        signed = [(axis, side, h) for axis, h in zip(one.axes, one.half, strict=True) for side in (-1.0, 1.0)]
+def _face_gaps(first: Core, second: Core, rounding: float) -> list[Expression]:
+    """Return the gaps to the second core along the outward normals of the first's faces; none for a segment."""
+    if isinstance(first, BoxCore):
+        signed = [(axis, side, h) for axis, h in zip(first.axes, first.half, strict=True) for side in (-1.0, 1.0)]
         normals = [(triple(side * part for part in axis), h) for axis, side, h in signed]
-        return [_lowest(other, normal, one.centre, rounding) - h for normal, h in normals]
-    if not isinstance(one, Solid):
+        return [_least_height(second, normal, first.centre, rounding) - h for normal, h in normals]
+    if not isinstance(first, HullCore):
         return []
-    seen = _seen(other, one.centre, one.axes)
-    directions = np.vstack([one.hull.normals, _across_edges(one.hull)])
-    offsets = (directions @ one.hull.vertices.T).max(axis=1)
+    local = _in_frame(second, first.centre, first.axes)
+    directions = np.vstack([first.hull.normals, _edge_directions(first.hull)])
+    offsets = (directions @ first.hull.vertices.T).max(axis=1)
     pairs = zip(directions, offsets, strict=True)
-    return [_lowest(seen, _scalars(along), (0.0, 0.0, 0.0), rounding) - float(offset) for along, offset in pairs]
+    return [_least_height(local, _scalars(along), (0.0, 0.0, 0.0), rounding) - float(offset) for along, offset in pairs]
 
 
-def _across_edges(hull: Hull) -> Array:
-    """Unit directions half-way between faces that meet in an edge or corner, each two at more than pi/4. Shape (k, 3).
+def _edge_directions(hull: Hull) -> Array:
+    """Return bisectors of normals of faces that share an edge or corner, all more than pi/4 apart. Shape (k, 3).
 
-    Past an edge the normals of its two faces, an angle a apart, see cos(a/2) of a distance at most, 92 % at pi/4.
+    Beyond an edge whose faces' normals differ by an angle a, the normals alone see at most cos(a/2) of a distance, 92 %
+    at pi/4.
     """
     a, b, c = (hull.vertices[hull.faces[:, k]] for k in range(3))
     face = (np.cross(b - a, c - a) @ hull.normals.T).argmax(axis=1)
@@ -373,19 +384,19 @@ def _across_edges(hull: Hull) -> Array:
         for k in range(3):
             meeting.setdefault((corners[k],), set()).add(own)
             meeting.setdefault(tuple(sorted((corners[k], corners[k - 1]))), set()).add(own)
-    found = []
+    directions = []
     for faces in sorted({tuple(sorted(each)) for each in meeting.values() if len(each) > 1}):
         normals = hull.normals[list(faces)]
         if (normals @ normals.T)[np.triu_indices(len(faces), 1)].max() < cos(pi / 4):
             middle = normals.sum(axis=0)
-            found.append(middle / np.linalg.norm(middle))
-    return np.array(found).reshape(-1, 3)
+            directions.append(middle / np.linalg.norm(middle))
+    return np.array(directions).reshape(-1, 3)
 
 
-def _seen(core: Core, centre: Triple, axes: Sequence[Triple]) -> Core:
-    """The core in these axes from this centre."""
-    if isinstance(core, Rod):
-        return Rod(tuple(into(subtract(point, centre), axes) for point in core.points))
-    assert not isinstance(core, Plane)
-    place = into(subtract(core.centre, centre), axes)
-    return core._replace(centre=place, axes=tuple(into(axis, axes) for axis in core.axes))
+def _in_frame(core: Core, centre: Triple, axes: Sequence[Triple]) -> Core:
+    """Return the core in coordinates of these axes and centre."""
+    if isinstance(core, SegmentCore):
+        return SegmentCore(tuple(in_axes(subtract(point, centre), axes) for point in core.points))
+    assert not isinstance(core, PlaneCore)
+    place = in_axes(subtract(core.centre, centre), axes)
+    return core._replace(centre=place, axes=tuple(in_axes(axis, axes) for axis in core.axes))

@@ -1,11 +1,10 @@
-"""Convex hull of points in space: its vertices, its triangles, the planes of its faces.
+"""Convex hulls of points, and the closest points of pairs of convex hulls.
 
-Nearest points of convex hulls of a few points, many pairs at once: the numeric measure of distance.
-
-Two segments, and a segment and a box, have closed forms; for other hulls the one point of the hull of all
-differences that is nearest to the origin is looked for in simplices of at most four of them, each step adding the one
-that lies farthest towards the origin (Gilbert, Johnson, Keerthi 1988). Whatever direction a pair ends with, the gap
-along it (`gap_along`) is a lower bound of the distance, so that nobody need trust the search.
+`convex_hull` computes one hull with its vertices, triangles and face planes. `nearest_directions` computes the closest
+points of many pairs of hulls at once. Pairs of segments, and pairs of a segment and a box, are solved in closed form.
+Other pairs are solved by the algorithm of Gilbert, Johnson and Keerthi (1988), which searches the Minkowski difference
+for its point nearest to the origin. The gap along any direction (`gap_along`) is a lower bound of the distance, so a
+result can be verified without trusting the search.
 """
 
 from __future__ import annotations
@@ -26,15 +25,22 @@ from models.errors import ModelError
 __all__ = ["gap_along", "is_box", "nearest_directions"]
 
 
+GAP_TOLERANCE = 1e-12
+"""Relative difference of distance and gap at which the search has converged."""
+DEGENERATE = 1e-14
+"""Squared content, relative to the squared edges, below which a triangle or tetrahedron is degenerate."""
+EDGE_I, EDGE_J = np.triu_indices(3, 1)
+
+
 @dataclass(frozen=True, eq=False)
 class Hull:
-    """The convex hull of points.
+    """A convex hull of points.
 
     Attributes:
-        vertices: Its corners. Shape (m, 3), m.
+        vertices: Corners of the hull. Shape (m, 3), m.
         faces: Triangles of corners, counter-clockwise from outside. Shape (k, 3).
-        normals: Unit normals of its faces, outwards, each once. Shape (f, 3).
-        offsets: The hull are the x with normals x <= offsets. Shape (f,), m.
+        normals: Distinct outward unit normals of the faces. Shape (f, 3).
+        offsets: The hull is the set of x with normals x <= offsets. Shape (f,), m.
     """
 
     vertices: Array
@@ -44,16 +50,16 @@ class Hull:
 
 
 def convex_hull(points: Array) -> Hull:
-    """Return the convex hull of points, by qhull (Barber, Dobkin & Huhdanpaa 1996).
+    """Return the convex hull of points, computed by qhull (Barber, Dobkin & Huhdanpaa 1996).
 
-    Qhull takes seconds for some hundred thousand corners and hears nothing meanwhile. It works in a thread of its own,
-    so that Ctrl-C ends the wait for it at once.
+    Qhull takes seconds for several hundred thousand points and cannot be interrupted. It runs in its own thread, so
+    that Ctrl-C ends the wait for it at once.
 
     Args:
         points: Shape (n, 3), m.
 
     Raises:
-        ModelError: Points in a plane, on a line, at one place.
+        ModelError: The points are coplanar, collinear or coincident.
     """
     hull: Future[Hull] = Future()
 
@@ -71,124 +77,127 @@ def _convex_hull(points: Array) -> Hull:
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     size = float(np.abs(points - middle).max()) or 1.0
     centred = (points - middle) / size
-    few = centred[:: 1 + len(centred) // 1000]  # they tell the plane that all may lie in
+    sample = centred[:: 1 + len(centred) // 1000]  # enough to estimate the plane that all points may lie in
     flat = 1e-10
-    across = np.linalg.svd(few - few.mean(axis=0), full_matrices=False)[2][-1]
+    normal = np.linalg.svd(sample - sample.mean(axis=0), full_matrices=False)[2][-1]
     try:
-        if len(points) < 4 or np.ptp(centred @ across) <= flat:
+        if len(points) < 4 or np.ptp(centred @ normal) <= flat:
             raise QhullError
-        found = ConvexHull(centred, qhull_options="Qt")
+        qhull = ConvexHull(centred, qhull_options="Qt")
     except QhullError as error:
-        message = "mesh: its vertices lie in a plane; it has no volume. Give a Box as thick as it is"
+        message = "mesh: the vertices are coplanar, so the mesh has no volume; give a thin Box instead"
         raise ModelError(message, name="vertices", value=len(points), limit=flat * size) from error
-    corners, faces = np.unique(found.simplices, return_inverse=True)
-    faces = faces.reshape(found.simplices.shape)
+    corners, faces = np.unique(qhull.simplices, return_inverse=True)
+    faces = faces.reshape(qhull.simplices.shape)
     a, b, c = (centred[corners][faces[:, k]] for k in range(3))
-    outwards = found.equations[:, :3]
+    outwards = qhull.equations[:, :3]
     inwards = (np.cross(b - a, c - a) * outwards).sum(axis=1) < 0
     faces[inwards] = faces[inwards][:, [0, 2, 1]]
-    # a closed surface is convex where it is so across each edge (Tietze, Nakajima): its neighbours' corners decide
-    around = centred[corners][faces[found.neighbors].reshape(len(faces), -1)]
-    heights = np.einsum("fkj,fj->fk", around, outwards).max(axis=1)
+    # a closed surface is convex if it is convex across each edge (Tietze, Nakajima): test the neighbours' corners
+    neighbours = centred[corners][faces[qhull.neighbors].reshape(len(faces), -1)]
+    heights = np.einsum("fkj,fj->fk", neighbours, outwards).max(axis=1)
     first, same = _distinct(outwards)
     offsets = np.full(len(first), -np.inf)
     np.maximum.at(offsets, same, heights)
     normals = outwards[first]
-    offsets = size * (offsets + 1e-12) + normals @ middle  # out by more than qhull leaves points outside
+    offsets = size * (offsets + 1e-12) + normals @ middle  # by more than qhull leaves points outside
     return Hull(frozen(points[corners]), faces, frozen(normals), frozen(offsets))
 
 
 def _distinct(normals: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Each direction once, by where it comes first, and which of these each of them is. Shapes (f,), (k,)."""
-    near = cKDTree(normals).query_pairs(ROUNDING, p=np.inf, output_type="ndarray")
-    links = coo_array((np.ones(len(near)), near.T), shape=(len(normals), len(normals)))
+    """Return the indices of distinct directions and the position of every direction among these. Shapes (f,), (k,)."""
+    close_pairs = cKDTree(normals).query_pairs(ROUNDING, p=np.inf, output_type="ndarray")
+    links = coo_array((np.ones(len(close_pairs)), close_pairs.T), shape=(len(normals), len(normals)))
     _, same = connected_components(links, directed=False)
     first = np.unique(same, return_index=True)[1]
     order = np.argsort(np.argsort(first))
     return np.sort(first), order[same]
 
 
-CLOSE = 1e-12
-"""Relative: the distance is found when the gap along its direction is no less by more."""
-FLAT = 1e-14
-"""Of the squares of the edges: a triangle or tetrahedron of less content is none."""
-FIRSTS, SECONDS = np.triu_indices(3, 1)
-"""Of three edges the pairs."""
+def gap_along(direction: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return the gap of two hulls along a unit vector that points from the first to the second, for K pairs.
 
+    Args:
+        direction: Shape (K, 3).
+        first, second: Points of the hulls. Shapes (K, m, 3), (K, l, 3), m.
 
-def gap_along(direction: np.ndarray, one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """How far hulls of points (K, m, 3) and (K, l, 3) are apart along unit vectors (K, 3) from one to other. (K,)."""
+    Returns:
+        Signed gaps, lower bounds of the distances. Shape (K,), m.
+    """
     column = direction[:, :, None]
-    return np.asarray((other @ column).min(axis=(1, 2)) - (one @ column).max(axis=(1, 2)))
+    return np.asarray((second @ column).min(axis=(1, 2)) - (first @ column).max(axis=(1, 2)))
 
 
 def is_box(points: np.ndarray) -> bool:
-    """Whether points (m, 3) are the 8 corners of a box, the third edge from one to the next, then the second."""
+    """Return whether points (m, 3) are the 8 corners of a box, in the order of `Box.core`."""
     if len(points) != 8:
         return False
     edges = points[[4, 2, 1]] - points[0]
     squares = edges @ edges.T
     corners = points[0] + np.array([[k >> 2 & 1, k >> 1 & 1, k & 1] for k in range(8)]) @ edges
     size = float(squares.max())
-    right = np.abs(squares - np.diag(squares.diagonal())).max() <= CLOSE * size
-    return bool(right and (squares.diagonal() > 0).all() and np.abs(corners - points).max() <= CLOSE * size**0.5)
+    right = np.abs(squares - np.diag(squares.diagonal())).max() <= GAP_TOLERANCE * size
+    return bool(
+        right and (squares.diagonal() > 0).all() and np.abs(corners - points).max() <= GAP_TOLERANCE * size**0.5
+    )
 
 
 def nearest_directions(
-    one: np.ndarray, other: np.ndarray, boxes: tuple[bool, bool] = (False, False)
+    first: np.ndarray, second: np.ndarray, boxes: tuple[bool, bool] = (False, False)
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where hulls of points are nearest.
+    """Return the closest points of pairs of hulls and the unit vectors between them.
 
     Args:
-        one, other: Their points. Shapes (K, m, 3), (K, l, 3).
-        boxes: Whether each is known to be a box (`is_box`).
+        first, second: Points of the hulls. Shapes (K, m, 3), (K, l, 3).
+        boxes: Whether the first and the second hulls are boxes (`is_box`).
 
     Returns:
-        Unit vectors from a nearest point of one to one of the other (K, 3), and these points, (K, 3) each. Of hulls
-        that overlap, as far as the search can tell, the vector is that along which they overlap least of the axes
-        that were tried, which are enough for segments and boxes, and the points are one inside both.
+        Unit vectors from the first hull to the second, and the closest points on both, (K, 3) each. If two hulls
+        overlap, the vector is the direction of least overlap among the candidate axes, which are complete for segments
+        and boxes, and the two points coincide inside both hulls.
     """
-    if one.shape[1] == other.shape[1] == 2:
-        here, there, way = _between_segments(one, other)
-    elif one.shape[1] == 2 and boxes[1]:
-        here, there, way = _segment_beside_box(one, other)
-    elif other.shape[1] == 2 and boxes[0]:
-        there, here, way = _segment_beside_box(other, one)
-        way = -way
+    if first.shape[1] == second.shape[1] == 2:
+        on_first, on_second, difference = _between_segments(first, second)
+    elif first.shape[1] == 2 and boxes[1]:
+        on_first, on_second, difference = _segment_beside_box(first, second)
+    elif second.shape[1] == 2 and boxes[0]:
+        on_second, on_first, difference = _segment_beside_box(second, first)
+        difference = -difference
     else:
-        here, there, way = _between_hulls(one, other)
-    long = np.linalg.norm(way, axis=1)
-    size = np.abs(one).max(initial=0.0) + np.abs(other).max(initial=0.0)
-    apart = long > CLOSE * size
-    direction = np.where(apart[:, None], way / np.where(apart, long, 1.0)[:, None], 0.0)
-    if not apart.all():
-        direction[~apart] = _least_overlap(one[~apart], other[~apart], boxes)
-    return direction, here, there
+        on_first, on_second, difference = _between_hulls(first, second)
+    length = np.linalg.norm(difference, axis=1)
+    size = np.abs(first).max(initial=0.0) + np.abs(second).max(initial=0.0)
+    separated = length > GAP_TOLERANCE * size
+    direction = np.where(separated[:, None], difference / np.where(separated, length, 1.0)[:, None], 0.0)
+    if not separated.all():
+        direction[~separated] = _least_overlap(first[~separated], second[~separated], boxes)
+    return direction, on_first, on_second
 
 
-def _between_segments(one: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Nearest points of segments (K, 2, 3), and the way from the first to the other (K, 3) each.
+def _between_segments(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the closest points of segments (K, 2, 3) and the vector from the first to the second, (K, 3) each.
 
     Source: Ericson, Real-Time Collision Detection, 2005, 5.1.9.
     """
-    u, v, w = one[:, 1] - one[:, 0], other[:, 1] - other[:, 0], one[:, 0] - other[:, 0]
+    u, v, w = first[:, 1] - first[:, 0], second[:, 1] - second[:, 0], first[:, 0] - second[:, 0]
     a, e, b = (u * u).sum(axis=1), (v * v).sum(axis=1), (u * v).sum(axis=1)
     c, f = (u * w).sum(axis=1), (v * w).sum(axis=1)
     short, single = np.where(a > 0, a, 1.0), np.where(e > 0, e, 1.0)
-    across = a * e - b * b
-    sound = across > FLAT * a * e
-    s = np.where(sound, np.clip((b * f - c * e) / np.where(sound, across, 1.0), 0.0, 1.0), 0.0)
+    normal = a * e - b * b
+    sound = normal > DEGENERATE * a * e
+    s = np.where(sound, np.clip((b * f - c * e) / np.where(sound, normal, 1.0), 0.0, 1.0), 0.0)
     t = np.where(e > 0, np.clip((b * s + f) / single, 0.0, 1.0), 0.0)
     s = np.where(a > 0, np.clip((b * t - c) / short, 0.0, 1.0), 0.0)
-    here, there = one[:, 0] + s[:, None] * u, other[:, 0] + t[:, None] * v
-    return here, there, there - here
+    on_first, on_second = first[:, 0] + s[:, None] * u, second[:, 0] + t[:, None] * v
+    return on_first, on_second, on_second - on_first
 
 
 def _segment_beside_box(rod: np.ndarray, box: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """As `_between_segments` of a segment (K, 2, 3) and the corners of a box (K, 8, 3).
+    """Return the same as `_between_segments` for a segment (K, 2, 3) and the corners of a box (K, 8, 3).
 
-    Half the slope of the squared distance at a place s along the segment rises with s, straight between the places
-    where the segment enters or leaves the slabs of the box. It is worked out at these, and its root lies between two.
+    Half the derivative of the squared distance by the position s along the segment is increasing and piecewise linear.
+    It has its kinks where the segment enters or leaves a slab of the box. It is evaluated at the kinks, between two of
+    which its root is interpolated.
     """
     centre = (box[:, 0] + box[:, 7]) / 2
     axes = box[:, [4, 2, 1]] - box[:, :1]
@@ -202,58 +211,60 @@ def _segment_beside_box(rod: np.ndarray, box: np.ndarray) -> tuple[np.ndarray, n
     x = start[:, None] + places[:, :, None] * u[:, None]
     slopes = ((x - np.clip(x, -half[:, None], half[:, None])) * u[:, None]).sum(axis=2)
     rows = np.arange(len(u))
-    after = np.clip((slopes < 0).sum(axis=1), 1, places.shape[1] - 1)  # the first place where the slope is not negative
+    after = np.clip((slopes < 0).sum(axis=1), 1, places.shape[1] - 1)  # first parameter of nonnegative slope
     low, high = slopes[rows, after - 1], slopes[rows, after]
     rise = high - low
     share = np.clip(-low / np.where(rise > 0, rise, 1.0), 0.0, 1.0)
     s = places[rows, after - 1] + share * (places[rows, after] - places[rows, after - 1])
     x = start + s[:, None] * u
     nearest = np.clip(x, -half, half)
-    here, there, way = ((part[:, None] @ axes)[:, 0] for part in (x, nearest, nearest - x))
-    return here + centre, there + centre, way
+    on_first, on_second, difference = ((part[:, None] @ axes)[:, 0] for part in (x, nearest, nearest - x))
+    return on_first + centre, on_second + centre, difference
 
 
-def _between_hulls(one: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """As `_between_segments` of hulls of points (K, m, 3), (K, l, 3), by the algorithm of Gilbert, Johnson, Keerthi."""
-    here, there = one[:, 0].astype(float), other[:, 0].astype(float)
-    active = np.arange(len(one))
-    a, b = np.repeat(here[:, None], 4, axis=1), np.repeat(there[:, None], 4, axis=1)
-    found = there - here
-    towards = found.copy()
-    for _ in range(64):  # a few are enough, but for rounding
+def _between_hulls(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the same as `_between_segments` for hulls of points (K, m, 3), (K, l, 3), by the GJK algorithm."""
+    on_first, on_second = first[:, 0].astype(float), second[:, 0].astype(float)
+    active = np.arange(len(first))
+    a, b = np.repeat(on_first[:, None], 4, axis=1), np.repeat(on_second[:, None], 4, axis=1)
+    nearest = on_second - on_first
+    v = nearest.copy()
+    for _ in range(64):  # a few iterations suffice but for rounding
         if not active.size:
             break
         rows = np.arange(active.size)
-        p, q = one[active], other[active]
-        far = p[rows, (p @ towards[:, :, None])[:, :, 0].argmax(axis=1)]
-        near = q[rows, (q @ towards[:, :, None])[:, :, 0].argmin(axis=1)]
-        square = (towards * towards).sum(axis=1)
-        left = (square - (towards * (near - far)).sum(axis=1) > CLOSE * square) & (square > 0)
-        if not left.all():
-            active, a, b, towards, square = (part[left] for part in (active, a, b, towards, square))
-            far, near = far[left], near[left]
+        p, q = first[active], second[active]
+        support_first = p[rows, (p @ v[:, :, None])[:, :, 0].argmax(axis=1)]
+        support_second = q[rows, (q @ v[:, :, None])[:, :, 0].argmin(axis=1)]
+        square = (v * v).sum(axis=1)
+        unconverged = (square - (v * (support_second - support_first)).sum(axis=1) > GAP_TOLERANCE * square) & (
+            square > 0
+        )
+        if not unconverged.all():
+            active, a, b, v, square = (part[unconverged] for part in (active, a, b, v, square))
+            support_first, support_second = support_first[unconverged], support_second[unconverged]
             if not active.size:
                 break
-        # the place of a point without weight, which there is in every simplex but a full one, takes the new one
-        a[:, 3], b[:, 3] = far, near
+        # the last vertex has no weight in any simplex that is not full: replace it by the new one
+        a[:, 3], b[:, 3] = support_first, support_second
         weights, new = _weights(b - a)
         order = np.argsort(-weights, axis=1, kind="stable")[:, :, None]
         weights = np.take_along_axis(weights[:, :, None], order, axis=1)
         a, b = np.take_along_axis(a, order, axis=1), np.take_along_axis(b, order, axis=1)
         nearer = (new * new).sum(axis=1) < square
         chosen = active[nearer]
-        here[chosen], there[chosen] = ((weights * part)[nearer].sum(axis=1) for part in (a, b))
-        found[chosen] = new[nearer]
+        on_first[chosen], on_second[chosen] = ((weights * part)[nearer].sum(axis=1) for part in (a, b))
+        nearest[chosen] = new[nearer]
         a, b = (np.where(weights > 0, part, part[:, :1]) for part in (a, b))
         keep = nearer & (weights[:, 3, 0] == 0)
-        active, a, b, towards = (part[keep] for part in (active, a, b, new))
-    return here, there, found
+        active, a, b, v = (part[keep] for part in (active, a, b, new))
+    return on_first, on_second, nearest
 
 
 def _weights(w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of four points, which may coincide, the weights whose mean is nearest to the origin, and that mean.
+    """Return the weights of the point of a simplex that is nearest to the origin, and that point.
 
-    Shape (K, 4, 3) to (K, 4) and (K, 3). Only simplices with the last point, which was added, are looked at.
+    Shape (K, 4, 3) to (K, 4) and (K, 3). The vertices may coincide. Only faces that contain the last vertex are tried.
     """
     last = w[:, 3]
     edges = w[:, :3] - last[:, None]
@@ -262,51 +273,51 @@ def _weights(w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     each = np.arange(3)
     along = -(edges @ last[:, :, None])[:, :, 0] / np.where(squares > 0, squares, 1.0)
     shares[:, 1 + each, each], valid[:, 1:4] = along, (along > 0) & (along < 1)
-    u, v = edges[:, FIRSTS], edges[:, SECONDS]
+    u, v = edges[:, EDGE_I], edges[:, EDGE_J]
     normals = _cross(u, v)
     sizes = (normals * normals).sum(axis=2)
-    sound = sizes > FLAT * squares[:, FIRSTS] * squares[:, SECONDS]
+    sound = sizes > DEGENERATE * squares[:, EDGE_I] * squares[:, EDGE_J]
     sizes = np.where(sound, sizes, 1.0)
-    across = _cross(normals, last[:, None])  # (v x last) normal = v (last x normal)
-    s, t = -(v * across).sum(axis=2) / sizes, (u * across).sum(axis=2) / sizes
-    shares[:, 4 + each, FIRSTS], shares[:, 4 + each, SECONDS] = s, t
+    normal = _cross(normals, last[:, None])  # (v x last) normal = v (last x normal)
+    s, t = -(v * normal).sum(axis=2) / sizes, (u * normal).sum(axis=2) / sizes
+    shares[:, 4 + each, EDGE_I], shares[:, 4 + each, EDGE_J] = s, t
     valid[:, 4:7] = sound & (s > 0) & (t > 0) & (s + t < 1)
     content = (edges[:, 0] * normals[:, 2]).sum(axis=1)
-    full = content**2 > FLAT * squares.prod(axis=1)
+    full = content**2 > DEGENERATE * squares.prod(axis=1)
     inside = (normals @ last[:, :, None])[:, ::-1, 0] * [-1.0, 1.0, -1.0]
     inside /= np.where(full, content, 1.0)[:, None]  # Cramer: the normals are those of edges 12, 02 and 01
     shares[:, 7, :3], valid[:, 7] = inside, full & (inside > 0).all(axis=1) & (inside.sum(axis=1) < 1)
     shares[:, :, 3] = 1 - shares[:, :, :3].sum(axis=2)
     means = shares @ w
-    # however near they are, the way to an edge is across it, and that to a triangle its normal
-    astray = (means[:, 1:4] * edges).sum(axis=2) / np.where(squares > 0, squares, 1.0)
-    means[:, 1:4] -= astray[:, :, None] * edges
+    # against cancellation: the vector to an edge is orthogonal to it, the vector to a triangle parallel to its normal
+    parallel = (means[:, 1:4] * edges).sum(axis=2) / np.where(squares > 0, squares, 1.0)
+    means[:, 1:4] -= parallel[:, :, None] * edges
     means[:, 4:7] = normals * ((normals * last[:, None]).sum(axis=2) / sizes)[:, :, None]
     lengths = np.where(valid, (means * means).sum(axis=2), np.inf)
     rows, least = np.arange(len(w)), lengths.argmin(axis=1)
     return shares[rows, least], means[rows, least]
 
 
-def _cross(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Of vectors, their entries last; with less ado than numpy's own."""
+def _cross(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return the cross product along the last axis; faster than numpy's own."""
     i, j = [1, 2, 0], [2, 0, 1]
-    return np.asarray(one[..., i] * other[..., j] - one[..., j] * other[..., i])
+    return np.asarray(first[..., i] * second[..., j] - first[..., j] * second[..., i])
 
 
-def _least_overlap(one: np.ndarray, other: np.ndarray, boxes: tuple[bool, bool]) -> np.ndarray:
-    """Unit vectors (K, 3) from one to other along which hulls that overlap do so least, of some that are tried.
+def _least_overlap(first: np.ndarray, second: np.ndarray, boxes: tuple[bool, bool]) -> np.ndarray:
+    """Return the candidate unit vectors (K, 3), from first to second, along which hulls overlap least.
 
-    The line of the middles, and the normals of edges of both and of their pairs, edges being those from a first point
-    to the next three; of a box its own.
+    Candidates are the line between the centroids, the edges of both hulls and the cross products of their edges. The
+    edges of a hull are those from its first point to the next three; of a box, those from its first corner.
     """
-    ends = [[1, 2, 4] if box else [1, 2, 3][: p.shape[1] - 1] for p, box in zip((one, other), boxes, strict=True)]
-    edges = np.concatenate([p[:, few] - p[:, :1] for p, few in zip((one, other), ends, strict=True)], axis=1)
+    ends = [[1, 2, 4] if box else [1, 2, 3][: p.shape[1] - 1] for p, box in zip((first, second), boxes, strict=True)]
+    edges = np.concatenate([p[:, indices] - p[:, :1] for p, indices in zip((first, second), ends, strict=True)], axis=1)
     i, j = np.triu_indices(edges.shape[1], 1)
-    middles = (other.mean(axis=1) - one.mean(axis=1))[:, None]
-    axes = np.broadcast_to(np.eye(3), (len(one), 3, 3))
-    tried = np.concatenate([middles, edges, _cross(edges[:, i], edges[:, j]), axes], axis=1)
-    lengths = np.linalg.norm(tried, axis=2, keepdims=True)
-    units = np.where(lengths > 0, tried / np.where(lengths > 0, lengths, 1.0), axes[:, :1])
+    middles = (second.mean(axis=1) - first.mean(axis=1))[:, None]
+    axes = np.broadcast_to(np.eye(3), (len(first), 3, 3))
+    candidates = np.concatenate([middles, edges, _cross(edges[:, i], edges[:, j]), axes], axis=1)
+    lengths = np.linalg.norm(candidates, axis=2, keepdims=True)
+    units = np.where(lengths > 0, candidates / np.where(lengths > 0, lengths, 1.0), axes[:, :1])
     units = np.concatenate([units, -units], axis=1)
-    there, here = units @ np.swapaxes(other, 1, 2), units @ np.swapaxes(one, 1, 2)
-    return np.asarray(units[np.arange(len(one)), (there.min(axis=2) - here.max(axis=2)).argmax(axis=1)])
+    on_second, on_first = units @ np.swapaxes(second, 1, 2), units @ np.swapaxes(first, 1, 2)
+    return np.asarray(units[np.arange(len(first)), (on_second.min(axis=2) - on_first.max(axis=2)).argmax(axis=1)])

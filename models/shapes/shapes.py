@@ -1,17 +1,18 @@
-"""Shapes of bodies and obstacles: spheres, capsules, cylinders, boxes, half-spaces, meshes.
+"""Shapes of bodies and obstacles: spheres, capsules, cylinders, boxes, half-spaces and meshes.
 
-Each is the convex hull of a few points, its core, swelled by a distance: what `distance` works with. A shape is given
-in some frame: an obstacle in world, the body of a link in the frame of the link.
+Every bounded shape is the convex hull of a few points, its core, swept by a sphere. `models.shapes.distance` computes
+distances from this representation. The coordinates of an obstacle are in world, those of a link's body in the link's
+frame.
 """
 
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from math import cos, pi
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, Self, TypeAlias, cast
 
 import numpy as np
 
@@ -30,21 +31,52 @@ from models.errors import ModelError
 from models.shapes.hull import Hull, convex_hull
 
 SIDES = 16
-"""Of the prism around a cylinder."""
+"""Number of sides of the prism that circumscribes a cylinder."""
 CORNERS = np.array([(x, y, z) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
-"""Of the cube of half-edge 1. Shape (8, 3)."""
+"""Corners of the cube of half-edge 1. Shape (8, 3)."""
+
+
+class _SweptCore:
+    """A convex solid: all points within `swept_radius` of the convex hull of the points `core`."""
+
+    @property
+    def core(self) -> Array:
+        """Points whose convex hull is the core of the shape. Shape (m, 3), m."""
+        raise NotImplementedError
+
+    @property
+    def swept_radius(self) -> float:
+        """Distance that the shape extends beyond the convex hull of its core, m."""
+        return 0.0
+
+    def reach(self, point: ArrayInput) -> float:
+        """Return the largest distance of the shape's points from a point. Shape (3,), m; inf if it is unbounded."""
+        centre = checked_array(point, (3,), "shape", "point")
+        return float(np.linalg.norm(self.core - centre, axis=1).max()) + self.swept_radius
+
+
+class _Posed(_SweptCore):
+    """A shape with a pose of its own."""
+
+    def placed(self, rotation: ArrayInput, translation: ArrayInput) -> Self:
+        """Return the shape in another frame, in which its own has this rotation (3, 3) and position (3,), m."""
+        turn, shift = _motion(rotation, translation)
+        own: Any = copy(self)  # shares the hull, which is costly to compute
+        object.__setattr__(own, "position", frozen(turn @ own.position + shift))
+        object.__setattr__(own, "rotation", frozen(turn @ own.rotation))
+        return cast(Self, own)
 
 
 @dataclass(frozen=True, eq=False)
-class Sphere:
-    """All points within a radius of a point.
+class Sphere(_SweptCore):
+    """A ball: all points within a radius of its centre.
 
     Attributes:
         radius: m.
-        position: Its centre. Shape (3,), m.
+        position: Centre. Shape (3,), m.
 
     Raises:
-        ModelError: A radius that is not positive, a position that is missing or not finite.
+        ModelError: The radius is not positive, or the position is missing or not finite.
     """
 
     radius: float
@@ -56,34 +88,30 @@ class Sphere:
 
     @property
     def core(self) -> Array:
-        """Shape (1, 3), m."""
+        """Centre of the sphere. Shape (1, 3), m."""
         return np.array([self.position])
 
     @property
-    def swelling(self) -> float:
-        """How far the shape goes beyond its core, m."""
+    def swept_radius(self) -> float:
+        """Radius of the sphere, m."""
         return self.radius
 
     def placed(self, rotation: ArrayInput, translation: ArrayInput) -> Sphere:
-        """The same sphere where its frame has this rotation (3, 3) and position (3,), m, in another."""
+        """Return the sphere in another frame, in which its own has this rotation (3, 3) and position (3,), m."""
         turn, shift = _motion(rotation, translation)
         return Sphere(self.radius, turn @ self.position + shift)
 
-    def reach(self, point: ArrayInput) -> float:
-        """Largest distance of its points from a point. Shape (3,), m."""
-        return _reach(self, point)
-
 
 @dataclass(frozen=True, eq=False)
-class Capsule:
-    """All points within a radius of a segment; a sphere where its ends are one.
+class Capsule(_SweptCore):
+    """All points within a radius of a segment; a sphere if both ends coincide.
 
     Attributes:
-        radius: m; 0 for a bare segment.
+        radius: m; 0 for a segment without thickness.
         start, end: Ends of the segment. Shape (3,), m.
 
     Raises:
-        ModelError: A radius that is negative, an end that is not finite, a bare point (no radius, no length).
+        ModelError: The radius is negative, an end is not finite, or radius and length are both zero.
     """
 
     radius: float
@@ -92,46 +120,44 @@ class Capsule:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "radius", checked_nonnegative(self.radius, "capsule", "radius", "m"))
-        for what in ("start", "end"):
-            object.__setattr__(self, what, checked_array(getattr(self, what), (3,), "capsule", what))
+        for name in ("start", "end"):
+            object.__setattr__(self, name, checked_array(getattr(self, name), (3,), "capsule", name))
         if self.radius == 0 and (self.start == self.end).all():
-            raise ModelError("capsule: no radius and no length", name="radius", value=0.0, limit=0.0)
+            message = "capsule: radius and length are zero; give a positive radius or two different ends"
+            raise ModelError(message, name="radius", value=0.0, limit=0.0)
 
     @property
     def core(self) -> Array:
-        """Its ends. Shape (2, 3), m."""
+        """Ends of the segment. Shape (2, 3), m."""
         return np.array([self.start, self.end])
 
     @property
-    def swelling(self) -> float:
-        """How far the shape goes beyond its core, m."""
+    def swept_radius(self) -> float:
+        """Radius of the capsule, m."""
         return self.radius
 
     def placed(self, rotation: ArrayInput, translation: ArrayInput) -> Capsule:
-        """The same capsule where its frame has this rotation (3, 3) and position (3,), m, in another."""
+        """Return the capsule in another frame, in which its own has this rotation (3, 3) and position (3,), m."""
         turn, shift = _motion(rotation, translation)
         return Capsule(self.radius, turn @ self.start + shift, turn @ self.end + shift)
 
-    def reach(self, point: ArrayInput) -> float:
-        """Largest distance of its points from a point. Shape (3,), m."""
-        return _reach(self, point)
-
 
 @dataclass(frozen=True, eq=False)
-class Cylinder:
-    """A solid cylinder about the z axis of its own.
+class Cylinder(_Posed):
+    """A solid cylinder about its own z axis.
 
-    It counts as the regular prism of SIDES sides around it, whose edges stand out of it by 1/cos(pi / SIDES) - 1,
-    2 % of the radius; its ends and the middles of the prism's sides are its own.
+    Distances use the circumscribed regular prism of SIDES sides. The edges of the prism exceed the cylinder by
+    1/cos(pi / SIDES) - 1, 2 % of the radius; its ends and the centre lines of its sides lie on the cylinder.
 
     Attributes:
         radius: m.
         length: Along z, m.
-        position: Its centre. Shape (3,), m.
-        rotation: Its axes as columns. Shape (3, 3).
+        position: Centre. Shape (3,), m.
+        rotation: Axes of the cylinder as columns. Shape (3, 3).
 
     Raises:
-        ModelError: A radius or length that is not positive, a position that is missing, a rotation that is none.
+        ModelError: The radius or length is not positive, the position is missing, or the rotation is no rotation
+            matrix.
     """
 
     radius: float
@@ -140,9 +166,9 @@ class Cylinder:
     rotation: ArrayInput = field(default_factory=lambda: np.eye(3))
 
     def __post_init__(self) -> None:
-        for what in ("radius", "length"):
-            size = checked_number(getattr(self, what), "cylinder", what, positive=True, unit="m")
-            object.__setattr__(self, what, size)
+        for name in ("radius", "length"):
+            size = checked_number(getattr(self, name), "cylinder", name, positive=True, unit="m")
+            object.__setattr__(self, name, size)
         object.__setattr__(self, "position", _place(self.position, "cylinder"))
         object.__setattr__(self, "rotation", checked_rotation(self.rotation, "cylinder", "rotation"))
 
@@ -153,39 +179,26 @@ class Cylinder:
 
     @cached_property
     def hull(self) -> Hull:
-        """The prism in the cylinder's own axes."""
+        """The prism in the axes of the cylinder."""
         angles = 2 * pi / SIDES * (np.arange(SIDES) + 0.5)
         around = self.radius / cos(pi / SIDES) * np.column_stack([np.cos(angles), np.sin(angles)])
         half = np.full((SIDES, 1), self.length / 2)
         return convex_hull(np.vstack([np.hstack([around, -half]), np.hstack([around, half])]))
 
-    @property
-    def swelling(self) -> float:
-        """How far the shape goes beyond its core: nowhere."""
-        return 0.0
-
-    def placed(self, rotation: ArrayInput, translation: ArrayInput) -> Cylinder:
-        """The same cylinder where its frame has this rotation (3, 3) and position (3,), m, in another."""
-        turn, shift = _motion(rotation, translation)
-        return replace(self, position=turn @ self.position + shift, rotation=turn @ self.rotation)
-
-    def reach(self, point: ArrayInput) -> float:
-        """Largest distance of the prism's points from a point. Shape (3,), m."""
-        return _reach(self, point)
-
 
 @dataclass(frozen=True, eq=False)
-class Box:
+class Box(_Posed):
     """A solid box.
 
     Attributes:
-        size: Full length of its edges. Shape (3,), m; inf for a box without ends along an axis, as the walls of a wind
-            tunnel are: such a one has no core and no distance but to the rig.
-        position: Its centre. Shape (3,), m; the origin unless it is said.
-        rotation: Its axes as columns. Shape (3, 3).
+        size: Full length of the edges. Shape (3,), m; inf along an axis without ends, as for walls of a wind tunnel.
+            A box with an infinite edge has no core; only the distances of the captive trajectory rig accept it.
+        position: Centre. Shape (3,), m.
+        rotation: Axes of the box as columns. Shape (3, 3).
 
     Raises:
-        ModelError: An edge that is not positive, no finite edge, a position that is none, a rotation that is none.
+        ModelError: An edge is not positive, every edge is infinite, the position is not finite, or the rotation is no
+            rotation matrix.
     """
 
     size: ArrayInput
@@ -202,39 +215,29 @@ class Box:
 
     @property
     def core(self) -> Array:
-        """Its corners, the z edge from one to the next, then y, then x. Shape (8, 3), m.
+        """Corners: along the z edge first, then y, then x. Shape (8, 3), m.
 
         Raises:
-            ModelError: An edge that is infinite.
+            ModelError: An edge is infinite.
         """
         size = checked_array(self.size, (3,), "box", "size", unit="m")
         return np.asarray(self.position + (CORNERS * size / 2) @ self.rotation.T)
 
-    @property
-    def swelling(self) -> float:
-        """How far the shape goes beyond its core: nowhere."""
-        return 0.0
-
-    def placed(self, rotation: ArrayInput, translation: ArrayInput) -> Box:
-        """The same box where its frame has this rotation (3, 3) and position (3,), m, in another."""
-        turn, shift = _motion(rotation, translation)
-        return replace(self, position=turn @ self.position + shift, rotation=turn @ self.rotation)
-
     def reach(self, point: ArrayInput) -> float:
-        """Largest distance of its points from a point. Shape (3,), m; inf for a box without ends."""
-        return _reach(self, point) if np.isfinite(self.size).all() else np.inf
+        """Return the largest distance of the box's points from a point. Shape (3,), m; inf for an infinite box."""
+        return super().reach(point) if np.isfinite(self.size).all() else np.inf
 
 
 @dataclass(frozen=True, eq=False)
-class HalfSpace:
-    """Everything on one side of a plane: a floor, a wall.
+class HalfSpace(_SweptCore):
+    """All points on one side of a plane: a floor or a wall.
 
     Attributes:
-        normal: Of the plane, out of what is solid; kept at length 1. Shape (3,).
-        point: On the plane. Shape (3,), m.
+        normal: Normal of the plane, pointing out of the solid; normalised. Shape (3,).
+        point: A point on the plane. Shape (3,), m.
 
     Raises:
-        ModelError: A normal of no length, a point that is missing, something that is not finite.
+        ModelError: The normal has no length, the point is missing, or an entry is not finite.
     """
 
     normal: ArrayInput
@@ -250,40 +253,36 @@ class HalfSpace:
 
     @property
     def core(self) -> Array:
-        """Its point. Shape (1, 3), m."""
+        """Point on the plane. Shape (1, 3), m."""
         return np.array([self.point])
 
-    @property
-    def swelling(self) -> float:
-        """Zero: what is solid is said by the normal."""
-        return 0.0
-
     def placed(self, rotation: ArrayInput, translation: ArrayInput) -> HalfSpace:
-        """The same half-space where its frame has this rotation (3, 3) and position (3,), m, in another."""
+        """Return the half-space in another frame, in which its own has this rotation (3, 3) and position (3,), m."""
         turn, shift = _motion(rotation, translation)
         return HalfSpace(turn @ self.normal, turn @ self.point + shift)
 
     def reach(self, point: ArrayInput) -> float:
-        """Largest distance of its points from a point, which is inf."""
+        """Return inf: a half-space is unbounded."""
         checked_array(point, (3,), "half-space", "point")
         return np.inf
 
 
 @dataclass(frozen=True, eq=False)
-class Mesh:
-    """A body of triangles, of which the convex hull counts: hollows and holes are filled.
+class Mesh(_Posed):
+    """The convex hull of a triangle mesh; cavities and holes are filled.
 
     Attributes:
-        vertices: Shape (n, 3); None where a file is given.
-        faces: Triangles of vertices; None for all vertices. Vertices of no triangle do not count. Shape (m, 3).
-        position, rotation: Of the mesh's own axes in the frame it is given in. Shapes (3,), m; (3, 3).
-        file: STL, OBJ or DAE, read once: vertices and faces are its own.
-        scale: m for each unit of the vertices, a number or one for each axis; negative ones mirror.
-        hull: Of what counts, scaled, in the mesh's own axes, m.
+        vertices: Shape (n, 3); None if a file is given.
+        faces: Triangles as indices of vertices, or None to use every vertex. Unreferenced vertices are ignored. Shape
+            (m, 3).
+        position, rotation: Pose of the mesh's axes in the frame of the shape. Shapes (3,), m; (3, 3).
+        file: STL, OBJ or DAE file that vertices and faces are read from, once.
+        scale: m per unit of the vertices, a number or one for each axis; a negative factor mirrors.
+        hull: Convex hull of the scaled vertices in the mesh's axes, m.
 
     Raises:
-        ModelError: Vertices and a file, or neither; a file that cannot be read; fewer than 4 vertices or all of them in
-            a plane; faces of no vertices; a scale of zero; a position that is none, a rotation that is none.
+        ModelError: Both vertices and a file, or neither; an unreadable file; fewer than 4 vertices, or coplanar ones;
+            faces of unknown vertices; a zero scale; a position that is not finite, or no rotation matrix.
     """
 
     vertices: ArrayInput = None
@@ -296,9 +295,16 @@ class Mesh:
 
     def __post_init__(self) -> None:
         if self.file is not None:
-            self._read()
+            if self.vertices is not None or self.faces is not None:
+                raise ModelError("mesh: give vertices or a file, not both", name="file", value=self.file)
+            if not isinstance(self.file, str | Path) or not str(self.file):
+                raise ModelError(f"mesh: file {self.file!r} is not a path", name="file", value=self.file)
+            from models.shapes.mesh_files import read_mesh
+
+            for name, value in zip(("vertices", "faces"), read_mesh(self.file), strict=True):
+                object.__setattr__(self, name, value)
         elif self.vertices is None:
-            raise ModelError("mesh: give vertices or a file", name="vertices", value=None)
+            raise ModelError("mesh: vertices are missing; give vertices or a file", name="vertices", value=None)
         vertices = checked_array(self.vertices, ("vertices", 3), "mesh", "vertices", least=4)
         object.__setattr__(self, "vertices", vertices)
         if self.faces is not None:
@@ -309,53 +315,27 @@ class Mesh:
             object.__setattr__(self, "faces", faces)
         scale = one_for_each(self.scale, 3, "mesh", "scale", "axes")
         if not scale.all():
-            raise ModelError(f"mesh: scale {scale.tolist()} leaves nothing", name="scale", value=scale, limit=0.0)
+            message = f"mesh: scale {scale.tolist()} has a zero; every axis needs a nonzero factor"
+            raise ModelError(message, name="scale", value=scale, limit=0.0)
         object.__setattr__(self, "scale", scale)
         object.__setattr__(self, "position", _place(self.position, "mesh"))
         object.__setattr__(self, "rotation", checked_rotation(self.rotation, "mesh", "rotation"))
-        counted = vertices if self.faces is None else vertices[np.unique(self.faces)]
-        object.__setattr__(self, "hull", convex_hull(counted * scale))
+        used = vertices if self.faces is None else vertices[np.unique(self.faces)]
+        object.__setattr__(self, "hull", convex_hull(used * scale))
 
     @classmethod
     def around(cls, hull: Hull) -> Mesh:
-        """The body of a hull, which is not sought again."""
-        found = object.__new__(cls)
-        parts = {"vertices": hull.vertices, "faces": hull.faces, "position": np.zeros(3), "rotation": np.eye(3)}
-        for what, value in {**parts, "file": None, "scale": np.ones(3), "hull": hull}.items():
-            object.__setattr__(found, what, value)
-        return found
-
-    def _read(self) -> None:
-        if self.vertices is not None or self.faces is not None:
-            raise ModelError("mesh: give vertices or a file, not both", name="file", value=self.file)
-        if not isinstance(self.file, str | Path) or not str(self.file):
-            raise ModelError(f"mesh: file {self.file!r} is not a path", name="file", value=self.file)
-        from models.shapes.mesh_files import read_mesh
-
-        for what, value in zip(("vertices", "faces"), read_mesh(self.file), strict=True):
-            object.__setattr__(self, what, value)
+        """Return the mesh of a known hull, without computing the hull again."""
+        mesh = object.__new__(cls)
+        fields = {"vertices": hull.vertices, "faces": hull.faces, "position": np.zeros(3), "rotation": np.eye(3)}
+        for name, value in {**fields, "file": None, "scale": np.ones(3), "hull": hull}.items():
+            object.__setattr__(mesh, name, value)
+        return mesh
 
     @property
     def core(self) -> Array:
         """Vertices of the hull. Shape (m, 3), m."""
         return np.asarray(self.position + self.hull.vertices @ self.rotation.T)
-
-    @property
-    def swelling(self) -> float:
-        """How far the shape goes beyond its core: nowhere."""
-        return 0.0
-
-    def placed(self, rotation: ArrayInput, translation: ArrayInput) -> Mesh:
-        """The same mesh where its frame has this rotation (3, 3) and position (3,), m, in another."""
-        turn, shift = _motion(rotation, translation)
-        found = copy(self)  # with its hull, which is not sought again
-        object.__setattr__(found, "position", frozen(turn @ self.position + shift))
-        object.__setattr__(found, "rotation", frozen(turn @ self.rotation))
-        return found
-
-    def reach(self, point: ArrayInput) -> float:
-        """Largest distance of its points from a point. Shape (3,), m."""
-        return _reach(self, point)
 
 
 Shape: TypeAlias = Sphere | Capsule | Cylinder | Box | HalfSpace | Mesh
@@ -364,7 +344,7 @@ KINDS = (Sphere, Capsule, Cylinder, Box, HalfSpace, Mesh)
 
 
 def checked_shape(value: Any, owner: str, what: str) -> Shape:
-    """`value` itself; ModelError naming `owner` and `what` unless it is a shape."""
+    """Return `value` itself; raise a ModelError that names `owner` and `what` if it is not a shape."""
     if not isinstance(value, KINDS):
         names = ", ".join(kind.__name__ for kind in KINDS)
         message = f"{owner}: {what} must be a shape ({names}), not {value!r}"
@@ -374,15 +354,10 @@ def checked_shape(value: Any, owner: str, what: str) -> Shape:
 
 def _place(value: ArrayInput, owner: str, what: str = "position") -> Array:
     if value is None:
-        raise ModelError(f"{owner}: {what} is missing; say where it is", name=what, value=None)
+        raise ModelError(f"{owner}: {what} is missing; give its coordinates, shape (3,), m", name=what, value=None)
     return checked_array(value, (3,), owner, what)
 
 
 def _motion(rotation: ArrayInput, translation: ArrayInput) -> tuple[Array, Array]:
     turn = checked_rotation(rotation, "shape", "rotation")
     return turn, checked_array(translation, (3,), "shape", "translation")
-
-
-def _reach(shape: Sphere | Capsule | Cylinder | Box | Mesh, point: ArrayInput) -> float:
-    centre = checked_array(point, (3,), "shape", "point")
-    return float(np.linalg.norm(shape.core - centre, axis=1).max()) + shape.swelling

@@ -40,8 +40,8 @@ class AccessoryProblem:
         normals: Gradients of all limits at the points. Shape (M, l, nz + nu).
         strong: Which of them are equalities or have a multiplier. Shape (M, l), bool.
         weak: Which of them are active without a multiplier. Shape (M, l), bool.
-        node_normals, node_strong: The same for the states at the ends of the intervals. Shapes (N + 1, l', nz), (N + 1,
-            l').
+        node_normals, node_strong: The same for the states at the ends of the intervals.
+            Shapes (N + 1, l', nz), (N + 1, l').
         moved: Whether a control switches in an interval. Shape (N, nu), bool.
         switching: Second variation of shifting that switch, per squared area, unscaled. Shape (N, nu).
         unit: Scales of (z, u) with which the sweep is well conditioned. Shape (nz + nu,).
@@ -74,9 +74,8 @@ class AccessoryProblem:
         weight = curvature * size**2
         largest = float(weight.max(initial=0.0))
         negligible = size <= RESOLVED_SHARE * size.max(initial=0.0)  # whose size is not meaningful
-        curves = (weight > MACHINE_SHARE * largest) | (
-            negligible & (curvature > MACHINE_SHARE * curvature.max(initial=0.0))
-        )
+        is_curved = curvature > MACHINE_SHARE * curvature.max(initial=0.0)
+        curves = (weight > MACHINE_SHARE * largest) | (negligible & is_curved)
         self.range = np.where(curves, np.sqrt(largest / np.where(curves, curvature, 1.0)), sizes.control)
         state = self.along.state_size.copy()
         share_sizes(state, self.along.form.states, self.along.form.problem.declared.states, LIMIT_SHARE)
@@ -90,6 +89,7 @@ class AccessoryProblem:
         return [*keep, *inputs], [*range(len(keep)), *range(self.nz, self.nz + self.nu)]
 
     def _second_order(self) -> None:
+        """Set the derivatives of dynamics and Hamiltonian, in scaled variations."""
         along, form, m = self.along, self.along.form, len(self.along.s)
         lam, mu = form.sym("lam", form.nx), form.sym("mu", len(form.path))
         multipliers = np.zeros((m, len(form.path)))
@@ -127,9 +127,8 @@ class AccessoryProblem:
     def residual_slope(self) -> np.ndarray:
         """Remaining slope of T H along the controls that curve it, in scaled controls. Shape (M, nu)."""
         along = self.along
-        gradient = slope(along, self.adjoint.costate) + np.einsum(
-            "kmu,km->ku", along.control_limits_u, self.adjoint.control_multipliers
-        )
+        multipliers = self.adjoint.control_multipliers
+        gradient = slope(along, self.adjoint.costate) + np.einsum("kmu,km->ku", along.control_limits_u, multipliers)
         return np.asarray(np.where(self.linear_controls, 0.0, gradient * self.range))
 
     @property
@@ -147,7 +146,9 @@ class AccessoryProblem:
 
     @property
     def cost_scale(self) -> float:
-        """The same, for the states by the running cost alone: multipliers do not belong to the size of the cost."""
+        """Curvature over the sizes by the running cost alone for the states: multipliers do not belong to a size of the
+        cost.
+        """
         sizes, curvature = self.along.sizes, np.abs(self._curves[:, self.nx + 1 :])
         total = self.along.share @ (np.abs(self._cost_curves) @ sizes.state**2 + curvature @ sizes.control**2)
         return float(total) / 2

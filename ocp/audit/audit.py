@@ -147,6 +147,7 @@ class Audit:
 
     @property
     def _word(self) -> str:
+        """The verdict in one word or two."""
         return "passed" if self.passed else "not decided" if self.feasible and self.optimal is None else "FAILED"
 
     def __str__(self) -> str:
@@ -254,10 +255,10 @@ def audit(
         if name not in names:
             raise unknown_name("name in tolerances", name, names)
     constraint_values: dict[str, float] = {}
-    for check in violations(form, motion, judged_states, size, bounds, p, solution.horizon, constraints, grid.states):
+    for check in violations(along, motion, judged_states, constraints):
         finding = violation_finding(check, constraints, limits.get(check.name))
         findings.append(replace(finding, unit=form.units.get(check.name, "")))
-        constraint_values[check.name] = max(constraint_values.get(check.name, 0.0), float(np.max(check.missed)))
+        constraint_values[check.name] = max(constraint_values.get(check.name, 0.0), float(np.max(check.excess)))
 
     clearances = {name: clearance(form, each, solution, p) for name, each in problem.declared.apart.items()}
     findings += [clearance_finding(each, limits.get(name, CLEARANCE_TOLERANCE_M)) for name, each in clearances.items()]
@@ -265,7 +266,7 @@ def audit(
     findings.append(jump("control jump, relative", solution.control_interpolant, solution.horizon, size.control, None))
     is_sound = all(finding.passed for finding in findings)
     # an infeasible plan needs no best multipliers
-    optimum = optimality(form, solution, p, bounds, along, lost if is_sound else np.inf)
+    optimum = optimality(form, solution, p, bounds, along=along, allowed=lost if is_sound else np.inf)
     excess = cost.value if cost.passed and solution.cost > running + final else 0.0
     findings += optimality_findings(form, optimum, excess, lost, costates, stationarity, drift)
     undecided = optimum.curvature.flat
@@ -359,7 +360,7 @@ def integration_finding(motion: Reintegration, limit: float, is_unstable: bool) 
 def violation_finding(violation: Violation, constraints: float, tolerance: float | None) -> Finding:
     """Return the largest violation, relative to the size or, with a given tolerance, in its own unit."""
     if tolerance is not None:
-        return worst(violation.label, violation.missed, violation.t, tolerance)
+        return worst(violation.label, violation.excess, violation.t, tolerance)
     k = int(np.argmax(violation.shares))
     size, share = float(violation.sizes[k]), float(violation.shares[k])
     return Finding(violation.label, share * size, constraints * size, float(violation.t[k]) if share > 0 else None)

@@ -258,6 +258,7 @@ class _Search:
         self.best, self.when, self.points = np.full(n, np.inf), np.zeros(n), np.zeros((n, 2, 3))
 
     def run(self) -> Clearance:
+        """Halve intervals until every pair is decided, or the limits of the search are reached."""
         n, level = len(self.apart), self.top
         self._evaluate_at_closest_balls()
         blocks = np.arange(-(-self.pieces >> level) if level else self.pieces)

@@ -31,32 +31,32 @@ class IntegrationSettings:
         tolerance: Error over one grid cell, relative to the size of each state.
         rounding: Rounding error, relative to the value of a state.
         corrections: Largest number of corrections.
-        left: Largest remaining correction, relative to the sizes: ten times the tolerance.
-        falling: Largest ratio of successive corrections.
+        remainder: Largest remaining correction, relative to the sizes: ten times the tolerance.
+        contraction: Largest ratio of successive corrections.
         order: Order of the error of a step in its width.
-        pieces: Largest number of parts that a step is split into at once: the error of an unstable step does not tell
+        splits: Largest number of parts that a step is split into at once: the error of an unstable step does not tell
             its width.
         rounds: Largest number of rounds of splitting.
         steps: Largest number of simultaneous steps. Stiffer or chattering dynamics count as a breakdown within seconds.
         block: Steps in one call.
         blocks: Calls between two checks of the time limit.
         inline: Number of instructions of the dynamics up to which a step is one flat function.
-        grown: Factor between the deviation and the sum of the defects above which the dynamics are unstable.
+        growth: Factor between the deviation and the sum of the defects above which the dynamics are unstable.
     """
 
     tolerance: float = 1e-11
     rounding: float = 4 * float(np.finfo(float).eps)
     corrections: int = 5
-    left: float = 1e-10
-    falling: float = 0.1
+    remainder: float = 1e-10
+    contraction: float = 0.1
     order: int = 5
-    pieces: int = 4
+    splits: int = 4
     rounds: int = 40
     steps: int = 300_000
     block: int = 512
     blocks: int = 8
     inline: int = 1000
-    grown: float = 10.0
+    growth: float = 10.0
 
 
 SETTINGS = IntegrationSettings()
@@ -182,11 +182,11 @@ class _Newton:
                 break
             change = error + self._propagated(error[:, -1], x) if chained else error
             size = float(np.abs(change).reshape(-1, nx).max(axis=0) @ (1 / self.unit[:nx]))
-            if not size < SETTINGS.falling * last:
+            if not size < SETTINGS.contraction * last:
                 break
             rate = size / last if np.isfinite(last) else rate
             x = x + change
-            if rate * size <= SETTINGS.left:
+            if rate * size <= SETTINGS.remainder:
                 return _Converged(x, float(integral[:, -1, nx].sum()) + self._cost_change(change), rate)
             integral, last = self._integral(x), size
             error = None if integral is None else self._own_error(integral, x)

@@ -51,8 +51,8 @@ class Adjoint:
     Attributes:
         t: Ends of the intervals, s. Shape (N + 1,).
         costate: At the Gauss points, integrated backwards in every interval from the plan's own at its end. (N q, nx).
-        control_multipliers: Multipliers of the control limits at the Gauss points, per unit of s. Shape (N q, nu + r +
-            a).
+        control_multipliers: Multipliers of the control limits at the Gauss points, per unit of s.
+            Shape (N q, nu + r + a).
         state_multipliers: Multipliers of the state limits at the Gauss points, per unit of s. Atoms at the ends of the
             intervals are distributed to the adjacent points. Shape (N q, nx + r').
         error: Error of the costates over each interval, from end to end. Shape (N,).
@@ -61,8 +61,8 @@ class Adjoint:
         between: Error of the costates reported between the ends of an interval. Shape (N,).
         charge: Products of the multipliers of the state limits and their gaps, in each interval. Shape (N,).
         node_shifts: Part of the costates reported at the ends of the intervals that belongs to atoms before them: a
-            limit that a transcription imposes only at a node acts there at once for both adjacent intervals. Shape (N +
-            1, nx).
+            limit that a transcription imposes only at a node acts there at once for both adjacent intervals.
+            Shape (N + 1, nx).
         ends: The conditions at the ends.
     """
 
@@ -85,8 +85,8 @@ def adjoint(along: Linearisation, curved: np.ndarray | None, cost: float, shifts
         along: Linearisation of the plan.
         curved: T H_uu at the points, (M, nu, nu), or None if no path inequality has a control.
         cost: Size of the cost, by which errors are weighted.
-        shifts: Of an earlier call. They are subtracted from the reported costates at the nodes, so that the atoms
-            are distributed.
+        shifts: Node shifts of an earlier call. They are subtracted from the reported costates at the nodes, so that the
+            atoms are distributed.
     """
     (n, q), m = along.shape, along.state_limits.lower.shape[1]
     first, last = interval_end_costates(along)

@@ -1,5 +1,4 @@
-"""Second order: does the cost curve upwards along every feasible variation of a plan, and how much cost does the plan
-lose?
+"""Second order: does the cost curve upwards along every feasible variation of a plan, and how much does it lose?
 
 A stationary plan may be a maximum, a saddle point, or a minimum only up to a conjugate point. The second variation of
 the cost (:mod:`ocp.audit.accessory`) is swept backwards stage by stage. The cost must curve upwards along all
@@ -232,8 +231,8 @@ class _Linearised(NamedTuple):
 
     Attributes:
         whole: Variations of (z, u) at the points. Shape (N, q, nz + nu, nz + q nu).
-        step, stage: State at the end and cost, as functions of (z, 1, controls). Shapes (N, nz + 1, nz + 1 + q nu), (N,
-            nz + 1 + q nu, nz + 1 + q nu).
+        step, stage: State at the end and cost, as functions of (z, 1, controls).
+            Shapes (N, nz + 1, nz + 1 + q nu), (N, nz + 1 + q nu, nz + 1 + q nu).
         metric: Square root of the quadrature weight of each point. Shape (N, q).
         end_cost, end_rows, start_cost, start_rows: See :func:`ocp.audit.accessory.end_conditions`.
         scale: Largest curvature along the controls of a stage.

@@ -101,13 +101,13 @@ class Linearisation:
         state_size: Sizes of the states by which costates are judged. Shape (nx,).
         control_size: Sizes of the controls by which distances to their limits are judged. Shape (nu,).
         end_row, end_y: End rows, then start rows, and their derivatives in (x, x0, T). Shapes (m,), (m, 2 nx + 1).
-        final_y, final_yy: First and second derivatives of the terminal cost in these. Shapes (2 nx + 1,), (2 nx + 1, 2
-            nx + 1).
+        final_y, final_yy: First and second derivatives of the terminal cost in these.
+            Shapes (2 nx + 1,), (2 nx + 1, 2 nx + 1).
         control_limits: Limits of the controls, of path rows with a control (``mixed``) and of arcs along state
             equalities, in this order. Shape (M, nu + r + a).
         control_limits_u: Their derivatives in the controls. Shape (M, nu + r + a, nu).
-        state_limits: Limits of the states and of path rows without a control (``still``), in this order. Shape (M, nx +
-            r').
+        state_limits: Limits of the states and of path rows without a control (``still``), in this order.
+            Shape (M, nx + r').
         state_limits_x: Their derivatives in (x, T). Shape (M, nx + r', nx + 1).
         node_limits, node_limits_x: The same at the N + 1 ends of the intervals.
         low, high: Bounds of the controls at the points. Shape (M, nu).
@@ -140,6 +140,7 @@ class Linearisation:
         self._arcs()
 
     def _differentiate(self) -> None:
+        """Set the derivatives of running cost, dynamics and path rows."""
         form, m = self.form, len(self.s)
         self.y = ca.vertcat(form.x, form.T, form.u)
         self.fraction, *self.scaled = form.cached("over the fraction of the horizon", lambda: over_fraction(form))
@@ -182,6 +183,7 @@ class Linearisation:
         return np.asarray((self.width[:, None] * self.weight).ravel())
 
     def _at_ends(self) -> None:
+        """Set the rows at the ends and the derivatives of these and of the terminal cost."""
         form, solution = self.form, self.solution
         x0, x1 = (solution.state_interpolant(np.array([end]))[0] for end in (0.0, 1.0))
         u0, u1 = stack(solution.controls, 2)[[0, -1]]
@@ -235,6 +237,7 @@ class Linearisation:
         return np.asarray(np.where(distance <= RESOLVED_SHARE * full, full, own))
 
     def _limits(self) -> None:
+        """Set the limits of controls and states at the points and at the ends of the intervals."""
         form, sizes, (n, q) = self.form, self.sizes, self.shape
         nx, nu = form.nx, form.nu
         self.mixed = np.flatnonzero(form.path.uses_control)

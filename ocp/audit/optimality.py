@@ -178,15 +178,12 @@ class _Dual:
         reachable = np.einsum("k,kij,j->i", along.share, np.abs(along.rate_y[:, :, nx + 1 :]), self.step)
         self.end_price = max(1.0, float((reachable / along.state_size).max(initial=0.0)))
         # arcs of the states are among the state limits
-        chosen = along.control_limits.near & (np.arange(along.control_limits_u.shape[1]) < nu + len(along.mixed))
+        controls, states, slopes = along.control_limits, along.state_limits, along.control_limits_u
+        chosen = controls.near & (np.arange(slopes.shape[1]) < nu + len(along.mixed))
         chosen[:, :nu] = True
-        self.control_limits = _Multipliers.of(
-            self.program, along.control_limits, chosen, along.control_limits_u, self.step, along.share
-        )
+        self.control_limits = _Multipliers.of(self.program, controls, chosen, slopes, self.step, along.share)
         scales = np.append(along.state_size, 0.0)
-        self.state_limits = _Multipliers.of(
-            self.program, along.state_limits, along.state_limits.near, along.state_limits_x, scales
-        )
+        self.state_limits = _Multipliers.of(self.program, states, states.near, along.state_limits_x, scales)
         interior = along.node_limits.near & (along.nodal | ~along.node_limits.equal)
         interior[[0, -1]] = False  # the conditions at the ends are separate
         self.node = _Multipliers.of(self.program, along.node_limits, interior, along.node_limits_x, scales)
@@ -320,8 +317,8 @@ class Optimality:
             control changes that are resolved.
         error_size: Reference of the costate errors, in units of cost. The cost is quadratic in these errors.
         t: Times of the Gauss points, s. Shape (N q,).
-        stationarity: Largest remaining slope of the Hamiltonian at these, relative to the sizes of its parts. Shape (N
-            q,).
+        stationarity: Largest remaining slope of the Hamiltonian at these, relative to the sizes of its parts.
+            Shape (N q,).
         adjoint: Costates and multipliers.
         hamiltonian: The Hamiltonian along the plan.
         curvature: The second variation.
@@ -349,6 +346,7 @@ def optimality(
     solution: Solution,
     p: np.ndarray,
     bounds: Bounds,
+    *,
     along: Linearisation | None = None,
     allowed: float = LIMIT_SHARE,
 ) -> Optimality:
@@ -370,10 +368,10 @@ def optimality(
         candidate, loss = first, _misfit(along, first, curved)
         for _ in range(4):  # each pass resolves atoms at single nodes better by the width of an interval
             candidate = adjoint(along, curved, cost, candidate.node_shifts)
-            loss_found = _misfit(along, candidate, curved)
-            if loss_found >= loss:
+            new_loss = _misfit(along, candidate, curved)
+            if new_loss >= loss:
                 break
-            first, loss = candidate, loss_found
+            first, loss = candidate, new_loss
     accessory = AccessoryProblem(along, first)
     spread = accessory.hamiltonian_scale
     cost = max(abs(solution.cost), LIMIT_SHARE * accessory.cost_scale, LIMIT_SHARE**2 * along.slope_size)
@@ -417,11 +415,13 @@ def _total_loss(by_interval: np.ndarray, multipliers: Adjoint) -> float:
     return float(by_interval.sum() + multipliers.ends.charge)
 
 
-def _misfit(along: Linearisation, found: Adjoint, curved: np.ndarray | None) -> float:
+def _misfit(along: Linearisation, multipliers: Adjoint, curved: np.ndarray | None) -> float:
     """Return the loss and the costate errors of a plan with these multipliers, in units of cost."""
     assert curved is not None
-    loss = control_loss(along, found.costate, found.control_multipliers, curved).sum()
-    return float(loss + found.charge.sum() + found.ends.charge + found.total + found.ends.transversality)
+    loss = control_loss(along, multipliers.costate, multipliers.control_multipliers, curved).sum()
+    return float(
+        loss + multipliers.charge.sum() + multipliers.ends.charge + multipliers.total + multipliers.ends.transversality
+    )
 
 
 def _control_curvature(along: Linearisation) -> np.ndarray | None:

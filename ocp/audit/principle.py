@@ -1,5 +1,4 @@
-"""The minimum principle along a plan: does an admissible control lower the Hamiltonian, and by how much would it lower
-the cost?
+"""The minimum principle along a plan: does an admissible control lower the Hamiltonian, and what does that save?
 
 The multipliers of the solver are not used. At each point the multipliers of the limits of the controls are computed by
 least squares, with the signs that the minimum principle demands (Bryson, Ho 1975, chapter 3). The remaining slope of

@@ -20,10 +20,10 @@ import numpy as np
 
 from ocp.audit.correction import SETTINGS, IntegratedMotion, corrected_motion
 from ocp.audit.linearisation import Linearisation
-from ocp.audit.sizes import FineGrid, Sizes, integral, row_changes
+from ocp.audit.sizes import FineGrid, integral, row_changes
 from ocp.console import check_time
 from ocp.curves import dormand_prince_step, newton_coefficients
-from ocp.problem.formulation import Bounds, Formulation
+from ocp.problem.formulation import Formulation
 from ocp.problem.values import evaluate_in_blocks
 from ocp.tolerances import LIMIT_SHARE, SOLVER_SHARE
 
@@ -73,8 +73,8 @@ class Reintegration:
             return False
         first = int(np.argmax(beyond))
         k = int(self.interval[first])
-        here = self.local_errors[self.interval == k].max()
-        return bool(self.added[k] + here <= limit / SETTINGS.grown)
+        defect = self.local_errors[self.interval == k].max()
+        return bool(self.added[k] + defect <= limit / SETTINGS.growth)
 
 
 def reintegrate(along: Linearisation, grid: FineGrid) -> Reintegration:
@@ -93,8 +93,8 @@ def reintegrate(along: Linearisation, grid: FineGrid) -> Reintegration:
         grid.states,
         cost,
         local_cost,
-        _relative(states - grid.states, sizes.state),
-        _relative(local - grid.states, sizes.state),
+        _worst(np.abs(states - grid.states) / sizes.state),
+        _worst(np.abs(local - grid.states) / sizes.state),
         np.concatenate([[0.0], np.cumsum(_worst(defects))]),
         float(grid.t[np.argmax(failed)]) if failed.any() else None,
     )
@@ -112,11 +112,6 @@ def integrated_motion(along: Linearisation, grid: FineGrid) -> IntegratedMotion:
     motions = (starts, by_interval), (chained, continuous)
     local, states = (np.concatenate([start[:, None], values[:, :, :-1]], axis=1) for start, values in motions)
     return IntegratedMotion(local, states, float(by_interval[:, -1, -1].sum()), float(continuous[-1, -1, -1]))
-
-
-def _relative(difference: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """Return the largest difference of each row (M, n), relative to the sizes (n,). Shape (M,)."""
-    return _worst(np.abs(difference) / sizes)
 
 
 def _worst(values: np.ndarray) -> np.ndarray:
@@ -196,7 +191,7 @@ class Flow:
                 ratio = (error / allowed).max(axis=1)
             required = np.ceil(np.where(np.isfinite(ratio), ratio, np.inf) ** (1 / SETTINGS.order))
             started = np.isfinite(before).all(axis=1)  # a step without a finite start waits
-            parts = np.where(accurate | ~started, 1, np.clip(required, 2, SETTINGS.pieces)).astype(int)[~valid]
+            parts = np.where(accurate | ~started, 1, np.clip(required, 2, SETTINGS.splits)).astype(int)[~valid]
             cell, place, width = cell[~valid], place[~valid], width[~valid]
             if not parts.size or parts.sum() > SETTINGS.steps:
                 break
@@ -257,7 +252,7 @@ class Violation:
         label: Description, such as ``end of q``.
         name: Name of the state, control or constraint.
         t: Times, s. Shape (K,).
-        missed: Largest violation among its rows at each time, infinite for nan. Shape (K,).
+        excess: Largest violation among its rows at each time, infinite for nan. Shape (K,).
         shares: Largest violation relative to the size of its row. Shape (K,).
         sizes: Size of that row. Shape (K,).
     """
@@ -265,34 +260,24 @@ class Violation:
     label: str
     name: str
     t: np.ndarray
-    missed: np.ndarray
+    excess: np.ndarray
     shares: np.ndarray
     sizes: np.ndarray
 
 
-def violations(
-    form: Formulation,
-    again: Reintegration,
-    states: np.ndarray,
-    sizes: Sizes,
-    bounds: Bounds,
-    p: np.ndarray,
-    horizon: float,
-    share: float,
-    reported: np.ndarray,
-) -> list[Violation]:
+def violations(along: Linearisation, motion: Reintegration, states: np.ndarray, share: float) -> list[Violation]:
     """Return the violation of every bound and constraint along states (M, nx) on the fine grid.
 
     If a constraint declares a tolerance, its size is at most that for which the allowed ``share`` equals the tolerance.
-    It is then also judged along the ``reported`` states (M, nx), which are the ones that are executed.
+    It is then also judged along the states of the plan itself, which are the ones that are executed.
     """
-    lower, upper = bounds
+    form, sizes, p, horizon, (lower, upper) = along.form, along.sizes, along.p, along.solution.horizon, along.bounds
     places = form.bounds.places
     results: list[Violation] = []
-    first, last = slice(0, 1), slice(-1, None)
+    whole, first, last = slice(None), slice(0, 1), slice(-1, None)
     for kind, pool, values, size, at, description in (
-        ("state", form.states, states, sizes.state, slice(None), "bounds of"),
-        ("control", form.controls, again.controls, sizes.control, slice(None), "bounds of"),
+        ("state", form.states, states, sizes.state, whole, "bounds of"),
+        ("control", form.controls, motion.controls, sizes.control, whole, "bounds of"),
         ("initial", form.states, states, sizes.state, first, "start of"),
         ("terminal", form.states, states, sizes.state, last, "end of"),
     ):
@@ -304,18 +289,17 @@ def violations(
                 bounded = low == high
             if np.any(bounded):
                 excess = excess_over(values[at][:, place][:, bounded], low[bounded], high[bounded])
-                results.append(violation_of(f"{description} {name}", name, again.t[at], excess, size[place][bounded]))
-    initial = states[0], again.controls[0]
+                results.append(violation_of(f"{description} {name}", name, motion.t[at], excess, size[place][bounded]))
+    initial = states[0], motion.controls[0]
     entries = LIMIT_SHARE * np.concatenate([sizes.state, sizes.control])
-    whole = slice(None)
-    here = states, again.controls, again.t, horizon, p, (form.x0, initial[0]), (form.u0, initial[1])
+    point = states, motion.controls, motion.t, horizon, p, (form.x0, initial[0]), (form.u0, initial[1])
     outputs = [form.path.expression, form.watch.expression]
-    sampled = dict(zip(("path", "watch"), form.sampled(outputs, *here, cache_as="rows along a plan"), strict=True))
+    sampled = dict(zip(("path", "watch"), form.sampled(outputs, *point, cache_as="rows along a plan"), strict=True))
     for kind, at in (("path", whole), ("start", first), ("end", last), ("watch", whole)):
         rows, size = getattr(form, kind), getattr(sizes, kind)
         if len(rows) == 0:
             continue
-        x, u, t = states[at], again.controls[at], again.t[at]
+        x, u, t = states[at], motion.controls[at], motion.t[at]
         if kind in sampled:
             g = sampled[kind]
         else:
@@ -324,7 +308,7 @@ def violations(
         excess = excess_over(_integrated(form, kind, g, t), lower[rows.bounds], upper[rows.bounds])
         limited = np.isfinite(rows.tolerance)
         if kind in sampled and limited.any():
-            g_reported = form.sampled(outputs, reported, *here[1:], cache_as="rows along a plan")[kind == "watch"]
+            g_reported = form.sampled(outputs, motion.plan, *point[1:], cache_as="rows along a plan")[kind == "watch"]
             g_reported = _integrated(form, kind, g_reported, t)
             reported_excess = excess_over(g_reported, lower[rows.bounds], upper[rows.bounds])
             excess = np.where(limited, np.maximum(excess, reported_excess), excess)
@@ -332,16 +316,15 @@ def violations(
         at_max = np.argmax(excess, axis=0), np.arange(len(rows))
         # judge a violation by its local rate of change
         if kind != "watch" and np.any(excess[at_max] > SOLVER_SHARE * size[at_max]):
-            change = row_changes(form, kind, (x[at_max[0]], u[at_max[0]], t[at_max[0]]), initial, horizon, p, entries)[
-                1
-            ]
+            samples = x[at_max[0]], u[at_max[0]], t[at_max[0]]
+            _, change = row_changes(form, kind, samples, initial, horizon, p, entries)
             local_size = change.sum(axis=0)[at_max[1], at_max[1]] / LIMIT_SHARE
             size[at_max] = np.clip(local_size, SOLVER_SHARE * size[at_max], size[at_max])
         with np.errstate(divide="ignore"):
             size = np.minimum(size, rows.tolerance / share)
         for name in rows.names:
-            mine = rows.of(name)
-            results.append(violation_of(name, name, t, excess[:, mine], size[:, mine]))
+            own_rows = rows.of(name)
+            results.append(violation_of(name, name, t, excess[:, own_rows], size[:, own_rows]))
     return results
 
 

@@ -249,8 +249,8 @@ def _rows_of(
     nearest = np.minimum(1.0, nearest_bound(_select(bounds, rows.bounds)))
     threshold, is_constant = np.where(moves, 0.0, STANDSTILL), ~moves & (largest > STANDSTILL)
     for name in rows.names:
-        mine = rows.of(name)
-        size[mine] = _floored(size[mine], is_constant[mine], nearest[mine], threshold[mine])[0]
+        own_rows = rows.of(name)
+        size[own_rows] = _floored(size[own_rows], is_constant[own_rows], nearest[own_rows], threshold[own_rows])[0]
     return np.asarray(size)
 
 
@@ -264,9 +264,9 @@ def _watched(form: Formulation, by_variables: np.ndarray, horizon: float, path_l
     by_variables = np.where(form.watch_integral, horizon, 1.0) * by_variables
     length, size = _spread(path_lengths)[0], by_variables.copy()
     for name in form.watch.names:
-        mine = form.watch.of(name)
+        own_rows = form.watch.of(name)
         if form.problem.declared.watch[name].way is not None:
-            size[mine] = max(length[mine].max(), HELD_SHARE * by_variables[mine].max())
+            size[own_rows] = max(length[own_rows].max(), HELD_SHARE * by_variables[own_rows].max())
     return np.asarray(size)
 
 

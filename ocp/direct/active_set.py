@@ -157,6 +157,9 @@ class NewtonSettings:
     price: float = 1e6
 
 
+SETTINGS = NewtonSettings()
+
+
 class Newton:
     """Newton's method for one program, with its matrix in a banded order.
 
@@ -164,10 +167,8 @@ class Newton:
         program, transcription: The program.
     """
 
-    def __init__(
-        self, program: Program, transcription: Transcription, settings: NewtonSettings = NewtonSettings()
-    ) -> None:
-        self._program, self._settings = program, settings
+    def __init__(self, program: Program, transcription: Transcription) -> None:
+        self._program = program
         n, m = transcription.size, transcription.n_rows
         row, column = (np.array(part, dtype=np.int64) for part in program.jacobian.sparsity_out(1).get_triplet())
         first, second = (np.array(part, dtype=np.int64) for part in program.hessian.sparsity_out(0).get_triplet())
@@ -200,9 +201,9 @@ class Newton:
             scales: Units in which residuals and multipliers are judged.
         """
         began, earlier, steps = time.monotonic(), list[Sides](), 0
-        while len(earlier) < self._settings.sets and not any(_same(sides, each) for each in earlier):
+        while len(earlier) < SETTINGS.sets and not any(_same(sides, each) for each in earlier):
             earlier.append(sides)
-            root = self._root(start, sides, arguments, scales, self._settings.steps - steps)
+            root = self._root(start, sides, arguments, scales, SETTINGS.steps - steps)
             if root is None:
                 return None
             steps, start = steps + root.iterations, root
@@ -218,16 +219,16 @@ class Newton:
         return None
 
     def _root(
-        self, start: Outcome, sides: Sides, arguments: dict[str, np.ndarray], scales: Scales, most: int
+        self, start: Outcome, sides: Sides, arguments: dict[str, np.ndarray], scales: Scales, max_steps: int
     ) -> Outcome | None:
-        """Take at most ``most`` Newton steps with a fixed active set; None if they do not converge."""
-        a, b, c, p, settings = scales.variables, scales.rows, scales.cost, arguments["p"], self._settings
+        """Take at most ``max_steps`` Newton steps with a fixed active set; None if they do not converge."""
+        a, b, c, p = scales.variables, scales.rows, scales.cost, arguments["p"]
         fixed, held = _held(sides, arguments)
         target = np.where(sides["x"] > 0, arguments["ubx"], arguments["lbx"])
         row_target = np.where(sides["g"] > 0, arguments["ubg"], arguments["lbg"])
         v, lam = np.where(fixed, target, start.variables), np.where(held, start.multipliers, 0.0)
         before, is_new, matrix = np.inf, False, None
-        for step in range(most + 1):
+        for step in range(max_steps + 1):
             slope, jacobian = self._program.numbers.first(v, p)
             cost, rows = self._program.numbers.values(v, p)
             along = np.bincount(self._column, jacobian.data * lam[self._row], minlength=len(v))
@@ -235,17 +236,17 @@ class Newton:
             residual = np.where(held, rows - row_target, 0.0) / b
             multipliers = np.abs(lam * b / c)
             error = max(
-                np.abs(gradient).max(initial=0.0) / max(1.0, multipliers.max(initial=0.0) / settings.multipliers),
+                np.abs(gradient).max(initial=0.0) / max(1.0, multipliers.max(initial=0.0) / SETTINGS.multipliers),
                 np.abs(residual).max(initial=0.0) / np.abs(v / a).max(initial=1.0),
                 float(multipliers @ np.abs(residual)) / max(1.0, abs(cost / c)),  # the cost of the row residuals
             )
-            stalls = is_new and settings.gain * before < error <= SOLVER_RESIDUAL  # limited by rounding
-            if error <= settings.tolerance or stalls:
+            stalls = is_new and SETTINGS.gain * before < error <= SOLVER_RESIDUAL  # limited by rounding
+            if error <= SETTINGS.tolerance or stalls:
                 status = SolverStatus.SOLVED
                 return Outcome(v, cost, rows, lam, status, str(status), step, 0.0, False, "newton")
-            if step == most or not error < np.inf or (is_new and error > before and step > 1) or reason_to_stop():
+            if step == max_steps or not error < np.inf or (is_new and error > before and step > 1) or reason_to_stop():
                 return None
-            is_new = matrix is None or error > settings.gain * before
+            is_new = matrix is None or error > SETTINGS.gain * before
             if is_new:
                 matrix = self._matrix(v, p, lam, (fixed, held), scales)
             if matrix is None:
@@ -289,7 +290,7 @@ class Newton:
             np.maximum.at(of_row, self._row, np.where(slopes != 0, of_variable[self._column], 0.0))
         weight = np.divide(np.sqrt(np.where(of_row > 0, of_row / largest, 1.0)), size, out=np.zeros(m), where=size > 0)
         slopes *= weight[self._row]
-        penalty = self._settings.price * largest
+        penalty = SETTINGS.price * largest
         by_row = sp.csr_array((slopes[self._by_row], self._within[0], self._starts[0]), shape=(m, n))
         by_column = sp.csr_array((slopes[self._by_column], self._within[1], self._starts[1]), shape=(n, m))
         penalty_matrix = by_column @ by_row
@@ -301,7 +302,7 @@ class Newton:
         values[self._diagonal_at] *= 1.0 + 4 * np.finfo(float).eps  # curvature at this level may be rounding
         values[self._diagonal_at[fixed]] = 1.0
         factors = self._order.cholesky(values)
-        return None if factors is None else _Matrix(factors, by_row, by_column, weight, penalty, self._settings)
+        return None if factors is None else _Matrix(factors, by_row, by_column, weight, penalty)
 
 
 @dataclass(frozen=True)
@@ -320,7 +321,6 @@ class _Matrix:
     by_column: sp.csr_array
     weight: np.ndarray
     price: float
-    settings: NewtonSettings
 
     def step(self, gradient: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return Newton's step of variables and multipliers, scaled, by passes of the method of multipliers."""
@@ -333,8 +333,8 @@ class _Matrix:
             violation = self.by_row @ move + residual
             multipliers = multipliers + self.price * violation
             largest = float(np.abs(violation).max(initial=0.0))
-            tolerance = tolerance or self.settings.exact * max(largest, float(np.abs(residual).max(initial=0.0)))
-            if not tolerance < largest < (1 - self.settings.gain) * last:
+            tolerance = tolerance or SETTINGS.exact * max(largest, float(np.abs(residual).max(initial=0.0)))
+            if not tolerance < largest < (1 - SETTINGS.gain) * last:
                 break
             last = largest
         return move[place], self.weight * multipliers
@@ -346,9 +346,9 @@ def _held(sides: Sides, arguments: dict[str, np.ndarray]) -> tuple[np.ndarray, n
     return fixed, held
 
 
-def _same(sides: Sides, others: Sides) -> bool:
+def _same(sides: Sides, other_sides: Sides) -> bool:
     """Return whether two active sets are the same."""
-    return all(np.array_equal(side, others[kind]) for kind, side in sides.items())
+    return all(np.array_equal(side, other_sides[kind]) for kind, side in sides.items())
 
 
 class Bordered:

@@ -20,17 +20,7 @@ from ocp.console import check_time
 from ocp.curves import PiecewisePolynomial
 from ocp.problem.values import symbols_of
 
-__all__ = [
-    "SIZES",
-    "Block",
-    "Derivatives",
-    "Interpolants",
-    "Program",
-    "Stages",
-    "Transcription",
-    "assemble",
-    "derivatives",
-]
+__all__ = ["Block", "Derivatives", "Interpolants", "Program", "Stages", "Transcription", "assemble", "derivatives"]
 
 
 @dataclass(frozen=True)
@@ -154,6 +144,7 @@ class Transcription:
 
     @property
     def n_rows(self) -> int:
+        """Number of rows."""
         return len(self.row_labels)
 
     @property

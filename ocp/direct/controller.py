@@ -121,18 +121,14 @@ def problem_header(form: Formulation, transcription: Transcription) -> str:
         "CONTROL_PIECES": len(curves.mesh) - 1,
         "CONTROL_NODES": len(curves.control_nodes),
     }
-    lines = [f"/* {comment(form.name)} */", *(f"#define PLAN_{name} {size}" for name, size in sizes.items())]
+    title = quoted(form.name).replace("*/", "* /")
+    lines = [f"/* {title} */", *(f"#define PLAN_{name} {size}" for name, size in sizes.items())]
     tables = {"breaks": curves.breaks, "nodes": curves.nodes, "mesh": curves.mesh, "samples": curves.control_nodes}
     for name, values in tables.items():
         lines.append(f"static const double plan_{name}[] = {{{', '.join(f'{value:.17g}' for value in values)}}};")
     for name, words in (("parameters", labels), ("columns", [*form.state_labels, *form.control_labels])):
         lines.append(f"static const char *const plan_{name}[] = {{{', '.join([*map(quoted, words), '0'])}}};")
     return "\n".join([*lines, ""])
-
-
-def comment(text: str) -> str:
-    """Return a text as the content of a C comment."""
-    return quoted(text).replace("*/", "* /")
 
 
 def quoted(text: str) -> str:

@@ -114,9 +114,8 @@ def diagnosis(
         if labels[i] not in reported:
             reported.add(labels[i])
             lines.append(f"  {labels[i]} is missed by {violation[i]:.3g} at {fractions[i] * horizon:.4g} s")
-            worst.append(
-                {"name": labels[i], "value": float(violation[i]), "limit": 0.0, "time": float(fractions[i] * horizon)}
-            )
+            time = float(fractions[i] * horizon)
+            worst.append({"name": labels[i], "value": float(violation[i]), "limit": 0.0, "time": time})
     lines += at_bounds(built, outcome.variables, arguments, horizon)
     if not reported and not undefined.size:
         lines.append("  all constraints are met; the plan is feasible but not optimal")

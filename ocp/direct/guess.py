@@ -1,5 +1,4 @@
-"""Initial points of a solver: guesses of every kind evaluated at the variables of a transcription, and alternative
-starts.
+"""Initial points of a solver: guesses evaluated at the variables of a transcription, and alternative starts.
 
 If the solver fails from the guess, it may start from zeros or from a roll-out of the dynamics.
 """
@@ -102,14 +101,12 @@ def shifted_indices(transcription: Transcription, intervals: int) -> tuple[np.nd
     The index itself where the horizon ends earlier.
     """
     step = intervals / (len(transcription.mesh) - 1)
-    meanings = [
-        f"{role} {entry}" for role, entry in zip(transcription.variable_role, transcription.variable_entry, strict=True)
-    ]
+    roles, entries = transcription.variable_role, transcription.variable_entry
+    meanings = [f"{role} {entry}" for role, entry in zip(roles, entries, strict=True)]
+    variables = meanings, transcription.variable_fraction
+    rows = transcription.row_labels, transcription.row_fractions
     indices = []
-    for kinds, fractions in (
-        (meanings, transcription.variable_fraction),
-        (transcription.row_labels, transcription.row_fractions),
-    ):
+    for kinds, fractions in (variables, rows):
         _, label = np.unique(kinds, return_inverse=True)
         order = np.lexsort((fractions, label))
         key = label[order] + fractions[order] / 2  # sorted by meaning, then by time
@@ -287,9 +284,9 @@ def roll_out(form: Formulation, transcription: Transcription, point: np.ndarray,
     rate = form.function("rate", [form.f], ["f"])
     x, d = ca.MX.sym("x", form.nx), ca.MX.sym("d", 3 * form.nu + 2)
 
-    def slope(place: float, state_here: ca.MX) -> ca.MX:
+    def slope(place: float, state_at: ca.MX) -> ca.MX:
         offset = round(2 * place) * form.nu
-        return rate(state_here, d[offset : offset + form.nu], d[-2] + place * d[-1], horizon, p)
+        return rate(state_at, d[offset : offset + form.nu], d[-2] + place * d[-1], horizon, p)
 
     step = ca.Function("step", [x, d], [rk4_step(slope, x, d[-1])])
     start = point[transcription.start]

@@ -1,5 +1,6 @@
-"""Solver calls: options, progress, interruption and status; and the solution from a solver's result, with costates and
-cost gradients.
+"""Solver calls, and the solution from the result of a solver.
+
+A call handles options, progress, interruption and status. The solution adds curves, costates and cost gradients.
 """
 
 from __future__ import annotations
@@ -144,7 +145,12 @@ def build_solver(
             "ng": list(stages.rows),
             "N": len(stages.states) - 1,
         }
-    check_loaded(solver)
+    if not ca.has_nlpsol(solver):
+        try:
+            ca.load_nlpsol(solver)
+        except RuntimeError as error:
+            reason = str(error).partition("Error code: ")[2].partition("\n")[0] or last_line(error)
+            raise SolveError(f"{solver} cannot be loaded: {reason}", name="solver", value=solver) from error
     try:
         return ca.nlpsol("solver", solver, nlp, {**settings, solver: solver_options}), progress
     except RuntimeError as error:
@@ -154,19 +160,8 @@ def build_solver(
 
 def iteration_limit(solver: str, options: dict[str, Any]) -> int:
     """Return the iteration limit in a solver's options; 0 if they are invalid."""
-    most = {"max_iter": IPOPT["max_iter"], **DEFAULTS[solver], **options}["max_iter"]
-    return int(most) if isinstance(most, int | float | np.number) else 0
-
-
-def check_loaded(solver: str) -> None:
-    """Raise SolveError with the system's reason if the library of a solver cannot be loaded."""
-    if ca.has_nlpsol(solver):
-        return
-    try:
-        ca.load_nlpsol(solver)
-    except RuntimeError as error:
-        reason = str(error).partition("Error code: ")[2].partition("\n")[0] or last_line(error)
-        raise SolveError(f"{solver} cannot be loaded: {reason}", name="solver", value=solver) from error
+    limit = {"max_iter": IPOPT["max_iter"], **DEFAULTS[solver], **options}["max_iter"]
+    return int(limit) if isinstance(limit, int | float | np.number) else 0
 
 
 def fatrop_functions(program: Program, watch: FatropMonitor) -> dict[str, Any]:

@@ -225,13 +225,13 @@ class Prepared:
         elastic = None if attempts[-1].is_final else self._elastic(first)
         remaining = self._max_iterations - sum(attempt.outcome.iterations for attempt in attempts[1:])
         if elastic is not None and check and remaining > 0:
-            everything = self._all_names
-            attempts.append(
-                self._attempt("elastic plan", elastic.plan, everything, arguments, bounds, self._short_solver)
-            )
+            start = "elastic plan", elastic.plan, self._all_names
+            attempts.append(self._attempt(*start, arguments, bounds, self._short_solver))
             if attempts[-1].plan is not None:
                 return attempts[-1].plan
         decisive = attempts[-1] if attempts[-1].is_final else first
+        point = decisive.arguments["x0"]
+        sizes = sizes_along(self._pattern, point, decisive.names, bounds, p)
         raise diagnosis(
             self,
             decisive.outcome,
@@ -240,7 +240,7 @@ class Prepared:
             decisive.solution,
             elastic,
             [str(attempt) for attempt in attempts],
-            self._scaling_fault(decisive, bounds),
+            scaling_fault(self._pattern, point, p, decisive.scales, sizes),
         ) from decisive.error
 
     def _alternative_attempts(self, first: Attempt, arguments: dict[str, np.ndarray], bounds: Bounds) -> list[Attempt]:
@@ -357,12 +357,6 @@ class Prepared:
             # its tolerances are absolute: do not enlarge the adjoint variables
             return dataclasses.replace(scales, cost=max(scales.cost, 1.0))
         return scales
-
-    def _scaling_fault(self, attempt: Attempt, bounds: Bounds) -> str:
-        """Return a description of bad scaling for the solver, or ""."""
-        x0, p = attempt.arguments["x0"], attempt.arguments["p"]
-        sizes = sizes_along(self._pattern, x0, attempt.names, bounds, p)
-        return scaling_fault(self._pattern, x0, p, attempt.scales, sizes)
 
     @property
     def _all_names(self) -> set[str]:

@@ -1,5 +1,4 @@
-"""Scaling of a program by the sizes of its states, controls, horizon, constraints and cost, and elimination of
-redundant limits.
+"""Scaling of a program by the sizes of its variables, rows and cost, and removal of redundant limits.
 
 A solver's tolerances are absolute and suit numbers near 1. Each variable is divided by its size; each row and the cost
 by their change when the variables change by their sizes. Scaling is linear and keeps the optimum. Scales are powers of

@@ -7,8 +7,6 @@ factorisation, and one back-substitution for each entry of the parameter.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import casadi as ca
 import numpy as np
 import scipy.sparse as sp
@@ -30,19 +28,10 @@ from ocp.solution import Sensitivity, Solution
 __all__ = ["sensitivity"]
 
 METHODS = {"Collocation": Collocation, "MultipleShooting": MultipleShooting}
-
-
-@dataclass(frozen=True)
-class SystemSettings:
-    """Solution of the linear system.
-
-    Attributes:
-        softening: Regularisation of dependent rows, relative to their size and to the curvature.
-        refinements: Passes of iterative refinement that correct for it.
-    """
-
-    softening: float = 1e-11
-    refinements: int = 4
+SOFTENING = 1e-11
+"""Regularisation of dependent rows in the linear system, relative to their size and to the curvature."""
+REFINEMENTS = 4
+"""Passes of iterative refinement that correct for it."""
 
 
 def sensitivity(solution: Solution, name: str) -> Sensitivity:
@@ -86,7 +75,7 @@ def sensitivity(solution: Solution, name: str) -> Sensitivity:
     sides = [np.concatenate([arguments[f"{s}x"] / a, arguments[f"{s}g"] / b]) for s in ("lb", "ub")]
     side_rates = [np.vstack([low_x, low_g]), np.vstack([high_x, high_g])]
     held = np.concatenate([at.fixed, at.held])
-    multipliers, multiplier_rates = np.concatenate([at.of_bounds, at.of_rows]), np.vstack([of_bounds, of_rows])
+    force, force_rates = np.concatenate([at.of_bounds, at.of_rows]), np.vstack([of_bounds, of_rows])
     is_equality = sides[0] == sides[1]
     labels = [*variable_names(form, transcription), *transcription.row_labels]
     value = p[place]
@@ -96,10 +85,7 @@ def sensitivity(solution: Solution, name: str) -> Sensitivity:
         distances = [
             (np.where(held, np.inf, values - sides[0]), rates - side_rates[0]),
             (np.where(held, np.inf, sides[1] - values), side_rates[1] - rates),
-            (
-                np.where(held & ~is_equality, np.abs(multipliers), np.inf),
-                np.sign(multipliers)[:, None] * multiplier_rates,
-            ),
+            (np.where(held & ~is_equality, np.abs(force), np.inf), np.sign(force)[:, None] * force_rates),
         ]
     for distance, rate in distances:
         finite = np.flatnonzero(np.isfinite(distance))
@@ -179,12 +165,7 @@ def by_parameters(
 
 
 def solve_system(
-    at: Conditions,
-    slope: np.ndarray,
-    change: np.ndarray,
-    at_x: np.ndarray,
-    at_g: np.ndarray,
-    settings: SystemSettings = SystemSettings(),
+    at: Conditions, slope: np.ndarray, change: np.ndarray, at_x: np.ndarray, at_g: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return derivatives of the variables (n, k) and of the multipliers of rows (m, k) and bounds (n, k), scaled.
 
@@ -206,10 +187,10 @@ def solve_system(
     system = hessian[free][:, free]
     if m:
         system = sp.block_array([[system, active_rows.T], [active_rows, None]], format="csc")
-    softened = system - sp.diags_array(np.concatenate([np.zeros(n), np.full(m, settings.softening * largest)]))
+    softened = system - sp.diags_array(np.concatenate([np.zeros(n), np.full(m, SOFTENING * largest)]))
     solve = sla.splu(sp.csc_array(softened))
     solution = solve.solve(sides)
-    for _ in range(settings.refinements):
+    for _ in range(REFINEMENTS):
         solution += solve.solve(sides - system @ solution)
     residual = float(np.abs(sides - system @ solution).max(initial=0.0))
     # a larger residual means that active limits contradict each other

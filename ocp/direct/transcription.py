@@ -118,6 +118,7 @@ class TranscriptionBuilder:
 
     @property
     def intervals(self) -> int:
+        """Number of intervals."""
         return len(self.mesh) - 1
 
     # ---- variables -------------------------------------------------------------------------------------------

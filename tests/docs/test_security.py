@@ -21,7 +21,7 @@ LIMITS = {
     "waypoints, trajectory (CSV, JSON, YAML), G-code": INPUT_LIMITS.text_bytes / MB,
     "lines of a text": INPUT_LIMITS.text_lines,
     "characters of a line": INPUT_LIMITS.line_characters,
-    "sampled trajectory of a schedule (CSV)": trajectory.LARGEST_FILE / MB,
+    "sampled trajectory of a schedule (CSV)": trajectory.MAX_FILE_BYTES / MB,
     "task and obstacle files": INPUT_LIMITS.task_bytes / MB,
     "parts of a name, containers within containers": INPUT_LIMITS.nesting,
     "values of a JSON or YAML file": INPUT_LIMITS.tree_values,

@@ -16,7 +16,7 @@ import numpy as np
 
 from models import Line, ModelError, ModelWarning
 from models.arrays import Array, ArrayInput, checked_array
-from models.paths import Segment, chains
+from models.paths import Segment, split_at_reversals
 from models.paths.path import Reversal
 from models.paths.segments import SHORTEST_SEGMENT
 from ocp.app.files.lines import FileName, read_lines, wrong_line
@@ -72,7 +72,7 @@ def read_gcode(
         start: Where the program begins, in its own coordinates. Shape (3,), m.
         home: Where G28, G30 and G53 with zeros lead, in the coordinates of the program. Shape (3,), m. If None they
             are passed over where nothing has moved yet or nothing moves afterwards, and refused elsewhere.
-        reversal: "split", or the width (m) of the bulb in which the path turns round: see models.paths.chains.
+        reversal: "split", or the width (m) of the bulb of a reversal, see models.paths.split_at_reversals.
         gap: Largest difference (m) of an arc's ends in their distance from the centre that counts as rounding; by the
             unit if None: 0.028 mm or 0.0028 inch. A thousandth of the radius is rounding too.
         block_delete: Whether lines that begin with `/` are passed over.
@@ -416,6 +416,6 @@ class _Reader:
         self.moved = True
         segments, feeds, tolerances, lines = zip(*self.moves, strict=True)
         self.moves = []
-        for path, index in chains(segments, self.reversal):
+        for path, index in split_at_reversals(segments, self.reversal):
             made = Cut(path, np.array(feeds)[index], np.array(tolerances)[index], np.array(lines)[index])
             self.stretches.append(made)

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from models import ModelError, Path, SmoothPath
 from models.arrays import ROUNDING, Array, warn_of_degrees, warn_of_millimetres
-from models.paths import Line, chains
+from models.paths import Line, split_at_reversals
 from models.paths.orientation import product, rotation_vector
 from models.paths.path import Reversal
 from models.paths.segments import SHORTEST_SEGMENT
@@ -117,7 +117,7 @@ class Waypoints:
         if not lines:
             message = f"{self.file}: all waypoints are at one place; a path needs two"
             raise ProblemError(message, name="positions", value=self.positions[0])
-        return tuple(path for path, _ in chains(lines, turned_round))
+        return tuple(path for path, _ in split_at_reversals(lines, turned_round))
 
     def path(self, *, reversal: Reversal | None = None) -> Path:
         """The one path of `paths`.

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from models import CollisionShape, Machine, ModelError, Robot, link_frames
 from models.arrays import Array
-from models.shapes.mesh_files import Triangles, bare, find_mesh, read_painted_mesh, together
+from models.shapes.mesh_files import Triangles, find_mesh, join_meshes, read_painted_mesh, without_colors
 from ocp.problem.values import Sampler
 
 __all__ = [
@@ -173,7 +173,7 @@ def _triangles(shape: CollisionShape, folders: Sequence[Any]) -> Triangles:
     if shape.kind == "box":
         signs = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
         quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
-        return bare(signs * size, np.concatenate([quads[:, :3], quads[:, [0, 2, 3]]]))
+        return without_colors(signs * size, np.concatenate([quads[:, :3], quads[:, [0, 2, 3]]]))
     if shape.kind == "cylinder":
         half = size[1] / 2
         return _turned(np.array([[0.0, -half], [size[0], -half], [size[0], half], [0.0, half]]))
@@ -194,7 +194,7 @@ def _turned(profile: Array) -> Triangles:
     k, i = (part.ravel() for part in np.meshgrid(np.arange(len(profile) - 1), np.arange(sides), indexing="ij"))
     a, b = k * sides + i, k * sides + (i + 1) % sides
     quads = np.stack([a, b, b + sides, a + sides], axis=1)
-    return bare(points.reshape(-1, 3), np.concatenate([quads[:, :3], quads[:, [0, 2, 3]]]))
+    return without_colors(points.reshape(-1, 3), np.concatenate([quads[:, :3], quads[:, [0, 2, 3]]]))
 
 
 def rod(start: Array, end: Array, radius: float) -> Triangles:
@@ -256,7 +256,7 @@ def _parts(found: list[tuple[str, Triangles]]) -> list[Part]:
     """By link and colour."""
     parts = []
     for link in dict.fromkeys(name for name, _ in found):
-        mesh = together([one for name, one in found if name == link])
+        mesh = join_meshes([one for name, one in found if name == link])
         colors, which = np.unique(np.round(mesh.colors, 3), axis=0, return_inverse=True)
         for k, color in enumerate(colors):
             own = mesh.faces[which.ravel() == k]

@@ -99,7 +99,7 @@ def of_shapes(shapes: Iterable[Shape]) -> list[Obstacle]:
     return [
         Obstacle(np.asarray(one.point, dtype=float)[None], 0.0, np.asarray(one.normal, dtype=float))
         if isinstance(one, HalfSpace)
-        else Obstacle(np.asarray(one.core), one.swelling)
+        else Obstacle(np.asarray(one.core), one.swept_radius)
         for one in shapes
     ]
 

@@ -21,7 +21,7 @@ from models.arrays import Array
 from ocp.audit.audit import Audit
 from ocp.audit.clearance import Clearance, Track, clearance_along
 from ocp.errors import ProblemError, SolveError, checked_instance, checked_mapping, checked_nonnegative
-from ocp.motion.local.collisions import Collision, find_collisions, hulls_of
+from ocp.motion.local.collisions import Collision, find_collisions, scene_hulls
 from ocp.problem.declarations import Variable
 from ocp.problem.hulls import frames_of
 from ocp.problem.problem import Problem
@@ -134,7 +134,7 @@ class ClearanceConstraints:
         problem.separate(
             f"{CLEARANCE}{suffix}",
             _said(around.placements, base, joints, time),
-            hulls_of(around),
+            scene_hulls(around),
             around.pairs,
             np.full(len(around.pairs), around.clearance),
             levers={name: pair[0] for name, pair in moved.items()},
@@ -198,7 +198,7 @@ def clearance_of(
     apart = Separation(
         CLEARANCE,
         placements,
-        hulls_of(around),
+        scene_hulls(around),
         around.pairs,
         np.full(n, around.clearance),
         movers={"joints": machine.joint_size},

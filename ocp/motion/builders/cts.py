@@ -22,8 +22,8 @@ import numpy as np
 from models import ModelError
 from models.arrays import Array
 from models.cts.best_roll import optimal_inverse
-from models.cts.clearance import CollisionScene, Radii, checked_clearance, clearances, nearness
-from models.cts.rig import HOME, Branch, Rig, Tunnel, checked_branch, joints_of, posture_at
+from models.cts.clearance import CollisionScene, Radii, checked_clearance, clearances, proximity_cost
+from models.cts.rig import HOME, Branch, Rig, Tunnel, checked_branch, configuration_at, joints_of
 from models.cts.roll import index_harmonics
 from models.cts.table import checked_targets
 from models.shapes.distance import soft_minimum
@@ -170,7 +170,7 @@ def roll_problem(
         raise ProblemError(words, name="symbols", value=symbols)
     x, phi = ca.SX.sym("target", 5), ca.SX.sym("roll")
     c, s = ca.cos(phi), ca.sin(phi)
-    posture = posture_at(rig, x, c, s, branch)
+    posture = configuration_at(rig, x, c, s, branch)
     joints = joints_of(rig, x, phi, posture)
     held = [k for k in range(5) if np.isfinite([rig.lower[k], rig.upper[k]]).any()]
     limited = ca.vertcat(*[joints[k] for k in held])
@@ -180,7 +180,7 @@ def roll_problem(
     short = _beyond(reached, -LARGEST_SINE, LARGEST_SINE) + _beyond(limited, rig.lower[held], rig.upper[held])
     if scene is not None:
         gap = soft_minimum(list(clearances(rig, joints, scene, radii).values()), softness)
-        near = nearness(gap, clearance_weight, clearance_width)
+        near = proximity_cost(gap, clearance_weight, clearance_width)
         if np.isfinite(clearance):
             short += ca.fmax(clearance + SEARCH.margin * softness - gap, 0)
     t = np.linspace(0, horizon, SEARCH.times)

@@ -44,7 +44,7 @@ from ocp.motion.tasks.checks import (
     checked_configuration,
     checked_horizon,
     checked_tasks,
-    inside_limits,
+    clip_to_limits,
     rates_at_rest,
 )
 from ocp.motion.tasks.equations import TaskEquations, bind
@@ -198,11 +198,11 @@ class _Ends:
     ) -> _Ends:
         robot, n, hint = machine.robot, machine.joint_size, "keep them, or leave that end free by nan"
         first, last = (
-            inside_limits(what, robot.joint_names, _ends(what, given, n), bounds.lower, bounds.upper, hint)
+            clip_to_limits(what, robot.joint_names, _ends(what, given, n), bounds.lower, bounds.upper, hint)
             for what, given in zip(("start_joints", "end_joints"), joints, strict=True)
         )
         first_rates, last_rates = (
-            inside_limits(
+            clip_to_limits(
                 f"{what} velocities", robot.joint_names, rates_at(what, given, n), -bounds.velocity, bounds.velocity,
                 hint,
             )
@@ -388,5 +388,5 @@ def _declare_tasks(problem: Problem, equations: TaskEquations, ends: _Ends, moti
         problem.start("tip velocity", residual, lower=0, upper=0, unit=equations.unit())
     gap = equations.acceleration(base, joints, rates, second, problem.time)
     problem.path("tip", gap, lower=0, upper=0, unit=equations.unit("/s^2", "/s^2"))
-    for name, stray in equations.strays(base, joints, rates, targets).items():
+    for name, stray in equations.deviations(base, joints, rates, targets).items():
         problem.watch(name, **stray)

@@ -19,8 +19,8 @@ from ocp.errors import ProblemError, checked_each, checked_flag, checked_instanc
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.tool_motion import ToolMotion, stretches_of, tool_motion_problem
 from ocp.motion.local.inverse_kinematics import inverse_kinematics
-from ocp.motion.local.rates import LocalMotion, follow
-from ocp.motion.tasks.checks import checked_configuration, checked_tasks, checked_weights, horizon_of, inside_limits
+from ocp.motion.local.rates import LocalMotion, track_tasks
+from ocp.motion.tasks.checks import checked_configuration, checked_tasks, checked_weights, clip_to_limits, horizon_of
 from ocp.motion.tasks.equations import bind
 from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.motion.tasks.tip_task import TipTask
@@ -100,7 +100,7 @@ def minimum_velocity_problem(
             begins = stretch is stretches[0] and start_joints is not None
             checked_tasks(stretch.equations, base, joints, duration, start=begins)
     bounds, names = limits.bounds(machine, ("velocity",)), machine.robot.joint_names
-    joints = inside_limits("start_joints", names, joints, bounds.lower, bounds.upper, "start inside them")
+    joints = clip_to_limits("start_joints", names, joints, bounds.lower, bounds.upper, "start inside them")
     if clearance_constraints is not None:
         checked_instance("clearance_constraints", clearance_constraints, ClearanceConstraints)
     motion = tool_motion_problem(
@@ -121,10 +121,12 @@ def _attach_guess(
         steps = max(int(np.ceil(STEPS_OF_GUESS * stretch.duration / motion.horizon)), 1)
         times = np.union1d(np.linspace(stretch.begin, stretch.end, steps + 1), stretch.breaks)
         if stretch.equations is None:
-            followed.append(LocalMotion.resting(times, place, at))
+            followed.append(LocalMotion.stationary(times, place, at))
         else:
             told: dict[str, Any] = {"weights": weights, "damping": damping}
-            followed.append(follow(stretch.equations, at, place, times, lower=bounds.lower, upper=bounds.upper, **told))
+            followed.append(
+                track_tasks(stretch.equations, at, place, times, lower=bounds.lower, upper=bounds.upper, **told)
+            )
         place, at = followed[-1].base[:, -1], followed[-1].joints[:, -1]
     declared = motion.problem.declared
     for name, guess in motion.guess(followed, 0).items():

@@ -36,7 +36,7 @@ from ocp.motion.builders.timing_tables import (
 )
 from ocp.motion.schedule.limits import JointPath, LineLimits, PathLike, check_line, check_smooth
 from ocp.motion.schedule.planner import Schedule
-from ocp.motion.schedule.profile import Array, SpeedProfile, advanced
+from ocp.motion.schedule.profile import Array, SpeedProfile, integrate_jerk
 from ocp.problem.problem import Problem
 from ocp.solution import Solution
 
@@ -213,7 +213,7 @@ def minimum_time_problem(
     if guess is not None and abs(guess.path.length - path.length) > 1e-9 * path.length:
         message = f"the guess is for a path of {guess.path.length:g} m, this one has {path.length:g} m"
         raise ProblemError(message, name="guess", value=guess.path.length, limit=path.length)
-    path_columns(path, limits, limited, path.dense())  # refuses what is not finite
+    path_columns(path, limits, limited, path.sample_distances())  # refuses what is not finite
     reference = reference_motion(path, limits, limited) if guess is None else guess.profile
     if guess is not None and limited is not None:
         check_smooth(path, limits, limited)  # refuses what no motion keeps, as a schedule does
@@ -307,7 +307,7 @@ def _demands(limits: LineLimits, joints: JointPath | None, values: Any, v: Any, 
 def _parts(profile: SpeedProfile, demand: Array) -> NDArray[np.intp]:
     """Into how many each interval of the problem is to be cut; the error falls with the square of their width."""
     v, a, j, t = profile.speed, profile.acceleration, profile.jerk, np.diff(profile.t)
-    way, speed, _ = advanced(v[:-1], a[:-1], j, t)
+    way, speed, _ = integrate_jerk(v[:-1], a[:-1], j, t)
     covered, gained = way / np.diff(profile.distance) - 1, (speed - v[1:]) / v.max()
     error = np.maximum((demand - 1) / CUTS.demand, np.maximum(np.abs(covered), np.abs(gained)) / CUTS.defect)[1:-1]
     parts = np.ceil(np.sqrt(np.maximum(error, 1.0)) * 1.2).astype(np.intp)

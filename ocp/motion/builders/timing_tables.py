@@ -28,7 +28,7 @@ from ocp.motion.schedule.limits import (
     rates_along,
 )
 from ocp.motion.schedule.planner import schedule
-from ocp.motion.schedule.profile import Array, LineMotion, SpeedProfile, piece_of
+from ocp.motion.schedule.profile import Array, LineMotion, SpeedProfile, segment_index
 
 __all__ = [
     "Columns",
@@ -118,7 +118,7 @@ def table(columns: Columns, breaks: Array) -> Any:
 
 def asked_speed(path: PathLike, limits: LineLimits, s: Array) -> Array:
     """Asked line speed at distances (M,)."""
-    return np.asarray(path.by_piece(limits.speed)[piece_of(path.bounds, s)])
+    return np.asarray(path.by_piece(limits.speed)[segment_index(path.bounds, s)])
 
 
 def path_columns(path: PathLike, limits: LineLimits, joints: JointPath | None, s: Array) -> Array:

@@ -322,7 +322,7 @@ def _declare_stretch(motion: _Motion, stretch: Stretch, known: Array | None) -> 
         free = not begins or motion.free
         _declare_tasks(motion, stretch, (place, joints, rates), pace, slack, free, asked, of_drives)
         placed = np.concatenate([is_holonomic(part) for part in stretch.equations.bound]).astype(bool)
-        leads = slopes[stretch.equations.posed | (placed & (begins | ~asked))]
+        leads = slopes[stretch.equations.pose_rows | (placed & (begins | ~asked))]
     if machine.base_size:
         problem.dynamics(place, pace * machine.base_rate(place, joints, rates))
     problem.dynamics(joints, pace * rates)
@@ -470,16 +470,16 @@ def _declare_tasks(
             problem.start(f"start velocity{when}", (residual - closure)[rows], 0, 0, unit=equations.unit())
     elif equations.size:
         problem.path(f"task{when}", residual - closure, lower=0, upper=0, unit=equations.unit())
-    most = equations.most_lean
+    most = equations.cone_angles
     if most.size:
-        problem.path(f"lean{when}", equations.leans(base, joints, targets), lower=np.cos(most))
-    for name, stray in equations.strays(base, joints, rates, targets).items():
+        problem.path(f"lean{when}", equations.cone_cosines(base, joints, targets), lower=np.cos(most))
+    for name, stray in equations.deviations(base, joints, rates, targets).items():
         if stray["integral"]:
             stray = {**stray, "expression": pace * stray["expression"]}
         problem.watch(f"{name}{when}", **{**stray, "way": pace * stray["way"]})
     if not free:
         return
-    error = equations.error(base, joints, targets)[np.flatnonzero(begins & equations.posed).tolist()]
+    error = equations.error(base, joints, targets)[np.flatnonzero(begins & equations.pose_rows).tolist()]
     # a velocity says nothing of places: at the start of the motion its tip is where the reference has it
     held = [] if stretch.begin else [equations.holding(base, joints, motion.base, motion.reference)]
     if (condition := ca.vertcat(error, *held)).numel():
@@ -496,7 +496,7 @@ def _slopes(stretch: Stretch, base: Array, reference: Array) -> Array:
     b, q = ca.SX.sym("base", len(base)), ca.SX.sym("joints", len(reference))
     error = equations.error(b, q, equations.target_function()(stretch.begin))
     held, at, rows = equations.holding(b, q, base, reference), 0, []
-    for i, posed in enumerate(equations.posed):
+    for i, posed in enumerate(equations.pose_rows):
         rows.append(error[i] if posed else held[at])
         at += not posed
     slope = ca.Function("slope", [b, q], [ca.jacobian(ca.vertcat(*rows), ca.vertcat(b, q))])

@@ -1,1 +1,1 @@
-"""Instant by instant: redundancy resolved locally, inverse kinematics, reach."""
+"""Local methods: inverse kinematics and redundancy resolution at velocity and acceleration level."""

@@ -1,9 +1,9 @@
-"""Instantaneous redundancy resolution of a standing machine at acceleration level (Yoo et al. 2004), simulated.
+"""Instantaneous redundancy resolution of a standing machine at acceleration level (Yoo et al. 2004).
 
 Each law builds q'' task by task: the least accelerations that do a task and leave the earlier tasks unchanged,
 equations (20), (22), (26), (33)-(34) corrected. Pinning the zero moment point leaves an inverted pendulum, which falls
-while the stability index stays 1. Every run therefore reports the vertical ground force, the zero moment point, joint
-limits and rates, and stops with a reason where the foot would lift off or the motion diverges.
+while the stability index stays 1. Every simulation therefore reports vertical ground force, zero moment point, joint
+limits and rates, and stops with a reason if the foot lifts off or the motion diverges.
 """
 
 from __future__ import annotations
@@ -34,33 +34,27 @@ from ocp.motion.tasks.checks import check_length, checked_configuration, checked
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.motion.tasks.tracks import on_symbols
-from ocp.motion.tasks.zmp_rules import checked_place, is_finite
+from ocp.motion.tasks.zmp_rules import checked_point, is_finite
 
 __all__ = [
-    "AccelerationSolution",
-    "Law",
-    "Layer",
-    "Stabiliser",
-    "Stop",
-    "accelerations",
-    "checked_law",
+    "AccelerationSolution", "Law", "Layer", "Stabiliser", "Stop", "accelerations", "checked_law",
     "resolve_accelerations",
-]
+]  # fmt: skip
 
 Law: TypeAlias = Literal["pseudo_inverse", "augmented", "null_space", "stabilised"]
 
 
 @dataclass(frozen=True)
 class Layer:
-    """A posture index that spare freedom drives, below the task and the zero moment point.
+    """Configuration index that the remaining freedom improves, below the task and the zero moment point.
 
     Attributes:
-        index: ``joint_limits``, p1 (23), to be kept small; ``manipulability`` of the tasks' rows, p2 (27), to be kept
-            large.
-        demand: What is asked: negative makes p1 fall, positive makes p2 grow.
-        form: ``assigned``: the second derivative of the index is the demand, (25)-(26), (29)-(33); takes one degree of
-            freedom, and accelerations without bound where the index cannot be changed. ``gradient``: demand times the
-            projected gradient; bounded, takes all that is left.
+        index: ``joint_limits``, p1 (23), to be decreased; ``manipulability`` of the rows of the tasks, p2 (27), to be
+            increased.
+        demand: Negative to decrease p1, positive to increase p2.
+        form: ``assigned``: the second derivative of the index equals the demand, (25)-(26), (29)-(33); takes one degree
+            of freedom, with unbounded accelerations where the index is stationary. ``gradient``: demand times the
+            projected gradient; bounded, takes all remaining freedom.
     """
 
     index: Literal["joint_limits", "manipulability"]
@@ -79,13 +73,13 @@ class Layer:
 class Stabiliser:
     """Gains of the law that keeps the inverted pendulum over a pinned zero moment point upright.
 
-    The centre of mass is commanded y'' = -k2 y' - k1 (y - y*) + k0 L, with L the moment of momentum about the point,
-    which obeys dL/dt = -M g (y - y*): the characteristic polynomial is s^3 + k2 s^2 + k1 s + k0 M g.
+    The centre of mass is commanded y'' = -k2 y' - k1 (y - y*) + k0 L, with L the angular momentum about the point,
+    dL/dt = -M g (y - y*): the characteristic polynomial is s^3 + k2 s^2 + k1 s + k0 M g.
 
     Attributes:
-        poles: Minus its roots, three positive numbers, 1/s.
-        damping: Of the joint velocities in the freedom that is left, 1/s.
-        gradient: Of the joint-limit index p1 in the freedom that is left, 1/s^2.
+        poles: Negated roots of the polynomial, three positive numbers, 1/s.
+        damping: Damping of the joint velocities in the remaining freedom, 1/s.
+        gradient: Gain of the gradient of the joint-limit index p1 in the remaining freedom, 1/s^2.
     """
 
     poles: tuple[float, float, float] = (4.0, 4.0, 4.0)
@@ -97,34 +91,36 @@ class Stabiliser:
         if len(poles[:4]) != 3 or not all(is_finite(pole) and pole > 0 for pole in poles):
             words = f"stabiliser: poles must be three positive numbers, not {self.poles!r}"
             raise ProblemError(words, name="poles", value=self.poles, limit=0.0)
-        for what in ("damping", "gradient"):
-            checked_nonnegative(f"stabiliser: {what}", getattr(self, what))
+        for gain in ("damping", "gradient"):
+            checked_nonnegative(f"stabiliser: {gain}", getattr(self, gain))
 
 
-class _Stack:
-    """Joint accelerations built task by task, each in the null space of those before."""
+class _TaskHierarchy:
+    """Joint accelerations built task by task, each in the null space of the tasks before."""
 
     def __init__(self, size: int) -> None:
         self.accelerations: Any = ca.DM.zeros(size)
-        self.free: Any = ca.DM.eye(size)
+        self.projector: Any = ca.DM.eye(size)
 
-    def do(self, rows: Any, wanted: Any) -> None:
-        """Make rows q'' = wanted with the least change."""
-        within = ca.mtimes(rows, self.free)
-        inverse = least_rates(within, ca.DM.eye(rows.shape[0]))
-        self.accelerations = self.accelerations + ca.mtimes(inverse, wanted - ca.mtimes(rows, self.accelerations))
-        self.free = self.free - ca.mtimes(inverse, within)
+    def add_task(self, rows: Any, target: Any) -> None:
+        """Add rows q'' = target with the least change of the accelerations."""
+        projected = ca.mtimes(rows, self.projector)
+        inverse = least_rates(projected, ca.DM.eye(rows.shape[0]))
+        self.accelerations = self.accelerations + ca.mtimes(inverse, target - ca.mtimes(rows, self.accelerations))
+        self.projector = self.projector - ca.mtimes(inverse, projected)
 
-    def push(self, direction: Any) -> None:
-        """Add a vector in the freedom that is left."""
-        self.accelerations = self.accelerations + ca.mtimes(self.free, direction)
+    def add_free(self, direction: Any) -> None:
+        """Add a vector, projected to the remaining freedom."""
+        self.accelerations = self.accelerations + ca.mtimes(self.projector, direction)
 
 
 def checked_law(machine: Standing, size: int, law: Law, layers: Sequence[Layer], damping: float) -> None:
-    """Raise ProblemError for an unknown law, or one that asks for more than the machine has joints.
+    """Raise ProblemError if a law is unknown or needs more joints than the machine has.
 
     Args:
-        size: Rows of all tasks.
+        machine: The machine.
+        size: Number of rows of all tasks.
+        law, layers, damping: As for `resolve_accelerations`.
     """
     checked_choice("law", law, get_args(Law))
     checked_nonnegative("null_damping", damping)
@@ -136,8 +132,8 @@ def checked_law(machine: Standing, size: int, law: Law, layers: Sequence[Layer],
     tasks |= {"the assigned layers": sum(layer.form == "assigned" for layer in layers)}
     needed, size = sum(tasks.values()), machine.joint_size
     if needed > size:
-        asked = ", ".join(f"{count} for {what}" for what, count in tasks.items() if count)
-        words = f"law {law!r} needs {needed} joints ({asked}), there are {size}"
+        listed = ", ".join(f"{count} for {name}" for name, count in tasks.items() if count)
+        words = f"law {law!r} needs {needed} joints ({listed}), there are {size}"
         raise ProblemError(words, name="law", value=needed, limit=size)
 
 
@@ -155,85 +151,81 @@ def accelerations(
     stabiliser: Stabiliser | None = None,
     null_damping: float = 0.0,
 ) -> Any:
-    """Joint accelerations of a law. Shape (n, 1).
+    """Return the joint accelerations of a law. Shape (n, 1).
 
     Args:
-        equations: What the tips do.
+        machine: The machine.
+        equations: Equations of the tasks.
         law: ``pseudo_inverse``: the tasks alone. ``augmented``: tasks and zero moment point together, (20).
-            ``null_space``: the zero moment point in the null space of the tasks, (21)-(22). ``stabilised``: as
+            ``null_space``: the zero moment point in the null space of the tasks, (21)-(22). ``stabilised``: like
             augmented, with the centre of mass commanded in their null space.
         time, q, qd: Symbols of one kind.
-        zmp: Where the zero moment point is to be, (x, y) of the time, m, in the directions in which motion moves it.
+        zmp: Target (x, y) of the zero moment point as a function of time, m, in the directions in which motion moves
+            it.
+        external: External wrenches as a function of time and tip position.
         layers: Applied in this order after the law.
-        null_damping: Of the joint velocities in the freedom that is left at last, 1/s.
+        stabiliser: Gains of the stabilised law.
+        null_damping: Damping of the joint velocities in the freedom that remains at the end, 1/s.
     """
-    directions, none = ca.DM(machine.moving_directions), ca.DM(0, 1)
+    directions, no_base = ca.DM(machine.moving_directions), ca.DM(0, 1)
     wrenches = wrenches_at(external, time, machine.tip_pose((), q).position)
-    jacobian = equations.jacobian(none, q)
-    task = -equations.acceleration(none, q, qd, ca.DM(machine.joint_size, 1), time)
+    jacobian = equations.jacobian(no_base, q)
+    task = -equations.acceleration(no_base, q, qd, ca.DM(machine.joint_size, 1), time)
     place = zmp(time)
     zmp_rows = machine.zmp_rows(q, qd, place, wrenches)
     balance, needed = ca.mtimes(directions, zmp_rows.jacobian), ca.mtimes(directions, zmp_rows.needed(qd))
 
-    stack = _Stack(machine.joint_size)
+    hierarchy = _TaskHierarchy(machine.joint_size)
     if law in ("pseudo_inverse", "null_space"):
-        stack.do(jacobian, task)
+        hierarchy.add_task(jacobian, task)
     if law == "null_space":
-        stack.do(balance, needed)
+        hierarchy.add_task(balance, needed)
     if law in ("augmented", "stabilised"):
-        stack.do(ca.vertcat(jacobian, balance), ca.vertcat(task, needed))
+        hierarchy.add_task(ca.vertcat(jacobian, balance), ca.vertcat(task, needed))
     for layer in layers:
-        _apply(layer, stack, _index(layer, machine, jacobian, q), q, qd)
+        limits = layer.index == "joint_limits"
+        index = joint_limit_index(machine.robot, q) if limits else manipulability_of(jacobian)
+        gradient = ca.jacobian(index, q)
+        if layer.form == "gradient":
+            hierarchy.add_free(layer.demand * gradient.T)
+        else:
+            hierarchy.add_task(gradient, layer.demand - ca.jtimes(ca.mtimes(gradient, qd), q, qd))
     if law == "stabilised":
         gains = stabiliser or Stabiliser()
-        stack.do(*_upright(machine, gains, q, qd, place, zmp_rows.right))
-        stack.push(-gains.damping * qd - gains.gradient * ca.gradient(joint_limit_index(machine.robot, q), q))
+        hierarchy.add_task(*_stabilising_task(machine, gains, q, qd, place, zmp_rows.right))
+        hierarchy.add_free(-gains.damping * qd - gains.gradient * ca.gradient(joint_limit_index(machine.robot, q), q))
     if null_damping:
-        stack.push(-null_damping * qd)
-    return stack.accelerations
+        hierarchy.add_free(-null_damping * qd)
+    return hierarchy.accelerations
 
 
-def _index(layer: Layer, machine: Standing, jacobian: Any, q: Any) -> Any:
-    if layer.index == "joint_limits":
-        return joint_limit_index(machine.robot, q)
-    return manipulability_of(jacobian)
+def _stabilising_task(machine: Standing, gains: Stabiliser, q: Any, qd: Any, place: Any, right: Any) -> tuple[Any, Any]:
+    """Return rows and values of the commanded acceleration of the centre of mass.
 
-
-def _apply(layer: Layer, stack: _Stack, index: Any, q: Any, qd: Any) -> None:
-    slope = ca.jacobian(index, q)
-    if layer.form == "gradient":
-        stack.push(layer.demand * slope.T)
-    else:
-        stack.do(slope, layer.demand - ca.jtimes(ca.mtimes(slope, qd), q, qd))
-
-
-def _upright(machine: Standing, gains: Stabiliser, q: Any, qd: Any, place: Any, right: Any) -> tuple[Any, Any]:
-    """Rows and values of the commanded acceleration of the centre of mass.
-
-    `right` is C of (18), minus the moment of weight and wrenches over the place: it vanishes for a centre of mass
-    at y*, and C / (M g) is how far the centre of mass is beyond y*, with its sign turned.
+    `right` is C of (18), minus the moment of weight and wrenches about the place: it vanishes for a centre of mass at
+    y*, and -C / (M g) is the distance of the centre of mass beyond y*.
     """
     a, b, c = gains.poles
     k2, k1, k0 = a + b + c, a * b + b * c + c * a, a * b * c / machine.weight
     rest = ca.DM.zeros(machine.joint_size)
     motion = center_of_mass_motion(machine.robot, q, qd, rest, machine.world_from_base())
     rows = ca.jacobian(motion.position, q)[:2, :]
-    about = ca.vertcat(place, 0)
-    spin = momentum(machine.robot, q, qd, about, machine.world_from_base())
-    lean = ca.vertcat(-spin[1], spin[0])  # grows with the fall towards -x, -y
-    wanted = -k2 * motion.velocity[:2] + k1 * right / machine.weight + k0 * lean - motion.acceleration[:2]
+    pivot = ca.vertcat(place, 0)
+    angular_momentum = momentum(machine.robot, q, qd, pivot, machine.world_from_base())
+    momentum_xy = ca.vertcat(-angular_momentum[1], angular_momentum[0])  # grows as the machine falls towards -x, -y
+    target = -k2 * motion.velocity[:2] + k1 * right / machine.weight + k0 * momentum_xy - motion.acceleration[:2]
     directions = ca.DM(machine.moving_directions)
-    return ca.mtimes(directions, rows), ca.mtimes(directions, wanted)
+    return ca.mtimes(directions, rows), ca.mtimes(directions, target)
 
 
 @dataclass(frozen=True)
 class StepSettings:
-    """How a motion by accelerations is integrated and looked at.
+    """Settings of the simulation.
 
     Attributes:
-        chunk: Steps between two looks at the motion.
-        tip_tolerance: m and rad, by which the tip may miss its task before the motion stops.
-        cvodes_steps: Of the integrator between two samples.
+        chunk: Steps between two checks of the motion.
+        tip_tolerance: Largest pose error of a successful motion, m and rad.
+        cvodes_steps: Largest number of integrator steps between two samples.
     """
 
     chunk: int = 50
@@ -246,14 +238,14 @@ STEPPING = StepSettings()
 
 @dataclass(frozen=True)
 class Stop:
-    """Why a motion ends before its horizon.
+    """Reason why a motion ends before its horizon.
 
     Attributes:
-        reason: ``lift_off``: the ground would have to pull. ``divergence``: a joint is faster than the speed limit.
-            ``breakdown``: the accelerations, the integration or the forces are not finite: a task cannot be done
-            there, or `external` gives no number.
-        time: When, s.
-        message: The same in words, with the numbers.
+        reason: ``lift_off``: the vertical ground force is not positive. ``divergence``: a joint exceeds the speed
+            limit. ``breakdown``: accelerations, states or forces are not finite: a task cannot be done, or `external`
+            is not a number.
+        time: Time of the stop, s.
+        message: The reason in words, with the numbers.
     """
 
     reason: Literal["lift_off", "divergence", "breakdown"]
@@ -263,14 +255,14 @@ class Stop:
 
 @dataclass(frozen=True)
 class AccelerationSolution:
-    """A motion by instantaneous resolution.
+    """Motion of an acceleration-level law.
 
     Attributes:
-        law: What made it.
-        motion: Positions, velocities, accelerations and what they take, at every step up to the end or the stop, the
-            instant of which is the last where it has finite numbers.
-        tip_error: Norm of the pose errors in the tasks' rows, m and rad; zero for velocities. Shape (M,).
-        stopped: Why it ends before the horizon; None when it does not.
+        law: The law.
+        motion: Positions, velocities, accelerations and forces at every step up to the end or the stop; the sample of
+            the stop is the last one if it is finite.
+        tip_error: Norm of the pose errors in the rows of the tasks, m and rad; zero for velocities. Shape (M,).
+        stopped: Why the motion ends before the horizon; None if it does not.
     """
 
     law: Law
@@ -280,24 +272,24 @@ class AccelerationSolution:
 
     @property
     def failures(self) -> tuple[str, ...]:
-        """What is wrong with the motion, () if nothing: a reason to stop, or one of those that do not end it.
+        """Failures of the motion, () if there is none.
 
-        ``lift_off``, ``divergence``, ``breakdown`` as for Stop; ``leaves_foot``: the zero moment point does;
-        ``joint_limits``; ``leaves_path``: a tip leaves its pose, by more than 1e-3 (m or rad).
+        ``lift_off``, ``divergence``, ``breakdown`` as for Stop; ``leaves_foot``: the zero moment point leaves the
+        support; ``joint_limits``; ``leaves_path``: a tip leaves its pose by more than 1e-3 (m or rad).
         """
         motion = self.motion
-        wrong = {
+        failed = {
             "lift_off": not motion.stays_on_ground,
             "leaves_foot": not motion.stays_in_foot,
             "joint_limits": not motion.stays_in_limits,
             "leaves_path": not bool((self.tip_error <= STEPPING.tip_tolerance).all()),
         }
         first = () if self.stopped is None else (self.stopped.reason,)
-        return (*first, *(name for name, is_wrong in wrong.items() if is_wrong and name not in first))
+        return (*first, *(name for name, value in failed.items() if value and name not in first))
 
     @property
     def succeeded(self) -> bool:
-        """Whether it reaches the horizon on the ground, inside the foot, within the joint limits and on its path."""
+        """Whether the motion reaches the horizon on the ground, in the foot, within joint limits and on its path."""
         return not self.failures
 
     def __repr__(self) -> str:
@@ -338,42 +330,42 @@ def resolve_accelerations(
         horizon: Final time, s.
         law: ``pseudo_inverse``, ``augmented`` (20), ``null_space`` (21)-(22) or ``stabilised``.
         start_velocities: Shape (n,); at rest if None.
-        zmp: (x, y) where the laws other than the first keep the zero moment point, or a function of a casadi time that
+        zmp: Target (x, y) of the zero moment point for all laws but the first, or a function of CasADi time that
             returns it; the machine's most stable point if None.
-        external: Wrenches from outside as a function of time and tip position.
-        layers: Posture indices driven by the freedom that is left, in sequence, (23)-(34).
+        external: External wrenches as a function of time and tip position.
+        layers: Configuration indices that the remaining freedom improves, in sequence, (23)-(34).
         stabiliser: Gains of the stabilised law.
-        null_damping: Damping of the joint velocities in the freedom left at last, 1/s.
-        step: Of the fixed-step integration, and between samples, s.
+        null_damping: Damping of the joint velocities in the freedom that remains at the end, 1/s.
+        step: Step of the integration and between samples, s.
         integrator: ``rk4`` with fixed steps or ``cvodes`` with error control.
-        tolerance: Absolute and relative, of cvodes.
+        tolerance: Absolute and relative tolerance of cvodes.
         stop_at_lift_off: Whether a vertical ground force that is not positive ends the motion.
         speed_limit: Joint speed, rad/s or m/s, above which the motion counts as diverged.
 
     Raises:
-        ProblemError: Something does not fit the machine, or the tasks cannot be done even at the start.
+        ProblemError: An argument does not fit the machine, or the tasks cannot be done at the start.
     """
     equations, duration = bind(checked_instance("machine", machine, Standing), tasks), checked_horizon(horizon)
     checked_flag("stop_at_lift_off", stop_at_lift_off)
     joints, base = checked_configuration(machine, start_joints, None)
     checked_law(machine, equations.size, law, layers, null_damping)
-    for what, number in (("step", step), ("tolerance", tolerance), ("speed_limit", speed_limit)):
-        checked_positive(what, number)
+    for name, number in (("step", step), ("tolerance", tolerance), ("speed_limit", speed_limit)):
+        checked_positive(name, number)
     checked_choice("integrator", integrator, ("rk4", "cvodes"))
     checked_tasks(equations, base, joints, duration)
     check_length(equations, base, duration)
     n = machine.joint_size
-    given = np.zeros(n) if start_velocities is None else start_velocities
-    velocities = checked_numbers(given, n, "start_velocities", "one entry for each joint")
+    start = np.zeros(n) if start_velocities is None else start_velocities
+    velocities = checked_numbers(start, n, "start_velocities", "one entry for each joint")
     if not isinstance(stabiliser, Stabiliser | None):
         words = f"stabiliser must be a Stabiliser(...), not {stabiliser!r}"
         raise ProblemError(words, name="stabiliser", value=stabiliser)
-    place = _target(machine.most_stable_point if zmp is None else zmp)
+    zmp_target = _zmp_target(machine.most_stable_point if zmp is None else zmp)
 
     def law_function(symbols: Any) -> Any:
         time, q, qd = symbols.sym("time"), symbols.sym("q", n), symbols.sym("qd", n)
         qdd = accelerations(
-            machine, equations, law, time, q, qd, zmp=place, external=external, layers=layers,
+            machine, equations, law, time, q, qd, zmp=zmp_target, external=external, layers=layers,
             stabiliser=stabiliser, null_damping=null_damping,
         )  # fmt: skip
         gap = ca.norm_2(equations.error(ca.DM(0, 1), q, equations.targets(time)))
@@ -383,32 +375,33 @@ def resolve_accelerations(
     if not np.isfinite(np.array(function(0.0, joints, velocities)[0])).all():
         words = (
             f"law {law!r} has no accelerations at the start joints {joints.tolist()}: a task, the zero moment "
-            "point or a layer cannot be moved there; start elsewhere or ask for less"
+            "point or a layer is singular there; start elsewhere or remove it"
         )
         raise ProblemError(words, name="law", value=law, time=0.0)
     steps = max(int(np.ceil(duration / step - 1e-9)), 1)
     simulate = _Simulation(function, n, duration / steps, integrator, tolerance)
-    reported = motion_function(machine, external, lambda q: equations.jacobian(ca.DM(0, 1), q))
-    watch = _Watch(reported, function, stop_at_lift_off, speed_limit)
+    outputs = motion_function(machine, external, lambda q: equations.jacobian(ca.DM(0, 1), q))
+    recorder = _Recorder(outputs, function, stop_at_lift_off, speed_limit)
     state, done = np.concatenate([joints, velocities]), 0
-    stopped = watch.look(np.zeros(1), state[None, :])
+    stopped = recorder.add(np.zeros(1), state[None, :])
     while done < steps and stopped is None:
         count = min(STEPPING.chunk, steps - done)
         times = np.asarray((done + np.arange(1, count + 1)) * simulate.step, dtype=float)
-        stopped = watch.look(times, simulate.advance(done * simulate.step, state, count))
-        state, done = watch.state, done + count
-    return AccelerationSolution(law, watch.motion(), watch.gaps(), stopped)
+        stopped = recorder.add(times, simulate.advance(done * simulate.step, state, count))
+        state, done = recorder.state, done + count
+    return AccelerationSolution(law, *recorder.results(), stopped)
 
 
-def _target(zmp: Callable[[Any], Any] | Any) -> Callable[[Any], Any]:
+def _zmp_target(zmp: Callable[[Any], Any] | Any) -> Callable[[Any], Any]:
+    """Return the target of the zero moment point as a checked function of time."""
     if callable(zmp):
-        return lambda time: checked_place(zmp(time), "zmp")
-    point = checked_place(zmp, "zmp")
+        return lambda time: checked_point(zmp(time), "zmp")
+    point = checked_point(zmp, "zmp")
     return lambda time: point
 
 
 class _Simulation:
-    """Advances the state (q, q') by a fixed step, many at a time."""
+    """Integration of the state (q, q') over many fixed steps at a time."""
 
     def __init__(self, law: Any, n: int, step: float, integrator: str, tolerance: float) -> None:
         self.step, self._law, self._n = step, law, n
@@ -420,13 +413,8 @@ class _Simulation:
         if integrator == "cvodes":
             fraction = ca.MX.sym("fraction")
             problem = {"t": fraction, "x": state, "p": time, "ode": step * rate(time + step * fraction, state)}
-            options = {
-                "abstol": tolerance,
-                "reltol": tolerance,
-                "max_num_steps": STEPPING.cvodes_steps,
-                "disable_internal_warnings": True,
-                "show_eval_warnings": False,
-            }
+            options = {"abstol": tolerance, "reltol": tolerance, "max_num_steps": STEPPING.cvodes_steps}
+            options |= {"disable_internal_warnings": True, "show_eval_warnings": False}
             solver = ca.integrator("motion", "cvodes", problem, 0.0, 1.0, options)
             after = solver(x0=state, p=time)["xf"]
         else:
@@ -435,52 +423,53 @@ class _Simulation:
         self._many: dict[int, Any] = {}
 
     def advance(self, time: float, state: Array, count: int) -> Array:
-        """States after each of `count` steps, nan from where the integration fails. Shape (count, 2 n)."""
+        """Return the states after each of `count` steps, nan from where the integration fails. Shape (count, 2 n)."""
         times = time + self.step * np.arange(count)
         if count not in self._many:
             self._many[count] = self._once.mapaccum("steps", count)
         try:
             return np.array(self._many[count](state, times[None, :])).T
-        except RuntimeError:  # the integrator gives up somewhere: go step by step
-            reached = np.full((count, 2 * self._n), np.nan)
+        except RuntimeError:  # the integrator fails at some step: integrate step by step
+            states = np.full((count, 2 * self._n), np.nan)
             for i, at in enumerate(times):
                 try:
                     state = np.array(self._once(state, at)).ravel()
                 except RuntimeError:
                     break
-                reached[i] = state
-            return reached
+                states[i] = state
+            return states
 
 
-class _Watch:
-    """Evaluates what has been reached, keeps what is sound and says why the rest is not."""
+class _Recorder:
+    """Records samples of the motion up to the first failure."""
 
     def __init__(self, motion: Any, law: Any, stop_at_lift_off: bool, speed_limit: float) -> None:
         self._motion, self._law = motion, law
         self._stop_at_lift_off, self._speed_limit = stop_at_lift_off, speed_limit
-        self._kept: list[dict[str, Array]] = []
+        self._records: list[dict[str, Array]] = []
         self.state = np.zeros(0)
 
-    def look(self, times: Array, states: Array) -> Stop | None:
+    def add(self, times: Array, states: Array) -> Stop | None:
+        """Evaluate and record samples; return a Stop at the first one that fails."""
         n = states.shape[1] // 2
         q, qd = states[:, :n], states[:, n:]
         qdd, gap = (np.array(part).T for part in self._law.map(len(times))(times[None, :], q.T, qd.T))
-        found = evaluate(self._motion, times, q, qd, qdd)
-        lost = ~np.isfinite(np.hstack([states, qdd, found["ground_force"]])).all(axis=1)
-        vertical = found["ground_force"][:, 2]
+        outputs = evaluate(self._motion, times, q, qd, qdd)
+        not_finite = ~np.isfinite(np.hstack([states, qdd, outputs["ground_force"]])).all(axis=1)
+        vertical = outputs["ground_force"][:, 2]
         speed = np.abs(qd).max(axis=1)
-        fast = speed > self._speed_limit
+        too_fast = speed > self._speed_limit
         lifted = (vertical <= 0) & self._stop_at_lift_off
-        bad = lost | fast | lifted
+        bad = not_finite | too_fast | lifted
         end = int(bad.argmax()) if bad.any() else len(times)
-        kept = end + 1 if bad.any() and not lost[end] else end  # show what goes wrong where it has numbers
+        count = end + 1 if bad.any() and not not_finite[end] else end  # a finite failing sample is recorded too
         motion = {"t": times, "joints": q, "joint_velocities": qd, "joint_accelerations": qdd, "gap": gap[:, 0]}
-        self._kept.append({name: value[:kept] for name, value in {**motion, **found}.items()})
+        self._records.append({name: value[:count] for name, value in {**motion, **outputs}.items()})
         self.state = states[-1]
         if end == len(times):
             return None
         at = float(times[end])
-        if lost[end]:
+        if not_finite[end]:
             words = f"breaks down at {at:.4g} s: accelerations that do the tasks, or forces, are not finite"
             return Stop("breakdown", at, words)
         if lifted[end]:
@@ -489,11 +478,8 @@ class _Watch:
         words = f"diverges at {at:.4g} s: a joint reaches {speed[end]:.4g} rad/s (or m/s), above {self._speed_limit:g}"
         return Stop("divergence", at, words)
 
-    def _joined(self) -> dict[str, Array]:
-        return {name: np.concatenate([part[name] for part in self._kept]) for name in self._kept[0]}
-
-    def motion(self) -> StandingMotion:
-        return StandingMotion(**{name: value for name, value in self._joined().items() if name != "gap"})
-
-    def gaps(self) -> Array:
-        return self._joined()["gap"]
+    def results(self) -> tuple[StandingMotion, Array]:
+        """Return the recorded motion and its pose errors (M,)."""
+        joined = {name: np.concatenate([record[name] for record in self._records]) for name in self._records[0]}
+        gap = joined.pop("gap")
+        return StandingMotion(**joined), gap

@@ -1,12 +1,9 @@
-"""How near the bodies of a machine come to each other and to obstacles at samples of a motion.
+"""Distances between the bodies of a machine and obstacles at samples of a motion, and their increase by self-motion.
 
-Between the samples nothing is said: a plan's audit proves what holds there (:mod:`ocp.audit.clearance`).
-
-Postures slid along their self-motions until no bodies touch.
-
-Where joints are more than a task's rows, of the postures that do the task a sample may touch and others between not.
-Each step moves what touches apart by damped least squares (Nakamura & Hanafusa 1986) in the null space of the task, and
-puts the tips back on it. Slopes of distances are finite differences: depths of hulls have no better ones.
+Nothing is proven between the samples; the audit of a plan does that (:mod:`ocp.audit.clearance`). A redundant machine
+can move IK solutions that are in collision along their self-motions: each step separates the colliding bodies by damped
+least squares (Nakamura & Hanafusa 1986) in the null space of the task, and then corrects the tips. Gradients of
+distances are finite differences, since penetration depths of hulls have no better ones.
 """
 
 from __future__ import annotations
@@ -24,15 +21,17 @@ from ocp.errors import ProblemError, checked_instance
 from ocp.problem.hulls import BodyPairs, Hull, frames_of
 from ocp.problem.values import Sampler
 
-__all__ = ["Collision", "checked_collision_scene", "distances_along", "find_collisions", "hulls_of", "slid"]
+__all__ = ["Collision", "checked_collision_scene", "distances_along", "find_collisions", "scene_hulls", "slide_apart"]
 
 
 class Collision(NamedTuple):
-    """Two bodies that come too near.
+    """A pair of bodies closer than the clearance.
 
     Attributes:
-        pair: Its place in `CollisionScene.pairs`. bodies: Their names.
-        distance: m, negative where they overlap. time: s.
+        pair: Index in `CollisionScene.pairs`.
+        bodies: Names of the bodies.
+        distance: Distance, m, negative if they overlap.
+        time: Time, s.
     """
 
     pair: int
@@ -45,84 +44,88 @@ class Collision(NamedTuple):
         return f"{self.bodies[0]} and {self.bodies[1]} {how} at {self.time:.4g} s"
 
 
-def hulls_of(scene: CollisionScene) -> dict[str, Hull]:
-    """The bodies and obstacles, by name."""
+def scene_hulls(scene: CollisionScene) -> dict[str, Hull]:
+    """Return the bodies and obstacles of a scene by name."""
     return {
-        body.name: Hull(body.frame, body.shape.core, body.shape.swelling, getattr(body.shape, "normal", np.zeros(0)))
+        body.name: Hull(
+            body.frame, body.shape.core, body.shape.swept_radius, getattr(body.shape, "normal", np.zeros(0))
+        )
         for body in scene.bodies
     }
 
 
-def distances_along(scene: CollisionScene, base: Array, joints: Array, times: Array, near: float = np.inf) -> Array:
-    """Distances of all pairs at samples of a motion; how deep those with a mesh or a cylinder overlap is told about.
+def distances_along(scene: CollisionScene, base: Array, joints: Array, times: Array, cutoff: float = np.inf) -> Array:
+    """Return the distances of all pairs at samples of a motion. Shape (M, n), m.
 
-    Shape (M, n), m.
+    The penetration depth of a pair with a mesh or a cylinder is an estimate.
 
     Args:
-        scene: Of the machine that moves.
-        base: Its base, shape (M, base_size) or (base_size,). joints: Shape (M, joint_size). times: s. Shape (M,).
-        near: Of pairs that are no nearer than this, m, some number is told that is no less, and no more than they are.
+        scene: Collision scene of the machine that moves.
+        base: Base configurations, shape (M, base_size) or (base_size,).
+        joints: Joint positions. Shape (M, joint_size).
+        times: Times, s. Shape (M,).
+        cutoff: For pairs farther apart than this, m, a lower bound of at least `cutoff` may be returned.
     """
     count = len(joints)
     if not len(scene.pairs):
         return np.zeros((count, 0))
-    placements, bodies = _prepared(scene)
-    places = np.broadcast_to(base, (count, scene.machine.base_size))
-    return bodies.distances(frames_of(placements(places, joints, np.reshape(times, (-1, 1)))[0]), near)
+    placements, bodies = _prepare(scene)
+    bases = np.broadcast_to(base, (count, scene.machine.base_size))
+    return bodies.distances(frames_of(placements(bases, joints, np.reshape(times, (-1, 1)))[0]), cutoff)
 
 
 def find_collisions(scene: CollisionScene, base: Array, joints: Array, times: Array) -> list[Collision]:
-    """The pairs that come nearer than the clearance at some samples, each where it is nearest, the worst first.
+    """Return the pairs closer than the clearance, each at its closest sample, the worst first.
 
-    Args: As of `distances_along`.
+    The arguments are those of `distances_along`.
     """
-    apart = distances_along(scene, base, joints, times, scene.clearance)
-    if not apart.size:
+    distances = distances_along(scene, base, joints, times, scene.clearance)
+    if not distances.size:
         return []
-    where, labels = apart.argmin(axis=0), scene.labels
-    found = [
-        Collision(pair, labels[pair], float(apart[where[pair], pair]), float(np.ravel(times)[where[pair]]))
-        for pair in np.flatnonzero(apart.min(axis=0) < scene.clearance).tolist()
+    closest, labels = distances.argmin(axis=0), scene.labels
+    collisions = [
+        Collision(pair, labels[pair], float(distances[closest[pair], pair]), float(np.ravel(times)[closest[pair]]))
+        for pair in np.flatnonzero(distances.min(axis=0) < scene.clearance).tolist()
     ]
-    return sorted(found, key=lambda touch: touch.distance)
+    return sorted(collisions, key=lambda collision: collision.distance)
 
 
-def _prepared(scene: CollisionScene) -> tuple[Sampler, BodyPairs]:
-    """Of base, joints and time the placements, and all pairs; kept with the surroundings."""
-    kept: tuple[Sampler, BodyPairs] | None = scene.__dict__.get("_prepared")
-    if kept is None:
+def _prepare(scene: CollisionScene) -> tuple[Sampler, BodyPairs]:
+    """Return the placements as a function of base, joints and time, and all pairs of bodies, cached with the scene."""
+    cached: tuple[Sampler, BodyPairs] | None = scene.__dict__.get("_prepared")
+    if cached is None:
         machine = scene.machine
         base, joints = ca.SX.sym("base", machine.base_size), ca.SX.sym("q", machine.joint_size)
         time = ca.SX.sym("time")
         placements = Sampler([base, joints, time], [ca.SX(scene.placements(base, joints, time))])
-        hulls = tuple(hulls_of(scene).values())
-        kept = placements, BodyPairs(hulls, scene.pairs, scene.covers)
-        scene.__dict__["_prepared"] = kept
-    return kept
+        hulls = tuple(scene_hulls(scene).values())
+        cached = placements, BodyPairs(hulls, scene.pairs, scene.covers)
+        scene.__dict__["_prepared"] = cached
+    return cached
 
 
 def checked_collision_scene(value: Any, machine: Machine, limits: bool = True) -> CollisionScene:
-    """Surroundings of a machine whose joints keep their limits, or do not, or ProblemError unless they are."""
+    """Return a collision scene; ProblemError unless it is of the machine and treats joint limits as `limits` says."""
     if checked_instance("scene", value, CollisionScene).machine is not machine:
-        words = "surroundings are those of another machine; make them of this one: Surroundings(machine, ...)"
+        words = "scene belongs to another machine; build it from this one: CollisionScene(machine, ...)"
         raise ProblemError(words, name="scene", value=value)
     if value.limits and not limits:
-        words = "surroundings keep the joints within their limits; make them without: Surroundings(..., limits=False)"
+        words = "scene assumes joints within their limits; build it without: CollisionScene(..., limits=False)"
         raise ProblemError(words, name="scene", value=value)
-    found: CollisionScene = value
-    return found
+    scene: CollisionScene = value
+    return scene
 
 
 @dataclass(frozen=True)
 class SlidingSettings:
-    """How postures are slid.
+    """Settings of `slide_apart`.
 
     Attributes:
-        steps: At most.
-        difference: Of finite differences, rad or m: the root of the distances' rounding, 1e-10 m.
-        longest: Step of any joint, rad or m.
-        damping: Relative to the size of the slopes.
-        spare: By which what is slid is farther off than it has to be, so that putting the tips back leaves it clear, m.
+        steps: Largest number of steps.
+        difference: Step of the finite differences, rad or m: the root of the rounding error of distances, 1e-10 m.
+        longest: Longest step of any joint, rad or m.
+        damping: Damping relative to the size of the gradients.
+        spare: Distance in excess of the clearance, so that correcting the tips does not use up the clearance, m.
     """
 
     steps: int = 12
@@ -132,7 +135,10 @@ class SlidingSettings:
     spare: float = 2e-3
 
 
-def slid(
+SLIDING = SlidingSettings()
+
+
+def slide_apart(
     scene: CollisionScene,
     base: Array,
     joints: Array,
@@ -142,48 +148,48 @@ def slid(
     back: Callable[[Array], Array],
     lower: Array,
     upper: Array,
-    settings: SlidingSettings = SlidingSettings(),
 ) -> Array:
-    """Postures moved off what they touch, as far as that goes.
+    """Move configurations in collision along their self-motions, as far as needed or possible.
 
     Args:
-        scene: Of the machine. base: Its base. Shape (base_size,). time: s.
-        joints: Postures that do the task. Shape (K, n).
-        jacobian: Of the task at a posture (n,). Shape (m, n).
-        back: Postures (K, n) -> postures nearby that do the task again.
+        scene: Collision scene of the machine.
+        base: Base configuration. Shape (base_size,).
+        joints: Configurations that do the task. Shape (K, n).
+        time: Time, s.
+        jacobian: Jacobian of the task at a configuration (n,). Shape (m, n).
+        back: Configurations (K, n) -> nearby configurations that do the task again.
         lower, upper: Limits of the joints. Shape (n,).
-        settings: How.
 
     Returns:
-        Of each posture the one on its way whose least distance is largest. Shape (K, n).
+        For each configuration the one on its path with the largest minimum distance. Shape (K, n).
     """
     count, n = joints.shape
-    wanted = scene.clearance + settings.spare
+    target = scene.clearance + SLIDING.spare
 
-    def measured(postures: Array) -> Array:
-        """Of all pairs, those farther than is wanted not told how far. Shape (K, P)."""
-        return distances_along(scene, base, postures, np.full(len(postures), time), near=wanted)
+    def distances(configurations: Array) -> Array:
+        """Return the distances of all pairs; beyond the target a lower bound is enough. Shape (K, P)."""
+        return distances_along(scene, base, configurations, np.full(len(configurations), time), cutoff=target)
 
-    best, at, depth = joints.copy(), joints.copy(), np.full(count, -np.inf)
-    for _ in range(settings.steps):
-        moved = (at[:, None] + settings.difference * np.eye(n)).reshape(-1, n)
-        gaps = measured(at)
-        least = gaps.min(axis=1)
-        better = least > depth
-        best[better], depth[better] = at[better], least[better]
-        if (depth >= scene.clearance).any():
+    best, current, clearance = joints.copy(), joints.copy(), np.full(count, -np.inf)
+    for _ in range(SLIDING.steps):
+        perturbed = (current[:, None] + SLIDING.difference * np.eye(n)).reshape(-1, n)
+        gaps = distances(current)
+        minimum = gaps.min(axis=1)
+        better = minimum > clearance
+        best[better], clearance[better] = current[better], minimum[better]
+        if (clearance >= scene.clearance).any():
             break
-        slopes = (measured(moved).reshape(count, n, -1) - gaps[:, None]) / settings.difference
-        step = np.array([_step(*each, wanted, settings) for each in zip(map(jacobian, at), gaps, slopes, strict=True)])
-        at = back(np.clip(at + step, lower, upper))
+        gradients = (distances(perturbed).reshape(count, n, -1) - gaps[:, None]) / SLIDING.difference
+        step = np.array([_step(*each, target) for each in zip(map(jacobian, current), gaps, gradients, strict=True)])
+        current = back(np.clip(current + step, lower, upper))
     return best
 
 
-def _step(task: Array, gaps: Array, slopes: Array, wanted: float, settings: SlidingSettings) -> Array:
-    """Joints (n,) that move what is too near apart, and the tips nowhere to first order."""
-    close = gaps < wanted
-    null = np.eye(task.shape[1]) - np.linalg.pinv(task) @ task
-    rows = slopes[:, close].T @ null
-    soft = settings.damping**2 * max(float((rows**2).sum(axis=1).max(initial=0.0)), 1e-12)
-    step = rows.T @ np.linalg.solve(rows @ rows.T + soft * np.eye(len(rows)), wanted - gaps[close])
-    return np.asarray(step * min(1.0, settings.longest / max(float(np.abs(step).max()), 1e-12)))
+def _step(jacobian: Array, distances: Array, gradients: Array, target: float) -> Array:
+    """Return the joint step (n,) that separates close pairs and, to first order, does not move the tips."""
+    close = distances < target
+    projector = np.eye(jacobian.shape[1]) - np.linalg.pinv(jacobian) @ jacobian
+    rows = gradients[:, close].T @ projector
+    regularisation = SLIDING.damping**2 * max(float((rows**2).sum(axis=1).max(initial=0.0)), 1e-12)
+    step = rows.T @ np.linalg.solve(rows @ rows.T + regularisation * np.eye(len(rows)), target - distances[close])
+    return np.asarray(step * min(1.0, SLIDING.longest / max(float(np.abs(step).max()), 1e-12)))

@@ -1,7 +1,7 @@
-"""Joint positions for a pose: multi-start inverse kinematics under joint limits, and where a task leaves the reach.
+"""Multi-start inverse kinematics under joint limits.
 
-Damped Gauss-Newton (Levenberg 1944, Marquardt 1963) from many starts at once, on bounds by projection: joints at a
-limit that a step would leave are held for that step. All starts share one mapped casadi function.
+Damped Gauss-Newton (Levenberg 1944, Marquardt 1963) from many starts at once, with bounds by projection: joints at a
+limit that a step would violate are fixed in that step. All starts share one mapped CasADi function.
 """
 
 from __future__ import annotations
@@ -18,34 +18,34 @@ from models import CollisionScene, Machine
 from models.arrays import Array
 from ocp.console import interruptible
 from ocp.errors import NOT_NUMBERS, ProblemError, checked_count, checked_flag, checked_positive, floats, real
-from ocp.motion.local.collisions import Collision, checked_collision_scene, find_collisions, slid
+from ocp.motion.local.collisions import Collision, checked_collision_scene, find_collisions, slide_apart
 from ocp.motion.tasks.checks import checked_configuration
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.geometry import pose_in_reference
 from ocp.motion.tasks.tip_task import ANGULAR, TipTask
 
-__all__ = ["IkSolution", "Unreachable", "inverse_kinematics", "postures_of"]
+__all__ = ["IkSolution", "Unreachable", "inverse_kinematics", "inverse_kinematics_at"]
 
 LARGEST_SEED = 2**64
 
 
 @dataclass(frozen=True)
-class InverseSettings:
-    """How postures are looked for: Levenberg-Marquardt steps from many starts.
+class IkSettings:
+    """Settings of the Levenberg-Marquardt iterations and of the selection of their solutions.
 
     Attributes:
-        tolerance: Largest misfit of a posture, m and rad.
-        apart: Postures nearer to each other are one, m and rad.
-        iterations: Of each start.
-        slide_spread: m: of the starts of slides without limits.
-        first_damping: Of the first step.
-        least_damping: Below which it does not fall.
-        most_damping: At which a start is given up.
-        growth: Of the damping after a step that fails.
-        shrinkage: Of the damping after a step that succeeds.
-        reach_tolerance: A pose missed by less, m or rad, is not called out of reach.
-        slid: Postures that touch least, slid along their self-motions where all of them touch.
-        simpson_steps: Over which a velocity is summed up to a position.
+        tolerance: Largest pose error of a solution, m and rad.
+        apart: Solutions closer to each other count as one, m and rad.
+        iterations: Largest number of iterations of each start.
+        slide_spread: Range of the starts of prismatic joints without limits, m.
+        first_damping: Damping of the first step.
+        least_damping: Least damping.
+        most_damping: Damping at which a start is abandoned.
+        growth: Factor of the damping after a step that fails.
+        shrinkage: Factor of the damping after a step that succeeds.
+        reach_tolerance: Pose error below which a pose does not count as out of reach, m or rad.
+        slide_count: Number of solutions in collision that are moved along their self-motions if no solution is free.
+        simpson_steps: Steps of the integration of a velocity to a position.
     """
 
     tolerance: float = 1e-10
@@ -58,29 +58,27 @@ class InverseSettings:
     growth: float = 4.0
     shrinkage: float = 0.25
     reach_tolerance: float = 1e-4
-    slid: int = 8
+    slide_count: int = 8
     simpson_steps: int = 400
 
 
-INVERSE = InverseSettings()
-
-"""Instants of the horizon at which a task's poses are looked for, the start among them."""
+IK_SETTINGS = IkSettings()
 
 
 @dataclass(frozen=True)
 class IkSolution:
-    """Joint positions that put the tip where it is wanted.
+    """Joint positions at a target pose.
 
     Attributes:
         joints: Shape (joint_size,), rad or m.
-        quality: Manipulability of the task times the least distance of a joint from its limits, the latter as a share
-            of half its range: 0 at a limit or where the task is singular.
-        misfit: Distance that is left, m or rad, the greatest of all tasks.
+        quality: Manipulability of the task times the least distance of a joint from its limits, as a share of half its
+            range: 0 at a limit or a singularity.
+        pose_error: Largest remaining pose error of all tasks, m or rad.
     """
 
     joints: Array
     quality: float
-    misfit: float
+    pose_error: float
 
 
 class Unreachable(ProblemError):
@@ -88,17 +86,17 @@ class Unreachable(ProblemError):
 
     Attributes:
         joints: The nearest miss. Shape (joint_size,).
-        misfit: How far it is off, m or rad (2 sin(angle / 2)).
+        pose_error: Its pose error, m or rad (2 sin(angle / 2)).
     """
 
-    def __init__(self, message: str, joints: Array, misfit: float, **details: Any) -> None:
+    def __init__(self, message: str, joints: Array, pose_error: float, **details: Any) -> None:
         super().__init__(message, **details)
         self.joints = joints
-        self.misfit = misfit
+        self.pose_error = pose_error
 
     def __reduce__(self) -> Any:
-        """Pickled with what it is made from, and with its fields."""
-        return type(self), (*self.args, self.joints, self.misfit), self.__dict__
+        """Pickle the arguments together with the fields."""
+        return type(self), (*self.args, self.joints, self.pose_error), self.__dict__
 
 
 @interruptible
@@ -112,51 +110,51 @@ def inverse_kinematics(
     near: Any = None,
     seed: int = 0,
     limits: bool = True,
-    tolerance: float = INVERSE.tolerance,
-    apart: float = INVERSE.apart,
-    iterations: int = INVERSE.iterations,
+    tolerance: float = IK_SETTINGS.tolerance,
+    apart: float = IK_SETTINGS.apart,
+    iterations: int = IK_SETTINGS.iterations,
     scene: CollisionScene | None = None,
 ) -> list[IkSolution]:
-    """Different joint positions at which the machine is where its pose tasks want it, the best first.
+    """Return distinct joint positions at which the machine does its pose tasks, the best first.
 
-    Where the joints are more than the rows, solutions form families, of which each start gives one member.
+    If there are more joints than rows, the solutions form families, and each start gives one member.
 
     Args:
-        machine: Any machine; a floating base stands at `base` meanwhile.
-        task: A TipTask with a pose, or several that hold at once; tasks of velocities are left out.
-        time: At which the tasks are taken, s.
+        machine: Any machine; a floating base stays at `base`.
+        task: A TipTask with a pose, or several that hold at once; velocity tasks are ignored.
+        time: Time of the tasks, s.
         base: Base configuration, shape (base_size,); the machine's base_home() if None.
-        starts: How many random starts, uniform between the limits, -pi .. pi where there are none.
+        starts: Number of random starts, uniform between the limits, -pi .. pi for unlimited joints.
         near: Further starts, before the random ones. Shape (joint_size,) or (k, joint_size).
-        seed: Of the random starts.
-        limits: Whether the robot's position limits hold.
-        tolerance: Largest misfit of a solution, m and rad.
-        apart: Least distance between two solutions, in the greatest joint, angles modulo full turns.
-        iterations: Of each start, at most.
-        scene: Of the machine; postures in which its bodies come nearer to each other or to obstacles than the
-            clearance are left out. Where that leaves none, those that touch least are slid along their self-motions.
+        seed: Seed of the random starts.
+        limits: Whether the position limits of the robot apply.
+        tolerance: Largest pose error of a solution, m and rad.
+        apart: Least distance between two solutions, in the largest joint difference, angles modulo full turns.
+        iterations: Largest number of iterations of each start.
+        scene: Collision scene of the machine; solutions closer than the clearance are left out. If that leaves none,
+            the ones with the largest distances are moved along their self-motions.
 
     Returns:
-        The solutions, at least one, by falling quality.
+        The solutions, at least one, by decreasing quality.
 
     Raises:
-        Unreachable: No start leads to the pose, with the nearest miss; or none to a posture that is clear, with the
-            pair that touches least.
-        ProblemError: No pose among the tasks, no joint, wrong sizes or numbers.
+        Unreachable: No start leads to the pose, with the nearest miss; or no solution is collision-free, with the pair
+            of the one that is closest to it.
+        ProblemError: No task is a pose, the robot has no joint, or a size or number is invalid.
     """
     equations = bind(machine, task)
     if not machine.joint_size:
-        words = "inverse_kinematics: the robot has no moving joint, and stands where its base is"
+        words = "inverse_kinematics: the robot has no moving joint"
         raise ProblemError(words, name="machine", value=machine)
-    posed = tuple(part for part in equations.bound if part.task.is_pose)
-    if not posed:
+    pose_tasks = tuple(part for part in equations.bound if part.task.is_pose)
+    if not pose_tasks:
         words = "inverse kinematics need a pose: task=TipTask(position=..., orientation=... or direction=...)"
         raise ProblemError(words, name="task")
-    equations = TaskEquations(machine, posed)
-    for what, number in (("starts", starts), ("iterations", iterations)):
-        checked_count(what, number, least=int(what == "iterations"))
-    for what, value in (("tolerance", tolerance), ("apart", apart)):
-        checked_positive(what, value)
+    equations = TaskEquations(machine, pose_tasks)
+    for name, number in (("starts", starts), ("iterations", iterations)):
+        checked_count(name, number, least=int(name == "iterations"))
+    for name, value in (("tolerance", tolerance), ("apart", apart)):
+        checked_positive(name, value)
     checked_count("seed", seed, 0, LARGEST_SEED)
     checked_flag("limits", limits)
     if scene is not None:
@@ -164,253 +162,277 @@ def inverse_kinematics(
     if not np.isfinite(real(time)):
         raise ProblemError(f"time must be a finite number of seconds, not {time!r}", name="time", value=time)
     size = machine.joint_size
-    place = checked_configuration(machine, np.zeros(size), base)[1]
+    base_values = checked_configuration(machine, np.zeros(size), base)[1]
     unbounded = np.full(size, np.inf)
     lower, upper = (machine.robot.lower, machine.robot.upper) if limits else (-unbounded, unbounded)
-    first = starts_of(machine, lower, upper, int(starts), near, seed)
+    first = start_configurations(machine, lower, upper, int(starts), near, seed)
     targets = np.array(equations.target_function()(float(time))).ravel()
     if not np.isfinite(targets).all():
         words = f"the task's targets are not finite at {time:g} s"
         raise ProblemError(words, name="task", value=targets, time=float(time))
 
-    search = _Search(equations, place, targets, lower, upper, tolerance, apart, int(iterations))
-    distinct = search.postures(first, int(starts))
+    search = _MultiStart(equations, base_values, targets, lower, upper, tolerance, apart, int(iterations))
+    solutions = search.solve(first, int(starts))
     if scene is None:
-        return distinct
-    nearest = _touching(distinct, scene, place, float(time))
-    if all(nearest) and equations.size < size:
-        order = sorted(range(len(distinct)), key=lambda k: -nearest[k].distance)  # type: ignore[union-attr]
-        least = np.array([distinct[k].joints for k in order[: INVERSE.slid]])
-        moved = slid(
+        return solutions
+    collisions = _closest_collisions(solutions, scene, base_values, float(time))
+    if all(collisions) and equations.size < size:
+        order = sorted(range(len(solutions)), key=lambda k: -collisions[k].distance)  # type: ignore[union-attr]
+        closest = np.array([solutions[k].joints for k in order[: IK_SETTINGS.slide_count]])
+        moved = slide_apart(
             scene,
-            place,
-            least,
+            base_values,
+            closest,
             float(time),
-            jacobian=lambda joints: np.array(equations.jacobian_function(joints, place)),
-            back=lambda joints: search.back(joints)[0],
+            jacobian=lambda joints: np.array(equations.jacobian_function(joints, base_values)),
+            back=lambda joints: search.iterate(joints)[0],
             lower=lower,
             upper=upper,
         )
-        distinct += search.rated(*search.back(moved))
-        nearest = _touching(distinct, scene, place, float(time))
-    return _clear(distinct, nearest, scene, float(time))
+        solutions += search.rank(*search.iterate(moved))
+        collisions = _closest_collisions(solutions, scene, base_values, float(time))
+    return _collision_free(solutions, collisions, scene, float(time))
 
 
-def postures_of(equations: TaskEquations, targets: Array, *, starts: int, seed: int, limits: bool) -> list[IkSolution]:
-    """As `inverse_kinematics` on a fixed base, of poses whose targets are known; again and again at little cost.
+def inverse_kinematics_at(
+    equations: TaskEquations, targets: Array, *, starts: int, seed: int, limits: bool
+) -> list[IkSolution]:
+    """Return IK solutions on a fixed base for known targets, repeatedly at low cost; see `inverse_kinematics`.
 
     Raises:
-        Unreachable: As there.
+        Unreachable: No start leads to the pose.
     """
     machine, unbounded = equations.machine, np.full(equations.machine.joint_size, np.inf)
     lower, upper = (machine.robot.lower, machine.robot.upper) if limits else (-unbounded, unbounded)
-    first = starts_of(machine, lower, upper, starts, None, seed)
-    return _Search(equations, np.zeros(0), targets, lower, upper).postures(first, starts)
+    first = start_configurations(machine, lower, upper, starts, None, seed)
+    return _MultiStart(equations, np.zeros(0), targets, lower, upper).solve(first, starts)
 
 
 @dataclass(frozen=True)
-class _Search:
-    """For postures that do tasks at one time; arguments as of `inverse_kinematics`."""
+class _MultiStart:
+    """Iterations from many starts towards the pose tasks at one time; fields as for `inverse_kinematics`."""
 
     equations: TaskEquations
     base: Array
     targets: Array
     lower: Array
     upper: Array
-    tolerance: float = INVERSE.tolerance
-    apart: float = INVERSE.apart
-    iterations: int = INVERSE.iterations
+    tolerance: float = IK_SETTINGS.tolerance
+    apart: float = IK_SETTINGS.apart
+    iterations: int = IK_SETTINGS.iterations
 
-    def postures(self, first: Array, random: int) -> list[IkSolution]:
-        """Those that starts (K, n) lead to, the best first; of the last `random` ones angles without limits come round.
+    def solve(self, first: Array, random: int) -> list[IkSolution]:
+        """Return the solutions from starts (K, n), the best first; unlimited angles of the last `random` ones are
+        wrapped.
 
         Raises:
-            Unreachable: There is none.
+            Unreachable: There is no solution.
         """
         lower, upper = self.lower, self.upper
-        q, misfit = self.back(first)
-        wrap = self._turns & ~np.isfinite(lower) & ~np.isfinite(upper)
-        last = slice(len(first) - random, None)  # what is near a given start stays there
+        q, error = self.iterate(first)
+        wrap = self._revolute & ~np.isfinite(lower) & ~np.isfinite(upper)
+        last = slice(len(first) - random, None)  # solutions from given starts stay near them
         q[last, wrap] = np.remainder(q[last, wrap] + np.pi, 2 * np.pi) - np.pi
-        if not (misfit <= self.tolerance).any():
-            nearest = int(misfit.argmin())
-            raise unreachable(self.equations.machine, self.equations, q[nearest], float(misfit[nearest]), lower, upper)
-        return self.rated(q, misfit)
+        if not (error <= self.tolerance).any():
+            nearest = int(error.argmin())
+            raise unreachable_error(self.equations, q[nearest], float(error[nearest]), lower, upper)
+        return self.rank(q, error)
 
-    def back(self, joints: Array) -> tuple[Array, Array]:
-        """Joints (K, n) and greatest misfits (K,) that others lead to."""
-        told = ca.DM(self.base), ca.DM(self.targets)
-        function = self.equations.misfit_function
-        return gauss_newton(function, joints, self.lower, self.upper, self.tolerance, self.iterations, told)
+    def iterate(self, joints: Array) -> tuple[Array, Array]:
+        """Return joints (K, n) and largest pose errors (K,) after the iterations from these joints."""
+        fixed = ca.DM(self.base), ca.DM(self.targets)
+        function = self.equations.pose_residual_function
+        return gauss_newton(function, joints, self.lower, self.upper, self.tolerance, self.iterations, fixed)
 
-    def rated(self, joints: Array, misfits: Array) -> list[IkSolution]:
-        """Those that do the task, the best first, each once."""
-        good, lower, upper = np.flatnonzero(misfits <= self.tolerance), self.lower, self.upper
-        if not good.size:
+    def rank(self, joints: Array, errors: Array) -> list[IkSolution]:
+        """Return the distinct solutions among candidates, the best first."""
+        solved, lower, upper = np.flatnonzero(errors <= self.tolerance), self.lower, self.upper
+        if not solved.size:
             return []
-        joints, size = joints[good], self.equations.size
-        slopes = np.array(self.equations.jacobian_function.map(len(good))(joints.T, ca.DM(self.base)))
-        values = np.linalg.svd(slopes.reshape(size, *joints.shape).transpose(1, 0, 2), compute_uv=False)
+        joints, size = joints[solved], self.equations.size
+        jacobians = np.array(self.equations.jacobian_function.map(len(solved))(joints.T, ca.DM(self.base)))
+        values = np.linalg.svd(jacobians.reshape(size, *joints.shape).transpose(1, 0, 2), compute_uv=False)
         with np.errstate(invalid="ignore"):
             share = np.minimum(joints - lower, upper - joints) / ((upper - lower) / 2)
         margin = np.min(share[:, np.isfinite(upper - lower) & (upper > lower)], axis=1, initial=1.0)
         quality = values.prod(axis=1) * np.maximum(margin, 0.0)
-        found = [IkSolution(*each) for each in zip(joints, quality.tolist(), misfits[good].tolist(), strict=True)]
-        return distinct(sorted(found, key=lambda posture: -posture.quality), self._turns, self.apart)
+        solutions = [IkSolution(*each) for each in zip(joints, quality.tolist(), errors[solved].tolist(), strict=True)]
+        return distinct_solutions(sorted(solutions, key=lambda solution: -solution.quality), self._revolute, self.apart)
 
     @property
-    def _turns(self) -> NDArray[np.bool_]:
-        """Which joints turn. Shape (n,)."""
+    def _revolute(self) -> NDArray[np.bool_]:
+        """Which joints are revolute. Shape (n,)."""
         return np.array([joint.kind != "prismatic" for joint in self.equations.machine.robot.moving_joints])
 
 
-def as_pose(machine: Machine, task: TipTask, start: Array, time: float, base: Any = ()) -> TipTask | None:
-    """The pose that a task has come to at a time; None where that depends on the way, or has a gap to close.
+def equivalent_pose(machine: Machine, task: TipTask, start: Array, time: float, base: Any = ()) -> TipTask | None:
+    """Return a task as a pose task at a time; None if its pose depends on the path or has a start gap to close.
 
     Args:
+        machine, task: The machine and its task.
         start, base: Joints and base at the start.
-        time: s, from when the task begins.
+        time: Time since the begin of the task, s.
     """
     if task.is_pose:
-        return task if task.start_gap <= INVERSE.reach_tolerance else None
+        return task if task.start_gap <= IK_SETTINGS.reach_tolerance else None
     rows = [row for row in task.chosen if row not in ANGULAR]
     if not rows or task.axes not in ("world", "reference") or (task.axes == "world") != (task.relative_to is None):
         return None
     equations = bind(machine, task)
-    times = np.linspace(0.0, time, INVERSE.simpson_steps + 1)
+    times = np.linspace(0.0, time, IK_SETTINGS.simpson_steps + 1)
     values = np.array(equations.target_function().map(len(times))(times[None, :]))
-    weights = np.ones(INVERSE.simpson_steps + 1)
+    weights = np.ones(IK_SETTINGS.simpson_steps + 1)
     weights[1:-1:2], weights[2:-1:2] = 4, 2
-    moved = np.zeros(3)
-    wanted = values[[task.chosen.index(row) for row in rows]]
-    moved[[row - 3 for row in rows]] = wanted @ weights * time / INVERSE.simpson_steps / 3
-    first, _ = pose_in_reference(equations.bound[0], ca.DM(base), ca.DM(start))
-    return replace(task, velocity=None, rows=rows, position=np.array(ca.DM(first)).ravel() + moved)
+    displacement = np.zeros(3)
+    velocities = values[[task.chosen.index(row) for row in rows]]
+    displacement[[row - 3 for row in rows]] = velocities @ weights * time / IK_SETTINGS.simpson_steps / 3
+    origin, _ = pose_in_reference(equations.bound[0], ca.DM(base), ca.DM(start))
+    return replace(task, velocity=None, rows=rows, position=np.array(ca.DM(origin)).ravel() + displacement)
 
 
-def starts_of(machine: Machine, lower: Array, upper: Array, count: int, near: Any, seed: int) -> Array:
+def start_configurations(machine: Machine, lower: Array, upper: Array, count: int, near: Any, seed: int) -> Array:
+    """Return the starts: those of `near`, then `count` random ones between the limits. Shape (K, n)."""
     size, rng = machine.joint_size, np.random.default_rng(seed)
-    slides = np.array([joint.kind == "prismatic" for joint in machine.robot.moving_joints])
-    span = np.where(slides, INVERSE.slide_spread, np.pi)
+    prismatic = np.array([joint.kind == "prismatic" for joint in machine.robot.moving_joints])
+    span = np.where(prismatic, IK_SETTINGS.slide_spread, np.pi)
     low = np.where(np.isfinite(lower), lower, np.where(np.isfinite(upper), upper - 2 * span, -span))
     high = np.where(np.isfinite(upper), upper, np.where(np.isfinite(lower), lower + 2 * span, span))
     try:
-        given = np.zeros((0, size)) if near is None else np.atleast_2d(floats(near))
+        first = np.zeros((0, size)) if near is None else np.atleast_2d(floats(near))
     except NOT_NUMBERS as error:
         raise ProblemError(f"near {near!r} is not numeric", name="near", value=near, limit=(size,)) from error
-    if given.ndim != 2 or given.shape[1] != size or not np.isfinite(given).all():
-        words = f"near has shape {given.shape}, ({size},) or (k, {size}) of finite numbers expected"
-        raise ProblemError(words, name="near", value=given, limit=(size,))
-    both = np.vstack([given, low + (high - low) * rng.random((count, size))])
-    if not len(both):
+    if first.ndim != 2 or first.shape[1] != size or not np.isfinite(first).all():
+        words = f"near has shape {first.shape}, ({size},) or (k, {size}) of finite numbers expected"
+        raise ProblemError(words, name="near", value=first, limit=(size,))
+    starts = np.vstack([first, low + (high - low) * rng.random((count, size))])
+    if not len(starts):
         raise ProblemError("starts = 0 and near = None leave no start", name="starts", value=0, limit=1)
-    return np.asarray(np.clip(both, lower, upper))
+    return np.asarray(np.clip(starts, lower, upper))
 
 
-def at_rest(lower: Array, upper: Array) -> Array:
-    """Where joints stand of which nothing is asked: in the middle of their limits, else within them next to 0."""
+def idle_positions(lower: Array, upper: Array) -> Array:
+    """Return positions for joints without effect: the middle of their limits, else the value next to 0."""
     with np.errstate(invalid="ignore"):
         middle = (lower + upper) / 2
     return np.asarray(np.where(np.isfinite(middle), middle, np.clip(0.0, lower, upper)))
 
 
 def gauss_newton(
-    function: Any, first: Array, lower: Array, upper: Array, tolerance: float, iterations: int, told: Sequence[Any] = ()
+    function: Any,
+    starts: Array,
+    lower: Array,
+    upper: Array,
+    tolerance: float,
+    iterations: int,
+    fixed: Sequence[Any] = (),
 ) -> tuple[Array, Array]:
-    """Joints (K, n) and greatest misfits (K,) that the starts lead to.
+    """Return joints (K, n) and largest residuals (K,) after damped Gauss-Newton iterations from starts.
 
     Args:
-        function: Casadi Function of the joints, and what else is `told` of all, -> (misfit, its Jacobian).
+        function: CasADi Function of the joints and `fixed` -> (residual, its Jacobian).
+        first: Starts. Shape (K, n).
+        lower, upper: Limits of the joints. Shape (n,).
+        tolerance: Largest residual of a solution.
+        iterations: Largest number of iterations.
+        fixed: Further arguments of the function, common to all starts.
     """
-    q = first.copy()
+    q = starts.copy()
     count, n = q.shape
     mapped = function.map(count)
 
     def evaluate(at: Array) -> tuple[Array, Array]:
-        residual, jacobian = (np.array(part) for part in mapped(at.T, *told))
+        residual, jacobian = (np.array(part) for part in mapped(at.T, *fixed))
         rows = len(residual)
         return residual.T, jacobian.reshape(rows, count, n).transpose(1, 0, 2)
 
     residual, jacobian = evaluate(q)
-    cost, damping = (residual**2).sum(axis=1), np.full(count, INVERSE.first_damping)
+    cost, damping = (residual**2).sum(axis=1), np.full(count, IK_SETTINGS.first_damping)
     for _ in range(iterations):
-        busy = (np.abs(residual).max(axis=1) > tolerance / 10) & (damping < INVERSE.most_damping)
-        if not busy.any():
+        active = (np.abs(residual).max(axis=1) > tolerance / 10) & (damping < IK_SETTINGS.most_damping)
+        if not active.any():
             break
         gradient = np.einsum("kij,ki->kj", jacobian, residual)
-        held = ((q <= lower) & (gradient > 0)) | ((q >= upper) & (gradient < 0))
-        free = np.where(held[:, None, :], 0.0, jacobian)
+        at_limit = ((q <= lower) & (gradient > 0)) | ((q >= upper) & (gradient < 0))
+        free = np.where(at_limit[:, None, :], 0.0, jacobian)
         normal = np.einsum("kij,kil->kjl", free, free) + damping[:, None, None] * np.eye(n)
-        step = -np.linalg.solve(normal, np.where(held, 0.0, gradient)[:, :, None])[:, :, 0]
+        step = -np.linalg.solve(normal, np.where(at_limit, 0.0, gradient)[:, :, None])[:, :, 0]
         trial = np.clip(q + np.clip(step, -1.0, 1.0), lower, upper)
-        trial[~busy] = q[~busy]
+        trial[~active] = q[~active]
         new_residual, new_jacobian = evaluate(trial)
         new_cost = (new_residual**2).sum(axis=1)
-        better = busy & (new_cost < cost)
+        better = active & (new_cost < cost)
         q[better], residual[better], jacobian[better] = trial[better], new_residual[better], new_jacobian[better]
         cost[better] = new_cost[better]
-        less, more = np.maximum(INVERSE.shrinkage * damping, INVERSE.least_damping), INVERSE.growth * damping
-        damping = np.where(better, less, np.where(busy, more, damping))
+        decreased, increased = (
+            np.maximum(IK_SETTINGS.shrinkage * damping, IK_SETTINGS.least_damping),
+            IK_SETTINGS.growth * damping,
+        )
+        damping = np.where(better, decreased, np.where(active, increased, damping))
     return q, np.abs(residual).max(axis=1)
 
 
-def distinct(found: list[IkSolution], turns: NDArray[np.bool_], apart: float = INVERSE.apart) -> list[IkSolution]:
-    """Of those nearer than `apart`, full turns not counted, the best."""
-    kept: list[IkSolution] = []
-    for posture in found:
-        for other in kept:
-            difference = posture.joints - other.joints
-            difference[turns] = np.remainder(difference[turns] + np.pi, 2 * np.pi) - np.pi
+def distinct_solutions(
+    solutions: list[IkSolution], revolute: NDArray[np.bool_], apart: float = IK_SETTINGS.apart
+) -> list[IkSolution]:
+    """Return the first of each group of solutions within `apart`, angles modulo full turns."""
+    distinct: list[IkSolution] = []
+    for solution in solutions:
+        for previous in distinct:
+            difference = solution.joints - previous.joints
+            difference[revolute] = np.remainder(difference[revolute] + np.pi, 2 * np.pi) - np.pi
             if np.abs(difference).max() < apart:
                 break
         else:
-            kept.append(posture)
-    return kept
+            distinct.append(solution)
+    return distinct
 
 
-def _touching(found: list[IkSolution], scene: CollisionScene, base: Array, time: float) -> list[Collision | None]:
-    """Of each posture the pair that is nearest, where it comes nearer than the clearance."""
-    touching = [find_collisions(scene, base[None], posture.joints[None], np.array([time])) for posture in found]
-    return [each[0] if each else None for each in touching]
+def _closest_collisions(
+    solutions: list[IkSolution], scene: CollisionScene, base: Array, time: float
+) -> list[Collision | None]:
+    """Return for each solution its closest pair below the clearance, or None."""
+    collisions = (find_collisions(scene, base[None], solution.joints[None], np.array([time])) for solution in solutions)
+    return [next(iter(each), None) for each in collisions]
 
 
-def _clear(
-    found: list[IkSolution], nearest: list[Collision | None], scene: CollisionScene, time: float
+def _collision_free(
+    solutions: list[IkSolution], collisions: list[Collision | None], scene: CollisionScene, time: float
 ) -> list[IkSolution]:
-    """The postures in which nothing comes nearer than the clearance.
+    """Return the collision-free solutions.
 
     Raises:
         Unreachable: There are none.
     """
-    collision_free = [posture for posture, touch in zip(found, nearest, strict=True) if touch is None]
-    if collision_free:
-        return collision_free
-    best = max(range(len(found)), key=lambda k: nearest[k].distance if nearest[k] else 0.0)  # type: ignore[union-attr]
-    touch = nearest[best]
-    assert touch is not None
+    free = [solution for solution, collision in zip(solutions, collisions, strict=True) if collision is None]
+    if free:
+        return free
+    best = max(range(len(solutions)), key=lambda k: collisions[k].distance if collisions[k] else 0.0)  # type: ignore[union-attr]
+    collision = collisions[best]
+    assert collision is not None
     raise Unreachable(
-        f"each of the {len(found)} postures found touches; the one that does least: {touch}",
-        found[best].joints,
-        found[best].misfit,
-        name=" and ".join(touch.bodies),
-        value=touch.distance,
+        f"each of the {len(solutions)} IK solutions is in collision; closest to collision-free: {collision}",
+        solutions[best].joints,
+        solutions[best].pose_error,
+        name=" and ".join(collision.bodies),
+        value=collision.distance,
         limit=scene.clearance,
         time=time,
     )
 
 
-def unreachable(
-    machine: Machine, equations: TaskEquations, joints: Array, misfit: float, lower: Array, upper: Array
+def unreachable_error(
+    equations: TaskEquations, joints: Array, pose_error: float, lower: Array, upper: Array
 ) -> Unreachable:
+    """Return the error for a pose without solution, with the nearest miss."""
     names = [part.task.link or part.tip.robot.tip_link for part in equations.bound]
-    stopped = np.flatnonzero((joints <= lower) | (joints >= upper))
-    at_limit = [machine.robot.joint_names[k] for k in stopped]
+    limited = np.flatnonzero((joints <= lower) | (joints >= upper))
+    at_limit = [equations.machine.robot.joint_names[k] for k in limited]
     where = f", with {at_limit} at their limits" if at_limit else ""
     return Unreachable(
-        f"no joint positions put {names} where the task wants them: the nearest miss is {misfit:.3g} (m or rad) at "
+        f"no joint positions put {names} where the task wants them: the nearest miss is {pose_error:.3g} (m or rad) at "
         f"{np.round(joints, 6).tolist()}{where}; ask for a pose within reach, leave a row free, or raise starts",
         joints,
-        misfit,
+        pose_error,
         name=names[0],
-        value=misfit,
+        value=pose_error,
     )

@@ -1,17 +1,14 @@
-"""Instantaneous redundancy resolution: at each instant the least joint rates that do the task, blind to the future.
+"""Instantaneous redundancy resolution at velocity level: the least joint rates that do the task at each time.
 
-The classical method that optimal plans are compared with, and the source of their first guesses.
-
-Many local motions at once: each keeps its tips on their tasks with the least joint rates, inside the joints' limits.
-
-What posture the motion starts from decides where it leads. Followed on one grid of times from all of them together, a
-prediction with the least rates and a correction of the poses that are left, they are found at the cost of a few: where
-each one leads, what it costs, and where it cannot follow. They are the guesses of plans, and no plans themselves.
+This is the classical method to which optimal plans are compared. `resolve` integrates one motion accurately.
+`track_tasks` tracks tasks from many start configurations at once, on one grid of times and within the joint limits, at
+low cost: it shows where each start leads, at what cost, and where it cannot track the task. Its motions are guesses of
+plans.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
@@ -29,11 +26,12 @@ from ocp.motion.local.collisions import checked_collision_scene, distances_along
 from ocp.motion.tasks.checks import checked_configuration, checked_tasks, checked_weights, dependent_rows, horizon_of
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.tip_task import TipTask
+from ocp.motion.tasks.tracks import on_symbols
 
-__all__ = ["LocalMotion", "LocalSolution", "follow", "least_rates", "resolve"]
+__all__ = ["LocalMotion", "LocalSolution", "least_rates", "resolve", "track_tasks"]
 
-INTEGRATOR_STEPS = 20000
-"""Between two samples, at most; a smooth motion takes some tens."""
+MAX_INTEGRATOR_STEPS = 20000
+"""Between two samples; a smooth motion takes some tens."""
 
 
 @dataclass(frozen=True)
@@ -44,17 +42,17 @@ class LocalSolution:
         t: Times, the first 0. Shape (M,), s.
         base: Base configuration, as the machine defines it. Shape (M, base_size).
         joints: Joint positions. Shape (M, joint_size), rad or m.
-        joint_rates: Shape (M, joint_size).
+        joint_rates: Joint rates. Shape (M, joint_size).
         base_rates: Time derivative of `base`. Shape (M, base_size).
         tip_in_world: Position of the tip. Shape (M, 3), m.
-        manipulability: Of the task's rows, undamped. Shape (M,).
+        manipulability: Undamped manipulability of the rows of the tasks. Shape (M,).
         cost: Integral of half the (weighted) squared joint rates, up to each time. Shape (M,).
         tolerance: Absolute and relative tolerance of the integration.
-        stopped: Why the motion ends before the horizon; None when it does not.
-        clearance: Least distance of two bodies, m, nan where no surroundings were given. Shape (M,).
-        nearest: The names of these two at each time, or nothing.
-        task_error: Pose wanted less pose found in the rows of the tasks, m and rad; zero for velocities.
-            Shape (M, rows of all tasks).
+        stopped: Reason why the motion ends before the horizon, None if it does not.
+        clearance: Least distance of two bodies, m, nan without a collision scene. Shape (M,).
+        nearest: Names of these two bodies at each time; empty without a collision scene.
+        task_error: Target pose minus pose in the rows of the tasks, m and rad; zero for velocities. Shape (M, rows of
+            all tasks).
     """
 
     t: Array
@@ -76,7 +74,9 @@ class LocalSolution:
         return f"<LocalSolution of {self.t[-1]:.6g} s, {self.joints.shape[1]} joints: cost {self.cost[-1]:.6g}{end}>"
 
     def at(self, time: float) -> dict[str, Array]:
-        """Cubic interpolation of "base" and "joints", linear of "joint_rates"; beyond the ends the end values."""
+        """Return "base" and "joints" by cubic and "joint_rates" by linear interpolation; the end values beyond the
+        ends.
+        """
         time = float(np.clip(time, self.t[0], self.t[-1]))
         rates = np.array([np.interp(time, self.t, column) for column in self.joint_rates.T])
         if len(self.t) == 1:
@@ -87,8 +87,8 @@ class LocalSolution:
 
         def hermite(value: Array, rate: Array) -> Array:
             mean = (value[k + 1] - value[k]) / step
-            bend = (1 - s) * (rate[k] - mean) + s * (mean - rate[k + 1])
-            return np.asarray(value[k] + step * s * (mean + (1 - s) * bend))
+            correction = (1 - s) * (rate[k] - mean) + s * (mean - rate[k + 1])
+            return np.asarray(value[k] + step * s * (mean + (1 - s) * correction))
 
         base, joints = hermite(self.base, self.base_rates), hermite(self.joints, self.joint_rates)
         return {"base": base, "joints": joints, "joint_rates": rates}
@@ -108,36 +108,34 @@ def resolve(
     samples: Any = 501,
     scene: CollisionScene | None = None,
 ) -> LocalSolution:
-    """Simulate x2' = G# v, equation (26) of the free-floating paper with u = 0, and the base that follows.
+    """Integrate x2' = G# v, equation (26) of the free-floating paper with u = 0, and the motion of the base.
 
-    What the machine does at rest (its drift) and what a pose task feeds back are part of v.
+    The motion of the machine at rest (its drift) and the feedback of pose tasks are part of v.
 
     Args:
         machine: Any machine of `models`, on a fixed or a floating base.
-        tasks: What its tips do; several are done at once.
+        tasks: Tasks of its tips; several are done at once.
         start_joints: Shape (joint_size,).
         horizon: Final time, s; that of the tasks if None.
         start_base: Base configuration at the start, shape (base_size,); the machine's base_home() if None.
-        weights: Of the squared joint rates that are least, positive. Shape (joint_size,); all 1 if None.
-        damping: 0 for the pseudo-inverse G# = G' (G G')^-1; otherwise G' (G G' + damping^2 1)^-1, which stays
-            bounded where the Jacobian loses rank, at the price of a task error.
+        weights: Positive weights of the squared joint rates that are minimised. Shape (joint_size,); all 1 if None.
+        damping: 0 for the pseudo-inverse G# = G' (G G')^-1; otherwise G' (G G' + damping^2 1)^-1, which stays bounded
+            where the Jacobian loses rank, at the price of a task error.
         tolerance: Absolute and relative tolerance of the integrator (cvodes, Adams).
-        samples: How many equally spaced times to report, or the increasing times themselves from 0 to the
-            horizon.
-        scene: Of the machine; how near its bodies come to each other and to obstacles is reported, at the
-            samples, and changes nothing.
+        samples: Number of equidistant times to report, or the increasing times themselves from 0 to the horizon.
+        scene: Collision scene of the machine; the distances of its bodies are reported at the samples and have no
+            effect.
 
     Returns:
-        The motion up to the horizon, or up to the last sample before it breaks down, with the reason in
-        `stopped`.
+        The motion up to the horizon, or up to the last sample before it breaks down, with the reason in `stopped`.
 
     Raises:
-        ProblemError: Something does not fit the machine, or the task is singular already at the start.
+        ProblemError: An argument does not fit the machine, or the task is singular at the start.
     """
     equations = bind(machine, tasks)
     joints, base = checked_configuration(machine, start_joints, start_base)
     duration = horizon_of([part.task for part in equations.bound], horizon)
-    heavy = checked_weights(weights, machine.joint_size)
+    rate_weights = checked_weights(weights, machine.joint_size)
     checked_tasks(equations, base, joints, duration)
     checked_nonnegative("damping", damping)
     checked_positive("tolerance", tolerance)
@@ -148,39 +146,37 @@ def resolve(
             "start elsewhere, fix fewer rows, or give a damping"
         )
         raise ProblemError(words, name=rows_dependent, value=joints, time=0.0)
-    try:
-        model = _Model(equations, heavy, damping, ca.SX)
-    except (RuntimeError, NotImplementedError):  # interpolants and external functions take MX only
-        model = _Model(equations, heavy, damping, ca.MX)
+    model = on_symbols(lambda symbols: _Model(equations, rate_weights, damping, symbols))
     states, costs, stopped = _integrate(model, np.concatenate([base, joints]), times, tolerance)
-    report = _report(machine, model, times[: len(states)], states, costs, tolerance, stopped)
+    solution = _report(machine, model, times[: len(states)], states, costs, tolerance, stopped)
     if scene is None:
-        return replace(report, clearance=np.full(len(report.t), np.nan))
-    apart = distances_along(checked_collision_scene(scene, machine), report.base, report.joints, report.t)
-    if not apart.shape[1]:
-        return replace(report, clearance=np.full(len(report.t), np.inf))
+        return replace(solution, clearance=np.full(len(solution.t), np.nan))
+    distances = distances_along(checked_collision_scene(scene, machine), solution.base, solution.joints, solution.t)
+    if not distances.shape[1]:
+        return replace(solution, clearance=np.full(len(solution.t), np.inf))
     labels = scene.labels
-    near = tuple(labels[k] for k in apart.argmin(axis=1).tolist())
-    return replace(report, clearance=apart.min(axis=1), nearest=near)
+    nearest = tuple(labels[k] for k in distances.argmin(axis=1).tolist())
+    return replace(solution, clearance=distances.min(axis=1), nearest=nearest)
 
 
 def least_rates(jacobian: Any, velocity: Any, damping: float = 0.0, weights: Any = None) -> Any:
-    """G' (G G' + damping^2 1)^-1 v: the least joint rates that give the velocity, G# v when undamped.
+    """Return G' (G G' + damping^2 1)^-1 v, the least joint rates for a velocity, G# v when undamped. Shape (n, k).
 
-    With weights W^-1 G' (G W^-1 G' + damping^2 1)^-1 v, W their diagonal matrix. Shape (n, k).
+    With weights W^-1 G' (G W^-1 G' + damping^2 1)^-1 v, W their diagonal matrix.
 
     Args:
         jacobian: Rows of the task, G. Shape (m, n), m <= n.
         velocity: v, or several as columns. Shape (m, k).
         damping: In units of the Jacobian.
-        weights: Of the squared joint rates, positive numbers. Shape (n,).
+        weights: Positive weights of the squared joint rates. Shape (n,).
     """
-    light = jacobian.T if weights is None else ca.mtimes(ca.diag(1 / ca.DM(weights)), jacobian.T)
-    square = ca.mtimes(jacobian, light) + damping**2 * ca.DM.eye(jacobian.shape[0])
-    return ca.mtimes(light, solve_spd(square, velocity))
+    weighted = jacobian.T if weights is None else ca.mtimes(ca.diag(1 / ca.DM(weights)), jacobian.T)
+    square = ca.mtimes(jacobian, weighted) + damping**2 * ca.DM.eye(jacobian.shape[0])
+    return ca.mtimes(weighted, solve_spd(square, velocity))
 
 
 def _times(samples: Any, horizon: float) -> Array:
+    """Return the times of the samples, checked."""
     if not isinstance(samples, list | tuple | np.ndarray):
         count = real(samples)
         if not (2 <= count <= MAX_COUNT and count == int(count)):
@@ -190,7 +186,7 @@ def _times(samples: Any, horizon: float) -> Array:
     try:
         times = floats(samples)
     except NOT_NUMBERS as error:
-        raise ProblemError(f"samples {samples!r} are no times", name="samples", value=samples) from error
+        raise ProblemError(f"samples {samples!r} are not times", name="samples", value=samples) from error
     if times.ndim != 1 or len(times) < 2 or times[0] != 0 or not np.isclose(times[-1], horizon, rtol=1e-12):
         words = f"samples must be times from 0 to the horizon {horizon:g} s"
         raise ProblemError(words, name="samples", value=times, limit=(0.0, horizon))
@@ -200,7 +196,7 @@ def _times(samples: Any, horizon: float) -> Array:
 
 
 class _Model:
-    """Rates of the state (base, joints) and what is reported of it, as casadi functions of (time, state)."""
+    """Rates of the state (base, joints) and reported outputs as CasADi functions of (time, state)."""
 
     def __init__(self, equations: TaskEquations, weights: Array, damping: float, symbols: Any) -> None:
         machine = equations.machine
@@ -219,69 +215,70 @@ class _Model:
         outputs = [machine.tip_pose(base, joints).position, jacobian, equations.error(base, joints, targets)]
         self.outputs = ca.Function("outputs", [self.time, self.state], outputs)
 
-    def integrator(self, start: float, times: Array, tolerance: float) -> Callable[..., Any]:
+    def integrator(self, start: float, times: Array, tolerance: float) -> Any:
+        """Return the integrator of state and cost from `start` to the times."""
         problem = {"t": self.time, "x": self.state, "ode": self.ode, "quad": self.running}
-        return self._cvodes(problem, start, times, tolerance)
+        return _cvodes(problem, start, times, tolerance)
 
-    def one_interval(self, tolerance: float) -> Callable[..., Any]:
-        """From p[0] over p[1] seconds: the same integrator for every interval between samples."""
+    def one_interval(self, tolerance: float) -> Any:
+        """Return an integrator from p[0] over p[1] seconds, for any interval between samples."""
         span, fraction = type(self.time).sym("span", 2), type(self.time).sym("fraction")
-        at = ca.Function("at", [self.time, self.state], [self.ode, self.running])
-        ode, running = at(span[0] + fraction * span[1], self.state)
+        rates = ca.Function("at", [self.time, self.state], [self.ode, self.running])
+        ode, running = rates(span[0] + fraction * span[1], self.state)
         problem = {"t": fraction, "x": self.state, "p": span, "ode": span[1] * ode, "quad": span[1] * running}
-        return self._cvodes(problem, 0.0, np.array([1.0]), tolerance)
+        return _cvodes(problem, 0.0, np.array([1.0]), tolerance)
 
-    @staticmethod
-    def _cvodes(problem: dict[str, Any], start: float, times: Array, tolerance: float) -> Callable[..., Any]:
-        built: Callable[..., Any] = integrator(
-            "motion", problem, times.tolist(), tolerance=tolerance, max_steps=INTEGRATOR_STEPS, start=start
-        )
-        return built
+
+def _cvodes(problem: dict[str, Any], start: float, times: Array, tolerance: float) -> Any:
+    """Return the integrator of a problem from `start` to the times."""
+    options: dict[str, Any] = {"tolerance": tolerance, "max_steps": MAX_INTEGRATOR_STEPS, "start": start}
+    return integrator("motion", problem, times.tolist(), **options)
 
 
 def _integrate(model: _Model, first: Array, times: Array, tolerance: float) -> tuple[Array, Array, str | None]:
-    """States and costs at as many of the times as can be reached, and why not at all."""
+    """Return states and costs at all reachable times, and the reason if these are not all."""
     try:
-        found = model.integrator(times[0], times[1:], tolerance)(x0=first)
-        states = np.vstack([first, np.array(found["xf"]).T])
-        costs = np.concatenate([[0.0], np.array(found["qf"]).ravel()])
+        result = model.integrator(times[0], times[1:], tolerance)(x0=first)
+        states = np.vstack([first, np.array(result["xf"]).T])
+        costs = np.concatenate([[0.0], np.array(result["qf"]).ravel()])
         if np.isfinite(states).all() and np.isfinite(costs).all():
             return states, costs, None
     except RuntimeError:
-        pass  # go again from sample to sample, to learn how far it goes
+        pass  # integrate again from sample to sample to find how far it goes
     step = model.one_interval(tolerance)
-    reached, spent = [first], [0.0]
+    states_so_far, costs_so_far = [first], [0.0]
     for begin, end in pairwise(times):
         try:
-            found = step(x0=reached[-1], p=[begin, end - begin])
-            state, cost = np.array(found["xf"]).ravel(), float(found["qf"])
+            result = step(x0=states_so_far[-1], p=[begin, end - begin])
+            state, cost = np.array(result["xf"]).ravel(), float(result["qf"])
             usable = np.isfinite([*state, cost]).all() and np.isfinite(np.array(model.rate(end, state))).all()
         except RuntimeError:
             usable = False
         if not usable:
-            manipulability = float(_manipulabilities(np.array(model.outputs(begin, reached[-1])[1])[None])[0])
+            manipulability = float(_manipulabilities(np.array(model.outputs(begin, states_so_far[-1])[1])[None])[0])
             reason = (
                 f"the integration fails between {begin:g} and {end:g} s, where the manipulability "
                 f"falls to {manipulability:.3g}: the task becomes singular; give a damping or another start"
             )
-            return np.array(reached), np.array(spent), reason
-        reached.append(state)
-        spent.append(spent[-1] + cost)
-    return np.array(reached), np.array(spent), None
+            return np.array(states_so_far), np.array(costs_so_far), reason
+        states_so_far.append(state)
+        costs_so_far.append(costs_so_far[-1] + cost)
+    return np.array(states_so_far), np.array(costs_so_far), None
 
 
 def _report(
     machine: Machine, model: _Model, times: Array, states: Array, costs: Array, tolerance: float, stopped: str | None
 ) -> LocalSolution:
+    """Return the solution with all reported outputs."""
     rates = np.array(model.rate.map(len(times))(times[None, :], states.T)).T
-    tip, jacobians, error = (np.array(part) for part in model.outputs.map(len(times))(times[None, :], states.T))
-    cut, size = machine.base_size, error.size // len(times)
+    tip, jacobians, error = (np.array(value) for value in model.outputs.map(len(times))(times[None, :], states.T))
+    base_size, size = machine.base_size, error.size // len(times)
     return LocalSolution(
         t=times,
-        base=states[:, :cut],
-        joints=states[:, cut:],
-        joint_rates=rates[:, cut:],
-        base_rates=rates[:, :cut],
+        base=states[:, :base_size],
+        joints=states[:, base_size:],
+        joint_rates=rates[:, base_size:],
+        base_rates=rates[:, :base_size],
         tip_in_world=tip.T,
         manipulability=_manipulabilities(jacobians.reshape(size, len(times), machine.joint_size).transpose(1, 0, 2)),
         cost=costs,
@@ -292,26 +289,26 @@ def _report(
 
 
 def _manipulabilities(jacobians: Array) -> Array:
-    """sqrt(det(G G')), as the product of the singular values. Shapes (M, m, n) to (M,)."""
+    """Return sqrt(det(G G')) as the product of the singular values. Shapes (M, m, n) to (M,)."""
     return np.asarray(np.linalg.svd(jacobians, compute_uv=False).prod(axis=-1))
 
 
 CORRECTIONS = 2
-"""Of the poses after each step; the second one leaves about the fourth power of what the step missed."""
+"""Corrections of the poses after each step; the second one leaves about the fourth power of the error."""
 
 
 @dataclass(frozen=True, eq=False)
 class LocalMotion:
-    """K local motions at M times.
+    """K local motions at M times, tracked by resolved-rate control.
 
     Attributes:
-        t: Shape (M,), s.
+        t: Times. Shape (M,), s.
         base: Shape (K, M, base_size).
         joints: Shape (K, M, joint_size), within the limits.
-        rates: Mean joint rates from each time to the next, and the last ones again. Shape (K, M, joint_size).
+        rates: Mean joint rates from each time to the next; the last ones are repeated. Shape (K, M, joint_size).
         cost: Integral of half the weighted squared joint rates. Shape (K,).
-        misfit: Largest pose error anywhere, m and rad; infinite where a motion ran away. Shape (K,).
-        lost_at: When the pose error is largest, s. Shape (K,).
+        pose_error: Largest pose error, m and rad; infinite if a motion diverges. Shape (K,).
+        worst_time: Time of the largest pose error, s. Shape (K,).
     """
 
     t: Array
@@ -319,28 +316,29 @@ class LocalMotion:
     joints: Array
     rates: Array
     cost: Array
-    misfit: Array
-    lost_at: Array
+    pose_error: Array
+    worst_time: Array
 
     @classmethod
-    def resting(cls, times: Array, base: Array, joints: Array) -> LocalMotion:
-        """Motions in which nothing moves.
+    def stationary(cls, times: Array, base: Array, joints: Array) -> LocalMotion:
+        """Return motions at rest.
 
         Args:
-            times: Shape (M,), s. base, joints: Shape (K, base_size) and (K, joint_size).
+            times: Shape (M,), s.
+            base, joints: Shapes (K, base_size) and (K, joint_size).
         """
-        count, many = len(joints), len(times)
-        still, none = np.zeros((count, many, joints.shape[1])), np.zeros(count)
-        places, angles = (np.repeat(each[:, None], many, axis=1) for each in (base, joints))
-        return cls(times, places, angles, still, none, none, none)
+        count, samples = len(joints), len(times)
+        rates, zeros = np.zeros((count, samples, joints.shape[1])), np.zeros(count)
+        bases, positions = (np.repeat(each[:, None], samples, axis=1) for each in (base, joints))
+        return cls(times, bases, positions, rates, zeros, zeros, zeros)
 
-    def of(self, rows: Any) -> LocalMotion:
-        """Some of the motions."""
-        kept = (self.base, self.joints, self.rates, self.cost, self.misfit, self.lost_at)
-        return LocalMotion(self.t, *(part[rows] for part in kept))
+    def take(self, rows: Any) -> LocalMotion:
+        """Return the motions at these indices."""
+        fields = (self.base, self.joints, self.rates, self.cost, self.pose_error, self.worst_time)
+        return LocalMotion(self.t, *(value[rows] for value in fields))
 
 
-def follow(
+def track_tasks(
     equations: TaskEquations,
     joints: Array,
     base: Array,
@@ -351,114 +349,114 @@ def follow(
     lower: Array,
     upper: Array,
 ) -> LocalMotion:
-    """Follow tasks from several postures.
+    """Track tasks from several configurations.
 
     Args:
-        equations: Of the tasks, at times of their own.
-        joints: At the first time. Shape (K, joint_size).
-        base: At the first time. Shape (K, base_size).
-        times: Increasing. Shape (M,), s.
-        weights: Of the squared joint rates. Shape (joint_size,).
-        damping: Relative to the root mean square of the singular values of the tasks' Jacobian.
+        equations: Equations of the tasks.
+        joints: Joints at the first time. Shape (K, joint_size).
+        base: Base at the first time. Shape (K, base_size).
+        times: Increasing times, s. Shape (M,).
+        weights: Weights of the squared joint rates. Shape (joint_size,).
+        damping: Relative to the root mean square of the singular values of the Jacobian of the tasks.
         lower, upper: Limits of the joints. Shape (joint_size,).
     """
     machine, count, steps = equations.machine, len(joints), np.diff(times)
     targets = np.array(equations.target_function().map(len(times))(times[None, :]))
-    task = equations.function().map(count)
+    task = equations.function.map(count)
     b, q, u = ca.SX.sym("b", machine.base_size), ca.SX.sym("q", machine.joint_size), ca.SX.sym("u", machine.joint_size)
-    moves = ca.Function("moves", [b, q, u], [machine.base_rate(b, q, u)]).map(count) if machine.base_size else None
-    posed, most = equations.posed, np.cos(equations.most_lean)
-    leaning = _leaning(equations).map(count) if most.size else None
-    place, at = np.array(base, dtype=float), np.clip(joints, lower, upper)
-    bases, postures, misfits = [place], [at], list[Array]()
+    motion = ca.Function("moves", [b, q, u], [machine.base_rate(b, q, u)]).map(count) if machine.base_size else None
+    pose_rows, min_cosines = equations.pose_rows, np.cos(equations.cone_angles)
+    cones = _cone_function(equations).map(count) if min_cosines.size else None
+    base_now, joints_now = np.array(base, dtype=float), np.clip(joints, lower, upper)
+    bases, configurations, errors = [base_now], [joints_now], list[Array]()
 
-    def asked(k: int) -> tuple[Array, Array, Array, Array]:
-        """Jacobians (K, m, n), what they are to give (K, m), pose errors (K, m), and misfits (K,)."""
-        jacobian, right, error, misfit = (
-            np.array(part) for part in task(place.T, at.T, np.repeat(targets[:, k : k + 1], count, axis=1))
+    def linearise(k: int) -> tuple[Array, Array, Array, Array]:
+        """Return Jacobians (K, m, n), task velocities (K, m), pose errors (K, m) and largest residuals (K,)."""
+        jacobian, right, error, residual = (
+            np.array(part) for part in task(base_now.T, joints_now.T, np.repeat(targets[:, k : k + 1], count, axis=1))
         )
         matrix = jacobian.reshape(equations.size, count, machine.joint_size).transpose(1, 0, 2)
-        off = np.abs(misfit).max(axis=0, initial=0.0)
-        right, error = right.T, np.where(posed, error.T, 0.0)
-        if leaning is not None:  # axes that lean too far are turned back, others may turn as they like
-            cosines, slopes = (
-                np.array(part) for part in leaning(place.T, at.T, np.repeat(targets[:, k : k + 1], count, 1))
+        errors_along = np.abs(residual).max(axis=0, initial=0.0)
+        right, error = right.T, np.where(pose_rows, error.T, 0.0)
+        if cones is not None:  # axes outside their cones are turned back, others are free
+            cosines, columns = (
+                np.array(part) for part in cones(base_now.T, joints_now.T, np.repeat(targets[:, k : k + 1], count, 1))
             )
-            missing = np.maximum(most - cosines.T, 0.0)
-            turning = slopes.reshape(most.size, count, machine.joint_size).transpose(1, 0, 2)
-            matrix = np.concatenate([matrix, np.where((missing > 0)[:, :, None], turning, 0.0)], axis=1)
-            right, error = np.hstack([right, np.zeros_like(missing)]), np.hstack([error, missing])
-        return matrix, right, error, np.where(np.isfinite(off), off, np.inf)
+            violation = np.maximum(min_cosines - cosines.T, 0.0)
+            gradients = columns.reshape(min_cosines.size, count, machine.joint_size).transpose(1, 0, 2)
+            matrix = np.concatenate([matrix, np.where((violation > 0)[:, :, None], gradients, 0.0)], axis=1)
+            right, error = np.hstack([right, np.zeros_like(violation)]), np.hstack([error, violation])
+        return matrix, right, error, np.where(np.isfinite(errors_along), errors_along, np.inf)
 
-    def moved(step: Array, drifting: float) -> Array:
-        """The base (K, base_size) after joints moved by `step`, in a time in which it drifts too."""
-        if moves is None:
-            return place
-        still = np.array(moves(place.T, at.T, np.zeros_like(at).T)).T
-        return np.asarray(place + np.array(moves(place.T, at.T, step.T)).T - still + drifting * still)
+    def move_base(step: Array, duration: float) -> Array:
+        """Return the base (K, base_size) after joint steps and a duration of drift."""
+        if motion is None:
+            return base_now
+        drift = np.array(motion(base_now.T, joints_now.T, np.zeros_like(joints_now).T)).T
+        return np.asarray(base_now + np.array(motion(base_now.T, joints_now.T, step.T)).T - drift + duration * drift)
 
     for k, h in enumerate([*steps, 0.0]):
-        matrix, right, error, misfit = asked(k)
+        matrix, right, error, residual = linearise(k)
         for _ in range(CORRECTIONS if k else 0):
-            correction = _least(matrix, error, weights, damping, at, lower, upper)
-            place, at = moved(correction, 0.0), np.clip(at + correction, lower, upper)
-            matrix, right, error, misfit = asked(k)
-        bases[k], postures[k] = place, at
-        misfits.append(misfit)
+            correction = _damped_rates(matrix, error, weights, damping, joints_now, lower, upper)
+            base_now, joints_now = move_base(correction, 0.0), np.clip(joints_now + correction, lower, upper)
+            matrix, right, error, residual = linearise(k)
+        bases[k], configurations[k] = base_now, joints_now
+        errors.append(residual)
         if h:
-            first = h * _least(matrix, right, weights, damping, at, lower, upper)
-            start = place, at
-            place, at = moved(first, h), np.clip(at + first, lower, upper)
-            matrix, right, _, _ = asked(k + 1)
-            second = h * _least(matrix, right, weights, damping, at, lower, upper)
-            place, at = start
+            first = h * _damped_rates(matrix, right, weights, damping, joints_now, lower, upper)
+            before = base_now, joints_now
+            base_now, joints_now = move_base(first, h), np.clip(joints_now + first, lower, upper)
+            matrix, right, _, _ = linearise(k + 1)
+            second = h * _damped_rates(matrix, right, weights, damping, joints_now, lower, upper)
+            base_now, joints_now = before
             mean = (first + second) / 2
-            place, at = moved(mean, h), np.clip(at + mean, lower, upper)
-            bases.append(place)
-            postures.append(at)
-    path = np.stack(postures, axis=1)
-    rates = np.diff(path, axis=1) / steps[:, None]
-    off = np.stack(misfits, axis=1)
-    worst = off.argmax(axis=1)
+            base_now, joints_now = move_base(mean, h), np.clip(joints_now + mean, lower, upper)
+            bases.append(base_now)
+            configurations.append(joints_now)
+    joint_path = np.stack(configurations, axis=1)
+    rates = np.diff(joint_path, axis=1) / steps[:, None]
+    errors_along = np.stack(errors, axis=1)
+    worst = errors_along.argmax(axis=1)
     return LocalMotion(
         times,
         np.stack(bases, axis=1),
-        path,
+        joint_path,
         np.concatenate([rates, rates[:, -1:]], axis=1),
         np.asarray(np.einsum("kmn,n,m->k", rates**2, weights, steps) / 2),
-        off.max(axis=1),
+        errors_along.max(axis=1),
         times[worst],
     )
 
 
-def _leaning(equations: TaskEquations) -> Any:
-    """casadi Function (base, joints, targets) -> cosines of the angles by which axes lean, and their slopes in q."""
+def _cone_function(equations: TaskEquations) -> Any:
+    """Return the CasADi function (base, joints, targets) -> cone cosines and their gradients by the joints."""
     machine = equations.machine
     b, q, u = (ca.SX.sym("v", size) for size in (machine.base_size, machine.joint_size, machine.joint_size))
     targets = ca.SX.sym("targets", equations.target_function().numel_out())
-    cosines = equations.leans(b, q, targets)
+    cosines = equations.cone_cosines(b, q, targets)
     slopes = ca.jacobian(cosines, q)
     if machine.base_size:
         slopes = slopes + ca.mtimes(ca.jacobian(cosines, b), ca.jacobian(machine.base_rate(b, q, u), u))
     return ca.Function("leaning", [b, q, targets], [cosines, ca.densify(slopes)], {"cse": True})
 
 
-def _least(
-    matrix: Array, wanted: Array, weights: Array, damping: float, at: Array, lower: Array, upper: Array
+def _damped_rates(
+    matrix: Array, velocities: Array, weights: Array, damping: float, joints: Array, lower: Array, upper: Array
 ) -> Array:
-    """Least weighted rates (K, n) that give what is wanted (K, m); joints at a limit that they would leave are held."""
-    finite: Any = np.isfinite(matrix).all(axis=(1, 2)) & np.isfinite(wanted).all(axis=1)
-    matrix, wanted = np.where(finite[:, None, None], matrix, 0.0), np.where(finite[:, None], wanted, 0.0)
+    """Return the least weighted rates (K, n) for velocities (K, m), joints fixed at limits that they would leave."""
+    finite: Any = np.isfinite(matrix).all(axis=(1, 2)) & np.isfinite(velocities).all(axis=1)
+    matrix, velocities = np.where(finite[:, None, None], matrix, 0.0), np.where(finite[:, None], velocities, 0.0)
     size = np.sqrt((matrix**2).sum(axis=(1, 2)) / max(matrix.shape[1], 1))
-    soft = ((damping * size) ** 2 + np.finfo(float).tiny)[:, None, None] * np.eye(matrix.shape[1])
-    free: Any = np.ones(at.shape, dtype=bool)
-    rates = np.zeros_like(at)
-    for _ in range(at.shape[1] + 1):
-        light = np.where(free[:, None, :], matrix, 0.0) / weights
-        square = light @ matrix.transpose(0, 2, 1) + soft
-        rates = np.einsum("kmn,km->kn", light, np.linalg.solve(square, wanted[:, :, None])[:, :, 0])
-        leaves: Any = free & (((at <= lower) & (rates < 0)) | ((at >= upper) & (rates > 0)))
-        if not leaves.any():
+    regularisation = ((damping * size) ** 2 + np.finfo(float).tiny)[:, None, None] * np.eye(matrix.shape[1])
+    free: Any = np.ones(joints.shape, dtype=bool)
+    rates = np.zeros_like(joints)
+    for _ in range(joints.shape[1] + 1):
+        weighted = np.where(free[:, None, :], matrix, 0.0) / weights
+        square = weighted @ matrix.transpose(0, 2, 1) + regularisation
+        rates = np.einsum("kmn,km->kn", weighted, np.linalg.solve(square, velocities[:, :, None])[:, :, 0])
+        violates: Any = free & (((joints <= lower) & (rates < 0)) | ((joints >= upper) & (rates > 0)))
+        if not violates.any():
             break
-        free = np.logical_and(free, np.logical_not(leaves))
+        free = np.logical_and(free, np.logical_not(violates))
     return np.asarray(np.where(free, rates, 0.0))

@@ -309,7 +309,7 @@ class CandidateSolver(Solver):
                 for part, own in zip(stretch.equations.bound, errors, strict=True):
                     if part.task.start_gap <= self.settings.tip_tolerance:  # the feedback closes a larger one
                         worst = np.maximum(worst, np.linalg.norm(own, axis=1))
-                worst = np.maximum(worst, stretch.equations.overhangs(times, base, joints).max(axis=1, initial=0))
+                worst = np.maximum(worst, stretch.equations.cone_violations(times, base, joints).max(axis=1, initial=0))
         return np.asarray(np.maximum(worst[:-1], worst[1:]).reshape(-1, count).max(axis=1))
 
     def _samples(self, solution: Solution) -> Array:

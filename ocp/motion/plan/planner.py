@@ -57,7 +57,7 @@ from ocp.motion.search.configurations import (
 from ocp.motion.search.dead_end import DeadEnd
 from ocp.motion.search.search import checked_bound
 from ocp.motion.search.task_search import TaskSearch
-from ocp.motion.tasks.checks import checked_configuration, checked_tasks, checked_weights, horizon_of, inside_limits
+from ocp.motion.tasks.checks import checked_configuration, checked_tasks, checked_weights, clip_to_limits, horizon_of
 from ocp.motion.tasks.equations import bind
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.tip_task import TipTask
@@ -123,7 +123,7 @@ def seeds_of(
     tracked = misfits <= max(OUT_OF_REACH, misfits.min(initial=np.inf))
     seeds = []
     for number in np.lexsort((costs, ~tracked)).tolist():
-        local = [part.of(slice(number, number + 1)) for part in followed]
+        local = [part.take(slice(number, number + 1)) for part in followed]
         guess = solver.motion.guess(local, 0)
         seed = Seed(guess, float(costs[number]), local, bool(tracked[number]), **kind)
         seeds.append(
@@ -194,7 +194,7 @@ def _through_cells(
     """
     request, every = solver.request, solver.request.search == "global"
     sound = np.flatnonzero(follows(request, followed))
-    local = seeds_of(solver, [part.of(sound) for part in followed], postures[sound], direct=every)
+    local = seeds_of(solver, [part.take(sound) for part in followed], postures[sound], direct=every)
     try:
         found = CellSearch(request, postures).followed()
     except DeadEnd:
@@ -426,7 +426,7 @@ def checked_asked(
     if joints is not None:
         bounds = told.bounds(machine)
         names, hint = machine.robot.joint_names, "start inside them"
-        joints = inside_limits("start", names, joints, bounds.lower, bounds.upper, hint)
+        joints = clip_to_limits("start", names, joints, bounds.lower, bounds.upper, hint)
     heavy = checked_weights(weights, machine.joint_size)
     return Asked(
         machine,

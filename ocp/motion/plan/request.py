@@ -47,7 +47,7 @@ from ocp.motion.builders.tool_motion import ToolMotion, stretches_of, tool_motio
 from ocp.motion.search.configurations import Asked
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.tip_task import TipTask
-from ocp.motion.tasks.tracks import rated
+from ocp.motion.tasks.tracks import TrackWithRate
 from ocp.motion.tasks.zmp_rules import IndexAtLeast, InFoot, Pinned
 from ocp.problem.function_reader import FunctionReader
 from ocp.problem.function_writer import FunctionWriter
@@ -286,7 +286,7 @@ def _read(value: Any, functions: list[Any], machine: Machine | None) -> Any:
         return SYMBOLS[value["symbols"]]
     if "track" in value:
         at = _of_time(functions[value["track"]])
-        return at if "rate" not in value else rated(at, _of_time(functions[value["rate"]]))
+        return at if "rate" not in value else TrackWithRate(at, _of_time(functions[value["rate"]]))
     own = {name: read(part) for name, part in value["fields"].items()}
     if value["kind"] == "CollisionScene":
         around = {name: own[name] for name in ("obstacles", "clearance", "ignored", "limits")}

@@ -24,7 +24,7 @@ from ocp.console import interruptible
 from ocp.errors import NOT_NUMBERS, ProblemError, SolveError, checked_choice, checked_count, checked_instance, floats
 from ocp.motion.builders.clearance import clearance_of
 from ocp.motion.local.collisions import Collision, distances_along, find_collisions
-from ocp.motion.local.inverse_kinematics import LARGEST_SEED, Unreachable, at_rest
+from ocp.motion.local.inverse_kinematics import LARGEST_SEED, Unreachable, idle_positions
 from ocp.motion.plan.planner import clear_of
 from ocp.motion.plan.waypoint_plan import WaypointPlan
 from ocp.motion.search.charts import Instant, SelfMotions
@@ -185,7 +185,7 @@ class _Ways:
         self.space = JointSpace(machine, bounds.lower, bounds.upper, np.ones(machine.joint_size))
         free = bind(machine, self._task(0))
         equations = Held(machine, free.bound, tuple(np.flatnonzero(free.idle).tolist()))
-        at = at_rest(self.lower, self.upper)
+        at = idle_positions(self.lower, self.upper)
         targets = np.zeros((len(places), 18))
         targets[:, :3] = places
         targets[:, 6:15] = turns.transpose(0, 2, 1).reshape(-1, 9)

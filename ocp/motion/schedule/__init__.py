@@ -1,4 +1,4 @@
-"""Time schedules: jerk-limited line speed along a path, at the asked speed wherever the limits allow it."""
+"""Time schedules of paths: jerk-limited line speed, at the requested value wherever the limits allow it."""
 
 from ocp.motion.schedule.limits import JointLimits, JointPath, JointRates, LineLimits, PathLike, ToolLimits, TorqueRates
 from ocp.motion.schedule.planner import Dip, Schedule, schedule
@@ -7,22 +7,7 @@ from ocp.motion.schedule.ramps import peak_acceleration, ramp_distance, ramp_tim
 from ocp.motion.schedule.trajectory import JointTrajectory, joint_motion, joint_trajectory
 
 __all__ = [
-    "Dip",
-    "JointLimits",
-    "JointPath",
-    "JointRates",
-    "JointTrajectory",
-    "LineLimits",
-    "LineMotion",
-    "PathLike",
-    "Schedule",
-    "SpeedProfile",
-    "ToolLimits",
-    "TorqueRates",
-    "joint_motion",
-    "joint_trajectory",
-    "peak_acceleration",
-    "ramp_distance",
-    "ramp_time",
-    "schedule",
-]
+    "Dip", "JointLimits", "JointPath", "JointRates", "JointTrajectory", "LineLimits", "LineMotion", "PathLike",
+    "Schedule", "SpeedProfile", "ToolLimits", "TorqueRates", "joint_motion", "joint_trajectory",
+    "peak_acceleration", "ramp_distance", "ramp_time", "schedule",
+]  # fmt: skip

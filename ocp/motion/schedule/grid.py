@@ -1,8 +1,8 @@
-"""Nodes along a path that resolve its limits, and the limits there as rows.
+"""Grids along a path that resolve its limits.
 
-The bounds between pieces are nodes. Intervals are halved until every row's demand at the fastest steady speed changes
-evenly from node to node, and are short enough for the jerk to change at the right time: a part of the time that the
-acceleration takes to build up. Towards rest, where v ~ s^(2/3), they shrink in proportion to the distance.
+The bounds between the segments of the path are nodes. Intervals are halved until every row at the fastest steady speed
+varies almost linearly between nodes. They also last only a fraction of the time in which the acceleration builds up, so
+that the jerk can change at the right time. Towards rest, where v ~ s^(2/3), they shrink in proportion to the distance.
 """
 
 from __future__ import annotations
@@ -15,52 +15,52 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ocp.errors import ProblemError
-from ocp.motion.schedule.limits import JointPath, LineLimits, PathLike, Rows, causes, check_smooth, rows_at
-from ocp.motion.schedule.profile import Array, piece_of
+from ocp.motion.schedule.limits import JointPath, LineLimits, PathLike, Rows, check_smooth, limit_names, limit_rows
+from ocp.motion.schedule.profile import Array, segment_index
 from ocp.motion.schedule.settings import SETTINGS
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = ["Grid", "make_grid", "nodes_only", "reach"]
+__all__ = ["Grid", "coarse_grid", "make_grid", "reachable_bounds"]
 
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """Nodes along a path, and the limits at them.
+    """Nodes along a path, with the limits to evaluate there.
 
     Attributes:
-        path, limits, joints: Of the schedule.
-        distance: Of the nodes, from 0 to the path's length. Shape (N + 1,), m.
-        asked: Speed in each interval. Shape (N,), m/s.
-        jumps: Nodes where the path's pieces meet. Shape (B,).
+        path, limits, joints: As of the schedule.
+        distance: Nodes, from 0 to the length of the path. Shape (N + 1,), m.
+        requested: Requested speed in each interval. Shape (N,), m/s.
+        jumps: Nodes where segments of the path meet. Shape (B,).
         before: Distances just before these. Shape (B,), m.
-        sharp: Whether jerks are limited anywhere.
+        sharp: Whether any jerk is limited.
     """
 
     path: PathLike
     limits: LineLimits
     joints: JointPath | None
     distance: Array
-    asked: Array
+    requested: Array
     jumps: NDArray[np.intp]
     before: Array
     sharp: bool = True
 
     def ends(self, first: int, last: int) -> tuple[Rows, Rows]:
-        """Rows at the first and at the last place of the intervals between two nodes. Shape (N,) each.
+        """Return the rows at the first and at the last place of the intervals between two nodes. Shape (N,) each.
 
-        They are made when they are asked for: all of a long path would fill the memory.
+        They are evaluated on request: all rows of a long path would fill the memory.
         """
         at = np.flatnonzero((self.jumps > first) & (self.jumps <= last))
         places = np.concatenate([self.distance[first : last + 1], self.before[at]])
-        rows = rows_at(self.path, self.limits, self.joints, places)
+        rows = limit_rows(self.path, self.limits, self.joints, places)
         count = last - first
         right = np.arange(1, count + 1)
         right[self.jumps[at] - first - 1] = count + 1 + np.arange(len(at))
-        return rows.of(slice(count)), rows.of(right)
+        return rows.take(slice(count)), rows.take(right)
 
     def parts(self) -> list[tuple[int, int]]:
-        """First and last nodes of parts of bounded length."""
-        ends = [*range(0, len(self.asked), SETTINGS.block), len(self.asked)]
+        """Return the first and last nodes of parts of bounded length."""
+        ends = [*range(0, len(self.requested), SETTINGS.block), len(self.requested)]
         return list(pairwise(ends))
 
 
@@ -68,121 +68,123 @@ class _Cells(NamedTuple):
     """Intervals that resolve the limits. Shape (N,) each.
 
     Attributes:
-        begin: Where they begin, m.
-        top: Fastest steady speed, m/s.
-        rates: Acceleration that no motion exceeds, m/s^2.
-        most, sharp: Greatest acceleration and jerk of the line at rest, m/s^2 and m/s^3.
+        begin: Beginnings of the intervals, m.
+        top: Fastest steady speeds, m/s.
+        rates: Upper bounds of the acceleration of any motion, m/s^2.
+        acceleration, jerk: Largest values of the line at rest, m/s^2 and m/s^3.
     """
 
     begin: Array
     top: Array
     rates: Array
-    most: Array
-    sharp: Array
+    acceleration: Array
+    jerk: Array
 
 
 def make_grid(path: PathLike, limits: LineLimits, joints: JointPath | None) -> Grid:
-    """Nodes of a path.
+    """Return the grid of a path.
 
     Args:
-        path, limits: Of the schedule.
-        joints: None where none are limited.
+        path, limits: As of the schedule.
+        joints: None if no joint is limited.
 
     Raises:
-        ProblemError: A jerk limit that no speed can keep, because the path's curvature jumps; a singular arm.
+        ProblemError: A jerk limit cannot be kept because the curvature jumps, or the arm is singular.
     """
     check_smooth(path, limits, joints)
-    asked, bounds = path.by_piece(limits.speed), np.asarray(path.bounds, dtype=float)
-    # a piece that is next to nothing has no interval of its own
-    some = np.concatenate([[True], np.diff(bounds)[:-1] > SETTINGS.shortest * path.length, [True]])
-    some[-2] &= len(bounds) == 2 or bounds[-1] - bounds[-2] > SETTINGS.shortest * path.length
-    nodes = bounds[some]
-    first = _apart(np.concatenate([path.dense(SETTINGS.cells, max(1, SETTINGS.segments // len(bounds))), nodes]), nodes)
+    requested, bounds = path.by_piece(limits.speed), np.asarray(path.bounds, dtype=float)
+    # a negligible segment has no interval of its own
+    kept = np.concatenate([[True], np.diff(bounds)[:-1] > SETTINGS.shortest * path.length, [True]])
+    kept[-2] &= len(bounds) == 2 or bounds[-1] - bounds[-2] > SETTINGS.shortest * path.length
+    nodes = bounds[kept]
+    dense = path.dense(SETTINGS.cells, max(1, SETTINGS.segments // len(bounds)))
+    first = _separate(np.concatenate([dense, nodes]), nodes)
     parts = [
-        _halved(path, limits, joints, first[begin : begin + SETTINGS.block + 1], (bounds, asked))
+        _halved(path, limits, joints, first[begin : begin + SETTINGS.block + 1], (bounds, requested))
         for begin in range(0, len(first) - 1, SETTINGS.block)
     ]
     cells = _Cells(*(np.concatenate(kind) for kind in zip(*parts, strict=True)))
-    s = _apart(np.concatenate([_in_time(cells, path.length), nodes]), nodes)
+    s = _separate(np.concatenate([_time_nodes(cells, path.length), nodes]), nodes)
     inner = nodes[1:-1]
     before = inner - np.minimum(ROUNDING_SHARE * path.length, np.diff(nodes)[:-1] / 2)
-    of_interval = np.asarray(asked[piece_of(bounds, (s[:-1] + s[1:]) / 2)])
-    sharp = bool(np.isfinite(cells.sharp).any())
+    of_interval = np.asarray(requested[segment_index(bounds, (s[:-1] + s[1:]) / 2)])
+    sharp = bool(np.isfinite(cells.jerk).any())
     return Grid(path, limits, joints, s, of_interval, np.searchsorted(s, inner), before, sharp)
 
 
 def _halved(
-    path: PathLike, limits: LineLimits, joints: JointPath | None, s: Array, asked: tuple[Array, Array]
+    path: PathLike, limits: LineLimits, joints: JointPath | None, s: Array, requested: tuple[Array, Array]
 ) -> _Cells:
-    """Intervals between places, halved until their rows change evenly.
+    """Return the intervals between places, halved until their rows vary almost linearly.
 
     Args:
-        path, limits, joints: As of `make_grid`.
+        path, limits, joints: As for `make_grid`.
         s: Places. Shape (M + 1,), m.
-        asked: Bounds of the path's pieces, and the speed in each.
+        requested: Bounds of the segments of the path, and the speed in each.
     """
-    rows = rows_at(path, limits, joints, s)
-    _check_rest(rows, s, causes(limits, joints))
+    rows = limit_rows(path, limits, joints, s)
+    _check_rest(rows, s, limit_names(limits, joints))
     new = np.arange(len(s) - 1)
     for _ in range(SETTINGS.halvings):
         middle = (s[new] + s[new + 1]) / 2
-        between = rows_at(path, limits, joints, middle)
-        wide = _uneven(rows.of(new), between, rows.of(new + 1), _top(rows, s, *asked)[new])
-        wide &= s[new + 1] - s[new] > SETTINGS.shortest * path.length
-        if not wide.any():
+        middle_rows = limit_rows(path, limits, joints, middle)
+        uneven = _uneven(rows.take(new), middle_rows, rows.take(new + 1), _steady_speeds(rows, s, *requested)[new])
+        uneven &= s[new + 1] - s[new] > SETTINGS.shortest * path.length
+        if not uneven.any():
             break
-        cut = new[wide]
-        s = np.insert(s, cut + 1, middle[wide])
-        rows = Rows(*(np.insert(a, cut + 1, b[wide], axis=0) for a, b in zip(rows, between, strict=True)))
+        cut = new[uneven]
+        s = np.insert(s, cut + 1, middle[uneven])
+        rows = Rows(*(np.insert(a, cut + 1, b[uneven], axis=0) for a, b in zip(rows, middle_rows, strict=True)))
         new = np.sort(np.concatenate([cut + np.arange(len(cut)), cut + np.arange(len(cut)) + 1]))
-    top, left, right = _top(rows, s, *asked), rows.of(slice(-1)), rows.of(slice(1, None))
+    top, left, right = _steady_speeds(rows, s, *requested), rows.take(slice(-1)), rows.take(slice(1, None))
     with np.errstate(divide="ignore"):
-        sharp = 1 / np.maximum(np.abs(left.jerk[:, :, 0]), np.abs(right.jerk[:, :, 0])).max(axis=1, initial=0.0)
-    most = 1 / np.maximum(np.abs(left.acceleration[:, :, 0]), np.abs(right.acceleration[:, :, 0])).max(axis=1)
-    return _Cells(s[:-1], top, _rates(left, right, top**2, top**2), most, sharp)
+        jerk = 1 / np.maximum(np.abs(left.jerk[:, :, 0]), np.abs(right.jerk[:, :, 0])).max(axis=1, initial=0.0)
+    acceleration = 1 / np.maximum(np.abs(left.acceleration[:, :, 0]), np.abs(right.acceleration[:, :, 0])).max(axis=1)
+    return _Cells(s[:-1], top, _acceleration_bounds(left, right, top**2, top**2), acceleration, jerk)
 
 
-def nodes_only(path: PathLike, limits: LineLimits) -> Grid:
-    """The first nodes of a path, no interval halved: enough to say where the line binds."""
+def coarse_grid(path: PathLike, limits: LineLimits) -> Grid:
+    """Return the first nodes of a path without halving: enough to find where limits are active."""
     bounds = np.asarray(path.bounds, dtype=float)
     s = np.unique(np.concatenate([path.dense(SETTINGS.cells, 1), bounds]))
-    asked = np.asarray(path.by_piece(limits.speed)[piece_of(bounds, (s[:-1] + s[1:]) / 2)])
-    return Grid(path, limits, None, s, asked, np.zeros(0, dtype=np.intp), np.zeros(0))
+    requested = np.asarray(path.by_piece(limits.speed)[segment_index(bounds, (s[:-1] + s[1:]) / 2)])
+    return Grid(path, limits, None, s, requested, np.zeros(0, dtype=np.intp), np.zeros(0))
 
 
 def _check_rest(rows: Rows, s: Array, names: tuple[str, ...]) -> None:
-    """Refuse what breaks a limit at rest: a torque that does not hold the load."""
-    rest = np.abs(rows.acceleration[:, :, 2])
-    at, row = np.unravel_index(int(rest.argmax()), rest.shape)
-    if rest[at, row] >= 1:
-        place, need, cause = float(s[at]), float(rest[at, row]), names[rows.speed.shape[1] + int(row)]
-        message = f"{cause} does not hold the load at {place:g} m, it takes {need:.3g} times the limit; raise it"
-        raise ProblemError(message, name=cause, value=need, limit=1.0, time=place)
+    """Raise ProblemError if a limit is violated at rest, as by a torque that does not hold the load."""
+    usages = np.abs(rows.acceleration[:, :, 2])
+    at, row = np.unravel_index(int(usages.argmax()), usages.shape)
+    if usages[at, row] >= 1:
+        place, usage, cause = float(s[at]), float(usages[at, row]), names[rows.speed.shape[1] + int(row)]
+        message = f"{cause} does not hold the load at {place:g} m: {usage:.3g} times the limit is needed; raise it"
+        raise ProblemError(message, name=cause, value=usage, limit=1.0, time=place)
 
 
-def _apart(places: Array, nodes: Array) -> Array:
-    """Places in order, without those that all but fall on one of the nodes or on one another."""
+def _separate(places: Array, nodes: Array) -> Array:
+    """Return the places in order, without those too close to a node or to one another."""
     s = np.unique(places)
     for _ in range(3):
         gap = np.diff(s)
-        beside = np.maximum(np.append(gap, 0.0), np.insert(gap, 0, 0.0))
-        near = np.minimum(np.append(gap, np.inf), np.insert(gap, 0, np.inf)) < SETTINGS.closest * beside
-        near &= ~np.isin(s, nodes)
-        near[1:] &= ~near[:-1]  # of two that are close one stays
-        if not near.any():
+        longer_gap = np.maximum(np.append(gap, 0.0), np.insert(gap, 0, 0.0))
+        close = np.minimum(np.append(gap, np.inf), np.insert(gap, 0, np.inf)) < SETTINGS.closest * longer_gap
+        close &= ~np.isin(s, nodes)
+        close[1:] &= ~close[:-1]  # of two that are close one stays
+        if not close.any():
             break
-        s = s[~near]
+        s = s[~close]
     return s
 
 
-def _top(rows: Rows, s: Array, bounds: Array, asked: Array) -> Array:
-    """Fastest steady speed in each interval, m/s."""
+def _steady_speeds(rows: Rows, s: Array, bounds: Array, requested: Array) -> Array:
+    """Return the fastest steady speed in each interval, m/s."""
     steady = rows.steady()[0]
-    return np.asarray(np.minimum(np.minimum(steady[:-1], steady[1:]), asked[piece_of(bounds, (s[:-1] + s[1:]) / 2)]))
+    here = requested[segment_index(bounds, (s[:-1] + s[1:]) / 2)]
+    return np.asarray(np.minimum(np.minimum(steady[:-1], steady[1:]), here))
 
 
 def _uneven(left: Rows, middle: Rows, right: Rows, top: Array) -> NDArray[np.bool_]:
-    """Which intervals' middles differ from what their ends say, at the top speed. Shape (N,)."""
+    """Return which intervals have middles that differ from the mean of their ends, at the top speed. Shape (N,)."""
     sides = left, middle, right
     kinds = (
         # by the squared speed, as the rows of speed are in the program
@@ -190,86 +192,84 @@ def _uneven(left: Rows, middle: Rows, right: Rows, top: Array) -> NDArray[np.boo
         ([rows.acceleration[:, :, 1] for rows in sides], top**2, SETTINGS.uneven),
         ([rows.jerk[:, :, 2] for rows in sides], top**3, SETTINGS.uneven),
     )
-    wide = np.zeros(len(top), dtype=bool)
-    for (first, between, last), scale, most in kinds:
-        bent = np.abs(between - (first + last) / 2) * scale[:, None]
-        wide |= bent.max(axis=1, initial=0.0) > most
-    return wide
+    uneven = np.zeros(len(top), dtype=bool)
+    for (first, mid, last), scale, tolerance in kinds:
+        deviation = np.abs(mid - (first + last) / 2) * scale[:, None]
+        uneven |= deviation.max(axis=1, initial=0.0) > tolerance
+    return uneven
 
 
-def reach(distance: Array, caps: Array, left: Rows, right: Rows, at_rest: tuple[bool, bool]) -> tuple[Array, Array]:
-    """Squared speeds that no motion exceeds, and accelerations of the line that none exceeds.
+def reachable_bounds(
+    distance: Array, caps: Array, left: Rows, right: Rows, at_rest: tuple[bool, bool]
+) -> tuple[Array, Array]:
+    """Return upper bounds of the squared speeds at nodes (N + 1,) and of the accelerations in intervals (N,).
 
     Args:
         distance: Nodes. Shape (N + 1,), m.
         caps: Greatest squared speed at each. Shape (N + 1,).
         left, right: Rows at both ends of each interval. Shape (N,).
         at_rest: Whether the motion begins and ends at rest.
-
-    Returns:
-        Squared speeds at the nodes (N + 1,), accelerations in the intervals (N,).
     """
-    rates = _rates(left, right, caps[:-1], caps[1:])
-    return _reached(distance, caps, rates, at_rest), rates
+    rates = _acceleration_bounds(left, right, caps[:-1], caps[1:])
+    return _reachable_squares(distance, caps, rates, at_rest), rates
 
 
-def _rates(left: Rows, right: Rows, first: Array, last: Array) -> Array:
-    """Accelerations that none exceeds in intervals, by the greatest squared speeds at their ends. Shape (N,) each."""
+def _acceleration_bounds(left: Rows, right: Rows, first: Array, last: Array) -> Array:
+    """Return upper bounds of the accelerations in intervals from squared speeds at their ends. Shape (N,) each."""
     rates = np.full(len(first), np.inf)
     for side, most in ((left, first), (right, last)):
-        of = np.abs(side.acceleration)
+        rows = np.abs(side.acceleration)
         with np.errstate(divide="ignore", invalid="ignore"):
-            one = (1 + of[:, :, 1] * most[:, None] + of[:, :, 2]) / of[:, :, 0]
-        rates = np.minimum(rates, np.where(of[:, :, 0] > 0, one, np.inf).min(axis=1, initial=np.inf))
+            bound = (1 + rows[:, :, 1] * most[:, None] + rows[:, :, 2]) / rows[:, :, 0]
+        rates = np.minimum(rates, np.where(rows[:, :, 0] > 0, bound, np.inf).min(axis=1, initial=np.inf))
     return rates
 
 
-def _reached(distance: Array, caps: Array, rates: Array, at_rest: tuple[bool, bool]) -> Array:
-    """Squared speeds at nodes that keep to caps and to accelerations in the intervals."""
+def _reachable_squares(distance: Array, caps: Array, rates: Array, at_rest: tuple[bool, bool]) -> Array:
+    """Return squared speeds at nodes that keep the caps and the accelerations in the intervals."""
     gain = np.concatenate([[0.0], np.cumsum(2 * rates * np.diff(distance))])
-    up = caps.copy()
-    up[[i for i, rest in zip((0, -1), at_rest, strict=True) if rest]] = 0.0
-    up = np.minimum.accumulate(up - gain) + gain
-    up = np.minimum.accumulate((up + gain)[::-1])[::-1] - gain
-    return np.asarray(np.maximum(up, 0.0))
+    squares = caps.copy()
+    squares[[i for i, rest in zip((0, -1), at_rest, strict=True) if rest]] = 0.0
+    squares = np.minimum.accumulate(squares - gain) + gain
+    squares = np.minimum.accumulate((squares + gain)[::-1])[::-1] - gain
+    return np.asarray(np.maximum(squares, 0.0))
 
 
-def _in_time(cells: _Cells, length: float) -> Array:
-    """Nodes that cut intervals into such that are short in time as well, and shrink towards both ends."""
-    _, top, rates, most, sharp = cells
+def _time_nodes(cells: _Cells, length: float) -> Array:
+    """Return nodes that split intervals into ones that are short in time too and shrink towards both ends."""
+    _, top, rates, acceleration, jerk = cells
     s = np.append(cells.begin, length)
     caps = np.minimum(np.append(top, np.inf), np.insert(top, 0, np.inf)) ** 2
-    up = _reached(s, caps, rates, (True, True))
-    ramp = top / most
+    squares = _reachable_squares(s, caps, rates, (True, True))
+    ramp = top / acceleration
     with np.errstate(invalid="ignore"):
-        build_up = np.minimum(most / sharp, np.sqrt(top / sharp))
+        build_up = np.minimum(acceleration / jerk, np.sqrt(top / jerk))
     duration = np.minimum(np.maximum(SETTINGS.build_up * build_up, SETTINGS.ramp * ramp), SETTINGS.turn * ramp)
     duration = np.maximum(duration, SETTINGS.least_build_up * build_up)
-    speed = np.sqrt(np.maximum(np.maximum(up[:-1], up[1:]), 0.0))
+    speed = np.sqrt(np.maximum(np.maximum(squares[:-1], squares[1:]), 0.0))
     longest = np.minimum(speed * duration, length)
-    # what is a whole number but for rounding is one: the unit of length must not change the nodes
+    # ceil with a margin for rounding: the unit of length must not change the nodes
     parts = np.clip(np.ceil(np.diff(s) / longest * (1 - ROUNDING_SHARE)), 1, SETTINGS.parts).astype(np.intp)
-    nodes = np.append(np.repeat(s[:-1], parts) + np.repeat(np.diff(s) / parts, parts) * _count(parts), length)
+    nodes = np.append(np.repeat(s[:-1], parts) + np.repeat(np.diff(s) / parts, parts) * _group_indices(parts), length)
     near: list[Array] = [np.zeros(0), np.zeros(0)]
     for end in (0, -1):
         away = nodes if end == 0 else length - nodes
         build = max(float(build_up[end]), 1e-3 * float(ramp[end]))
-        room = float(s[1] if end == 0 else length - s[-2])
-        first = min(float(most[end]) / build * (SETTINGS.first * build) ** 3 / 6, room / 4)
-        # intervals in proportion to the distance from rest, until they are as long as the others
+        available = float(s[1] if end == 0 else length - s[-2])
+        first = min(float(acceleration[end]) / build * (SETTINGS.first * build) ** 3 / 6, available / 4)
+        # geometric intervals from rest, until they are as long as the others
         steps = np.diff(np.sort(away))[:3].max(initial=0.0)
-        reached = min(max(steps * SETTINGS.growth / (SETTINGS.growth - 1), first), length / 2)
-        count = max(int(np.ceil(np.log(reached / first) / np.log(SETTINGS.growth))), 1)
+        geometric_range = min(max(steps * SETTINGS.growth / (SETTINGS.growth - 1), first), length / 2)
+        count = max(int(np.ceil(np.log(geometric_range / first) / np.log(SETTINGS.growth))), 1)
         near[end] = np.asarray(first * SETTINGS.growth ** np.arange(count + 1), dtype=float)
-        # what resolves a limit more finely than these, as a bend near the end, stays beside them
+        # finer nodes, which resolve a limit such as a bend near the end, are kept
         gap = np.diff(nodes)
         finest = np.minimum(np.append(gap, np.inf), np.insert(gap, 0, np.inf))
-        stays = finest < away * (1 - 1 / SETTINGS.growth)
-        nodes = nodes[(away == 0) | stays | (away >= near[end][-1] * (1 + (SETTINGS.growth - 1) / 2))]
-    merged = np.unique(np.concatenate([nodes, near[0], length - near[1]]))
-    return merged
+        finer = finest < away * (1 - 1 / SETTINGS.growth)
+        nodes = nodes[(away == 0) | finer | (away >= near[end][-1] * (1 + (SETTINGS.growth - 1) / 2))]
+    return np.unique(np.concatenate([nodes, near[0], length - near[1]]))
 
 
-def _count(parts: NDArray[np.intp]) -> NDArray[np.intp]:
-    """0, 1, ... in each group of so many."""
-    return np.arange(parts.sum()) - np.repeat(np.cumsum(parts) - parts, parts)
+def _group_indices(sizes: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Return 0, 1, ... in each group of the given sizes."""
+    return np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)

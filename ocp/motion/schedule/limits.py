@@ -1,14 +1,12 @@
-"""What a schedule must keep to, and the line speed that it leaves at each place of a path.
-
-Every limit of a schedule as rows in the speed v, the acceleration a and the jerk j of the line, at places of a path.
+"""Limits of a schedule, and their rows in the speed v, acceleration a and jerk j of the line at places of a path.
 
     speed          k v <= 1
     acceleration   -1 <= p a + q v^2 + r <= 1
     jerk           |p j + q v a + r v^3| <= 1
 
-Joint velocities, accelerations and jerks give (q'), (q', q'') and (q', 3 q'', q''') over their limits, centripetal
-acceleration and the turn rate of the tool a speed, torques (m, b, c) of m(s) a + b(s) v^2 + c(s), and acceleration and
-jerk of the tool those of its directions (`ToolLimits`).
+Joint velocities, accelerations and jerks give (q'), (q', q'') and (q', 3 q'', q''') over their limits. Centripetal
+acceleration and the turn rate of the tool limit the speed. Torques m(s) a + b(s) v^2 + c(s) give (m, b, c) over their
+limits. Acceleration and jerk of the tool (`ToolLimits`) give those of its coordinates.
 """
 
 from __future__ import annotations
@@ -25,29 +23,14 @@ from ocp.motion.schedule.profile import Array, LineMotion
 from ocp.motion.schedule.settings import SETTINGS
 
 __all__ = [
-    "JointLimits",
-    "JointPath",
-    "JointRates",
-    "LineLimits",
-    "PathLike",
-    "Rows",
-    "ToolLimits",
-    "TorqueRates",
-    "causes",
-    "check_joints",
-    "check_line",
-    "check_smooth",
-    "curvature_along",
-    "rates_along",
-    "rows_at",
-    "tool_along",
-    "torque_rows",
-    "torques_along",
-]
+    "JointLimits", "JointPath", "JointRates", "LineLimits", "PathLike", "Rows", "ToolLimits", "TorqueRates",
+    "check_joints", "check_line", "check_smooth", "curvature_along", "limit_names", "limit_rows", "rates_along",
+    "tool_along", "torque_rows", "torques_along",
+]  # fmt: skip
 
 
 class PathLike(Protocol):
-    """What a schedule asks of a path: models.paths.SmoothPath has it."""
+    """Protocol of a path of a schedule; models.paths.SmoothPath has it."""
 
     @property
     def length(self) -> float: ...
@@ -60,7 +43,7 @@ class PathLike(Protocol):
 
 
 class JointRates(Protocol):
-    """Joint positions along a path and their first three derivatives by the distance. Shape (M, n) each."""
+    """Joint positions along a path and their first three derivatives by distance. Shape (M, n) each."""
 
     @property
     def position(self) -> Array: ...
@@ -73,7 +56,7 @@ class JointRates(Protocol):
 
 
 class TorqueRates(Protocol):
-    """Joint torques along a path as a linear form of the line's motion: inertia a + drag v^2 + rest. Shape (M, n)."""
+    """Joint torques along a path, linear in the motion of the line: inertia a + drag v^2 + rest. Shape (M, n) each."""
 
     @property
     def inertia(self) -> Array: ...
@@ -84,9 +67,9 @@ class TorqueRates(Protocol):
 
 
 class JointPath(Protocol):
-    """Joints as a function of the distance: models.scara_along and ocp.joint_path make one.
+    """Joints as a function of distance, as from models.scara_along and ocp.joint_path.
 
-    Where torques are limited it has `torques(distance) -> TorqueRates` too.
+    With torque limits it also has `torques(distance) -> TorqueRates`.
     """
 
     @property
@@ -96,12 +79,12 @@ class JointPath(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class JointLimits:
-    """Greatest joint velocities (rad/s or m/s), accelerations, jerks and torques (Nm or N), symmetric.
+    """Symmetric limits of joint velocities (rad/s or m/s), accelerations, jerks and torques (Nm or N).
 
-    Each of shape (n,), or one for all.
+    Each is one number, or has shape (n,).
 
     Raises:
-        ProblemError: A limit that is not positive; it may be infinite.
+        ProblemError: A limit is not positive; it may be infinite.
     """
 
     velocity: ArrayLike = np.inf
@@ -116,14 +99,14 @@ class JointLimits:
 
 @dataclass(frozen=True, eq=False)
 class ToolLimits:
-    """Greatest acceleration (m/s^2) and jerk (m/s^3) of the tool along each axis of the world, and its turn rate.
+    """Limits of acceleration (m/s^2) and jerk (m/s^3) of the tool along each world axis, and of its turn rate.
 
     Attributes:
-        acceleration, jerk: Symmetric. Shape (3,), or one for all axes.
-        turn_rate: Greatest angular speed, rad/s.
+        acceleration, jerk: Symmetric. Shape (3,), or one number for all axes.
+        turn_rate: Largest angular speed, rad/s.
 
     Raises:
-        ProblemError: A limit that is not positive; it may be infinite.
+        ProblemError: A limit is not positive; it may be infinite.
     """
 
     acceleration: ArrayLike = np.inf
@@ -145,15 +128,15 @@ class LineLimits:
     """Limits of a schedule.
 
     Attributes:
-        speed: Asked line speed, m/s: one, or one for each segment of the task.
-        acceleration: Of the line speed, peak, m/s^2. See `peak_acceleration` for a mean one.
-        jerk: Of the line speed, m/s^3; infinite for none, and the acceleration may then jump.
-        centripetal: Greatest speed^2 x curvature, m/s^2.
-        joints: Of the joints, or None.
-        tool: Of the tool, or None.
+        speed: Requested line speed, m/s: one number, or one for each segment of the task.
+        acceleration: Peak acceleration of the line, m/s^2. See `peak_acceleration` for a mean one.
+        jerk: Jerk of the line, m/s^3; infinite for none, the acceleration may then jump.
+        centripetal: Largest speed^2 x curvature, m/s^2.
+        joints: Joint limits, or None.
+        tool: Tool limits, or None.
 
     Raises:
-        ProblemError: A limit that is not positive, nan, or not finite where it must be.
+        ProblemError: A limit is not positive, or not finite where it must be.
     """
 
     speed: ArrayLike
@@ -171,18 +154,19 @@ class LineLimits:
                 checked_instance("joint limits" if name == "joints" else "tool limits", getattr(self, name), kind)
 
     def of_joints(self, count: int) -> Array:
-        """Velocity, acceleration and jerk limits of `count` joints. Shape (3, count)."""
+        """Return velocity, acceleration and jerk limits of `count` joints. Shape (3, count)."""
         return self._of_joints(count, ("velocity", "acceleration", "jerk"))
 
     def torques(self, count: int) -> Array:
-        """Torque limits of `count` joints. Shape (count,)."""
+        """Return torque limits of `count` joints. Shape (count,)."""
         return np.asarray(self._of_joints(count, ("torque",))[0])
 
     def _of_joints(self, count: int, names: tuple[str, ...]) -> Array:
-        given = self.joints or JointLimits()
+        """Return the limits of these names for `count` joints, checked."""
+        joints = self.joints or JointLimits()
         rows = []
         for name in names:
-            value = np.asarray(getattr(given, name), dtype=float)
+            value = np.asarray(getattr(joints, name), dtype=float)
             if value.ndim and value.shape != (count,):
                 message = f"joint {name} limits have shape {value.shape}; the arm has {count} joints"
                 raise ProblemError(message, name=f"joint {name}", value=value.shape, limit=(count,))
@@ -191,6 +175,7 @@ class LineLimits:
 
 
 def _check(name: str, value: ArrayLike, finite: bool, dimensions: int = 1) -> None:
+    """Raise ProblemError unless a limit is positive, of at most these dimensions, and finite if `finite`."""
     try:
         array = floats(value)
     except NOT_NUMBERS as error:
@@ -198,27 +183,27 @@ def _check(name: str, value: ArrayLike, finite: bool, dimensions: int = 1) -> No
     if array.ndim > dimensions:
         message = f"{name} limit has shape {array.shape}; give one number{', or a row' if dimensions else ''}"
         raise ProblemError(message, name=name, value=array.shape)
-    wrong = ~(array > 0) | (finite & ~np.isfinite(array))
-    if array.size == 0 or wrong.any():
-        bad = float(array[wrong].flat[0]) if array.size else np.nan
-        message = f"{name} limit {bad:g} must be positive{' and finite' if finite else ''}"
-        raise ProblemError(message, name=name, value=bad, limit=0.0)
+    invalid = ~(array > 0) | (finite & ~np.isfinite(array))
+    if array.size == 0 or invalid.any():
+        value_at_fault = float(array[invalid].flat[0]) if array.size else np.nan
+        message = f"{name} limit {value_at_fault:g} must be positive{' and finite' if finite else ''}"
+        raise ProblemError(message, name=name, value=value_at_fault, limit=0.0)
     numbers = np.finfo(float)
     low, high = (float(end) ** 0.2 for end in (numbers.tiny, numbers.max))  # products of five are numbers
-    odd = array[np.isfinite(array) & ~((low < array) & (array < high))]
-    if odd.size:
-        message = f"{name} limit {odd[0]:g} is no size to compute with, {low:.0e} to {high:.0e}: is its unit right?"
-        raise ProblemError(message, name=name, value=float(odd[0]), limit=(low, high))
+    extreme = array[np.isfinite(array) & ~((low < array) & (array < high))]
+    if extreme.size:
+        message = f"{name} limit {extreme[0]:g} is outside the range of sizes {low:.0e} to {high:.0e}: check its unit"
+        raise ProblemError(message, name=name, value=float(extreme[0]), limit=(low, high))
 
 
 def check_line(path: PathLike, limits: LineLimits, joints: JointPath | None) -> JointPath | None:
-    """The joints that are limited, None where none are.
+    """Return the limited joints, None if no joint is limited.
 
     Raises:
-        ProblemError: No path, no limits, no joints along a path, or joint limits without joints.
+        ProblemError: Path, limits or joints have the wrong type, or there are joint limits without joints.
     """
-    what = ("length", "bounds", "by_piece", "curvature", "dense")
-    missing = [name for name in what if isinstance(path, type) or not hasattr(path, name)]
+    required = ("length", "bounds", "by_piece", "curvature", "dense")
+    missing = [name for name in required if isinstance(path, type) or not hasattr(path, name)]
     if missing:
         hint = "give a SmoothPath, as models.smooth makes it"
         raise ProblemError(f"the path {path!r} has no {missing[0]}; {hint}", name="path", value=path)
@@ -232,17 +217,17 @@ def check_line(path: PathLike, limits: LineLimits, joints: JointPath | None) -> 
 
 
 def check_joints(joints: JointPath) -> None:
-    """Raise ProblemError where something has not the names and places of joints along a path."""
+    """Raise ProblemError unless an object has the names and positions of joints along a path."""
     if isinstance(joints, type) or not hasattr(joints, "names") or not callable(getattr(joints, "at", None)):
         message = f"joints must be a function of the distance, as models.scara_along makes it, not {joints!r}"
         raise ProblemError(message, name="joints", value=joints)
 
 
 def rates_along(joints: JointPath, distance: Array) -> JointRates:
-    """Joints at distances (M,), checked.
+    """Return the joints at distances (M,), checked.
 
     Raises:
-        ProblemError: Shapes that are not (M, n), a value that is not finite.
+        ProblemError: A shape is not (M, n), or a value is not finite.
     """
     check_joints(joints)
     rates = joints.at(distance)
@@ -259,16 +244,16 @@ def rates_along(joints: JointPath, distance: Array) -> JointRates:
         finite = np.isfinite(value)
         if not finite.all():
             at, joint = np.argwhere(~finite)[0]
-            name, bad, place = joints.names[joint], float(value[at, joint]), float(distance[at])
-            what = "position" if kind == "position" else f"{kind} derivative"
-            message = f"the {what} of joint {name!r} is {bad:g}, not finite, at {place:g} m"
+            name, number, place = joints.names[joint], float(value[at, joint]), float(distance[at])
+            quantity = "position" if kind == "position" else f"{kind} derivative"
+            message = f"the {quantity} of joint {name!r} is {number:g}, not finite, at {place:g} m"
             message += ", the arm is singular there; keep the path away"
-            raise ProblemError(message, name=name, value=bad, time=place)
+            raise ProblemError(message, name=name, value=number, time=place)
     return rates
 
 
 def curvature_along(path: PathLike, distance: Array) -> Array:
-    """Curvature at distances, shape (M,), 1/m; ProblemError for another shape or what is not finite."""
+    """Return the curvature at distances (M,), 1/m; ProblemError for a wrong shape or a value that is not finite."""
     value = np.asarray(path.curvature(distance), dtype=float)
     if value.shape != np.shape(distance):
         message = f"the path's curvature has shape {value.shape}, expected {np.shape(distance)}"
@@ -281,26 +266,26 @@ def curvature_along(path: PathLike, distance: Array) -> Array:
 
 
 def torques_along(joints: JointPath, distance: Array) -> TorqueRates:
-    """Torques at distances (M,), checked.
+    """Return the torques at distances (M,), checked.
 
     Raises:
-        ProblemError: Joints that know no torques, shapes that are not (M, n), a value that is not finite.
+        ProblemError: The joints have no torques, a shape is not (M, n), or a value is not finite.
     """
     if not callable(getattr(joints, "torques", None)):
         message = "torque limits need joints with torques: joints=joint_path(machine, plan)"
         raise ProblemError(message, name="joint torque", value=joints)
-    found: TorqueRates = joints.torques(distance)  # type: ignore[attr-defined]
+    torques: TorqueRates = joints.torques(distance)  # type: ignore[attr-defined]
     shape = (len(distance), len(joints.names))
     for kind in ("inertia", "drag", "rest"):
-        value = np.asarray(getattr(found, kind), dtype=float)
+        value = np.asarray(getattr(torques, kind), dtype=float)
         if value.shape != shape or not np.isfinite(value).all():
             message = f"torques along the path: {kind} must be finite and of shape {shape}, it has {value.shape}"
             raise ProblemError(message, name=kind, value=value.shape, limit=shape)
-    return found
+    return torques
 
 
 def tool_along(path: PathLike, distance: Array) -> tuple[Array, Array, Array, Array]:
-    """Tangent, curvature vector, its rate, and the turn rate at unit speed, at distances (M,). Shape (M, 3) each."""
+    """Return tangent, curvature vector, its rate, and turn rate at unit speed, at distances (M,). Shape (M, 3) each."""
     missing = [name for name in ("at", "turn") if not callable(getattr(path, name, None))]
     if missing:
         message = f"tool limits need a path with places and turns, as models.smooth makes it; it has no {missing[0]}"
@@ -310,31 +295,27 @@ def tool_along(path: PathLike, distance: Array) -> tuple[Array, Array, Array, Ar
 
 
 def check_smooth(path: PathLike, limits: LineLimits, joints: JointPath | None) -> None:
-    """Refuse jerk limits of joints or tool on a path whose curvature jumps.
-
-    Raises:
-        ProblemError: Where it jumps most.
-    """
-    of_joints = joints is not None and np.isfinite(limits.of_joints(len(joints.names))[2]).any()
-    of_tool = limits.tool is not None and np.isfinite(limits.tool.jerk).any()
-    jumps = path.curvature_jumps() if of_joints or of_tool else np.zeros(0)
+    """Raise ProblemError for jerk limits of joints or tool on a path whose curvature jumps, where it jumps most."""
+    joints_limited = joints is not None and np.isfinite(limits.of_joints(len(joints.names))[2]).any()
+    tool_limited = limits.tool is not None and np.isfinite(limits.tool.jerk).any()
+    jumps = path.curvature_jumps() if joints_limited or tool_limited else np.zeros(0)
     if not jumps.size:
         return
     at = int(jumps.argmax())
     if jumps[at] > 1e-9 * (1 + float(path.curvature(path.bounds).max())):
-        place, jump, whose = float(path.bounds[at + 1]), float(jumps[at]), "joint" if of_joints else "tool"
+        place, jump, owner = float(path.bounds[at + 1]), float(jumps[at]), "joint" if joints_limited else "tool"
         message = (
-            f"a {whose} jerk limit cannot be kept at {place:g} m, where the path's curvature jumps by "
-            f"{jump:.3g} /m and the {whose} accelerations with it; round the corners with kind='quintic'"
+            f"a {owner} jerk limit cannot be kept at {place:g} m, where the path's curvature jumps by "
+            f"{jump:.3g} /m and the {owner} accelerations with it; round the corners with kind='quintic'"
         )
         raise ProblemError(message, name="curvature", value=jump, time=place)
 
 
 class Rows(NamedTuple):
-    """Limits at S places.
+    """Rows of the limits at S places.
 
     Attributes:
-        speed: Shape (S, K), s/m.
+        speed: k of each row. Shape (S, K), s/m.
         acceleration: p, q and r of each row. Shape (S, L, 3).
         jerk: p, q and r of each row. Shape (S, P, 3).
     """
@@ -343,18 +324,18 @@ class Rows(NamedTuple):
     acceleration: Array
     jerk: Array
 
-    def of(self, places: NDArray[np.intp] | slice) -> Rows:
-        """Those at some of the places."""
+    def take(self, places: NDArray[np.intp] | slice) -> Rows:
+        """Return the rows at some of the places."""
         return Rows(self.speed[places], self.acceleration[places], self.jerk[places])
 
     def steady(self) -> tuple[Array, NDArray[np.intp]]:
-        """Greatest steady speed (m/s) at each place, and the row of `causes` that limits it. Shape (S,) each."""
+        """Return the greatest steady speed at each place, m/s, and its row in `limit_names`. Shape (S,) each."""
         with np.errstate(divide="ignore", invalid="ignore"):
-            room = 1 - np.sign(self.acceleration[:, :, 1]) * self.acceleration[:, :, 2]
+            available = 1 - np.sign(self.acceleration[:, :, 1]) * self.acceleration[:, :, 2]
             speeds = np.concatenate(
                 [
                     1 / self.speed,
-                    np.sqrt(np.maximum(room, 0) / np.abs(self.acceleration[:, :, 1])),
+                    np.sqrt(np.maximum(available, 0) / np.abs(self.acceleration[:, :, 1])),
                     np.cbrt(1 / np.abs(self.jerk[:, :, 2])),
                 ],
                 axis=1,
@@ -366,29 +347,30 @@ class Rows(NamedTuple):
 
     @property
     def total(self) -> int:
-        """Of rows at a place."""
+        """Number of rows at a place."""
         return sum(kind.shape[1] for kind in self)
 
-    def demands(self, motion: LineMotion) -> Array:
-        """Each row of `causes` over its limit, with its sign, during a motion at these places. Shape (S, K + L + P)."""
+    def usage(self, motion: LineMotion) -> Array:
+        """Return each row of `limit_names` over its limit, signed, in a motion at the places. Shape (S, K + L + P)."""
         v, a, j = (value[:, None] for value in (motion.speed, motion.acceleration, motion.jerk))
-        of_a, of_j = self.acceleration, self.jerk
+        acceleration, jerk = self.acceleration, self.jerk
         return np.concatenate(
             [
                 self.speed * v,
-                of_a[:, :, 0] * a + of_a[:, :, 1] * v**2 + of_a[:, :, 2],
-                of_j[:, :, 0] * j + of_j[:, :, 1] * v * a + of_j[:, :, 2] * v**3,
+                acceleration[:, :, 0] * a + acceleration[:, :, 1] * v**2 + acceleration[:, :, 2],
+                jerk[:, :, 0] * j + jerk[:, :, 1] * v * a + jerk[:, :, 2] * v**3,
             ],
             axis=1,
         )
 
 
-def causes(limits: LineLimits, joints: JointPath | None) -> tuple[str, ...]:
-    """What each row limits, in the order of `Rows.demands`."""
-    return tuple(name for kind in _kinds(limits, joints) for name in kind)
+def limit_names(limits: LineLimits, joints: JointPath | None) -> tuple[str, ...]:
+    """Return the name of the limit of each row, in the order of `Rows.usage`."""
+    return tuple(name for kind in _names_by_kind(limits, joints) for name in kind)
 
 
-def _kinds(limits: LineLimits, joints: JointPath | None) -> tuple[list[str], list[str], list[str]]:
+def _names_by_kind(limits: LineLimits, joints: JointPath | None) -> tuple[list[str], list[str], list[str]]:
+    """Return the names of the rows of speed, acceleration and jerk."""
     speed, acceleration, jerk = ["centripetal acceleration"], ["line acceleration"], []
     if np.isfinite(limits.jerk):
         jerk = ["line jerk"]
@@ -407,56 +389,57 @@ def _kinds(limits: LineLimits, joints: JointPath | None) -> tuple[list[str], lis
 
 
 def torque_rows(limits: LineLimits, joints: JointPath | None) -> int:
-    """Rows of acceleration that are torques: the last so many."""
+    """Return the number of rows of acceleration that are torques; they come last."""
     if joints is None or not np.isfinite(limits.torques(len(joints.names))).any():
         return 0
     return len(joints.names)
 
 
-def rows_at(
+def limit_rows(
     path: PathLike, limits: LineLimits, joints: JointPath | None, distance: Array, *, torques: bool = True
 ) -> Rows:
-    """Rows of all limits at distances (S,) of a path, those of `causes`; zeros for torques that are not asked for.
+    """Return the rows of `limit_names` at distances (S,) of a path, with zero torques unless `torques`.
 
     Raises:
-        ProblemError: A curvature or joints that are not finite, as at a singular arm, or of a wrong shape.
+        ProblemError: Curvature or joints are not finite, as at a singular arm, or have a wrong shape.
     """
     if len(distance) <= SETTINGS.block:
-        return _rows_at(path, limits, joints, distance, torques)
-    # into memory that is there: the parts of a long path and the whole would be twice as much
-    speed, acceleration, jerk = (len(kind) for kind in _kinds(limits, joints))
+        return _block_rows(path, limits, joints, distance, torques)
+    # fill preallocated arrays: concatenating the parts of a long path takes twice the memory
+    speed, acceleration, jerk = (len(kind) for kind in _names_by_kind(limits, joints))
     shapes = ((speed,), (acceleration, 3), (jerk, 3))
-    all_of_them = Rows(*(np.empty((len(distance), *shape)) for shape in shapes))
+    whole = Rows(*(np.empty((len(distance), *shape)) for shape in shapes))
     for first in range(0, len(distance), SETTINGS.block):
-        part = _rows_at(path, limits, joints, distance[first : first + SETTINGS.block], torques)
-        for kind, own in zip(all_of_them, part, strict=True):
-            kind[first : first + SETTINGS.block] = own
-    return all_of_them
+        part = _block_rows(path, limits, joints, distance[first : first + SETTINGS.block], torques)
+        for kind, rows in zip(whole, part, strict=True):
+            kind[first : first + SETTINGS.block] = rows
+    return whole
 
 
-def _rows_at(path: PathLike, limits: LineLimits, joints: JointPath | None, s: Array, torques: bool) -> Rows:
-    speed, acceleration, jerk = (np.zeros((len(s), len(kind), 3)) for kind in _kinds(limits, joints))
+def _block_rows(path: PathLike, limits: LineLimits, joints: JointPath | None, s: Array, torques: bool) -> Rows:
+    """Return the rows at distances of one block."""
+    speed, acceleration, jerk = (np.zeros((len(s), len(kind), 3)) for kind in _names_by_kind(limits, joints))
     if not s.size:
         return Rows(speed[:, :, 0], acceleration, jerk)
     if np.isfinite(limits.centripetal):
         speed[:, 0, 0] = np.sqrt(curvature_along(path, s) / limits.centripetal)
     acceleration[:, 0, 0] = 1 / limits.acceleration
-    lines = int(np.isfinite(limits.jerk))
-    jerk[:, :lines, 0] = 1 / limits.jerk
-    k, m, p = 1, 1, lines
+    line_jerks = int(np.isfinite(limits.jerk))
+    jerk[:, :line_jerks, 0] = 1 / limits.jerk
+    k, m, p = 1, 1, line_jerks
     if limits.tool is not None:
-        tangent, bend, rate, turn = tool_along(path, s)
+        tangent, curvature, rate, turn = tool_along(path, s)
         speed[:, 1, 0] = np.linalg.norm(turn, axis=1) / limits.tool.turn_rate
-        most, jerks = (np.broadcast_to(value, (3,)) for value in (limits.tool.acceleration, limits.tool.jerk))
-        acceleration[:, 1:4, 0], acceleration[:, 1:4, 1] = tangent / most, bend / most
-        jerk[:, p : p + 3] = np.stack([tangent, 3 * bend, rate], axis=2) / jerks[:, None]
+        accelerations, jerks = (np.broadcast_to(value, (3,)) for value in (limits.tool.acceleration, limits.tool.jerk))
+        acceleration[:, 1:4, 0], acceleration[:, 1:4, 1] = tangent / accelerations, curvature / accelerations
+        jerk[:, p : p + 3] = np.stack([tangent, 3 * curvature, rate], axis=2) / jerks[:, None]
         k, m, p = 2, 4, p + 3
     if joints is not None:
         n = len(joints.names)
-        rates, (velocities, most, jerks) = rates_along(joints, s), limits.of_joints(n)
+        rates, (velocities, accelerations, jerks) = rates_along(joints, s), limits.of_joints(n)
         first, second, third = (np.asarray(values, dtype=float) for values in (rates.first, rates.second, rates.third))
         speed[:, k:, 0] = np.abs(first) / velocities
-        acceleration[:, m : m + n, 0], acceleration[:, m : m + n, 1] = first / most, second / most
+        acceleration[:, m : m + n, 0], acceleration[:, m : m + n, 1] = first / accelerations, second / accelerations
         jerk[:, p:] = np.stack([first, 3 * second, third], axis=2) / jerks[:, None]
         if torques and torque_rows(limits, joints):
             along = torques_along(joints, s)

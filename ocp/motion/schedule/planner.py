@@ -1,11 +1,11 @@
-"""Time along a path: the asked line speed wherever the limits allow it, slowed smoothly just where they do not.
+"""Time schedules of paths: the requested line speed wherever the limits allow it, and smooth reductions elsewhere.
 
-Long paths on which centripetal acceleration alone slows the line: stretches of one speed, joined by ramps.
-
-What a steady speed may be is the maximum velocity curve, sqrt(most / curvature), on a grid that is fine where it
-changes and near its minima. The path is planned in zones of one speed each; where the plan is above the curve, the
-stretch about the slowest place gets its speed, and the plan is made anew. Ramps are exact; the speed follows the curve
-in steps, and takes some 8 % more time on random short lines than the fastest motion, at a fiftieth of the work.
+On long paths where centripetal acceleration alone reduces the speed, the schedule consists of stretches of constant
+speed joined by ramps. The maximum velocity curve, sqrt(limit / curvature), is sampled on a grid that is refined where
+it changes and near its minima. The path is planned in zones of constant speed; if the plan exceeds the curve, the
+stretch around the slowest place gets its speed, and the path is planned again. Ramps are exact, but the speed follows
+the curve in steps, which takes about 8 % more time on random short lines than the fastest motion, at a fiftieth of the
+work.
 """
 
 from __future__ import annotations
@@ -18,38 +18,38 @@ from numpy.typing import ArrayLike, NDArray
 
 from ocp.console import interruptible
 from ocp.errors import ProblemError, checked_flag, sample_times
-from ocp.motion.schedule.grid import Grid, make_grid, nodes_only
-from ocp.motion.schedule.limits import JointPath, LineLimits, PathLike, causes, check_line, curvature_along
-from ocp.motion.schedule.profile import Array, LineMotion, SpeedProfile, joined, piece_of
-from ocp.motion.schedule.ramps import Zones, plan, ramp_distance
+from ocp.motion.schedule.grid import Grid, coarse_grid, make_grid
+from ocp.motion.schedule.limits import JointPath, LineLimits, PathLike, check_line, curvature_along, limit_names
+from ocp.motion.schedule.profile import Array, LineMotion, SpeedProfile, join_profiles, segment_index
+from ocp.motion.schedule.ramps import Zones, plan_zones, ramp_distance
 from ocp.motion.schedule.settings import SETTINGS
-from ocp.motion.schedule.stretch import fastest_over
+from ocp.motion.schedule.stretch import fastest_profile
 from ocp.motion.schedule.window import Stretch
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = ["Dip", "Schedule", "ramps_below_the_curve", "schedule"]
+__all__ = ["Dip", "Schedule", "plan_below_velocity_curve", "schedule"]
 
 
-def ramps_below_the_curve(path: PathLike, limits: LineLimits) -> SpeedProfile:
-    """The motion from rest to rest that keeps the limits of the line and of centripetal acceleration.
+def plan_below_velocity_curve(path: PathLike, limits: LineLimits) -> SpeedProfile:
+    """Return a motion from rest to rest within the limits of the line and of centripetal acceleration.
 
     Raises:
-        ProblemError: A curvature that is not finite; no plan below the curve.
+        ProblemError: The curvature is not finite, or no plan below the curve is found.
     """
-    s, permitted, asked = _curve(path, limits)
-    speed, memory = asked.copy(), dict[tuple[float, ...], tuple[tuple[float, float], ...]]()
+    s, permitted, requested = _velocity_curve(path, limits)
+    speed, cache = requested.copy(), dict[tuple[float, ...], tuple[tuple[float, float], ...]]()
     for number in range(SETTINGS.zone_rounds):
-        profile = plan(_zones(s, speed, limits), memory)
-        if not _lowered(s, permitted, speed, profile, number >= SETTINGS.thorough_from):
+        profile = plan_zones(_constant_zones(s, speed, limits), cache)
+        if not _lower_speeds(s, permitted, speed, profile, number >= SETTINGS.thorough_from):
             return profile
-    message = f"no plan below the speed that centripetal acceleration permits, after {SETTINGS.zone_rounds} rounds"
+    message = f"no plan below the speed that centripetal acceleration permits after {SETTINGS.zone_rounds} rounds"
     raise ProblemError(message, name="centripetal", value=limits.centripetal)
 
 
-def _curve(path: PathLike, limits: LineLimits) -> tuple[Array, Array, Array]:
-    """Distances, the speed permitted at them (G,), and the asked one in each interval (G - 1,)."""
+def _velocity_curve(path: PathLike, limits: LineLimits) -> tuple[Array, Array, Array]:
+    """Return distances, the permitted speed at them (G,), and the requested one in each interval (G - 1,)."""
     of_pieces, bounds = path.by_piece(limits.speed), np.asarray(path.bounds, dtype=float)
-    first = np.unique(np.concatenate([path.dense(8, 2), bounds]))
+    first = np.unique(np.concatenate([path.sample_distances(8, 2), bounds]))
     parts = []
     for begin in range(0, len(of_pieces), SETTINGS.block):
         ends = bounds[begin : begin + SETTINGS.block + 1]
@@ -66,106 +66,109 @@ def _curve(path: PathLike, limits: LineLimits) -> tuple[Array, Array, Array]:
 def _refined(
     path: PathLike, limits: LineLimits, s: Array, bounds: Array, of_pieces: Array
 ) -> tuple[Array, Array, Array]:
-    """`_curve` over some of the pieces, from distances that are halved until they resolve it."""
+    """Return the `_velocity_curve` over some segments, refined from these distances until they resolve it."""
 
-    def most(places: Array) -> Array:
+    def permitted_at(places: Array) -> Array:
         with np.errstate(divide="ignore"):
             return np.asarray(np.sqrt(limits.centripetal / curvature_along(path, places)))
 
-    permitted = most(s)
+    permitted = permitted_at(s)
     inner = bounds[1:]
     before = inner - np.minimum(ROUNDING_SHARE * path.length, np.diff(bounds) / 2)
     at = np.searchsorted(s, inner)
-    permitted[at] = np.minimum(most(before), permitted[at])
+    permitted[at] = np.minimum(permitted_at(before), permitted[at])
     for _ in range(SETTINGS.curve_halvings):
-        asked = of_pieces[piece_of(bounds, (s[:-1] + s[1:]) / 2)]
-        cut = np.flatnonzero(_coarse(path.length, s, permitted, asked, limits.acceleration))
-        if not cut.size:
+        requested = of_pieces[segment_index(bounds, (s[:-1] + s[1:]) / 2)]
+        coarse = np.flatnonzero(_unresolved(path.length, s, permitted, requested, limits.acceleration))
+        if not coarse.size:
             break
-        middle = (s[cut] + s[cut + 1]) / 2
-        s, permitted = np.insert(s, cut + 1, middle), np.insert(permitted, cut + 1, most(middle))
-    return s, permitted, np.asarray(of_pieces[piece_of(bounds, (s[:-1] + s[1:]) / 2)])
+        middle = (s[coarse] + s[coarse + 1]) / 2
+        s, permitted = np.insert(s, coarse + 1, middle), np.insert(permitted, coarse + 1, permitted_at(middle))
+    return s, permitted, np.asarray(of_pieces[segment_index(bounds, (s[:-1] + s[1:]) / 2)])
 
 
-def _coarse(length: float, s: Array, permitted: Array, asked: Array, acceleration: float) -> NDArray[np.bool_]:
-    """Which intervals do not resolve the permitted speed, where that is near or below the asked one.
+def _unresolved(length: float, s: Array, permitted: Array, requested: Array, acceleration: float) -> NDArray[np.bool_]:
+    """Return which intervals do not resolve the permitted speed where it matters.
 
-    Nor where no motion that is slow enough in its neighbourhood gets near to it.
+    It matters where it is near or below the requested speed and a motion slow enough in the neighbourhood can get near
+    it.
     """
     low = np.minimum(permitted[:-1], permitted[1:])
     gain = 2 * acceleration * (s - s[0])
-    within = np.minimum.accumulate(permitted**2 - gain) + gain
-    within = np.minimum.accumulate((within + gain)[::-1])[::-1] - gain
-    within = np.sqrt(np.maximum(within[:-1], within[1:]))
-    matters = (low < 1.1 * np.minimum(asked, within)) & (np.diff(s) > ROUNDING_SHARE * length)
-    value = np.log(np.minimum(permitted, 2 * asked.max()))
+    reachable = np.minimum.accumulate(permitted**2 - gain) + gain
+    reachable = np.minimum.accumulate((reachable + gain)[::-1])[::-1] - gain
+    reachable = np.sqrt(np.maximum(reachable[:-1], reachable[1:]))
+    matters = (low < 1.1 * np.minimum(requested, reachable)) & (np.diff(s) > ROUNDING_SHARE * length)
+    value = np.log(np.minimum(permitted, 2 * requested.max()))
     step, slope = np.diff(s), np.diff(value) / np.diff(s)
-    bend, least = np.zeros(len(s)), np.zeros(len(s), dtype=bool)
+    bend, minimum = np.zeros(len(s)), np.zeros(len(s), dtype=bool)
     bend[1:-1] = 2 * np.abs(np.diff(slope)) / (step[:-1] + step[1:])
-    least[1:-1] = (slope[:-1] <= 0) & (slope[1:] >= 0) & (bend[1:-1] > 0)
-    error = np.where(least[:-1] | least[1:], step**2 / 8 * np.maximum(bend[:-1], bend[1:]), 0.0)
+    minimum[1:-1] = (slope[:-1] <= 0) & (slope[1:] >= 0) & (bend[1:-1] > 0)
+    error = np.where(minimum[:-1] | minimum[1:], step**2 / 8 * np.maximum(bend[:-1], bend[1:]), 0.0)
     return np.asarray(matters & ((np.abs(np.diff(value)) > SETTINGS.speed_change) | (error > SETTINGS.speed_error)))
 
 
-def _zones(s: Array, speed: Array, limits: LineLimits) -> Zones:
-    """Neighbours of one speed as one zone."""
+def _constant_zones(s: Array, speed: Array, limits: LineLimits) -> Zones:
+    """Merge neighbouring intervals of one speed into zones."""
     starts = np.concatenate([[0], 1 + np.flatnonzero(np.diff(speed))])
     same = np.ones(len(starts))
     return Zones(s[np.append(starts, len(speed))], speed[starts], limits.acceleration * same, limits.jerk * same)
 
 
-def _lowered(s: Array, permitted: Array, speed: Array, profile: SpeedProfile, thoroughly: bool) -> bool:
-    """Lower speeds, in place, where a plan is faster than permitted; False when it is nowhere."""
-    here = np.concatenate([profile.at_distance(part).speed for part in np.array_split(s, len(s) // SETTINGS.block + 1)])
-    top = np.maximum(here[:-1], here[1:])
+def _lower_speeds(s: Array, permitted: Array, speed: Array, profile: SpeedProfile, everywhere: bool) -> bool:
+    """Lower speeds, in place, where a profile is faster than permitted; return whether there was any."""
+    speeds = np.concatenate(
+        [profile.at_distance(part).speed for part in np.array_split(s, len(s) // SETTINGS.block + 1)]
+    )
+    top = np.maximum(speeds[:-1], speeds[1:])
     peaks = profile.peaks()
-    np.maximum.at(top, piece_of(s, peaks.distance), peaks.speed)
-    most = np.minimum(permitted[:-1], permitted[1:])
-    fast = np.minimum(top, speed) > most * (1 + ROUNDING_SHARE)
-    if thoroughly:
-        speed[fast] = most[fast]
-        return bool(fast.any())
-    inside = np.flatnonzero(fast)
+    np.maximum.at(top, segment_index(s, peaks.distance), peaks.speed)
+    allowed = np.minimum(permitted[:-1], permitted[1:])
+    excess = np.minimum(top, speed) > allowed * (1 + ROUNDING_SHARE)
+    if everywhere:
+        speed[excess] = allowed[excess]
+        return bool(excess.any())
+    inside = np.flatnonzero(excess)
     if not inside.size:
         return False
-    # one stretch about the slowest place of each run of them, as far as not much more is permitted
+    # one stretch around the slowest place of each run, as far as the permitted speed is similar
     starts = np.flatnonzero(np.diff(inside, prepend=-2) > 1)
     run = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(inside)))
-    here = most[inside]
-    least = np.minimum.reduceat(here, starts)
-    slowest = np.minimum.reduceat(np.where(here == least[run], inside, len(most)), starts)
-    apart = np.concatenate([[-1], inside[here > SETTINGS.spread * least[run]], [len(most)]])
-    after = np.searchsorted(apart, slowest)
-    near = (inside > apart[after - 1][run]) & (inside < apart[after][run])
-    speed[inside[near]] = np.minimum(speed[inside[near]], least[run[near]])
+    speeds = allowed[inside]
+    least = np.minimum.reduceat(speeds, starts)
+    slowest = np.minimum.reduceat(np.where(speeds == least[run], inside, len(allowed)), starts)
+    borders = np.concatenate([[-1], inside[speeds > SETTINGS.spread * least[run]], [len(allowed)]])
+    after = np.searchsorted(borders, slowest)
+    lowered = (inside > borders[after - 1][run]) & (inside < borders[after][run])
+    speed[inside[lowered]] = np.minimum(speed[inside[lowered]], least[run[lowered]])
     return True
 
 
 @dataclass(frozen=True)
 class Dip:
-    """A stretch in which the schedule stays below what was asked.
+    """Stretch in which the schedule is slower than requested.
 
     Attributes:
         start, end: Distances along the path, m.
-        cause: The limit that binds, for example "centripetal acceleration" or "joint 'elbow' velocity".
-        asked, permitted: Asked line speed and the lowest steady one that the limits permit there, m/s: the same where
-            the limit binds on a ramp alone.
+        cause: The active limit, for example "centripetal acceleration" or "joint 'elbow' velocity".
+        requested, permitted: Requested line speed and lowest steady speed that the limits permit there, m/s; equal if
+            the limit is active on a ramp only.
         speed: Lowest line speed of the schedule there, m/s.
-        acceleration, jerk: Of the line speed, largest there, m/s^2 and m/s^3.
+        acceleration, jerk: Largest values of the line there, m/s^2 and m/s^3.
     """
 
     start: float
     end: float
     cause: str
-    asked: float
+    requested: float
     permitted: float
     speed: float
     acceleration: float
     jerk: float
 
     def __str__(self) -> str:
-        slow = self.permitted < self.asked
-        amount = f"permits {self.permitted:.4g} of {self.asked:.4g} m/s" if slow else "binds on a ramp"
+        slow = self.permitted < self.requested
+        amount = f"permits {self.permitted:.4g} of {self.requested:.4g} m/s" if slow else "is active on a ramp"
         return (
             f"{self.start:.6g} to {self.end:.6g} m: {self.cause} {amount}, "
             f"line acceleration {self.acceleration:.4g} m/s^2, jerk {self.jerk:.4g} m/s^3"
@@ -174,13 +177,13 @@ class Dip:
 
 @dataclass(frozen=True, eq=False)
 class Schedule:
-    """When the path is where.
+    """Motion along a path over time.
 
     Attributes:
-        path: What it was made for.
-        limits: What it keeps to.
+        path: The path.
+        limits: Its limits.
         profile: Distance and speed over time.
-        dips: Where it is slower than asked, and why; empty if nowhere.
+        dips: Stretches that are slower than requested, with the cause.
         joints: The joints along the path, if they were limited.
     """
 
@@ -191,180 +194,175 @@ class Schedule:
     joints: JointPath | None = None
 
     def __repr__(self) -> str:
-        slower = f"slower than asked in {len(self.dips)} places" if self.dips else "at the asked speed"
+        slower = f"slower than requested in {len(self.dips)} places" if self.dips else "at the requested speed"
         return f"<Schedule of {self.profile.distance[-1]:.6g} m in {self.duration:.6g} s, {slower}>"
 
     @property
     def duration(self) -> float:
-        """s."""
+        """Duration, s."""
         return self.profile.duration
 
     def at(self, time: ArrayLike) -> LineMotion:
-        """LineMotion at times of [0, duration]. Shape (M,), s."""
+        """Return the motion at times in [0, duration]. Shape (M,), s."""
         return self.profile.at(time)
 
     def time_at(self, distance: ArrayLike) -> Array:
-        """Times at which the path has the given distances from its start. Shape (M,), s."""
+        """Return the times at which the path reaches distances from its start. Shape (M,), s."""
         return self.profile.at_distance(distance).t
 
     def sample(self, period: float) -> LineMotion:
-        """LineMotion every `period` s from the start; the last sample, at the end, comes as early as the duration says.
+        """Return the motion every `period` s from the start; the last sample, at the end, may come earlier.
 
         Raises:
-            ProblemError: A period that is not positive, or nan, or too short.
+            ProblemError: The period is not positive, or too short.
         """
         return self.at(sample_times("sample period", period, self.duration))
 
     def function(self) -> Any:
-        """casadi Function of the time, see SpeedProfile.function."""
+        """Return the CasADi function of time, see SpeedProfile.function."""
         return self.profile.function()
 
 
 @interruptible
 def schedule(path: PathLike, limits: LineLimits, *, joints: JointPath | None = None, strict: bool = False) -> Schedule:
-    """Plan the line speed along a path from rest to rest, in the least time that the limits allow.
+    """Plan the line speed along a path from rest to rest in the least time that the limits allow.
 
-    One jerk-limited motion if nothing but speed, acceleration and jerk binds; the speed is then constant at the asked
-    one, through the blends as well, between its ramps. Where that breaks another limit, the stretch about the place is
-    planned anew under all of them: by exact passes where no jerk is limited, else by convex programs. All limits hold
-    between the nodes too, to 0.1 %. A long path without limits of joints or tool is slowed by ramps.
+    If only speed, acceleration and jerk of the line are active, the result is one jerk-limited motion, at the requested
+    speed between its ramps and through the blends. Where that violates another limit, the stretch around the place is
+    planned again under all limits: by exact passes without jerk limits, else by convex programs. All limits hold
+    between the nodes too, to 0.1 %. Long paths without limits of joints or tool use ramps.
 
     Args:
-        path: A models.paths.SmoothPath, or whatever has what PathLike says.
-        limits: What to keep to.
-        joints: The joints along the path, where limits.joints is given.
-        strict: Raise instead of slowing down.
+        path: A models.paths.SmoothPath, or any PathLike.
+        limits: The limits.
+        joints: The joints along the path; required with limits.joints.
+        strict: Raise an error instead of reducing the speed.
 
     Raises:
-        ProblemError: Joint limits without joints, or a limit that would be broken at the asked speed, if strict;
-            limits that no motion keeps.
+        ProblemError: There are joint limits without joints, no motion keeps the limits, or, if strict, the requested
+            speed violates a limit.
     """
     limited = check_line(path, limits, joints)
     checked_flag("strict", strict)
-    base = _by_ramps(path, limits) if np.isfinite(limits.jerk) else None
-    more = limited is not None or limits.tool is not None or np.isfinite(limits.centripetal)
-    if base is not None and not more:
-        return Schedule(path, limits, base, (), joints)
-    if base is not None and limited is None and limits.tool is None and len(path.bounds) > SETTINGS.long_path:
-        profile = ramps_below_the_curve(path, limits)
-        grid = nodes_only(path, limits)
+    line_profile = None
+    if np.isfinite(limits.jerk):
+        line_profile = plan_zones(_constant_zones(np.asarray(path.bounds), path.by_piece(limits.speed), limits), {})
+    further_limits = limited is not None or limits.tool is not None or np.isfinite(limits.centripetal)
+    if line_profile is not None and not further_limits:
+        return Schedule(path, limits, line_profile, (), joints)
+    if line_profile is not None and limited is None and limits.tool is None and len(path.bounds) > SETTINGS.long_path:
+        profile = plan_below_velocity_curve(path, limits)
+        grid = coarse_grid(path, limits)
     else:
         grid = make_grid(path, limits, limited)
-        profile = _planned(grid, base)
-    dips = () if profile is base else _dips(grid, profile, causes(limits, limited))
+        profile = _constrained_profile(grid, line_profile)
+    dips = () if profile is line_profile else _find_dips(grid, profile, limit_names(limits, limited))
     if strict and dips:
         listed = "\n  ".join(str(dip) for dip in dips[:10])
-        hint, one = "ask for less, larger blends, or strict=False", dips[0]
-        message = f"the asked speed breaks limits in {len(dips)} place(s); {hint}:\n  {listed}"
-        raise ProblemError(message, name=one.cause, value=one.asked, limit=one.permitted, time=one.start)
+        hint, dip = "reduce the speed, enlarge the blends, or set strict=False", dips[0]
+        message = f"the requested speed violates limits in {len(dips)} place(s); {hint}:\n  {listed}"
+        raise ProblemError(message, name=dip.cause, value=dip.requested, limit=dip.permitted, time=dip.start)
     return Schedule(path, limits, profile, dips, joints)
 
 
-def _by_ramps(path: PathLike, limits: LineLimits) -> SpeedProfile:
-    """The motion that keeps speed, acceleration and jerk of the line."""
-    asked, bounds = path.by_piece(limits.speed), np.asarray(path.bounds, dtype=float)
-    first = np.concatenate([[0], 1 + np.flatnonzero(np.diff(asked))])
-    same = np.ones(len(first))
-    zones = Zones(bounds[np.append(first, len(asked))], asked[first], limits.acceleration * same, limits.jerk * same)
-    return plan(zones, {})
-
-
-def _planned(grid: Grid, base: SpeedProfile | None) -> SpeedProfile:
-    """The base motion where it keeps all limits, the fastest motion elsewhere."""
-    count = len(grid.asked)
-    if base is None:
-        return fastest_over(Stretch(grid, 0, count))
-    broken = _broken(grid, base)
-    if not broken.any():
-        return base
-    s, reach = grid.distance, 1.0
+def _constrained_profile(grid: Grid, line_profile: SpeedProfile | None) -> SpeedProfile:
+    """Return the line profile where it keeps all limits, and the fastest motion elsewhere."""
+    count = len(grid.requested)
+    if line_profile is None:
+        return fastest_profile(Stretch(grid, 0, count))
+    violated = _violated_intervals(grid, line_profile)
+    if not violated.any():
+        return line_profile
+    s, extent = grid.distance, 1.0
     while True:
-        stretches = _stretches(grid, base, broken, reach)
-        found = []
+        stretches = _stretches(grid, line_profile, violated, extent)
+        motions = []
         for first, last in stretches:
-            ends = [(0.0 if k in (0, count) else float(grid.asked[k]) ** 2, 0.0) for k in (first, last)]
+            ends = [(0.0 if k in (0, count) else float(grid.requested[k]) ** 2, 0.0) for k in (first, last)]
             try:
-                motion = fastest_over(Stretch(grid, first, last, (ends[0], ends[1])))
+                motion = fastest_profile(Stretch(grid, first, last, (ends[0], ends[1])))
             except ProblemError:
                 if (first, last) == (0, count):
                     raise
-                break  # too short to change the speed in
-            if not _long_enough(grid, motion, first, last):
+                break  # too short for the change of speed
+            if not _reaches_speed_at_ends(grid, motion, first, last):
                 break
-            found.append(motion)
-        if len(found) == len(stretches):
+            motions.append(motion)
+        if len(motions) == len(stretches):
             break
-        reach *= 2
+        extent *= 2
     parts: list[SpeedProfile] = []
-    passed = 0.0
-    for (first, last), motion in zip(stretches, found, strict=True):
-        if s[first] > passed:
-            parts.append(_cut(base, passed, float(s[first])))
+    done = 0.0
+    for (first, last), motion in zip(stretches, motions, strict=True):
+        if s[first] > done:
+            parts.append(_cut_profile(line_profile, done, float(s[first])))
         parts.append(motion)
-        passed = float(s[last])
-    if passed < s[-1]:
-        parts.append(_cut(base, passed, float(s[-1])))
-    return joined(parts)
+        done = float(s[last])
+    if done < s[-1]:
+        parts.append(_cut_profile(line_profile, done, float(s[-1])))
+    return join_profiles(parts)
 
 
-def _broken(grid: Grid, base: SpeedProfile) -> NDArray[np.bool_]:
-    """Intervals of the grid in which a motion breaks a limit. Shape (N,)."""
-    over = np.zeros(len(grid.asked), dtype=bool)
-    # inside an interval the jerk may change, and the speed be larger
-    turns = base.at(np.concatenate([base.t, np.maximum(base.t[1:] - 1e-12 * base.duration, 0.0), base.peaks().t]))
-    at = piece_of(grid.distance, turns.distance)
+def _violated_intervals(grid: Grid, profile: SpeedProfile) -> NDArray[np.bool_]:
+    """Return the intervals of the grid in which a motion violates a limit. Shape (N,)."""
+    violated = np.zeros(len(grid.requested), dtype=bool)
+    # inside an interval the jerk may change and the speed may have its maximum
+    peaks = profile.at(
+        np.concatenate([profile.t, np.maximum(profile.t[1:] - 1e-12 * profile.duration, 0.0), profile.peaks().t])
+    )
+    at = segment_index(grid.distance, peaks.distance)
     for first, last in grid.parts():
-        here, inside = base.at_distance(grid.distance[first : last + 1]), (at >= first) & (at < last)
-        turn = LineMotion(*(value[inside] for value in turns))
+        at_nodes, inside = profile.at_distance(grid.distance[first : last + 1]), (at >= first) & (at < last)
+        turn = LineMotion(*(value[inside] for value in peaks))
         for rows, ends in zip(grid.ends(first, last), (slice(-1), slice(1, None)), strict=True):
-            motion = LineMotion(*(value[ends] for value in here))
-            over[first:last] |= (np.abs(rows.demands(motion)) > 1 + ROUNDING_SHARE).any(axis=1)
-            passed = (np.abs(rows.of(at[inside] - first).demands(turn)) > 1 + ROUNDING_SHARE).any(axis=1)
-            np.logical_or.at(over, at[inside], passed)
-    return over
+            motion = LineMotion(*(value[ends] for value in at_nodes))
+            violated[first:last] |= (np.abs(rows.usage(motion)) > 1 + ROUNDING_SHARE).any(axis=1)
+            exceeded = (np.abs(rows.take(at[inside] - first).usage(turn)) > 1 + ROUNDING_SHARE).any(axis=1)
+            np.logical_or.at(violated, at[inside], exceeded)
+    return violated
 
 
-def _stretches(grid: Grid, base: SpeedProfile, broken: NDArray[np.bool_], reach: float) -> list[tuple[int, int]]:
-    """First and last nodes of the stretches to be planned anew: between them the base is steady, or the path ends.
+def _stretches(grid: Grid, profile: SpeedProfile, violated: NDArray[np.bool_], extent: float) -> list[tuple[int, int]]:
+    """Return first and last nodes of the stretches to plan again, between steady speeds or the ends of the path.
 
-    On either side of what is broken they are `reach` times as long as a ramp to rest.
+    They extend beyond the violated intervals by `extent` times the length of a ramp to rest.
     """
-    count, s, limits = len(broken), grid.distance, grid.limits
-    here = base.at_distance(s)
-    steady = (np.abs(here.acceleration) <= ROUNDING_SHARE * limits.acceleration) & (here.jerk == 0)
-    asked = np.minimum(np.append(grid.asked, np.inf), np.insert(grid.asked, 0, np.inf))
-    steady &= np.abs(here.speed - asked) <= ROUNDING_SHARE * asked
+    count, s, limits = len(violated), grid.distance, grid.limits
+    motion = profile.at_distance(s)
+    steady = (np.abs(motion.acceleration) <= ROUNDING_SHARE * limits.acceleration) & (motion.jerk == 0)
+    requested = np.minimum(np.append(grid.requested, np.inf), np.insert(grid.requested, 0, np.inf))
+    steady &= np.abs(motion.speed - requested) <= ROUNDING_SHARE * requested
     steady[[0, -1]] = True
-    seats = np.flatnonzero(steady)
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], broken.astype(np.int8), [0]]))).reshape(-1, 2)
-    found: list[tuple[int, int]] = []
+    steady_nodes = np.flatnonzero(steady)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], violated.astype(np.int8), [0]]))).reshape(-1, 2)
+    stretches: list[tuple[int, int]] = []
     for first, last in edges.tolist():
-        ramp = reach * ramp_distance(0.0, float(grid.asked[first:last].max()), limits.acceleration, limits.jerk)
+        ramp = extent * ramp_distance(0.0, float(grid.requested[first:last].max()), limits.acceleration, limits.jerk)
         low = int(np.searchsorted(s, s[first] - ramp, side="right")) - 1
         high = int(np.searchsorted(s, s[last] + ramp))
-        begin = int(seats[np.searchsorted(seats, max(low, 0), side="right") - 1])
-        end = int(seats[np.searchsorted(seats, min(high, count))])
-        if found and begin <= found[-1][1]:
-            found[-1] = (found[-1][0], max(end, found[-1][1]))
+        begin = int(steady_nodes[np.searchsorted(steady_nodes, max(low, 0), side="right") - 1])
+        end = int(steady_nodes[np.searchsorted(steady_nodes, min(high, count))])
+        if stretches and begin <= stretches[-1][1]:
+            stretches[-1] = (stretches[-1][0], max(end, stretches[-1][1]))
         else:
-            found.append((begin, end))
-    return found
+            stretches.append((begin, end))
+    return stretches
 
 
-def _long_enough(grid: Grid, motion: SpeedProfile, first: int, last: int) -> bool:
-    """Whether a motion has not left the asked speed near those ends of its stretch that are none of the path."""
+def _reaches_speed_at_ends(grid: Grid, motion: SpeedProfile, first: int, last: int) -> bool:
+    """Return whether a motion keeps the requested speed near the ends of its stretch, except at path ends."""
     length = motion.distance[-1] - motion.distance[0]
     for node, inside in ((first, first), (last, last - 1)):
-        if node in (0, len(grid.asked)):
+        if node in (0, len(grid.requested)):
             continue
         near = np.abs(motion.distance - grid.distance[node]) < 0.02 * length
-        if (motion.speed[near] < grid.asked[inside] * (1 - SETTINGS.leaving)).any():
+        if (motion.speed[near] < grid.requested[inside] * (1 - SETTINGS.leaving)).any():
             return False
     return True
 
 
-def _cut(profile: SpeedProfile, begin: float, end: float) -> SpeedProfile:
-    """The part of a profile between two distances."""
+def _cut_profile(profile: SpeedProfile, begin: float, end: float) -> SpeedProfile:
+    """Return the part of a profile between two distances."""
     first, last = (profile.at_distance([place]) for place in (begin, end))
     inside = (profile.t > first.t[0]) & (profile.t < last.t[0])
     t, s, v, a = (
@@ -374,46 +372,46 @@ def _cut(profile: SpeedProfile, begin: float, end: float) -> SpeedProfile:
     s[0], s[-1] = begin, end
     if end == profile.distance[-1]:
         v[-1], a[-1] = profile.speed[-1], profile.acceleration[-1]
-    return SpeedProfile(t - t[0], s, v, a, profile.jerk[piece_of(profile.t, (t[:-1] + t[1:]) / 2)])
+    return SpeedProfile(t - t[0], s, v, a, profile.jerk[segment_index(profile.t, (t[:-1] + t[1:]) / 2)])
 
 
-def _dips(grid: Grid, profile: SpeedProfile, names: tuple[str, ...]) -> tuple[Dip, ...]:
-    """Where another limit than those of the line binds, while the motion stays below the asked speed."""
+def _find_dips(grid: Grid, profile: SpeedProfile, names: tuple[str, ...]) -> tuple[Dip, ...]:
+    """Return the stretches below the requested speed where a limit other than those of the line is active."""
     middle = profile.at_distance((grid.distance[:-1] + grid.distance[1:]) / 2)
-    of_line = [k for k, name in enumerate(names) if name.startswith("line ")]
-    cause, steady = np.zeros(len(grid.asked), dtype=np.intp), np.zeros(len(grid.asked))
-    binding = middle.speed < grid.asked * (1 - SETTINGS.reached)
+    line_rows = [k for k, name in enumerate(names) if name.startswith("line ")]
+    cause, steady = np.zeros(len(grid.requested), dtype=np.intp), np.zeros(len(grid.requested))
+    binding = middle.speed < grid.requested * (1 - SETTINGS.reached)
     for first, last in grid.parts():
         part, sides = slice(first, last), grid.ends(first, last)
-        here = LineMotion(*(value[part] for value in middle))
-        demand = np.maximum(*(np.abs(rows.demands(here)) for rows in sides))
-        line = demand[:, of_line].max(axis=1, initial=0.0)
-        demand[:, of_line] = 0.0
-        cause[part], most = demand.argmax(axis=1), demand.max(axis=1)
-        binding[part] &= (most > SETTINGS.binding) & (most >= line - (1 - SETTINGS.binding))
+        motion = LineMotion(*(value[part] for value in middle))
+        usage = np.maximum(*(np.abs(rows.usage(motion)) for rows in sides))
+        line = usage[:, line_rows].max(axis=1, initial=0.0)
+        usage[:, line_rows] = 0.0
+        cause[part], largest = usage.argmax(axis=1), usage.max(axis=1)
+        binding[part] &= (largest > SETTINGS.binding) & (largest >= line - (1 - SETTINGS.binding))
         steady[part] = np.minimum(*(rows.steady()[0] for rows in sides))
-    permitted = np.minimum(steady, grid.asked)
-    changes = (np.diff(binding) != 0) | (np.diff(cause) != 0) | (np.diff(grid.asked) != 0)
+    permitted = np.minimum(steady, grid.requested)
+    changes = (np.diff(binding) != 0) | (np.diff(cause) != 0) | (np.diff(grid.requested) != 0)
     edges = np.concatenate([[0], 1 + np.flatnonzero(changes), [len(binding)]])
     runs = np.stack([edges[:-1], edges[1:]], axis=1)[binding[edges[:-1]]]
     if not runs.size:
         return ()
-    # runs of one cause are one dip, unless the asked speed is reached between them: the count of such intervals grows
-    reached = np.concatenate([[0], np.cumsum(middle.speed >= grid.asked * (1 - SETTINGS.reached))])
+    # runs of one cause form one dip unless the count of intervals at the requested speed grows between them
+    reached = np.concatenate([[0], np.cumsum(middle.speed >= grid.requested * (1 - SETTINGS.reached))])
     begin, end = runs[1:, 0], runs[:-1, 1]
-    apart = (cause[begin] != cause[end - 1]) | (grid.asked[begin] != grid.asked[end - 1])
-    groups = np.concatenate([[0], 1 + np.flatnonzero(apart | (reached[begin] != reached[end]))])
+    separate = (cause[begin] != cause[end - 1]) | (grid.requested[begin] != grid.requested[end - 1])
+    groups = np.concatenate([[0], 1 + np.flatnonzero(separate | (reached[begin] != reached[end]))])
 
-    def extreme(of: np.ufunc, values: Array) -> Array:
-        each = of.reduceat(np.append(values, values[-1]), runs.ravel())[::2]
-        return np.asarray(of.reduceat(each, groups))
+    def extreme(function: np.ufunc, values: Array) -> Array:
+        by_run = function.reduceat(np.append(values, values[-1]), runs.ravel())[::2]
+        return np.asarray(function.reduceat(by_run, groups))
 
     begin, end = runs[groups, 0], np.append(runs[groups[1:] - 1, 1], runs[-1, 1])
     columns = (
         grid.distance[begin],
         grid.distance[end],
         [names[k] for k in cause[begin].tolist()],
-        grid.asked[begin],
+        grid.requested[begin],
         extreme(np.minimum, permitted),
         extreme(np.minimum, middle.speed),
         extreme(np.maximum, np.abs(middle.acceleration)),

@@ -1,16 +1,15 @@
-"""Jerk-limited changes of the line speed, and the profile that they make of limits that change along the path.
+"""Jerk-limited ramps of the line speed, and exact passes where no jerk is limited.
 
-A ramp changes the speed without acceleration at both its ends: its time and distance, its inverse (the speed within
-reach), and the fastest motion from one speed to another over a distance. A zone is a stretch of one limit each of
-speed, acceleration and jerk; `plan` finds the speeds at their bounds and joins the fastest motions between them.
+A ramp changes the speed with zero acceleration at both ends. This module has its time and distance, its inverse (the
+speed within reach), and the fastest motion between two speeds over a distance. A zone is a stretch with constant limits
+of speed, acceleration and jerk; `plan_zones` finds the speeds at their bounds and joins the fastest motions between
+them.
 
-The fastest motion where speeds and accelerations bind alone: exact passes backward and forward in (s, v^2).
-
-With x = v^2 at the nodes and one acceleration u in each interval of width h, x grows by 2 h u, and each row is linear
-in (u, x). Backward, the squared speeds from which the end can be reached are an interval at each node: in the rows of
-an interval u is eliminated, which leaves bounds on x alone. Forward, the greatest u that stays among them is taken.
-(Pham and Pham, A New Approach to Time-Optimal Path Parameterization Based on Reachability Analysis, 2018; the rows
-hold at both ends of an interval.)
+Without jerk limits the fastest motion follows from a backward and a forward pass in (s, v^2). With x = v^2 at the nodes
+and one acceleration u in each interval of width h, x grows by 2 h u, and each row is linear in (u, x). Backward, the
+squared speeds from which the end can be reached form an interval at each node: eliminating u from the rows of an
+interval leaves bounds on x. Forward, the greatest u that stays among them is taken (Pham and Pham, A New Approach to
+Time-Optimal Path Parameterization Based on Reachability Analysis, 2018; the rows hold at both ends of an interval).
 """
 
 from __future__ import annotations
@@ -23,33 +22,25 @@ import numpy as np
 from ruckig import InputParameter, Result, Ruckig, RuckigError, Trajectory
 
 from ocp.errors import ProblemError, checked_nonnegative, checked_positive
-from ocp.motion.schedule.profile import Array, SpeedProfile, advanced
+from ocp.motion.schedule.profile import Array, SpeedProfile, integrate_jerk
 from ocp.tolerances import ROUNDING_SHARE
 
 __all__ = [
-    "Memory",
-    "Phases",
-    "Zones",
-    "fastest",
-    "passes",
-    "peak_acceleration",
-    "plan",
-    "ramp_distance",
-    "ramp_time",
-    "reach",
-]
+    "Memory", "Phases", "Zones", "fastest_motion", "peak_acceleration", "plan_zones", "ramp_distance", "ramp_time",
+    "reachability_passes", "reachable_speed",
+]  # fmt: skip
 
 Phases = tuple[tuple[float, float], ...]
-"""Durations (s) and jerks (m/s^3) of the parts of constant jerk, in order."""
+"""Durations (s) and jerks (m/s^3) of consecutive phases of constant jerk."""
 Memory = MutableMapping[tuple[float, ...], Phases]
-"""Motions already found, by their limits and ends."""
+"""Cache of motions by their limits and ends."""
 
 REACH_MARGIN = 1e-6
-"""Share of a zone's length kept back when its ends' speeds are chosen, so that a motion surely exists."""
+"""Share of the length of a zone reserved when the speeds at its ends are chosen, so that a motion exists."""
 
 
 class Zones(NamedTuple):
-    """Stretches of a path with limits of their own.
+    """Consecutive stretches of a path, each with constant limits.
 
     Attributes:
         bounds: Distances at which the zones begin, and the end. Shape (Z + 1,), m.
@@ -63,10 +54,10 @@ class Zones(NamedTuple):
 
 
 def ramp_time(change: float, acceleration: float, jerk: float) -> float:
-    """Shortest time (s) of a speed change (m/s) that begins and ends without acceleration.
+    """Return the shortest time (s) of a speed change (m/s) with zero acceleration at both ends.
 
     Raises:
-        ProblemError: A negative change, a limit that is not positive.
+        ProblemError: The change is negative, or a limit is not positive.
     """
     checked_nonnegative("ramp: change", change)
     for name, value in (("acceleration", acceleration), ("jerk", jerk)):
@@ -77,19 +68,19 @@ def ramp_time(change: float, acceleration: float, jerk: float) -> float:
 
 
 def ramp_distance(first: float, last: float, acceleration: float, jerk: float) -> float:
-    """Distance (m) that the shortest change from one speed to the other takes; raises as ramp_time."""
+    """Return the distance (m) of the shortest change from one speed to another; raises as ramp_time."""
     for name, value in (("first", first), ("last", last)):
         checked_nonnegative(f"ramp: {name}", value)
     return (first + last) / 2 * ramp_time(abs(last - first), acceleration, jerk)
 
 
-def reach(speed: float, distance: float, acceleration: float, jerk: float) -> float:
-    """Greatest speed (m/s) to which the speed can change within a distance (m), without acceleration at both ends.
+def reachable_speed(speed: float, distance: float, acceleration: float, jerk: float) -> float:
+    """Return the greatest speed (m/s) to which the speed can change within a distance (m), from ramp to ramp.
 
-    The inverse of ramp_distance: the same for slowing down from that speed.
+    This is the inverse of ramp_distance; the same holds for slowing down from that speed.
     """
-    # without constant acceleration x = sqrt((v - speed)/jerk) solves jerk x^3 + 2 speed x = distance: Cardano's
-    # difference of two roots, as the quotient that does not cancel
+    # without constant acceleration x = sqrt((v - speed)/jerk) solves jerk x^3 + 2 speed x = distance, by Cardano's
+    # formula as a quotient without cancellation
     half, third = distance / (2 * jerk), 2 * speed / (3 * jerk)
     root = cbrt(half + hypot(half, third**1.5))
     x = 2 * half / (root * root + third + (third / root) ** 2)
@@ -102,12 +93,12 @@ def reach(speed: float, distance: float, acceleration: float, jerk: float) -> fl
 
 
 def peak_acceleration(mean: float, speed: float, jerk: float) -> float:
-    """Peak acceleration (m/s^2) whose ramp from rest to `speed` (m/s) has the mean acceleration `mean`.
+    """Return the peak acceleration (m/s^2) of a ramp from rest to `speed` (m/s) with mean acceleration `mean`.
 
-    v/A + A/J = v/mean, the smaller root.
+    It is the smaller root of v/A + A/J = v/mean.
 
     Raises:
-        ProblemError: Values that are not positive; a jerk too low for that mean.
+        ProblemError: A value is not positive, or the jerk is too low for that mean.
     """
     for name, value in (("mean", mean), ("speed", speed), ("jerk", jerk)):
         checked_positive(f"peak_acceleration: {name}", value)
@@ -120,52 +111,52 @@ def peak_acceleration(mean: float, speed: float, jerk: float) -> float:
     return jerk * (time - sqrt(square)) / 2
 
 
-def fastest(distance: float, first: float, last: float, top: float, acceleration: float, jerk: float) -> Phases:
-    """Fastest motion over a distance (m) from one speed to another, without acceleration at both ends.
+def fastest_motion(distance: float, first: float, last: float, top: float, acceleration: float, jerk: float) -> Phases:
+    """Return the fastest motion over a distance (m) between two speeds, with zero acceleration at both ends.
 
-    ruckig finds it, in units of the distance and of the time that the top speed takes for it. Where its answer does
-    not close, which happens for distances that are barely enough, the same profile is put together from two ramps.
+    ruckig computes it, in units of the distance and of the time to cover it at top speed. If its result does not close,
+    as for distances that are barely enough, the same profile is built from two ramps.
 
     Args:
-        distance: m; enough for the change of speed, see ramp_distance.
-        first, last: m/s, at most `top`.
+        distance: m; at least the ramp_distance of the change of speed.
+        first, last: Speeds, m/s, at most `top`.
         top, acceleration, jerk: Limits, m/s, m/s^2, m/s^3.
     """
     unit = distance / top
-    asked = InputParameter(1)
-    asked.current_position, asked.target_position = [0.0], [1.0]
-    asked.current_velocity, asked.target_velocity = [first / top], [last / top]
-    asked.max_velocity = [1.0]
-    asked.max_acceleration = [acceleration * unit / top]
-    asked.max_jerk = [jerk * unit * unit / top]
+    request = InputParameter(1)
+    request.current_position, request.target_position = [0.0], [1.0]
+    request.current_velocity, request.target_velocity = [first / top], [last / top]
+    request.max_velocity = [1.0]
+    request.max_acceleration = [acceleration * unit / top]
+    request.max_jerk = [jerk * unit * unit / top]
     trajectory = Trajectory(1)
     try:
-        solved = Ruckig(1).calculate(asked, trajectory) == Result.Working
-    except RuckigError:  # its root finding gave up
+        solved = Ruckig(1).calculate(request, trajectory) == Result.Working
+    except RuckigError:  # its root finding failed
         solved = False
     if solved:
-        found = trajectory.profiles[0][0]
+        profile = trajectory.profiles[0][0]
         scale = top / (unit * unit)
-        phases = tuple((t * unit, j * scale) for t, j in zip(found.t, found.j, strict=True) if t > 0)
+        phases = tuple((t * unit, j * scale) for t, j in zip(profile.t, profile.j, strict=True) if t > 0)
         if _closes(phases, distance, first, last, top):
             return phases
     return _two_ramps(distance, first, last, top, acceleration, jerk)
 
 
 def _closes(phases: Phases, distance: float, first: float, last: float, top: float) -> bool:
-    """Whether a motion ends at its distance and last speed, and stays between the speeds on the way."""
+    """Return whether a motion ends at its distance and last speed, and keeps the speeds between the limits."""
     s, v, a = 0.0, first, 0.0
     error = ROUNDING_SHARE * top
     for t, j in phases:
-        way, v, a = advanced(v, a, j, t)
-        s += way
+        covered, v, a = integrate_jerk(v, a, j, t)
+        s += covered
         if not min(first, last) - error <= v <= top + error:
             return False
     return abs(s - distance) <= ROUNDING_SHARE * distance and abs(v - last) <= error
 
 
 def _two_ramps(distance: float, first: float, last: float, top: float, acceleration: float, jerk: float) -> Phases:
-    """A ramp up to the highest speed that leaves way enough, that speed, and a ramp down."""
+    """Return a ramp up to the highest speed that the distance allows, that speed, and a ramp down."""
 
     def needed(peak: float) -> float:
         return ramp_distance(first, peak, acceleration, jerk) + ramp_distance(peak, last, acceleration, jerk)
@@ -184,7 +175,7 @@ def _two_ramps(distance: float, first: float, last: float, top: float, accelerat
 
 
 def _ramp(change: float, acceleration: float, jerk: float) -> Phases:
-    """The shortest change of the speed by `change` (m/s)."""
+    """Return the shortest change of the speed by `change` (m/s)."""
     size, sign = abs(change), 1.0 if change > 0 else -1.0
     if size == 0:
         return ()
@@ -197,11 +188,11 @@ def _ramp(change: float, acceleration: float, jerk: float) -> Phases:
     return ((t, sign * jerk), *flat, (t, -sign * jerk))
 
 
-def plan(zones: Zones, memory: Memory) -> SpeedProfile:
-    """Line speed from rest to rest, as fast as the zones' limits allow with no acceleration at their bounds.
+def plan_zones(zones: Zones, cache: Memory) -> SpeedProfile:
+    """Return the line speed from rest to rest, as fast as possible with zero acceleration at the bounds of zones.
 
-    A backward and a forward pass find the speeds at the bounds, then each zone is the fastest motion between them.
-    One zone alone gives the time optimum; more do but for the acceleration that drops to zero at a bound.
+    A backward and a forward pass find the speeds at the bounds; each zone is then the fastest motion between them. The
+    result is time-optimal for one zone, and for several up to the condition of zero acceleration at their bounds.
     """
     lengths = np.diff(zones.bounds).tolist()
     limits = list(zip(zones.speed.tolist(), zones.acceleration.tolist(), zones.jerk.tolist(), strict=True))
@@ -215,17 +206,17 @@ def plan(zones: Zones, memory: Memory) -> SpeedProfile:
             ends[i] = _limited(ends[i], ends[i + 1], lengths[i], limits[i])
 
     motions: list[Phases] = []
-    for (top, most, jerk), length, first, last in zip(limits, lengths, ends[:-1], ends[1:], strict=True):
-        key = (length, first, last, top, most, jerk)
+    for (top, acceleration, jerk), length, first, last in zip(limits, lengths, ends[:-1], ends[1:], strict=True):
+        key = (length, first, last, top, acceleration, jerk)
         if first == last == top:
             motions.append(((length / top, 0.0),))
         else:
-            motions.append(memory[key] if key in memory else memory.setdefault(key, fastest(*key)))
+            motions.append(cache[key] if key in cache else cache.setdefault(key, fastest_motion(*key)))
     return _profile(zones, np.array(ends), motions)
 
 
 def _profile(zones: Zones, ends: Array, motions: list[Phases]) -> SpeedProfile:
-    """Motions through the zones, one after the other, from the speeds at the zones' bounds. Shape (Z + 1,), m/s."""
+    """Return the motions through the zones as one profile, from speeds at the bounds. Shape (Z + 1,), m/s."""
     counts = np.array([len(phases) for phases in motions])
     durations, jerks = np.array([phase for phases in motions for phase in phases]).reshape(-1, 2).T
     if not durations.size or not np.isfinite(durations).all():
@@ -234,38 +225,38 @@ def _profile(zones: Zones, ends: Array, motions: list[Phases]) -> SpeedProfile:
     starts = np.cumsum(counts) - counts
     s, v, a = (np.zeros(len(durations) + 1) for _ in range(3))
     place, speed, rate = zones.bounds[:-1].copy(), ends[:-1].copy(), np.zeros(len(motions))
-    for number in range(int(counts.max())):  # of the phase, in all motions that have so many
-        on = np.flatnonzero(counts > number)
-        at = starts[on] + number
-        s[at], v[at], a[at] = place[on], speed[on], rate[on]
-        way, faster, rising = advanced(speed[on], rate[on], jerks[at], durations[at])
-        place[on] += way
-        speed[on] = np.maximum(faster, 0.0)
-        rate[on] = np.where(np.abs(rising) > 1e-9 * zones.acceleration[on], rising, 0.0)
+    for phase_number in range(int(counts.max())):
+        longer = np.flatnonzero(counts > phase_number)
+        at = starts[longer] + phase_number
+        s[at], v[at], a[at] = place[longer], speed[longer], rate[longer]
+        covered, new_speed, new_acceleration = integrate_jerk(speed[longer], rate[longer], jerks[at], durations[at])
+        place[longer] += covered
+        speed[longer] = np.maximum(new_speed, 0.0)
+        rate[longer] = np.where(np.abs(new_acceleration) > 1e-9 * zones.acceleration[longer], new_acceleration, 0.0)
     s[-1] = zones.bounds[-1]
     return SpeedProfile(np.concatenate([[0.0], np.cumsum(durations)]), s, v, a, jerks)
 
 
-def _limited(speed: float, other: float, length: float, limits: tuple[float, float, float]) -> float:
-    """The greater speed at one end of a zone, lowered to what can be reached from that at the other."""
-    return min(speed, reach(other, length * (1 - REACH_MARGIN), *limits[1:]))
+def _limited(speed: float, other_end: float, length: float, limits: tuple[float, float, float]) -> float:
+    """Return the greater speed at one end of a zone, lowered to what can be reached from the other end."""
+    return min(speed, reachable_speed(other_end, length * (1 - REACH_MARGIN), *limits[1:]))
 
 
-def passes(distance: Array, most: Array, p: Array, q: Array, low: Array, high: Array) -> Array:
-    """Greatest squared speeds at nodes, from rest to rest.
+def reachability_passes(distance: Array, caps: Array, p: Array, q: Array, low: Array, high: Array) -> Array:
+    """Return the greatest squared speeds at nodes, from rest to rest. Shape (N + 1,).
 
     Args:
-        distance: Of the nodes. Shape (N + 1,), m.
-        most: Greatest squared speed at each. Shape (N + 1,).
-        p, q, low, high: low <= p u + q x <= high in each interval, x being that at its first node. Shape (N, R).
+        distance: Nodes. Shape (N + 1,), m.
+        caps: Greatest squared speed at each. Shape (N + 1,).
+        p, q, low, high: low <= p u + q x <= high in each interval, x at its first node. Shape (N, R).
 
     Raises:
-        ProblemError: A node that no motion can pass, as its `time` (m).
+        ProblemError: No motion can pass a node, its distance (m) as `time`.
     """
     h = np.diff(distance)
-    floor, ceiling = _alone(p, q, low, high, most[:-1])
+    floor, ceiling = _feasible_squares(p, q, low, high, caps[:-1])
     least, top = np.zeros(len(distance)), np.zeros(len(distance))
-    # u between lines over x: those with p > 0 bound it from above by `high`, from below by `low`, the others mirrored
+    # bounds of u, linear in x: rows with p > 0 bound u from above by `high`, from below by `low`, others vice versa
     sign = np.sign(p)
     with np.errstate(divide="ignore", invalid="ignore"):
         slope = np.where(sign == 0, 0.0, -q / p)
@@ -273,7 +264,7 @@ def passes(distance: Array, most: Array, p: Array, q: Array, low: Array, high: A
         below = np.where(sign == 0, -np.inf, np.where(sign > 0, low, high) / p)
     with np.errstate(divide="ignore", invalid="ignore"):
         for k in range(len(h) - 1, -1, -1):
-            # x + 2 h u: its least value must not be above the next interval's end, its greatest not below its start
+            # the range of x + 2 h u over u must intersect the reachable interval of the next node
             bend = 1 + 2 * h[k] * slope[k]
             ends = (top[k + 1] - 2 * h[k] * below[k]) / bend
             starts = (least[k + 1] - 2 * h[k] * above[k]) / bend
@@ -295,14 +286,14 @@ def passes(distance: Array, most: Array, p: Array, q: Array, low: Array, high: A
     return x
 
 
-def _alone(p: Array, q: Array, low: Array, high: Array, most: Array) -> tuple[Array, Array]:
-    """Squared speeds at which an interval's rows leave some acceleration: bounds of x. Shape (N,) each."""
-    floor, ceiling = np.zeros(len(p)), most.copy()
+def _feasible_squares(p: Array, q: Array, low: Array, high: Array, caps: Array) -> tuple[Array, Array]:
+    """Return bounds of the squared speeds at which the rows of an interval leave some acceleration. Shape (N,) each."""
+    floor, ceiling = np.zeros(len(p)), caps.copy()
     count = p.shape[1]
     with np.errstate(divide="ignore", invalid="ignore"):
         for i in range(count):
             for j in range(i, count):
-                # any two rows: u eliminated leaves a row of x between two bounds
+                # eliminating u from two rows leaves bounds on x
                 weight = np.where(p[:, i] == 0, 1.0, p[:, j]), np.where(p[:, i] == 0, 0.0, -p[:, i])
                 if i == j:
                     weight = np.where(p[:, i] == 0, 1.0, 0.0), np.zeros(len(p))
@@ -310,8 +301,8 @@ def _alone(p: Array, q: Array, low: Array, high: Array, most: Array) -> tuple[Ar
                 least = sum(np.minimum(w * low[:, r], w * high[:, r]) for w, r in zip(weight, (i, j), strict=True))
                 greatest = sum(np.maximum(w * low[:, r], w * high[:, r]) for w, r in zip(weight, (i, j), strict=True))
                 ends = least / of_x, greatest / of_x
-                some = of_x != 0
-                ceiling = np.where(some, np.minimum(ceiling, np.fmax(*ends)), ceiling)
-                floor = np.where(some, np.maximum(floor, np.fmin(*ends)), floor)
-                ceiling = np.where(~some & ((least > 0) | (greatest < 0)) & (np.abs(weight[0]) > 0), -1.0, ceiling)
+                bounded = of_x != 0
+                ceiling = np.where(bounded, np.minimum(ceiling, np.fmax(*ends)), ceiling)
+                floor = np.where(bounded, np.maximum(floor, np.fmin(*ends)), floor)
+                ceiling = np.where(~bounded & ((least > 0) | (greatest < 0)) & (np.abs(weight[0]) > 0), -1.0, ceiling)
     return floor, ceiling

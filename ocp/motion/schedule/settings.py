@@ -1,4 +1,4 @@
-"""What schedules are planned with: how fine, how accurately, and how much at once."""
+"""Settings of the schedules: resolution, accuracy, and sizes of blocks."""
 
 from __future__ import annotations
 
@@ -9,59 +9,61 @@ __all__ = ["SETTINGS", "ScheduleSettings"]
 
 @dataclass(frozen=True)
 class ScheduleSettings:
-    """How a schedule is planned. Shares are relative.
+    """Settings of the schedules. Shares are relative.
 
     Attributes:
-        block: Places whose limits are evaluated at once: bounds the memory of a long path.
-        halvings, curve_halvings: Of an interval of the first grid at most, and of one of the curve of permitted speeds,
-            whose minima are sharp.
-        shortest: Share of the path below which a piece counts with the next, and an interval is not halved.
+        block: Places whose limits are evaluated at once, which bounds the memory of a long path.
+        halvings, curve_halvings: Largest number of halvings of an interval of the first grid, and of one of the
+            velocity curve, whose minima are sharp.
+        shortest: Share of the path below which a segment is merged with the next, and an interval is not halved.
 
-        uneven, uneven_speed: Largest error of a demand between two nodes, over its limit, when it counts as even; that
-            of the rows of speed, which hold at nodes alone.
-        cells, segments: Intervals of the first grid in each cell of a blend, and on all segments together at least.
-        closest: Ratio of neighbouring intervals below which their node goes, unless pieces meet there.
-        build_up, ramp: Duration of an interval over the time in which the acceleration builds up, or over that in which
-            the top speed is reached, if that is more.
-        turn, least_build_up: But no more than this share of the time of the ramp, for the speed must not change much in
-            an interval; nor less than this share of the build-up, for with low jerks no motion gets near the limits of
-            acceleration.
-        parts: Most intervals that one which resolves the limits is cut into.
+        uneven, uneven_speed: Largest interpolation error of a row between two nodes, over its limit; that of the rows
+            of speed, which are enforced at nodes only.
+        cells, segments: Intervals of the first grid in each cell of a blend, and at least on all segments together.
+        closest: Ratio of neighbouring intervals below which their node is dropped, unless segments meet there.
+        build_up, ramp: Duration of an interval over the time in which the acceleration builds up, or, if longer, over
+            that in which the top speed is reached.
+        turn, least_build_up: Upper bound as a share of the ramp time, since the speed must not change much in an
+            interval; lower bound as a share of the build-up, since with low jerks no motion gets near the acceleration
+            limits.
+        parts: Largest number of parts into which an interval that resolves the limits is split.
         growth: Ratio of neighbouring distances from rest, where the speed grows as their power 2/3.
         first: Duration of the first and last interval, of constant jerk, over that of the build-up.
 
-        room: Share of the limits that is left for what lies between the places where rows are held: half of what
-            schedules promise to keep limits to, 1e-3.
-        bend: Share of the limits by which a demand may bend away from a parabola before more places are looked at.
+        room: Share of the limits reserved for what happens between the places where rows are enforced: half of the
+            promised accuracy of 1e-3.
+        bend: Share of the limits by which a row may deviate from a parabola before more places are evaluated.
         looked: Share of a bound used at one of three places above which the vertex between them is evaluated: a
             parabola exceeds the greatest of three values by a quarter at most.
-        fine: Parts of an interval at whose ends demands are evaluated where they bend; the middle is one of them.
+        fine: Parts into which an interval is split for that evaluation; even, so that the middle is an end of one.
 
-        rounds: Of tightening.
-        accuracies: Of the time of a window, relative, round by round: no more than rows still change by; the last is
-            for all later rounds.
-        lowered: Largest ratio by which a bound is lowered in a round.
-        around, few: Intervals on either side of one that passes a limit, which are planned again with it; they alone if
-            they are no more than this share of all.
+        rounds: Largest number of rounds of tightening.
+        accuracies: Relative accuracy of the time of a window in each round, no finer than the rows still change; the
+            last value serves all later rounds.
+        lowered: Largest factor by which a bound is lowered in a round.
+        around, few: Intervals on either side of a violated one that are planned again with it; only these are planned
+            if their share is at most `few`.
         window, overlap: Intervals of a window, which bounds the memory, and those at its end that the next one plans
             again.
-        seam: Share of the bounds that a window uses behind its seam, so that the next has room.
-        binding: A limit binds where more than this share of it is used; rows that reach less whatever the motion are
-            left out at first.
-        near: Once a motion is known, rows that came less near to their bound in an interval and beside it are left out.
-        start, again: Squared speed to start from, over that of a fastest steady motion that accelerates as it may; and
-            over that of a solution of a similar program. again_inside: Over that, where this leads nowhere.
-        center, center_again: Complementarity over the time that the interior point begins with there.
-        dive: Squared speed inside an interval over that at its beginning at least, where a rough spline dives.
+        seam: Share of the bounds that a window uses behind its seam, so that the next one has freedom.
+        binding: Share of a limit above which it counts as active; rows that stay below it in every motion are left out
+            at first.
+        near: Once a motion is known, rows that use less than this share in an interval and beside it are left out.
+        start, again: Initial squared speed over that of a fastest steady motion with bounded acceleration, and over
+            that of the solution of a similar program.
+        again_inside: Further factor if that start fails.
+        center, center_again: Initial complementarity over the time for these starts.
+        dive: Least squared speed inside an interval over that at its beginning, for rough splines.
 
-        reached: Share of the asked speed below which a motion must be to count as slowed.
-        leaving: Share of the asked speed that a motion may be slower near the ends of a stretch that is long enough.
-        long_path: Pieces from which on a path with centripetal limits alone is slowed by ramps, which take a fiftieth
-            of the work.
-        speed_error: Relative error of the permitted speed between two places of its curve, which is kept back.
-        speed_change: Largest relative change of it between two places; the lower one counts for what lies between.
-        spread: A stretch of one speed spans permitted speeds up to this ratio.
-        zone_rounds, thorough_from: Rounds after which no plan is found, and after which every place gets its own speed.
+        reached: Relative reduction of the requested speed above which a motion counts as slower.
+        leaving: Relative reduction accepted near the ends of a stretch that is long enough.
+        long_path: Number of segments from which a path with centripetal limits alone uses ramps, at a fiftieth of the
+            work.
+        speed_error: Relative error of the permitted speed between two places of the velocity curve, which is
+            subtracted.
+        speed_change: Largest relative change of it between two places; the lower value holds between them.
+        spread: Largest ratio of permitted speeds in a stretch of one speed.
+        zone_rounds, thorough_from: Largest number of rounds, and the round from which every place gets its own speed.
     """
 
     block: int = 20_000

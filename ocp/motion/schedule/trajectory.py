@@ -1,4 +1,4 @@
-"""Joint trajectories sampled from a schedule, and their exchange as CSV and as a ROS 2 JointTrajectory."""
+"""Joint trajectories sampled from a schedule, and their exchange as CSV and as ROS 2 JointTrajectory messages."""
 
 from __future__ import annotations
 
@@ -18,22 +18,21 @@ from ocp.storage import checked_path, column_name, joint_name, write_text
 
 __all__ = ["JointTrajectory", "joint_motion", "joint_trajectory"]
 
-LARGEST_FILE = 2**26
-"""Bytes."""
+MAX_FILE_BYTES = 2**26
 KINDS = ("positions", "velocities", "accelerations")
 
 
 @dataclass(frozen=True, eq=False)
 class JointTrajectory:
-    """Sampled joints.
+    """Sampled joint trajectory.
 
     Attributes:
-        names: Of the n joints.
-        t: Time from the start, increasing. Shape (M,), s.
+        names: Names of the n joints.
+        t: Increasing times from the start, s. Shape (M,).
         positions, velocities, accelerations: Shape (M, n), rad or m, and per s, s^2.
 
     Raises:
-        ProblemError: Wrong shapes, nan, times that do not increase, names that repeat.
+        ProblemError: A shape is wrong, a value is not finite, times do not increase, or names repeat.
     """
 
     names: tuple[str, ...]
@@ -45,7 +44,7 @@ class JointTrajectory:
     def __post_init__(self) -> None:
         names = checked_each("trajectory: names", self.names, str)
         if isinstance(self.names, str) or not names or len(set(names)) != len(names):
-            message = f"trajectory: joint names {list(names)} must be there and differ"
+            message = f"trajectory: joint names {list(names)} must be given and distinct"
             raise ProblemError(message, name="names", value=names)
         object.__setattr__(self, "names", names)
         t = _numbers("times", self.t)
@@ -72,9 +71,9 @@ class JointTrajectory:
 
     @classmethod
     def read_csv(cls, path: str | FilePath[str]) -> JointTrajectory:
-        """Read what write_csv wrote, bit for bit; ProblemError for anything else."""
+        """Read a file from write_csv, bit for bit; ProblemError for any other file."""
         try:
-            text = read_regular(checked_path(path), LARGEST_FILE).decode()
+            text = read_regular(checked_path(path), MAX_FILE_BYTES).decode()
         except (OSError, ValueError) as error:
             words = f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}"
             raise ProblemError(words, name="path", value=path) from error
@@ -93,10 +92,10 @@ class JointTrajectory:
         return cls(tuple(map(joint_name, columns)), table[:, 0], *np.split(table[:, 1:], 3, axis=1))
 
     def to_ros(self) -> dict[str, Any]:
-        """Plain dictionary of the fields of trajectory_msgs/msg/JointTrajectory. Times are whole nanoseconds there.
+        """Return the fields of trajectory_msgs/msg/JointTrajectory as a dictionary; times are whole nanoseconds.
 
         Raises:
-            ProblemError: Times less than a nanosecond apart.
+            ProblemError: Times are less than a nanosecond apart.
         """
         nanoseconds = np.round(self.t * 1e9).astype(np.int64)
         if (np.diff(nanoseconds) <= 0).any():
@@ -115,7 +114,7 @@ class JointTrajectory:
 
     @classmethod
     def from_ros(cls, message: Mapping[str, Any]) -> JointTrajectory:
-        """Read what to_ros made: the same numbers, times to the nanosecond. ProblemError when a field is missing."""
+        """Read a message from to_ros, with times to the nanosecond; ProblemError if a field is missing."""
         try:
             points = message["points"]
             stamps = [p["time_from_start"] for p in points]
@@ -123,12 +122,13 @@ class JointTrajectory:
             values = [floats([p[kind] for p in points]) for kind in KINDS]
             names = tuple(message["joint_names"])
         except (KeyError, IndexError, TypeError, ValueError) as error:
-            text = f"this is no joint trajectory message: {error!r}"
+            text = f"this is not a joint trajectory message: {error!r}"
             raise ProblemError(text, name="message", value=message) from error
         return cls(names, t, *values)
 
 
 def _numbers(what: str, value: Any) -> Array:
+    """Return a value as an array; ProblemError if it is not numeric."""
     try:
         return floats(value)
     except NOT_NUMBERS as error:
@@ -136,23 +136,23 @@ def _numbers(what: str, value: Any) -> Array:
 
 
 def joint_motion(joints: JointPath, motion: LineMotion) -> tuple[Array, Array, Array, Array]:
-    """Joints, their velocities, accelerations and jerks during a motion along the path. Shape (M, n) each.
+    """Return joints, velocities, accelerations and jerks in a motion along the path. Shape (M, n) each.
 
     q' v, q'' v^2 + q' a, q''' v^3 + 3 q'' v a + q' j.
     """
     checked_instance("motion", motion, LineMotion)
-    along = rates_along(joints, motion.distance)
+    rates = rates_along(joints, motion.distance)
     v, a, j = (value[:, None] for value in (motion.speed, motion.acceleration, motion.jerk))
-    velocity = along.first * v
-    acceleration = along.second * v**2 + along.first * a
-    return along.position, velocity, acceleration, along.third * v**3 + 3 * along.second * v * a + along.first * j
+    velocity = rates.first * v
+    acceleration = rates.second * v**2 + rates.first * a
+    return rates.position, velocity, acceleration, rates.third * v**3 + 3 * rates.second * v * a + rates.first * j
 
 
 def joint_trajectory(schedule: Schedule, joints: JointPath, period: float) -> JointTrajectory:
-    """Joints every `period` s from the start to the end of a schedule; ProblemError for a bad period.
+    """Return the joints every `period` s from the start to the end of a schedule; ProblemError for a bad period.
 
-    Times are whole nanoseconds, those of the message, and the joints are those of these times; the last is the first
-    one at or after the end, at rest.
+    Times are whole nanoseconds, those of the ROS message, and the joints are those at these times. The last time is the
+    first one at or after the end, at rest.
     """
     checked_instance("schedule", schedule, Schedule)
     check_joints(joints)

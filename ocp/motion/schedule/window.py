@@ -1,4 +1,4 @@
-"""What is solved at once: intervals of a grid with rows at places inside them, and what a motion demands there."""
+"""Windows of a grid that are solved at once: their rows inside the intervals, and the usage of limits by a motion."""
 
 from __future__ import annotations
 
@@ -9,29 +9,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ocp.motion.schedule.grid import Grid
-from ocp.motion.schedule.limits import Rows, rows_at, torque_rows
-from ocp.motion.schedule.profile import Array, LineMotion, SpeedProfile, through
+from ocp.motion.schedule.limits import Rows, limit_rows, torque_rows
+from ocp.motion.schedule.profile import Array, LineMotion, SpeedProfile, profile_through
 from ocp.motion.schedule.settings import SETTINGS
 
-__all__ = ["HELD", "INSIDE", "Ends", "Motion", "Stretch", "Window", "demanded", "profile_of"]
+__all__ = ["HELD", "INSIDE", "Ends", "Motion", "Stretch", "Window", "limit_usage", "motion_profile"]
 
 INSIDE = (0.25, 0.5, 0.75)
-"""Where each interval is looked at between its ends, as shares of its length."""
+"""Places in each interval where rows are evaluated between its ends, as shares of its length."""
 HELD = (0, 1, 3, 4)
-"""Which of the places, ends included, rows are held at: not the middle, where the jerk of the motion may change."""
+"""Places, ends included, where rows are enforced: not the middle, where the jerk of the motion may change."""
 
 Ends: TypeAlias = tuple[tuple[float, float], tuple[float, float]]
-"""Squared speed and its slope by the distance, at the beginning and at the end."""
+"""Squared speed and its slope by distance, at the beginning and at the end."""
 Motion: TypeAlias = tuple[Array, Array]
 """Squared speeds and their slopes at nodes. Shape (N + 1,) each."""
 
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """A part of a grid between two nodes.
+    """Part of a grid between two nodes.
 
     Attributes:
-        grid: All of it.
+        grid: The whole grid.
         first, last: Nodes.
         ends: Squared speed and its slope at either; rest where the path ends. Shape (2, 2).
     """
@@ -44,14 +44,13 @@ class Stretch:
 
 @dataclass(frozen=True, eq=False)
 class Window(Stretch):
-    """A stretch that is solved at once.
+    """Stretch that is solved at once.
 
     Attributes:
-        rows: Where intervals begin, `INSIDE` them, and where they end. Shape (N,) each.
-        bends: What parabolas through the rows of acceleration and of jerk at three of these places miss at most.
-            Shape (N, L, 3) and (N, P, 3).
-        close: Rows at places nearer to one another, of intervals of the grid that were looked at so, with or without
-            those of torques.
+        rows: Rows where intervals begin, `INSIDE` them, and where they end. Shape (N,) each.
+        bends: Largest errors of parabolas through the rows of acceleration and of jerk at three of these places. Shape
+            (N, L, 3) and (N, P, 3).
+        close: Cache of rows at a finer spacing, by interval of the grid and whether with torques.
     """
 
     rows: tuple[Rows, ...] = ()
@@ -59,74 +58,75 @@ class Window(Stretch):
     close: dict[tuple[int, bool], Rows] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, stretch: Stretch, first: int, last: int, ends: Ends) -> Window:
-        """Part of a stretch between two nodes."""
+    def build(cls, stretch: Stretch, first: int, last: int, ends: Ends) -> Window:
+        """Return the window of a stretch between two nodes."""
         grid = stretch.grid
         begin, h = grid.distance[first:last], np.diff(grid.distance[first : last + 1])
         left, right = grid.ends(first, last)
         places = np.concatenate([begin + share * h for share in INSIDE])
-        rows = rows_at(grid.path, grid.limits, grid.joints, places)
-        inside = [rows.of(slice(k * len(h), (k + 1) * len(h))) for k in range(len(INSIDE))]
-        all_of_them = (left, *inside, right)
-        bends = _bends([each.acceleration for each in all_of_them]), _bends([each.jerk for each in all_of_them])
-        return cls(grid, first, last, ends, all_of_them, bends)
+        rows = limit_rows(grid.path, grid.limits, grid.joints, places)
+        inside = [rows.take(slice(k * len(h), (k + 1) * len(h))) for k in range(len(INSIDE))]
+        every = (left, *inside, right)
+        bends = (
+            _parabola_errors([each.acceleration for each in every]),
+            _parabola_errors([each.jerk for each in every]),
+        )
+        return cls(grid, first, last, ends, every, bends)
 
-    def closely(self, intervals: NDArray[np.intp], torques: bool) -> Rows:
-        """Rows at the ends of the `fine` parts of some intervals but for their own, place by place.
+    def fine_rows(self, intervals: NDArray[np.intp], torques: bool) -> Rows:
+        """Return rows at the inner ends of the `fine` parts of some intervals, place by place.
 
-        Shape ((SETTINGS.fine - 1) B,); those of torques, which take longest, where they are asked for.
+        Shape ((SETTINGS.fine - 1) B,); with torques, which take longest, on request.
         """
         parts = SETTINGS.fine
-        new = [at for at in intervals.tolist() if (self.first + at, torques) not in self.close]
-        if new:
-            grid, begin, h = self.grid, self.nodes[new], np.diff(self.nodes)[new]
+        missing = [at for at in intervals.tolist() if (self.first + at, torques) not in self.close]
+        if missing:
+            grid, begin, h = self.grid, self.nodes[missing], np.diff(self.nodes)[missing]
             places = begin[:, None] + np.arange(1, parts) / parts * h[:, None]
-            rows = rows_at(grid.path, grid.limits, grid.joints, places.ravel(), torques=torques)
-            for k, at in enumerate(new):
-                self.close[self.first + at, torques] = rows.of(
-                    slice(k * (SETTINGS.fine - 1), (k + 1) * (SETTINGS.fine - 1))
-                )
-        found = [self.close[self.first + at, torques] for at in intervals.tolist()]
-        return Rows(*(np.stack(kind, axis=1).reshape(-1, *kind[0].shape[1:]) for kind in zip(*found, strict=True)))
+            rows = limit_rows(grid.path, grid.limits, grid.joints, places.ravel(), torques=torques)
+            for k, at in enumerate(missing):
+                self.close[self.first + at, torques] = rows.take(slice(k * (parts - 1), (k + 1) * (parts - 1)))
+        rows_of = [self.close[self.first + at, torques] for at in intervals.tolist()]
+        return Rows(*(np.stack(kind, axis=1).reshape(-1, *kind[0].shape[1:]) for kind in zip(*rows_of, strict=True)))
 
     @property
     def torques(self) -> slice:
-        """Rows of `causes` that are torques."""
+        """Slice of the rows of `limit_names` that are torques."""
         speed, acceleration, _ = (kind.shape[1] for kind in self.rows[0])
         count = torque_rows(self.grid.limits, self.grid.joints)
         return slice(speed + acceleration - count, speed + acceleration)
 
     @property
     def nodes(self) -> Array:
-        """Distances. Shape (N + 1,), m."""
+        """Distances of the nodes. Shape (N + 1,), m."""
         return self.grid.distance[self.first : self.last + 1]
 
 
-def profile_of(stretch: Stretch, x: Array, slope: Array | None) -> SpeedProfile:
-    """The motion with squared speeds, and their slopes where jerks are limited, at the first nodes of a stretch."""
+def motion_profile(stretch: Stretch, x: Array, slope: Array | None) -> SpeedProfile:
+    """Return the motion with squared speeds, and slopes with jerk limits, at the first nodes of a stretch."""
     s = stretch.grid.distance[stretch.first : stretch.first + len(x)]
     v = np.sqrt(x)
     if slope is not None:
-        return through(s, v, slope[: len(x)] / 2)
+        return profile_through(s, v, slope[: len(x)] / 2)
     t = np.concatenate([[0.0], np.cumsum(2 * np.diff(s) / (v[:-1] + v[1:]))])
     return SpeedProfile(t, s, v, np.append(np.diff(x) / (2 * np.diff(s)), 0.0), np.zeros(len(s) - 1))
 
 
-def demanded(
+def limit_usage(
     window: Window, profile: SpeedProfile, which: NDArray[np.intp], closely: bool = True
 ) -> tuple[Array, Array]:
-    """Demands over their limits in some intervals (B,): the largest, upwards and downwards, and those at `HELD` places.
+    """Return rows over their limits in some intervals (B,): the largest in each direction, and those at `HELD` places.
 
-    Shape (2, N, K + L + P) and (4, N, K + L + P), none in the others.
+    Shapes (2, N, K + L + P) and (4, N, K + L + P), zero in the other intervals.
 
-    In either half of an interval each demand is a parabola through three places; its vertex counts too. Where that may
-    miss what matters, and they are looked at `closely`, more places count.
+    In either half of an interval each row is interpolated by a parabola through three places, whose vertex counts too.
+    Where the interpolation error may matter, and if `closely`, more places are evaluated.
     """
     count, h = len(which), np.diff(window.nodes)[which]
     every, left = count == window.last - window.first, window.nodes[which]
-    begin, before, here, after, end = window.rows if every else (rows.of(which) for rows in window.rows)
+    begin, before, here, after, end = window.rows if every else (rows.take(which) for rows in window.rows)
     each = len(profile.jerk) // (window.last - window.first)
-    # the halves meet where the jerk changes, near the middle: rows there are those of a parabola as well
+    # the halves meet where the jerk changes, near the middle; the rows there are interpolated by a parabola
     at = profile.distance[1::2][which] if each == 2 else left + h / 2
     f = (at - left) / h
     x = (f - INSIDE[1]) / (INSIDE[1] - INSIDE[0])
@@ -143,19 +143,21 @@ def demanded(
 
     first = states(each * which, profile.jerk[each * which])
     last = states(each * (which + 1), profile.jerk[each * (which + 1) - 1])
-    if each == 1:  # the acceleration jumps at nodes: it is that before them
+    if each == 1:  # the acceleration jumps at nodes; use the one before
         last = last._replace(acceleration=first.acceleration)
     zero = np.zeros(count)
     places = np.concatenate([left + INSIDE[0] * h, at, left + INSIDE[2] * h])
     inside = profile.at_distance(places)
-    quarter, met, far = (LineMotion(*(kind[k * count : (k + 1) * count] for kind in inside)) for k in range(3))
+    quarter, met, three_quarter = (
+        LineMotion(*(kind[k * count : (k + 1) * count] for kind in inside)) for k in range(3)
+    )
     halves = (
         ((begin, first), (before, quarter), (middle, met._replace(jerk=first.jerk))),
-        ((middle, met._replace(jerk=last.jerk)), (after, far), (end, last)),
+        ((middle, met._replace(jerk=last.jerk)), (after, three_quarter), (end, last)),
     )
-    values = np.stack([rows.demands(motion) for half in halves for rows, motion in half])
+    values = np.stack([rows.usage(motion) for half in halves for rows, motion in half])
     used = np.stack([values.max(axis=0), -values.min(axis=0)])
-    # a parabola is beyond the greatest of three of its values by at most a quarter of these
+    # a parabola exceeds the greatest of three of its values by at most a quarter
     at_row = np.nonzero(np.maximum(*used) > SETTINGS.looked)
     high = np.stack([value[at_row] for value in values])
     shares = (zero, INSIDE[0] + zero, f, f, INSIDE[2] + zero, zero + 1)
@@ -166,70 +168,70 @@ def demanded(
             side[at_row] = np.maximum(side[at_row], value)
     if closely:
         bends = window.bends if every else (window.bends[0][which], window.bends[1][which])
-        missed = _missed(bends, used, (first, met, last))
-        bent, heavy = missed.any(axis=1), missed[:, window.torques].any(axis=1)
-        for torques, these in ((False, np.flatnonzero(bent & ~heavy)), (True, np.flatnonzero(heavy))):
+        missed = _inaccurate_rows(bends, used, (first, met, last))
+        inaccurate, by_torques = missed.any(axis=1), missed[:, window.torques].any(axis=1)
+        for torques, these in ((False, np.flatnonzero(inaccurate & ~by_torques)), (True, np.flatnonzero(by_torques))):
             if these.size:
                 known = values[[0, 2, 3, 5]][:, these]
-                close = _closely(window, profile, which[these], f[these], known, torques)
+                finer = _fine_usage(window, profile, which[these], f[these], known, torques)
                 if not torques:
-                    close[:, :, window.torques] = used[:, these, window.torques]
-                used[:, these] = close
-    found = values[[0, 1, 4, 5]]
+                    finer[:, :, window.torques] = used[:, these, window.torques]
+                used[:, these] = finer
+    held_values = values[[0, 1, 4, 5]]
     if every:
-        return used, found
-    everywhere = [np.zeros((len(kind), window.last - window.first, kind.shape[2])) for kind in (used, found)]
-    for kind, own in zip(everywhere, (used, found), strict=True):
-        kind[:, which] = own
+        return used, held_values
+    everywhere = [np.zeros((len(kind), window.last - window.first, kind.shape[2])) for kind in (used, held_values)]
+    for kind, compact in zip(everywhere, (used, held_values), strict=True):
+        kind[:, which] = compact
     return everywhere[0], everywhere[1]
 
 
-def _bends(rows: list[Array]) -> Array:
-    """What parabolas through rows at three of five places in a line miss at most. Shape (N, L, 3) of five of them."""
+def _parabola_errors(rows: list[Array]) -> Array:
+    """Return the largest errors of parabolas through rows at three of five equidistant places. Shape (N, L, 3)."""
     a, b, c, d, e = rows
-    # the third difference tells the cubic that a parabola leaves, at most 1/(9 sqrt 3) of it
+    # the third difference gives the cubic term; a parabola misses at most 1/(9 sqrt 3) of it
     return np.asarray(np.maximum(np.abs(d - a + 3 * (b - c)), np.abs(e - b + 3 * (c - d))) / (9 * np.sqrt(3)))
 
 
-def _missed(bends: tuple[Array, Array], used: Array, motions: tuple[LineMotion, ...]) -> NDArray[np.bool_]:
-    """Demands that seem to be kept and may be passed between three places. Shape (N, K + L + P)."""
+def _inaccurate_rows(bends: tuple[Array, Array], used: Array, motions: tuple[LineMotion, ...]) -> NDArray[np.bool_]:
+    """Return rows that seem to be kept but may be violated between three places. Shape (N, K + L + P)."""
     v, a, j = (
         np.max([np.abs(getattr(motion, kind)) for motion in motions], axis=0)[:, None]
         for kind in ("speed", "acceleration", "jerk")
     )
-    of_a, of_j = bends
-    miss = [
-        np.zeros((len(v), used.shape[2] - of_a.shape[1] - of_j.shape[1])),
-        of_a[:, :, 0] * a + of_a[:, :, 1] * v**2 + of_a[:, :, 2],
-        of_j[:, :, 0] * j + of_j[:, :, 1] * v * a + of_j[:, :, 2] * v**3,
+    acceleration, jerk = bends
+    errors = [
+        np.zeros((len(v), used.shape[2] - acceleration.shape[1] - jerk.shape[1])),
+        acceleration[:, :, 0] * a + acceleration[:, :, 1] * v**2 + acceleration[:, :, 2],
+        jerk[:, :, 0] * j + jerk[:, :, 1] * v * a + jerk[:, :, 2] * v**3,
     ]
-    missed = np.concatenate(miss, axis=1)
-    return np.asarray((missed > SETTINGS.bend) & (used.max(axis=0) + missed > 1))
+    error = np.concatenate(errors, axis=1)
+    return np.asarray((error > SETTINGS.bend) & (used.max(axis=0) + error > 1))
 
 
-def _closely(
-    window: Window, profile: SpeedProfile, bent: NDArray[np.intp], f: Array, known: Array, torques: bool
+def _fine_usage(
+    window: Window, profile: SpeedProfile, intervals: NDArray[np.intp], f: Array, known: Array, torques: bool
 ) -> Array:
-    """Largest demands, upwards and downwards, of some intervals by places near one another. Shape (2, B, R).
+    """Return the largest usage in each direction in some intervals, from closely spaced places. Shape (2, B, R).
 
     Args:
-        window, profile: As of `demanded`.
-        bent: The intervals. Shape (B,).
-        f: Where in them the jerk changes. Shape (B,).
-        known: Demands at their beginning, before and after that change, and at their end. Shape (4, B, R).
-        torques: Whether those of torques are asked for.
+        window, profile: As for `limit_usage`.
+        intervals: The intervals. Shape (B,).
+        f: Places in them where the jerk changes. Shape (B,).
+        known: Usage at their beginning, before and after that change, and at their end. Shape (4, B, R).
+        torques: Whether those of torques are evaluated.
     """
     parts, half = SETTINGS.fine, SETTINGS.fine // 2
-    places = window.nodes[bent] + np.arange(1, parts)[:, None] / parts * np.diff(window.nodes)[bent]
-    demands = window.closely(bent, torques).demands(profile.at_distance(places.ravel()))
-    demands = demands.reshape(parts - 1, len(bent), -1)
-    fine = np.arange(parts + 1)[:, None] / parts + np.zeros(len(bent))
+    places = window.nodes[intervals] + np.arange(1, parts)[:, None] / parts * np.diff(window.nodes)[intervals]
+    usage = window.fine_rows(intervals, torques).usage(profile.at_distance(places.ravel()))
+    usage = usage.reshape(parts - 1, len(intervals), -1)
+    fine = np.arange(parts + 1)[:, None] / parts + np.zeros(len(intervals))
     fine[half] = f
     begin, before, after, end = known[:, None]
     used = np.zeros((2, *begin.shape[1:]))
     for values, at in (
-        (np.concatenate([begin, demands[: half - 1], before]), fine[: half + 1]),
-        (np.concatenate([after, demands[half:], end]), fine[half:]),
+        (np.concatenate([begin, usage[: half - 1], before]), fine[: half + 1]),
+        (np.concatenate([after, usage[half:], end]), fine[half:]),
     ):
         used = np.maximum(used, [values.max(axis=0), -values.min(axis=0)])
         for k in range(0, half, 2):
@@ -239,11 +241,11 @@ def _closely(
 
 
 def _vertex(values: Array, places: list[Array]) -> Array:
-    """The vertex of parabolas through three values where it lies between the first and the last, else the first."""
+    """Return the vertex of parabolas through three values if it lies between the first and the last, else the first."""
     (a, b, c), (at, inside, end) = values, places
     slope = (b - a) / (inside - at)
     with np.errstate(divide="ignore", invalid="ignore"):
-        bend = ((c - b) / (end - inside) - slope) / (end - at)
-        vertex = (at + inside) / 2 - slope / (2 * bend)
+        curvature = ((c - b) / (end - inside) - slope) / (end - at)
+        vertex = (at + inside) / 2 - slope / (2 * curvature)
         within = (vertex - at) * (vertex - end) < 0
-        return np.asarray(np.where(within, a + (vertex - at) * (slope + bend * (vertex - inside)), a))
+        return np.asarray(np.where(within, a + (vertex - at) * (slope + curvature * (vertex - inside)), a))

@@ -309,7 +309,7 @@ class _Cells:
         """Which states lean no farther than they may, and are clear."""
         good, times = np.isfinite(layer.cost), np.full(len(layer.cost), layer.time)
         if kinematics.equations is not None and len(times):
-            over = kinematics.equations.overhangs(times, layer.base, layer.joints)
+            over = kinematics.equations.cone_violations(times, layer.base, layer.joints)
             good &= over.max(axis=1, initial=0.0) <= OUT_OF_REACH
         if self.asked.clearance_constraints is not None and good.any():
             around, at = self.asked.clearance_constraints.scene, np.flatnonzero(good)

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from models.arrays import Array
 from ocp.errors import ProblemError
-from ocp.motion.local.branches import Branches, branches_of
-from ocp.motion.local.inverse_kinematics import Unreachable, postures_of
+from ocp.motion.local.branches import IkBranches, ik_branches
+from ocp.motion.local.inverse_kinematics import Unreachable, inverse_kinematics_at
 from ocp.motion.search.joint_space import TOLERANCE, JointSpace
 from ocp.motion.tasks.equations import TaskEquations
 from ocp.problem.values import Sampler
@@ -185,8 +185,8 @@ class SelfMotions:
     # ---- postures ------------------------------------------------------------------------------------------------
 
     @cached_property
-    def _branches(self) -> Branches | None:
-        return branches_of(self.equations, self.space.lower, self.space.upper)
+    def _branches(self) -> IkBranches | None:
+        return ik_branches(self.equations, self.space.lower, self.space.upper)
 
     def seeds(self, number: int, limits: Any, seed: int) -> Array:
         """Postures of an instant within limits, of as many parts of the set as are found. Shape (K, n).
@@ -198,12 +198,12 @@ class SelfMotions:
         """
         listed, count = np.zeros((0, len(self.space.scale))), self.settings.listed
         if self._branches is not None:
-            found = self._branches.postures(self.targets[number], count, count * number)
+            found = self._branches.solutions(self.targets[number], count, count * number)
             on, good = self.corrected(np.full(len(found), number), found)
             listed = on[good & self.space.within(on)]
         told: dict[str, Any] = {"limits": limits, "seed": seed, "starts": self.settings.starts}
         try:
-            sought = [one.joints for one in postures_of(self.equations, self.targets[number], **told)]
+            sought = [one.joints for one in inverse_kinematics_at(self.equations, self.targets[number], **told)]
         except Unreachable:
             if not len(listed):
                 raise

@@ -15,8 +15,14 @@ from ocp.errors import ProblemError
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.tool_motion import Stretch
 from ocp.motion.local.collisions import Collision, distances_along
-from ocp.motion.local.inverse_kinematics import Unreachable, at_rest, distinct, inverse_kinematics, starts_of
-from ocp.motion.local.rates import LocalMotion, follow
+from ocp.motion.local.inverse_kinematics import (
+    Unreachable,
+    distinct_solutions,
+    idle_positions,
+    inverse_kinematics,
+    start_configurations,
+)
+from ocp.motion.local.rates import LocalMotion, track_tasks
 from ocp.motion.search.settings import PlannerSettings
 from ocp.motion.tasks.checks import ignorable_joints
 from ocp.motion.tasks.equations import bind
@@ -103,9 +109,9 @@ def postures_at_the_start(asked: Asked) -> Array:
         found = inverse_kinematics(asked.machine, first, **options)
     except Unreachable as error:
         raise placed(asked, error, 0.0) from error
-    resting, slides = at_rest(asked.bounds.lower, asked.bounds.upper), asked.machine.robot.moving_joints
+    resting, slides = idle_positions(asked.bounds.lower, asked.bounds.upper), asked.machine.robot.moving_joints
     found = [replace(posture, joints=np.where(asked.idle, resting, posture.joints)) for posture in found]
-    found = distinct(found, np.array([joint.kind != "prismatic" for joint in slides]))
+    found = distinct_solutions(found, np.array([joint.kind != "prismatic" for joint in slides]))
     joints = np.array([posture.joints for posture in found])
     touching = [touch is not None for touch in touches_at_the_start(asked, joints)]
     return joints[np.argsort(touching, kind="stable")]
@@ -172,13 +178,15 @@ def settled(asked: Asked, postures: Array) -> tuple[Array, Array]:
         if stretch.equations is not None:
             ignorable &= ignorable_joints(stretch.equations, asked.base)
     ended = np.isfinite(bounds.upper - bounds.lower)
-    start[ignorable] = np.where(ended, at_rest(bounds.lower, bounds.upper), postures[0])[ignorable]
+    start[ignorable] = np.where(ended, idle_positions(bounds.lower, bounds.upper), postures[0])[ignorable]
 
     def collision_count(values: Array) -> int:
         return touches_at_the_start(asked, np.where(ignorable, values, postures)).count(None)
 
     if ignorable.any() and not collision_count(start):
-        others = starts_of(asked.machine, bounds.lower, bounds.upper, asked.settings.ik_starts, None, asked.seed)
+        others = start_configurations(
+            asked.machine, bounds.lower, bounds.upper, asked.settings.ik_starts, None, asked.seed
+        )
         start[ignorable] = max((start, *postures, *others), key=collision_count)[ignorable]
     return start, np.where(ignorable, start, postures)
 
@@ -204,10 +212,12 @@ def followed_from(asked: Asked, postures: Array) -> list[LocalMotion]:
             times = np.union1d(np.linspace(stretch.begin, stretch.end, share + 1), stretch.breaks)
             equations = stretch.equations
             if equations is None:
-                found.append(LocalMotion.resting(times, base, joints))
+                found.append(LocalMotion.stationary(times, base, joints))
             else:
                 soft: dict[str, Any] = {"weights": asked.weights, "damping": damping}
-                found.append(follow(equations, joints, base, times, lower=bounds.lower, upper=bounds.upper, **soft))
+                found.append(
+                    track_tasks(equations, joints, base, times, lower=bounds.lower, upper=bounds.upper, **soft)
+                )
             base, joints = found[-1].base[:, -1], found[-1].joints[:, -1]
         best = best or found
         if min(misfits_of(found)) <= OUT_OF_REACH:
@@ -253,7 +263,7 @@ def _straight(part: LocalMotion, joints: Array) -> LocalMotion:
 
 def misfits_of(followed: list[LocalMotion]) -> list[float]:
     """Of each posture the largest pose error on its way."""
-    return np.max([part.misfit for part in followed], axis=0).tolist()  # type: ignore[no-any-return]
+    return np.max([part.pose_error for part in followed], axis=0).tolist()  # type: ignore[no-any-return]
 
 
 def _check_reach(asked: Asked, followed: list[LocalMotion]) -> None:
@@ -266,7 +276,7 @@ def _check_reach(asked: Asked, followed: list[LocalMotion]) -> None:
         ]
         if not poses:
             continue
-        lost = np.unique(part.lost_at[part.misfit > OUT_OF_REACH])
+        lost = np.unique(part.worst_time[part.pose_error > OUT_OF_REACH])
         for time in lost.tolist():
             near = part.joints[:, int(np.searchsorted(part.t, time))]
             try:

@@ -103,8 +103,8 @@ class Held(TaskEquations):
     def error(self, base: Any, joints: Any, targets: Any) -> Any:
         return ca.vertcat(super().error(base, joints, targets), self._rows(joints, targets))
 
-    def misfit(self, base: Any, joints: Any, targets: Any) -> Any:
-        return ca.vertcat(super().misfit(base, joints, targets), self._rows(joints, targets))
+    def pose_residual(self, base: Any, joints: Any, targets: Any) -> Any:
+        return ca.vertcat(super().pose_residual(base, joints, targets), self._rows(joints, targets))
 
     def jacobian(self, base: Any, joints: Any) -> Any:
         rows = ca.DM.eye(self.machine.joint_size)[list(self.held), :]

@@ -23,7 +23,13 @@ from numpy.typing import NDArray
 from models import FreeFloating, Machine, center_of_mass
 from models.arrays import Array
 from models.spatial import rotation, rotation_from_quaternion
-from ocp.motion.local.inverse_kinematics import Unreachable, as_pose, gauss_newton, starts_of, unreachable
+from ocp.motion.local.inverse_kinematics import (
+    Unreachable,
+    equivalent_pose,
+    gauss_newton,
+    start_configurations,
+    unreachable_error,
+)
 from ocp.motion.search.joint_space import TOLERANCE
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.tip_task import TipTask
@@ -122,7 +128,7 @@ class ReducedKinematics:
             least = ROUNDING_SHARE * np.abs(lower).max(axis=(1, 2)) + np.finfo(float).tiny
             lower[:, i, i] = np.where(np.abs(lower[:, i, i]) < least, least, lower[:, i, i])
         if self.equations is not None:
-            error = np.where(self.equations.posed, error, 0.0)
+            error = np.where(self.equations.pose_rows, error, 0.0)
         return Slopes(right, error, turning, drift, whole[:, :, : self.rows], lower, whole[:, :, self.rows :])
 
     def speed(self, base: Array, joints: Array, time: float) -> Array:
@@ -138,9 +144,9 @@ class ReducedKinematics:
     def missed(self, base: Array, joints: Array, rates: Array, time: float) -> tuple[Array, Array]:
         """How fast joint rates (K, n) move tips off what velocities ask for, and how fast these are. Shapes (K,)."""
         none = np.zeros(len(joints))
-        if self.equations is None or self.equations.posed.all():
+        if self.equations is None or self.equations.pose_rows.all():
             return none, none
-        slopes, rows = self.at(base, joints, time), ~self.equations.posed
+        slopes, rows = self.at(base, joints, time), ~self.equations.pose_rows
         return np.linalg.norm((slopes.given(rates * self.root) - slopes.right)[:, rows], axis=1), np.linalg.norm(
             slopes.right[:, rows], axis=1
         )
@@ -158,7 +164,7 @@ class ReducedKinematics:
         middle = self.at(_sound(half), joints + step / 2 * rates / self.root, begin + step / 2)
         rates = middle.least(middle.right) + middle.idle(slopes.idle(rates))
         base, joints = _sound(base + step * (middle.moved(rates) + middle.drift)), joints + step * rates / self.root
-        if self.equations is None or self.equations.posed.all():
+        if self.equations is None or self.equations.pose_rows.all():
             return self.corrected(base, joints, end, exact)
 
         def missed(there: Slopes, joints: Array) -> Array:
@@ -185,12 +191,14 @@ class ReducedKinematics:
             missed: Of slopes and joints there what velocities ask for and was not done, in all rows. Shape (K, m).
         """
         off = np.zeros(len(joints))
-        if self.equations is None or (missed is None and not self.equations.posed.any()):
+        if self.equations is None or (missed is None and not self.equations.pose_rows.any()):
             return base, joints, off
         for number in range(most + 1):
             slopes = self.at(base, joints, time)
             error = (
-                slopes.error if missed is None else np.where(self.equations.posed, slopes.error, missed(slopes, joints))
+                slopes.error
+                if missed is None
+                else np.where(self.equations.pose_rows, slopes.error, missed(slopes, joints))
             )
             off = np.abs(error).max(axis=1)
             off = np.where(np.isfinite(off), off, np.inf)
@@ -282,7 +290,7 @@ def check_floating_reach(
     n, turns = machine.joint_size, 1 if machine.base_size == 3 else 4
     rng = np.random.default_rng(seed)
     attitudes = rng.normal(size=(STARTS, 4)) if turns == 4 else rng.uniform(-np.pi, np.pi, (STARTS, 1))
-    starts = np.hstack([starts_of(machine, lower, upper, STARTS, None, seed), attitudes])
+    starts = np.hstack([start_configurations(machine, lower, upper, STARTS, None, seed), attitudes])
     free = np.full(turns, np.inf)
     limits = np.concatenate([lower, -free]), np.concatenate([upper, free])
     known = np.zeros((0, n + turns))  # where the poses of the time before were met
@@ -293,14 +301,14 @@ def check_floating_reach(
         poses = []
         for task in tasks:
             if task.begin <= time <= task.end and (task.is_pose or not task.begin):
-                pose = as_pose(machine, task, start, time, base)
+                pose = equivalent_pose(machine, task, start, time, base)
                 poses += [] if pose is None else [pose]
         if not poses:
             return None
         equations = bind(machine, poses)
         targets = np.array(equations.target_function()(time)).ravel()
         z = ca.SX.sym("z", n + turns)
-        misfit = equations.misfit(_placed(machine, base, start, z, time), z[:n], ca.SX(ca.DM(targets)))
+        misfit = equations.pose_residual(_placed(machine, base, start, z, time), z[:n], ca.SX(ca.DM(targets)))
         function = ca.Function("misfit", [z], [misfit, ca.densify(ca.jacobian(misfit, z))], {"cse": True})
         found, off = gauss_newton(function, np.vstack([known, starts]), *limits, PLACE_TOLERANCE, 100)
         good = off <= PLACE_TOLERANCE
@@ -308,7 +316,7 @@ def check_floating_reach(
             known = found[good][:STARTS]
             return None
         best = int(off.argmin())
-        return unreachable(machine, equations, found[best, :n], float(off[best]), lower, upper)
+        return unreachable_error(equations, found[best, :n], float(off[best]), lower, upper)
 
     reached = begin
     for time in np.linspace(begin, end, looks).tolist():

@@ -87,7 +87,7 @@ class TaskSearch:
         for stretch, part in zip(asked.stretches, followed, strict=True):
             if (equations := stretch.equations) is None:
                 continue
-            if not equations.posed.all():
+            if not equations.pose_rows.all():
                 words = "search='global' needs poses, and a task gives velocities; say where its tip is: position=..."
                 raise ProblemError(words, name="search", value="global", time=stretch.begin)
             size = machine.joint_size - equations.size - len(self._held)

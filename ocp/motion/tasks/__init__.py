@@ -1,1 +1,1 @@
-"""What a machine is asked to do: frames and their poses or twists over time, where a standing machine's weight is."""
+"""Tip tasks of a machine: targets over time, their equations and checks, and rules of the zero moment point."""

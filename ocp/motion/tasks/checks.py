@@ -1,4 +1,4 @@
-"""Checks of tasks against a machine and a start, before anything is solved: for builders and local resolution alike."""
+"""Checks of tasks against a machine and a start configuration, before anything is solved."""
 
 from __future__ import annotations
 
@@ -12,41 +12,30 @@ from numpy.typing import NDArray
 
 from models import Joint, Machine
 from models.arrays import Array, warn_of_degrees
-from ocp.errors import NOT_NUMBERS, ProblemError, floats, format_distinct, real
+from ocp.errors import NOT_NUMBERS, ProblemError, checked_positive, floats, format_distinct
 from ocp.motion.tasks.equations import TaskEquations
-from ocp.motion.tasks.geometry import Bound, is_holonomic, target_size
+from ocp.motion.tasks.geometry import BoundTask, is_holonomic, target_size
 from ocp.motion.tasks.tip_task import ANGULAR, TipTask
 
 __all__ = [
-    "check_closed",
-    "check_length",
-    "check_rest",
-    "check_speed",
-    "checked_configuration",
-    "checked_horizon",
-    "checked_numbers",
-    "checked_tasks",
-    "checked_weights",
-    "dependent_rows",
-    "horizon_of",
-    "ignorable_joints",
-    "inside_limits",
-    "rates_at_rest",
-]
+    "check_closed", "check_length", "check_rest", "check_speed", "checked_configuration", "checked_horizon",
+    "checked_numbers", "checked_tasks", "checked_weights", "clip_to_limits", "dependent_rows", "horizon_of",
+    "ignorable_joints", "rates_at_rest",
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
 class CheckSettings:
-    """How finely tasks are looked at before anything is solved, and what counts as nothing.
+    """Sampling and tolerances of the checks of tasks.
 
     Attributes:
-        track_samples: Of a track.
-        closure_samples: Of a closed track: an odd number, for Simpson's rule.
+        track_samples: Samples of a track.
+        closure_samples: Samples of a closed track: an odd number, for Simpson's rule.
         closed: Largest gap of a closed path, m and rad.
-        ignorable: Relative change below which a joint changes nothing.
-        ignorable_samples: Random configurations in which that is looked at.
-        rounding: rad or m, of a joint with a limit below 1, else of its limit: how far beyond it rounding may have it.
-        still: Largest velocity asked for where the joints are to rest, m/s and rad/s.
+        ignorable: Relative change below which a joint counts as without effect.
+        ignorable_samples: Random configurations in which that is evaluated.
+        rounding: Relative tolerance of a joint limit, absolute (rad or m) for limits below 1.
+        still: Largest task velocity where the joints are to be at rest, m/s and rad/s.
     """
 
     track_samples: int = 201
@@ -62,34 +51,30 @@ CHECKS = CheckSettings()
 
 
 def checked_horizon(horizon: Any) -> float:
-    """The horizon; ProblemError unless it is a positive, finite number."""
-    duration = real(horizon)
-    if not 0 < duration < np.inf:
-        words = f"horizon must be a positive number of seconds, not {horizon!r}"
-        raise ProblemError(words, name="horizon", value=horizon, limit=0.0)
-    return duration
+    """Return the horizon; ProblemError unless it is a positive, finite number."""
+    return float(checked_positive("horizon", horizon))
 
 
 def horizon_of(tasks: Sequence[TipTask], horizon: Any) -> float:
-    """The horizon, s, or where it is None the time at which the last task ends.
+    """Return the horizon, s; None stands for the time at which the last task ends.
 
     Raises:
-        ProblemError: None is given, and no task says how long it lasts; not a positive number.
+        ProblemError: The horizon is not positive, or it is None and no task has a duration.
     """
     if horizon is None:
         ends = [task.end for task in tasks if task.duration is not None]
         if not ends:
-            words = "horizon is missing: no task says how long it lasts; give horizon=... in s"
+            words = "horizon is missing: no task has a duration; give horizon=... in s"
             raise ProblemError(words, name="horizon")
         horizon = max(ends)
     return checked_horizon(horizon)
 
 
 def checked_configuration(machine: Machine, joints: Any, base: Any) -> tuple[Array, Array]:
-    """Joints (joint_size,) and base (base_size,) at the start; the machine's base_home() if None.
+    """Return joints (joint_size,) and base (base_size,) at the start; the machine's base_home() if the base is None.
 
     Raises:
-        ProblemError: Wrong sizes, not finite; a quaternion that is not of unit length.
+        ProblemError: Wrong sizes, a value that is not finite, or a quaternion that is not of unit length.
 
     Warns:
         ModelWarning: Angles that look like degrees.
@@ -97,45 +82,49 @@ def checked_configuration(machine: Machine, joints: Any, base: Any) -> tuple[Arr
     if joints is None:
         words = "start_joints are missing; inverse_kinematics(machine, task) finds some for a pose"
         raise ProblemError(words, name="start_joints")
-    angles = checked_numbers(joints, machine.joint_size, "start_joints", "one entry for each joint")
-    for joint, angle in zip(machine.robot.moving_joints, angles, strict=True):
+    positions = checked_numbers(joints, machine.joint_size, "start_joints", "one entry for each joint")
+    for joint, angle in zip(machine.robot.moving_joints, positions, strict=True):
         if joint.kind != "prismatic":
             warn_of_degrees(angle, "start_joints", joint.name, f"joint {joint.name!r} at")
     home = machine.base_home() if base is None else base
-    place = checked_numbers(home, machine.base_size, "start_base", "the machine's base configuration")
-    if machine.base_size == 7 and abs(np.linalg.norm(place[3:]) - 1) > 1e-9:
-        words = f"start_base has the quaternion {place[3:].tolist()}, which is not of unit length"
-        raise ProblemError(words, name="start_base", value=place[3:])
-    return angles, place
+    base_values = checked_numbers(home, machine.base_size, "start_base", "the machine's base configuration")
+    if machine.base_size == 7 and abs(np.linalg.norm(base_values[3:]) - 1) > 1e-9:
+        words = f"start_base has the quaternion {base_values[3:].tolist()}, which is not of unit length"
+        raise ProblemError(words, name="start_base", value=base_values[3:])
+    return positions, base_values
 
 
-def inside_limits(what: str, names: Sequence[str], joints: Array, lower: Array, upper: Array, hint: str) -> Array:
-    """Joints at an end, nan where they are free, moved onto the limits that rounding has them beyond. Shape (n,).
+def clip_to_limits(what: str, names: Sequence[str], joints: Array, lower: Array, upper: Array, hint: str) -> Array:
+    """Return joints at an end of a motion, nan where free, with rounding errors beyond the limits clipped. Shape (n,).
+
+    Args:
+        what: Name of the joints in errors, for example "end_joints".
+        hint: End of the error message: what to do.
 
     Raises:
-        ProblemError: A joint farther outside its limits; ends with a hint what to do.
+        ProblemError: A joint is outside its limits by more than rounding.
     """
     for name, value, low, high in zip(names, joints.tolist(), lower.tolist(), upper.tolist(), strict=True):
         if value < low - CHECKS.rounding * max(1.0, abs(low)) or value > high + CHECKS.rounding * max(1.0, abs(high)):
-            at, least, most = format_distinct(value, low, high)
+            at, least, greatest = format_distinct(value, low, high)
             verb = "ends" if what.startswith("end") else "starts"
-            words = f"{what}: {name!r} {verb} at {at}, outside its limits {least} .. {most}; {hint}"
+            words = f"{what}: {name!r} {verb} at {at}, outside its limits {least} .. {greatest}; {hint}"
             raise ProblemError(words, name=name, value=value, limit=(low, high))
     return np.clip(joints, lower, upper)
 
 
 def checked_weights(weights: Any, size: int) -> Array:
-    """Weights of the squared joint rates, ones if None; ProblemError unless they are positive. Shape (size,)."""
+    """Return weights of the squared joint rates, ones if None; ProblemError unless all are positive. Shape (size,)."""
     if weights is None:
         return np.ones(size)
-    given = checked_numbers(weights, size, "weights", "one for each joint")
-    if not (given > 0).all():
-        raise ProblemError(f"weights {given.tolist()} must be positive", name="weights", value=given, limit=0.0)
-    return given
+    array = checked_numbers(weights, size, "weights", "one for each joint")
+    if not (array > 0).all():
+        raise ProblemError(f"weights {array.tolist()} must be positive", name="weights", value=array, limit=0.0)
+    return array
 
 
 def checked_numbers(value: Any, size: int, what: str, meaning: str) -> Array:
-    """Finite numbers as a flat array; ProblemError, with their name and meaning, unless there are `size` of them."""
+    """Return `size` finite numbers as a flat array; ProblemError with name and meaning if they are not."""
     try:
         array = floats(value).ravel()
     except NOT_NUMBERS as error:
@@ -149,15 +138,17 @@ def checked_numbers(value: Any, size: int, what: str, meaning: str) -> Array:
 
 
 def checked_tasks(equations: TaskEquations, base: Array, joints: Array, horizon: float, *, start: bool = True) -> None:
-    """Raise ProblemError where tasks ask for what no joint moves, what cannot be asked at once, or a jump at the start.
+    """Raise ProblemError if tasks prescribe motions that the machine cannot make, or a jump at the start.
 
     Args:
-        horizon: Where the tasks end, s; 1 for those of a path parameter.
+        equations: Equations of the tasks.
+        base, joints: Start configuration.
+        horizon: End of the tasks, s; 1 for tasks of a path parameter.
         start: Whether the pose at the start is checked.
     """
-    place, q = ca.SX.sym("base", len(base)), ca.SX.sym("joints", len(joints))
+    b, q = ca.SX.sym("base", len(base)), ca.SX.sym("joints", len(joints))
     rows = _rows_by_name(equations)
-    jacobian = equations.jacobian(place, q)
+    jacobian = equations.jacobian(b, q)
     if equations.size > len(joints):
         words = f"the task fixes {equations.size} rows {rows} but the machine has only {len(joints)} joints"
         raise ProblemError(words, name="rows", value=equations.size, limit=len(joints))
@@ -165,13 +156,13 @@ def checked_tasks(equations: TaskEquations, base: Array, joints: Array, horizon:
     if unmoved:
         words = f"rows {rows}: no joint moves the tip in rows {unmoved}; leave them out of the task"
         raise ProblemError(words, name="rows", value=unmoved)
-    numeric = ca.Function("jacobian", [place, q], [jacobian])
+    numeric = ca.Function("jacobian", [b, q], [jacobian])
     rng = np.random.default_rng(0)
-    places = [joints, *rng.normal(size=(5, len(joints)))]
-    if not any(_has_full_rank(np.array(numeric(base, at))) for at in places):
+    configurations = [joints, *rng.normal(size=(5, len(joints)))]
+    if not any(_has_full_rank(np.array(numeric(base, at))) for at in configurations):
         words = (
-            f"the {equations.size} rows of the task are linearly dependent in every configuration tried: they ask for "
-            "the same motion twice or for more than the machine can do; leave out rows"
+            f"the {equations.size} rows of the task are linearly dependent in every configuration tried: they "
+            "prescribe a motion twice or one that the machine cannot make; leave out rows"
         )
         raise ProblemError(words, name="rows", value=rows)
     if not any(part.task.is_pose for part in equations.bound):
@@ -187,8 +178,8 @@ def checked_tasks(equations: TaskEquations, base: Array, joints: Array, horizon:
             if not part.task.is_pose:
                 continue
             alone = TaskEquations(equations.machine, (part,))
-            misfit = np.array(alone.misfit(base, joints, alone.target_function()(0.0)))
-            gap = float(np.abs(misfit).max())
+            residual = np.array(alone.pose_residual(base, joints, alone.target_function()(0.0)))
+            gap = float(np.abs(residual).max())
             if gap > part.task.start_gap:
                 words = (
                     f"at the start joints {joints.tolist()} the frame of {_frame(part)!r} is {gap:.3g} (m or rad) away "
@@ -199,7 +190,7 @@ def checked_tasks(equations: TaskEquations, base: Array, joints: Array, horizon:
 
 
 def dependent_rows(equations: TaskEquations, base: Array, joints: Array) -> str | None:
-    """The task's name where its rows are linearly dependent there, to rounding; None where they are not."""
+    """Return a name of the task if its rows are linearly dependent there, to rounding, else None."""
     if not equations.size:
         return None
     values = np.linalg.svd(np.array(ca.DM(equations.jacobian(base, joints))), compute_uv=False)
@@ -207,94 +198,100 @@ def dependent_rows(equations: TaskEquations, base: Array, joints: Array) -> str 
 
 
 def ignorable_joints(equations: TaskEquations, base: Array) -> NDArray[np.bool_]:
-    """Which joints may be anywhere without anything changing that tasks and base ask of the joint rates. Shape (n,).
+    """Return which joints have no effect on what tasks and base require of the joint rates. Shape (n,).
 
-    Judged in random configurations, to rounding: by the rates that do the tasks, by those that are left free, by how
-    all of them move the base, and by how tool axes lean.
+    Evaluated to rounding in random configurations: the rates that do the tasks, the null space, the motion of the base,
+    and the cones of tool axes do not depend on such a joint.
     """
     machine, rng, n = equations.machine, np.random.default_rng(0), equations.machine.joint_size
     b, q, u = (ca.SX.sym("v", size) for size in (machine.base_size, n, n))
-    targets = ca.SX.sym("targets", sum(target_size(part.task) for part in equations.bound))
+    targets = ca.SX.sym("targets", sum(target_size(value.task) for value in equations.bound))
     parts = [equations.jacobian(b, q), equations.right(b, q, targets)]
-    parts += [machine.base_rate(b, q, u), equations.leans(b, q, targets)]
-    function = ca.Function("asked", [b, q, u, targets], parts, {"cse": True})
-    at_zero = np.array(equations.target_function()(0.0)).ravel()
-    found = np.ones(n, dtype=bool)
+    parts += [machine.base_rate(b, q, u), equations.cone_cosines(b, q, targets)]
+    function = ca.Function("requirements", [b, q, u, targets], parts, {"cse": True})
+    start = np.array(equations.target_function()(0.0)).ravel()
+    ignorable = np.ones(n, dtype=bool)
     for _ in range(CHECKS.ignorable_samples):
-        rates, places = rng.normal(size=n), np.tile(rng.normal(size=n), (n + 1, 1))
-        places[np.arange(n), np.arange(n)] += rng.normal(size=n)
-        seen = []
-        for at in places:
-            jacobian, right, base_rate, lean = (np.array(part) for part in function(base, at, rates, at_zero))
+        rates, configurations = rng.normal(size=n), np.tile(rng.normal(size=n), (n + 1, 1))
+        configurations[np.arange(n), np.arange(n)] += rng.normal(size=n)
+        effect = []
+        for at in configurations:
+            jacobian, right, base_rate, lean = (np.array(value) for value in function(base, at, rates, start))
             inverse = np.linalg.pinv(jacobian, rcond=1e-10)
-            seen.append(np.concatenate([np.ravel(v) for v in (inverse @ jacobian, inverse @ right, base_rate, lean)]))
-        changes = np.abs(np.array(seen[:-1]) - seen[-1]).max(axis=1, initial=0.0)
-        found &= changes <= CHECKS.ignorable * (1 + np.abs(seen[-1]).max(initial=0.0))
-    return found
+            effect.append(np.concatenate([np.ravel(v) for v in (inverse @ jacobian, inverse @ right, base_rate, lean)]))
+        changes = np.abs(np.array(effect[:-1]) - effect[-1]).max(axis=1, initial=0.0)
+        ignorable &= changes <= CHECKS.ignorable * (1 + np.abs(effect[-1]).max(initial=0.0))
+    return ignorable
 
 
 def _rows_by_name(equations: TaskEquations) -> list[int]:
-    """The twist rows of a single task; else the numbers of the stacked rows."""
-    alone = equations.bound[0].task
-    if len(equations.bound) == 1 and not alone.tilts:
-        return list(alone.chosen)
+    """Return the twist rows of a single task, else the numbers of the stacked rows."""
+    first = equations.bound[0].task
+    if len(equations.bound) == 1 and not first.tilts:
+        return list(first.chosen)
     return list(range(equations.size))
 
 
-def _frame(part: Bound) -> str:
-    """The name of the link that a task moves."""
+def _frame(part: BoundTask) -> str:
+    """Return the name of the link that a task moves."""
     return part.task.link or part.tip.robot.tip_link
 
 
 def _sampled(equations: TaskEquations, horizon: float, count: int) -> tuple[Array, Array]:
-    """Equal times (count,) and the targets there, one column each."""
+    """Return equidistant times (count,) and the targets there, one column each."""
     times = np.linspace(0.0, horizon, count)
     return times, np.array(equations.target_function().map(count)(times[None, :]))
 
 
-def _parts(equations: TaskEquations, values: Array) -> list[tuple[Bound, Array]]:
-    """Each task with its rows of the targets."""
+def _parts(equations: TaskEquations, values: Array) -> list[tuple[BoundTask, Array]]:
+    """Return each task with its rows of the targets."""
     ends = np.cumsum([target_size(part.task) for part in equations.bound])
     return list(zip(equations.bound, np.split(values, ends[:-1]), strict=True))
 
 
 def _check_rotations(equations: TaskEquations, values: Array, times: Array) -> None:
-    for part, mine in _parts(equations, values):
+    """Raise ProblemError if an orientation is not a rotation."""
+    for part, targets in _parts(equations, values):
         if part.task.orientation is not None:
-            turn = mine[-12:-3].T.reshape(-1, 3, 3)
-            wrong = np.abs(turn @ turn.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2)) > 1e-6
-            wrong |= np.linalg.det(turn) < 0
-            if wrong.any():
-                time, found = float(times[wrong][0]), turn[wrong][0].T
-                words = f"orientation is no rotation at {time:g} s: {found.tolist()}"
-                raise ProblemError(words, name="orientation", value=found, time=time)
+            rotations = targets[-12:-3].T.reshape(-1, 3, 3)
+            invalid = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2)) > 1e-6
+            invalid |= np.linalg.det(rotations) < 0
+            if invalid.any():
+                time, matrix = float(times[invalid][0]), rotations[invalid][0].T
+                words = f"orientation is not a rotation at {time:g} s: {matrix.tolist()}"
+                raise ProblemError(words, name="orientation", value=matrix, time=time)
 
 
 def _has_full_rank(jacobian: Array) -> bool:
-    if not jacobian.size:  # axes that lean alone
+    """Return whether the rows of a Jacobian are linearly independent."""
+    if not jacobian.size:  # tasks of cones alone
         return True
     values = np.linalg.svd(jacobian, compute_uv=False)
     return bool(np.isfinite(values).all() and values[-1] > 1e-9 * values[0])
 
 
 def check_closed(equations: TaskEquations, horizon: float) -> None:
-    """Raise ProblemError where a task does not end where it began, as far as that does not depend on the way.
+    """Raise ProblemError if a task does not return to its start, as far as that does not depend on the path.
 
-    Poses by their targets, velocities by their integrals.
+    Poses are checked by their targets, velocities by their integrals.
     """
     times, values = _sampled(equations, horizon, CHECKS.closure_samples)
-    for part, mine in _parts(equations, values):
+    for part, targets in _parts(equations, values):
         task = part.task
         if task.is_pose:
-            gap = np.abs(np.delete(mine[:, -1] - mine[:, 0], _rate_rows(task))).max()
+            gap = np.abs(np.delete(targets[:, -1] - targets[:, 0], _rate_rows(task))).max()
         else:
-            closes = is_holonomic(part)
-            none = np.zeros(CHECKS.closure_samples)
-            whole = [mine[list(task.chosen).index(row)] if row in task.chosen else none for row in ANGULAR]
-            linear = [i for i, row in enumerate(task.chosen) if row not in ANGULAR and closes[i]]
-            moved = _integral(mine[linear], times[1])
-            turned = _turn(np.array(whole), times[1]) if closes[[row in ANGULAR for row in task.chosen]].any() else 0.0
-            gap = max(float(np.abs(moved).max(initial=0.0)), turned)
+            holonomic = is_holonomic(part)
+            zeros = np.zeros(CHECKS.closure_samples)
+            angular = [targets[list(task.chosen).index(row)] if row in task.chosen else zeros for row in ANGULAR]
+            linear = [i for i, row in enumerate(task.chosen) if row not in ANGULAR and holonomic[i]]
+            displacement = _integral(targets[linear], times[1])
+            rotation = (
+                _rotation_angle(np.array(angular), times[1])
+                if holonomic[[row in ANGULAR for row in task.chosen]].any()
+                else 0.0
+            )
+            gap = max(float(np.abs(displacement).max(initial=0.0)), rotation)
         if gap > CHECKS.closed:
             words = (
                 f"cyclic: the task of {_frame(part)!r} is not closed: it ends {gap:.3g} (m or rad) "
@@ -304,168 +301,162 @@ def check_closed(equations: TaskEquations, horizon: float) -> None:
 
 
 def check_rest(equations: TaskEquations, *times: float | None) -> None:
-    """Raise ProblemError where a task moves at a time at which the joints are to rest; None: no time."""
+    """Raise ProblemError if a task moves at one of the times at which the joints are to be at rest; None is skipped."""
     targets = equations.target_function()
     for time in times:
         if time is None:
             continue
-        for part, mine in _parts(equations, np.array(targets(time)).ravel()):
-            asked = mine[_rate_rows(part.task)] if part.task.is_pose else mine
-            if np.linalg.norm(asked) > CHECKS.still:
+        for part, values in _parts(equations, np.array(targets(time)).ravel()):
+            velocity = values[_rate_rows(part.task)] if part.task.is_pose else values
+            if np.linalg.norm(velocity) > CHECKS.still:
                 words = (
-                    f"the task of {_frame(part)!r} moves at {asked.tolist()} (m/s or rad/s) at {time:g} s, where the "
-                    "joints are to be at rest; let it come to rest there, or say 'free' for that end"
+                    f"the task of {_frame(part)!r} moves at {velocity.tolist()} (m/s or rad/s) at {time:g} s, where "
+                    "the joints are to be at rest; let it come to rest there, or say 'free' for that end"
                 )
-                raise ProblemError(words, name=_frame(part), value=asked, limit=CHECKS.still, time=float(time))
+                raise ProblemError(words, name=_frame(part), value=velocity, limit=CHECKS.still, time=float(time))
 
 
 def check_length(equations: TaskEquations, base: Array, horizon: float) -> None:
-    """Raise ProblemError where positions in world are further from the first joint than the arm is long."""
+    """Raise ProblemError if target positions in the world are further from the first joint than the arm is long."""
     for part in equations.bound:
         task = part.task
         if task.position is None or task.axes != "world" or task.relative_to is not None or part.tip.base_size:
             continue
         times, values = _sampled(TaskEquations(equations.machine, (part,)), horizon, CHECKS.track_samples)
-        wanted = values[task.linear].T
-        shoulder, reach = _reach(part.tip, base)
-        far = np.linalg.norm(wanted - shoulder[task.linear], axis=1)
+        positions = values[task.linear].T
+        shoulder, reach = _shoulder_and_reach(part.tip, base)
+        far = np.linalg.norm(positions - shoulder[task.linear], axis=1)
         worst = int(far.argmax())
         if far[worst] > reach:
             words = (
                 f"the task of {_frame(part)!r} leads {far[worst]:.4g} m away from the first joint at "
-                f"{times[worst]:.4g}, to {wanted[worst].tolist()} m, but the arm is at most {reach:.4g} m long"
+                f"{times[worst]:.4g}, to {positions[worst].tolist()} m, but the arm is at most {reach:.4g} m long"
             )
             raise ProblemError(words, name=_frame(part), value=float(far[worst]), limit=reach, time=float(times[worst]))
 
 
-def check_speed(equations: TaskEquations, most: Array, begin: float, end: float) -> None:
-    """Raise ProblemError where a task is faster than its joints at their limits could move the tip in any posture.
+def check_speed(equations: TaskEquations, rate_limits: Array, begin: float, end: float) -> None:
+    """Raise ProblemError if a task is faster than joints at their rate limits can move the tip in any configuration.
 
-    A joint that turns moves the tip by its rate times the distance, at most the length of the links from its axis on.
+    A revolute joint moves the tip at most by its rate times the length of the links from its axis to the tip.
 
     Args:
-        equations: Of a fixed base; others are not looked at.
-        most: Limits of the joint rates, rad/s or m/s, shape (n,). begin, end: Of the tasks, s.
+        equations: Equations of the tasks; those on a floating base are not checked.
+        rate_limits: Limits of the joint rates, rad/s or m/s. Shape (n,).
+        begin, end: Time interval of the tasks, s.
     """
     times = np.linspace(begin, end, CHECKS.track_samples)[1:-1]
     values = np.array(equations.target_function().map(len(times))(times[None, :]))
-    for part, mine in _parts(equations, values):
+    for part, targets in _parts(equations, values):
         chain = [joint for joint in part.tip.robot.path_to(part.tip.robot.tip_link) if joint.moves]
-        task, moving = part.task, any(joint.mimic is not None for joint in chain)
-        if part.tip.base_size or part.reference or task.axes != "world" or moving or task.start_gap > CHECKS.closed:
+        task, coupled = part.task, any(joint.mimic is not None for joint in chain)
+        if part.tip.base_size or part.reference or task.axes != "world" or coupled or task.start_gap > CHECKS.closed:
             continue
-        for asked, limit, unit in zip(
-            _speeds(task, mine), _fastest(part.tip, chain, most), ("m/s", "rad/s"), strict=True
+        for speeds, limit, unit in zip(
+            _task_speeds(task, targets), _max_tip_speeds(part.tip, chain, rate_limits), ("m/s", "rad/s"), strict=True
         ):
-            worst = int(asked.argmax())
-            if asked[worst] > limit * (1 + CHECKS.closed):
+            worst = int(speeds.argmax())
+            if speeds[worst] > limit * (1 + CHECKS.closed):
                 words = (
-                    f"at {times[worst]:.4g} s the task of {_frame(part)!r} asks for {asked[worst]:.4g} {unit}, "
+                    f"at {times[worst]:.4g} s the task of {_frame(part)!r} asks for {speeds[worst]:.4g} {unit}, "
                     f"but joints at the limits of their rates move it at {limit:.4g} {unit} at most; run it slower"
                 )
-                told: dict[str, Any] = {"value": float(asked[worst]), "limit": limit, "time": float(times[worst])}
-                raise ProblemError(words, name=_frame(part), **told)
+                details: dict[str, Any] = {"value": float(speeds[worst]), "limit": limit, "time": float(times[worst])}
+                raise ProblemError(words, name=_frame(part), **details)
 
 
-def _fastest(machine: Machine, chain: Sequence[Joint], most: Array) -> tuple[float, float]:
-    """How fast joints at their limits (n,) move the tip, m/s, and turn it, rad/s, at most."""
-    moved, turned = 0.0, 0.0
+def _max_tip_speeds(machine: Machine, chain: Sequence[Joint], rate_limits: Array) -> tuple[float, float]:
+    """Return the largest speed, m/s, and angular speed, rad/s, of the tip with joints at their rate limits (n,)."""
+    linear, angular = 0.0, 0.0
+    whole = machine.robot.path_to(machine.robot.tip_link)
+    after = {joint.name: whole[i + 1 :] for i, joint in enumerate(whole)}
     for joint in chain:
-        rate, turns = float(most[machine.robot.joint_names.index(joint.name)]), joint.kind != "prismatic"
-        moved += rate * (_length_from(machine, joint) if turns else 1.0)
-        turned += rate if turns else 0.0
-    return moved, turned
+        rate, revolute = float(rate_limits[machine.robot.joint_names.index(joint.name)]), joint.kind != "prismatic"
+        linear += rate * (_chain_length(machine, after[joint.name]) if revolute else 1.0)
+        angular += rate if revolute else 0.0
+    return linear, angular
 
 
-def _speeds(task: TipTask, targets: Array) -> tuple[Array, Array]:
-    """How fast a task moves and turns its tip in its rows. Shape (M,) each, m/s and rad/s."""
-    turned = [row for row in task.chosen if row in ANGULAR]
+def _task_speeds(task: TipTask, targets: Array) -> tuple[Array, Array]:
+    """Return the speed and angular speed of a task in its rows, m/s and rad/s. Shape (M,) each."""
+    angular_rows = [row for row in task.chosen if row in ANGULAR]
     if task.is_pose:
-        spins = targets[-3:] if task.tilts else targets[-3:][turned]
-        way = targets[3:6][task.linear] if task.position is not None else targets[:0]
+        angular = targets[-3:] if task.tilts else targets[-3:][angular_rows]
+        linear = targets[3:6][task.linear] if task.position is not None else targets[:0]
     else:
-        at = {row: targets[i] for i, row in enumerate(task.chosen)}
-        none = np.zeros((0, targets.shape[1]))
-        way, spins = (
-            np.array([at[row] for row in at if (row in ANGULAR) == angular]).reshape(-1, none.shape[1])
-            for angular in (False, True)
+        by_row = {row: targets[i] for i, row in enumerate(task.chosen)}
+        linear, angular = (
+            np.array([by_row[row] for row in by_row if (row in ANGULAR) == is_angular]).reshape(-1, targets.shape[1])
+            for is_angular in (False, True)
         )
-    return np.linalg.norm(way, axis=0), np.linalg.norm(spins, axis=0)
+    return np.linalg.norm(linear, axis=0), np.linalg.norm(angular, axis=0)
 
 
-def _length_from(machine: Machine, joint: Joint) -> float:
-    """How far the tip can be from a joint's axis at most, m."""
-    robot = machine.robot
-    chain = robot.path_to(robot.tip_link)
-    after = chain[[other.name for other in chain].index(joint.name) + 1 :]
-    return _length(machine, after)
-
-
-def _length(machine: Machine, joints: Sequence[Joint]) -> float:
-    """Of the way along joints to the tip, m: links, and slides where they are longest."""
+def _chain_length(machine: Machine, joints: Sequence[Joint]) -> float:
+    """Return the length of a chain of joints to the tip, m: its links, and its slides at their longest."""
     length = float(np.linalg.norm(machine.robot.tip_translation))
     length += sum(float(np.linalg.norm(joint.translation)) for joint in joints)
     return length + sum(max(abs(joint.lower), abs(joint.upper)) for joint in joints if joint.kind == "prismatic")
 
 
-def _reach(machine: Machine, base: Array) -> tuple[Array, float]:
-    """Where the first moving joint stands in the world, (3,), and how far from there the tip can be at most."""
+def _shoulder_and_reach(machine: Machine, base: Array) -> tuple[Array, float]:
+    """Return the position of the first moving joint in the world, (3,), and the largest distance of the tip from it."""
     robot = machine.robot
     chain = robot.path_to(robot.tip_link)
     first = next((i for i, joint in enumerate(chain) if joint.moves), len(chain) - 1)
     frame = machine.world_from_base(base)
-    turn, shoulder = np.array(ca.DM(frame.rotation)), np.array(ca.DM(frame.position)).ravel()
+    rotation, shoulder = np.array(ca.DM(frame.rotation)), np.array(ca.DM(frame.position)).ravel()
     for joint in chain[: first + 1]:
-        shoulder, turn = shoulder + turn @ joint.translation, turn @ joint.rotation
+        shoulder, rotation = shoulder + rotation @ joint.translation, rotation @ joint.rotation
     slides = [joint for joint in chain[: first + 1] if joint.kind == "prismatic"]
-    before = sum(max(abs(joint.lower), abs(joint.upper)) for joint in slides)
-    return shoulder, before + _length(machine, chain[first + 1 :])
+    slide_length = sum(max(abs(joint.lower), abs(joint.upper)) for joint in slides)
+    return shoulder, slide_length + _chain_length(machine, chain[first + 1 :])
 
 
 def _rate_rows(task: TipTask) -> list[int]:
-    """Which entries of a pose task's targets are velocities."""
-    kinds = [(task.position, [3, 4, 5], 6), (task.orientation, [9, 10, 11], 12), (task.direction, [3, 4, 5], 6)]
+    """Return which entries of a pose task's targets are velocities."""
+    tracks = [(task.position, [3, 4, 5], 6), (task.orientation, [9, 10, 11], 12), (task.direction, [3, 4, 5], 6)]
     rows, at = [], 0
-    for track, mine, size in kinds:
+    for track, entries, size in tracks:
         if track is not None:
-            rows += [at + row for row in mine]
+            rows += [at + row for row in entries]
             at += size
     return rows
 
 
 def _integral(values: Array, step: float) -> Array:
-    """Simpson's rule over an odd number of samples. Shapes (k, samples) to (k,)."""
+    """Return the integral over equidistant samples, an odd number, by Simpson's rule. Shapes (k, samples) to (k,)."""
     weights = np.ones(CHECKS.closure_samples)
     weights[1:-1:2], weights[2:-1:2] = 4, 2
     return np.asarray(values @ weights * step / 3)
 
 
-def _turn(spin: Array, step: float) -> float:
-    """Angle (rad) by which an angular velocity in world axes, shape (3, samples), turns a body in all."""
-    turn = np.eye(3)
-    for k in range(
-        0, CHECKS.closure_samples - 1, 2
-    ):  # Magnus' expansion of fourth order over two steps by Simpson's rule
-        first, middle, last = spin[:, k], spin[:, k + 1], spin[:, k + 2]
+def _rotation_angle(velocity: Array, step: float) -> float:
+    """Return the angle, rad, of the rotation that an angular velocity in world axes, (3, samples), integrates to."""
+    rotation = np.eye(3)
+    # fourth-order Magnus expansion over two steps at a time
+    for k in range(0, CHECKS.closure_samples - 1, 2):
+        first, middle, last = velocity[:, k], velocity[:, k + 1], velocity[:, k + 2]
         width = 2 * step
         vector = width / 6 * (first + 4 * middle + last) + width**2 / 12 * np.cross(last, first)
         angle = float(np.linalg.norm(vector))
         if angle > 0:
             cross = np.array(ca.DM(ca.skew(ca.DM(vector / angle))))
-            turn = (np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross) @ turn
-    axial = np.array([turn[i, j] - turn[j, i] for i, j in ((2, 1), (0, 2), (1, 0))])
-    return float(np.arctan2(np.linalg.norm(axial) / 2, (np.trace(turn) - 1) / 2))
+            rotation = (np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross) @ rotation
+    axial = np.array([rotation[i, j] - rotation[j, i] for i, j in ((2, 1), (0, 2), (1, 0))])
+    return float(np.arctan2(np.linalg.norm(axial) / 2, (np.trace(rotation) - 1) / 2))
 
 
 def rates_at_rest(equations: TaskEquations, base: Any, joints: Array, rows: NDArray[np.bool_] | None = None) -> Array:
-    """Joint velocities to ask for where a motion ends at rest, nan where free. Shape (n,).
+    """Return the joint velocities to prescribe where a motion ends at rest, nan where free. Shape (n,).
 
-    A tip whose acceleration is prescribed comes to rest by itself, one whose velocity is prescribed too: as many joints
-    as the tasks have such rows then follow the others, and demanding rest of them too would be redundant. Those that
-    move the tip best are left out.
+    A tip whose velocity or acceleration is prescribed comes to rest by itself. As many joints as the tasks have such
+    rows then follow from the others, and prescribing their rest too would be redundant. The joints that move the tip
+    most are left free.
 
     Args:
-        base, joints: Configuration about there.
+        equations: Equations of the tasks.
+        base, joints: Configuration near that end.
         rows: Which rows of the tasks come to rest by themselves; all if None. Shape (size,).
     """
     rest = np.zeros(len(joints))
@@ -475,7 +466,7 @@ def rates_at_rest(equations: TaskEquations, base: Any, joints: Array, rows: NDAr
     for _ in range(len(jacobian)):
         best = int((jacobian**2).sum(axis=0).argmax())
         length = np.linalg.norm(jacobian[:, best])
-        if length < CHECKS.ignorable:  # singular: the joints left out move the tip all ways that there are
+        if length < CHECKS.ignorable:  # singular: the free joints already span all motions of the tip
             break
         direction = jacobian[:, best] / length
         jacobian = jacobian - np.outer(direction, direction @ jacobian)

@@ -1,14 +1,13 @@
-"""Tasks of a machine's tips as equations of its joint rates, J u = b, the drift and the feedback in b, or of their
-derivatives, J u' = c, which are the same equations differentiated along the motion.
+"""Equations of tip tasks in the joint rates, J u = b, with drift and feedback in b, or in their derivatives, J u' = c.
 
-Everything that depends on the time alone is the column of targets; everything else is a function of configuration and
-targets, written element by element on SX symbols.
+The latter are the former differentiated along the motion. Everything that depends on time alone is in the column of
+targets; everything else is a function of configuration and targets, written element by element on SX symbols.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -23,24 +22,23 @@ from models.robot.indices import manipulability_of
 from models.spatial import on_scalars
 from ocp.errors import ProblemError, checked_each
 from ocp.motion.tasks.geometry import (
-    Bound,
+    BoundTask,
     angular_velocity,
     closing_combinations,
     cross_product,
     derivative,
-    held_task,
-    holding_rows,
     is_holonomic,
+    movable_angular_rows,
     pose_error,
+    pose_error_rows,
     pose_in_reference,
     reference_pose,
     relative_twist,
     rotation_of,
-    rows_of,
     split_targets,
     target_size,
-    turning_rows,
-    wanted_twist,
+    target_twist,
+    task_rows,
 )
 from ocp.motion.tasks.tip_task import ANGULAR, TipTask
 from ocp.motion.tasks.tracks import on_symbols, track_expression
@@ -50,288 +48,291 @@ __all__ = ["TaskEquations", "bind", "task_errors"]
 
 @dataclass(frozen=True, eq=False)
 class TaskEquations:
-    """The stacked equations of some tasks of a machine. Make it with `bind`.
+    """Stacked equations of the tasks of a machine. Use `bind` to build them.
 
     Attributes:
         machine: The machine.
-        bound: Its tasks.
+        bound: Its tasks, each with the machines whose tips are its frame and its reference.
         size: Number of rows of all tasks.
     """
 
     machine: Machine
-    bound: tuple[Bound, ...]
+    bound: tuple[BoundTask, ...]
 
     @property
     def size(self) -> int:
         return sum(part.task.size for part in self.bound)
 
     @property
-    def posed(self) -> NDArray[np.bool_]:
-        """Which rows are of poses. Shape (size,), bool."""
+    def pose_rows(self) -> NDArray[np.bool_]:
+        """Which rows belong to pose tasks. Shape (size,), bool."""
         return np.repeat([part.task.is_pose for part in self.bound], [part.task.size for part in self.bound])
 
     @cached_property
     def idle(self) -> NDArray[np.bool_]:
-        """Which joints move neither the frame of a task nor its reference, as the tree says. Shape (joint_size,).
+        """Which joints move neither the frame of a task nor its reference, by the kinematic tree. Shape (joint_size,).
 
-        None of a machine whose base floats or that has to keep its balance: there every joint counts.
+        On a floating base or a standing machine no joint is idle: each one moves the base or the balance.
         """
         drives = self.machine.robot.drives
-        alone = isinstance(self.machine, FixedBase) and not isinstance(self.machine, Standing)
-        idle = np.full(self.machine.joint_size, alone)
+        fixed_base = isinstance(self.machine, FixedBase) and not isinstance(self.machine, Standing)
+        idle = np.full(self.machine.joint_size, fixed_base)
         for robot in (tip.robot for part in self.bound for tip in (part.tip, part.reference) if tip is not None):
             idle[[drives[joint.name].column for joint in robot.path_to(robot.tip_link) if joint.moves]] = False
         return idle
 
     def unit(self, pose: str = "/s", velocity: str = "/s") -> str:
-        """Units of the rows, "rad/s, m/s" of `residual`: rad of turning and m of places, with what they are taken per.
+        """Return the units of the rows, for example "rad/s, m/s" for `residual`.
 
         Args:
-            pose, velocity: Of the rows of poses and of those of velocities: "" for `error`, "/s^2" for `acceleration`.
+            pose, velocity: Time units of the rows of pose and of velocity tasks: "" for `error`, "/s^2" for
+                `acceleration`.
         """
-        found: dict[str, None] = {}
+        units: dict[str, None] = {}
         for task in (part.task for part in self.bound):
             tilt = ["rad"] if task.tilts else []
             kinds = [*tilt, *("rad" if row in ANGULAR else "m" for row in task.chosen)]
-            found |= dict.fromkeys(kind + (pose if task.is_pose else velocity) for kind in kinds)
-        return ", ".join(found)
+            units |= dict.fromkeys(kind + (pose if task.is_pose else velocity) for kind in kinds)
+        return ", ".join(units)
 
     def targets(self, time: Any, pace: Any = 1) -> Any:
-        """What the tasks ask at a time, a column of expressions of the symbol `time`.
+        """Return the targets of the tasks at a time as a column of expressions of the symbol `time`.
 
-        For each task: the velocity in its rows; or position and velocity (3, 3), rotation and angular velocity (9, 3),
-        direction and angular velocity (3, 3), as far as given, in its reference.
+        For each task: the velocity in its rows; or, in its reference and as far as given, position and velocity (3, 3),
+        rotation and angular velocity (9, 3), direction and angular velocity (3, 3).
 
         Args:
-            time: The symbol that the tracks are functions of: the time, s, or a path parameter.
-            pace: Its rate, 1/s, where it is a path parameter.
+            time: Symbol that the tracks are functions of: the time, s, or a path parameter.
+            pace: Rate of a path parameter, 1/s.
 
         Raises:
-            ProblemError: Wrong sizes, not finite, or an expression of anything but the time.
+            ProblemError: A track has a wrong size, is not finite, or depends on anything but the time.
         """
         parts = []
         for task in (part.task for part in self.bound):
             if task.velocity is not None:
                 parts.append(pace * track_expression(task.velocity, time, (task.size, 1), "velocity", task.begin))
             if task.position is not None:
-                value = _whole(task, task.position, time, "position")
+                value = _position_of(task, task.position, time, "position")
                 rate = getattr(task.position, "rate", None)
-                given = derivative(value, time) if rate is None else _whole(task, rate, time, "position rate")
-                parts += [value, pace * given]
+                velocity = derivative(value, time) if rate is None else _position_of(task, rate, time, "position rate")
+                parts += [value, pace * velocity]
             if task.orientation is not None:
                 value = track_expression(task.orientation, time, ((4, 1), (3, 3)), "orientation", task.begin)
-                turn = rotation_of(value) if value.shape == (4, 1) else value
+                rotation = rotation_of(value) if value.shape == (4, 1) else value
                 rate = getattr(task.orientation, "rate", None)
                 if rate is None:
-                    spin = angular_velocity(turn, ca.reshape(derivative(ca.vec(turn), time), 3, 3))
+                    angular = angular_velocity(rotation, ca.reshape(derivative(ca.vec(rotation), time), 3, 3))
                 else:
-                    spin = track_expression(rate, time, (3, 1), "orientation rate", task.begin)
-                parts += [ca.vec(turn), pace * spin]
+                    angular = track_expression(rate, time, (3, 1), "orientation rate", task.begin)
+                parts += [ca.vec(rotation), pace * angular]
             if task.direction is not None:
                 value = track_expression(task.direction, time, (3, 1), "direction", task.begin)
                 length = ca.norm_2(value)
                 unit, rate = value / length, getattr(task.direction, "rate", None)
                 if rate is None:
-                    change = derivative(unit, time)
+                    unit_rate = derivative(unit, time)
                 else:
-                    change = track_expression(rate, time, (3, 1), "direction rate", task.begin) / length
-                parts += [unit, pace * cross_product(unit, change)]
+                    unit_rate = track_expression(rate, time, (3, 1), "direction rate", task.begin) / length
+                parts += [unit, pace * cross_product(unit, unit_rate)]
         return ca.densify(ca.vertcat(*parts))
 
     @on_scalars
     def jacobian(self, base: Any, joints: Any) -> Any:
-        """J, shape (size, joint_size)."""
+        """Return the Jacobian J of the tasks. Shape (size, joint_size)."""
         rows = []
         for part in self.bound:
-            relative = relative_twist(part, base, joints, part.tip.tip_jacobian(base, joints), None)
-            rows.append(rows_of(part, base, joints, relative))
-        return ca.densify(ca.cse(ca.vertcat(*rows)) if _is_symbolic(base, joints) else ca.vertcat(*rows))
+            columns = relative_twist(part, base, joints, part.tip.tip_jacobian(base, joints), None)
+            rows.append(task_rows(part, base, joints, columns))
+        symbolic = isinstance(base, ca.SX) or isinstance(joints, ca.SX)
+        return ca.densify(ca.cse(ca.vertcat(*rows)) if symbolic else ca.vertcat(*rows))
 
     @on_scalars
     def right(self, base: Any, joints: Any, targets: Any) -> Any:
-        """b: what the joint rates have to add to the drift so that the tasks are done. Shape (size, 1)."""
+        """Return b, the part of the task velocities that the joint rates add to the drift. Shape (size, 1)."""
         return -self.residual(base, joints, ca.DM(self.machine.joint_size, 1), targets)
 
     @on_scalars
     def residual(self, base: Any, joints: Any, rates: Any, targets: Any) -> Any:
-        """J u - b. Shape (size, 1)."""
+        """Return J u - b. Shape (size, 1)."""
         rows = []
-        for part, wanted in self._with_targets(targets):
+        for part, target in self._with_targets(targets):
             twist = relative_twist(part, base, joints, part.tip.tip_twist(base, joints, rates), rates)
             if part.task.velocity is not None:
-                rows.append(rows_of(part, base, joints, twist) - wanted)
+                rows.append(task_rows(part, base, joints, twist) - target)
             else:
-                rows.append(rows_of(part, base, joints, twist - wanted_twist(part, base, joints, wanted)))
+                rows.append(task_rows(part, base, joints, twist - target_twist(part, base, joints, target)))
         return ca.densify(ca.vertcat(*rows))
 
     @on_scalars
     def twist(self, base: Any, joints: Any, rates: Any) -> Any:
-        """What the tips do in the rows of the tasks, rad/s and m/s. Shape (size, 1)."""
+        """Return the velocities of the tips in the rows of the tasks, rad/s and m/s. Shape (size, 1)."""
         rows = []
         for part in self.bound:
-            moving = relative_twist(part, base, joints, part.tip.tip_twist(base, joints, rates), rates)
-            rows.append(rows_of(part, base, joints, moving))
+            twist = relative_twist(part, base, joints, part.tip.tip_twist(base, joints, rates), rates)
+            rows.append(task_rows(part, base, joints, twist))
         return ca.densify(ca.vertcat(*rows))
 
-    def strays(self, base: Any, joints: Any, rates: Any, targets: Any) -> dict[str, dict[str, Any]]:
-        """How far the tips stray from their tasks, to be watched: arguments of `Problem.watch` by name.
+    def deviations(self, base: Any, joints: Any, rates: Any, targets: Any) -> dict[str, dict[str, Any]]:
+        """Return the deviations of the tips from their tasks as arguments of `Problem.watch`, by name.
 
-        Errors of poses, "task position" and "task orientation"; of velocities the integral of what they are missed by,
-        "task way" and "task turn"; each judged by the way of the tips. Where a task is held as an equation of
-        velocities or accelerations, errors too small for that equation may add up. A pose may be off by the gap at the
-        start that its task allows, which the feedback closes, and by the tolerance of its task.
+        For poses these are their errors, "task position" and "task orientation"; for velocities the integral of their
+        residual, "task displacement" and "task rotation"; each is judged relative to the path of the tips. If a task is
+        enforced at velocity or acceleration level, errors too small for that equation may accumulate. A pose may
+        deviate by the start gap of its task, which the feedback closes, and by the tolerance of its task.
         """
         tolerances = self.tolerances
         gaps = np.repeat([part.task.start_gap for part in self.bound], [part.task.size for part in self.bound])
-        gaps = np.where(gaps > TipTask.start_gap, gaps, 0.0)  # no more than the default is no gap
-        error, missed = self.error(base, joints, targets), self.residual(base, joints, rates, targets)
-        moving, found = self.twist(base, joints, rates), dict[str, dict[str, Any]]()
-        for posed, turning, name, unit in (
+        gaps = np.where(gaps > TipTask.start_gap, gaps, 0.0)  # the default closes nothing
+        error, residual = self.error(base, joints, targets), self.residual(base, joints, rates, targets)
+        twist, deviations = self.twist(base, joints, rates), dict[str, dict[str, Any]]()
+        for posed, angular, name, unit in (
             (True, False, "task position", "m"),
             (True, True, "task orientation", "rad"),
-            (False, False, "task way", "m"),
-            (False, True, "task turn", "rad"),
+            (False, False, "task displacement", "m"),
+            (False, True, "task rotation", "rad"),
         ):
-            rows = np.flatnonzero((self.posed == posed) & (self.turning == turning)).tolist()
+            rows = np.flatnonzero((self.pose_rows == posed) & (self.turning == angular)).tolist()
             if rows:
-                what = (error if posed else missed)[rows]
-                off = gaps[rows] if posed else 0.0
-                bounds = {"lower": -off, "upper": off, "integral": not posed, "unit": unit}
-                allowed = tolerances[rows] if posed else None
-                found[name] = {"expression": what, "way": moving[rows], "tolerance": allowed, **bounds}
-        return found
+                expression = (error if posed else residual)[rows]
+                gap = gaps[rows] if posed else 0.0
+                bounds = {"lower": -gap, "upper": gap, "integral": not posed, "unit": unit}
+                tolerance = tolerances[rows] if posed else None
+                deviations[name] = {"expression": expression, "way": twist[rows], "tolerance": tolerance, **bounds}
+        return deviations
 
     @property
     def tolerances(self) -> Array:
-        """By how much each row may be missed, m and rad. Shape (size,)."""
+        """Tolerances of the rows, m and rad. Shape (size,)."""
         pairs = np.repeat([part.task.tolerance for part in self.bound], [part.task.size for part in self.bound], axis=0)
         return np.asarray(np.where(self.turning, *pairs.T[::-1]))
 
     @property
     def turning(self) -> NDArray[np.bool_]:
-        """Which rows turn, rather than move. Shape (size,), bool."""
-        found: list[bool] = []
+        """Which rows are angular. Shape (size,), bool."""
+        angular: list[bool] = []
         for task in (part.task for part in self.bound):
-            found += [*([True, True] if task.tilts else []), *(row in ANGULAR for row in task.chosen)]
-        return np.array(found, dtype=bool)
+            angular += [*([True, True] if task.tilts else []), *(row in ANGULAR for row in task.chosen)]
+        return np.array(angular, dtype=bool)
 
     def acceleration(
         self, base: Any, joints: Any, rates: Any, second: Any, time: Any, pace: Any = 1, change: Any = 0
     ) -> Any:
-        """J u' - c, by differentiating `residual` along the motion, with the feedback of its own. Shape (size, 1).
+        """Return J u' - c with the feedback, by differentiating `residual` along the motion. Shape (size, 1).
 
         d/dt (J u - b) + gain (J u - b): the error of a pose decays as e'' + 2 gain e' + gain^2 e = 0.
 
         Args:
             base, joints, rates: Symbols.
             second: Joint accelerations u', (joint_size, 1).
-            time, pace: As of `targets`; a pace other than 1 is a symbol too.
+            time, pace: As for `targets`; a pace other than 1 is a symbol too.
             change: Rate of the pace, 1/s^2.
         """
         residual = self.residual(base, joints, rates, self.targets(time, pace))
-        at, moving = [joints, rates, time], [rates, second, 1]
+        symbols, rates_of = [joints, rates, time], [rates, second, 1]
         if self.machine.base_size:
-            at, moving = [base, *at], [self.machine.base_rate(base, joints, rates), *moving]
+            symbols, rates_of = [base, *symbols], [self.machine.base_rate(base, joints, rates), *rates_of]
         if isinstance(pace, ca.SX | ca.MX):
-            at, moving = [*at, pace], [*moving[:-1], pace, change]
+            symbols, rates_of = [*symbols, pace], [*rates_of[:-1], pace, change]
         gains = np.repeat([float(part.task.gain) for part in self.bound], [part.task.size for part in self.bound])
-        return ca.jtimes(residual, ca.vertcat(*at), ca.vertcat(*moving)) + ca.sparsify(ca.DM(gains)) * residual
+        return ca.jtimes(residual, ca.vertcat(*symbols), ca.vertcat(*rates_of)) + ca.sparsify(ca.DM(gains)) * residual
 
     @on_scalars
     def manipulability(self, base: Any, joints: Any) -> Any:
-        """sqrt(det(J J')) of the rows of all tasks (Yoshikawa 1985). Shape (1, 1)."""
+        """Return sqrt(det(J J')) of the rows of all tasks (Yoshikawa 1985). Shape (1, 1)."""
         return manipulability_of(self.jacobian(base, joints))
 
     @on_scalars
     def error(self, base: Any, joints: Any, targets: Any) -> Any:
-        """Pose wanted less pose found, in the tasks' rows, m and rad; zero for velocities. Shape (size, 1)."""
+        """Return target pose minus pose in the rows of the tasks, m and rad; zero for velocities. Shape (size, 1)."""
         rows = []
-        for part, wanted in self._with_targets(targets):
+        for part, target in self._with_targets(targets):
             if part.task.velocity is not None:
                 rows.append(ca.DM(part.task.size, 1))
             else:
-                rows.append(rows_of(part, base, joints, pose_error(part, base, joints, wanted)))
+                rows.append(task_rows(part, base, joints, pose_error(part, base, joints, target)))
         return ca.densify(ca.vertcat(*rows))
 
     def gap(self, base: Any, joints: Any, rates: Any, targets: Any) -> Any:
-        """Pose found less pose wanted in the rows of poses, `residual` in those of velocities. Shape (size, 1)."""
+        """Return pose minus target pose in the rows of poses, `residual` in those of velocities. Shape (size, 1)."""
         error, residual = self.error(base, joints, targets), self.residual(base, joints, rates, targets)
-        return ca.vertcat(*((-error if posed else residual)[i] for i, posed in enumerate(self.posed)))
+        return ca.vertcat(*((-error if is_pose else residual)[i] for i, is_pose in enumerate(self.pose_rows)))
 
     @on_scalars
-    def misfit(self, base: Any, joints: Any, targets: Any) -> Any:
-        """Distance from the poses, one column, without the zeros that `error` has half a turn away.
+    def pose_residual(self, base: Any, joints: Any, targets: Any) -> Any:
+        """Return the deviation from the poses as one column that, unlike `error`, is not zero half a turn away.
 
-        m, and chords of the unit circle (2 sin(angle / 2), near zero the angle in rad): for all turning of a frame the
-        differences of its axes over sqrt 2, for some rows of it those of the half-angle vector. Velocities have none.
+        In m, and chords of the unit circle (2 sin(angle / 2), near zero the angle in rad). If all rotation is
+        prescribed, these are the differences of the frame axes over sqrt 2, otherwise the rows of the half-angle
+        vector. Velocity tasks have no entries.
         """
         rows: list[Any] = [ca.DM(0, 1)]
-        for part, wanted in self._with_targets(targets):
+        for part, target in self._with_targets(targets):
             task = part.task
             if not task.is_pose:
                 continue
-            place, turning = split_targets(task, wanted)
+            position_target, rotation_target = split_targets(task, target)
             reference = reference_pose(part, base, joints)
-            turn = part.tip.tip_pose(base, joints).rotation
-            error = pose_error(part, base, joints, wanted)
-            if turning is not None:
-                goal = turning[0] if reference is None else ca.mtimes(reference.rotation, turning[0])
+            rotation = part.tip.tip_pose(base, joints).rotation
+            error = pose_error(part, base, joints, target)
+            if rotation_target is not None:
+                goal = rotation_target[0] if reference is None else ca.mtimes(reference.rotation, rotation_target[0])
                 if task.within is not None:
-                    rows.append(ca.fmax(float(np.cos(task.within)) - self._cosine(part, base, joints, wanted), 0))
+                    rows.append(ca.fmax(float(np.cos(task.within)) - self._cosine(part, base, joints, target), 0))
                 elif task.direction is not None:
-                    rows.append(goal - ca.mtimes(turn, ca.DM(task.tool_axis)))
-                elif set(task.chosen) >= set(ANGULAR) or set(task.chosen) >= set(turning_rows(part)):
-                    rows.append(ca.vec(goal - turn) / np.sqrt(2))
+                    rows.append(goal - ca.mtimes(rotation, ca.DM(task.tool_axis)))
+                elif set(task.chosen) >= set(ANGULAR) or set(task.chosen) >= set(movable_angular_rows(part)):
+                    rows.append(ca.vec(goal - rotation) / np.sqrt(2))
                 else:
-                    cosine = (ca.trace(ca.mtimes(goal, turn.T)) - 1) / 2
+                    cosine = (ca.trace(ca.mtimes(goal, rotation.T)) - 1) / 2
                     half = error[0:3] * ca.sqrt(2 / (1 + ca.fmax(cosine, -1 + 1e-9)))
                     angular = [i for i, row in enumerate(task.chosen) if row in ANGULAR]
-                    rows.append(rows_of(part, base, joints, ca.vertcat(half, ca.DM(3, 1)))[angular])
-            if place is not None:
+                    rows.append(task_rows(part, base, joints, ca.vertcat(half, ca.DM(3, 1)))[angular])
+            if position_target is not None:
                 tilt = 2 if task.tilts else 0
                 linear = [tilt + i for i, row in enumerate(task.chosen) if row not in ANGULAR]
-                rows.append(rows_of(part, base, joints, ca.vertcat(ca.DM(3, 1), error[3:6]))[linear])
+                rows.append(task_rows(part, base, joints, ca.vertcat(ca.DM(3, 1), error[3:6]))[linear])
         return ca.densify(ca.vertcat(*rows))
 
     @on_scalars
-    def leans(self, base: Any, joints: Any, targets: Any) -> Any:
-        """Cosines of the angles by which tool axes lean from their directions, of the tasks that let them.
-
-        Shape (number of tasks with `within`, 1).
-        """
+    def cone_cosines(self, base: Any, joints: Any, targets: Any) -> Any:
+        """Return the cosine of the angle between tool axis and direction for each task with `within`. Shape (k, 1)."""
         rows: list[Any] = [ca.DM(0, 1)]
-        for part, wanted in self._with_targets(targets):
+        for part, target in self._with_targets(targets):
             if part.task.within is not None:
-                rows.append(self._cosine(part, base, joints, wanted))
+                rows.append(self._cosine(part, base, joints, target))
         return ca.densify(ca.vertcat(*rows))
 
     @property
-    def most_lean(self) -> Array:
-        """Angles that the tool axes of `leans` may lean, rad. Shape as of `leans`, (k,)."""
+    def cone_angles(self) -> Array:
+        """Half-angles of the cones of `cone_cosines`, rad. Shape (k,)."""
         return np.array([part.task.within for part in self.bound if part.task.within is not None], dtype=float)
 
-    def _cosine(self, part: Bound, base: Any, joints: Any, wanted: Any) -> Any:
-        """Of the angle between a task's tool axis and its direction."""
-        _, turning = split_targets(part.task, wanted)
+    def _cosine(self, part: BoundTask, base: Any, joints: Any, target: Any) -> Any:
+        """Return the cosine of the angle between a task's tool axis and its direction."""
+        _, direction = split_targets(part.task, target)
         reference = reference_pose(part, base, joints)
-        goal = turning[0] if reference is None else ca.mtimes(reference.rotation, turning[0])
+        goal = direction[0] if reference is None else ca.mtimes(reference.rotation, direction[0])
         return ca.dot(goal, ca.mtimes(part.tip.tip_pose(base, joints).rotation, ca.DM(part.task.tool_axis)))
 
     def holding(self, base: Any, joints: Any, at_base: Array, at_joints: Array) -> Any:
-        """Pose at (at_base, at_joints) less pose at (base, joints), in the rows of the velocity tasks.
+        """Return pose at (at_base, at_joints) minus pose at (base, joints) in the rows of the velocity tasks.
 
-        Shape (rows of all velocity tasks, 1). For a start that is free but for the pose of its task.
+        For a start configuration that is free except for the pose of the tip. Shape (rows of all velocity tasks, 1).
         """
         rows: list[Any] = [ca.DM(0, 1)]
         for part in self.bound:
             if part.task.velocity is not None:
-                position, turn = (ca.DM(value) for value in pose_in_reference(part, at_base, at_joints))
-                held = part._replace(task=held_task(part.task))
-                targets = ca.vertcat(position, ca.DM(3, 1), ca.vec(turn), ca.DM(3, 1))
-                rows.append(holding_rows(held, base, joints, targets))
+                position, rotation = (ca.DM(value) for value in pose_in_reference(part, at_base, at_joints))
+                bound = part._replace(
+                    task=replace(part.task, velocity=None, position=np.zeros(3), orientation=np.eye(3))
+                )
+                targets = ca.vertcat(position, ca.DM(3, 1), ca.vec(rotation), ca.DM(3, 1))
+                rows.append(pose_error_rows(bound, base, joints, targets))
         return ca.vertcat(*rows)
 
-    def _with_targets(self, targets: Any) -> Iterator[tuple[Bound, Any]]:
+    def _with_targets(self, targets: Any) -> Iterator[tuple[BoundTask, Any]]:
+        """Iterate over the tasks with their targets."""
         at = 0
         for part in self.bound:
             size = target_size(part.task)
@@ -339,96 +340,91 @@ class TaskEquations:
             at += size
 
     def errors(self, t: Any, base: Any, joints: Any) -> Array:
-        """As `task_errors`. Shape (M, size)."""
-        place, angles, targets = self._along(t, base, joints)
-        count = len(angles)
-        return np.array(self.function().map(count)(place.T, angles.T, targets)[2]).reshape(-1, count).T
+        """Return the pose errors along a motion, see `task_errors`. Shape (M, size)."""
+        bases, positions, targets = self._along(t, base, joints)
+        count = len(positions)
+        return np.array(self.function.map(count)(bases.T, positions.T, targets)[2]).reshape(-1, count).T
 
     def _along(self, t: Any, base: Any, joints: Any) -> tuple[Array, Array, Any]:
-        """Base (M, base_size), joints (M, joint_size) and targets, one column each, along a motion."""
-        times, angles = np.atleast_1d(np.asarray(t, dtype=float)), np.atleast_2d(np.asarray(joints, dtype=float))
-        place = np.zeros((len(times), 0)) if base is None else np.atleast_2d(np.asarray(base, dtype=float))
-        return place, angles, self.target_function().map(len(times))(times[None, :])
+        """Return base (M, base_size), joints (M, joint_size) and targets, as columns, along a motion."""
+        times, positions = np.atleast_1d(np.asarray(t, dtype=float)), np.atleast_2d(np.asarray(joints, dtype=float))
+        bases = np.zeros((len(times), 0)) if base is None else np.atleast_2d(np.asarray(base, dtype=float))
+        return bases, positions, self.target_function().map(len(times))(times[None, :])
 
-    def overhangs(self, t: Any, base: Any, joints: Any) -> Array:
-        """Angles by which tool axes lean further than they may, rad, arguments as of `errors`. Shape (M, k)."""
-        place, angles, targets = self._along(t, base, joints)
-        if not self.most_lean.size:
-            return np.zeros((len(angles), 0))
-        cosines = np.array(self._lean_function.map(len(angles))(place.T, angles.T, targets)).T
-        return np.asarray(np.maximum(np.arccos(np.clip(cosines, -1.0, 1.0)) - self.most_lean, 0.0))
+    def cone_violations(self, t: Any, base: Any, joints: Any) -> Array:
+        """Return by how much tool axes leave their cones, rad; arguments as for `errors`. Shape (M, k)."""
+        bases, positions, targets = self._along(t, base, joints)
+        if not self.cone_angles.size:
+            return np.zeros((len(positions), 0))
+        cosines = np.array(self._cone_function.map(len(positions))(bases.T, positions.T, targets)).T
+        return np.asarray(np.maximum(np.arccos(np.clip(cosines, -1.0, 1.0)) - self.cone_angles, 0.0))
 
     @cached_property
-    def _lean_function(self) -> Any:
-        base, joints, targets = self._symbols
-        return ca.Function("leans", [base, joints, targets], [self.leans(base, joints, targets)], {"cse": True})
+    def _cone_function(self) -> Any:
+        symbols = self._symbols
+        return ca.Function("cone_cosines", symbols, [self.cone_cosines(*symbols)], {"cse": True})
 
+    @cached_property
     def function(self) -> Any:
-        """Casadi Function (base, joints, targets) -> (J, b, error, misfit)."""
-        return self._function
+        """CasADi Function (base, joints, targets) -> (J, b, error, pose residual)."""
+        symbols = self._symbols
+        rows = [of_targets(*symbols) for of_targets in (self.right, self.error, self.pose_residual)]
+        return ca.Function("task", symbols, [self.jacobian(*symbols[:2]), *rows], {"cse": True})
 
     @cached_property
-    def _function(self) -> Any:
+    def pose_residual_function(self) -> Any:
+        """CasADi Function (joints, base, targets) -> (pose residual, its Jacobian by the joints)."""
         base, joints, targets = self._symbols
-        parts = [self.jacobian(base, joints)]
-        parts += [what(base, joints, targets) for what in (self.right, self.error, self.misfit)]
-        return ca.Function("task", [base, joints, targets], parts, {"cse": True})
-
-    @cached_property
-    def misfit_function(self) -> Any:
-        """Casadi Function (joints, base, targets) -> (misfit, its Jacobian by the joints)."""
-        base, joints, targets = self._symbols
-        misfit = self.misfit(base, joints, targets)
-        slopes = ca.densify(ca.jacobian(misfit, joints))
-        return ca.Function("misfit", [joints, base, targets], [misfit, slopes], {"cse": True})
+        residual = self.pose_residual(base, joints, targets)
+        jacobian = ca.densify(ca.jacobian(residual, joints))
+        return ca.Function("pose_residual", [joints, base, targets], [residual, jacobian], {"cse": True})
 
     @cached_property
     def jacobian_function(self) -> Any:
-        """Casadi Function (joints, base) -> J."""
+        """CasADi Function (joints, base) -> J."""
         base, joints, _ = self._symbols
         return ca.Function("jacobian", [joints, base], [self.jacobian(base, joints)], {"cse": True})
 
     @property
-    def _symbols(self) -> tuple[Any, Any, Any]:
-        """Of base, joints and targets."""
-        base, joints = ca.SX.sym("base", self.machine.base_size), ca.SX.sym("joints", self.machine.joint_size)
-        return base, joints, ca.SX.sym("targets", sum(target_size(part.task) for part in self.bound))
+    def _symbols(self) -> tuple[Any, ...]:
+        """Symbols of base, joints and targets."""
+        targets = sum(target_size(part.task) for part in self.bound)
+        sizes = {"base": self.machine.base_size, "joints": self.machine.joint_size, "targets": targets}
+        return tuple(ca.SX.sym(name, size) for name, size in sizes.items())
 
     def target_function(self) -> Any:
-        """Casadi Function time -> targets, on MX symbols where a track needs them."""
+        """Return the CasADi Function time -> targets, on MX symbols if a track needs them."""
 
-        def made(symbols: Any) -> Any:
+        def build(symbols: Any) -> Any:
             time = symbols.sym("time")
             return ca.Function("targets", [time], [self.targets(time)])
 
-        return on_symbols(made)
+        return on_symbols(build)
 
     def closing(self, base: Array, joints: Array) -> Array:
-        """Directions of the task rows that a closed task closes without the joints returning. Shape (size, k).
+        """Return the directions of the task rows that close by themselves in a cyclic motion. Shape (size, k).
 
-        Where the joints return to where they were after a closed task, some of these conditions follow from the task:
-        all of its rows on a fixed base; on a floating one, as many combinations of the rows as do not depend on the
-        pose of the base, given that the centre of mass stays. Rows whose integral depends on the way do not count.
+        If the joints return to their start, part of the closure conditions follows from the task: all of its rows on a
+        fixed base; on a floating base the combinations of rows that are independent of the base pose while the centre
+        of mass stays. Rows whose integral depends on the path do not count.
 
         Raises:
-            ProblemError: The centre of mass moves, and the joints cannot return.
+            ProblemError: The momentum moves the centre of mass, and the joints cannot return.
         """
-        chosen = np.concatenate([is_holonomic(part) for part in self.bound])
+        holonomic = np.concatenate([is_holonomic(part) for part in self.bound])
+        directions = np.eye(self.size)[:, holonomic]
         if self.machine.base_size == 0:
-            return np.eye(self.size)[:, chosen]
-        found = np.zeros((self.size, 0))
-        if isinstance(self.machine, FreeFloating):
-            closes = closing_combinations(self.machine, self.bound, chosen, base, joints)
-            found = np.zeros((self.size, closes.shape[1]))
-            found[chosen] = closes
-        return found
+            return directions
+        if not isinstance(self.machine, FreeFloating):
+            return np.zeros((self.size, 0))
+        return directions @ closing_combinations(self.machine, self.bound, holonomic, base, joints)
 
 
-def _whole(task: TipTask, track: Any, time: Any, what: str) -> Any:
-    """A track of positions with all three coordinates, zero where the task leaves them out. Shape (3, 1)."""
+def _position_of(task: TipTask, track: Any, time: Any, name: str) -> Any:
+    """Return a position track with all three coordinates, zero where the task leaves them out. Shape (3, 1)."""
     short = task.along_reference and len(task.linear) < 3
     shapes = ((3, 1), (len(task.linear), 1)) if short else ((3, 1),)
-    value = track_expression(track, time, shapes, what, task.begin)
+    value = track_expression(track, time, shapes, name, task.begin)
     if value.shape[0] == 3:
         return value
     whole = type(value)(3, 1)
@@ -437,13 +433,13 @@ def _whole(task: TipTask, track: Any, time: Any, what: str) -> Any:
 
 
 def bind(machine: Machine, tasks: TipTask | Sequence[TipTask]) -> TaskEquations:
-    """The equations of a task, or of several stacked, for a machine.
+    """Return the equations of one or several tasks of a machine.
 
-    That of the equations has the frame of the first task for its tip where the robot has none.
+    If the robot has no tip, the machine of the equations has the frame of the first task as its tip.
 
     Raises:
-        ProblemError: No machine, no task, something else than a task, an unknown link, a task of the tip of a robot
-            that has none.
+        ProblemError: `machine` or a task has the wrong type, there is no task, a link is unknown, or a task is of the
+            tip of a robot that has none.
     """
     if isinstance(machine, type) or not isinstance(getattr(machine, "robot", None), Robot):
         words = f"machine must be a FixedBase(robot), FreeFloating(robot) or Standing(robot, ...), not {machine!r}"
@@ -459,12 +455,12 @@ def bind(machine: Machine, tasks: TipTask | Sequence[TipTask]) -> TaskEquations:
             reference = None if task.relative_to is None else with_tip(machine, task.relative_to)
         except ModelError as error:
             raise ProblemError(str(error), **vars(error)) from error
-        bound.append(Bound(task, tip, reference))
+        bound.append(BoundTask(task, tip, reference))
     return TaskEquations(bound[0].tip if machine.robot.tip is None else machine, tuple(bound))
 
 
 def task_errors(machine: Machine, tasks: TipTask | Sequence[TipTask], t: Any, base: Any, joints: Any) -> Array:
-    """Pose wanted less pose found along a motion, in the rows of the tasks, m and rad; zero for velocities.
+    """Return target pose minus pose along a motion in the rows of the tasks, m and rad; zero for velocities.
 
     Args:
         t: Times, s. Shape (M,).
@@ -475,7 +471,3 @@ def task_errors(machine: Machine, tasks: TipTask | Sequence[TipTask], t: Any, ba
         Shape (M, rows of all tasks).
     """
     return bind(machine, tasks).errors(t, base, joints)
-
-
-def _is_symbolic(*values: Any) -> bool:
-    return any(isinstance(value, ca.SX) for value in values)

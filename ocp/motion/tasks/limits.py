@@ -1,4 +1,4 @@
-"""What a machine's joints bear, and the ground that it stands on."""
+"""Limits of a machine's joints and of the contact with the ground."""
 
 from __future__ import annotations
 
@@ -17,11 +17,12 @@ __all__ = ["JointBounds", "Limits", "unknown_limits"]
 
 
 class JointBounds(NamedTuple):
-    """Limits of every joint, infinite where there are none. Shape (n,) each, rad or m and seconds, N m or N, W.
+    """Limits of every joint, infinite where there is none. Shape (n,) each; rad or m, s, N m or N, W.
 
     Attributes:
-        lower, upper: Of the positions.
-        velocity, acceleration, jerk, torque: The greatest sizes. power: What a drive gives at most.
+        lower, upper: Position limits.
+        velocity, acceleration, jerk, torque: Largest absolute values.
+        power: Largest power that an actuator delivers.
     """
 
     lower: Array
@@ -35,19 +36,20 @@ class JointBounds(NamedTuple):
 
 @dataclass(frozen=True)
 class Limits:
-    """What joints and ground bear; None means what the robot says, which is nothing of accelerations, jerks and power.
+    """Limits of joints and ground contact.
 
-    A robot that says 0 of a velocity or a torque, as many URDF files do, does not know it: no such limit holds.
+    None means the limit of the robot description, which has none for acceleration, jerk and power. Many URDF files give
+    0 for an unknown velocity or torque limit; 0 is read as unlimited.
 
     Attributes:
-        velocity, acceleration, jerk, torque: Of each joint, or one number for all; inf for no limit.
-        power: What each drive gives at most, W, likewise; braking is free.
-        joints: Whether the robot's position limits hold.
-        vertical_force: Least vertical force of the ground on a standing machine, N; a tenth of its weight if None.
-        friction: Coefficient of friction of the ground.
+        velocity, acceleration, jerk, torque: One number for each joint, or one for all; inf for no limit.
+        power: Largest power that each actuator delivers, W, in the same form; braking is free.
+        joints: Whether the position limits of the robot apply.
+        vertical_force: Least vertical ground force on a standing machine, N; None for a tenth of its weight.
+        friction: Friction coefficient of the ground.
 
     Raises:
-        ProblemError: A limit that is not positive.
+        ProblemError: A limit is not positive.
     """
 
     velocity: Any = None
@@ -60,15 +62,15 @@ class Limits:
     friction: float = np.inf
 
     def __post_init__(self) -> None:
-        for what in ("velocity", "acceleration", "jerk", "torque", "power"):
-            value = getattr(self, what)
+        for kind in ("velocity", "acceleration", "jerk", "torque", "power"):
+            value = getattr(self, kind)
             if value is not None and not (_numbers(value) > 0).all():
-                words = f"limits: {what} must be positive, one number or one for each joint, not {value!r}"
-                raise ProblemError(words, name=what, value=value, limit=0.0)
+                words = f"limits: {kind} must be positive, one number or one for each joint, not {value!r}"
+                raise ProblemError(words, name=kind, value=value, limit=0.0)
         if self.vertical_force is not None:
             checked_positive("limits: vertical_force", self.vertical_force)
         checked_flag("limits: joints", self.joints)
-        if not real(self.friction) > 0:  # which may be infinite
+        if not real(self.friction) > 0:
             words = f"limits: friction must be positive, not {self.friction!r}"
             raise ProblemError(words, name="friction", value=self.friction, limit=0.0)
 
@@ -77,47 +79,47 @@ class Limits:
         return 0.1 * machine.weight if self.vertical_force is None else float(self.vertical_force)
 
     def bounds(self, machine: Machine, used: Collection[str] = ()) -> JointBounds:
-        """Return the limits of a machine's joints; those that the robot does not know are infinite.
+        """Return the joint limits of a machine; those that the robot description does not give are infinite.
 
         Args:
-            machine: Whose joints.
-            used: Kinds of limits, "velocity" or "torque", of which a robot is warned of that gives 0 for them.
+            machine: The machine.
+            used: Kinds of limits, "velocity" or "torque", to warn about if the robot gives 0 for them.
 
         Raises:
-            ProblemError: Not one number or one for each joint.
+            ProblemError: A limit is neither one number nor one number for each joint.
 
         Warns:
-            ModelWarning: The robot gives joints 0 for a used limit that is not given here, so that none holds.
+            ModelWarning: A used limit is not set here and 0 in the robot description, so that the joints are unlimited.
         """
         robot, n = machine.robot, machine.joint_size
-        free = np.full(n, np.inf)
-        given = {"velocity": robot.velocity, "acceleration": free, "jerk": free, "torque": robot.effort, "power": free}
-        for what in given:
-            value = getattr(self, what)
+        inf = np.full(n, np.inf)
+        values = {"velocity": robot.velocity, "acceleration": inf, "jerk": inf, "torque": robot.effort, "power": inf}
+        for kind in values:
+            value = getattr(self, kind)
             if value is not None:
                 array = _numbers(value)
                 if array.size not in (1, n):
-                    words = f"limits: {what} must be positive, one number or {n}, not {value!r}"
-                    raise ProblemError(words, name=what, value=value, limit=n)
-                given[what] = np.array(np.broadcast_to(array, n))
-            elif what in used and (names := unknown_limits(robot, what)):
-                words = f"the robot gives {', '.join(names)} a {what} limit of 0, which says that it is unknown: none "
-                words += f"holds; give Limits({what}=...), inf for no limit"
+                    words = f"limits: {kind} must be positive, one number or {n}, not {value!r}"
+                    raise ProblemError(words, name=kind, value=value, limit=n)
+                values[kind] = np.array(np.broadcast_to(array, n))
+            elif kind in used and (names := unknown_limits(robot, kind)):
+                words = f"the robot gives {', '.join(names)} a {kind} limit of 0, which is read as unknown: they are "
+                words += f"unlimited; set Limits({kind}=...), inf for no limit"
                 warn(ModelWarning(words, name=names[0], value=0.0), stacklevel=2)
-        lower, upper = (robot.lower, robot.upper) if self.joints else (-free, free)
-        return JointBounds(lower, upper, **given)
+        lower, upper = (robot.lower, robot.upper) if self.joints else (-inf, inf)
+        return JointBounds(lower, upper, **values)
 
 
-def unknown_limits(robot: Robot, what: str) -> list[str]:
-    """Return the joints for which a robot's description says 0: their limit of "velocity" or "torque" is unknown."""
-    own = {"velocity": "velocity", "torque": "effort"}.get(what)
-    return [joint.name for joint in robot.moving_joints if own and getattr(joint, own) == 0]
+def unknown_limits(robot: Robot, kind: str) -> list[str]:
+    """Return the joints whose "velocity" or "torque" limit is 0, that is unknown, in the robot description."""
+    attribute = {"velocity": "velocity", "torque": "effort"}.get(kind)
+    return [joint.name for joint in robot.moving_joints if attribute and getattr(joint, attribute) == 0]
 
 
 def _numbers(value: Any) -> Array:
-    """A limit as a flat array, a single 0 where it is none."""
+    """Return a limit as a flat array, a single 0 if it is not numeric."""
     try:
-        given = floats(value).ravel()
-        return given if given.size else np.zeros(1)
+        numbers = floats(value).ravel()
+        return numbers if numbers.size else np.zeros(1)
     except NOT_NUMBERS:
         return np.zeros(1)

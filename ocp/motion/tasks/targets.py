@@ -1,4 +1,4 @@
-"""What tasks ask of a frame along a motion, in the world, to be shown beside what is done."""
+"""Target poses of tasks along a motion, in the world, for display next to the motion."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ __all__ = ["Target", "targets_along"]
 
 
 class Target(NamedTuple):
-    """A frame that a task asks for, at M times; nan where it asks for nothing.
+    """Target frame of a task at M times, nan where the task prescribes nothing.
 
     Attributes:
-        t: s. Shape (M,).
-        position: Of its origin in the world. Shape (M, 3), m.
-        rotation: Its axes, as columns, in the world; of a tool that may roll the tool axis alone, as the last column.
+        t: Times, s. Shape (M,).
+        position: Origin of the frame in the world. Shape (M, 3), m.
+        rotation: Axes of the frame in the world, as columns; with a free roll the tool axis alone, as the last column.
             Shape (M, 3, 3).
     """
 
@@ -33,23 +33,29 @@ class Target(NamedTuple):
 
 
 def targets_along(
-    machine: Machine, tasks: Sequence[TipTask], times: Array, base: Array, joints: Array, told: Array | None = None
+    machine: Machine,
+    tasks: Sequence[TipTask],
+    times: Array,
+    base: Array,
+    joints: Array,
+    shown_times: Array | None = None,
 ) -> tuple[Target, ...]:
-    """The targets of the tasks that ask for a pose, along a motion, which moves those relative to a link.
+    """Return the target of each pose task along a motion; the motion moves the targets that are relative to a link.
 
     Args:
-        machine: It does the tasks.
-        tasks: Each from its begin to its end.
-        times: Of the tasks, s. Shape (M,).
-        base: Configurations of the base, shape (M, base_size). joints: Shape (M, joint_size).
-        told: Times of the motion, where these are others. Shape (M,), s.
+        machine: The machine that does the tasks.
+        tasks: The tasks, each active from its begin to its end.
+        times: Times on the clock of the tasks, s. Shape (M,).
+        base: Base configurations. Shape (M, base_size).
+        joints: Joint positions. Shape (M, joint_size).
+        shown_times: Times to report in the targets if they differ from `times`, s. Shape (M,).
     """
     equations = bind(machine, tasks)
     count = len(times)
-    wanted = np.array(equations.target_function().map(count)(times[None, :])).reshape(-1, count).T
-    found, at = [], 0
-    for part in equations.bound:
-        task, values = part.task, wanted[:, at : at + target_size(part.task)]
+    target_values = np.array(equations.target_function().map(count)(times[None, :])).reshape(-1, count).T
+    targets, at = [], 0
+    for bound in equations.bound:
+        task, values = bound.task, target_values[:, at : at + target_size(bound.task)]
         at += target_size(task)
         if not task.is_pose:
             continue
@@ -61,20 +67,20 @@ def targets_along(
             rotation = values[:, :9].reshape(count, 3, 3).transpose(0, 2, 1)
         elif task.direction is not None:
             rotation[:, :, 2] = values[:, :3]
-        if part.reference is not None:
-            turn, place = _frames(part.reference, base, joints)
-            position = np.einsum("mij,mj->mi", turn, position) + place
-            rotation = turn @ rotation
-        asked = (times >= task.begin) & (times <= task.end)
-        position[~asked], rotation[~asked] = np.nan, np.nan
-        found.append(Target(times if told is None else told, position, rotation))
-    return tuple(found)
+        if bound.reference is not None:
+            rotations, origin = _frames(bound.reference, base, joints)
+            position = np.einsum("mij,mj->mi", rotations, position) + origin
+            rotation = rotations @ rotation
+        active = (times >= task.begin) & (times <= task.end)
+        position[~active], rotation[~active] = np.nan, np.nan
+        targets.append(Target(times if shown_times is None else shown_times, position, rotation))
+    return tuple(targets)
 
 
 def _frames(machine: Machine, base: Array, joints: Array) -> tuple[Array, Array]:
-    """Rotations (M, 3, 3) and positions (M, 3) of a machine's tip."""
+    """Return rotations (M, 3, 3) and positions (M, 3) of a machine's tip."""
     b, q = ca.SX.sym("b", machine.base_size), ca.SX.sym("q", machine.joint_size)
     pose: Any = machine.tip_pose(b, q)
     function = ca.Function("frames", [b, q], [pose.rotation, pose.position])
-    turns, places = (np.array(part) for part in function.map(len(joints))(base.T, joints.T))
-    return turns.reshape(3, -1, 3).transpose(1, 0, 2), places.T
+    rotations, positions = (np.array(value) for value in function.map(len(joints))(base.T, joints.T))
+    return rotations.reshape(3, -1, 3).transpose(1, 0, 2), positions.T

@@ -1,7 +1,7 @@
-"""What a frame of the machine is asked to do: rows of its twist, or a pose over time that it is held to.
+"""Tasks of a frame of the machine: rows of its twist, or a pose that it tracks over time.
 
-Poses become velocities by differentiation, with the pose error fed back so that it does not accumulate (Baumgarte
-1972): wanted twist = twist of the target + gain x pose error.
+Pose tasks are differentiated to velocities, with the pose error fed back so that it does not accumulate (Baumgarte
+1972): task twist = twist of the target + gain x pose error.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from models.arrays import Array, ArrayInput, checked_array
 from models.robot.indices import checked_rows
 from models.spatial import expression
 from ocp.errors import ProblemError, checked_choice, checked_nonnegative, checked_positive, checked_text
-from ocp.motion.tasks.tracks import Track, along, run_by
+from ocp.motion.tasks.tracks import Track, path_tracks, reparametrized
 from ocp.tolerances import ORIENTATION_TOLERANCE_RAD, POSITION_TOLERANCE_M
 
 __all__ = ["Axes", "Roll", "TipTask", "Velocity", "timed"]
@@ -33,44 +33,44 @@ ANGULAR, LINEAR = (0, 1, 2), (3, 4, 5)
 
 @dataclass(frozen=True, eq=False)
 class TipTask:
-    """A task of one frame: either `velocity`, or a pose by `position` and one of `orientation` and `direction`.
+    """Task of one frame: either `velocity`, or a pose by `position` and one of `orientation` and `direction`.
 
-    Tracks are differentiated by their time symbol; a position with a method `rate`, a function of time, is asked for
-    its velocity instead. Several tasks are stacked by giving a list of them: one for each arm, or one that holds the
-    base still (rows 0, 1, 2 of the root link, velocity zero: reactionless motion).
+    Tracks are differentiated with respect to their time symbol; a track with a method `rate` is asked for its rate
+    instead. A list of tasks stacks them: one for each arm, or one that keeps the base from rotating (rows 0, 1, 2 of
+    the root link, velocity zero: reactionless motion).
 
     Attributes:
-        rows: Which rows of the twist the task fixes: angular 0..2, linear 3..5, along `axes`. Needed with `velocity`;
-            otherwise all that the pose defines if None. A `direction` always fixes the two rows of the tilt, and `rows`
-            those of the position.
-        velocity: In the rows, along `axes`: constant or function of time (s). Shape (len(rows),).
-        position: Of the frame's origin, in the reference: constant or function of time. Shape (3,), m; or only its
-            entries in the linear `rows`, in their order, where these are taken along the axes of the reference.
-        orientation: Of the frame, in the reference: constant or function of time; quaternion [w, x, y, z], shape (4,),
-            or matrix, shape (3, 3).
-        direction: Of the tool axis, in the reference; the roll about it is free. Constant or function of time, of any
-            length but zero. Shape (3,).
-        within: Angle that the tool axis may lean from the direction, rad, between 0 and pi; None: it may not.
-        tool_axis: In the frame. Shape (3,).
-        axes: Along which axes the rows are taken: of the world, of the base (root) link, of the frame itself ("tip"),
-            or of the reference. The twist is the same in all: it is not relative to these axes.
-        link: Name of the link whose frame it is; None for the robot's tip.
-        point: Origin of the frame in the link's frame. Shape (3,), m. Only with `link`.
-        relative_to: Name of the reference, a link relative to which the motion and the pose are meant; None for the
-            world.
-        gain: Of the feedback of the pose error, 1/s. A rate of decay: leave it below what the mesh resolves; `plan`
-            lowers it to that where there is no gap to close. Where accelerations are asked for it damps critically, and
-            velocities decay to what a `velocity` asks.
-        start_gap: Largest pose error at the start, m and rad. Above zero the feedback closes the gap.
-        tolerance: By how much a plan's audit lets each row of a pose be off, position (m) and orientation (rad), and by
-            no more than 1e-3 of the path along which the tip moves or turns. Shape (2,).
-        begin: When the task begins, s; its tracks are functions of the time from there on.
-        duration: How long it lasts, s; None: to the end of the motion.
-        breaks: Times from its beginning at which its tracks are less smooth, where a mesh should have nodes. Shape
-            (k,), s.
+        rows: Rows of the twist that the task prescribes: angular 0..2, linear 3..5, along `axes`. Required with
+            `velocity`; None selects all rows that the pose defines. A `direction` always prescribes the two rows of the
+            tilt, and `rows` select those of the position.
+        velocity: Velocity in the rows, along `axes`: constant or function of time (s). Shape (len(rows),).
+        position: Origin of the frame in the reference: constant or function of time. Shape (3,), m; if the rows are
+            taken along the axes of the reference, the entries of the linear `rows` alone suffice, in their order.
+        orientation: Orientation of the frame in the reference: constant or function of time; quaternion [w, x, y, z],
+            shape (4,), or matrix, shape (3, 3).
+        direction: Direction of the tool axis in the reference, of any nonzero length; the roll about it is free.
+            Constant or function of time. Shape (3,).
+        within: Half-angle of the cone about the direction in which the tool axis stays, rad, between 0 and pi; None:
+            the axis equals the direction.
+        tool_axis: Tool axis in the frame. Shape (3,).
+        axes: Axes along which the rows are taken: of the world, of the base (root) link, of the frame itself ("tip"),
+            or of the reference. They only resolve the twist; the motion is not relative to them.
+        link: Name of the link that carries the frame; None for the tip of the robot.
+        point: Origin of the frame in the link frame. Shape (3,), m. Only with `link`.
+        relative_to: Name of the reference link, to which motion and pose are relative; None for the world.
+        gain: Feedback gain of the pose error, 1/s, its rate of decay. Keep it below what the mesh resolves; `plan`
+            lowers it to that if there is no start gap to close. At acceleration level the feedback is critically
+            damped, and the error of a `velocity` decays at this rate.
+        start_gap: Largest pose error at the start, m and rad. If positive, the feedback closes the gap.
+        tolerance: Pose error that the audit of a plan accepts in each row, position (m) and orientation (rad), but at
+            most 1e-3 of the path along which the tip moves or rotates. Shape (2,).
+        begin: Begin of the task, s; its tracks are functions of the time since then.
+        duration: Duration of the task, s; None: to the end of the motion.
+        breaks: Times since the begin at which tracks are less smooth, where a mesh should have nodes. Shape (k,), s.
 
     Raises:
-        ProblemError: A task that is not one of the two kinds, rows that it does not define, wrong sizes or values.
+        ProblemError: The task is neither a velocity nor a pose, selects rows that it does not define, or has wrong
+            sizes or values.
     """
 
     rows: Sequence[int] | None = None
@@ -99,18 +99,18 @@ class TipTask:
             words = "a tip task takes an orientation or a direction of its tool axis, not both"
             raise ProblemError(words, name="direction")
         checked_choice("axes", self.axes, get_args(Axes))
-        for what in ("link", "relative_to"):
-            name = getattr(self, what)
-            if name is not None and not checked_text(f"tip task: {what}", name):
-                raise ProblemError(f"tip task: {what} is an empty name", name=what, value=name)
-        for what in ("gain", "start_gap", "begin"):
-            checked_nonnegative(what, getattr(self, what))
+        for attribute in ("link", "relative_to"):
+            name = getattr(self, attribute)
+            if name is not None and not checked_text(f"tip task: {attribute}", name):
+                raise ProblemError(f"tip task: {attribute} is an empty name", name=attribute, value=name)
+        for attribute in ("gain", "start_gap", "begin"):
+            checked_nonnegative(attribute, getattr(self, attribute))
         if self.duration is not None:
             checked_positive("duration", self.duration)
         if self.within is not None:
             checked_positive("within", self.within, below=np.pi)
             if self.direction is None:
-                words = "a tool axis leans within an angle of a direction: give direction=... too"
+                words = "within is an angle about a direction: give direction=... too"
                 raise ProblemError(words, name="within", value=self.within)
         try:
             axis = checked_array(self.tool_axis, (3,), "tip task", "tool_axis")
@@ -141,31 +141,31 @@ class TipTask:
         tool_axis: ArrayInput = (0.0, 0.0, 1.0),
         **others: Any,
     ) -> Self:
-        """The task of running along a path: its position, and the tool as the path turns it.
+        """Return the task of moving along a path, with the tool oriented as the path says.
 
-        Where the path says nothing of the tool's orientation, only the position is asked for, unless `direction` or
-        `orientation` says more. Duration and breaks are those of the path.
+        If the path has no tool orientation, only the position is prescribed, unless `direction` or `orientation` is
+        given. Duration and breaks are those of the path.
 
         Args:
-            path: As `models.smooth` makes it.
-            speed: Constant, m/s; or a Schedule of the path.
-            roll: "free": the tool axis points where the path turns it, the roll about it is free (a `within` lets it
-                lean, too); "given": the whole orientation is the path's.
-            tool_axis: In the tool's frame. Shape (3,).
+            path: Path from `models.smooth`.
+            speed: Constant, m/s, or a Schedule of the path.
+            roll: "free": the tool axis points as the path says and the roll about it is free (within a cone if `within`
+                is given); "given": the path prescribes the whole orientation.
+            tool_axis: Tool axis in the tool frame. Shape (3,).
             others: Further attributes of the task: `link`, `gain`, `within`, `begin`, ...; `direction` or `orientation`
-                instead of the path's.
+                replace those of the path.
 
         Raises:
-            ProblemError: No path, a speed that is none, or what the attributes say.
+            ProblemError: `path` is not a path, the speed is not positive, or an attribute is invalid.
         """
         checked_choice("roll", roll, get_args(Roll))
-        tracks = along(path, speed)
-        given: dict[str, Any] = {"position": tracks.position, "duration": tracks.duration, "breaks": tracks.breaks}
+        tracks = path_tracks(path, speed)
+        attributes: dict[str, Any] = {"position": tracks.position, "duration": tracks.duration, "breaks": tracks.breaks}
         if path.path.oriented and not {"direction", "orientation"} & set(others):
             axis = checked_array(tool_axis, (3,), "tip task", "tool_axis")
-            told = {"orientation": tracks.orientation} if roll == "given" else {"direction": tracks.axis(axis)}
-            given |= told
-        return cls(tool_axis=tool_axis, **{**given, **others})
+            whole = roll == "given"
+            attributes |= {"orientation": tracks.orientation} if whole else {"direction": tracks.axis(axis)}
+        return cls(tool_axis=tool_axis, **{**attributes, **others})
 
     def _checked_breaks(self) -> Array:
         times = np.unique(checked_array(self.breaks, ("times",), "tip task", "breaks", least=0))
@@ -184,26 +184,26 @@ class TipTask:
         defined = (ANGULAR if self.orientation is not None else ()) + (LINEAR if self.position is not None else ())
         if self.rows is None:
             return defined
-        none = self.direction is not None and np.size(self.rows) == 0  # the tilt alone, or a lean
-        rows = () if none else tuple(checked_rows(self.rows))
-        if strange := [row for row in rows if row not in defined]:
+        only_tilt = self.direction is not None and np.size(self.rows) == 0
+        rows = () if only_tilt else tuple(checked_rows(self.rows))
+        if undefined := [row for row in rows if row not in defined]:
             needs = "rows 0..2 need an orientation, rows 3..5 a position; a direction fixes its own rows"
-            raise ProblemError(f"rows {strange}: {needs}", name="rows", value=strange, limit=defined)
+            raise ProblemError(f"rows {undefined}: {needs}", name="rows", value=undefined, limit=defined)
         return rows
 
     @property
     def is_pose(self) -> bool:
-        """Whether the task is a pose over time."""
+        """Whether the task prescribes a pose over time."""
         return not (self.position is None and self.orientation is None and self.direction is None)
 
     @property
     def chosen(self) -> tuple[int, ...]:
-        """The rows, after those of the tilt."""
+        """Rows of the twist that the task prescribes; those of the tilt come before them."""
         return tuple(self.rows or ())
 
     @property
     def linear(self) -> list[int]:
-        """Coordinates 0..2 of the position that the rows fix, in their order."""
+        """Coordinates 0..2 of the position that the rows prescribe, in their order."""
         return [row - 3 for row in self.chosen if row in LINEAR]
 
     @property
@@ -213,36 +213,35 @@ class TipTask:
 
     @property
     def tilts(self) -> bool:
-        """Whether the direction fixes the two rows of the tilt; where the axis may lean it does not."""
+        """Whether the direction prescribes the two rows of the tilt: not if the axis may move in a cone."""
         return self.direction is not None and self.within is None
 
     @property
     def size(self) -> int:
-        """Number of rows, with those of the tilt."""
+        """Number of rows, including those of the tilt."""
         return len(self.chosen) + (2 if self.tilts else 0)
 
     @property
     def end(self) -> float:
-        """When the task ends, s; infinite where it lasts to the end of the motion."""
+        """End of the task, s; infinite if it lasts to the end of the motion."""
         return np.inf if self.duration is None else float(self.begin + self.duration)
 
 
 def timed(task: TipTask, clock: Callable[[Any], Any]) -> TipTask:
-    """A task over a path parameter as one over time.
+    """Return a task over a path parameter as a task over time.
 
     Args:
-        task: Its tracks are functions of the parameter, its velocity is per unit of it.
-        clock: Casadi time (s) -> parameter.
+        task: Task whose tracks are functions of the parameter and whose velocity is per unit of it.
+        clock: CasADi function time (s) -> parameter.
     """
 
     def velocity(time: Any) -> Any:
-        at = clock(time)
-        given = task.velocity(at) if callable(task.velocity) else task.velocity
-        return ca.jacobian(at, time) * expression(given)
+        parameter = clock(time)
+        rate = task.velocity(parameter) if callable(task.velocity) else task.velocity
+        return ca.jacobian(parameter, time) * expression(rate)
 
-    changed: dict[str, Any] = {
-        name: run_by(getattr(task, name), clock) for name in ("position", "orientation", "direction")
-    }
+    poses = ("position", "orientation", "direction")
+    tracks: dict[str, Any] = {name: reparametrized(getattr(task, name), clock) for name in poses}
     if task.velocity is not None:
-        changed["velocity"] = velocity
-    return replace(task, **changed)
+        tracks["velocity"] = velocity
+    return replace(task, **tracks)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from models import Box, Rig, Tunnel, optimal_inverse, reference_rig, reference_tunnel, solve_table
-from models.cts.clearance import CollisionScene, Radii, clear_inverse, clearances
+from models.cts.clearance import CollisionScene, Radii, clearances, collision_free_inverse
 from models.cts.rig import INCH, Branch
 from models.cts.table import all_joint_sets, reachable_rolls
 from tests.bad_values import (
@@ -91,8 +91,8 @@ CASES = [
         },
     ),
     Case(
-        "clear_inverse",
-        clear_inverse,
+        "collision_free_inverse",
+        collision_free_inverse,
         {"rig": RIG, "tunnel": TUNNEL, "scene": WALLS},
         {
             "rig": INSTANCE,

@@ -23,7 +23,6 @@ from models.cts.rig import (
     goose_neck_corner,
     inverse,
     task_jacobian,
-    tool_frame,
 )
 from models.cts.roll import index_harmonics
 from tests.models.cts.cts_oracle import Array, corner_by_rotation, index_by_geometry, joints_by_geometry, random_targets
@@ -49,9 +48,8 @@ def pose_of(rig: Rig, q: Array) -> Array:
 @given(lengths, seeds)
 def test_closed_forward_is_the_dh_product(sizes: list[float], seed: int) -> None:
     rig, q = Rig(*sizes), random_joints(seed)
-    product, closed = dh_frames(rig, q)[-1], tool_frame(rig, q)
-    np.testing.assert_allclose(numeric(closed.rotation), numeric(product.rotation), atol=1e-12)
-    np.testing.assert_allclose(numeric(closed.position), numeric(product.position), atol=1e-12)
+    position = numeric(dh_frames(rig, q)[-1].position).ravel()
+    np.testing.assert_allclose(pose_of(rig, q)[:3], position, atol=1e-12)
 
 
 @given(lengths, seeds)
@@ -62,7 +60,7 @@ def test_tool_rotation_is_yaw_pitch_roll_of_the_pose(sizes: list[float], seed: i
     turn_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
     turn_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
     turn_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
-    np.testing.assert_allclose(numeric(tool_frame(rig, q).rotation), turn_z @ turn_y @ turn_x, atol=1e-12)
+    np.testing.assert_allclose(numeric(dh_frames(rig, q)[-1].rotation), turn_z @ turn_y @ turn_x, atol=1e-12)
 
 
 def test_inverse_of_forward_holds_the_joints_among_its_branches() -> None:

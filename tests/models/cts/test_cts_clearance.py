@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from models import Box, ModelError, optimal_inverse, reference_rig, reference_tunnel, solve_table
-from models.cts.clearance import CollisionScene, clear_inverse, clearances
+from models.cts.clearance import CollisionScene, clearances, collision_free_inverse
 from models.cts.rig import HOME, INCH, inverse
 from models.cts.roll import ACTIVE, STATUS
 from models.shapes.distance import soft_minimum
@@ -42,7 +42,7 @@ def grid_costs(weight: float, width: float, rate_weight: float = 0.0) -> tuple[A
     ("clearance", "weight", "rate_weight"), [(0.15, 0.0, 0.0), (-np.inf, 0.3, 0.0), (0.1, 0.05, 0.5)]
 )
 def test_no_roll_of_a_dense_grid_is_clear_and_better(clearance: float, weight: float, rate_weight: float) -> None:
-    function = clear_inverse(
+    function = collision_free_inverse(
         RIG, TUNNEL, AROUND, clearance=clearance, weight=weight, width=0.1, rate_weight=rate_weight
     )
     costs, distances = grid_costs(weight, 0.1, rate_weight)
@@ -59,7 +59,7 @@ def test_no_roll_of_a_dense_grid_is_clear_and_better(clearance: float, weight: f
 def test_the_best_roll_is_found_where_the_best_clear_roll_of_the_grid_is_elsewhere() -> None:
     """Between two boxes: the best roll is in another basin than the best roll of the grid that is clear."""
     boxes = (Box((0.054, 0.154, 0.19), (2.009, -0.165, 0.153)), Box((0.088, 0.168, 0.084), (1.919, -0.022, -0.091)))
-    function = clear_inverse(RIG, TUNNEL, CollisionScene(solids=boxes), clearance=0.03)
+    function = collision_free_inverse(RIG, TUNNEL, CollisionScene(solids=boxes), clearance=0.03)
     for target, known in (
         ((2.598, 0.156, 0.078, 0.167, 0.076), 0.0172392516),
         ((2.585, 0.092, -0.055, 0.147, 0.053), 0.0468053923),
@@ -79,7 +79,7 @@ def test_the_constraint_that_holds_the_roll_is_named() -> None:
 
 def test_far_from_everything_it_is_the_closed_form() -> None:
     far = CollisionScene(solids=(Box((2.0, 2, 2), (80.0, 0, 0)),))
-    function, closed = clear_inverse(RIG, TUNNEL, far, clearance=0.1), optimal_inverse(RIG, TUNNEL)
+    function, closed = collision_free_inverse(RIG, TUNNEL, far, clearance=0.1), optimal_inverse(RIG, TUNNEL)
     for row in TARGETS:
         np.testing.assert_allclose(np.array(function(row, 0.3)[0]), np.array(closed(row, 0.3)[0]), atol=1e-7)
 
@@ -107,6 +107,6 @@ def test_a_target_that_is_never_clear_is_marked_and_leaves_the_others_alone() ->
 )
 def test_what_cannot_be_asked_is_named(options: dict[str, Any], reason: str) -> None:
     with pytest.raises(ModelError, match=reason):
-        clear_inverse(RIG, TUNNEL, AROUND, **options)
+        collision_free_inverse(RIG, TUNNEL, AROUND, **options)
     with pytest.raises(ModelError, match="empty"):
-        clear_inverse(RIG, TUNNEL, CollisionScene())
+        collision_free_inverse(RIG, TUNNEL, CollisionScene())

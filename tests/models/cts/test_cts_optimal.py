@@ -190,10 +190,12 @@ def test_arcs_are_the_rolls_that_reach(seed: int, branch: Branch, limited: bool)
 
 def test_ends_of_an_arc_sit_on_the_constraint_they_name() -> None:
     targets = random_targets(np.random.default_rng(11), 60)
-    pairs = [(target, arc) for target in targets.T for arc in reachable_rolls(RIG, target) if arc.holds[0] != "free"]
+    pairs = [
+        (target, arc) for target in targets.T for arc in reachable_rolls(RIG, target) if arc.constraints[0] != "free"
+    ]
     assert len(pairs) > 10
     for target, arc in pairs:
-        for roll, name in ((arc.start, arc.holds[0]), (arc.end, arc.holds[1])):
+        for roll, name in ((arc.start, arc.constraints[0]), (arc.end, arc.constraints[1])):
             joints, _ = joints_by_geometry(RIG, target[:, None], roll, HOME)
             stretched = {"pitch reach": abs(np.sin(joints[3, 0])), "yaw reach": abs(np.cos(joints[1, 0]))}
             assert stretched[name] == pytest.approx(1, abs=1e-9)

@@ -101,7 +101,7 @@ def test_yaw_and_pitch_are_those_of_the_rig() -> None:
         (lambda: Box((1, 0, 1)), "size .* m is not positive"),
         (lambda: Box((np.inf,) * 3), "no outside"),
         (lambda: soft_minimum([ca.DM(1)], 0.0), "width"),
-        (lambda: soft_minimum([], 1.0), "no values"),
+        (lambda: soft_minimum([], 1.0), "a list of 1 to"),
     ],
 )
 def test_what_cannot_be_is_named(make: Callable[[], Any], message: str) -> None:

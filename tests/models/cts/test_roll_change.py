@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from models import ModelError, reference_rig, reference_tunnel
-from models.cts.roll import checked_gain, convex_minima, descend, roll_window, unrolled
+from models.cts.roll import checked_gain, convex_minima, minimize_convex, roll_window, unwrap_roll
 from models.cts.trigonometric import Harmonics
 from tests.models.cts.cts_oracle import index_by_geometry, random_targets
 
@@ -43,7 +43,7 @@ def test_no_roll_of_a_grid_is_better_than_the_best_of_the_minima(rig: Any, weigh
 
 @given(st.floats(-9, 9), st.floats(-np.pi, np.pi))
 def test_a_roll_is_told_in_the_turn_that_is_nearest_to_the_one_before(previous: float, roll: float) -> None:
-    found = float(ca.DM(unrolled(RIGS["free"], ca.DM(np.cos(roll)), ca.DM(np.sin(roll)), ca.DM(previous))))
+    found = float(ca.DM(unwrap_roll(RIGS["free"], ca.DM(np.cos(roll)), ca.DM(np.sin(roll)), ca.DM(previous))))
     assert abs(found - previous) <= np.pi + 1e-12
     assert np.sin((found - roll) / 2) == pytest.approx(0, abs=1e-12)
 
@@ -63,7 +63,7 @@ def test_the_window_is_a_turn_within_the_limits(previous: float) -> None:
 def test_descent_ends_where_the_slope_vanishes(gain: float) -> None:
     """Of cos(x) + gain (x - 1)^2, convex for gain > 1 / 2."""
     f = Harmonics(0.0, 1.0, 0.0, 0.0, 0.0)
-    x = float(ca.DM(descend(f, gain, ca.DM(1.0), ca.DM(-3.0), ca.DM(5.0), ca.DM(1.0), 20)))
+    x = float(ca.DM(minimize_convex(f, gain, ca.DM(1.0), (ca.DM(-3.0), ca.DM(5.0)), start=ca.DM(1.0), steps=20)))
     assert -np.sin(x) + 2 * gain * (x - 1) == pytest.approx(0, abs=1e-12)
 
 

@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose
 
 from models import CollisionScene, link_frames
 from models.arrays import Array
-from models.shapes.bodies import bodies_of
+from models.shapes.bodies import collision_bodies
 from models.shapes.pairs import ALWAYS, NEIGHBOURS, NEVER, RIGID
 from ocp import TipTask, inverse_kinematics
 from ocp.motion.local.collisions import distances_along
@@ -38,7 +38,7 @@ def postures(problem: Benchmark) -> Array:
 def by_coal(problem: Benchmark, joints: Array) -> dict[frozenset[str], Array]:
     """Distances (M,) of all capsules to each other and to the boxes, by their names; of none that is ignored."""
     robot = problem.machine.robot
-    bodies = {body.link: body.shape for body in bodies_of(robot)}
+    bodies = {body.link: body.shape for body in collision_bodies(robot)}
     boxes = {f"obstacle {k}": box for k, box in enumerate(problem.boxes)}
     listed = {frozenset(pair) for pair in problem.ignored}
     q = ca.SX.sym("q", robot.dof)

@@ -111,7 +111,7 @@ def test_distances_are_those_of_the_hulls(name: str) -> None:
         for i, (one, other, _) in enumerate(around.pairs):
             a, c = sides[2 * i][None], sides[2 * i + 1][None]
             shapes = around.bodies[one].shape, around.bodies[other].shape
-            radii = shapes[0].swelling + shapes[1].swelling
+            radii = shapes[0].swept_radius + shapes[1].swept_radius
             way = -shapes[1].normal[None] if isinstance(shapes[1], HalfSpace) else nearest_directions(a, c)[0]
             gap = gap_along(way, a, c)[0]
             if any(isinstance(shape, Cylinder) for shape in shapes):  # of which the distance is a bound from below
@@ -148,7 +148,7 @@ def test_no_point_moves_or_bends_by_more_than_its_levers_say(name: str) -> None:
         speeds, bends = np.array(found[: len(parts)]), np.array(found[len(parts) :])
         slow = lever @ np.abs(rate)
         most = lever @ np.abs(push) + 2 * (turn @ np.abs(rate)) * slow
-        # of a swelling nothing is seen here; the core's points move less than it says
+        # the swept radius has no influence here; the core's points move less than it says
         assert np.all(speeds.reshape(-1, 2).sum(axis=1) <= slow + 1e-9)
         assert np.all(bends.reshape(-1, 2).sum(axis=1) <= most + 1e-9)
         moving = slow > 0
@@ -191,7 +191,7 @@ def test_which_pairs_are_left() -> None:
     machine = FixedBase(armoured_arm())
     around = CollisionScene(machine, OBSTACLES, ignored=[("link6", "obstacle 1"), ("link2", "link4")])
     assert around.left["base", "obstacle 0"] == "neither moves"
-    assert around.left["link6", "obstacle 1"] == "told"
+    assert around.left["link6", "obstacle 1"] == "ignored by request"
     assert not {("link6", "obstacle 1"), ("link2", "link4"), ("base", "obstacle 3")} & set(around.labels)
     assert ("link6", "obstacle 0") in around.labels
     moving = CollisionScene(machine, [MovingObstacle(OBSTACLES[0], lambda t: (t, 0, 0))])

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from models import Arc, Helix, Line, ModelError, Path, Scara, scara_along, smooth
 from models.machines.scara_path import ScaraPath
 from models.paths import Segment
+from models.paths.blends import cubic, curvature, quintic
 
 Array = NDArray[np.float64]
 seeds = st.integers(0, 2**32 - 1)
@@ -82,3 +83,22 @@ def random_arm_path(rng: np.random.Generator) -> ScaraPath | None:
         return scara_along(arm, path, "left" if rng.random() < 0.5 else "right")
     except ModelError:
         return None
+
+
+def peak_curvature(shape: float, angle: float, remaining: float, kind: str = "cubic") -> float:
+    """Return the largest curvature (1/m) of a blend between two lines, sampled on a grid refined about its maximum."""
+    n1, n2 = np.array([1.0, 0.0, 0.0]), np.array([-np.cos(angle), np.sin(angle), 0.0])
+    rate, zero = shape * remaining, np.zeros(3)
+    start, end = -remaining * n1, remaining * n2
+    if kind == "cubic":
+        curve = cubic(start, rate * n1, end, rate * n2)
+    else:
+        curve = quintic(start, rate * n1, zero, end, rate * n2, zero)
+    low, high, best = 0.0, 1.0, 0.0
+    for _ in range(5):
+        u = np.linspace(low, high, 2001)
+        values = curvature(curve, u)
+        k = int(values.argmax())
+        best = float(values[k])
+        low, high = u[max(k - 2, 0)], u[min(k + 2, len(u) - 1)]
+    return best

@@ -5,18 +5,7 @@ from __future__ import annotations
 import pytest
 
 from models import Arc, Helix, Line, Path, SmoothPath, smooth
-from models.paths import (
-    end_curvature,
-    gamma,
-    gauss_newton,
-    march,
-    middle_curvature,
-    path_function,
-    peak_curvature,
-    predictor_corrector,
-    rest_to_rest,
-    turn_function,
-)
+from models.paths import gamma, gauss_newton, march, path_function, predictor_corrector, rest_to_rest, turn_function
 from tests.bad_values import (
     CHOICE,
     COUNT,
@@ -139,7 +128,7 @@ CASES = [
     ),
     *[method(rounded, name, {"distance": 0.1}, distance=DISTANCE) for name in ("at", "curvature", "turn", "parameter")],
     method(rounded, "blend", {"vertex": 0}, vertex=WHOLE | NOTHING | {"high": 9}),
-    method(rounded, "dense", {"per_cell": 4}, per_cell=COUNT | NOTHING, per_segment=COUNT | NOTHING),
+    method(rounded, "sample_distances", {"per_cell": 4}, per_cell=COUNT | NOTHING, per_segment=COUNT | NOTHING),
     method(
         rounded, "by_piece", {"of_segments": 1.0}, of_segments=but(FINITE, "inf", "minus inf") | {"three": [1, 2, 3]}
     ),
@@ -148,15 +137,6 @@ CASES = [
         for function in (path_function, turn_function)
     ],
     Case("gamma", gamma, AT_CORNER, {"shape": POSITIVE, "angle": POSITIVE | {"turned": 4.0}, "kind": CHOICE}),
-    *[
-        Case(
-            function.__name__,
-            function,
-            {**AT_CORNER, "remaining": 0.1},
-            {"shape": POSITIVE, "angle": POSITIVE | {"turned": 4.0}, "remaining": POSITIVE | NOTHING},
-        )
-        for function in (end_curvature, middle_curvature, peak_curvature)
-    ],
     Case("rest_to_rest", rest_to_rest, {"s": 0.5}, {"s": {"word": "a", "None": None, "mapping": {}, "nan": NAN}}),
     Case("predictor_corrector", predictor_corrector, {}, {"degree": COUNT, "corrections": WHOLE | NOTHING}),
     Case(

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from models import Arc, Line, ModelError, Path, SmoothPath, smooth
-from models.paths import end_curvature, gamma, peak_curvature
+from models.paths import gamma
+from models.paths.blends import curvature
+from tests.models.paths.task_paths import peak_curvature
 
 MM = 1e-3
 
@@ -32,7 +34,9 @@ def test_the_distance_of_a_blend_from_its_corner(shape: float, angle: float, val
 
 
 def test_curvatures_at_shape_three() -> None:
-    assert end_curvature(3.0, np.radians(70.0), 1.0) == pytest.approx(0.0, abs=1e-14)
+    corner = Path.through([(-1, 0, 0), (0, 0, 0), (-np.cos(np.radians(70.0)), np.sin(np.radians(70.0)), 0)])
+    curve = smooth(corner, 0.5, kind="cubic", shape=3.0).coefficients[0]
+    assert curvature(curve, np.array([0.0, 1.0])) == pytest.approx(0.0, abs=1e-13)
     assert peak_curvature(3.0, np.radians(90.0), 1.0) == pytest.approx(3.771, abs=1e-3)
     assert peak_curvature(3.0, np.radians(45.0), 1.0) == pytest.approx(16.82, abs=1e-2)
 

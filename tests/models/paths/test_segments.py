@@ -182,7 +182,7 @@ TILTED = turned((1.0, 0, 0))
         (lambda: Helix((1, 0, 0), (0, 0, 0), (0, 0, 0), 1.0, 0.1), "helix: .* no direction"),
         (lambda: Helix((1, 0, 0), (0, 0, 0.1), (0, 0, 1), 1.0, 0.1), "helix: .* perpendicular"),
         (lambda: Helix((1, 0, 0), (0, 0, 0), (0, 0, 1), -1.0, 0.1), "sweep -1.0 rad is not positive"),
-        (lambda: Helix((1, 0, 0), (0, 0, 0), (0, 0, 1), 1e-10, 0.0), "drop it"),
+        (lambda: Helix((1, 0, 0), (0, 0, 0), (0, 0, 1), 1e-10, 0.0), "remove it"),
         (lambda: Helix((1, 0, 0), (0, 0, 0), (0, 0, 1), 1.0, NAN), "rise nan"),
         (lambda: Path(()), "no segment"),
         (lambda: Path(3), "no sequence"),  # type: ignore[arg-type]

@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize_scalar
 
 from models import Arc, Helix, Line, Path, SmoothPath, smooth
-from models.paths import peak_curvature
 from models.paths.blends import corner_shape, polynomial
-from tests.models.paths.task_paths import random_path, seeds
+from tests.models.paths.task_paths import peak_curvature, random_path, seeds
 
 few = settings(max_examples=40)
 pytestmark = pytest.mark.filterwarnings("ignore:overlap='shrink'")

@@ -75,14 +75,14 @@ def by_coal(one: Shape, other: Shape) -> float:
 def by_differences(one: Shape, other: Shape) -> float:
     """Signed distance from the hull of all differences of points of two cores: its depth, or its point nearest 0."""
     differences = (one.core[:, None] - other.core[None]).reshape(-1, 3)
-    swelling = one.swelling + other.swelling
+    swept_radius = one.swept_radius + other.swept_radius
     hull = ConvexHull(differences, qhull_options="QJ1e-12")
     depth = float(hull.equations[:, 3].max())
     if depth < 0:
-        return depth - swelling
+        return depth - swept_radius
     differences, weight = differences[hull.vertices], 1e3
     shares, _ = nnls(np.vstack([differences.T, np.full(len(differences), weight)]), np.array([0, 0, 0, weight]))
-    return float(np.linalg.norm(differences.T @ (shares / shares.sum()))) - swelling
+    return float(np.linalg.norm(differences.T @ (shares / shares.sum()))) - swept_radius
 
 
 def moved_distance(one: Shape, other: Shape, rounding: float = 0.0) -> tuple[Callable[..., Any], Callable[..., Any]]:

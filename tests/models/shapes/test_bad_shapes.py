@@ -112,20 +112,20 @@ CASES = [
     Case(
         "distance",
         distance,
-        {"one": Box((1, 1, 1)), "other": Sphere(1.0, (2, 0, 0))},
+        {"first": Box((1, 1, 1)), "second": Sphere(1.0, (2, 0, 0))},
         {
-            "one": INSTANCE | {"endless": Box((INF, 1, 1))},
-            "other": INSTANCE | {"endless": Box((INF, 1, 1))},
-            "one_frame": FRAME,
-            "other_frame": FRAME,
+            "first": INSTANCE | {"endless": Box((INF, 1, 1))},
+            "second": INSTANCE | {"endless": Box((INF, 1, 1))},
+            "first_frame": FRAME,
+            "second_frame": FRAME,
             "rounding": NONNEGATIVE | NOTHING,
         },
     ),
     Case(
         "distance of a half-space",
         distance,
-        {"one": a_half_space(), "other": a_box()},
-        {"other": {"too": a_half_space()}},
+        {"first": a_half_space(), "second": a_box()},
+        {"second": {"too": a_half_space()}},
     ),
     Case(
         "soft_minimum", soft_minimum, {"values": [1.0, 2.0], "width": 0.1}, {"values": {"none": []}, "width": POSITIVE}

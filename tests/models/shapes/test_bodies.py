@@ -12,8 +12,8 @@ import trimesh
 
 from models import CollisionScene, CollisionShape, FixedBase, Joint, Link, ModelError, ModelWarning, Robot
 from models.arrays import Array
-from models.shapes.bodies import Body, bodies_of, capsule_around
-from models.shapes.covering import inside
+from models.shapes.bodies import Body, capsule_around, collision_bodies
+from models.shapes.covering import exceedance
 from models.shapes.mesh_files import find_mesh, read_mesh
 from models.shapes.shapes import Box, Capsule, Cylinder, HalfSpace, Mesh, Sphere
 from tests.models.robot.pinocchio_robots import ROBOTS, urdf_file
@@ -32,7 +32,7 @@ def shape(kind: Any, size: Any, **more: Any) -> CollisionShape:
 
 def test_simple_shapes_are_what_they_are() -> None:
     robot = one_link(shape("box", (0.1, 0.2, 0.3)), shape("sphere", (0.1,)), shape("capsule", (0.1, 0.4)))
-    box, ball, rod = (body.shape for body in bodies_of(robot))
+    box, ball, rod = (body.shape for body in collision_bodies(robot))
     assert isinstance(box, Box)
     np.testing.assert_array_equal(box.size, [0.1, 0.2, 0.3])
     np.testing.assert_allclose(box.rotation, TURN, atol=1e-15)
@@ -41,17 +41,17 @@ def test_simple_shapes_are_what_they_are() -> None:
     assert isinstance(rod, Capsule)
     np.testing.assert_allclose(rod.start, PLACE - 0.2 * TURN[:, 2], atol=1e-15)
     np.testing.assert_allclose(rod.end, PLACE + 0.2 * TURN[:, 2], atol=1e-15)
-    assert [body.overhang for body in bodies_of(robot)] == [0.0, 0.0, 0.0]
+    assert [body.overhang for body in collision_bodies(robot)] == [0.0, 0.0, 0.0]
 
 
 @pytest.mark.parametrize(("radius", "length"), [(0.05, 0.6), (0.05, 0.11), (0.1, 0.02), (0.03, 0.06), (0.01, 1.0)])
 def test_a_cylinder_lies_in_what_stands_for_it(radius: float, length: float) -> None:
-    (body,) = bodies_of(one_link(shape("cylinder", (radius, length))))
+    (body,) = collision_bodies(one_link(shape("cylinder", (radius, length))))
     angles = np.linspace(0, 2 * np.pi, 500)
     rim = np.column_stack([radius * np.cos(angles), radius * np.sin(angles), np.full(500, length / 2)])
     points = PLACE + np.concatenate([rim, rim * [1, 1, -1]]) @ TURN.T
     if isinstance(body.shape, Capsule):
-        assert inside(body.shape, points).max() <= 0
+        assert exceedance(body.shape, points).max() <= 0
         pole = np.linalg.norm(np.subtract(body.shape.end, body.shape.start)) / 2 + body.shape.radius - length / 2
         assert body.overhang == pytest.approx(pole)
         assert body.overhang >= body.shape.radius - radius
@@ -106,21 +106,21 @@ def mesh_points(robot: Robot) -> dict[str, list[Array]]:
 def outside(bodies: tuple[Body, ...], link: str, points: Array) -> float:
     """How far the worst point is outside of all of a link's bodies that cover meshes, m."""
     shapes = [body.shape for body in bodies if body.link == link]
-    return float(np.min([inside(each, points) for each in shapes if isinstance(each, Capsule | Box)], axis=0).max())
+    return float(np.min([exceedance(each, points) for each in shapes if isinstance(each, Capsule | Box)], axis=0).max())
 
 
 def test_a_mesh_is_found_scaled_mirrored_and_placed(mesh_robot: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     robot = Robot.from_urdf(mesh_robot)
     (points,) = mesh_points(robot)["upper"]
-    bodies = bodies_of(robot)
+    bodies = collision_bodies(robot)
     assert outside(bodies, "upper", points) <= 1e-12
     assert len(bodies) == 1
     assert isinstance(bodies[0].shape, Capsule)
     assert bodies[0].shape.radius == pytest.approx(0.03, rel=0.02)
     text = mesh_robot.read_text(encoding="utf-8")
     with pytest.raises(ModelError, match=r"'upper'.*upper\.stl.*folders"):
-        bodies_of(Robot.from_urdf(text))  # a text has no folder
-    again = bodies_of(Robot.from_urdf(text), folders=[mesh_robot.parents[2]])
+        collision_bodies(Robot.from_urdf(text))  # a text has no folder
+    again = collision_bodies(Robot.from_urdf(text), folders=[mesh_robot.parents[2]])
     np.testing.assert_array_equal(again[0].shape.core, bodies[0].shape.core)
 
 
@@ -146,20 +146,20 @@ def test_a_missing_mesh_is_named_and_skipped_only_if_told(mesh_robot: Path) -> N
     (mesh_robot.parents[1] / "meshes" / "upper.stl").unlink()
     robot = Robot.from_urdf(mesh_robot)
     with pytest.raises(ModelError, match=r"'upper'.*upper\.stl") as caught:
-        bodies_of(robot)
+        collision_bodies(robot)
     assert caught.value.name == "package://arm_description/meshes/upper.stl"
     assert caught.value.value == "upper"
     with pytest.warns(ModelWarning, match=r"'upper'.*upper\.stl"):
-        assert bodies_of(robot, missing="skip") == ()
+        assert collision_bodies(robot, missing="skip") == ()
 
 
 def test_a_broken_mesh_is_named_with_its_link(mesh_robot: Path) -> None:
     (mesh_robot.parents[1] / "meshes" / "upper.stl").write_bytes(b"solid\nvertex\n")
     robot = Robot.from_urdf(mesh_robot)
     with pytest.raises(ModelError, match=r"link 'upper': mesh .*line 2"):
-        bodies_of(robot)
+        collision_bodies(robot)
     with pytest.warns(ModelWarning, match="line 2"):
-        assert bodies_of(robot, missing="skip") == ()
+        assert collision_bodies(robot, missing="skip") == ()
 
 
 @pytest.mark.parametrize(
@@ -170,7 +170,7 @@ def test_real_robots_are_covered(name: str) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ModelWarning)
         robot = Robot.from_urdf(urdf_file(package, ending), **options)
-    bodies = bodies_of(robot)
+    bodies = collision_bodies(robot)
     assert {body.link for body in bodies} == {link.name for link in robot.links if link.collisions}
     for link, meshes in mesh_points(robot).items():
         for points in meshes:
@@ -192,7 +192,7 @@ def test_real_robots_are_covered(name: str) -> None:
 def test_bad_requests_are_named(options: dict[str, Any], name: str) -> None:
     options = {"robot": one_link()} | options
     with pytest.raises(ModelError) as caught:
-        bodies_of(options.pop("robot"), **options)
+        collision_bodies(options.pop("robot"), **options)
     assert caught.value.name == name
 
 

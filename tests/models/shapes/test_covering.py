@@ -15,7 +15,7 @@ from models import ModelError, cache
 from models.arrays import Array
 from models.shapes import covering
 from models.shapes.bodies import capsule_around
-from models.shapes.covering import Cover, cover, cut, fitted, inside
+from models.shapes.covering import Cover, cover, exceedance, fit_cover, split_triangles
 from models.shapes.hull import convex_hull
 from models.shapes.mesh_files import Faces
 from models.shapes.shapes import Box, Capsule
@@ -79,32 +79,32 @@ def surface_points(vertices: Array, faces: Faces, count: int = 20_000) -> Array:
 @pytest.mark.parametrize("mesh", MESHES)
 def test_no_point_of_the_surface_is_outside(mesh: str) -> None:
     vertices, faces = MESHES[mesh]()
-    covers = fitted(vertices[faces])
+    covers = fit_cover(vertices[faces])
     for points in (vertices[np.unique(faces)], surface_points(vertices, faces)):
-        assert np.min([inside(each.shape, points) for each in covers], axis=0).max() <= 0
+        assert np.min([exceedance(each.shape, points) for each in covers], axis=0).max() <= 0
 
 
 def test_what_a_closed_surface_encloses_is_covered() -> None:
     """Also where the surface itself is covered in parts: random points inside the dumbbell's rod and discs."""
     vertices, faces = dumbbell()
-    covers = fitted(vertices[faces])
+    covers = fit_cover(vertices[faces])
     assert len(covers) > 1
     rng = np.random.default_rng(0)
     points = rng.uniform([-0.06, -0.06, -0.3], [0.06, 0.06, 0.3], (40_000, 3))
     across, along = np.hypot(points[:, 0], points[:, 1]), np.abs(points[:, 2])
     solid = (across < 0.019) | ((across < 0.059) & (along > 0.2))
-    assert np.min([inside(each.shape, points[solid]) for each in covers], axis=0).max() <= 0
+    assert np.min([exceedance(each.shape, points[solid]) for each in covers], axis=0).max() <= 0
 
 
 def test_parts_cover_less_than_one_capsule() -> None:
     vertices, faces = dumbbell()
     one = capsule_around(0.06, 0.6)[0]
-    assert volume(fitted(vertices[faces])) < 0.8 * one
+    assert volume(fit_cover(vertices[faces])) < 0.8 * one
 
 
 def test_a_plate_gets_a_box_of_its_own_size() -> None:
     vertices, faces = plate()
-    (only,) = fitted(vertices[faces])
+    (only,) = fit_cover(vertices[faces])
     assert isinstance(only.shape, Box)
     np.testing.assert_allclose(np.sort(only.shape.size), [0.02, 0.3, 0.4], rtol=1e-6)
     assert only.overhang < 1e-6
@@ -112,7 +112,7 @@ def test_a_plate_gets_a_box_of_its_own_size() -> None:
 
 def test_a_capsule_is_covered_by_itself() -> None:
     mesh = trimesh.creation.capsule(radius=0.1, height=0.5, count=[24, 24])
-    (only,) = fitted(np.asarray(mesh.vertices)[mesh.faces])
+    (only,) = fit_cover(np.asarray(mesh.vertices)[mesh.faces])
     assert isinstance(only.shape, Capsule)
     assert volume((only,)) == pytest.approx(np.pi * 0.01 * (0.5 + 4 / 3 * 0.1), rel=0.01)
     assert only.overhang < 0.003  # the mesh is a polyhedron within the capsule
@@ -121,7 +121,7 @@ def test_a_capsule_is_covered_by_itself() -> None:
 def test_a_cylinder_is_covered_as_the_closed_form_says() -> None:
     radius, length = 0.05, 0.6
     mesh = trimesh.creation.cylinder(radius=radius, height=length, sections=64)
-    covers = fitted(np.asarray(mesh.vertices)[mesh.faces])
+    covers = fit_cover(np.asarray(mesh.vertices)[mesh.faces])
     assert len(covers) == 1
     assert volume(covers) == pytest.approx(capsule_around(radius, length)[0], rel=0.01)
 
@@ -132,10 +132,10 @@ def test_the_cover_moves_and_grows_with_the_mesh(mesh: str) -> None:
     rng = np.random.default_rng(3)
     turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     turn *= np.sign(np.linalg.det(turn))
-    here, there = fitted(vertices[faces]), fitted((2.5 * vertices @ turn.T + [1.0, -2.0, 0.5])[faces])
+    here, there = fit_cover(vertices[faces]), fit_cover((2.5 * vertices @ turn.T + [1.0, -2.0, 0.5])[faces])
     assert volume(there) == pytest.approx(2.5**3 * volume(here), rel=0.15)
     assert len(there) == len(here)
-    scaled = fitted((2.0 * vertices)[faces])  # a power of two: the same arithmetic
+    scaled = fit_cover((2.0 * vertices)[faces])  # a power of two: the same arithmetic
     assert volume(scaled) == pytest.approx(8 * volume(here), rel=1e-9)
     np.testing.assert_allclose([each.overhang for each in scaled], [2 * each.overhang for each in here], rtol=1e-9)
 
@@ -144,7 +144,7 @@ def test_the_overhang_is_the_farthest_point_from_the_hull() -> None:
     """By an independent way: the distance of many points of the cover from the hull, by trimesh."""
     vertices, faces = blob(4)
     hull = trimesh.convex.convex_hull(vertices[np.unique(faces)])
-    for each in fitted(vertices[faces]):
+    for each in fit_cover(vertices[faces]):
         assert isinstance(each.shape, Capsule)
         rng = np.random.default_rng(0)
         around = rng.normal(size=(3000, 3))
@@ -176,15 +176,15 @@ def test_flat_and_tiny_meshes_are_covered() -> None:
     for vertices, faces in [(square, [[0, 1, 2], [0, 2, 3]]), (line, [[0, 1, 2]]), (point, [[0, 1, 2]])]:
         for scale in (1.0, 1e-6, 1e3):
             moved = scale * vertices + 5.0
-            covers = fitted(moved[np.array(faces)])
-            assert np.min([inside(each.shape, moved) for each in covers], axis=0).max() <= 0
+            covers = fit_cover(moved[np.array(faces)])
+            assert np.min([exceedance(each.shape, moved) for each in covers], axis=0).max() <= 0
 
 
 def test_cut_triangles_are_on_their_sides_and_keep_their_area() -> None:
     rng = np.random.default_rng(0)
     triangles = rng.normal(size=(200, 3, 3))
     axis = np.array([0.6, 0.0, 0.8])
-    low, high = cut(triangles, axis, 0.1)
+    low, high = split_triangles(triangles, axis, 0.1)
     assert (low @ axis).max() <= 0.1 + ROUNDING
     assert (high @ axis).min() >= 0.1 - ROUNDING
 
@@ -198,21 +198,21 @@ def test_large_meshes_are_covered_too() -> None:
     mesh = trimesh.creation.icosphere(subdivisions=4, radius=0.2)  # 5120 triangles
     mesh.apply_scale([1.0, 1.0, 3.0])
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
-    covers = fitted(vertices[faces])
-    assert np.min([inside(each.shape, vertices) for each in covers], axis=0).max() <= 0
+    covers = fit_cover(vertices[faces])
+    assert np.min([exceedance(each.shape, vertices) for each in covers], axis=0).max() <= 0
     assert volume(covers) < 2 * 4 / 3 * np.pi * 0.2**2 * 0.6
 
 
 def same(one: tuple[Cover, ...], other: tuple[Cover, ...]) -> bool:
-    return [covering._written(each) for each in one] == [covering._written(each) for each in other]
+    return [covering._to_json(each) for each in one] == [covering._to_json(each) for each in other]
 
 
 def test_what_is_kept_is_what_was_fitted(own_cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     vertices, faces = dumbbell()
     first = cover(vertices, faces)
     assert len(list(own_cache.iterdir())) == 1
-    assert same(first, fitted(vertices[faces]))
-    monkeypatch.setattr(covering, "fitted", lambda triangles: pytest.fail("fitted again"))
+    assert same(first, fit_cover(vertices[faces]))
+    monkeypatch.setattr(covering, "fit_cover", lambda triangles: pytest.fail("fitted again"))
     assert same(cover(vertices, faces), first)
     assert same(cover(vertices.tolist(), faces.tolist()), first)
 
@@ -220,7 +220,7 @@ def test_what_is_kept_is_what_was_fitted(own_cache: Path, monkeypatch: pytest.Mo
 @functools.cache
 def covers_of_plate() -> tuple[Cover, ...]:
     vertices, faces = plate()
-    return fitted(vertices[faces])
+    return fit_cover(vertices[faces])
 
 
 @pytest.mark.parametrize(
@@ -228,7 +228,7 @@ def covers_of_plate() -> tuple[Cover, ...]:
 )
 def test_a_broken_cache_is_no_error(own_cache: Path, contents: str, monkeypatch: pytest.MonkeyPatch) -> None:
     vertices, faces = plate()
-    monkeypatch.setattr(covering, "fitted", lambda triangles: covers_of_plate())
+    monkeypatch.setattr(covering, "fit_cover", lambda triangles: covers_of_plate())
     first = cover(vertices, faces)
     (file,) = own_cache.iterdir()
     file.write_text(contents, encoding="utf-8")
@@ -323,6 +323,6 @@ def test_bad_meshes_are_named(vertices: object, faces: object, name: str) -> Non
 
 def test_the_hull_of_a_part_is_in_its_capsule() -> None:
     vertices, faces = blob(5)
-    (only, *more) = fitted(vertices[faces])
+    (only, *more) = fit_cover(vertices[faces])
     if not more:
-        assert inside(only.shape, convex_hull(vertices[np.unique(faces)]).vertices).max() <= 0
+        assert exceedance(only.shape, convex_hull(vertices[np.unique(faces)]).vertices).max() <= 0

@@ -141,7 +141,7 @@ def test_height_above_a_half_space_is_that_of_the_lowest_point(kind: type) -> No
     rng = np.random.default_rng(5)
     for _ in range(20):
         ground, shape = random_shape(HalfSpace, rng), random_shape(kind, rng)
-        known = ((shape.core - ground.point) @ ground.normal).min() - shape.swelling
+        known = ((shape.core - ground.point) @ ground.normal).min() - shape.swept_radius
         assert number(distance(shape, ground)) == pytest.approx(known, abs=1e-12)
         assert number(distance(ground, shape)) == pytest.approx(known, abs=1e-12)
 
@@ -301,7 +301,7 @@ def between_boxes(one: Box, other: Box) -> float:
 def test_rounded_distances_are_short_by_as_much_as_is_said(pair: tuple[type, type], rounding: float) -> None:
     pairs = random_pairs(pair, 2000, seed=12)
     known, found = in_bulk(pairs), in_bulk(pairs, rounding)
-    apart = known + [one.swelling + other.swelling for one, other in pairs]
+    apart = known + [one.swept_radius + other.swept_radius for one, other in pairs]
     assert (found <= known + 1e-9).all()
     if pair == (Box, Box):
         seen = np.array([between_boxes(*both) for both in pairs])

@@ -73,7 +73,7 @@ def test_a_cube_has_eight_corners_and_six_normals() -> None:
 @pytest.mark.parametrize("rank", [0, 1, 2])
 def test_points_without_a_volume_are_refused(rank: int) -> None:
     flat = cloud(1)[:, :rank] @ cloud(2, rank) + 0.3
-    with pytest.raises(ModelError, match="lie in a plane") as caught:
+    with pytest.raises(ModelError, match="coplanar") as caught:
         convex_hull(flat)
     assert (caught.value.name, caught.value.value) == ("vertices", 40)
 

@@ -133,8 +133,10 @@ def test_a_collada_scene_places_its_meshes_and_knows_its_unit(tmp_path: Path) ->
 def test_parts_side_by_side_keep_their_triangles() -> None:
     """Of different sizes, and one of none."""
     rng = np.random.default_rng(1)
-    parts = [mesh_files.bare(rng.normal(size=(n, 3)), rng.integers(0, max(n, 1), (n, 3))) for n in (3, 0, 5, 2)]
-    whole = mesh_files.together(parts)
+    parts = [
+        mesh_files.without_colors(rng.normal(size=(n, 3)), rng.integers(0, max(n, 1), (n, 3))) for n in (3, 0, 5, 2)
+    ]
+    whole = mesh_files.join_meshes(parts)
     wanted = np.concatenate([part.vertices[part.faces].reshape(-1, 3) for part in parts])
     np.testing.assert_array_equal(whole.vertices[whole.faces].reshape(-1, 3), wanted)
     assert whole.faces.min() >= 0
@@ -167,9 +169,9 @@ DOUBLING = (
     + "<node id='n40'><instance_geometry url='#g'/></node>"
 )
 BROKEN: list[tuple[str, str | bytes, str]] = [
-    ("a.stl", b"", "cut off"),
+    ("a.stl", b"", "complete binary"),
     ("a.stl", b"\0" * 84, "no triangle"),
-    ("a.stl", binary_stl(CORNERS, FACES)[:-1], "cut off"),
+    ("a.stl", binary_stl(CORNERS, FACES)[:-1], "complete binary"),
     ("a.stl", b" " * 80 + struct.pack("<I", 2**32 - 1), "4294967295"),
     ("a.stl", binary_stl(np.full((4, 3), np.nan), FACES), "not finite"),
     ("a.stl", "solid\nendsolid\n", "no triangle"),
@@ -212,8 +214,8 @@ BROKEN: list[tuple[str, str | bytes, str]] = [
     ("a.dae", dae(ONE).replace("stride='3'", "stride='3' offset='1'"), "offset 1"),
     ("a.dae", dae(ONE).replace("0.3", "nan"), "not finite"),
     ("a.dae", dae("<node><rotate>0 0 0 90</rotate></node>"), "no direction"),
-    ("a.dae", dae(ONE, faces=f"<triangles>{INPUT}<p>0 1 2</p><p>1 2 3</p></triangles>"), "not read"),
-    ("a.dae", dae(ONE, faces=f"<polygons>{INPUT}<ph><p>0 1 2</p></ph></polygons>"), "not read"),
+    ("a.dae", dae(ONE, faces=f"<triangles>{INPUT}<p>0 1 2</p><p>1 2 3</p></triangles>"), "not supported"),
+    ("a.dae", dae(ONE, faces=f"<polygons>{INPUT}<ph><p>0 1 2</p></ph></polygons>"), "not supported"),
     ("a.dae", dae(ONE, faces=f"<polylist>{INPUT}<vcount>2000000000</vcount><p>0 1 2</p></polylist>"), "<vcount>"),
     ("a.dae", dae("<node><instance_controller url='#g'/></node>"), "#g not found"),
     ("a.dae", b"PK\3\4" + bytes(30), "well-formed"),

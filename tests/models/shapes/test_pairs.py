@@ -1,4 +1,4 @@
-"""Which pairs of bodies are checked: by laws of the tree, by proof, as told; against a benchmark and coal."""
+"""Which pairs of bodies are checked: by laws of the tree, by proof, by request; against a benchmark and coal."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ import pytest
 
 from models import CollisionShape, Frame, Joint, Link, Mimic, ModelError, ModelWarning, Robot, link_frames, renamed
 from models.arrays import Array
-from models.shapes.bodies import Body, LinkMesh, RigidParts, bodies_of
+from models.shapes.bodies import Body, LinkMesh, RigidParts, collision_bodies
 from models.shapes.distance import distance
 from models.shapes.pairs import (
     ALWAYS,
     ASSUMED,
     COVERED,
+    IGNORED,
     NEIGHBOURS,
     NEVER,
     RIGID,
     SRDF,
-    TOLD,
     Pairs,
-    _Between,
-    _postures,
+    _BodyPair,
+    _random_configurations,
     checked_pairs,
 )
 from models.shapes.shapes import Box, Capsule, Shape, Sphere
@@ -146,10 +146,10 @@ def test_bodies_are_where_the_kinematics_have_them(seed: int) -> None:
     known = gaps(robot, bodies, every, 10)
     for (i, j), row in zip(every, known, strict=True):
         one, other = bodies[i].shape, bodies[j].shape
-        between = _Between(robot, one, other, *parts.path(bodies[i].link, bodies[j].link))
+        between = _BodyPair(robot, one, other, *parts.path(bodies[i].link, bodies[j].link))
         turn, shift = between._relative(postures)
         np.testing.assert_allclose(exact_distances(one, other, turn, shift), row, atol=1e-9)
-        assert (between.gaps(postures)[0] <= row + 1e-9).all()
+        assert (between.bounds(postures)[0] <= row + 1e-9).all()
 
 
 def test_of_several_bodies_the_reason_that_matters_most_is_told() -> None:
@@ -227,7 +227,7 @@ def test_a_mesh_on_a_link_that_is_fixed_lies_where_it_is_fixed(shift: tuple[floa
 
 def bound(one: Shape, other: Shape, turn: Array, shift: Array) -> Array:
     """Distances as the proof has them."""
-    return _Between(chain(0.1)[0], one, other, [], []).below(turn, shift)
+    return _BodyPair(chain(0.1)[0], one, other, [], []).distance_bounds(turn, shift)
 
 
 def exact_distances(one: Shape, other: Shape, turn: Array, shift: Array) -> Array:
@@ -280,7 +280,7 @@ def test_random_postures_fill_the_limits_or_a_turn_or_a_metre_either_way() -> No
         joints.append(Joint(f"joint{k}", kind, f"link{k}", f"link{k + 1}"))
         links.append(Link(f"link{k + 1}"))
     low, high = np.tile(np.array(ends).T, 2)
-    found = _postures(Robot(tuple(links), tuple(joints)), low, high, 4000, np.random.default_rng(1))
+    found = _random_configurations(Robot(tuple(links), tuple(joints)), low, high, 4000, np.random.default_rng(1))
     for first, room in ((0, np.pi), (4, 1.0)):
         spans = [(-0.3, 0.4), (1.0, 1.0 + 2 * room), (1.0 - 2 * room, 1.0), (-room, room)]
         for k, (least, most) in enumerate(spans):
@@ -344,7 +344,7 @@ def test_an_srdf_file_and_the_user_leave_pairs_out(tmp_path: Path) -> None:
             pairs = checked_pairs(robot, bodies, srdf=source, ignored=[("link3", "link0")])
         assert pairs.checked == ((1, 3),)
         assert pairs.left["link0", "link2"] == SRDF
-        assert pairs.left["link0", "link3"] == TOLD
+        assert pairs.left["link0", "link3"] == IGNORED
 
 
 def test_names_and_the_order_of_declaration_do_not_matter() -> None:
@@ -377,7 +377,7 @@ def test_a_follower_counts_as_it_moves() -> None:
 def test_the_benchmark_of_redundant_arms(name: str) -> None:
     """Capsules and pairs as given: distances at random postures as an own formula and coal have them."""
     robot, ignored = redundancy_benchmark.robot_of(name), redundancy_benchmark.ignored_pairs(name)
-    bodies = bodies_of(robot)
+    bodies = collision_bodies(robot)
     pairs = checked_pairs(robot, bodies, ignored=ignored)
     for pair in ignored:
         assert frozenset(pair) not in by_links(bodies, pairs)
@@ -454,7 +454,7 @@ def test_arms_are_free_at_home(name: str) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ModelWarning)
         robot = Robot.from_urdf(urdf_file(package, ending), **options)
-    bodies = bodies_of(robot)
+    bodies = collision_bodies(robot)
     pairs = checked_pairs(robot, bodies)
     assert not {ALWAYS, COVERED} & set(pairs.left.values())
     frames = link_frames(robot, [HOME[name].get(joint, 0.0) for joint in robot.joint_names])
@@ -503,7 +503,7 @@ def test_collision_shapes_become_checked_bodies() -> None:
         Joint(f"joint{k}", "revolute", f"link{k - 1}", f"link{k}", (0.12, 0, 0), lower=-3, upper=3) for k in (1, 2)
     )
     robot = Robot(links, joints)
-    assert checked_pairs(robot, bodies_of(robot)).checked == ((0, 2),)
+    assert checked_pairs(robot, collision_bodies(robot)).checked == ((0, 2),)
 
 
 def far_meshes(gap: float) -> tuple[Robot, tuple[Body, ...]]:

@@ -26,7 +26,7 @@ def test_a_placed_shape_has_the_moved_core(kind: Any) -> None:
         shape, frame = random_shape(kind, rng), random_frame(rng)
         moved = shape.placed(frame.rotation, frame.position.ravel())
         assert type(moved) is kind
-        assert moved.swelling == shape.swelling
+        assert moved.swept_radius == shape.swept_radius
         np.testing.assert_allclose(moved.core, shape.core @ frame.rotation.T + frame.position.ravel(), atol=1e-12)
         if isinstance(shape, HalfSpace):
             np.testing.assert_allclose(moved.normal, frame.rotation @ shape.normal, atol=1e-12)
@@ -39,7 +39,7 @@ def test_reach_is_the_distance_of_the_farthest_point(kind: type) -> None:
     shape, point = random_shape(kind, rng), rng.normal(size=3)
     shares = rng.dirichlet(np.full(len(shape.core), 0.05), 4000)
     away = rng.normal(size=(4000, 3))
-    drawn = shares @ shape.core + shape.swelling * away / np.linalg.norm(away, axis=1, keepdims=True)
+    drawn = shares @ shape.core + shape.swept_radius * away / np.linalg.norm(away, axis=1, keepdims=True)
     farthest = np.linalg.norm(drawn - point, axis=1).max()
     assert farthest <= shape.reach(point) + 1e-9
     assert farthest >= 0.95 * shape.reach(point)

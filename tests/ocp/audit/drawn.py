@@ -1,4 +1,4 @@
-"""Plans drawn by hand, sound or not, and what an audit must say of them."""
+"""Hand-made plans, valid or not, and the verdicts that an audit must reach."""
 
 from __future__ import annotations
 
@@ -101,21 +101,21 @@ def of(plan: Solution, problem: Problem) -> Solution:
 
 
 def holds(audit: Audit) -> None:
-    """The plan does what is asked and is a local minimum."""
+    """Check that the plan is feasible and a local minimum."""
     assert audit.feasible, str(audit)
     assert audit.optimal is True, str(audit)
     assert audit.passed
 
 
 def is_no_minimum(audit: Audit) -> None:
-    """The motion does what is asked, and some other one beside it costs less."""
+    """Check that the motion is feasible and no local minimum."""
     assert audit.feasible, str(audit)
     assert audit.optimal is False, str(audit)
     assert not audit.passed
 
 
 def is_no_proven_minimum(audit: Audit) -> None:
-    """The motion does what is asked; whether it is a minimum is denied or left open with a reason, never granted."""
+    """Check that the motion is feasible and not accepted as a minimum: rejected, or undetermined with a reason."""
     assert audit.feasible, str(audit)
     assert audit.optimal is not True, str(audit)
     assert audit.optimal is False or audit.undecided
@@ -123,6 +123,6 @@ def is_no_proven_minimum(audit: Audit) -> None:
 
 
 def does_not_do_what_is_asked(audit: Audit) -> None:
-    """The motion is not the one that the problem asks for."""
+    """Check that the motion is infeasible."""
     assert not audit.feasible, str(audit)
     assert not audit.passed

@@ -69,7 +69,7 @@ def test_a_long_path_is_followed_to_a_tenth_of_a_millimetre(length: float) -> No
 
 
 def test_reported_joints_are_what_is_run() -> None:
-    """They may be off what the rates make of them by a thousandth of their spread, 5 mm here, but for the tip."""
+    """Joints may deviate from their integrated rates by a thousandth of their spread, here 5 mm; the tip may not."""
     plan = along(10.0)
     curve = plan.state_interpolant
     values = curve.values.copy()
@@ -116,7 +116,7 @@ def test_a_tolerance_of_the_task_is_one_of_numbers() -> None:
 
 
 def straight(kind: str, tolerance: Any) -> Problem:
-    """From 0 to 100 in a second, with a condition that a plan of the problem without it misses by 0.01 (of 100)."""
+    """From 0 to 100 in 1 s, with a condition that the plan without it violates by 0.01 of 100."""
     problem = Problem("straight")
     x, u = problem.state("x", initial=0.0, terminal=100.0), problem.control("u")
     problem.dynamics(x, u)

@@ -1,4 +1,4 @@
-"""Several solutions of one problem against each other: what agrees, what does not, and what cannot be compared."""
+"""Certificates: solutions of one problem that agree, that differ, and that cannot be compared."""
 
 from __future__ import annotations
 

@@ -65,7 +65,7 @@ def drifting(place: float | None = None) -> Problem:
 
 
 def sprung(stiffness: float | None = None, unit: float = 1.0, zero: float = 0.0) -> Problem:
-    """A mass on a spring whose stiffness is for the plan to choose: a state that stands still."""
+    """A mass on a spring with a free stiffness, stored as a constant state."""
     problem = Problem("sprung")
     q, v = problem.state("q", initial=1.0), problem.state("v", initial=0.0, terminal=0.0)
     given: dict[str, Any] = {} if stiffness is None else {"initial": (stiffness - zero) * unit}
@@ -80,7 +80,7 @@ def sprung(stiffness: float | None = None, unit: float = 1.0, zero: float = 0.0)
 
 
 def priced(stiffness: float | None = None, unit: float = 1.0, zero: float = 0.0) -> Problem:
-    """The same where the choice is paid for at the end, and enters nothing else."""
+    """The same with a choice that only enters the terminal cost."""
     problem = Problem("priced")
     q, v = problem.state("q", initial=1.0, terminal=0.0), problem.state("v", initial=0.0, terminal=0.0)
     given: dict[str, Any] = {} if stiffness is None else {"initial": (stiffness - zero) * unit}

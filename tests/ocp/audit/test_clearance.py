@@ -1,4 +1,4 @@
-"""Proof of distances between the samples: closed forms, fine sampling, thin walls, and what must not change it."""
+"""Clearance proofs against closed forms, fine sampling and thin walls, and their invariances."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def test_the_pair_that_misses_most_of_what_is_asked_of_it_is_the_worst() -> None
 
 
 def test_the_nearest_pair_is_named_however_loose_the_bound_of_another() -> None:
-    """What is far off is told by a bound alone, which may be below the least distance of the nearest pair."""
+    """Distant pairs have a bound only, which may be below the smallest distance of the closest pair."""
     far = {f"far {k}": Hull(-1, np.array([[0.4, y, 0.0]]), 0.0) for k, y in enumerate(np.linspace(0.31, 0.9, 200))}
     hulls = {"ball": BALL, "near": Hull(-1, np.array([[0.5, 0.3, 0.0]]), 0.0), **far}
     found = proof(flight([0, 0, 0], [1, 0, 0], hulls, [[0, k, -1] for k in range(1, len(hulls))], 0.0))
@@ -355,7 +355,7 @@ UP = np.array([0.0, 1.0, 0.0])
 
 @pytest.mark.parametrize("low", [0.3, 0.45, 0.6, 0.81])
 def test_what_slides_on_what_turns_bends_by_coriolis(low: float) -> None:
-    """It comes nearer than is asked for an instant, between all places that are looked at first."""
+    """The required clearance is violated briefly, between all samples of the first pass."""
     found = swinging(low, asked=4e-4).worst
     assert found is not None
     assert found.missed > 0
@@ -368,7 +368,7 @@ def test_what_slides_on_what_turns_bends_by_coriolis(low: float) -> None:
 
 @pytest.mark.parametrize("smooth", [True, False])
 def test_the_pieces_of_a_track_do_not_matter(smooth: bool) -> None:
-    """Many are looked at together at first; the last of an odd number is by itself."""
+    """The first pass combines segments in blocks; the last of an odd number is separate."""
     for pieces in (1, 2, 7, 128, 129, 1001):
         found = swinging(0.3137, pieces, smooth, asked=-0.5)
         assert found.settled
@@ -401,7 +401,7 @@ def test_nothing_is_looked_at_beyond_the_ends(pieces: int) -> None:
 
 @pytest.mark.parametrize("unit", [1e-2, 1.0, 1e2])
 def test_the_unit_of_a_state_does_not_matter(unit: float) -> None:
-    """A point that dips to a height of 1 m, 0.3 s after it starts, told in cm, m, or 100 m."""
+    """A point that dips to a height of 1 m after 0.3 s, in units of cm, m or 100 m."""
     hulls = {"point": Hull(0, np.zeros((1, 3))), "floor": Hull(-1, np.zeros((1, 3)), 0.0, UP)}
     one, rate, second = np.ones((1, 1)), np.array([[1.4 / unit]]), np.array([[2.0 / unit]])
 
@@ -438,7 +438,7 @@ def test_the_least_distance_is_known_to_two_hundredths_and_no_better_than_need_b
 
 
 def test_what_would_take_too_long_is_not_proven() -> None:
-    """It is told from below all the same, and no more is looked at than may be."""
+    """The result is still a lower bound, and the number of intervals stays within its limit."""
     assert swinging(0.3137, asked=-1e-5).settled
     short = swinging(0.3137, asked=-1e-5, settings=ProofSettings(most_intervals=12))
     assert not short.settled

@@ -1,4 +1,4 @@
-"""Multipliers that lose least: what they lose is what a plan costs more, whatever costates it reports."""
+"""Multipliers with the smallest loss: it equals the excess cost of the plan, whatever costates it reports."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def lost(found: Fit) -> float:
 
 
 def without_costates(plan: Solution) -> Solution:
-    """The same plan, of which nothing is known but its motion."""
+    """Return the plan with zero costates and multipliers."""
     curve = plan.costate_interpolant
     nothing = PiecewisePolynomial(curve.breaks, curve.nodes, np.zeros_like(curve.values))
     return replace(

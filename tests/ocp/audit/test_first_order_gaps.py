@@ -1,4 +1,4 @@
-"""Plans that do what is asked and are no extremal, with costates made up to look like one: none passes."""
+"""Feasible plans that are no extremals, with costates forged to look like one: none passes."""
 
 from __future__ import annotations
 
@@ -205,7 +205,7 @@ MOTIONS = {  # start, rad, and direction of the tip; what the pseudo-inverse cos
 @pytest.mark.parametrize("size", [1e-3, 1.0, 1e4])
 @pytest.mark.parametrize("motion", MOTIONS)
 def test_the_pseudo_inverse_is_no_optimum_of_the_whole_motion(size: float, motion: str) -> None:
-    """Least rates at each instant, costates of minus the rates: stationary, and dearer than the optimum."""
+    """Smallest rates at each time, with costates of minus the rates: stationary, but costlier than the optimum."""
     start, way, dearer = MOTIONS[motion]
     machine = planar([size] * len(start))
     task = TipTask(rows=(3, 4), velocity=size * np.array(way))

@@ -1,4 +1,4 @@
-"""Saved plans of five kinds, edited in every way: what is beyond its tolerance fails or is refused by name.
+"""Saved plans of five kinds with edits: any edit beyond its tolerance fails or is rejected by name.
 
 Edits are coherent where they can be: a curve that is changed is reported as changed. Sizes are shares of the spread of
 what is edited along the plan: edits of ``FRAUD`` are found, those of ``ROUNDING`` pass, and between the two nothing is

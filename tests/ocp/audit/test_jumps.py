@@ -164,7 +164,7 @@ def test_costates_between_nodes_at_a_bound_are_those_of_the_closed_form(sign: fl
 @pytest.mark.parametrize("gain", [0.0, 0.3])
 @pytest.mark.parametrize("control", ["held", "linear"])
 def test_what_a_plan_by_shooting_loses_along_a_bound_is_its_true_excess(control: Any, gain: float) -> None:
-    """Atoms at the nodes are the transcription's own and lose nothing.
+    """Atoms at the nodes belong to the transcription and lose no cost.
 
     Those between linear controls go to and fro, and their spread is told too high by the square of the width.
     """

@@ -1,4 +1,4 @@
-"""Linear programs in time: the multipliers found lose exactly what a plan costs more than the optimum, however told.
+"""Linear programs in time: the loss of the best multipliers is exactly the excess cost of a plan.
 
 Strong duality: of a plan that keeps its limits the least loss over all multipliers is its excess, no more, no less.
 The truth is a linear program of another make: controls held over many short intervals, their effects by the exponential
@@ -95,7 +95,7 @@ class Linear:
         return float(np.trapezoid(x @ self.c + u @ self.d, t) + x[-1] @ self.e)
 
     def judged(self, kind: str, **told: Any) -> Solution:
-        """A plan that keeps all limits, told to be one of this program: its optimum, or that of another cost."""
+        """Return a feasible plan of this program: its optimum, or the optimum of another cost."""
         if kind == "another":
             rng = np.random.default_rng(99)
             c, d, e = (rng.normal(size=2) for _ in range(3))

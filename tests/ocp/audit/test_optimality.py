@@ -1,4 +1,4 @@
-"""What a plan loses is what it costs above the optimum, exactly where the problem is linear and quadratic."""
+"""The loss of a plan is its excess cost over the optimum, exactly for linear-quadratic problems."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the controls really do: integrated in steps that see what happens between the points of a plan."""
+"""Re-integration of the controls in steps that resolve events between the points of a plan."""
 
 from __future__ import annotations
 

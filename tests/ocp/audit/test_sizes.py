@@ -1,4 +1,4 @@
-"""The size of each named thing along a plan: its own spread, whatever its unit, its origin and its bounds."""
+"""Sizes along a plan: the spread of each quantity, independent of unit, origin and bounds."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ def under(limit: float, method: Collocation | MultipleShooting, declared: float 
 
 
 def without_multipliers(plan: Solution) -> Solution:
-    """The same, with nothing in its costates and multipliers."""
+    """Return the plan with zero costates and multipliers."""
     curve = plan.costate_interpolant
     return replace(
         plan,
@@ -74,7 +74,7 @@ def test_a_file_does_not_hide_the_price(tmp_path: Path) -> None:
 
 
 def test_a_bound_that_is_hardly_tightened_costs_hardly_anything() -> None:
-    """Push times tightening: a thousandth of what a limit of 4.5 costs per unit."""
+    """Multiplier times tightening: a thousandth of the marginal cost of a limit of 4.5."""
     method = MultipleShooting(40, control="linear")
     plan, declared = under(4.5, method, 4.5 + 1e-4), solve(push(4.5 + 1e-4), method)
     audit = plan.audit()
@@ -117,7 +117,7 @@ def test_a_tightened_bound_makes_no_minimum_of_a_maximum(width: float) -> None:
 
 
 def test_tightening_without_the_path_rows_is_none_of_these() -> None:
-    """A plan put together by hand may say nothing of the path rows: they count as they are declared."""
+    """A hand-made plan may lack the tightening of path rows: their declared limits count."""
     problem, _, v, u = double_integrator("rows", limit=10.0)
     problem.path("power", u * v, upper=100.0)
     problem.minimize(running=u**2 / 2)

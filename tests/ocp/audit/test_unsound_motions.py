@@ -1,4 +1,4 @@
-"""Plans whose motion is not the one asked for: another horizon, scale, order, bound, a push between the samples."""
+"""Plans with an infeasible motion: wrong horizon, scale, order or bound, or a force pulse between the samples."""
 
 from __future__ import annotations
 
@@ -159,7 +159,7 @@ def test_times_and_breaks_outside_the_plan_are_refused(beyond: Callable[[Solutio
 @pytest.mark.parametrize("way", [9e-4, 1e-5, 1e-9])
 @pytest.mark.parametrize("where", ["initial", "terminal", "end", "path"])
 def test_a_plan_that_stands_still_does_not_go_a_small_way(way: float, where: str) -> None:
-    """A way of less than a millimetre is a way: standing still costs nothing, going costs way^2 / 2."""
+    """A distance below a millimetre counts: resting costs nothing, moving costs distance^2 / 2."""
 
     def build() -> Problem:
         problem = Problem("small way")
@@ -198,7 +198,7 @@ def test_an_arm_that_never_moves_does_no_task_however_small_it_is(size: float) -
 @pytest.mark.parametrize("size", [1e-3, 1.0])
 @pytest.mark.parametrize("drift", [1e-2, 5e-3])
 def test_a_tip_that_drifts_from_its_task_is_found(size: float, drift: float) -> None:
-    """A tip asked for 0.05 links a second goes a share of that aside, all the time: 1e-4 m/s with links of 0.2 m."""
+    """A tip to move 0.05 link lengths a second drifts sideways by a share of it: 1e-4 m/s for 0.2 m links."""
     machine = arm(size)
     velocity = np.array([0.05, -0.02]) * size
     aside = drift * np.array([0.02, 0.05]) * size
@@ -233,7 +233,7 @@ def test_a_small_thing_beside_a_large_one_is_not_drowned_in_it() -> None:
 @pytest.mark.parametrize("away", [1e2, 1e6])
 @every_method
 def test_the_place_of_the_origin_hides_no_error(method: str, away: float) -> None:
-    """A way of 1 far from the origin: the plan misses its dynamics, or its end, by a tenth of the way."""
+    """A distance of 1 far from the origin: the plan violates its dynamics, or its end, by a tenth of it."""
 
     def build(end: float = 1.0) -> Problem:
         problem, _, _, u = double_integrator("far away", start=(away, 0.0), end=(away + end, 0.0))
@@ -248,7 +248,7 @@ def test_the_place_of_the_origin_hides_no_error(method: str, away: float) -> Non
 
 
 def test_a_made_up_costate_of_a_small_price_is_not_drowned_in_a_large_one() -> None:
-    """Two independent ways, one a hundred times as dear; the cheap one bends without need: by b^2 / 6 of 50.5."""
+    """Two independent motions, one with 100 times the cost; the other has a needless bend: b^2 / 6 of 50.5."""
     for price in (1.0, 100.0):
         problem = Problem("two prices")
         x, y = problem.state("x", initial=0.0, terminal=1.0), problem.state("y", initial=0.0, terminal=1.0)
@@ -388,7 +388,7 @@ def test_states_and_controls_are_read_by_name_in_whatever_order(order: str, load
 @pytest.mark.parametrize("at", [0.31, 0.5003, 0.777])
 @every_method
 def test_a_push_between_the_nodes_is_not_stepped_over(shape: str, width: float, at: float, method: str) -> None:
-    """A push of 1 N s within a millisecond: without an answer to it the speed at the end is 1, not 0."""
+    """A pulse of 1 N s within a millisecond: without a reaction the final speed is 1, not 0."""
 
     def build(push: float) -> Problem:
         problem = Problem("pushed")
@@ -483,7 +483,7 @@ def test_no_rule_lets_the_zero_moment_point_leave_the_foot() -> None:
 
 
 def test_the_helpers_draw_what_they_say() -> None:
-    """A plan that is drawn from the optimum costs what the optimum costs, and its array and curves agree."""
+    """A plan sampled from the optimum has its cost, and its arrays and curves agree."""
 
     def q(t: Array) -> Array:
         return 3 * t**2 - 2 * t**3

@@ -24,7 +24,7 @@ def ready(problem: Problem, method: Method, solver: str = "ipopt") -> Prepared:
 @pytest.mark.parametrize("name", ["fastest", "strength", "duration", "way"])
 @pytest.mark.parametrize("method", ["radau", "rk4-linear"])
 def test_from_the_last_plan_a_few_steps_lead_to_the_next(name: str, method: str) -> None:
-    """While the same limits push, Newton's steps; where others do, the whole way. The optimum is that from afar."""
+    """A few Newton steps suffice for small changes; larger changes lead to the same optimum as a cold start."""
     prepared = ready(moved(), FINE[method])
     plan = prepared.solve(MOVED)
     for factor in (1.0005, 0.9995, 1.04, 0.9):
@@ -74,7 +74,7 @@ def test_limits_that_repeat_each_other_are_no_matter() -> None:
 
 @pytest.mark.parametrize("stiffness", [8.0, 10.5, 15.0, 30.0])
 def test_a_saddle_beside_a_plan_is_none(stiffness: float) -> None:
-    """A rod that bows to one side: from about pi^2 on, what was the only way is a saddle between two."""
+    """A rod that buckles: from about pi^2 on, the only solution becomes a saddle point between two."""
     problem = Problem("rod")
     k, x, u = problem.parameter("k"), problem.state("x", initial=[0.0]), problem.control("u")
     problem.dynamics(x, u)
@@ -106,7 +106,7 @@ def test_a_saddle_to_which_curved_steps_lead_is_none() -> None:
 
 
 def test_units_of_states_controls_and_cost_do_not_matter() -> None:
-    """Of powers of two, so that they round nothing: the same steps to the same plan."""
+    """With scales of powers of two nothing is rounded: the same steps lead to the same plan."""
     found = {}
     for scale, strength, price in ((1.0, 1.0, 1.0), (2.0**20, 1.0, 1.0), (2.0**-18, 2.0**15, 2.0**17)):
         problem = Problem("in units")
@@ -204,7 +204,7 @@ def receding(method: Method) -> Problem:
 
 @pytest.mark.parametrize("method", [Collocation(30), MultipleShooting(30)], ids=["radau", "rk4"])
 def test_a_horizon_that_recedes_goes_on_from_the_plan_moved_on(method: Method) -> None:
-    """The plan's own state an interval later is where the next one begins: what is left of it is nearly the plan."""
+    """The next problem starts at the plan's state one interval later: the rest of the plan is nearly its solution."""
     prepared = ready(receding(method), method)
     plan = prepared.solve({"now": [3.0, 1.0]})
     steps = {0: 0, 1: 0}

@@ -91,7 +91,7 @@ def assert_derivatives_agree(program: Program, seed: int) -> None:
 
 
 def takes(method: Method, kind: str, staged: bool) -> bool:
-    """Whether the layout takes the problem: a staged one has no control at the end unless it stands at the nodes."""
+    """Return whether the layout supports the problem: a staged one needs node controls at the end."""
     at_nodes = isinstance(method, MultipleShooting) and method.control == "linear"
     return at_nodes or not staged or kind not in ("swing with tied controls", "fixed horizon by a parameter")
 

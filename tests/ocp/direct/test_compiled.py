@@ -1,4 +1,4 @@
-"""Compiled functions are the interpreted ones to the last bit; libraries are made once, and survive what goes wrong."""
+"""Compiled functions equal the interpreted ones to the last bit; libraries are built once and survive failures."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture(scope="module")
 def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A cache for the tests that only ask for what is compiled."""
+    """A cache for tests that only query what is compiled."""
     place = tmp_path_factory.mktemp("cache")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(place))
@@ -266,7 +266,7 @@ def test_without_a_compiler_the_numbers_are_the_same_and_one_line_says_so(
 def test_the_solver_and_its_numbers_depend_on_no_cache_and_no_compiler(
     own: Path, compiler: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Before something is compiled, by a compiled solve and after it; what is not asked for is not compiled."""
+    """Before, during and after a compiled solve; nothing else is compiled."""
     monkeypatch.setenv("CC", compiler)
     plans = []
     problem, method = van_der_pol(), Collocation(6)

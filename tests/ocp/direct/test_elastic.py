@@ -26,7 +26,7 @@ def conflicts(problem: Problem, method: Any, **settings: Any) -> list[tuple[str,
 
 
 def drive(distance: float = 1.0, push: float = 1.0, **bounds: Any) -> tuple[Problem, Any, Any]:
-    """Rest to rest by a bounded push; takes a push of 4 distance / T^2."""
+    """Rest to rest by a bounded force; requires a force of 4 distance / T^2."""
     problem = Problem("drive")
     q = problem.state("q", initial=0.0, terminal=distance)
     v = problem.state("v", initial=0.0, terminal=0.0, **bounds)
@@ -75,7 +75,7 @@ def test_a_path_constraint_in_the_way_is_named_where_it_stands() -> None:
 
 
 def test_a_final_time_that_is_too_short_is_named() -> None:
-    """A speed of 1 m/s and at most 0.9 s for 1 m; the speed may not give way, for it stands in the dynamics."""
+    """A speed of 1 m/s and at most 0.9 s for 1 m; the speed cannot be relaxed, since it is part of the dynamics."""
     problem, q, u = plant("race", state="q", initial=0.0, terminal=1.0, u={"lower": -1.0, "upper": 1.0}, horizon=None)
     problem.dynamics(q, u / (1 + u**4))  # at most 0.5699 m/s, wherever u goes
     final = problem.horizon(lower=0.1, upper=0.9, guess=0.5)
@@ -149,7 +149,7 @@ def test_of_two_that_cost_the_same_the_one_in_the_way_of_the_cost_gives_way(
 @pytest.mark.parametrize("wall", [1e-4, 1.0, 1e4])
 @pytest.mark.parametrize("gate", [1e-4, 1.0, 1e4])
 def test_units_of_constraints_scale_what_lacks_and_change_nothing_else(gate: float, wall: float, draw: float) -> None:
-    """The gate gives way: 0.2 m are a smaller share of its 0.9 m than of the wall's 0.7 m, whatever the cost."""
+    """The gate is relaxed: 0.2 m is a smaller share of its 0.9 m than of the wall's 0.7 m, whatever the cost."""
     found = conflicts(between(1.0, draw, wall, gate), Collocation(20))
     assert found[0][0] == "gate"
     assert found[0][1] == pytest.approx(0.2 * gate, rel=5e-3)

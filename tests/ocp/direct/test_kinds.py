@@ -109,7 +109,7 @@ def test_a_problem_without_cost_finds_a_feasible_plan(method: str, solver: str, 
 @both_solvers
 @pytest.mark.parametrize("method", METHODS)
 def test_states_and_controls_of_several_sizes_keep_their_places(method: str, solver: str) -> None:
-    """Six independent integrators told apart by their targets: x_i goes straight to its own."""
+    """Six independent integrators with different targets: x_i goes straight to its own."""
     problem = Problem("many")
     targets = {"a": [1.0], "b": [2.0, -3.0], "c": [4.0, 5.0, -6.0]}
     states = {name: problem.state(name, initial=np.zeros(len(goal)), terminal=goal) for name, goal in targets.items()}

@@ -1,4 +1,4 @@
-"""Limits on what nothing can change are let go while solving, and held against the plan afterwards."""
+"""Limits on predetermined variables are removed for the solve and checked afterwards."""
 
 from __future__ import annotations
 

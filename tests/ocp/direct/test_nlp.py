@@ -1,4 +1,4 @@
-"""The solver call: both solvers agree, both tell what went wrong, and Ctrl-C is kept in hand."""
+"""Solver calls: both solvers agree, both report failures, and Ctrl-C is handled."""
 
 from __future__ import annotations
 

@@ -104,7 +104,7 @@ def test_other_parameters_may_make_equalities_of_limits() -> None:
 
 
 def test_the_ceiling_that_leaves_no_freedom_is_reached() -> None:
-    """Bryson-Denham's, in contact on the nodes: its bound does not push there."""
+    """Bryson-Denham problem with contact at the nodes: the bound has no multiplier there."""
     problem = Problem("Bryson-Denham")
     x, v = problem.state("x", initial=0.0, terminal=0.0, upper=1 / 9), problem.state("v", initial=1.0, terminal=-1.0)
     u = problem.control("u")

@@ -1,4 +1,4 @@
-"""Scaling by sizes: plans do not depend on units, what is reported stays in them, and bad scales are called so."""
+"""Scaling by sizes: plans do not depend on units, results keep their units, and bad scaling is reported."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ UNITS = [(1e9, 1.0), (1.0, 1e-6), (1e9, 1e-6), (1e-6, 1e3), (1e-9, 1e-6), (1e9, 
 
 
 def drive(metre: float, second: float, price: float = 1.0, push: float | None = None, order: int = 1) -> Problem:
-    """A metre in a second from rest to rest with least energy, told in units of which there are so many in each."""
+    """A metre in a second from rest to rest with minimal energy, in other units of length and time."""
     problem = Problem("drive")
     bounds: dict[str, Any] = (
         {} if push is None else {"lower": -push * metre / second**2, "upper": push * metre / second**2}
@@ -35,7 +35,7 @@ def drive(metre: float, second: float, price: float = 1.0, push: float | None = 
 
 
 def race(metre: float, second: float, guess: bool) -> Problem:
-    """A metre from rest to rest with a push of 1 m/s^2 in least time, 2 s."""
+    """A metre from rest to rest with at most 1 m/s^2 in minimal time, 2 s."""
     problem = Problem("race")
     q, v = problem.state("q", initial=0.0, terminal=metre), problem.state("v", initial=0.0, terminal=0.0)
     u = problem.control("u", lower=-metre / second**2, upper=metre / second**2)

@@ -105,7 +105,7 @@ def pushing(plan: Solution, bound: float) -> np.ndarray:
 
 
 def test_the_range_ends_where_the_limits_that_push_change() -> None:
-    """Within the range told the same torques stand at their limit; what ends it is named. To first order."""
+    """Within the reported range the active torques stay the same, to first order; the next limit is named."""
     prepared = prepare(loaded(4.0), Collocation(8))
     plan = prepared.solve({"payload": 0.5})
     found = plan.sensitivity("payload")

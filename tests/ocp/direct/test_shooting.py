@@ -175,7 +175,7 @@ def test_linear_controls_are_continuous_and_held_ones_constant(integrator: str) 
 
 @pytest.mark.parametrize("control", CONTROLS)
 def test_interpolant_follows_the_integrator_between_nodes(control: str) -> None:
-    """With many steps the reported curve is the trajectory of the controls, also where it was not asked to pass."""
+    """With many steps the reported curve is the trajectory of the controls, also between the nodes."""
     solution = solve(van_der_pol(), MultipleShooting(4, steps=25, control=control))
     audit = solution.audit()
     assert audit.integration_error < 1e-7

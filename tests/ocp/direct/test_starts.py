@@ -1,4 +1,4 @@
-"""Other starts where the guess fails, and what is told where all of them do."""
+"""Alternative starts after a failed guess, and the report if all of them fail."""
 
 from __future__ import annotations
 

@@ -109,7 +109,7 @@ def test_the_builders_watch_where_the_tips_are() -> None:
     moving = TipTask(position=lambda t: [place[0] - 0.1 * t, place[1]], rows=(3, 4))
     for task, names in (
         (moving, ("task position",)),
-        (TipTask(velocity=[-0.1, 0.0, 0.1], rows=(2, 3, 4)), ("task way", "task turn")),
+        (TipTask(velocity=[-0.1, 0.0, 0.1], rows=(2, 3, 4)), ("task displacement", "task rotation")),
     ):
         problem = minimum_velocity_problem(machine, tasks=task, **asked)
         assert tuple(problem.declared.watch) == names

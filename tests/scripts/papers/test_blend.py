@@ -155,7 +155,7 @@ def test_the_default_mapping_is_the_better_one_everywhere(run: Run[Results]) -> 
 def test_curvature_jumps(run: Run[Results], summary: Summary) -> None:
     np.testing.assert_allclose(summary["curvature_jumps_cubic_per_mm"], [0, 0, 1.62e-4, 3.25e-4], rtol=0, atol=1e-6)
     assert summary["max_curvature_jump_cubic"] == max(summary["curvature_jumps_cubic_per_mm"])
-    peak = run.results.quintic.curvature(run.results.quintic.dense()).max() * MM
+    peak = run.results.quintic.curvature(run.results.quintic.sample_distances()).max() * MM
     assert summary["max_curvature_jump_quintic"] < 1e-9 * peak
 
 

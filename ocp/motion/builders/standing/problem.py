@@ -218,7 +218,7 @@ def standing_problem(
         None
         if end == "free"
         else rates_at_rest(
-            equations, (), guess["joints"].values[-1], ~equations.posed if tip_level == "position" else None
+            equations, (), guess["joints"].values[-1], ~equations.pose_rows if tip_level == "position" else None
         )
     )
     motion, jerks = _motion(problem, machine.robot, bounds, begin, start, resting, end_joints, control, guess)
@@ -272,7 +272,7 @@ def _hold_tips(
         problem.start("tip velocity", residual, lower=0, upper=0, unit=equations.unit())
     gap = equations.acceleration(none, joints, velocities, accelerations, *progress)
     problem.path("tip", gap, lower=0, upper=0, unit=equations.unit("/s^2", "/s^2"))
-    for name, stray in equations.strays(none, joints, velocities, targets).items():
+    for name, stray in equations.deviations(none, joints, velocities, targets).items():
         problem.watch(name, **stray)
 
 

@@ -20,7 +20,7 @@ from models.robot.dynamics import Wrench
 from ocp.direct.guess import Samples
 from ocp.errors import ProblemError
 from ocp.motion.local.accelerations import resolve_accelerations
-from ocp.motion.tasks.checks import inside_limits
+from ocp.motion.tasks.checks import clip_to_limits
 from ocp.motion.tasks.equations import TaskEquations
 from ocp.motion.tasks.limits import JointBounds
 from ocp.motion.tasks.tip_task import timed
@@ -62,7 +62,7 @@ def start_inside(machine: Machine, joints: Array, lower: Array, upper: Array) ->
         if not low < high:
             message = f"joint {name!r} cannot move between its limits {low:g} .. {high:g}: lock it there"
             raise ProblemError(message, name=name, value=float(value), limit=(low, high))
-    return inside_limits("start_joints", machine.robot.joint_names, joints, lower, upper, "start inside them")
+    return clip_to_limits("start_joints", machine.robot.joint_names, joints, lower, upper, "start inside them")
 
 
 def check_freedom(machine: Standing, size: int, zmp: ZmpRule, along: str, tip_level: str, end: str) -> None:

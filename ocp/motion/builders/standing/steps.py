@@ -192,7 +192,7 @@ def _phase(steps: Steps, k: int, start: Array | None, guess: dict[str, Any], ask
     if equations is not None:
         gap = equations.acceleration(none, joints, rates, second, problem.time)
         problem.path("feet", gap, lower=0, upper=0, unit=equations.unit("/s^2", "/s^2"))
-        for name, stray in equations.strays(none, joints, rates, equations.targets(problem.time)).items():
+        for name, stray in equations.deviations(none, joints, rates, equations.targets(problem.time)).items():
             problem.watch(name.replace("task", "feet"), **stray)
     for swing in steps.swings(k):
         _swing(problem, stance, swing, (joints, rates), problem.time / final, asked.clearance)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from models import Path
-from models.paths import chains
+from models.paths import split_at_reversals
 from ocp.app.files import Program, RawTrajectory, TimedProgram, Waypoints, read_gcode, read_trajectory, read_waypoints
 from ocp.motion.schedule import LineLimits
 from tests.bad_values import (
@@ -131,8 +131,8 @@ CASES = [
     method(waypoints, "path", {}, reversal=WIDTH),
     method(waypoints, "smooth", {}, tolerance=POSITIVE | NOTHING, reversal=WIDTH, kind=CHOICE),
     Case(
-        "chains",
-        chains,
+        "split_at_reversals",
+        split_at_reversals,
         {"segments": path().segments},
         {"segments": SEQUENCE | {"none": ()}, "reversal": WIDTH | NOTHING},
     ),

@@ -44,7 +44,9 @@ def sampled(path: Path | SmoothPath, step: float = STEP) -> Array:
     """Points no further apart than `step`. Shape (M, 3), m."""
     if isinstance(path, SmoothPath):
         # many in the cells of a sharp corner, too
-        return path.at(np.append(np.linspace(0, path.length, int(path.length / step) + 2), path.dense(64))).position
+        return path.at(
+            np.append(np.linspace(0, path.length, int(path.length / step) + 2), path.sample_distances(64))
+        ).position
     places = [np.linspace(0, length, int(length / step) + 2) for length in path.lengths]
     index = np.repeat(np.arange(len(places)), [len(each) for each in places])
     return path.at(index, np.concatenate(places))[0]
@@ -71,7 +73,9 @@ def test_a_program_goes_through_and_its_path_stays_within_the_tolerance(file: Fi
         # half a step beside the nearest point, where the curve bends away
         assert strayed(cut.path, smooth) ** 2 <= (1.001 * max(said, tolerance)) ** 2 + 2 * (STEP / 8) ** 2
         assert smooth.at([0.0, smooth.length]).position[0] == pytest.approx(cut.path.segments[0].start, abs=1e-12)
-        assert smooth.curvature_jumps().max(initial=0.0) < 1e-6 * (1 + smooth.curvature(smooth.dense()).max())
+        assert smooth.curvature_jumps().max(initial=0.0) < 1e-6 * (
+            1 + smooth.curvature(smooth.sample_distances()).max()
+        )
 
 
 @pytest.mark.parametrize("file", REFUSED, ids=lambda file: file.stem)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 
 from models import Arc, Line, ModelError, Path
-from models.paths import Segment, chains
+from models.paths import Segment, split_at_reversals
 from ocp import ProblemError
 from ocp.app.files import Cut, Pause, Program, Rapid, TimedProgram, read_gcode
 from ocp.motion.schedule import JointLimits, LineLimits
@@ -169,9 +169,9 @@ SMALL = Arc.about((0.3, 0, 0), (0, 0, 0), (0, 1, 0), 1.0)
     ],
 )
 def test_a_bulb_leaves_a_vertex_as_it_was_reached_and_comes_back(segments: tuple[Segment, ...], width: float) -> None:
-    parts = chains(segments)
+    parts = split_at_reversals(segments)
     assert [index.tolist() for _, index in parts] == [[0], [1]]
-    ((path, index),) = chains(segments, width)
+    ((path, index),) = split_at_reversals(segments, width)
     assert index.tolist() == [0, 0, 0, 0, 1]
     assert path.corner_angles() == pytest.approx(np.pi, abs=2e-6)
     assert path.lengths[1:4].sum() == pytest.approx(7 * np.pi / 3 * width / 2)
@@ -187,7 +187,7 @@ def test_a_bulb_leaves_a_vertex_as_it_was_reached_and_comes_back(segments: tuple
 @pytest.mark.parametrize("wrong", ["join", 0.0, -1.0, float("nan"), None, True])
 def test_a_reversal_that_is_neither_a_word_nor_a_width_is_a_named_error(wrong: object) -> None:
     with pytest.raises(ModelError, match="reversal"):
-        chains([Line((0, 0, 0), (1, 0, 0))], wrong)  # type: ignore[arg-type]
+        split_at_reversals([Line((0, 0, 0), (1, 0, 0))], wrong)  # type: ignore[arg-type]
 
 
 def test_limits_that_a_program_does_not_take_are_named_errors(program: Program, timed: TimedProgram) -> None:

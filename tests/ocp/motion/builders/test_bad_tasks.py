@@ -64,7 +64,7 @@ from ocp import (
     steps_problem,
     walk,
 )
-from ocp.motion.tasks.tracks import along, pose_line
+from ocp.motion.tasks.tracks import path_tracks, pose_line
 from tests.bad_values import (
     CALLABLE,
     CHOICE,
@@ -168,7 +168,7 @@ TASKS = [
             "velocity": NOTHING,
         },
     ),
-    Case("along", along, {"path": None, "speed": 0.1}, {"path": INSTANCE, "speed": POSITIVE}),
+    Case("along", path_tracks, {"path": None, "speed": 0.1}, {"path": INSTANCE, "speed": POSITIVE}),
     Case(
         "pose_line",
         pose_line,

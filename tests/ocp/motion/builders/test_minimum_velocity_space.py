@@ -13,7 +13,7 @@ from models import FreeFloating, Path, center_of_mass, paper_example, smooth
 from models.machines.machine import with_tip
 from ocp import Collocation, ProblemError, TipTask, minimum_velocity_problem, resolve, solve
 from ocp.motion.tasks.equations import bind
-from ocp.motion.tasks.tracks import along
+from ocp.motion.tasks.tracks import path_tracks
 from tests.models.robot.trees import numeric
 from tests.ocp.motion.builders.test_minimum_velocity import audited, chain
 from tests.ocp.motion.local.test_rates import PAPER_START
@@ -191,7 +191,7 @@ def test_the_free_roll_of_a_tool_is_planned_along_a_raster_without_a_jump() -> N
     rotation, position = pose(ur5(), (), UR5_START)
     corners = position + np.array([[0, 0, 0], [0.0, 0.15, 0], [0.04, 0.15, 0], [0.04, 0, 0]])
     path = smooth(Path.through(corners), deviation=0.008)
-    task = TipTask(position=along(path, 0.1).position, direction=rotation[:, 2])
+    task = TipTask(position=path_tracks(path, 0.1).position, direction=rotation[:, 2])
     horizon = path.length / 0.1
     asked: dict[str, Any] = {"tasks": task, "start_joints": UR5_START, "horizon": horizon}
     local = resolve(ur5(), **asked)

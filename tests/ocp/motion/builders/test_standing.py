@@ -480,13 +480,13 @@ def test_a_pushed_machine_is_asked_to_stand_where_a_time_dependent_force_lets_it
         ({"start_joints": np.deg2rad([20.0, 160, 240, 200, 50])}, "'joint1' starts at 0.349.*outside its limits"),
         ({"tasks": TipTask(velocity=(0.0, 0.0), rows=(1, 4))}, r"no joint moves the tip in rows \[1\]"),
         ({"tasks": TipTask(velocity=(0.1,), rows=(4,))}, "'link5' moves at .* 0 s, where the joints are to be at rest"),
-        ({"horizon": -1.0}, "horizon must be a positive number"),
+        ({"horizon": -1.0}, "horizon must be positive and finite"),
         ({"control": "force"}, "control must be 'acceleration' or 'jerk'"),
         ({"along": "arc"}, "along must be 'time' or 'parameter'"),
         ({"end": "soft"}, "end must be 'rest' or 'free'"),
         ({"control": "jerk", "tip_level": "acceleration"}, "goes with control 'acceleration'"),
         ({"zmp": "foot"}, "zmp must be InFoot, .* not 'foot'"),
-        ({"zmp": InFoot(0.15)}, "margin 0.15 m leaves no room"),
+        ({"zmp": InFoot(0.15)}, "margin 0.15 m is too large"),
         ({"limits": 3}, "limits must be a Limits, not "),
         ({"zmp": Following(lambda t: t)}, "Following: the reference must be two numbers"),
         ({"zmp": Pinned("here")}, "Pinned: point must be two numbers"),
@@ -508,7 +508,7 @@ def test_a_margin_wider_than_a_triangular_foot_is_refused() -> None:
     """Inscribed circle of 0.0828 m, though the bounding box is 0.3 m wide."""
     triangle = replace(arm(), support=Support([(-0.1, -0.1), (0.2, -0.1), (-0.1, 0.1828427)]))
     settings: dict[str, Any] = {"zmp": InFoot(0.09)}
-    with pytest.raises(ProblemError, match=r"margin 0.09 m leaves no room .* 0.08\d"):
+    with pytest.raises(ProblemError, match=r"margin 0.09 m is too large .* 0.08\d"):
         standing_problem(triangle, arm_task(), ARM_START, ARM_HORIZON, **settings)
 
 

@@ -223,7 +223,7 @@ def test_limits_that_leave_nothing_are_named(anymal: Peered, name: str, limits: 
 @pytest.mark.parametrize(("what", "told"), [("velocity", "velocity"), ("effort", "torque")])
 def test_a_limit_of_0_is_unknown_and_none_holds(anymal: Peered, what: str, told: str) -> None:
     name = "j2s6s200_joint_3"
-    with pytest.warns(ModelWarning, match=f"gives {name} a {told} limit of 0, which says that it is unknown") as caught:
+    with pytest.warns(ModelWarning, match=f"gives {name} a {told} limit of 0, which is read as unknown") as caught:
         unknown = pushing.problem(changed(anymal.machine, name, **{what: 0.0}))
     assert caught[0].message.name == name  # type: ignore[union-attr]
     free = pushing.problem(changed(anymal.machine, name, **{what: np.inf}))

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from models import FixedBase, Joint, Link, Mimic, Robot
 from models.arrays import Array
 from ocp import TipTask, inverse_kinematics
-from ocp.motion.local.branches import branches_of
+from ocp.motion.local.branches import ik_branches
 from ocp.motion.local.closed_forms import ClosedForm, closed_forms
 from ocp.motion.tasks.equations import bind
 from tests.ocp.motion.tasks.space_tasks import panda, ur5
@@ -77,11 +77,11 @@ def counts(machine: FixedBase, form: ClosedForm, rng: Any, count: int) -> Any:
     joints = rng.uniform(-np.pi, np.pi, (count, machine.joint_size))
     joints[:, ~form.turns] /= 10
     places, turns = poses(machine, joints)
-    own, found = form.postures(places, turns, joints[:, list(form.held)])
+    own, found = form.solutions(places, turns, joints[:, list(form.redundant)])
     again = poses(machine, found)
     assert again[0] == pytest.approx(places[own], abs=1e-9)
     assert again[1] == pytest.approx(turns[own], abs=1e-9)
-    assert (found[:, list(form.held)] == joints[own][:, list(form.held)]).all()
+    assert (found[:, list(form.redundant)] == joints[own][:, list(form.redundant)]).all()
     for k in range(count):
         here = found[own == k]
         assert apart(joints[k], here, form.turns).min() < 1e-6
@@ -96,7 +96,7 @@ def test_of_random_arms_postures_come_in_pairs_at_most_eight_and_lead_to_the_pos
     for _ in range(3):
         machine = random_arm(kind, first, rng)
         (form,) = closed_forms(machine)
-        assert (form.kind, form.three, form.held) == (kind, (first, first + 1, first + 2), ())
+        assert (form.kind, form.triple, form.redundant) == (kind, (first, first + 1, first + 2), ())
         found = counts(machine, form, rng, 60)
         assert found.max() <= 8
         assert not (found % 2).any()  # solutions come and go in pairs
@@ -108,7 +108,7 @@ def test_newtons_method_from_many_starts_finds_the_same_postures(kind: str) -> N
     machine = random_arm(kind, 3 if kind == "meeting" else 1, rng)
     (form,) = closed_forms(machine)
     places, turns = poses(machine, rng.uniform(-np.pi, np.pi, (3, 6)))
-    own, found = form.postures(places, turns, np.zeros((3, 0)))
+    own, found = form.solutions(places, turns, np.zeros((3, 0)))
     for k in range(3):
         task = TipTask(position=places[k], orientation=turns[k])
         others = np.array([one.joints for one in inverse_kinematics(machine, task, starts=200, seed=k)])
@@ -142,9 +142,9 @@ def test_of_arms_with_more_joints_some_are_held_and_the_rest_has_a_closed_form()
     rng = np.random.default_rng(2)
     fetch, lift = problem_of("fetch_arm__s").machine, problem_of("fetch__square").machine
     # three axes meet in the shoulder of the Panda, in the shoulder and in the wrist of the Fetch
-    assert {form.held for form in closed_forms(panda())} == {(3,), (4,), (5,), (6,)}
-    assert {form.held for form in closed_forms(fetch)} == {(0,), (1,), (2,), (3,), (5,), (6,)}
-    assert all(form.held[0] == 0 for form in closed_forms(lift))  # what slides is held
+    assert {form.redundant for form in closed_forms(panda())} == {(3,), (4,), (5,), (6,)}
+    assert {form.redundant for form in closed_forms(fetch)} == {(0,), (1,), (2,), (3,), (5,), (6,)}
+    assert all(form.redundant[0] == 0 for form in closed_forms(lift))  # what slides is held
     for machine in (panda(), fetch, lift):
         for form in closed_forms(machine):
             assert counts(machine, form, rng, 20).max() <= 8
@@ -174,7 +174,7 @@ def test_other_arms_have_none_and_poses_out_of_reach_no_posture() -> None:
     )
     assert closed_forms(FixedBase(Robot(six.links, tuple(following), tip=six.tip))) == ()
     (form,) = closed_forms(ur5())
-    own, found = form.postures(np.array([[5.0, 0.0, 0.0]]), np.eye(3)[None], np.zeros((1, 0)))
+    own, found = form.solutions(np.array([[5.0, 0.0, 0.0]]), np.eye(3)[None], np.zeros((1, 0)))
     assert own.shape == (0,)
     assert found.shape == (0, 6)
 
@@ -186,10 +186,10 @@ def test_branches_keep_limits_are_turned_in_all_ways_and_do_the_task() -> None:
     at, turn = poses(machine, np.array([[3.4, 0.4, 0.9, -3.3, 0.7, 0.3]]))
     for rolls, told in ((1, {"orientation": turn[0]}), (12, {"direction": 2.0 * turn[0, :, 2]})):
         equations = bind(machine, TipTask(position=at[0], **told))
-        branches = branches_of(equations, machine.robot.lower, machine.robot.upper)
+        branches = ik_branches(equations, machine.robot.lower, machine.robot.upper)
         assert branches is not None
         target = np.array(equations.target_function()(0.0)).ravel()
-        found = branches.postures(target, rolls)
+        found = branches.solutions(target, rolls)
         assert (np.abs(found) <= limit + 1e-9).all()
         assert max(np.abs(equations.errors(0.0, None, one)).max() for one in found) < 1e-9
         wrapped = np.remainder(found.round(6), round(TURN, 6))
@@ -208,9 +208,9 @@ def test_branches_of_a_scara_and_none_of_what_is_not_one_pose() -> None:
     for rows, orientation in (((3, 4, 5), None), ((2, 3, 4, 5), [np.cos(0.3), 0, 0, np.sin(0.3)])):
         task = TipTask(position=(0.35, 0.1, 0.05), orientation=orientation, rows=rows)
         equations = bind(machine, task)
-        branches = branches_of(equations, *told)
+        branches = ik_branches(equations, *told)
         assert branches is not None
-        found = branches.postures(np.array(equations.target_function()(0.0)).ravel(), 16)
+        found = branches.solutions(np.array(equations.target_function()(0.0)).ravel(), 16)
         assert len(found) == (2 if orientation else len(found))
         assert len(found) >= 2
         assert max(np.abs(equations.errors(0.0, None, one)).max() for one in found) < 1e-9
@@ -222,4 +222,4 @@ def test_branches_of_a_scara_and_none_of_what_is_not_one_pose() -> None:
         TipTask(orientation=np.eye(3)),
         TipTask(position=place, orientation=np.eye(3), rows=[0, 1, 2, 3, 4]),
     ):
-        assert branches_of(bind(arm_of_six, other), arm_of_six.robot.lower, arm_of_six.robot.upper) is None
+        assert ik_branches(bind(arm_of_six, other), arm_of_six.robot.lower, arm_of_six.robot.upper) is None

@@ -28,4 +28,4 @@ def test_a_floating_arm_reaches_as_far_as_its_centre_of_mass_allows(share: float
         return
     with pytest.raises(Unreachable) as caught:
         check_floating_reach(machine, [task], home, np.array([1.0]), 0.0, 1.0, **bounds)
-    assert 0.07 / np.sqrt(3) <= caught.value.misfit <= 0.07  # the largest entry of a miss of 0.07 m
+    assert 0.07 / np.sqrt(3) <= caught.value.pose_error <= 0.07  # the largest entry of a miss of 0.07 m

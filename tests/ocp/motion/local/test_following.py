@@ -10,7 +10,7 @@ import pytest
 
 from models import FixedBase, Machine, Path, planar_chain, smooth
 from ocp import TipTask, inverse_kinematics, resolve
-from ocp.motion.local.rates import LocalMotion, follow
+from ocp.motion.local.rates import LocalMotion, track_tasks
 from ocp.motion.tasks.equations import bind
 from tests.models.robot.trees import Array, numeric
 from tests.ocp.motion.tasks.space_tasks import PANDA_START, floating_panda, panda, pose, ur5
@@ -30,7 +30,7 @@ def followed(
     options = {"weights": np.ones(machine.joint_size), "damping": 1e-6, "lower": robot.lower, "upper": robot.upper}
     home = machine.base_home() if base is None else base
     times = np.union1d(np.linspace(0, asked.duration or 1.0, steps + 1), asked.breaks)
-    return follow(bind(machine, asked), joints, np.tile(home, (len(joints), 1)), times, **{**options, **given})
+    return track_tasks(bind(machine, asked), joints, np.tile(home, (len(joints), 1)), times, **{**options, **given})
 
 
 def postures(machine: Machine, asked: TipTask, **given: Any) -> Array:
@@ -40,7 +40,7 @@ def postures(machine: Machine, asked: TipTask, **given: Any) -> Array:
 def test_poses_are_kept_and_joints_stay_inside_their_limits() -> None:
     for machine in (panda(), ur5()):
         found = followed(machine, task(), postures(machine, task()))
-        follows = found.misfit < 1e-6
+        follows = found.pose_error < 1e-6
         assert follows.sum() >= len(follows) / 2
         equations = bind(machine, task())
         for joints in found.joints[follows]:
@@ -57,12 +57,12 @@ def test_each_motion_is_the_one_that_is_followed_alone() -> None:
         alone = followed(panda(), task(), start[None], damping=0.01)
         np.testing.assert_allclose(alone.joints[0], together.joints[number], atol=1e-9)
         assert alone.cost[0] == pytest.approx(together.cost[number])
-        assert alone.lost_at[0] == together.lost_at[number] or together.misfit[number] < 1e-9
+        assert alone.worst_time[0] == together.worst_time[number] or together.pose_error[number] < 1e-9
 
 
 def test_the_cost_is_the_one_of_the_least_rates_at_every_time() -> None:
     """`resolve` integrates the same law with small steps; weights are those of the metric."""
-    (start, *_) = [q for q in postures(panda(), task()) if followed(panda(), task(), q[None]).misfit[0] < 1e-6]
+    (start, *_) = [q for q in postures(panda(), task()) if followed(panda(), task(), q[None]).pose_error[0] < 1e-6]
     weights = np.array([9.0, 1, 1, 4, 1, 1, 0.5])
     found = followed(panda(), task(), start[None], steps=256, weights=weights)
     horizon = task().duration
@@ -99,13 +99,13 @@ def test_a_joint_at_its_limit_stays_there_and_the_others_do_the_task() -> None:
     line = smooth(Path.through([place, place + np.array([0.1, -0.5, 0.0])]), deviation=0.01)
     asked = TipTask.along(line, 0.2, rows=(3, 4))
     free = followed(arm, asked, start[None], lower=np.full(4, -np.inf), upper=np.full(4, np.inf))
-    assert free.misfit[0] < 1e-6
+    assert free.pose_error[0] < 1e-6
     lower, upper = np.full(4, -np.inf), np.full(4, np.inf)
     moves = free.joints[0, :, 0] - start[0]
     assert np.abs(moves).max() > 0.03
     lower[0], upper[0] = start[0] - 0.02, start[0] + 0.02
     tight = followed(arm, asked, start[None], lower=lower, upper=upper)
-    assert tight.misfit[0] < 1e-6
+    assert tight.pose_error[0] < 1e-6
     assert (tight.joints[0, :, 0] >= lower[0]).all()
     assert (tight.joints[0, :, 0] <= upper[0]).all()
     assert np.abs(np.abs(tight.joints[0, :, 0] - start[0]) - 0.02).min() < 1e-4
@@ -118,10 +118,10 @@ def test_where_the_path_is_lost_is_told() -> None:
     line = smooth(Path.through([(1.5, -1.0, 0.0), (2.6, 0.0, 0.0), (1.5, 1.0, 0.0)]), deviation=0.01)
     asked = TipTask.along(line, 0.5, rows=(3, 4))
     found = followed(arm, asked, postures(arm, asked, starts=4), damping=0.05)
-    assert (found.misfit > 0.1).all()
-    distance = np.linalg.norm(line.at(np.clip(0.5 * found.lost_at, 0, line.length)).position, axis=1)
+    assert (found.pose_error > 0.1).all()
+    distance = np.linalg.norm(line.at(np.clip(0.5 * found.worst_time, 0, line.length)).position, axis=1)
     assert (distance > 2.4).all()
-    assert (found.misfit >= (distance - 2.4) / np.sqrt(2)).all()  # of the larger coordinate
+    assert (found.pose_error >= (distance - 2.4) / np.sqrt(2)).all()  # of the larger coordinate
 
 
 def test_axes_that_may_lean_are_turned_back_only_where_they_lean_too_far() -> None:
@@ -129,12 +129,12 @@ def test_axes_that_may_lean_are_turned_back_only_where_they_lean_too_far() -> No
     start = postures(panda(), task())[:6]
     found = followed(panda(), asked, start, damping=0.01)
     free = followed(panda(), TipTask.along(LINE, 0.1), start, damping=0.01)
-    follows = (found.misfit < 1e-5) & (free.misfit < 1e-5)
+    follows = (found.pose_error < 1e-5) & (free.pose_error < 1e-5)
     assert follows.any()
     equations, within = bind(panda(), task(within=1e-6)), 0.2
     for lean, loose in zip(found.joints[follows], free.joints[follows], strict=True):
-        assert equations.overhangs(found.t, None, lean).max() < within + 1e-3
-        if equations.overhangs(free.t, None, loose).max() < within - 0.01:
+        assert equations.cone_violations(found.t, None, lean).max() < within + 1e-3
+        if equations.cone_violations(free.t, None, loose).max() < within - 0.01:
             np.testing.assert_allclose(lean, loose, atol=1e-6)
 
 
@@ -147,7 +147,7 @@ def test_a_floating_base_goes_where_its_momentum_says(momentum: Any) -> None:
     asked = TipTask.along(line, 0.05)
     found = followed(machine, asked, PANDA_START[None], steps=256)
     local = resolve(machine, tasks=asked, start_joints=PANDA_START, horizon=asked.duration, samples=257)
-    assert found.misfit[0] < 1e-6
+    assert found.pose_error[0] < 1e-6
     np.testing.assert_allclose(found.base[0, -1], local.base[-1], atol=2e-4)
     np.testing.assert_allclose(found.joints[0, -1], local.joints[-1], atol=2e-4)
     assert np.abs(found.base[0, -1] - found.base[0, 0]).max() > 1e-3
@@ -158,5 +158,5 @@ def test_what_runs_away_is_told_as_infinite_and_harms_no_other() -> None:
     bad = np.vstack([start, np.full(7, np.nan)])
     found = followed(panda(), task(), bad)
     alone = followed(panda(), task(), start)
-    assert np.isinf(found.misfit[2])
+    assert np.isinf(found.pose_error[2])
     np.testing.assert_allclose(found.joints[:2], alone.joints, atol=1e-9)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from models import FixedBase, Joint, Link, Machine, Robot, planar_chain
 from ocp import ProblemError, TipTask, Unreachable, inverse_kinematics
-from ocp.motion.local.inverse_kinematics import postures_of
+from ocp.motion.local.inverse_kinematics import inverse_kinematics_at
 from ocp.motion.tasks.equations import bind
 from tests.models.robot.trees import seeds
 from tests.ocp.motion.tasks.space_tasks import (
@@ -57,13 +57,13 @@ def test_from_equations_and_targets_the_same_postures_are_found(limits: bool) ->
         task = TipTask(position=position, orientation=rotation)
         equations = equations or bind(panda(), task)
         targets = np.concatenate([position, np.zeros(3), rotation.T.ravel(), np.zeros(3)])
-        found = postures_of(equations, targets, seed=seed, **told)
+        found = inverse_kinematics_at(equations, targets, seed=seed, **told)
         asked = inverse_kinematics(panda(), task, seed=seed, **told)
         for one, other in zip(found, asked, strict=True):
             np.testing.assert_allclose(one.joints, other.joints, atol=1e-8)
             assert one.quality == pytest.approx(other.quality)
     with pytest.raises(Unreachable):
-        postures_of(bind(panda(), task), targets + 5.0, seed=0, **told)
+        inverse_kinematics_at(bind(panda(), task), targets + 5.0, seed=0, **told)
 
 
 def test_a_two_link_arm_has_two_elbows_in_closed_form() -> None:
@@ -102,7 +102,7 @@ def test_the_base_may_float_and_two_arms_may_hold_one_thing() -> None:
         ),
     ]
     posture = inverse_kinematics(both, tasks)[0]
-    assert posture.misfit < 1e-10
+    assert posture.pose_error < 1e-10
     assert posture.joints.shape == (14,)
 
 
@@ -119,11 +119,11 @@ def test_the_nearest_miss_is_told_and_pickled() -> None:
     machine = FixedBase(planar_chain([1.0, 0.7], [1.0, 1.0]))
     with pytest.raises(Unreachable, match=r"nearest miss is 0\.3 ") as caught:
         inverse_kinematics(machine, TipTask(position=(2.0, 0.0, 0.0), rows=(3, 4)))
-    assert caught.value.misfit == pytest.approx(0.3, abs=1e-6)
+    assert caught.value.pose_error == pytest.approx(0.3, abs=1e-6)
     np.testing.assert_allclose(np.sin(caught.value.joints), 0.0, atol=1e-3)
     again = pickle.loads(pickle.dumps(caught.value))
     assert (type(again), str(again)) == (Unreachable, str(caught.value))
-    assert (again.name, again.value, again.misfit) == ("link2", caught.value.misfit, caught.value.misfit)
+    assert (again.name, again.value, again.pose_error) == ("link2", caught.value.pose_error, caught.value.pose_error)
     np.testing.assert_array_equal(again.joints, caught.value.joints)
 
 
@@ -142,7 +142,7 @@ def test_an_orientation_half_a_turn_away_is_no_solution() -> None:
     machine = FixedBase(Robot((Link("post"), Link("door")), (pin,)))
     with pytest.raises(Unreachable) as caught:
         inverse_kinematics(machine, TipTask(orientation=np.diag([-1.0, -1.0, 1.0])))
-    assert caught.value.misfit > 1.0
+    assert caught.value.pose_error > 1.0
 
 
 @pytest.mark.parametrize(

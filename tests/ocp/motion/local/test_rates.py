@@ -215,8 +215,8 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"start_joints": (0.0, 1.0, np.inf)}, "start_joints .* not finite"),
     ({"start_joints": "home"}, "start_joints 'home' is not numeric"),
     ({"start_base": (0.0,) * 7}, "start_base has 7 entries, expected 3"),
-    ({"horizon": 0.0}, "horizon must be a positive number"),
-    ({"horizon": np.inf}, "horizon must be a positive number"),
+    ({"horizon": 0.0}, "horizon must be positive and finite"),
+    ({"horizon": np.inf}, "horizon must be positive and finite"),
 ]
 """What is wrong with a request of any motion of the paper's machine, and what the error says."""
 

@@ -29,7 +29,7 @@ from models.shapes.distance import COLUMNS
 from models.shapes.mesh_files import find_mesh, read_mesh
 from models.spatial import skew
 from ocp import ProblemError
-from ocp.motion.local.collisions import checked_collision_scene, distances_along, find_collisions, hulls_of
+from ocp.motion.local.collisions import checked_collision_scene, distances_along, find_collisions, scene_hulls
 from tests.models.machines.armoured import armoured_arm
 from tests.models.machines.test_surroundings import OBSTACLES, machines, postures, turned
 from tests.ocp.motion.tasks.space_tasks import panda, ur5
@@ -145,10 +145,10 @@ def test_no_pairs_have_no_distances_and_what_is_no_number_touches() -> None:
 
 def test_the_hulls_are_the_bodies() -> None:
     around = CollisionScene(FixedBase(armoured_arm()), OBSTACLES)
-    hulls = hulls_of(around)
+    hulls = scene_hulls(around)
     assert list(hulls) == [body.name for body in around.bodies]
     for hull, body in zip(hulls.values(), around.bodies, strict=True):
-        assert (hull.frame, hull.radius) == (body.frame, body.shape.swelling)
+        assert (hull.frame, hull.radius) == (body.frame, body.shape.swept_radius)
         assert_allclose(hull.core, body.shape.core)
         assert hull.normal.size == (3 if isinstance(body.shape, HalfSpace) else 0)
 

@@ -17,7 +17,7 @@ from ocp import ClearanceConstraints, Limits, ProblemError, SolveError, TipTask,
 from ocp.app.files import log_rerun, write_mcap
 from ocp.motion.plan import Plan, plan, plan_in_segments, plan_waypoints
 from ocp.motion.schedule import LineLimits, schedule
-from ocp.motion.tasks.tracks import along
+from ocp.motion.tasks.tracks import path_tracks
 from tests.bad_values import (
     CHOICE,
     FINITE,
@@ -160,7 +160,7 @@ CASES = [
             "breaks": {"after the end": [99.0], "negative": [-1.0], "nan": [NAN], "word": "a", "matrix": [[0.1]]},
         },
     ),
-    Case("along", along, {"path": LINE, "speed": 0.2}, {"path": INSTANCE, "speed": POSITIVE}),
+    Case("along", path_tracks, {"path": LINE, "speed": 0.2}, {"path": INSTANCE, "speed": POSITIVE}),
     method(
         made,
         "at",
@@ -261,7 +261,7 @@ def test_a_start_that_is_too_far_says_by_how_much() -> None:
     """Three links of 2.4 m in all; 3 m are asked."""
     with pytest.raises(Unreachable, match="at 0 s") as caught:
         plan(ARM, leads_to([(3.0, 0, 0), (2.0, 0, 0)], rows=(3, 4)))
-    assert caught.value.misfit == pytest.approx(0.6, abs=1e-6)
+    assert caught.value.pose_error == pytest.approx(0.6, abs=1e-6)
     assert caught.value.time == 0.0
     np.testing.assert_allclose(np.sin(caught.value.joints[1:]), 0.0, atol=1e-3)
 
@@ -279,8 +279,8 @@ def test_a_path_that_leaves_the_reach_on_its_way_says_when_and_where(search: Any
     assert found.time is not None
     place = LEAVING.at(0.5 * found.time).position[0]
     assert np.linalg.norm(place) > 2.4
-    assert found.misfit == pytest.approx(np.linalg.norm(place) - 2.4, abs=1e-4)
-    assert found.misfit > 0.05
+    assert found.pose_error == pytest.approx(np.linalg.norm(place) - 2.4, abs=1e-4)
+    assert found.pose_error > 0.05
     assert str(np.round(place, 6).tolist()) in str(found)
 
 
@@ -292,7 +292,7 @@ def test_a_path_beyond_the_joint_limits_says_so() -> None:
     stiff = tuple(replace(joint, lower=-0.6, upper=0.6) for joint in (second, third))
     with pytest.raises(Unreachable) as caught:
         plan(FixedBase(replace(CHAIN, joints=(first, *stiff))), near)
-    assert caught.value.misfit > 0.1
+    assert caught.value.pose_error > 0.1
     assert caught.value.time is not None
 
 
@@ -302,7 +302,7 @@ def test_a_later_task_out_of_reach_is_named_with_its_time() -> None:
     with pytest.raises(Unreachable, match="task 1") as caught:
         plan(ARM, [first, second])
     assert caught.value.time == pytest.approx(3.0)
-    assert caught.value.misfit == pytest.approx(0.5, abs=1e-6)
+    assert caught.value.pose_error == pytest.approx(0.5, abs=1e-6)
 
 
 def test_an_orientation_out_of_reach_says_so() -> None:
@@ -312,5 +312,5 @@ def test_an_orientation_out_of_reach_says_so() -> None:
     for machine in (ur5(), angled_ur5()):
         with pytest.raises(Unreachable) as caught:
             plan(machine, task)
-        assert caught.value.misfit > 0.01
+        assert caught.value.pose_error > 0.01
     assert DOWN[2] == -1

@@ -298,7 +298,7 @@ def test_what_never_touches_within_limits_is_looked_at_without_them() -> None:
     robot = armoured_arm()
     narrow = replace(robot, joints=tuple(replace(joint, lower=-0.3, upper=0.3) for joint in robot.joints))
     within, beyond = (CollisionScene(FixedBase(narrow), limits=limits) for limits in (True, False))
-    assert within.left["link2", "link6"] == "never touch"
+    assert within.left["link2", "link6"] == "never in collision"
     assert ("link2", "link6") in beyond.labels
     free_of_limits = Limits(joints=False)
     asked: dict[str, Any] = {"tasks": line(), "start_joints": START, "horizon": SECONDS, "limits": free_of_limits}
@@ -330,7 +330,7 @@ def test_a_target_inside_an_obstacle_names_the_pair_the_time_and_the_depth() -> 
     assert 1 <= caught.value.time <= SECONDS
     last = str(caught.value).split("\n")[-1]
     assert last.startswith("the cheapest that touches: link6 and obstacle 0 overlap")
-    assert re.search(r"; no other posture is clear then: each of the \d+ postures found touches", last)
+    assert re.search(r"; no other posture is clear then: each of the \d+ IK solutions is in collision", last)
 
 
 def test_where_no_posture_is_clear_no_alternatives_are_searched(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,7 @@ import pytest
 from models import FixedBase, FreeFloating, Link, Robot, Sphere, attached, merged, planar_chain
 from models.robot.kinematics import link_frames
 from ocp import TipTask, plan, plan_waypoints
-from ocp.motion.local.branches import branches_of
+from ocp.motion.local.branches import ik_branches
 from ocp.motion.local.closed_forms import closed_forms
 from ocp.motion.tasks.checks import ignorable_joints
 from ocp.motion.tasks.equations import bind
@@ -86,15 +86,16 @@ def test_a_gripper_leaves_the_closed_forms_of_its_arm(arm: Any) -> None:
     hand = handed(bare.robot, GRIPPER)
     forms, others = closed_forms(hand), closed_forms(bare)
     assert forms
-    assert [(one.kind, one.three, one.held) for one in forms] == [(one.kind, one.three, one.held) for one in others]
+    kinds, expected = ([(one.kind, one.triple, one.redundant) for one in each] for each in (forms, others))
+    assert kinds == expected
     n = bare.joint_size
     task = straight(hand, np.append(PANDA_START if n == 7 else UR5_START, 0.3), (0.1, 0, 0))
     found = []
     for machine in (hand, bare):
         equations = bind(machine, task)
-        branches = branches_of(equations, machine.robot.lower, machine.robot.upper)
+        branches = ik_branches(equations, machine.robot.lower, machine.robot.upper)
         assert branches is not None
-        found.append(branches.postures(np.array(equations.target_function()(0.0)).ravel(), 16))
+        found.append(branches.solutions(np.array(equations.target_function()(0.0)).ravel(), 16))
     np.testing.assert_allclose(found[0][:, :n], found[1], atol=1e-9)
     np.testing.assert_allclose(found[0][:, n], 0.5)  # the middle of its limits
 

@@ -151,7 +151,7 @@ def test_what_stands_still_costs_nothing(task: TipTask) -> None:
     assert found.cost < 1e-12
     np.testing.assert_allclose(found["joints"], found["joints"][:1].repeat(len(found.t), axis=0), atol=1e-6)
     if task.within is not None:
-        assert bind(panda(), task).overhangs(found.t, None, found["joints"]).max() < 1e-6
+        assert bind(panda(), task).cone_violations(found.t, None, found["joints"]).max() < 1e-6
 
 
 def test_a_velocity_is_done_and_what_it_does_not_need_rests() -> None:

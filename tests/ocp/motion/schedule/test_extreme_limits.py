@@ -21,7 +21,7 @@ def test_limits_of_no_size_to_compute_with_are_refused_by_name(which: int, value
     of_joints, of_line = [*JOINTS], [0.5, 1.0, 10.0]
     of_joints[which] = of_line[which] = value
     for kind, values in ((JointLimits, of_joints), (LineLimits, of_line)):
-        with pytest.raises(ProblemError, match="is its unit right") as caught:
+        with pytest.raises(ProblemError, match="check its unit") as caught:
             kind(*values)
         assert caught.value.value == value
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
@@ -29,8 +29,8 @@ from ocp.motion.schedule import (
 )
 from ocp.motion.schedule import grid as grids
 from ocp.motion.schedule import stretch as stretches
-from ocp.motion.schedule.profile import advanced, through
-from ocp.motion.schedule.ramps import passes
+from ocp.motion.schedule.profile import integrate_jerk, profile_through
+from ocp.motion.schedule.ramps import reachability_passes
 from ocp.motion.schedule.settings import SETTINGS
 from scripts.timing.schedules import JOINTS, panda_path
 from tests.families import some
@@ -125,7 +125,7 @@ def test_the_passes_find_what_a_linear_program_finds(seed: int, rows: int) -> No
     p = size * np.cos(2 * np.pi * s[:-1, None] + phase[0])
     q = rng.uniform(0, 2) * np.sin(2 * np.pi * s[:-1, None] + phase[1])
     most = rng.uniform(0.5, 2, count + 1)
-    x = passes(s, np.where(np.isin(s, [0, 1]), 0.0, most), p, q, -np.ones_like(p), np.ones_like(p))
+    x = reachability_passes(s, np.where(np.isin(s, [0, 1]), 0.0, most), p, q, -np.ones_like(p), np.ones_like(p))
     matrix, bounds = [], [(0, 0), *((0, top) for top in most[1:-1]), (0, 0)]
     for k in range(count):
         for r in range(rows):
@@ -144,10 +144,11 @@ def test_two_jerks_lead_through_any_motion(seed: int) -> None:
     rng = np.random.default_rng(seed)
     t, first, second = rng.uniform(0.1, 1), *rng.normal(size=2)
     v, a = rng.uniform(2, 4), rng.normal()
-    middle = advanced(v, a, first, t)
-    end = advanced(*middle[1:], second, t)
+    middle = integrate_jerk(v, a, first, t)
+    end = integrate_jerk(*middle[1:], second, t)
+    assume(min(middle[0], end[0], middle[1], end[1]) > 0)
     states = np.array([[0.0, v, a], [middle[0] + end[0], *end[1:]]]).T
-    made = through(*states)
+    made = profile_through(*states)
     assert made.jerk == pytest.approx([first, second], rel=1e-6, abs=1e-6)
     assert made.duration == pytest.approx(2 * t, rel=1e-9)
 
@@ -353,7 +354,7 @@ def test_a_dip_names_place_cause_and_amount() -> None:
     assert dip.permitted == pytest.approx(1.0 / rates.max(), rel=1e-2)
     speed = plan.profile.at_distance(inside).speed
     assert speed * rates == pytest.approx(1.0, rel=0.03)
-    assert (speed < dip.asked).all()
+    assert (speed < dip.requested).all()
 
 
 def test_joint_motions_of_a_schedule_are_those_of_its_profile() -> None:

@@ -9,17 +9,17 @@ from hypothesis import strategies as st
 
 from ocp.motion.schedule import LineLimits, schedule
 from ocp.motion.schedule.grid import make_grid
-from ocp.motion.schedule.limits import rows_at
-from ocp.motion.schedule.profile import LineMotion, through
-from ocp.motion.schedule.program import INTERIOR, Program, Spline, SplineRows, _Rows, least_time
+from ocp.motion.schedule.limits import limit_rows
+from ocp.motion.schedule.profile import LineMotion, profile_through
+from ocp.motion.schedule.program import INTERIOR, Program, Spline, SplineRows, _Constraints, least_time
 from ocp.motion.schedule.settings import SETTINGS
-from ocp.motion.schedule.stretch import _jerk_of
-from ocp.motion.schedule.window import Stretch, Window, demanded, profile_of
+from ocp.motion.schedule.stretch import _jerk_place
+from ocp.motion.schedule.window import Stretch, Window, limit_usage, motion_profile
 from scripts.timing.schedules import JOINTS, panda_path
 from tests.models.paths.task_paths import seeds
 
 
-def random_rows(seed: int, count: int) -> tuple[Program, _Rows, np.ndarray]:
+def random_rows(seed: int, count: int) -> tuple[Program, _Constraints, np.ndarray]:
     """Rows at random places of so many intervals, and coefficients."""
     rng = np.random.default_rng(seed)
     size = int(rng.integers(1, 6 * count + 1))
@@ -35,7 +35,7 @@ def random_rows(seed: int, count: int) -> tuple[Program, _Rows, np.ndarray]:
     most = np.where(rng.uniform(size=count + 2) < 0.5, 5.0, np.inf)
     spline = Spline(np.cumsum(rng.uniform(0.1, 1.0, count + 1)))
     program = Program(spline, rows, most, (0.0, 0.0), np.arange(0))
-    return program, _Rows(program), rng.uniform(0.5, 2.0, count + 2)
+    return program, _Constraints(program), rng.uniform(0.5, 2.0, count + 2)
 
 
 @settings(max_examples=40)
@@ -43,8 +43,8 @@ def random_rows(seed: int, count: int) -> tuple[Program, _Rows, np.ndarray]:
 def test_rows_are_those_of_a_matrix(seed: int, count: int) -> None:
     """What they miss and its tangents, sums of values times these, and the diagonals of the sum of their squares."""
     program, every, b = random_rows(seed, count)
-    gap, _ = every.look(b)
-    matrix = np.array([every.of(column) for column in np.eye(len(b))]).T
+    gap, _ = every.evaluate(b)
+    matrix = np.array([every.change_of(column) for column in np.eye(len(b))]).T
     values = np.random.default_rng(seed).uniform(0.1, 1.0, len(gap))
     assert every.gathered(values) == pytest.approx(matrix.T @ values, abs=1e-9)
     normal = matrix.T @ (values[:, None] * matrix)
@@ -52,14 +52,14 @@ def test_rows_are_those_of_a_matrix(seed: int, count: int) -> None:
         assert diagonal == pytest.approx(np.diag(normal, k), abs=1e-9)
     step = 1e-6 * np.random.default_rng(seed + 1).normal(size=len(b))
     change = matrix @ step
-    assert (every.look(b + step)[0] - every.look(b - step)[0]) / 2 == pytest.approx(change, abs=1e-10)
+    assert (every.evaluate(b + step)[0] - every.evaluate(b - step)[0]) / 2 == pytest.approx(change, abs=1e-10)
 
     rows, near = program.rows, np.stack([b[program.rows.interval + k] for k in range(3)])
     x, slope, bend = (program.spline.basis(rows.interval, rows.fraction) * near).sum(axis=1)
     root = (program.spline.basis(rows.interval, rows.root)[0] * near).sum(axis=0)
     bound = rows.bound * np.where(rows.jerk, root**-0.5, 1.0)
-    missed = [(rows.of * np.stack([x, slope, bend], axis=1)).sum(axis=1) - bound, -b[1:-1], b - program.most]
-    every.look(b)
+    missed = [(rows.of * np.stack([x, slope, bend], axis=1)).sum(axis=1) - bound, -b[1:-1], b - program.upper]
+    every.evaluate(b)
     assert np.sort(gap) == pytest.approx(np.sort(np.concatenate([part[np.isfinite(part)] for part in missed])))
 
 
@@ -144,8 +144,8 @@ def test_the_jerks_of_a_motion_are_those_at_a_sixth_of_an_interval(slope: float,
     for h in (0.04, 0.02):
         s = np.array([0.0, h])
         x = 1 + slope * s + bend * s**2 / 2
-        jerk = through(s, np.sqrt(x), (slope + bend * s) / 2).jerk
-        places = h * np.array([_jerk_of(0.0), _jerk_of(1.0)])
+        jerk = profile_through(s, np.sqrt(x), (slope + bend * s) / 2).jerk
+        places = h * np.array([_jerk_place(0.0), _jerk_place(1.0)])
         errors.append(np.abs(jerk - bend / 2 * np.sqrt(1 + slope * places + bend * places**2 / 2)).max())
     assert errors[1] <= errors[0] / 3.5 + 1e-11
     assert errors[0] <= 1e-3
@@ -156,21 +156,21 @@ def test_what_is_demanded_is_what_dense_samples_demand() -> None:
     path, joints = panda_path(4)
     limits = LineLimits(0.5, 5.0, 200.0, 5.0, JOINTS)
     grid = make_grid(path, limits, joints)
-    stretch, every = Stretch(grid, 0, len(grid.asked)), np.arange(len(grid.asked))
-    window = Window.of(stretch, 0, len(grid.asked), stretch.ends)
+    stretch, every = Stretch(grid, 0, len(grid.requested)), np.arange(len(grid.requested))
+    window = Window.build(stretch, 0, len(grid.requested), stretch.ends)
     plan = schedule(path, limits, joints=joints)
     motion = plan.profile.at_distance(grid.distance)
-    profile = profile_of(window, motion.speed**2, 2 * motion.acceleration)
-    used, values = demanded(window, profile, every)
+    profile = motion_profile(window, motion.speed**2, 2 * motion.acceleration)
+    used, values = limit_usage(window, profile, every)
     some = np.sort(np.random.default_rng(0).permutation(every)[:50])
-    for whole, part in zip((used, values), demanded(window, profile, some), strict=True):
+    for whole, part in zip((used, values), limit_usage(window, profile, some), strict=True):
         assert part[:, some] == pytest.approx(whole[:, some], abs=1e-12)
         assert not np.delete(part, some, axis=1).any()
     shares = np.linspace(1e-6, 1 - 1e-6, 201)
     places = grid.distance[:-1, None] + shares * np.diff(grid.distance)[:, None]
     dense = profile.at_distance(places.ravel())
-    rows = rows_at(path, limits, joints, places.ravel())
-    values = rows.demands(LineMotion(*dense)).reshape(*places.shape, -1)
+    rows = limit_rows(path, limits, joints, places.ravel())
+    values = rows.usage(LineMotion(*dense)).reshape(*places.shape, -1)
     for side, sign in zip(used, (1, -1), strict=True):
         most = (sign * values).max(axis=1)
         near = most > 0.9

@@ -113,10 +113,10 @@ def change(drawn: tuple[float, ...]) -> tuple[float, ...]:
 def test_the_fastest_motion_ends_where_it_must_whether_ruckig_finds_it_or_two_ramps_make_it(drawn: Any) -> None:
     asked = change(drawn)
     distance, first, last, top, acceleration, jerk = asked
-    found = ramps.fastest(*asked)
+    found = ramps.fastest_motion(*asked)
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(ramps, "Ruckig", lambda _: SimpleNamespace(calculate=lambda *_: None))
-        made = ramps.fastest(*asked)
+        made = ramps.fastest_motion(*asked)
     for phases in (found, made):
         s, v, a = 0.0, first, 0.0
         for t, j in phases:
@@ -134,7 +134,7 @@ def test_the_speed_within_reach_is_the_inverse_of_the_ramps_distance(
     speed: float, gain: float, x: float, y: float
 ) -> None:
     distance = ramp_distance(speed, speed + gain, 10**x, 10**y)
-    assert ramps.reach(speed, distance, 10**x, 10**y) == pytest.approx(speed + gain, rel=1e-9)
+    assert ramps.reachable_speed(speed, distance, 10**x, 10**y) == pytest.approx(speed + gain, rel=1e-9)
 
 
 @given(seeds, st.integers(1, 6))
@@ -233,7 +233,7 @@ def test_centripetal_acceleration_slows_the_blends_only() -> None:
         most = path.curvature(np.linspace(blend.start, blend.end, 4001)).max()
         assert dip.permitted == pytest.approx(np.sqrt(5.0 / most), rel=2e-3)
         assert dip.permitted <= dip.speed * 1.001
-        assert dip.asked == 1.0
+        assert dip.requested == 1.0
         assert "centripetal acceleration permits" in str(dip)
     # away from the dips and the ramps to them the asked speed is kept
     away = ramp_distance(1.0, min(dip.permitted for dip in plan.dips), 5.0, 200.0) * 1.01
@@ -243,7 +243,7 @@ def test_centripetal_acceleration_slows_the_blends_only() -> None:
 
 def test_a_slower_asked_speed_needs_no_dip() -> None:
     path = example("quintic")
-    peak = path.curvature(path.dense(200)).max()
+    peak = path.curvature(path.sample_distances(200)).max()
     plan = schedule(path, LineLimits(0.999 * np.sqrt(5.0 / peak), 5.0, 200.0, centripetal=5.0), strict=True)
     assert not plan.dips
 
@@ -352,5 +352,5 @@ def test_about_the_slowest_place_of_each_run_a_stretch_gets_its_speed(seed: int,
                     if most[at] > SETTINGS.spread * most[k]:
                         break
                     expected[at] = min(speed[at], most[k])
-    assert planner._lowered(s, permitted, speed, even, False) == fast.any()
+    assert planner._lower_speeds(s, permitted, speed, even, False) == fast.any()
     assert speed == pytest.approx(expected)

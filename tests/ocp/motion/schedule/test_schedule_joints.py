@@ -27,7 +27,7 @@ from ocp.motion.schedule import (
     schedule,
 )
 from ocp.motion.schedule.grid import make_grid
-from ocp.motion.schedule.limits import causes, rows_at
+from ocp.motion.schedule.limits import limit_names, limit_rows
 from tests.models.paths.task_paths import random_arm_path, seeds
 from tests.models.paths.test_paths import example
 from tests.ocp.motion.schedule.check import largest
@@ -100,7 +100,7 @@ def test_a_joint_limit_slows_and_is_named_as_the_cause(limits: JointLimits, kind
     used = largest(plan, arm).max()
     assert 0.9 < used <= 1.001  # no slower than need be
     assert any(kind in dip.cause for dip in plan.dips)
-    with pytest.raises(ProblemError, match="breaks limits"):
+    with pytest.raises(ProblemError, match="violates limits"):
         schedule(arm.path, asked, joints=arm, strict=True)
 
 
@@ -141,16 +141,16 @@ def test_where_the_curvature_jumps_both_sides_are_kept() -> None:
     limits = LineLimits(9.0, 5.0, 200.0, 2.0, JointLimits(2.0))
     grid, bounds = make_grid(arm.path, limits, arm), arm.path.bounds[1:-1]
     assert grid.distance[grid.jumps] == pytest.approx(bounds, abs=1e-15)
-    left, right = grid.ends(0, len(grid.asked))
+    left, right = grid.ends(0, len(grid.requested))
     step = 1e-10 * arm.path.length
-    for rows, sides in ((left.of(grid.jumps), bounds + step), (right.of(grid.jumps - 1), bounds - step)):
-        expected = rows_at(arm.path, limits, arm, sides)
+    for rows, sides in ((left.take(grid.jumps), bounds + step), (right.take(grid.jumps - 1), bounds - step)):
+        expected = limit_rows(arm.path, limits, arm, sides)
         for kind, value in zip(rows, expected, strict=True):
             assert kind == pytest.approx(value, rel=1e-5, abs=1e-6)
-    assert (np.abs(left.of(grid.jumps).speed - right.of(grid.jumps - 1).speed).max(axis=0) > 0.01).any()
+    assert (np.abs(left.take(grid.jumps).speed - right.take(grid.jumps - 1).speed).max(axis=0) > 0.01).any()
     plan = schedule(arm.path, limits, joints=arm)
     assert largest(plan, arm).max() <= 1.001
-    assert {dip.cause for dip in plan.dips} <= set(causes(limits, arm))
+    assert {dip.cause for dip in plan.dips} <= set(limit_names(limits, arm))
 
 
 class BrokenJoints:
@@ -208,7 +208,7 @@ def test_ramps_are_gentler_only_where_a_joint_binds(joints: JointLimits, cause: 
     assert plan.dips[0].start < 1e-3
     assert plan.dips[0].end < 0.1
     assert min(plan.dips[0].jerk / 200, plan.dips[0].acceleration / 5) < 0.99
-    assert "binds on a ramp" in str(plan.dips[0])
+    assert "is active on a ramp" in str(plan.dips[0])
     assert 0.9 < largest(plan, arm).max() <= 1.001
     before_end = np.linspace(0, plan.duration - plan.time_at(0.1)[0], 1000)
     mine, other = plan.at(plan.duration - before_end), free.at(free.duration - before_end)
@@ -278,7 +278,7 @@ def test_names_with_commas_come_back_from_csv(tmp_path: File) -> None:
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"names": ("a", "a")}, "differ"),
+        ({"names": ("a", "a")}, "distinct"),
         ({"t": np.array([0.0, 0.0])}, "increasing"),
         ({"t": np.array([0.0, np.nan])}, "finite"),
         ({"positions": np.zeros((2, 2))}, "shape"),

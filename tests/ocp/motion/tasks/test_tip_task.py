@@ -12,7 +12,7 @@ from models.machines.machine import with_tip
 from ocp import ProblemError, TipTask, resolve
 from ocp.motion.tasks.equations import bind, task_errors
 from ocp.motion.tasks.tip_task import timed
-from ocp.motion.tasks.tracks import along, pose_line
+from ocp.motion.tasks.tracks import path_tracks, pose_line
 from tests.models.machines.standing_machines import standing_arm
 from tests.models.robot.trees import Array, numeric
 from tests.ocp.motion.tasks.space_tasks import (
@@ -187,7 +187,7 @@ def test_a_path_is_followed_at_constant_speed() -> None:
     rotation, position = pose(ur5(), (), UR5_START)
     corners = position + np.array([[0, 0, 0], [0.0, 0.1, 0], [0.04, 0.1, 0], [0.04, 0, 0]])
     path = smooth(Path.through(corners), deviation=0.004)
-    task = TipTask(position=along(path, 0.1).position, direction=rotation[:, 2])
+    task = TipTask(position=path_tracks(path, 0.1).position, direction=rotation[:, 2])
     local = resolve(ur5(), tasks=task, start_joints=UR5_START, horizon=path.length / 0.1, samples=41)
     assert np.abs(local.task_error).max() < 1e-6
     motion = zip(local.joints, local.joint_rates, strict=True)
@@ -264,7 +264,7 @@ def test_tasks_that_are_none_are_refused(fields: dict[str, Any], message: str) -
     [
         (TipTask(rows=(3, 4), velocity=(0.0,)), r"velocity has shape \(1, 1\)"),
         (TipTask(position=lambda t: [t, ca.SX.sym("wind"), 0]), r"position depends on \['wind'\]"),
-        (TipTask(orientation=lambda t: 2 * ca.DM.eye(3)), "orientation is no rotation"),
+        (TipTask(orientation=lambda t: 2 * ca.DM.eye(3)), "orientation is not a rotation"),
         ([TipTask(rows=(3, 4), velocity=(0, 0))] * 2, "linearly dependent in every configuration"),
         ([TipTask(rows=range(6), velocity=np.zeros(6)), TipTask(rows=(0, 1), velocity=(0, 0))], "fixes 8 rows"),
         (TipTask(rows=(3,), velocity=(0.0,), link="base_link"), "no joint moves the tip"),
@@ -343,7 +343,7 @@ def test_a_task_of_a_path_parameter_run_by_a_clock_is_the_timed_task(name: str) 
     """The chain rule at both levels: pace and change of pace of the parameter on one side, `timed` on the other."""
     machine, symbols = standing_arm(), ca.MX if name == "path" else ca.SX
     path = smooth(Path.through([(0.0, 0, 0), (0.5, 0.0, 0), (0.5, 0.6, 0)]), deviation=0.02)
-    task = TASKS[name] if name != "path" else TipTask(position=along(path, 0.4).position)
+    task = TASKS[name] if name != "path" else TipTask(position=path_tracks(path, 0.4).position)
     equations, n = bind(machine, task), machine.joint_size
     both = bind(machine, timed(task, lambda t: 0.3 * t + 0.2 * t**2))
     q, u, second, time, pace, change = (

@@ -17,7 +17,7 @@ from ocp import TipTask
 from ocp.motion.schedule import LineLimits, schedule
 from ocp.motion.tasks.equations import bind
 from ocp.motion.tasks.tip_task import timed
-from ocp.motion.tasks.tracks import PathTracks, along
+from ocp.motion.tasks.tracks import PathTracks, path_tracks
 from tests.models.robot.trees import Array
 from tests.ocp.motion.tasks.space_tasks import panda
 
@@ -39,8 +39,8 @@ PATH = turning()
 SPEED = 0.3
 TIMING = schedule(PATH, LineLimits(speed=0.3, acceleration=0.5, jerk=4.0))
 TRACKS: dict[str, tuple[PathTracks, Callable[[Array], Array], Callable[[Array], Array]]] = {
-    "constant": (along(PATH, SPEED), lambda t: SPEED * t, lambda t: np.full_like(t, SPEED)),
-    "scheduled": (along(PATH, TIMING), lambda t: TIMING.at(t).distance, lambda t: TIMING.at(t).speed),
+    "constant": (path_tracks(PATH, SPEED), lambda t: SPEED * t, lambda t: np.full_like(t, SPEED)),
+    "scheduled": (path_tracks(PATH, TIMING), lambda t: TIMING.at(t).distance, lambda t: TIMING.at(t).speed),
 }
 every_track = pytest.mark.parametrize("kind", TRACKS)
 
