@@ -1,7 +1,7 @@
-"""What happens at the console while something is at work: Ctrl-C, time limits, progress, and CasADi's own words.
+"""Ctrl-C, time limits, progress lines and CasADi's output during a call.
 
-A public call is done in a thread of its own, for which the main thread waits: so Ctrl-C reaches Python at once,
-whatever CasADi is at, and never CasADi itself, which would make a RuntimeError of it, to be caught as a breakdown.
+A public call runs in its own thread, for which the main thread waits. So Ctrl-C reaches Python at once, whatever CasADi
+is doing, and never CasADi itself, which would turn it into a RuntimeError that looks like a numerical failure.
 """
 
 from __future__ import annotations
@@ -25,49 +25,35 @@ from tqdm import tqdm
 
 from ocp.status import SolverStatus
 
-__all__ = [
-    "LOG",
-    "OutOfTime",
-    "Progress",
-    "Watch",
-    "check_time",
-    "interruptible",
-    "limited",
-    "listening",
-    "quiet",
-    "reason_to_stop",
-    "time_left",
-]
-
 LOG = logging.getLogger("ocp")
 P = ParamSpec("P")
 T = TypeVar("T")
 
 
-GRACE = 0.8
-"""s after Ctrl-C in which a call may end by itself, with what it has found; the caller has control within a second."""
+GRACE_PERIOD_S = 0.8
+"""Time after Ctrl-C, s, in which a call may end by itself and return its iterate; control returns within a second."""
 
 
 # ---- Ctrl-C ------------------------------------------------------------------------------------------------------
 
 
 class _Call(threading.Thread):
-    """A public call under way.
+    """A public call in progress.
 
     Attributes:
-        stop: Whether it is asked to end.
-        listeners: How many loops inside it look at ``stop`` and end by themselves. heard: Whether one has seen it.
+        stop: Whether it has been asked to end.
+        listeners: Number of loops inside it that poll ``stop`` and end by themselves. heard: Whether one has seen it.
     """
 
     def __init__(self, work: Callable[[], Any]) -> None:
-        # no daemon: what CasADi is at when Python ends must come to its end before
+        # not a daemon: Python must not exit while CasADi is running
         super().__init__(name="ocp", daemon=False)
         self.stop, self.heard, self.listeners = False, False, 0
         self.value: Any = None
         self.error: BaseException | None = None
         self._work, self._context = work, contextvars.copy_context()
         self._leaving = threading.Lock()
-        self.left = threading.Event()  # a join that Ctrl-C interrupts takes a thread for dead that is not
+        self.left = threading.Event()  # after an interrupted join Python takes a running thread for dead
 
     def run(self) -> None:
         try:
@@ -77,7 +63,7 @@ class _Call(threading.Thread):
                 self.error = error
             with self._leaving:
                 self.left.set()
-        except KeyboardInterrupt:  # it was told to end when it was about to
+        except KeyboardInterrupt:  # interrupted when it was about to end
             self.left.set()
 
     def _inside(self) -> Any:
@@ -85,11 +71,11 @@ class _Call(threading.Thread):
         return self._work()
 
     def end(self) -> None:
-        """Ask it to end; if nothing listens, raise KeyboardInterrupt in it, at the next step that is Python's."""
+        """Ask the call to end; if no loop polls, raise KeyboardInterrupt in it at its next Python step."""
         self.stop = True
         began = time.monotonic()
         try:
-            while (self.listeners or self.heard) and time.monotonic() - began < GRACE:
+            while (self.listeners or self.heard) and time.monotonic() - began < GRACE_PERIOD_S:
                 if self.left.wait(0.02):
                     return
         finally:
@@ -99,7 +85,7 @@ class _Call(threading.Thread):
                         ctypes.c_ulong(self.ident), ctypes.py_object(KeyboardInterrupt)
                     )
         if self.ident is not None:
-            self.left.wait(max(0.02, began + GRACE - time.monotonic()))
+            self.left.wait(max(0.02, began + GRACE_PERIOD_S - time.monotonic()))
 
 
 _CALL: contextvars.ContextVar[_Call | None] = contextvars.ContextVar("call", default=None)
@@ -107,26 +93,26 @@ _DEADLINE: contextvars.ContextVar[float] = contextvars.ContextVar("deadline", de
 
 
 def interruptible(function: Callable[P, T]) -> Callable[P, T]:
-    """A public function that Ctrl-C ends within a second.
+    """Return a public function that Ctrl-C ends within a second.
 
-    KeyboardInterrupt is raised, or what else a handler of signals raises; it carries as ``solution`` what the call had
-    found, where it had (see :class:`ocp.errors.Interrupted`). Outside the main thread, where no signal arrives, the
-    function is called as it is.
+    KeyboardInterrupt is raised, or whatever another signal handler raises. It carries as ``solution`` the last iterate
+    of the call, if any (see :class:`ocp.errors.Interrupted`). Outside the main thread, which alone receives signals,
+    the function is called directly.
     """
 
     @wraps(function)
-    def call(*arguments: P.args, **named: P.kwargs) -> T:
+    def call(*arguments: P.args, **keywords: P.kwargs) -> T:
         if threading.current_thread() is not threading.main_thread():
-            return function(*arguments, **named)
-        work = _Call(partial(function, *arguments, **named))
+            return function(*arguments, **keywords)
+        work = _Call(partial(function, *arguments, **keywords))
         try:
             work.start()
             while not work.left.wait(1.0):
                 pass
         except BaseException as raised:
             work.end()
-            found = getattr(work.error, "solution", None)
-            if found is not None and isinstance(raised, KeyboardInterrupt):
+            solution = getattr(work.error, "solution", None)
+            if solution is not None and isinstance(raised, KeyboardInterrupt):
                 raise work.error from None  # type: ignore[misc]
             raise
         try:
@@ -134,14 +120,14 @@ def interruptible(function: Callable[P, T]) -> Callable[P, T]:
                 raise work.error
             return work.value  # type: ignore[no-any-return]
         finally:
-            del work  # or the traceback would hold what holds it
+            del work  # breaks the reference cycle with the traceback
 
     return call
 
 
 @contextmanager
-def listening() -> Iterator[None]:
-    """Inside, the loop at work asks :func:`reason_to_stop` again and again, and ends by itself."""
+def stop_requests_polled() -> Iterator[None]:
+    """Declare that the loop inside polls :func:`reason_to_stop` and ends by itself."""
     call = _CALL.get()
     if call is None:
         yield
@@ -154,7 +140,7 @@ def listening() -> Iterator[None]:
 
 
 def reason_to_stop() -> SolverStatus | None:
-    """Why the work at hand should end, INTERRUPTED or TIME_LIMIT; None where it need not."""
+    """Return INTERRUPTED or TIME_LIMIT if the current work should end, else None."""
     call = _CALL.get()
     if call is not None and call.stop:
         call.heard = True
@@ -166,10 +152,10 @@ def reason_to_stop() -> SolverStatus | None:
 
 
 @contextmanager
-def limited(seconds: float | None) -> Iterator[None]:
-    """Solves inside end after so many seconds in all, or after what an outer limit leaves; None for no limit."""
-    before = _DEADLINE.get()
-    token = _DEADLINE.set(before if seconds is None else min(before, time.monotonic() + seconds))
+def time_limited(seconds: float | None) -> Iterator[None]:
+    """Limit the time of all solves inside, s, in addition to an outer limit; None for no limit."""
+    outer = _DEADLINE.get()
+    token = _DEADLINE.set(outer if seconds is None else min(outer, time.monotonic() + seconds))
     try:
         yield
     finally:
@@ -177,25 +163,25 @@ def limited(seconds: float | None) -> Iterator[None]:
 
 
 def time_left() -> float:
-    """Seconds until the time limit, infinite without one; negative behind it."""
+    """Return the time until the time limit, s; infinite without one, negative after it."""
     return _DEADLINE.get() - time.monotonic()
 
 
-class OutOfTime(Exception):
-    """What has no word of its own for it is behind its time limit; who set the limit says what was found."""
+class TimeLimitReached(Exception):
+    """The time limit has passed in a computation without its own status; the function that set the limit reports it."""
 
 
 def check_time() -> None:
-    """Raise OutOfTime behind the time limit."""
+    """Raise TimeLimitReached after the time limit."""
     if time_left() <= 0:
-        raise OutOfTime(str(SolverStatus.TIME_LIMIT))
+        raise TimeLimitReached(str(SolverStatus.TIME_LIMIT))
 
 
 # ---- progress ----------------------------------------------------------------------------------------------------
 
 
 class Progress(ca.Callback):  # type: ignore[misc]
-    """One line on the terminal for each iteration, and a way to stop between two; keeps the iterate."""
+    """Iteration callback: shows one line on the terminal, can stop the solver, and stores the iterate."""
 
     def __init__(self, n: int, m: int, np_: int, title: str, show: bool) -> None:
         ca.Callback.__init__(self)
@@ -235,7 +221,7 @@ class Progress(ca.Callback):  # type: ignore[misc]
                 self.bar.set_postfix_str(words, refresh=False)
                 self.bar.update()
             self.stopped = reason_to_stop()
-        except KeyboardInterrupt:  # CasADi would make another error of it
+        except KeyboardInterrupt:  # CasADi would turn it into another error
             self.stopped = SolverStatus.INTERRUPTED
         self.iterations, self.iterate = self.iterations + 1, np.asarray(arguments[0].full()).reshape(-1)
         return [int(bool(self.stopped))]
@@ -245,10 +231,10 @@ class Progress(ca.Callback):  # type: ignore[misc]
             self.bar.close()
 
 
-class Watch(ca.Callback):  # type: ignore[misc]
-    """The function of an iterate that is 1 while a solver may go on and 0 when it must end; keeps the iterate.
+class FatropMonitor(ca.Callback):  # type: ignore[misc]
+    """Function of an iterate that is 1 to continue and 0 to stop the solver, and stores the iterate.
 
-    For fatrop's plugin, which has no iteration callback.
+    It serves fatrop's plugin, which has no iteration callback.
     """
 
     def __init__(self, n: int, title: str) -> None:
@@ -263,7 +249,7 @@ class Watch(ca.Callback):  # type: ignore[misc]
         self.stopped, self.iterations = None, 0
 
     def close(self) -> None:
-        """The solve has ended."""
+        """End a solve."""
 
     def get_n_in(self) -> int:
         return 1
@@ -283,11 +269,11 @@ class Watch(ca.Callback):  # type: ignore[misc]
         return [float(not self.stopped)]
 
 
-# ---- CasADi's own words ------------------------------------------------------------------------------------------
+# ---- CasADi's output --------------------------------------------------------------------------------------------
 
 
-class _Hushed(io.TextIOBase):
-    """``sys.stderr`` without what some threads write."""
+class _FilteredStream(io.TextIOBase):
+    """``sys.stderr`` without the output of silenced threads."""
 
     def __init__(self, real: Any) -> None:
         self.real = real
@@ -306,26 +292,26 @@ class _Hushed(io.TextIOBase):
         return int(self.real.fileno())
 
 
-_HUSHING = threading.Lock()
+_FILTER_LOCK = threading.Lock()
 
 
 @contextmanager
-def quiet() -> Iterator[None]:
-    """Swallow what CasADi writes to ``sys.stderr`` from this thread where a function breaks down and that is expected.
+def casadi_silenced() -> Iterator[None]:
+    """Suppress what CasADi writes to ``sys.stderr`` from this thread when an expected evaluation fails.
 
-    It would print the function's inputs; no option of its functions keeps it from that.
+    It would print the function's inputs, and no option of its functions prevents that.
     """
-    me = threading.get_ident()
-    with _HUSHING:
-        if not isinstance(sys.stderr, _Hushed):
-            sys.stderr = _Hushed(sys.stderr)
-        hushed = sys.stderr
-        hushed.silent[me] += 1
+    thread = threading.get_ident()
+    with _FILTER_LOCK:
+        if not isinstance(sys.stderr, _FilteredStream):
+            sys.stderr = _FilteredStream(sys.stderr)
+        stream = sys.stderr
+        stream.silent[thread] += 1
     try:
         yield
     finally:
-        with _HUSHING:
-            hushed.silent[me] -= 1
-            hushed.silent = +hushed.silent
-            if not hushed.silent and sys.stderr is hushed:
-                sys.stderr = hushed.real
+        with _FILTER_LOCK:
+            stream.silent[thread] -= 1
+            stream.silent = +stream.silent
+            if not stream.silent and sys.stderr is stream:
+                sys.stderr = stream.real

@@ -1,7 +1,4 @@
-"""Curves over time: piecewise polynomials kept as values at nodes, and the integration of differential equations.
-
-Piecewise polynomials are the form in which a solution stores its interpolants.
-"""
+"""Piecewise polynomials given by values at nodes, the form of a solution's interpolants, and integrators of ODEs."""
 
 from __future__ import annotations
 
@@ -12,18 +9,6 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-__all__ = [
-    "PiecewisePolynomial",
-    "barycentric_weights",
-    "differentiation_matrix",
-    "dormand_prince_step",
-    "integrator",
-    "lagrange",
-    "newton_coefficients",
-    "quadrature_weights",
-    "rk4_step",
-]
-
 DORMAND_PRINCE = (
     (0.0, ()),
     (1 / 5, (1 / 5,)),
@@ -32,17 +17,17 @@ DORMAND_PRINCE = (
     (8 / 9, (19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729)),
     (1.0, (9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656)),
     (1.0, (35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84)),
-)  # place and weights of each stage; the last are those of the step
+)  # position and weights of each stage; the last weights are those of the step
 DORMAND_PRINCE_ERROR = (71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40)
 
 
 @dataclass(frozen=True)
 class PiecewisePolynomial:
-    """One polynomial a piece, given by its values at nodes.
+    """A polynomial on each interval, given by its values at nodes.
 
     Attributes:
-        breaks: Where pieces begin and end, increasing. Shape (K + 1,).
-        nodes: Places of the values in a piece, in 0..1. Shape (d,); one node makes a piecewise constant.
+        breaks: Ends of the intervals, increasing. Shape (K + 1,).
+        nodes: Positions of the values in an interval, in 0..1. Shape (d,); one node gives a piecewise constant.
         values: Shape (K, d, n).
     """
 
@@ -51,45 +36,45 @@ class PiecewisePolynomial:
     values: np.ndarray
 
     def __post_init__(self) -> None:
-        # laid out alike wherever they come from, for sums to be rounded alike
+        # a uniform memory layout makes sums round identically
         object.__setattr__(self, "values", np.ascontiguousarray(self.values))
 
     def __repr__(self) -> str:
-        pieces, nodes, columns = self.values.shape
-        return f"<PiecewisePolynomial of {pieces} pieces of {nodes} nodes, {columns} columns>"
+        intervals, nodes, columns = self.values.shape
+        return f"<PiecewisePolynomial of {intervals} intervals of {nodes} nodes, {columns} columns>"
 
     def __call__(self, at: np.ndarray) -> np.ndarray:
-        """Values at ``at`` (M,), continuous from the right at breaks, clipped to the ends. Shape (M, n)."""
-        piece = np.clip(np.searchsorted(self.breaks, at, side="right") - 1, 0, len(self.breaks) - 2)
-        start, end = self.breaks[piece], self.breaks[piece + 1]
-        return self.within(piece, np.clip((at - start) / (end - start), 0.0, 1.0))
+        """Return values at ``at`` (M,), right-continuous at breaks, clipped to the ends. Shape (M, n)."""
+        interval = np.clip(np.searchsorted(self.breaks, at, side="right") - 1, 0, len(self.breaks) - 2)
+        start, end = self.breaks[interval], self.breaks[interval + 1]
+        return self.within(interval, np.clip((at - start) / (end - start), 0.0, 1.0))
 
     def derivative(self) -> PiecewisePolynomial:
-        """Its derivative, by what the breaks are made of; zero where a piece has one node."""
+        """Return the derivative, in the unit of the breaks; zero if there is one node."""
         if len(self.nodes) == 1:
             return PiecewisePolynomial(self.breaks, self.nodes, np.zeros_like(self.values))
         slopes = np.einsum("ij,kjn->kin", differentiation_matrix(self.nodes), self.values)
         return PiecewisePolynomial(self.breaks, self.nodes, slopes / np.diff(self.breaks)[:, None, None])
 
-    def within(self, piece: np.ndarray, place: np.ndarray) -> np.ndarray:
-        """Values at ``place`` (M,) in 0..1 of pieces ``piece`` (M,), so that both sides of a break can be asked."""
-        return np.asarray(np.einsum("md,mdn->mn", lagrange(self.nodes, place), self.values[piece]))
+    def within(self, interval: np.ndarray, place: np.ndarray) -> np.ndarray:
+        """Return values at positions ``place`` (M,) in 0..1 of intervals ``interval`` (M,): either side of a break."""
+        return np.asarray(np.einsum("md,mdn->mn", lagrange(self.nodes, place), self.values[interval]))
 
 
 def barycentric_weights(nodes: np.ndarray) -> np.ndarray:
-    """Weights of the barycentric formula (Berrut, Trefethen 2004, eq 3.2). Shape (d,)."""
+    """Return the weights of the barycentric formula (Berrut, Trefethen 2004, eq 3.2). Shape (d,)."""
     difference = nodes[:, None] - nodes[None, :]
     np.fill_diagonal(difference, 1.0)
     return np.asarray(1.0 / difference.prod(axis=1))
 
 
 def lagrange(nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Lagrange basis polynomials of ``nodes`` (d,) at ``at`` (M,), in barycentric form. Shape (M, d)."""
+    """Return Lagrange basis polynomials of ``nodes`` (d,) at ``at`` (M,), in barycentric form. Shape (M, d)."""
     at = np.asarray(at, dtype=float)
     if len(nodes) == 1:
         return np.ones((len(at), 1))
     distance = at[:, None] - nodes[None, :]
-    hit = np.abs(distance) < np.sqrt(np.finfo(float).tiny)  # nearer to a node, its weight would overflow
+    hit = np.abs(distance) < np.sqrt(np.finfo(float).tiny)  # closer to a node, its weight would overflow
     terms = barycentric_weights(nodes) / np.where(hit, 1.0, distance)
     on_node = hit.any(axis=1, keepdims=True)
     total = np.where(on_node, 1.0, terms.sum(axis=1, keepdims=True))
@@ -97,7 +82,7 @@ def lagrange(nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
 
 
 def differentiation_matrix(nodes: np.ndarray) -> np.ndarray:
-    """Derivatives of the Lagrange basis at its own nodes: row j, column i is l_i'(node_j). Shape (d, d)."""
+    """Return derivatives of the Lagrange basis at its nodes: row j, column i is l_i'(node_j). Shape (d, d)."""
     weights = barycentric_weights(nodes)
     difference = nodes[:, None] - nodes[None, :]
     np.fill_diagonal(difference, 1.0)
@@ -108,27 +93,27 @@ def differentiation_matrix(nodes: np.ndarray) -> np.ndarray:
 
 
 def quadrature_weights(points: np.ndarray) -> np.ndarray:
-    """Weights of the interpolatory quadrature on 0..1 at ``points`` (d,). Shape (d,)."""
-    at, weight = np.polynomial.legendre.leggauss(len(points))
-    return np.asarray(0.5 * weight @ lagrange(points, 0.5 * (at + 1.0)))
+    """Return the weights of the interpolatory quadrature on 0..1 at ``points`` (d,). Shape (d,)."""
+    gauss, weight = np.polynomial.legendre.leggauss(len(points))
+    return np.asarray(0.5 * weight @ lagrange(points, 0.5 * (gauss + 1.0)))
 
 
 def newton_coefficients(nodes: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Divided differences c of values (K, d, n) at nodes (d,). Shape (K, d, n).
+    """Return divided differences c of values (K, d, n) at nodes (d,). Shape (K, d, n).
 
     The polynomial is c0 + (s - node 0) (c1 + (s - node 1) (c2 + ...)), which takes the fewest operations.
     """
-    found = np.array(values, dtype=float)
+    coefficients = np.array(values, dtype=float)
     for i in range(1, len(nodes)):
         width = (nodes[i:] - nodes[:-i])[None, :, None]
-        found[:, i:] = (found[:, i:] - found[:, i - 1 : -1]) / width
-    return found
+        coefficients[:, i:] = (coefficients[:, i:] - coefficients[:, i - 1 : -1]) / width
+    return coefficients
 
 
 def rk4_step(slope: Callable[[float, Any], Any], x: Any, h: Any) -> Any:
-    """One step of width ``h`` of the classical Runge-Kutta method from ``x``, an array or an expression.
+    """Take one step of width ``h`` of the classical Runge-Kutta method from ``x``, an array or an expression.
 
-    ``slope(place, x)`` is dx/dt at the place 0, 1/2 or 1 of the step.
+    ``slope(place, x)`` is dx/dt at the position 0, 1/2 or 1 of the step.
     """
     k1 = slope(0.0, x)
     k2 = slope(0.5, x + h / 2 * k1)
@@ -138,9 +123,9 @@ def rk4_step(slope: Callable[[float, Any], Any], x: Any, h: Any) -> Any:
 
 
 def dormand_prince_step(slope: Callable[[float, Any], Any], x: Any, h: Any) -> tuple[Any, Any]:
-    """One step of width ``h`` of order 5 from ``x``, and the estimate of its error of order 4 (Dormand, Prince 1980).
+    """Take one step of order 5 from ``x``; return it with its error estimate of order 4 (Dormand, Prince 1980).
 
-    ``slope(place, x)`` is dx/dt at a place 0..1 of the step.
+    ``slope(place, x)`` is dx/dt at a position 0..1 of the step, whose width is ``h``.
     """
     slopes: list[Any] = []
     after = x
@@ -163,13 +148,14 @@ def integrator(
     smooth: bool = True,
     start: float = 0.0,
 ) -> Any:
-    """A casadi integrator (cvodes: variable step and order) of ``dae`` from ``start`` to each of ``places``.
+    """Return a casadi integrator (cvodes: variable step and order) of ``dae`` from ``start`` to each of ``places``.
 
     Args:
         dae: casadi's dictionary: x, t, p, ode and, if any, quad, which is under error control too.
-        tolerance: Relative and absolute, of the local error. max_steps: Most steps between two places.
-        smooth: Adams' formulas, for smooth dynamics that are not stiff, and no word about a trial step that fails,
-            which may go anywhere; else backward differentiation formulas.
+        tolerance: Relative and absolute tolerance of the local error. max_steps: Maximum number of steps between two
+            places.
+        smooth: Use Adams formulas, for smooth dynamics that are not stiff, and no warning of a failed trial step; else
+            backward differentiation formulas.
     """
     options: dict[str, Any] = {
         "reltol": tolerance,

@@ -1,6 +1,7 @@
 """Exceptions of the package, and the checks of arguments that raise them.
 
-Each message names the offending thing, its value and what to do; the exception carries the same as fields.
+Each message names the faulty argument or constraint, its value and the remedy. The exception holds the same data as
+fields.
 """
 
 from __future__ import annotations
@@ -17,17 +18,16 @@ from models.arrays import NOT_NUMBERS, check_entries, floats
 from models.input_files import INPUT_LIMITS
 
 __all__ = [
-    "MOST",
+    "MAX_COUNT",
     "NOT_NUMBERS",
     "AuditError",
     "BoundWarning",
-    "Detailed",
+    "DetailedError",
     "Interrupted",
     "ProblemError",
     "RefinementWarning",
     "SolveError",
     "StorageWarning",
-    "about",
     "check_entries",
     "checked_choice",
     "checked_count",
@@ -39,25 +39,26 @@ __all__ = [
     "checked_positive",
     "checked_text",
     "checked_time_limit",
+    "error_names",
     "floats",
+    "format_distinct",
     "real",
     "sample_times",
-    "told_apart",
     "unknown_name",
 ]
 
-MOST = 1_000_000
-"""Of what is counted: more than these take longer than anybody waits."""
+MAX_COUNT = 1_000_000
+"""Largest accepted count: more items take longer than anybody waits."""
 _Kind = TypeVar("_Kind")
 
 
-class Detailed(Exception):
-    """An exception that carries what its message says; it is pickled with all of it.
+class DetailedError(Exception):
+    """An exception that carries the data of its message as fields, also through pickling.
 
     Attributes:
-        name: Of the offending state, control, constraint, parameter, option or argument, where it is one.
-        value: What was found. limit: What it may be. time: When, s, or where along a path, m. Each None where the
-            message says none.
+        name: Name of the faulty state, control, constraint, parameter, option or argument; None if there is none.
+        value: The value at fault. limit: The value allowed. time: When, s, or where along a path, m. Each is None if
+            the message states none.
     """
 
     def __init__(
@@ -67,20 +68,21 @@ class Detailed(Exception):
         self.name, self.value, self.limit, self.time = name, value, limit, time
 
     def __reduce__(self) -> Any:
-        """Pickled with all that it carries; of what cannot be pickled, such as an expression, with how it is shown."""
+        """Pickle all fields; a field that cannot be pickled, such as an expression, is replaced by its `repr`."""
         return type(self), self.args, {key: _pickled(value) for key, value in self.__dict__.items()}
 
 
-class ProblemError(Detailed, ValueError):
-    """A problem, a method or an argument that cannot be right, found before anything is solved."""
+class ProblemError(DetailedError, ValueError):
+    """An invalid problem, method or argument, detected before anything is solved."""
 
 
-class SolveError(Detailed, RuntimeError):
+class SolveError(DetailedError, RuntimeError):
     """A solve that ended without an optimum.
 
     Attributes:
-        solution: The last iterate as an unsuccessful solution, or None where there is none.
-        conflicts: The constraints that have to give way (:class:`ocp.direct.diagnosis.Conflict`), the worst first.
+        solution: The last iterate as an unsuccessful solution, or None.
+        conflicts: The constraints that would have to be relaxed (:class:`ocp.direct.diagnosis.Conflict`), the worst
+            first.
     """
 
     def __init__(self, message: str = "", solution: Any = None, conflicts: Sequence[Any] = (), **details: Any) -> None:
@@ -89,7 +91,7 @@ class SolveError(Detailed, RuntimeError):
 
 
 class Interrupted(KeyboardInterrupt):
-    """Ctrl-C, where something had been found before.
+    """Ctrl-C during a solve that already has an iterate.
 
     Attributes:
         solution: The last iterate as an unsuccessful solution.
@@ -100,42 +102,42 @@ class Interrupted(KeyboardInterrupt):
         self.solution = solution
 
 
-class AuditError(Detailed, RuntimeError):
-    """An audit that cannot be made, for example of a loaded solution without its problem."""
+class AuditError(DetailedError, RuntimeError):
+    """An audit that is impossible, for example of a loaded solution without its problem."""
 
 
-class RefinementWarning(Detailed, UserWarning):
-    """A refinement that stopped where the audit does not pass; ``value`` is the share of its limit that a row is at."""
+class RefinementWarning(DetailedError, UserWarning):
+    """A refinement that stopped before the audit passed; ``value`` is the worst row's value divided by its limit."""
 
 
-class StorageWarning(Detailed, UserWarning):
-    """A part that a file cannot hold as data, such as a problem that calls a function of Python's."""
+class StorageWarning(DetailedError, UserWarning):
+    """A part that cannot be saved as data, such as a problem that calls a Python function."""
 
 
-class BoundWarning(Detailed, UserWarning):
-    """A motion that costs less, ``value``, than the lower bound of all, ``limit``: a fault of this package."""
+class BoundWarning(DetailedError, UserWarning):
+    """A motion whose cost, ``value``, is below the proven lower bound, ``limit``: a bug of this package."""
 
 
 @contextmanager
-def about(name: str) -> Iterator[None]:
-    """What is raised inside, and names nothing itself, is about ``name``."""
+def error_names(name: str) -> Iterator[None]:
+    """Set the name of every exception raised inside that has no name yet."""
     try:
         yield
-    except Detailed as error:
+    except DetailedError as error:
         error.name = name if error.name is None else error.name
         raise
 
 
 def unknown_name(kind: str, name: object, known: Iterable[str]) -> ProblemError:
-    """Error for a name that nothing bears, listing the near ones (or all, if none is near)."""
+    """Return the error for an unknown name, with the most similar known names, or all names if none is similar."""
     names = [str(item) for item in known]
-    near = get_close_matches(str(name), names, n=3)
-    hint = f"did you mean {', '.join(near)}?" if near else f"known: {', '.join(names) or 'none'}"
+    similar = get_close_matches(str(name), names, n=3)
+    hint = f"did you mean {', '.join(similar)}?" if similar else f"known: {', '.join(names) or 'none'}"
     return ProblemError(f"unknown {kind} {name!r}; {hint}", name=str(name) or kind, limit=tuple(names))
 
 
 def real(value: Any) -> float:
-    """A single real number, nan where it is none."""
+    """Return a real number as a float, nan if the value is not a real number."""
     if isinstance(value, bool | np.bool_) or not isinstance(value, int | float | np.integer | np.floating):
         return np.nan
     try:
@@ -145,119 +147,121 @@ def real(value: Any) -> float:
 
 
 def checked_choice(what: str, value: Any, choices: Sequence[str]) -> str:
-    """``value``, or ProblemError where it is none of the words ``choices``; ``what`` ends with the argument's name."""
+    """Return ``value``, or raise ProblemError unless it is one of ``choices``. ``what`` ends with the argument."""
     if not isinstance(value, str) or value not in choices:
-        words = " or ".join(repr(choice) for choice in choices)
-        raise ProblemError(
-            f"{what} must be {words}, not {value!r}", name=_last(what), value=value, limit=tuple(choices)
-        )
+        raise _invalid(what, " or ".join(repr(choice) for choice in choices), value, tuple(choices))
     return value
 
 
 def checked_count(what: str, value: Any, least: int = 1, most: int | None = None) -> int:
-    """``value`` as a plain integer, or ProblemError unless it is a whole number from ``least`` to ``most``."""
+    """Return ``value`` as an int, or raise ProblemError unless it is an integer from ``least`` to ``most``."""
     whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
-    if not whole or value < least or value > (MOST if most is None else most):
+    if not whole or value < least or value > (MAX_COUNT if most is None else most):
         kind = "a positive integer" if least == 1 else f"a whole number, at least {least}"
         kind = kind if most is None else f"{least} to {most}"
-        raise ProblemError(f"{what} must be {kind}, not {value!r}", name=_last(what), value=value, limit=(least, most))
+        raise _invalid(what, kind, value, (least, most))
     return int(value)
 
 
 def checked_nonnegative(what: str, value: Any) -> float:
-    """``value``, or ProblemError unless it is a finite number, zero or above."""
+    """Return ``value``, or raise ProblemError unless it is a finite number, zero or above."""
     if not 0 <= real(value) < np.inf:
-        words = f"{what} must be a finite number, zero or above, not {value!r}"
-        raise ProblemError(words, name=_last(what), value=value, limit=0.0)
-    kept: float = value  # a whole number stays one
-    return kept
+        raise _invalid(what, "a finite number, zero or above", value, 0.0)
+    number: float = value  # an integer stays an integer
+    return number
 
 
 def checked_positive(what: str, value: Any, below: float = np.inf) -> float:
-    """``value``, or ProblemError unless it is a number between 0 and ``below``, both excluded."""
+    """Return ``value``, or raise ProblemError unless 0 < ``value`` < ``below``."""
     if not 0 < real(value) < below:
         kind = "positive and finite" if below == np.inf else f"between 0 and {below:g}"
-        raise ProblemError(f"{what} must be {kind}, not {value!r}", name=_last(what), value=value, limit=below)
-    kept: float = value
-    return kept
+        raise _invalid(what, kind, value, below)
+    number: float = value
+    return number
 
 
-def told_apart(*numbers: float) -> list[str]:
-    """Numbers for a message, in six digits, or in as many more as tell those apart that differ."""
-    told = [[f"{number:.{digits}g}" for number in numbers] for digits in range(6, 18)]
-    return next((each for each in told if len({*each}) == len({repr(number) for number in numbers})), told[-1])
+def format_distinct(*numbers: float) -> list[str]:
+    """Format numbers with six digits, or with as many more as it takes to distinguish unequal numbers."""
+    candidates = [[f"{number:.{digits}g}" for number in numbers] for digits in range(6, 18)]
+    different = len({repr(number) for number in numbers})
+    return next((texts for texts in candidates if len({*texts}) == different), candidates[-1])
 
 
 def sample_times(what: str, period: Any, duration: float) -> np.ndarray:
-    """Every `period` from 0 on, and the end of the duration, which comes as early as that says; s.
+    """Return the times 0, period, 2 period, ... before the end of the duration, and the end itself, s.
 
     Raises:
-        ProblemError: A period that is not positive, or so short that there were more than `INPUT_LIMITS.array_entries`.
+        ProblemError: The period is not positive, or gives more than `INPUT_LIMITS.array_entries` samples.
     """
     step = checked_positive(what, period)
-    count = np.ceil(duration / step * (1 - 1e-12))  # but for rounding
+    count = np.ceil(duration / step * (1 - 1e-12))  # tolerates rounding of the quotient
     most = INPUT_LIMITS.array_entries
     if not count < most:
-        words = f"{what} {step:g} s asks for {count:g} samples of {duration:g} s, more than {most}"
-        raise ProblemError(words, name=_last(what), value=period, limit=duration / most)
+        words = f"{what} {step:g} s gives {count:g} samples over {duration:g} s, more than {most}"
+        raise ProblemError(words, name=_argument(what), value=period, limit=duration / most)
     return np.append(np.arange(int(count)) * step, duration)
 
 
 def checked_text(what: str, value: Any) -> str:
-    """``value``, or ProblemError unless it is a string; an empty one will do."""
+    """Return ``value``, or raise ProblemError unless it is a string, which may be empty."""
     if not isinstance(value, str):
-        raise ProblemError(f"{what} must be a string, not {value!r}", name=_last(what), value=value)
+        raise _invalid(what, "a string", value)
     return value
 
 
 def checked_flag(what: str, value: Any) -> bool:
-    """``value`` as a bool, or ProblemError unless it is True or False."""
+    """Return ``value`` as a bool, or raise ProblemError unless it is True or False."""
     if not isinstance(value, bool | np.bool_):
-        raise ProblemError(f"{what} must be True or False, not {value!r}", name=_last(what), value=value)
+        raise _invalid(what, "True or False", value)
     return bool(value)
 
 
 def checked_instance(what: str, value: Any, kind: type[_Kind]) -> _Kind:
-    """``value``, or ProblemError unless it is a ``kind``."""
+    """Return ``value``, or raise ProblemError unless it is an instance of ``kind``."""
     if not isinstance(value, kind):
-        words = f"{what} must be a {kind.__name__}, not {value!r}"
-        raise ProblemError(words, name=_last(what), value=value, limit=kind.__name__)
+        raise _invalid(what, f"a {kind.__name__}", value, kind.__name__)
     return value
 
 
 def checked_each(what: str, values: Any, kind: type[_Kind]) -> tuple[_Kind, ...]:
-    """``values`` as a tuple, or ProblemError unless they are several (or none) of a ``kind``."""
+    """Return ``values`` as a tuple, or raise ProblemError unless they are a list of ``kind``, which may be empty."""
     try:
         check_entries(values)
-        each = tuple(values)
+        items = tuple(values)
     except NOT_NUMBERS as error:
-        words = f"{what} must be a list of {kind.__name__}, not {values!r}"
-        raise ProblemError(words, name=_last(what), value=values, limit=kind.__name__) from error
-    for value in each:
-        checked_instance(what, value, kind)
-    return each
+        raise _invalid(what, f"a list of {kind.__name__}", values, kind.__name__) from error
+    for item in items:
+        checked_instance(what, item, kind)
+    return items
 
 
 def checked_time_limit(seconds: Any) -> float | None:
-    """A time limit, or ProblemError unless it is a positive number of seconds, or None for no limit."""
+    """Return a time limit in seconds, None for no limit; raise ProblemError unless it is positive."""
     return None if seconds is None else checked_positive("time_limit", seconds)
 
 
 def checked_mapping(what: str, values: Any) -> dict[str, Any]:
-    """A dictionary by name, or nothing, as a dictionary of its own; ProblemError for anything else."""
+    """Return a copy of a dictionary by name, empty for None; raise ProblemError for any other value."""
     if not isinstance(values, Mapping | None):
-        raise ProblemError(f"{what} must be a dictionary by name, not {values!r}", name=_last(what), value=values)
+        raise _invalid(what, "a dictionary by name", values)
     return dict(values or {})
 
 
-def _last(what: str) -> str:
-    """The name of an argument at the end of ``Collocation: scheme``."""
+def _argument(what: str) -> str:
+    """Return the argument's name, ``scheme``, from a description such as ``Collocation: scheme``."""
     return what.rpartition(" ")[2].strip("'")
 
 
+def _invalid(what: str, requirement: str, value: Any, limit: Any = None) -> ProblemError:
+    """Return the error of an argument that violates a requirement."""
+    words = f"{what} must be {requirement}, not {value!r}"
+    return ProblemError(words, name=_argument(what), value=value, limit=limit)
+
+
 def _pickled(value: Any) -> Any:
+    """Return a value, or its `repr` if it cannot be pickled."""
     try:
         pickle.dumps(value)
-    except Exception:  # of any kind
+    except Exception:  # pickling raises errors of many kinds
         return repr(value)
     return value

@@ -1,8 +1,8 @@
-"""C code compiled by the machine's compiler, once: shared libraries that are kept between runs.
+"""C code of functions, compiled once by the machine's compiler into shared libraries that are cached between runs.
 
-A library is known by what it is made of, by the compiler and by its flags, so meshes, processes and runs share it (see
-`models.cache`). Compiled functions return the very numbers that interpreted ones do: the same operations in the same
-order, none of them fused. The compiler is that of the environment's CC, else `cc`; without one, functions are
+A library is identified by its source data, the compiler and its flags, so meshes, processes and runs share it (see
+`models.cache`). Compiled functions return exactly the numbers of interpreted ones: the same operations in the same
+order, without fused operations. The compiler is that of the environment's CC, else `cc`; without one, functions are
 interpreted.
 """
 
@@ -26,34 +26,35 @@ from typing import Any
 import casadi as ca
 
 from models import cache
-from ocp.console import LOG, check_time, quiet
+from ocp.console import LOG, casadi_silenced, check_time
 
-__all__ = ["CompilerError", "Library", "built", "code", "generated"]
+__all__ = ["CompilerError", "Library", "build_library", "generate_c", "generate_code"]
 
-VERSION = "1"  # of what is made of contents
+VERSION = "1"  # of the generated code
 FLAGS = ("-fPIC", "-shared", "-w", "-ffp-contract=off", *(("-Wl,-z,defs",) if sys.platform == "linux" else ()))
-"""What is not defined is an error here, where it is the end of Python when it is called."""
-LINK = "-lm"  # behind the C
-SERIALISED = "casadi:"  # before the text of a function
+"""Undefined symbols are errors at link time; otherwise a call would crash Python."""
+LINK = "-lm"  # must follow the source file
+SERIALISED = "casadi:"  # prefix of a serialised function
 WATCHED = """
 exec 3<&0
 (trap "" TERM; read -r _ <&3; kill 0; rm -rf "$PWD"; kill -9 0) &
 exec "$@" </dev/null 3<&-
 """
-"""Shell words that run a command; when their input ends, as where Python is killed, they end it, its folder too."""
+"""Shell script that runs a command; when its input closes, as when Python dies, it kills it and removes its folder."""
 
 
 class CompilerError(RuntimeError):
-    """C code that cannot be made, compiled or loaded, and why."""
+    """C code that cannot be generated, compiled or loaded, with the reason."""
 
 
 @dataclass(frozen=True)
 class CodeSizes:
-    """Characters of C.
+    """Limits on the C code, in characters.
 
     Attributes:
-        optimized: The most that are optimized: more take minutes, and without it half as long again to run.
-        accepted: The most that are compiled: gcc takes 130 bytes of memory for each.
+        optimized: Largest code that is optimised: more takes minutes, and without optimisation it runs half as long
+            again.
+        accepted: Largest code that is compiled: gcc takes 130 bytes of memory for each character.
     """
 
     optimized: int = 300_000
@@ -71,8 +72,8 @@ class Library:
     """A shared library.
 
     Attributes:
-        contents: All that its C follows from, such as serialised functions. text: Makes the C; not called where the
-            library is kept.
+        contents: The data that determine its C code, such as serialised functions. text: Generates the C code; not
+            called if the library is in the cache.
     """
 
     contents: tuple[str, ...]
@@ -89,24 +90,24 @@ class Library:
         return cache.cache_key(VERSION, *machine, *compiler(), *FLAGS, LINK, *self.contents)
 
 
-def code(functions: Iterable[Any]) -> str:
-    """C of casadi Functions, each by its name.
+def generate_code(functions: Iterable[Any]) -> str:
+    """Return the C code of casadi Functions, each under its name.
 
     Raises:
-        CompilerError: One of them has no C.
+        CompilerError: One of them has no C code.
     """
-    return generated(functions, "unit", header=False)[0]
+    return generate_c(functions, "unit", header=False)[0]
 
 
-def generated(functions: Iterable[Any], name: str, *, header: bool = True) -> list[str]:
-    """The texts NAME.c and NAME.h of casadi Functions.
+def generate_c(functions: Iterable[Any], name: str, *, header: bool = True) -> list[str]:
+    """Return the texts of NAME.c and NAME.h of casadi Functions.
 
     Raises:
-        CompilerError: One of them has no C.
+        CompilerError: One of them has no C code.
     """
     files = [f"{name}.c", f"{name}.h"] if header else [f"{name}.c"]
     try:
-        with tempfile.TemporaryDirectory() as place, quiet():
+        with tempfile.TemporaryDirectory() as place, casadi_silenced():
             generator = ca.CodeGenerator(files[0], {"with_header": header})
             for function in functions:
                 generator.add(function)
@@ -116,36 +117,36 @@ def generated(functions: Iterable[Any], name: str, *, header: bool = True) -> li
         raise CompilerError(str(error).strip().splitlines()[-1]) from error
     if gap := re.search(r"^ *#error (.*)", texts[0], re.MULTILINE):
         raise CompilerError(gap[1])
-    # where nothing is mapped CasADi adds to a null pointer, which gcc takes for an error from version 14 on
+    # for an empty map CasADi adds to a null pointer, which is an error for gcc from version 14 on
     return [text.replace("0+ i*0", "0") for text in texts]
 
 
-def built(library: Library) -> Path:
-    """A library, compiled where it is not kept. It is waited for; Ctrl-C and time limits end that.
+def build_library(library: Library) -> Path:
+    """Return the path of a library, compiled if it is not cached. Ctrl-C and time limits end the wait.
 
     Raises:
-        CompilerError: There is no compiler, or it takes the C for wrong.
-        OutOfTime: The time limit is over.
+        CompilerError: There is no compiler, or it rejects the code.
+        TimeLimitReached: The time limit is reached.
     """
     key = library.key
-    found = _OWN.get(key) or cache.load_library(key)
-    if found is not None:
-        return found
+    path = _OWN.get(key) or cache.load_library(key)
+    if path is not None:
+        return path
     with cache.exclusive(key, check_time):
-        found = _OWN.get(key) or cache.load_library(key)  # another process may have made it meanwhile
-        if found is not None:
-            return found
-        content = _compiled(library)
-        found = cache.store_library(key, content)
-    if found is None:  # for this process only
-        found = Path(_own_folder().name) / f"{key}.so"
-        found.write_bytes(content)
-        _OWN[key] = found
-    return found
+        path = _OWN.get(key) or cache.load_library(key)  # another process may have compiled it meanwhile
+        if path is not None:
+            return path
+        content = _compile(library)
+        path = cache.store_library(key, content)
+    if path is None:  # for this process only
+        path = Path(_own_folder().name) / f"{key}.so"
+        path.write_bytes(content)
+        _OWN[key] = path
+    return path
 
 
 _OWN: dict[str, Path] = {}
-"""Libraries of this process, where nothing can be kept."""
+"""Libraries of this process, if the cache is not writable."""
 
 
 @lru_cache(1)
@@ -157,7 +158,7 @@ def _own_folder() -> tempfile.TemporaryDirectory[str]:
 
 
 def compiler() -> tuple[str, str]:
-    """The compiler's command, and what it says of its version.
+    """Return the compiler's command and its version text.
 
     Raises:
         CompilerError: There is none.
@@ -171,21 +172,17 @@ def compiler() -> tuple[str, str]:
 
 @lru_cache
 def _version(command: str, path: str) -> str:
-    """What a compiler on the path says of its version; "" where it says nothing."""
+    """Return the version text of a compiler on the path; "" if it has none."""
     try:
         words = [*shlex.split(command), "--version"]
-        told = subprocess.run(words, capture_output=True, stdin=subprocess.DEVNULL, timeout=10, check=True)
-        return told.stdout.decode(errors="replace").strip()
+        result = subprocess.run(words, capture_output=True, stdin=subprocess.DEVNULL, timeout=10, check=True)
+        return result.stdout.decode(errors="replace").strip()
     except (OSError, ValueError, IndexError, subprocess.SubprocessError):
         return ""
 
 
-def _compiled(library: Library) -> bytes:
-    """What the compiler makes of the C of a library.
-
-    Raises:
-        CompilerError: It fails, or there is no C. OutOfTime: The time limit is over.
-    """
+def _compile(library: Library) -> bytes:
+    """Return the shared library that the compiler makes of the C code; raise as :func:`build_library`."""
     text = library.text()
     if len(text) > SIZES.accepted:
         raise CompilerError(f"{len(text)} characters of C are more than {SIZES.accepted}")
@@ -195,13 +192,13 @@ def _compiled(library: Library) -> bytes:
     try:
         (place / "unit.c").write_text(text, encoding="utf-8")
         words = [*shlex.split(compiler()[0]), speed, *FLAGS, "unit.c", "-o", "unit.so", LINK]
-        process = begun(words, place)
-        if wait(process):
-            told = (place / "words").read_text(errors="replace").strip().splitlines()
-            raise CompilerError(f"{words[0]} fails: {told[-1] if told else 'it does not say why'}")
+        process = start_process(words, place)
+        if exit_status(process):
+            output = (place / "words").read_text(errors="replace").strip().splitlines()
+            raise CompilerError(f"{words[0]} fails: {output[-1] if output else 'without a message'}")
         return (place / "unit.so").read_bytes()
-    except OSError as error:  # no room, or no process
-        raise CompilerError(f"nothing can be compiled: {error}") from error
+    except OSError as error:  # no space, or no process
+        raise CompilerError(f"the compiler cannot run: {error}") from error
     finally:
         if process is not None and process.stdin is not None:
             process.stdin.close()
@@ -209,30 +206,30 @@ def _compiled(library: Library) -> bytes:
         shutil.rmtree(place, ignore_errors=True)
 
 
-def begun(words: list[str], place: Path) -> subprocess.Popen[bytes]:
-    """A command that runs in a folder, where what it says is kept too, until its input is closed."""
-    with open(place / "words", "wb") as told:
+def start_process(words: list[str], place: Path) -> subprocess.Popen[bytes]:
+    """Run a command in a folder, which also receives its output, until its input is closed."""
+    with open(place / "words", "wb") as output:
         return subprocess.Popen(
             ["sh", "-c", WATCHED, "sh", *words],
             cwd=place,
             env={**os.environ, "TMPDIR": str(place)},
             stdin=subprocess.PIPE,
-            stdout=told,
-            stderr=told,
+            stdout=output,
+            stderr=output,
             start_new_session=True,
         )
 
 
-def wait(process: subprocess.Popen[bytes]) -> int:
-    """The exit status of a process. The time limit is looked at every 50 ms."""
+def exit_status(process: subprocess.Popen[bytes]) -> int:
+    """Wait for a process, checking the time limit every 50 ms, and return its exit status."""
     while True:
         check_time()
         with suppress(subprocess.TimeoutExpired):
             return process.wait(0.05)
 
 
-def serialised(function: Any) -> str:
-    """The text of a casadi Function, by which it is known again; a name for this process where it has none."""
+def function_key(function: Any) -> str:
+    """Return the serialised text of a casadi Function; if it has none, a name that is unique in this process."""
     try:
         return SERIALISED + str(function.serialize())
     except RuntimeError:  # of a Callback, say
@@ -240,6 +237,6 @@ def serialised(function: Any) -> str:
 
 
 @lru_cache
-def notice(words: str) -> None:
-    """Say once why functions are interpreted."""
-    LOG.warning("functions are interpreted, which is slower: %s", words)
+def warn_interpreted(reason: str) -> None:
+    """Log once why functions are interpreted."""
+    LOG.warning("functions are interpreted, which is slower: %s", reason)

@@ -1,10 +1,9 @@
-"""``solve(problem, method)``, and ``prepare`` for problems that are solved many times.
+"""``solve(problem, method)``, ``prepare`` for repeated solves, and ``certificate`` for the comparison of methods.
 
-The certificate with a second solver of another kind: does it find the same plan?
-
-The interior-point method that solves problems and an active-set method share no step: SLEQP (sequential linear programs
-that name the active set, then equality-constrained quadratic ones; Byrd, Gould, Nocedal, Waltz 2004) finds its own
-multipliers and its own active set.
+A second solver of another kind confirms a plan. The interior-point method that solves problems and the active-set
+method SLEQP have no step in common: SLEQP (sequential linear programs that determine the active set, then
+equality-constrained quadratic programs; Byrd, Gould, Nocedal, Waltz 2004) finds its own multipliers and its own active
+set.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from ocp.audit import certificate as comparison
 from ocp.audit.certificate import Certificate
 from ocp.audit.curvature import Curvature
 from ocp.audit.optimality import optimality
-from ocp.console import interruptible, limited
+from ocp.console import interruptible, time_limited
 from ocp.direct.collocation import Collocation
 from ocp.direct.guess import Samples
 from ocp.direct.shooting import MultipleShooting
@@ -35,12 +34,12 @@ __all__ = ["Method", "PreparedProblem", "certificate", "prepare", "solve"]
 
 @dataclass(frozen=True)
 class DescentSettings:
-    """How a plan that is stationary but no minimum is left.
+    """Settings of the descent from a stationary plan that is not a minimum.
 
     Attributes:
-        descents: The most, one after the other.
-        move: By which share of its spread along the plan, or of its range, or by how much, a plan is moved to start
-            beside it.
+        descents: Maximum number of consecutive descents.
+        move: Displacement of the new guess, relative to the range of the plan or of its bounds, or absolute without
+            either.
     """
 
     descents: int = 3
@@ -51,7 +50,7 @@ SETTINGS = DescentSettings()
 
 
 class PreparedProblem(Protocol):
-    """A problem that a method has made ready to be solved many times."""
+    """A problem that a method has prepared for repeated solves."""
 
     def solve(
         self, parameters: ByName = None, guess: Guess = None, check: bool = True, *, time_limit: float | None = None
@@ -61,7 +60,7 @@ class PreparedProblem(Protocol):
 
 
 class Method(Protocol):
-    """What solves problems: ``Collocation(...)``, ``MultipleShooting(...)``, ``Indirect(...)``."""
+    """A method of solution: ``Collocation(...)``, ``MultipleShooting(...)``, ``Indirect(...)``."""
 
     def prepare(
         self,
@@ -72,7 +71,7 @@ class Method(Protocol):
         compiled: bool = False,
         scaling: bool = True,
     ) -> PreparedProblem:
-        """Build a problem once, to be solved many times; see :func:`prepare`."""
+        """Build a problem once for repeated solves; see :func:`prepare`."""
         ...
 
 
@@ -86,24 +85,25 @@ def prepare(
     compiled: bool = False,
     scaling: bool = True,
 ) -> PreparedProblem:
-    """Build a problem once; the result's ``solve(parameters=, guess=)`` is called many times.
+    """Build a problem once; call the result's ``solve(parameters=, guess=)`` repeatedly.
 
     Args:
-        problem: What is asked. method: How it is transcribed.
-        solver: ``ipopt``, ``fatrop`` (another interior-point method, whose linear algebra goes from stage to stage;
-            slow to build, and takes no coupling of controls at the end) or ``sleqp`` (an active-set method, to confirm
-            a plan, started there). For the indirect method, of the direct solution that seeds it.
-        options: Passed to the solver, for example ``{"max_iter": 500}``.
-        compiled: Whether the functions of the problem and their derivatives go through the machine's C compiler (that
-            of the environment's CC, else cc), which makes solves several times faster and changes no number. What was
-            compiled is kept for all meshes, processes and runs (``selfmotion cache``); what is not kept is compiled
-            first, which takes seconds. Without a compiler functions are interpreted, which is told once; for sleqp
-            they always are.
-        scaling: Divide states, controls, horizon, constraints and cost by their sizes (:mod:`ocp.direct.scaling`) where
-            these are far from 1; all that is reported stays in the units of the problem.
+        problem: The problem. method: How it is transcribed.
+        solver: ``ipopt``, ``fatrop`` (another interior-point method, whose linear algebra exploits the stage structure;
+            slow to build, and without terms that couple controls at the end) or ``sleqp`` (an active-set method, to
+            confirm a plan from which it starts). For the indirect method, the solver of the direct solution that seeds
+            it.
+        options: Options of the solver, for example ``{"max_iter": 500}``.
+        compiled: Whether the functions of the problem and their derivatives are compiled by the machine's C compiler
+            (that of the environment's CC, else cc), which makes solves several times faster and changes no number.
+            Compiled functions are cached for all meshes, processes and runs (``selfmotion cache``); the first
+            compilation takes seconds. Without a compiler functions are interpreted, with one warning; for sleqp they
+            always are.
+        scaling: Divide states, controls, horizon, constraints and cost by their sizes (:mod:`ocp.direct.scaling`) if
+            these are far from 1; all results stay in the units of the problem.
 
     Raises:
-        ProblemError: The problem is not complete, or the method or solver cannot take it.
+        ProblemError: The problem is incomplete, or not supported by the method or solver.
     """
     checked_problem(problem)
     if not callable(getattr(type(method), "prepare", None)):
@@ -130,43 +130,43 @@ def solve(
 ) -> Solution:
     """Solve a problem by a method.
 
-    Where the solver fails from the guess, it starts again from zeros (moved inside the bounds, a free horizon longer),
-    from a roll-out of the dynamics with the controls of the guess, and from the plan that misses the constraints least;
-    each with at most 200 iterations and ``max_iter`` together. Where it stops at a plan that is stationary but no
-    minimum, it starts again beside it, on both sides along the variation that lowers the cost, and the cheaper plan
-    counts. ``Solution.start`` says what worked.
+    If the solver fails from the guess, it starts again from zeros (moved inside the bounds, a free horizon longer),
+    from a roll-out of the dynamics with the controls of the guess, and from the plan of least constraint violation;
+    each with at most 200 iterations and ``max_iter`` together. If it stops at a stationary plan that is not a minimum,
+    it starts again on both sides of it, along the variation that lowers the cost, and the plan of lower cost counts.
+    ``Solution.start`` names the successful start.
 
     Args:
-        problem: What is asked. method: For example ``Collocation(intervals=20, degree=3)``.
+        problem: The problem. method: For example ``Collocation(intervals=20, degree=3)``.
         parameters: Value of every parameter by name.
         solver, options, scaling: See :func:`prepare`.
         guess: An earlier solution (of any grid or method), or a dictionary by name of values, functions of time, or
             samples (M, n) over the times ``"t"`` (M,); ``"horizon"`` for a free final time.
-        check: Raise where the solver fails, after a second solve that finds what would have to give way; False runs it
-            once, from the guess, and returns the unsuccessful solution with its status.
-        time_limit: After so many seconds, the build and all starts included, the solver is stopped between two
-            iterations, which counts as a failure; where it was not built by then there is no solution to return,
-            whatever `check` says. None for no limit.
+        check: Raise SolveError after a failure, with a second solve that finds the conflicting constraints. False runs
+            the solver once, from the guess, and returns an unsuccessful solution with its status.
+        time_limit: Time in s for the build and all starts, after which the solver stops at the next iteration and
+            counts as failed. If the build is not finished by then, SolveError is raised regardless of `check`. None for
+            no limit.
 
     Raises:
-        ProblemError: The problem, method or arguments cannot be right.
-        KeyboardInterrupt: Ctrl-C; the exception's ``solution``, where it has one, is the last iterate.
-        SolveError: The solver failed from every start; names the constraints that cannot hold together, by how much and
-            when, and the worst residuals by constraint, state and time. Or what it found is no minimum, and beside it
-            there is none either.
+        ProblemError: The problem, method or arguments are invalid.
+        KeyboardInterrupt: Ctrl-C; the exception's ``solution``, if any, is the last iterate.
+        SolveError: The solver failed from every start; names the conflicting constraints, by how much and when, and the
+            worst residuals by constraint, state and time. Or the plan is not a minimum, and no minimum was found near
+            it.
     """
     checked_flag("solve: check", check)
-    with limited(checked_time_limit(time_limit)):
+    with time_limited(checked_time_limit(time_limit)):
         prepared = prepare(problem, method, solver=solver, options=options, scaling=scaling)
         solution = prepared.solve(parameters, guess, check)
-        return lowered(prepared, solution) if check and solution.regularised else solution
+        return descend(prepared, solution) if check and solution.regularised else solution
 
 
-def lowered(prepared: PreparedProblem, solution: Solution) -> Solution:
-    """The plan, or a cheaper one beside it where its cost can be lowered along a feasible variation.
+def descend(prepared: PreparedProblem, solution: Solution) -> Solution:
+    """Return the plan, or one of lower cost if a feasible variation lowers its cost.
 
     Raises:
-        SolveError: It can, but from beside it the solver finds no plan: the cost may have no least.
+        SolveError: There is such a variation, but the solver finds no plan along it: the cost may be unbounded below.
     """
     form = Formulation.of(solution.problem)
     p = form.parameter_vector(solution.parameters)
@@ -174,24 +174,24 @@ def lowered(prepared: PreparedProblem, solution: Solution) -> Solution:
     for _ in range(SETTINGS.descents):
         if not solution.regularised:
             break
-        found = optimality(form, solution, p, bounds, allowed=np.inf).curvature
-        if not found.least < -FLAT_SHARE:
+        curvature = optimality(form, solution, p, bounds, allowed=np.inf).curvature
+        if not curvature.least < -FLAT_SHARE:
             break
-        others = [
-            prepared.solve(solution.parameters, beside(form, solution, found, bounds, sign), check=False)
+        attempts = [
+            prepared.solve(solution.parameters, displaced_guess(form, solution, curvature, bounds, sign), check=False)
             for sign in (1.0, -1.0)
         ]
-        plans = [other for other in others if other.success]
-        if not plans and found.upwards is False:
-            words = f"no minimum: the cost falls along a variation from {found.time or 0.0:.4g} s on"
-            beyond = "; ".join(other.message for other in others)
+        plans = [attempt for attempt in attempts if attempt.success]
+        if not plans and curvature.upwards is False:
+            words = f"no minimum: the cost falls along a variation from {curvature.time or 0.0:.4g} s on"
+            ends = "; ".join(attempt.message for attempt in attempts)
             raise SolveError(
-                f"problem {form.name!r}: the plan found, of cost {solution.cost:.6g}, is stationary but {words}; from "
-                f"beside it the solver ended with {beyond}",
+                f"problem {form.name!r}: the plan, of cost {solution.cost:.6g}, is stationary but {words}; solves from "
+                f"guesses on both sides of it ended with {ends}",
                 replace(solution, success=False, status=SolverStatus.REJECTED, message=words),
                 name="cost",
                 value=solution.cost,
-                time=found.time,
+                time=curvature.time,
             )
         best = min([solution, *plans], key=lambda plan: plan.cost)
         if best is solution:
@@ -200,34 +200,36 @@ def lowered(prepared: PreparedProblem, solution: Solution) -> Solution:
     return solution
 
 
-def beside(form: Formulation, solution: Solution, found: Curvature, bounds: Bounds, sign: float) -> dict[str, Any]:
-    """A guess: the plan moved along the variation that lowers its cost, as far as is visible in its own size.
+def displaced_guess(
+    form: Formulation, solution: Solution, curvature: Curvature, bounds: Bounds, sign: float
+) -> dict[str, Any]:
+    """Return the plan displaced along the variation that lowers its cost, by a visible share of its size.
 
-    Where the cost falls but no variation is told, all controls are pushed by seeded random amounts.
+    If the variation is unknown, all controls are displaced by seeded random amounts.
     """
     breaks = solution.control_interpolant.breaks * solution.horizon
-    times = np.union1d(breaks, found.t)
-    here = times / solution.horizon
-    plan = np.hstack([solution.state_interpolant(here), solution.control_interpolant(here)])
+    times = np.union1d(breaks, curvature.t)
+    fractions = times / solution.horizon
+    plan = np.hstack([solution.state_interpolant(fractions), solution.control_interpolant(fractions)])
     index = np.concatenate([form.bounds.places[kind] for kind in ("state", "control")])
     width = bounds[1][index] - bounds[0][index]
     spread = np.ptp(plan, axis=0)
     size = np.where(spread > 0, spread, np.where(np.isfinite(width) & (width > 0), width, np.inf))
-    if found.direction is None:
-        push = np.random.default_rng(0).normal(size=form.nu) * np.where(np.isfinite(size), size, 1.0)[form.nx :]
-        move = np.hstack([np.zeros((len(times), form.nx)), np.tile(push, (len(times), 1))])
+    if curvature.direction is None:
+        pulse = np.random.default_rng(0).normal(size=form.nu) * np.where(np.isfinite(size), size, 1.0)[form.nx :]
+        variation = np.hstack([np.zeros((len(times), form.nx)), np.tile(pulse, (len(times), 1))])
     else:
-        controls, states = found.direction
-        curves = [*((breaks, column) for column in states.T), *((found.t, column) for column in controls.T)]
-        move = np.column_stack([np.interp(times, at, column) for at, column in curves])
-    share = float((np.abs(move) / size).max(initial=0.0)) or float(np.abs(move).max(initial=0.0))
-    moved = plan + sign * SETTINGS.move / share * move
+        controls, states = curvature.direction
+        curves = [*((breaks, column) for column in states.T), *((curvature.t, column) for column in controls.T)]
+        variation = np.column_stack([np.interp(times, at, column) for at, column in curves])
+    share = float((np.abs(variation) / size).max(initial=0.0)) or float(np.abs(variation).max(initial=0.0))
+    displaced = plan + sign * SETTINGS.move / share * variation
     places = {**form.states, **{name: slice(s.start + form.nx, s.stop + form.nx) for name, s in form.controls.items()}}
-    guess: dict[str, Any] = {name: Samples(times, moved[:, place]) for name, place in places.items()}
+    guess: dict[str, Any] = {name: Samples(times, displaced[:, place]) for name, place in places.items()}
     return guess | {"horizon": solution.horizon}
 
 
-SECOND = "sleqp"
+SECOND_SOLVER = "sleqp"
 METHODS = {"Collocation": Collocation, "MultipleShooting": MultipleShooting}
 
 
@@ -242,26 +244,28 @@ def certificate(
     """Compare solutions of one problem by different methods, and audit each.
 
     Args:
-        problem: The problem that all of them solve.
+        problem: The common problem.
         solutions: By name, or a sequence named after their methods. The reference is the first indirect one, else the
             first.
-        tolerance: Largest relative difference at which they agree.
-        second_solver: Solve the program of the first direct one again with another kind of solver, from that plan, and
-            compare what it ends with as one more solution, ``NAME, by sleqp``; then one solution is enough.
+        tolerance: Largest relative difference of solutions that agree.
+        second_solver: Solve the program of the first direct solution again by another kind of solver, started at that
+            plan, and compare the result as one more solution, ``NAME, by sleqp``; then one solution is enough.
 
     Raises:
-        ProblemError: Fewer than two solutions, one of another problem, or solved at other parameters; no direct one for
-            a second solver.
+        ProblemError: Fewer than two solutions, solutions of other problems or other parameters; no direct one for a
+            second solver.
     """
     if not checked_flag("certificate: second_solver", second_solver):
         return comparison.certificate(problem, solutions, tolerance=tolerance)
-    named = comparison.checked_solutions(solutions)
-    direct = [name for name, solution in named.items() if solution.method["type"] in METHODS]
+    by_name = comparison.checked_solutions(solutions)
+    direct = [name for name, solution in by_name.items() if solution.method["type"] in METHODS]
     if not direct:
-        words = "a second solver confirms plans of Collocation(...) and MultipleShooting(...); none is given"
-        raise ProblemError(words, name="solutions", value=[*named])
-    plan = named[direct[0]]
+        words = "a second solver confirms plans of Collocation(...) and MultipleShooting(...); there is none"
+        raise ProblemError(words, name="solutions", value=[*by_name])
+    plan = by_name[direct[0]]
     settings = dict(plan.method)
     method = METHODS[settings.pop("type")](**settings)
-    other = prepare(problem, method, solver=SECOND).solve(plan.parameters, plan, check=False)
-    return comparison.certificate(problem, {**named, f"{direct[0]}, by {SECOND}": other}, tolerance=tolerance)
+    confirmation = prepare(problem, method, solver=SECOND_SOLVER).solve(plan.parameters, plan, check=False)
+    return comparison.certificate(
+        problem, {**by_name, f"{direct[0]}, by {SECOND_SOLVER}": confirmation}, tolerance=tolerance
+    )

@@ -1,4 +1,4 @@
-"""Mesh refinement by the audit: intervals are split where its rows are beyond their limits, until none is."""
+"""Mesh refinement driven by the audit: intervals are split until every row of the audit is within its limit."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ import numpy as np
 
 from ocp.audit.audit import Audit, Finding
 from ocp.audit.audit import audit as judge
-from ocp.console import OutOfTime, limited, time_left
+from ocp.console import TimeLimitReached, time_left, time_limited
 from ocp.direct.mesh import check_meshed
 from ocp.direct.prepared import DirectMethod
 from ocp.errors import (
     ProblemError,
     RefinementWarning,
     SolveError,
-    about,
     checked_count,
     checked_mapping,
     checked_time_limit,
+    error_names,
     unknown_name,
 )
 from ocp.methods import solve
@@ -33,26 +33,27 @@ from ocp.solution import ByName, Guess, Refinement, Solution, stack
 from ocp.status import SolverStatus
 from ocp.tolerances import ROUNDING_SHARE, SOLVER_SHARE
 
-__all__ = ["refine", "refined", "split"]
+__all__ = ["refine", "refine_from", "split"]
 
-LIMITS = [name for name, given in signature(judge).parameters.items() if given.kind is Parameter.KEYWORD_ONLY]
+LIMITS = [name for name, entry in signature(judge).parameters.items() if entry.kind is Parameter.KEYWORD_ONLY]
 KINDS = ("integration", "equalities", "limits", "cost", "other")
 
 
 @dataclasses.dataclass(frozen=True)
 class RefinementSettings:
-    """How meshes are refined.
+    """Settings of the refinement.
 
     Attributes:
-        target: Share of its limit to which a row is brought by splitting: half, as the order of an error is not known.
-        pieces: That an interval is split into at once, at most.
-        least_width: Of an interval, as a share of the horizon: what is narrower is rounding.
-        rounds: At most. patience: Rounds that may pass without any row coming nearer to its limit.
-        nearer: Share of what it was to which a row must fall to count as falling.
+        target: Value of a row, relative to its limit, aimed at by splitting: half, as the order of an error is
+            uncertain.
+        max_parts: Maximum number of parts into which an interval is split at once.
+        least_width: Smallest width of an interval, relative to the horizon: less is rounding.
+        rounds: Maximum number of rounds. patience: Rounds without progress of any row before it stops.
+        nearer: Ratio to its best value to which a row must fall to count as progress.
     """
 
     target: float = 0.5
-    pieces: int = 4
+    max_parts: int = 4
     least_width: float = ROUNDING_SHARE
     rounds: int = 12
     patience: int = 2
@@ -76,41 +77,41 @@ def refine(
     guess: Guess = None,
     time_limit: float | None = None,
 ) -> Solution:
-    """Solve, and split intervals until no row of the audit is beyond its limit.
+    """Solve, and split intervals until every row of the audit is within its limit.
 
-    Looked at in every interval are the distance of the plan from its re-integration, what path equalities, bounds and
-    inequalities are missed by between the points, and the cost that the controls lose. Each falls with a power of the
-    width that the method sets, which says into how many pieces an interval is split. A row that no interval answers for
-    (the conditions at the ends) is met by splitting those that are worst in the others. Nodes stay nodes. Every round
-    starts from the plan before.
+    In every interval it evaluates the deviation of the plan from its re-integration, the violations of path equalities,
+    bounds and inequalities between the points, and the cost that the controls lose. Each falls with a power of the
+    width that the method determines, from which follows the number of parts of an interval. A row that cannot be
+    attributed to intervals (end conditions) is met by splitting the intervals with the largest other errors. Nodes are
+    kept. Every round starts from the previous plan.
 
     Args:
         problem, parameters, solver, options, guess: As for :func:`ocp.methods.solve`.
-        method: The mesh to start from.
+        method: The method with the initial mesh.
         tolerance: Largest integration error, relative to the size of each state: over the whole horizon, or summed over
-            the intervals where the motion is unstable and that over the horizon means nothing.
-        limits: Of the audit's other rows, as of :func:`ocp.audit.audit.audit`: ``{"constraints": 1e-6}``. Its own
-            limits where none is given.
-        breaks: Times at which there have to be nodes, because something jumps or bends there, s. Of a fixed horizon
-            only; for a free one give ``method.with_nodes_at(fractions)``.
-        max_intervals: Cap on the number of intervals.
-        time_limit: After so many seconds, all rounds and their audits included, it stops: a solve between two
-            iterations, an audit between two of its parts. None for no limit.
+            the intervals if the motion is unstable and the error over the horizon is meaningless.
+        limits: Limits of the audit's other rows, as of :func:`ocp.audit.audit.audit`: ``{"constraints": 1e-6}``. By
+            default the audit's own.
+        breaks: Times of required nodes, because of a jump or kink there, s. Only for a fixed horizon; for a free one
+            give ``method.with_nodes_at(fractions)``.
+        max_intervals: Maximum number of intervals.
+        time_limit: Time in s for all rounds and their audits, after which it stops: a solve at the next iteration, an
+            audit after the current part. None for no limit.
 
     Returns:
-        The last solution, or at the time limit the last that was audited; its ``refinement`` says how the mesh came
-        about, and whether the audit passes in the end.
+        The last solution, or at the time limit the last audited one; its ``refinement`` records the rounds, and whether
+        the audit passes in the end.
 
     Raises:
-        ProblemError: tolerance not positive, a limit that the audit does not have, breaks outside the horizon or of a
-            free one, cap below the first mesh, a time limit that is none.
-        SolveError: A round failed, or the time limit was reached in the first, before there was an audited plan; then
-            it names ``time_limit`` and carries the plan as an unsuccessful one.
+        ProblemError: tolerance not positive, an unknown limit of the audit, breaks outside the horizon or with a free
+            horizon, max_intervals below the initial mesh, an invalid time limit.
+        SolveError: A round failed, or the time limit was reached before there was an audited plan; then it names
+            ``time_limit`` and carries the plan as an unsuccessful one.
 
     Warns:
-        RefinementWarning: It stopped with a row beyond its limit, at the cap, at the time limit or where finer
-            intervals do not help, and names the worst; or with all rows within theirs where the audit does not decide
-            whether it is an optimum.
+        RefinementWarning: It stopped with a row beyond its limit, at max_intervals, at the time limit or because finer
+            intervals do not help; names the worst row. Or all rows are within their limits but optimality is
+            undetermined.
     """
     check_meshed("refine", method, tolerance)
     checked_time_limit(time_limit)
@@ -129,22 +130,22 @@ def refine(
             value=max_intervals,
             limit=method.intervals,
         )
-    given = {"parameters": parameters, "solver": solver, "options": options}
-    with limited(time_limit):
-        first = _first(problem, method, {**given, "guess": guess}, settings, time_limit)
-        return _refined(problem, method, first, tolerance, given, settings, max_intervals)[0]
+    arguments = {"parameters": parameters, "solver": solver, "options": options}
+    with time_limited(time_limit):
+        first = _first(problem, method, {**arguments, "guess": guess}, settings, time_limit)
+        return _refined(problem, method, first, tolerance, arguments, settings, max_intervals)[0]
 
 
-def refined(
+def refine_from(
     problem: Problem, method: DirectMethod, solution: Solution, audit: Audit, options: ByName = None, check: bool = True
 ) -> tuple[Solution, Audit]:
-    """As `refine`, from a plan that was solved on the method's mesh and audited already; with the last one's audit.
+    """Refine a plan that was solved on the method's mesh and audited; return the last plan with its audit.
 
-    Without `check` a round that fails from the plan before it is not begun elsewhere, and what conflicts not looked
-    for: see :func:`ocp.methods.solve`.
+    Without `check`, a round that fails from the previous plan is neither restarted nor diagnosed: see
+    :func:`ocp.methods.solve`.
     """
-    given = {"options": options, "check": check}
-    return _refined(problem, method, (solution, audit), SOLVER_SHARE, given, {}, 400)
+    arguments = {"options": options, "check": check}
+    return _refined(problem, method, (solution, audit), SOLVER_SHARE, arguments, {}, 400)
 
 
 def _refined(
@@ -152,11 +153,11 @@ def _refined(
     method: DirectMethod,
     first: tuple[Solution, Audit],
     tolerance: float,
-    given: dict[str, Any],
+    arguments: dict[str, Any],
     settings: dict[str, Any],
     max_intervals: int,
 ) -> tuple[Solution, Audit]:
-    """The last of the plans, and its audit; RefinementWarning as `refine` says."""
+    """Return the last of the plans and its audit, with the RefinementWarning of `refine`."""
     solution, audit = first
     form = Formulation.of(problem)
     p = form.parameter_vector(solution.parameters)
@@ -173,57 +174,59 @@ def _refined(
         nearer = [row for row in beyond if row.value < SETTINGS.nearer * best.get(row.name, np.inf)]
         best |= {row.name: min(row.value, best.get(row.name, np.inf)) for row in rows}
         idle = 0 if nearer else idle + 1
-        finer = split(method.fractions, *_pieces(beyond, rows, method.fractions), max_intervals)
+        finer = split(method.fractions, *_parts_per_interval(beyond, rows, method.fractions), max_intervals)
         spent = idle == SETTINGS.patience or len(intervals) == SETTINGS.rounds
         if not beyond or spent or len(finer) == method.intervals + 1:
             break
         method = method.with_mesh(finer)
-        found = _next(problem, method, {**given, "guess": solution}, settings)
-        if found is None:
+        result = _next(problem, method, {**arguments, "guess": solution}, settings)
+        if result is None:
             late = True
             break
-        solution, audit = found
+        solution, audit = result
     stopped = f"refinement of {problem.name!r} stopped at {intervals[-1]} of at most {max_intervals} intervals"
     idles = idle == SETTINGS.patience and not late
     if (warning := _shortfall(stopped, late, idles, beyond, audit, form)) is not None:
         warnings.warn(warning, stacklevel=2)
-    told = {kind: tuple(values) for kind, values in errors.items()}
-    refinement = Refinement(tuple(intervals), told, tolerance, audit.passed and not beyond)
+    history = {kind: tuple(values) for kind, values in errors.items()}
+    refinement = Refinement(tuple(intervals), history, tolerance, audit.passed and not beyond)
     return dataclasses.replace(solution, refinement=refinement), audit
 
 
 def _shortfall(
     stopped: str, late: bool, idles: bool, beyond: list[_Row], audit: Audit, form: Formulation
 ) -> RefinementWarning | None:
-    """What refinement leaves, in the order in which it matters; None where the last plan passes its audit."""
+    """Return the warning for the most important remaining fault; None if the last plan passes its audit."""
     if beyond:
         worst = max(beyond, key=lambda row: row.value)
         hint = "the time limit is reached: raise time_limit" if late else "raise max_intervals"
         if idles:
-            hint = "finer intervals do not lower it" + ("; draw it in (tighten)" if worst.kind == "limits" else "")
+            hint = "finer intervals do not lower it" + (
+                "; tighten the limits (tighten)" if worst.kind == "limits" else ""
+            )
         words = f"{stopped} with {worst.name!r} at {worst.value:.2e} of its limit; {hint}"
         return RefinementWarning(words, name=worst.name, value=worst.value, limit=1.0)
-    if touching := [each for each in audit.failures if each.name in form.apart]:
-        words = f"{stopped}; finer intervals keep no bodies apart, add constraints that do: {touching[0].note}"
-        return RefinementWarning(words, name=touching[0].name, value=touching[0].value, limit=1.0)
+    if collisions := [finding for finding in audit.failures if finding.name in form.separations]:
+        words = f"{stopped}; finer intervals do not separate bodies, add clearance constraints: {collisions[0].note}"
+        return RefinementWarning(words, name=collisions[0].name, value=collisions[0].value, limit=1.0)
     if not audit.passed:
-        words = f"{stopped} with every row of the audit within its limit, but not decided: {audit.undecided}"
+        words = f"{stopped} with every row of the audit within its limit, but undetermined: {audit.undecided}"
         return RefinementWarning(words, name="undecided", value=audit.undecided)
     return None
 
 
 def _first(
-    problem: Problem, method: DirectMethod, given: dict[str, Any], settings: dict[str, Any], time_limit: float | None
+    problem: Problem,
+    method: DirectMethod,
+    arguments: dict[str, Any],
+    settings: dict[str, Any],
+    time_limit: float | None,
 ) -> tuple[Solution, Audit]:
-    """The plan on the first mesh, and its audit.
-
-    Raises:
-        SolveError: The solve failed, or the time limit is reached.
-    """
-    solution = solve(problem, method, **given)
+    """Return the plan on the first mesh, and its audit; raise SolveError at the time limit or if the solve fails."""
+    solution = solve(problem, method, **arguments)
     try:
         return solution, judge(problem, solution, **settings)
-    except OutOfTime as error:
+    except TimeLimitReached as error:
         words = f"{SolverStatus.TIME_LIMIT}: raise time_limit"
         raise SolveError(
             f"refinement of {problem.name!r} ended in the audit of its first plan with {words}",
@@ -234,30 +237,26 @@ def _first(
 
 
 def _next(
-    problem: Problem, method: DirectMethod, given: dict[str, Any], settings: dict[str, Any]
+    problem: Problem, method: DirectMethod, arguments: dict[str, Any], settings: dict[str, Any]
 ) -> tuple[Solution, Audit] | None:
-    """The plan on a finer mesh, and its audit; None where the time limit is reached before there are both.
-
-    Raises:
-        SolveError: The solve failed while there was time.
-    """
+    """Return the plan on a finer mesh, and its audit; None if the time limit is reached first."""
     if time_left() <= 0:
-        return None  # nothing is built
+        return None
     try:
-        solution = solve(problem, method, **given)
+        solution = solve(problem, method, **arguments)
         if not solution.success:
             raise SolveError(f"refinement of {problem.name!r} failed: {solution.status}", solution)
         return solution, judge(problem, solution, **settings)
-    except (SolveError, OutOfTime) as error:
+    except (SolveError, TimeLimitReached) as error:
         if isinstance(error, SolveError) and time_left() > 0:
             raise
         return None
 
 
 class _Row(NamedTuple):
-    """A row of the audit: its value, and what each interval adds to it (N,), both as shares of its limit.
+    """A row of the audit: its value and the contribution of each interval (N,), both divided by its limit.
 
-    ``order`` is the power of the width with which it falls; ``errors`` is None where no interval answers for it.
+    ``order`` is the power of the width with which it falls; ``errors`` is None if it cannot be attributed to intervals.
     """
 
     name: str
@@ -268,7 +267,7 @@ class _Row(NamedTuple):
 
 
 class _Parts(NamedTuple):
-    """What each interval adds to a row (N,), in any unit; the row is their sum, or the largest of them."""
+    """Contribution of each interval to a row (N,), in any unit; the row is their sum or their maximum."""
 
     kind: str
     values: np.ndarray
@@ -276,35 +275,35 @@ class _Parts(NamedTuple):
     summed: bool = False
 
     def shares(self, total: float) -> np.ndarray:
-        """Of a row that is so large, where an interval may have the same part of a sum as any other. Shape (N,)."""
+        """Return contributions scaled to a row's value; in a sum, the average scales to the value. Shape (N,)."""
         values = self.values if np.isfinite(self.values).all() else np.where(np.isfinite(self.values), 0.0, 1.0)
-        whole = values.mean() if self.summed else values.max()
-        found = np.zeros(len(values))
-        found[values > 0] = total * (values[values > 0] / (whole or 1.0))
-        return found
+        reference = values.mean() if self.summed else values.max()
+        result = np.zeros(len(values))
+        result[values > 0] = total * (values[values > 0] / (reference or 1.0))
+        return result
 
 
 def _rows(
     form: Formulation, p: np.ndarray, solution: Solution, audit: Audit, tolerance: float, method: DirectMethod
 ) -> list[_Row]:
-    """What an audit says of a plan, row by row, and which intervals answer for it."""
-    # over the whole horizon an unstable motion runs away; what feedback would have to mend is the sum
-    slip = min(audit.integration_error, float(audit.local_errors.sum()))
-    asked = Finding(f"integration error, {tolerance:.0e} asked", slip, tolerance)
+    """Return the rows of the audit of a plan, with the intervals to which they are attributed."""
+    # over the whole horizon an unstable motion diverges; the sum is what feedback would have to correct
+    deviation = min(audit.integration_error, float(audit.local_errors.sum()))
+    requested = Finding(f"integration error, {tolerance:.0e} requested", deviation, tolerance)
     order = method.control_order
     parts = {
         name: _Parts("integration", audit.local_errors, method.order)
-        for name in (asked.name, "integration error, relative", "integration error of one interval")
+        for name in (requested.name, "integration error, relative", "integration error of one interval")
     }
     parts["cost lost, relative"] = _Parts("cost", audit.lost, 2 * order, summed=True)
     costates = audit.optimality.adjoint
     parts["costate equation, relative"] = _Parts("other", costates.error, order, summed=True)
     parts["costates between the nodes, relative"] = _Parts("other", costates.between, order)
-    for name, (equal, misses) in _missed(form, p, solution, audit).items():
+    for name, (equal, misses) in _violations(form, p, solution, audit).items():
         parts[name] = _Parts("equalities" if equal else "limits", misses, order)
     rows = []
-    for finding in (asked, *audit.findings):
-        if finding.limit is None or finding.name in form.apart:  # no finer interval keeps bodies apart
+    for finding in (requested, *audit.findings):
+        if finding.limit is None or finding.name in form.separations:  # refinement does not separate bodies
             continue
         value = 0.0 if finding.value == 0 else finding.value / finding.limit if finding.limit > 0 else np.inf
         value = np.inf if np.isnan(value) else float(value)
@@ -316,14 +315,15 @@ def _rows(
     return rows
 
 
-def _missed(form: Formulation, p: np.ndarray, solution: Solution, audit: Audit) -> dict[str, tuple[bool, np.ndarray]]:
-    """Of each bounded state, control and path constraint by the name of its row in the audit: whether it is an
-    equality, and by how much it is missed most in every interval (N,)."""
+def _violations(
+    form: Formulation, p: np.ndarray, solution: Solution, audit: Audit
+) -> dict[str, tuple[bool, np.ndarray]]:
+    """Return by name whether each bounded quantity is an equality, and its violation in every interval (N,)."""
     n = len(audit.local_errors)
     x, u = stack(audit.states), stack(audit.controls, len(audit.t))
     g = form.sampled([form.path.expression], x, u, audit.t, solution.horizon, p)[0]
     lower, upper = form.bound_values(p)
-    found = {}
+    violations = {}
     for kind, pool, values in (
         ("state", {f"bounds of {name}": place for name, place in form.states.items()}, x),
         ("control", {f"bounds of {name}": place for name, place in form.controls.items()}, u),
@@ -331,55 +331,55 @@ def _missed(form: Formulation, p: np.ndarray, solution: Solution, audit: Audit) 
     ):
         for name, place in pool.items():
             index = form.bounds.places[kind][place]
-            miss = np.maximum(lower[index] - values[:, place], values[:, place] - upper[index]).clip(min=0.0)
-            miss = np.where(np.isnan(miss), np.inf, miss).max(axis=1)
-            found[name] = bool((lower[index] == upper[index]).all()), miss.reshape(n, -1).max(axis=1)
-    return found
+            violation = np.maximum(lower[index] - values[:, place], values[:, place] - upper[index]).clip(min=0.0)
+            violation = np.where(np.isnan(violation), np.inf, violation).max(axis=1)
+            violations[name] = bool((lower[index] == upper[index]).all()), violation.reshape(n, -1).max(axis=1)
+    return violations
 
 
-def _pieces(beyond: list[_Row], rows: list[_Row], mesh: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Into how many pieces each interval is split for the rows beyond their limits, and how bad it is. Both (N,)."""
+def _parts_per_interval(beyond: list[_Row], rows: list[_Row], mesh: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the number of parts into which each interval is split, and its largest error. Shape (N,) each."""
     n = len(mesh) - 1
-    pieces, bad = np.ones(n, int), np.zeros(n)
+    parts, error = np.ones(n, int), np.zeros(n)
     for row in beyond:
         if row.errors is not None:
             with np.errstate(over="ignore"):
-                wanted = np.ceil((row.errors / SETTINGS.target) ** (1.0 / row.order))
-            pieces = np.maximum(pieces, np.clip(wanted, 1, SETTINGS.pieces).astype(int))
-            bad = np.maximum(bad, row.errors)
-    if np.all(pieces == 1):  # no interval answers for what is beyond its limit
+                count = np.ceil((row.errors / SETTINGS.target) ** (1.0 / row.order))
+            parts = np.maximum(parts, np.clip(count, 1, SETTINGS.max_parts).astype(int))
+            error = np.maximum(error, row.errors)
+    if np.all(parts == 1):  # the rows beyond their limits cannot be attributed to intervals
         for row in rows:
-            bad = bad if row.errors is None else np.maximum(bad, row.errors)
-        far = max((row.value for row in beyond), default=0.0) > 2.0
-        pieces[far | (bad >= np.median(bad))] = 2
-    pieces[np.diff(mesh) < 2 * SETTINGS.least_width] = 1
-    return pieces, bad
+            error = error if row.errors is None else np.maximum(error, row.errors)
+        severe = max((row.value for row in beyond), default=0.0) > 2.0
+        parts[severe | (error >= np.median(error))] = 2
+    parts[np.diff(mesh) < 2 * SETTINGS.least_width] = 1
+    return parts, error
 
 
-def split(mesh: np.ndarray, pieces: np.ndarray, bad: np.ndarray, most: int) -> np.ndarray:
-    """The mesh (N + 1,) with each interval cut into its number of pieces; shape (N' + 1,), at most ``most`` intervals.
+def split(mesh: np.ndarray, parts: np.ndarray, error: np.ndarray, max_intervals: int) -> np.ndarray:
+    """Return the mesh (N + 1,) with each interval split into its number of parts, at most ``max_intervals`` in all.
 
-    Where there is no room for all, intervals that are less ``bad`` (N,) give way.
+    If these are too few, the intervals of least ``error`` (N,) are split less.
     """
-    pieces = pieces.copy()
-    room = most - len(pieces)
-    for k in np.argsort(bad, kind="stable"):
-        excess = int(np.sum(pieces - 1)) - room
+    parts = parts.copy()
+    available = max_intervals - len(parts)
+    for k in np.argsort(error, kind="stable"):
+        excess = int(np.sum(parts - 1)) - available
         if excess <= 0:
             break
-        pieces[k] = max(1, pieces[k] - excess)
-    cuts = [np.linspace(mesh[k], mesh[k + 1], n + 1)[:-1] for k, n in enumerate(pieces)]
-    return np.concatenate([*cuts, mesh[-1:]])
+        parts[k] = max(1, parts[k] - excess)
+    nodes = [np.linspace(mesh[k], mesh[k + 1], n + 1)[:-1] for k, n in enumerate(parts)]
+    return np.concatenate([*nodes, mesh[-1:]])
 
 
 def _fractions(form: Formulation, p: np.ndarray, breaks: Sequence[float]) -> np.ndarray:
-    """Times of a fixed horizon as fractions of it."""
-    with about("breaks"):
+    """Return times as fractions of a fixed horizon."""
+    with error_names("breaks"):
         times = numeric("refine: breaks", breaks)
     if not times.size:
         return times
     if form.horizon_is_free:
-        words = "refine: breaks in s have no place on a free horizon; give method.with_nodes_at(fractions)"
+        words = "refine: breaks in s need a fixed horizon; give method.with_nodes_at(fractions)"
         raise ProblemError(words, name="breaks", value=times.tolist())
     horizon = float(form.horizon_at(p))
     if not np.all((times >= 0) & (times <= horizon)):

@@ -1,9 +1,9 @@
 """Functions of upper packages that classes of lower packages offer as methods.
 
-`Solution.audit`, `Solution.sensitivity` and the `plot` methods are methods of classes, but the work is
-done by packages that import `Solution`. The upper packages register those functions here by name and the methods
-look them up, so that imports run in one direction. A function is registered by its module's name and is imported when
-it is first called: a program that draws nothing does not load matplotlib.
+`Solution.audit`, `Solution.sensitivity` and the `plot` methods belong to classes, but the work is done by packages that
+import `Solution`. The upper packages register those functions here by name, and the methods look them up, so that
+imports run in one direction. A function is registered by its module's name and imported on its first call: a program
+that plots nothing does not load matplotlib.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a solution is made of besides the class itself, and whether its arrays are whole."""
+"""Parts of a solution besides the class itself, and checks of their consistency."""
 
 from __future__ import annotations
 
@@ -13,32 +13,8 @@ from ocp.errors import ProblemError, unknown_name
 from ocp.status import SolverStatus
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = [
-    "AT_NODE",
-    "HEAD",
-    "INTERPOLANTS",
-    "MOST_HEAD",
-    "PARTS",
-    "PLAIN",
-    "POOLS",
-    "Refinement",
-    "Sample",
-    "Sensitivity",
-    "by_name",
-    "check_belongs",
-    "check_finite",
-    "check_structure",
-    "drawn_in_at",
-    "in_order_of",
-    "plain",
-    "read_head",
-    "read_status",
-    "stack",
-    "unstack",
-]
-
 T = TypeVar("T")
-MOST_HEAD = 2**24  # bytes of its text: a mesh of half a million intervals
+MAX_HEAD_BYTES = 2**24  # a mesh of half a million intervals
 HEAD = {
     "name": str,
     "method": dict,
@@ -55,9 +31,9 @@ HEAD = {
     "tightening_cost": float,
 }
 POOLS = ("states", "controls", "costates", "parameters", "cost_gradients")
-AT_NODE = 1e-12  # of the horizon: a fraction nearer to a node is the node
-PLAIN = ("t", "variables", "multipliers")
-PARTS = ("breaks", "nodes", "values")  # of an interpolant
+NODE_TOLERANCE = 1e-12  # fraction of the horizon within which a point counts as a node
+ARRAY_FIELDS = ("t", "variables", "multipliers")
+CURVE_FIELDS = ("breaks", "nodes", "values")  # of an interpolant
 INTERPOLANTS = ("state_interpolant", "control_interpolant", "costate_interpolant")
 
 
@@ -70,14 +46,14 @@ class Sample(dict[str, np.ndarray]):
 
 @dataclass(frozen=True)
 class Refinement:
-    """How a mesh was refined.
+    """Record of a mesh refinement.
 
     Attributes:
-        intervals: Number of intervals of every round.
-        errors: Of every round the worst error of each kind, as a share of its limit, so that 1 is what may be:
-            "integration", "equalities" and "limits" (bounds and inequalities) between the points, "cost" that is lost,
-            "other" rows of the audit.
-        tolerance: Of the integration, as asked. reached: Whether no error is beyond its limit and the audit passes.
+        intervals: Number of intervals in each round.
+        errors: The largest error of each kind in each round, divided by its limit: "integration", "equalities" and
+            "limits" (bounds and inequalities) between the points, lost "cost", "other" rows of the audit.
+        tolerance: Requested integration tolerance. reached: Whether all errors are within their limits and the audit
+            passes.
     """
 
     intervals: tuple[int, ...]
@@ -88,16 +64,16 @@ class Refinement:
 
 @dataclass(frozen=True, eq=False)
 class Sensitivity:
-    """How a plan moves with a parameter of k entries, to first order.
+    """First-order change of a plan with a parameter of k entries.
 
     Attributes:
         name, value: Of the parameter, (k,).
         t: The reported times, s. Shape (M,).
         states, controls: Derivatives in the entries of the parameter, at fixed fractions of the horizon. (M, n, k).
         horizon, cost: Derivatives of the horizon, s, and of the optimal cost. Shape (k,) each.
-        lower, upper: Between which values of an entry, the others held, the same limits push and all others hold, to
-            first order; infinite where nothing ends it. Shape (k,) each.
-        limits: For each entry what ends this below and above, "" where nothing does.
+        lower, upper: Range of an entry, the others fixed, in which the set of active limits does not change, to first
+            order; infinite if unbounded. Shape (k,) each.
+        limits: For each entry the limit that ends its range below and above, "" if there is none.
     """
 
     name: str
@@ -112,61 +88,60 @@ class Sensitivity:
     limits: tuple[tuple[str, str], ...]
 
     def __getitem__(self, name: str) -> np.ndarray:
-        """Derivative of a state or control at the reported times. Shape (M, n, k)."""
-        return by_name("state or control", name, {**self.states, **self.controls})
+        """Return the derivative of a state or control at the reported times. Shape (M, n, k)."""
+        return entry_named("state or control", name, {**self.states, **self.controls})
 
     def __str__(self) -> str:
-        """The valid range of each entry, a line each."""
+        """Return the valid range of each entry, one a line."""
         lines = []
         for k, (below, above) in enumerate(self.limits):
             entry = self.name if len(self.value) == 1 else f"{self.name}[{k}]"
             why = "; ".join(f"{word} {what}" for word, what in (("below", below), ("above", above)) if what)
             lines.append(
-                f"{entry} = {self.value[k]:.6g}: the same limits push from {self.lower[k]:.6g} to {self.upper[k]:.6g}"
+                f"{entry} = {self.value[k]:.6g}: same active limits from {self.lower[k]:.6g} to {self.upper[k]:.6g}"
                 + (f" ({why})" if why else "")
             )
         return "\n".join(lines)
 
 
 def read_head(path: Any, text: np.ndarray) -> Any:
-    """What stands in the head of a file; ProblemError where it is longer than that of any plan.
-
-    JSON takes up to thirty times its length when it is read.
+    """Return the head of a file; raise ProblemError if it is too long, as reading JSON takes up to thirty times its
+    length.
     """
-    if text.nbytes > MOST_HEAD:
-        words = f"{path} is not a saved solution: its head has {text.nbytes:.3g} bytes, {MOST_HEAD:.3g} at most"
-        raise ProblemError(words, name="head", value=text.nbytes, limit=MOST_HEAD)
+    if text.nbytes > MAX_HEAD_BYTES:
+        words = f"{path} is not a saved solution: its head has {text.nbytes:.3g} bytes, {MAX_HEAD_BYTES:.3g} at most"
+        raise ProblemError(words, name="head", value=text.nbytes, limit=MAX_HEAD_BYTES)
     return json.loads(text.tobytes().decode())
 
 
 def read_status(path: Any, word: Any) -> SolverStatus:
-    """Return the status that stands in the head of a file; ProblemError where it is none."""
+    """Return the status in the head of a file, or raise ProblemError."""
     if word not in [status.value for status in SolverStatus]:
-        raise ProblemError(f"{path}: {word!r} is no status of a solver", name="status", value=word)
+        raise ProblemError(f"{path}: {word!r} is not a solver status", name="status", value=word)
     return SolverStatus(word)
 
 
-def by_name(kind: str, name: Any, pool: Mapping[str, T]) -> T:
-    """An entry of a pool; ProblemError, which lists the near ones, where nothing bears the name."""
+def entry_named(kind: str, name: Any, pool: Mapping[str, T]) -> T:
+    """Return an entry of a pool; raise ProblemError, which lists similar names, if there is none."""
     if not isinstance(name, str) or name not in pool:
         raise unknown_name(kind, name, pool)
     return pool[name]
 
 
 def plain(value: Any) -> Any:
-    """A number of numpy in the settings of a method as one of Python, for JSON."""
+    """Return a numpy number or array in the settings of a method as Python numbers, for JSON."""
     if isinstance(value, np.generic | np.ndarray):
         return value.tolist()
     raise TypeError(f"{value!r} cannot be saved")
 
 
 def stack(pool: Mapping[str, np.ndarray], like: int = 0) -> np.ndarray:
-    """The arrays (M, n) of a pool side by side; without any, (``like``, 0)."""
+    """Return the arrays (M, n) of a pool side by side; of an empty pool an array (``like``, 0)."""
     return np.hstack(list(pool.values())) if pool else np.zeros((like, 0))
 
 
 def unstack(pool: dict[str, np.ndarray], stacked: np.ndarray) -> dict[str, np.ndarray]:
-    """Columns of stacked values (M, n) by name, in the order and sizes of ``pool``."""
+    """Return columns of stacked values (M, n) by name, in the order and sizes of ``pool``."""
     values, offset = {}, 0
     for name, like in pool.items():
         values[name] = stacked[:, offset : offset + like.shape[1]]
@@ -174,60 +149,64 @@ def unstack(pool: dict[str, np.ndarray], stacked: np.ndarray) -> dict[str, np.nd
     return values
 
 
-class Places(Protocol):
-    """Where the states and controls of a problem stand in its vectors, by name."""
+class VariableSlices(Protocol):
+    """Slices of the states and controls of a problem in its vectors, by name."""
 
     name: str
     states: dict[str, slice]
     controls: dict[str, slice]
 
 
-def check_belongs(form: Places, solution: Any) -> None:
-    """Raise ProblemError unless the states and controls of a plan are those of a problem, in whatever order."""
+def check_variables_match(form: VariableSlices, solution: Any) -> None:
+    """Raise ProblemError unless a plan has the states and controls of a problem, in any order."""
     for what in ("states", "controls"):
-        have = {name: values.shape[1] for name, values in getattr(solution, what).items()}
-        want = {name: place.stop - place.start for name, place in getattr(form, what).items()}
-        if have != want:
-            words = f"plan {solution.name!r} has {what} {have}, problem {form.name!r} has {want}"
-            raise ProblemError(words, name=what, value=have, limit=want)
+        sizes = {name: values.shape[1] for name, values in getattr(solution, what).items()}
+        expected = {name: place.stop - place.start for name, place in getattr(form, what).items()}
+        if sizes != expected:
+            words = f"plan {solution.name!r} has {what} {sizes}, problem {form.name!r} has {expected}"
+            raise ProblemError(words, name=what, value=sizes, limit=expected)
 
 
-def in_order_of(form: Places, solution: Any) -> Any:
-    """The same plan with its states and controls, which interpolants hold by position, in the order of a problem."""
+def match_order(form: VariableSlices, solution: Any) -> Any:
+    """Return the plan with states and controls in the order of a problem, since interpolants have no names."""
     orders = {"states": list(form.states), "costates": list(form.states), "controls": list(form.controls)}
     changes: dict[str, Any] = {}
     for pool, interpolant in zip(("states", "controls", "costates"), INTERPOLANTS, strict=True):
-        own, names = getattr(solution, pool), orders[pool]
-        if list(own) == names:
+        values_by_name, names = getattr(solution, pool), orders[pool]
+        if list(values_by_name) == names:
             continue
-        ends = dict(zip(own, np.cumsum([values.shape[1] for values in own.values()]), strict=True))
-        columns = np.concatenate([np.arange(ends[name] - own[name].shape[1], ends[name]) for name in names])
+        offsets = dict(
+            zip(values_by_name, np.cumsum([values.shape[1] for values in values_by_name.values()]), strict=True)
+        )
+        columns = np.concatenate(
+            [np.arange(offsets[name] - values_by_name[name].shape[1], offsets[name]) for name in names]
+        )
         curve = getattr(solution, interpolant)
-        changes[pool] = {name: own[name] for name in names}
+        changes[pool] = {name: values_by_name[name] for name in names}
         changes[interpolant] = replace(curve, values=curve.values[:, :, columns])
-        if solution.drawn_in is not None and pool != "costates":
+        if solution.bound_tightening is not None and pool != "costates":
             first = 0 if pool == "states" else sum(values.shape[1] for values in solution.states.values())
-            drawn = changes.setdefault("drawn_in", solution.drawn_in.copy())
-            drawn[:, :, first : first + len(columns)] = solution.drawn_in[:, :, first + columns]
+            tightening = changes.setdefault("bound_tightening", solution.bound_tightening.copy())
+            tightening[:, :, first : first + len(columns)] = solution.bound_tightening[:, :, first + columns]
     return replace(solution, **changes) if changes else solution
 
 
-def drawn_in_at(drawn_in: np.ndarray, mesh: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """By how much bounds that are drawn in (2, N, m) on a mesh (N + 1,) are so at fractions ``at`` (M,).
+def tightening_at(bound_tightening: np.ndarray, mesh: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Return the bound tightening (2, N, m) of a mesh (N + 1,) at fractions ``at`` (M,). Shape (2, M, m).
 
-    At a node between two intervals the larger of both, as holds for what they share. Shape (2, M, m).
+    At a node between two intervals it is the larger of both.
     """
     last = len(mesh) - 2
-    sides = (np.clip(np.searchsorted(mesh, at + slip) - 1, 0, last) for slip in (-AT_NODE, AT_NODE))
-    left, right = (drawn_in[:, side] for side in sides)
+    sides = (np.clip(np.searchsorted(mesh, at + slip) - 1, 0, last) for slip in (-NODE_TOLERANCE, NODE_TOLERANCE))
+    left, right = (bound_tightening[:, side] for side in sides)
     return np.asarray(np.maximum(left, right))
 
 
 def check_structure(solution: Any) -> None:
-    """Raise ProblemError, which names the part, unless the arrays of a plan are whole: sizes, order of times, breaks.
+    """Raise ProblemError, naming the part, unless the arrays of a plan are consistent.
 
-    Times run up from 0 and breaks from 0 to 1; every array has a row for each time, every interpolant a
-    piece for each pair of breaks, nodes within 0..1, and as many columns as what it interpolates.
+    Times increase from 0 and breaks from 0 to 1. Every array has a row for each time. Every interpolant has one
+    polynomial between two breaks, nodes within 0..1, and as many columns as the interpolated pool.
     """
     _check_head(solution)
     for pool in ("parameters", "cost_gradients"):
@@ -237,37 +216,37 @@ def check_structure(solution: Any) -> None:
         _real(solution, name, getattr(solution, name), 1)
     t, slack = _real(solution, "t", solution.t, 1), ROUNDING_SHARE * solution.horizon
     if t.size < 2 or not (np.diff(t) >= -slack).all() or abs(t[0]) > slack:
-        raise _refused(solution, "t", "does not increase from 0")
+        raise _invalid(solution, "t", "does not increase from 0")
     for pool, interpolant in zip(("states", "controls", "costates"), INTERPOLANTS, strict=True):
         columns = 0
         for name, values in getattr(solution, pool).items():
             if len(_real(solution, f"{pool[:-1]} {name!r}", values, 2)) != t.size:
-                raise _refused(solution, f"{pool[:-1]} {name!r}", f"has {len(values)} rows for {t.size} times")
+                raise _invalid(solution, f"{pool[:-1]} {name!r}", f"has {len(values)} rows for {t.size} times")
             columns += values.shape[1]
         _check_interpolant(solution, interpolant, columns)
-    if solution.drawn_in is not None:
-        _check_drawn_in(solution)
+    if solution.bound_tightening is not None:
+        _check_tightening(solution)
 
 
-def _refused(solution: Any, name: str, words: str) -> ProblemError:
+def _invalid(solution: Any, name: str, words: str) -> ProblemError:
     return ProblemError(f"plan {solution.name!r}: {name} {words}", name=name)
 
 
 def _real(solution: Any, name: str, value: Any, dimensions: int) -> np.ndarray:
-    """Return a part of a plan; ProblemError unless it is an array of so many dimensions, of real numbers."""
+    """Return a part of a plan; raise ProblemError unless it is a real array of this number of dimensions."""
     array = np.asarray(value)
     if array.dtype.kind not in "fiu" or array.ndim != dimensions:
-        words = f"is no real array of {dimensions} dimensions, but {array.dtype} of shape {array.shape}"
-        raise _refused(solution, name, words)
+        words = f"is not a real array of {dimensions} dimensions, but {array.dtype} of shape {array.shape}"
+        raise _invalid(solution, name, words)
     return array
 
 
 def _check_head(solution: Any) -> None:
-    """Raise ProblemError unless the fields that are no arrays are of their kinds."""
+    """Raise ProblemError unless the fields that are not arrays have the right types."""
     for pool in POOLS:
         if not isinstance(getattr(solution, pool), dict):
-            words = f"are no dictionary by name, but {type(getattr(solution, pool)).__name__}"
-            raise _refused(solution, pool, words)
+            words = f"must be a dictionary by name, not {type(getattr(solution, pool)).__name__}"
+            raise _invalid(solution, pool, words)
     if set(solution.costates) != set(solution.states):
         words = f"plan {solution.name!r} has costates of {[*solution.costates]}, its states are {[*solution.states]}"
         raise ProblemError(words, name="costates", value=[*solution.costates], limit=[*solution.states])
@@ -275,43 +254,47 @@ def _check_head(solution: Any) -> None:
         value = getattr(solution, name)
         kinds: Any = {bool: bool | np.bool_, int: int | np.integer, float: int | float | np.number}.get(kind, kind)
         if not isinstance(value, kinds) or (kind is not bool and isinstance(value, bool)):
-            no = {bool: "is neither True nor False", str: "is no text", dict: "is no dictionary"}
-            no[SolverStatus] = "is no SolverStatus"
-            raise _refused(solution, name, f"{no.get(kind, 'is no number')}: {value!r}")
+            required = {bool: "True or False", str: "a string", dict: "a dictionary", SolverStatus: "a SolverStatus"}
+            raise _invalid(solution, name, f"must be {required.get(kind, 'a number')}, not {value!r}")
     if not isinstance(solution.method.get("type"), str):
-        raise _refused(solution, "method", f"has no type: {solution.method!r}")
+        raise _invalid(solution, "method", f"has no type: {solution.method!r}")
     if not 0 < solution.horizon < np.inf:
-        raise _refused(solution, "horizon", f"{solution.horizon!r} s is not positive and finite")
+        raise _invalid(solution, "horizon", f"must be positive and finite, not {solution.horizon!r} s")
 
 
 def _check_interpolant(solution: Any, name: str, columns: int) -> None:
-    """Raise ProblemError unless an interpolant of so many columns is whole."""
+    """Raise ProblemError unless an interpolant of this number of columns is consistent."""
     curve = getattr(solution, name)
     breaks, nodes = (_real(solution, f"{name}.{part}", getattr(curve, part), 1) for part in ("breaks", "nodes"))
     values = _real(solution, f"{name}.values", curve.values, 3)
-    rising = breaks.size >= 2 and (np.diff(breaks) > 0).all()
-    if not rising or abs(breaks[0]) > AT_NODE or abs(breaks[-1] - 1) > AT_NODE:
-        raise _refused(solution, f"{name}.breaks", "do not increase from 0 to 1")
-    rising = nodes.size > 0 and np.isfinite(nodes).all() and (np.diff(nodes) > 0).all()
-    if not rising or nodes[0] < -AT_NODE or nodes[-1] > 1 + AT_NODE:
-        raise _refused(solution, f"{name}.nodes", "do not increase within 0 to 1")
+    increasing = breaks.size >= 2 and (np.diff(breaks) > 0).all()
+    if not increasing or abs(breaks[0]) > NODE_TOLERANCE or abs(breaks[-1] - 1) > NODE_TOLERANCE:
+        raise _invalid(solution, f"{name}.breaks", "do not increase from 0 to 1")
+    increasing = nodes.size > 0 and np.isfinite(nodes).all() and (np.diff(nodes) > 0).all()
+    if not increasing or nodes[0] < -NODE_TOLERANCE or nodes[-1] > 1 + NODE_TOLERANCE:
+        raise _invalid(solution, f"{name}.nodes", "do not increase within 0 to 1")
     shape = (breaks.size - 1, nodes.size, columns)
     if values.shape != shape:
-        raise _refused(solution, f"{name}.values", f"have shape {values.shape}, not {shape}")
+        raise _invalid(solution, f"{name}.values", f"have shape {values.shape}, not {shape}")
 
 
-def _check_drawn_in(solution: Any) -> None:
-    """Raise ProblemError unless what the bounds are drawn in by has an entry for each of them, zero or above."""
-    drawn = _real(solution, "drawn_in", solution.drawn_in, 3)
+def _check_tightening(solution: Any) -> None:
+    """Raise ProblemError unless the tightening has a finite entry, zero or above, for each bound."""
+    amounts = _real(solution, "bound_tightening", solution.bound_tightening, 3)
     entries = sum(values.shape[1] for pool in (solution.states, solution.controls) for values in pool.values())
     shape = (2, len(solution.control_interpolant.breaks) - 1, entries)
-    if drawn.shape[:2] != shape[:2] or drawn.shape[2] < entries or not (drawn >= 0).all() or np.isinf(drawn).any():
-        words = f"is no array of finite numbers, zero or above, of shape {shape} or with path rows behind"
-        raise _refused(solution, "drawn_in", words)
+    if (
+        amounts.shape[:2] != shape[:2]
+        or amounts.shape[2] < entries
+        or not (amounts >= 0).all()
+        or np.isinf(amounts).any()
+    ):
+        words = f"must be finite and not negative, of shape {shape} or with additional path rows"
+        raise _invalid(solution, "bound_tightening", words)
 
 
 def check_finite(solution: Any) -> None:
-    """Raise ProblemError, which names the part, where a plan that counts as a success holds what is not finite."""
+    """Raise ProblemError, naming the part, if a successful plan contains a number that is not finite."""
     if not solution.success:
         return
     parts: dict[str, Any] = {

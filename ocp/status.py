@@ -1,4 +1,4 @@
-"""How a solver ended: one enumeration for all solvers."""
+"""The end of a solve: one enumeration for all solvers."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ __all__ = ["SolverStatus"]
 
 
 class SolverStatus(Enum):
-    """How a solver ended. The value is the word of IPOPT where IPOPT has one, and what files hold."""
+    """The end of a solve. The value is IPOPT's word if IPOPT has one; files store it."""
 
     SOLVED = "Solve_Succeeded"
     ACCEPTABLE = "Solved_To_Acceptable_Level"
@@ -23,29 +23,29 @@ class SolverStatus(Enum):
     TOO_FEW_VARIABLES = "Not_Enough_Degrees_Of_Freedom"
     STEP_FAILED = "Error_In_Step_Computation"
     REJECTED = "Rejected"
-    """The solver found a point that a check of it refused; the message says why."""
+    """The solver found a point that a later check rejected; the message gives the reason."""
     FAILED = "Failed"
     """Any other end; the message holds the solver's own word."""
 
     @classmethod
     def of_word(cls, word: str) -> SolverStatus:
-        """Return the status whose value a solver's word is, FAILED for any other word."""
+        """Return the status whose value is a solver's word, FAILED for any other word."""
         return cls(word) if word in cls._value2member_map_ else cls.FAILED
 
     @property
     def is_success(self) -> bool:
-        """Whether the solver reports an optimum."""
+        """Return whether the solver reports an optimum."""
         return self in (SolverStatus.SOLVED, SolverStatus.ACCEPTABLE)
 
     @property
     def message(self) -> str:
-        """The value, with what to try where that is known; "" of a success."""
+        """Return the value with advice on what to try next; "" for a success."""
         if self.is_success:
             return ""
         return f"{self.value}: {ADVICE[self]}" if self in ADVICE else self.value
 
     def __str__(self) -> str:
-        """The value."""
+        """Return the value."""
         return self.value
 
 

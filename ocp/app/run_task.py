@@ -13,7 +13,7 @@ from ocp.app.files import write_mcap
 from ocp.app.files.outputs import MARK, SUFFIXES, checked_output
 from ocp.app.files.task_file import Task
 from ocp.app.files.text_files import missing_package
-from ocp.errors import MOST, ProblemError, checked_instance, checked_positive
+from ocp.errors import MAX_COUNT, ProblemError, checked_instance, checked_positive
 from ocp.motion.plan import Plan, SegmentedPlan, plan, plan_in_segments
 from ocp.storage import write_text
 
@@ -150,9 +150,11 @@ def export_plan(plan: Plan, file: Path, period: float, force: bool = False) -> N
 def check_period(plan: Plan, period: float) -> None:
     """Raise ProblemError if a sampling period is not positive or gives more than MOST samples."""
     checked_positive("period", period)
-    if plan.horizon / period > MOST:
-        words = f"a period of {period:g} s gives {plan.horizon / period:.3g} samples; at most {MOST} can be written"
-        raise ProblemError(words, name="period", value=period, limit=plan.horizon / MOST)
+    if plan.horizon / period > MAX_COUNT:
+        words = (
+            f"a period of {period:g} s gives {plan.horizon / period:.3g} samples; at most {MAX_COUNT} can be written"
+        )
+        raise ProblemError(words, name="period", value=period, limit=plan.horizon / MAX_COUNT)
 
 
 def _yaml(plan: Plan, file: Path, period: float) -> None:

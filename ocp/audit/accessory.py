@@ -54,7 +54,7 @@ class AccessoryProblem:
         self.nx, self.nu = form.nx, form.nu
         self.free, self.with_start = form.horizon_is_free, form.ties_ends
         self.nz = self.nx * (1 + self.with_start) + self.free
-        self.obstacle = str(form.kept("obstacle", lambda: obstacle(form)))
+        self.obstacle = str(form.cached("obstacle", lambda: obstacle(form)))
         self._second_order()
         self._constraints()
         self._switches()
@@ -101,8 +101,8 @@ class AccessoryProblem:
             total = cost + ca.dot(lam, rate) + ca.dot(mu, path)
             return [ca.hessian(total, along.y)[0], ca.diag(ca.hessian(cost, form.x)[0])]
 
-        multiplier_values = (lam, self.adjoint.costate), (mu, multipliers)
-        hessian, self._cost_curves = form.sampled(outputs, *along.point, *multiplier_values, kept="second derivatives")
+        values = (lam, self.adjoint.costate), (mu, multipliers)
+        hessian, self._cost_curves = form.sampled(outputs, *along.point, *values, cache_as="second derivatives")
         ny = self.nx + 1 + self.nu
         hessian = hessian.reshape(m, ny, ny)
         self.curved = hessian[:, self.nx + 1 :, self.nx + 1 :]
@@ -254,7 +254,7 @@ def end_conditions(accessory: AccessoryProblem) -> tuple[np.ndarray, np.ndarray,
     form, solution, (low, high) = along.form, along.solution, along.bounds
     places, nx = form.bounds.places, accessory.nx
     x0, x1 = (solution.state_interpolant(np.array([end]))[0] for end in (0.0, 1.0))
-    second = form.kept("curvature of the ends", lambda: curved_ends(form))
+    second = form.cached("curvature of the ends", lambda: curved_ends(form))
     hessians = second(x1, x0, solution.horizon, along.p, ends.end, ends.start)
     end_curved, start_curved = (np.asarray(v.full()) for v in hessians)
     order = [*range(nx), 2 * nx, *range(nx, 2 * nx)]  # of (x, T, x0) in (x, x0, T)

@@ -21,7 +21,7 @@ from ocp.curves import PiecewisePolynomial
 from ocp.errors import ProblemError, checked_mapping, unknown_name
 from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.problem import Problem
-from ocp.solution import Solution, check_belongs, check_structure, in_order_of, stack, unstack
+from ocp.solution import Solution, check_structure, check_variables_match, match_order, stack, unstack
 from ocp.tolerances import (
     CLEARANCE_TOLERANCE_M,
     COSTATE_SHARE,
@@ -217,7 +217,7 @@ def audit(
     Raises:
         ProblemError: The plan does not belong to the problem, a limit is not a number, or a name in ``tolerances`` is
             unknown.
-        OutOfTime: Only inside :func:`ocp.console.limited`, after its limit.
+        TimeLimitReached: Only inside :func:`ocp.console.time_limited`, after its limit.
     """
     limits = checked_mapping("audit: tolerances", tolerances)
     required = {"integration": integration, "constraints": constraints, "lost": lost, **limits}
@@ -228,8 +228,8 @@ def audit(
             raise ProblemError(words, name=name, value=limit)
     form = Formulation.of(problem)
     check_structure(solution)
-    check_belongs(form, solution)
-    solution = in_order_of(form, solution)
+    check_variables_match(form, solution)
+    solution = match_order(form, solution)
     p = form.parameter_vector(solution.parameters)
     bounds = form.bound_values(p)
     grid = fine_grid(solution)
@@ -250,7 +250,7 @@ def audit(
     findings.append(horizon_finding(form, solution, bounds))
 
     rows = (form.path, form.start, form.end, form.watch)
-    names = [*form.states, *form.controls, *form.apart, *[name for kind in rows for name in kind.names]]
+    names = [*form.states, *form.controls, *form.separations, *[name for kind in rows for name in kind.names]]
     for name in limits:
         if name not in names:
             raise unknown_name("name in tolerances", name, names)

@@ -14,7 +14,7 @@ from ocp.console import interruptible
 from ocp.errors import ProblemError, checked_each, checked_mapping, checked_positive
 from ocp.problem.formulation import Formulation
 from ocp.problem.problem import Problem
-from ocp.solution import Solution, check_belongs
+from ocp.solution import Solution, check_variables_match
 from ocp.tolerances import LIMIT_SHARE
 
 __all__ = ["Certificate", "Comparison", "certificate"]
@@ -131,7 +131,7 @@ def certificate(
         raise ProblemError(words, name="solutions", value=len(named), limit=2)
     form = Formulation.of(problem)
     for solution in named.values():
-        check_belongs(form, solution)
+        check_variables_match(form, solution)
     order = sorted(named, key=lambda name: named[name].method["type"] != "Indirect")  # stable: indirect first
     reference = order[0]
     p = form.parameter_vector(named[reference].parameters)

@@ -25,10 +25,10 @@ from ocp.console import check_time
 from ocp.curves import PiecewisePolynomial
 from ocp.problem.enclosures import PrescribedMotion
 from ocp.problem.formulation import Formulation
-from ocp.problem.hulls import Frames, PairsOfBodies, frames_of
+from ocp.problem.hulls import BodyPairs, Frames, frames_of
 from ocp.problem.problem import Problem
 from ocp.problem.separation import Separation
-from ocp.solution import Solution, check_belongs, in_order_of
+from ocp.solution import Solution, check_variables_match, match_order
 
 __all__ = [
     "Clearance",
@@ -217,8 +217,8 @@ def separation_frames(
 def _tracks(problem: Problem, solution: Solution, suffix: str) -> list[tuple[Separation, Track]]:
     """Return the separations that have pairs and whose moving states end with a suffix, each with its track."""
     form = Formulation.of(problem)
-    check_belongs(form, solution)
-    solution, p = in_order_of(form, solution), form.parameter_vector(solution.parameters)
+    check_variables_match(form, solution)
+    solution, p = match_order(form, solution), form.parameter_vector(solution.parameters)
     moving = [each for each in problem.declared.apart.values() if all(name.endswith(suffix) for name in each.movers)]
     return [(each, _track_of(form, each, solution, p)) for each in moving if len(each)]
 
@@ -227,13 +227,13 @@ def _track_of(form: Formulation, apart: Separation, solution: Solution, p: np.nd
     """Return the motion of the bodies of a separation along a plan."""
     columns = [k for name in apart.movers for k in range(*form.states[name].indices(form.nx))]
     curve, horizon = solution.state_interpolant, solution.horizon
-    outputs, kept = [form.apart[apart.name]], ("placements", apart.name)
+    outputs, kept = [form.separations[apart.name]], ("placements", apart.name)
 
     def frames(at: np.ndarray) -> Frames:
         controls = np.zeros((len(at), form.nu))
-        return frames_of(form.sampled(outputs, curve(at), controls, at * horizon, horizon, p, kept=kept)[0])
+        return frames_of(form.sampled(outputs, curve(at), controls, at * horizon, horizon, p, cache_as=kept)[0])
 
-    prescribed = PrescribedMotion(apart, form.apart[apart.name], form.t, [form.p], [p])
+    prescribed = PrescribedMotion(apart, form.separations[apart.name], form.t, [form.p], [p])
     return Track(curve.breaks, horizon, *_rate_bounds(curve, columns, horizon), False, frames, prescribed)
 
 
@@ -253,7 +253,7 @@ class _Search:
         for level in range(self.top):
             rates, seconds = (_pairwise_maximum(values) for values in self.fastest[level])
             self.fastest.append((rates, seconds if track.smooth else np.full_like(seconds, np.inf)))
-        self.bodies = PairsOfBodies(tuple(apart.hulls.values()), apart.pairs, apart.covers)
+        self.bodies = BodyPairs(tuple(apart.hulls.values()), apart.pairs, apart.covers)
         n = len(apart)
         self.best, self.when, self.points = np.full(n, np.inf), np.zeros(n), np.zeros((n, 2, 3))
 

@@ -150,7 +150,7 @@ class _Newton:
         form, (n, samples) = self.along.form, x.shape[:2]
         states, controls, t = (part.reshape(n * samples, part.shape[2]) for part in (x, self.u, self.t))
         point = states, controls, t, self.along.solution.horizon, self.along.p
-        (flow,) = form.sampled(lambda: [ca.vertcat(form.f, form.running)], *point, kept="flow")
+        (flow,) = form.sampled(lambda: [ca.vertcat(form.f, form.running)], *point, cache_as="flow")
         flow = flow.reshape(n, samples, -1) * (self.width * self.along.solution.horizon)
         panels = _panels(flow)
         doubt = np.abs(panels @ self.doubt).max(axis=1).reshape(n, -1, flow.shape[2]).max(axis=1)

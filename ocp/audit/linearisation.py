@@ -143,12 +143,12 @@ class Linearisation:
         """Set the derivatives of running cost, dynamics and path rows."""
         form, m = self.form, len(self.s)
         self.y = ca.vertcat(form.x, form.T, form.u)
-        self.fraction, *self.scaled = form.kept("over the fraction of the horizon", lambda: over_fraction(form))
+        self.fraction, *self.scaled = form.cached("over the fraction of the horizon", lambda: over_fraction(form))
 
         def outputs() -> list[Any]:
             return [self.scaled[2], *(ca.jacobian(part, self.y) for part in self.scaled)]
 
-        self.row, self.cost_y, rate_y, row_y = form.sampled(outputs, *self.point, kept="first derivatives")
+        self.row, self.cost_y, rate_y, row_y = form.sampled(outputs, *self.point, cache_as="first derivatives")
         ny = form.nx + 1 + form.nu
         self.rate_y = rate_y.reshape(m, ny, form.nx).transpose(0, 2, 1)
         self.row_y = row_y.reshape(m, ny, len(form.path)).transpose(0, 2, 1)
@@ -187,7 +187,7 @@ class Linearisation:
         form, solution = self.form, self.solution
         x0, x1 = (solution.state_interpolant(np.array([end]))[0] for end in (0.0, 1.0))
         u0, u1 = stack(solution.controls, 2)[[0, -1]]
-        function = form.kept("ends", lambda: ends_of(form))
+        function = form.cached("ends", lambda: ends_of(form))
         found = [np.asarray(v.full()) for v in function(x1, x0, u1, u0, solution.horizon, self.p)]
         self.end_row, self.end_y, self.final_y, self.final_yy = found[0][:, 0], found[1], found[2][:, 0], found[3]
 
@@ -246,8 +246,9 @@ class Linearisation:
         index = np.concatenate([form.bounds.places[kind] for kind in kinds])
         low, high = (side[index] for side in self.bounds)
         tightening = np.zeros((2, n, len(index)))
-        if self.solution.drawn_in is not None:  # a plan assembled by hand may lack the path rows
-            tightening[:, :, : self.solution.drawn_in.shape[2]] = self.solution.drawn_in[:, :, : len(index)]
+        amounts = self.solution.bound_tightening
+        if amounts is not None:  # a plan assembled by hand may lack the path rows
+            tightening[:, :, : amounts.shape[2]] = amounts[:, :, : len(index)]
         equal = np.concatenate([np.zeros(nx + nu, bool), form.path.equality])
         equal |= low == high
         size = np.concatenate([sizes.state, self.control_size, sizes.path])
@@ -273,7 +274,7 @@ class Linearisation:
 
         x, u, horizon = self.solution.state_interpolant(at), np.zeros((n + 1, nu)), self.solution.horizon
         point = x, u, at * horizon, horizon, self.p, (self.fraction, at[:, None])
-        row, row_y = form.sampled(still, *point, kept="rows of the states")
+        row, row_y = form.sampled(still, *point, cache_as="rows of the states")
         before, after = np.maximum(np.arange(n + 1) - 1, 0), np.minimum(np.arange(n + 1), n - 1)
         at_nodes = np.maximum(tightening[:, before], tightening[:, after])[:, :, states]
         self.node_limits = Limits(np.hstack([x, row]), low[states], high[states], equal[states], size[states], at_nodes)
@@ -290,7 +291,7 @@ class Linearisation:
         """
         form, equal = self.form, np.flatnonzero(self.form.path.equality[self.still])
         arcs = np.zeros((len(self.s), len(equal), form.nu))
-        for which, slopes in form.kept("arcs", lambda: arcs_of(form, self.still[equal])):
+        for which, slopes in form.cached("arcs", lambda: arcs_of(form, self.still[equal])):
             rates = [form.signals_at(self.t, order) for order in range(MAX_DERIVATIVES + 1 if form.signals else 1)]
             values = slopes(*self.point[:2], self.t[:, None], *self.point[3:5], *rates)[0]
             arcs[:, which] = values.reshape(len(self.s), form.nu, len(which)).transpose(0, 2, 1)

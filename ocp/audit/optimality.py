@@ -436,7 +436,7 @@ def _control_curvature(along: Linearisation) -> np.ndarray | None:
     def outputs() -> list[Any]:
         return [ca.hessian(along.scaled[0] + ca.dot(lam, along.scaled[1]), form.u)[0]]
 
-    (curved,) = form.sampled(outputs, *along.point, (lam, along.costate), kept="curvature in the controls")
+    (curved,) = form.sampled(outputs, *along.point, (lam, along.costate), cache_as="curvature in the controls")
     return np.asarray(curved.reshape(-1, form.nu, form.nu))
 
 

@@ -57,7 +57,7 @@ def hamiltonian(form: Formulation, solution: Solution, p: np.ndarray) -> Hamilto
     x, u, costate = (stack(pool, len(solution.t)) for pool in pools)
     lam = form.sym("lam", form.nx)
     point = x, u, solution.t, solution.horizon, p, (lam, costate)
-    running, products = form.sampled(lambda: [form.running, lam * form.f], *point, kept="Hamiltonian")
+    running, products = form.sampled(lambda: [form.running, lam * form.f], *point, cache_as="Hamiltonian")
     scale = float(np.max(np.abs(running[:, 0]) + np.abs(products).sum(axis=1), initial=0.0))
     return Hamiltonian(solution.t, running[:, 0] + products.sum(axis=1), scale or 1.0)
 

@@ -24,7 +24,7 @@ from ocp.audit.sizes import FineGrid, integral, row_changes
 from ocp.console import check_time
 from ocp.curves import dormand_prince_step, newton_coefficients
 from ocp.problem.formulation import Formulation
-from ocp.problem.values import in_blocks
+from ocp.problem.values import evaluate_in_blocks
 from ocp.tolerances import LIMIT_SHARE, SOLVER_SHARE
 
 __all__ = ["Reintegration", "Violation", "reintegrate", "violations"]
@@ -155,7 +155,7 @@ class Flow:
         self._columns = np.column_stack([differences, curve.breaks[:-1], np.diff(curve.breaks)])
         self._tolerance = SETTINGS.tolerance * np.append(sizes.state, sizes.cost)
         name = "steps", curve.nodes.tobytes()
-        self._step = form.kept(name, lambda: step_function(form, curve.nodes).mapaccum("steps", SETTINGS.block))
+        self._step = form.cached(name, lambda: step_function(form, curve.nodes).mapaccum("steps", SETTINGS.block))
         self._intervals = len(curve.values)
 
     def integrate(self, chain: np.ndarray, starts: np.ndarray, steps: Steps | None = None) -> tuple[np.ndarray, Steps]:
@@ -214,7 +214,7 @@ class Flow:
         for at in range(0, padded, SETTINGS.blocks * SETTINGS.block):
             check_time()
             part = slice(at, at + SETTINGS.blocks * SETTINGS.block)
-            in_blocks(self._step, SETTINGS.block, data[part], [after[part], errors[part]], state)
+            evaluate_in_blocks(self._step, SETTINGS.block, data[part], [after[part], errors[part]], state)
         return after[:count], np.abs(errors[:count])
 
 
@@ -294,7 +294,7 @@ def violations(along: Linearisation, motion: Reintegration, states: np.ndarray, 
     entries = LIMIT_SHARE * np.concatenate([sizes.state, sizes.control])
     point = states, motion.controls, motion.t, horizon, p, (form.x0, initial[0]), (form.u0, initial[1])
     outputs = [form.path.expression, form.watch.expression]
-    sampled = dict(zip(("path", "watch"), form.sampled(outputs, *point, kept="rows along a plan"), strict=True))
+    sampled = dict(zip(("path", "watch"), form.sampled(outputs, *point, cache_as="rows along a plan"), strict=True))
     for kind, at in (("path", whole), ("start", first), ("end", last), ("watch", whole)):
         rows, size = getattr(form, kind), getattr(sizes, kind)
         if len(rows) == 0:
@@ -304,11 +304,11 @@ def violations(along: Linearisation, motion: Reintegration, states: np.ndarray, 
             g = sampled[kind]
         else:
             starts = (form.x0, initial[0]), (form.u0, initial[1])
-            g = form.sampled([rows.expression], x, u, t, horizon, p, *starts, kept=(kind, "from the start"))[0]
+            g = form.sampled([rows.expression], x, u, t, horizon, p, *starts, cache_as=(kind, "from the start"))[0]
         excess = excess_over(_integrated(form, kind, g, t), lower[rows.bounds], upper[rows.bounds])
         limited = np.isfinite(rows.tolerance)
         if kind in sampled and limited.any():
-            g_reported = form.sampled(outputs, motion.plan, *point[1:], kept="rows along a plan")[kind == "watch"]
+            g_reported = form.sampled(outputs, motion.plan, *point[1:], cache_as="rows along a plan")[kind == "watch"]
             g_reported = _integrated(form, kind, g_reported, t)
             reported_excess = excess_over(g_reported, lower[rows.bounds], upper[rows.bounds])
             excess = np.where(limited, np.maximum(excess, reported_excess), excess)

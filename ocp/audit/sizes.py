@@ -139,8 +139,8 @@ def sizes_along(form: Formulation, grid: FineGrid, horizon: float, p: np.ndarray
     control, control_moves = _sizes_of(grid.controls, declared, [], np.zeros(form.nu, dtype=bool))
     entries = np.concatenate([state, control]), np.concatenate([state_moves, control_moves])
     point = grid.states, grid.controls, grid.t, horizon, p, (form.x0, grid.states[0]), (form.u0, grid.controls[0])
-    outputs = [form.running, form.path.expression, form.watch_way]
-    running, rows, path_lengths = form.sampled(outputs, *point, kept="along a plan")
+    outputs = [form.running, form.path.expression, form.watch_reference_rate]
+    running, rows, path_lengths = form.sampled(outputs, *point, cache_as="along a plan")
     path = _rows_of(form, "path", grid, horizon, p, bounds, entries, rows)
     start, end, watch = (_rows_of(form, k, grid, horizon, p, bounds, entries) for k in ("start", "end", "watch"))
     absolute = np.where(np.isfinite(running), np.abs(running), 0.0)[:, 0]
@@ -324,7 +324,7 @@ def row_changes(
     x, u, t = samples
     size, count = form.nx + form.nu, len(t)
     expression = getattr(form, kind) if kind in COSTS else getattr(form, kind).expression
-    uses_start = form.kept((kind, "tied"), lambda: ca.depends_on(expression, ca.vertcat(form.x0, form.u0)))
+    uses_start = form.cached((kind, "tied"), lambda: ca.depends_on(expression, ca.vertcat(form.x0, form.u0)))
     used = 2 * size if uses_start else size
     steps = np.vstack([np.zeros(2 * size), *(s * np.diag(np.concatenate([moves, moves]))[:used] for s in (1.0, -1.0))])
     sample = np.tile(np.arange(count), len(steps))
@@ -332,7 +332,7 @@ def row_changes(
     columns = np.hstack([x[sample], u[sample], first]) + np.repeat(steps, count, axis=0)
     x, u, x0, u0 = np.split(columns, np.cumsum([form.nx, form.nu, form.nx]), axis=1)
     starts = (form.x0, x0), (form.u0, u0)
-    values = form.sampled([expression], x, u, t[sample], horizon, p, *starts, kept=(kind, "from the start"))[0]
+    values = form.sampled([expression], x, u, t[sample], horizon, p, *starts, cache_as=(kind, "from the start"))[0]
     g = values.reshape(len(steps), count, -1)
     change = np.abs(np.where(np.isfinite(g[1:] - g[0]), g[1:] - g[0], 0.0))
     return g[0], change.reshape(2, used, count, -1).max(axis=0)

@@ -333,7 +333,7 @@ def assemble(transcription: Transcription, parameters: int, functions: Sequence[
     """Assemble the program of a transcription, from given derivatives of its blocks or by deriving them.
 
     Raises:
-        OutOfTime: The time limit is over.
+        TimeLimitReached: The time limit is over.
     """
     blocks = transcription.blocks
     if functions is None:

@@ -105,7 +105,7 @@ def transcribe(method: Collocation, form: Formulation, staged: bool) -> Transcri
         (np.repeat(controls[:, 0], d, axis=0) if piecewise_constant else controls.reshape(n * d, nu)).T,
         stage_of,
     )
-    numbers = np.vstack([form.moments(at), np.repeat(width, d), np.outer(width, weights).ravel()])
+    numbers = np.vstack([form.point_data(at), np.repeat(width, d), np.outer(width, weights).ravel()])
     data = form.sym("d", len(numbers))  # fraction and signals, width, weight
     function = form.point_function(
         "point", data, data[-1] * form.T * form.running, ca.vertcat(-data[-2] * form.T * form.f, rows.expression)

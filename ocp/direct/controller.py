@@ -31,7 +31,16 @@ import numpy as np
 from ocp.direct import assembly
 from ocp.direct.assembly import SIZES, Derivatives, Transcription, assemble, derivatives, gather
 from ocp.errors import ProblemError
-from ocp.libraries import SERIALISED, CompilerError, Library, built, code, generated, notice, serialised
+from ocp.libraries import (
+    SERIALISED,
+    CompilerError,
+    Library,
+    build_library,
+    function_key,
+    generate_c,
+    generate_code,
+    warn_interpreted,
+)
 from ocp.problem.formulation import Formulation
 from ocp.storage import write_text
 
@@ -81,7 +90,7 @@ def write_controller(form: Formulation, transcription: Transcription, guess: np.
         OSError: The folder cannot be written.
     """
     try:
-        plan = generated(controller_functions(form, transcription, guess), "plan")
+        plan = generate_c(controller_functions(form, transcription, guess), "plan")
     except CompilerError as error:
         raise ProblemError(f"problem {form.name!r} has no C: {error}", name="method", value=form.name) from error
     texts = dict(zip(("plan.c", "plan.h"), plan, strict=True))
@@ -266,9 +275,9 @@ def block_derivatives(transcription: Transcription, compiled: bool) -> list[Deri
         compiled: Whether to compile. Functions that cannot be compiled are interpreted, with one warning.
 
     Raises:
-        OutOfTime: The time limit is over.
+        TimeLimitReached: The time limit is over.
     """
-    texts = [serialised(block.function) for block in transcription.blocks]
+    texts = [function_key(block.function) for block in transcription.blocks]
     by_text: dict[str, Derivatives] = {}
     for text, block in zip(texts, transcription.blocks, strict=True):
         if text not in by_text:
@@ -286,8 +295,8 @@ def _can_be_compiled(function: Any, text: str) -> bool:
 def _compiled(function: Any, text: str) -> Derivatives:
     """Return the derivatives of a function from a compiled library, or interpreted if compilation fails."""
     try:
-        path = built(Library((RECIPE, text), lambda: code(derivatives(function))))
+        path = build_library(Library((RECIPE, text), lambda: generate_code(derivatives(function))))
         return Derivatives(*(ca.external(name, str(path)) for name in Derivatives._fields))
     except (CompilerError, RuntimeError) as error:
-        notice(str(error))
+        warn_interpreted(str(error))
         return derivatives(function)

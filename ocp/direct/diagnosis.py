@@ -15,7 +15,7 @@ from typing import Any, Protocol
 import casadi as ca
 import numpy as np
 
-from ocp.console import Progress, listening, time_left
+from ocp.console import Progress, stop_requests_polled, time_left
 from ocp.direct.assembly import Program, Transcription, sparse
 from ocp.direct.nlp import Outcome
 from ocp.direct.scaling import SCALING, Scales
@@ -275,7 +275,7 @@ def elastic_plan(
     progress.open(lower, upper)
     try:
         solver = ca.nlpsol("elastic", "ipopt", {"x": x, "p": p, "f": f, "g": g}, options)
-        with listening():
+        with stop_requests_polled():
             result = solver(
                 x0=np.concatenate([scaled["x0"], np.zeros(k)]),
                 p=scaled["p"],

@@ -14,7 +14,7 @@ import numpy as np
 
 from ocp.curves import rk4_step
 from ocp.direct.assembly import Transcription
-from ocp.errors import ProblemError, about, unknown_name
+from ocp.errors import ProblemError, error_names, unknown_name
 from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.values import numeric, table
 from ocp.solution import Guess, Solution
@@ -51,7 +51,7 @@ def initial_point(form: Formulation, transcription: Transcription, guess: Guess,
         text = f"guess must be a Solution, a dictionary or None, not {type(guess).__name__}"
         raise ProblemError(text, name="guess", value=guess)
     if "horizon" in values:
-        with about("horizon"):
+        with error_names("horizon"):
             number = numeric("guess of the horizon", values.pop("horizon"))
         if not (number.size == 1 and np.isfinite(number[0]) and number[0] > 0):
             text = f"guess of the horizon must be one positive finite number, not {number.tolist()} s"
@@ -74,9 +74,9 @@ def initial_point(form: Formulation, transcription: Transcription, guess: Guess,
             elif value is None:
                 curve = default(form, role, entries, bounds)
             else:
-                with about(name):
+                with error_names(name):
                     curve = trajectory(name, value, entries.stop - entries.start, horizon, times)
-            with about(name):
+            with error_names(name):
                 table[:, entries] = curve(fractions)
             for i in np.flatnonzero(~np.isfinite(table[:, entries]).all(axis=1)):
                 text = f"guess of {name!r} is not finite at {fractions[i] * horizon:g} s: {table[i, entries]}"

@@ -9,7 +9,7 @@ from typing import Any, Self
 import numpy as np
 
 from ocp.direct.assembly import Transcription
-from ocp.errors import NOT_NUMBERS, ProblemError, about, checked_count, checked_positive, floats
+from ocp.errors import NOT_NUMBERS, ProblemError, checked_count, checked_positive, error_names, floats
 from ocp.problem.formulation import Formulation
 from ocp.problem.values import numeric
 from ocp.tolerances import ROUNDING_SHARE
@@ -77,7 +77,7 @@ class MeshedMethod(ABC):
             ProblemError: The fractions are not numbers from 0 to 1.
         """
         details: dict[str, Any] = {"name": "fractions", "value": fractions}
-        with about("fractions"):
+        with error_names("fractions"):
             added = numeric("with_nodes_at: fractions", fractions)
         if not np.all((added >= 0.0) & (added <= 1.0)):
             raise ProblemError(f"with_nodes_at: fractions must be numbers from 0 to 1, not {fractions!r}", **details)

@@ -14,7 +14,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ocp.console import LOG, Progress, Watch, listening, quiet
+from ocp.console import LOG, FatropMonitor, Progress, casadi_silenced, stop_requests_polled
 from ocp.curves import PiecewisePolynomial
 from ocp.direct.assembly import Program, Stages, Transcription
 from ocp.errors import ProblemError, SolveError
@@ -107,7 +107,7 @@ class Outcome:
 
 def build_solver(
     program: Program, solver: str, options: dict[str, Any], stages: Stages | None, title: str
-) -> tuple[Any, Progress | Watch]:
+) -> tuple[Any, Progress | FatropMonitor]:
     """Return the casadi solver of a program, and the callback that stops it.
 
     Raises:
@@ -120,7 +120,7 @@ def build_solver(
     if not solver_options.get("print_level", 0) and "max_iter" in solver_options:
         settings["show_eval_warnings"] = False
     nlp = program.nlp
-    progress: Progress | Watch
+    progress: Progress | FatropMonitor
     if solver in ("ipopt", "sleqp"):
         progress = Progress(n, m, n_p, title, not solver_options["print_level"])
         settings["iteration_callback"] = progress
@@ -135,7 +135,7 @@ def build_solver(
     else:
         assert stages is not None
         nlp = {**nlp, "f": finite(nlp["f"]), "g": finite(nlp["g"])}
-        progress = Watch(n, title)
+        progress = FatropMonitor(n, title)
         # this interface has no options for given derivatives; it looks them up in its cache under these names
         settings |= {
             "cache": fatrop_functions(program, progress),
@@ -164,7 +164,7 @@ def iteration_limit(solver: str, options: dict[str, Any]) -> int:
     return int(limit) if isinstance(limit, int | float | np.number) else 0
 
 
-def fatrop_functions(program: Program, watch: Watch) -> dict[str, Any]:
+def fatrop_functions(program: Program, watch: FatropMonitor) -> dict[str, Any]:
     """Return the derivatives of a program with the signatures that casadi's fatrop interface uses.
 
     The interface raises unless the next state has factor 1 in the rows that close gaps. A zero Jacobian therefore stops
@@ -195,7 +195,7 @@ def finite(expression: Any) -> Any:
     return ca.MX(expression.sparsity(), ca.fmax(ca.fmin(expression.nz[:], 1e20), -1e20))
 
 
-def call_solver(solver: Any, progress: Progress | Watch, arguments: dict[str, np.ndarray]) -> Outcome:
+def call_solver(solver: Any, progress: Progress | FatropMonitor, arguments: dict[str, np.ndarray]) -> Outcome:
     """Run a solver; Ctrl-C and a time limit stop it between two iterations, at its last iterate."""
     began = time.monotonic()
     name = KINDS[solver.class_name()]
@@ -204,7 +204,7 @@ def call_solver(solver: Any, progress: Progress | Watch, arguments: dict[str, np
     log_line(f"solving {progress.title!r}: {arguments['lbx'].size} variables, {arguments['lbg'].size} rows")
     try:
         # SLEQP prints each subproblem that it gives up
-        with listening(), quiet() if name == "sleqp" else nullcontext():
+        with stop_requests_polled(), casadi_silenced() if name == "sleqp" else nullcontext():
             result = solver(**(tighten_for_fatrop(arguments) if name == "fatrop" else arguments))
     except RuntimeError as error:
         text = str(error).lower()
@@ -235,7 +235,7 @@ def call_solver(solver: Any, progress: Progress | Watch, arguments: dict[str, np
     return Outcome(*result_values, status, message, iterations, seconds, regularised(stats), name)
 
 
-def stopped(solver: Any, progress: Progress | Watch, arguments: dict[str, np.ndarray], began: float) -> Outcome:
+def stopped(solver: Any, progress: Progress | FatropMonitor, arguments: dict[str, np.ndarray], began: float) -> Outcome:
     """Return the last iterate of a solver that was stopped or failed without a result; its multipliers are unknown."""
     cost, rows = (np.asarray(v.full()).reshape(-1) for v in solver.oracle()(progress.iterate, arguments["p"]))
     unknown, seconds = np.full(rows.shape, np.nan), time.monotonic() - began
@@ -386,7 +386,7 @@ def cost_gradient(
     for index, multiplier in ((transcription.variable_bounds, lam_x), (transcription.row_bounds, lam)):
         np.add.at(forces[0], index, np.minimum(multiplier, 0.0))  # at a lower bound
         np.add.at(forces[1], index, np.maximum(multiplier, 0.0))
-    return np.asarray(direct - form.bounds.pull(p, forces))
+    return np.asarray(direct - form.bounds.pullback(p, forces))
 
 
 def costate_interpolant(transcription: Transcription, costates: np.ndarray) -> PiecewisePolynomial:

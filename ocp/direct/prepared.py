@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ocp.console import OutOfTime, check_time, interruptible, limited
+from ocp.console import TimeLimitReached, check_time, interruptible, time_limited
 from ocp.direct.active_set import Newton, active_sides
 from ocp.direct.assembly import Program, assemble
 from ocp.direct.controller import block_derivatives, write_controller
@@ -80,7 +80,7 @@ class DirectMethod(MeshedMethod):
         """
         try:
             return Prepared(problem, self, solver, options, compiled, scaling)
-        except OutOfTime as error:
+        except TimeLimitReached as error:
             words = f"problem {problem.name!r} was still being built: {SolverStatus.TIME_LIMIT}: raise time_limit"
             raise SolveError(words, name="time_limit") from error
 
@@ -173,7 +173,7 @@ class Prepared:
         if ahead and not (self._is_own_plan(guess) and self.method.mesh is None):
             words = "solve: shift requires as guess a plan of this problem, method and mesh, with equal intervals"
             raise ProblemError(words, name="shift", value=shift)
-        with limited(checked_time_limit(time_limit)), self._lock:
+        with time_limited(checked_time_limit(time_limit)), self._lock:
             return self._solve(parameters, guess, check, tighter, ahead)
 
     @interruptible

@@ -128,7 +128,7 @@ def program_of(solution: Solution) -> tuple[Formulation, Transcription, Program]
     if method_name not in METHODS or solution.problem is None:
         text = f"{plan}: sensitivities need a plan of Collocation(...) or MultipleShooting(...) with its problem"
         raise ProblemError(text, name="method", value=method_name)
-    if not solution.success or solution.drawn_in is not None:
+    if not solution.success or solution.bound_tightening is not None:
         text = f"{plan}: it is not an optimum under the bounds of its problem"
         raise ProblemError(text, name="solution", value=solution.message)
     form = Formulation.of(solution.problem)

@@ -201,11 +201,11 @@ class TranscriptionBuilder:
         """Impose path rows at K points with fractions ``at``, states (nx, K) and controls (nu, K)."""
         if len(rows) == 0 or len(at) == 0:
             return
-        moments = self.formulation.moments(at)
-        d = self.formulation.sym("d", len(moments))
+        point_data = self.formulation.point_data(at)
+        d = self.formulation.sym("d", len(point_data))
         function = self.formulation.point_function("path", d, 0, rows.expression)
         index = self.rows(rows.labels, rows.bounds, stages, at)
-        self.blocks.append(Block(function, self.point(states, controls, stages), moments, index))
+        self.blocks.append(Block(function, self.point(states, controls, stages), point_data, index))
 
     def node_rows(self, rows: Rows, controls: np.ndarray, *, first_only: bool = False) -> None:
         """Impose rows at every node; at the first node only those that fixed initial states do not determine.

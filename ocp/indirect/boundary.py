@@ -1,7 +1,4 @@
-"""The boundary value problem of the minimum principle, written for shooting.
-
-Newton's method for boundary value problems: sparse, damped, interruptible.
-"""
+"""The boundary value problem of the minimum principle, written for shooting, and Newton's method for it."""
 
 from __future__ import annotations
 
@@ -12,7 +9,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ocp.console import listening, quiet, reason_to_stop
+from ocp.console import casadi_silenced, reason_to_stop, stop_requests_polled
 from ocp.curves import integrator
 from ocp.errors import ProblemError
 from ocp.indirect.hamiltonian import Hamiltonian, numeric_bounds
@@ -21,9 +18,9 @@ from ocp.problem.formulation import Formulation
 from ocp.problem.values import symbols_of
 from ocp.status import SolverStatus
 
-__all__ = ["LOBATTO", "BoundaryProblem", "Found", "newton"]
+__all__ = ["LOBATTO", "BoundaryProblem", "NewtonResult", "newton"]
 
-LOBATTO = 0.5 - 0.5 * np.cos(np.pi * np.arange(10) / 9)  # Chebyshev-Lobatto nodes of a reported piece, 0..1
+LOBATTO = 0.5 - 0.5 * np.cos(np.pi * np.arange(10) / 9)  # Chebyshev-Lobatto nodes of a reported segment, 0..1
 
 
 class BoundaryProblem:
@@ -48,7 +45,7 @@ class BoundaryProblem:
         self._systems: dict[tuple[int, ...], tuple[Any, ...]] = {}
 
     def system(self, arcs: ControlArcs) -> tuple[Any, ...]:
-        """Residual and its Jacobian as functions of (unknowns, data), for a number of segments in every arc."""
+        """Return the residual and its Jacobian as functions of (unknowns, data), for these numbers of segments."""
         key = tuple(arcs.segments)
         if key not in self._systems:
             build = self._backward if self.backward else self._multiple
@@ -59,7 +56,7 @@ class BoundaryProblem:
         return self._systems[key]
 
     def _multiple(self, arcs: ControlArcs) -> tuple[Any, Any, Any]:
-        """Forward multiple shooting: unknown y at every segment's start and at the end."""
+        """Return forward multiple shooting, with y at the start of every segment and at the end as unknowns."""
         form = self.form
         at, of = self.layout(arcs), self._data(arcs)
         z, data = ca.MX.sym("z", at["end"].stop), ca.MX.sym("data", of["guess"].stop)
@@ -71,8 +68,8 @@ class BoundaryProblem:
         residuals = [ca.vec(y[:, 1:] - ends)]
         last = inputs[:, -1]
         for i, (component, node) in enumerate(zip(arcs.components, arcs.nodes, strict=True)):
-            here = y[:, int(node)]
-            values = self.outputs(*self.arguments(here, z[at["switches"]][i], horizon, inputs[:, int(node) - 1]))
+            y_switch = y[:, int(node)]
+            values = self.outputs(*self.arguments(y_switch, z[at["switches"]][i], horizon, inputs[:, int(node) - 1]))
             residuals.append(values[3][component])
         values = self.outputs(*self.arguments(y[:, -1], horizon, horizon, last))
         multipliers = z[at["start"]], z[at["end"]]
@@ -83,7 +80,7 @@ class BoundaryProblem:
         return z, data, ca.vertcat(*residuals)
 
     def _backward(self, arcs: ControlArcs) -> tuple[Any, Any, Any]:
-        """Backward shooting: unknown end state only; the start must be met."""
+        """Return backward shooting, with the end state as unknown and the given start as condition."""
         form = self.form
         of = self._data(arcs)
         total = sum(arcs.segments)
@@ -92,7 +89,7 @@ class BoundaryProblem:
         return z, data, y_start[: form.nx, :] - data[of["ends"]][form.nx : 2 * form.nx]
 
     def _chain(self, state: Any, data: Any, arcs: ControlArcs, total: int) -> tuple[list[Any], Any]:
-        """y at all nodes from the end to the start, integrated backwards from an end state."""
+        """Return y at all nodes from the end to the start, integrated backwards from an end state."""
         form, of = self.form, self._data(arcs)
         horizon = data[of["horizon"]]
         gradient = ca.gradient(form.terminal, form.x)
@@ -107,7 +104,7 @@ class BoundaryProblem:
         return nodes, y
 
     def _segment_data(self, switches: Any, horizon: Any, data: Any, arcs: ControlArcs) -> Any:
-        """The q of every segment side by side."""
+        """Return the q of every segment side by side."""
         of, total = self._data(arcs), sum(arcs.segments)
         knots = ca.vertcat(0, switches, horizon)
         begins, lengths = [], []
@@ -125,14 +122,14 @@ class BoundaryProblem:
         )
 
     def arguments(self, y: Any, at: Any, horizon: Any, q: Any) -> list[Any]:
-        """The arguments of a Hamiltonian system's functions, of y and q (columns, one a sample) at times ``at``."""
+        """Return the arguments of the Hamiltonian functions from y and q (one column per sample) at times ``at``."""
         sizes = self.ham.sizes
         cuts = np.cumsum([3, *sizes[4:]])
         tail = [q[int(a) : int(b)] for a, b in itertools.pairwise(cuts)]
         return [y[: sizes[0]], y[sizes[0] :], at, horizon, *tail]
 
     def layout(self, arcs: ControlArcs) -> dict[str, slice]:
-        """Where everything stands in the vector of unknowns."""
+        """Return the slices of the vector of unknowns."""
         form = self.form
         total = sum(arcs.segments)
         sizes = {
@@ -145,46 +142,48 @@ class BoundaryProblem:
         return side_by_side(sizes)
 
     def _data(self, arcs: ControlArcs) -> dict[str, slice]:
-        """Where everything stands in the vector of data: horizon if fixed, p, end values, bang values, guesses."""
+        """Return the slices of the vector of data: horizon if fixed, p, end values, bang values, guesses."""
         sizes = self.ham.sizes
         total = sum(arcs.segments)
         parts = {"horizon": 1, "p": sizes[4], "ends": 4 * sizes[0], "bang": sizes[5] * total, "guess": sizes[6] * total}
         return side_by_side(parts)
 
     def _integrator(self, places: np.ndarray) -> Any:
-        """Function (y, q) -> (y at ``places``, integrals of L and dH/dT); q = [t0, duration, T, p, bang, guess]."""
+        """Return the function (y, q) -> (y at ``places``, integrals of L and dH/dT); q = [t0, duration, T, p, bang,
+        guess].
+        """
         ham = self.ham
         sizes = ham.sizes
         flow = ham.flow()
         sym = symbols_of(flow).sym
-        y, place = sym("y", 2 * sizes[0]), sym("place")
+        y, position = sym("y", 2 * sizes[0]), sym("place")
         q = sym("q", 3 + sum(sizes[4:]))
-        x_rate, lam_rate, cost, by_horizon = flow(*self.arguments(y, q[0] + place * q[1], q[2], q))
+        x_rate, lam_rate, cost, by_horizon = flow(*self.arguments(y, q[0] + position * q[1], q[2], q))
         ode, quad = q[1] * ca.vertcat(x_rate, lam_rate), q[1] * ca.vertcat(cost, by_horizon)
-        dae = {"x": y, "t": place, "p": q, "ode": ode, "quad": quad}
-        flown = integrator("flow", dae, places.tolist(), tolerance=self.tolerance)
+        dae = {"x": y, "t": position, "p": q, "ode": ode, "quad": quad}
+        flow_integrator = integrator("flow", dae, places.tolist(), tolerance=self.tolerance)
         y, q = ca.MX.sym("y", 2 * sizes[0]), ca.MX.sym("q", q.numel())
-        result = flown(x0=y, p=q)
+        result = flow_integrator(x0=y, p=q)
         return ca.Function("segment", [y, q], [result["xf"], result["qf"][:, -1]])
 
     def integrate(self, segment: Any, y: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """States (2 nx, places) and integrals (2,); nan where the integration breaks down."""
+        """Return states (2 nx, places) and integrals (2,); nan if the integration fails."""
         try:
-            with quiet():
-                states, spent = segment(y, q)
-            return np.asarray(states.full()), np.asarray(spent.full()).reshape(-1)
+            with casadi_silenced():
+                states, integrals = segment(y, q)
+            return np.asarray(states.full()), np.asarray(integrals.full()).reshape(-1)
         except RuntimeError:
             return np.full(segment.size_out(0), np.nan), np.full(2, np.nan)
 
     def end_multipliers(self, z: np.ndarray, arcs: ControlArcs) -> tuple[np.ndarray, np.ndarray]:
-        """Multipliers of the start and of the end constraints."""
+        """Return the multipliers of the start and of the end constraints."""
         if self.backward:
             return np.zeros(0), np.zeros(0)
         at = self.layout(arcs)
         return z[at["start"]], z[at["end"]]
 
     def advance(self, y: np.ndarray, q: np.ndarray, place: float) -> np.ndarray:
-        """y at a place 0..1 of a segment that begins with ``y``. Shape (2 nx,)."""
+        """Return y at a position 0..1 of a segment that begins with ``y``. Shape (2 nx,)."""
         if place == 0.0:
             return y
         return self.integrate(self.step, y, np.concatenate([[q[0], place * q[1]], q[2:]]))[0][:, -1]
@@ -192,7 +191,7 @@ class BoundaryProblem:
     def unpack(
         self, z: np.ndarray, arcs: ControlArcs, data: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-        """y at the nodes (2 nx, S + 1), q of the segments, switch times, horizon."""
+        """Return y at the nodes (2 nx, S + 1), q of the segments, switch times, horizon."""
         form, total = self.form, sum(arcs.segments)
         horizon, switches = float(data[0]), np.zeros(0)
         if self.backward:
@@ -200,55 +199,55 @@ class BoundaryProblem:
             nodes, _ = self._chain(*symbols, arcs, total)
             chain = ca.Function("chain", symbols, [ca.horzcat(*reversed(nodes))])
             try:
-                with quiet():
+                with casadi_silenced():
                     y = np.asarray(chain(z, data).full())
-            except RuntimeError:  # the integration broke down
+            except RuntimeError:  # the integration failed
                 y = np.full((2 * form.nx, total + 1), np.nan)
         else:
             at = self.layout(arcs)
             y = z[at["y"]].reshape(total + 1, 2 * form.nx).T
             switches = z[at["switches"]]
             horizon = float(z[at["horizon"]][0]) if form.horizon_is_free else horizon
-        w, at_end, given = ca.MX.sym("w", switches.size), ca.MX.sym("T"), ca.MX.sym("data", data.size)
-        inputs = ca.Function("q", [w, at_end, given], [self._segment_data(w, at_end, given, arcs)])
+        w, at_end, numbers = ca.MX.sym("w", switches.size), ca.MX.sym("T"), ca.MX.sym("data", data.size)
+        inputs = ca.Function("q", [w, at_end, numbers], [self._segment_data(w, at_end, numbers, arcs)])
         return y, np.asarray(inputs(switches, horizon, data).full()), switches, horizon
 
 
 def side_by_side(sizes: dict[str, int]) -> dict[str, slice]:
-    """Where each part stands in a vector of all, in order."""
+    """Return the slice of each part in a stacked vector, in order."""
     cuts = np.cumsum([0, *sizes.values()]).tolist()
     return {name: slice(a, b) for name, (a, b) in zip(sizes, itertools.pairwise(cuts), strict=True)}
 
 
 def check_backward(ham: Hamiltonian) -> None:
-    """Raise ProblemError where backward shooting cannot take the problem."""
+    """Raise ProblemError if backward shooting does not support the problem."""
     form = ham.form
     low, high = numeric_bounds(form)
-    given = {end: low[form.bounds.places[end]] == high[form.bounds.places[end]] for end in ("initial", "terminal")}
+    fixed = {end: low[form.bounds.places[end]] == high[form.bounds.places[end]] for end in ("initial", "terminal")}
     reasons = {
         "start constraints": len(form.start) > 0,
         "end constraints": len(form.end) > 0,
         "a free horizon": form.horizon_is_free,
         "a cost that ties both ends": form.ties_ends,
         "controls that switch": len(ham.linear) > 0,
-        "a state that is free at the start": not np.all(given["initial"]),
-        "a state that is given at the end": bool(np.any(given["terminal"])),
+        "a state that is free at the start": not np.all(fixed["initial"]),
+        "a state that is given at the end": bool(np.any(fixed["terminal"])),
     }
-    found = [reason for reason, holds in reasons.items() if holds]
-    if found:
+    unsupported = [reason for reason, holds in reasons.items() if holds]
+    if unsupported:
         raise ProblemError(
-            f"backward shooting cannot take {', '.join(found)}: it needs a given start, a free end state and a fixed "
-            "horizon; use Indirect(shooting='multiple')",
+            f"backward shooting does not support {', '.join(unsupported)}: it needs a given start, a free end state "
+            "and a fixed horizon; use Indirect(shooting='multiple')",
             name="shooting",
             value="backward",
         )
 
 
 def end_conditions(form: Formulation) -> Any:
-    """Function (y0, yN, T, p, nu0, nu1, ends) -> (2 nx + n_start + n_end conditions, dPhi/dT).
+    """Return the function (y0, yN, T, p, nu0, nu1, ends) -> (2 nx + n_start + n_end conditions, dPhi/dT).
 
-    ``ends`` are, for initial and then for terminal states, 1 where an entry is given and its value; elsewhere the
-    costate there is the gradient of Phi = terminal cost + nu . constraints (with minus at the start).
+    ``ends`` holds, for initial and then for terminal states, 1 if an entry is fixed and its value. For free entries the
+    costate is the gradient of Phi = terminal cost + nu . constraints (with a minus sign at the start).
     """
     sym = form.sym
     nx = form.nx
@@ -262,20 +261,20 @@ def end_conditions(form: Formulation) -> Any:
     phi = terminal + ca.dot(nu0, begin) + ca.dot(nu1, end)
     parts = [ca.gradient(phi, form.x0), ca.gradient(phi, form.x), ca.gradient(phi, form.T), begin, end]
     parts = ca.substitute([ca.densify(part) for part in parts], [form.x0, form.x], [y0[:nx], y1[:nx]])
-    fixed0, given0, fixed1, given1 = (ends[i * nx : (i + 1) * nx] for i in range(4))
-    first = ca.if_else(fixed0, y0[:nx] - given0, y0[nx:] + parts[0])
-    last = ca.if_else(fixed1, y1[:nx] - given1, y1[nx:] - parts[1])
+    fixed0, value0, fixed1, value1 = (ends[i * nx : (i + 1) * nx] for i in range(4))
+    first = ca.if_else(fixed0, y0[:nx] - value0, y0[nx:] + parts[0])
+    last = ca.if_else(fixed1, y1[:nx] - value1, y1[nx:] - parts[1])
     conditions = ca.vertcat(first, last, parts[3], parts[4])
     return ca.Function("ends", [y0, y1, form.T, form.p, nu0, nu1, ends], [conditions, parts[2]])
 
 
 @dataclass(frozen=True)
 class NewtonSettings:
-    """When Newton's method gives up.
+    """Termination of Newton's method.
 
     Attributes:
-        steps: The most steps. halvings: Of a step, before it counts as none.
-        descent: Share of the fall that a step of this length promises which it must bring (Armijo's rule).
+        steps: Maximum number of steps. halvings: Maximum number of halvings of a step.
+        descent: Required reduction, as a share of the one predicted for the step length (Armijo's rule).
     """
 
     steps: int = 40
@@ -284,8 +283,8 @@ class NewtonSettings:
 
 
 @dataclass(frozen=True)
-class Found:
-    """Where Newton's method ended."""
+class NewtonResult:
+    """The last iterate of Newton's method."""
 
     unknowns: np.ndarray
     residual: float
@@ -295,7 +294,7 @@ class Found:
 
     @property
     def success(self) -> bool:
-        """Whether it converged, and no check refused what it found."""
+        """Return whether it converged, and no later check rejected it."""
         return self.status.is_success
 
 
@@ -306,15 +305,15 @@ def newton(
     scale: float,
     tolerance: float,
     settings: NewtonSettings = NewtonSettings(),
-) -> Found:
-    """Damped Newton's method on a sparse system; the step is halved until the residual falls."""
+) -> NewtonResult:
+    """Solve a sparse system by damped Newton steps; each step is halved until the residual falls."""
     residual, jacobian = system
 
     def evaluate(z: np.ndarray) -> np.ndarray:
         try:
-            with quiet():
+            with casadi_silenced():
                 return np.asarray(residual(z, data).full()).reshape(-1)
-        except RuntimeError:  # the integration broke down: as bad as can be
+        except RuntimeError:  # the integration failed: the worst residual
             return np.full(z.size, np.inf)
 
     z, value = start, evaluate(start)
@@ -322,45 +321,47 @@ def newton(
         words = f"the boundary value problem has {value.size} conditions for {start.size} unknowns"
         raise ProblemError(words, name="conditions", value=value.size, limit=start.size)
     polished, stopped = False, None
-    with listening():
+    with stop_requests_polled():
         for steps in range(settings.steps + 1):
             size = float(np.max(np.abs(value), initial=0.0))
             if not np.isfinite(size):
-                return Found(z, size, steps, SolverStatus.NOT_FINITE, "the integration broke down at the seed")
+                return NewtonResult(z, size, steps, SolverStatus.NOT_FINITE, "the integration fails at the seed")
             if size <= tolerance * scale and polished:
-                return Found(z, size, steps, SolverStatus.SOLVED, f"Converged in {steps} Newton steps")
-            polished = size <= tolerance * scale  # one more step: it costs little and gains digits
+                return NewtonResult(z, size, steps, SolverStatus.SOLVED, f"Converged in {steps} Newton steps")
+            polished = size <= tolerance * scale  # one more step costs little and gains digits
             stopped = reason_to_stop()
             if stopped or steps == settings.steps:
                 break
             try:
-                with quiet():
+                with casadi_silenced():
                     slopes = jacobian(z, data)
             except RuntimeError:
                 status = SolverStatus.SOLVED if polished else SolverStatus.NOT_FINITE
-                return Found(z, size, steps, status, "the integration of the sensitivities broke down")
+                return NewtonResult(z, size, steps, status, "the integration of the sensitivities fails")
             try:
                 step = np.asarray(ca.solve(slopes, ca.DM(-value), "qr").full()).reshape(-1)
             except RuntimeError:
                 step = np.full(z.size, np.nan)
             if not np.all(np.isfinite(step)):
-                word = "Newton's matrix is singular: the plan is not determined"
+                word = "Newton's matrix is singular: the plan is not unique"
                 if polished:
-                    return Found(z, size, steps, SolverStatus.SOLVED, f"Converged in {steps} Newton steps; {word}")
-                return Found(z, size, steps, SolverStatus.STEP_FAILED, word)
+                    return NewtonResult(
+                        z, size, steps, SolverStatus.SOLVED, f"Converged in {steps} Newton steps; {word}"
+                    )
+                return NewtonResult(z, size, steps, SolverStatus.STEP_FAILED, word)
             length = 1.0
             for _ in range(settings.halvings):
                 trial = z + length * step
-                new = evaluate(trial)
-                if np.linalg.norm(new) < (1.0 - settings.descent * length) * np.linalg.norm(value) or polished:
+                trial_value = evaluate(trial)
+                if np.linalg.norm(trial_value) < (1.0 - settings.descent * length) * np.linalg.norm(value) or polished:
                     break
                 length *= 0.5
             else:
-                words = "no step along Newton's direction makes the residual smaller"
-                return Found(z, size, steps, SolverStatus.STEP_FAILED, words)
-            if polished and np.max(np.abs(new)) > size:
-                return Found(z, size, steps, SolverStatus.SOLVED, f"Converged in {steps} Newton steps")
-            z, value = trial, new
+                words = "no step along Newton's direction reduces the residual"
+                return NewtonResult(z, size, steps, SolverStatus.STEP_FAILED, words)
+            if polished and np.max(np.abs(trial_value)) > size:
+                return NewtonResult(z, size, steps, SolverStatus.SOLVED, f"Converged in {steps} Newton steps")
+            z, value = trial, trial_value
     if stopped is not None:
-        return Found(z, size, steps, stopped, str(stopped))
-    return Found(z, size, steps, SolverStatus.ITERATION_LIMIT, f"not converged in {settings.steps} Newton steps")
+        return NewtonResult(z, size, steps, stopped, str(stopped))
+    return NewtonResult(z, size, steps, SolverStatus.ITERATION_LIMIT, f"not converged in {settings.steps} Newton steps")

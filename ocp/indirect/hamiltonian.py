@@ -1,7 +1,7 @@
-"""Pontryagin's minimum principle of a problem, by automatic differentiation.
+"""Pontryagin's minimum principle of a problem, derived by automatic differentiation.
 
 H = L + lambda . f + mu . h with running cost L, dynamics f and path equalities h that contain the control. The costates
-obey lambda' = -dH/dx, the control makes H least. Bryson, Ho, Applied Optimal Control, 1975, chapters 2 and 3.
+obey lambda' = -dH/dx, and the control minimises H. Bryson, Ho, Applied Optimal Control, 1975, chapters 2 and 3.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ocp.errors import ProblemError, about
+from ocp.errors import ProblemError, error_names
 from ocp.problem.formulation import Formulation
 from ocp.problem.values import symbols_of
 from ocp.tolerances import ROUNDING_SHARE
@@ -27,12 +27,12 @@ class Hamiltonian:
     Attributes:
         form: The problem.
         lam, mu: Symbols of the costates (nx, 1) and of the multipliers of the path equalities (m, 1).
-        rows: Path equalities, zero where they hold. Shape (m, 1).
+        rows: Residuals of the path equalities. Shape (m, 1).
         value: H. Scalar expression of x, u, lam, mu, t, T, p.
         smooth, linear: Indices of the controls in which H is curved, and of those in which it is linear.
-        unknowns: Function (x, lam, t, T, p, bang, guess) -> w = [smooth controls; mu] that make H least. ``bang`` are
-            the values of the linear controls, each at one of its bounds; ``guess`` a guess of w for iterations.
-        how: ``quadratic`` (solved symbolically), ``projected`` (then put inside its bounds) or ``iterated``.
+        unknowns: Function (x, lam, t, T, p, bang, guess) -> w = [smooth controls; mu] that minimises H. ``bang`` are
+            the values of the linear controls, each at one of its bounds; ``guess`` starts an iteration for w.
+        how: ``quadratic`` (solved symbolically), ``projected`` (then projected on its bounds) or ``iterated``.
     """
 
     form: Formulation
@@ -50,8 +50,8 @@ class Hamiltonian:
         """Derive the Hamiltonian system.
 
         Raises:
-            ProblemError: The problem has a constraint that the minimum principle as built here cannot take, or H is
-                linear in a control that has no bounds, or does not determine a control; says which.
+            ProblemError: An unsupported constraint, a control without bounds in which H is linear, or a control that H
+                does not determine; names it.
         """
         check_constraints(form)
         sym = form.sym
@@ -75,22 +75,25 @@ class Hamiltonian:
         return (form.nx, form.nx, 1, 1, form.np, len(self.linear), len(self.smooth) + len(form.path))
 
     def flow(self) -> Any:
-        """Function (x, lam, t, T, p, bang, guess) -> (x', lambda', L, dH/dT), the control making H least."""
+        """Return the function (x, lam, t, T, p, bang, guess) -> (x', lambda', L, dH/dT) for the control that minimises
+        H.
+        """
         form = self.form
-        # H is stationary in u and mu, so it is differentiated with both held
+        # H is stationary in u and mu, so both are constant in its derivatives
         outputs = [form.f, -ca.gradient(self.value, form.x), form.running, ca.gradient(self.value, form.T)]
-        return self._eliminated("flow", outputs)
+        return self._eliminate("flow", outputs)
 
     def outputs(self) -> Any:
-        """Function (x, lam, t, T, p, bang, guess) -> (u, mu, H, dH/du of the linear controls)."""
+        """Return the function (x, lam, t, T, p, bang, guess) -> (u, mu, H, dH/du of the linear controls)."""
         slope = ca.gradient(self.value, self.form.u)
         switching = slope[list(self.linear)] if self.linear else slope[:0, :]
-        return self._eliminated("outputs", [self.form.u, self.mu, self.value, switching])
+        return self._eliminate("outputs", [self.form.u, self.mu, self.value, switching])
 
     def multipliers(
         self, free: np.ndarray, x: np.ndarray, u: np.ndarray, lam: np.ndarray, t: np.ndarray, horizon: float, p: Any
     ) -> np.ndarray:
-        """Multipliers of the path equalities that best make H stationary in the free controls. Shape (K, m).
+        """Return the multipliers of the path equalities of least-squares stationarity in the free controls. Shape (K,
+        m).
 
         Args:
             free: Which controls are off their bounds. Shape (K, nu), bool.
@@ -108,7 +111,8 @@ class Hamiltonian:
                 mu[k] = np.linalg.lstsq(columns, -slopes[k][free[k]], rcond=None)[0]
         return mu
 
-    def _eliminated(self, name: str, outputs: list[Any]) -> Any:
+    def _eliminate(self, name: str, outputs: list[Any]) -> Any:
+        """Return a function of outputs in which w is replaced by the minimiser of H."""
         form = self.form
         sym = form.sym
         w, bang = sym("w", self.sizes[-1]), sym("bang", self.sizes[-2])
@@ -118,13 +122,13 @@ class Hamiltonian:
         inner = ca.Function(name, [form.x, self.lam, form.t, form.T, form.p, bang, w], outputs, {"cse": True})
         sym = symbols_of(self.unknowns, inner).sym
         arguments = [sym(f"a{i}", size) for i, size in enumerate(self.sizes)]
-        found = inner.call([*arguments[:-1], self.unknowns.call(arguments)[0]])
-        return ca.Function(name, arguments, found, {"cse": True})
+        results = inner.call([*arguments[:-1], self.unknowns.call(arguments)[0]])
+        return ca.Function(name, arguments, results, {"cse": True})
 
     # ---- the equations that make H stationary in the smooth controls, and their solution ----------------------
 
     def _solve(self) -> tuple[Any, str]:
-        """Function (x, lam, t, T, p, bang, guess) -> w, and how it works."""
+        """Return the function (x, lam, t, T, p, bang, guess) -> w, and the kind of its solution."""
         form, n, m = self.form, len(self.smooth), len(self.form.path)
         sym = form.sym
         self._check_linear()
@@ -142,10 +146,10 @@ class Hamiltonian:
         separate = m == 0 and pattern.is_diag()
         if not ca.depends_on(matrix, w) and (not bounded or separate):
             offset = ca.substitute([residual], [w], [ca.DM.zeros(n + m)])[0]
-            found = -symmetric_solve(matrix, offset, n) if n + m else w
+            solution = -symmetric_solve(matrix, offset, n) if n + m else w
             if bounded:
-                found = ca.fmax(low, ca.fmin(high, found))
-            return ca.Function("unknowns", [*known, guess], [found]), "projected" if bounded else "quadratic"
+                solution = ca.fmax(low, ca.fmin(high, solution))
+            return ca.Function("unknowns", [*known, guess], [solution]), "projected" if bounded else "quadratic"
         if bounded:  # stationary or at a bound: u is the projection of u - H_u on the bounds
             inside = ca.fmax(low, ca.fmin(high, w[:n, :] - residual[:n, :]))
             residual = ca.vertcat(w[:n, :] - inside, residual[n:, :])
@@ -156,7 +160,7 @@ class Hamiltonian:
         return ca.Function("unknowns", symbols, [finder(symbols[-1], ca.vertcat(*symbols[:-1]))]), "iterated"
 
     def _residual(self, w: Any, bang: Any) -> Any:
-        """Gradient of H in the smooth controls, and the path equalities. Shape (n + m, 1)."""
+        """Return the gradient of H in the smooth controls, and the path equalities. Shape (n + m, 1)."""
         n = len(self.smooth)
         gradient = ca.gradient(self.value, self.form.u)[list(self.smooth)] if n else self.form.problem.symbols(0, 1)
         stacked = ca.densify(ca.vertcat(gradient, self.rows))
@@ -175,13 +179,13 @@ class Hamiltonian:
             if not (np.isfinite(low[at]) and np.isfinite(high[at])):
                 raise ProblemError(
                     f"the Hamiltonian is linear in control {self.form.control_labels[i]!r}, which is not bounded on "
-                    "both sides: no control makes it least; bound it or add a quadratic term to the cost",
+                    "both sides, so it has no minimum; bound the control or add a quadratic term to the cost",
                     name=self.form.control_labels[i],
                     value=(float(low[at]), float(high[at])),
                 )
 
     def _check_regular(self, matrix: Any, symbols: list[Any]) -> None:
-        """Raise where the equations of the control are singular at a random point."""
+        """Raise ProblemError if the equations of the control are singular at a random point."""
         if 0 in matrix.shape:
             return
         rng = np.random.default_rng(0)
@@ -189,8 +193,8 @@ class Hamiltonian:
         singular = np.linalg.svd(sample, compute_uv=False) if np.all(np.isfinite(sample)) else np.ones(1)
         if singular[-1] < ROUNDING_SHARE * singular[0]:
             raise ProblemError(
-                "the Hamiltonian does not determine the control: its second derivative is singular on the directions "
-                "that the path equalities leave; add a quadratic term in the control to the cost",
+                "the Hamiltonian does not determine the control: its second derivative is singular on the null space "
+                "of the path equalities; add a quadratic term in the control to the cost",
                 name="control",
                 value=float(singular[-1]),
                 limit=float(ROUNDING_SHARE * singular[0]),
@@ -198,76 +202,77 @@ class Hamiltonian:
 
 
 def assemble_control(form: Formulation, smooth: Any, linear: Any, w: Any, bang: Any) -> Any:
-    """All controls, from the smooth ones (first entries of ``w``) and those at their bounds."""
+    """Return all controls from the smooth ones (first entries of ``w``) and those at their bounds."""
     order = {index: w[i] for i, index in enumerate(smooth)} | {index: bang[i] for i, index in enumerate(linear)}
     return ca.densify(ca.vertcat(form.problem.symbols(0, 1), *[order[i] for i in range(form.nu)]))
 
 
 def check_constraints(form: Formulation) -> None:
-    """Raise ProblemError for a constraint that the indirect method cannot take, naming it."""
+    """Raise ProblemError, naming the constraint, if the indirect method does not support one."""
     for name, place in form.states.items():
         index = form.bounds.places["state"][place]
         low, high = (bound[index] for bound in numeric_bounds(form))
         if np.any(np.isfinite(low) | np.isfinite(high)):
             raise ProblemError(
-                f"the indirect method cannot take the bounds of state {name!r}: it knows path constraints only as "
-                "bounds of controls and equalities that contain a control; drop them or use a direct method",
+                f"the indirect method does not support the bounds of state {name!r}: path constraints must be bounds "
+                "of controls or equalities that contain a control; drop them or use a direct method",
                 name=name,
             )
     path = form.path
     for owner, label, equality, uses in zip(path.owners, path.labels, path.equality, path.uses_control, strict=True):
-        with about(owner):
+        with error_names(owner):
             if not equality:
-                raise ProblemError(
-                    f"the indirect method cannot take the path inequality {label!r}; drop it or use a direct method"
-                )
+                words = f"the indirect method does not support the path inequality {label!r}"
+                raise ProblemError(f"{words}; drop it or use a direct method")
             if not uses:
                 raise ProblemError(
-                    f"the indirect method cannot take the path equality {label!r}, which contains no control; "
+                    f"the indirect method does not support the path equality {label!r}, which contains no control; "
                     "differentiate it until one appears or use a direct method"
                 )
     if form.nu and ca.depends_on(form.terminal, form.u0):
-        words = "the indirect method cannot take a terminal cost on the control at the start"
+        words = "the indirect method does not support a terminal cost on the control at the start"
         raise ProblemError(words, name="terminal cost")
     controls = ca.vertcat(form.u, form.u0)
     for kind, rows in (("start", form.start), ("end", form.end)):
         for i, (owner, label, equality) in enumerate(zip(rows.owners, rows.labels, rows.equality, strict=True)):
-            with about(owner):
+            with error_names(owner):
                 if not equality:
-                    raise ProblemError(f"the indirect method cannot take the {kind} inequality {label!r}")
+                    raise ProblemError(f"the indirect method does not support the {kind} inequality {label!r}")
                 if form.nu and ca.depends_on(rows.expression[i], controls):
-                    raise ProblemError(f"the indirect method cannot take {kind} constraint {label!r} on the control")
+                    raise ProblemError(
+                        f"the indirect method does not support {kind} constraint {label!r} on the control"
+                    )
 
 
 def nonzeros(matrix: Any, symbols: list[Any]) -> Any:
-    """Sparsity of the entries that are not zero; of an MX expression, not zero at one of three random points."""
+    """Return the sparsity of the nonzero entries; of an MX expression, nonzero at one of three random points."""
     if isinstance(matrix, ca.SX):
         return ca.sparsify(matrix).sparsity()
     rng = np.random.default_rng(0)
-    size = np.abs([numbers(matrix, symbols, rng) for _ in range(3)]).max(axis=0)  # nan stays and counts
+    size = np.abs([numbers(matrix, symbols, rng) for _ in range(3)]).max(axis=0)  # nan counts as nonzero
     return ca.sparsify(ca.DM(np.where(size == 0, 0.0, 1.0))).sparsity()
 
 
 def used_columns(pattern: Any) -> list[bool]:
-    """Which columns of a sparsity pattern have any entry."""
+    """Return which columns of a sparsity pattern have an entry."""
     starts = pattern.colind()
     return [starts[i + 1] > starts[i] for i in range(pattern.size2())]
 
 
 def numeric_bounds(form: Formulation) -> tuple[np.ndarray, np.ndarray]:
-    """The bound table with all parameters one, to see which bounds are finite."""
+    """Return the bound table with all parameters one, to see which bounds are finite."""
     lower, upper = (np.asarray(v.full()).reshape(-1) for v in form.bounds.function(np.ones(form.np)))
     return lower, upper
 
 
 def numbers(matrix: Any, symbols: list[Any], rng: np.random.Generator) -> np.ndarray:
-    """An expression at a random point in 0.1..1."""
+    """Return the value of an expression at a random point in 0.1..1."""
     function = ca.Function("matrix", symbols, [ca.densify(matrix)])
     return np.asarray(function.call([ca.DM(rng.uniform(0.1, 1.0, s.numel())) for s in symbols])[0].full())
 
 
 def symmetric_solve(matrix: Any, rhs: Any, n: int) -> Any:
-    """Solve [[W, A'], [A, 0]] w = rhs with W (n, n) by elimination, falling back on the whole where W is singular."""
+    """Solve [[W, A'], [A, 0]] w = rhs with W (n, n) by elimination, or as a whole if W is not positive definite."""
     if not isinstance(matrix, ca.SX):
         return ca.solve(matrix, rhs)
     curvature, constraint = matrix[:n, :n], matrix[n:, :n]
@@ -284,7 +289,7 @@ def symmetric_solve(matrix: Any, rhs: Any, n: int) -> Any:
 
 
 def positive(matrix: Any) -> bool:
-    """Whether a symmetric matrix is positive definite at a random point."""
+    """Return whether a symmetric matrix is positive definite at a random point."""
     sample = numbers(matrix, ca.symvar(matrix), np.random.default_rng(0))
     values = np.linalg.eigvalsh(sample)
     return bool(np.all(np.isfinite(values)) and values[0] > ROUNDING_SHARE * values[-1])

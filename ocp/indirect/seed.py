@@ -1,7 +1,7 @@
-"""From a direct solution to where Newton's method starts: the arcs of bang-bang controls, unknowns and data.
+"""Initial values of the indirect method from a direct solution: arcs of bang-bang controls, unknowns and data.
 
-The signs of dH/du along the seed say which bound each control is at in which H is linear, and where it switches; a
-seed with a singular arc or chattering is refused. States, costates and switch times of the seed are the first unknowns.
+The signs of dH/du along the seed determine at which bound each linear control is, and where it switches. A seed with a
+singular arc or chattering is rejected. States, costates and switch times of the seed are the first unknowns.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from ocp.errors import ProblemError, SolveError
 from ocp.indirect.hamiltonian import Hamiltonian
 from ocp.problem.formulation import Bounds, Formulation
-from ocp.problem.values import at_samples
+from ocp.problem.values import evaluate_at_samples
 from ocp.solution import Solution
 from ocp.tolerances import RESOLVED_SHARE, SOLVER_SHARE
 
@@ -23,12 +23,12 @@ __all__ = ["ControlArcs", "read_arcs", "read_unknowns"]
 
 @dataclass(frozen=True)
 class SeedSettings:
-    """Which seeds are refused, for the sake of coarse ones not all that look odd.
+    """Criteria of rejected seeds, tolerant because seeds may be coarse.
 
     Attributes:
-        inside: Share of its range by which a control must be off both bounds to count as inside them.
-        singular: Share of the horizon, and number of samples in a row, that a control may spend inside its bounds.
-        quick: Arcs in a row that are shorter than an interval of the seed, at which it chatters.
+        inside: Distance from both bounds, relative to their range, beyond which a control is inside them.
+        singular: Share of the horizon, and number of consecutive samples, that a control may spend inside its bounds.
+        quick: Consecutive arcs shorter than an interval of the seed that count as chattering.
     """
 
     inside: float = 0.1
@@ -61,19 +61,19 @@ class ControlArcs:
         return np.cumsum(self.segments)[:-1]
 
     def times(self, horizon: float) -> np.ndarray:
-        """Times of all nodes, s. Shape (S + 1,)."""
+        """Return the times of all nodes, s. Shape (S + 1,)."""
         knots = np.concatenate([[0.0], self.switches, [1.0]]) * horizon
-        pieces = [np.linspace(knots[a], knots[a + 1], n + 1)[:-1] for a, n in enumerate(self.segments)]
-        return np.concatenate([*pieces, [horizon]])
+        arcs = [np.linspace(knots[a], knots[a + 1], n + 1)[:-1] for a, n in enumerate(self.segments)]
+        return np.concatenate([*arcs, [horizon]])
 
 
 def read_arcs(
     ham: Hamiltonian, outputs: Any, seed: Solution, p: np.ndarray, bounds: Bounds, segments: int
 ) -> ControlArcs:
-    """Arcs from the signs of dH/du along a seed: positive where a control is at its lower bound.
+    """Return the arcs from the signs of dH/du along a seed: a positive slope means the lower bound.
 
     Raises:
-        SolveError: A control in which H is linear stays inside its bounds: a singular arc.
+        SolveError: A control in which H is linear stays inside its bounds (a singular arc) or chatters.
     """
     form = ham.form
     if not ham.linear:
@@ -86,16 +86,16 @@ def read_arcs(
         for pool, places in ((seed.states, form.states), (seed.costates, form.states), (seed.controls, form.controls))
     )
     guess = np.hstack([u[:, list(ham.smooth)], np.zeros((len(u), len(form.path)))])
-    slope = at_samples(outputs, x, lam, seed.t[:, None], seed.horizon, p, u[:, index_of], guess)[3]
-    own_low, own_high = own_bounds(form, seed, bounds)
-    check_singular(ham, seed, own_low[index_of], own_high[index_of])
+    slope = evaluate_at_samples(outputs, x, lam, seed.t[:, None], seed.horizon, p, u[:, index_of], guess)[3]
+    seed_low, seed_high = seed_bounds(form, seed, bounds)
+    check_singular(ham, seed, seed_low[index_of], seed_high[index_of])
 
     at_lower = signs(slope) > 0
     events: list[tuple[float, int]] = []
     for j in range(len(ham.linear)):
         for k in np.flatnonzero(at_lower[1:, j] != at_lower[:-1, j]):
-            a, b = slope[k, j], slope[k + 1, j]
-            share = a / (a - b)
+            before, after = slope[k, j], slope[k + 1, j]
+            share = before / (before - after)
             events.append((float(seed.t[k] + share * (seed.t[k + 1] - seed.t[k])) / seed.horizon, j))
     events = sorted(event for event in events if 1e-6 < event[0] < 1 - 1e-6)
     switches = np.array([at for at, _ in events])
@@ -111,12 +111,12 @@ def read_arcs(
     return ControlArcs(switches, tuple(j for _, j in events), counts, np.array(values))
 
 
-def own_bounds(form: Formulation, seed: Solution, bounds: Bounds) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds of the controls that the seed was solved with, which may be other ones. Shape (nu,) each."""
+def seed_bounds(form: Formulation, seed: Solution, bounds: Bounds) -> tuple[np.ndarray, np.ndarray]:
+    """Return the control bounds under which the seed was solved, which may differ. Shape (nu,) each."""
     source = form if seed.problem is None else Formulation(seed.problem)
     try:
         low, high = source.bound_values(source.parameter_vector(seed.parameters))
-    except ProblemError:  # loaded, and solved with other parameters altogether
+    except ProblemError:  # a loaded seed whose parameters do not fit its problem
         source, (low, high) = form, bounds
     places = source.bounds.places["control"]
     index = np.concatenate([places[source.controls[name]] for name in form.controls])
@@ -124,27 +124,28 @@ def own_bounds(form: Formulation, seed: Solution, bounds: Bounds) -> tuple[np.nd
 
 
 def signs(slope: np.ndarray) -> np.ndarray:
-    """Signs of sampled switching functions (M, n); one too small to tell takes that of the next clear one or the last.
+    """Return signs of sampled switching functions (M, n); an insignificant sample takes the next significant sign.
 
-    A switching function that vanishes at an end, as of a free state there, has the noise of the seed for its sign.
+    After the last significant sample its sign continues. A switching function that vanishes at an end, for example at a
+    free state, would have the sign of the seed's noise there.
     """
-    found = np.sign(slope)
+    result = np.sign(slope)
     for j in range(slope.shape[1]):
         significant = np.flatnonzero(np.abs(slope[:, j]) > SOLVER_SHARE * np.max(np.abs(slope[:, j])))
         if significant.size:
             nearest = np.clip(np.searchsorted(significant, np.arange(len(slope))), 0, len(significant) - 1)
-            found[:, j] = np.sign(slope[significant[nearest], j])
-    return np.asarray(found)
+            result[:, j] = np.sign(slope[significant[nearest], j])
+    return np.asarray(result)
 
 
 def check_singular(ham: Hamiltonian, seed: Solution, low: np.ndarray, high: np.ndarray) -> None:
-    """Raise SolveError where a linear control of the seed stays inside its bounds for long."""
+    """Raise SolveError if a linear control of the seed stays inside its bounds too long."""
     samples = seed.control_interpolant
     widths = np.diff(samples.breaks)
     at = (samples.breaks[:-1, None] + widths[:, None] * samples.nodes).ravel()
     sizes = [values.shape[1] for values in seed.controls.values()]
     columns = dict(zip(seed.controls, np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1]), strict=True))
-    order = np.concatenate([columns[name] for name in ham.form.controls])[list(ham.linear)]  # the seed's own
+    order = np.concatenate([columns[name] for name in ham.form.controls])[list(ham.linear)]  # in the order of the seed
     values = samples.values.reshape(len(at), -1)[:, order]
     for j, index in enumerate(ham.linear):
         margin = SETTINGS.inside * (high[j] - low[j])
@@ -164,7 +165,7 @@ def check_singular(ham: Hamiltonian, seed: Solution, low: np.ndarray, high: np.n
 
 
 def check_chattering(ham: Hamiltonian, events: list[tuple[float, int]], seed: Solution) -> None:
-    """Raise SolveError where a control switches again and again within the width of the seed's intervals."""
+    """Raise SolveError if a control switches repeatedly within the width of the seed's intervals."""
     width = 1.5 * float(np.max(np.diff(seed.control_interpolant.breaks)))
     for j, index in enumerate(ham.linear):
         label = ham.form.control_labels[index]
@@ -184,10 +185,10 @@ def check_chattering(ham: Hamiltonian, events: list[tuple[float, int]], seed: So
 def read_unknowns(
     ham: Hamiltonian, seed: Solution, arcs: ControlArcs, p: np.ndarray, bounds: Bounds, *, backward: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Unknowns and data, laid out as :class:`ocp.indirect.boundary.BoundaryProblem` has them, from a seed.
+    """Return unknowns and data from a seed, in the layout of :class:`ocp.indirect.boundary.BoundaryProblem`.
 
-    The unknowns are states and costates at all nodes, switch times, the horizon where it is free, multipliers of start
-    and end constraints (zero); or of backward shooting the end state. A seed of another horizon is stretched.
+    The unknowns are states and costates at all nodes, switch times, the horizon if free, and multipliers of start and
+    end constraints (zero); for backward shooting the end state alone. A seed of another horizon is stretched.
     """
     form = ham.form
     horizon = seed.horizon if form.horizon_is_free else float(form.horizon_at(p))
@@ -197,8 +198,8 @@ def read_unknowns(
     places = form.bounds.places
     ends = []
     for end in ("initial", "terminal"):
-        given = bounds[0][places[end]] == bounds[1][places[end]]
-        ends += [given, np.where(given, bounds[0][places[end]], 0.0)]
+        fixed = bounds[0][places[end]] == bounds[1][places[end]]
+        ends += [fixed, np.where(fixed, bounds[0][places[end]], 0.0)]
     guess = control_guess(ham, seed, 0.5 * (fractions[:-1] + fractions[1:]), horizon, p, bounds)
     data = np.concatenate([[horizon], p, *ends, arcs.bang.ravel(), guess.ravel()])
     if backward:
@@ -209,7 +210,7 @@ def read_unknowns(
 
 
 def sampled(form: Formulation, seed: Solution, fractions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """States (K, nx), costates (K, nx) and controls (K, nu) of a seed at fractions of its horizon."""
+    """Return states (K, nx), costates (K, nx) and controls (K, nu) of a seed at fractions of its horizon."""
     sample = seed.at_fraction(fractions)
     reported = np.hstack([seed.costates[name] for name in form.states])
     lam = np.column_stack([np.interp(fractions * seed.horizon, seed.t, column) for column in reported.T])
@@ -220,9 +221,9 @@ def sampled(form: Formulation, seed: Solution, fractions: np.ndarray) -> tuple[n
 def control_guess(
     ham: Hamiltonian, seed: Solution, fractions: np.ndarray, horizon: float, p: np.ndarray, bounds: Bounds
 ) -> np.ndarray:
-    """Smooth controls and multipliers of the path equalities at fractions of the horizon. Shape (K, n + m).
+    """Return smooth controls and multipliers of the path equalities at fractions of the horizon. Shape (K, n + m).
 
-    Where controls have bounds too, their equations cannot be solved from multipliers far off: nothing would be free.
+    With bounds, the control equations cannot be solved from distant multipliers: all controls would be at bounds.
     """
     form, count = ham.form, len(fractions)
     x, lam, control = sampled(form, seed, fractions)

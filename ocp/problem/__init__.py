@@ -1,1 +1,1 @@
-"""What is asked: states, controls, parameters, dynamics, constraints, cost."""
+"""Statement of an optimal control problem: states, controls, parameters, dynamics, constraints, cost."""

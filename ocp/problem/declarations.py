@@ -1,4 +1,4 @@
-"""What a problem consists of: variables, signals, constraints, horizon, phases, by name, and how each reads."""
+"""The parts of a problem by name (variables, signals, constraints, horizon, phases) and their texts."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ class Variable:
     """A named state, control or parameter.
 
     Attributes:
-        name: Its name, unique in the problem.
-        symbol: Its symbol. Shape (n, 1).
+        name: Unique name in the problem.
+        symbol: Shape (n, 1).
         lower, upper: Bounds, casadi expressions of parameters. Shape (n, 1).
-        initial, terminal: Values at both ends, nan where an entry is free. Shape (n, 1). States only.
+        initial, terminal: Values at both ends, nan for free entries. Shape (n, 1). States only.
         guess: A value, a function of time, or None. States and controls only.
-        unit: For those who read it, "rad" or "m/s"; of a vector of several kinds all of them, "rad, m".
-        scale: Sizes that solvers divide the entries by, nan where they find them. Shape (n,), or None for all nan.
+        unit: For display, "rad" or "m/s"; for mixed entries all units, "rad, m".
+        scale: Sizes by which solvers divide the entries, nan if derived by the solver. Shape (n,), or None for all nan.
     """
 
     name: str
@@ -57,8 +57,8 @@ class Signal:
     """A named, known function of time.
 
     Attributes:
-        name: Its name, unique in the problem.
-        symbol: What stands for its value. Shape (n, 1).
+        name: Unique name in the problem.
+        symbol: Symbol of its value. Shape (n, 1).
         function: casadi Function time (s) -> value.
     """
 
@@ -76,13 +76,14 @@ class Constraint:
     """A named vector constraint ``lower <= expression <= upper``; equal bounds make an equality.
 
     Attributes:
-        name: Its name, unique among the constraints of the problem.
+        name: Unique among the constraints of the problem.
         expression: Shape (m, 1).
         lower, upper: casadi expressions of parameters. Shape (m, 1).
         unit: As of a variable.
-        tolerance: Largest violation of each row that the audit lets pass, in its unit; None: as its size says. (m,).
-        integral: Whether it is the integral of the expression over time that is meant. Of what is watched only.
-        way: Rate of the way that it is judged against, shape (m, 1), or None. Of what is watched only.
+        tolerance: Largest violation of each row that the audit accepts, in its unit; None: relative to its size. Shape
+            (m,).
+        integral: Whether the bounds apply to the integral of the expression over time. Watched constraints only.
+        way: Rate of the reference path length, shape (m, 1), or None. Watched constraints only.
     """
 
     name: str
@@ -99,23 +100,23 @@ class Constraint:
         return int(self.expression.numel())
 
     def check(self, symbols: Any) -> None:
-        """Raise ProblemError where its parts do not fit together; see :meth:`Declarations.check`."""
+        """Raise ProblemError if the parts are inconsistent; see :meth:`Declarations.check`."""
         what = f"constraint {self.name!r}"
         way = () if self.way is None else (self.way,)
         _require_columns(symbols, self.size, what, self.expression, self.lower, self.upper, *way)
         _require(isinstance(self.unit, str) and isinstance(self.integral, bool), what)
-        given = np.ones(1) if self.tolerance is None else np.asarray(self.tolerance, dtype=float)
-        _require(given.size in (1, self.size) and bool((given > 0).all()), what)
+        tolerance = np.ones(1) if self.tolerance is None else np.asarray(self.tolerance, dtype=float)
+        _require(tolerance.size in (1, self.size) and bool((tolerance > 0).all()), what)
 
     def __str__(self) -> str:
         low, high = column_text(self.lower), column_text(self.upper)
-        what = f"integral of {short(self.expression)} dt" if self.integral else short(self.expression)
+        what = f"integral of {shorten(self.expression)} dt" if self.integral else shorten(self.expression)
         return f"{self.name} ({self.size}): {low} <= {what} <= {high} {self.unit}".rstrip()
 
 
 @dataclass
 class Horizon:
-    """The final time: fixed when lower and upper are one expression."""
+    """The final time, fixed if lower and upper are one expression."""
 
     symbol: Any
     lower: Any
@@ -124,7 +125,7 @@ class Horizon:
     fixed: bool
 
     def check(self, symbols: Any) -> None:
-        """Raise ProblemError where its parts do not fit together; see :meth:`Declarations.check`."""
+        """Raise ProblemError if the parts are inconsistent; see :meth:`Declarations.check`."""
         _require(isinstance(self.fixed, bool), "horizon")
         _require_columns(symbols, 1, "horizon", self.symbol, self.lower, self.upper)
         _require(self.guess is None or bool(np.isfinite(float(self.guess))), "horizon")
@@ -136,12 +137,12 @@ class Horizon:
 
 @dataclass(frozen=True)
 class PhaseTimes:
-    """When a phase is, of a problem of several one after the other (:mod:`ocp.problem.phases`).
+    """Times and cost of one phase of a problem of consecutive phases (:mod:`ocp.problem.phases`).
 
     Attributes:
-        name: Of the phase. What belongs to it bears names that begin with it and a dot.
-        begin, duration: Expressions of states that stand still, and of parameters. Scalars, s.
-        running, terminal: Its own share of the cost: density over the fraction of the phase, and what comes at its end.
+        name: Name of the phase, the prefix, before a dot, of the names of its parts.
+        begin, duration: Expressions of free parameters and of parameters. Scalars, s.
+        running, terminal: Cost of the phase: density over the fraction of the phase, and terminal cost.
     """
 
     name: str
@@ -153,7 +154,7 @@ class PhaseTimes:
 
 @dataclass
 class Declarations:
-    """Everything declared so far, by kind and name, in order of declaration."""
+    """All declarations by kind and name, in order of declaration."""
 
     states: dict[str, Variable] = field(default_factory=dict)
     controls: dict[str, Variable] = field(default_factory=dict)
@@ -172,39 +173,39 @@ class Declarations:
     terminal: Any = None
 
     def check_new_variable(self, kind: str, name: Any) -> None:
-        """Raise ProblemError unless a name can be that of a new variable; ``kind`` is that of the message."""
+        """Raise ProblemError unless a new variable may have this name; ``kind`` is for the message."""
         if not isinstance(name, str) or not name:
             raise ProblemError(f"{kind} name must be a non-empty string, not {name!r}")
         if name in RESERVED:
             raise ProblemError(f"{kind} {name!r}: this name is reserved ({', '.join(RESERVED)})")
-        for other in ("states", "controls", "parameters", "signals"):
-            if name in getattr(self, other):
-                raise ProblemError(f"{kind} {name!r}: a {other[:-1]} of this name exists already")
+        for pool in ("states", "controls", "parameters", "signals"):
+            if name in getattr(self, pool):
+                raise ProblemError(f"{kind} {name!r}: a {pool[:-1]} of this name exists already")
 
     def check_new_constraint(self, kind: str, name: Any) -> None:
-        """Raise ProblemError unless a name can be that of a new constraint; ``kind`` is that of the message."""
+        """Raise ProblemError unless a new constraint may have this name; ``kind`` is for the message."""
         if not isinstance(name, str) or not name:
             raise ProblemError(f"{kind}: its name must be a non-empty string, not {name!r}")
         if any(name in pool for pool in (self.path, self.start, self.end, self.watch, self.apart)):
             raise ProblemError(f"{kind} {name!r}: a constraint of this name exists already")
 
     def check(self, symbols: Any) -> None:
-        """Raise ProblemError, which names the part, where declarations that were read from a file do not fit together.
+        """Raise ProblemError, naming the part, if declarations that were read from a file are inconsistent.
 
         Args:
-            symbols: ``casadi.SX`` or ``casadi.MX``, of which every expression is made.
+            symbols: ``casadi.SX`` or ``casadi.MX``, the type of every expression.
         """
-
         for pool, kind in PART_KINDS.items():
             for name, part in getattr(self, pool).items():
                 _require(isinstance(part, kind) and isinstance(name, str) and part.name == name, f"{pool}: {name!r}")
         self._check_variables(symbols)
         self._check_equations(symbols)
-        for one in (*self.path.values(), *self.start.values(), *self.end.values(), *self.watch.values()):
-            one.check(symbols)
-        for apart in self.apart.values():
-            movers = {name: self.states[name].size for name in apart.movers if name in self.states}
-            _require(movers == apart.movers and isinstance(apart.placements, symbols), f"separation {apart.name!r}")
+        for constraint in (*self.path.values(), *self.start.values(), *self.end.values(), *self.watch.values()):
+            constraint.check(symbols)
+        for separation in self.apart.values():
+            movers = {name: self.states[name].size for name in separation.movers if name in self.states}
+            fits = movers == separation.movers and isinstance(separation.placements, symbols)
+            _require(fits, f"separation {separation.name!r}")
         for phase in self.phases.values():
             parts = phase.begin, phase.duration, phase.running, phase.terminal
             _require_columns(symbols, 1, f"phase {phase.name!r}", *parts)
@@ -216,12 +217,12 @@ class Declarations:
         """Check sizes, guesses, scales and units of states, controls and parameters."""
         bounded = ("symbol", "lower", "upper")
         for pool, needed in (("parameters", ("symbol",)), ("controls", bounded), ("states", (*bounded, *ENDS))):
-            for name, one in getattr(self, pool).items():
-                what, n = f"{pool[:-1]} {name!r}", int(np.prod(one.symbol.shape))
-                _require_columns(symbols, n, what, *(getattr(one, part) for part in needed))
-                for value, sizes in ((one.guess, (1, n)), (one.scale, (n,))):
+            for name, variable in getattr(self, pool).items():
+                what, n = f"{pool[:-1]} {name!r}", int(np.prod(variable.symbol.shape))
+                _require_columns(symbols, n, what, *(getattr(variable, part) for part in needed))
+                for value, sizes in ((variable.guess, (1, n)), (variable.scale, (n,))):
                     _require(value is None or np.asarray(value, dtype=float).size in sizes, what)
-                _require(isinstance(one.unit, str), what)
+                _require(isinstance(variable.unit, str), what)
 
     def _check_equations(self, symbols: Any) -> None:
         """Check dynamics, symbols at the start, signals and cost."""
@@ -239,7 +240,7 @@ class Declarations:
             _require(value is None or (isinstance(value, symbols) and value.numel() == 1), "cost")
 
     def __str__(self) -> str:
-        """States, controls, parameters, horizon, dynamics, constraints and cost by name, one a line."""
+        """Return states, controls, parameters, horizon, dynamics, constraints and cost by name, one a line."""
         lines = ["  horizon      not declared" if self.horizon is None else f"  horizon      {self.horizon}"]
         for state in self.states.values():
             ends = [f"; {end} {text}" for end in ENDS if (text := column_text(getattr(state, end))) != "nan"]
@@ -247,12 +248,12 @@ class Declarations:
         lines += [f"  control      {control}" for control in self.controls.values()]
         lines += [f"  parameter    {p.name} ({p.size})" for p in self.parameters.values()]
         lines += [f"  signal       {s.name} ({s.size})" for s in self.signals.values()]
-        lines += [f"  d{state}/dt = {short(rate)}" for state, rate in self.dynamics.items()]
+        lines += [f"  d{state}/dt = {shorten(rate)}" for state, rate in self.dynamics.items()]
         for kind in ("path", "start", "end", "watch"):
             lines += [f"  {kind:<12} {constraint}" for constraint in getattr(self, kind).values()]
-        lines += [f"  apart        {apart}" for apart in self.apart.values()]
+        lines += [f"  separation   {separation}" for separation in self.apart.values()]
         if self.running is not None:
-            lines.append(f"  minimize     integral of {short(self.running)} dt + {short(self.terminal)}")
+            lines.append(f"  minimize     integral of {shorten(self.running)} dt + {shorten(self.terminal)}")
         return "\n".join(lines)
 
 
@@ -265,30 +266,33 @@ PART_KINDS: dict[str, Any] = {
 }
 
 
-def _require(holds: bool, what: str) -> None:
-    """Raise ProblemError, which names a part, unless it fits the rest of its problem."""
-    if not holds:
+def _require(condition: bool, what: str) -> None:
+    """Raise ProblemError, naming the part, unless the condition holds."""
+    if not condition:
         raise ProblemError(f"{what} does not fit the rest of its problem", name=what)
 
 
 def _require_columns(symbols: Any, size: int, what: str, *values: Any) -> None:
-    """Require that the values of a part are columns of so many entries, of these symbols."""
+    """Require that the values of a part are columns of ``size`` entries of these symbols."""
     for value in values:
         _require(isinstance(value, symbols) and value.shape == (size, 1), what)
 
 
 def column_text(value: Any) -> str:
-    """A column of numbers or expressions; one number where all entries are the same."""
+    """Return the text of a column of numbers or expressions; a single number if all entries are equal."""
     if isinstance(value, ca.MX):
         if ca.symvar(value):
-            return short(str(value))
+            return shorten(str(value))
         value = ca.evalf(value)
     entries = [str(entry) for entry in ca.vertsplit(value)]
-    return entries[0] if len(set(entries)) == 1 else short("[" + ", ".join(entries) + "]")
+    return entries[0] if len(set(entries)) == 1 else shorten("[" + ", ".join(entries) + "]")
 
 
-def short(expression: Any) -> str:
-    """An expression on one line of bounded length. SX prints its shared parts first; only bounded text is kept."""
+def shorten(expression: Any) -> str:
+    """Return an expression on one line of bounded length.
+
+    SX prints shared subexpressions first, so a large expression is described by its symbols instead.
+    """
     if not isinstance(expression, str) and ca.Function("size", ca.symvar(expression), [expression]).n_nodes() > 60:
         return f"expression of {', '.join(s.name() for s in ca.symvar(expression)[:8])}, ..."
     text, width = " ".join(str(expression).split()), 100

@@ -1,21 +1,19 @@
-"""Ranges and slopes of expressions of one symbol over whole intervals of it, valid across kinks and jumps.
+"""Enclosures of expressions of one symbol: ranges and slopes over whole intervals, valid across kinks and jumps.
 
 This is forward-mode differentiation in interval arithmetic. Each instruction carries its range and an interval of
-slopes that holds every difference quotient (x(s) - x(t)) / (s - t) of two places in the interval. A smooth operation
-passes slopes on by the mean value theorem. At a kink the slopes of both sides are hulled, as in Clarke's generalised
-gradient (Clarke 1983, *Optimization and Nonsmooth Analysis*, section 2.3). Where a jump cannot be ruled out the slopes
-have no bounds and the range alone says how far the value may go. No derivative of a whole expression is ever taken:
-casadi's leaves jumps out.
+slopes that contains every difference quotient (x(s) - x(t)) / (s - t) of two places in the interval. A smooth operation
+propagates slopes by the mean value theorem. At a kink the slopes of both sides are hulled, as in Clarke's generalised
+gradient (Clarke 1983, *Optimization and Nonsmooth Analysis*, section 2.3). Where a jump cannot be excluded the slopes
+are unbounded, and the range alone bounds the value. No whole expression is differentiated, as casadi's derivatives
+ignore jumps.
 
-Bodies whose motion time alone prescribes: how far they may get within an interval of time, and off its chord.
-
-Over an interval of length h, let every coordinate of a point stay in a range of width w and have slopes, all difference
-quotients, in [l, u] (:mod:`ocp.problem.enclosures`). Then it gets no farther from where it is in the middle than
+They bound the motion of bodies that is prescribed as a function of time. Over an interval of length h, let every
+coordinate of a point have a range of width w and slopes in [l, u]. Then the point's distance from its position at the
+middle is at most
 
     min(w, h/2 max(|l|, |u|)),
 
-and stays within h/4 (u - l) of the straight line between its ends. Both hold across kinks. Where a jump cannot be ruled
-out the slopes have no bounds, and the width alone counts: it is that of the jump.
+and its distance from the chord between its end positions is at most h/4 (u - l). Both hold across kinks.
 """
 
 from __future__ import annotations
@@ -28,7 +26,7 @@ import casadi as ca
 import numpy as np
 
 from ocp.errors import ProblemError
-from ocp.problem.hulls import Covered
+from ocp.problem.hulls import CoveredPairs
 from ocp.problem.intervals import RULES, Interval, check_instructions, constant, decided, evaluate, multiple_of
 from ocp.problem.separation import WORLD, Separation
 from ocp.problem.values import identity, table
@@ -37,11 +35,11 @@ __all__ = ["Enclosure", "Enclosures", "PrescribedMotion"]
 
 
 class Enclosure(NamedTuple):
-    """Bounds of n expressions over M intervals; -inf and inf where there are none.
+    """Bounds of n expressions over M intervals; -inf and inf if unbounded.
 
     Attributes:
-        low, high: Of the values. Shape (M, n).
-        least, most: Of the slopes: of all difference quotients within an interval. Shape (M, n).
+        low, high: Bounds of the values. Shape (M, n).
+        least, most: Bounds of the slopes, that is of all difference quotients within an interval. Shape (M, n).
     """
 
     low: np.ndarray
@@ -51,10 +49,10 @@ class Enclosure(NamedTuple):
 
 
 class Enclosures:
-    """Bounds of a column of expressions of one symbol, over any intervals of the symbol.
+    """Bounds of a column of expressions of one symbol over intervals of the symbol.
 
-    Bounds hold wherever an entry and all that it is made of are numbers: the root of something that dips below zero
-    counts where it is defined.
+    The bounds hold wherever an entry and all its subexpressions are defined: the square root of a function that becomes
+    negative counts where it is real.
 
     Raises:
         ProblemError: An operation without a rule, by name; another symbol in the values; a shape other than (n, 1).
@@ -62,13 +60,13 @@ class Enclosures:
 
     def __init__(self, values: Any, symbol: Any, what: str = "bounds") -> None:
         if not (isinstance(symbol, ca.SX | ca.MX) and symbol.shape == (1, 1) and symbol.is_valid_input()):
-            raise ProblemError(f"{what}: symbol {symbol!r} is no scalar symbol", name="symbol", value=symbol)
+            raise ProblemError(f"{what}: {symbol!r} is not a scalar symbol", name="symbol", value=symbol)
         try:
             column = ca.densify(type(symbol)(values))
             function = ca.Function("values", [symbol], [column])
             self._function = function if isinstance(symbol, ca.SX) else function.expand()
         except (RuntimeError, NotImplementedError, TypeError) as error:
-            words = f"{what}: values are no expressions of the symbol alone: {str(error).splitlines()[-1]}"
+            words = f"{what}: values must be expressions of the symbol alone: {str(error).splitlines()[-1]}"
             raise ProblemError(words, name="values", value=values) from error
         if column.shape[1] != 1 or column.shape[0] == 0:
             words = f"{what}: values have shape {column.shape}, expected (n, 1)"
@@ -82,37 +80,38 @@ class Enclosures:
             low, high: Ends of the intervals. Shape (M,).
 
         Raises:
-            ProblemError: Ends of different numbers, not finite, or in the wrong order.
+            ProblemError: Ends of different shapes, not finite, or in the wrong order.
         """
         starts, ends = (np.atleast_1d(table(f"bounds: {name}", x)) for name, x in (("low", low), ("high", high)))
         if starts.shape != ends.shape or starts.ndim != 1:
-            words = f"bounds: {ends.shape} high ends of {starts.shape} intervals"
+            words = f"bounds: high has shape {ends.shape}, low has {starts.shape}"
             raise ProblemError(words, name="high", value=ends.shape, limit=starts.shape)
-        if not (np.isfinite(starts) & np.isfinite(ends) & (starts <= ends)).all():
-            wrong = int(np.flatnonzero(~(np.isfinite(starts) & np.isfinite(ends) & (starts <= ends)))[0])
-            words = f"bounds: interval {wrong} goes from {starts[wrong]} to {ends[wrong]}"
+        invalid = np.flatnonzero(~(np.isfinite(starts) & np.isfinite(ends) & (starts <= ends)))
+        if invalid.size:
+            wrong = int(invalid[0])
+            words = f"bounds: interval {wrong}, from {starts[wrong]} to {ends[wrong]}, is not finite or is reversed"
             name = "high" if np.isfinite(starts[wrong]) else "low"
             raise ProblemError(words, name=name, value=float(ends[wrong]), limit=float(starts[wrong]))
-        columns = self._jets(_Jet(Interval(starts, ends), constant(1.0, starts)))
-        return Enclosure(*(np.column_stack([side(jet) for jet in columns]) for side in _SIDES))
+        jets = self._jets(_Jet(Interval(starts, ends), constant(1.0, starts)))
+        return Enclosure(*(np.column_stack([side(jet) for jet in jets]) for side in _SIDES))
 
     def _jets(self, time: _Jet) -> list[_Jet]:
         function, slots, outputs = self._function, dict[int, _Jet](), dict[int, _Jet]()
-        still = constant(0.0, time.value.low)
+        zero = constant(0.0, time.value.low)
         with np.errstate(all="ignore"):
             for k in range(function.n_instructions()):
-                code, given = function.instruction_id(k), function.instruction_input(k)
+                code, inputs = function.instruction_id(k), function.instruction_input(k)
                 if code == ca.OP_OUTPUT:
-                    outputs[function.instruction_output(k)[1]] = slots[given[0]]
+                    outputs[function.instruction_output(k)[1]] = slots[inputs[0]]
                     continue
                 if code == ca.OP_INPUT:
-                    found = time
+                    jet = time
                 elif code == ca.OP_CONST:
-                    found = _Jet(constant(function.instruction_constant(k), still.low), still)
+                    jet = _Jet(constant(function.instruction_constant(k), zero.low), zero)
                 else:
                     rule: Callable[..., _Jet] = _KINKED.get(code, _smooth)
-                    found = rule(code, *(slots[slot] for slot in given))
-                slots[function.instruction_output(k)[0]] = found
+                    jet = rule(code, *(slots[slot] for slot in inputs))
+                slots[function.instruction_output(k)[0]] = jet
         return [outputs[k] for k in range(len(outputs))]
 
 
@@ -135,16 +134,16 @@ ADD, MULTIPLY, SUBTRACT = (RULES[code] for code in (ca.OP_ADD, ca.OP_MUL, ca.OP_
 # ---- rules ----------------------------------------------------------------------------------------------------------
 
 
-def _where(known: Any, slope: Interval) -> Interval:
-    """Slopes that are known in some intervals, and without bounds in the others."""
-    return Interval(np.where(known, slope.low, -np.inf), np.where(known, slope.high, np.inf))
+def _where(valid: Any, slope: Interval) -> Interval:
+    """Return the slopes in the valid intervals, and no bounds elsewhere."""
+    return Interval(np.where(valid, slope.low, -np.inf), np.where(valid, slope.high, np.inf))
 
 
 def _smooth(code: int, *jets: _Jet) -> _Jet:
-    """The rule of an operation that is smooth where its range is bounded: the mean value theorem."""
+    """Apply the rule of a smooth operation: the mean value theorem."""
     value = RULES[code](*(jet.value for jet in jets))
-    powers = code in (ca.OP_POW, ca.OP_CONSTPOW)
-    exponent = _number(jets[1].value) if powers else None
+    is_power = code in (ca.OP_POW, ca.OP_CONSTPOW)
+    exponent = _number(jets[1].value) if is_power else None
     slope = constant(0.0, value.low)
     inputs = [jet.value for jet in jets[: 1 if exponent is not None else None]]
     for partial, jet in zip(evaluate(_partials(code, len(jets), exponent), inputs), jets, strict=False):
@@ -155,7 +154,7 @@ def _smooth(code: int, *jets: _Jet) -> _Jet:
 
 @lru_cache(maxsize=4096)
 def _partials(code: int, count: int, exponent: float | None) -> Any:
-    """Partial derivatives of one operation as an SX function; of a power with a fixed exponent, by its base."""
+    """Return the partial derivatives of an operation as an SX function; of a power with fixed exponent, in its base."""
     x, y = ca.SX.sym("x"), ca.SX.sym("y")
     if count == 1:
         return ca.Function("partials", [x], [ca.densify(ca.gradient(ca.SX.unary(code, x), x))])
@@ -166,13 +165,13 @@ def _partials(code: int, count: int, exponent: float | None) -> Any:
 
 
 def _number(x: Interval) -> float | None:
-    """The number that an interval is, the same everywhere; None where it is none."""
+    """Return the number if an interval is the same single number everywhere, else None."""
     first = float(x.low[0])
     return first if bool((x.low == first).all() and (x.high == first).all()) else None
 
 
 def _steps(code: int, *jets: _Jet) -> _Jet:
-    """The rule of what is constant but for jumps: floor, ceil, sign, tests."""
+    """Apply the rule of a piecewise constant operation: floor, ceil, sign, tests."""
     value = RULES[code](*(jet.value for jet in jets))
     return _Jet(value, _where(value.low == value.high, constant(0.0, value.low)))
 
@@ -184,12 +183,12 @@ def _absolute(code: int, x: _Jet) -> _Jet:
 
 
 def _extreme(code: int, x: _Jet, y: _Jet) -> _Jet:
-    """The rule of fmin and fmax: the slopes of the one that is chosen, or of both."""
+    """Apply the rule of fmin and fmax: the slopes of the selected argument, or of both."""
     low, high = (x, y) if code == ca.OP_FMIN else (y, x)
     first, second = low.value.high <= high.value.low, high.value.high <= low.value.low
     ends = [
-        np.where(first, one, np.where(second, other, both(one, other)))
-        for one, other, both in zip(
+        np.where(first, slope_x, np.where(second, slope_y, hull(slope_x, slope_y)))
+        for slope_x, slope_y, hull in zip(
             (x.slope.low, x.slope.high), (y.slope.low, y.slope.high), (np.minimum, np.maximum), strict=True
         )
     ]
@@ -216,10 +215,10 @@ def _copysign(code: int, x: _Jet, y: _Jet) -> _Jet:
 
 
 def _angle(code: int, y: _Jet, x: _Jet) -> _Jet:
-    """The rule of atan2: smooth off the half-line where it jumps by a turn."""
-    found = _smooth(code, y, x)
-    off = (x.value.low > 0) | (y.value.low > 0) | (y.value.high < 0)
-    return _Jet(found.value, _where(off, found.slope))
+    """Apply the rule of atan2, smooth except on the half-line where it jumps by a turn."""
+    smooth = _smooth(code, y, x)
+    continuous = (x.value.low > 0) | (y.value.low > 0) | (y.value.high < 0)
+    return _Jet(smooth.value, _where(continuous, smooth.slope))
 
 
 _KINKED: dict[int, Callable[..., _Jet]] = {
@@ -236,95 +235,101 @@ _KINKED: dict[int, Callable[..., _Jet]] = {
         for name in ("FLOOR", "CEIL", "SIGN", "LT", "LE", "EQ", "NE", "NOT", "AND", "OR")
     },
 }
-"""Rules of operations that are not smooth, by the code of casadi's instruction; all others are."""
+"""Rules of the operations that are not smooth, by the code of casadi's instruction."""
 
 
-ENTRIES = 12
-"""Of a frame: its rotation column by column, its position."""
+FRAME_ENTRIES = 12
+"""Entries of a frame: its rotation column by column, then its position."""
 
 
 class PrescribedMotion:
-    """The bodies of some pairs that ride on frames which time alone moves.
+    """The bodies of separated pairs whose frames depend on time alone.
 
     Args:
-        apart: The pairs. placements: Theirs, or the same in other symbols. time: Its symbol.
+        separation: The pairs. placements: Their frames, possibly in other symbols. time: The symbol of time.
         parameters, values: Symbols of parameters, and their numbers.
 
     Raises:
-        ProblemError: A frame of time and states; one seen from another frame than the world; an operation that has no
-            bounds, by its name.
+        ProblemError: A frame of time and states; such a frame observed from another one than the world; an operation
+            without bounds, by its name.
     """
 
     def __init__(
-        self, apart: Separation, placements: Any, time: Any, parameters: Sequence[Any], values: Sequence[Any]
+        self, separation: Separation, placements: Any, time: Any, parameters: Sequence[Any], values: Sequence[Any]
     ) -> None:
-        what = f"separation {apart.name!r}"
-        parts = [placements[k : k + ENTRIES] for k in range(0, placements.numel(), ENTRIES)]
+        what = f"separation {separation.name!r}"
+        parts = [placements[k : k + FRAME_ENTRIES] for k in range(0, placements.numel(), FRAME_ENTRIES)]
         frames = [k for k, part in enumerate(parts) if ca.depends_on(part, time)]
         rows = [_of_time(f"{what}: frame {k}", parts[k], time, parameters, values) for k in frames]
         self._enclosures = Enclosures(ca.vertcat(*rows), time, what) if rows else None
-        hulls = list(apart.hulls.values())
-        covered = Covered(apart.pairs, apart.covers)
-        for one, other, seen in covered.rows:
-            if seen != WORLD and {seen, hulls[one].frame, hulls[other].frame} & set(frames):
-                words = f"{what}: bodies on a frame that time moves have to be seen from the world, -1, not from {seen}"
+        hulls = list(separation.hulls.values())
+        covered = CoveredPairs(separation.pairs, separation.covers)
+        for first, second, seen in covered.rows:
+            if seen != WORLD and {seen, hulls[first].frame, hulls[second].frame} & set(frames):
+                words = (
+                    f"{what}: bodies on frames that depend on time must be observed from the world, -1, not from {seen}"
+                )
                 raise ProblemError(words, name="pairs", value=int(seen), limit=WORLD)
         self._bodies: list[tuple[int, np.ndarray]] = []
-        self._of_pair = np.full((len(apart), 2), -1)
+        self._of_pair = np.full((len(separation), 2), -1)
         for pair, side in np.ndindex(*self._of_pair.shape):
-            _, mine = covered.of(np.array([pair]))
-            riding = [hulls[k] for k in covered.rows[mine, side] if hulls[k].frame in frames]
-            if riding:
-                core = np.concatenate([hull.core for hull in riding])
+            _, indices = covered.of(np.array([pair]))
+            moving = [hulls[k] for k in covered.rows[indices, side] if hulls[k].frame in frames]
+            if moving:
+                core = np.concatenate([hull.core for hull in moving])
                 self._of_pair[pair, side] = len(self._bodies)
-                self._bodies.append((frames.index(riding[0].frame), _coordinates(core)))
+                self._bodies.append((frames.index(moving[0].frame), _coordinates(core)))
 
     def bounds(self, pair: np.ndarray, begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """How far the bodies of pairs get from the middle of intervals of time, and off their chords. Shape (K,), m.
+        """Bound the motion of the bodies of pairs within intervals of time.
 
         Args:
-            pair, begin, end: The pairs by their places, and the ends of the intervals in the unit of the time, (K,).
+            pair, begin, end: Indices of the pairs, and the ends of the intervals in the unit of the time. Shape (K,).
+
+        Returns:
+            Largest distance from the position at the middle of the interval, and from the chord between its ends. Shape
+            (K,) each, m.
         """
-        strays, bows = np.zeros(len(pair)), np.zeros(len(pair))
+        displacements, deviations = np.zeros(len(pair)), np.zeros(len(pair))
         mine = np.flatnonzero((self._of_pair[pair] >= 0).any(axis=1))
         if self._enclosures is None or not mine.size:
-            return strays, bows
+            return displacements, deviations
         ends, where = np.unique(np.stack([begin[mine], end[mine]]), axis=1, return_inverse=True)
-        found = self._enclosures(*ends)
-        huge = 1e150  # for a bound that there is none of: products and squares of it are finite
+        enclosure = self._enclosures(*ends)
+        huge = 1e150  # stands for an infinite bound: its products and squares are finite
         low, high, least, most = (
-            np.clip(np.nan_to_num(side, posinf=huge, neginf=-huge), -huge, huge) for side in found
+            np.clip(np.nan_to_num(side, posinf=huge, neginf=-huge), -huge, huge) for side in enclosure
         )
         half = (ends[1] - ends[0])[:, None] / 2
         bodies = self._of_pair[pair[mine]]
         for body in np.unique(bodies[bodies >= 0]).tolist():
-            frame, map_ = self._bodies[body]
-            entries = slice(ENTRIES * frame, ENTRIES * (frame + 1))
-            up, down = np.maximum(map_, 0.0), np.minimum(map_, 0.0)
-            falls = least[:, entries] @ up.T + most[:, entries] @ down.T
-            rises = most[:, entries] @ up.T + least[:, entries] @ down.T
-            width = (high - low)[:, entries] @ np.abs(map_).T
-            stray = _longest(np.minimum(width, half * np.maximum(np.abs(falls), np.abs(rises))))
-            bow = _longest(half / 2 * (rises - falls))
-            at = np.flatnonzero((bodies == body).any(axis=1))  # no pair has a body twice
-            strays[mine[at]] += stray[where.ravel()[at]]
-            bows[mine[at]] += bow[where.ravel()[at]]
-        return strays, bows
+            frame, coordinates = self._bodies[body]
+            entries = slice(FRAME_ENTRIES * frame, FRAME_ENTRIES * (frame + 1))
+            positive, negative = np.maximum(coordinates, 0.0), np.minimum(coordinates, 0.0)
+            lowest = least[:, entries] @ positive.T + most[:, entries] @ negative.T
+            highest = most[:, entries] @ positive.T + least[:, entries] @ negative.T
+            width = (high - low)[:, entries] @ np.abs(coordinates).T
+            displacement = _longest(np.minimum(width, half * np.maximum(np.abs(lowest), np.abs(highest))))
+            deviation = _longest(half / 2 * (highest - lowest))
+            rows = np.flatnonzero((bodies == body).any(axis=1))  # the bodies of a pair differ
+            displacements[mine[rows]] += displacement[where.ravel()[rows]]
+            deviations[mine[rows]] += deviation[where.ravel()[rows]]
+        return displacements, deviations
 
 
 def _of_time(what: str, frame: Any, time: Any, parameters: Sequence[Any], values: Sequence[Any]) -> Any:
-    """A frame with the numbers of its parameters."""
+    """Return a frame with the values of its parameters inserted."""
     known = {identity(symbol) for symbol in ca.symvar(ca.vertcat(time, *parameters))}
     others = [symbol for symbol in ca.symvar(frame) if identity(symbol) not in known]
     if others and ca.depends_on(frame, ca.vertcat(*map(ca.vec, others))):
-        words = f"{what} is moved by time and by states; let a state of its own follow the time"
+        words = f"{what} depends on time and on states; introduce a state for the time"
         raise ProblemError(words, name="placements", value=", ".join(map(str, others)))
     function = ca.Function("frame", [time, *parameters, *others], [frame])
     return function(time, *values, *(ca.DM.zeros(other.shape) for other in others))
 
 
 def _coordinates(core: np.ndarray) -> np.ndarray:
-    """The map from a frame to the coordinates in world of the corners of a box about points. Shape (3 C, 12)."""
+    """Return the map from a frame to the world coordinates of the corners of a box about points. Shape (3 C, 12)."""
     ends = np.stack([core.min(axis=0), core.max(axis=0)])
     corners = np.unique(np.stack(np.meshgrid(*ends.T, indexing="ij"), axis=-1).reshape(-1, 3), axis=0)
     with_one = np.column_stack([corners, np.ones(len(corners))])
@@ -332,6 +337,6 @@ def _coordinates(core: np.ndarray) -> np.ndarray:
 
 
 def _longest(coordinates: np.ndarray) -> np.ndarray:
-    """Length of the longest of some vectors (M, 3 C), coordinate by coordinate; inf where one is huge. Shape (M,)."""
-    found = np.linalg.norm(coordinates.reshape(len(coordinates), -1, 3), axis=2).max(axis=1)
-    return np.where(found < 1e100, found, np.inf)
+    """Return the length of the longest of stacked vectors (M, 3 C); inf if one is huge. Shape (M,)."""
+    lengths = np.linalg.norm(coordinates.reshape(len(coordinates), -1, 3), axis=2).max(axis=1)
+    return np.where(lengths < 1e100, lengths, np.inf)

@@ -1,4 +1,4 @@
-"""Values that users give, read as checked columns of a problem's symbols."""
+"""Reader of values given by the user as checked columns of a problem's symbols."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ Value = Any  # a number, an array, or a casadi expression of parameters
 
 @dataclass(frozen=True)
 class ExpressionReader:
-    """Read values as expressions of the symbols of one problem.
+    """Reader of values as expressions of the symbols of one problem.
 
     Attributes:
         symbols: ``casadi.SX`` or ``casadi.MX``. parameters: The symbols of the parameters declared so far.
@@ -40,14 +40,14 @@ class ExpressionReader:
     parameters: tuple[Any, ...]
 
     def expression(self, what: str, value: Value, known: Sequence[Any], *, finite: bool = True) -> Any:
-        """A value as a dense column in which no symbols occur but the ``known`` ones; constants are finite if asked."""
+        """Return a value as a dense column of ``known`` symbols only; with ``finite``, its constants must be finite."""
         if value is None or isinstance(value, str):
             raise ProblemError(f"{what}: a number or an expression is expected, not {value!r}")
         if is_symbolic(value):
             expression = stacked(what, value)
             if not isinstance(expression, self.symbols):
-                have, want = type(expression).__name__, self.symbols.__name__
-                raise ProblemError(f"{what} is made of {have} symbols, the problem of {want} symbols")
+                own, expected = type(expression).__name__, self.symbols.__name__
+                raise ProblemError(f"{what} is made of {own} symbols, the problem of {expected} symbols")
             entries = ca.vertsplit(expression) if isinstance(expression, ca.SX) and expression.numel() else []
             if finite and not all(np.isfinite(float(entry)) for entry in entries if entry.is_constant()):
                 raise ProblemError(f"{what} is not finite: {expression}")
@@ -59,20 +59,19 @@ class ExpressionReader:
         for symbol in ca.symvar(expression):
             if identity(symbol) not in identities:
                 raise ProblemError(
-                    f"{what} uses the symbol {symbol.name()!r}, which may not stand there: it is not part of this "
+                    f"{what} uses the symbol {symbol.name()!r}, which is not allowed here: it is not part of this "
                     f"problem, was declared later, or has no meaning at this place"
                 )
         return expression
 
     def column(self, what: str, value: Value, size: int, default: float) -> Any:
-        """A value as a column of the problem's symbols, free of anything but parameters. Shape (size, 1)."""
+        """Return a value as a column that depends on parameters only. Shape (size, 1)."""
         if value is None:
             return self.symbols(ca.DM.ones(size, 1) * default)
         if is_symbolic(value):
             expression = self.expression(what, value, self.parameters, finite=False)  # nan frees an entry
         else:
-            array = numeric(what, value)
-            expression = self.symbols(ca.DM(array))
+            expression = self.symbols(ca.DM(numeric(what, value)))
         if expression.numel() == 1:
             expression = ca.repmat(expression, size, 1)
         if expression.numel() != size:
@@ -81,7 +80,7 @@ class ExpressionReader:
         return ca.densify(ca.vec(expression))
 
     def bounds(self, what: str, size: int, lower: Value, upper: Value) -> tuple[Any, Any]:
-        """Lower and upper bounds as columns of so many entries, infinite where there is none."""
+        """Return lower and upper bounds as columns of ``size`` entries, infinite if there are none."""
         low = self.column(f"{what}: lower", lower, size, -np.inf)
         high = self.column(f"{what}: upper", upper, size, np.inf)
         for label, value in (("lower", lower), ("upper", upper)):
@@ -99,7 +98,7 @@ class ExpressionReader:
         unit: str,
         tolerance: Value,
     ) -> Constraint:
-        """A constraint on an expression of the ``known`` symbols; ``kind`` is that of errors."""
+        """Return a constraint on an expression of the ``known`` symbols; ``kind`` is for messages."""
         what = f"{kind} constraint {name!r}"
         checked_text(f"{what}: unit", unit)
         vector = self.expression(what, expression, known)
@@ -111,7 +110,7 @@ class ExpressionReader:
         return Constraint(name, vector, low, high, unit, read_tolerance(what, tolerance, vector.numel()))
 
     def horizon(self, what: str, value: Value, lower: Value, upper: Value, guess: float | None) -> Horizon:
-        """A horizon fixed at ``value``, or free from ``lower`` to ``upper``."""
+        """Return a horizon fixed at ``value``, or free from ``lower`` to ``upper``."""
         for label, bound in (("value", value), ("lower", lower), ("upper", upper)):
             _check_number(what, label, bound)
         symbol = self.symbols.sym("horizon")
@@ -135,12 +134,12 @@ class ExpressionReader:
         return Horizon(symbol, low, high, guess, fixed=False)
 
 
-def number_of_entries(what: str, size: int | None, given: dict[str, Value]) -> int:
-    """The size that is given, or that of the values by their labels; 1 where they are all scalars."""
+def number_of_entries(what: str, size: int | None, values: dict[str, Value]) -> int:
+    """Return the given size, or the common size of the labelled values; 1 if all are scalars."""
     if size is not None:
         return checked_count(f"{what}: size", size)
-    plain = {f"{what}: {k}": v for k, v in given.items() if v is not None and not callable(v)}
-    lengths = {k: stacked(k, v).numel() if is_symbolic(v) else numeric(k, v).size for k, v in plain.items()}
+    labelled = {f"{what}: {k}": v for k, v in values.items() if v is not None and not callable(v)}
+    lengths = {k: stacked(k, v).numel() if is_symbolic(v) else numeric(k, v).size for k, v in labelled.items()}
     for label, n in lengths.items():
         if n == 0:
             raise ProblemError(f"{label} is empty")
@@ -151,19 +150,19 @@ def number_of_entries(what: str, size: int | None, given: dict[str, Value]) -> i
     return int(next(iter(sizes.values()), 1))
 
 
-def read_scale(what: str, given: Value, size: int) -> Any:
-    """Sizes of the entries, nan where none is told. Shape (size,), or None."""
-    if given is None:
+def read_scale(what: str, value: Value, size: int) -> Any:
+    """Return the scales of the entries, nan for unknown ones. Shape (size,), or None."""
+    if value is None:
         return None
-    array = numeric(f"{what}: scale", given)
+    array = numeric(f"{what}: scale", value)
     if array.size not in (1, size) or not (np.isnan(array) | (np.isfinite(array) & (array > 0))).all():
-        words = f"{what}: scale must be positive, one number or {size}, nan where none is told, not {given!r}"
-        raise ProblemError(words, value=given, limit=size)
+        words = f"{what}: scale must be positive, one number or {size}, nan for an unknown one, not {value!r}"
+        raise ProblemError(words, value=value, limit=size)
     return np.array(np.broadcast_to(array.ravel(), size))
 
 
 def check_guess(what: str, guess: Any, size: int) -> None:
-    """Raise unless a guess is None, a function, or one finite number or as many as there are entries."""
+    """Raise ProblemError unless a guess is None, a function, or one finite number for all entries or for each."""
     if guess is None or callable(guess):
         return
     array = numeric(f"{what}: guess", guess)
@@ -173,28 +172,28 @@ def check_guess(what: str, guess: Any, size: int) -> None:
         raise ProblemError(words, value=array.size, limit=size)
 
 
-def read_tolerance(what: str, given: Value, size: int) -> list[float] | None:
-    """Tolerances of the rows of a constraint, (size,); None where none is told."""
-    if given is None:
+def read_tolerance(what: str, value: Value, size: int) -> list[float] | None:
+    """Return the tolerances of the rows of a constraint, (size,), or None."""
+    if value is None:
         return None
-    array = numeric(f"{what}: tolerance", given)
+    array = numeric(f"{what}: tolerance", value)
     if array.size not in (1, size) or not (array > 0).all():
-        words = f"{what}: tolerance must be positive numbers, 1 or {size} of them, not {given!r}"
-        raise ProblemError(words, value=given, limit=size)
+        words = f"{what}: tolerance must be positive numbers, 1 or {size} of them, not {value!r}"
+        raise ProblemError(words, value=value, limit=size)
     return [float(entry) for entry in np.broadcast_to(array, size)]
 
 
 def signal_function(what: str, track: Callable[[Any], Any]) -> Any:
-    """The casadi Function time -> column of a function of the time alone."""
+    """Return the casadi Function time -> column of a function of time alone."""
     time = ca.MX.sym("time")
     try:
         return ca.Function("signal", [time], [ca.densify(ca.vec(ca.MX(track(time))))])
-    except Exception as error:  # of the function's own, too
-        words = f"{what}: a function of the time alone is expected, that gives a column: {error}"
+    except Exception as error:  # the user's function may raise anything
+        words = f"{what}: a function of time alone that returns a column is expected: {error}"
         raise ProblemError(words, value=track) from error
 
 
 def _check_number(what: str, label: str, bound: Value) -> None:
-    """Raise where a bound that is given as numbers holds one that is nan."""
+    """Raise ProblemError if a numeric bound contains nan."""
     if bound is not None and not is_symbolic(bound) and np.any(np.isnan(numeric(what, bound))):
         raise ProblemError(f"{what}: {label} is not a number: {bound!r}", value=bound)

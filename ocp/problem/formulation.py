@@ -1,6 +1,6 @@
-"""A problem flattened into vectors: the one form that every transcription and the audit read.
+"""A problem flattened into vectors: the common form that all transcriptions and the audit read.
 
-Time runs as the fraction ``s`` of the horizon, ``t = s * T``, so that a free final time is one more number.
+Time is the fraction ``s`` of the horizon, ``t = s * T``, so that a free final time is one additional unknown.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any, TypeAlias
 import casadi as ca
 import numpy as np
 
-from ocp.errors import ProblemError, about, unknown_name
+from ocp.errors import ProblemError, error_names, unknown_name
 from ocp.problem.declarations import Constraint, Declarations, Signal, Variable
 from ocp.problem.problem import Problem, checked_problem
 from ocp.problem.values import Sampler, check_finite, check_horizon, check_inside, check_order, constant, numeric
@@ -26,7 +26,7 @@ Bounds: TypeAlias = tuple[np.ndarray, np.ndarray]  # lower and upper values of a
 
 @dataclass(frozen=True)
 class Rows:
-    """Scalar constraint rows of one place (path, start or end).
+    """Scalar constraint rows of one kind (path, start, end or watch).
 
     Attributes:
         expression: Shape (m, 1), in the symbols of the formulation.
@@ -35,7 +35,7 @@ class Rows:
         equality: Whether lower and upper bound are one expression. Shape (m,), bool.
         uses_control: Whether the row contains a control. Shape (m,), bool.
         uses_state: Which states the row contains. Shape (m, nx), bool.
-        tolerance: Largest violation that the audit lets pass, infinite where none is declared. Shape (m,).
+        tolerance: Largest violation that the audit accepts, infinite if none is declared. Shape (m,).
     """
 
     expression: Any
@@ -56,76 +56,74 @@ class Rows:
         return tuple(dict.fromkeys(self.owners))
 
     def of(self, name: str) -> np.ndarray:
-        """Indices of the rows of a constraint."""
+        """Return the indices of the rows of a constraint."""
         return np.array([i for i, owner in enumerate(self.owners) if owner == name])
 
     def select(self, mask: np.ndarray) -> Rows:
-        """The rows where ``mask`` (m,) holds."""
+        """Return the rows selected by ``mask`` (m,)."""
         keep = np.flatnonzero(mask)
-        return Rows(
-            self.expression[keep.tolist()] if keep.size else self.expression[:0, :],
-            tuple(self.labels[i] for i in keep),
-            tuple(self.owners[i] for i in keep),
-            self.bounds[keep],
-            self.equality[keep],
-            self.uses_control[keep],
-            self.uses_state[keep],
-            self.tolerance[keep],
-        )
+        expression = self.expression[keep.tolist()] if keep.size else self.expression[:0, :]
+        names, owners = (tuple(texts[i] for i in keep) for texts in (self.labels, self.owners))
+        arrays = (self.bounds, self.equality, self.uses_control, self.uses_state, self.tolerance)
+        return Rows(expression, names, owners, *(array[keep] for array in arrays))
 
 
 @dataclass(frozen=True)
 class BoundTable:
-    """All bounds of a problem in two vectors; variables and rows of an NLP point into them.
+    """All bounds of a problem in two vectors; the variables and rows of an NLP refer to their entries.
 
     Attributes:
         function: Parameters -> (lower, upper), each of shape (n, 1).
-        places: Index of every entry by what it bounds: ``free``, ``zero``, ``state``, ``initial``, ``terminal``,
+        places: Indices of the entries by what they bound: ``free``, ``zero``, ``state``, ``initial``, ``terminal``,
             ``control``, ``horizon``, ``path``, ``start``, ``end``, ``watch``.
     """
 
     function: Any
     places: dict[str, np.ndarray]
 
-    def pull(self, p: np.ndarray, push: np.ndarray) -> np.ndarray:
-        """Sum of ``push`` (2, n) on lower and upper bounds times their derivatives in the parameters. Shape (np,)."""
-        return np.asarray(self._pull(p, push.T).full()).reshape(-1)
+    def pullback(self, p: np.ndarray, multipliers: np.ndarray) -> np.ndarray:
+        """Return multipliers (2, n) of lower and upper bounds times the bounds' derivatives in p. Shape (np,)."""
+        return np.asarray(self._pullback(p, multipliers.T).full()).reshape(-1)
 
     @cached_property
-    def _pull(self) -> Any:
-        """The function of :meth:`pull`."""
+    def _pullback(self) -> Any:
+        """The function of :meth:`pullback`."""
         count, n = self.function.numel_in(0), self.function.numel_out(0)
-        q, push = ca.MX.sym("p", count), ca.MX.sym("push", n, 2)
-        bounds = self.function(q)
-        return ca.Function("pull", [q, push], [sum(ca.jtimes(bounds[i], q, push[:, i], True) for i in (0, 1))])
+        parameters, multipliers = ca.MX.sym("p", count), ca.MX.sym("multipliers", n, 2)
+        bounds = self.function(parameters)
+        return ca.Function(
+            "pullback",
+            [parameters, multipliers],
+            [sum(ca.jtimes(bounds[i], parameters, multipliers[:, i], True) for i in (0, 1))],
+        )
 
 
 class Formulation:
-    """Vectors and functions of a checked problem. Later changes of the problem do not reach it.
+    """Vectors and functions of a checked problem. Later changes of the problem do not affect it.
 
     Attributes:
-        x, u, p, t, T: Symbols of states (nx, 1), controls (nu, 1), parameters (np, 1), time, horizon. sym: Makes more.
-        w: Symbols of the signals (nw, 1), in what holds inside the horizon; at its ends they are numbers.
-        x0, u0: Symbols of states and controls at the start, for what ties both ends.
+        x, u, p, t, T: Symbols of states (nx, 1), controls (nu, 1), parameters (np, 1), time, horizon. sym: Creates
+            symbols of the same type.
+        w: Symbols of the signals (nw, 1) inside the horizon; at its ends they are numbers.
+        x0, u0: Symbols of states and controls at the start, for expressions that couple both ends.
         f: State derivative. Shape (nx, 1).
-        running, terminal: Cost densities, scalars.
-        path, start, end: Constraint rows. watch: Rows that the audit judges and no method holds.
-        apart: Placements of the bodies that have to stay apart, by the name of the separation. Shape (12 F, 1) each.
-        watch_integral: Which of these mean the integral over time. Shape (rows,), bool.
-        watch_way: Rates of the ways that they are judged against, zero where none is. Shape (rows, 1).
-        states, controls, parameters: Slices of the vectors by name. state_labels,
-            control_labels: A name for every entry.
-        units: Of states, controls and constraints by name, as declared; empty where none is, or where a constraint
-            bears the name of a variable of another unit.
+        running, terminal: Running and terminal cost, scalars.
+        path, start, end: Constraint rows. watch: Rows that only the audit checks.
+        separations: Poses of the frames of separated bodies, by the name of the separation. Shape (12 F, 1) each.
+        watch_integral: Which watched rows bound the integral over time. Shape (rows,), bool.
+        watch_reference_rate: Rates of their reference path lengths, zero if there is none. Shape (rows, 1).
+        states, controls, parameters: Slices of the vectors by name. state_labels, control_labels: A name for every
+            entry.
+        units: Units of states, controls and constraints by name; empty if undeclared, or if a constraint and a variable
+            of one name have different units.
         bounds: The bound table.
-        horizon_is_free, horizon_value: Whether T is unknown; its value (an expression of p) where it is not.
-        free_parameters: Which states stand still whatever is done. Shape (nx,), bool.
-        scales: What the entries of states and controls are divided by to be solved for, nan where nothing is told of
-            them. Shape (nx + nu,).
+        horizon_is_free, horizon_value: Whether T is unknown; its value (an expression of p) if it is not.
+        free_parameters: Which states have zero rate. Shape (nx,), bool.
+        scales: Declared scales of states and controls, nan if undeclared. Shape (nx + nu,).
         initial_is_fixed: Which initial states are given. Shape (nx,), bool.
-        ties_ends: Whether anything at the end refers to the start.
-        indifferent: Whether the cost is a constant, so that every plan that meets the constraints is optimal.
-        autonomous: Whether dynamics, running cost and path are free of time.
+        ties_ends: Whether an end constraint or the terminal cost depends on the start.
+        indifferent: Whether the cost is constant, so that every feasible plan is optimal.
+        autonomous: Whether dynamics, running cost and path constraints are independent of time.
     """
 
     def __init__(self, problem: Problem) -> None:
@@ -147,10 +145,10 @@ class Formulation:
         self.t, self.T = sym("t"), sym("T")
         self.signals = slices(declared.signals)
         self.w = sym("w", total(self.signals))
-        self._declared, self._made_of = declared, entries_of(declared)
-        self._kept: dict[Any, Any] = {}
-        # an audit asks for the same times again and again
-        self._signals_at = lru_cache(maxsize=16)(self._sampled_signals)
+        self._declared, self._entries = declared, entries_of(declared)
+        self._cache: dict[Any, Any] = {}
+        # an audit evaluates the signals at the same times repeatedly
+        self._signals_at = lru_cache(maxsize=16)(self._evaluate_signals)
         self.horizon_is_free = not horizon.fixed
         self.horizon_guess = horizon.guess
 
@@ -158,67 +156,72 @@ class Formulation:
         self.free_parameters = np.array([rate.is_zero() for rate in ca.vertsplit(self.f)], dtype=bool)
         self.running = self.flat(0 if declared.running is None else declared.running)
         self.terminal = self.flat(0 if declared.terminal is None else declared.terminal)
-        self.horizon_value = self.flat(horizon.lower)  # of use where it is fixed
+        self.horizon_value = self.flat(horizon.lower)  # meaningful if the horizon is fixed
         self._signal = self._signal_function()
         self.indifferent = not ca.symvar(ca.vertcat(self.running, self.terminal))
         self.bounds = self._bound_table()
         self.path = self._rows("path", declared.path)
-        if declared.phases and problem.symbols is ca.SX:  # placed one by one, expressions share nothing any more
+        if (
+            declared.phases and problem.symbols is ca.SX
+        ):  # phases were substituted one by one, so common subexpressions are duplicated
             self.f, self.running, rows = ca.cse([self.f, self.running, self.path.expression])
             self.path = replace(self.path, expression=rows)
         self.start = self._rows("start", declared.start, 0.0)
         self.end = self._rows("end", declared.end, 1.0)
         self.watch = self._rows("watch", declared.watch)
-        self.apart = {name: self.flat(each.placements) for name, each in declared.apart.items()}
+        self.separations = {name: self.flat(separation.placements) for name, separation in declared.apart.items()}
         watched = declared.watch.values()
         self.watch_integral = np.array([w.integral for w in watched for _ in range(w.size)], dtype=bool)
-        ways = [problem.symbols(w.size, 1) if w.way is None else w.way for w in watched]
-        self.watch_way = self.flat(ca.vertcat(problem.symbols(0, 1), *ways))
+        rates = [problem.symbols(w.size, 1) if w.way is None else w.way for w in watched]
+        self.watch_reference_rate = self.flat(ca.vertcat(problem.symbols(0, 1), *rates))
         inner = ca.vertcat(self.f, self.running, self.path.expression)
         self.autonomous = not ca.depends_on(inner, ca.vertcat(self.t, self.w))
         self.initial_is_fixed = ~np.concatenate([is_free(s.initial) for s in declared.states.values()])
-        both = ca.vertcat(self.end.expression, self.terminal)
-        self.ties_ends = bool(ca.depends_on(both, ca.vertcat(self.x0, self.u0)))
+        end_terms = ca.vertcat(self.end.expression, self.terminal)
+        self.ties_ends = bool(ca.depends_on(end_terms, ca.vertcat(self.x0, self.u0)))
         variables = (*declared.states.values(), *declared.controls.values())
-        told = [np.full(v.size, np.nan) if v.scale is None else v.scale for v in variables]
-        self.scales = np.concatenate(told)
-        self.guesses = {v.name: v.guess for v in (*declared.states.values(), *declared.controls.values())}
+        self.scales = np.concatenate([np.full(v.size, np.nan) if v.scale is None else v.scale for v in variables])
+        self.guesses = {v.name: v.guess for v in variables}
 
     @classmethod
     def of(cls, problem: Problem) -> Formulation:
-        """The formulation that is kept with a problem, a new one where more has been declared since."""
-        kept: Formulation | None = checked_problem(problem).formulated
+        """Return the formulation cached in a problem, or a new one if the declarations have changed."""
+        cached: Formulation | None = checked_problem(problem).formulated
         entries = entries_of(problem.declared)
-        if kept is None or len(kept._made_of) != len(entries) or not all(map(operator.is_, kept._made_of, entries)):
-            kept = problem.formulated = cls(problem)
-        return kept
+        if (
+            cached is None
+            or len(cached._entries) != len(entries)
+            or not all(map(operator.is_, cached._entries, entries))
+        ):
+            cached = problem.formulated = cls(problem)
+        return cached
 
-    def kept(self, name: Any, make: Callable[[], Any]) -> Any:
-        """What is made once of the problem, by a name."""
-        if name not in self._kept:
-            self._kept[name] = make()
-        return self._kept[name]
+    def cached(self, name: Any, make: Callable[[], Any]) -> Any:
+        """Return the cached value of a name, made on the first call."""
+        if name not in self._cache:
+            self._cache[name] = make()
+        return self._cache[name]
 
     def function(self, name: str, outputs: list[Any], names: list[str]) -> Any:
-        """A casadi Function of (x, u, t, T, p), of MX where it needs signals."""
-        inputs, of = [self.x, self.u, self.t, self.T, self.p], ["x", "u", "t", "T", "p"]
+        """Return a casadi Function of (x, u, t, T, p), of MX type if it depends on signals."""
+        inputs, labels = [self.x, self.u, self.t, self.T, self.p], ["x", "u", "t", "T", "p"]
         if not (self.signals and ca.depends_on(ca.vertcat(*map(ca.vec, outputs)), self.w)):
-            return ca.Function(name, inputs, outputs, of, names)
+            return ca.Function(name, inputs, outputs, labels, names)
         inner = ca.Function(name, [*inputs, self.w], outputs)
-        at = [ca.MX.sym(symbol, part.numel()) for symbol, part in zip(of, inputs, strict=True)]
-        return ca.Function(name, at, inner.call([*at, self._signal(at[2])]), of, names)
+        symbols = [ca.MX.sym(label, part.numel()) for label, part in zip(labels, inputs, strict=True)]
+        return ca.Function(name, symbols, inner.call([*symbols, self._signal(symbols[2])]), labels, names)
 
-    def moments(self, fractions: np.ndarray) -> np.ndarray:
-        """What of the time a point function needs at fractions (K,): these, and the signals. Shape (1 + nw, K)."""
+    def point_data(self, fractions: np.ndarray) -> np.ndarray:
+        """Return the data of point functions at fractions (K,): the fractions and the signals. Shape (1 + nw, K)."""
         return np.vstack([np.reshape(fractions, (1, -1)), self.signals_at(np.ravel(fractions) * self.duration).T])
 
     def signals_at(self, times: np.ndarray, order: int = 0) -> np.ndarray:
-        """Signals, or their derivatives in time of an order, at times (M,), s. Shape (M, nw)."""
+        """Return the signals, or their time derivatives of an order, at times (M,), s. Shape (M, nw)."""
         times = np.ravel(times).astype(float)
         return self._signals_at(order, times.tobytes()) if self.signals else np.zeros((len(times), 0))
 
-    def _sampled_signals(self, order: int, times: bytes) -> np.ndarray:
-        """What :meth:`signals_at` returns, at times given as the bytes of an array."""
+    def _evaluate_signals(self, order: int, times: bytes) -> np.ndarray:
+        """Return :meth:`signals_at` for times given as the bytes of an array, which can be hashed."""
 
         def make() -> Sampler:
             t = ca.MX.sym("t")
@@ -227,12 +230,12 @@ class Formulation:
                 value = ca.jacobian(value, t)
             return Sampler([t], [ca.densify(value)])
 
-        sampler: Sampler = self.kept(f"signals, order {order}", make)
+        sampler: Sampler = self.cached(f"signals, order {order}", make)
         return sampler(np.frombuffer(times)[:, None])[0]
 
     @property
     def duration(self) -> float:
-        """The horizon where there are signals, s; 1 where there are none and it may not be known."""
+        """The horizon if there are signals, s; else 1, as the horizon may be unknown."""
         return float(self.horizon_value) if self.signals else 1.0
 
     def sampled(
@@ -244,49 +247,51 @@ class Formulation:
         horizon: Any,
         p: Any,
         *more: tuple[Any, Any],
-        kept: Any = None,
+        cache_as: Any = None,
     ) -> list[np.ndarray]:
-        """Expressions of (x, u, t, T, p) and of ``more`` symbols at M samples; each output (M, its number of entries).
+        """Return expressions of (x, u, t, T, p) and of ``more`` symbols at M samples. Shape (M, number of entries)
+        each.
 
-        An output that is a matrix is read column by column.
+        A matrix is read column by column.
 
         Args:
-            outputs: Expressions of the symbols of the formulation and of those in ``more``, or what makes them.
+            outputs: Expressions of the symbols of the formulation and of those in ``more``, or a function that returns
+                them.
             x, u: States (M, nx), controls (M, nu). t: Times, s. Shape (M,).
             horizon: s. p: Parameters. Shape (np,).
-            more: Pairs of another symbol and its values, (M, n), or (n,) where they are the same at all samples.
-            kept: A name under which the function of these outputs is kept, which are the same whenever it is told.
+            more: Pairs of another symbol and its values, (M, n), or (n,) if they are constant.
+            cache_as: Name under which the compiled function is cached; it must identify the outputs.
         """
 
         def make() -> Sampler:
             return self.sampler(outputs() if callable(outputs) else outputs, *(symbol for symbol, _ in more))
 
-        function = make() if kept is None else self.kept(kept, make)
+        function = make() if cache_as is None else self.cached(cache_as, make)
         times = np.reshape(t, (-1, 1))
         values = (value for _, value in more)
         return list(function(x, u, times, horizon, p, self.signals_at(times), *values))
 
     def sampler(self, outputs: list[Any], *more: Any) -> Sampler:
-        """The function (x, u, t, T, p, w, *more) -> outputs, to be called at many samples."""
+        """Return the function (x, u, t, T, p, w, *more) -> outputs for evaluation at many samples."""
         symbols = self.problem.symbols
         inputs = [self.x, self.u, self.t, self.T, self.p, self.w, *more]
         return Sampler(inputs, [symbols(output) for output in outputs])
 
     def terminal_cost(self, x: np.ndarray, x0: np.ndarray, u0: np.ndarray, horizon: float, p: np.ndarray) -> float:
-        """The terminal cost of a final state, and of the state and controls at the start."""
+        """Return the terminal cost of a final state, given the state and controls at the start."""
         symbols = [self.x, self.x0, self.u0, self.t, self.T, self.p]
-        function = self.kept("terminal", lambda: ca.Function("terminal", symbols, [self.terminal]))
+        function = self.cached("terminal", lambda: ca.Function("terminal", symbols, [self.terminal]))
         return float(function(x, x0, u0, horizon, horizon, p))
 
     def horizon_at(self, p: Any) -> Any:
-        """The fixed horizon at parameters, numbers or symbols."""
+        """Return the fixed horizon for parameters, numbers or symbols."""
         return self.bounds.function(p)[0][int(self.bounds.places["horizon"][0])]
 
     def point_function(self, name: str, d: Any, cost: Any, g: Any) -> Any:
-        """A block function of one point, (v, d, p) -> (cost, g), with v = [x; u; T where free].
+        """Return a block function of one point, (v, d, p) -> (cost, g), with v = [x; u; T if free].
 
-        ``cost`` and ``g`` are expressions of x, u, t, T, p, w and of the data ``d``, whose first entries are what
-        :meth:`moments` says of the fraction s.
+        ``cost`` and ``g`` are expressions of x, u, t, T, p, w and of the data ``d``, which begin with a column of
+        :meth:`point_data`.
         """
         v = self.sym("v", self.nx + self.nu + self.horizon_is_free)
         inside = slice(self.nx, self.nx + self.nu)
@@ -297,22 +302,22 @@ class Formulation:
         return ca.Function(name, [v, d, self.p], outputs, {"cse": True})
 
     def parameter_vector(self, values: dict[str, Any] | None) -> np.ndarray:
-        """Parameters stacked. Shape (np,).
+        """Return the stacked parameters. Shape (np,).
 
         Raises:
             ProblemError: A parameter is missing, unknown, of the wrong size or not finite.
         """
-        given = dict(values or {})
-        for name in given:
+        entries = dict(values or {})
+        for name in entries:
             if name not in self.parameters:
                 raise unknown_name("parameter", name, self.parameters)
         vector = np.zeros(self.np)
         for name, place in self.parameters.items():
             what, size = f"parameter {name!r}", place.stop - place.start
-            with about(name):
-                if name not in given:
+            with error_names(name):
+                if name not in entries:
                     raise ProblemError(f"{what} has no value; give parameters={{{name!r}: ...}}")
-                value = numeric(what, given[name])
+                value = numeric(what, entries[name])
                 if value.size not in (1, size):
                     raise ProblemError(
                         f"{what} has {value.size} entries, {size} expected", value=value.size, limit=size
@@ -322,35 +327,35 @@ class Formulation:
         return vector
 
     def bound_values(self, p: np.ndarray) -> Bounds:
-        """The bound table at given parameters, checked: (lower, upper), each (n,)."""
+        """Return the bound table for these parameters, after checks: (lower, upper), each (n,)."""
         lower, upper = (np.asarray(v.full()).reshape(-1) for v in self.bounds.function(p))
         places = self.bounds.places
-        where = f"problem {self.name!r} at these parameters"
+        what = f"problem {self.name!r} at these parameters"
         for kind, pool in (("state", self.states), ("control", self.controls)):
-            for name, part in pool.items():
-                index = places[kind][part]
-                with about(name):
-                    check_order(f"{where}: {kind} {name!r}", lower[index], upper[index])
+            for name, entries in pool.items():
+                index = places[kind][entries]
+                with error_names(name):
+                    check_order(f"{what}: {kind} {name!r}", lower[index], upper[index])
                     for end in ("initial", "terminal") if kind == "state" else ():
-                        fixed = places[end][part]
+                        fixed = places[end][entries]
                         values = np.where(lower[fixed] == upper[fixed], lower[fixed], np.nan)
-                        check_inside(f"{where}: {kind} {name!r}: {end}", values, lower[index], upper[index])
+                        check_inside(f"{what}: {kind} {name!r}: {end}", values, lower[index], upper[index])
         for rows in (self.path, self.start, self.end, self.watch):
             for owner, label, index in zip(rows.owners, rows.labels, rows.bounds, strict=True):
-                with about(owner):
-                    check_order(f"{where}: constraint {label!r}", lower[[index]], upper[[index]])
+                with error_names(owner):
+                    check_order(f"{what}: constraint {label!r}", lower[[index]], upper[[index]])
         index = places["horizon"]
-        with about("horizon"):
-            check_horizon(f"{where}: horizon", lower[index])
-            check_order(f"{where}: horizon", lower[index], upper[index])
+        with error_names("horizon"):
+            check_horizon(f"{what}: horizon", lower[index])
+            check_order(f"{what}: horizon", lower[index], upper[index])
         if np.any(np.isnan(lower)) or np.any(np.isnan(upper)):
-            raise ProblemError(f"{where}: a bound is not a number")
+            raise ProblemError(f"{what}: a bound is not a number")
         return lower, upper
 
     # ---- flattening ------------------------------------------------------------------------------------------
 
     def flat(self, expression: Any) -> Any:
-        """An expression of the declared symbols as one of the stacked symbols."""
+        """Return an expression of the declared symbols as one of the stacked symbols."""
         d = self._declared
         old: list[Any] = [self.problem.time]
         new: list[Any] = [self.t]
@@ -371,23 +376,19 @@ class Formulation:
         return ca.densify(ca.substitute([self.problem.symbols(expression)], old, new)[0])
 
     def _signal_function(self) -> Any:
-        """casadi Function time -> all signals.
-
-        Raises:
-            ProblemError: The horizon is free, or made of parameters.
-        """
+        """Return the casadi Function time -> all signals; raise ProblemError unless the horizon is a number."""
         if not self.signals:
             return None
         if self.horizon_is_free or ca.symvar(self.horizon_value):
             name = next(iter(self.signals))
-            words = f"problem {self.name!r}: signals need a horizon that is a number; {name!r} is one"
+            words = f"problem {self.name!r}: signal {name!r} needs a horizon that is a number"
             raise ProblemError(words, name=name)
         t = ca.MX.sym("t")
         parts = [signal.function(t) for signal in self._declared.signals.values()]
         return ca.Function("signals", [t], [ca.densify(ca.vertcat(*parts))])
 
     def _rows(self, kind: str, pool: dict[str, Constraint], end: float | None = None) -> Rows:
-        """Rows of a place; at an ``end``, 0 or 1, of the horizon the signals are numbers."""
+        """Return the rows of a kind; at an ``end`` of the horizon, 0 or 1, the signals become numbers."""
         symbols = self.problem.symbols
         expression = self.flat(ca.vertcat(symbols(0, 1), *[c.expression for c in pool.values()]))
         if self.signals and end is not None:
@@ -431,7 +432,7 @@ class Formulation:
         }
         for end in ("initial", "terminal"):
             value = stack(states, end)
-            free = np.concatenate([is_free(getattr(state, end)) for state in states])  # keeps its bounds
+            free = np.concatenate([is_free(getattr(state, end)) for state in states])  # free entries keep their bounds
             parts[end] = tuple(
                 ca.vertcat(*[bound[i] if free[i] else value[i] for i in range(len(free))]) for bound in (low, high)
             )
@@ -449,13 +450,13 @@ class Formulation:
 
 
 def entries_of(declared: Declarations) -> list[Any]:
-    """All that is declared, one thing an entry."""
+    """Return all declared parts as one list."""
     pools = [getattr(declared, kind.name) for kind in fields(declared)]
     return [entry for pool in pools for entry in (pool.values() if isinstance(pool, dict) else [pool])]
 
 
 def slices(pool: Mapping[str, Variable | Signal]) -> dict[str, slice]:
-    """Where each variable stands in the stacked vector."""
+    """Return the slice of each variable in the stacked vector."""
     places, offset = {}, 0
     for name, variable in pool.items():
         places[name] = slice(offset, offset + variable.size)
@@ -464,21 +465,21 @@ def slices(pool: Mapping[str, Variable | Signal]) -> dict[str, slice]:
 
 
 def labels(pool: dict[str, Any]) -> tuple[str, ...]:
-    """A name for every entry: ``q`` alone, ``q[2]`` of several."""
+    """Return a name for every entry: ``q`` for a scalar, ``q[2]`` in a vector."""
     return tuple(f"{v.name}[{i}]" if v.size > 1 else v.name for v in pool.values() for i in range(v.size))
 
 
 def units(declared: Declarations) -> dict[str, str]:
-    """Of states, controls and constraints by name; a name that two bear in different units has none."""
-    found: dict[str, set[str]] = {}
+    """Return the units of states, controls and constraints by name; "" for a name with two different units."""
+    units_of: dict[str, set[str]] = {}
     for pool in (declared.states, declared.controls, declared.path, declared.start, declared.end, declared.watch):
         for name, item in pool.items():
-            found.setdefault(name, set()).update([item.unit] if item.unit else [])
-    return {name: next(iter(given)) if len(given) == 1 else "" for name, given in found.items()}
+            units_of.setdefault(name, set()).update([item.unit] if item.unit else [])
+    return {name: next(iter(own)) if len(own) == 1 else "" for name, own in units_of.items()}
 
 
 def is_free(end: Any) -> np.ndarray:
-    """Which entries of an initial or terminal value are nan, that is free. Shape (n,), bool."""
+    """Return which entries of an initial or terminal value are free (nan). Shape (n,), bool."""
     numbers = np.array([not ca.symvar(entry) for entry in ca.vertsplit(end)])
     return np.asarray(numbers & np.isnan(constant(end)))
 

@@ -1,8 +1,8 @@
-"""CasADi functions read from data: lists of elementary operations, checked one by one before a function is built.
+"""Reader of CasADi functions from data: lists of elementary operations, each checked before the function is built.
 
-A function is a list of scalar operations in which each may use the results of those before it. It may call functions
-that stand before it, so that no chain of calls closes. What is no scalar arithmetic (a look-up table, a spline, an
-interpolant, a linear solve, an integrator) stands there by the numbers that define it. Nothing of a record reaches
+A function is a list of scalar operations, each of which may use the results of earlier ones. It may call functions that
+precede it, so calls are never recursive. Functions that are not scalar arithmetic (a look-up table, a spline, an
+interpolant, a linear solve, an integrator) are stored by the numbers that define them. No part of a record reaches
 CasADi's own reader of serialised functions, which can load libraries and run a compiler.
 """
 
@@ -29,24 +29,24 @@ BINARY = (
 )  # fmt: skip
 STRUCTURAL = ("INPUT", "CONSTANT", "CALL", "RESULT")
 OPERATIONS = (*STRUCTURAL, *UNARY, *BINARY)
-"""The names of the operations. Files hold places in this list: append new operations, never reorder them."""
+"""Names of the operations. Files store indices of this list: append new operations, never reorder them."""
 INPUT, CONSTANT, CALL, RESULT = range(len(STRUCTURAL))
 CODES = [getattr(ca, f"OP_{name}") for name in OPERATIONS[len(STRUCTURAL) :]]
 PLACES = {code: place for place, code in enumerate(CODES, len(STRUCTURAL))}
 FIRST_BINARY = len(STRUCTURAL) + len(UNARY)
 
 MAX_OPERATIONS = 2**20
-"""Operations in all functions of a file; an operation takes about 5 microseconds and 200 bytes to rebuild."""
+"""Maximum number in all functions of a file; rebuilding an operation takes about 5 microseconds and 200 bytes."""
 MAX_WORK = 2**26
-"""Operations of one evaluation with all the calls in it: a short file can call functions that call functions."""
+"""Maximum number in one evaluation with all nested calls, which can be many even in a short file."""
 MAX_ENTRIES = 2**20
-"""Entries of all arguments and results of the functions of a file together."""
+"""Maximum number of entries of all arguments and results of the functions of a file."""
 OPAQUE = {"never_inline": True}
-"""Of functions that are no scalar arithmetic: where they are called on scalars, they stay calls."""
+"""Options of functions that are not scalar arithmetic: on scalars, they remain calls."""
 MAX_DIMENSIONS = 6
-"""Dimensions of a table that is interpolated."""
+"""Maximum dimension of an interpolated table."""
 MAX_DEGREE = 9
-"""Degree of a spline."""
+"""Maximum degree of a spline."""
 INTEGRATORS = {"RungeKutta": "rk", "Collocation": "collocation", "CvodesInterface": "cvodes", "IdasInterface": "idas"}
 INTEGRATOR_OPTIONS: dict[str, tuple[str, type]] = {
     "number_of_finite_elements": ("FixedStepIntegrator::nk_target", int),
@@ -55,27 +55,26 @@ INTEGRATOR_OPTIONS: dict[str, tuple[str, type]] = {
     "reltol": ("SundialsInterface::reltol", float),
     "max_num_steps": ("SundialsInterface::max_num_steps", int),
 }
-"""Options of integrators that are kept, and what CasADi's debugging output calls them."""
+"""Integrator options that are stored, with their names in CasADi's debugging output."""
 
 
 class FunctionReader:
-    """Builds the functions of records, and refuses what a `FunctionWriter` cannot have written.
+    """Builder of functions from records, which rejects anything that a `FunctionWriter` cannot have written.
 
     Args:
-        records: As of a `FunctionWriter`, from wherever. Nothing in them is trusted.
+        records: As of a `FunctionWriter`, from an untrusted source.
 
     Attributes:
-        functions: One for each record, as CasADi Functions.
+        functions: A CasADi Function for each record.
 
     Raises:
-        ProblemError: An operation, a place, a size or a number that cannot be; more operations than are read, in the
-            file or in one evaluation.
+        ProblemError: An invalid operation, index, size or number; too many operations in the file or in one evaluation.
     """
 
     def __init__(self, records: Sequence[Mapping[str, Any]]) -> None:
         self.functions: list[Any] = []
         self._work: list[int] = []
-        self._passed = 0  # entries that calls hand over
+        self._passed = 0  # total entries of the arguments of calls
         total = len(records) + sum(len(record["rows"]) for record in records if record["kind"] == "operations")
         for what, count, most in (
             ("operations", total, MAX_OPERATIONS),
@@ -86,29 +85,29 @@ class FunctionReader:
         for number, record in enumerate(records):
             kind = record["kind"]
             if kind == "operations":
-                function, work = self._rebuilt(record, f"stored_{number}")
+                function, work = self._rebuild(record, f"stored_{number}")
             elif kind in BUILDERS:
                 function, work = BUILDERS[kind](record, self.functions), MAX_ENTRIES if kind == "integrator" else 1
             else:
-                raise ProblemError(f"functions of kind {kind!r} are not known", name="kind", value=kind)
+                raise ProblemError(f"functions of kind {kind!r} are unknown", name="kind", value=kind)
             if work > MAX_WORK:
                 words = f"function {number} takes {work} operations, at most {MAX_WORK} are accepted"
                 raise ProblemError(words, name="rows", value=work, limit=MAX_WORK)
             self.functions.append(function)
             self._work.append(work)
 
-    def _rebuilt(self, record: Mapping[str, Any], name: str) -> tuple[Any, int]:
-        """A function of a list of operations, and how many operations an evaluation takes.
+    def _rebuild(self, record: Mapping[str, Any], name: str) -> tuple[Any, int]:
+        """Return a function of a list of operations, and how many operations an evaluation takes.
 
-        It has SX symbols, or MX symbols where it calls others: only these differentiate all calls as CasADi does.
+        It has SX symbols, or MX symbols if it calls other functions: only these differentiate all calls as CasADi does.
         """
-        patterns = [_read_pattern(one) for one in record["inputs"]]
+        patterns = [_read_pattern(shape) for shape in record["inputs"]]
         table, constants = _integers(record["rows"], (None, 3)), _floats(record["constants"]).tolist()
         rows, kind = table.tolist(), ca.MX if (table[:, 0] == CALL).any() else ca.SX
         inputs = [kind.sym(f"i{k}", pattern) for k, pattern in enumerate(patterns)]
-        given = [_nonzeros(symbol) for symbol in inputs]
+        input_entries = [_nonzeros(symbol) for symbol in inputs]
         arguments, work = _integers(record["arguments"], (None,)).tolist(), len(rows)
-        values: list[Any] = []  # a scalar each; of a call the list of its results
+        values: list[Any] = []  # a scalar of each row; for a call the list of its results
 
         def operand(row: int) -> Any:
             value = values[_place(row, len(values), "operand")]
@@ -118,7 +117,8 @@ class FunctionReader:
 
         for operation, first, second in rows:
             if operation == INPUT:
-                values.append(given[_place(first, len(given), "input")][_place(second, len(given[first]), "entry")])
+                entries = input_entries[_place(first, len(input_entries), "input")]
+                values.append(entries[_place(second, len(entries), "entry")])
             elif operation == CONSTANT:
                 values.append(kind(constants[_place(first, len(constants), "constant")]))
             elif operation == CALL:
@@ -126,31 +126,34 @@ class FunctionReader:
                 work += self._work[first]
                 self._passed += _entries(callee)
                 if self._passed > MAX_OPERATIONS:
-                    words = f"calls hand over more than {MAX_OPERATIONS} numbers"
+                    words = f"calls have more than {MAX_OPERATIONS} arguments"
                     raise ProblemError(words, name="arguments", limit=MAX_OPERATIONS)
                 values.append(_call(callee, [operand(row) for row in arguments[max(second, 0) :][: _entries(callee)]]))
             elif operation == RESULT:
                 results = values[_place(first, len(values), "call")]
                 if not isinstance(results, list):
-                    raise ProblemError(f"row {first} is no call", name="rows", value=first)
+                    raise ProblemError(f"row {first} is not a call", name="rows", value=first)
                 values.append(results[_place(second, len(results), "result")])
             elif CALL < operation < FIRST_BINARY:
                 values.append(kind.unary(CODES[operation - len(STRUCTURAL)], operand(first)))
             elif operation < len(OPERATIONS) and operation > 0:
                 values.append(kind.binary(CODES[operation - len(STRUCTURAL)], operand(first), operand(second)))
             else:
-                words = f"operation {operation} is not known, only 0 to {len(OPERATIONS) - 1}"
+                words = f"operation {operation} is unknown, only 0 to {len(OPERATIONS) - 1} exist"
                 raise ProblemError(words, name="operation", value=operation, limit=len(OPERATIONS) - 1)
-        shapes = [_read_pattern(one) for one in record["outputs"]]
-        results = _integers(record["results"], (sum(one.nnz() for one in shapes),)).tolist()
+        patterns = [_read_pattern(shape) for shape in record["outputs"]]
+        results = _integers(record["results"], (sum(pattern.nnz() for pattern in patterns),)).tolist()
         outputs, begin = [], 0
-        for shape in shapes:
-            outputs.append(shaped(shape, [operand(row) for row in results[begin : begin + shape.nnz()]], kind))
-            begin += shape.nnz()
+        for pattern in patterns:
+            outputs.append(
+                from_entries(pattern, [operand(row) for row in results[begin : begin + pattern.nnz()]], kind)
+            )
+            begin += pattern.nnz()
         return ca.Function(name, inputs, outputs), work
 
 
-def shaped(pattern: Any, entries: Sequence[Any], kind: Any = ca.SX) -> Any:
+def from_entries(pattern: Any, entries: Sequence[Any], kind: Any = ca.SX) -> Any:
+    """Return a matrix of a sparsity pattern from its entries."""
     return kind(pattern, ca.vertcat(*entries) if entries else kind(0, 1))
 
 
@@ -159,9 +162,9 @@ def _nonzeros(matrix: Any) -> list[Any]:
 
 
 def _declared_entries(record: Mapping[str, Any]) -> int:
-    """How many entries the arguments and results of a function will have, as its record says."""
+    """Return the number of entries of the arguments and results that a record declares."""
     if record["kind"] == "operations":
-        return sum(abs(one[0] * one[1]) for one in (*record["inputs"], *record["outputs"]))
+        return sum(abs(shape[0] * shape[1]) for shape in (*record["inputs"], *record["outputs"]))
     sizes = [abs(int(record.get(what, 1))) for what in ("count", "size", "columns")]
     return int(np.prod(sizes, dtype=object)) + sizes[1] ** 2
 
@@ -171,25 +174,25 @@ def _entries(function: Any) -> int:
 
 
 def _call(callee: Any, entries: list[Any]) -> list[Any]:
-    """The entries of all results of a call on the entries of all its arguments."""
+    """Return the entries of all results of a call, given the entries of all its arguments."""
     if len(entries) != _entries(callee):
         raise ProblemError(f"a call has {len(entries)} arguments, not {_entries(callee)}", name="arguments")
-    given, begin = [], 0
+    arguments, begin = [], 0
     for k in range(callee.n_in()):
-        given.append(shaped(callee.sparsity_in(k), entries[begin : begin + callee.nnz_in(k)], ca.MX))
+        arguments.append(from_entries(callee.sparsity_in(k), entries[begin : begin + callee.nnz_in(k)], ca.MX))
         begin += callee.nnz_in(k)
-    return [entry for result in callee.call(given, False, True) for entry in _nonzeros(result)]
+    return [entry for result in callee.call(arguments, False, True) for entry in _nonzeros(result)]
 
 
 def _place(place: int, count: int, what: str) -> int:
     if not 0 <= place < count:
-        raise ProblemError(f"{what} {place} does not exist, only {count}", name=what, value=place, limit=count)
+        raise ProblemError(f"{what} {place} does not exist, there are {count}", name=what, value=place, limit=count)
     return place
 
 
 def _whole(value: Any, what: str, least: int, most: int) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
-        words = f"{what} {value!r} is no whole number from {least} to {most}"
+        words = f"{what} {value!r} is not an integer from {least} to {most}"
         raise ProblemError(words, name=what, value=value, limit=(least, most))
     return value
 
@@ -198,9 +201,7 @@ def _integers(values: Any, shape: tuple[int | None, ...]) -> np.ndarray:
     array = np.asarray(values)
     fits = array.ndim == len(shape) and all(n in (None, m) for n, m in zip(shape, array.shape, strict=True))
     if not fits or (array.dtype.kind not in "iu" and array.size):
-        raise ProblemError(
-            f"whole numbers of shape {shape} are expected, not {array.dtype} of {array.shape}", name="rows"
-        )
+        raise ProblemError(f"integers of shape {shape} are expected, not {array.dtype} of {array.shape}", name="rows")
     return array
 
 
@@ -211,36 +212,36 @@ def _floats(values: Any, *, finite: bool = False) -> np.ndarray:
     return array.astype(float)
 
 
-def _read_pattern(written: Any) -> Any:
-    """A sparsity pattern of [rows, columns] or [rows, columns, places of the entries]."""
-    if not isinstance(written, list) or len(written) not in (2, 3):
-        raise ProblemError(f"a shape is expected, not {written!r:.80}", name="shape")
-    rows, columns = (_whole(size, "size", 0, MAX_ENTRIES) for size in written[:2])
+def _read_pattern(shape: Any) -> Any:
+    """Return the sparsity pattern of [rows, columns] or [rows, columns, positions of the entries]."""
+    if not isinstance(shape, list) or len(shape) not in (2, 3):
+        raise ProblemError(f"a shape is expected, not {shape!r:.80}", name="shape")
+    rows, columns = (_whole(size, "size", 0, MAX_ENTRIES) for size in shape[:2])
     if rows * columns > MAX_ENTRIES:
         raise ProblemError(f"{rows} x {columns} entries, at most {MAX_ENTRIES}", name="shape", limit=MAX_ENTRIES)
-    if len(written) == 2:
+    if len(shape) == 2:
         return ca.Sparsity.dense(rows, columns)
-    places = _integers(written[2], (None,))
+    places = _integers(shape[2], (None,))
     if places.size and (places[0] < 0 or places[-1] >= rows * columns or (np.diff(places) <= 0).any()):
-        raise ProblemError("places of entries do not increase within the matrix", name="shape")
+        raise ProblemError("positions of entries do not increase within the matrix", name="shape")
     return ca.Sparsity.nonzeros(rows, columns, places.tolist())
 
 
-# ---- what is no scalar arithmetic -----------------------------------------------------------------------------------
+# ---- functions that are not scalar arithmetic ------------------------------------------------------------------------
 
 
 def _low(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
-    """The cell of a table in which a number lies."""
+    """Return the function that finds the cell of a table for a number."""
     table, modes = _floats(record["table"], finite=True), ("linear", "exact", "binary")
     count, mode = _whole(record["count"], "count", 0, MAX_ENTRIES), _whole(record["mode"], "mode", 0, 2)
     if len(table) < 2 or (np.diff(table) < 0).any():
-        raise ProblemError("the places of a table do not increase", name="table")
+        raise ProblemError("the grid of a table does not increase", name="table")
     x = ca.MX.sym("x", count)
     return ca.Function("low", [x], [ca.low(ca.DM(table), x, {"lookup_mode": modes[mode]})], OPAQUE)
 
 
 def _gather(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
-    """Entries of a table at places that are computed; nan outside."""
+    """Return the function that takes entries of a table at computed positions; nan outside."""
     table, x = _floats(record["table"]), ca.MX.sym("x", _whole(record["count"], "count", 0, MAX_ENTRIES))
     if not len(table):
         raise ProblemError("a table is empty", name="table")
@@ -248,34 +249,34 @@ def _gather(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
 
 
 def _solve(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
-    """The solution of a system of linear equations."""
+    """Return the function that solves linear equations."""
     size, columns = (_whole(record[what], what, 1, 1024) for what in ("size", "columns"))
     matrix, right = ca.MX.sym("A", size, size), ca.MX.sym("b", size, columns)
     return ca.Function("solve", [matrix, right], [ca.solve(matrix, right)], OPAQUE)
 
 
 def _grids(record: Mapping[str, Any], what: str) -> list[list[float]]:
-    """The places along each dimension of a table."""
+    """Return the grid of a table along each dimension."""
     places, offsets = _floats(record[what], finite=True), _integers(record["offsets"], (None,)).tolist()
     if not 2 <= len(offsets) <= MAX_DIMENSIONS + 1 or offsets[0] != 0 or offsets[-1] != len(places):
-        raise ProblemError(f"a table has {len(offsets) - 1} dimensions or loses places", name="offsets")
+        raise ProblemError(f"the offsets of a grid of {len(offsets) - 1} dimensions are inconsistent", name="offsets")
     grids = [places[begin:end] for begin, end in pairwise(offsets)]
     if any(len(grid) < 2 or (np.diff(grid) < 0).any() for grid in grids):
-        raise ProblemError("the places of a table do not increase", name=what)
+        raise ProblemError("the grid of a table does not increase", name=what)
     return [grid.tolist() for grid in grids]
 
 
 def _bspline(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
-    """A spline of one or several variables."""
+    """Return a spline of one or several variables."""
     knots, coefficients = _grids(record, "knots"), _floats(record["coefficients"])
     degrees = [_whole(degree, "degree", 0, MAX_DEGREE) for degree in record["degrees"]]
     modes = [("linear", "exact", "binary")[_whole(mode, "mode", 0, 2)] for mode in record["modes"]]
     size, count = (_whole(record[what], what, 1, MAX_ENTRIES) for what in ("size", "count"))
     if len(degrees) != len(knots) or len(modes) != len(knots):
         raise ProblemError(f"{len(degrees)} degrees for {len(knots)} dimensions", name="degrees")
-    lengths = [len(own) - degree - 1 for own, degree in zip(knots, degrees, strict=True)]
+    lengths = [len(grid) - degree - 1 for grid, degree in zip(knots, degrees, strict=True)]
     if min(lengths) < 1 or any(length <= degree for length, degree in zip(lengths, degrees, strict=True)):
-        raise ProblemError("a spline has fewer knots than its degree asks for", name="knots")
+        raise ProblemError("a spline has too few knots for its degree", name="knots")
     if len(coefficients) != size * int(np.prod(lengths, dtype=object)):
         raise ProblemError(f"{len(coefficients)} coefficients for {lengths} x {size}", name="coefficients")
     x = ca.MX.sym("x", len(knots), count)
@@ -284,20 +285,20 @@ def _bspline(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
 
 
 def _interpolant(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
-    """A table that is interpolated linearly, or the derivative of one."""
+    """Return a linear interpolant of a table, or the derivative of one."""
     grids, values = _grids(record, "grid"), _floats(record["values"])
     cells = int(np.prod([len(grid) for grid in grids], dtype=object))
     if not len(values) or len(values) % cells or any((np.diff(grid) <= 0).any() for grid in grids):
         raise ProblemError(f"{len(values)} values for a table of {cells}", name="values", value=len(values))
-    found = ca.interpolant("interpolant", "linear", grids, values.tolist())
-    return found.jacobian() if record["derivative"] is True else found
+    function = ca.interpolant("interpolant", "linear", grids, values.tolist())
+    return function.jacobian() if record["derivative"] is True else function
 
 
 def _integrator(record: Mapping[str, Any], functions: Sequence[Any]) -> Any:
-    """An integrator of the differential equations that a function gives."""
+    """Return an integrator of the differential equations of a stored function."""
     equations = functions[_place(_whole(record["equations"], "equations", 0, MAX_ENTRIES), len(functions), "equations")]
     if record["plugin"] not in INTEGRATORS.values():
-        raise ProblemError(f"integrator {record['plugin']!r} is not known", name="plugin", value=record["plugin"])
+        raise ProblemError(f"integrator {record['plugin']!r} is unknown", name="plugin", value=record["plugin"])
     begin, times = float(record["begin"]), _floats(record["times"], finite=True)
     if not np.isfinite(begin) or not len(times) or (np.diff([begin, *times]) < 0).any():
         raise ProblemError("an integrator's times do not increase", name="times")
@@ -307,12 +308,12 @@ def _integrator(record: Mapping[str, Any], functions: Sequence[Any]) -> Any:
         if kind is int:
             _whole(value, option, 0, 9 if option == "interpolation_order" else 100_000)
         elif not (isinstance(value, float) and 0 < value < 1):
-            raise ProblemError(f"{option} {value!r} is no tolerance", name=option, value=value)
+            raise ProblemError(f"{option} {value!r} is not a tolerance", name=option, value=value)
     names = [("t", "x", "z", "p", "u"), ("ode", "alg", "quad", "zero")]
-    if [tuple(one) for one in record["names"]] != names or (equations.n_in(), equations.n_out()) != (5, 4):
-        raise ProblemError("an integrator's equations have other arguments", name="names", value=record["names"])
+    if [tuple(labels) for labels in record["names"]] != names or (equations.n_in(), equations.n_out()) != (5, 4):
+        raise ProblemError("an integrator's equations have wrong arguments", name="names", value=record["names"])
     symbols = [ca.MX.sym(name, equations.sparsity_in(k)) for k, name in enumerate(names[0])]
-    named = ca.Function("equations", symbols, equations.call(symbols), *(list(one) for one in names))
+    named = ca.Function("equations", symbols, equations.call(symbols), *(list(labels) for labels in names))
     return ca.integrator("integrator", record["plugin"], named, begin, times.tolist(), options)
 
 

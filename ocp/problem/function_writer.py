@@ -1,7 +1,7 @@
-"""CasADi functions written as data: lists of elementary operations, as :mod:`ocp.problem.function_reader` reads them.
+"""Writer of CasADi functions as data: lists of elementary operations, which :mod:`ocp.problem.function_reader` reads.
 
-A function of matrices is worked out on scalars, operation by operation. The numbers that define tables, splines and
-integrators come from CasADi's own debugging output of a function, which is never read from a file.
+A function of matrices is expanded to scalars, operation by operation. The numbers that define tables, splines and
+integrators come from CasADi's debugging output of a function in memory, never from a file.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from ocp.problem.function_reader import (
     INTEGRATORS,
     PLACES,
     RESULT,
-    shaped,
+    from_entries,
 )
 
 __all__ = ["FunctionWriter"]
 
 
 class FunctionWriter:
-    """Writes functions as records, each once, after the functions that it calls.
+    """Writer of functions as records, each once, after the functions that it calls.
 
     Attributes:
-        records: Of each function a dictionary of text, numbers, lists and arrays, as `FunctionReader` takes them.
+        records: For each function a dictionary of text, numbers, lists and arrays, as `FunctionReader` takes them.
     """
 
     def __init__(self) -> None:
@@ -40,13 +40,13 @@ class FunctionWriter:
         self._written: list[Any] = []  # the functions of the records
         self._numbers: dict[int, int] = {}
         self._pending: set[int] = set()
-        self._kept: list[Any] = []  # a function that is gone gives its hash to another one
+        self._alive: list[Any] = []  # keeps functions alive: CasADi reuses the hash of a deleted one
 
     def write(self, function: Any) -> int:
         """Return the number of a function's record.
 
         Raises:
-            ProblemError: The function, or one that it calls, cannot be written, such as a callback of Python's.
+            ProblemError: The function, or one that it calls, cannot be written, such as a Python callback.
         """
         key = function.__hash__()
         if key in self._numbers:
@@ -54,29 +54,29 @@ class FunctionWriter:
         if key in self._pending:
             raise _unwritable(function)
         self._pending.add(key)
-        self._kept.append(function)
+        self._alive.append(function)
         kind = function.class_name()
         if kind == "BSplineInterpolant":
-            return self._numbered(key, self.write(function.find_functions()[0]))
+            return self._register(key, self.write(function.find_functions()[0]))
         if kind in ("LinearInterpolant", "LinearInterpolantJac"):
             record = _interpolant_record(function, kind)
         elif kind in INTEGRATORS:
             record = _integrator_record(function, self.write(function.oracle()))
         else:
             record = self._operations(self._as_scalars(function))
-            if (callee := self._passed_to(record)) is not None:
-                return self._numbered(key, callee)
+            if (callee := self._forwarded_to(record)) is not None:
+                return self._register(key, callee)
         return self._append(key, record, function)
 
     def _append(self, key: int, record: dict[str, Any], function: Any) -> int:
         self.records.append(record)
         self._written.append(function)
-        return self._numbered(key, len(self.records) - 1)
+        return self._register(key, len(self.records) - 1)
 
-    def _passed_to(self, record: dict[str, Any]) -> int | None:
-        """The number of the function to which a function passes all that it is given, and nothing else; None if none.
+    def _forwarded_to(self, record: dict[str, Any]) -> int | None:
+        """Return the number of the function to which a function merely forwards its arguments; None otherwise.
 
-        Without this look, every writing of what was read would wrap its tables in one more function.
+        Without this check, each save of a loaded problem would wrap its tables in one more function.
         """
         rows, count = record["rows"], sum(_size(pattern) for pattern in record["inputs"])
         if len(rows) <= count or rows[count, 0] != CALL:
@@ -91,65 +91,63 @@ class FunctionWriter:
         results = [_pattern(callee.sparsity_out(k)) for k in range(callee.n_out())]
         return int(rows[count, 1]) if passes and (patterns, results) == (record["inputs"], record["outputs"]) else None
 
-    def _numbered(self, key: int, number: int) -> int:
+    def _register(self, key: int, number: int) -> int:
         self._numbers[key] = number
         return number
 
     def _leaf(self, record: dict[str, Any]) -> Any:
-        """A function of a record, known under it."""
+        """Return the function of a record, and store the record."""
         function = BUILDERS[record["kind"]](record, ())
-        self._kept.append(function)
+        self._alive.append(function)
         self._append(function.__hash__(), record, function)
         return function
 
-    def _called(self, record: dict[str, Any], entries: Sequence[Any], pattern: Any) -> Any:
-        """The result of a function of one column that a record defines."""
-        given = ca.vertcat(*entries) if entries else ca.SX(0, 1)
-        return shaped(pattern, self._leaf(record).call([given], False, True)[0].nonzeros())
+    def _call_leaf(self, record: dict[str, Any], entries: Sequence[Any], pattern: Any) -> Any:
+        """Return the result of the function of a record, called on one column."""
+        argument = ca.vertcat(*entries) if entries else ca.SX(0, 1)
+        return from_entries(pattern, self._leaf(record).call([argument], False, True)[0].nonzeros())
 
     def _as_scalars(self, function: Any) -> Any:
-        """The same function of SX symbols, with calls for what is no scalar arithmetic."""
+        """Return the function in SX symbols, with calls for parts that are not scalar arithmetic."""
         kind = function.class_name()
         if kind == "SXFunction":
             return function
         inputs = [ca.SX.sym(f"i{k}", function.sparsity_in(k)) for k in range(function.n_in())]
         try:
-            outputs = (
-                self._interpreted(function, inputs) if kind == "MXFunction" else _called_on_scalars(function, inputs)
-            )
+            outputs = self._interpret(function, inputs) if kind == "MXFunction" else _call_on_scalars(function, inputs)
             return ca.Function(function.name(), inputs, outputs)
         except (RuntimeError, NotImplementedError) as error:
             raise _unwritable(function) from error
 
-    def _interpreted(self, function: Any, inputs: Sequence[Any]) -> list[Any]:
-        """The results of a function of matrices, worked out on SX matrices."""
+    def _interpret(self, function: Any, inputs: Sequence[Any]) -> list[Any]:
+        """Return the results of a function of matrices, evaluated on SX matrices."""
         values: dict[int, Any] = {}
         outputs: list[list[Any]] = [[] for _ in range(function.n_out())]
         for k in range(function.n_instructions()):
             code = function.instruction_id(k)
             slots, places = function.instruction_input(k), function.instruction_output(k)
             if code == ca.OP_OUTPUT:
-                outputs[places[0]] += values[slots[0]].nonzeros()  # an output may come in several parts, in order
+                outputs[places[0]] += values[slots[0]].nonzeros()  # an output may consist of several parts, in order
                 continue
             node = function.instruction_MX(k)
             if code == ca.OP_INPUT:
                 where = node.info()
                 entries = inputs[where["ind"]].nonzeros()[where["offset"] : where["offset"] + node.nnz()]
-                results = [shaped(node.sparsity(), entries)]
+                results = [from_entries(node.sparsity(), entries)]
             else:
                 arguments = [values[slot] if slot >= 0 else None for slot in slots]
-                results = self._applied(function, node, code, arguments)
+                results = self._apply(function, node, code, arguments)
             values.update((slot, result) for slot, result in zip(places, results, strict=True) if slot >= 0)
-        return [shaped(function.sparsity_out(k), entries) for k, entries in enumerate(outputs)]
+        return [from_entries(function.sparsity_out(k), entries) for k, entries in enumerate(outputs)]
 
-    def _applied(self, function: Any, node: Any, code: int, arguments: Sequence[Any]) -> list[Any]:
-        """The results of one operation on matrices."""
+    def _apply(self, function: Any, node: Any, code: int, arguments: Sequence[Any]) -> list[Any]:
+        """Return the results of one operation on matrices."""
         if code == ca.OP_CONST:
             return [ca.SX(node.to_DM())]
         if code == ca.OP_CALL:
             callee = node.which_function()
-            given = [ca.SX(callee.sparsity_in(k)) if value is None else value for k, value in enumerate(arguments)]
-            return _called_on_scalars(callee, given)
+            inputs = [ca.SX(callee.sparsity_in(k)) if value is None else value for k, value in enumerate(arguments)]
+            return _call_on_scalars(callee, inputs)
         symbols = [ca.MX.sym("a", node.dep(k).sparsity()) for k in range(node.n_dep())]
         step = ca.Function("step", symbols, node.eval_mx(symbols))
         if code == ca.OP_LOW:
@@ -157,11 +155,13 @@ class FunctionWriter:
             if _is_constant(table):
                 mode = _fields(step, {"Low::lookup_mode": int})["Low::lookup_mode"]
                 record = {"kind": "low", "table": _numbers(table), "count": at.nnz(), "mode": mode}
-                return [self._called(record, at.nonzeros(), node.sparsity())]
+                return [self._call_leaf(record, at.nonzeros(), node.sparsity())]
             inner = table.nonzeros()[1:-1]
-            return [shaped(node.sparsity(), [sum((x >= edge for edge in inner), ca.SX(0)) for x in at.nonzeros()])]
+            return [
+                from_entries(node.sparsity(), [sum((x >= edge for edge in inner), ca.SX(0)) for x in at.nonzeros()])
+            ]
         if code == ca.OP_GETNONZEROS_PARAM:
-            return [self._gathered(node, arguments)]
+            return [self._gather(node, arguments)]
         if code == ca.OP_BSPLINE and node.n_dep() == 1:
             record = {"kind": "bspline", **_spline_fields(step), "count": arguments[0].size2()}
             return list(self._leaf(record).call([ca.densify(arguments[0])], False, True))
@@ -174,8 +174,8 @@ class FunctionWriter:
             return [largest + ca.log(ca.sum1(ca.exp(arguments[0] - largest)))]
         return list(step.expand().call(list(arguments)))
 
-    def _gathered(self, node: Any, arguments: Sequence[Any]) -> Any:
-        """Entries of a table at places that are computed."""
+    def _gather(self, node: Any, arguments: Sequence[Any]) -> Any:
+        """Return entries of a table at computed positions."""
         where, chosen = node.info(), [argument.nonzeros() for argument in arguments[1:]]
         sides = {
             side: [ca.SX(k) for k in range(*(where[side][key] for key in ("start", "stop", "step")))]
@@ -191,13 +191,13 @@ class FunctionWriter:
         table = arguments[0]
         if _is_constant(table):
             record = {"kind": "gather", "table": _numbers(table), "count": len(places)}
-            return self._called(record, places, node.sparsity())
+            return self._call_leaf(record, places, node.sparsity())
         entries = table.nonzeros()
-        found = [sum((ca.if_else(place == k, one, 0) for k, one in enumerate(entries)), ca.SX(0)) for place in places]
-        return shaped(node.sparsity(), found)
+        values = [sum((ca.if_else(place == k, x, 0) for k, x in enumerate(entries)), ca.SX(0)) for place in places]
+        return from_entries(node.sparsity(), values)
 
     def _operations(self, function: Any) -> dict[str, Any]:
-        """The record of a function of SX symbols."""
+        """Return the record of a function of SX symbols."""
         nodes: list[Any] = []
         rows: list[tuple[int, int, int]] = []
         constants: list[float] = []
@@ -206,19 +206,19 @@ class FunctionWriter:
         outputs = [[0] * function.nnz_out(k) for k in range(function.n_out())]
         for k in range(function.n_instructions()):
             code = function.instruction_id(k)
-            given, places = function.instruction_input(k), function.instruction_output(k)
+            inputs, places = function.instruction_input(k), function.instruction_output(k)
             if code == ca.OP_OUTPUT:
-                outputs[places[0]][places[1]] = slots[given[0]]
+                outputs[places[0]][places[1]] = slots[inputs[0]]
                 continue
             if code == ca.OP_INPUT:
-                rows.append((INPUT, *given))
+                rows.append((INPUT, *inputs))
             elif code == ca.OP_CONST:
                 rows.append((CONSTANT, len(constants), 0))
                 constants.append(function.instruction_constant(k))
             elif code == ca.OP_CALL:
                 nodes = nodes or function.instructions_sx().nonzeros()
                 begin, call = len(arguments), len(rows)
-                arguments += [slots[slot] for slot in given]
+                arguments += [slots[slot] for slot in inputs]
                 rows.append((CALL, self.write(nodes[k].which_function()), begin))
                 for number, place in enumerate(places):
                     if place >= 0:
@@ -226,10 +226,10 @@ class FunctionWriter:
                         rows.append((RESULT, call, number))
                 continue
             elif code in PLACES:
-                operands = [slots[slot] for slot in given]
+                operands = [slots[slot] for slot in inputs]
                 rows.append((PLACES[code], operands[0], operands[-1]))
             elif code in (ca.OP_ASSIGN, ca.OP_LIFT):
-                slots[places[0]] = slots[given[0]]
+                slots[places[0]] = slots[inputs[0]]
                 continue
             else:
                 raise _unwritable(function)
@@ -252,7 +252,7 @@ def _unwritable(function: Any) -> ProblemError:
 
 
 def _pattern(pattern: Any) -> list[Any]:
-    """Rows, columns and, of a sparse one, the places of its entries column by column."""
+    """Return rows, columns and, if sparse, the positions of the entries column by column."""
     shape = [pattern.size1(), pattern.size2()]
     return shape if pattern.is_dense() else [*shape, pattern.find()]
 
@@ -261,9 +261,9 @@ def _size(pattern: list[Any]) -> int:
     return len(pattern[2]) if len(pattern) > 2 else pattern[0] * pattern[1]
 
 
-def _called_on_scalars(function: Any, inputs: Sequence[Any]) -> list[Any]:
-    """The results of a function of any kind on SX matrices, as a call where CasADi can make one."""
-    if function.class_name() == "Switch":  # on scalars it compares the number of the case, which it else cuts off
+def _call_on_scalars(function: Any, inputs: Sequence[Any]) -> list[Any]:
+    """Return the results of any function on SX matrices, as a call if CasADi can make one."""
+    if function.class_name() == "Switch":  # on scalars CasADi compares the case number, which it otherwise truncates
         case = ca.if_else(inputs[0] < 0, ca.ceil(inputs[0]), ca.floor(inputs[0]))
         inputs = [case, *inputs[1:]]
     return list(function.call(list(inputs), False, True))
@@ -278,7 +278,7 @@ def _numbers(matrix: Any) -> np.ndarray:
 
 
 def _fields(function: Any, kinds: Mapping[str, Any]) -> dict[str, Any]:
-    """Values that CasADi tells of a function by name in its debugging output: `int`, `float` or lists of them.
+    """Return values that CasADi's debugging output states by name: `int`, `float` or lists of them.
 
     The text comes from a function of this process, never from a file.
     """
@@ -300,47 +300,40 @@ def _fields(function: Any, kinds: Mapping[str, Any]) -> dict[str, Any]:
             raise _unwritable(function)
         return kind(np.frombuffer(text[at + 1 : at + 9], dtype)[0])
 
-    found = {}
+    values = {}
     for name, kind in kinds.items():
         letter = b"V" if isinstance(kind, list) else types[kind][0]
-        at = text.rfind(name.encode() + letter)  # of what the function was derived from it tells before
+        at = text.rfind(name.encode() + letter)  # the function's own fields follow those of its base
         if at >= 0:
-            found[name] = value(at + len(name), kind)
-    return found
+            values[name] = value(at + len(name), kind)
+    return values
 
 
 def _spline_fields(step: Any) -> dict[str, Any]:
-    own = "BSplineCommon::"
-    kinds = {f"{own}{name}": [int] for name in ("offset", "degree", "lookup_mode")}
-    told = _fields(step, {f"{own}knots": [float], "BSpline::coeffs": [float], f"{own}m": int, **kinds})
+    prefix = "BSplineCommon::"
+    kinds = {f"{prefix}{name}": [int] for name in ("offset", "degree", "lookup_mode")}
+    numbers = _fields(step, {f"{prefix}knots": [float], "BSpline::coeffs": [float], f"{prefix}m": int, **kinds})
     return {
-        "knots": told[f"{own}knots"],
-        "offsets": told[f"{own}offset"].tolist(),
-        "degrees": told[f"{own}degree"].tolist(),
-        "modes": told[f"{own}lookup_mode"].tolist(),
-        "coefficients": told["BSpline::coeffs"],
-        "size": told[f"{own}m"],
+        "knots": numbers[f"{prefix}knots"],
+        "offsets": numbers[f"{prefix}offset"].tolist(),
+        "degrees": numbers[f"{prefix}degree"].tolist(),
+        "modes": numbers[f"{prefix}lookup_mode"].tolist(),
+        "coefficients": numbers["BSpline::coeffs"],
+        "size": numbers[f"{prefix}m"],
     }
 
 
 def _interpolant_record(function: Any, kind: str) -> dict[str, Any]:
-    told = _fields(
-        function,
-        {
-            "Interpolant::grid": [float],
-            "Interpolant::values": [float],
-            "Interpolant::offset": [int],
-            "Interpolant::m": int,
-            "Interpolant::batch_x": int,
-        },
-    )
-    if told["Interpolant::batch_x"] != 1 or not told["Interpolant::values"].size:
+    prefix = "Interpolant::"
+    kinds = {f"{prefix}{name}": [float] for name in ("grid", "values")}
+    numbers = _fields(function, {**kinds, f"{prefix}offset": [int], f"{prefix}batch_x": int})
+    if numbers[f"{prefix}batch_x"] != 1 or not numbers[f"{prefix}values"].size:
         raise _unwritable(function)
     return {
         "kind": "interpolant",
-        "grid": told["Interpolant::grid"],
-        "offsets": told["Interpolant::offset"].tolist(),
-        "values": told["Interpolant::values"],
+        "grid": numbers[f"{prefix}grid"],
+        "offsets": numbers[f"{prefix}offset"].tolist(),
+        "values": numbers[f"{prefix}values"],
         "derivative": kind == "LinearInterpolantJac",
     }
 
@@ -348,8 +341,8 @@ def _interpolant_record(function: Any, kind: str) -> dict[str, Any]:
 def _integrator_record(function: Any, oracle: int) -> dict[str, Any]:
     kinds = dict(INTEGRATOR_OPTIONS.values())
     names = {"Integrator::t0": float, "Integrator::tout": [float], "Integrator::nfwd": int, "Integrator::nadj": int}
-    told = _fields(function, {**kinds, **names})
-    if told["Integrator::nfwd"] or told["Integrator::nadj"]:
+    numbers = _fields(function, {**kinds, **names})
+    if numbers["Integrator::nfwd"] or numbers["Integrator::nadj"]:
         raise _unwritable(function)
     equations = function.oracle()
     return {
@@ -357,7 +350,7 @@ def _integrator_record(function: Any, oracle: int) -> dict[str, Any]:
         "plugin": INTEGRATORS[function.class_name()],
         "equations": oracle,
         "names": [equations.name_in(), equations.name_out()],
-        "begin": told["Integrator::t0"],
-        "times": told["Integrator::tout"],
-        "options": {option: told[name] for option, (name, _) in INTEGRATOR_OPTIONS.items() if name in told},
+        "begin": numbers["Integrator::t0"],
+        "times": numbers["Integrator::tout"],
+        "options": {option: numbers[name] for option, (name, _) in INTEGRATOR_OPTIONS.items() if name in numbers},
     }

@@ -1,9 +1,8 @@
 """Interval arithmetic: the range of each instruction of an expression over whole intervals of its inputs.
 
-Moore, Kearfott & Cloud, *Introduction to Interval Analysis*, 2009, chapters 2 to 5. Every instruction is done on all
-intervals at once and its result is let out by a few roundings, so the bounds hold for the real value as well as for
-what casadi works out at any time in the interval. They are wide by about the length of the interval: halve it, and they
-are half as wide.
+Moore, Kearfott & Cloud, *Introduction to Interval Analysis*, 2009, chapters 2 to 5. Every instruction is evaluated on
+all intervals at once, and its result is widened by a few roundings, so the bounds hold for the exact value as well as
+for casadi's result. Their overestimation is about proportional to the length of the interval.
 """
 
 from __future__ import annotations
@@ -24,12 +23,12 @@ Array: TypeAlias = np.ndarray
 
 
 class Interval(NamedTuple):
-    """Bounds of a number over each interval of time, and what it is for the sake of if_else.
+    """Bounds of a number over each interval of time, with the structure of if_else expressions.
 
     Attributes:
         low, high: Shape (M,).
-        negates: The test of which it is the opposite, if any.
-        part: Where it is (a test, a value): the value where the test holds and else 0.
+        negates: The test of which it is the negation, if any.
+        part: If it is (a test, a value): the value where the test holds and 0 elsewhere.
     """
 
     low: Array
@@ -39,31 +38,31 @@ class Interval(NamedTuple):
 
 
 def evaluate(function: Any, inputs: Sequence[Interval]) -> list[Interval]:
-    """Return the range of each entry of the only output of an SX function, in their order.
+    """Return the range of each entry of the only output of an SX function, in order.
 
     Args:
-        function: Of scalars; its instructions are those of `RULES`, see `check_instructions`.
+        function: Function of scalars whose instructions are those of `RULES`, see `check_instructions`.
         inputs: The range of each input, over the same M intervals.
     """
     slots: dict[int, Interval] = {}
     outputs: dict[int, Interval] = {}
     for k in range(function.n_instructions()):
-        code, given = function.instruction_id(k), function.instruction_input(k)
+        code, operands = function.instruction_id(k), function.instruction_input(k)
         if code == ca.OP_OUTPUT:
-            outputs[function.instruction_output(k)[1]] = slots[given[0]]
+            outputs[function.instruction_output(k)[1]] = slots[operands[0]]
         else:
             slots[function.instruction_output(k)[0]] = (
-                inputs[given[0]]
+                inputs[operands[0]]
                 if code == ca.OP_INPUT
                 else constant(function.instruction_constant(k), inputs[0].low)
                 if code == ca.OP_CONST
-                else RULES[code](*(slots[slot] for slot in given))
+                else RULES[code](*(slots[slot] for slot in operands))
             )
     return [outputs[k] for k in range(len(outputs))]
 
 
 def check_instructions(what: str, function: Any) -> None:
-    """Raise ProblemError that names an instruction of an SX function which no rule bounds."""
+    """Raise ProblemError, naming the instruction, if an SX function has an instruction without a rule."""
     for k in range(function.n_instructions()):
         code = function.instruction_id(k)
         if code not in RULES and code not in (ca.OP_INPUT, ca.OP_OUTPUT, ca.OP_CONST):
@@ -76,11 +75,11 @@ def check_instructions(what: str, function: Any) -> None:
 
 
 def _out(low: Any, high: Any) -> Interval:
-    """Bounds let out by what rounding may do; what is no number is no bound."""
+    """Return bounds widened by possible rounding; nan becomes unbounded."""
     low, high = np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)
-    # the functions of a C library are good to four units of the last place
-    share, least = 4 * np.finfo(float).eps, 1e-300
-    spread = [share * np.where(np.isfinite(end), np.abs(end), 0.0) + least for end in (low, high)]
+    # the functions of a C library are accurate to four units in the last place
+    share, smallest = 4 * np.finfo(float).eps, 1e-300
+    spread = [share * np.where(np.isfinite(end), np.abs(end), 0.0) + smallest for end in (low, high)]
     return Interval(low - spread[0], high + spread[1])
 
 
@@ -89,17 +88,20 @@ def constant(value: float, like: Array) -> Interval:
     return Interval(np.full(like.shape, value), np.full(like.shape, value))
 
 
-def _least_and_most(corners: list[Array]) -> Interval:
+def _range_of(corners: list[Array]) -> Interval:
+    """Return the range of the values at the corners."""
     stacked = np.array(corners)
     return _out(stacked.min(axis=0), stacked.max(axis=0))
 
 
-def _quiet(rule: Callable[..., Interval]) -> Callable[..., Interval]:
-    def silent(*given: Interval) -> Interval:
-        with np.errstate(all="ignore"):
-            return rule(*given)
+def _without_warnings(rule: Callable[..., Interval]) -> Callable[..., Interval]:
+    """Return the rule without floating-point warnings."""
 
-    return silent
+    def without_warnings(*operands: Interval) -> Interval:
+        with np.errstate(all="ignore"):
+            return rule(*operands)
+
+    return without_warnings
 
 
 def _add(x: Interval, y: Interval) -> Interval:
@@ -108,12 +110,12 @@ def _add(x: Interval, y: Interval) -> Interval:
     return _out(x.low + y.low, x.high + y.high)
 
 
-def _opposite(test: Interval, other: Interval) -> bool:
-    return test.negates is other or other.negates is test
+def _opposite(first: Interval, second: Interval) -> bool:
+    return first.negates is second or second.negates is first
 
 
 def _either(test: Interval, yes: Interval, no: Interval) -> Interval:
-    """One value where the test holds, else the other."""
+    """Return the range of one value if the test holds and of the other if not."""
     holds, fails = decided(test)
     low = np.where(holds, yes.low, np.where(fails, no.low, np.minimum(yes.low, no.low)))
     high = np.where(holds, yes.high, np.where(fails, no.high, np.maximum(yes.high, no.high)))
@@ -121,13 +123,13 @@ def _either(test: Interval, yes: Interval, no: Interval) -> Interval:
 
 
 def decided(test: Interval) -> tuple[Any, Any]:
-    """Return where a test holds all over the interval, and where it fails all over it. Shape (M,) each."""
+    """Return where a test holds in the whole interval, and where it fails in the whole interval. Shape (M,) each."""
     return (test.low > 0) | (test.high < 0), (test.low == 0) & (test.high == 0)
 
 
 def _if_else_zero(test: Interval, value: Interval) -> Interval:
-    found = _either(test, value, constant(0.0, value.low))
-    return found._replace(part=(test, value))
+    result = _either(test, value, constant(0.0, value.low))
+    return result._replace(part=(test, value))
 
 
 def _subtract(x: Interval, y: Interval) -> Interval:
@@ -138,7 +140,7 @@ def _multiply(x: Interval, y: Interval) -> Interval:
     if x is y:
         return _square(x)
     corners = [a * b for a, b in product((x.low, x.high), (y.low, y.high))]
-    return _least_and_most([np.where(np.isnan(corner), 0.0, corner) for corner in corners])  # 0 inf is 0 here
+    return _range_of([np.where(np.isnan(corner), 0.0, corner) for corner in corners])  # 0 times infinity is 0 here
 
 
 def _inverse(x: Interval) -> Interval:
@@ -151,10 +153,10 @@ def _divide(x: Interval, y: Interval) -> Interval:
 
 
 def _square(x: Interval) -> Interval:
-    most = np.maximum(np.abs(x.low), np.abs(x.high))
-    least = np.maximum(0.0, np.maximum(x.low, -x.high))
-    found = _out(least * least, most * most)
-    return Interval(np.maximum(found.low, 0.0), found.high)
+    largest = np.maximum(np.abs(x.low), np.abs(x.high))
+    smallest = np.maximum(0.0, np.maximum(x.low, -x.high))
+    squares = _out(smallest * smallest, largest * largest)
+    return Interval(np.maximum(squares.low, 0.0), squares.high)
 
 
 def _power(x: Interval, y: Interval) -> Interval:
@@ -168,9 +170,9 @@ def _power(x: Interval, y: Interval) -> Interval:
             return _clamped(_out(base.low**exponent, base.high**exponent), low=0.0)
         return _out(x.low**exponent, x.high**exponent)
     base = _clamped(x, low=0.0)
-    found = _least_and_most([a**b for a, b in product((base.low, base.high), (y.low, y.high))])
-    unknown = (x.high < 0) | ((x.low < 0) & ~fixed)  # a whole exponent may lie in y
-    return Interval(np.where(unknown, -np.inf, found.low), np.where(unknown, np.inf, found.high))
+    powers = _range_of([a**b for a, b in product((base.low, base.high), (y.low, y.high))])
+    unknown = (x.high < 0) | ((x.low < 0) & ~fixed)  # y may contain an integer exponent
+    return Interval(np.where(unknown, -np.inf, powers.low), np.where(unknown, np.inf, powers.high))
 
 
 def _clamped(x: Interval, low: float = -np.inf, high: float = np.inf) -> Interval:
@@ -182,68 +184,61 @@ def _absolute(x: Interval) -> Interval:
 
 
 def _rising(function: Callable[[Any], Any], low: float = -np.inf, high: float = np.inf) -> Callable[..., Interval]:
-    """The rule of a function that rises, defined from low to high."""
+    """Return the rule of an increasing function on the domain from low to high."""
 
     def rule(x: Interval) -> Interval:
         inside = _clamped(x, low, high)
-        found = _out(function(inside.low), function(inside.high))
-        nowhere = (x.high < low) | (x.low > high)
-        return Interval(np.where(nowhere, -np.inf, found.low), np.where(nowhere, np.inf, found.high))
+        result = _out(function(inside.low), function(inside.high))
+        undefined = (x.high < low) | (x.low > high)
+        return Interval(np.where(undefined, -np.inf, result.low), np.where(undefined, np.inf, result.high))
 
     return rule
 
 
 def _falling(function: Callable[[Any], Any], low: float, high: float) -> Callable[..., Interval]:
+    """Return the rule of a decreasing function on the domain from low to high."""
     rising = _rising(lambda x: -function(x), low, high)
 
-    def rule(x: Interval) -> Interval:
-        return _negative(rising(x))
-
-    return rule
+    return lambda x: _negative(rising(x))
 
 
 def _negative(x: Interval) -> Interval:
     return Interval(-x.high, -x.low)
 
 
-def _holds_one_of(x: Interval, first: float, step: float) -> Any:
-    """Whether first + k step lies in the interval for a whole k, or so near that rounding may have moved it."""
-    # multiples of a turn are known to fifty units of the last place of the angle
+def _contains_multiple(x: Interval, first: float, step: float) -> Any:
+    """Return whether first + k step lies in the interval for an integer k, within rounding."""
+    # multiples of a turn are accurate to fifty units in the last place of the angle
     slack = 1e-14 * (1 + np.maximum(np.abs(x.low), np.abs(x.high)))
     return np.floor((x.high + slack - first) / step) >= np.ceil((x.low - slack - first) / step)
 
 
 def _wave(function: Callable[[Any], Any], crest: float) -> Callable[..., Interval]:
-    """The rule of a wave of a full turn and height 1 with a crest at an angle."""
+    """Return the rule of a sinusoid of amplitude 1 with a crest at an angle."""
 
     def rule(x: Interval) -> Interval:
         ends = function(x.low), function(x.high)
-        found = _out(np.minimum(*ends), np.maximum(*ends))
-        high = np.where(_holds_one_of(x, crest, tau), 1.0, np.minimum(found.high, 1.0))
-        low = np.where(_holds_one_of(x, crest + tau / 2, tau), -1.0, np.maximum(found.low, -1.0))
-        endless = ~(np.isfinite(x.low) & np.isfinite(x.high))
-        return Interval(np.where(endless, -1.0, low), np.where(endless, 1.0, high))
+        result = _out(np.minimum(*ends), np.maximum(*ends))
+        high = np.where(_contains_multiple(x, crest, tau), 1.0, np.minimum(result.high, 1.0))
+        low = np.where(_contains_multiple(x, crest + tau / 2, tau), -1.0, np.maximum(result.low, -1.0))
+        unbounded = ~(np.isfinite(x.low) & np.isfinite(x.high))
+        return Interval(np.where(unbounded, -1.0, low), np.where(unbounded, 1.0, high))
 
     return rule
 
 
 def _tangent(x: Interval) -> Interval:
-    pole = _holds_one_of(x, tau / 4, tau / 2) | ~(np.isfinite(x.low) & np.isfinite(x.high))
-    found = _out(np.tan(x.low), np.tan(x.high))
-    return Interval(np.where(pole, -np.inf, found.low), np.where(pole, np.inf, found.high))
+    pole = _contains_multiple(x, tau / 4, tau / 2) | ~(np.isfinite(x.low) & np.isfinite(x.high))
+    result = _out(np.tan(x.low), np.tan(x.high))
+    return Interval(np.where(pole, -np.inf, result.low), np.where(pole, np.inf, result.high))
 
 
 def _angle(y: Interval, x: Interval) -> Interval:
-    """atan2: of a rectangle that neither holds the origin nor meets the cut, the corners have the extremes."""
-    found = _least_and_most([np.arctan2(a, b) for a, b in product((y.low, y.high), (x.low, x.high))])
-    whole = ~((x.low > 0) | (y.low > 0) | (y.high < 0))
+    """Apply atan2: a rectangle without the origin and the branch cut has its extremes at the corners."""
+    result = _range_of([np.arctan2(a, b) for a, b in product((y.low, y.high), (x.low, x.high))])
+    crosses_cut = ~((x.low > 0) | (y.low > 0) | (y.high < 0))
     half = float(np.nextafter(np.pi, 4))
-    return Interval(np.where(whole, -half, found.low), np.where(whole, half, found.high))
-
-
-def _cosh(x: Interval) -> Interval:
-    base = _absolute(x)
-    return _out(np.cosh(base.low), np.cosh(base.high))
+    return Interval(np.where(crosses_cut, -half, result.low), np.where(crosses_cut, half, result.high))
 
 
 def _hypot(x: Interval, y: Interval) -> Interval:
@@ -251,27 +246,15 @@ def _hypot(x: Interval, y: Interval) -> Interval:
     return _clamped(_out(np.hypot(first.low, second.low), np.hypot(first.high, second.high)), low=0.0)
 
 
-def _least(x: Interval, y: Interval) -> Interval:
-    return Interval(np.minimum(x.low, y.low), np.minimum(x.high, y.high))
-
-
-def _most(x: Interval, y: Interval) -> Interval:
-    return Interval(np.maximum(x.low, y.low), np.maximum(x.high, y.high))
-
-
 def _copysign(x: Interval, y: Interval) -> Interval:
     size = _absolute(x)
-    other = _negative(size)
-    both = _hull(other, size)  # of a zero the sign is not known
-    return Interval(np.where(y.low > 0, size.low, both.low), np.where(y.high < 0, other.high, both.high))
-
-
-def _hull(x: Interval, y: Interval) -> Interval:
-    return Interval(np.minimum(x.low, y.low), np.maximum(x.high, y.high))
+    low = np.where(y.low > 0, size.low, np.minimum(-size.high, size.low))  # a zero may have either sign
+    high = np.where(y.high < 0, -size.low, np.maximum(-size.low, size.high))
+    return Interval(low, high)
 
 
 def multiple_of(x: Interval, y: Interval, rounded: Callable[[Any], Any]) -> tuple[Any, Any]:
-    """Return the whole multiple of y next to x, a quotient being rounded so, and where it is one all over."""
+    """Return the rounded quotient x / y, and where it is constant over the interval."""
     quotient = _divide(x, y)
     multiple = rounded(quotient.low)
     known = np.isfinite(multiple) & (multiple == rounded(quotient.high))
@@ -279,35 +262,37 @@ def multiple_of(x: Interval, y: Interval, rounded: Callable[[Any], Any]) -> tupl
 
 
 def _modulo(x: Interval, y: Interval) -> Interval:
-    """fmod: x minus the whole multiple of y towards zero; its sign is that of x."""
+    """Apply fmod: x minus the multiple of y, rounded towards zero; its sign is that of x."""
     multiple, known = multiple_of(x, y, np.trunc)
-    same = _subtract(x, _multiply(Interval(multiple, multiple), y))
-    most = np.minimum(_absolute(y).high, _absolute(x).high)
-    low, high = np.where(x.low < 0, -most, 0.0), np.where(x.high > 0, most, 0.0)
-    return Interval(np.where(known, np.maximum(same.low, low), low), np.where(known, np.minimum(same.high, high), high))
+    result = _subtract(x, _multiply(Interval(multiple, multiple), y))
+    largest = np.minimum(_absolute(y).high, _absolute(x).high)
+    low, high = np.where(x.low < 0, -largest, 0.0), np.where(x.high > 0, largest, 0.0)
+    return Interval(
+        np.where(known, np.maximum(result.low, low), low), np.where(known, np.minimum(result.high, high), high)
+    )
 
 
 def _remainder(x: Interval, y: Interval) -> Interval:
-    """Return x minus the nearest whole multiple of y."""
+    """Apply the remainder: x minus the nearest integer multiple of y."""
     multiple, known = multiple_of(x, y, np.rint)
-    same = _subtract(x, _multiply(Interval(multiple, multiple), y))
+    result = _subtract(x, _multiply(Interval(multiple, multiple), y))
     half = np.minimum(_absolute(y).high / 2, _absolute(x).high)
     return Interval(
-        np.where(known, np.maximum(same.low, -half), -half), np.where(known, np.minimum(same.high, half), half)
+        np.where(known, np.maximum(result.low, -half), -half), np.where(known, np.minimum(result.high, half), half)
     )
 
 
 def _below(x: Interval, y: Interval, *, strict: bool) -> Interval:
-    """A test: 1 where x < y, or x <= y, 0 where not."""
-    surely = x.high < y.low if strict else x.high <= y.low
+    """Apply the test x < y or x <= y: 1 if true, 0 if false."""
+    always = x.high < y.low if strict else x.high <= y.low
     never = x.low >= y.high if strict else x.low > y.high
-    return Interval(np.where(surely, 1.0, 0.0), np.where(never, 0.0, 1.0))
+    return Interval(np.where(always, 1.0, 0.0), np.where(never, 0.0, 1.0))
 
 
 def _equal(x: Interval, y: Interval) -> Interval:
-    surely = (x.low == x.high) & (y.low == y.high) & (x.low == y.low)
+    always = (x.low == x.high) & (y.low == y.high) & (x.low == y.low)
     never = (x.low > y.high) | (x.high < y.low)
-    return Interval(np.where(surely, 1.0, 0.0), np.where(never, 0.0, 1.0))
+    return Interval(np.where(always, 1.0, 0.0), np.where(never, 0.0, 1.0))
 
 
 def _not(x: Interval) -> Interval:
@@ -326,16 +311,12 @@ def _or(x: Interval, y: Interval) -> Interval:
 
 
 def _step(function: Callable[[Any], Any]) -> Callable[..., Interval]:
-    """The rule of a function that rises in steps, which are whole numbers: rounding does not touch it."""
+    """Return the rule of an increasing step function with integer values, which rounding does not affect."""
     return lambda x: Interval(function(x.low), function(x.high))
 
 
-def _same(x: Interval) -> Interval:
-    return x
-
-
 _BY_NAME: dict[str, Callable[..., Interval]] = {
-    "ASSIGN": _same,
+    "ASSIGN": lambda x: x,
     "ADD": _add,
     "SUB": _subtract,
     "MUL": _multiply,
@@ -359,15 +340,15 @@ _BY_NAME: dict[str, Callable[..., Interval]] = {
     "ATAN": _rising(np.arctan),
     "ATAN2": _angle,
     "SINH": _rising(np.sinh),
-    "COSH": _cosh,
+    "COSH": lambda x: _rising(np.cosh)(_absolute(x)),
     "TANH": _rising(np.tanh),
     "ASINH": _rising(np.arcsinh),
     "ACOSH": _rising(np.arccosh, low=1.0),
     "ATANH": _rising(np.arctanh, -1.0, 1.0),
     "HYPOT": _hypot,
     "FABS": _absolute,
-    "FMIN": _least,
-    "FMAX": _most,
+    "FMIN": lambda x, y: Interval(np.minimum(x.low, y.low), np.minimum(x.high, y.high)),
+    "FMAX": lambda x, y: Interval(np.maximum(x.low, y.low), np.maximum(x.high, y.high)),
     "FMOD": _modulo,
     "REMAINDER": _remainder,
     "COPYSIGN": _copysign,
@@ -383,6 +364,6 @@ _BY_NAME: dict[str, Callable[..., Interval]] = {
     "OR": _or,
     "IF_ELSE_ZERO": _if_else_zero,
 }
-RULES = {getattr(ca, f"OP_{name}"): _quiet(rule) for name, rule in _BY_NAME.items()}
-"""Interval by the code of casadi's instruction."""
+RULES = {getattr(ca, f"OP_{name}"): _without_warnings(rule) for name, rule in _BY_NAME.items()}
+"""Rules by the code of casadi's instruction."""
 NAMES = {getattr(ca, name): name.removeprefix("OP_").lower() for name in dir(ca) if name.startswith("OP_")}

@@ -1,4 +1,4 @@
-"""A problem as data: names, numbers, and its expressions as functions written by elementary operations."""
+"""Problems as data: names, numbers, and expressions as functions written by elementary operations."""
 
 from __future__ import annotations
 
@@ -13,34 +13,34 @@ from ocp.errors import ProblemError
 from ocp.problem.function_reader import FunctionReader
 from ocp.problem.function_writer import FunctionWriter
 
-__all__ = ["DAMAGED", "NUMBERS", "packed", "restored", "stored", "unpacked"]
+__all__ = ["ARRAY_NAMES", "RECORD_ERRORS", "from_record", "pack_record", "to_record", "unpack_record"]
 
 SYMBOLS = {"SX": ca.SX, "MX": ca.MX}
-DAMAGED = (
+RECORD_ERRORS = (
     AttributeError, IndexError, KeyError, NotImplementedError, OverflowError, RecursionError, RuntimeError, TypeError,
     ValueError,
 )  # fmt: skip
-"""What it raises to build something of data that has another form than was written."""
+"""Errors raised by rebuilding objects from damaged data."""
 ARRAYS = {"i": "integers", "f": "numbers"}
-NUMBERS = tuple(ARRAYS.values())
-"""Names of the arrays that a record is packed into."""
+ARRAY_NAMES = tuple(ARRAYS.values())
+"""Names of the arrays into which a record is packed."""
 
 
 # ---- a problem ---------------------------------------------------------------------------------------------------
 
 
-def stored(name: str, symbols: Any, time: Any, declared: Any) -> dict[str, Any]:
-    """Return a record of names, numbers and arrays. Guesses that are functions are left out.
+def to_record(name: str, symbols: Any, time: Any, declared: Any) -> dict[str, Any]:
+    """Return a problem as names, numbers and arrays. Guesses that are functions are left out.
 
     Args:
         name: Name of the problem.
         symbols: ``casadi.SX`` or ``casadi.MX``.
         time: Its symbol of time.
-        declared: A dataclass of expressions, values, dictionaries and dataclasses of such. What is called ``symbol``,
-            and what stands in ``at_start``, are symbols; all other expressions are made of them.
+        declared: A dataclass of expressions, values, dictionaries and such dataclasses. Fields called ``symbol`` and
+            the entries of ``at_start`` are symbols; all other expressions depend on them.
 
     Raises:
-        ProblemError: An expression calls what is no elementary operation, such as a function of Python's.
+        ProblemError: An expression calls a function that is not elementary, such as a Python callback.
     """
     inputs, outputs, writer = [time], list[Any](), FunctionWriter()
 
@@ -78,34 +78,36 @@ def stored(name: str, symbols: Any, time: Any, declared: Any) -> dict[str, Any]:
     return {**record, "functions": writer.records}
 
 
-def restored(record: Mapping[str, Any], kinds: Sequence[type]) -> tuple[str, Any, Any, Any]:
-    """Return the name, the kind of symbols, the symbol of time and all declarations, with new symbols.
+def from_record(record: Mapping[str, Any], kinds: Sequence[type]) -> tuple[str, Any, Any, Any]:
+    """Return the name, the type of symbols, the symbol of time and all declarations, with new symbols.
 
     Args:
-        record: As :func:`stored` returns it, from wherever. Nothing in it is trusted.
-        kinds: The dataclasses that may stand in it.
+        record: As :func:`to_record` returns it, from an untrusted source.
+        kinds: The dataclasses that may occur in it.
 
     Raises:
         ProblemError: The record is damaged.
     """
     try:
-        return _restored(record, {kind.__name__: kind for kind in kinds})
-    except (*DAMAGED, ProblemError) as error:
-        raise ProblemError(f"the problem that was written is damaged: {error}", name="problem") from error
+        return _from_record(record, {kind.__name__: kind for kind in kinds})
+    except (*RECORD_ERRORS, ProblemError) as error:
+        raise ProblemError(f"the saved problem is damaged: {error}", name="problem") from error
 
 
-def _restored(record: Mapping[str, Any], kinds: Mapping[str, type]) -> tuple[str, Any, Any, Any]:
+def _from_record(record: Mapping[str, Any], kinds: Mapping[str, type]) -> tuple[str, Any, Any, Any]:
     symbols, functions = SYMBOLS[record["symbols"]], FunctionReader(record["functions"]).functions
     expressions = functions[record["expressions"]]
     time = symbols.sym("time")
     inputs: list[Any] = [time] + [None] * (expressions.n_in() - 1)
-    for written in _symbols_in(record["declared"]):
-        if inputs[written["input"]] is not None or not isinstance(written["name"], str):
-            raise ValueError(f"symbol {written['input']} stands twice in it")
-        size = expressions.size_in(written["input"])
-        if size != (written["size"], 1):
-            raise ValueError(f"symbol {written['name']!r} has {written['size']} entries, its place {size}")
-        inputs[written["input"]] = symbols.sym(written["name"], size[0])
+    for symbol in _symbols_in(record["declared"]):
+        if inputs[symbol["input"]] is not None or not isinstance(symbol["name"], str):
+            raise ValueError(f"symbol {symbol['input']} occurs twice")
+        size = expressions.size_in(symbol["input"])
+        if size != (symbol["size"], 1):
+            raise ValueError(
+                f"symbol {symbol['name']!r} has {symbol['size']} entries, the input of the function {size}"
+            )
+        inputs[symbol["input"]] = symbols.sym(symbol["name"], size[0])
     outputs = expressions.call(inputs, True, False)
 
     def read(value: Any) -> Any:
@@ -125,7 +127,7 @@ def _restored(record: Mapping[str, Any], kinds: Mapping[str, type]) -> tuple[str
 
 
 def _symbols_in(value: Any) -> Iterator[dict[str, Any]]:
-    """The records of symbols in what was declared."""
+    """Yield the records of symbols in a record of declarations."""
     if isinstance(value, dict) and "input" in value:
         yield value
     elif isinstance(value, dict | list):
@@ -134,7 +136,7 @@ def _symbols_in(value: Any) -> Iterator[dict[str, Any]]:
 
 
 def symbol_name(symbol: Any) -> str:
-    """Return the name that a symbol was made with."""
+    """Return the name with which a symbol was created."""
     first = str(ca.symvar(symbol)[0].name())
     return first.rpartition("_")[0] if isinstance(symbol, ca.SX) and symbol.numel() > 1 else first
 
@@ -142,38 +144,38 @@ def symbol_name(symbol: Any) -> str:
 # ---- records in files of arrays ----------------------------------------------------------------------------------
 
 
-def packed(record: Any) -> tuple[Any, dict[str, np.ndarray]]:
-    """Return what JSON can hold of a record, and its arrays, one behind the other, by the kind of their numbers."""
-    gathered: dict[str, list[np.ndarray]] = {name: [] for name in NUMBERS}
-    lengths = dict.fromkeys(gathered, 0)
+def pack_record(record: Any) -> tuple[Any, dict[str, np.ndarray]]:
+    """Return the structure of a record, which JSON can hold, and its arrays, concatenated by type."""
+    chunks: dict[str, list[np.ndarray]] = {name: [] for name in ARRAY_NAMES}
+    lengths = dict.fromkeys(chunks, 0)
 
     def pack(value: Any) -> Any:
         if isinstance(value, np.ndarray):
             name = ARRAYS[value.dtype.kind]
-            gathered[name].append(value.ravel())
+            chunks[name].append(value.ravel())
             lengths[name] += value.size
             return {"array": name, "begin": lengths[name] - value.size, "shape": list(value.shape)}
         if isinstance(value, dict):
             return {key: pack(part) for key, part in value.items()}
         return [pack(part) for part in value] if isinstance(value, list | tuple) else value
 
-    told = pack(record)
+    structure = pack(record)
     empty = {"integers": np.zeros(0, dtype=np.int64), "numbers": np.zeros(0)}
-    return told, {name: np.concatenate([empty[name], *parts]) for name, parts in gathered.items()}
+    return structure, {name: np.concatenate([empty[name], *parts]) for name, parts in chunks.items()}
 
 
-def unpacked(told: Any, arrays: Mapping[str, np.ndarray]) -> Any:
-    """Return the record of which :func:`packed` returned these parts.
+def unpack_record(structure: Any, arrays: Mapping[str, np.ndarray]) -> Any:
+    """Return the record whose parts :func:`pack_record` returned.
 
     Raises:
-        ValueError, KeyError, TypeError: They are damaged.
+        ValueError, KeyError, TypeError: The parts are damaged.
     """
-    if isinstance(told, dict) and told.get("array") in NUMBERS:
-        shape, begin = [int(size) for size in told["shape"]], int(told["begin"])
+    if isinstance(structure, dict) and structure.get("array") in ARRAY_NAMES:
+        shape, begin = [int(size) for size in structure["shape"]], int(structure["begin"])
         size = int(np.prod(shape, dtype=object))
-        if begin < 0 or min(shape, default=0) < 0 or begin + size > arrays[told["array"]].size:
-            raise ValueError("an array lies outside the numbers of the file")
-        return arrays[told["array"]][begin : begin + size].reshape(shape)
-    if isinstance(told, dict):
-        return {key: unpacked(part, arrays) for key, part in told.items()}
-    return [unpacked(part, arrays) for part in told] if isinstance(told, list) else told
+        if begin < 0 or min(shape, default=0) < 0 or begin + size > arrays[structure["array"]].size:
+            raise ValueError("an array exceeds the numbers of the file")
+        return arrays[structure["array"]][begin : begin + size].reshape(shape)
+    if isinstance(structure, dict):
+        return {key: unpack_record(part, arrays) for key, part in structure.items()}
+    return [unpack_record(part, arrays) for part in structure] if isinstance(structure, list) else structure

@@ -1,7 +1,4 @@
-"""Values that users give: numbers, arrays and expressions, told apart, stacked and checked.
-
-CasADi functions of columns evaluated at many samples, block by block.
-"""
+"""Values given by the user, read as numbers, arrays or expressions, and functions evaluated at many samples."""
 
 from __future__ import annotations
 
@@ -10,35 +7,18 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ocp.errors import NOT_NUMBERS, ProblemError, floats, told_apart
-
-__all__ = [
-    "Sampler",
-    "at_samples",
-    "check_finite",
-    "check_horizon",
-    "check_inside",
-    "check_order",
-    "constant",
-    "identity",
-    "in_blocks",
-    "is_symbolic",
-    "numeric",
-    "stacked",
-    "symbols_of",
-    "table",
-]
+from ocp.errors import NOT_NUMBERS, ProblemError, floats, format_distinct
 
 
 def is_symbolic(value: Any) -> bool:
-    """Whether a value is an expression, or a list or tuple that holds one."""
+    """Return whether a value is an expression, or a list or tuple that contains one."""
     if isinstance(value, list | tuple):
         return any(is_symbolic(entry) for entry in value)
     return isinstance(value, ca.SX | ca.MX)
 
 
 def stacked(what: str, value: Any) -> Any:
-    """An expression as one column; a list or tuple of expressions and numbers is stacked."""
+    """Return an expression as one column; a list or tuple of expressions and numbers is stacked."""
     try:
         return ca.densify(ca.vec(ca.vertcat(*value) if isinstance(value, list | tuple) else value))
     except NOT_NUMBERS as error:
@@ -47,22 +27,22 @@ def stacked(what: str, value: Any) -> Any:
 
 
 def symbols_of(*functions: Any) -> Any:
-    """The symbols to call functions with: ``casadi.SX`` where all are made of SX, which inlines them, else MX."""
+    """Return the symbols to call functions with: ``casadi.SX`` if all are SX functions, which inlines them, else MX."""
     return ca.SX if all(function.is_a("SXFunction") for function in functions) else ca.MX
 
 
 def identity(symbol: Any) -> int:
-    """A number that is the same for the same scalar SX or the same MX symbol."""
+    """Return a number that is equal for equal scalar SX or equal MX symbols only."""
     return int(symbol.element_hash() if isinstance(symbol, ca.SX) else symbol.__hash__())
 
 
 def numeric(what: str, value: Any) -> np.ndarray:
-    """A value as a flat float array, or ProblemError where it is none."""
+    """Return a value as a flat float array, or raise ProblemError."""
     return table(what, value).reshape(-1)
 
 
 def table(what: str, value: Any) -> np.ndarray:
-    """A value as a float array of its own shape, or ProblemError where it is none."""
+    """Return a value as a float array of its own shape, or raise ProblemError."""
     try:
         return floats(value.full() if isinstance(value, ca.DM) else value)
     except NOT_NUMBERS as error:
@@ -71,7 +51,7 @@ def table(what: str, value: Any) -> np.ndarray:
 
 
 def constant(expression: Any) -> np.ndarray:
-    """Numbers of a column of constants, nan where an entry is an expression of parameters. Shape (n,)."""
+    """Return the numbers of a column of constants, nan for entries that depend on parameters. Shape (n,)."""
     entries = ca.vertsplit(expression)
     if isinstance(expression, ca.MX):
         if not ca.symvar(expression):
@@ -81,112 +61,116 @@ def constant(expression: Any) -> np.ndarray:
 
 
 def check_finite(what: str, value: np.ndarray) -> None:
-    """Raise where an entry is infinite or not a number."""
+    """Raise ProblemError if an entry is infinite or nan."""
     if not np.all(np.isfinite(value)):
         raise ProblemError(f"{what} is not finite: {value.tolist()}", value=value.tolist())
 
 
 def check_order(what: str, lower: np.ndarray, upper: np.ndarray) -> None:
-    """Raise where a lower bound lies above its upper bound, or bounds cannot be met at all."""
+    """Raise ProblemError if a lower bound exceeds its upper bound, or if no finite number meets both."""
     for i, (low, high) in enumerate(zip(lower, upper, strict=True)):
-        given: dict[str, Any] = {"value": float(low), "limit": float(high)}
+        details: dict[str, Any] = {"value": float(low), "limit": float(high)}
         if low > high:
-            least, most = told_apart(float(low), float(high))
-            raise ProblemError(f"{what}: lower bound {least} is above upper bound {most} (entry {i})", **given)
+            least, greatest = format_distinct(float(low), float(high))
+            raise ProblemError(f"{what}: lower bound {least} is above upper bound {greatest} (entry {i})", **details)
         if low == np.inf or high == -np.inf:
-            raise ProblemError(f"{what}: bounds [{low:g}, {high:g}] exclude everything (entry {i})", **given)
+            raise ProblemError(f"{what}: bounds [{low:g}, {high:g}] exclude everything (entry {i})", **details)
 
 
 def check_inside(what: str, value: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
-    """Raise where a value (nan: free) is infinite or lies outside its bounds (nan: not known yet)."""
+    """Raise ProblemError if a value (nan: free) is infinite or outside its bounds (nan: not known yet)."""
     for i, (number, low, high) in enumerate(zip(value, lower, upper, strict=True)):
-        given: dict[str, Any] = {"value": float(number), "limit": (float(low), float(high))}
+        details: dict[str, Any] = {"value": float(number), "limit": (float(low), float(high))}
         if np.isinf(number):
-            raise ProblemError(f"{what} is not finite: {number} (entry {i}); use nan to leave it free", **given)
+            raise ProblemError(f"{what} is not finite: {number} (entry {i}); use nan to leave it free", **details)
         if number < low or number > high:
-            told, least, most = told_apart(float(number), float(low), float(high))
-            words = f"{what} value {told} is outside the bounds [{least}, {most}] (entry {i})"
-            raise ProblemError(words, **given)
+            shown, least, greatest = format_distinct(float(number), float(low), float(high))
+            words = f"{what} value {shown} is outside the bounds [{least}, {greatest}] (entry {i})"
+            raise ProblemError(words, **details)
 
 
 def check_horizon(what: str, value: np.ndarray) -> None:
-    """Raise unless a horizon is a positive finite number (nan: an expression of parameters)."""
+    """Raise ProblemError unless a horizon is a positive finite number (nan: depends on parameters)."""
     if np.isinf(value[0]) or value[0] <= 0:
         words = f"{what} must be positive and finite, not {value[0]:g} s"
         raise ProblemError(words, value=float(value[0]))
 
 
-BLOCKS = (512, 32)  # samples in one call of a function: a map of them all takes longer to make than to evaluate
+BLOCK_SIZES = (512, 32)  # samples per call: one map of all samples takes longer to build than to evaluate
 
 
 class Sampler:
-    """A function of columns, called at many samples at once."""
+    """A function of columns that is evaluated at many samples at once, in blocks.
+
+    Args:
+        symbols: Arguments of the function, one column each.
+        outputs: Expressions of the symbols. A matrix is read column by column.
+    """
 
     def __init__(self, symbols: list[Any], outputs: list[Any]) -> None:
-        """Of expressions of symbols; an output that is a matrix is read column by column."""
         self._inputs, self._outputs = ([part.numel() for part in parts] for parts in (symbols, outputs))
-        packed, found = ca.vertcat(*symbols), ca.vertcat(*[ca.densify(ca.vec(output)) for output in outputs])
-        if isinstance(packed, ca.MX):  # of which only symbols can be inputs
-            inner = ca.Function("inner", symbols, [found], {"cse": True})
+        packed, results = ca.vertcat(*symbols), ca.vertcat(*[ca.densify(ca.vec(output)) for output in outputs])
+        if isinstance(packed, ca.MX):  # the inputs of an MX function must be symbols
+            inner = ca.Function("inner", symbols, [results], {"cse": True})
             packed = ca.MX.sym("packed", sum(self._inputs))
-            found = inner(*ca.vertsplit(packed, np.cumsum([0, *self._inputs]).tolist()))
-        self._function = ca.Function("sampled", [packed], [found])
-        self._filled = np.array(self._function.sparsity_out(0).row(), dtype=int)  # CasADi drops constants that are zero
+            results = inner(*ca.vertsplit(packed, np.cumsum([0, *self._inputs]).tolist()))
+        self._function = ca.Function("sampled", [packed], [results])
+        self._filled = np.array(self._function.sparsity_out(0).row(), dtype=int)  # CasADi drops constant zeros
         self._maps: dict[int, Any] = {}
 
     def __call__(self, *columns: Any) -> list[np.ndarray]:
-        """Its outputs at M samples, each (M, n).
+        """Return the outputs at M samples. Shape (M, n) each.
 
         Args:
-            columns: Its arguments: an array (M, n) of what differs from sample to sample, or (n,) or a number of what
-                does not.
+            columns: The arguments: an array (M, n) that varies over the samples, or (n,) or a number that does not.
         """
         values = [np.asarray(column, dtype=float) for column in columns]
-        m = next(len(value) for value in values if value.ndim == 2)
-        whole = -(-m // BLOCKS[-1]) * BLOCKS[-1]
-        given, filled = np.empty((whole, sum(self._inputs))), np.empty((whole, self._filled.size))
+        count = next(len(value) for value in values if value.ndim == 2)
+        padded = -(-count // BLOCK_SIZES[-1]) * BLOCK_SIZES[-1]
+        arguments, results = np.empty((padded, sum(self._inputs))), np.empty((padded, self._filled.size))
         first = 0
         for size, value in zip(self._inputs, values, strict=True):
-            given[:m, first : first + size] = value
+            arguments[:count, first : first + size] = value
             first += size
-        given[m:] = given[m - 1 : m]  # what is left of the last block says the last sample again
-        at = 0
-        for size in BLOCKS:
-            end = whole - (whole - at) % size
-            if end > at:
+        arguments[count:] = arguments[count - 1 : count]  # pad the last block with the last sample
+        begin = 0
+        for size in BLOCK_SIZES:
+            end = padded - (padded - begin) % size
+            if end > begin:
                 block = self._maps.get(size) or self._maps.setdefault(size, self._function.map(size))
-                in_blocks(block, size, given[at:end], [filled[at:end]])
-            at = end
-        found = np.zeros((whole, sum(self._outputs)))
-        found[:, self._filled] = filled
-        return np.split(found[:m], np.cumsum(self._outputs[:-1]), axis=1)
+                evaluate_in_blocks(block, size, arguments[begin:end], [results[begin:end]])
+            begin = end
+        values_out = np.zeros((padded, sum(self._outputs)))
+        values_out[:, self._filled] = results
+        return np.split(values_out[:count], np.cumsum(self._outputs[:-1]), axis=1)
 
 
-def in_blocks(
-    function: Any, size: int, given: np.ndarray, outputs: list[np.ndarray], state: np.ndarray | None = None
+def evaluate_in_blocks(
+    function: Any, size: int, inputs: np.ndarray, outputs: list[np.ndarray], previous: np.ndarray | None = None
 ) -> None:
-    """Call a casadi function of ``size`` columns side by side block by block.
+    """Call a casadi function of ``size`` columns side by side, block by block, into existing arrays.
 
     Args:
-        given, outputs: Its input and outputs, the columns as rows, in whole blocks: (K size, n) each.
-        state: An input (n,) before that: the last column of the first output of the block before.
+        inputs, outputs: Input and outputs with samples as rows, in whole blocks. Shape (K size, n) each.
+        previous: First argument of the function: the last row of its first output in the previous block. Shape (n,).
+            Updated in place.
     """
     memory, evaluate = function.buffer()
-    if state is not None:
-        memory.set_arg(0, state.data)
-    for at in range(0, len(given), size):
-        part = slice(at, at + size)
-        memory.set_arg(0 if state is None else 1, given[part].data)
+    if previous is not None:
+        memory.set_arg(0, previous.data)
+    for begin in range(0, len(inputs), size):
+        block = slice(begin, begin + size)
+        memory.set_arg(0 if previous is None else 1, inputs[block].data)
         for i, value in enumerate(outputs):
-            memory.set_res(i, value[part].data)
+            memory.set_res(i, value[block].data)
         evaluate()
         if memory.ret():
-            raise RuntimeError(f"{function.name()} failed at samples {at} to {at + size - 1}")
-        if state is not None:
-            state[:] = outputs[0][at + size - 1]
+            raise RuntimeError(f"{function.name()} failed at samples {begin} to {begin + size - 1}")
+        if previous is not None:
+            previous[:] = outputs[0][begin + size - 1]
 
 
-def at_samples(function: Any, *columns: Any) -> list[np.ndarray]:
-    """A casadi function of dense columns at M samples, see :class:`Sampler`."""
+def evaluate_at_samples(function: Any, *columns: Any) -> list[np.ndarray]:
+    """Return the outputs of a casadi function of dense columns at M samples; see :class:`Sampler`."""
     symbols = [ca.MX.sym(f"input{i}", function.numel_in(i)) for i in range(function.n_in())]
     return Sampler(symbols, list(function.call(symbols)))(*columns)

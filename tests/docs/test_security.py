@@ -28,7 +28,7 @@ LIMITS = {
     "MCAP, as it is and unpacked": INPUT_LIMITS.log_bytes / MB,
     "a record or chunk of it, unpacked": INPUT_LIMITS.log_record_bytes / MB,
     "its messages of joints": INPUT_LIMITS.log_message_bytes / MB,
-    "plan or solution, as it is and unpacked": storage.MOST_BYTES / MB,
+    "plan or solution, as it is and unpacked": storage.MAX_FILE_BYTES / MB,
     "elementary operations of its expressions": function_reader.MAX_OPERATIONS,
     "entries of the arguments and results of its functions": function_reader.MAX_ENTRIES,
     "operations of one evaluation, calls included": function_reader.MAX_WORK,

@@ -37,6 +37,6 @@ def test_a_plan_with_every_kind_of_constraint_is_confirmed() -> None:
 
 def test_a_second_solver_needs_a_direct_plan() -> None:
     problem = van_der_pol()
-    with pytest.raises(ProblemError, match="none is given") as caught:
+    with pytest.raises(ProblemError, match="there is none") as caught:
         certificate(problem, {"extremal": solve(problem, Indirect(8))}, second_solver=True)
     assert caught.value.name == "solutions"

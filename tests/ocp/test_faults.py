@@ -32,7 +32,7 @@ from ocp import (
     solve,
     tighten,
 )
-from ocp.console import OutOfTime, check_time, interruptible, limited, quiet, time_left
+from ocp.console import TimeLimitReached, casadi_silenced, check_time, interruptible, time_left, time_limited
 from ocp.direct.prepared import Prepared
 from ocp.errors import Interrupted
 from ocp.status import SolverStatus
@@ -316,16 +316,16 @@ def test_a_time_limit_that_cannot_be_right_is_named(limit: Any) -> None:
 
 def test_an_outer_time_limit_holds_inside() -> None:
     assert time_left() == np.inf
-    with limited(5.0):
-        with limited(100.0):
+    with time_limited(5.0):
+        with time_limited(100.0):
             assert time_left() <= 5.0
-        with limited(None):
+        with time_limited(None):
             assert time_left() <= 5.0
-        with limited(1.0):
+        with time_limited(1.0):
             assert time_left() <= 1.0
     assert time_left() == np.inf
     check_time()
-    with limited(1e-9), pytest.raises(OutOfTime, match="Maximum_WallTime_Exceeded"):
+    with time_limited(1e-9), pytest.raises(TimeLimitReached, match="Maximum_WallTime_Exceeded"):
         check_time()
 
 
@@ -354,7 +354,7 @@ def overtaken(monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, call: int,
         calls.append(name)
         if len(calls) < call:
             return real(*arguments, **named)
-        with limited(1e-9):
+        with time_limited(1e-9):
             return real(*arguments, **named)
 
     monkeypatch.setattr(owner, name, slow)
@@ -428,14 +428,14 @@ def test_tightening_carries_its_best_plan_and_says_what_remains(rounds: int, mon
     method = Collocation(10, scheme="legendre")  # takes four rounds
     overtaken(monkeypatch, Prepared, "solve", rounds + 1, ocp.tightening)
     with pytest.raises(
-        SolveError, match=r"Maximum_WallTime_Exceeded: raise time_limit; .* still goes .* beyond"
+        SolveError, match=r"Maximum_WallTime_Exceeded: raise time_limit; .* still exceeds its bound"
     ) as told:
         tighten(walled(), method, tolerance=1e-10, time_limit=100.0)
     assert (told.value.name, told.value.value) == ("time_limit", 100.0)
     plan = told.value.solution
     assert not plan.success
     assert plan.status is SolverStatus.TIME_LIMIT
-    assert (plan.drawn_in is None) == (rounds == 1)  # under the bounds of its own round
+    assert (plan.bound_tightening is None) == (rounds == 1)  # under the bounds of its own round
     monkeypatch.undo()
     plain, tight = solve(walled(), method), tighten(walled(), method, tolerance=1e-10)
     assert beyond(tight) < beyond(plan)
@@ -542,7 +542,7 @@ def test_what_one_thread_keeps_quiet_does_not_silence_another(capsys: pytest.Cap
     inside, leave = threading.Event(), threading.Event()
 
     def hushed() -> None:
-        with quiet():
+        with casadi_silenced():
             print("of the thread", file=sys.stderr)
             inside.set()
             leave.wait(10.0)
@@ -550,9 +550,9 @@ def test_what_one_thread_keeps_quiet_does_not_silence_another(capsys: pytest.Cap
     thread = threading.Thread(target=hushed)
     thread.start()
     inside.wait(10.0)
-    with quiet():
+    with casadi_silenced():
         print("of the main thread, hushed", file=sys.stderr)
-        with quiet():
+        with casadi_silenced():
             pass
         print("still hushed", file=sys.stderr)
     print("of the main thread", file=sys.stderr)

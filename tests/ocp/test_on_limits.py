@@ -14,19 +14,19 @@ from hypothesis import strategies as st
 from models import FixedBase, Joint, Robot, planar_chain
 from models.arrays import Array
 from ocp import DynamicsSetup, Limits, Problem, ProblemError, TipTask, minimum_velocity_problem, plan, plan_dynamics
-from ocp.errors import told_apart
+from ocp.errors import format_distinct
 
 LOW, HIGH = np.array([-0.0175, -2.0]), np.array([3.7525, 2.0])
 
 
-def limited() -> FixedBase:
+def time_limited() -> FixedBase:
     arm = planar_chain([0.5, 0.4], [1.0, 1.0])
     bounds = zip(arm.joints, LOW, HIGH, strict=True)
     joints = [Joint(j.name, j.kind, j.parent, j.child, j.translation, lower=a, upper=b) for j, a, b in bounds]
     return FixedBase(Robot(arm.links, tuple(joints), tip_translation=arm.tip_translation))
 
 
-MACHINE = limited()
+MACHINE = time_limited()
 
 
 def leaving(joints: Array) -> TipTask:
@@ -78,11 +78,11 @@ def test_a_declared_value_just_beyond_a_bound_is_told_with_the_digits_that_diffe
 
 @given(st.lists(st.floats(allow_nan=False), min_size=2, max_size=4))
 def test_numbers_that_differ_look_different(numbers: list[float]) -> None:
-    told = told_apart(*numbers)
+    told = format_distinct(*numbers)
     for one, text in zip(numbers, told, strict=True):
         for other, beside in zip(numbers, told, strict=True):
             assert (text == beside) == (repr(one) == repr(other))
 
 
 def test_six_digits_are_enough_for_what_differs_there() -> None:
-    assert told_apart(-0.0175, 3.75251234) == ["-0.0175", "3.75251"]
+    assert format_distinct(-0.0175, 3.75251234) == ["-0.0175", "3.75251"]

@@ -85,7 +85,7 @@ def test_the_tolerance_is_reached(method: str) -> None:
 def test_from_a_plan_that_is_audited_already_it_goes_the_same_way(method: str) -> None:
     """As from its first solve; and the audit that comes with it is that of the plan."""
     first = solve(van_der_pol(), START[method])
-    found, audit = refinement.refined(first.problem, START[method], first, first.audit())
+    found, audit = refinement.refine_from(first.problem, START[method], first, first.audit())
     whole = refined(method)
     assert found.refinement is not None
     assert whole.refinement is not None
@@ -109,7 +109,7 @@ def test_a_round_that_fails_is_begun_elsewhere_only_where_that_is_asked(
 
     monkeypatch.setattr(refinement, "solve", briefly)
     with pytest.raises(SolveError, match="from the guess: " if check else "^refinement of .* failed: ") as failed:
-        refinement.refined(first.problem, method, first, first.audit(), {"max_iter": 1}, check)
+        refinement.refine_from(first.problem, method, first, first.audit(), {"max_iter": 1}, check)
     assert asked == [check]
     assert failed.value.solution is not None
     assert not failed.value.solution.success
@@ -273,7 +273,7 @@ def hurried() -> tuple[Problem, float, float]:
     ],
     ids=str,
 )
-@pytest.mark.filterwarnings("ignore:.*not decided:ocp.errors.RefinementWarning")
+@pytest.mark.filterwarnings("ignore:.*undetermined:ocp.errors.RefinementWarning")
 def test_the_mesh_clusters_at_a_switch(method: Method) -> None:
     problem, horizon, switch = hurried()
     solution = refine(problem, method)
@@ -333,7 +333,7 @@ def test_what_finer_intervals_do_not_mend_is_not_reached_and_named() -> None:
 def test_what_the_audit_does_not_decide_is_not_reached_though_every_row_holds() -> None:
     """Where a control enters the conditions at the end, the second order is not known."""
     problem = swing(control_ties=True)
-    with pytest.warns(RefinementWarning, match="not decided: the control") as told:
+    with pytest.warns(RefinementWarning, match="undetermined: the control") as told:
         solution = refine(problem, Collocation(10), tolerance=1e-4, parameters=SWING)
     assert solution.refinement is not None
     assert not solution.refinement.reached
@@ -458,7 +458,7 @@ def test_the_cost_that_is_lost_falls_with_twice_the_order_of_the_controls(method
     """
     past = refined(method).refinement
     assert past is not None
-    assert past.intervals[1] == SETTINGS.pieces * past.intervals[0]
+    assert past.intervals[1] == SETTINGS.max_parts * past.intervals[0]
     assert order(1 / np.array(past.intervals[:2]), np.array(past.errors["cost"][:2])) > least
 
 

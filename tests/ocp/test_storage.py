@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from ocp import ProblemError, Solution
-from ocp.storage import MOST_BYTES, read_arrays, write_arrays
+from ocp.storage import MAX_FILE_BYTES, read_arrays, write_arrays
 from tests.ocp.test_faults import ROOT, run
 
 ARRAYS = {"a": np.arange(6.0).reshape(2, 3), "b/c": np.array([1, 2, 3])}
@@ -30,8 +30,8 @@ def npy(array: np.ndarray) -> bytes:
     return stream.getvalue()
 
 
-def archive(path: Path, members: dict[str, bytes], packed: int = zipfile.ZIP_DEFLATED) -> Path:
-    with zipfile.ZipFile(path, "w", packed, compresslevel=1) as file:
+def archive(path: Path, members: dict[str, bytes], pack_record: int = zipfile.ZIP_DEFLATED) -> Path:
+    with zipfile.ZipFile(path, "w", pack_record, compresslevel=1) as file:
         for name, data in members.items():
             file.writestr(name, data)
     return path
@@ -166,16 +166,16 @@ def test_what_is_no_file_is_not_replaced_by_one(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.npz")
     (tmp_path / "folder.npz").mkdir()
     for name in ("pipe.npz", "folder.npz"):
-        with pytest.raises(ProblemError, match="is no file, but a folder, a pipe or a device"):
+        with pytest.raises(ProblemError, match="is not a file, but a folder, a pipe or a device"):
             write_arrays(tmp_path / name, ARRAYS)
-    with pytest.raises(ProblemError, match="/dev/null is no file"):
+    with pytest.raises(ProblemError, match="/dev/null is not a file"):
         write_arrays("/dev/null", ARRAYS)
     assert {file.name for file in tmp_path.iterdir()} == {"pipe.npz", "folder.npz"}
 
 
 def test_what_could_not_be_read_again_is_not_written(tmp_path: Path) -> None:
     with pytest.raises(ProblemError, match="bytes of arrays"):
-        write_arrays(tmp_path / "a.npz", {"a": np.broadcast_to(np.float64(0), (MOST_BYTES,))})
+        write_arrays(tmp_path / "a.npz", {"a": np.broadcast_to(np.float64(0), (MAX_FILE_BYTES,))})
     assert list(tmp_path.iterdir()) == []
 
 
@@ -186,7 +186,7 @@ def test_what_is_no_file_is_refused_and_not_waited_for(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.npz")
     (tmp_path / "folder.npz").mkdir()
     for path in (tmp_path / "pipe.npz", tmp_path / "folder.npz", Path("/dev/zero"), Path("/dev/null")):
-        refused(path, "is no file, but a folder, a pipe or a device")
+        refused(path, "file, but a folder, a pipe or a device")
     with pytest.raises(FileNotFoundError):
         Solution.load(tmp_path / "absent.npz")
     for wrong in (None, 3, "a\0b", ["a"]):
@@ -224,7 +224,7 @@ BROKEN: dict[str, Callable[[Path], object]] = {
     "lzma": lambda p: archive(p, {"head.npy": npy(np.zeros(3))}, zipfile.ZIP_LZMA),
     "many names": lambda p: archive(p, {f"{k:06}.npy": b"" for k in range(30000)}),
     "deep JSON": lambda p: archive(p, {"head.npy": npy(np.frombuffer(b"[" * 10**6, dtype=np.uint8))}),
-    "a long file": lambda p: os.truncate(archive(p, {"a.npy": b""}), MOST_BYTES + 1),
+    "a long file": lambda p: os.truncate(archive(p, {"a.npy": b""}), MAX_FILE_BYTES + 1),
 }
 
 
@@ -238,7 +238,7 @@ def test_a_name_that_stands_twice_is_refused(tmp_path: Path) -> None:
     archive(tmp_path / "twice.npz", {"head.npy": npy(np.zeros(3)), "tail.npy": npy(np.ones(3))})
     data = (tmp_path / "twice.npz").read_bytes()
     (tmp_path / "twice.npz").write_bytes(data.replace(b"tail.npy", b"head.npy"))
-    refused(tmp_path / "twice.npz", "stands in it twice")
+    refused(tmp_path / "twice.npz", "a name occurs twice")
 
 
 def test_reading_bombs_takes_less_than_a_gigabyte(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ocp import Collocation, Problem, solve
-from ocp.switching import at_switches, switches
+from ocp.switching import solve_at_switches, switches
 
 
 def pushed(push: float = 1.0, brake: float = 3.0) -> Problem:
@@ -27,7 +27,7 @@ def test_a_node_comes_to_where_the_plan_switches(scheme: str) -> None:
     """sqrt(2 d (1/a + 1/b)) s, exactly on a mesh with a node at 3/4 of it."""
     problem, method = pushed(), Collocation(7, 4, scheme)
     rough = solve(problem, method)
-    plan = at_switches(problem, method, rough)
+    plan = solve_at_switches(problem, method, rough)
     assert rough.horizon > plan.horizon * (1 + 1e-6)
     assert plan.horizon == pytest.approx(np.sqrt(8 / 3), rel=1e-7)
     assert np.abs(plan.control_interpolant.breaks - 0.75).min() < 1e-5
@@ -46,7 +46,7 @@ def test_arcs_that_meet_without_a_jump_have_a_node_where_they_meet() -> None:
     problem.dynamics(speed, force)
     problem.minimize(running=force**2)
     method = Collocation(9, 3)
-    plan = at_switches(problem, method, solve(problem, method))
+    plan = solve_at_switches(problem, method, solve(problem, method))
     # u = 1 up to c, then linear to -1 at 1 - c: place = (1 + 2 c - 2 c^2) / 6
     c = (1 - np.sqrt(1 - 2 * (6 * 0.2 - 1))) / 2
     nodes = plan.control_interpolant.breaks
@@ -64,4 +64,4 @@ def test_a_plan_that_does_not_switch_stays_as_it_is() -> None:
     problem.minimize(running=force**2)
     plan = solve(problem, method)
     assert not switches(problem, plan).size
-    assert at_switches(problem, method, plan) is plan
+    assert solve_at_switches(problem, method, plan) is plan

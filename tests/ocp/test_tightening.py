@@ -16,7 +16,7 @@ from models import FixedBase, planar_chain
 from ocp import Collocation, MultipleShooting, Problem, ProblemError, Solution, SolveError, solve, tighten
 from ocp.direct.prepared import Prepared
 from ocp.problem.formulation import Formulation
-from ocp.solution import drawn_in_at, in_order_of
+from ocp.solution import match_order, tightening_at
 from tests.ocp.problems import double_integrator, plant, van_der_pol
 
 pytestmark = pytest.mark.xdist_group("tightening")  # one process, so that every plan is tightened once
@@ -65,21 +65,21 @@ def test_the_plan_keeps_by_how_much_its_bounds_were_drawn_in(method: Any) -> Non
     """States q, v, control u, path row power: at its own points the plan is within what was left of their bounds."""
     tight = tightened(method)
     mesh = tight.control_interpolant.breaks
-    assert tight.drawn_in is not None
-    assert tight.drawn_in.shape == (2, len(mesh) - 1, 4)
-    assert (tight.drawn_in >= 0).all()
-    assert tight.drawn_in[1, :, 0].max() > 0  # the ceiling
-    assert not tight.drawn_in[:, :, 1].any()  # a speed without bounds
+    assert tight.bound_tightening is not None
+    assert tight.bound_tightening.shape == (2, len(mesh) - 1, 4)
+    assert (tight.bound_tightening >= 0).all()
+    assert tight.bound_tightening[1, :, 0].max() > 0  # the ceiling
+    assert not tight.bound_tightening[:, :, 1].any()  # a speed without bounds
     lower, upper = np.array([-np.inf, -np.inf, -9, -4.5]), np.array([1 / 9, np.inf, 9, 4.5])
     curve = tight.control_interpolant
     owner = np.repeat(np.arange(len(mesh) - 1), len(curve.nodes))
     at = mesh[owner] + np.diff(mesh)[owner] * np.tile(curve.nodes, len(mesh) - 1)
     u = curve.values.reshape(-1, 1)
-    shared = drawn_in_at(tight.drawn_in, mesh, at)
+    shared = tightening_at(tight.bound_tightening, mesh, at)
     states = np.hstack([tight.at_fraction(at)["q"], tight.at_fraction(at)["v"]])
     values = np.hstack([states, u, u * states[:, 1:]])
     jumps = [False, False, *[getattr(method, "control", "") != "linear"] * 2]
-    below, above = np.where(jumps, tight.drawn_in[:, owner], shared)
+    below, above = np.where(jumps, tight.bound_tightening[:, owner], shared)
     points = isinstance(method, Collocation) and method.control == "points"  # where all of it is asked
     looked_at = slice(None) if points else slice(2, 3)
     inside = (at > 0) & (at < 1)  # the ends of q and v are given
@@ -90,9 +90,9 @@ def test_the_plan_keeps_by_how_much_its_bounds_were_drawn_in(method: Any) -> Non
 @pytest.mark.parametrize("method", METHODS, ids=str)
 def test_an_active_limit_is_met_where_it_was_drawn_in_to(method: Any) -> None:
     tight = tightened(method)
-    assert tight.drawn_in is not None
+    assert tight.bound_tightening is not None
     at = tight.t / tight.horizon
-    _, above = drawn_in_at(tight.drawn_in, tight.control_interpolant.breaks, at)[:, :, 0]
+    _, above = tightening_at(tight.bound_tightening, tight.control_interpolant.breaks, at)[:, :, 0]
     assert (tight["q"][:, 0] <= 1 / 9 - above + 1e-7)[1:-1].all()
     reached = np.isclose(tight["q"][:, 0], 1 / 9 - above, rtol=0, atol=1e-6)
     assert (reached & (above > 1e-5)).any()
@@ -101,8 +101,8 @@ def test_an_active_limit_is_met_where_it_was_drawn_in_to(method: Any) -> None:
 def test_a_control_that_may_jump_is_drawn_in_for_its_own_interval_alone() -> None:
     """Van der Pol's control leaves its limit in one interval, and only there its polynomial goes beyond."""
     tight = tighten(van_der_pol(lower=-0.5, upper=0.3, horizon=4.0), Collocation(10))
-    assert tight.drawn_in is not None
-    assert np.argwhere(tight.drawn_in)[:, 1:].tolist() == [[7, 2]]
+    assert tight.bound_tightening is not None
+    assert np.argwhere(tight.bound_tightening)[:, 1:].tolist() == [[7, 2]]
 
 
 @pytest.mark.parametrize("method", METHODS, ids=str)
@@ -147,7 +147,7 @@ def test_a_node_is_drawn_in_by_the_larger_of_both_sides() -> None:
     drawn = np.zeros((2, 3, 1))
     drawn[0, :, 0], drawn[1, :, 0] = [1.0, 3.0, 2.0], [0.0, 0.0, 5.0]
     mesh = np.array([0.0, 0.2, 0.7, 1.0])
-    below, above = drawn_in_at(drawn, mesh, np.array([0.0, 0.1, 0.2, 0.5, 0.7, 0.9, 1.0]))[:, :, 0]
+    below, above = tightening_at(drawn, mesh, np.array([0.0, 0.1, 0.2, 0.5, 0.7, 0.9, 1.0]))[:, :, 0]
     assert below.tolist() == [1, 1, 3, 3, 3, 2, 2]
     assert above.tolist() == [0, 0, 0, 0, 5, 5, 5]
 
@@ -156,16 +156,16 @@ def test_what_was_drawn_in_comes_back_from_a_file(tmp_path: Path) -> None:
     tight = tightened(METHODS[0])
     tight.save(tmp_path / "plan.npz")
     loaded = Solution.load(tmp_path / "plan.npz")
-    assert loaded.drawn_in is not None
-    assert tight.drawn_in is not None
-    assert loaded.drawn_in.tobytes() == tight.drawn_in.tobytes()
+    assert loaded.bound_tightening is not None
+    assert tight.bound_tightening is not None
+    assert loaded.bound_tightening.tobytes() == tight.bound_tightening.tobytes()
     solve(walled(), METHODS[0]).save(tmp_path / "plan.npz")
-    assert Solution.load(tmp_path / "plan.npz").drawn_in is None
+    assert Solution.load(tmp_path / "plan.npz").bound_tightening is None
 
 
 @pytest.mark.parametrize("damage", ["intervals", "entries", "negative", "nan", "inf", "words", "flat"])
 def test_a_damaged_file_of_what_was_drawn_in_is_refused(damage: str, tmp_path: Path) -> None:
-    drawn = tightened(METHODS[0]).drawn_in
+    drawn = tightened(METHODS[0]).bound_tightening
     assert drawn is not None
     bad = {
         "intervals": drawn[:, 1:],
@@ -176,15 +176,15 @@ def test_a_damaged_file_of_what_was_drawn_in_is_refused(damage: str, tmp_path: P
         "words": drawn.astype(str),
         "flat": drawn[0],
     }[damage]
-    replace(tightened(METHODS[0]), drawn_in=bad).save(tmp_path / "plan.npz")
-    with pytest.raises(ProblemError, match="drawn_in") as caught:
+    replace(tightened(METHODS[0]), bound_tightening=bad).save(tmp_path / "plan.npz")
+    with pytest.raises(ProblemError, match="bound_tightening") as caught:
         Solution.load(tmp_path / "plan.npz")
-    assert caught.value.name == "drawn_in"
+    assert caught.value.name == "bound_tightening"
 
 
 def test_what_was_drawn_in_follows_the_order_of_the_problem() -> None:
     tight = tightened(METHODS[0])
-    assert tight.drawn_in is not None
+    assert tight.bound_tightening is not None
     other = Problem("walled, declared in another order")
     v, q = other.state("v"), other.state("q", upper=1 / 9)
     u = other.control("u")
@@ -192,9 +192,9 @@ def test_what_was_drawn_in_follows_the_order_of_the_problem() -> None:
     other.dynamics(v, u)
     other.path("power", u * v, lower=-4.5, upper=4.5)
     other.horizon(1.0)
-    moved = in_order_of(Formulation(other), tight)
-    assert moved.drawn_in is not None
-    np.testing.assert_array_equal(moved.drawn_in, tight.drawn_in[:, :, [1, 0, 2, 3]])
+    moved = match_order(Formulation(other), tight)
+    assert moved.bound_tightening is not None
+    np.testing.assert_array_equal(moved.bound_tightening, tight.bound_tightening[:, :, [1, 0, 2, 3]])
 
 
 def round_a_disc() -> Problem:
@@ -282,7 +282,7 @@ def test_a_plan_that_exceeds_nothing_is_left_as_it_is() -> None:
     problem.minimize(running=u**2)
     tight = tighten(problem, Collocation(4))
     assert tight.cost == solve(problem, Collocation(4)).cost
-    assert tight.drawn_in is None
+    assert tight.bound_tightening is None
 
 
 def test_it_takes_parameters_and_a_free_horizon() -> None:

@@ -319,7 +319,7 @@ def redrawn(plan: Solution, pool: str, change: Callable[[Array, Array, Array], A
 def tightened(given: Subject, rng: Any, size: float) -> Solution:
     """The plan of a narrower problem, whose bounds are said to have been tightened."""
     if not given.others:
-        return replace(given.plan, drawn_in=np.full(shape_drawn(given), size))
+        return replace(given.plan, bound_tightening=np.full(shape_drawn(given), size))
     other = given.others[rng.integers(len(given.others))]
     drawn = np.zeros(shape_drawn(given))
     form, narrow = Formulation.of(given.problem), Formulation.of(other.problem)
@@ -330,7 +330,7 @@ def tightened(given: Subject, rng: Any, size: float) -> Solution:
         with np.errstate(invalid="ignore"):
             by = np.nan_to_num(sign * (wide - own), nan=0.0, posinf=0.0, neginf=0.0)
         drawn[side] = np.maximum(by, 0.0)
-    found = replace(other, problem=given.problem, drawn_in=drawn)
+    found = replace(other, problem=given.problem, bound_tightening=drawn)
     return without_multipliers(found) if rng.random() < 0.5 else found
 
 
@@ -381,10 +381,10 @@ def edited(given: Subject, kind: str, rng: Any, size: float) -> Solution:
     if kind == "tightened":
         return tightened(given, rng, size)
     if kind == "tightened elsewhere":
-        return replace(plan, drawn_in=rng.random(shape_drawn(given)) * size)
+        return replace(plan, bound_tightening=rng.random(shape_drawn(given)) * size)
     if kind == "tightened without rows":
         form = Formulation.of(given.problem)
-        return replace(plan, drawn_in=np.full((*shape_drawn(given)[:2], form.nx + form.nu), size))
+        return replace(plan, bound_tightening=np.full((*shape_drawn(given)[:2], form.nx + form.nu), size))
     if kind == "another problem's" and given.others:
         other = given.others[int(rng.integers(len(given.others)))]
         return replace(other, problem=given.problem)

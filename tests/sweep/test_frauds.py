@@ -26,7 +26,7 @@ def test_no_plan_of_narrower_bounds_passes_as_one_of_wider_ones(kind: str, seed:
     plan = edited(given, "tightened", np.random.default_rng(seed), 0.1)
     assert measured(given, plan) > 1.0
     assert not plan.audit().passed
-    assert not replace(plan, drawn_in=None).audit().passed
+    assert not replace(plan, bound_tightening=None).audit().passed
 
 
 @pytest.mark.parametrize("kind", list(PLANS))

@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 
 from models.errors import ModelError
 from ocp.app.batch.content import Payload, canonical_text, digest_of, pack_result, unpack_result
-from ocp.errors import Detailed, ProblemError, SolveError
+from ocp.errors import DetailedError, ProblemError, SolveError
 
 __all__ = [
     "Engine",
@@ -112,7 +112,7 @@ def failed(status: str, error: str, message: str) -> Payload:
 def message_of(error: BaseException) -> str:
     """Return the message of an exception, with the line where it was raised unless it is one of the package."""
     words = str(error).encode("utf-8", "replace").decode()
-    if isinstance(error, Detailed | ModelError):
+    if isinstance(error, DetailedError | ModelError):
         return words
     steps = [step for step in traceback.extract_tb(error.__traceback__) if step.filename != __file__]
     location = f" ({os.path.basename(steps[-1].filename)}, line {steps[-1].lineno})" if steps else ""
@@ -149,7 +149,7 @@ def cached(make: Function, *arguments: Any) -> Any:
             try:
                 _CACHE[key] = make(*arguments), inputs
             except Exception as error:
-                if isinstance(error, Detailed | ModelError) or getattr(error, "errno", None) in DISK_ERRORS:
+                if isinstance(error, DetailedError | ModelError) or getattr(error, "errno", None) in DISK_ERRORS:
                     raise
                 call = f"{key[0][0]}({', '.join(map(repr, arguments))})"
                 words = f"cached: {call} raised {type(error).__name__}: {message_of(error)}"

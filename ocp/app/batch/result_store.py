@@ -24,7 +24,7 @@ from typing import Any
 from ocp.app.batch.content import Payload, canonical_text, key_of, unpack_result
 from ocp.console import LOG
 from ocp.errors import ProblemError
-from ocp.storage import END, checked_path, open_unlinked, write_whole
+from ocp.storage import END_RECORD, checked_path, open_unlinked, write_whole
 
 __all__ = ["STATUSES", "ResultStore"]
 
@@ -182,7 +182,7 @@ class ResultStore:
                     if stream.seek(0, os.SEEK_END) != file["bytes"]:
                         return None
                     stream.seek(-22, os.SEEK_END)  # the end record of a zip archive
-                    if stream.read(4) != END:
+                    if stream.read(4) != END_RECORD:
                         return None
         except (FileNotFoundError, NotADirectoryError, ValueError, AttributeError, KeyError, TypeError, RecursionError):
             return None

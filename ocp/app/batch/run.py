@@ -20,7 +20,7 @@ from ocp.app.batch.content import Payload, canonical_text, digest_of, key_of, ne
 from ocp.app.batch.engine import Engine, Function, Job, checked_cluster, failed
 from ocp.app.batch.result_store import STATUSES, ResultStore
 from ocp.app.batch.table import Batch, Result, row_of
-from ocp.errors import MOST, NOT_NUMBERS, ProblemError, check_entries, checked_choice, checked_count, checked_text
+from ocp.errors import MAX_COUNT, NOT_NUMBERS, ProblemError, check_entries, checked_choice, checked_count, checked_text
 
 __all__ = ["run_batch"]
 
@@ -236,8 +236,8 @@ def texts_of(tasks: Any) -> dict[str, str]:
     try:
         check_entries(tasks)
         for i, task in enumerate(tasks):
-            if i >= MOST:
-                raise ProblemError(f"tasks: at most {MOST} at a time", name="tasks", limit=MOST)
+            if i >= MAX_COUNT:
+                raise ProblemError(f"tasks: at most {MAX_COUNT} at a time", name="tasks", limit=MAX_COUNT)
             text = canonical_text(task, f"tasks[{i}]")
             texts[key_of(text)] = text
     except ProblemError:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ocp.app.batch.result_store import ResultStore
-from ocp.errors import Detailed, ProblemError, SolveError, checked_each, checked_instance, unknown_name
+from ocp.errors import DetailedError, ProblemError, SolveError, checked_each, checked_instance, unknown_name
 from ocp.storage import cell, checked_path, write_text, write_whole
 
 __all__ = ["Batch", "BatchError", "Result", "read_batch", "row_of"]
@@ -21,7 +21,7 @@ COLUMNS = ("key", "status", "cost", "verdict", "seconds", "error", "message")
 Group = str | Callable[[Any], Any]
 
 
-class BatchError(Detailed, RuntimeError):
+class BatchError(DetailedError, RuntimeError):
     """Tasks of a batch failed; all others are done, and all results are stored.
 
     Attributes:

@@ -32,7 +32,7 @@ from ocp.motion.tasks.limits import JointBounds
 from ocp.motion.tasks.targets import Target
 from ocp.problem.formulation import Formulation
 from ocp.problem.values import Sampler
-from ocp.solution import Solution, in_order_of
+from ocp.solution import Solution, match_order
 
 __all__ = [
     "PAGE_SETTINGS",
@@ -445,7 +445,7 @@ def _problem_curves(solution: Solution, fractions: Array, times: Array) -> list[
     if solution.problem is None:
         return []
     form = Formulation.of(solution.problem)
-    ordered = in_order_of(form, solution)
+    ordered = match_order(form, solution)
     x, u = ordered.state_interpolant(fractions), ordered.control_interpolant(fractions)
     p = form.parameter_vector(ordered.parameters)
     running, rows = form.sampled([form.running, form.path.expression], x, u, times, ordered.horizon, p)

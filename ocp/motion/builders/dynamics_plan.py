@@ -53,8 +53,8 @@ from ocp.problem.phases import DURATION, Phases
 from ocp.problem.problem import Problem
 from ocp.refinement import split
 from ocp.solution import Solution
-from ocp.switching import NEAR, at_switches
-from ocp.tightening import exceeded, tighten
+from ocp.switching import WARM_START_OPTIONS, solve_at_switches
+from ocp.tightening import largest_excess, tighten
 
 __all__ = ["Leg", "audit_error", "breaks_of", "checked_legs", "dynamics_phases", "plan_dynamics", "within_limits"]
 
@@ -274,13 +274,17 @@ def plan_dynamics(
             if value is not None:
                 raise ProblemError(f"{name}: every leg has its own; set it in Leg(...)", name=name, value=value)
         names = [leg.name or f"leg {k + 1}" for k, leg in enumerate(legs)]
-        limited = {name: (own, limits) for name, own in zip(names, _machines(machine, legs, names), strict=True)}
+        limited_machines = {
+            name: (own, limits) for name, own in zip(names, _machines(machine, legs, names), strict=True)
+        }
 
         def declare_legs(clearance: ClearanceConstraints | None) -> Problem:
             own = replace(setup, clearance_constraints=clearance)
             return dynamics_phases(machine, legs, total=total, setup=own, **shared)
 
-        return within_limits(declare_legs, setup.clearance_constraints, method, (), options, tolerances, limited)
+        return within_limits(
+            declare_legs, setup.clearance_constraints, method, (), options, tolerances, limited_machines
+        )
     if total is not None:
         raise ProblemError("total is for legs alone; set the horizon instead", name="total", value=total)
 
@@ -392,7 +396,9 @@ def _first_within_limits(
         for plan in [plan for own, plan in costly if own is finest]:
             own = finest.with_mesh(plan.control_interpolant.breaks)
             with suppress(SolveError):
-                plan = tighten(problem, own, tolerance=HOLDING.excess, options={**NEAR, **settings}, guess=plan)
+                plan = tighten(
+                    problem, own, tolerance=HOLDING.excess, options={**WARM_START_OPTIONS, **settings}, guess=plan
+                )
                 audit = plan.audit(tolerances=tolerances)
                 tightened += [plan] if audit.feasible else []
                 reasons.append(f"{finest.intervals} intervals, tightened at any cost: {audit.sentence}")
@@ -408,14 +414,14 @@ def _attempts(
     problem: Problem, mesh: Collocation, settings: Mapping[str, Any], guess: Solution | None
 ) -> Iterator[tuple[str, Solution | SolveError]]:
     """Yield plans on a mesh that satisfy their limits, or the errors; the caller stops when one is good enough."""
-    warm = {**NEAR, **settings}
+    warm = {**WARM_START_OPTIONS, **settings}
     try:
         plan = solve(problem, mesh, options=warm if guess else settings, guess=guess)
     except SolveError as error:
         yield "", error
         return
     yield "", _tightened(problem, mesh, plan, warm)
-    switched = at_switches(problem, mesh, plan, options=settings)
+    switched = solve_at_switches(problem, mesh, plan, options=settings)
     if switched is not plan:
         yield ", with nodes at its switches", _tightened(problem, mesh, switched, warm)
 
@@ -424,11 +430,11 @@ def _tightened(
     problem: Problem, mesh: Collocation, plan: Solution, settings: Mapping[str, Any]
 ) -> Solution | SolveError:
     """Return a plan that satisfies its limits between the nodes at hardly any extra cost, or the error."""
-    if exceeded(problem, plan) <= HOLDING.excess:
+    if largest_excess(problem, plan) <= HOLDING.excess:
         return plan
     own, largest = mesh.with_mesh(plan.control_interpolant.breaks), plan.cost + HOLDING.cost_increase * abs(plan.cost)
     try:
-        tight = tighten(problem, own, tolerance=HOLDING.excess, options=settings, guess=plan, dearest=largest)
+        tight = tighten(problem, own, tolerance=HOLDING.excess, options=settings, guess=plan, max_cost=largest)
     except SolveError as error:
         return error
     if tight.cost <= largest:
@@ -439,9 +445,9 @@ def _tightened(
 
 def _finer(mesh: Collocation, plan: Solution, failure: SolveError) -> Collocation:
     """Return the next mesh: refined where tightening cost the last plan too much, if only that failed; else halved."""
-    if plan.drawn_in is None or failure.solution is not plan or failure.name != "cost":
+    if plan.bound_tightening is None or failure.solution is not plan or failure.name != "cost":
         return mesh.halved()
-    nodes, amounts = plan.control_interpolant.breaks, plan.drawn_in.max(axis=(0, 2))
+    nodes, amounts = plan.control_interpolant.breaks, plan.bound_tightening.max(axis=(0, 2))
     parts = np.where(amounts > 0, HOLDING.splits, 1)
     return mesh.with_mesh(split(nodes, parts, amounts, HOLDING.splits * len(amounts)))
 
@@ -456,8 +462,8 @@ def _with_joint_names(error: SolveError, machines: Mapping[str, tuple[Machine, L
         machine, limits = machines[phase.removesuffix(".")]
         names = list(machine.robot.joint_names)
         if quantity == "torques":
-            limited = np.isfinite((limits or Limits()).bounds(machine).torque)
-            names = [name for name, own in zip(names, limited, strict=True) if own]
+            limited_machines = np.isfinite((limits or Limits()).bounds(machine).torque)
+            names = [name for name, own in zip(names, limited_machines, strict=True) if own]
         return f"{phase}{quantity} of {names[row]!r}" if row < len(names) else label[0]
 
     rows = re.compile(ROWS)

@@ -18,7 +18,7 @@ import numpy as np
 from models import CollisionScene, Machine
 from models.arrays import Array
 from ocp.errors import ProblemError, checked_instance
-from ocp.problem.hulls import Hull, PairsOfBodies, frames_of
+from ocp.problem.hulls import BodyPairs, Hull, frames_of
 from ocp.problem.values import Sampler
 
 __all__ = ["Collision", "checked_collision_scene", "distances_along", "find_collisions", "scene_hulls", "slide_apart"]
@@ -90,16 +90,16 @@ def find_collisions(scene: CollisionScene, base: Array, joints: Array, times: Ar
     return sorted(collisions, key=lambda collision: collision.distance)
 
 
-def _prepare(scene: CollisionScene) -> tuple[Sampler, PairsOfBodies]:
+def _prepare(scene: CollisionScene) -> tuple[Sampler, BodyPairs]:
     """Return the placements as a function of base, joints and time, and all pairs of bodies, cached with the scene."""
-    cached: tuple[Sampler, PairsOfBodies] | None = scene.__dict__.get("_prepared")
+    cached: tuple[Sampler, BodyPairs] | None = scene.__dict__.get("_prepared")
     if cached is None:
         machine = scene.machine
         base, joints = ca.SX.sym("base", machine.base_size), ca.SX.sym("q", machine.joint_size)
         time = ca.SX.sym("time")
         placements = Sampler([base, joints, time], [ca.SX(scene.placements(base, joints, time))])
         hulls = tuple(scene_hulls(scene).values())
-        cached = placements, PairsOfBodies(hulls, scene.pairs, scene.covers)
+        cached = placements, BodyPairs(hulls, scene.pairs, scene.covers)
         scene.__dict__["_prepared"] = cached
     return cached
 

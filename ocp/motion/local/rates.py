@@ -21,7 +21,7 @@ from models.arrays import Array
 from models.spatial import solve_spd
 from ocp.console import interruptible
 from ocp.curves import integrator
-from ocp.errors import MOST, NOT_NUMBERS, ProblemError, checked_nonnegative, checked_positive, floats, real
+from ocp.errors import MAX_COUNT, NOT_NUMBERS, ProblemError, checked_nonnegative, checked_positive, floats, real
 from ocp.motion.local.collisions import checked_collision_scene, distances_along
 from ocp.motion.tasks.checks import checked_configuration, checked_tasks, checked_weights, dependent_rows, horizon_of
 from ocp.motion.tasks.equations import TaskEquations, bind
@@ -179,7 +179,7 @@ def _times(samples: Any, horizon: float) -> Array:
     """Return the times of the samples, checked."""
     if not isinstance(samples, list | tuple | np.ndarray):
         count = real(samples)
-        if not (2 <= count <= MOST and count == int(count)):
+        if not (2 <= count <= MAX_COUNT and count == int(count)):
             words = f"samples must be at least 2 points or an array of times, not {samples!r}"
             raise ProblemError(words, name="samples", value=samples, limit=2)
         return np.linspace(0.0, horizon, int(count))

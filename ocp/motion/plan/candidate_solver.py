@@ -37,7 +37,7 @@ from ocp.motion.search.configurations import (
     describe_alternatives,
 )
 from ocp.problem.values import constant
-from ocp.refinement import refined, split
+from ocp.refinement import refine_from, split
 from ocp.solution import Solution
 
 __all__ = ["CandidateSolver"]
@@ -264,7 +264,7 @@ class CandidateSolver(Solver):
                 warnings.simplefilter("ignore", RefinementWarning)
                 current_mesh = _mesh_of(mesh, solution)
                 options = self._options(motion, current_mesh, solution.cost, self.settings.fine_options)
-                solution, audit = refined(motion.problem, current_mesh, solution, audit, options, check)
+                solution, audit = refine_from(motion.problem, current_mesh, solution, audit, options, check)
             if not _refinable_failures(audit):
                 refined_solution = self._refine_for_tasks(motion, mesh, solution, check)
                 if refined_solution is not solution:

@@ -26,7 +26,7 @@ from ocp.motion.plan.request import MotionRequest, request_of, restored_request,
 from ocp.motion.schedule.trajectory import JointTrajectory
 from ocp.motion.tasks.targets import Target, targets_along
 from ocp.motion.tasks.tip_task import TipTask
-from ocp.problem.stored import DAMAGED, NUMBERS, packed, unpacked
+from ocp.problem.stored import ARRAY_NAMES, RECORD_ERRORS, pack_record, unpack_record
 from ocp.registry import call_registered
 from ocp.solution import Solution, read_head
 from ocp.storage import read_arrays, table_head, write_arrays, write_text
@@ -308,7 +308,7 @@ class Plan:
             except ProblemError as error:
                 words = f"{path} is saved with the problem instead of the request: {error}"
                 warnings.warn(StorageWarning(words, name=error.name), stacklevel=2)
-        head, numbers = packed(
+        head, numbers = pack_record(
             {
                 "request": request,
                 "parts": self.parts,
@@ -342,7 +342,9 @@ class Plan:
             words = f"{path} holds a solution and no plan; read it with Solution.load"
             raise ProblemError(words, name="path", value=str(path))
         try:
-            head = unpacked(read_head(path, arrays["plan"]), {name: arrays[f"plan.{name}"] for name in NUMBERS})
+            head = unpack_record(
+                read_head(path, arrays["plan"]), {name: arrays[f"plan.{name}"] for name in ARRAY_NAMES}
+            )
             request = restored_request(head["request"])
             if request.builder:
                 solution = solution.tied_to(request.problem())
@@ -356,7 +358,7 @@ class Plan:
             plan = cls(request.machine, solution, parts, candidates, bound, targets)
             plan._check_parts()
             return plan.with_targets(request.tasks) if request.builder and targets else plan
-        except (*DAMAGED, ModelError) as error:
+        except (*RECORD_ERRORS, ModelError) as error:
             name = getattr(error, "name", None) or "plan"
             words = f"{path}: the plan in it is damaged: {error}"
             raise ProblemError(words, name=str(name), value=str(path)) from error

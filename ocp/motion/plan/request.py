@@ -52,7 +52,7 @@ from ocp.motion.tasks.zmp_rules import IndexAtLeast, InFoot, Pinned
 from ocp.problem.function_reader import FunctionReader
 from ocp.problem.function_writer import FunctionWriter
 from ocp.problem.problem import Problem
-from ocp.problem.stored import DAMAGED
+from ocp.problem.stored import RECORD_ERRORS
 
 __all__ = ["MotionRequest", "declared_motion", "request_of", "restored_request", "stored_request"]
 
@@ -270,7 +270,7 @@ def restored_request(record: Any) -> MotionRequest:
         if record["builder"] not in BUILDERS and record["builder"] != "":
             raise ValueError(f"builder {record['builder']!r} is not known")
         return MotionRequest(record["builder"], arguments)
-    except (*DAMAGED, ProblemError) as error:
+    except (*RECORD_ERRORS, ProblemError) as error:
         raise ProblemError(f"the stored request is damaged: {error}", name="request") from error
 
 

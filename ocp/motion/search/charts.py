@@ -2,12 +2,12 @@
 
 If a task leaves r of n joint directions free, the configurations that do it at one time form curves (r = 1), surfaces
 (r = 2) or isolated points (r = 0). A chart consists of a configuration, an orthonormal basis of the tangent space
-there (the self-motions, which do not move the tip), and a box in the tangent space that stays near the manifold.
+there (the self-motions), and a box in the tangent space near the manifold.
 
 The atlas grows from the solutions of inverse kinematics at all time samples. Wherever the edge of a chart lies in no
 other chart, the next chart is put there, until the union of the charts has no edge except at the joint limits
 (Henderson 2002, Multiple parameter continuation, Int. J. Bifurcation and Chaos 12). Connected components are covered
-completely. Folds and bifurcations need no special treatment.
+completely, also at folds and bifurcations.
 """
 
 from __future__ import annotations
@@ -240,8 +240,7 @@ class SelfMotionManifolds:
             error_size = np.abs(error).max(axis=1, initial=0.0)
             done = error_size < TOLERANCE
             converged[active[done]] = True
-            unfinished = ~done & np.isfinite(error_size)
-            active, error, jacobian = active[unfinished], error[unfinished], jacobian[unfinished]
+            active, error, jacobian = (part[~done & np.isfinite(error_size)] for part in (active, error, jacobian))
             if active.size:
                 solved = _solve_normal_equations(jacobian @ jacobian.transpose(0, 2, 1), error)
                 step = np.einsum("kmn,km->kn", jacobian, solved)

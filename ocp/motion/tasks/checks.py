@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from models import Joint, Machine
 from models.arrays import Array, warn_of_degrees
-from ocp.errors import NOT_NUMBERS, ProblemError, checked_positive, floats, told_apart
+from ocp.errors import NOT_NUMBERS, ProblemError, checked_positive, floats, format_distinct
 from ocp.motion.tasks.equations import TaskEquations
 from ocp.motion.tasks.geometry import BoundTask, is_holonomic, target_size
 from ocp.motion.tasks.tip_task import ANGULAR, TipTask
@@ -106,7 +106,7 @@ def clip_to_limits(what: str, names: Sequence[str], joints: Array, lower: Array,
     """
     for name, value, low, high in zip(names, joints.tolist(), lower.tolist(), upper.tolist(), strict=True):
         if value < low - CHECKS.rounding * max(1.0, abs(low)) or value > high + CHECKS.rounding * max(1.0, abs(high)):
-            at, least, greatest = told_apart(value, low, high)
+            at, least, greatest = format_distinct(value, low, high)
             verb = "ends" if what.startswith("end") else "starts"
             words = f"{what}: {name!r} {verb} at {at}, outside its limits {least} .. {greatest}; {hint}"
             raise ProblemError(words, name=name, value=value, limit=(low, high))

@@ -29,7 +29,7 @@ def under(limit: float, method: Collocation | MultipleShooting, declared: float 
     plan = solve(push(limit), method)
     drawn = np.zeros((2, method.intervals, 3))
     drawn[:, :, 2] = declared - limit
-    return replace(plan, problem=push(declared), drawn_in=drawn)
+    return replace(plan, problem=push(declared), bound_tightening=drawn)
 
 
 def without_multipliers(plan: Solution) -> Solution:
@@ -113,7 +113,7 @@ def test_a_tightened_bound_makes_no_minimum_of_a_maximum(width: float) -> None:
     drawn = np.zeros((2, 10, 2))
     drawn[:, :, 1] = 1.5 - width
     assert replace(plan, problem=hump(width)).audit().feasible
-    assert not replace(plan, problem=hump(1.5), drawn_in=drawn).audit().passed
+    assert not replace(plan, problem=hump(1.5), bound_tightening=drawn).audit().passed
 
 
 def test_tightening_without_the_path_rows_is_none_of_these() -> None:
@@ -122,7 +122,7 @@ def test_tightening_without_the_path_rows_is_none_of_these() -> None:
     problem.path("power", u * v, upper=100.0)
     problem.minimize(running=u**2 / 2)
     plan = solve(problem, Collocation(20))
-    assert replace(plan, drawn_in=np.zeros((2, 20, 3))).audit().passed
+    assert replace(plan, bound_tightening=np.zeros((2, 20, 3))).audit().passed
 
 
 @pytest.mark.parametrize("cost", [np.nan, np.inf, -np.inf])

@@ -21,10 +21,10 @@ import pytest
 
 from models import cache
 from ocp import Collocation, MultipleShooting, Problem, SolveError, libraries, prepare
-from ocp.console import OutOfTime, limited
+from ocp.console import TimeLimitReached, time_limited
 from ocp.direct import controller
 from ocp.direct.assembly import Derivatives, derivatives
-from ocp.libraries import CompilerError, Library, built
+from ocp.libraries import CompilerError, Library, build_library
 from ocp.problem.formulation import Formulation
 from tests.conformance import brachistochrone, bryson_denham
 from tests.conformance.case import Case
@@ -37,7 +37,7 @@ ROOT = Path(__file__).parents[3]
 def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty cache, and notices that have not been given yet."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    libraries.notice.cache_clear()
+    libraries.warn_interpreted.cache_clear()
     return tmp_path / "cache" / "selfmotion"
 
 
@@ -217,12 +217,12 @@ def test_compilers_and_contents_are_told_apart(own: Path, tmp_path: Path, monkey
 
 @pytest.mark.parametrize("damage", [b"", b"\x7fELF", None])
 def test_a_damaged_file_is_made_again(own: Path, damage: bytes | None) -> None:
-    library = built(number(4))
+    library = build_library(number(4))
     whole = library.read_bytes()
     library.unlink()  # Python has not loaded it
     library.write_bytes(whole[:-1] + b"x" if damage is None else damage)
     assert cache.load_library(number(4).key) is None
-    assert told(built(number(4))) == 4
+    assert told(build_library(number(4))) == 4
     assert [file.read_bytes() for file in own.iterdir()] == [whole]
 
 
@@ -237,16 +237,16 @@ def test_without_a_folder_it_is_compiled_for_the_process(tmp_path: Path, monkeyp
 
 
 def test_a_folder_that_may_only_be_read_serves(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    library = built(number(5))
+    library = build_library(number(5))
 
     def refused(*_: Any, **__: Any) -> Any:
         raise PermissionError
 
     monkeypatch.setattr(os, "utime", refused)
     monkeypatch.setattr(cache, "NamedTemporaryFile", refused)
-    assert built(number(5)) == library
-    assert told(built(number(6))) == 6
-    assert built(number(6)) != library
+    assert build_library(number(5)) == library
+    assert told(build_library(number(6))) == 6
+    assert build_library(number(6)) != library
 
 
 @pytest.mark.parametrize("words", ["false", "no-such-compiler", "'", " "])
@@ -286,7 +286,7 @@ def test_a_compiler_that_fails_is_told_of_and_not_asked_again(
 ) -> None:
     monkeypatch.setenv("CC", script(tmp_path / "failing", "echo no room on device >&2; exit 1"))
     with pytest.raises(CompilerError, match="no room on device"):
-        built(number(7))
+        build_library(number(7))
     assert prepare(van_der_pol(), Collocation(4), compiled=True).solve().success
     assert "no room on device" in caplog.text
 
@@ -294,19 +294,19 @@ def test_a_compiler_that_fails_is_told_of_and_not_asked_again(
 def test_what_is_not_defined_is_no_library() -> None:
     """A call of it would be the end of Python."""
     with pytest.raises(CompilerError, match="fails"):
-        built(Library(("undefined",), lambda: "int gone(void); int number(void) { return gone(); }"))
+        build_library(Library(("undefined",), lambda: "int gone(void); int number(void) { return gone(); }"))
 
 
 def test_what_is_too_long_is_not_compiled(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(libraries, "SIZES", libraries.CodeSizes(accepted=10))
     with pytest.raises(CompilerError, match="characters"):
-        built(number(8))
+        build_library(number(8))
 
 
 def test_a_library_of_somebody_else_is_not_run(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     key = number(9).key
     assert cache.load_library(key) is None
-    library = built(number(9))
+    library = build_library(number(9))
     assert cache.load_library(key) == library
     monkeypatch.setattr(os, "geteuid", lambda: os.getuid() + 1)
     if library.stat().st_uid == 0:
@@ -315,15 +315,15 @@ def test_a_library_of_somebody_else_is_not_run(own: Path, monkeypatch: pytest.Mo
 
 
 def test_libraries_that_are_used_least_make_room(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    files = [built(number(value)) for value in range(10, 13)]
+    files = [build_library(number(value)) for value in range(10, 13)]
     for age, file in enumerate(files):
         os.utime(file, (0, 1000 + age))
-    assert built(number(10)) == files[0]  # used again
+    assert build_library(number(10)) == files[0]  # used again
     monkeypatch.setattr(cache, "MAX_LIBRARY_BYTES", 3 * files[0].stat().st_size)
-    newest = built(number(13))
+    newest = build_library(number(13))
     assert {file for file in own.iterdir() if file.suffix == ".so"} == {files[0], files[2], newest}
     monkeypatch.setattr(cache, "MAX_LIBRARY_BYTES", 0)
-    assert built(number(14)).exists()  # what is needed now stays
+    assert build_library(number(14)).exists()  # what is needed now stays
     assert len(list(own.glob("*.so"))) == 1
 
 
@@ -331,10 +331,10 @@ def test_libraries_that_are_used_least_make_room(own: Path, monkeypatch: pytest.
 
 
 def test_locks_are_removed_unless_somebody_has_them(own: Path) -> None:
-    built(number(21))
+    build_library(number(21))
     (own / "left.lock").touch()
     with cache.exclusive("taken"):
-        built(number(22))
+        build_library(number(22))
         assert {file.name for file in own.glob("*.lock")} == {"taken.lock"}
     assert not list(own.glob("*.lock"))
 
@@ -348,8 +348,8 @@ def test_a_time_limit_ends_the_wait_and_leaves_nothing(
     monkeypatch.setenv("CC", script(tmp_path / "slow", SLOW))
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
     (tmp_path / "temporary").mkdir()
-    with limited(0.3), pytest.raises(OutOfTime):
-        built(number(17))
+    with time_limited(0.3), pytest.raises(TimeLimitReached):
+        build_library(number(17))
     assert is_gone(appears(tmp_path / "pid"))
     assert is_empty(tmp_path / "temporary")
     assert not list(own.iterdir())

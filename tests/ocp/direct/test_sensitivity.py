@@ -119,7 +119,7 @@ def test_the_range_ends_where_the_limits_that_push_change() -> None:
     for value in outside:
         assert not np.array_equal(pushing(prepared.solve({"payload": value}), 4.0), now)
     assert all("torque" in word for word in found.limits[0])
-    assert f"payload = 0.5: the same limits push from {found.lower[0]:.6g}" in str(found)
+    assert f"payload = 0.5: same active limits from {found.lower[0]:.6g}" in str(found)
 
 
 def test_a_linear_plan_moves_linearly_without_end() -> None:

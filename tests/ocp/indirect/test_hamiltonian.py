@@ -216,7 +216,7 @@ BACKWARD: dict[str, tuple[Callable[[], Problem], str]] = {
 @pytest.mark.parametrize("kind", BACKWARD)
 def test_backward_shooting_says_what_it_cannot_take(kind: str) -> None:
     build, message = BACKWARD[kind]
-    with pytest.raises(ProblemError, match=rf"backward shooting cannot take.*{message}.*shooting='multiple'"):
+    with pytest.raises(ProblemError, match=rf"backward shooting does not support.*{message}.*shooting='multiple'"):
         prepare(build(), Indirect(shooting="backward"))
 
 
@@ -373,7 +373,7 @@ def test_the_switches_of_another_problem_are_found_out(horizon: float, rate: flo
     """Newton's method converges all the same: only the sign of the switching function tells."""
     right = solve(oscillator(8.0, 1.7), Indirect())
     seed = solve(oscillator(horizon, rate), Collocation(40, control="held"))
-    with pytest.raises(SolveError, match=r"'u' is at the wrong bound at .* s.*not those of the seed"):
+    with pytest.raises(SolveError, match=r"'u' is at the wrong bound at .* s.*the seed has other switches"):
         solve(oscillator(8.0, 1.7), Indirect(), guess=seed)
     wrong = solve(oscillator(8.0, 1.7), Indirect(), guess=seed, check=False)
     assert not wrong.success
@@ -421,7 +421,7 @@ def test_a_maximum_of_the_hamiltonian_is_no_extremal() -> None:
     problem, x, u = plant("concave", initial=0.0, u={"lower": -1, "upper": 2, "guess": 0.1})
     problem.dynamics(x, u)
     problem.minimize(running=-(u**2) / 2, terminal=x**2)
-    with pytest.raises(SolveError, match="stationary but not least in control 'u'"):
+    with pytest.raises(SolveError, match="stationary but not minimal in control 'u'"):
         solve(problem, Indirect())
 
 
@@ -429,7 +429,7 @@ def test_a_saddle_of_the_hamiltonian_is_no_extremal() -> None:
     """H = u1^2/2 + 3 u1 u2 + u2^2/2 + lambda (u1 + u2) has one stationary point, a saddle."""
     problem = declare(lambda x, u: ca.sumsqr(u) / 2 + 3 * u[0] * u[1], size=2, name="saddle")
     seed = solve(declare(lambda x, u: ca.sumsqr(u), size=2), Collocation(10))
-    with pytest.raises(SolveError, match="stationary but not least"):
+    with pytest.raises(SolveError, match="stationary but not minimal"):
         solve(problem, Indirect(), guess=seed)
 
 
@@ -450,7 +450,7 @@ def test_the_wrong_branch_of_a_heading_is_no_extremal() -> None:
     turned = replace(
         seed, controls={"angle": 0 * seed["angle"]}, control_interpolant=replace(curve, values=0 * curve.values)
     )
-    with pytest.raises(SolveError, match="stationary but not least in control 'angle' at 0 s"):
+    with pytest.raises(SolveError, match="stationary but not minimal in control 'angle' at 0 s"):
         solve(compass(), Indirect(), guess=turned)
 
 
@@ -477,7 +477,7 @@ def test_a_horizon_held_by_its_bound_is_not_passed_over() -> None:
     horizon = problem.horizon(lower=0.1, upper=0.5, guess=0.4)
     problem.dynamics(x, u)
     problem.minimize(running=u**2 / 2, terminal=horizon)
-    with pytest.raises(SolveError, match=r"horizon comes out as 0\.707107 s, beyond its bounds 0\.1 \.\. 0\.5 s"):
+    with pytest.raises(SolveError, match=r"horizon is 0\.707107 s, outside its bounds 0\.1 to 0\.5 s"):
         solve(problem, Indirect())
 
 
@@ -506,7 +506,7 @@ def test_newton_from_a_bad_guess_says_so_and_returns_what_it_has(
 def test_a_guess_that_is_not_finite_is_a_failure_with_words() -> None:
     seed = solve(van_der_pol(), Collocation(5))
     broken = replace(seed, costates={"x": seed.costates["x"] * np.nan})
-    with pytest.raises(SolveError, match="the integration broke down at the seed"):
+    with pytest.raises(SolveError, match="the integration fails at the seed"):
         solve(van_der_pol(), Indirect(), guess=broken)
     assert not solve(van_der_pol(), Indirect(), guess=broken, check=False).success
 
@@ -519,7 +519,7 @@ def unreachable() -> Problem:
 
 
 def test_a_failure_of_its_own_seed_is_named_as_such() -> None:
-    with pytest.raises(SolveError, match=r"direct solution that was to seed it failed: problem 'unreachable': ipopt"):
+    with pytest.raises(SolveError, match=r"direct solution for its seed failed: problem 'unreachable': ipopt"):
         solve(unreachable(), Indirect())
     unsolved = solve(unreachable(), Indirect(), check=False)
     assert not unsolved.success
@@ -534,4 +534,4 @@ def test_a_plan_that_nothing_determines_is_an_extremal_with_a_word() -> None:
     problem.minimize(running=u**2 / 2)
     solution = solve(problem, Indirect())
     assert solution.cost == pytest.approx(0, abs=1e-12)
-    assert "not determined" in solution.message
+    assert "not unique" in solution.message

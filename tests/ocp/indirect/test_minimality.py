@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from ocp import Problem
 from ocp.indirect.hamiltonian import Hamiltonian
-from ocp.indirect.method import not_least, null_space
+from ocp.indirect.method import hamiltonian_defect, null_space
 from ocp.indirect.sensitivity import Extremal
 from ocp.problem.formulation import Formulation
 from tests.ocp.problems import Array
@@ -107,7 +107,7 @@ def verdict(
         np.zeros(0),
     )
     p = form.parameter_vector({})
-    return not_least(ham, path, p, form.bound_values(p))
+    return hamiltonian_defect(ham, path, p, form.bound_values(p))
 
 
 units = pytest.mark.parametrize(("cost", "unit"), [(1.0, 1.0), (1e8, 1.0), (1e-8, 1.0), (1.0, 1e5), (1.0, 1e-5)])
@@ -120,7 +120,7 @@ def test_the_closed_form_is_least_and_what_is_beside_it_is_not_in_any_unit(cost:
         told: dict[str, Any] = {"costate": costate, "curvatures": (1.0, 4.0), "cost": cost, "unit": unit}
         assert verdict(least, **told) == ""
         assert verdict(least * (1 + 1e-8), **told) == ""
-        assert "not least in control 'u[1]'" in verdict(least * [1, 1 + 1e-4], **told)
+        assert "not minimal in control 'u[1]'" in verdict(least * [1, 1 + 1e-4], **told)
 
 
 @units
@@ -128,9 +128,9 @@ def test_a_control_at_its_bound_must_push_outwards(cost: float, unit: float) -> 
     told: dict[str, Any] = {"lower": [-3.0, -3.0], "upper": [5.0, 5.0], "cost": cost, "unit": unit}
     for costate, bound in ((7.0, -3.0), (-7.0, 5.0)):  # H is least beyond it
         assert verdict([bound, bound], costate, **told) == ""
-        assert "not least" in verdict([bound, bound + 1e-3 * np.sign(costate)], costate, **told)
-        assert "not least" in verdict([bound, 2 - bound], costate, **told)  # the other bound
-        assert "not least" in verdict([bound, bound], -costate, **told)
+        assert "not minimal" in verdict([bound, bound + 1e-3 * np.sign(costate)], costate, **told)
+        assert "not minimal" in verdict([bound, 2 - bound], costate, **told)  # the other bound
+        assert "not minimal" in verdict([bound, bound], -costate, **told)
     # a stationary control on its bound need not push
     assert verdict([-3.0, -3.0], 3.0, **told) == verdict([5.0, 5.0], -5.0, **told) == ""
 
@@ -142,7 +142,7 @@ def test_a_bound_holds_what_is_nearer_than_a_billionth_of_its_range(width: float
     told: dict[str, Any] = {"lower": [low, low], "upper": [high, high]}
     for costate, bound, inwards in ((2 * width + 1, low, 1.0), (-2 * width - 1, high, -1.0)):
         assert verdict([bound, bound + inwards * 0.5e-9 * width], costate, **told) == ""
-        assert "not least" in verdict([bound, bound + inwards * 3e-9 * width], costate, **told)
+        assert "not minimal" in verdict([bound, bound + inwards * 3e-9 * width], costate, **told)
 
 
 def test_between_equal_bounds_any_slope_is_held() -> None:
@@ -153,11 +153,11 @@ def test_between_equal_bounds_any_slope_is_held() -> None:
 @units
 def test_what_curves_downwards_is_stationary_but_not_least_unless_held(cost: float, unit: float) -> None:
     told: dict[str, Any] = {"cost": cost, "unit": unit}
-    assert "stationary but not least" in verdict([-1.0, 2.0], 1.0, (1.0, -0.5), **told)
-    assert "stationary but not least" in verdict([-1.0, 1e3], 1.0, (1.0, -1e-3), **told)
+    assert "stationary but not minimal" in verdict([-1.0, 2.0], 1.0, (1.0, -0.5), **told)
+    assert "stationary but not minimal" in verdict([-1.0, 1e3], 1.0, (1.0, -1e-3), **told)
     # along u1 + u2 = const the curvature is the sum of both
     assert verdict([-1.0, 2.0], 1.0, (1.0, -0.5), total=1.0, **told) == ""
-    assert "stationary but not least" in verdict([-1.0, 2.0], 1.0, (-1.0, 0.5), total=1.0, **told)
+    assert "stationary but not minimal" in verdict([-1.0, 2.0], 1.0, (-1.0, 0.5), total=1.0, **told)
     # at a bound that it is pushed to the curvature does not count
     bounds: dict[str, Any] = {"lower": [-9.0, -9.0], "upper": [9.0, 3.0]}
     assert verdict([-1.0, 3.0], 1.0, (1.0, -0.5), **bounds, **told) == ""

@@ -277,7 +277,7 @@ def test_calls_that_multiply_are_refused_before_they_are_worked_out() -> None:
     wide = record_of(*[(INPUT, 0, k) for k in range(1024)], inputs=[[1024, 1]], results=(0,))
     calls = [row for k in range(1100) for row in ((CALL, 0, 0), (RESULT, 1024 + 2 * k, 0))]
     caller = {**wide, "rows": np.concatenate([wide["rows"], calls]), "arguments": np.arange(1024)}
-    with pytest.raises(ProblemError, match="hand over more than"):
+    with pytest.raises(ProblemError, match="calls have more than"):
         FunctionReader([wide, caller])
 
 

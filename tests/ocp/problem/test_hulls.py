@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 from scipy.optimize import minimize
 
 from models.shapes.hull import gap_along, is_box, nearest_directions
-from ocp.problem.hulls import Frames, Hull, PairsOfBodies, frames_of, grouped
+from ocp.problem.hulls import BodyPairs, Frames, Hull, frames_of, group_pairs
 
 CORNERS = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)]) / 2.0
 
@@ -156,8 +156,8 @@ def test_balls_about_bodies_are_no_farther_apart_than_the_bodies() -> None:
     pairs = np.array([[0, 1, -1], [1, 2, -1], [3, 2, 1], [0, 3, 0], [1, 3, 2], [4, 2, -1], [3, 4, -1]])
     places = np.concatenate([np.swapaxes(turns(rng, 150), 1, 2).reshape(-1, 9), rng.normal(size=(150, 3))], axis=1)
     frames = frames_of(places.reshape(50, 36))
-    bodies = PairsOfBodies([*hulls, ground], pairs, {})
-    for kind in grouped([*hulls, ground], pairs):
+    bodies = BodyPairs([*hulls, ground], pairs, {})
+    for kind in group_pairs([*hulls, ground], pairs):
         for pair in np.flatnonzero(kind.has):
             one, other = ([*hulls, ground][k] for k in pairs[pair, :2])
             at, row = np.arange(50), np.full(50, kind.row[pair])

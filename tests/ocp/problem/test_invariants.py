@@ -44,9 +44,9 @@ def body(name: str, angle: float, inertia: Any = (1.0, 1.0, 1.0), terminal: Any 
     told = turned(angle) if isinstance(terminal, str) else terminal
     q = problem.state("q", 4, initial=[1, 0, 0, 0], terminal=told, guess=lambda t: turned(angle * t / TIME))
     w, u = problem.state("w", 3, initial=0.0, terminal=0.0), problem.control("u", 3)
-    moments = ca.diag(ca.DM(inertia))
+    point_data = ca.diag(ca.DM(inertia))
     problem.dynamics(q, quaternion_rate(q, w))
-    problem.dynamics(w, ca.mtimes(ca.inv(moments), u - ca.cross(w, ca.mtimes(moments, w))))
+    problem.dynamics(w, ca.mtimes(ca.inv(point_data), u - ca.cross(w, ca.mtimes(point_data, w))))
     if free:
         problem.horizon(lower=0.5, upper=10.0, guess=TIME)
     else:

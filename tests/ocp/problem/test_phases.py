@@ -343,7 +343,7 @@ def test_a_part_of_a_plan_is_a_plan_over_its_own_time() -> None:
     assert (part.t[0], part.t[-1]) == (0.0, 0.25)
     assert part.at(0.25)["x"] == pytest.approx([0.75])
     assert (list(part.states), list(part.controls)) == (["x"], ["u"])
-    with pytest.raises(Exception, match="audited with the whole"):
+    with pytest.raises(Exception, match="audited as a part of"):
         part.audit()
 
 
@@ -370,17 +370,17 @@ def test_what_cannot_be_joined_is_named() -> None:
         "phase": lambda: phases.join("first", "third"),
         "state of phase 'second'": lambda: phases.join("first", "second", {"y": 0.0}),
         "state or control of phase 'first'": lambda: first.at_end("y"),
-        "no state of the same name": lambda: phases.join("second", "first", {"x": None}),
-        "may not stand there": lambda: apart.join("first", "wide", {"x": strange["first"].at_end("x")}),
+        "no states of the same name": lambda: phases.join("second", "first", {"x": None}),
+        "is not allowed here": lambda: apart.join("first", "wide", {"x": strange["first"].at_end("x")}),
         "and then 2": lambda: apart.join("first", "wide"),
         "has 3 entries": lambda: apart.join("first", "wide", {"x": [1.0, 2.0, 3.0]}),
         "phases itself": lambda: Phases("twice", {"all": phases}),
         "without a dot": lambda: Phases("dot", {"a.b": regulator(1.0)}),
-        "are expected": lambda: Phases("none", {}),
+        "must not be empty": lambda: Phases("none", {}),
         "a Problem is expected": lambda: Phases("no problem", {"a": 1}),  # type: ignore[dict-item]
         "has no horizon": lambda: Phases("half", {"a": _half()}),
         "in one phase, 3 in another": lambda: Phases("sizes", {"a": other, "b": another}),
-        "need a horizon that is a number": lambda: Phases("signals", {"a": signalled}),
+        "needs a horizon that is a number": lambda: Phases("signals", {"a": signalled}),
         "belongs to the problem of a phase": lambda: phases.minimize(running=second.at_end("x")),
     }
     for words, call in refused.items():

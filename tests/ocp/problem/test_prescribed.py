@@ -91,9 +91,9 @@ def test_what_cannot_be_proven_is_refused_by_name() -> None:
     told: dict[str, Any] = {"levers": {"q": np.ones((1, 3))}, "turns": {"q": np.zeros((1, 3))}}
     frame = ca.vertcat(EYE, q)
     for other, seen, word in (
-        (ca.vertcat(EYE, q + problem.time), -1, "frame 1 is moved by time and by states"),
+        (ca.vertcat(EYE, q + problem.time), -1, "frame 1 depends on time and on states"),
         (ca.vertcat(EYE, ca.erf(problem.time), p, 0), -1, "operation 'erf' has no bounds"),
-        (ca.vertcat(EYE, problem.time, p, 0), 0, "seen from the world"),
+        (ca.vertcat(EYE, problem.time, p, 0), 0, "observed from the world"),
     ):
         with pytest.raises(ProblemError, match=word):
             problem.separate("apart", ca.vertcat(frame, other), hulls, [[0, 1, seen]], 0.0, **told)

@@ -148,7 +148,7 @@ def test_what_is_kept_by_a_name_is_made_once(symbols: Any) -> None:
     for count in (1, 31, 700):
         x, u, t = rng.normal(size=(count, form.nx)), rng.normal(size=(count, form.nu)), rng.normal(size=count)
         costate, p = rng.normal(size=count), rng.normal(size=form.np)
-        own = form.sampled(outputs, x, u, t, 2.0, p, (lam, costate[:, None]), kept="both")
+        own = form.sampled(outputs, x, u, t, 2.0, p, (lam, costate[:, None]), cache_as="both")
         anew = form.sampled([form.f, form.x[0] * lam], x, u, t, 2.0, p, (lam, costate[:, None]))
         for one, other in zip(own, anew, strict=True):
             np.testing.assert_array_equal(one, other)

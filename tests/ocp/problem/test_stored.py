@@ -30,7 +30,7 @@ from ocp import (
     prepare,
     solve,
 )
-from ocp.problem.stored import packed, unpacked
+from ocp.problem.stored import pack_record, unpack_record
 from tests.ocp.problems import SWING, energy, plant, swing, van_der_pol
 from tests.ocp.test_faults import run
 
@@ -158,11 +158,11 @@ def test_a_problem_that_calls_python_is_left_out_and_the_plan_says_so(tmp_path: 
     with pytest.raises(ProblemError, match=r"problem 'of Python' cannot be written: .*Callback") as caught:
         pickle.dumps(problem)
     assert caught.value.name == "of Python"
-    with pytest.warns(StorageWarning, match=r"saved without its problem, .*CallbackInternal"):
+    with pytest.warns(StorageWarning, match=r"saved without its problem and cannot be audited: .*CallbackInternal"):
         plan.save(tmp_path / "plan.npz")
     for again in (Solution.load(tmp_path / "plan.npz"), pickle.loads(pickle.dumps(plan))):
         assert again.problem is None
-        with pytest.raises(AuditError, match=r"comes without its problem .*cannot be written.*; call audit\(problem\)"):
+        with pytest.raises(AuditError, match=r"has no problem .*cannot be written.*; call audit\(problem\)"):
             again.audit()
         np.testing.assert_array_equal(again["x"], plan["x"])
         again.save(tmp_path / "again.npz")
@@ -209,23 +209,23 @@ def test_an_exception_whose_value_cannot_be_pickled_tells_how_it_is_shown() -> N
 
 @pytest.mark.parametrize("part", ["functions", "expressions", "declared", "symbols", "name"])
 def test_a_record_that_was_changed_is_refused(part: str) -> None:
-    told, arrays = packed(energy().__getstate__())
-    record = unpacked(json.loads(json.dumps(told)), arrays)
-    assert str(Problem.restored(record)) == str(energy())
+    told, arrays = pack_record(energy().__getstate__())
+    record = unpack_record(json.loads(json.dumps(told)), arrays)
+    assert str(Problem.from_record(record)) == str(energy())
     without = {key: value for key, value in record.items() if key != part}
     changed = {**record, part: record["symbols"][:1]}
     for wrong in (without,) if part == "name" else (without, changed):
-        with pytest.raises(ProblemError, match="the problem that was written is damaged"):
-            Problem.restored(wrong)
+        with pytest.raises(ProblemError, match="the saved problem is damaged"):
+            Problem.from_record(wrong)
 
 
 def test_units_watches_drawn_in_bounds_and_starts_survive_the_file(tmp_path: Path) -> None:
     plan = solve(mapped(), Collocation(5))
-    drawn = replace(plan, drawn_in=np.full((2, 5, 6), 0.25), start="zeros", regularised=True)
+    drawn = replace(plan, bound_tightening=np.full((2, 5, 6), 0.25), start="zeros", regularised=True)
     drawn.save(tmp_path / "plan.npz")
     loaded = Solution.load(tmp_path / "plan.npz")
     assert (loaded.start, loaded.regularised) == ("zeros", True)
-    np.testing.assert_array_equal(loaded.drawn_in, drawn.drawn_in)
+    np.testing.assert_array_equal(loaded.bound_tightening, drawn.bound_tightening)
     assert loaded.problem.declared.states["x"].unit == "rad"
     assert loaded.problem.declared.start["third"].unit == "rad"
     watched = loaded.problem.declared.watch["drift"]

@@ -21,7 +21,7 @@ import numpy as np
 
 from models.machines.standing import Standing
 from ocp.audit.audit import Audit
-from ocp.console import interruptible, limited, time_left
+from ocp.console import interruptible, time_left, time_limited
 from ocp.direct.collocation import Collocation
 from ocp.direct.shooting import MultipleShooting
 from ocp.errors import ProblemError, SolveError, checked_instance, checked_mapping, checked_time_limit
@@ -340,7 +340,7 @@ def plan_steps(
     settings = {**IPOPT, **checked_mapping("options", options)}
     trials: list[Trial] = [(None, method or STEPS)]
     judge = _Judge(tolerances, lambda _: None)
-    with limited(checked_time_limit(time_limit)):
+    with time_limited(checked_time_limit(time_limit)):
         guess = guess_in_time(steps, start, step_options, settings)
         return _first_accepted(
             lambda _: steps_problem(steps, start=start, **step_options), trials, settings, judge, guess

@@ -19,7 +19,7 @@ from ocp import ProblemError, Solution
 from ocp.motion.plan import Candidate, Plan, Reason, Rejection
 from ocp.motion.plan.request import restored_request, stored_request
 from ocp.motion.schedule import JointTrajectory
-from ocp.problem.stored import packed, unpacked
+from ocp.problem.stored import pack_record, unpack_record
 from tests.models.robot.trees import numeric
 from tests.ocp.motion.plan.motions import planned
 from tests.ocp.motion.tasks.space_tasks import floating_manipulator, floating_panda, panda, two_pandas
@@ -102,7 +102,7 @@ def having(record: dict[str, Any], machine: Any) -> dict[str, Any]:
 
 
 def recorded(machine: Machine) -> Any:
-    return machine_in({"request": packed(stored_request("", {"machine": machine}))[0]})
+    return machine_in({"request": pack_record(stored_request("", {"machine": machine}))[0]})
 
 
 def without(name: str) -> Callable[[dict[str, Any]], Any]:
@@ -325,8 +325,8 @@ def alike(first: Any, second: Any) -> bool:
 @pytest.mark.parametrize("kind", MACHINES)
 def test_a_machine_is_read_as_it_was_written(kind: str) -> None:
     machine = MACHINES[kind]()
-    record, arrays = packed(stored_request("", {"machine": machine}))
-    again = restored_request(unpacked(json.loads(json.dumps(record)), arrays)).machine
+    record, arrays = pack_record(stored_request("", {"machine": machine}))
+    again = restored_request(unpack_record(json.loads(json.dumps(record)), arrays)).machine
     assert alike(machine, again)
     rng = np.random.default_rng(3)
     q, qd = rng.normal(size=(2, machine.joint_size))
