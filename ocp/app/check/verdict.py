@@ -133,6 +133,13 @@ class Check:
         return data
 
 
+FAULT_ORDER = {
+    kind: place
+    for place, kind in enumerate(("unknown joint", "missing joint", "times", "not a number", "units", "jump"))
+}
+"""Kinds of faults that explain others, in the order of reporting."""
+
+
 @interruptible
 def check_trajectory(
     robot: Robot,
@@ -213,10 +220,7 @@ def check_trajectory(
     bounds = bounds_of(robot, velocity, acceleration, jerk, torque, notes)
     progress("reading")
     if time_unit is not None:
-        units = ("s", "ms", "us", "ns")
-        unit_s = time_unit if not isinstance(time_unit, str) else UNITS[checked_choice("time_unit", time_unit, units)]
-        checked_positive("time_unit", unit_s)
-        trajectory = replace(trajectory, t=trajectory.t * unit_s)
+        trajectory = replace(trajectory, t=trajectory.t * _seconds(time_unit))
     cleaned = clean_trajectory(trajectory, robot, *bounds[:3], time_unit is not None, unwrap)
     if rule is not None:
         checked_choice("rule", rule, get_args(Rule))
@@ -241,7 +245,7 @@ def check_trajectory(
         gravity = np.asarray(gravity, dtype=float)
         pose = (
             np.asarray(translation, dtype=float),
-            np.eye(3) if rotation is None else np.asarray(rotation, dtype=float),
+            np.asarray(np.eye(3) if rotation is None else rotation, dtype=float),
         )
         machine = _machine_of(robot, cleaned, base, pose, gravity, foot, notes)
         bases = None
@@ -276,10 +280,7 @@ def check_trajectory(
     if not names_confirmed:
         suspicions += exchanged_joints(motion, robot, cleaned.joints, complete and base != "floating")
     unlimited = _unlimited(rows)
-    kind_order = {
-        kind: k for k, kind in enumerate(("unknown joint", "missing joint", "times", "not a number", "units", "jump"))
-    }
-    faults.sort(key=lambda fault: kind_order.get(fault.kind, len(kind_order)))
+    faults.sort(key=lambda fault: FAULT_ORDER.get(fault.kind, len(FAULT_ORDER)))
     return Check(
         trajectory.file,
         robot.name,
@@ -295,6 +296,13 @@ def check_trajectory(
         (*cleaned.notes, *notes),
         cleaned,
     )
+
+
+def _seconds(time_unit: str | float) -> float:
+    """Return a time unit in s."""
+    if isinstance(time_unit, str):
+        return UNITS[checked_choice("time_unit", time_unit, ("s", "ms", "us", "ns"))]
+    return checked_positive("time_unit", time_unit)
 
 
 def _machine_of(

@@ -136,9 +136,9 @@ def steps_motion(steps: Steps, solution: Solution, samples: int = SAMPLES) -> St
     for k, name in enumerate(steps.names):
         stance = steps.stances[k]
         values = solution.phase(name).at_fraction(share)
-        other_feet = {foot: values[f"{foot} load"] for foot in stance.other_feet}
+        foot_loads = {foot: values[f"{foot} load"] for foot in stance.other_feet}
         motion = tuple(values[part] for part in ("joints", "velocities", "accelerations"))
-        quantities = sample_stance(steps, stance, motion, other_feet)
+        quantities = sample_stance(steps, stance, motion, foot_loads)
         begin, end = times[name]
         parts.append({"t": begin + (end - begin) * share, "phase": np.full(count, float(k)), **quantities})
     return motion_of(steps, parts)
@@ -156,17 +156,17 @@ def motion_of(steps: Steps, parts: Sequence[Mapping[str, Array]]) -> StepsMotion
 
 
 def sample_stance(
-    steps: Steps, stance: Stance, motion: tuple[Array, ...], other_feet: Mapping[str, Array]
+    steps: Steps, stance: Stance, motion: tuple[Array, ...], foot_loads: Mapping[str, Array]
 ) -> dict[str, Array]:
     """Return the quantities of `StepsMotion` for a motion in one stance, by name. Shape (M, ...) each.
 
     Args:
         motion: q, q', q'' in the stance's order. Shape (M, n) each.
-        other_feet: Loads of the feet besides the first, in their held rows. Shape (M, k) each.
+        foot_loads: Loads of the feet besides the first, in their held rows. Shape (M, k) each.
     """
     q, qd, qdd = motion
     function, names = _function(steps, stance)
-    stacked = np.column_stack([np.zeros((len(q), 0)), *other_feet.values()])
+    stacked = np.column_stack([np.zeros((len(q), 0)), *foot_loads.values()])
     outputs = function.map(len(q))(q.T, qd.T, qdd.T, stacked.T)
     values = {name: np.array(ca.DM(value)).T for name, value in zip(names, outputs, strict=True)}
     order = steps.order(stance)
@@ -191,11 +191,11 @@ def _function(steps: Steps, stance: Stance) -> tuple[Any, list[str]]:
     n = stance.joint_size
     q, qd, qdd = (ca.SX.sym(name, n) for name in ("q", "qd", "qdd"))
     rows = {name: ca.SX.sym("load", len(stance.load_rows[name])) for name in stance.other_feet}
-    other_feet = {name: stance.full_load(name, part) for name, part in rows.items()}
-    loads = stance.loads(q, qd, qdd, other_feet)
+    foot_loads = {name: stance.full_load(name, part) for name, part in rows.items()}
+    loads = stance.loads(q, qd, qdd, foot_loads)
     root = link_frames(stance.robot, q, stance.world_from_base())[steps.robot.root]
     outputs = {
-        "joint_torques": stance.joint_torques(q, qd, qdd, other_feet),
+        "joint_torques": stance.joint_torques(q, qd, qdd, foot_loads),
         "root_position": root.position,
         "root_rotation": ca.vec(root.rotation),
         "center_of_mass": stance.center_of_mass(q),
@@ -293,8 +293,8 @@ def _least_loads(stance: Stance, motion: tuple[Array, Array, Array]) -> dict[str
         return {}
     q, qd, qdd = (ca.SX.sym(name, stance.joint_size) for name in ("q", "qd", "qdd"))
     rows = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
-    other_feet = {name: stance.full_load(name, part) for name, part in rows.items()}
-    every = ca.vertcat(*stance.loads(q, qd, qdd, other_feet).values())
+    foot_loads = {name: stance.full_load(name, part) for name, part in rows.items()}
+    every = ca.vertcat(*stance.loads(q, qd, qdd, foot_loads).values())
     free = ca.vertcat(*rows.values())
     slope = ca.jacobian(every, free)
     rest = ca.substitute(every, free, ca.DM.zeros(free.shape))

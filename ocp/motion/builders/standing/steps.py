@@ -214,11 +214,11 @@ def _phase(steps: Steps, k: int, start: Array | None, guess: dict[str, Any], opt
         elif last:
             problem.end("balance", over, lower=options.margin, unit="m")
 
-    other_feet = {name: _load(problem, stance, name) for name in stance.other_feet}
-    loads = stance.loads(joints, rates, second, other_feet)
+    foot_loads = {name: _load(problem, stance, name) for name in stance.other_feet}
+    loads = stance.loads(joints, rates, second, foot_loads)
     for name, load in loads.items():
         _limit_load(problem, stance, name, load, options)
-    torques = stance.joint_torques(joints, rates, second, other_feet)
+    torques = stance.joint_torques(joints, rates, second, foot_loads)
     effort = bounds["torque"]
     limited = np.flatnonzero(np.isfinite(effort)).tolist()
     if limited:
@@ -297,12 +297,12 @@ def _swing(
 def _distinct_rows(rows: Any, joints: Any) -> list[int]:
     """Return the rows that differ from all earlier ones; soles of planar machines have coinciding corners."""
     rng = np.random.default_rng(0)
-    other_feet = [
+    others = [
         symbol for symbol in ca.symvar(rows) if not any(ca.is_equal(symbol, each) for each in ca.vertsplit(joints))
     ]
-    inputs = [joints, ca.vertcat(ca.DM(0, 1), *other_feet)]
+    inputs = [joints, ca.vertcat(ca.DM(0, 1), *others)]
     function = ca.Function("rows", inputs, [rows])
-    samples = [function(rng.normal(size=joints.numel()), rng.uniform(size=len(other_feet))) for _ in range(3)]
+    samples = [function(rng.normal(size=joints.numel()), rng.uniform(size=len(others))) for _ in range(3)]
     values = np.column_stack([np.array(value).ravel() for value in samples])
     return [i for i in range(len(values)) if not any(np.allclose(values[i], values[j]) for j in range(i))]
 
