@@ -142,12 +142,12 @@ def _sweep(
     """
     reduced = _reduced(accessory, stages, weak, tolerances)
     if not accessory.linear_controls.any():
-        found = _swept(accessory, stages, reduced, tolerances, upwards=True)
-        if found is not None:
-            return found
-    found = _swept(accessory, stages, reduced, tolerances, upwards=False)
-    assert found is not None
-    return found
+        sweep = _swept(accessory, stages, reduced, tolerances, upwards=True)
+        if sweep is not None:
+            return sweep
+    sweep = _swept(accessory, stages, reduced, tolerances, upwards=False)
+    assert sweep is not None
+    return sweep
 
 
 def _swept(

@@ -188,8 +188,8 @@ class Linearisation:
         x0, x1 = (solution.state_interpolant(np.array([end]))[0] for end in (0.0, 1.0))
         u0, u1 = stack(solution.controls, 2)[[0, -1]]
         function = form.cached("ends", lambda: ends_of(form))
-        found = [np.asarray(v.full()) for v in function(x1, x0, u1, u0, solution.horizon, self.p)]
-        self.end_row, self.end_y, self.final_y, self.final_yy = found[0][:, 0], found[1], found[2][:, 0], found[3]
+        ends = [np.asarray(v.full()) for v in function(x1, x0, u1, u0, solution.horizon, self.p)]
+        self.end_row, self.end_y, self.final_y, self.final_yy = ends[0][:, 0], ends[1], ends[2][:, 0], ends[3]
 
     def _state_sizes(self) -> np.ndarray:
         """Return the sizes of the states. Shape (nx,).

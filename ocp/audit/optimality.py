@@ -365,10 +365,10 @@ def optimality(
     curved = _control_curvature(along)
     first = adjoint(along, curved, cost)
     if first.node_shifts.any():
-        candidate, loss = first, _misfit(along, first, curved)
+        candidate, loss = first, _loss_of_fit(along, first, curved)
         for _ in range(4):  # each pass resolves atoms at single nodes better by the width of an interval
             candidate = adjoint(along, curved, cost, candidate.node_shifts)
-            new_loss = _misfit(along, candidate, curved)
+            new_loss = _loss_of_fit(along, candidate, curved)
             if new_loss >= loss:
                 break
             first, loss = candidate, new_loss
@@ -415,7 +415,7 @@ def _total_loss(by_interval: np.ndarray, multipliers: Adjoint) -> float:
     return float(by_interval.sum() + multipliers.ends.charge)
 
 
-def _misfit(along: Linearisation, multipliers: Adjoint, curved: np.ndarray | None) -> float:
+def _loss_of_fit(along: Linearisation, multipliers: Adjoint, curved: np.ndarray | None) -> float:
     """Return the loss and the costate errors of a plan with these multipliers, in units of cost."""
     assert curved is not None
     loss = control_loss(along, multipliers.costate, multipliers.control_multipliers, curved).sum()

@@ -67,9 +67,9 @@ def clearance_rows(scene: CollisionScene, motion: Motion, bases: Array | None) -
     ignored = []
     if assumptions:
         note = f"ignored by assumption: {', '.join(assumptions)}"
-        ignored = [Row("pairs not checked", len(assumptions), None, "", None, RowVerdict.TOLD, note)]
+        ignored = [Row("pairs not checked", len(assumptions), None, "", None, RowVerdict.INFO, note)]
     if not len(scene.pairs):
-        none = Row("clearance", np.inf, scene.clearance, "m", None, RowVerdict.TOLD, "no pairs that can collide")
+        none = Row("clearance", np.inf, scene.clearance, "m", None, RowVerdict.INFO, "no pairs that can collide")
         return [none, *ignored], []
     if bases is not None:
         rows, faults = _sampled(scene, motion, bases)
@@ -218,7 +218,7 @@ def path_rows(
 def _row(name: str, value: float, limit: float, unit: str, time: float | None) -> Row:
     """Return the row of a value and its limit, which may be infinite."""
     bounded = bool(np.isfinite(limit))
-    verdict = RowVerdict.of(value > limit) if bounded else RowVerdict.TOLD
+    verdict = RowVerdict.of(value > limit) if bounded else RowVerdict.INFO
     return Row(name, value, limit if bounded else None, unit, time, verdict)
 
 

@@ -55,7 +55,7 @@ class RowVerdict(StrEnum):
     UNDECIDED = "undetermined"
     """The file has too few digits, or the proof is inconclusive."""
     UNLIMITED = "unlimited"
-    TOLD = "info"
+    INFO = "info"
     """The value is information without a requirement."""
 
     @classmethod
@@ -122,7 +122,7 @@ def limit_rows(
 
 def audit_rows(audit: Audit) -> list[Row]:
     """Return the findings of an audit as rows of a table."""
-    verdicts = [RowVerdict.TOLD if f.limit is None else RowVerdict.of(not f.passed) for f in audit.findings]
+    verdicts = [RowVerdict.INFO if f.limit is None else RowVerdict.of(not f.passed) for f in audit.findings]
     return [
         Row(f.name, f.value, f.limit, f.unit, f.time, verdict, f.note)
         for f, verdict in zip(audit.findings, verdicts, strict=True)
@@ -380,8 +380,8 @@ def integrate_base(machine: FreeFloating, motion: Motion) -> tuple[Array, list[R
     k, j = int(distance.argmax()), int(turns.argmax())
     note = "integrated so that momentum is conserved"
     rows = [
-        Row("displacement of the base", float(distance[k]), None, "m", float(motion.t[k]), RowVerdict.TOLD, note),
-        Row("rotation of the base", float(turns[j]), None, "rad", float(motion.t[j]), RowVerdict.TOLD, note),
+        Row("displacement of the base", float(distance[k]), None, "m", float(motion.t[k]), RowVerdict.INFO, note),
+        Row("rotation of the base", float(turns[j]), None, "rad", float(motion.t[j]), RowVerdict.INFO, note),
     ]
     return bases, rows
 

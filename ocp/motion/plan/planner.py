@@ -203,8 +203,8 @@ def _search_cells(
     batches = [candidates_from(solver, motions, motions[0].joints[:, 0], direct=True) for motions in passes]
     if include_costlier:
         lowest_costs = [min((seed.cost for seed in batch), default=np.inf) for batch in batches]
-        cheaper = [batch for batch, cost in zip(batches, lowest_costs, strict=True) if cost < lowest_costs[0]]
-        queue.run([*local, *(seed for batch in (*batches[:1], *cheaper) for seed in batch)], include_costlier=True)
+        lower = [batch for batch, cost in zip(batches, lowest_costs, strict=True) if cost < lowest_costs[0]]
+        queue.run([*local, *(seed for batch in (*batches[:1], *lower) for seed in batch)], include_costlier=True)
         return
     # give up a motion early while others wait
     settings = request.settings

@@ -95,7 +95,7 @@ class _StandingSolver(Solver):
     tasks: list[TipTask]
     duration: float
     options: dict[str, Any]
-    start_given: bool
+    start_is_fixed: bool
 
     def advance(self, candidate: Candidate) -> list[Candidate]:
         """Return the candidate, audited or rejected.
@@ -106,7 +106,7 @@ class _StandingSolver(Solver):
         try:
             solution = plan_standing(self.machine, self.tasks, self.duration, start=candidate.start, **self.options)
         except (ProblemError, SolveError) as error:
-            if self.start_given or isinstance(error.__cause__, KeyboardInterrupt):
+            if self.start_is_fixed or isinstance(error.__cause__, KeyboardInterrupt):
                 raise
             return [candidate.rejected(Reason.of_error(Rejection.INFEASIBLE, error))]
         return [replace(candidate, stage=Stage.AUDITED, cost=solution.cost, solution=solution)]

@@ -47,7 +47,7 @@ Reconfigurations: TypeAlias = Literal["forbidden", "counted"]
 WAYPOINT = "waypoint {:g}"
 TOO_MANY_CHARTS = "configurations"
 """Name in the error of a search that needs too many charts."""
-NONE_FOUND = "no path through the waypoints keeps all limits"
+NO_PATH = "no path through the waypoints keeps all limits"
 
 
 @dataclass(frozen=True)
@@ -272,7 +272,7 @@ class _WaypointPlanner:
         paths = sorted(paths, key=lambda path: (bool(path.failure), path.cost))
         if not paths or paths[0].failure:
             reasons = "; ".join(dict.fromkeys(path.failure for path in paths))
-            raise SolveError(f"{NONE_FOUND}{reasons and ': '}{reasons}", name="waypoints")
+            raise SolveError(f"{NO_PATH}{reasons and ': '}{reasons}", name="waypoints")
         best = paths[0]
         candidates = tuple((path.cost, path.failure or ("" if path is best else "costlier")) for path in paths)
         lower_bound = checked_bound(bound, best.cost) or 0.0
@@ -373,7 +373,7 @@ class _WaypointPlanner:
         uncovered = [float(time) for time, charts in zip(search.times, search.atlas, strict=True) if not len(charts)]
         if uncovered and self._section_joint is not None:
             name = self.machine.robot.joint_names[self._section_joint]
-            words = f"{NONE_FOUND}: no configuration was found at waypoint {uncovered[0]:g} on the sections of {name!r}"
+            words = f"{NO_PATH}: no configuration was found at waypoint {uncovered[0]:g} on the sections of {name!r}"
             raise SolveError(words, name=name, time=uncovered[0])
         error = dead_end(search, WAYPOINT, proven=False)
         if error is None:

@@ -33,7 +33,7 @@ class ScheduleSettings:
         room: Share of the limits reserved for what happens between the places where rows are enforced: half of the
             promised accuracy of 1e-3.
         bend: Share of the limits by which a row may deviate from a parabola before more places are evaluated.
-        looked: Share of a bound used at one of three places above which the vertex between them is evaluated: a
+        vertex_usage: Share of a bound used at one of three places above which the vertex between them is evaluated: a
             parabola exceeds the greatest of three values by a quarter at most.
         fine: Parts into which an interval is split for that evaluation; even, so that the middle is an end of one.
 
@@ -86,7 +86,7 @@ class ScheduleSettings:
 
     room: float = 5e-4
     bend: float = 1e-4
-    looked: float = 0.75
+    vertex_usage: float = 0.75
     fine: int = 16
 
     rounds: int = 20

@@ -158,7 +158,7 @@ def limit_usage(
     values = np.stack([rows.usage(motion) for half in halves for rows, motion in half])
     used = np.stack([values.max(axis=0), -values.min(axis=0)])
     # a parabola exceeds the greatest of three of its values by at most a quarter
-    at_row = np.nonzero(np.maximum(*used) > SETTINGS.looked)
+    at_row = np.nonzero(np.maximum(*used) > SETTINGS.vertex_usage)
     high = np.stack([value[at_row] for value in values])
     shares = (zero, INSIDE[0] + zero, f, f, INSIDE[2] + zero, zero + 1)
     places_of = [place[at_row[0]] for place in shares]

@@ -83,7 +83,7 @@ class StepCost(ABC):
     """Lower bound of the cost of a straight step."""
 
     @abstractmethod
-    def cheapest_steps(
+    def minimal_steps(
         self, delta: Array, target: Charts, after: QuadraticBounds, seconds: float
     ) -> tuple[Array, Array]:
         """Return costs (P,) and places (P, r) of the cheapest steps into P charts, with centres `delta` (P, n) away."""
@@ -122,7 +122,7 @@ class SquaredRates(StepCost):
     def reach(self, cost: float, seconds: float) -> float:
         return float(np.sqrt(2 * seconds * cost))
 
-    def cheapest_steps(
+    def minimal_steps(
         self, delta: Array, target: Charts, after: QuadraticBounds, seconds: float
     ) -> tuple[Array, Array]:
         flat = np.einsum("pnr,pn->pr", target.tangents, self.weights * delta)
@@ -332,7 +332,7 @@ class Homogeneous(StepCost):
         least = np.minimum(slope_left * box[0], slope_left * box[1])
         return (gradient * delta).sum(axis=1) + least + after.least, gradient, place[:, None]
 
-    def cheapest_steps(
+    def minimal_steps(
         self, delta: Array, target: Charts, after: QuadraticBounds, seconds: float
     ) -> tuple[Array, Array]:
         cost, _, place = self.minimize(delta, target, after)

@@ -166,7 +166,7 @@ class ChartGraph:
         if not rows.size:
             return
         candidates = charts.select(rows)
-        costs, places = self.cost.cheapest_steps(delta[rows], candidates, after.select(rows), seconds)
+        costs, places = self.cost.minimal_steps(delta[rows], candidates, after.select(rows), seconds)
         for i in np.argsort(costs, kind="stable")[: self.settings.successors].tolist():
             yield replace(candidates.select([i]), centers=joints + delta[rows[[i]]]), places[i]
 

@@ -1,0 +1,49 @@
+"""Names in the code are words of the field: none of those that CONTRIBUTING lists as replaced."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+REPLACED = {
+    "asked", "bent", "brief", "cheaper", "cheapest", "dear", "dearer", "drawn", "found", "given", "instant", "instants",
+    "looked", "made", "misfit", "posture", "postures", "said", "stray", "strays", "sunk", "surroundings", "told",
+    "touch", "touches", "touching",
+}  # fmt: skip
+"""Words that no name contains: participles and riddles in place of the noun of what is named."""
+FILES = sorted(file for package in ("models", "ocp") for file in (ROOT / package).rglob("*.py"))
+
+
+def names(tree: ast.AST) -> Iterator[tuple[str, int]]:
+    """Names that a module defines: functions, classes, arguments, fields and variables, with their lines."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            yield node.name, node.lineno
+        elif isinstance(node, ast.arg):
+            yield node.arg, node.lineno
+        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            yield node.id, node.lineno
+        elif isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store):
+            yield node.attr, node.lineno
+
+
+def words(name: str) -> set[str]:
+    """The words of a name in snake_case, CamelCase or capitals, in lower case."""
+    return {word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])", name)}
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: str(file.relative_to(ROOT)))
+def test_names_are_words_of_the_field(file: Path) -> None:
+    tree = ast.parse(file.read_text(encoding="utf-8"))
+    assert not [f"line {line}: {name}" for name, line in names(tree) if words(name) & REPLACED]
+
+
+def test_every_kind_of_name_is_read() -> None:
+    source = "class AskedFor:\n    told: int = 0\ndef _found(given, *, STRAYS=1):\n    self.postures = drawn = lambda bent: 0"
+    read = {name for name, _ in names(ast.parse(source)) if words(name) & REPLACED}
+    assert read == {"AskedFor", "told", "_found", "given", "STRAYS", "postures", "drawn", "bent"}
