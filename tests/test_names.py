@@ -44,6 +44,7 @@ def test_names_are_words_of_the_field(file: Path) -> None:
 
 
 def test_every_kind_of_name_is_read() -> None:
-    source = "class AskedFor:\n    told: int = 0\ndef _found(given, *, STRAYS=1):\n    self.postures = drawn = lambda bent: 0"
+    source = "class AskedFor:\n    told: int = 0\n"
+    source += "def _found(given, *, STRAYS=1):\n    self.postures = drawn = lambda bent: 0\n"
     read = {name for name, _ in names(ast.parse(source)) if words(name) & REPLACED}
     assert read == {"AskedFor", "told", "_found", "given", "STRAYS", "postures", "drawn", "bent"}

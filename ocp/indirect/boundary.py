@@ -1,4 +1,7 @@
-"""The boundary value problem of the minimum principle, written for shooting, and Newton's method for it."""
+"""The boundary value problem of the minimum principle for shooting, and Newton's method for it.
+
+Its equations are the canonical equations, the end conditions, and the transversality conditions on the costates.
+"""
 
 from __future__ import annotations
 

@@ -54,7 +54,7 @@ def hamiltonian_defect(ham: Hamiltonian, path: Extremal, p: np.ndarray, bounds: 
     """Return why the controls of an extremal do not minimise the Hamiltonian, or "".
 
     At each sample H must be stationary in the free controls, must not fall when a control leaves its bound, and must
-    not curve downwards.
+    not curve downwards (Legendre-Clebsch condition).
     """
     form = ham.form
     if not form.nu:
