@@ -106,14 +106,14 @@ def _run_segments(
         numbered = {kind: file.with_stem(f"{file.stem}-{number}") for kind, file in outputs.items()}
         write(motion, numbered)
         files += numbered.values()
-    reconfiguration_fields = ("time", "before", "after", "duration", "why")
+    reconfiguration_fields = ("time", "before", "after", "duration", "failure")
     data = {
         "passed": passed,
         "cost": segmented.cost,
         "duration": segmented.duration,
         "joints": segmented.segments[0].names,
         "fewest": segmented.fewest,
-        "pieces": [
+        "segments": [
             {"begin": begin, "duration": segment.horizon, "cost": segment.cost, "bound": segment.bound}
             for begin, segment in zip(segmented.start_times, segmented.segments, strict=True)
         ],

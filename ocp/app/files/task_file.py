@@ -21,7 +21,7 @@ velocity = 2.0                      # for all joints, rad/s or m/s, or { elbow =
 [cost]
 weights = { elbow = 4 }             # of squared joint rates; 1 of all others
 [search]
-kind = "postures"                   # or "start", "global"; "pieces": the fewest motions, if one is not enough
+kind = "configurations"             # or "start", "global"; "segments": the fewest motions, if one is not enough
 # start = { elbow = 1.2 }           # joints at the start, all of them; cyclic = true; seed = 1; pace = "free"
 [scene]
 clearance = 0.01                    # m; ignored = [["link1", "link3"]]; srdf = "..."; folders = ["..."]
@@ -215,7 +215,7 @@ def read_task(file: FileName, output_folder: FileName | None = None) -> Task:
     outputs_in = folder if output_folder is None else Path(output_folder)
     outputs, period = _outputs(root.table("output", "a table [output]"), outputs_in)
     root.done()
-    in_segments = options.pop("in_pieces", False)
+    in_segments = options.pop("in_segments", False)
     return Task(machine, task, options, outputs, period, str(file), urdf, outputs_in, in_segments)
 
 
@@ -361,14 +361,14 @@ def _check_joints(entries: TomlTable, name: str, by_joint: dict[str, float], nam
 
 def _search(entries: TomlTable, names: tuple[str, ...], folder: Path) -> dict[str, Any]:
     """Return the options of the planner for its search."""
-    kind = entries.choice("kind", ("postures", "start", "global", "pieces"), "postures")
+    kind = entries.choice("kind", ("configurations", "start", "global", "segments"), "configurations")
     cyclic, pace = entries.flag("cyclic"), entries.choice("pace", ("given", "free"), "given")
     options: dict[str, Any] = {"seed": entries.count("seed", "a whole number, 0 or more", 0)}
-    if kind == "pieces":
+    if kind == "segments":
         for name, is_set in (("cyclic", cyclic), ("pace", pace == "free")):
             if is_set:
-                raise entries.error(name, f'kind = "pieces" does not support {name}; remove it')
-        options["in_pieces"] = True
+                raise entries.error(name, f'kind = "segments" does not support {name}; remove it')
+        options["in_segments"] = True
     else:
         options |= {"search": kind, "cyclic": cyclic}
     if pace == "free":

@@ -202,7 +202,7 @@ def check_line(path: PathLike, limits: LineLimits, joints: JointPath | None) -> 
     Raises:
         ProblemError: Path, limits or joints have the wrong type, or there are joint limits without joints.
     """
-    required = ("length", "bounds", "by_piece", "curvature", "dense")
+    required = ("length", "bounds", "by_piece", "curvature", "sample_distances")
     missing = [name for name in required if isinstance(path, type) or not hasattr(path, name)]
     if missing:
         hint = "give a SmoothPath, as models.smooth makes it"

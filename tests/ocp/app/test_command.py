@@ -178,9 +178,9 @@ def test_a_report_of_a_check_names_the_faults(capsys: Any, tmp_path: Path) -> No
         ("points = [[0.75, 0.1, 0.3], [0.75, 0.3, 0.3]]", 'file = "none.csv"', 7, "there is no file"),
         ("points =", 'file = "a.csv"\npoints =', 6, "not both"),
         ('tool = "free"', 'tool = "loose"', 9, 'one of "free roll", "given", "free"'),
-        ('kind = "start"', 'kind = "best"', 12, 'one of "postures", "start", "global"'),
-        ('kind = "start"', 'kind = "pieces"\ncyclic = true', 13, "remove it"),
-        ('kind = "start"', 'kind = "pieces"\npace = "free"', 13, "remove it"),
+        ('kind = "start"', 'kind = "best"', 12, 'one of "configurations", "start", "global"'),
+        ('kind = "start"', 'kind = "segments"\ncyclic = true', 13, "remove it"),
+        ('kind = "start"', 'kind = "segments"\npace = "free"', 13, "remove it"),
         ('kind = "start"', "start = { elbw = 1 }", 12, "no independent joint 'elbw'"),
         ('kind = "start"', "start = { elbow = 1 }", 12, "start has no shoulder, wrist, slide"),
         ('kind = "start"', 'kind = "start"\nseed = -1', 13, "seed must be a whole number"),
@@ -256,7 +256,7 @@ def test_what_no_one_motion_does_is_written_in_pieces_and_the_ways_between_them_
     (tmp_path / "line.toml").write_text(
         "[robot]\nurdf = 'robot.urdf'\ntip = 'tip'\n"
         "[path]\npoints = [[0.6, -0.45, 0], [0.6, 0.45, 0]]\nspeed = 0.45\ntool = 'free'\n"
-        "[search]\nkind = 'pieces'\n[scene]\nlook = false\n[output]\ncsv = 'line.csv'\n"
+        "[search]\nkind = 'segments'\n[scene]\nlook = false\n[output]\ncsv = 'line.csv'\n"
     )
     status, out, err = run(capsys, "plan", tmp_path / "line.toml", "-o", tmp_path / "line.npz", "--json")
     assert status == 0, err

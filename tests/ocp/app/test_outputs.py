@@ -106,7 +106,7 @@ def test_numbered_outputs_stay_there_too(tmp_path: Path, capsys: Any) -> None:
     folder.mkdir()
     (folder / "seam-2.csv").symlink_to(own)
     file = task(folder, 'csv = "seam.csv"')
-    file.write_text(file.read_text().replace('kind = "start"', 'kind = "pieces"'))
+    file.write_text(file.read_text().replace('kind = "start"', 'kind = "segments"'))
     status, _, err = run(capsys, "plan", file, "--quiet")
     assert (status, "is outside of" in err) == (2, True)
     assert own.read_text() == "export PATH=/mine\n"

@@ -93,7 +93,7 @@ CASES = [
         },
     ),
     Case(
-        "plan_in_pieces",
+        "plan_in_segments",
         plan_in_segments,
         {"machine": ARM, "tasks": GOOD, "start": START, "clearance": None},
         {

@@ -298,7 +298,7 @@ def test_what_never_touches_within_limits_is_looked_at_without_them() -> None:
     robot = armoured_arm()
     narrow = replace(robot, joints=tuple(replace(joint, lower=-0.3, upper=0.3) for joint in robot.joints))
     within, beyond = (CollisionScene(FixedBase(narrow), limits=limits) for limits in (True, False))
-    assert within.left["link2", "link6"] == "never touch"
+    assert within.left["link2", "link6"] == "never in collision"
     assert ("link2", "link6") in beyond.labels
     free_of_limits = Limits(joints=False)
     required: dict[str, Any] = {"tasks": line(), "start": START, "horizon": SECONDS, "limits": free_of_limits}
@@ -330,7 +330,9 @@ def test_a_target_inside_an_obstacle_names_the_pair_the_time_and_the_depth() -> 
     assert 1 <= caught.value.time <= SECONDS
     last = str(caught.value).split("\n")[-1]
     assert last.startswith("the cheapest candidate in collision: link6 and obstacle 0 overlap")
-    assert re.search(r"; no other configuration is collision-free then: each of the \d+ postures found touches", last)
+    assert re.search(
+        r"; no other configuration is collision-free then: each of the \d+ IK solutions is in collision", last
+    )
 
 
 def test_where_no_posture_is_clear_no_alternatives_are_searched(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -349,7 +351,7 @@ def test_postures_that_touch_are_left_out_or_named() -> None:
     every, clearance_constraints = inverse_kinematics(ARM, at), inverse_kinematics(ARM, at, scene=around)
     apart = [distances_along(around, np.zeros(0), posture.joints[None], np.zeros(1)).min() for posture in every]
     assert len(clearance_constraints) == sum(each >= 0.01 for each in apart) < len(every)
-    with pytest.raises(Unreachable, match=r"touches.*link6 and obstacle 0 overlap") as caught:
+    with pytest.raises(Unreachable, match=r"is in collision.*link6 and obstacle 0 overlap") as caught:
         inverse_kinematics(ARM, at, scene=CollisionScene(ARM, [Sphere(0.2, FIRST)]))
     assert caught.value.name == "link6 and obstacle 0"
 
@@ -414,5 +416,5 @@ def test_a_posture_that_touches_slides_along_its_self_motion_until_it_is_clear()
     assert_allclose(tip_at(ARM, found[0].joints), FIRST, atol=1e-9)
     assert distances_along(around, np.zeros(0), found[0].joints[None], np.zeros(1)).min() >= 0.01
     buried = CollisionScene(ARM, [Sphere(0.1, FIRST)])
-    with pytest.raises(Unreachable, match="touches"):
+    with pytest.raises(Unreachable, match="in collision"):
         inverse_kinematics(ARM, line(), starts=0, near=START, scene=buried)
