@@ -487,6 +487,6 @@ def _closest_pairs(solution: Solution, parts: Sequence[tuple[str, Array]], horiz
     if len(pairs) < len(t):
         return None
     points, distances, required = (
-        np.array([getattr(pair, name) for pair in pairs]) for name in ("points", "distance", "asked")
+        np.array([getattr(pair, name) for pair in pairs]) for name in ("points", "distance", "required")
     )
     return ClosestPairs(t, points, distances, required, tuple(pair.bodies for pair in pairs))

@@ -280,7 +280,11 @@ def test_what_no_one_motion_does_is_written_in_pieces_and_the_ways_between_them_
     status, out, _ = run(capsys, "plan", tmp_path / "line.toml", "--json")
     assert status == 1  # the pieces are there, and pass
     told = json.loads(out)
-    assert (told["passed"], told["duration"], told["reconfigurations"][0]["why"]) == (False, None, "the way is barred")
+    assert (told["passed"], told["duration"], told["reconfigurations"][0]["failure"]) == (
+        False,
+        None,
+        "the way is barred",
+    )
     assert {Path(file).name for file in told["written"]} == {"line-1.csv", "line-3.csv"}
     assert not (tmp_path / "line-2.csv").exists()
 

@@ -243,7 +243,7 @@ def test_what_was_not_found_has_no_cost_in_print() -> None:
     lost = [Candidate(START, cost, Reason(Rejection.INFEASIBLE, "lost")) for cost in (np.nan, 3.0, np.nan, 4.5)]
     told = str(replace(motion(), candidates=(motion().candidates[0], *lost)))
     assert "3 to 4.5" in told
-    assert "4 motions: no motion was found: lost" in told
+    assert "4 motions: the solver found no motion: lost" in told
     assert "nan" in str(replace(motion(), candidates=tuple(lost[:1])))
 
 
