@@ -173,7 +173,7 @@ import ctypes, sys, threading, time, types
 for face in ("models", "ocp"):  # what the faces show is not needed, and takes a second
     sys.modules[face] = types.ModuleType(face)
     sys.modules[face].__path__ = [face]
-from ocp.libraries import Library, built
+from ocp.libraries import Library, build_library
 def number(value):
     return Library((f"number {value}",), lambda: f"int number(void) {{ return {value}; }}")
 """
@@ -192,7 +192,7 @@ def test_meshes_share_what_is_compiled(own: Path, tmp_path: Path, monkeypatch: p
 
 def test_processes_compile_once(own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CC", script(tmp_path / "slow", f"sleep 0.5; {COUNTED}"))
-    words = ALONE + "print(ctypes.CDLL(str(built(number(3)))).number())"
+    words = ALONE + "print(ctypes.CDLL(str(build_library(number(3)))).number())"
     both = [subprocess.Popen([sys.executable, "-c", words], cwd=ROOT, stdout=subprocess.PIPE) for _ in range(2)]
     assert [process.communicate()[0] for process in both] == [b"3\n", b"3\n"]
     assert (tmp_path / "count").read_text().split() == ["once"]
@@ -356,7 +356,7 @@ def test_a_time_limit_ends_the_wait_and_leaves_nothing(
 
 
 LEAVING = """
-threading.Thread(target=built, args=[number(18)], daemon=True).start()
+threading.Thread(target=build_library, args=[number(18)], daemon=True).start()
 print("under way", flush=True)
 time.sleep(float(sys.argv[1]))
 """
