@@ -325,7 +325,7 @@ def stopping(kind):
 
 
 stopping(console.Progress)
-stopping(console.Watch)
+stopping(console.FatropMonitor)
 before = signal.getsignal(signal.SIGINT)
 for check in (False, True):
     try:
@@ -334,7 +334,7 @@ for check in (False, True):
     except KeyboardInterrupt as error:
         print(error.solution.success, error.solution.message, error.solution["x"].shape)
     print("restored", signal.getsignal(signal.SIGINT) is before)
-console.Progress.stops = console.Watch.stops = False
+console.Progress.stops = console.FatropMonitor.stops = False
 again = prepare(problem, Collocation(20), solver=SOLVER).solve()
 print("afterwards", again.success)
 try:
