@@ -174,7 +174,7 @@ def test_the_guess_is_the_local_motion_in_steps_of_first_order(monkeypatch: pyte
     machine, errors = paper_example(), []
     local = resolve(machine, TASK, PAPER_START, 5.0)
     for steps in (64, 256, 1024):
-        monkeypatch.setattr(minimum_velocity, "STEPS_OF_GUESS", steps)
+        monkeypatch.setattr(minimum_velocity, "GUESS_STEPS", steps)
         states = minimum_velocity_problem(machine, TASK, 5.0, start=PAPER_START, guess_damping=1e-4).declared.states
         apart = [
             np.abs(states[name].guess(time) - local.at(time)[name]).max()
