@@ -93,6 +93,7 @@ def test_joint_limits_hold_and_no_better_roll_is_within_them(limits: dict[str, A
         assert {f"joint {k}" for k in (1, 2, 3, 5, 6)} <= {ACTIVE[code][:7] for code in active}
 
 
+@pytest.mark.long
 @settings(max_examples=8)  # each builds a search of its own
 @given(st.lists(st.floats(0.05, 2.0), min_size=6, max_size=6), seeds, st.sampled_from(BRANCHES))
 def test_other_rigs_tunnels_and_branches(sizes: list[float], seed: int, branch: Branch) -> None:

@@ -169,6 +169,7 @@ def test_what_lies_within_the_hull_does_not_stand_out_of_it(shift: tuple[float, 
             assert 0.9 * out <= found <= out + 1e-12
 
 
+@pytest.mark.long
 def test_flat_and_tiny_meshes_are_covered() -> None:
     square = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
     line = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])

@@ -238,7 +238,7 @@ def test_states_of_very_different_size_pass(ratio: float) -> None:
 # ---- machines and limits ---------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("intervals", [40, 80])
+@pytest.mark.parametrize("intervals", [40, pytest.param(80, marks=pytest.mark.long)])
 def test_a_standing_plan_with_its_tip_at_its_position_fails_by_nothing_but_what_it_loses(intervals: int) -> None:
     """An inequality with a held control is active at one end of an interval; its multiplier is not inside it.
 

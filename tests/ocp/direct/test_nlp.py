@@ -187,7 +187,7 @@ def no_least_cost() -> Problem:
     ("problem", "options", "word", "status"),
     [
         (van_der_pol(), {"max_iter": 2}, "iteration limit", SolverStatus.ITERATION_LIMIT),
-        (too_far(), {}, "deadpoint", SolverStatus.STEP_FAILED),
+        pytest.param(too_far(), {}, "deadpoint", SolverStatus.STEP_FAILED, marks=pytest.mark.long),
         (no_least_cost(), {}, "unbounded", SolverStatus.DIVERGING),
     ],
     ids=["iteration limit", "deadpoint", "unbounded"],

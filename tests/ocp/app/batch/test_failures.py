@@ -91,6 +91,7 @@ def test_failures_are_tried_again_when_a_file_has_changed_and_results_stay(tmp_p
     assert {name: now[name] for name in kept_results} == kept_results
 
 
+@pytest.mark.long
 def test_failures_are_tried_again_when_the_function_or_what_stands_beside_it_has_changed(tmp_path: Path) -> None:
     def run(helper: str, function: str) -> subprocess.CompletedProcess[str]:
         source = f"""

@@ -252,6 +252,7 @@ def longer(robot: Robot, share: float) -> Robot:
     return replace(robot, links=tuple(links), joints=tuple(joints), tip_translation=tip)
 
 
+@pytest.mark.long
 def test_a_capture_in_another_unit_of_length_is_the_same() -> None:
     share = 10.0
     asked = planar_capture() | SHORT
@@ -370,6 +371,7 @@ def test_both_phases_together_cost_less_than_one_after_the_other() -> None:
     assert planar().cost < sum(plan.cost for plan in chain) * (1 - 1e-4)
 
 
+@pytest.mark.long
 def test_what_drifts_is_caught_and_goes_on_with_the_pair() -> None:
     """Chaser and target have momenta of their own: at the end nothing turns, and the pair goes on at P / m.
 

@@ -139,6 +139,7 @@ def test_a_plan_at_collocation_points_passes_its_audit(zmp: Any) -> None:
     assert tip_error(machine(), sampled(machine(), fine), table_task(1)) < 1e-5
 
 
+@pytest.mark.long
 def test_the_audit_of_a_held_plan_finds_its_motion_sound_and_what_it_loses() -> None:
     """80 held accelerations cost 2e-3 more than free ones, which is beyond what an optimum may lose."""
     solution = held(table_plan(1, IN_RANGE))

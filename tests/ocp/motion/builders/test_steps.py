@@ -130,6 +130,7 @@ def test_a_step_of_the_other_foot_is_the_mirrored_step() -> None:
     np.testing.assert_allclose(left.loads["left"], right.loads["right"], rtol=0, atol=1e-3)
 
 
+@pytest.mark.long
 def test_a_machine_of_another_size_takes_the_same_steps_at_the_same_cost() -> None:
     """Lengths times s, masses s^3, torques s^4, times sqrt(s): all that is asked scales, and so does the motion."""
     steps, coarse = planar_steps(1, 0.6, 0.7), Collocation(4, degree=3, scheme="legendre")

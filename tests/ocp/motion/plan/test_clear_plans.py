@@ -221,6 +221,7 @@ def test_a_space_arm_passes_a_box_on_its_base() -> None:
     assert "base" in proof.worst.bodies[0]
 
 
+@pytest.mark.long
 def test_a_space_arm_passes_a_box_in_the_world() -> None:
     machine = space_arm(panel=False)
     post = Sphere(0.08, FIRST + np.array([0, 0.2, 0.18]))

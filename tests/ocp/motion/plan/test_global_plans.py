@@ -19,7 +19,9 @@ from tests.ocp.motion.tasks.space_tasks import PANDA_START, UR5_START, panda, ur
 
 
 @pytest.mark.parametrize(
-    ("machine", "start", "rows"), [(panda(), PANDA_START, "pose"), (ur5(), UR5_START, "axis")], ids=["panda", "ur5"]
+    ("machine", "start", "rows"),
+    [(panda(), PANDA_START, "pose"), pytest.param(ur5(), UR5_START, "axis", marks=pytest.mark.long)],
+    ids=["panda", "ur5"],
 )
 def test_the_cheapest_of_all_motions_has_a_bound_near_its_cost(machine, start, rows, tmp_path) -> None:  # type: ignore[no-untyped-def]
     task = moved(machine, start, rows)
@@ -36,6 +38,7 @@ def test_the_cheapest_of_all_motions_has_a_bound_near_its_cost(machine, start, r
     assert Plan.load(tmp_path / "plan.npz").bound == found.bound
 
 
+@pytest.mark.long
 def test_from_a_given_start_the_bound_is_of_motions_from_there() -> None:
     task = moved(panda(), PANDA_START, "pose")
     found = plan(panda(), task, start=PANDA_START, search="global", clearance=None)

@@ -113,6 +113,7 @@ def test_fingers_cost_nothing_in_a_global_plan_of_a_whole_hand() -> None:
     np.testing.assert_allclose(found["joints"][:, 7], 0.02, atol=1e-9)
 
 
+@pytest.mark.long
 def test_a_given_start_says_where_fingers_stand() -> None:
     machine = three_links(3)
     start = np.array([0.4, 0.8, -0.5, 2.0, -0.01, -1.0])

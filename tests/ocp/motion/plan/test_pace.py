@@ -64,7 +64,7 @@ def effort(found: Plan, time_cost: float) -> float:
 # ---- slow motions ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("slower", [*(pytest.param(each, marks=pytest.mark.long) for each in (10.0, 1e3)), 1e5])
+@pytest.mark.parametrize("slower", [*(pytest.param(each, marks=pytest.mark.long) for each in (10.0, 1e5)), 1e3])
 def test_a_motion_may_be_as_slow_as_one_likes(slower: float) -> None:
     """From 6 s to a week: the same way, its cost divided, on a mesh as coarse."""
     one, other = fixed(0.05), fixed(0.05 / slower)
@@ -169,7 +169,7 @@ def costs(limited: bool) -> tuple[Array, list[Plan]]:
     return prices, [free(price, 1.0 if limited else FAST, limited) for price in prices]
 
 
-@pytest.mark.parametrize("limited", [False, True])
+@pytest.mark.parametrize("limited", [False, pytest.param(True, marks=pytest.mark.long)])
 def test_a_higher_time_cost_is_never_slower_and_the_cost_rises_with_it_by_the_time(limited: bool) -> None:
     """The least of functions linear in the time cost is concave in it, and its slope is the time."""
     prices, plans = costs(limited)

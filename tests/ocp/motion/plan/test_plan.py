@@ -154,6 +154,7 @@ def test_the_cost_falls_with_time_as_its_inverse(short: Plan) -> None:
     assert_same_way(slow, short)
 
 
+@pytest.mark.long
 @pytest.mark.xdist_group("plan short")
 def test_the_world_may_be_turned_and_moved_with_all_that_is_in_it(short: Plan) -> None:
     turn, shift = Rotation.from_euler("xyz", [0.4, -0.7, 1.1]), np.array([1.0, -2.0, 0.5])
@@ -189,6 +190,7 @@ def test_weights_scale_the_cost_and_a_dear_joint_moves_less(short: Plan) -> None
     assert heavy.cost >= short.cost * (1 - 1e-6)
 
 
+@pytest.mark.long
 @pytest.mark.xdist_group("plan three_lanes_panda")
 def test_what_leaves_more_freedom_is_never_dearer() -> None:
     """From one start: a held axis, one that leans, none at all; and one that leans further."""

@@ -173,7 +173,7 @@ def moved_by_a_pose() -> TipTask:
     return TipTask(position=lambda t: ca.DM(at) + t * ca.DM([0.05, 0.05, 0.0]), duration=2.0)
 
 
-@pytest.mark.parametrize("first", [moved_by_a_velocity, moved_by_a_pose])
+@pytest.mark.parametrize("first", [moved_by_a_velocity, pytest.param(moved_by_a_pose, marks=pytest.mark.long)])
 @pytest.mark.parametrize("rows", [(3, 4, 5), (3,), ()], ids=["the place", "one coordinate", "nothing"])
 def test_to_hold_what_was_reached_costs_nothing_more(first: Callable[[], TipTask], rows: tuple[int, ...]) -> None:
     """That the tip begins where it is held follows from what it did before: it is not asked twice."""

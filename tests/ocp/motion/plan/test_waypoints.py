@@ -43,7 +43,11 @@ def test_a_problem_of_the_benchmark_is_solved_by_its_rules_and_shorter_than_publ
     assert faults("panda__1cube", found.joints + 1e-3)  # it finds some
 
 
-@pytest.mark.parametrize(("machine", "start"), [(panda(), PANDA_START), (ur5(), UR5_START)], ids=["panda", "ur5"])
+@pytest.mark.parametrize(
+    ("machine", "start"),
+    [pytest.param(panda(), PANDA_START, marks=pytest.mark.long), (ur5(), UR5_START)],
+    ids=["panda", "ur5"],
+)
 def test_the_way_back_is_as_long_and_weights_count(machine: FixedBase, start: Array) -> None:
     places, turns = poses(machine, start, 21)
     found = plan_waypoints(machine, places, turns, clearance=None)
