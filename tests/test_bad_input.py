@@ -39,7 +39,6 @@ MADE_BY_THE_PACKAGE = {
     "Note",
     "PathLike",
     "Plan",
-    "PlanInPieces",
     "Pause",
     "Program",
     "ProgramMotion",
@@ -50,6 +49,7 @@ MADE_BY_THE_PACKAGE = {
     "STANDING_STARTS",
     "Schedule",
     "Section",
+    "SegmentedPlan",
     "SmoothPath",
     "Solution",
     "StepsMotion",
@@ -61,8 +61,8 @@ MADE_BY_THE_PACKAGE = {
 """Results, protocols and constants: their methods are in the panels, but nobody makes them."""
 WITHOUT_ARGUMENTS = {"Anywhere", "SolverStatus", "paper_example", "reference_tunnel", "standing_example"}
 RAISED = {"DeadEnd", "Unreachable"}
-LOOKED_AT_IN_A_PROBLEM = {"Following", "Pinned"}
-"""What a rule says of the zero moment point is looked at by standing_problem, which has them in its panel."""
+LOOKED_AT_IN_A_PROBLEM = {"DynamicsSetup", "Following", "Pinned", "RollObstacles", "RollSettings", "StandingSetup"}
+"""Options that a builder checks: their fields are in the panels of dynamics_problem, standing_problem, roll_problem."""
 
 
 def test_everything_a_user_types_is_in_a_panel() -> None:

@@ -119,7 +119,7 @@ CASES = [
         },
     ),
     Case(
-        "Surroundings",
+        "CollisionScene",
         CollisionScene,
         {"walls": Box((10, 10, 10))},
         {"walls": but(INSTANCE, "None"), "solids": SEQUENCE | {"alone": Box((1, 1, 1))}, "capsules": SEQUENCE},

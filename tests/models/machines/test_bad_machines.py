@@ -108,7 +108,7 @@ def arm() -> Scara:
 
 BOLTED_CASES = [
     Case(
-        "Surroundings",
+        "CollisionScene",
         lambda **given: CollisionScene(**given),
         {"machine": ARMOURED, "obstacles": [Sphere(0.1, (2.0, 0.0, 0.0))], "clearance": 0.01},
         {
@@ -122,7 +122,7 @@ BOLTED_CASES = [
         },
     ),
     Case(
-        "Moving",
+        "MovingObstacle",
         MovingObstacle,
         {"shape": Sphere(0.1, (0.0, 0.0, 0.0)), "position": lambda time: (time, 0.0, 0.0)},
         {

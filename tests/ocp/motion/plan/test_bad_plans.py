@@ -131,7 +131,7 @@ CASES = [
         },
     ),
     Case(
-        "Clear",
+        "ClearanceConstraints",
         ClearanceConstraints,
         {"scene": AROUND, "margins": {0: 0.01}},
         {
