@@ -268,7 +268,7 @@ def plan_dynamics(
     setup = DynamicsSetup() if setup is None else checked_instance("plan_dynamics: setup", setup, DynamicsSetup)
     shared: dict[str, Any] = {"start": start, "limits": limits, "effort": effort}
     tip_tasks: Any = tasks
-    if isinstance(tasks, Sequence) and any(isinstance(each, Leg) for each in tasks):
+    if isinstance(tasks, Sequence) and isinstance(next(iter(tasks), None), Leg):
         legs = checked_legs(tasks)
         for name, value in (("horizon", horizon), ("end", end)):
             if value is not None:
