@@ -1,4 +1,4 @@
-"""The front door: a machine and its tasks in, the cheapest motion out that passes its audit."""
+"""The front door: a machine and its tasks in, the lowest-cost motion that passes its audit out."""
 
 from ocp.motion.plan.candidate import Candidate, Reason, Rejection
 from ocp.motion.plan.motion import Plan, PlanSample

@@ -374,7 +374,7 @@ class CandidateSolver(Solver):
     # ---- results -----------------------------------------------------------------------------------------------------
 
     def failure(self, candidates: Sequence[Candidate]) -> SolveError:
-        """Return the error that none passes; with collisions, about the cheapest candidate in collision."""
+        """Return the error that none passes; with collisions, about the lowest-cost candidate in collision."""
         error = super().failure(candidates)
         reasons = ((candidate, candidate.reason) for candidate in candidates)
         colliding = [c for c, reason in reasons if reason is not None and reason.kind is Rejection.COLLISION]
@@ -384,7 +384,7 @@ class CandidateSolver(Solver):
         assert worst is not None
         assert worst.time is not None
         alternatives = describe_alternatives(self._count_clear_at(worst.time))
-        words = "; ".join([f"{error}\nthe cheapest candidate in collision: {worst.detail}", *alternatives])
+        words = "; ".join([f"{error}\nthe lowest-cost candidate in collision: {worst.detail}", *alternatives])
         details = {"name": worst.name, "value": worst.value, "limit": worst.limit, "time": worst.time}
         return SolveError(words, error.solution, error.conflicts, **details)
 

@@ -214,7 +214,7 @@ def _search_cells(
             queue.run(batch[begin : begin + settings.batch])
             if queue.passed:
                 return
-    reason = Reason(Rejection.NOT_TRIED, f"the {settings.max_failures} cheapest of its search fail")
+    reason = Reason(Rejection.NOT_TRIED, f"the {settings.max_failures} lowest-cost motions of its search fail")
     rest = [seed for batch in batches for seed in batch[settings.max_failures :]]
     queue.candidates += [seed.rejected(reason) for seed in rest]
 

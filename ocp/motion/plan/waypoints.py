@@ -59,7 +59,7 @@ class WaypointSettings:
             next if no path found goes through all.
         first_steps: With two free directions, number of steps of a first search, which finds short paths.
         steps, strides: Approximate number of steps of the next two searches, and their least strides.
-        max_paths: Paths of a search that are shortened, the cheapest first.
+        max_paths: Paths of a search that are shortened, the lowest cost first.
         widths: Initial and final spacing of the configurations of `shorten_path`, rad or m.
         pose_tolerance: Largest pose error, m and rad, which the last width leaves.
         search, sections: Settings of the searches with at most one free direction, and with two.

@@ -330,7 +330,7 @@ def test_a_target_inside_an_obstacle_names_the_pair_the_time_and_the_depth() -> 
     assert caught.value.value < caught.value.limit == 0.01
     assert 1 <= caught.value.time <= SECONDS
     last = str(caught.value).split("\n")[-1]
-    assert last.startswith("the cheapest candidate in collision: link6 and obstacle 0 overlap")
+    assert last.startswith("the lowest-cost candidate in collision: link6 and obstacle 0 overlap")
     assert re.search(
         r"; no other configuration is collision-free then: each of the \d+ IK solutions is in collision", last
     )

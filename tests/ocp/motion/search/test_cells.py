@@ -165,6 +165,6 @@ def test_of_ways_that_all_fail_a_few_of_each_search_are_tried_and_the_others_are
     count = sum(min(size, 8) for size in sizes)
     assert tried in ([2] * count, [6] + [2] * count)  # the local motion at first
     rest = sum(sizes) - count
-    assert f"{rest} of {len(tried) + rest} candidates: not tried: the 8 cheapest of its search fail" in str(
+    assert f"{rest} of {len(tried) + rest} candidates: not tried: the 8 lowest-cost motions of its search fail" in str(
         caught.value
     )
