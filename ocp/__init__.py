@@ -7,7 +7,7 @@ from ocp.direct.shooting import MultipleShooting
 from ocp.errors import AuditError, BoundWarning, ProblemError, RefinementWarning, SolveError, StorageWarning
 from ocp.indirect.method import Indirect
 from ocp.methods import certificate, prepare, solve
-from ocp.motion.builders.actuator_limits import Effort, JointFriction, joint_torques
+from ocp.motion.builders.actuator_limits import JointFriction, joint_torques
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.cts import RollObstacles, RollSettings, roll_problem, spline_targets
 from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem
@@ -25,18 +25,11 @@ from ocp.motion.builders.timing import minimum_time_problem, plan_minimum_time
 from ocp.motion.local.accelerations import Layer, Stabiliser, resolve_accelerations
 from ocp.motion.local.inverse_kinematics import Unreachable, inverse_kinematics
 from ocp.motion.local.rates import resolve
-from ocp.motion.plan import (
-    Candidate,
-    DeadEnd,
-    Plan,
-    Reconfiguration,
-    SegmentedPlan,
-    WaypointPlan,
-    plan,
-    plan_in_segments,
-    plan_waypoints,
-)
+from ocp.motion.plan import Candidate, DeadEnd, Plan, Reconfiguration, plan
+from ocp.motion.tasks.cost import Cost
+from ocp.motion.tasks.goals import Goal, Start, Waypoints
 from ocp.motion.tasks.limits import Limits
+from ocp.motion.tasks.scene import Scene
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.motion.tasks.zmp_rules import Anywhere, Following, IndexAtLeast, InFoot, Pinned
 from ocp.problem.phases import Phases
@@ -51,6 +44,7 @@ __version__ = "0.1.0"
 
 _register("audit", "ocp.audit.audit")
 _register("sensitivity", "ocp.direct.sensitivity")
+_register("load_plan", "ocp.motion.plan.dispatch")
 for _drawing in ("plot_solution", "html_of_solution", "plot_plan", "html_of_plan"):
     _register(_drawing, "ocp.app.view.plots")
 
@@ -64,12 +58,13 @@ __all__ = [
     "ClearanceConstraints",
     "Collocation",
     "Cone",
+    "Cost",
     "DeadEnd",
     "DynamicsSetup",
-    "Effort",
     "Finding",
     "Following",
     "FreeTime",
+    "Goal",
     "Grasp",
     "InFoot",
     "IndexAtLeast",
@@ -88,7 +83,7 @@ __all__ = [
     "RefinementWarning",
     "RollObstacles",
     "RollSettings",
-    "SegmentedPlan",
+    "Scene",
     "Sensitivity",
     "Solution",
     "SolveError",
@@ -96,13 +91,14 @@ __all__ = [
     "Stabiliser",
     "StancePhase",
     "StandingSetup",
+    "Start",
     "StepWeights",
     "Steps",
     "StepsMotion",
     "StorageWarning",
     "TipTask",
     "Unreachable",
-    "WaypointPlan",
+    "Waypoints",
     "Weights",
     "capture_problem",
     "certificate",
@@ -117,11 +113,9 @@ __all__ = [
     "plan",
     "plan_capture",
     "plan_dynamics",
-    "plan_in_segments",
     "plan_minimum_time",
     "plan_standing",
     "plan_steps",
-    "plan_waypoints",
     "prepare",
     "refine",
     "resolve",

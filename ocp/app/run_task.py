@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from glob import escape
 from pathlib import Path
 from typing import Any
 
-from models import FixedBase
 from ocp.app.files import write_mcap
 from ocp.app.files.outputs import MARK, SUFFIXES, checked_output
 from ocp.app.files.task_file import Task
 from ocp.app.files.text_files import missing_package
-from ocp.errors import MAX_COUNT, ProblemError, checked_instance, checked_positive
-from ocp.motion.plan import Plan, SegmentedPlan, plan, plan_in_segments
+from ocp.errors import MAX_COUNT, ProblemError, checked_positive
+from ocp.motion.plan import Plan, plan
+from ocp.motion.plan.segmented_plan import SegmentedPlan
 from ocp.storage import write_text
 
 __all__ = ["EXPORT_KINDS", "check_period", "export_plan", "run_task"]
@@ -50,16 +49,8 @@ def run_task(
             WRITERS[kind](result, path, task.period, task.file)
 
     for kind, file in outputs.items():  # check the outputs before the user waits for the plan
-        numbered = file.parent.glob(f"{escape(file.stem)}-*{escape(file.suffix)}") if task.in_segments else ()
-        for existing in (file, *numbered):
-            checked(kind, existing)
-    if task.in_segments:
-        segmented = plan_in_segments(checked_instance("machine", task.machine, FixedBase), task.task, **task.options)
-        if segmented.reconfigurations:
-            return _run_segments(task, segmented, outputs, progress, write)
-        result = segmented.segments[0]
-    else:
-        result = plan(task.machine, task.task, **task.options)
+        checked(kind, file)
+    result = plan(task.machine, task.task, **task.options)
     check_period(result, task.period)
     progress("audit")
     audit = result.audit()
@@ -78,51 +69,25 @@ def run_task(
             for candidate in result.candidates
         ],
         "audit": [{name: getattr(finding, name) for name in FINDING_FIELDS} for finding in audit.findings],
+        **_segments(result),
         "written": {kind: str(file) for kind, file in outputs.items()},
     }
     return (0 if audit.passed else 1), "\n".join(lines), data
 
 
-def _run_segments(
-    task: Task,
-    segmented: SegmentedPlan,
-    outputs: dict[str, Path],
-    progress: Callable[[str], None],
-    write: Callable[[Plan, dict[str, Path]], None],
-) -> tuple[int, str, Any]:
-    """Audit and write the segments and the motions between them, with files numbered in the order of execution."""
-    motions: list[Plan | None] = [segmented.segments[0]]
-    for reconfiguration, segment in zip(segmented.reconfigurations, segmented.segments[1:], strict=True):
-        motions += [reconfiguration.motion, segment]
-    lines, files, passed = [str(segmented)], list[Path](), None not in motions
-    for number, motion in enumerate(motions, 1):
-        if motion is None:
-            continue
-        check_period(motion, task.period)
-        progress(f"audit of motion {number}")
-        audit = motion.audit()
-        passed &= audit.passed
-        lines.append(f"Motion {number} {audit.sentence}.")
-        numbered = {kind: file.with_stem(f"{file.stem}-{number}") for kind, file in outputs.items()}
-        write(motion, numbered)
-        files += numbered.values()
-    reconfiguration_fields = ("time", "before", "after", "duration", "failure")
-    data = {
-        "passed": passed,
-        "cost": segmented.cost,
-        "duration": segmented.duration,
-        "joints": segmented.segments[0].names,
-        "fewest": segmented.fewest,
+def _segments(result: Plan) -> dict[str, Any]:
+    """Return the segments of a plan, and the motions between them, if it has several."""
+    if not isinstance(result, SegmentedPlan):
+        return {}
+    names = ("time", "before", "after", "duration", "failure")
+    return {
+        "fewest": result.fewest,
         "segments": [
             {"begin": begin, "duration": segment.horizon, "cost": segment.cost, "bound": segment.bound}
-            for begin, segment in zip(segmented.start_times, segmented.segments, strict=True)
+            for begin, segment in zip(result.start_times, result.segments, strict=True)
         ],
-        "reconfigurations": [
-            {name: getattr(each, name) for name in reconfiguration_fields} for each in segmented.reconfigurations
-        ],
-        "written": [str(file) for file in files],
+        "reconfigurations": [{name: getattr(each, name) for name in names} for each in result.reconfigurations],
     }
-    return (0 if passed else 1), "\n".join(lines + _output_lines(files)), data
 
 
 def _output_lines(files: list[Path]) -> list[str]:

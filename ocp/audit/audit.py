@@ -7,7 +7,7 @@ as fine as the plan, and checks the minimum principle with newly computed multip
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -31,7 +31,7 @@ from ocp.tolerances import (
     UNFIT_COSTATE_SHARE,
 )
 
-__all__ = ["Audit", "Finding", "audit"]
+__all__ = ["Audit", "Finding", "audit", "clearance_finding"]
 
 
 @dataclass(frozen=True)
@@ -78,20 +78,21 @@ class Audit:
             (M,).
         states, controls: Values of the re-integrated plan by name. Shape (M, n) each.
         clearances: Proven clearance of each separation by name.
-        optimality: Costates, multipliers, curvature, and the cost that the plan loses.
+        optimality: Costates, multipliers, curvature, and the cost that the plan loses; None for a plan that solves no
+            optimal control problem. The fields from `constraints` on are then empty.
     """
 
     name: str
     findings: tuple[Finding, ...]
     undecided: str
-    constraints: dict[str, float]
-    integration_error: float
-    local_errors: np.ndarray
-    t: np.ndarray
-    states: dict[str, np.ndarray]
-    controls: dict[str, np.ndarray]
-    clearances: dict[str, Clearance]
-    optimality: Optimality
+    constraints: dict[str, float] = field(default_factory=dict)
+    integration_error: float = 0.0
+    local_errors: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    t: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    states: dict[str, np.ndarray] = field(default_factory=dict)
+    controls: dict[str, np.ndarray] = field(default_factory=dict)
+    clearances: dict[str, Clearance] = field(default_factory=dict)
+    optimality: Optimality = field(default=None)  # type: ignore[assignment]
 
     @property
     def feasible(self) -> bool:
@@ -118,7 +119,7 @@ class Audit:
     @property
     def lost(self) -> np.ndarray:
         """Excess cost of each interval over the nearest extremal, in units of cost. Shape (N,)."""
-        return self.optimality.lost
+        return np.zeros(0) if self.optimality is None else self.optimality.lost
 
     def __getitem__(self, name: str) -> Finding:
         """Return a finding by its name."""

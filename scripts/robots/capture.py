@@ -21,8 +21,8 @@ from ocp import (
     Audit,
     Collocation,
     Cone,
+    Cost,
     DynamicsSetup,
-    Effort,
     FreeTime,
     Grasp,
     Limits,
@@ -125,7 +125,7 @@ def asked_for(spin: Any = SPIN) -> dict[str, Any]:
         "approach": APPROACH, "detumble": DETUMBLE, "target_base": place, "cone": CONE, "grasp": GRASP,
         "end": [*START, np.nan, np.nan, np.nan],
         "limits": Limits(velocity=[RATE] * 7 + [MOMENTUM / WHEEL] * 3, torque=[JOINT_TORQUE] * 7 + [TORQUE] * 3),
-        "effort": Effort(torque=[0.01] * 7 + [10.0] * 3, acceleration=[100.0] * 7 + [0.0] * 3, time=0.05),
+        "cost": Cost(velocity=0.0, effort=[0.01] * 7 + [10.0] * 3, acceleration=[100.0] * 7 + [0.0] * 3, time=0.05),
         "method": METHOD,
     }  # fmt: skip
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from models import FreeFloating, Link, Robot, planar_chain, with_wheels
-from ocp import Collocation, Effort, Limits, chained_capture, plan_capture
+from ocp import Collocation, Cost, Limits, chained_capture, plan_capture
 from scripts.drawing import COLORS, sheet
 from scripts.papers.run import Table, write
 
@@ -68,7 +68,7 @@ def asked_for(spin: float, kind: str) -> dict[str, Any]:
         "chaser": FreeFloating(robot, "planar", conserved_momentum=carried),
         "target": FreeFloating(target, "planar", conserved_momentum=[INERTIA * spin, 0.0, 0.0]),
         "start": joints, "approach": DURATION, "detumble": DURATION,
-        "target_base": [*GRASPED, -spin * DURATION], "effort": Effort(torque=1.0, acceleration=weights),
+        "target_base": [*GRASPED, -spin * DURATION], "cost": Cost(velocity=0.0, effort=1.0, acceleration=weights),
         "limits": Limits(velocity=rates), "method": METHOD,
     }  # fmt: skip
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from models import FixedBase, Link, Robot, VisualShape, attach_tool, with_load
 from models.arrays import Array
-from ocp import Audit, Collocation, Effort, Leg, Solution, TipTask, inverse_kinematics, joint_torques, plan_dynamics
+from ocp import Audit, Collocation, Cost, Leg, Solution, TipTask, inverse_kinematics, joint_torques, plan_dynamics
 from ocp.app.view.appearance import TIP_FRAME, Frames, frames_along
 from scripts.drawing import COLORS
 from scripts.robots.drawing import Scene, animate, joint_curves, page
@@ -32,7 +32,7 @@ PICK, PLACE = (0.6, -0.7, 0.06), (0.6, 0.7, 0.26)
 """Where the middle of the load is: distance from the arm's first axis, m; direction, rad; height, m."""
 ABOVE = 0.15  # m, of the points above the load and its place
 WAY, DOWN, ACROSS = 1.6, 0.4, 1.6  # durations of legs, s
-EFFORT = Effort(torque=1.0, acceleration=2.0)
+EFFORT = Cost(velocity=0.0, effort=1.0, acceleration=2.0)
 METHOD = Collocation(6, degree=5, scheme="legendre")
 FINE = 81  # times of a leg
 HANDED = ("lift", "carry", "set down")
@@ -160,7 +160,7 @@ def plan(coarse: bool = False) -> PickAndPlace:
     """Both plans, audited; on one mesh only, `coarse` or not."""
     plans, motions, audits = {}, {}, {}
     for name in KINDS:
-        plans[name] = plan_dynamics(arm(), legs(name == "load known"), start=HOME, effort=EFFORT, method=METHOD)
+        plans[name] = plan_dynamics(arm(), legs(name == "load known"), start=HOME, cost=EFFORT, method=METHOD)
         motions[name], audits[name] = motion_of(plans[name]), plans[name].audit()
     return PickAndPlace(plans, motions, audits)
 

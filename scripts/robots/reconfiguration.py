@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from models import CollisionScene, FixedBase
 from models.arrays import Array
 from models.paths import rest_to_rest
-from ocp import Audit, Limits, Plan, Reconfiguration, SegmentedPlan, TipTask, inverse_kinematics, plan_in_segments
+from ocp import Audit, Limits, Plan, Reconfiguration, SegmentedPlan, TipTask, inverse_kinematics
 from ocp.app.view.appearance import frames_along
 from ocp.app.view.rendering import tube
 from ocp.motion.search.charts import Charts, SelfMotionManifolds, TimeSample
@@ -136,7 +136,7 @@ def ring() -> TipTask:
 def plan(coarse: bool = False) -> InPieces:
     """The task in the fewest pieces, and all postures that do it; `coarse` at fewer times."""
     machine, task = FixedBase(PANDA.read()), ring()
-    made = plan_in_segments(machine, task)
+    made = plan(machine, task, search="segments")
     return InPieces(machine, task, made, postures(machine, task, COARSE if coarse else INSTANTS))
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from models import Box, CollisionScene, FixedBase, Robot, Sphere, link_frames
 from models.arrays import Array
 from models.shapes.shapes import Shape
-from ocp import Plan, plan
+from ocp import Plan, Scene, plan
 from ocp.audit.clearance import Clearance
 from ocp.motion.builders.clearance import clearance_of
 from ocp.motion.local.collisions import distances_along
@@ -82,7 +82,7 @@ def plans(case: str, repeats: int) -> list[dict[str, Any]]:
     """From the start of a motion clear of itself: a plan that looks at nothing, one beside boxes, one beside a ball."""
     file, link, lean = CASES[case]
     machine, task = FixedBase(file.read()), lanes(2, 0.3, 0.05, within=lean)
-    clearance_constraints = plan(machine, task, search="start", clearance=CLEARANCE)
+    clearance_constraints = plan(machine, task, search="start", scene=Scene(clearance=CLEARANCE))
     planned = partial(plan, machine, task, start=clearance_constraints.at(0.0)["joints"], search="start")
     spent, plain = least(partial(planned, clearance=None), repeats)
     rows = [{"robot": case, "plan": "plain", "plan_s": spent, "ratio": 1.0, "cost": plain.cost, "held": 0}]

@@ -36,7 +36,7 @@ def leaving(joints: Array) -> TipTask:
 
 
 def planned(joints: Array) -> float:
-    return float(plan(MACHINE, leaving(joints), start=joints, clearance=None).at(0.0)["joints"][0])
+    return float(plan(MACHINE, leaving(joints), start=joints, scene=False).at(0.0)["joints"][0])
 
 
 def moved(joints: Array) -> float:

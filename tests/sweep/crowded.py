@@ -18,7 +18,7 @@ import coal
 import numpy as np
 
 from models import Box, CollisionScene, FixedBase
-from ocp import Plan, ProblemError, SolveError, TipTask, inverse_kinematics, plan
+from ocp import Plan, ProblemError, Scene, SolveError, TipTask, inverse_kinematics, plan
 from ocp.motion.local.collisions import distances_along
 from tests.models.shapes.shape_oracles import in_coal
 from tests.ocp.motion.plan.motions import pair
@@ -141,7 +141,7 @@ def _by_coal(around: CollisionScene, joints: np.ndarray, pairs: np.ndarray) -> n
 def planned(given: Crowd, **options: Any) -> Plan | str:
     """The plan, or the first line of why there is none."""
     try:
-        return plan(given.machine, given.tasks, obstacles=given.boxes, clearance=CLEARANCE, **options)
+        return plan(given.machine, given.tasks, scene=Scene(obstacles=given.boxes, clearance=CLEARANCE), **options)
     except (ProblemError, SolveError) as error:
         return str(error).split("\n")[0]
 

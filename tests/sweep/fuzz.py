@@ -40,7 +40,7 @@ from mcap_ros2.writer import Writer
 from models import Box, FixedBase, ModelError, MovingObstacle, Robot, Sphere, planar_chain
 from models.shapes.mesh_files import read_mesh
 from models.shapes.pairs import checked_pairs
-from ocp import AuditError, Collocation, Plan, Problem, ProblemError, Solution, SolveError, TipTask, plan, solve
+from ocp import AuditError, Collocation, Plan, Problem, ProblemError, Scene, Solution, SolveError, TipTask, plan, solve
 from ocp.app.files import read_gcode, read_trajectory, read_waypoints
 from ocp.app.files.mcap import DEFINITIONS, STATE
 from ocp.app.files.task_file import read_obstacles, read_task
@@ -419,7 +419,7 @@ def plan_file() -> bytes:
     ball = MovingObstacle(Sphere(0.05, (0, 0, 0)), lambda time: (2.0, 1.0 + 0.3 * time, 0.0))
     around = [ball, Box((0.1, 0.1, 0.1), position=(0, -2, 0))]
     task = TipTask(rows=(3, 4), velocity=(-0.05, 0.02))
-    return saved(plan(arm, task, 1.0, start=(0.3, 0.6, 0.5), obstacles=around, search="start"))
+    return saved(plan(arm, task, 1.0, start=(0.3, 0.6, 0.5), scene=Scene(obstacles=around), search="start"))
 
 
 @cache

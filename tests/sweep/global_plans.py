@@ -70,7 +70,7 @@ def by_search(kind: str, seed: int) -> dict[str, Any]:
     machine, task = task_of(kind, seed)
     begun = time.process_time()
     try:
-        found = plan(machine, task, search="global", clearance=None)
+        found = plan(machine, task, search="global", scene=False)
         row = {"cost": found.cost, "bound": found.bound, "passed": found.audit().passed}
     except (SolveError, ProblemError) as error:
         row = {"cost": np.inf, "bound": 0.0, "passed": False, "said": str(error)[:200]}
@@ -85,7 +85,7 @@ def by_starts(kind: str, seed: int, starts: int) -> dict[str, Any]:
         for posture in inverse_kinematics(machine, task, seed=1000 * seed + k, starts=starts):
             k += 1
             try:
-                best = min(best, plan(machine, task, start=posture.joints, search="start", clearance=None).cost)
+                best = min(best, plan(machine, task, start=posture.joints, search="start", scene=False).cost)
             except (SolveError, ProblemError):
                 failed += 1
             if k == starts:

@@ -124,7 +124,7 @@ def passage(seed: int, beyond: float = 0.0) -> Passage:
 def planned(given: Passage, **options: Any) -> Plan | str:
     """The plan, or the first lines of why there is none."""
     try:
-        return plan(given.machine, given.task, start=given.start, clearance=None, **options)
+        return plan(given.machine, given.task, start=given.start, scene=False, **options)
     except (ProblemError, SolveError) as error:
         return f"{type(error).__name__} {error}"[:300]
 

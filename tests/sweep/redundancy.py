@@ -17,8 +17,8 @@ import numpy as np
 import pinocchio as pin
 
 from models.arrays import Array
-from ocp import SolveError
-from ocp.motion.plan.waypoints import WaypointPlan, plan_waypoints
+from ocp import Scene, SolveError, Waypoints, plan
+from ocp.motion.plan.waypoints import WaypointPlan
 from tests.models.machines.test_redundancy_benchmark import by_coal
 from tests.redundancy_benchmark import FOLDER, PROBLEMS, Benchmark, problem_of, tip_and_file
 from tests.sweep.results import Row, Sweep, parser
@@ -34,13 +34,10 @@ SECONDS, MEGABYTES = 60.0, 2000.0
 def planned(problem: Benchmark) -> WaypointPlan:
     """The shortest way, rad and m counted alike."""
     turns = turning(problem)
-    return plan_waypoints(
+    return plan(
         problem.machine,
-        problem.positions,
-        problem.quaternions,
-        step=np.where(turns, REVOLUTE, PRISMATIC) * (1 - 1e-9),
-        obstacles=problem.boxes,
-        ignored=problem.ignored,
+        Waypoints(problem.positions, problem.quaternions, step=np.where(turns, REVOLUTE, PRISMATIC) * (1 - 1e-9)),
+        scene=Scene(obstacles=problem.boxes, ignored=problem.ignored),
     )
 
 

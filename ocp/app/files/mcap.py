@@ -67,7 +67,7 @@ def write_mcap(plan: Plan, file: str | os.PathLike[str], period: float = 0.01, *
         ProblemError: An argument is invalid, or mcap-ros2-support is not installed.
         OSError: The file cannot be written.
     """
-    checked_instance("plan", plan, Plan)
+    checked_instance("plan", plan, Plan)  # type: ignore[type-abstract]
     checked_text("frame", frame)
     try:
         from mcap_ros2.writer import Writer
@@ -231,7 +231,7 @@ def log_rerun(plan: Plan, rerun: Any, period: float = 0.01, *, entity: str = "pl
     Raises:
         ProblemError: The plan or the period is invalid, or `rerun` lacks a required name.
     """
-    checked_instance("plan", plan, Plan)
+    checked_instance("plan", plan, Plan)  # type: ignore[type-abstract]
     checked_text("entity", entity)
     checked_text("timeline", timeline)
     missing = [name for name in REQUIRED_NAMES if not callable(getattr(rerun, name, None))]

@@ -19,7 +19,7 @@ speed = 0.05                        # m/s; with acceleration and jerk it starts 
 velocity = 2.0                      # for all joints, rad/s or m/s, or { elbow = 1.5 }
 # torque = { elbow = 40 }           # N m or N; acceleration, jerk, power (W) likewise
 [cost]
-weights = { elbow = 4 }             # of squared joint rates; 1 of all others
+weights = { elbow = 4 }             # of squared joint rates; 1 of all others; time = 1.0 costs a second of a free pace
 [search]
 kind = "configurations"             # or "start", "global"; "segments": the fewest motions, if one is not enough
 # start = { elbow = 1.2 }           # joints at the start, all of them; cyclic = true; seed = 1; pace = "free"
@@ -46,6 +46,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -81,7 +82,9 @@ from ocp.app.files.toml_table import REQUIRED, TomlTable, read_toml
 from ocp.app.files.waypoints import read_waypoints
 from ocp.errors import NOT_NUMBERS, ProblemError, floats
 from ocp.motion.schedule import LineLimits, schedule
+from ocp.motion.tasks.cost import Cost
 from ocp.motion.tasks.limits import Limits
+from ocp.motion.tasks.scene import Scene
 from ocp.motion.tasks.tip_task import TipTask
 
 __all__ = ["OUTPUTS", "Task", "obstacles_of", "read_obstacles", "read_task", "rotation_of"]
@@ -166,7 +169,7 @@ class Task:
     Attributes:
         machine: Robot on its base.
         task: Task of its tip.
-        options: Keywords of `ocp.plan`, or of `ocp.plan_in_segments` if `in_segments`.
+        options: Keywords of `ocp.plan`.
         outputs: Files to write, by kind of OUTPUTS, all in or below `output_folder`.
         period: Sampling period of the outputs, s.
         file, urdf: Names of the task file and of the robot's file.
@@ -180,7 +183,6 @@ class Task:
     file: str
     urdf: Path
     output_folder: Path
-    in_segments: bool = False
 
 
 def read_task(file: FileName, output_folder: FileName | None = None) -> Task:
@@ -206,17 +208,26 @@ def read_task(file: FileName, output_folder: FileName | None = None) -> Task:
     assert path is not None
     task = _task(path, folder)
     path.done()
-    options: dict[str, Any] = {"obstacles": obstacles_of(root, folder)}
+    options: dict[str, Any] = {}
+    obstacles = obstacles_of(root, folder)
     names = machine.robot.joint_names
-    for name, read in (("limits", _limits), ("cost", _cost), ("search", _search), ("scene", _scene)):
+    for name, read in (
+        ("limits", _limits),
+        ("cost", _cost),
+        ("search", _search),
+        ("scene", partial(_scene, obstacles)),
+    ):
         if (table := root.table(name, f"a table [{name}]")) is not None:
             options |= read(table, names, folder)
             table.done()
     outputs_in = folder if output_folder is None else Path(output_folder)
     outputs, period = _outputs(root.table("output", "a table [output]"), outputs_in)
     root.done()
-    in_segments = options.pop("in_segments", False)
-    return Task(machine, task, options, outputs, period, str(file), urdf, outputs_in, in_segments)
+    options.setdefault("scene", Scene(obstacles=obstacles))
+    cost = options.get("cost")
+    if options.get("horizon") == "free" and cost is not None and not cost.time:
+        options["cost"] = replace(cost, time=1.0)
+    return Task(machine, task, options, outputs, period, str(file), urdf, outputs_in)
 
 
 @contextmanager
@@ -336,7 +347,9 @@ def _limits(entries: TomlTable, names: tuple[str, ...], folder: Path) -> dict[st
 
 def _cost(entries: TomlTable, names: tuple[str, ...], folder: Path) -> dict[str, Any]:
     """Return the weights as an option of the planner."""
-    return {"weights": _each(entries, "weights", names, 1.0, "numbers above 0 by joint: { elbow = 4 }")}
+    weights = _each(entries, "weights", names, 1.0, "numbers above 0 by joint: { elbow = 4 }")
+    time = entries.number("time", "a number above 0, 1/s: cost of a second with a free pace", least=0.0)
+    return {"cost": Cost(time=time or 0.0, weights=weights)}
 
 
 def _each(entries: TomlTable, name: str, names: tuple[str, ...], default: float, expected: str) -> Any:
@@ -368,9 +381,7 @@ def _search(entries: TomlTable, names: tuple[str, ...], folder: Path) -> dict[st
         for name, is_set in (("cyclic", cyclic), ("pace", pace == "free")):
             if is_set:
                 raise entries.error(name, f'kind = "segments" does not support {name}; remove it')
-        options["in_segments"] = True
-    else:
-        options |= {"search": kind, "cyclic": cyclic}
+    options |= {"search": kind, "cyclic": cyclic}
     if pace == "free":
         options["horizon"] = "free"
     if "start" in entries:
@@ -382,19 +393,27 @@ def _search(entries: TomlTable, names: tuple[str, ...], folder: Path) -> dict[st
     return options
 
 
-def _scene(entries: TomlTable, names: tuple[str, ...], folder: Path) -> dict[str, Any]:
-    """Return the options of the planner for its collision scene."""
+def _scene(obstacles: tuple[Shape, ...], entries: TomlTable, names: tuple[str, ...], folder: Path) -> dict[str, Any]:
+    """Return the scene as an option of the planner."""
     checked = entries.flag("look", True)
     clearance = entries.number("clearance", "a distance of 0 or more, m", 0.0, least=-1e-300)
     srdf = entries.text("srdf", "the name of an SRDF file")
     folders = entries.texts("folders", "a list of names of folders")
-    options: dict[str, Any] = {"clearance": clearance if checked else None}
-    if checked:
-        options["ignored"] = tuple(entries.pairs("ignored", 'pairs of links: [["link1", "link3"]]'))
-        options["srdf"] = None if srdf is None else folder / srdf
-        options["folders"] = tuple(folder / name for name in folders)
-        options["missing"] = entries.choice("meshes", ("raise", "skip"), "raise")
-    return options
+    if not checked:
+        if obstacles:
+            raise entries.error(
+                "look", "look = false checks no collisions, but there are obstacles; remove one"
+            )
+        return {"scene": False}
+    scene = Scene(
+        obstacles,
+        clearance,
+        tuple(entries.pairs("ignored", 'pairs of links: [["link1", "link3"]]')),
+        None if srdf is None else folder / srdf,
+        tuple(folder / name for name in folders),
+        entries.choice("meshes", ("raise", "skip"), "raise"),
+    )
+    return {"scene": scene}
 
 
 def _outputs(entries: TomlTable | None, folder: Path) -> tuple[dict[str, Path], float]:

@@ -22,11 +22,10 @@ from ocp.app.check.joint_limits import Row, audit_rows, floating_torques, integr
 from ocp.app.check.plan_verdict import PlanVerdict, verdict_of
 from ocp.app.check.verdict import bounds_of
 from ocp.app.files import RawTrajectory
-from ocp.app.view.pictures import Obstacle, obstacles_of, times_by_part
+from ocp.app.view.pictures import Obstacle, obstacles_of, obstacles_of_plan
 from ocp.audit.audit import Audit
 from ocp.audit.clearance import closest_pairs_along
 from ocp.errors import ProblemError, unknown_name
-from ocp.motion.builders.tool_motion import CLOCK
 from ocp.motion.plan import Plan
 from ocp.motion.tasks.limits import JointBounds
 from ocp.motion.tasks.targets import Target
@@ -275,20 +274,18 @@ def animate_plan(plan: Plan, name: str = "plan", **settings: Any) -> Animation:
     sample = plan.sampled(times)
     base = plan.at(times)["base"] if plan.machine.base_size else np.zeros((len(times), 0))
     times_of_pairs = np.linspace(0.0, plan.horizon, PAGE_SETTINGS.pair_samples)
-    single = len(plan.parts) == 1
-    own_curves: list[Curve] = []
-    if single:
-        fractions = plan._fractions(plan.parts[0], times)
-        solution_times = fractions * plan.solution.horizon if CLOCK in plan.solution.states else times
-        own_curves = _problem_curves(plan.solution, fractions, solution_times)
+    parts, own_curves = plan.solved_parts(times), list[Curve]()
+    if len(parts) == 1:
+        solution, _, solution_times = parts[0]
+        own_curves = _problem_curves(solution, solution_times / solution.horizon, solution_times)
     derivatives = sample.joints, sample.rates, sample.accelerations
     details: dict[str, Any] = {
-        "closest": _closest_pairs(plan.solution, times_by_part(plan, times_of_pairs), plan.horizon),
-        "obstacles": tuple(obstacles_of(plan.solution, times_by_part(plan, times))),
+        "closest": _closest_pairs(plan.solved_parts(times_of_pairs), plan.horizon),
+        "obstacles": tuple(obstacles_of_plan(plan, times)),
         "cost": plan.cost,
         "targets": plan.targets,
     }
-    details |= _audited(plan.solution, lambda: verdict_of(plan, sample, name, **settings))
+    details |= _audited([part[0] for part in parts], lambda: verdict_of(plan, sample, name, **settings))
     base_rates = np.gradient(base, times, axis=0, edge_order=2) if base.shape[1] else base
     return _animation(name, plan.machine, times, base, *derivatives, base_rates, own_curves, **details)
 
@@ -335,10 +332,10 @@ def animate_solution(
     q, v, a = (samples[:, columns[joints]] for samples in (states, slopes, second_derivatives))
     base_path = states[:, columns[base]] if machine.base_size else np.zeros((len(times), 0))
     base_rates = slopes[:, columns[base]] if machine.base_size else np.zeros((len(times), 0))
-    details: dict[str, Any] = {"cost": solution.cost, "obstacles": tuple(obstacles_of(solution, [("", times)]))}
-    details |= _audited(solution, lambda: solution.audit(**settings))
+    details: dict[str, Any] = {"cost": solution.cost, "obstacles": tuple(obstacles_of([(solution, "", times)]))}
+    details |= _audited([solution], lambda: solution.audit(**settings))
     times_of_pairs = np.linspace(0.0, solution.horizon, PAGE_SETTINGS.pair_samples)
-    details["closest"] = _closest_pairs(solution, [("", times_of_pairs)], solution.horizon)
+    details["closest"] = _closest_pairs([(solution, "", times_of_pairs)], solution.horizon)
     smooth = _torque_like(solution, joints)
     own_curves = _problem_curves(solution, fractions, times)
     return _animation(name, machine, times, base_path, q, v, a if smooth else None, base_rates, own_curves, **details)
@@ -428,10 +425,11 @@ def _torque_like(solution: Solution, joints: str) -> bool:
     )
 
 
-def _audited(solution: Solution, judge: Callable[[], Audit | PlanVerdict]) -> dict[str, Any]:
+def _audited(solutions: Sequence[Solution], judge: Callable[[], Audit | PlanVerdict]) -> dict[str, Any]:
     """Return sentence, result and rows of the audit, or only a sentence if the problem is missing."""
-    if solution.problem is None:
-        return {"verdict": f"There is no audit, because the file has no problem: {solution.problem_lost}."}
+    lost = next((solution.problem_lost for solution in solutions if solution.problem is None), None)
+    if lost is not None:
+        return {"verdict": f"There is no audit, because the file has no problem: {lost}."}
     verdict = judge()
     audit = verdict.audit if isinstance(verdict, PlanVerdict) else verdict
     return {"verdict": f"The plan {verdict.sentence}.", "passed": verdict.passed, "rows": tuple(audit_rows(audit))}
@@ -472,17 +470,19 @@ def _margins(rows: Sequence[Curve]) -> list[Curve]:
     return [one for one in curves if np.isfinite(one.values).any()]
 
 
-def _closest_pairs(solution: Solution, parts: Sequence[tuple[str, Array]], horizon: float) -> ClosestPairs | None:
+def _closest_pairs(parts: Sequence[tuple[Solution, str, Array]], horizon: float) -> ClosestPairs | None:
     """Return the closest bodies at uniform times of a motion, or None if they are unknown.
 
     Args:
-        solution: The solution.
-        parts: As returned by `times_by_part` for these times.
+        parts: As returned by `Plan.solved_parts` for these times.
         horizon: Duration of the motion, s.
     """
-    if solution.problem is None:
-        return None
-    pairs = [pair for suffix, times in parts for pair in closest_pairs_along(solution.problem, solution, times, suffix)]
+    pairs = [
+        pair
+        for solution, suffix, times in parts
+        if solution.problem is not None
+        for pair in closest_pairs_along(solution.problem, solution, times, suffix)
+    ]
     t = np.linspace(0.0, horizon, PAGE_SETTINGS.pair_samples)
     if len(pairs) < len(t):
         return None

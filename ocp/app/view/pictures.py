@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from models import HalfSpace, Machine
+from models import HalfSpace, Machine, MovingObstacle
 from models.arrays import Array
 from models.shapes.hull import convex_hull
 from models.shapes.shapes import Shape
@@ -30,6 +30,7 @@ from ocp.app.view.appearance import (
 from ocp.app.view.rendering import PICTURE_STYLE, Camera, Floor, Layer, parts_in_world, render, tube
 from ocp.audit.clearance import separation_frames
 from ocp.motion.plan import Plan
+from ocp.motion.plan.path_plan import PathPlan
 from ocp.motion.tasks.limits import JointBounds
 from ocp.problem.problem import Problem
 from ocp.problem.separation import Separation
@@ -47,8 +48,8 @@ __all__ = [
     "draw_scene",
     "line_style",
     "obstacles_of",
+    "obstacles_of_plan",
     "obstacles_of_shapes",
-    "times_by_part",
 ]
 
 Solid = tuple[Array, NDArray[np.intp]]
@@ -101,22 +102,21 @@ def obstacles_of_shapes(shapes: Iterable[Shape]) -> list[Obstacle]:
     ]
 
 
-def obstacles_of(solution: Solution, parts: Sequence[tuple[str, Array]]) -> list[Obstacle]:
-    """Return the obstacles in the problem of a solution.
+def obstacles_of(parts: Sequence[tuple[Solution, str, Array]]) -> list[Obstacle]:
+    """Return the obstacles in the problems of solutions.
 
     A moving obstacle is attached to a frame that depends on time but on no state.
 
     Args:
-        solution: Its problem declares the separations; without a problem there are no obstacles.
-        parts: Parts of a motion in sequence: the suffix of the names of its states, "" for a single part, and the times
-            in the solution, shape (K,), s, to evaluate.
+        parts: Parts of a motion in sequence: a solution, whose problem declares the separations; the suffix of the
+            names of its states, "" for a single part; and the times in the solution, shape (K,), s, to evaluate.
     """
-    problem = solution.problem
-    if problem is None:
-        return []
     static: dict[str, Obstacle] = {}
     moving: dict[str, list[tuple[Any, Array, Array]]] = {}
-    for suffix, times in parts:
+    for solution, suffix, times in parts:
+        problem = solution.problem
+        if problem is None:
+            continue
         placements: list[tuple[Separation, Any]] | None = None
         for separation in problem.declared.apart.values():
             if not all(name.endswith(suffix) for name in separation.movers):
@@ -136,19 +136,17 @@ def obstacles_of(solution: Solution, parts: Sequence[tuple[str, Array]]) -> list
     for segments in moving.values():
         hull = segments[0][0]
         rotations, positions = (np.concatenate([segment[k] for segment in segments]) for k in (1, 2))
-        if len(positions) == sum(len(times) for _, times in parts):
+        if len(positions) == sum(len(times) for *_, times in parts):
             obstacles.append(Obstacle(hull.core, hull.radius, None, rotations, positions))
     return obstacles
 
 
-def times_by_part(plan: Plan, times: Array) -> list[tuple[str, Array]]:
-    """Return increasing times of a plan (M,), s, by part: the suffix of its states, and the times in its solution."""
-    begins = [part.begin for part in plan.parts]
-    which = np.clip(np.searchsorted(begins, times, "right") - 1, 0, len(begins) - 1)
-    return [
-        (part.suffix, plan._fractions(part, times[which == k]) * plan.solution.horizon)
-        for k, part in enumerate(plan.parts)
-    ]
+def obstacles_of_plan(plan: Plan, times: Array) -> list[Obstacle]:
+    """Return the obstacles of a plan at increasing times (M,), s."""
+    if isinstance(plan, PathPlan):
+        obstacles = () if plan.constraints is None else plan.constraints.scene.obstacles
+        return obstacles_of_shapes(shape for shape in obstacles if not isinstance(shape, MovingObstacle))
+    return obstacles_of(plan.solved_parts(times))
 
 
 def _moves(problem: Problem, separation: Separation, frame: int) -> bool:

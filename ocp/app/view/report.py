@@ -18,7 +18,7 @@ from ocp.app.check.interpolation import Motion
 from ocp.app.check.joint_limits import Row, RowVerdict, audit_rows
 from ocp.app.check.plan_verdict import verdict_of
 from ocp.app.check.verdict import Check, bounds_of
-from ocp.app.view.pictures import Obstacle, draw_curves, draw_scene, obstacles_of, times_by_part
+from ocp.app.view.pictures import Obstacle, draw_curves, draw_scene, obstacles_of_plan
 from ocp.motion.plan import Plan
 from ocp.motion.tasks.limits import JointBounds
 
@@ -173,7 +173,7 @@ def report_of_plan(plan: Plan, period: float, title: str) -> Report:
         verdict.passed,
         (robot.name, f"{plan.horizon:.5g} s", f"{robot.dof} joints", cost, f"{len(plan.candidates)} candidates"),
         tuple(str(fault) for fault in check.faults),
-        draw_scene(machine, motion, base_path, obstacles_of(plan.solution, times_by_part(plan, sample.t))),
+        draw_scene(machine, motion, base_path, obstacles_of_plan(plan, sample.t)),
         draw_curves(motion, plan.names, units, bounds, check.faults),
         (("The audit", tuple(audit_rows(audit))), (f"Samples every {period:g} s against the limits", tuple(limited))),
         tuple(f"unlimited: {one}" for one in check.unlimited),

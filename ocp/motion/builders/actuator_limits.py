@@ -1,4 +1,4 @@
-"""Actuation of a machine: joint torques, friction, and the weights of the effort."""
+"""Actuation of a machine: joint torques and friction."""
 
 from __future__ import annotations
 
@@ -7,14 +7,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
-import numpy as np
 
 from models import FixedBase, FreeFloating, Standing
-from models.arrays import Array
 from models.robot.dynamics import GRAVITY, Wrench, inverse_dynamics
-from ocp.errors import NOT_NUMBERS, ProblemError, checked_nonnegative, floats
+from ocp.errors import ProblemError, checked_nonnegative
+from ocp.motion.tasks.checks import nonnegative_each
 
-__all__ = ["Effort", "JointFriction", "Motors", "checked_motors", "joint_torques", "nonnegative_each"]
+__all__ = ["JointFriction", "Motors", "checked_motors", "joint_torques"]
 
 Motors = FixedBase | FreeFloating
 """Machines that are moved by the torques of their joints alone."""
@@ -50,39 +49,6 @@ class JointFriction:
             ca.DM(nonnegative_each(f"friction: {name}", getattr(self, name), n)) for name in ("viscous", "coulomb")
         )
         return viscous * rates + coulomb * ca.tanh(rates / self.slip)
-
-
-@dataclass(frozen=True)
-class Effort:
-    """Weights of the cost, an integral over the motion plus `time` times the final time.
-
-    Attributes:
-        torque: Weight of the squared torques (losses in the windings), one number or one for each joint, 1/(N m)^2/s.
-        energy: Weight of the positive actuator work, the sum of max(torque times rate, 0), 1/J. Braking regains
-            nothing.
-        acceleration: Weight of the squared accelerations, one number or one for each joint. It matters for light joints
-            at the end of an arm, which need hardly any torque.
-        jerk: Weight of the squared jerks, if they are the control.
-        turning: Weight of the squared angular velocity of a floating base, 1/(rad/s)^2/s.
-        time: Weight of the final time, 1/s.
-
-    Raises:
-        ProblemError: A weight is negative, or all are zero.
-    """
-
-    torque: Any = 1.0
-    energy: float = 0.0
-    acceleration: Any = 0.0
-    jerk: float = 0.0
-    turning: float = 0.0
-    time: float = 0.0
-
-    def __post_init__(self) -> None:
-        each = [nonnegative_each(f"effort: {name}", getattr(self, name), None) for name in ("torque", "acceleration")]
-        names = ("energy", "jerk", "turning", "time")
-        parts = [checked_nonnegative(f"effort: {name}", getattr(self, name)) for name in names]
-        if not (any(parts) or np.concatenate(each).any()):
-            raise ProblemError("effort: at least one weight must be above zero", name="effort", value=self, limit=0.0)
 
 
 def joint_torques(
@@ -130,21 +96,3 @@ def checked_motors(name: str, machine: Any) -> Motors:
         words += "standing_problem for a standing machine"
         raise ProblemError(words, name="machine", value=machine)
     return machine
-
-
-def nonnegative_each(label: str, value: Any, size: int | None) -> Array:
-    """Return nonnegative finite numbers, one or with a size that many; raise ProblemError for others."""
-    name = label.rpartition(" ")[2]
-    try:
-        numbers = floats(value).reshape(-1)
-    except NOT_NUMBERS as error:
-        words = f"{label} must be one number or one for each joint, not {value!r}"
-        raise ProblemError(words, name=name, value=value) from error
-    if not numbers.size or not (np.isfinite(numbers) & (numbers >= 0)).all():
-        raise ProblemError(f"{label} must be zero or above, and finite: {value!r}", name=name, value=value, limit=0.0)
-    if size is None:
-        return numbers
-    if numbers.size not in (1, size):
-        words = f"{label} must have one number or {size}, not {numbers.size}"
-        raise ProblemError(words, name=name, value=numbers.size, limit=size)
-    return np.array(np.broadcast_to(numbers, size))

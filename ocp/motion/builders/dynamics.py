@@ -27,14 +27,7 @@ from models.robot.dynamics import Wrench
 from models.spatial import quaternion_product
 from ocp.console import interruptible
 from ocp.errors import NOT_NUMBERS, ProblemError, checked_choice, checked_each, checked_instance, floats
-from ocp.motion.builders.actuator_limits import (
-    Effort,
-    JointFriction,
-    Motors,
-    checked_motors,
-    joint_torques,
-    nonnegative_each,
-)
+from ocp.motion.builders.actuator_limits import JointFriction, Motors, checked_motors, joint_torques
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.standing.problem import FreeTime, declare_horizon
 from ocp.motion.tasks.checks import (
@@ -44,8 +37,10 @@ from ocp.motion.tasks.checks import (
     checked_horizon,
     checked_tasks,
     clip_to_limits,
+    nonnegative_each,
     rates_at_rest,
 )
+from ocp.motion.tasks.cost import Cost
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.motion.tasks.tip_task import TipTask
@@ -95,7 +90,7 @@ def dynamics_problem(
     start: Any,
     end: Any = None,
     limits: Limits | None = None,
-    effort: Effort | None = None,
+    cost: Cost | None = None,
     setup: DynamicsSetup | None = None,
 ) -> Problem:
     """Declare a motion within actuator limits of least effort, energy or time.
@@ -113,7 +108,7 @@ def dynamics_problem(
         start, end: Joints at the start and at the end. Shape (n,), rad or m; nan where free, None if all are free. A
             start is free only in a phase that is joined to another.
         limits: Limits of joints, velocities, accelerations, jerks, torques and power; the robot's own if None.
-        effort: Weights of the cost; the squared torques if None.
+        cost: Weights of the cost; the squared torques if None.
         setup: Velocities and base at both ends, friction, loads, control and clearance; the defaults if None.
 
     Raises:
@@ -123,14 +118,17 @@ def dynamics_problem(
     """
     checked_motors("dynamics_problem", machine)
     limits = Limits() if limits is None else checked_instance("dynamics_problem: limits", limits, Limits)
-    effort = Effort() if effort is None else checked_instance("dynamics_problem: effort", effort, Effort)
+    cost = Cost(velocity=0.0, effort=1.0) if cost is None else checked_instance("dynamics_problem: cost", cost, Cost)
     setup = DynamicsSetup() if setup is None else checked_instance("dynamics_problem: setup", setup, DynamicsSetup)
     for option, kind in (("friction", JointFriction), ("clearance_constraints", ClearanceConstraints)):
         if getattr(setup, option) is not None:
             checked_instance(f"dynamics_problem: {option}", getattr(setup, option), kind)
+    if cost.length:
+        words = "cost: the length of a motion under dynamics is not smooth at rest; weight its velocity instead"
+        raise ProblemError(words, name="length", value=cost.length, limit=0.0)
     control = checked_choice("control", setup.control, ("acceleration", "jerk"))
     bounds = limits.bounds(machine, ("velocity", "torque"))
-    if control == "acceleration" and (np.isfinite(bounds.jerk).any() or effort.jerk):
+    if control == "acceleration" and (np.isfinite(bounds.jerk).any() or cost.jerk):
         words = "the jerk is limited or weighted, but the control is the acceleration; set control='jerk'"
         raise ProblemError(words, name="control", value=control, limit="jerk")
     free = isinstance(horizon, FreeTime)
@@ -151,7 +149,7 @@ def dynamics_problem(
     torques = joint_torques(
         machine, *motion[:4], friction=setup.friction, wrenches=setup.wrenches, gravity=setup.gravity
     )
-    running = _declare_actuators(problem, machine, motion, torques, bounds, effort)
+    running = _declare_actuators(problem, machine, motion, torques, bounds, cost)
     if equations is not None:
         _declare_tasks(problem, equations, ends, motion, duration)
     if setup.clearance_constraints is not None:
@@ -159,7 +157,7 @@ def dynamics_problem(
         setup.clearance_constraints.declare(
             problem, motion.base, motion.joints, base_name=name, horizon=None if free else duration
         )
-    problem.minimize(running=running, terminal=effort.time * final)
+    problem.minimize(running=running, terminal=cost.time * final)
     return problem
 
 
@@ -274,23 +272,25 @@ def _declare_motion(
 
 
 def _declare_actuators(
-    problem: Problem, machine: Motors, motion: _Motion, torques: Any, bounds: JointBounds, effort: Effort
+    problem: Problem, machine: Motors, motion: _Motion, torques: Any, bounds: JointBounds, cost: Cost
 ) -> Any:
     """Declare the limits of torque and power, and return the running cost."""
     n, limited = machine.joint_size, np.flatnonzero(np.isfinite(bounds.torque)).tolist()
     if limited:
         largest = bounds.torque[limited]
         problem.path("torques", torques[limited], lower=-largest, upper=largest, unit=machine.robot.effort_unit)
-    running = ca.dot(ca.DM(nonnegative_each("effort: acceleration", effort.acceleration, n)), motion.second**2)
-    running += effort.jerk * ca.sumsqr(motion.jerks)
-    if effort.turning and isinstance(machine, FreeFloating):
+    running = ca.dot(ca.DM(nonnegative_each("cost: acceleration", cost.acceleration, n)), motion.second**2)
+    if cost.velocity:
+        running += ca.dot(ca.DM(cost.joint_weights(n)), motion.rates**2) / 2
+    running += cost.jerk * ca.sumsqr(motion.jerks)
+    if cost.turning and isinstance(machine, FreeFloating):
         spin = [k for k, row in enumerate(machine.twist_rows) if row < 3]
-        running += effort.turning * ca.sumsqr(machine.base_twist(motion.base, motion.joints, motion.rates)[spin])
-    running += ca.dot(ca.DM(nonnegative_each("effort: torque", effort.torque, n)), torques**2)
-    if effort.energy or np.isfinite(bounds.power).any():
+        running += cost.turning * ca.sumsqr(machine.base_twist(motion.base, motion.joints, motion.rates)[spin])
+    running += ca.dot(ca.DM(nonnegative_each("cost: effort", cost.effort, n)), torques**2)
+    if cost.energy or np.isfinite(bounds.power).any():
         power = problem.control("power", n, lower=0.0, upper=bounds.power, unit="W")
         problem.path("power", power - torques * motion.rates, lower=0.0, unit="W")
-        running += effort.energy * ca.sum1(power)
+        running += cost.energy * ca.sum1(power)
     return running
 
 

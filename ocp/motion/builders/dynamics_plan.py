@@ -36,7 +36,7 @@ from ocp.errors import (
     checked_text,
 )
 from ocp.methods import solve
-from ocp.motion.builders.actuator_limits import Effort, Motors, checked_motors
+from ocp.motion.builders.actuator_limits import Motors, checked_motors
 from ocp.motion.builders.clearance import (
     ClearanceConstraints,
     Constraints,
@@ -47,6 +47,7 @@ from ocp.motion.builders.clearance import (
 from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem
 from ocp.motion.builders.standing.problem import FreeTime
 from ocp.motion.tasks.checks import checked_horizon
+from ocp.motion.tasks.cost import Cost
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.phases import DURATION, Phases
@@ -88,7 +89,7 @@ def dynamics_phases(
     start: Any,
     total: float | None = None,
     limits: Limits | None = None,
-    effort: Effort | None = None,
+    cost: Cost | None = None,
     setup: DynamicsSetup | None = None,
 ) -> Phases:
     """Declare consecutive legs as the phases of one problem, of least total cost.
@@ -98,7 +99,7 @@ def dynamics_phases(
         legs: At least one; all have the joints of the machine.
         start: Joints at the start of the first leg. Shape (n,), rad or m.
         total: Duration of all legs together, s, if some have a free time; None leaves it free.
-        limits, effort, setup: Arguments of `dynamics_problem` for all legs. `start_velocity` and `start_base` hold
+        limits, cost, setup: Arguments of `dynamics_problem` for all legs. `start_velocity` and `start_base` hold
             where the first leg begins, `end_base` where the last one ends, and clearance on those legs whose machine
             is that of the collision scene. The legs give their `end_velocity` themselves.
 
@@ -134,7 +135,7 @@ def dynamics_phases(
             clearance_constraints=clearance if clearance and clearance.scene.machine is machines[k] else None,
         )
         problems[name] = dynamics_problem(
-            machines[k], leg.tasks, leg.horizon, start=begin, end=leg.joints, limits=limits, effort=effort, setup=own
+            machines[k], leg.tasks, leg.horizon, start=begin, end=leg.joints, limits=limits, cost=cost, setup=own
         )
         begin = leg.joints
     phases = Phases("legs", problems)
@@ -234,7 +235,7 @@ def plan_dynamics(
     start: Any,
     end: Any = None,
     limits: Limits | None = None,
-    effort: Effort | None = None,
+    cost: Cost | None = None,
     setup: DynamicsSetup | None = None,
     total: float | None = None,
     method: Collocation | None = None,
@@ -245,12 +246,12 @@ def plan_dynamics(
 
     The plan satisfies its limits between the nodes, too, to 1e-5 of their units. The first plan that passes its audit
     is returned. If none passes, the feasible plan of least cost is returned; its optimality is then undetermined, or it
-    costs too much, by about its `tightening_cost`. Least time alone, `Effort(torque=0, time=1)`, leaves the motion of
+    costs too much, by about its `tightening_cost`. Least time alone, `Cost(velocity=0, time=1)`, leaves the motion of
     joints that need not hurry undetermined, so that the optimality is undetermined, too. Add a small weight of
     accelerations or torques.
 
     Args:
-        machine, start, end, limits, effort, setup: As for `dynamics_problem`.
+        machine, start, end, limits, cost, setup: As for `dynamics_problem`.
         tasks: Tip tasks as for `dynamics_problem`, or the legs of `dynamics_phases`. The plan has a phase for each leg
             then, `plan.phase(name)`.
         horizon: Final time, s, or FreeTime(...); None for legs, which have their own.
@@ -266,7 +267,7 @@ def plan_dynamics(
         ProblemError: As `dynamics_problem` and `dynamics_phases`.
     """
     setup = DynamicsSetup() if setup is None else checked_instance("plan_dynamics: setup", setup, DynamicsSetup)
-    shared: dict[str, Any] = {"start": start, "limits": limits, "effort": effort}
+    shared: dict[str, Any] = {"start": start, "limits": limits, "cost": cost}
     tip_tasks: Any = tasks
     if isinstance(tasks, Sequence) and isinstance(next(iter(tasks), None), Leg):
         legs = checked_legs(tasks)

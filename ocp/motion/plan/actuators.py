@@ -17,8 +17,9 @@ from ocp.motion.builders.actuator_limits import checked_motors, joint_torques
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.dynamics_plan import within_limits
 from ocp.motion.builders.tool_motion import ToolMotion
-from ocp.motion.plan.motion import CHECKED_TIMES, Plan
+from ocp.motion.plan.motion import CHECKED_TIMES
 from ocp.motion.plan.request import declared_motion
+from ocp.motion.plan.solved_plan import SolvedPlan
 from ocp.motion.search.configurations import PlanRequest
 from ocp.motion.tasks.limits import Limits
 from ocp.problem.problem import Problem
@@ -64,7 +65,7 @@ class ActuatorDemand:
         )
 
     @classmethod
-    def of(cls, plan: Plan, limits: Limits) -> ActuatorDemand | None:
+    def of(cls, plan: SolvedPlan, limits: Limits) -> ActuatorDemand | None:
         """Return the largest demand of a plan; None if no actuator is limited."""
         machine = checked_motors("limits", plan.machine)
         robot, bounds = machine.robot, limits.bounds(machine)
@@ -92,7 +93,9 @@ class ActuatorDemand:
         return None if largest is None else largest[1]
 
 
-def solve_within_actuator_limits(request: PlanRequest, start: Array, reference: Array, unlimited: Plan) -> Solution:
+def solve_within_actuator_limits(
+    request: PlanRequest, start: Array, reference: Array, unlimited: SolvedPlan
+) -> Solution:
     """Return a motion within the actuator limits, from one without; from its own start if many are equally good.
 
     Args:
@@ -147,7 +150,7 @@ def _with_demand(error: SolveError, demand: ActuatorDemand | None) -> SolveError
     return SolveError(f"{words}\n{error}", error.solution, error.conflicts, **details)
 
 
-def _set_guess(motion: ToolMotion, unlimited: Plan) -> None:
+def _set_guess(motion: ToolMotion, unlimited: SolvedPlan) -> None:
     """Set the guess of the states and controls of a problem to a motion without actuator limits."""
     fractions = np.linspace(0.0, 1.0, CHECKED_TIMES)
     sample = unlimited.solution.at_fraction(fractions)

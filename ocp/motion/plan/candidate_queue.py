@@ -17,7 +17,7 @@ import numpy as np
 
 from ocp.errors import SolveError
 from ocp.motion.plan.candidate import Candidate, Reason, Rejection, Stage
-from ocp.motion.plan.motion import Plan
+from ocp.motion.plan.solved_plan import SolvedPlan
 from ocp.motion.search.settings import PlannerSettings
 from ocp.solution import Solution
 
@@ -58,7 +58,7 @@ class Solver:
         details = {"name": cause.name or "plan", "value": cause.value, "limit": cause.limit, "time": cause.time}
         return SolveError(f"{words}\n{cause}", cause.solution or last, cause.conflicts, **details)
 
-    def plan(self, candidates: Sequence[Candidate]) -> Plan:
+    def plan(self, candidates: Sequence[Candidate]) -> SolvedPlan:
         """Return the plan of the first candidate, with the others."""
         raise NotImplementedError
 
@@ -124,7 +124,7 @@ class CandidateQueue:
         duplicate = Reason(Rejection.DUPLICATE)
         self.candidates += [candidate.rejected(duplicate) for motion in self._motions for candidate in motion.waiting]
 
-    def plan(self) -> Plan:
+    def plan(self) -> SolvedPlan:
         """Return the plan of the best candidate that passed, with the others and the reasons of their rejection.
 
         Raises:

@@ -28,8 +28,8 @@ from ocp.motion.local.inverse_kinematics import Unreachable
 from ocp.motion.plan.actuators import solve_within_actuator_limits
 from ocp.motion.plan.candidate import Candidate, Reason, Rejection, Seed, Stage, collision_reason
 from ocp.motion.plan.candidate_queue import Solver
-from ocp.motion.plan.motion import Plan, parts_of
 from ocp.motion.plan.request import declared_motion
+from ocp.motion.plan.solved_plan import SolvedPlan, parts_of
 from ocp.motion.search.configurations import (
     REACH_TOLERANCE,
     PlanRequest,
@@ -388,14 +388,15 @@ class CandidateSolver(Solver):
         details = {"name": worst.name, "value": worst.value, "limit": worst.limit, "time": worst.time}
         return SolveError(words, error.solution, error.conflicts, **details)
 
-    def plan(self, candidates: Sequence[Candidate]) -> Plan:
+    def plan(self, candidates: Sequence[Candidate]) -> SolvedPlan:
         """Return the plan of the first candidate, with the others."""
         best = candidates[0]
         assert best.solution is not None
         parts = parts_of(self.motion.stretches)
         if self.request.time_cost is not None:
             parts = (parts[0]._replace(end=float(best.solution[CLOCK][-1, 0])),)
-        return Plan(self.request.machine, best.solution, parts, tuple(candidates)).with_targets(self.request.tasks)
+        plan = SolvedPlan(self.request.machine, best.solution, parts, tuple(candidates))
+        return plan.with_targets(self.request.tasks)
 
 
 def _is_separated(candidate: Candidate) -> bool:

@@ -1,57 +1,43 @@
-"""Plan: the motion of a machine, its cost and audit, the rejected candidates, and its file format."""
+"""Plan: the motion of a machine over time, its cost, bound and audit, and its tables and files.
+
+Plans differ in what they are made of: a solution of an optimal control problem (`solved_plan`), a joint path through
+waypoints (`path_plan`), or several plans one after the other (`segmented_plan`).
+"""
 
 from __future__ import annotations
 
 import csv
 import io
-import json
 import os
-import warnings
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from abc import ABC, abstractmethod
 from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
-from models import Machine, ModelError
+from models import Machine
 from models.arrays import Array
 from models.spatial import quaternion_from_rotation
-from ocp.audit.audit import Finding
+from ocp.audit.audit import Audit, Finding
 from ocp.console import interruptible
-from ocp.errors import NOT_NUMBERS, ProblemError, StorageWarning, floats, sample_times, unknown_name
-from ocp.motion.builders.tool_motion import CLOCK, PACE, SLOPES, Stretch
+from ocp.errors import NOT_NUMBERS, ProblemError, floats, sample_times, unknown_name
 from ocp.motion.plan.candidate import Candidate
-from ocp.motion.plan.request import MotionRequest, request_of, restored_request, stored_request
 from ocp.motion.schedule.trajectory import JointTrajectory
-from ocp.motion.tasks.targets import Target, targets_along
-from ocp.motion.tasks.tip_task import TipTask
-from ocp.problem.stored import ARRAY_NAMES, RECORD_ERRORS, pack_record, unpack_record
+from ocp.motion.tasks.targets import Target
 from ocp.registry import call_registered
-from ocp.solution import Solution, read_head
-from ocp.storage import read_arrays, table_head, write_arrays, write_text
+from ocp.solution import Solution
+from ocp.storage import table_head, write_arrays, write_text
 
-__all__ = ["CHECKED_TIMES", "Part", "Plan", "PlanSample", "parts_of"]
+__all__ = ["CHECKED_TIMES", "Plan", "PlanSample"]
 
-RATES = ("rates", SLOPES, "velocities")
 MAX_LINES = 15
 """Lines of a printed plan."""
-TARGET_TIMES = 401
-"""Samples at which a plan keeps the targets of its tasks."""
 LIMIT_TOLERANCE = 1e-3
 """Largest relative excess over a joint limit, as in the audit."""
 CHECKED_TIMES = 2001
 """Samples at which joint limits are checked, besides the times of the plan."""
 TIME_TOLERANCE = 1e-9
 """Share of the horizon by which a time may lie outside it."""
-
-
-class Part(NamedTuple):
-    """Interval of a plan, s, and the suffix of its states and controls in the solution."""
-
-    begin: float
-    end: float
-    suffix: str
 
 
 class PlanSample(NamedTuple):
@@ -76,38 +62,42 @@ class PlanSample(NamedTuple):
         )
 
 
-@dataclass(frozen=True, eq=False)
-class Plan:
+class Plan(ABC):
     """Lowest-cost motion found that passes its audit.
 
     Attributes:
         machine: The machine.
-        solution: Solution of the optimal control problem.
-        parts: Intervals of time with the same tasks; in the solution they run side by side.
         candidates: All motions found, the plan first, then by rising cost.
-        bound: Lower bound of the cost of any motion that does the tasks; None if none was computed.
+        bound: Lower bound of the cost of any motion that does the same; None if none was computed.
         targets: Poses that the tasks require along the plan, in world.
+        solution: Solution of the optimal control problem of the motion. Plans of several motions raise ProblemError.
     """
 
     machine: Machine
+    candidates: tuple[Candidate, ...]
+    bound: float | None
+    targets: tuple[Target, ...]
     solution: Solution
-    parts: tuple[Part, ...]
-    candidates: tuple[Candidate, ...] = ()
-    bound: float | None = None
-    targets: tuple[Target, ...] = ()
-    _audits: dict[str, Any] = field(default_factory=dict, repr=False)
+    _audits: dict[str, Any]
 
     # ---- values ------------------------------------------------------------------------------------------------------
 
     @property
+    @abstractmethod
     def cost(self) -> float:
         """Cost of the motion."""
-        return self.solution.cost
 
     @property
+    def gap(self) -> float | None:
+        """Share of the cost by which it may exceed the lowest one, by the bound; None without a bound."""
+        if self.bound is None:
+            return None
+        return (self.cost - self.bound) / self.cost if self.cost > 0 else 0.0
+
+    @property
+    @abstractmethod
     def horizon(self) -> float:
         """Final time, s."""
-        return self.parts[-1].end
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -115,21 +105,23 @@ class Plan:
         return tuple(self.machine.robot.joint_names)
 
     @property
+    @abstractmethod
     def t(self) -> Array:
-        """Times of the plan's own grid, with both copies of the times between parts. Shape (M,), s."""
-        if CLOCK in self.solution.states:
-            return np.asarray(self.solution[CLOCK][:, 0])
-        share = self.solution.t / self.solution.horizon
-        return np.concatenate([part.begin + (part.end - part.begin) * share for part in self.parts])
+        """Times of the plan's own grid; where the motion changes abruptly, a time is there twice. Shape (M,), s."""
+
+    @abstractmethod
+    def _values(self, name: str) -> Array:
+        """Return "joints", "rates" or "base" at the times `t`. Shape (M, n)."""
+
+    @abstractmethod
+    def _values_at(self, name: str, times: Array) -> Array:
+        """Return "joints", "rates", "accelerations" or "base" at checked times (M,). Shape (M, n)."""
 
     def __getitem__(self, name: str) -> Array:
         """Return "joints", "rates" or "base" at the times `t`. Shape (M, n)."""
         if name not in self._names():
             raise unknown_name("name in a plan", name, self._names())
-        if self.rate_name == SLOPES and name == "rates":
-            return np.asarray(self.solution[SLOPES] / self.solution[PACE])
-        own = self.rate_name if name == "rates" else name
-        return np.concatenate([self.solution[own + part.suffix] for part in self.parts])
+        return self._values(name)
 
     def at(self, time: Any) -> dict[str, Array]:
         """Return "joints", "rates" and "base" at a time, each (n,), or at times (M,), each (M, n).
@@ -138,17 +130,7 @@ class Plan:
             ProblemError: A time is not finite or outside 0 to the horizon.
         """
         times = self._checked_times(time)
-
-        def values_of(name: str) -> Array:
-            def values(part: Part, fraction: Array) -> Array:
-                sample = self.solution.at_fraction(fraction)
-                if name == "rates":
-                    return sample[self.rate_name + part.suffix] / (sample[PACE] if self.rate_name == SLOPES else 1.0)
-                return sample[name + part.suffix]
-
-            return self._over(times.ravel(), values)
-
-        values_by_name = {name: values_of(name) for name in self._names()}
+        values_by_name = {name: self._values_at(name, times.ravel()) for name in self._names()}
         return {name: values[0] if times.ndim == 0 else values for name, values in values_by_name.items()}
 
     def sample(self, period: float) -> PlanSample:
@@ -167,41 +149,38 @@ class Plan:
         t = np.atleast_1d(self._checked_times(times))
         at = self.at(t)
         bases = at["base"] if "base" in at else np.zeros((len(t), 0))
-        accelerations, tips = self._over(t, self.accelerations), self._tips(bases, at["joints"])
+        accelerations, tips = self._values_at("accelerations", t), self._tips(bases, at["joints"])
         return PlanSample(t, at["joints"], at["rates"], accelerations, tips)
 
-    @property
-    def request(self) -> MotionRequest | None:
-        """Builder and arguments of the problem; None for a problem that the user declared."""
-        return request_of(self.solution.problem)
+    @abstractmethod
+    def solved_parts(self, times: Array) -> list[tuple[Solution, str, Array]]:
+        """Return the solutions of which the plan consists at increasing times (M,), s, in order.
 
-    def task_share(self, times: Any) -> Array:
-        """Return the share of the tasks' own time that has passed at times (M,), s.
-
-        It equals the share of the horizon unless the horizon is free, in which case the pace of the tasks is planned.
-
-        Raises:
-            ProblemError: A time is not finite or outside 0 to the horizon.
+        Each comes with the suffix of the names of its states, and with the times in it, shape (K,), s; all K add up to
+        M. The list is empty for a plan that solves no optimal control problem.
         """
-        t = np.atleast_1d(self._checked_times(times))
-        return self._fractions(self.parts[0], t) if CLOCK in self.solution.states else t / self.horizon
+
+    # ---- audit -------------------------------------------------------------------------------------------------------
 
     @interruptible
-    def audit(self, **settings: Any) -> Any:
-        """Check the motion independently of its solver; see `ocp.audit.audit.audit`. Results are cached by settings.
-
-        For a plan without a `request`, the limits of its machine are checked as well, since the meaning of the limits
-        in its problem is unknown.
-        """
+    def audit(self, **settings: Any) -> Audit:
+        """Check the motion independently of its solver; see `ocp.audit.audit.audit`. Results are cached by settings."""
         key = repr(sorted(settings.items()))
         if key not in self._audits:
-            audit = self.solution.audit(**settings)
-            if self.request is None:
-                audit = replace(audit, findings=(*audit.findings, *self._machine_limit_findings()))
-            self._audits[key] = audit
-        return self._audits[key]
+            self._audits[key] = self._audit(**settings)
+        audit: Audit = self._audits[key]
+        return audit
 
-    def _machine_limit_findings(self) -> list[Finding]:
+    @abstractmethod
+    def _audit(self, **settings: Any) -> Audit:
+        """Check the motion."""
+
+    @property
+    def audits(self) -> tuple[Audit, ...]:
+        """Cached audits, the first one first."""
+        return tuple(self._audits.values())
+
+    def limit_findings(self) -> list[Finding]:
         """Return the largest excess of joints and rates over the limits of the machine."""
         robot, t = self.machine.robot, np.union1d(self.t, np.linspace(0.0, self.horizon, CHECKED_TIMES))
         at, findings = self.at(t), list[Finding]()
@@ -218,11 +197,6 @@ class Plan:
             limit = LIMIT_TOLERANCE * (size if np.isfinite(size) else 1.0)
             findings.append(Finding(label, value, limit, float(t[row]), unit=unit))
         return findings
-
-    @property
-    def audits(self) -> tuple[Any, ...]:
-        """Cached audits, the first one first."""
-        return tuple(self._audits.values())
 
     def __repr__(self) -> str:
         return f"<Plan of {self.horizon:.6g} s: {len(self.names)} joints, {self._costs}, {self._counts}>"
@@ -269,25 +243,10 @@ class Plan:
     def _repr_html_(self) -> str:
         return str(call_registered("html_of_plan", self))
 
-    # ---- targets -----------------------------------------------------------------------------------------------------
-
-    def with_targets(self, tasks: Sequence[TipTask]) -> Plan:
-        """Return the plan with the targets of the tasks that it does, at TARGET_TIMES times."""
-        times = np.linspace(0.0, self.horizon, TARGET_TIMES)
-        clock = times
-        if CLOCK in self.solution.states:
-            clock = self.task_share(times) * self.solution.horizon
-        at = self.at(times)
-        base = at["base"] if "base" in at else np.zeros((TARGET_TIMES, 0))
-        return replace(self, targets=targets_along(self.machine, tasks, clock, base, at["joints"], times))
-
     # ---- files -------------------------------------------------------------------------------------------------------
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the plan to one `.npz` file, atomically. The file is data: reading it runs nothing.
-
-        It holds the request, from which `load` declares the problem again. For a problem that the user declared, it
-        holds the machine and the expressions of the problem, operation by operation.
 
         Raises:
             ProblemError, OSError: As in `Solution.save`; or a machine of an unknown kind.
@@ -296,34 +255,11 @@ class Plan:
             StorageWarning: A part of the request is not data, such as a Python callback. The file then holds the
                 problem instead, or only the solution if that cannot be written either.
         """
-        try:
-            request, hint = stored_request("", {"machine": self.machine}), ""
-        except ProblemError as error:
-            words = f"the machine cannot be stored in a file: {error}; save the plan's solution alone"
-            raise ProblemError(words, name="machine", value=error.value) from error
-        if self.request is not None and self.request.machine is self.machine:
-            try:
-                request = stored_request(self.request.builder, self.request.arguments)
-                hint = "it is declared again from the request of the plan: read the file with Plan.load"
-            except ProblemError as error:
-                words = f"{path} is saved with the problem instead of the request: {error}"
-                warnings.warn(StorageWarning(words, name=error.name), stacklevel=2)
-        head, numbers = pack_record(
-            {
-                "request": request,
-                "parts": self.parts,
-                "bound": self.bound,
-                "candidates": [
-                    [c.start.tolist(), c.cost, int(c.stage), c.reason and c.reason.record()] for c in self.candidates
-                ],
-                "targets": [
-                    np.column_stack([target.t, target.position, target.rotation.reshape(-1, 9)])
-                    for target in self.targets
-                ],
-            }
-        )
-        arrays = {**self.solution.arrays(path, hint), "plan": np.frombuffer(json.dumps(head).encode(), np.uint8)}
-        write_arrays(path, {**arrays, **{f"plan.{name}": values for name, values in numbers.items()}})
+        write_arrays(path, self.arrays(path))
+
+    @abstractmethod
+    def arrays(self, path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
+        """Return the arrays of the file of the plan; raise as `save`."""
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Plan:
@@ -336,32 +272,8 @@ class Plan:
         Raises:
             FileNotFoundError, ProblemError: As in `Solution.load`; or the file holds no plan.
         """
-        arrays = read_arrays(path)
-        solution = Solution.of_arrays(path, arrays)
-        if "plan" not in arrays:
-            words = f"{path} holds a solution and no plan; read it with Solution.load"
-            raise ProblemError(words, name="path", value=str(path))
-        try:
-            head = unpack_record(
-                read_head(path, arrays["plan"]), {name: arrays[f"plan.{name}"] for name in ARRAY_NAMES}
-            )
-            request = restored_request(head["request"])
-            if request.builder:
-                solution = solution.tied_to(request.problem())
-            parts = tuple(Part(float(a), float(b), str(suffix)) for a, b, suffix in head["parts"])
-            candidates = tuple(
-                Candidate.of_record(start, cost, stage, reason, solution)
-                for start, cost, stage, reason in head["candidates"]
-            )
-            bound = None if head["bound"] is None else float(head["bound"])
-            targets = tuple(Target(rows[:, 0], rows[:, 1:4], rows[:, 4:].reshape(-1, 3, 3)) for rows in head["targets"])
-            plan = cls(request.machine, solution, parts, candidates, bound, targets)
-            plan._check_parts()
-            return plan.with_targets(request.tasks) if request.builder and targets else plan
-        except (*RECORD_ERRORS, ModelError) as error:
-            name = getattr(error, "name", None) or "plan"
-            words = f"{path}: the plan in it is damaged: {error}"
-            raise ProblemError(words, name=str(name), value=str(path)) from error
+        plan: Plan = call_registered("load_plan", path)
+        return plan
 
     def trajectory(self, period: float) -> JointTrajectory:
         """Return the joint trajectory with a point every `period` s."""
@@ -393,23 +305,7 @@ class Plan:
         """Return a dictionary with the fields of trajectory_msgs/msg/JointTrajectory, a point every `period` s."""
         return self.trajectory(period).to_ros()
 
-    # ---- time of the motion and time of the solution -----------------------------------------------------------------
-
-    def _check_parts(self) -> None:
-        """Raise ValueError if the parts do not match the solution, or its joints not the machine."""
-        ends = [0.0, *(part.end for part in self.parts)]
-        contiguous = all(part.begin == end < part.end for part, end in zip(self.parts, ends, strict=False))
-        clock = self.solution.states.get(CLOCK)
-        if not (self.parts and contiguous and ends[-1] == (self.solution.horizon if clock is None else clock[-1, 0])):
-            raise ValueError(f"its parts {self.parts} do not fill the time of its solution one after the other")
-        variables = {**self.solution.states, **self.solution.controls}
-        sizes_by_name = {name: values.shape[1] for name, values in variables.items()}
-        sizes = {"joints": self.machine.joint_size, "base": self.machine.base_size}
-        for part in self.parts:
-            rate_sizes = [sizes_by_name.get(name + part.suffix) for name in RATES]
-            sizes_of_part = [sizes_by_name.get(name + part.suffix, 0) for name in sizes]
-            if sizes_of_part != list(sizes.values()) or sizes["joints"] not in rate_sizes:
-                raise ValueError(f"the solution has no joints and rates of this machine, {sizes}, in {part}")
+    # ---- helpers -----------------------------------------------------------------------------------------------------
 
     def _names(self) -> tuple[str, ...]:
         return ("joints", "rates", *(("base",) if self.machine.base_size else ()))
@@ -426,55 +322,6 @@ class Plan:
             raise ProblemError(words, name="time", value=time, limit=(0.0, self.horizon))
         return np.asarray(np.clip(times, 0.0, self.horizon))
 
-    @property
-    def rate_name(self) -> str:
-        """Name of the joint rates in the solution; SLOPES are derivatives by the path, to be divided by the pace."""
-        names = {**self.solution.states, **self.solution.controls}
-        return next(name for name in RATES if name + self.parts[0].suffix in names)
-
-    def accelerations(self, part: Part, fraction: Array) -> Array:
-        """Return the joint accelerations at fractions (M,) of a part. Shape (M, n)."""
-        sample, duration = self.solution.at_fraction(fraction), part.end - part.begin
-        name = self.rate_name + part.suffix
-        if "accelerations" + part.suffix in sample:
-            return sample["accelerations" + part.suffix]
-        slope = self._slope(name, fraction)
-        if self.rate_name != SLOPES:
-            return np.asarray(slope / duration)
-        pace, change = sample[PACE], self._slope(PACE, fraction)
-        return np.asarray((slope * pace - sample[name] * change) / pace**3 / self.solution.horizon)
-
-    def _slope(self, name: str, fraction: Array) -> Array:
-        """Return the derivative of a state or control by the fraction. Shape (M, n)."""
-        is_state = name in self.solution.states
-        pool = self.solution.states if is_state else self.solution.controls
-        interpolant = self.solution.state_interpolant if is_state else self.solution.control_interpolant
-        offset = sum(values.shape[1] for values in list(pool.values())[: list(pool).index(name)])
-        return np.asarray(interpolant.derivative()(fraction)[:, offset : offset + pool[name].shape[1]])
-
-    def _fractions(self, part: Part, times: Array) -> Array:
-        """Return the fractions of the solution's horizon at times (M,) of a part."""
-        if CLOCK not in self.solution.states:
-            return np.asarray(np.clip((times - part.begin) / (part.end - part.begin), 0.0, 1.0))
-        low, high = np.zeros(len(times)), np.ones(len(times))
-        for _ in range(np.finfo(float).nmant):  # bisection; the clock always advances
-            middle = (low + high) / 2
-            is_late = self.solution.at_fraction(middle)[CLOCK][:, 0] > times
-            low, high = np.where(is_late, low, middle), np.where(is_late, middle, high)
-        return np.asarray((low + high) / 2)
-
-    def _over(self, times: Array, evaluate: Callable[[Part, Array], Array]) -> Array:
-        """Evaluate each part at the fractions of the times (M,) that it covers; the later one where two meet."""
-        begins = [part.begin for part in self.parts]
-        which = np.clip(np.searchsorted(begins, times, side="right") - 1, 0, len(self.parts) - 1)
-        result: Array | None = None
-        for number in np.unique(which):
-            part, rows = self.parts[number], np.flatnonzero(which == number)
-            values = evaluate(part, self._fractions(part, times[rows]))
-            result = np.empty((len(times), values.shape[1])) if result is None else result
-            result[rows] = values
-        return np.zeros((0, self.machine.joint_size)) if result is None else result
-
     def _tips(self, bases: Array, joints: Array) -> Array:
         if self.machine.robot.tip is None:
             return np.zeros((len(joints), 7)) * np.nan
@@ -484,8 +331,3 @@ class Plan:
         position, rotation = function.map(len(joints))(bases.T, joints.T)
         turns = np.array(rotation).reshape(3, len(joints), 3).transpose(1, 0, 2)
         return np.column_stack([np.array(position).T, quaternion_from_rotation(turns)])
-
-
-def parts_of(stretches: Sequence[Stretch]) -> tuple[Part, ...]:
-    """Return the parts of a plan that consists of stretches."""
-    return tuple(Part(stretch.begin, stretch.end, stretch.suffix) for stretch in stretches)

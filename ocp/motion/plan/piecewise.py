@@ -9,14 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
 
 from models import FixedBase
 from models.arrays import Array
-from ocp.console import interruptible
 from ocp.direct.collocation import Collocation
 from ocp.direct.guess import Samples
 from ocp.errors import ProblemError, SolveError, checked_instance
@@ -26,16 +25,18 @@ from ocp.motion.builders.tool_motion import stretches_of
 from ocp.motion.local.collisions import distances_along
 from ocp.motion.local.inverse_kinematics import Unreachable
 from ocp.motion.plan.candidate import Candidate, Stage
-from ocp.motion.plan.motion import Part, Plan
 from ocp.motion.plan.planner import checked_request, clearance_for, plan_request
+from ocp.motion.plan.segmented_plan import Reconfiguration, SegmentedPlan
+from ocp.motion.plan.solved_plan import Part, SolvedPlan
 from ocp.motion.search.configurations import PlanRequest, fix_ignorable_joints, local_motions_from, start_configurations
 from ocp.motion.search.task_search import TaskSearch
 from ocp.motion.tasks.limits import Limits
+from ocp.motion.tasks.scene import Scene
 from ocp.motion.tasks.tip_task import TipTask, timed
 from ocp.problem.problem import Problem
 from ocp.solution import Solution
 
-__all__ = ["Reconfiguration", "SegmentedPlan", "plan_in_segments"]
+__all__ = ["plan_in_segments"]
 
 
 @dataclass(frozen=True)
@@ -62,104 +63,16 @@ class ReconfigurationSettings:
     rate_slack: float = 1e-9
 
 
-@dataclass(frozen=True, eq=False)
-class Reconfiguration:
-    """Motion between two segments, to the same place of the tasks in another configuration.
-
-    Attributes:
-        time: Time of the tasks, which wait, s.
-        before, after: Joints, rad or m. Shape (n,).
-        motion: Collision-free motion within the rate limits; unlike in a plan, its joints do not start at rest. None if
-            none was found, which does not prove that there is none.
-        failure: Why there is no motion; "" otherwise.
-    """
-
-    time: float
-    before: Array
-    after: Array
-    motion: Plan | None
-    failure: str = ""
-
-    @property
-    def duration(self) -> float:
-        """Duration of the motion, s; nan without a motion."""
-        return np.nan if self.motion is None else self.motion.horizon
-
-    def __str__(self) -> str:
-        largest = np.abs(self.after - self.before).max()
-        how = f"no collision-free motion was found: {self.failure}"
-        if self.motion is not None:
-            how = f"in {self.duration:.4g} s"
-        return f"at {self.time:.4g} s the arm reconfigures, a joint by up to {largest:.3g}: {how}"
-
-
-@dataclass(frozen=True, eq=False)
-class SegmentedPlan:
-    """Motions that do the tasks one after the other.
-
-    Attributes:
-        machine: The arm.
-        segments: Audited plans of parts of the tasks; the time of each starts at 0.
-        start_times: Time of the tasks at which each segment starts, s; each ends where the next one starts.
-        reconfigurations: Motions between segments.
-        fewest: Lower bound of the number of reconfigurations, under the assumptions of `ocp.motion.search.search`.
-    """
-
-    machine: FixedBase
-    segments: tuple[Plan, ...]
-    start_times: tuple[float, ...]
-    reconfigurations: tuple[Reconfiguration, ...]
-    fewest: int
-
-    @property
-    def cost(self) -> float:
-        """Cost of all segments, without reconfigurations."""
-        return float(sum(segment.cost for segment in self.segments))
-
-    @property
-    def horizon(self) -> float:
-        """Duration of the tasks, s."""
-        return self.start_times[-1] + self.segments[-1].horizon
-
-    @property
-    def duration(self) -> float:
-        """Duration of tasks and reconfigurations, s; nan if a reconfiguration has no motion."""
-        return self.horizon + float(sum(each.duration for each in self.reconfigurations))
-
-    def __repr__(self) -> str:
-        return f"<SegmentedPlan of {self.horizon:.6g} s: {len(self.segments)} segments, cost {self.cost:.6g}>"
-
-    def __str__(self) -> str:
-        count = len(self.reconfigurations)
-        counted = f"{count} reconfiguration{'' if count == 1 else 's'}"
-        fewest = "the fewest possible" if self.fewest == count else f"at least {self.fewest} needed"
-        names = ", ".join(self.machine.robot.joint_names)
-        lines = [f"plan of {self.horizon:.6g} s for {names}: {counted}, {fewest}; cost {self.cost:.6g}"]
-        for k, segment in enumerate(self.segments):
-            end = self.start_times[k] + segment.horizon
-            bound = "" if segment.bound is None else f", lower bound {segment.bound:.6g}"
-            lines.append(f"  {self.start_times[k]:.4g} to {end:.4g} s: cost {segment.cost:.6g}{bound}")
-            if k < count:
-                lines.append(f"  {self.reconfigurations[k]}")
-        return "\n".join(lines)
-
-
-@interruptible
 def plan_in_segments(
     machine: FixedBase,
     tasks: TipTask | Sequence[TipTask],
-    horizon: float | None = None,
+    horizon: Any = None,
     *,
     start: Any = None,
-    weights: Any = None,
+    cost: Any = None,
     limits: Limits | None = None,
+    scene: Scene | Literal[False] | None = None,
     seed: int = 0,
-    obstacles: Any = (),
-    clearance: float | None = 0.0,
-    ignored: Any = (),
-    srdf: Any = None,
-    folders: Any = (),
-    missing: str = "raise",
 ) -> SegmentedPlan:
     """Plan tasks in the fewest segments, between which the arm reconfigures, at the least cost.
 
@@ -169,10 +82,9 @@ def plan_in_segments(
 
     Args:
         machine: An arm on a fixed base.
-        tasks, horizon, start, weights, limits, seed: As in `plan`; the tasks are poses that leave at most two
+        tasks, horizon, start, cost, limits, seed: As in `plan`; the tasks are poses that leave at most two
             directions free. Actuator limits do not influence the division, but the segments are planned within them.
-        obstacles, clearance, ignored, srdf, folders, missing: As in `plan`, for static obstacles, since a
-            reconfiguration takes time.
+        scene: As in `plan`, with static obstacles, since a reconfiguration takes time.
 
     Returns:
         The segments and reconfigurations, with a lower bound of their number.
@@ -183,21 +95,19 @@ def plan_in_segments(
         SolveError: No segment could be planned, however the tasks were divided.
     """
     checked_instance("machine", machine, FixedBase)
-    options: dict[str, Any] = {"start": start, "weights": weights, "limits": limits, "seed": seed}
+    options: dict[str, Any] = {"start": start, "cost": cost, "limits": limits, "seed": seed}
     request = checked_request(machine, tasks, horizon, search="global", **options)
-    collision: dict[str, Any] = {"obstacles": obstacles, "clearance": clearance, "ignored": ignored}
-    collision |= {"srdf": srdf, "folders": folders, "missing": missing}
-    constraints = clearance_for(machine, limits, **collision)
+    constraints = clearance_for(machine, limits, scene)
     if constraints is not None and constraints.scene.has_moving_obstacles:
         words = "moving obstacles do not wait while the arm reconfigures; give static obstacles"
-        raise ProblemError(words, name="obstacles", value=obstacles)
+        raise ProblemError(words, name="obstacles", value=constraints.scene.obstacles)
     request = replace(request, clearance_constraints=constraints)
     configurations = start_configurations(request)
     if request.start is None:
         configurations = fix_ignorable_joints(request, configurations)[1]
     search = TaskSearch(request, local_motions_from(request, configurations))
     excluded: list[tuple[float, float]] = []
-    plans: dict[tuple[float, float], Plan] = {}
+    plans: dict[tuple[float, float], SolvedPlan] = {}
     error: SolveError | ProblemError | None = None
     while True:
         division = search.segments(excluded)
@@ -226,7 +136,7 @@ def plan_in_segments(
     return SegmentedPlan(machine, tuple(segments), start_times, tuple(reconfigurations), fewest - 1)
 
 
-def _plan_segment(request: PlanRequest, begin: float, end: float) -> Plan:
+def _plan_segment(request: PlanRequest, begin: float, end: float) -> SolvedPlan:
     """Plan the tasks from one time to another.
 
     Raises:
@@ -271,7 +181,7 @@ def _plan_reconfiguration(request: PlanRequest, time: float, before: Array, afte
             failure = failure or str(error).split("\n")[0]
             continue
         candidate = Candidate(before, solution.cost, None, Stage.AUDITED, solution)
-        motion = Plan(request.machine, solution, (Part(0.0, duration, ""),), (candidate,))
+        motion = SolvedPlan(request.machine, solution, (Part(0.0, duration, ""),), (candidate,))
         return Reconfiguration(time, before, after, motion)
     return Reconfiguration(time, before, after, None, failure)
 

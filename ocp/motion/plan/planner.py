@@ -17,9 +17,8 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from models import CollisionScene, Machine, ModelError, Standing
+from models import CollisionScene, Machine, ModelError
 from models.arrays import Array
-from ocp.console import interruptible
 from ocp.errors import (
     ProblemError,
     SolveError,
@@ -28,7 +27,6 @@ from ocp.errors import (
     checked_each,
     checked_flag,
     checked_instance,
-    checked_positive,
 )
 from ocp.motion.builders.actuator_limits import checked_motors
 from ocp.motion.builders.clearance import ClearanceConstraints
@@ -39,8 +37,7 @@ from ocp.motion.plan.actuators import limits_actuators, without_actuators
 from ocp.motion.plan.candidate import Candidate, Reason, Rejection, Seed
 from ocp.motion.plan.candidate_queue import CandidateQueue
 from ocp.motion.plan.candidate_solver import CandidateSolver
-from ocp.motion.plan.motion import Plan
-from ocp.motion.plan.standing import plan_to_stand
+from ocp.motion.plan.solved_plan import SolvedPlan
 from ocp.motion.search.cells import CellSearch, tracks_tasks
 from ocp.motion.search.configurations import (
     REACH_TOLERANCE,
@@ -56,17 +53,20 @@ from ocp.motion.search.configurations import (
 from ocp.motion.search.dead_end import DeadEnd
 from ocp.motion.search.search import checked_bound
 from ocp.motion.search.task_search import TaskSearch
-from ocp.motion.tasks.checks import checked_configuration, checked_tasks, checked_weights, clip_to_limits, horizon_of
+from ocp.motion.tasks.checks import checked_tasks, clip_to_limits, horizon_of
+from ocp.motion.tasks.cost import Cost
 from ocp.motion.tasks.equations import bind
+from ocp.motion.tasks.goals import Start
 from ocp.motion.tasks.limits import Limits
+from ocp.motion.tasks.scene import Scene
 from ocp.motion.tasks.tip_task import TipTask
 
-__all__ = ["candidates_from", "checked_request", "clearance_for", "plan", "plan_from_configurations", "plan_request"]
+__all__ = ["candidates_from", "checked_request", "clearance_for", "plan_from_configurations", "plan_request"]
 
 
 def plan_from_configurations(
     request: PlanRequest, configurations: Array, solver: CandidateSolver
-) -> tuple[Plan, float | None]:
+) -> tuple[SolvedPlan, float | None]:
     """Return the plan that start configurations lead to, and a lower bound of its cost or None.
 
     Args:
@@ -253,79 +253,7 @@ def _try_alternatives(queue: CandidateQueue, solver: CandidateSolver, seeds: lis
             return
 
 
-@interruptible
-def plan(
-    machine: Machine,
-    tasks: TipTask | Sequence[TipTask],
-    horizon: float | Literal["free"] | None = None,
-    *,
-    start: Any = None,
-    start_base: Any = None,
-    cyclic: bool = False,
-    weights: Any = None,
-    limits: Limits | None = None,
-    search: SearchKind = "configurations",
-    seed: int = 0,
-    time_cost: float = 1.0,
-    obstacles: Any = (),
-    clearance: float | None = 0.0,
-    ignored: Any = (),
-    srdf: Any = None,
-    folders: Any = (),
-    missing: str = "raise",
-) -> Plan:
-    """Plan the lowest-cost motion that does the tasks: the least integral of half the squared joint rates.
-
-    Args:
-        machine: A machine on a fixed or floating base, or standing, see `plan_to_stand` for its cost.
-        tasks: Tasks of its tips; each lasts from its `begin` for its `duration`.
-        horizon: s; None: until the last task ends. "free": the tasks may be done more slowly than they say, never
-            faster; their pace is planned together with the self-motion, for the least sum of `time_cost` and joint
-            rates.
-        start: Joints at the start, rad or m, shape (n,); None: any that do the first tasks, which are searched.
-        start_base: Base at the start, shape (base_size,); the machine's base_home() if None.
-        cyclic: Whether the joints end where they start.
-        weights: Weights of the squared joint rates, shape (n,); all 1 if None.
-        limits: Limits of joint positions and rates; the robot's own if None. Limits of acceleration, jerk, torque or
-            power, if given, hold at all times together with the robot's own torque limits, at the same cost (see
-            `plan.actuators`). Rates are then continuous. A machine starts or ends at rest only if its tasks require it.
-        search: "start": from the given start, or from the best conditioned solution of inverse kinematics.
-            "configurations": from all solutions of inverse kinematics; each may slide along its self-motion.
-            "global": among all motions in the tasks' own time. On a fixed base, the plan has a lower `bound`; the tasks
-            must be poses that leave at most two directions free, and joints that move no task frame, such as a
-            gripper's, stand still in `start` or in the middle of their limits (see `search.search`). On a floating
-            base, the motions come from a search over exact states without a bound (see `search.cells`), which also
-            passes singularities.
-        seed: Seed of inverse kinematics.
-        obstacles: Shapes in world, or `MovingObstacle` ones.
-        clearance: Least distance to obstacles and between links, m; None: collisions are not checked.
-        ignored, srdf, folders, missing: As in `models.CollisionScene`: pairs that are not checked, and the treatment of
-            missing meshes.
-        time_cost: Cost of a second if the horizon is free, in (rad/s)^2; the larger, the closer to the least time.
-
-    Returns:
-        The audited plan, with all other motions found, their costs and the reasons of their rejection.
-
-    Raises:
-        ProblemError: The request does not fit the machine or is contradictory. Its subclass Unreachable names the time
-            and the place out of reach.
-        SolveError: No motion passes its audit; names what happened to each candidate. Its subclass DeadEnd says where
-            the motions of a global search end, what obstructs them, by how much the tasks would have to be relaxed, and
-            in how few segments they may be done (`plan_in_segments`).
-    """
-    collision: dict[str, Any] = {"obstacles": obstacles, "clearance": clearance, "ignored": ignored}
-    collision |= {"srdf": srdf, "folders": folders, "missing": missing}
-    options: dict[str, Any] = {"start": start, "cyclic": cyclic, "weights": weights, "limits": limits}
-    options |= {"search": search, "seed": seed}
-    if isinstance(machine, Standing):
-        constraints = clearance_for(machine, limits, **collision)
-        return plan_to_stand(machine, tasks, horizon, clearance_constraints=constraints, **options)
-    options |= {"start_base": start_base, "time_cost": time_cost}
-    request = checked_request(machine, tasks, horizon, **options)
-    return plan_request(replace(request, clearance_constraints=clearance_for(machine, limits, **collision)))
-
-
-def plan_request(request: PlanRequest) -> Plan:
+def plan_request(request: PlanRequest) -> SolvedPlan:
     """Plan a checked request.
 
     Raises:
@@ -343,33 +271,24 @@ def plan_request(request: PlanRequest) -> Plan:
 
 
 def clearance_for(
-    machine: Machine,
-    limits: Limits | None,
-    *,
-    obstacles: Any,
-    clearance: Any,
-    ignored: Any,
-    srdf: Any,
-    folders: Any,
-    missing: Any,
+    machine: Machine, limits: Limits | None, scene: Scene | Literal[False] | None
 ) -> ClearanceConstraints | None:
-    """Return the clearance constraints of a motion, or None if no pair of bodies has to be checked.
+    """Return the clearance constraints of a motion in a scene, or None if no pair of bodies has to be checked.
 
     Raises:
-        ProblemError: An argument is invalid, or given though collisions are not checked.
+        ProblemError: A value of the scene is invalid, or does not fit the machine.
     """
-    if clearance is None:
-        for name, value in (("obstacles", obstacles), ("ignored", ignored), ("srdf", srdf)):
-            if value is not None and not (isinstance(value, tuple | list) and not len(value)):
-                words = f"{name}: collisions are not checked without a clearance; give one in m, 0 to exclude contact"
-                raise ProblemError(words, name=name, value=value)
+    if scene is False:
         return None
+    own = Scene() if scene is None else checked_instance("scene", scene, Scene)
+    joint_limits = not isinstance(limits, Limits) or limits.joints
     try:
-        joint_limits = not isinstance(limits, Limits) or limits.joints
-        scene = CollisionScene(machine, obstacles, clearance, ignored, srdf, folders, missing, joint_limits)
+        collision_scene = CollisionScene(
+            machine, own.obstacles, own.clearance, own.ignored, own.srdf, own.folders, own.missing, joint_limits
+        )
     except ModelError as error:
         raise ProblemError(str(error), **vars(error)) from error
-    return ClearanceConstraints(scene) if len(scene.pairs) else None
+    return ClearanceConstraints(collision_scene) if len(collision_scene.pairs) else None
 
 
 def checked_request(
@@ -378,13 +297,11 @@ def checked_request(
     horizon: Any,
     *,
     start: Any = None,
-    start_base: Any = None,
     cyclic: Any = False,
-    weights: Any = None,
+    cost: Any = None,
     limits: Any = None,
     search: Any = "configurations",
     seed: Any = 0,
-    time_cost: Any = 1.0,
 ) -> PlanRequest:
     """Check the arguments of `plan`, except those of the collision scene.
 
@@ -403,7 +320,7 @@ def checked_request(
         if search == "global":
             words = "search='global' needs a fixed horizon; give it in s, or use search='configurations'"
             raise ProblemError(words, name="search", value="global")
-    checked_positive("time_cost", time_cost)
+    own_cost = _checked_cost(machine, cost, free)
     checked_limits.bounds(machine, ("velocity", "torque") if limits_actuators(checked_limits) else ("velocity",))
     if limits_actuators(checked_limits):
         checked_motors("plan: actuator limits", machine)
@@ -411,8 +328,7 @@ def checked_request(
             words = "actuator limits need a fixed horizon; give it in s, or limit the rates alone"
             raise ProblemError(words, name="horizon", value=horizon)
     duration = horizon_of(all_tasks, None if free else horizon)
-    base = checked_configuration(machine, np.zeros(machine.joint_size), start_base)[1]
-    joints = None if start is None else checked_configuration(machine, start, start_base)[0]
+    joints, base = Start.of(start, machine)[1:]
     stretches = stretches_of(machine, all_tasks, duration)
     configuration = np.zeros(machine.joint_size) if joints is None else joints
     for stretch in stretches:
@@ -423,10 +339,35 @@ def checked_request(
         bounds = checked_limits.bounds(machine)
         names, hint = machine.robot.joint_names, "start inside them"
         joints = clip_to_limits("start", names, joints, bounds.lower, bounds.upper, hint)
-    joint_weights = checked_weights(weights, machine.joint_size)
     return PlanRequest(
-        *(machine, all_tasks, duration, stretches, joints, base, joint_weights, without_actuators(checked_limits)),
-        *(cyclic, int(seed), float(time_cost) if free else None),
+        *(machine, all_tasks, duration, stretches, joints, base, own_cost.joint_weights(machine.joint_size)),
+        *(without_actuators(checked_limits), cyclic, int(seed), float(own_cost.time) if free else None),
         search=search,
         actuator_limits=checked_limits if limits_actuators(checked_limits) else None,
     )
+
+
+def _checked_cost(machine: Machine, cost: Any, free: bool) -> Cost:
+    """Return the cost of tip tasks, with its weights checked.
+
+    Args:
+        free: Whether the horizon is free.
+
+    Raises:
+        ProblemError: The cost has a term that tip tasks do not take.
+    """
+    if cost is None:
+        return Cost(time=float(free))
+    own = checked_instance("cost", cost, Cost)
+    if not own.velocity:
+        words = "cost: motions of tip tasks weight the squared joint velocities; give Cost(velocity=...) above 0"
+        raise ProblemError(words, name="velocity", value=own.velocity, limit=0.0)
+    for term in set(own.terms) - {"velocity", "time"}:
+        words = f"cost: {term} is not weighted by motions of tip tasks; velocity and time are"
+        raise ProblemError(words, name=term, value=getattr(own, term), limit=0.0)
+    if free != bool(own.time):
+        words = "cost: a free horizon costs time" if free else "cost: time is fixed by the horizon"
+        words += "; give Cost(time=...) above 0" if free else "; give horizon='free', or leave time out"
+        raise ProblemError(words, name="time", value=own.time, limit=0.0)
+    own.joint_weights(machine.joint_size)
+    return own

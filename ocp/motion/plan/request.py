@@ -39,12 +39,13 @@ from models import (
 from models.shapes.bodies import Body, LinkMesh
 from models.spatial import expression
 from ocp.errors import ProblemError
-from ocp.motion.builders.actuator_limits import Effort, JointFriction
+from ocp.motion.builders.actuator_limits import JointFriction
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem
 from ocp.motion.builders.standing.problem import FreeTime, StandingSetup, Weights, standing_problem
 from ocp.motion.builders.tool_motion import ToolMotion, stretches_of, tool_motion_problem
 from ocp.motion.search.configurations import PlanRequest
+from ocp.motion.tasks.cost import Cost
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.motion.tasks.tracks import TrackWithRate
@@ -59,7 +60,7 @@ __all__ = ["MotionRequest", "declared_motion", "request_of", "restored_request",
 SHAPES = (Box, Capsule, Cylinder, HalfSpace, Mesh, Sphere)
 PARTS = (Robot, Link, Joint, Mimic, CollisionShape, VisualShape, Support)
 STANDING = (Weights, FreeTime, InFoot, Pinned, IndexAtLeast, StandingSetup)
-ARGUMENTS = (TipTask, Limits, ClearanceConstraints, Effort, JointFriction, DynamicsSetup, *STANDING)
+ARGUMENTS = (TipTask, Limits, ClearanceConstraints, Cost, JointFriction, DynamicsSetup, *STANDING)
 MACHINES = (FixedBase, FreeFloating, Standing)
 KINDS = {kind.__name__: kind for kind in (*MACHINES, *PARTS, *SHAPES, *ARGUMENTS, MovingObstacle, Body)}
 SYMBOLS = {"SX": ca.SX, "MX": ca.MX}

@@ -17,7 +17,7 @@ from ocp.motion.builders.standing.problem import StandingSetup, Weights
 from ocp.motion.local.inverse_kinematics import inverse_kinematics
 from ocp.motion.plan.candidate import Candidate, Reason, Rejection, Stage
 from ocp.motion.plan.candidate_queue import CandidateQueue, Solver
-from ocp.motion.plan.motion import Part, Plan
+from ocp.motion.plan.solved_plan import Part, SolvedPlan
 from ocp.motion.search.settings import PlannerSettings
 from ocp.motion.tasks.checks import check_rest, horizon_of
 from ocp.motion.tasks.equations import TaskEquations, bind
@@ -34,12 +34,12 @@ def plan_to_stand(
     *,
     start: Any,
     cyclic: bool,
-    weights: Weights | None,
+    cost: Weights | None,
     limits: Limits | None,
     search: str,
     seed: int,
     clearance_constraints: ClearanceConstraints | None,
-) -> Plan:
+) -> SolvedPlan:
     """Plan a motion that does the tasks with the zero moment point inside the foot, at the cost of `plan_standing`.
 
     The joints start and end at rest if their tasks do; else they may move there. Candidates start from every
@@ -50,7 +50,7 @@ def plan_to_stand(
         machine: The standing machine.
         tasks, horizon, start, limits, search, seed: As in `ocp.motion.plan.plan`.
         cyclic: Must be False.
-        weights: Weights of the terms of the cost.
+        cost: Weights of the terms of the cost.
         clearance_constraints: Clearance constraints, or None.
 
     Raises:
@@ -62,8 +62,8 @@ def plan_to_stand(
     if cyclic:
         words = "a standing motion cannot be cyclic; give plan_standing the joints at the end, StandingSetup(end=...)"
         raise ProblemError(words, name="cyclic", value=cyclic)
-    if weights is not None:
-        checked_instance("weights", weights, Weights)
+    if cost is not None:
+        checked_instance("cost", cost, Weights)
     all_tasks = [part.task for part in bind(machine, tasks).bound]
     duration = horizon_of(all_tasks, horizon)
     for number, task in enumerate(all_tasks):
@@ -77,7 +77,7 @@ def plan_to_stand(
         clearance_constraints=clearance_constraints,
         symbols=ca.SX if _takes_scalars(equations) else ca.MX,
     )
-    options: dict[str, Any] = {"weights": weights, "limits": limits, "setup": setup}
+    options: dict[str, Any] = {"weights": cost, "limits": limits, "setup": setup}
     queue = CandidateQueue(_StandingSolver(machine, all_tasks, duration, options, start is not None), PlannerSettings())
     seeds = [Candidate(joints) for joints in _start_configurations(machine, all_tasks, start, limits, seed)]
     for batch in [[candidate] for candidate in seeds] if search == "start" else [seeds]:
@@ -111,12 +111,12 @@ class _StandingSolver(Solver):
             return [candidate.rejected(Reason.of_error(Rejection.INFEASIBLE, error))]
         return [replace(candidate, stage=Stage.AUDITED, cost=solution.cost, solution=solution)]
 
-    def plan(self, candidates: Sequence[Candidate]) -> Plan:
+    def plan(self, candidates: Sequence[Candidate]) -> SolvedPlan:
         """Return the plan of the first candidate, with the others."""
         best = candidates[0].solution
         assert best is not None
         parts = (Part(0.0, self.duration, ""),)
-        return Plan(self.machine, best, parts, tuple(candidates)).with_targets(self.tasks)
+        return SolvedPlan(self.machine, best, parts, tuple(candidates)).with_targets(self.tasks)
 
 
 def _rest(equations: TaskEquations, time: float) -> Literal["rest", "free"]:

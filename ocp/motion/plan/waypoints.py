@@ -17,16 +17,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from models import CollisionScene, FixedBase
+from models import FixedBase
 from models.arrays import Array
-from ocp.audit.clearance import Clearance
-from ocp.console import interruptible
 from ocp.errors import NOT_NUMBERS, ProblemError, SolveError, checked_choice, checked_count, checked_instance, floats
-from ocp.motion.builders.clearance import clearance_of
+from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.local.collisions import Collision, distances_along, find_collisions
 from ocp.motion.local.inverse_kinematics import LARGEST_SEED, Unreachable, idle_positions
+from ocp.motion.plan.candidate import Candidate, Reason, Rejection, Stage
+from ocp.motion.plan.path_plan import PathPlan
 from ocp.motion.plan.planner import clearance_for
-from ocp.motion.plan.waypoint_plan import WaypointPlan
 from ocp.motion.search.charts import SelfMotionManifolds, TimeSample
 from ocp.motion.search.dead_end import RelaxationKind, dead_end
 from ocp.motion.search.joint_space import TOLERANCE, JointSpace, TasksWithFixedJoints
@@ -35,13 +34,15 @@ from ocp.motion.search.search import MAX_FREE_DIRECTIONS, AtlasSearch, SearchSet
 from ocp.motion.search.steps import Homogeneous, LargestMotion, PathLength
 from ocp.motion.search.value import shorten_path
 from ocp.motion.tasks.checks import checked_numbers
+from ocp.motion.tasks.cost import Cost
 from ocp.motion.tasks.equations import bind
+from ocp.motion.tasks.goals import Waypoints
 from ocp.motion.tasks.limits import Limits
+from ocp.motion.tasks.scene import Scene
 from ocp.motion.tasks.tip_task import TipTask
 
-__all__ = ["PathCost", "Reconfigurations", "WaypointPlan", "plan_waypoints"]
+__all__ = ["Reconfigurations", "plan_path"]
 
-PathCost: TypeAlias = Literal["length", "largest", "time"]
 Reconfigurations: TypeAlias = Literal["forbidden", "counted"]
 
 WAYPOINT = "waypoint {:g}"
@@ -94,44 +95,26 @@ class _Path(NamedTuple):
     breaks: tuple[int, ...] = ()
 
 
-@interruptible
-def plan_waypoints(
+def plan_path(
     machine: FixedBase,
-    positions: ArrayLike,
-    quaternions: ArrayLike,
+    waypoints: Waypoints,
     *,
-    cost: PathCost = "length",
-    step: Any = np.inf,
-    weights: Any = None,
+    cost: Any = None,
     limits: Limits | None = None,
-    obstacles: Any = (),
-    clearance: float | None = 0.0,
-    ignored: Any = (),
-    srdf: Any = None,
-    folders: Any = (),
-    missing: str = "raise",
-    reconfigurations: Reconfigurations = "forbidden",
+    scene: Scene | Literal[False] | None = None,
     seed: int = 0,
-) -> WaypointPlan:
+) -> PathPlan:
     """Plan the lowest-cost path through poses of the tip, within limits and collision-free at every waypoint.
 
     Args:
         machine: An arm on a fixed base whose number of joints exceeds the rows of a pose by at most two. If by two,
             paths are searched on sections in which the joint nearest to the base has one of several values (see
             `ocp.motion.search.reconfigurations`), and no bound is known.
-        positions: Positions of the tip in world. Shape (N, 3), m.
-        quaternions: Orientations of the tip, [w, x, y, z], of any length. Shape (N, 4).
-        cost: "length": sum of all joint displacements; "largest": displacement of the joint that moves farthest, from
-            waypoint to waypoint; "time": s, by the velocity limits of the joints.
-        step: Largest displacement of each joint between waypoints, rad or m; one number or one per joint.
-        weights: Weights of the joint displacements in the cost, 0 to ignore a joint. Shape (n,); all 1 if None. Not for
-            a time.
+        waypoints: Poses of the tip.
+        cost: `length`, the sum of all joint displacements with the `weights` of the joints, or `time`, s, by the
+            velocity limits of the joints, from waypoint to waypoint; None for the length.
         limits: Limits of the joint positions, and of the velocities for a time; the robot's own if None.
-        obstacles, clearance, ignored, srdf, folders, missing: As in `plan`.
-        reconfigurations: "forbidden", or "counted": if no path goes through all waypoints, find the fewest
-            reconfigurations, and among these the least cost. In a reconfiguration, the arm leaves the path at a
-            waypoint and returns at the next one in any configuration; it costs nothing and is not planned. With at most
-            one free direction.
+        scene: As in `plan`.
         seed: Seed of inverse kinematics.
 
     Raises:
@@ -142,45 +125,46 @@ def plan_waypoints(
     """
     checked_instance("machine", machine, FixedBase)
     checked_count("seed", seed, 0, LARGEST_SEED)
-    positions, rotations = _poses(positions, quaternions)
+    positions, rotations = _poses(waypoints.positions, waypoints.quaternions)
     n = machine.joint_size
     checked_limits = Limits() if limits is None else checked_instance("limits", limits, Limits)
-    joint_weights = np.ones(n) if weights is None else checked_numbers(weights, n, "weights", "one for each joint")
-    if not ((joint_weights >= 0).all() and joint_weights.any()):
-        words = f"weights {joint_weights.tolist()} must be non-negative and not all 0"
-        raise ProblemError(words, name="weights", value=joint_weights, limit=0.0)
-    checked_choice("cost", cost, get_args(PathCost))
-    checked_choice("reconfigurations", reconfigurations, get_args(Reconfigurations))
+    own_cost = Cost(velocity=0, length=1) if cost is None else checked_instance("cost", cost, Cost)
+    if own_cost.terms not in (("length",), ("time",)):
+        words = "cost: a path through waypoints costs its length or its time, Cost(velocity=0, length=1) or "
+        words += f"Cost(velocity=0, time=1), not {own_cost}"
+        raise ProblemError(words, name="cost", value=own_cost)
+    is_timed = own_cost.terms == ("time",)
     for quantity in ("velocity", "acceleration", "jerk", "torque", "power"):
-        if getattr(checked_limits, quantity) is not None and not (quantity == "velocity" and cost == "time"):
+        if getattr(checked_limits, quantity) is not None and not (quantity == "velocity" and is_timed):
             words = f"limits: a path through waypoints has no time, hence no {quantity}; leave it out, or give a step"
             raise ProblemError(words, name=quantity, value=getattr(checked_limits, quantity))
-    if cost == "time":
-        if weights is not None:
-            raise ProblemError("cost='time' takes no weights; leave them out", name="weights", value=weights)
-        joint_weights = 1 / checked_limits.bounds(machine, ("velocity",)).velocity
+    checked_choice("reconfigurations", waypoints.reconfigurations, get_args(Reconfigurations))
+    if is_timed:
+        if own_cost.weights is not None:
+            words = "cost: the time of a path takes no weights; leave them out"
+            raise ProblemError(words, name="weights", value=own_cost.weights)
+        joint_weights = own_cost.time / checked_limits.bounds(machine, ("velocity",)).velocity
         if not joint_weights.any():
-            raise ProblemError("cost='time' needs a joint with a velocity limit", name="velocity")
-    max_step = _step(step, n)
-    collision: dict[str, Any] = {"obstacles": obstacles, "clearance": clearance, "ignored": ignored}
-    collision |= {"srdf": srdf, "folders": folders, "missing": missing}
-    constraints = clearance_for(machine, checked_limits, **collision)
-    scene = None if constraints is None else constraints.scene
+            raise ProblemError("cost: the time needs a joint with a velocity limit", name="velocity")
+    else:
+        joint_weights = own_cost.length * _path_weights(own_cost.weights, n)
+    max_step = _step(waypoints.step, n)
+    constraints = clearance_for(machine, checked_limits, scene)
     planner = _WaypointPlanner(
         machine,
         positions,
         rotations,
         max_step,
-        (PathLength if cost == "length" else LargestMotion)(joint_weights),
+        (LargestMotion if is_timed else PathLength)(joint_weights),
         checked_limits,
-        scene,
+        constraints,
         int(seed),
     )
-    return planner.plan(reconfigurations == "counted")
+    return planner.plan(waypoints.reconfigurations == "counted")
 
 
 class _WaypointPlanner:
-    """Planner of a path through waypoints, with the checked arguments of `plan_waypoints`."""
+    """Planner of a path through waypoints, with the checked arguments of `plan_path`."""
 
     def __init__(
         self,
@@ -190,13 +174,14 @@ class _WaypointPlanner:
         step: Array,
         cost: Homogeneous,
         limits: Limits,
-        scene: CollisionScene | None,
+        constraints: ClearanceConstraints | None,
         seed: int,
         settings: WaypointSettings = WaypointSettings(),
     ) -> None:
         self.settings = settings
-        self.machine, self.positions, self.rotations, self.step, self.scene = machine, positions, rotations, step, scene
-        self.seed, self.joint_limits, self.cost = seed, limits.joints, cost
+        self.machine, self.positions, self.rotations, self.step = machine, positions, rotations, step
+        self.constraints, self.scene = constraints, None if constraints is None else constraints.scene
+        self.seed, self.limits, self.joint_limits, self.cost = seed, limits, limits.joints, cost
         bounds = limits.bounds(machine)
         self.lower, self.upper = bounds.lower, bounds.upper
         self.space = JointSpace(machine, bounds.lower, bounds.upper, np.ones(machine.joint_size))
@@ -218,7 +203,7 @@ class _WaypointPlanner:
         names = [joint.name for joint in robot.path_to(robot.tip_link) if joint.name in robot.joint_names]
         self._section_joint = robot.joint_names.index(names[0]) if self.manifolds.size > 1 else None
 
-    def plan(self, counted: bool) -> WaypointPlan:
+    def plan(self, counted: bool) -> PathPlan:
         """Return the lowest-cost path through all waypoints, in the fewest segments if `counted`.
 
         Some waypoints are searched, and the paths found are extended to all waypoints. If that fails, the waypoints
@@ -263,7 +248,7 @@ class _WaypointPlanner:
         paths, bound = search.paths()
         return [[Segment(0, len(path) - 1, path, search.path_cost(path), bound)] for path in paths], bound
 
-    def _best_plan(self, paths: list[_Path], bound: float) -> WaypointPlan:
+    def _best_plan(self, paths: list[_Path], bound: float) -> PathPlan:
         """Return the plan of the lowest-cost valid path.
 
         Raises:
@@ -273,27 +258,26 @@ class _WaypointPlanner:
         if not paths or paths[0].failure:
             reasons = "; ".join(dict.fromkeys(path.failure for path in paths))
             raise SolveError(f"{NO_PATH}{reasons and ': '}{reasons}", name="waypoints")
-        best = paths[0]
-        candidates = tuple((path.cost, path.failure or ("" if path is best else "costlier")) for path in paths)
-        lower_bound = checked_bound(bound, best.cost) or 0.0
-        clearance = self._verify_clearance(best.joints, best.breaks)
-        return WaypointPlan(self.machine, best.joints, best.cost, lower_bound, candidates, clearance, best.breaks)
+        candidates = [self._candidate(path, path is paths[0]) for path in paths]
+        best, lower_bound = paths[0], checked_bound(bound, paths[0].cost)
+        return PathPlan(
+            self.machine,
+            best.joints,
+            self.positions,
+            self.rotations,
+            self.step,
+            self.limits,
+            best.cost,
+            self.constraints,
+            tuple(candidates),
+            lower_bound or None,
+            best.breaks,
+        )
 
-    def _verify_clearance(self, joints: Array, breaks: tuple[int, ...]) -> Clearance | None:
-        """Verify the clearance of straight lines between waypoints, one second each, without the breaks."""
-        if self.scene is None:
-            return None
-        numbers, last = np.arange(len(joints), dtype=float), len(joints) - 1.0
-        rates = np.abs(np.diff(joints, axis=0))
-        rates[list(breaks)] = 0.0
-
-        def joints_at(fractions: Array) -> Array:
-            places = fractions * last
-            waiting = np.isin(np.floor(places), breaks)  # a break lasts until the next waypoint
-            places = np.where(waiting, np.floor(places), places)
-            return np.stack([np.interp(places, numbers, column) for column in joints.T], axis=1)
-
-        return clearance_of(self.scene, joints_at, numbers / last, last, rates, np.zeros_like(rates), False)
+    def _candidate(self, path: _Path, is_best: bool) -> Candidate:
+        """Return a path as a candidate of the plan."""
+        reason = Reason(Rejection.INFEASIBLE, path.failure) if path.failure else Reason(Rejection.COSTLIER)
+        return Candidate(path.joints[0], path.cost, None if is_best else reason, Stage.FINE)
 
     # ---- searched waypoints ------------------------------------------------------------------------------------------
 
@@ -464,6 +448,17 @@ class _WaypointPlanner:
             closest: Collision = find_collisions(self.scene, np.zeros(0), joints, indices.astype(float))[0]
             words = f"collision: {closest.bodies[0]} and {closest.bodies[1]} at waypoint {closest.time:g}"
         return words, np.flatnonzero(invalid | colliding)
+
+
+def _path_weights(weights: Any, size: int) -> Array:
+    """Return the weights of the joints in a length, 0 for joints that do not count. Shape (size,)."""
+    if weights is None:
+        return np.ones(size)
+    array = checked_numbers(weights, size, "weights", "one for each joint")
+    if not ((array >= 0).all() and array.any()):
+        words = f"weights {array.tolist()} must be non-negative and not all 0"
+        raise ProblemError(words, name="weights", value=array, limit=0.0)
+    return array
 
 
 def _step(step: Any, size: int) -> Array:

@@ -20,7 +20,7 @@ from ocp.motion.tasks.tip_task import ANGULAR, TipTask
 __all__ = [
     "check_closed", "check_length", "check_rest", "check_speed", "checked_configuration", "checked_horizon",
     "checked_numbers", "checked_tasks", "checked_weights", "clip_to_limits", "dependent_rows", "horizon_of",
-    "ignorable_joints", "rates_at_rest",
+    "ignorable_joints", "nonnegative_each", "rates_at_rest",
 ]  # fmt: skip
 
 
@@ -121,6 +121,24 @@ def checked_weights(weights: Any, size: int) -> Array:
     if not (array > 0).all():
         raise ProblemError(f"weights {array.tolist()} must be positive", name="weights", value=array, limit=0.0)
     return array
+
+
+def nonnegative_each(label: str, value: Any, size: int | None) -> Array:
+    """Return nonnegative finite numbers, one or with a size that many; raise ProblemError for others."""
+    name = label.rpartition(" ")[2]
+    try:
+        numbers = floats(value).reshape(-1)
+    except NOT_NUMBERS as error:
+        words = f"{label} must be one number or one for each joint, not {value!r}"
+        raise ProblemError(words, name=name, value=value) from error
+    if not numbers.size or not (np.isfinite(numbers) & (numbers >= 0)).all():
+        raise ProblemError(f"{label} must be zero or above, and finite: {value!r}", name=name, value=value, limit=0.0)
+    if size is None:
+        return numbers
+    if numbers.size not in (1, size):
+        words = f"{label} must have one number or {size}, not {numbers.size}"
+        raise ProblemError(words, name=name, value=numbers.size, limit=size)
+    return np.array(np.broadcast_to(numbers, size))
 
 
 def checked_numbers(value: Any, size: int, what: str, meaning: str) -> Array:

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from models import cache as kept
-from ocp import Plan, ProblemError, SegmentedPlan, SolveError, plan_in_segments
+from ocp import Plan, ProblemError, SegmentedPlan, SolveError, plan
 from ocp.app import main
 from ocp.app.files.task_file import read_task
 from ocp.app.progress import Progress
@@ -248,7 +248,7 @@ def test_what_no_one_motion_does_is_written_in_pieces_and_the_ways_between_them_
     made = list[SegmentedPlan]()
 
     def kept_too(*given: Any, **options: Any) -> SegmentedPlan:
-        made.append(plan_in_segments(*given, **options))
+        made.append(plan(*given, **options, search="segments"))
         return made[0]
 
     monkeypatch.setattr("ocp.app.run_task.plan_in_segments", kept_too)

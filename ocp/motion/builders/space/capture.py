@@ -29,7 +29,7 @@ from models.arrays import Array
 from ocp.console import interruptible
 from ocp.direct.collocation import Collocation
 from ocp.errors import ProblemError, checked_instance
-from ocp.motion.builders.actuator_limits import Effort, JointFriction
+from ocp.motion.builders.actuator_limits import JointFriction
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem, end_velocities
 from ocp.motion.builders.dynamics_plan import within_limits
@@ -45,6 +45,7 @@ from ocp.motion.builders.space.guess import (
 )
 from ocp.motion.builders.standing.problem import FreeTime
 from ocp.motion.tasks.checks import checked_configuration, checked_horizon
+from ocp.motion.tasks.cost import Cost
 from ocp.motion.tasks.limits import Limits
 from ocp.problem.phases import Phases
 from ocp.problem.problem import Problem
@@ -63,7 +64,7 @@ class CaptureOptions(TypedDict, total=False):
     target_base: Any
     start_velocity: Any
     limits: Limits | None
-    effort: Effort | None
+    cost: Cost | None
     friction: JointFriction | None
     cone: Cone | None
     grasp: Grasp | None
@@ -97,7 +98,7 @@ def capture_problem(
         start: Joints of the chaser at the start. Shape (n,), rad or m.
         options: start_base, target_base: Configurations of both bases at the start; home if None. Shape (base_size,).
             start_velocity: Velocities of the chaser's joints at the start; at rest if None. Shape (n,), rad/s.
-            limits, effort, friction: Arguments of `dynamics_problem` for both phases.
+            limits, cost, friction: Arguments of `dynamics_problem` for both phases.
             cone: Approach cone. The tip starts at twice its length or farther, or inside it.
             grasp: Load limits of the hand during detumbling.
             clearance_constraints: Collision avoidance of the chaser during the approach, without the target.
@@ -262,7 +263,7 @@ class _Capture:
     def shared(self) -> dict[str, Any]:
         """Return the arguments of both phases."""
         options: Mapping[str, Any] = self.options
-        return {name: options[name] for name in ("limits", "effort") if name in options}
+        return {name: options[name] for name in ("limits", "cost") if name in options}
 
     def approach(self, duration: float | FreeTime) -> Problem:
         """Declare the first phase, with the target's motion and the approach cone."""

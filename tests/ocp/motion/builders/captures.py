@@ -10,7 +10,7 @@ import numpy as np
 
 from models import FreeFloating, Joint, Link, Robot, planar_chain, with_wheels
 from models.spatial import quaternion_about
-from ocp import Cone, Effort, FreeTime, Grasp, Solution
+from ocp import Cone, Cost, FreeTime, Grasp, Solution
 from ocp.motion.builders.space.grasping import joined, pair_momentum
 from tests.models.robot.oracles import mujoco_model
 from tests.models.robot.trees import Array
@@ -40,7 +40,7 @@ def planar_capture() -> dict[str, Any]:
     return {
         "chaser": planar_chaser(), "target": planar_target(), "start": PLANAR_START, "approach": FREE,
         "detumble": FREE, "target_base": [1.9, 0.3, 0.0], "cone": CONE, "grasp": GRASP,
-        "effort": Effort(torque=1.0, acceleration=[1.0] * 3 + [0.0], time=0.05),
+        "cost": Cost(velocity=0.0, effort=1.0, acceleration=[1.0] * 3 + [0.0], time=0.05),
     }  # fmt: skip
 
 
@@ -80,7 +80,7 @@ def capture(spin: Any, inertia: Any = (5.0, 8.0, 6.0)) -> dict[str, Any]:
     return {
         "chaser": chaser(), "target": target(spin, inertia), "start": START, "approach": FREE,
         "detumble": FREE, "target_base": [2.5, 0.2, 0.6, 1.0, 0.0, 0.0, 0.0], "cone": CONE, "grasp": GRASP,
-        "effort": Effort(torque=1.0, acceleration=[1.0] * 6 + [0.0] * 3, time=0.05),
+        "cost": Cost(velocity=0.0, effort=1.0, acceleration=[1.0] * 6 + [0.0] * 3, time=0.05),
     }  # fmt: skip
 
 

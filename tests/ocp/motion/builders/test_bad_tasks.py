@@ -24,8 +24,8 @@ from models import (
 from ocp import (
     Collocation,
     Cone,
+    Cost,
     DynamicsSetup,
-    Effort,
     Following,
     FreeTime,
     Grasp,
@@ -438,11 +438,13 @@ FRICTION = {"negative": -1.0, "nan": NAN, "inf": INF, "text": "much", "empty": [
 DYNAMICS = [
     Case("JointFriction", JointFriction, {}, {"viscous": FRICTION, "coulomb": FRICTION, "slip": POSITIVE}),
     Case(
-        "Effort",
-        Effort,
+        "Cost",
+        Cost,
         {"time": 1.0},
         {
-            "torque": FRICTION,
+            "velocity": NONNEGATIVE,
+            "effort": FRICTION,
+            "length": NONNEGATIVE,
             "energy": NONNEGATIVE,
             "acceleration": NONNEGATIVE,
             "jerk": NONNEGATIVE,
@@ -461,7 +463,8 @@ DYNAMICS = [
             "setup": but(INSTANCE, "None"),
             "end": but(array(3), "nan"),
             "limits": but(INSTANCE, "None") | {"of two": Limits(torque=[1.0, 2.0]), "jerk": Limits(jerk=1.0)},
-            "effort": but(INSTANCE, "None") | {"of two": Effort(torque=[1.0, 2.0]), "jerk": Effort(jerk=1.0)},
+            "cost": but(INSTANCE, "None")
+            | {"of two": Cost(velocity=0.0, effort=[1.0, 2.0]), "jerk": Cost(velocity=0.0, effort=1.0, jerk=1.0)},
             "friction": but(INSTANCE, "None") | {"of two": JointFriction([1.0, 2.0])},
             "control": CHOICE,
             "start_velocity": CHOICE,

@@ -17,8 +17,8 @@ from models.machines.machine import with_tip
 from ocp import (
     Collocation,
     Cone,
+    Cost,
     DynamicsSetup,
-    Effort,
     Grasp,
     Limits,
     ProblemError,
@@ -264,7 +264,7 @@ def test_a_capture_in_another_unit_of_length_is_the_same() -> None:
         "target_base": share * np.array([1.9, 0.3, 0.0]),
         "cone": replace(CONE, length=share * CONE.length, depth=share * CONE.depth),
         "grasp": Grasp(force=share * GRASP.force, moment=share**2 * GRASP.moment),
-        "effort": Effort(torque=share**-4, acceleration=[1.0] * 3 + [0.0], time=0.05),
+        "cost": Cost(velocity=0.0, effort=share**-4, acceleration=[1.0] * 3 + [0.0], time=0.05),
     }
     plan = plan_capture(**asked)
     assert plan.cost == pytest.approx(short().cost, rel=1e-9)
@@ -277,7 +277,7 @@ def test_a_wheel_is_one_wherever_it_stands_among_the_joints() -> None:
     asked |= {
         "chaser": replace(asked["chaser"], robot=replace(asked["chaser"].robot, joints=(wheel, *arm))),
         "start": np.roll(PLANAR_START, 1),
-        "effort": Effort(torque=1.0, acceleration=[0.0] + [1.0] * 3, time=0.05),
+        "cost": Cost(velocity=0.0, effort=1.0, acceleration=[0.0] + [1.0] * 3, time=0.05),
     }
     plan = plan_capture(**asked)
     assert plan.cost == pytest.approx(short().cost, rel=1e-9)

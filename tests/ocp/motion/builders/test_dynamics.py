@@ -13,8 +13,8 @@ import pytest
 from models import FixedBase, FreeFloating, Joint, Link, Robot, planar_chain, with_load
 from ocp import (
     Collocation,
+    Cost,
     DynamicsSetup,
-    Effort,
     FreeTime,
     JointFriction,
     Limits,
@@ -123,7 +123,7 @@ def test_the_least_time_of_a_mass_is_known() -> None:
     """2 sqrt(m d / F), full on and then full off."""
     limits = Limits(torque=5.0)
     problem = dynamics_problem(
-        slider(), (), FreeTime(0.1, 9.0, 2.0), start=[0.0], end=[WAY], limits=limits, effort=Effort(torque=0, time=1.0)
+        slider(), (), FreeTime(0.1, 9.0, 2.0), start=[0.0], end=[WAY], limits=limits, cost=Cost(velocity=0.0, time=1.0)
     )
     plan = solve(problem, Collocation(20, 3, control="held"))
     assert plan.horizon == pytest.approx(2 * np.sqrt(MASS * WAY / 5.0), rel=1e-6)
@@ -141,7 +141,7 @@ def test_power_is_limited_and_braking_is_free() -> None:
         start=[0.0],
         end=[WAY],
         limits=Limits(torque=200.0, power=power),
-        effort=Effort(torque=1e-7, time=1.0),
+        cost=Cost(velocity=0.0, effort=1e-7, time=1.0),
         setup=DynamicsSetup(end_velocity="free"),
     )
     plan = solve(problem, Collocation(40, 3))
@@ -195,7 +195,7 @@ def test_energy_costs_what_drives_give_alone() -> None:
     """A mass that is pushed to v, coasts and is braked, which gives nothing back: m v^2 / 2, d = v T - v^2 m / F."""
     push, horizon = 40.0, 2.0
     problem = dynamics_problem(
-        slider(), (), horizon, start=[0.0], end=[WAY], limits=Limits(torque=push), effort=Effort(torque=0.0, energy=1.0)
+        slider(), (), horizon, start=[0.0], end=[WAY], limits=Limits(torque=push), cost=Cost(velocity=0.0, energy=1.0)
     )
     plan = solve(problem, Collocation(80, 2))
     a = push / MASS
@@ -250,10 +250,10 @@ def test_a_load_is_picked_up_and_put_down() -> None:
     robot = arm(1.0)
     loaded = FixedBase(with_load(robot, robot.tip_link, 2.0, (0.3, 0, 0)))
     places = [0.0, 0.4, 0.3], [1.0, -0.3, 0.6]
-    effort, limits = Effort(torque=0.02, acceleration=2e-3, time=1.0), Limits(torque=6.0)
+    effort, limits = Cost(velocity=0.0, effort=0.02, acceleration=2e-3, time=1.0), Limits(torque=6.0)
     free = FreeTime(0.1, 8.0, 2.0)
-    reach = dynamics_problem(FixedBase(robot), (), free, start=places[0], end=places[1], effort=effort, limits=limits)
-    carry = dynamics_problem(loaded, (), free, start=None, end=places[0], effort=effort, limits=limits)
+    reach = dynamics_problem(FixedBase(robot), (), free, start=places[0], end=places[1], cost=effort, limits=limits)
+    carry = dynamics_problem(loaded, (), free, start=None, end=places[0], cost=effort, limits=limits)
     phases = Phases("pick and place", {"reach": reach, "carry": carry})
     phases.join("reach", "carry", {"velocities": None})  # both rest there
     plan = solve(phases, Collocation(20, 4))

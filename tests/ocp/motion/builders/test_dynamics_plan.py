@@ -27,8 +27,8 @@ from models import (
 from models.arrays import Array
 from ocp import (
     Collocation,
+    Cost,
     DynamicsSetup,
-    Effort,
     FreeTime,
     Leg,
     Limits,
@@ -44,7 +44,7 @@ from tests.ocp.motion.builders.test_dynamics import MASS, WAY, slider, torques_a
 MACHINE = FixedBase(planar_chain([0.5, 0.4], [2.0, 1.5]))
 START, END = np.array([0.0, 0.3]), np.array([1.0, -0.5])
 MOST = np.array([10.0, 4.0])
-LEAST_TIME = Effort(torque=0.0, time=1.0)
+LEAST_TIME = Cost(velocity=0.0, time=1.0)
 SOON = FreeTime(0.1, 5.0, 1.0)
 
 
@@ -87,7 +87,7 @@ def least_time_along(s: Array, at: Array) -> float:
 
 @pytest.fixture(scope="module")
 def fastest() -> Solution:
-    return plan_dynamics(MACHINE, (), SOON, start=START, end=END, limits=Limits(torque=MOST), effort=LEAST_TIME)
+    return plan_dynamics(MACHINE, (), SOON, start=START, end=END, limits=Limits(torque=MOST), cost=LEAST_TIME)
 
 
 def fine(plan: Solution, times: int = 4001) -> Array:
@@ -137,10 +137,10 @@ def test_limits_that_no_mesh_holds_at_little_cost_are_held_at_what_it_takes(
 ) -> None:
     """Three meshes of low degree are too coarse; what the plan costs too much is told, about as a fine one finds it."""
     asked: dict[str, Any] = {"end": END, "limits": Limits(torque=MOST, velocity=most)}
-    effort = Effort(torque=1e-4, time=1.0)
-    best = plan_dynamics(MACHINE, (), SOON, start=START, effort=effort, **asked)
+    effort = Cost(velocity=0.0, effort=1e-4, time=1.0)
+    best = plan_dynamics(MACHINE, (), SOON, start=START, cost=effort, **asked)
     method = Collocation(mesh[0], degree=mesh[1], scheme="legendre")
-    plan = plan_dynamics(MACHINE, (), SOON, start=START, effort=effort, method=method, **asked)
+    plan = plan_dynamics(MACHINE, (), SOON, start=START, cost=effort, method=method, **asked)
     audit = plan.audit()
     assert audit.feasible
     assert not audit.passed
@@ -154,8 +154,8 @@ def test_limits_that_no_mesh_holds_at_little_cost_are_held_at_what_it_takes(
 
 def test_mixtures_lie_between_their_parts(fastest: Solution) -> None:
     asked: dict[str, Any] = {"end": END, "limits": Limits(torque=MOST)}
-    mixed = plan_dynamics(MACHINE, (), SOON, start=START, effort=Effort(torque=1e-3, time=1.0), **asked)
-    easy = plan_dynamics(MACHINE, (), mixed.horizon, start=START, effort=Effort(torque=1e-3), **asked)
+    mixed = plan_dynamics(MACHINE, (), SOON, start=START, cost=Cost(velocity=0.0, effort=1e-3, time=1.0), **asked)
+    easy = plan_dynamics(MACHINE, (), mixed.horizon, start=START, cost=Cost(velocity=0.0, effort=1e-3), **asked)
     assert mixed.audit().passed
     assert mixed.horizon > fastest.horizon
     assert fine(mixed).max() <= 1 + 1e-5

@@ -7,15 +7,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ocp import Collocation, Effort, dynamics_problem, solve
+from ocp import Collocation, Cost, dynamics_problem, solve
 from tests.ocp.motion.builders.dynamics_replay import replay
 from tests.ocp.motion.tasks.space_tasks import PANDA_START, floating_manipulator, panda, two_pandas
 
 MOVED = np.array([0.5, 0.4, -0.3, 0.4, 0.3, -0.4, 0.3])
-MACHINES: dict[str, tuple[Any, Any, float, Effort, int]] = {
-    "panda": (panda, PANDA_START, 1.0, Effort(torque=1.0, acceleration=1.0), 10),
-    "floating manipulator": (floating_manipulator, np.linspace(-0.4, 0.5, 7), 4.0, Effort(0.0, acceleration=1.0), 6),
-    "two arms": (two_pandas, np.tile(PANDA_START, 2), 4.0, Effort(0.0, acceleration=1.0), 4),
+MACHINES: dict[str, tuple[Any, Any, float, Cost, int]] = {
+    "panda": (panda, PANDA_START, 1.0, Cost(velocity=0.0, effort=1.0, acceleration=1.0), 10),
+    "floating manipulator": (
+        floating_manipulator,
+        np.linspace(-0.4, 0.5, 7),
+        4.0,
+        Cost(velocity=0.0, acceleration=1.0),
+        6,
+    ),
+    "two arms": (two_pandas, np.tile(PANDA_START, 2), 4.0, Cost(velocity=0.0, acceleration=1.0), 4),
 }
 """Machine, start, duration, what costs, intervals; the floating arms go half the way."""
 
@@ -26,7 +32,7 @@ def test_what_the_torques_do_is_the_energy_that_mujoco_finds(name: str) -> None:
     make, start, horizon, effort, intervals = MACHINES[name]
     machine = make()
     end = start + np.resize(MOVED, len(start)) * (0.5 if machine.base_size else 1.0)
-    problem = dynamics_problem(machine, (), horizon, start=start, end=end, effort=effort)
+    problem = dynamics_problem(machine, (), horizon, start=start, end=end, cost=effort)
     found = replay(machine, solve(problem, Collocation(intervals, degree=5, scheme="legendre")))
     size = np.ptp(found.energy)
     assert size > 1e-3

@@ -97,7 +97,7 @@ SPEED = LINE.length / 2.0
 
 
 def planned(tasks: TipTask | Sequence[TipTask], path: SmoothPath = LINE, **options: Any) -> Plan:
-    return plan(arm(), tasks, start=angles(np.zeros(1), path)[0], clearance=None, **options)
+    return plan(arm(), tasks, start=angles(np.zeros(1), path)[0], scene=False, **options)
 
 
 def halves() -> list[TipTask]:

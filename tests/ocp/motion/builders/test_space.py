@@ -12,8 +12,8 @@ from models import FreeFloating, Link, Robot, Wrench, mass_matrix, planar_chain,
 from models.spatial import quaternion_about
 from ocp import (
     Collocation,
+    Cost,
     DynamicsSetup,
-    Effort,
     ProblemError,
     Solution,
     TipTask,
@@ -145,11 +145,11 @@ def test_turning_that_costs_is_less() -> None:
     machine = FreeFloating(with_wheels(chain, [[0, 0, 1]], 0.02), "planar")
     asked: dict[str, Any] = {"end": [1.2, 0.3, nan], "setup": DynamicsSetup(end_velocity=[0.0, 0.0, nan])}
 
-    def most(effort: Effort | None) -> float:
-        plan = solve(dynamics_problem(machine, (), 10.0, start=[0.2, -0.9, 0.0], effort=effort, **asked), SHORT)
+    def most(effort: Cost | None) -> float:
+        plan = solve(dynamics_problem(machine, (), 10.0, start=[0.2, -0.9, 0.0], cost=effort, **asked), SHORT)
         return float(np.abs(plan["base"][:, 2]).max())
 
-    assert most(Effort(turning=1e4)) < 0.1 * most(None)
+    assert most(Cost(velocity=0.0, effort=1.0, turning=1e4)) < 0.1 * most(None)
 
 
 def test_an_attitude_is_held_at_the_end_whatever_the_sign_of_its_quaternion() -> None:

@@ -59,7 +59,7 @@ def asked(what: Callable[[], PlanCase]) -> Callable[[], PlanCase]:
 
 def plan_bare(*asked: Any, **options: Any) -> Plan:
     """As `plan`, for laws of motions whatever the links may touch."""
-    return plan(*asked, clearance=None, **options)
+    return plan(*asked, scene=False, **options)
 
 
 @cache

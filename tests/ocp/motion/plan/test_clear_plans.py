@@ -32,6 +32,7 @@ from ocp import (
     Limits,
     Plan,
     ProblemError,
+    Scene,
     SolveError,
     TipTask,
     Unreachable,
@@ -80,7 +81,7 @@ def line(machine: Any = ARM, first: Any = FIRST, way: Any = WAY, scale: float = 
 
 @cache
 def planned(*obstacles: Any, clearance: float | None = 0.0) -> Plan:
-    return plan(ARM, line(), start=START, search="start", obstacles=obstacles, clearance=clearance)
+    return plan(ARM, line(), start=START, search="start", scene=Scene(obstacles=obstacles, clearance=clearance))
 
 
 def least_apart(result: Plan, obstacles: Any, samples: int = 4001) -> float:
@@ -122,7 +123,7 @@ def test_mirrored_and_larger_it_is_the_same_motion() -> None:
     """A world three times as large: the same joints, the same cost, distances three times as large."""
     large = FixedBase(armoured_arm(scale=3.0))
     post = Sphere(0.24, 3 * POST.position)
-    result = plan(large, line(scale=3.0), start=START, search="start", obstacles=[post])
+    result = plan(large, line(scale=3.0), start=START, search="start", scene=Scene(obstacles=[post]))
     assert_allclose(result.cost, planned(POST).cost, rtol=2e-3)
     assert_allclose(result.at(1.0)["joints"], planned(POST).at(1.0)["joints"], atol=2e-2)
 
@@ -131,7 +132,7 @@ def test_a_moving_obstacle_is_avoided() -> None:
     ball = MovingObstacle(Sphere(0.05, (0, 0, 0)), lambda t: ca.DM(FIRST) + ca.vertcat(0, 0.25, 0.15 + 0.4 * (1.0 - t)))
     plain = planned(clearance=None)
     assert least_apart(plain, [ball]) < 0
-    result = plan(ARM, line(), start=START, search="start", obstacles=[ball], clearance=0.01)
+    result = plan(ARM, line(), start=START, search="start", scene=Scene(obstacles=[ball], clearance=0.01))
     assert result.audit().passed
     assert least_apart(result, [ball]) >= 0.01 - 1e-6
     still = Sphere(0.05, ball.frame(2.0).position.full().ravel())
@@ -140,7 +141,7 @@ def test_a_moving_obstacle_is_avoided() -> None:
 
 def test_the_search_finds_a_posture_that_is_clear() -> None:
     task = TipTask(position=lambda t: ca.DM(FIRST) + smooth_step(t) * ca.DM(WAY), duration=SECONDS)
-    result = plan(ARM, task, obstacles=[POST], clearance=0.02)
+    result = plan(ARM, task, scene=Scene(obstacles=[POST], clearance=0.02))
     assert result.audit().passed
     assert least_apart(result, [POST]) >= 0.02 - 1e-6
     assert result.cost < planned(POST, clearance=0.02).cost
@@ -154,7 +155,7 @@ def test_what_no_task_moves_stands_in_the_middle_of_its_range_or_where_it_is_cle
     robot = Robot((*arm.links, Link("pole", 0.5, collisions=(pole,))), (*arm.joints, flag), tip="tip")
     ball = Sphere(0.05, (-0.5 - 0.15 * np.sin(0.5), 0.15 * np.cos(0.5), 0))
     task = TipTask(position=lambda t: [0.6 - 0.1 * t, 0.2 + 0.1 * t], rows=[3, 4], duration=1.0)
-    free, beside = (plan(FixedBase(robot), task, obstacles=each) for each in ((), [ball]))
+    free, beside = (plan(FixedBase(robot), task, scene=Scene(obstacles=each)) for each in ((), [ball]))
     place = robot.joint_names.index("flag")
     assert_allclose(free.at(0.0)["joints"][place], 0.5)
     assert abs(beside.at(0.0)["joints"][place] - 0.5) > 0.3
@@ -173,7 +174,7 @@ def test_what_no_task_moves_begins_out_of_the_way_of_what_it_would_hinder() -> N
     )
     robot = Robot((*links, Link("pole", 0.5, collisions=(pole,))), (*arm.joints, flag), tip="tip")
     task = TipTask(position=lambda t: [0.6 - 0.2 * t, 0.25], rows=[3, 4], duration=1.0)
-    bare, clearance_constraints = (plan(FixedBase(robot), task, clearance=each) for each in (None, 0.01))
+    bare, clearance_constraints = (plan(FixedBase(robot), task, scene=Scene(clearance=each)) for each in (None, 0.01))
     place = robot.joint_names.index("flag")
     assert bare.at(0.0)["joints"][place] == 0
     assert least_apart(bare, ()) < 0
@@ -211,9 +212,9 @@ def space_arm(panel: bool) -> FreeFloating:
 @pytest.mark.long
 def test_a_space_arm_passes_a_box_on_its_base() -> None:
     machine = space_arm(panel=True)
-    free = plan(machine, line(), start=START, search="start", clearance=None)
+    free = plan(machine, line(), start=START, search="start", scene=False)
     assert least_apart(free, ()) < 0
-    result = plan(machine, line(), start=START, search="start", clearance=0.0)
+    result = plan(machine, line(), start=START, search="start", scene=Scene(clearance=0.0))
     assert result.audit().passed
     assert least_apart(result, ()) >= -1e-6
     proof = result.audit().clearances["clearance"]
@@ -225,8 +226,8 @@ def test_a_space_arm_passes_a_box_on_its_base() -> None:
 def test_a_space_arm_passes_a_box_in_the_world() -> None:
     machine = space_arm(panel=False)
     post = Sphere(0.08, FIRST + np.array([0, 0.2, 0.18]))
-    free = plan(machine, line(), start=START, search="start", clearance=None)
-    result = plan(machine, line(), start=START, search="start", obstacles=[post])
+    free = plan(machine, line(), start=START, search="start", scene=False)
+    result = plan(machine, line(), start=START, search="start", scene=Scene(obstacles=[post]))
     assert result.audit().passed
     assert least_apart(result, [post]) >= -1e-6
     assert result.cost >= free.cost * (1 - 1e-9)
@@ -245,7 +246,7 @@ def test_tasks_one_after_the_other_are_proven_stretch_by_stretch() -> None:
     first = TipTask(position=lambda t: ca.DM(FIRST) + smooth_step(t) * ca.DM(WAY), duration=SECONDS)
     back = TipTask(position=lambda t: ca.DM(FIRST + WAY) - smooth_step(t) * ca.DM(WAY), begin=3.0, duration=SECONDS)
     ball = MovingObstacle(Sphere(0.05, (0, 0, 0)), lambda t: ca.DM(FIRST) + ca.vertcat(0, 0.25, 0.15 + 0.4 * (4.0 - t)))
-    result = plan(ARM, [first, back], start=START, search="start", obstacles=[ball], clearance=0.01)
+    result = plan(ARM, [first, back], start=START, search="start", scene=Scene(obstacles=[ball], clearance=0.01))
     assert result.audit().passed
     assert len(result.audit().clearances) == 3
     assert least_apart(result, [ball], 10001) >= 0.01 - 1e-6
@@ -288,7 +289,7 @@ def test_every_motion_along_a_seam_is_clear_or_says_what_touches() -> None:
         if one.solution is not None and (one.reason is None or one.reason.kind is not Rejection.COLLISION):
             at = one.solution.at_fraction(np.linspace(0, 1, 2001))
             assert distances_along(around, np.zeros(0), at["joints"], np.zeros(2001)).min() >= -1e-6
-    bare = plan(machine, TipTask.along(bent_seam(), 0.03, direction=DOWN), clearance=None)
+    bare = plan(machine, TipTask.along(bent_seam(), 0.03, direction=DOWN), scene=False)
     assert bare.cost <= result.cost * (1 + 1e-6)
 
 
@@ -316,7 +317,7 @@ def test_what_never_touches_within_limits_is_looked_at_without_them() -> None:
 
 def test_a_start_that_touches_names_the_pair_and_the_depth() -> None:
     with pytest.raises(ProblemError, match=r"start: link6 and obstacle 0 overlap by 0\.0") as caught:
-        plan(ARM, line(), start=START, obstacles=[Sphere(0.08, FIRST - (0.1, 0, 0))])
+        plan(ARM, line(), start=START, scene=Scene(obstacles=[Sphere(0.08, FIRST - (0.1, 0, 0))]))
     assert caught.value.name == "link6 and obstacle 0"
     assert caught.value.value < 0
     assert caught.value.time == 0
@@ -325,7 +326,9 @@ def test_a_start_that_touches_names_the_pair_and_the_depth() -> None:
 
 def test_a_target_inside_an_obstacle_names_the_pair_the_time_and_the_depth() -> None:
     with pytest.raises(SolveError, match=r"link6 and obstacle 0 overlap by 0\.\d+ m at [12]\.?\d* s") as caught:
-        plan(ARM, line(), start=START, search="start", obstacles=[Sphere(0.1, FIRST + WAY)], clearance=0.01)
+        plan(
+            ARM, line(), start=START, search="start", scene=Scene(obstacles=[Sphere(0.1, FIRST + WAY)], clearance=0.01)
+        )
     assert caught.value.name == "link6 and obstacle 0"
     assert caught.value.value < caught.value.limit == 0.01
     assert 1 <= caught.value.time <= SECONDS
@@ -342,7 +345,7 @@ def test_where_no_posture_is_clear_no_alternatives_are_searched(monkeypatch: pyt
 
     monkeypatch.setattr(planner, "_try_alternatives", alternatives)
     with pytest.raises(SolveError, match="; no other configuration is collision-free then: each of the"):
-        plan(ARM, line(), obstacles=[Sphere(0.1, FIRST + WAY)], clearance=0.01)
+        plan(ARM, line(), scene=Scene(obstacles=[Sphere(0.1, FIRST + WAY)], clearance=0.01))
 
 
 def test_postures_that_touch_are_left_out_or_named() -> None:

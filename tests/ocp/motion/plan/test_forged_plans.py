@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from models import Box, FixedBase, MovingObstacle, Sphere, planar_chain
-from ocp import Collocation, Limits, Plan, Problem, StorageWarning, TipTask, plan, solve
+from ocp import Collocation, Limits, Plan, Problem, Scene, StorageWarning, TipTask, plan, solve
 from ocp.app.check.plan_verdict import verdict_of
 from ocp.app.command import main
 from ocp.app.view.animation import animate_plan
@@ -103,7 +103,7 @@ def test_obstacles_that_stand_or_move_and_the_bodies_of_meshes_are_rebuilt(tmp_p
         Box((0.1, 0.1, 0.1), position=(0, -2, 0)),
     ]
     task = TipTask(rows=(3, 4), velocity=(-0.05, 0.02))
-    found = plan(arm, task, 1.0, start=(0.3, 0.6, 0.5), obstacles=balls, search="start")
+    found = plan(arm, task, 1.0, start=(0.3, 0.6, 0.5), scene=Scene(obstacles=balls), search="start")
     found.save(tmp_path / "plan.npz")
     again = Plan.load(tmp_path / "plan.npz")
     assert str(again.audit()) == str(found.audit())

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from models import FixedBase, planar_chain
-from ocp import BoundWarning, Candidate, Plan, ProblemError, TipTask, Unreachable, plan
+from ocp import BoundWarning, Candidate, Cost, Plan, ProblemError, TipTask, Unreachable, plan
 from ocp.motion.plan.candidate import Reason, Rejection
 from ocp.motion.plan.candidate_solver import CandidateSolver
 from ocp.motion.search.search import AtlasSearch, checked_bound
@@ -25,8 +25,8 @@ from tests.ocp.motion.tasks.space_tasks import PANDA_START, UR5_START, panda, ur
 )
 def test_the_cheapest_of_all_motions_has_a_bound_near_its_cost(machine, start, rows, tmp_path) -> None:  # type: ignore[no-untyped-def]
     task = moved(machine, start, rows)
-    found = plan(machine, task, search="global", clearance=None)
-    others = plan(machine, task, search="configurations", clearance=None)
+    found = plan(machine, task, search="global", scene=False)
+    others = plan(machine, task, search="configurations", scene=False)
     assert found.audit().passed
     assert found.bound is not None
     assert 0.98 * found.cost <= found.bound <= found.cost
@@ -41,8 +41,8 @@ def test_the_cheapest_of_all_motions_has_a_bound_near_its_cost(machine, start, r
 @pytest.mark.long
 def test_from_a_given_start_the_bound_is_of_motions_from_there() -> None:
     task = moved(panda(), PANDA_START, "pose")
-    found = plan(panda(), task, start=PANDA_START, search="global", clearance=None)
-    free = plan(panda(), task, search="global", clearance=None)
+    found = plan(panda(), task, start=PANDA_START, search="global", scene=False)
+    free = plan(panda(), task, search="global", scene=False)
     assert found.bound is not None
     assert free.cost < found.bound <= found.cost <= found.bound / 0.98
     assert found["joints"][0] == pytest.approx(PANDA_START, abs=1e-9)
@@ -51,8 +51,8 @@ def test_from_a_given_start_the_bound_is_of_motions_from_there() -> None:
 def test_the_bound_follows_weights_and_pace() -> None:
     machine, start = planar(np.array([0.5, 0.4, 0.3])), np.array([0.5, 1.2, -1.4])
     task = moved(machine, start, "place")
-    one = plan(machine, task, search="global", clearance=None)
-    heavy = plan(machine, task, search="global", clearance=None, weights=np.full(3, 5.0))
+    one = plan(machine, task, search="global", scene=False)
+    heavy = plan(machine, task, search="global", scene=False, cost=Cost(weights=np.full(3, 5.0)))
     assert heavy.cost == pytest.approx(5 * one.cost, rel=1e-6)
     assert one.bound is not None
     assert heavy.bound == pytest.approx(5 * one.bound, rel=0.01)
@@ -77,7 +77,7 @@ def test_where_the_classes_that_may_be_the_cheapest_fail_every_one_is_followed_u
     motions, advance = AtlasSearch.class_representatives, CandidateSolver.advance
     monkeypatch.setattr(AtlasSearch, "class_representatives", followed)
     monkeypatch.setattr(CandidateSolver, "advance", failing)
-    found = plan(machine, moved(machine, start, "place"), search="global", clearance=None)
+    found = plan(machine, moved(machine, start, "place"), search="global", scene=False)
     assert asked == [False, True]
     assert failed
     assert found.audit().passed
@@ -101,11 +101,11 @@ def test_the_motion_that_the_search_found_is_solved_where_a_coarse_mesh_loses_it
     """Near its reach the arm whips round at last; with a free start a coarse mesh finds nothing but a dearer class."""
     ways = [[-0.6585, 0.3798], [-0.3619, 0.0052]]
     machine, task = winding([0.4428, 0.4788, 0.5695], [2.4578, -2.2448, 2.2583], ways, 3.4005)
-    found = plan(machine, task, search="global", clearance=None)
+    found = plan(machine, task, search="global", scene=False)
     assert found.audit().passed
     assert found.bound is not None
     assert found.bound <= found.cost <= 1.05 * found.bound
-    held = plan(machine, task, start=found.at(0.0)["joints"], clearance=None)
+    held = plan(machine, task, start=found.at(0.0)["joints"], scene=False)
     assert found.cost <= held.cost * (1 + 1e-6)
 
 
@@ -119,12 +119,12 @@ def test_a_bound_above_the_cost_of_a_motion_is_no_bound_and_warned_of(monkeypatc
     right = AtlasSearch.solve
     machine, start = planar(np.array([0.5, 0.4, 0.3]), 2.5), np.array([0.5, 1.2, -1.4])
     task = moved(machine, start, "place")
-    cost = plan(machine, task, search="global", clearance=None).cost
+    cost = plan(machine, task, search="global", scene=False).cost
     monkeypatch.setattr(AtlasSearch, "solve", best)
     with pytest.raises(BoundWarning):
-        plan(machine, task, search="global", clearance=None)
+        plan(machine, task, search="global", scene=False)
     with pytest.warns(BoundWarning, match="less than its lower bound") as caught:
-        found = plan(machine, task, search="global", clearance=None)
+        found = plan(machine, task, search="global", scene=False)
     assert found.cost == pytest.approx(cost)
     assert found.bound is None
     warning = caught[0].message
@@ -137,8 +137,8 @@ def test_a_bound_above_the_cost_of_a_motion_is_no_bound_and_warned_of(monkeypatc
 
 def test_where_the_set_of_postures_is_of_points_branches_are_compared() -> None:
     task = moved(ur5(), UR5_START, "pose")
-    found = plan(ur5(), task, search="global", clearance=None)
-    others = plan(ur5(), task, search="configurations", clearance=None)
+    found = plan(ur5(), task, search="global", scene=False)
+    others = plan(ur5(), task, search="configurations", scene=False)
     assert found.cost == pytest.approx(others.cost, rel=1e-6)
     assert found.bound is not None
     assert 0.98 * found.cost <= found.bound <= found.cost
@@ -154,7 +154,7 @@ def test_what_cannot_be_searched_is_refused() -> None:
         (panda(), task, {"horizon": "free"}, "needs a fixed horizon"),
     ):
         with pytest.raises(ProblemError, match=words):
-            plan(machine, asked, search="global", clearance=None, **more)
+            plan(machine, asked, search="global", scene=False, **more)
     with pytest.raises(Unreachable):
         plan(panda(), TipTask(position=[3.0, 0.0, 0.4], direction=[0, 0, -1], duration=1.0), search="global")
 
@@ -199,8 +199,8 @@ def test_stretches_of_time_are_searched_together(case: str) -> None:
         "round": ([closed], {}),
         "cyclic": ([closed], {"cyclic": True}),
     }[case]
-    found = plan(machine, tasks, search="global", clearance=None, **more)  # type: ignore[arg-type]
-    others = plan(machine, tasks, search="configurations", clearance=None, **more)  # type: ignore[arg-type]
+    found = plan(machine, tasks, search="global", scene=False, **more)  # type: ignore[arg-type]
+    others = plan(machine, tasks, search="configurations", scene=False, **more)  # type: ignore[arg-type]
     assert found.bound is not None
     assert found.cost <= others.cost * (1 + 1e-6)
     assert 0.97 * found.cost <= found.bound <= found.cost

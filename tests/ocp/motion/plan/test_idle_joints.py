@@ -10,7 +10,7 @@ import pytest
 
 from models import FixedBase, FreeFloating, Link, Robot, Sphere, attach_tool, merge_robots, planar_chain
 from models.robot.kinematics import link_frames
-from ocp import TipTask, plan, plan_waypoints
+from ocp import Scene, TipTask, Waypoints, plan
 from ocp.motion.local.branches import ik_branches
 from ocp.motion.local.closed_forms import closed_forms
 from ocp.motion.tasks.checks import ignorable_joints
@@ -105,8 +105,8 @@ def test_fingers_cost_nothing_in_a_global_plan_of_a_whole_hand() -> None:
     whole = FixedBase(Robot.from_urdf(PANDA_URDF, tip="panda_hand"))
     assert whole.joint_size == 8
     task = straight(panda(), PANDA_START, (0.15, 0.1, -0.05))
-    bare = plan(panda(), task, search="global", clearance=None)
-    found = plan(whole, task, search="global", clearance=None)
+    bare = plan(panda(), task, search="global", scene=False)
+    found = plan(whole, task, search="global", scene=False)
     assert found.cost == pytest.approx(bare.cost, rel=1e-6)
     assert found.bound == pytest.approx(bare.bound, rel=0.01)
     assert found.audit().passed
@@ -128,8 +128,8 @@ def test_a_given_start_says_where_fingers_stand() -> None:
                 return ca.DM(place) + 0.1 * ca.vertcat(ca.sin(np.pi * t), ca.cos(np.pi * t) - 1)
 
             there = TipTask(position=path, rows=[3, 4], duration=DURATION)
-        found = plan(machine, there, start=start, search="global", clearance=None, cyclic=cyclic)
-        alone = plan(bare, there, start=start[:3], search="global", clearance=None, cyclic=cyclic)
+        found = plan(machine, there, start=start, search="global", scene=False, cyclic=cyclic)
+        alone = plan(bare, there, start=start[:3], search="global", scene=False, cyclic=cyclic)
         assert found.cost == pytest.approx(alone.cost, rel=1e-6)
         assert found.bound == pytest.approx(alone.bound, rel=0.01)
         np.testing.assert_allclose(found["joints"][:, 3:], np.tile(start[3:], (len(found.t), 1)), atol=1e-9)
@@ -140,12 +140,12 @@ def test_the_other_arm_stands_still_while_one_works() -> None:
     two = FixedBase(merge_robots(Link("body", 3.0), {"l_": arm, "r_": arm}, translations={"r_": (0.0, 2.0, 0.0)}))
     start = np.array([0.4, 0.8, -0.5])
     task = straight(FixedBase(arm), start, (-0.1, 0.15, 0), rows=[3, 4])
-    alone = plan(FixedBase(arm), task, search="global", clearance=None)
+    alone = plan(FixedBase(arm), task, search="global", scene=False)
     found = plan(
         two,
         TipTask(position=task.position, rows=[3, 4], duration=DURATION, link="l_link3", point=arm.tip_translation),
         search="global",
-        clearance=None,
+        scene=False,
     )
     assert found.cost == pytest.approx(alone.cost, rel=1e-6)
     assert found.bound == pytest.approx(alone.bound, rel=0.01)
@@ -154,8 +154,8 @@ def test_the_other_arm_stands_still_while_one_works() -> None:
 
 def test_postures_that_differ_by_fingers_are_one() -> None:
     task = straight(ur5(), UR5_START, (0.1, 0.1, 0))
-    bare = plan(ur5(), task, clearance=None)
-    found = plan(handed(ur5().robot, GRIPPER), task, clearance=None)
+    bare = plan(ur5(), task, scene=False)
+    found = plan(handed(ur5().robot, GRIPPER), task, scene=False)
     assert len(found.candidates) == len(bare.candidates)
     assert found.cost == pytest.approx(bare.cost, rel=1e-6)
 
@@ -165,11 +165,11 @@ def test_fingers_collide_where_they_stand() -> None:
     machine = handed(planar_chain([0.4, 0.3, 0.2], [1.0] * 3), GRIPPER)
     start = np.array([0.4, 0.8, -0.5, 0.5])
     task = straight(machine, start, (-0.1, 0.15, 0), rows=[3, 4])
-    free = plan(machine, task, search="global", clearance=None)
+    free = plan(machine, task, search="global", scene=False)
     finger = link_frames(machine.robot, free.at(DURATION / 2)["joints"])["left"]
     there = np.array(ca.DM(finger.position)).ravel() + np.array(ca.DM(finger.rotation))[:, 2] * 0.04
     ball = Sphere(0.02, there - np.array([0.0107, 0.0344, 0.0]))
-    found = plan(machine, task, search="global", obstacles=[ball])
+    found = plan(machine, task, search="global", scene=Scene(obstacles=[ball]))
     assert found.audit().passed
     assert np.ptp(found["joints"][:, 3]) < 1e-12
     assert found.cost == pytest.approx(0.0417135, rel=1e-4)  # with the fingers locked at 0.5 rad
@@ -184,7 +184,7 @@ def test_a_task_of_the_fingers_counts_as_one() -> None:
     hand = TipTask(link="f0", orientation=np.eye(3), rows=[2], duration=DURATION)
     start = np.array([0.4, 0.8, -0.5])
     tip = straight(three_links(0), start, (-0.1, 0.15, 0), rows=[3, 4])
-    found = plan(machine, [tip, hand], search="global", clearance=None)
+    found = plan(machine, [tip, hand], search="global", scene=False)
     assert found.bound is not None
     assert np.ptp(found["joints"][:, 3]) > 0.01
 
@@ -194,8 +194,8 @@ def test_waypoints_are_planned_with_a_hand() -> None:
     quaternion = np.tile([0.0, 1.0, 0.0, 0.0], (12, 1))
     given: dict[str, Any] = {"clearance": None}
     whole = FixedBase(Robot.from_urdf(PANDA_URDF, tip="panda_hand"))
-    bare = plan_waypoints(panda(), places, quaternion, step=0.3, **given)
-    found = plan_waypoints(whole, places, quaternion, step=0.3, **given)
+    bare = plan(panda(), Waypoints(places, quaternion, step=0.3), **given)
+    found = plan(whole, Waypoints(places, quaternion, step=0.3), **given)
     assert found.cost == pytest.approx(bare.cost, rel=1e-3)
     assert found.bound == pytest.approx(bare.bound, rel=1e-2)
     np.testing.assert_allclose(found.joints[:, 7], 0.02, atol=1e-9)

@@ -8,7 +8,7 @@ import casadi as ca
 import pytest
 
 from models import MovingObstacle, Path, Sphere, smooth
-from ocp import SolveError, TipTask, plan
+from ocp import Scene, SolveError, TipTask, plan
 from tests.ocp.motion.tasks.space_tasks import ur5
 
 
@@ -23,4 +23,4 @@ def test_a_ball_that_darts_through_the_forearm_is_no_proven_clearance(half: floa
     seam = smooth(Path.through([(0.4, -0.2, 0.3), (0.4, 0.2, 0.3)]), deviation=0.002)
     task = TipTask.along(seam, 0.05, direction=(0, 0, -1))
     with pytest.raises(SolveError, match=r"obstacle 0"):
-        plan(ur5(), task, obstacles=[MovingObstacle(Sphere(0.05, (0, 0, 0)), position)], search="start")
+        plan(ur5(), task, scene=Scene(obstacles=[MovingObstacle(Sphere(0.05, (0, 0, 0)), position)]), search="start")

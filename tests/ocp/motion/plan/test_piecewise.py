@@ -14,7 +14,7 @@ import pytest
 from models import CollisionShape, FixedBase, Path, Sphere, smooth
 from models.arrays import Array
 from models.machines.moving_obstacle import MovingObstacle
-from ocp import DeadEnd, ProblemError, TipTask, plan, plan_in_segments
+from ocp import DeadEnd, ProblemError, Scene, TipTask, plan, plan_in_segments
 from ocp.motion.plan.piecewise import _task_between
 from tests.ocp.motion.search.test_charts import planar
 from tests.ocp.motion.search.test_reconfigurations import limited
@@ -56,7 +56,7 @@ def cost(first: float, last: float, reach: float, elbow: int) -> float:
 
 def test_of_two_links_the_pieces_are_the_branches_and_meet_where_that_costs_least() -> None:
     reach, machine = 0.45, arm()
-    made = plan_in_segments(machine, line(reach), clearance=None)
+    made = plan(machine, line(reach), scene=False, search="segments")
     assert made.fewest == len(made.reconfigurations) == 1
     (where,) = made.reconfigurations
     assert made.start_times == (0.0, where.time)
@@ -86,15 +86,15 @@ def test_of_two_links_the_pieces_are_the_branches_and_meet_where_that_costs_leas
     assert "1 reconfiguration, the fewest possible" in str(made)
     assert f"at {where.time:.4g} s the arm reconfigures" in str(made)
     with pytest.raises(DeadEnd, match="plan_in_segments") as refused:
-        plan(machine, line(reach), search="global", clearance=None)
+        plan(machine, line(reach), search="global", scene=False)
     assert refused.value.segments == pickle.loads(pickle.dumps(refused.value)).segments == 2
 
 
 @pytest.mark.long
 def test_what_one_motion_does_is_one_piece_and_the_plan() -> None:
-    made = plan_in_segments(arm(), line(0.1), clearance=None)
+    made = plan(arm(), line(0.1), scene=False, search="segments")
     assert (len(made.segments), made.reconfigurations, made.fewest) == (1, (), 0)
-    alone = plan(arm(), line(0.1), search="global", clearance=None)
+    alone = plan(arm(), line(0.1), search="global", scene=False)
     assert made.cost == pytest.approx(alone.cost, rel=1e-9)
     assert made.duration == made.horizon == SECONDS
 
@@ -118,7 +118,7 @@ def with_bodies() -> FixedBase:
 def test_a_reconfiguration_goes_round_what_is_in_the_way(angle: float) -> None:
     place = 0.85 * np.array([np.cos(angle), np.sin(angle)])
     machine, ball = with_bodies(), Sphere(0.03, (*place, 0.0))
-    made = plan_in_segments(machine, line(0.45), obstacles=[ball], clearance=0.01)
+    made = plan(machine, line(0.45), scene=Scene(obstacles=[ball], clearance=0.01), search="segments")
     (where,) = made.reconfigurations
     assert all(piece.audit().passed for piece in made.segments)
     assert where.motion is not None, where.failure
@@ -170,5 +170,5 @@ def test_a_horizon_of_which_the_task_is_no_part_is_refused() -> None:
 def test_obstacles_that_move_do_not_wait() -> None:
     ball = MovingObstacle(Sphere(0.03, (0.85, 0.0, 0.0)), lambda t: ca.vertcat(0.1 * t, 0, 0))
     with pytest.raises(ProblemError, match="wait") as refused:
-        plan_in_segments(with_bodies(), line(0.45), obstacles=[ball])
+        plan(with_bodies(), line(0.45), scene=Scene(obstacles=[ball]), search="segments")
     assert refused.value.name == "obstacles"

@@ -17,17 +17,17 @@ from models import FixedBase, Machine, Mimic, ModelWarning, Robot, planar_chain
 from models.spatial import quaternion_from_rotation
 from ocp import (
     Collocation,
+    Cost,
     Limits,
     ProblemError,
     TipTask,
+    Waypoints,
     inverse_kinematics,
     minimum_velocity_problem,
     plan,
     plan_dynamics,
-    plan_waypoints,
     solve,
 )
-from ocp.motion.plan import plan_in_segments
 from tests.ocp.motion.tasks.space_tasks import UR5_START, ur5
 
 START = np.array([0.4, 0.9, -0.6])
@@ -60,7 +60,7 @@ def planned(machine: FixedBase, **options: Any) -> Any:
 
 
 def in_pieces(machine: FixedBase) -> Any:
-    return [piece.cost for piece in plan_in_segments(machine, task(machine)).segments]
+    return [piece.cost for piece in plan(machine, task(machine), search="segments").segments]
 
 
 def least_velocities(machine: FixedBase) -> Any:
@@ -117,14 +117,14 @@ def test_waypoints_are_passed_whatever_is_unknown() -> None:
     poses = [machine.tip_pose((), UR5_START + k * step) for k in range(3)]
     places = np.array([ca.DM(pose.position).full().ravel() for pose in poses])
     turns = quaternion_from_rotation(np.array([ca.DM(pose.rotation).full() for pose in poses]))
-    way = plan_waypoints(unknown, places, turns, clearance=None)
-    assert way.cost == plan_waypoints(machine, places, turns, clearance=None).cost
+    way = plan(unknown, Waypoints(places, turns), scene=False)
+    assert way.cost == plan(machine, Waypoints(places, turns), scene=False).cost
     untimed = pytest.raises(ProblemError, match="a joint with a velocity limit")
     with untimed, pytest.warns(ModelWarning, match="velocity"):
-        plan_waypoints(unknown, places, turns, clearance=None, cost="time")
+        plan(unknown, Waypoints(places, turns), scene=False, cost=Cost(velocity=0.0, time=1.0))
     limits = Limits(velocity=machine.robot.velocity)
-    timed = plan_waypoints(unknown, places, turns, clearance=None, cost="time", limits=limits)
-    assert timed.cost == plan_waypoints(machine, places, turns, clearance=None, cost="time").cost
+    timed = plan(unknown, Waypoints(places, turns), scene=False, limits=limits, cost=Cost(velocity=0.0, time=1.0))
+    assert timed.cost == plan(machine, Waypoints(places, turns), scene=False, cost=Cost(velocity=0.0, time=1.0)).cost
 
 
 def test_a_follower_of_unknown_speed_does_not_slow_its_leader() -> None:

@@ -13,7 +13,7 @@ from models import Box, CollisionScene, FixedBase
 from models.arrays import Array
 from models.robot.rebuild import lock_joints
 from models.spatial import quaternion_from_rotation
-from ocp import DeadEnd, Limits, ProblemError, Unreachable, plan_waypoints
+from ocp import Cost, DeadEnd, Limits, ProblemError, Scene, Unreachable, Waypoints, plan
 from ocp.motion.local.collisions import distances_along
 from ocp.motion.plan.waypoints import PathCost
 from tests.ocp.motion.search.test_charts import planar
@@ -50,9 +50,14 @@ def test_a_problem_of_the_benchmark_is_solved_by_its_rules_and_shorter_than_publ
 )
 def test_the_way_back_is_as_long_and_weights_count(machine: FixedBase, start: Array) -> None:
     places, turns = poses(machine, start, 21)
-    found = plan_waypoints(machine, places, turns, clearance=None)
-    back = plan_waypoints(machine, places[::-1], -2.0 * turns[::-1], clearance=None)
-    heavy = plan_waypoints(machine, places, turns, clearance=None, weights=np.full(machine.joint_size, 3.0))
+    found = plan(machine, Waypoints(places, turns), scene=False)
+    back = plan(machine, Waypoints(places[::-1], -2.0 * turns[::-1]), scene=False)
+    heavy = plan(
+        machine,
+        Waypoints(places, turns),
+        scene=False,
+        cost=Cost(velocity=0.0, length=1.0, weights=np.full(machine.joint_size, 3.0)),
+    )
     assert back.cost == pytest.approx(found.cost, rel=1e-3)
     assert heavy.cost == pytest.approx(3 * found.cost, rel=1e-3)
     for one in (found, back, heavy):
@@ -69,8 +74,8 @@ def test_with_a_joint_more_the_way_is_no_longer_than_with_that_joint_held() -> N
     machine, told = problem.machine, (problem.positions[some], problem.quaternions[some])
     name = machine.robot.joint_names[0]
     middle = (machine.robot.lower[0] + machine.robot.upper[0]) / 2
-    found = plan_waypoints(machine, *told, clearance=None)
-    held = plan_waypoints(FixedBase(lock_joints(machine.robot, {name: middle})), *told, clearance=None)
+    found = plan(machine, Waypoints(*told), scene=False)
+    held = plan(FixedBase(lock_joints(machine.robot, {name: middle})), Waypoints(*told), scene=False)
     assert found.cost < held.cost
     assert found.steps[0] > 0
     tips = np.array([np.array(ca.DM(machine.tip_pose((), q).position)).ravel() for q in found.joints])
@@ -82,7 +87,9 @@ def test_the_largest_way_and_the_time_are_least_where_they_are_the_cost() -> Non
     velocity = panda().robot.velocity
     free: dict[str, Any] = {"clearance": None}
     kinds: tuple[PathCost, ...] = get_args(PathCost)
-    found = {cost: plan_waypoints(panda(), places, turns, cost=cost, **free) for cost in kinds}
+    found = {
+        cost: plan(panda(), Waypoints(places, turns), **free, cost=Cost(velocity=0.0, UNKNOWN=cost)) for cost in kinds
+    }
     measures: dict[PathCost, Callable[[Array], float]] = {
         "length": lambda ways: ways.sum(),
         "largest": lambda ways: ways.max(axis=1).sum(),
@@ -93,16 +100,22 @@ def test_the_largest_way_and_the_time_are_least_where_they_are_the_cost() -> Non
         assert found[cost].cost == pytest.approx(by_plan[cost], rel=1e-12)
         assert by_plan[cost] == min(by_plan.values())
         assert 0.9 * found[cost].cost <= found[cost].bound <= found[cost].cost
-    slow = plan_waypoints(panda(), places, turns, cost="time", limits=Limits(velocity=velocity / 4), **free)
+    slow = plan(
+        panda(),
+        Waypoints(places, turns),
+        limits=Limits(velocity=velocity / 4),
+        **free,
+        cost=Cost(velocity=0.0, time=1.0),
+    )
     assert slow.cost == pytest.approx(4 * found["time"].cost, rel=1e-3)
 
 
 @pytest.mark.long
 def test_what_stands_in_the_way_makes_it_longer_and_is_kept_clear_of() -> None:
     places, turns = poses(panda(), PANDA_START, 21)
-    free = plan_waypoints(panda(), places, turns)
+    free = plan(panda(), Waypoints(places, turns))
     box = Box((0.1, 0.1, 0.1), (0.25, 0.1, 0.9))
-    boxed = plan_waypoints(panda(), places, turns, obstacles=[box])
+    boxed = plan(panda(), Waypoints(places, turns), scene=Scene(obstacles=[box]))
     assert boxed.cost >= free.bound
     assert boxed.bound <= boxed.cost
     # between the waypoints no sample is nearer than what is proven, and some is as near as what was found
@@ -116,7 +129,7 @@ def test_what_stands_in_the_way_makes_it_longer_and_is_kept_clear_of() -> None:
     assert min(near.least for near in boxed.clearance.pairs) <= apart + 1e-9
     assert apart == pytest.approx(worst.distance, abs=1e-3)
     assert f"{worst.bodies[0]} and {worst.bodies[1]}, {worst.distance:.4g} m apart" in str(boxed)
-    assert plan_waypoints(panda(), places[:6], turns[:6], clearance=None).clearance is None
+    assert plan(panda(), Waypoints(places[:6], turns[:6]), scene=False).clearance is None
 
 
 def test_what_cannot_be_done_is_refused() -> None:
@@ -129,15 +142,15 @@ def test_what_cannot_be_done_is_refused() -> None:
         ((places, turns * 0), "quaternions"),
     ):
         with pytest.raises(ProblemError) as refused:
-            plan_waypoints(panda(), *told)
+            plan(panda(), Waypoints(*told))
         assert refused.value.name == name
     for more in ({"step": 0.0}, {"weights": np.zeros(7)}, {"weights": np.ones(3)}):
         with pytest.raises(ProblemError) as refused:
-            plan_waypoints(panda(), places, turns, **more)
+            plan(panda(), Waypoints(places, turns), **more)
         assert refused.value.name in more
     with pytest.raises(ProblemError, match="3 joints for the 6 rows"):
-        plan_waypoints(planar(np.array([0.5, 0.4, 0.3])), places, turns)
+        plan(planar(np.array([0.5, 0.4, 0.3])), Waypoints(places, turns))
     with pytest.raises(Unreachable, match="waypoint 0 at"):
-        plan_waypoints(panda(), places + 3.0, turns)
+        plan(panda(), Waypoints(places + 3.0, turns))
     with pytest.raises(DeadEnd, match=r"none continues to waypoint 1; .* in one step, 0.0001 at most"):
-        plan_waypoints(panda(), places, turns, step=1e-4, limits=Limits(), clearance=None)
+        plan(panda(), Waypoints(places, turns, step=1e-4), limits=Limits(), scene=False)

@@ -37,7 +37,7 @@ def example(horizon: float) -> TipTask:
     "horizon", [each if each == 3.5 else pytest.param(each, marks=pytest.mark.long) for each in EXTREMALS]
 )
 def test_from_the_start_alone_every_extremal_known_of_the_paper_is_found(horizon: float) -> None:
-    found = plan(paper_example(), example(horizon), start=START, search="global", clearance=None)
+    found = plan(paper_example(), example(horizon), start=START, search="global", scene=False)
     known = EXTREMALS[horizon]
     assert found.cost == pytest.approx(known[0], rel=1e-7)
     costs = np.array([one.cost for one in found.candidates if np.isfinite(one.cost)])
@@ -77,7 +77,7 @@ def test_what_leads_out_of_reach_is_refused_with_the_time_from_which_on_it_does(
     times = np.linspace(0.0, 8.0, 8001)
     gone = times[np.linalg.norm(first - center + np.outer(times, way), axis=1) > farthest_from_center()][0]
     with pytest.raises(Unreachable, match="no joint positions put") as caught:
-        plan(machine, task, start=START, search=search, clearance=None)
+        plan(machine, task, start=START, search=search, scene=False)
     assert caught.value.time == pytest.approx(gone, abs=0.01)
     assert caught.value.name == "link3"
 
@@ -86,11 +86,11 @@ def test_limits_that_stop_a_motion_are_named() -> None:
     robot = paper_example().robot
     slow = tuple(replace(joint, velocity=0.6) for joint in robot.joints)
     with pytest.raises(DeadEnd, match=r"is at its rate limit -?0\.6") as caught:
-        plan(FreeFloating(replace(robot, joints=slow), base="planar"), example(5.0), start=START, clearance=None)
+        plan(FreeFloating(replace(robot, joints=slow), base="planar"), example(5.0), start=START, scene=False)
     assert (caught.value.name, caught.value.limit) in {(joint.name, s) for joint in slow for s in (-0.6, 0.6)}
     narrow = tuple(replace(joint, lower=-1.3, upper=1.3) for joint in robot.joints)
     with pytest.raises(Unreachable, match="at their limits") as lost:
-        plan(FreeFloating(replace(robot, joints=narrow), base="planar"), example(5.0), start=START, clearance=None)
+        plan(FreeFloating(replace(robot, joints=narrow), base="planar"), example(5.0), start=START, scene=False)
     assert 0 < lost.value.time < 5.0
 
 
@@ -142,8 +142,8 @@ def test_tasks_one_after_the_other_are_searched_together() -> None:
         TipTask(position=lambda t: ca.DM(first) - t * ca.DM([0.4, 0.3, 0.0]), rows=[3, 4], duration=2.0),
         TipTask(position=ca.DM(first) - ca.DM([1.0, 0.4, 0.0]), rows=[3, 4], begin=3.0, duration=1.0),
     ]
-    found = plan(machine, lines, start=START, search="global", clearance=None)
-    local = plan(machine, lines, start=START, search="start", clearance=None)
+    found = plan(machine, lines, start=START, search="global", scene=False)
+    local = plan(machine, lines, start=START, search="start", scene=False)
     assert found.cost <= local.cost * (1 + 1e-6)
     assert len(found.parts) == 3
 
@@ -161,7 +161,7 @@ def test_of_ways_that_all_fail_a_few_of_each_search_are_tried_and_the_others_are
 
     monkeypatch.setattr(CandidateSolver, "advance", fails)
     with pytest.raises(SolveError, match="fails") as caught:
-        plan(machine, task, start=START, clearance=None)
+        plan(machine, task, start=START, scene=False)
     count = sum(min(size, 8) for size in sizes)
     assert tried in ([2] * count, [6] + [2] * count)  # the local motion at first
     rest = sum(sizes) - count

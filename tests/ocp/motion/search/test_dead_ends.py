@@ -11,7 +11,7 @@ import pytest
 
 from models import Box, FixedBase
 from models.arrays import Array
-from ocp import DeadEnd, Limits, TipTask, plan, plan_waypoints
+from ocp import DeadEnd, Limits, Scene, TipTask, Waypoints, plan
 from tests.ocp.motion.plan.test_waypoints import poses
 from tests.ocp.motion.search.test_charts import planar
 from tests.ocp.motion.tasks.space_tasks import PANDA_START, panda
@@ -45,7 +45,7 @@ def between(seed: int) -> tuple[FixedBase, TipTask]:
 def test_what_stops_the_motions_is_told_and_what_gives_way_does_all_else(seed: int) -> None:
     machine, task = between(seed)
     with pytest.raises(DeadEnd) as refused:
-        plan(machine, task, search="global", clearance=None)
+        plan(machine, task, search="global", scene=False)
     end = refused.value
     assert end.time is not None
     assert 0 <= end.time < end.until <= 2.0
@@ -73,7 +73,7 @@ def test_what_stops_the_motions_is_told_and_what_gives_way_does_all_else(seed: i
     # no joint is faster than twice what the stop says it would have to be: so much faster there is a motion
     if all(stop.kind == "step" for stop in end.obstructions):
         fast = 2 * max(stop.value / stop.limit for stop in end.obstructions)
-        assert plan(machine, task, search="global", clearance=None, limits=Limits(velocity=fast * velocity)).bound
+        assert plan(machine, task, search="global", scene=False, limits=Limits(velocity=fast * velocity)).bound
 
 
 @pytest.mark.parametrize("seed", [24, 36, 37])
@@ -94,7 +94,7 @@ def test_a_tool_that_turns_too_fast_may_lean_instead(seed: int) -> None:
     place = straight(begin, tip(machine, last) - begin, 2.0)
     task = TipTask(position=place, orientation=turn, rows=[2, 3, 4], duration=2.0)
     with pytest.raises(DeadEnd) as refused:
-        plan(machine, task, search="global", clearance=None)
+        plan(machine, task, search="global", scene=False)
     deviation, lean = refused.value.relaxations
     assert (deviation.kind, lean.kind) == ("deviation", "rotation")
     assert f"turned by {np.degrees(lean.amount):.3g} deg" in str(refused.value)
@@ -109,7 +109,11 @@ def test_a_tool_that_turns_too_fast_may_lean_instead(seed: int) -> None:
 def test_of_ways_through_waypoints_the_waypoint_and_the_bodies_are_told() -> None:
     places, turns = poses(panda(), PANDA_START, 21)
     with pytest.raises(DeadEnd) as refused:
-        plan_waypoints(panda(), places, turns, obstacles=[Box((0.02, 0.5, 0.5), (places[-1] + [0.03, 0.0, 0.2]))])
+        plan(
+            panda(),
+            Waypoints(places, turns),
+            scene=Scene(obstacles=[Box((0.02, 0.5, 0.5), (places[-1] + [0.03, 0.0, 0.2]))]),
+        )
     end = refused.value
     assert end.until == int(end.until)
     assert end.time in (end.until - 1, 0.0)

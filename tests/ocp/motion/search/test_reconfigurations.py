@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from models import FixedBase
 from models.arrays import Array
 from models.robot.rebuild import lock_joints
-from ocp import DeadEnd, ProblemError, TipTask, inverse_kinematics, plan_waypoints
+from ocp import DeadEnd, ProblemError, TipTask, Waypoints, inverse_kinematics, plan
 from ocp.motion.local.closed_forms import closed_forms
 from ocp.motion.search.charts import SelfMotionManifolds, TimeSample
 from ocp.motion.search.joint_space import JointSpace
@@ -96,7 +96,7 @@ def of_six_joints(seed: int) -> tuple[FixedBase, Array, Array, float, list[Array
 def test_of_six_joints_the_pieces_are_those_of_brute_force(seed: int, count: int) -> None:
     machine, places, quaternions, step, nodes = of_six_joints(seed)
     told: dict[str, Any] = {"step": step, "clearance": None}
-    found = plan_waypoints(machine, places, quaternions, **told, reconfigurations="counted")
+    found = plan(machine, Waypoints(places, quaternions, reconfigurations="counted"), **told)
     expected = fewest(nodes, step)
     after = found.reconfigurations
     assert (len(after), expected[0]) == (count, count)
@@ -110,7 +110,7 @@ def test_of_six_joints_the_pieces_are_those_of_brute_force(seed: int, count: int
     if count == 1:
         assert f"after waypoint {after[0]}" in str(found)
         with pytest.raises(DeadEnd):
-            plan_waypoints(machine, places, quaternions, **told)
+            plan(machine, Waypoints(places, quaternions), **told)
 
 
 def search_of(seed: int) -> tuple[AtlasSearch, list[Array], Array]:
@@ -197,8 +197,8 @@ def test_far_apart_parts_of_a_way_are_pieces_as_cheap_and_as_clear_as_by_themsel
             rows.append(np.array(ca.DM(pose.position)).ravel())
             turns.append(Rotation.from_matrix(np.array(ca.DM(pose.rotation))).as_quat()[[3, 0, 1, 2]])
     told: dict[str, Any] = {"step": 0.12, "obstacles": problem.boxes, "ignored": problem.ignored}
-    exclusive = [plan_waypoints(machine, rows[k : k + 3], turns[k : k + 3], **told) for k in (0, 3)]
-    found = plan_waypoints(machine, rows, turns, **told, reconfigurations="counted")
+    exclusive = [plan(machine, Waypoints(rows[k : k + 3], turns[k : k + 3]), **told) for k in (0, 3)]
+    found = plan(machine, Waypoints(rows, turns, reconfigurations="counted"), **told)
     assert found.reconfigurations == (2,)
     assert found.cost == pytest.approx(sum(one.cost for one in exclusive), rel=1e-6)
     assert found.clearance is not None
@@ -212,8 +212,8 @@ def test_pieces_are_counted_with_one_free_direction_at_most() -> None:
     problem = problem_of("fetch__square")
     told = (problem.positions[:3], problem.quaternions[:3])
     with pytest.raises(ProblemError, match="at most") as refused:
-        plan_waypoints(problem.machine, *told, clearance=None, reconfigurations="counted")
+        plan(problem.machine, Waypoints(*told, reconfigurations="counted"), scene=False)
     assert refused.value.name == "reconfigurations"
     with pytest.raises(ProblemError, match="reconfigurations") as refused:
-        plan_waypoints(problem.machine, *told, reconfigurations="few")  # type: ignore[arg-type]
+        plan(problem.machine, Waypoints(*told, reconfigurations="few"))  # type: ignore[arg-type]
     assert refused.value.name == "reconfigurations"

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from models import Box, FixedBase
 from models.arrays import Array
 from models.robot.rebuild import lock_joints
-from ocp import DeadEnd, ProblemError, SolveError, Unreachable, WaypointPlan, plan_waypoints
+from ocp import DeadEnd, ProblemError, Scene, SolveError, Unreachable, WaypointPlan, Waypoints, plan
 from ocp.motion.plan import waypoints
 from ocp.motion.plan.waypoints import WaypointSettings
 from ocp.motion.search.reconfigurations import SectionSettings, section_values
@@ -60,7 +60,7 @@ def task(count: int) -> tuple[Array, Array]:
 @cache
 def planned(count: int, **told: Any) -> WaypointPlan:
     machine = problem_of("fetch__square").machine
-    return plan_waypoints(machine, *task(count), clearance=None, step=STEP * 39 / (count - 1), **told)
+    return plan(machine, Waypoints(*task(count), step=STEP * 39 / (count - 1)), scene=False, **told)
 
 
 def limit_charts(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
@@ -78,7 +78,7 @@ def test_a_way_keeps_its_poses_and_steps_and_is_no_dearer_than_with_the_lift_hel
     assert np.ptp(found.joints[:, 0]) > 0.1  # from one value to another
     for height in (0.0, 0.2, 0.38):
         arm = FixedBase(lock_joints(machine.robot, {machine.robot.joint_names[0]: height}))
-        held = plan_waypoints(arm, *task(40), clearance=None, step=STEP)
+        held = plan(arm, Waypoints(*task(40), step=STEP), scene=False)
         assert found.cost <= held.cost * (1 + 1e-6)
 
 
@@ -86,18 +86,18 @@ def test_what_is_in_reach_at_no_one_height_of_the_lift_is_done_by_lifting() -> N
     machine, count = problem_of("fetch__square").machine, 40
     places = np.column_stack([np.full(count, 0.75), np.zeros(count), np.linspace(0.2, 1.4, count)])
     turns = np.tile((1.0, 0.0, 0.0, 0.0), (count, 1))
-    found = plan_waypoints(machine, places, turns, clearance=None, step=STEP)
+    found = plan(machine, Waypoints(places, turns, step=STEP), scene=False)
     assert found.joints[-1, 0] > found.joints[0, 0] + 0.1
     for height in (0.0, 0.2, 0.38):
         arm = FixedBase(lock_joints(machine.robot, {machine.robot.joint_names[0]: height}))
         with pytest.raises(Unreachable):
-            plan_waypoints(arm, places, turns, clearance=None, step=STEP)
+            plan(arm, Waypoints(places, turns, step=STEP), scene=False)
 
 
 def test_back_it_is_as_long_and_heavy_it_is_dearer() -> None:
     machine, found = problem_of("fetch__square").machine, planned(40)
     places, turns = task(40)
-    back = plan_waypoints(machine, places[::-1], -turns[::-1], clearance=None, step=STEP)
+    back = plan(machine, Waypoints(places[::-1], -turns[::-1], step=STEP), scene=False)
     assert back.cost == pytest.approx(found.cost, rel=0.03)
     heavy = planned(40, weights=(100.0, *np.ones(7)))
     assert np.abs(np.diff(heavy.joints[:, 0])).sum() < np.abs(np.diff(found.joints[:, 0])).sum()
@@ -114,11 +114,11 @@ def test_where_there_are_more_charts_than_memory_is_for_fewer_waypoints_are_sear
 ) -> None:
     limit_charts(monkeypatch, 4000)
     machine = problem_of("fetch__square").machine
-    found = plan_waypoints(machine, *task(40), clearance=None, step=STEP)
+    found = plan(machine, Waypoints(*task(40), step=STEP), scene=False)
     assert found.cost == pytest.approx(planned(40).cost, rel=0.1)
     limit_charts(monkeypatch, 10)
     with pytest.raises(ProblemError) as refused:
-        plan_waypoints(machine, *task(40), clearance=None, step=STEP)
+        plan(machine, Waypoints(*task(40), step=STEP), scene=False)
     assert refused.value.name == "configurations"
 
 
@@ -127,7 +127,11 @@ def test_what_is_in_the_way_is_named_with_the_waypoint() -> None:
     places, turns = task(40)
     box = Box((0.1, 0.1, 0.1), tuple(places[20]))
     with pytest.raises(DeadEnd, match="the search does not rule one out: from waypoint") as refused:
-        plan_waypoints(machine, places, turns, step=STEP, obstacles=[box], ignored=problem_of("fetch__square").ignored)
+        plan(
+            machine,
+            Waypoints(places, turns, step=STEP),
+            scene=Scene(obstacles=[box], ignored=problem_of("fetch__square").ignored),
+        )
     assert refused.value.time is not None
     assert refused.value.time < 20 <= refused.value.until + 10
     assert "obstacle 0" in str(refused.value)
@@ -137,7 +141,7 @@ def test_what_is_in_the_way_is_named_with_the_waypoint() -> None:
 def test_a_handful_of_waypoints_may_be_as_far_apart_as_one_likes(count: int) -> None:
     places, turns = (rows[:count] for rows in task(40))
     machine = problem_of("fetch__square").machine
-    found = plan_waypoints(machine, places, turns, clearance=None)
+    found = plan(machine, Waypoints(places, turns), scene=False)
     tips = [np.array(ca.DM(machine.tip_pose((), q).position)).ravel() for q in found.joints]
     assert np.array(tips) == pytest.approx(places, abs=1e-6)
     assert found.cost == pytest.approx(np.abs(np.diff(found.joints, axis=0)).sum(), rel=1e-12)
@@ -150,7 +154,7 @@ def test_a_waypoint_out_of_reach_is_named_wherever_it_is_seen_first() -> None:
     away = places.copy()
     away[number] += (0.0, 0.0, 3.0)
     with pytest.raises(Unreachable, match=f"^waypoint {number} at") as refused:
-        plan_waypoints(problem_of("fetch__square").machine, away, turns, clearance=None, step=STEP)
+        plan(problem_of("fetch__square").machine, Waypoints(away, turns, step=STEP), scene=False)
     assert refused.value.time == number
 
 
@@ -160,22 +164,26 @@ def test_where_nothing_is_clear_at_the_first_waypoint_none_begins() -> None:
         places, turns = task(40)
         box = Box((0.1, 0.1, 0.1), tuple(places[0]))
         with pytest.raises(DeadEnd, match="none begins at waypoint 0"):
-            plan_waypoints(problem.machine, places, turns, step=STEP, obstacles=[box], ignored=problem.ignored)
+            plan(
+                problem.machine,
+                Waypoints(places, turns, step=STEP),
+                scene=Scene(obstacles=[box], ignored=problem.ignored),
+            )
 
 
 def test_where_the_joint_is_held_at_no_value_that_does_the_waypoint_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(waypoints, "section_values", lambda *_: np.array([10.0]))
     machine = problem_of("fetch__square").machine
     with pytest.raises(SolveError, match="at waypoint 0 on the sections of 'torso_lift_joint'") as refused:
-        plan_waypoints(machine, *task(40), clearance=None, step=STEP)
+        plan(machine, Waypoints(*task(40), step=STEP), scene=False)
     assert (refused.value.name, refused.value.time) == ("torso_lift_joint", 0.0)
 
 
 def test_with_one_free_direction_fewer_waypoints_are_searched_too(monkeypatch: pytest.MonkeyPatch) -> None:
     machine = problem_of("fetch_arm__s").machine
     told: dict[str, Any] = {"clearance": None, "step": STEP}
-    found = plan_waypoints(machine, *task(40), **told)
+    found = plan(machine, Waypoints(*task(40)), **told)
     limit_charts(monkeypatch, 1000)  # there are some 300 at each of 9 waypoints
-    again = plan_waypoints(machine, *task(40), **told)
+    again = plan(machine, Waypoints(*task(40)), **told)
     assert again.cost == pytest.approx(found.cost, rel=0.02)
     assert again.bound <= again.cost

@@ -1,0 +1,119 @@
+"""One verb for every motion: a machine and what is asked of it in, the lowest-cost motion that passes its audit out."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, Literal, TypeAlias, get_args
+
+from models import FixedBase, Machine, Standing
+from ocp.console import interruptible
+from ocp.errors import ProblemError, checked_choice, checked_instance
+from ocp.motion.builders.standing.problem import Weights
+from ocp.motion.plan.motion import Plan
+from ocp.motion.plan.path_plan import PathPlan
+from ocp.motion.plan.piecewise import plan_in_segments
+from ocp.motion.plan.planner import checked_request, clearance_for, plan_request
+from ocp.motion.plan.segmented_plan import SegmentedPlan
+from ocp.motion.plan.solved_plan import SolvedPlan
+from ocp.motion.plan.standing import plan_to_stand
+from ocp.motion.plan.waypoints import plan_path
+from ocp.motion.tasks.cost import Cost
+from ocp.motion.tasks.goals import Waypoints
+from ocp.motion.tasks.limits import Limits
+from ocp.motion.tasks.scene import Scene
+from ocp.motion.tasks.tip_task import TipTask
+from ocp.storage import read_arrays
+
+__all__ = ["Search", "load_plan", "plan"]
+
+Search: TypeAlias = Literal["start", "configurations", "global", "segments"]
+
+
+@interruptible
+def plan(
+    machine: Machine,
+    tasks: TipTask | Waypoints | Sequence[TipTask],
+    horizon: float | Literal["free"] | None = None,
+    *,
+    start: Any = None,
+    cyclic: bool = False,
+    cost: Cost | Weights | None = None,
+    limits: Limits | None = None,
+    scene: Scene | Literal[False] | None = None,
+    search: Search = "configurations",
+    seed: int = 0,
+) -> Plan:
+    """Plan the lowest-cost motion that does the tasks: the least integral of half the squared joint rates.
+
+    Args:
+        machine: A machine on a fixed or floating base, or standing, see `plan_to_stand`.
+        tasks: Tasks of its tips, each from its `begin` for its `duration`; or waypoints, which an arm on a fixed base
+            whose joints exceed the rows of a pose by at most two passes by the shortest joint path.
+        horizon: s; None: until the last task ends. "free": the tasks may be done more slowly than they say, never
+            faster; their pace is planned together with the self-motion, for the least sum of duration and joint rates.
+        start: Joints at the start, rad or m, shape (n,), or a `Start` with the configuration of a floating base; None:
+            any joints that do the first tasks, which are searched.
+        cyclic: Whether the joints end where they start.
+        cost: Weights of the cost. For tip tasks, `velocity` with the `weights` of the joints, and `time` if the horizon
+            is free (1 if `cost` is None), in (rad/s)^2: the larger, the closer to the least time. For waypoints,
+            `length`, the sum of all joint displacements with the `weights` of the joints, or `time`, s, by the
+            velocity limits. `Weights` for a standing machine. None: half the squared joint velocities, the length of a
+            path through waypoints.
+        limits: Limits of joint positions and rates; the robot's own if None. Limits of acceleration, jerk, torque or
+            power, if given, hold at all times together with the robot's own torque limits, at the same cost (see
+            `plan.actuators`). Rates are then continuous. A machine starts or ends at rest only if its tasks require it.
+        scene: Obstacles, and the clearance that is kept from them and between links; None: the links of the machine do
+            not touch. False: collisions are not checked.
+        search: "start": from the given start, or from the best conditioned solution of inverse kinematics.
+            "configurations": from all solutions of inverse kinematics; each may slide along its self-motion.
+            "global": among all motions in the tasks' own time. On a fixed base, the plan has a lower `bound`; the tasks
+            must be poses that leave at most two directions free, and joints that move no task frame, such as a
+            gripper's, stand still in `start` or in the middle of their limits (see `search.search`). On a floating
+            base, the motions come from a search over exact states without a bound (see `search.cells`), which also
+            passes singularities. "segments": as "global"; if no single motion does the tasks, in the fewest segments,
+            between which an arm on a fixed base moves to another configuration while the tasks wait.
+        seed: Seed of inverse kinematics.
+
+    Returns:
+        The audited plan, with all other motions found, their costs and the reasons of their rejection.
+
+    Raises:
+        ProblemError: The request does not fit the machine or is contradictory. Its subclass Unreachable names the time
+            and the place out of reach.
+        SolveError: No motion passes its audit; names what happened to each candidate. Its subclass DeadEnd says where
+            the motions of a global search end, what obstructs them, by how much the tasks would have to be relaxed, and
+            in how few segments they may be done (search="segments").
+    """
+    if isinstance(tasks, Waypoints):
+        _check_unused("waypoints", horizon=horizon, start=start, cyclic=cyclic or None)
+        arm = checked_instance("machine", machine, FixedBase)
+        return plan_path(arm, tasks, cost=cost, limits=limits, scene=scene, seed=seed)
+    checked_choice("search", search, get_args(Search))
+    options: dict[str, Any] = {"start": start, "cost": cost, "limits": limits, "seed": seed}
+    if search == "segments":
+        _check_unused("search='segments'", cyclic=cyclic or None)
+        arm = checked_instance("machine", machine, FixedBase)
+        return plan_in_segments(arm, tasks, horizon, scene=scene, **options)
+    constraints = clearance_for(machine, limits, scene)
+    options |= {"search": search, "cyclic": cyclic}
+    if isinstance(machine, Standing):
+        return plan_to_stand(machine, tasks, horizon, clearance_constraints=constraints, **options)
+    request = checked_request(machine, tasks, horizon, **options)
+    return plan_request(replace(request, clearance_constraints=constraints))
+
+
+def _check_unused(reason: str, **arguments: Any) -> None:
+    """Raise ProblemError about the first argument that is not None."""
+    for name, value in arguments.items():
+        if value is not None:
+            raise ProblemError(f"{reason} takes no {name}; leave it out", name=name, value=value)
+
+
+def load_plan(path: str | os.PathLike[str]) -> Plan:
+    """Read the file of a plan of any kind; see `Plan.load`."""
+    arrays = read_arrays(path)
+    kinds: dict[str, type[PathPlan] | type[SegmentedPlan]] = {"path": PathPlan, "segments": SegmentedPlan}
+    kind = next((kinds[name] for name in kinds if name in arrays), SolvedPlan)
+    return kind.of_arrays(path, arrays)

@@ -1,0 +1,252 @@
+"""Joint path through a sequence of tool poses, as a plan."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from models import FixedBase, ModelError
+from models.arrays import Array
+from ocp.audit.audit import Audit, Finding, clearance_finding
+from ocp.audit.clearance import Clearance
+from ocp.errors import ProblemError
+from ocp.motion.builders.clearance import ClearanceConstraints, clearance_of
+from ocp.motion.plan.candidate import Candidate
+from ocp.motion.plan.motion import Plan
+from ocp.motion.plan.request import restored_request, stored_request
+from ocp.motion.tasks.limits import Limits
+from ocp.motion.tasks.targets import Target
+from ocp.problem.stored import ARRAY_NAMES, RECORD_ERRORS, pack_record, unpack_record
+from ocp.solution import Solution, read_head
+from ocp.tolerances import CLEARANCE_TOLERANCE_M
+
+__all__ = ["PathPlan"]
+
+POSE_TOLERANCE = 1e-6
+"""Largest pose error at a waypoint, m and rad."""
+STEP_TOLERANCE = 1e-6
+"""Largest excess over a joint limit or a step, rad or m."""
+UNLIMITED_RATE = 1.0
+"""Rate of joints without velocity limits by which a path is timed, rad/s or m/s."""
+UNDECIDED = "a path through waypoints is compared with its lower bound, not with its neighbours"
+
+
+@dataclass(frozen=True, eq=False)
+class PathPlan(Plan):
+    """Joint path through a sequence of tool poses, straight in the joints between them.
+
+    A path has no times of its own. The plan passes it in the least time at constant joint rates between waypoints
+    within the velocity limits; `ocp.joint_path` and `schedule` time it under further limits.
+
+    Attributes:
+        machine: The arm.
+        joints: Joints at the waypoints. Shape (N, n), rad or m.
+        positions, rotations: Poses of the tip at the waypoints, in world. Shapes (N, 3), m, and (N, 3, 3).
+        step: Largest displacement of each joint between waypoints. Shape (n,), rad or m.
+        limits: Limits of the joints.
+        path_cost: Cost of the path, without reconfigurations.
+        constraints: Collision scene; None without a collision check.
+        candidates, bound: As in `Plan`; the bound is that of any path with at most as many segments.
+        reconfigurations: Waypoints from which the arm moves to the next one in another configuration, by a motion that
+            is not planned.
+    """
+
+    machine: FixedBase
+    joints: Array
+    positions: Array
+    rotations: Array
+    step: Array
+    limits: Limits
+    path_cost: float
+    constraints: ClearanceConstraints | None = None
+    candidates: tuple[Candidate, ...] = ()
+    bound: float | None = None
+    reconfigurations: tuple[int, ...] = ()
+    _audits: dict[str, Any] = field(default_factory=dict, repr=False)
+
+    # ---- values ------------------------------------------------------------------------------------------------------
+
+    @property
+    def cost(self) -> float:
+        """Cost of the path, without reconfigurations."""
+        return self.path_cost
+
+    @property
+    def solution(self) -> Solution:  # type: ignore[override]
+        """A path through waypoints solves no optimal control problem.
+
+        Raises:
+            ProblemError: Always.
+        """
+        words = "a path through waypoints solves no optimal control problem; its joints are plan.joints"
+        raise ProblemError(words, name="solution")
+
+    @property
+    def targets(self) -> tuple[Target, ...]:  # type: ignore[override]
+        """Poses of the waypoints."""
+        return (Target(self.t, self.positions, self.rotations),)
+
+    @property
+    def t(self) -> Array:
+        """Times of the waypoints, s. Shape (N,)."""
+        limits = self.limits.bounds(self.machine).velocity
+        rates = np.where(np.isfinite(limits), limits, UNLIMITED_RATE)
+        durations = (np.abs(np.diff(self.joints, axis=0)) / rates).max(axis=1, initial=0.0)
+        least = max(float(durations.max(initial=0.0)), 1.0) * np.finfo(float).eps ** 0.5  # waypoints may be equal
+        return np.concatenate([[0.0], np.cumsum(np.maximum(durations, least))])
+
+    @property
+    def horizon(self) -> float:
+        """Time in which the path is passed at the velocity limits, s."""
+        return float(self.t[-1])
+
+    @property
+    def steps(self) -> Array:
+        """Largest displacement of each joint between waypoints, without reconfigurations. Shape (n,), rad or m."""
+        steps = np.delete(np.abs(np.diff(self.joints, axis=0)), list(self.reconfigurations), axis=0)
+        return np.asarray(steps.max(axis=0, initial=0.0))
+
+    def _values(self, name: str) -> Array:
+        return self.joints if name == "joints" else self._values_at(name, self.t)
+
+    def _values_at(self, name: str, times: Array) -> Array:
+        t = self.t
+        if name == "joints":
+            return np.stack([np.interp(times, t, column) for column in self.joints.T], axis=1)
+        if name == "rates":
+            interval = np.clip(np.searchsorted(t, times, side="right") - 1, 0, len(t) - 2)
+            return np.asarray((np.diff(self.joints, axis=0) / np.diff(t)[:, None])[interval])
+        return np.zeros((len(times), self.machine.joint_size if name == "accelerations" else 0))
+
+    def solved_parts(self, times: Array) -> list[tuple[Solution, str, Array]]:
+        """Return nothing, since the path solves no optimal control problem."""
+        return []
+
+    # ---- audit -------------------------------------------------------------------------------------------------------
+
+    def clearance(self) -> Clearance | None:
+        """Return the proven clearance of straight lines between waypoints, without reconfigurations; None if unchecked.
+
+        Its times are numbers of waypoints.
+        """
+        if self.constraints is None:
+            return None
+        numbers, last, breaks = np.arange(len(self.joints), dtype=float), len(self.joints) - 1.0, self.reconfigurations
+        rates = np.abs(np.diff(self.joints, axis=0))
+        rates[list(breaks)] = 0.0
+
+        def joints_at(fractions: Array) -> Array:
+            places = fractions * last
+            waiting = np.isin(np.floor(places), breaks)  # a break lasts until the next waypoint
+            places = np.where(waiting, np.floor(places), places)
+            return np.stack([np.interp(places, numbers, column) for column in self.joints.T], axis=1)
+
+        scene = self.constraints.scene
+        return clearance_of(scene, joints_at, numbers / last, last, rates, np.zeros_like(rates), False)
+
+    def _audit(self, **settings: Any) -> Audit:
+        if settings:
+            name = next(iter(settings))
+            words = f"the audit of a path through waypoints has no setting {name!r}"
+            raise ProblemError(words, name=name, value=settings[name])
+        t, bounds = self.t, self.limits.bounds(self.machine)
+        tips = self._tips(np.zeros((len(t), 0)), self.joints)
+        misses = np.abs(tips[:, :3] - self.positions)
+        turns = Rotation.from_quat(tips[:, [4, 5, 6, 3]]).inv() * Rotation.from_matrix(self.rotations)
+        excess = np.maximum(self.joints - bounds.upper, bounds.lower - self.joints)
+        steps = np.abs(np.diff(self.joints, axis=0)) - self.step
+        steps[list(self.reconfigurations)] = 0.0
+        names = self.names
+        findings = [
+            _largest("positions of the tip", misses, POSE_TOLERANCE, t, unit="m"),
+            _largest("orientations of the tip", turns.magnitude()[:, None], POSE_TOLERANCE, t, unit="rad"),
+            _largest("joints beyond their limits", excess, STEP_TOLERANCE, t, names),
+            _largest("steps beyond the largest", steps, STEP_TOLERANCE, t, names),
+        ]
+        clearance = self.clearance()
+        if clearance is not None:
+            finding = clearance_finding(clearance, CLEARANCE_TOLERANCE_M)
+            findings.append(finding)
+        clearances = {} if clearance is None else {clearance.name: clearance}
+        undecided = UNDECIDED if self.gap is None else f"{UNDECIDED}; it may cost {self.gap:.2g} too much"
+        return Audit("path through waypoints", tuple(findings), undecided, clearances=clearances)
+
+    def __str__(self) -> str:
+        lines = super().__str__().split("\n")
+        if self.reconfigurations:
+            places = ", ".join(map(str, self.reconfigurations))
+            count = f"{len(self.reconfigurations)} time{'s' if len(self.reconfigurations) > 1 else ''}"
+            lines.insert(1, f"  the arm reconfigures {count}, after waypoint {places}")
+        return "\n".join(lines)
+
+    # ---- files -------------------------------------------------------------------------------------------------------
+
+    def arrays(self, path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
+        """Return the arrays of the file of the plan."""
+        arguments = {"machine": self.machine, "limits": self.limits, "constraints": self.constraints}
+        head, numbers = pack_record(
+            {
+                "request": stored_request("", arguments),
+                "cost": self.path_cost,
+                "bound": self.bound,
+                "reconfigurations": list(self.reconfigurations),
+                "candidates": [candidate.record() for candidate in self.candidates],
+                **{name: getattr(self, name) for name in ("joints", "positions", "rotations", "step")},
+            }
+        )
+        arrays = {"path": np.frombuffer(json.dumps(head).encode(), np.uint8)}
+        return {**arrays, **{f"path.{name}": values for name, values in numbers.items()}}
+
+    @classmethod
+    def of_arrays(cls, path: str | os.PathLike[str], arrays: dict[str, np.ndarray]) -> PathPlan:
+        """Return the plan of the arrays of a file, which are not trusted; raise as `Plan.load`."""
+        try:
+            numbers = {name: arrays[f"path.{name}"] for name in ARRAY_NAMES}
+            head = unpack_record(read_head(path, arrays["path"]), numbers)
+            arguments = restored_request(head["request"]).arguments
+            machine, limits, constraints = (arguments[name] for name in ("machine", "limits", "constraints"))
+            n, count = machine.joint_size, len(head["joints"])
+            shapes = {"joints": (count, n), "positions": (count, 3), "rotations": (count, 3, 3), "step": (n,)}
+            values: dict[str, Any] = {name: np.asarray(head[name], dtype=float) for name in shapes}
+            wrong = [name for name, shape in shapes.items() if values[name].shape != shape]
+            finite = all(np.isfinite(values[name]).all() for name in ("joints", "positions", "rotations"))
+            if wrong or count < 2 or not finite or not isinstance(limits, Limits) or not isinstance(machine, FixedBase):
+                raise ValueError(f"its {', '.join(wrong) or 'values'} do not fit its machine")
+            if constraints is not None and not isinstance(constraints, ClearanceConstraints):
+                raise TypeError(f"its collision scene is a {type(constraints).__name__}")
+            breaks = tuple(int(number) for number in head["reconfigurations"])
+            if not all(0 <= number < count - 1 for number in breaks):
+                raise ValueError(f"it reconfigures at waypoints that it has not: {breaks}")
+            candidates = tuple(
+                Candidate.of_record(start, cost, stage, reason, None)
+                for start, cost, stage, reason in head["candidates"]
+            )
+            return cls(
+                machine=machine,
+                **values,
+                limits=limits,
+                path_cost=float(head["cost"]),
+                constraints=constraints,
+                candidates=candidates,
+                bound=None if head["bound"] is None else float(head["bound"]),
+                reconfigurations=breaks,
+            )
+        except (*RECORD_ERRORS, ModelError, ProblemError) as error:
+            words = f"{path}: the plan in it is damaged: {error}"
+            raise ProblemError(words, name="path", value=str(path)) from error
+
+
+def _largest(
+    name: str, values: Array, limit: float, times: Array, names: tuple[str, ...] = (), unit: str = ""
+) -> Finding:
+    """Return the finding of the largest positive value in a row for each time."""
+    if not values.size:
+        return Finding(name, 0.0, limit, unit=unit)
+    row, column = np.unravel_index(int(np.argmax(values)), values.shape)
+    label = f"{name}, {names[column]!r}" if names else name
+    return Finding(label, max(float(values[row, column]), 0.0), limit, float(times[row]), f"waypoint {row}", unit=unit)

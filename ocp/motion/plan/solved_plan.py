@@ -1,0 +1,279 @@
+"""Plan whose motion solves one optimal control problem, and its file format."""
+
+from __future__ import annotations
+
+import json
+import os
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from models import Machine, ModelError
+from models.arrays import Array
+from ocp.audit.audit import Audit
+from ocp.errors import ProblemError, StorageWarning
+from ocp.motion.builders.tool_motion import CLOCK, PACE, SLOPES, Stretch
+from ocp.motion.plan.candidate import Candidate
+from ocp.motion.plan.motion import Plan
+from ocp.motion.plan.request import MotionRequest, request_of, restored_request, stored_request
+from ocp.motion.tasks.targets import Target, targets_along
+from ocp.motion.tasks.tip_task import TipTask
+from ocp.problem.stored import ARRAY_NAMES, RECORD_ERRORS, pack_record, unpack_record
+from ocp.solution import Solution, read_head
+
+__all__ = ["Part", "SolvedPlan", "parts_of"]
+
+RATES = ("rates", SLOPES, "velocities")
+TARGET_TIMES = 401
+"""Samples at which a plan keeps the targets of its tasks."""
+
+
+class Part(NamedTuple):
+    """Interval of a plan, s, and the suffix of its states and controls in the solution."""
+
+    begin: float
+    end: float
+    suffix: str
+
+
+@dataclass(frozen=True, eq=False)
+class SolvedPlan(Plan):
+    """Plan whose motion solves one optimal control problem.
+
+    Attributes:
+        solution: The solution.
+        parts: Intervals of time with the same tasks; in the solution they run side by side.
+        machine, candidates, bound, targets: As in `Plan`.
+    """
+
+    machine: Machine
+    solution: Solution
+    parts: tuple[Part, ...]
+    candidates: tuple[Candidate, ...] = ()
+    bound: float | None = None
+    targets: tuple[Target, ...] = ()
+    _audits: dict[str, Any] = field(default_factory=dict, repr=False)
+
+    # ---- values ------------------------------------------------------------------------------------------------------
+
+    @property
+    def cost(self) -> float:
+        """Cost of the motion."""
+        return self.solution.cost
+
+    @property
+    def horizon(self) -> float:
+        """Final time, s."""
+        return self.parts[-1].end
+
+    @property
+    def t(self) -> Array:
+        """Times of the plan's own grid, with both copies of the times between parts. Shape (M,), s."""
+        if CLOCK in self.solution.states:
+            return np.asarray(self.solution[CLOCK][:, 0])
+        share = self.solution.t / self.solution.horizon
+        return np.concatenate([part.begin + (part.end - part.begin) * share for part in self.parts])
+
+    def _values(self, name: str) -> Array:
+        if self.rate_name == SLOPES and name == "rates":
+            return np.asarray(self.solution[SLOPES] / self.solution[PACE])
+        own = self.rate_name if name == "rates" else name
+        return np.concatenate([self.solution[own + part.suffix] for part in self.parts])
+
+    def _values_at(self, name: str, times: Array) -> Array:
+        def values(part: Part, fraction: Array) -> Array:
+            if name == "accelerations":
+                return self.accelerations(part, fraction)
+            sample = self.solution.at_fraction(fraction)
+            if name == "rates":
+                return sample[self.rate_name + part.suffix] / (sample[PACE] if self.rate_name == SLOPES else 1.0)
+            return sample[name + part.suffix]
+
+        return self._over(times, values)
+
+    def solved_parts(self, times: Array) -> list[tuple[Solution, str, Array]]:
+        """Return the solution once for each part; see `Plan.solved_parts`."""
+        begins = [part.begin for part in self.parts]
+        which = np.clip(np.searchsorted(begins, times, "right") - 1, 0, len(begins) - 1)
+        return [
+            (self.solution, part.suffix, self._fractions(part, times[which == k]) * self.solution.horizon)
+            for k, part in enumerate(self.parts)
+        ]
+
+    @property
+    def request(self) -> MotionRequest | None:
+        """Builder and arguments of the problem; None for a problem that the user declared."""
+        return request_of(self.solution.problem)
+
+    def task_share(self, times: Any) -> Array:
+        """Return the share of the tasks' own time that has passed at times (M,), s.
+
+        It equals the share of the horizon unless the horizon is free, in which case the pace of the tasks is planned.
+
+        Raises:
+            ProblemError: A time is not finite or outside 0 to the horizon.
+        """
+        t = np.atleast_1d(self._checked_times(times))
+        return self._fractions(self.parts[0], t) if CLOCK in self.solution.states else t / self.horizon
+
+    def _audit(self, **settings: Any) -> Audit:
+        """Return the audit of the solution.
+
+        For a plan without a `request`, the limits of its machine are checked as well, since the meaning of the limits
+        in its problem is unknown.
+        """
+        audit: Audit = self.solution.audit(**settings)
+        if self.request is None:
+            audit = replace(audit, findings=(*audit.findings, *self.limit_findings()))
+        return audit
+
+    # ---- targets -----------------------------------------------------------------------------------------------------
+
+    def with_targets(self, tasks: Sequence[TipTask]) -> SolvedPlan:
+        """Return the plan with the targets of the tasks that it does, at TARGET_TIMES times."""
+        times = np.linspace(0.0, self.horizon, TARGET_TIMES)
+        clock = times
+        if CLOCK in self.solution.states:
+            clock = self.task_share(times) * self.solution.horizon
+        at = self.at(times)
+        base = at["base"] if "base" in at else np.zeros((TARGET_TIMES, 0))
+        return replace(self, targets=targets_along(self.machine, tasks, clock, base, at["joints"], times))
+
+    # ---- files -------------------------------------------------------------------------------------------------------
+
+    def arrays(self, path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
+        """Return the arrays of the file of the plan.
+
+        They hold the request, from which `load` declares the problem again. For a problem that the user declared, they
+        hold the machine and the expressions of the problem, operation by operation.
+        """
+        try:
+            request, hint = stored_request("", {"machine": self.machine}), ""
+        except ProblemError as error:
+            words = f"the machine cannot be stored in a file: {error}; save the plan's solution alone"
+            raise ProblemError(words, name="machine", value=error.value) from error
+        if self.request is not None and self.request.machine is self.machine:
+            try:
+                request = stored_request(self.request.builder, self.request.arguments)
+                hint = "it is declared again from the request of the plan: read the file with Plan.load"
+            except ProblemError as error:
+                words = f"{path} is saved with the problem instead of the request: {error}"
+                warnings.warn(StorageWarning(words, name=error.name), stacklevel=2)
+        head, numbers = pack_record(
+            {
+                "request": request,
+                "parts": self.parts,
+                "bound": self.bound,
+                "candidates": [candidate.record() for candidate in self.candidates],
+                "targets": [
+                    np.column_stack([target.t, target.position, target.rotation.reshape(-1, 9)])
+                    for target in self.targets
+                ],
+            }
+        )
+        arrays = {**self.solution.arrays(path, hint), "plan": np.frombuffer(json.dumps(head).encode(), np.uint8)}
+        return {**arrays, **{f"plan.{name}": values for name, values in numbers.items()}}
+
+    @classmethod
+    def of_arrays(cls, path: str | os.PathLike[str], arrays: dict[str, np.ndarray]) -> SolvedPlan:
+        """Return the plan of the arrays of a file, which are not trusted; raise as `load`."""
+        solution = Solution.of_arrays(path, arrays)
+        if "plan" not in arrays:
+            words = f"{path} holds a solution and no plan; read it with Solution.load"
+            raise ProblemError(words, name="path", value=str(path))
+        try:
+            head = unpack_record(
+                read_head(path, arrays["plan"]), {name: arrays[f"plan.{name}"] for name in ARRAY_NAMES}
+            )
+            request = restored_request(head["request"])
+            if request.builder:
+                solution = solution.tied_to(request.problem())
+            parts = tuple(Part(float(a), float(b), str(suffix)) for a, b, suffix in head["parts"])
+            candidates = tuple(
+                Candidate.of_record(start, cost, stage, reason, solution)
+                for start, cost, stage, reason in head["candidates"]
+            )
+            bound = None if head["bound"] is None else float(head["bound"])
+            targets = tuple(Target(rows[:, 0], rows[:, 1:4], rows[:, 4:].reshape(-1, 3, 3)) for rows in head["targets"])
+            plan = cls(request.machine, solution, parts, candidates, bound, targets)
+            plan._check_parts()
+            return plan.with_targets(request.tasks) if request.builder and targets else plan
+        except (*RECORD_ERRORS, ModelError) as error:
+            name = getattr(error, "name", None) or "plan"
+            words = f"{path}: the plan in it is damaged: {error}"
+            raise ProblemError(words, name=str(name), value=str(path)) from error
+
+    # ---- time of the motion and time of the solution -----------------------------------------------------------------
+
+    def _check_parts(self) -> None:
+        """Raise ValueError if the parts do not match the solution, or its joints not the machine."""
+        ends = [0.0, *(part.end for part in self.parts)]
+        contiguous = all(part.begin == end < part.end for part, end in zip(self.parts, ends, strict=False))
+        clock = self.solution.states.get(CLOCK)
+        if not (self.parts and contiguous and ends[-1] == (self.solution.horizon if clock is None else clock[-1, 0])):
+            raise ValueError(f"its parts {self.parts} do not fill the time of its solution one after the other")
+        variables = {**self.solution.states, **self.solution.controls}
+        sizes_by_name = {name: values.shape[1] for name, values in variables.items()}
+        sizes = {"joints": self.machine.joint_size, "base": self.machine.base_size}
+        for part in self.parts:
+            rate_sizes = [sizes_by_name.get(name + part.suffix) for name in RATES]
+            sizes_of_part = [sizes_by_name.get(name + part.suffix, 0) for name in sizes]
+            if sizes_of_part != list(sizes.values()) or sizes["joints"] not in rate_sizes:
+                raise ValueError(f"the solution has no joints and rates of this machine, {sizes}, in {part}")
+
+    @property
+    def rate_name(self) -> str:
+        """Name of the joint rates in the solution; SLOPES are derivatives by the path, to be divided by the pace."""
+        names = {**self.solution.states, **self.solution.controls}
+        return next(name for name in RATES if name + self.parts[0].suffix in names)
+
+    def accelerations(self, part: Part, fraction: Array) -> Array:
+        """Return the joint accelerations at fractions (M,) of a part. Shape (M, n)."""
+        sample, duration = self.solution.at_fraction(fraction), part.end - part.begin
+        name = self.rate_name + part.suffix
+        if "accelerations" + part.suffix in sample:
+            return sample["accelerations" + part.suffix]
+        slope = self._slope(name, fraction)
+        if self.rate_name != SLOPES:
+            return np.asarray(slope / duration)
+        pace, change = sample[PACE], self._slope(PACE, fraction)
+        return np.asarray((slope * pace - sample[name] * change) / pace**3 / self.solution.horizon)
+
+    def _slope(self, name: str, fraction: Array) -> Array:
+        """Return the derivative of a state or control by the fraction. Shape (M, n)."""
+        is_state = name in self.solution.states
+        pool = self.solution.states if is_state else self.solution.controls
+        interpolant = self.solution.state_interpolant if is_state else self.solution.control_interpolant
+        offset = sum(values.shape[1] for values in list(pool.values())[: list(pool).index(name)])
+        return np.asarray(interpolant.derivative()(fraction)[:, offset : offset + pool[name].shape[1]])
+
+    def _fractions(self, part: Part, times: Array) -> Array:
+        """Return the fractions of the solution's horizon at times (M,) of a part."""
+        if CLOCK not in self.solution.states:
+            return np.asarray(np.clip((times - part.begin) / (part.end - part.begin), 0.0, 1.0))
+        low, high = np.zeros(len(times)), np.ones(len(times))
+        for _ in range(np.finfo(float).nmant):  # bisection; the clock always advances
+            middle = (low + high) / 2
+            is_late = self.solution.at_fraction(middle)[CLOCK][:, 0] > times
+            low, high = np.where(is_late, low, middle), np.where(is_late, middle, high)
+        return np.asarray((low + high) / 2)
+
+    def _over(self, times: Array, evaluate: Callable[[Part, Array], Array]) -> Array:
+        """Evaluate each part at the fractions of the times (M,) that it covers; the later one where two meet."""
+        begins = [part.begin for part in self.parts]
+        which = np.clip(np.searchsorted(begins, times, side="right") - 1, 0, len(self.parts) - 1)
+        result: Array | None = None
+        for number in np.unique(which):
+            part, rows = self.parts[number], np.flatnonzero(which == number)
+            values = evaluate(part, self._fractions(part, times[rows]))
+            result = np.empty((len(times), values.shape[1])) if result is None else result
+            result[rows] = values
+        return np.zeros((0, self.machine.joint_size)) if result is None else result
+
+
+def parts_of(stretches: Sequence[Stretch]) -> tuple[Part, ...]:
+    """Return the parts of a plan that consists of stretches."""
+    return tuple(Part(stretch.begin, stretch.end, stretch.suffix) for stretch in stretches)

@@ -1,0 +1,147 @@
+"""Where a motion starts, where it ends, and poses that it passes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from models import Box, Machine, Sphere
+from models.arrays import ArrayInput
+from ocp.errors import ProblemError, checked_choice, checked_positive, checked_text
+from ocp.motion.tasks.checks import checked_configuration
+from ocp.motion.tasks.tip_task import TipTask
+
+__all__ = ["Goal", "Start", "Waypoints"]
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """Where and how fast a machine starts.
+
+    Attributes:
+        joints: Joints, rad or m, shape (n,); None: searched.
+        base: Configuration of a floating base, shape (base_size,); None: the machine's base_home().
+        velocity: "rest", "free", or the joint velocities, shape (n,), rad/s or m/s; for goals, since the tasks of a tip
+            determine the velocities at their start.
+    """
+
+    joints: Any = None
+    base: Any = None
+    velocity: Literal["rest", "free"] | Any = "rest"
+
+    @classmethod
+    def of(cls, value: Any, machine: Machine) -> tuple[Start, Any, Any]:
+        """Return a start, its checked joints (n,) or None, and its base (base_size,).
+
+        Args:
+            value: A start, joints, or None.
+
+        Raises:
+            ProblemError: As `checked_configuration`.
+        """
+        start = value if isinstance(value, cls) else cls(value)
+        base = checked_configuration(machine, np.zeros(machine.joint_size), start.base)[1]
+        joints = None if start.joints is None else checked_configuration(machine, start.joints, start.base)[0]
+        return start, joints, base
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Goal:
+    """End of a motion, or of one part of it: joints, or a pose of the tip.
+
+    Attributes:
+        joints: Joints, nan where free. Shape (n,), rad or m.
+        tip: Link whose pose is meant; None for the tip of the robot.
+        position: Position of the tip in world. Shape (3,), m.
+        orientation: Its orientation in world: quaternion [w, x, y, z] or rotation matrix.
+        direction: Direction of the tool axis in world, with a free roll about it, in place of an orientation. Shape
+            (3,).
+        within: Half-angle of the cone about the direction in which the tool axis may lie, rad.
+        tool_axis: Tool axis in the tip's frame. Shape (3,).
+        region: Box or sphere in world in which the tip may lie, in place of a position.
+        velocity: "rest", "free", or the joint velocities there, nan where free. Shape (n,), rad/s or m/s.
+        base: Configuration of a floating base at the end, nan where free. Shape (base_size,).
+        duration: Duration of this part of a motion with several goals, s, or FreeTime(...); None: the horizon.
+        machine: Machine on the way to this goal, for example with a load; None for that of the part before.
+        tasks: Tip tasks on the way to this goal, as functions of the time since its beginning.
+        name: Name of this part; "leg 1", "leg 2", ... if empty.
+
+    Raises:
+        ProblemError: The goal is neither joints nor a pose, or both; or a value is invalid.
+    """
+
+    joints: Any = None
+    tip: str | None = None
+    position: Any = None
+    orientation: Any = None
+    direction: Any = None
+    within: float | None = None
+    tool_axis: ArrayInput = (0.0, 0.0, 1.0)
+    region: Box | Sphere | None = None
+    velocity: Literal["rest", "free"] | Any = "rest"
+    base: Any = None
+    duration: Any = None
+    machine: Machine | None = None
+    tasks: TipTask | Sequence[TipTask] = ()
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        checked_text("goal: name", self.name)
+        pose = {name: getattr(self, name) for name in ("position", "orientation", "direction", "region")}
+        named = [name for name, value in pose.items() if value is not None]
+        if self.joints is not None and named:
+            words = f"a goal has joints or a pose, not both: leave out joints, or {', '.join(named)}"
+            raise ProblemError(words, name="joints", value=self.joints)
+        if self.position is not None and self.region is not None:
+            words = "a goal has a position or a region in which the tip may lie, not both"
+            raise ProblemError(words, name="region", value=self.region)
+        if self.region is not None and not isinstance(self.region, Box | Sphere):
+            words = f"goal: region must be a Box or a Sphere in world, not a {type(self.region).__name__}"
+            raise ProblemError(words, name="region", value=self.region)
+        if self.within is not None:
+            checked_positive("goal: within", self.within, below=np.pi)
+        if isinstance(self.velocity, str):
+            checked_choice("goal: velocity", self.velocity, ("rest", "free"))
+        if self.has_pose:
+            _ = self.task  # checks the pose
+
+    @property
+    def has_pose(self) -> bool:
+        """Whether the goal is a pose of the tip."""
+        return any(value is not None for value in (self.position, self.orientation, self.direction, self.region))
+
+    @property
+    def task(self) -> TipTask:
+        """Task of the tip to be at the goal; at the centre of its region."""
+        center = self.position if self.region is None else self.region.position
+        return TipTask(
+            position=center,
+            orientation=self.orientation,
+            direction=self.direction,
+            within=self.within,
+            tool_axis=self.tool_axis,
+            link=self.tip,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Waypoints:
+    """Poses that the tip passes one after the other, without times.
+
+    Attributes:
+        positions: Positions of the tip in world. Shape (N, 3), m.
+        quaternions: Orientations of the tip, [w, x, y, z], of any length. Shape (N, 4).
+        step: Largest displacement of each joint between waypoints, rad or m; one number or one per joint.
+        reconfigurations: "forbidden", or "counted": if no path goes through all waypoints, find the fewest
+            reconfigurations, and among these the least cost. In a reconfiguration, the arm leaves the path at a
+            waypoint and returns at the next one in any configuration; it costs nothing and is not planned. With at most
+            one free direction.
+    """
+
+    positions: ArrayInput
+    quaternions: ArrayInput
+    step: Any = np.inf
+    reconfigurations: Literal["forbidden", "counted"] = "forbidden"
