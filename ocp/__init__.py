@@ -11,7 +11,7 @@ from ocp.motion.builders.actuator_limits import JointFriction, joint_torques
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.cts import RollObstacles, RollSettings, roll_problem, spline_targets
 from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem
-from ocp.motion.builders.dynamics_plan import Leg, dynamics_phases, plan_dynamics
+from ocp.motion.builders.dynamics_plan import dynamics_phases, plan_dynamics
 from ocp.motion.builders.joint_spline import joint_path
 from ocp.motion.builders.minimum_velocity import minimum_velocity_problem
 from ocp.motion.builders.space.capture import capture_problem, chained_capture, plan_capture
@@ -71,7 +71,6 @@ __all__ = [
     "Indirect",
     "JointFriction",
     "Layer",
-    "Leg",
     "Limits",
     "MultipleShooting",
     "Phases",

@@ -28,6 +28,7 @@ __all__ = ["Problem", "checked_problem", "remembers_request"]
 
 Declare = TypeVar("Declare", bound=Callable[..., Any])
 Arguments = ParamSpec("Arguments")
+Declared = TypeVar("Declared", bound="Problem")
 
 
 def _about_its_name(method: Declare) -> Declare:
@@ -48,14 +49,23 @@ def checked_problem(problem: Any) -> Problem:
     return problem
 
 
-def remembers_request(builder: str) -> Callable[[Callable[Arguments, Problem]], Callable[Arguments, Problem]]:
+def remembers_request(builder: str) -> Callable[[Callable[Arguments, Declared]], Callable[Arguments, Declared]]:
     """Return a decorator of builders: their problems store the builder's name and arguments, to be declared again."""
 
-    def decorate(declare: Callable[Arguments, Problem]) -> Callable[Arguments, Problem]:
+    def decorate(declare: Callable[Arguments, Declared]) -> Callable[Arguments, Declared]:
+        parameters = signature(declare)
+        options = [name for name, each in parameters.parameters.items() if each.kind is each.VAR_KEYWORD]
+
+        def bound(*args: Any, **kwargs: Any) -> dict[str, Any]:
+            arguments = dict(parameters.bind(*args, **kwargs).arguments)
+            for name in options:
+                arguments |= arguments.pop(name, {})
+            return arguments
+
         @wraps(declare)
-        def declared(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Problem:
+        def declared(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Declared:
             problem = declare(*args, **kwargs)
-            problem.origin = builder, signature(declare).bind(*args, **kwargs).arguments
+            problem.origin = builder, bound(*args, **kwargs)
             return problem
 
         return declared

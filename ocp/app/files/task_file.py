@@ -401,9 +401,7 @@ def _scene(obstacles: tuple[Shape, ...], entries: TomlTable, names: tuple[str, .
     folders = entries.texts("folders", "a list of names of folders")
     if not checked:
         if obstacles:
-            raise entries.error(
-                "look", "look = false checks no collisions, but there are obstacles; remove one"
-            )
+            raise entries.error("look", "look = false checks no collisions, but there are obstacles; remove one")
         return {"scene": False}
     scene = Scene(
         obstacles,

@@ -1,13 +1,13 @@
-"""Solve and audit motions within actuator limits, of one or several legs.
+"""Solve and audit motions within actuator limits, to one or several goals.
 
 A plan must satisfy its limits between the nodes of the mesh, too. A smooth plan of least effort needs few intervals. A
 plan of least time switches from limit to limit and gets nodes at its switches (`ocp.switching`). Where a limit is still
 exceeded between the nodes, it is tightened there (`ocp.tightening`). If that costs too much, the mesh is refined where
 the tightening is expensive: the excess of a smooth plan decreases with the square of the interval.
 
-A motion of several legs passes through waypoints, and may pick up and put down loads. Each leg is a phase with its own
-machine, declared by `dynamics_problem`. Joints and base are continuous between legs, so are the velocities if the
-machine does not stop there, and the accelerations if the jerk is the control. A load changes the machine and is picked
+A motion to several goals may pick up and put down loads there. The motion to each goal is a phase with its own machine,
+declared by `dynamics_problem`. Joints and base are continuous between phases, so are the velocities if the machine does
+not stop there, and the accelerations if the jerk is the control. A load changes the machine and is picked
 up or put down at rest only: then the momentum is zero before and after. Grasping a moving load is an impact with a
 velocity jump; it needs a join of `Phases` declared by hand.
 """
@@ -18,7 +18,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -26,15 +26,7 @@ from models import FreeFloating, Machine
 from ocp.audit.audit import Audit
 from ocp.console import interruptible
 from ocp.direct.collocation import Collocation
-from ocp.errors import (
-    ProblemError,
-    SolveError,
-    checked_choice,
-    checked_each,
-    checked_instance,
-    checked_mapping,
-    checked_text,
-)
+from ocp.errors import ProblemError, SolveError, checked_each, checked_instance, checked_mapping
 from ocp.methods import solve
 from ocp.motion.builders.actuator_limits import Motors, checked_motors
 from ocp.motion.builders.clearance import (
@@ -48,43 +40,27 @@ from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem
 from ocp.motion.builders.standing.problem import FreeTime
 from ocp.motion.tasks.checks import checked_horizon
 from ocp.motion.tasks.cost import Cost
+from ocp.motion.tasks.goals import Goal
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.phases import DURATION, Phases
-from ocp.problem.problem import Problem
+from ocp.problem.problem import Problem, remembers_request
 from ocp.refinement import split
 from ocp.solution import Solution
 from ocp.switching import WARM_START_OPTIONS, solve_at_switches
 from ocp.tightening import largest_excess, tighten
 
-__all__ = ["Leg", "audit_error", "breaks_of", "checked_legs", "dynamics_phases", "plan_dynamics", "within_limits"]
+__all__ = [
+    "audit_error", "breaks_of", "checked_goals", "dynamics_phases", "machines_of", "phase_names", "plan_dynamics",
+    "within_limits",
+]  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
-class Leg:
-    """Part of a motion up to a waypoint, or to a change of load.
-
-    Attributes:
-        joints: Joints at its end; nan where free, None if all are free. Shape (n,), rad or m.
-        horizon: Duration, s, or FreeTime(...).
-        end_velocity: "rest", or "free" to pass the end without a stop.
-        machine: Machine on this leg, for example `with_load`; None for that of the leg before.
-        tasks: Tip tasks as functions of the time since the leg's start. They need a leg that starts at known joints.
-        name: Name of the phase; "leg 1", "leg 2", ... if empty.
-    """
-
-    joints: Any
-    horizon: float | FreeTime
-    end_velocity: Literal["rest", "free"] = "rest"
-    machine: Motors | None = None
-    tasks: TipTask | Sequence[TipTask] = ()
-    name: str = ""
-
-
+@remembers_request("dynamics phases")
 @interruptible
 def dynamics_phases(
     machine: Motors,
-    legs: Sequence[Leg],
+    goals: Sequence[Goal],
     *,
     start: Any,
     total: float | None = None,
@@ -92,108 +68,128 @@ def dynamics_phases(
     cost: Cost | None = None,
     setup: DynamicsSetup | None = None,
 ) -> Phases:
-    """Declare consecutive legs as the phases of one problem, of least total cost.
+    """Declare the motions to consecutive goals as the phases of one problem, of least total cost.
 
     Args:
-        machine: Machine of the first leg, unless the leg has its own.
-        legs: At least one; all have the joints of the machine.
-        start: Joints at the start of the first leg. Shape (n,), rad or m.
-        total: Duration of all legs together, s, if some have a free time; None leaves it free.
-        limits, cost, setup: Arguments of `dynamics_problem` for all legs. `start_velocity` and `start_base` hold
-            where the first leg begins, `end_base` where the last one ends, and clearance on those legs whose machine
-            is that of the collision scene. The legs give their `end_velocity` themselves.
+        machine: Machine on the way to the first goal, unless the goal has its own.
+        goals: At least one, each with joints and a duration; all have the joints of the machine.
+        start: Joints at the start. Shape (n,), rad or m.
+        total: Duration of all phases together, s, if some have a free time; None leaves it free.
+        limits, cost, setup: Arguments of `dynamics_problem` for all phases. `start_velocity` and `start_base` hold
+            where the first one begins, `end_base` where the last one ends, and clearance in those phases whose machine
+            is that of the collision scene. The goals give their velocities themselves.
 
     Raises:
-        ProblemError: As `dynamics_problem`; there are no legs; their machines differ in the number of joints or in the
-            kind of base; the machine changes while it moves or has momentum; a leg with tasks starts at unknown joints;
-            the legs cannot have this total duration; the setup has an `end_velocity`.
+        ProblemError: As `dynamics_problem`; there are no goals; one is a pose, or has no duration; their machines
+            differ in the number of joints or in the kind of base; the machine changes while it moves or has momentum; a
+            phase with tasks starts at unknown joints; the phases cannot have this total duration; the setup has an
+            `end_velocity`.
     """
-    legs = checked_legs(legs)
+    goals = checked_goals(goals)
     setup = DynamicsSetup() if setup is None else checked_instance("dynamics_phases: setup", setup, DynamicsSetup)
     if setup.end_velocity != "rest":
-        words = "end_velocity: every leg has its own; set Leg(end_velocity=...)"
+        words = "end_velocity: every goal has its own; set Goal(velocity=...)"
         raise ProblemError(words, name="end_velocity", value=setup.end_velocity)
     clearance = setup.clearance_constraints
     if clearance is not None:
         checked_instance("dynamics_phases: clearance_constraints", clearance, ClearanceConstraints)
-    names = [leg.name or f"leg {k + 1}" for k, leg in enumerate(legs)]
-    if len(set(names)) < len(names):
-        raise ProblemError(f"legs: names {names} are not all different", name="legs", value=names)
-    machines, problems = _machines(machine, legs, names), {}
+    names = phase_names(goals)
+    machines, problems = machines_of(machine, goals), {}
     begin: Any = start
-    for k, (name, leg) in enumerate(zip(names, legs, strict=True)):
+    for k, (name, goal) in enumerate(zip(names, goals, strict=True)):
         known = begin is not None and not np.isnan(np.asarray(begin, dtype=float)).any()
-        if k and not known and not (isinstance(leg.tasks, Sequence) and not leg.tasks):
+        if k and not known and not (isinstance(goal.tasks, Sequence) and not goal.tasks):
             words = f"{name}: its tasks begin where {names[k - 1]!r} ends; give all joints there"
             raise ProblemError(words, name=name, value=begin)
         own = replace(
             setup,
-            start_velocity=setup.start_velocity if k == 0 else legs[k - 1].end_velocity,
-            end_velocity=leg.end_velocity,
+            start_velocity=setup.start_velocity if k == 0 else goals[k - 1].velocity,
+            end_velocity=goal.velocity,
             start_base=setup.start_base if k == 0 else np.full(machines[k].base_size, np.nan),
-            end_base=setup.end_base if k == len(legs) - 1 else None,
+            end_base=goal.base if goal.base is not None else setup.end_base if k == len(goals) - 1 else None,
             clearance_constraints=clearance if clearance and clearance.scene.machine is machines[k] else None,
         )
         problems[name] = dynamics_problem(
-            machines[k], leg.tasks, leg.horizon, start=begin, end=leg.joints, limits=limits, cost=cost, setup=own
+            machines[k], goal.tasks, goal.duration, start=begin, end=goal.joints, limits=limits, cost=cost, setup=own
         )
-        begin = leg.joints
-    phases = Phases("legs", problems)
-    for k in range(1, len(legs)):
-        _join(phases, names[k - 1], names[k], legs[k - 1])
+        begin = goal.joints
+    phases = Phases("motions to goals", problems)
+    for k in range(1, len(goals)):
+        _join(phases, names[k - 1], names[k], goals[k - 1])
     if total is not None:
         duration = checked_horizon(total)
-        if not any(isinstance(leg.horizon, FreeTime) for leg in legs):
-            words = "total: every leg has a fixed duration; give one of them FreeTime(...)"
+        if not any(isinstance(goal.duration, FreeTime) for goal in goals):
+            words = "total: every goal has a fixed duration; give one of them FreeTime(...)"
             raise ProblemError(words, name="total", value=total)
         last = phases[names[-1]]
         phases.end("total time", last.begin + last.duration - duration, lower=0.0, upper=0.0, unit="s")
     return phases
 
 
-def checked_legs(legs: Any) -> tuple[Leg, ...]:
-    """Return the legs as a tuple.
+def checked_goals(goals: Any) -> tuple[Goal, ...]:
+    """Return the goals of consecutive phases as a tuple.
 
     Raises:
-        ProblemError: There are none; one is no Leg; an end velocity or a name is invalid.
+        ProblemError: There are none; one is no Goal, is a pose, or has no duration; two have the same name.
     """
-    checked = checked_each("legs", legs, Leg)
+    checked = tuple(checked_each("goals", goals, Goal))
     if not checked:
-        raise ProblemError("legs: at least one is needed", name="legs", value=legs)
-    for leg in checked:
-        checked_choice("leg: end_velocity", leg.end_velocity, ("rest", "free"))
-        checked_text("leg: name", leg.name)
-    return tuple(checked)
+        raise ProblemError("goals: at least one is needed", name="goals", value=goals)
+    names = phase_names(checked)
+    if len(set(names)) < len(names):
+        raise ProblemError(f"goals: names {list(names)} are not all different", name="goals", value=names)
+    for name, goal in zip(names, checked, strict=True):
+        if goal.duration is None:
+            words = f"{name}: a goal before others needs a duration in s, or FreeTime(...)"
+            raise ProblemError(words, name="duration", value=None)
+        if goal.has_pose:
+            words = f"{name}: joints are needed here; inverse_kinematics(machine, goal.task) finds some for the pose"
+            raise ProblemError(words, name="joints", value=None)
+    return checked
 
 
-def _machines(machine: Motors, legs: Sequence[Leg], names: Sequence[str]) -> list[Motors]:
-    """Return the machine of each leg."""
-    machines = [checked_motors("dynamics_phases", machine)]
-    for k, (name, leg) in enumerate(zip(names, legs, strict=True)):
+def phase_names(goals: Sequence[Goal]) -> tuple[str, ...]:
+    """Return the names of the phases that end at goals."""
+    return tuple(goal.name or f"leg {k + 1}" for k, goal in enumerate(goals))
+
+
+def machines_of(machine: Motors, goals: Sequence[Goal]) -> tuple[Motors, ...]:
+    """Return the machine of each phase.
+
+    Raises:
+        ProblemError: The machine changes its joints or its kind of base, or while it moves or has momentum.
+    """
+    machines, names = [checked_motors("dynamics_phases", machine)], phase_names(goals)
+    for k, (name, goal) in enumerate(zip(names, goals, strict=True)):
         before = machines[-1]
-        own = before if leg.machine is None else checked_motors(name, leg.machine)
+        own = before if goal.machine is None else checked_motors(name, goal.machine)
         if (own.joint_size, own.base_size) != (before.joint_size, before.base_size):
             words = f"{name}: its machine has {own.joint_size} joints and a base of {own.base_size}, the one before "
             words += f"{before.joint_size} and {before.base_size}"
             raise ProblemError(words, name=name, value=own.joint_size, limit=before.joint_size)
         if k and own is not before:
-            if legs[k - 1].end_velocity != "rest":
+            if not _rests(goals[k - 1]):
                 words = f"{name}: a load is picked up or put down at rest; let {names[k - 1]!r} end at rest"
-                raise ProblemError(words, name=name, value=legs[k - 1].end_velocity, limit="rest")
+                raise ProblemError(words, name=name, value=goals[k - 1].velocity, limit="rest")
             for each in (own, before):
                 if isinstance(each, FreeFloating) and np.any(np.asarray(each.conserved_momentum)):
                     words = f"{name}: a machine that picks up or puts down a load must have no momentum"
                     raise ProblemError(words, name="conserved_momentum", value=each.conserved_momentum, limit=0.0)
         machines.append(own)
-    return machines[1:]
+    return tuple(machines[1:])
 
 
-def _join(phases: Phases, before: str, after: str, leg: Leg) -> None:
-    """Make the states continuous from one leg to the next, except those fixed at both ends anyway."""
+def _rests(goal: Goal) -> bool:
+    """Return whether the machine rests at a goal."""
+    return isinstance(goal.velocity, str) and goal.velocity == "rest"
+
+
+def _join(phases: Phases, before: str, after: str, goal: Goal) -> None:
+    """Make the states continuous from one phase to the next, except those fixed at both ends anyway."""
     fixed: dict[str, Any] = {}
-    if leg.joints is not None and not np.isnan(np.asarray(leg.joints, dtype=float)).any():
+    if goal.joints is not None and not np.isnan(np.asarray(goal.joints, dtype=float)).any():
         fixed["joints"] = None
-    if leg.end_velocity == "rest":
+    if _rests(goal):
         fixed |= {"velocities": None, "accelerations": None}
     states = [name for name in phases.of(after) if f"{after}.{name}" in phases.declared.states and name != DURATION]
     if any(name not in fixed for name in states):
@@ -229,7 +225,7 @@ HOLDING = HoldingSettings()
 @interruptible
 def plan_dynamics(
     machine: Motors,
-    tasks: TipTask | Sequence[TipTask] | Sequence[Leg],
+    tasks: TipTask | Sequence[TipTask] | Sequence[Goal],
     horizon: float | FreeTime | None = None,
     *,
     start: Any,
@@ -242,7 +238,7 @@ def plan_dynamics(
     options: Mapping[str, Any] | None = None,
     tolerances: Mapping[str, float] | None = None,
 ) -> Solution:
-    """Solve `dynamics_problem`, or the legs of `dynamics_phases`, and audit the plan.
+    """Solve `dynamics_problem`, or the phases of `dynamics_phases`, and audit the plan.
 
     The plan satisfies its limits between the nodes, too, to 1e-5 of their units. The first plan that passes its audit
     is returned. If none passes, the feasible plan of least cost is returned; its optimality is then undetermined, or it
@@ -252,10 +248,10 @@ def plan_dynamics(
 
     Args:
         machine, start, end, limits, cost, setup: As for `dynamics_problem`.
-        tasks: Tip tasks as for `dynamics_problem`, or the legs of `dynamics_phases`. The plan has a phase for each leg
-            then, `plan.phase(name)`.
-        horizon: Final time, s, or FreeTime(...); None for legs, which have their own.
-        total: Duration of all legs together, see `dynamics_phases`.
+        tasks: Tip tasks as for `dynamics_problem`, or the goals of `dynamics_phases`. The solution has a phase for each
+            goal then, `solution.phase(name)`.
+        horizon: Final time, s, or FreeTime(...); None for goals, which have their own durations.
+        total: Duration of all phases together, see `dynamics_phases`.
         method: First mesh, with controls at the points; None for 20 Legendre intervals of degree 5, with nodes at the
             breaks of the tasks. Up to two more meshes are tried, each twice as fine, or refined where needed.
         options: IPOPT options.
@@ -269,25 +265,23 @@ def plan_dynamics(
     setup = DynamicsSetup() if setup is None else checked_instance("plan_dynamics: setup", setup, DynamicsSetup)
     shared: dict[str, Any] = {"start": start, "limits": limits, "cost": cost}
     tip_tasks: Any = tasks
-    if isinstance(tasks, Sequence) and isinstance(next(iter(tasks), None), Leg):
-        legs = checked_legs(tasks)
+    if isinstance(tasks, Sequence) and isinstance(next(iter(tasks), None), Goal):
+        goals = checked_goals(tasks)
         for name, value in (("horizon", horizon), ("end", end)):
             if value is not None:
-                raise ProblemError(f"{name}: every leg has its own; set it in Leg(...)", name=name, value=value)
-        names = [leg.name or f"leg {k + 1}" for k, leg in enumerate(legs)]
-        limited_machines = {
-            name: (own, limits) for name, own in zip(names, _machines(machine, legs, names), strict=True)
-        }
+                raise ProblemError(f"{name}: every goal has its own; set it in Goal(...)", name=name, value=value)
+        phases = zip(phase_names(goals), machines_of(machine, goals), strict=True)
+        limited_machines = {name: (own, limits) for name, own in phases}
 
-        def declare_legs(clearance: ClearanceConstraints | None) -> Problem:
+        def declare_phases(clearance: ClearanceConstraints | None) -> Problem:
             own = replace(setup, clearance_constraints=clearance)
-            return dynamics_phases(machine, legs, total=total, setup=own, **shared)
+            return dynamics_phases(machine, goals, total=total, setup=own, **shared)
 
         return within_limits(
-            declare_legs, setup.clearance_constraints, method, (), options, tolerances, limited_machines
+            declare_phases, setup.clearance_constraints, method, (), options, tolerances, limited_machines
         )
     if total is not None:
-        raise ProblemError("total is for legs alone; set the horizon instead", name="total", value=total)
+        raise ProblemError("total is for several goals; set the horizon instead", name="total", value=total)
 
     def declare(clearance: ClearanceConstraints | None) -> Problem:
         own = replace(setup, clearance_constraints=clearance)

@@ -28,7 +28,7 @@ from ocp.registry import call_registered
 from ocp.solution import Solution
 from ocp.storage import table_head, write_arrays, write_text
 
-__all__ = ["CHECKED_TIMES", "Plan", "PlanSample"]
+__all__ = ["CHECKED_TIMES", "Plan", "PlanSample", "tips_along"]
 
 MAX_LINES = 15
 """Lines of a printed plan."""
@@ -149,7 +149,7 @@ class Plan(ABC):
         t = np.atleast_1d(self._checked_times(times))
         at = self.at(t)
         bases = at["base"] if "base" in at else np.zeros((len(t), 0))
-        accelerations, tips = self._values_at("accelerations", t), self._tips(bases, at["joints"])
+        accelerations, tips = self._values_at("accelerations", t), self._tips_at(t, bases, at["joints"])
         return PlanSample(t, at["joints"], at["rates"], accelerations, tips)
 
     @abstractmethod
@@ -322,12 +322,18 @@ class Plan(ABC):
             raise ProblemError(words, name="time", value=time, limit=(0.0, self.horizon))
         return np.asarray(np.clip(times, 0.0, self.horizon))
 
-    def _tips(self, bases: Array, joints: Array) -> Array:
-        if self.machine.robot.tip is None:
-            return np.zeros((len(joints), 7)) * np.nan
-        b, q = ca.SX.sym("b", self.machine.base_size), ca.SX.sym("q", self.machine.joint_size)
-        pose = self.machine.tip_pose(b, q)
-        function = ca.Function("tip", [b, q], [pose.position, pose.rotation])
-        position, rotation = function.map(len(joints))(bases.T, joints.T)
-        turns = np.array(rotation).reshape(3, len(joints), 3).transpose(1, 0, 2)
-        return np.column_stack([np.array(position).T, quaternion_from_rotation(turns)])
+    def _tips_at(self, times: Array, bases: Array, joints: Array) -> Array:
+        """Return the poses of the tip at checked times (M,). Shape (M, 7)."""
+        return tips_along(self.machine, bases, joints)
+
+
+def tips_along(machine: Machine, bases: Array, joints: Array) -> Array:
+    """Return the poses of a machine's tip in world: position (m) and quaternion; nan without a tip. Shape (M, 7)."""
+    if machine.robot.tip is None:
+        return np.full((len(joints), 7), np.nan)
+    b, q = ca.SX.sym("b", machine.base_size), ca.SX.sym("q", machine.joint_size)
+    pose = machine.tip_pose(b, q)
+    function = ca.Function("tip", [b, q], [pose.position, pose.rotation])
+    position, rotation = function.map(len(joints))(bases.T, joints.T)
+    rotations = np.array(rotation).reshape(3, len(joints), 3).transpose(1, 0, 2)
+    return np.column_stack([np.array(position).T, quaternion_from_rotation(rotations)])

@@ -17,7 +17,7 @@ from ocp.audit.clearance import Clearance
 from ocp.errors import ProblemError
 from ocp.motion.builders.clearance import ClearanceConstraints, clearance_of
 from ocp.motion.plan.candidate import Candidate
-from ocp.motion.plan.motion import Plan
+from ocp.motion.plan.motion import Plan, tips_along
 from ocp.motion.plan.request import restored_request, stored_request
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.targets import Target
@@ -155,7 +155,7 @@ class PathPlan(Plan):
             words = f"the audit of a path through waypoints has no setting {name!r}"
             raise ProblemError(words, name=name, value=settings[name])
         t, bounds = self.t, self.limits.bounds(self.machine)
-        tips = self._tips(np.zeros((len(t), 0)), self.joints)
+        tips = tips_along(self.machine, np.zeros((len(t), 0)), self.joints)
         misses = np.abs(tips[:, :3] - self.positions)
         turns = Rotation.from_quat(tips[:, [4, 5, 6, 3]]).inv() * Rotation.from_matrix(self.rotations)
         excess = np.maximum(self.joints - bounds.upper, bounds.lower - self.joints)

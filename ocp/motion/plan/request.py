@@ -21,6 +21,8 @@ from models import (
     CollisionShape,
     Cylinder,
     FixedBase,
+    Foot,
+    Foothold,
     FreeFloating,
     HalfSpace,
     Joint,
@@ -32,6 +34,7 @@ from models import (
     MovingObstacle,
     Robot,
     Sphere,
+    Stance,
     Standing,
     Support,
     VisualShape,
@@ -42,10 +45,16 @@ from ocp.errors import ProblemError
 from ocp.motion.builders.actuator_limits import JointFriction
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem
+from ocp.motion.builders.dynamics_plan import dynamics_phases, machines_of
+from ocp.motion.builders.space.capture import capture_machines, capture_problem
+from ocp.motion.builders.space.grasping import Cone, Grasp
 from ocp.motion.builders.standing.problem import FreeTime, StandingSetup, Weights, standing_problem
+from ocp.motion.builders.standing.stances import StancePhase, Steps
+from ocp.motion.builders.standing.steps import StepWeights, steps_problem
 from ocp.motion.builders.tool_motion import ToolMotion, stretches_of, tool_motion_problem
 from ocp.motion.search.configurations import PlanRequest
 from ocp.motion.tasks.cost import Cost
+from ocp.motion.tasks.goals import Goal
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.motion.tasks.tracks import TrackWithRate
@@ -60,12 +69,34 @@ __all__ = ["MotionRequest", "declared_motion", "request_of", "restored_request",
 SHAPES = (Box, Capsule, Cylinder, HalfSpace, Mesh, Sphere)
 PARTS = (Robot, Link, Joint, Mimic, CollisionShape, VisualShape, Support)
 STANDING = (Weights, FreeTime, InFoot, Pinned, IndexAtLeast, StandingSetup)
-ARGUMENTS = (TipTask, Limits, ClearanceConstraints, Cost, JointFriction, DynamicsSetup, *STANDING)
-MACHINES = (FixedBase, FreeFloating, Standing)
+STEPS = (Steps, StancePhase, StepWeights, Foot, Foothold)
+ARGUMENTS = (
+    TipTask,
+    Goal,
+    Limits,
+    ClearanceConstraints,
+    Cost,
+    JointFriction,
+    DynamicsSetup,
+    Cone,
+    Grasp,
+    *STANDING,
+    *STEPS,
+)
+MACHINES = (FixedBase, FreeFloating, Standing, Stance)
 KINDS = {kind.__name__: kind for kind in (*MACHINES, *PARTS, *SHAPES, *ARGUMENTS, MovingObstacle, Body)}
 SYMBOLS = {"SX": ca.SX, "MX": ca.MX}
 TRACKS = {TipTask: ("velocity", "position", "orientation", "direction"), MovingObstacle: ("position", "rotation")}
 """Fields that may be functions of time."""
+
+
+def _machine_of(arguments: Mapping[str, Any]) -> Machine:
+    """Return the machine of a motion by the arguments of its builder."""
+    if "steps" in arguments:
+        steps: Steps = arguments["steps"]
+        return steps.stances[0]
+    machine: Machine = next(arguments[name] for name in MACHINE_NAMES if name in arguments)
+    return machine
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,8 +114,7 @@ class MotionRequest:
     @property
     def machine(self) -> Machine:
         """Machine of the problem."""
-        machine: Machine = self.arguments["machine"]
-        return machine
+        return _machine_of(self.arguments)
 
     @property
     def tasks(self) -> tuple[TipTask, ...]:
@@ -149,7 +179,25 @@ BUILDERS: dict[str, Callable[..., Problem]] = {
     "tool motion": _tool_motion,
     "standing": standing_problem,
     "dynamics": dynamics_problem,
+    "dynamics phases": dynamics_phases,
+    "steps": steps_problem,
+    "capture": capture_problem,
 }
+MACHINE_NAMES = ("machine", "chaser")
+"""Arguments that are the machine of a motion."""
+
+
+def machines_of_phases(request: MotionRequest | None) -> tuple[Machine, ...]:
+    """Return the machine of each phase of a problem; none if it has no phases or is not known."""
+    if request is None:
+        return ()
+    arguments = request.arguments
+    if request.builder == "steps":
+        steps: Steps = arguments["steps"]
+        return steps.stances
+    if request.builder == "capture":
+        return capture_machines(arguments["chaser"], arguments["target"])
+    return machines_of(arguments["machine"], arguments["goals"]) if request.builder == "dynamics phases" else ()
 
 
 def request_of(problem: Problem | None) -> MotionRequest | None:
@@ -170,7 +218,7 @@ def stored_request(builder: str, arguments: Mapping[str, Any]) -> dict[str, Any]
         ProblemError: An argument is not data, such as a machine of another kind or a Python callback.
     """
     writer = FunctionWriter()
-    owner: Machine | None = arguments.get("machine")
+    owner: Machine | None = _machine_of(arguments)
 
     def put(value: Any) -> Any:
         if value is None or isinstance(value, str | bool | int | float):
@@ -263,11 +311,13 @@ def restored_request(record: Any) -> MotionRequest:
     try:
         functions = FunctionReader(record["functions"]).functions
         pool = dict(record["arguments"]["pool"])
-        machine = _read(pool["machine"], functions, None)
+        first = next(name for name in ("steps", *MACHINE_NAMES) if name in pool)
+        own = _read(pool[first], functions, None)
+        machine = _machine_of({first: own})
         if not isinstance(machine, MACHINES):
             raise TypeError(f"the machine is of type {type(machine).__name__}")
-        other_feet = {name: _read(value, functions, machine) for name, value in pool.items() if name != "machine"}
-        arguments = {"machine": machine, **other_feet}
+        others = {name: _read(value, functions, machine) for name, value in pool.items() if name != first}
+        arguments = {first: own, **others}
         if record["builder"] not in BUILDERS and record["builder"] != "":
             raise ValueError(f"builder {record['builder']!r} is not known")
         return MotionRequest(record["builder"], arguments)

@@ -48,10 +48,10 @@ from ocp.motion.tasks.checks import checked_configuration, checked_horizon
 from ocp.motion.tasks.cost import Cost
 from ocp.motion.tasks.limits import Limits
 from ocp.problem.phases import Phases
-from ocp.problem.problem import Problem
+from ocp.problem.problem import Problem, remembers_request
 from ocp.solution import Solution
 
-__all__ = ["CaptureOptions", "capture_problem", "chained_capture", "plan_capture"]
+__all__ = ["CaptureOptions", "capture_machines", "capture_problem", "chained_capture", "plan_capture"]
 
 APPROACH, DETUMBLE = "approach", "detumble"
 POINTS = Collocation(8, degree=4, scheme="legendre")
@@ -73,6 +73,7 @@ class CaptureOptions(TypedDict, total=False):
     rest: bool
 
 
+@remembers_request("capture")
 @interruptible
 def capture_problem(
     chaser: FreeFloating,
@@ -211,6 +212,15 @@ def chained_capture(
         return problem
 
     return first, within_limits(declare_detumbling, None, mesh, (), options, tolerances, {"": (capture.pair, limits)})
+
+
+def capture_machines(chaser: FreeFloating, target: FreeFloating) -> tuple[FreeFloating, FreeFloating]:
+    """Return the machines of both phases: the chaser, and the pair with the joints of the chaser.
+
+    Raises:
+        ProblemError: As `capture_problem`.
+    """
+    return chaser, replace(chaser, robot=checked_pair(chaser, target))
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,7 +35,7 @@ from ocp.motion.builders.standing.start import start_inside
 from ocp.motion.tasks.checks import checked_numbers, rates_at_rest
 from ocp.motion.tasks.limits import Limits
 from ocp.problem.phases import Phases
-from ocp.problem.problem import Problem
+from ocp.problem.problem import Problem, remembers_request
 
 __all__ = ["StepWeights", "steps_problem"]
 
@@ -79,6 +79,7 @@ class _Options:
     limits: Limits
 
 
+@remembers_request("steps")
 @interruptible
 def steps_problem(
     steps: Steps,
