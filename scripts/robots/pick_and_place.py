@@ -17,7 +17,7 @@ import numpy as np
 
 from models import FixedBase, Link, Robot, VisualShape, attach_tool, with_load
 from models.arrays import Array
-from ocp import Audit, Collocation, Cost, Leg, Solution, TipTask, inverse_kinematics, joint_torques, plan_dynamics
+from ocp import Audit, Collocation, Cost, Goal, Solution, TipTask, inverse_kinematics, joint_torques, plan_dynamics
 from ocp.app.view.appearance import TIP_FRAME, Frames, frames_along
 from scripts.drawing import COLORS
 from scripts.robots.drawing import Scene, animate, joint_curves, page
@@ -147,12 +147,12 @@ def postures() -> dict[str, Array]:
     return found
 
 
-def legs(known: bool) -> list[Leg]:
+def legs(known: bool) -> list[Goal]:
     """Of the way, with the load where it is known and in hand."""
     found = []
     for k, (name, end, horizon) in enumerate(ROUTE):
         machine = carried() if known and name == HANDED[0] else arm() if k == 0 or name == "let go" else None
-        found.append(Leg(postures()[end], horizon, machine=machine, name=name))
+        found.append(Goal(joints=postures()[end], duration=horizon, machine=machine, name=name))
     return found
 
 

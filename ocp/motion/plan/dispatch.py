@@ -86,11 +86,11 @@ def plan(
             the motions of a global search end, what obstructs them, by how much the tasks would have to be relaxed, and
             in how few segments they may be done (search="segments").
     """
+    checked_choice("search", search, get_args(Search))
     if isinstance(tasks, Waypoints):
         _check_unused("waypoints", horizon=horizon, start=start, cyclic=cyclic or None)
         arm = checked_instance("machine", machine, FixedBase)
         return plan_path(arm, tasks, cost=cost, limits=limits, scene=scene, seed=seed)
-    checked_choice("search", search, get_args(Search))
     options: dict[str, Any] = {"start": start, "cost": cost, "limits": limits, "seed": seed}
     if search == "segments":
         _check_unused("search='segments'", cyclic=cyclic or None)

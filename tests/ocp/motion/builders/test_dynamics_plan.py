@@ -30,7 +30,7 @@ from ocp import (
     Cost,
     DynamicsSetup,
     FreeTime,
-    Leg,
+    Goal,
     Limits,
     ProblemError,
     Solution,
@@ -169,13 +169,14 @@ def test_what_is_too_much_is_named() -> None:
     assert caught.value.time is not None
 
 
-# ---- legs ------------------------------------------------------------------------------------------------------------
+# ---- goals -----------------------------------------------------------------------------------------------------------
 
 
 def test_a_point_that_is_passed_is_passed_without_a_stop() -> None:
     """A mass that passes 0.5 m at a free time on its way to 0.8 m: no dearer than straight on, which does so too."""
-    legs = [Leg([0.5], FreeTime(0.1, 1.0, 0.6), end_velocity="free"), Leg([0.8], FreeTime(0.1, 1.0, 0.4))]
-    plan = plan_dynamics(slider(), legs, start=[0.0], total=1.0)
+    passed = Goal(joints=[0.5], duration=FreeTime(0.1, 1.0, 0.6), velocity="free")
+    last = Goal(joints=[0.8], duration=FreeTime(0.1, 1.0, 0.4))
+    plan = plan_dynamics(slider(), [passed, last], start=[0.0], total=1.0)
     assert plan.cost == pytest.approx(12 * MASS**2 * WAY**2, rel=1e-7)
     first, second = plan.phase("leg 1"), plan.phase("leg 2")
     assert first.horizon + second.horizon == pytest.approx(1.0, abs=1e-9)
@@ -189,8 +190,9 @@ def test_a_floating_machine_that_picks_up_a_load_at_rest_keeps_its_momentum() ->
     robot = planar_chain([0.5, 0.4], [2.0, 1.5], base=Link("base", 8.0, (0, 0, 0), 0.5 * np.eye(3)))
     alone = FreeFloating(robot, "planar")
     loaded = FreeFloating(with_load(robot, robot.tip_link, 2.0, (0.4, 0, 0)), "planar")
-    legs = [Leg([1.2, -0.4], 1.0, name="reach"), Leg([0.2, 0.5], 1.5, machine=loaded, name="carry")]
-    plan = plan_dynamics(alone, legs, start=[0.2, 0.5])
+    load = Goal(joints=[1.2, -0.4], duration=1.0, name="reach")
+    place = Goal(joints=[0.2, 0.5], duration=1.5, machine=loaded, name="carry")
+    plan = plan_dynamics(alone, [load, place], start=[0.2, 0.5])
     assert plan.audit().passed
     reach, carry = plan.phase("reach"), plan.phase("carry")
     assert carry["base"][0] == pytest.approx(reach["base"][-1], abs=1e-8)
@@ -209,28 +211,31 @@ def test_a_floating_machine_that_picks_up_a_load_at_rest_keeps_its_momentum() ->
         assert centers[0] == pytest.approx(centers[1], abs=1e-7)
 
 
-def test_legs_that_do_not_fit_are_refused() -> None:
-    rest, other = Leg(END, 1.0), FixedBase(planar_chain([0.5], [1.0]))
+def test_goals_that_do_not_fit_are_refused() -> None:
+    rest, other = Goal(joints=END, duration=1.0), FixedBase(planar_chain([0.5], [1.0]))
+    back = Goal(joints=START, duration=1.0)
     heavy = FixedBase(with_load(MACHINE.robot, MACHINE.robot.tip_link, 1.0))
-    for legs, more, words in (
+    for goals, more, words in (
         ([], {}, "at least one"),
-        ([Leg(END, 1.0, end_velocity="free"), Leg(START, 1.0, machine=heavy)], {}, "at rest"),
-        ([rest, Leg([0.0], 1.0, machine=other)], {}, "1 joints"),
-        ([rest, Leg(START, 1.0, name="leg 1")], {}, "not all different"),
+        ([replace(rest, velocity="free"), replace(back, machine=heavy)], {}, "at rest"),
+        ([rest, Goal(joints=[0.0], duration=1.0, machine=other)], {}, "1 joints"),
+        ([rest, replace(back, name="leg 1")], {}, "not all different"),
+        ([rest, replace(back, duration=None)], {}, "needs a duration"),
+        ([replace(rest, joints=None, position=[0.5, 0.1, 0.0]), back], {}, "joints are needed"),
         ([rest], {"total": 1.0}, "has a fixed duration"),
-        ([rest], {"setup": DynamicsSetup(end_velocity="free")}, "every leg has its own"),
+        ([rest], {"setup": DynamicsSetup(end_velocity="free")}, "every goal has its own"),
     ):
         with pytest.raises(ProblemError, match=words):
-            dynamics_phases(MACHINE, legs, start=START, **more)
+            dynamics_phases(MACHINE, goals, start=START, **more)
 
 
-def test_what_touches_on_a_leg_is_held_apart_there() -> None:
+def test_what_touches_on_the_way_to_a_goal_is_held_apart_there() -> None:
     """The tip goes round a ball in its way, by plain geometry, on the way out and back to where it begins."""
     chain, tip, ball, sizes = planar_chain([0.5, 0.4], [2.0, 1.5]), np.array([0.4, 0.0, 0.0]), 0.06, 0.11
     shape = CollisionShape("sphere", (sizes - ball,), translation=tip)
     links = [replace(link, collisions=(shape,)) if link.name == "link2" else link for link in chain.links]
     machine = FixedBase(replace(chain, links=tuple(links)))
-    legs = [Leg([0.6, 0.3], 1.0, end_velocity="free"), Leg(START, 1.0)]
+    legs = [Goal(joints=[0.6, 0.3], duration=1.0, velocity="free"), Goal(joints=START, duration=1.0)]
 
     def way(clearance_constraints: ClearanceConstraints | None) -> Array:
         """Of the tip, there and back. Shape (402, 3)."""

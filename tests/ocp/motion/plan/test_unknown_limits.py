@@ -28,6 +28,7 @@ from ocp import (
     plan_dynamics,
     solve,
 )
+from ocp.motion.plan.segmented_plan import SegmentedPlan
 from tests.ocp.motion.tasks.space_tasks import UR5_START, ur5
 
 START = np.array([0.4, 0.9, -0.6])
@@ -60,7 +61,9 @@ def planned(machine: FixedBase, **options: Any) -> Any:
 
 
 def in_pieces(machine: FixedBase) -> Any:
-    return [piece.cost for piece in plan(machine, task(machine), search="segments").segments]
+    made = plan(machine, task(machine), search="segments")
+    assert isinstance(made, SegmentedPlan)
+    return [piece.cost for piece in made.segments]
 
 
 def least_velocities(machine: FixedBase) -> Any:
