@@ -36,7 +36,7 @@ UNLIMITED_RATE = 1.0
 UNDECIDED = "a path through waypoints is compared with its lower bound, not with its neighbours"
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class PathPlan(Plan):
     """Joint path through a sequence of tool poses, straight in the joints between them.
 

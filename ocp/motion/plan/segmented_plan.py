@@ -67,7 +67,7 @@ class _Piece(NamedTuple):
     plan: SolvedPlan
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class SegmentedPlan(Plan):
     """Motions that do the tasks one after the other, and reconfigurations between them while the tasks wait.
 

@@ -39,7 +39,7 @@ class Part(NamedTuple):
     suffix: str
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class SolvedPlan(Plan):
     """Plan whose motion solves one optimal control problem.
 
