@@ -19,6 +19,7 @@ from ocp.motion.builders.clearance import ClearanceConstraints, clearance_of
 from ocp.motion.plan.candidate import Candidate
 from ocp.motion.plan.motion import Plan, tips_along
 from ocp.motion.plan.request import restored_request, stored_request
+from ocp.motion.search.steps import Homogeneous, LargestMotion, PathLength
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.targets import Target
 from ocp.problem.stored import ARRAY_NAMES, RECORD_ERRORS, pack_record, unpack_record
@@ -49,7 +50,7 @@ class PathPlan(Plan):
         positions, rotations: Poses of the tip at the waypoints, in world. Shapes (N, 3), m, and (N, 3, 3).
         step: Largest displacement of each joint between waypoints. Shape (n,), rad or m.
         limits: Limits of the joints.
-        path_cost: Cost of the path, without reconfigurations.
+        measure: Cost of a displacement between waypoints.
         constraints: Collision scene; None without a collision check.
         candidates, bound: As in `Plan`; the bound is that of any path with at most as many segments.
         reconfigurations: Waypoints from which the arm moves to the next one in another configuration, by a motion that
@@ -62,7 +63,7 @@ class PathPlan(Plan):
     rotations: Array
     step: Array
     limits: Limits
-    path_cost: float
+    measure: Homogeneous
     constraints: ClearanceConstraints | None = None
     candidates: tuple[Candidate, ...] = ()
     bound: float | None = None
@@ -74,7 +75,8 @@ class PathPlan(Plan):
     @property
     def cost(self) -> float:
         """Cost of the path, without reconfigurations."""
-        return self.path_cost
+        steps = np.delete(np.diff(self.joints, axis=0), list(self.reconfigurations), axis=0)
+        return float(self.measure.evaluate(steps, 1.0).sum())
 
     @property
     def solution(self) -> Solution:  # type: ignore[override]
@@ -130,24 +132,20 @@ class PathPlan(Plan):
     # ---- audit -------------------------------------------------------------------------------------------------------
 
     def clearance(self) -> Clearance | None:
-        """Return the proven clearance of straight lines between waypoints, without reconfigurations; None if unchecked.
-
-        Its times are numbers of waypoints.
-        """
+        """Return the proven clearance between waypoints, without reconfigurations; None if it is not checked."""
         if self.constraints is None:
             return None
-        numbers, last, breaks = np.arange(len(self.joints), dtype=float), len(self.joints) - 1.0, self.reconfigurations
-        rates = np.abs(np.diff(self.joints, axis=0))
-        rates[list(breaks)] = 0.0
+        t, horizon = self.t, self.horizon
+        breaks, rates = t / horizon, np.abs(np.diff(self.joints, axis=0)) / np.diff(t)[:, None]
+        rates[list(self.reconfigurations)] = 0.0
 
         def joints_at(fractions: Array) -> Array:
-            places = fractions * last
-            waiting = np.isin(np.floor(places), breaks)  # a break lasts until the next waypoint
-            places = np.where(waiting, np.floor(places), places)
-            return np.stack([np.interp(places, numbers, column) for column in self.joints.T], axis=1)
+            interval = np.clip(np.searchsorted(breaks, fractions, side="right") - 1, 0, len(t) - 2)
+            waiting = np.isin(interval, self.reconfigurations) & (fractions < 1.0)  # until the next waypoint
+            ends = t[interval + np.where(waiting, 0, 1)]
+            return self._values_at("joints", np.clip(fractions * horizon, t[interval], ends))
 
-        scene = self.constraints.scene
-        return clearance_of(scene, joints_at, numbers / last, last, rates, np.zeros_like(rates), False)
+        return clearance_of(self.constraints.scene, joints_at, breaks, horizon, rates, np.zeros_like(rates), False)
 
     def _audit(self, **settings: Any) -> Audit:
         if settings:
@@ -192,7 +190,8 @@ class PathPlan(Plan):
         head, numbers = pack_record(
             {
                 "request": stored_request("", arguments),
-                "cost": self.path_cost,
+                "timed": isinstance(self.measure, LargestMotion),
+                "weights": self.measure.weights,
                 "bound": self.bound,
                 "reconfigurations": list(self.reconfigurations),
                 "candidates": [candidate.record() for candidate in self.candidates],
@@ -211,14 +210,18 @@ class PathPlan(Plan):
             arguments = restored_request(head["request"]).arguments
             machine, limits, constraints = (arguments[name] for name in ("machine", "limits", "constraints"))
             n, count = machine.joint_size, len(head["joints"])
-            shapes = {"joints": (count, n), "positions": (count, 3), "rotations": (count, 3, 3), "step": (n,)}
+            shapes = {"joints": (count, n), "positions": (count, 3), "rotations": (count, 3, 3)}
+            shapes |= {"step": (n,), "weights": (n,)}
             values: dict[str, Any] = {name: np.asarray(head[name], dtype=float) for name in shapes}
             wrong = [name for name, shape in shapes.items() if values[name].shape != shape]
-            finite = all(np.isfinite(values[name]).all() for name in ("joints", "positions", "rotations"))
+            finite = all(np.isfinite(array).all() for name, array in values.items() if name != "step")
+            weights = values.pop("weights")
             if wrong or count < 2 or not finite or not isinstance(limits, Limits) or not isinstance(machine, FixedBase):
                 raise ValueError(f"its {', '.join(wrong) or 'values'} do not fit its machine")
             if constraints is not None and not isinstance(constraints, ClearanceConstraints):
                 raise TypeError(f"its collision scene is a {type(constraints).__name__}")
+            if constraints is not None and constraints.scene.has_moving_obstacles:
+                raise ValueError("its obstacles move, though a path has no times")
             breaks = tuple(int(number) for number in head["reconfigurations"])
             if not all(0 <= number < count - 1 for number in breaks):
                 raise ValueError(f"it reconfigures at waypoints that it has not: {breaks}")
@@ -230,7 +233,7 @@ class PathPlan(Plan):
                 machine=machine,
                 **values,
                 limits=limits,
-                path_cost=float(head["cost"]),
+                measure=(LargestMotion if head["timed"] else PathLength)(weights),
                 constraints=constraints,
                 candidates=candidates,
                 bound=None if head["bound"] is None else float(head["bound"]),
