@@ -129,15 +129,16 @@ def test_a_joint_beyond_its_limit_fails_by_the_excess() -> None:
     (finding,) = narrow.audit().failures
     assert finding.name == f"joints beyond their limits, {path().names[joint]!r}"
     assert finding.value == pytest.approx(0.01, abs=1e-12)
-    assert narrow.joints[np.searchsorted(narrow.t, finding.time), joint] == highest
+    assert finding.time is not None
+    assert narrow.at(finding.time)["joints"][joint] == highest
     assert replace(narrow, limits=Limits(joints=False), _audits={}).audit().feasible
 
 
 def test_the_clearance_between_waypoints_is_proven_and_an_obstacle_there_is_named_with_its_time() -> None:
     found, machine = path(), path().machine
     between = (found.t[4] + found.t[5]) / 2
-    ball = Sphere(0.02, found.sampled(between).tip[0, :3])
-    scene = CollisionScene(machine, [ball], 0.01)
+    ball = Sphere(0.005, found.sampled(between).tip[0, :3])
+    scene = CollisionScene(machine, [ball])
     finding = replace(found, constraints=ClearanceConstraints(scene), _audits={}).audit()["clearance"]
     assert not finding.passed
     assert "obstacle 0" in finding.note
@@ -256,7 +257,7 @@ FORGED: dict[str, Callable[[dict[str, Any]], Any]] = {
 def test_a_file_that_does_not_fit_together_is_refused(what: str, tmp_path: Path) -> None:
     head = json.loads(arrays()["path"].tobytes())
     FORGED[what](head)
-    forged = {**arrays(), "path": np.frombuffer(json.dumps(head).encode(), np.uint8)}
+    forged: dict[str, Any] = {**arrays(), "path": np.frombuffer(json.dumps(head).encode(), np.uint8)}
     np.savez(tmp_path / "forged.npz", **forged)
     with pytest.raises(ProblemError, match=r"forged\.npz") as refused:
         Plan.load(tmp_path / "forged.npz")

@@ -139,7 +139,9 @@ def test_the_audit_is_that_of_all_pieces_at_their_times() -> None:
     ("piece", "number"), [("segment 0", 1), ("reconfiguration 0", 2), ("segment 1", 3)], ids=["first", "motion", "last"]
 )
 def test_a_piece_that_was_changed_fails_by_its_number(piece: str, number: int, tmp_path: Path) -> None:
-    changes = {name: arrays()[name] + 0.01 for name in (f"{piece}/states/joints", f"{piece}/state_interpolant/values")}
+    changes: dict[str, Any] = {
+        name: arrays()[name] + 0.01 for name in (f"{piece}/states/joints", f"{piece}/state_interpolant/values")
+    }
     np.savez(tmp_path / "forged.npz", **{**arrays(), **changes})
     forged = Plan.load(tmp_path / "forged.npz").audit()
     assert not forged.feasible
@@ -209,7 +211,7 @@ FORGED: dict[str, Callable[[dict[str, Any]], Any]] = {
 def test_a_file_that_does_not_fit_together_is_refused(what: str, tmp_path: Path) -> None:
     head = json.loads(arrays()["segments"].tobytes())
     FORGED[what](head)
-    forged = {**arrays(), "segments": np.frombuffer(json.dumps(head).encode(), np.uint8)}
+    forged: dict[str, Any] = {**arrays(), "segments": np.frombuffer(json.dumps(head).encode(), np.uint8)}
     np.savez(tmp_path / "forged.npz", **forged)
     with pytest.raises(ProblemError, match=r"forged\.npz") as refused:
         Plan.load(tmp_path / "forged.npz")
