@@ -196,7 +196,7 @@ def machines_of_phases(request: MotionRequest | None) -> tuple[Machine, ...]:
         steps: Steps = arguments["steps"]
         return steps.stances
     if request.builder == "capture":
-        return capture_machines(arguments["chaser"], arguments["target"])
+        return capture_machines(arguments["chaser"], arguments["capture"].target)
     return machines_of(arguments["machine"], arguments["goals"]) if request.builder == "dynamics phases" else ()
 
 
