@@ -51,7 +51,8 @@ SHORT = {"approach": 5.0, "detumble": 5.0, "method": Collocation(6, degree=4, sc
 
 @cache
 def planar() -> Solution:
-    return called(solve_capture, **planar_capture())
+    solution: Solution = called(solve_capture, **planar_capture())
+    return solution
 
 
 def gaps(asked: dict[str, Any], plan: Solution) -> tuple[float, float, float]:
@@ -234,7 +235,8 @@ def test_momentum_that_wheels_cannot_hold_is_refused_with_what_is_missing() -> N
 
 @cache
 def short() -> Solution:
-    return called(solve_capture, **(planar_capture() | SHORT))
+    solution: Solution = called(solve_capture, **(planar_capture() | SHORT))
+    return solution
 
 
 def longer(robot: Robot, share: float) -> Robot:

@@ -32,9 +32,9 @@ FIRM = 0.03  # m: with this much TALOS stands still on the corner of a sole, see
 GROUND: dict[str, Any] = {"limits": Limits(friction=FRICTION)}
 
 
-def planned(steps: Steps, **asked: Any) -> tuple[Solution, StepsMotion]:
-    steps = replace(steps, **{"margin": MARGIN, **asked})
-    plan = solve_steps(steps, start=bent(steps), **GROUND)
+def planned(steps: Steps, method: Collocation | None = None, **asked: Any) -> tuple[Solution, StepsMotion]:
+    steps = with_margin(steps, **asked)
+    plan = solve_steps(steps, start=bent(steps), method=method, **GROUND)
     return plan, steps_motion(steps, plan)
 
 
