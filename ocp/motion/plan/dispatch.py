@@ -123,7 +123,8 @@ def _plan(
         arm = checked_instance("machine", machine, FixedBase)
         return plan_in_segments(arm, tasks, horizon, scene=scene, **options)
     if isinstance(tasks, Steps):
-        _check_unused("a walk, whose phases have durations", horizon=horizon, cyclic=cyclic or None, scene=scene)
+        _check_unused("a walk, whose phases have durations", horizon=horizon, cyclic=cyclic or None)
+        _check_unused("a walk, whose feet stand on footholds,", scene=scene or None)
         return plan_steps(machine, tasks, start=start, cost=cost, limits=limits)
     constraints = clearance_for(machine, limits, scene)
     if isinstance(tasks, Capture):

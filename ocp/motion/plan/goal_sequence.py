@@ -10,7 +10,7 @@ import numpy as np
 
 from models import FreeFloating, Machine, Stance
 from models.arrays import Array
-from ocp.errors import ProblemError, checked_instance
+from ocp.errors import ProblemError, checked_each, checked_instance
 from ocp.motion.builders.actuator_limits import checked_motors
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.dynamics import DynamicsSetup
@@ -60,12 +60,10 @@ def plan_sequence(
         ProblemError: As `dynamics_phases`; or the start is missing.
         SolveError: No motion satisfies its limits.
     """
-    motors = checked_motors("plan", machine)
+    motors, goals = checked_motors("plan", machine), checked_each("goals", goals, Goal)
     given, joints, base = Start.of(start, motors)
     if joints is None:
-        raise ProblemError(
-            "start is missing: a motion to a goal starts somewhere; give plan(..., start=)", name="start"
-        )
+        raise ProblemError("start is missing: a goal is reached from somewhere; give plan(..., start=)", name="start")
     own_limits = Limits() if limits is None else checked_instance("limits", limits, Limits)
     near, resolved = joints, list[Goal]()
     for goal in goals:
