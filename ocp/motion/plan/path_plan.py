@@ -176,6 +176,10 @@ class PathPlan(Plan):
         undecided = UNDECIDED if self.gap is None else f"{UNDECIDED}; it may cost {self.gap:.2g} too much"
         return Audit("path through waypoints", tuple(findings), undecided, clearances=clearances)
 
+    @property
+    def _counts(self) -> str:
+        return f"the best of {len(self.candidates)} paths"
+
     def _pose_findings(self, poses: PathPoses) -> list[Finding]:
         """Return the largest pose errors, and the largest excess of a displacement."""
         t, tips = self.t, tips_along(self.machine, np.zeros((len(self.joints), 0)), self.joints)
