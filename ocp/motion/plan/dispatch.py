@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, Literal, TypeAlias, get_args
 
@@ -29,6 +29,7 @@ from ocp.motion.tasks.goals import Goal, Waypoints
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.scene import Scene
 from ocp.motion.tasks.tip_task import TipTask
+from ocp.progress import shown_progress
 from ocp.solution import read_head
 from ocp.storage import read_arrays
 
@@ -52,6 +53,7 @@ def plan(
     search: Search = "configurations",
     seed: int = 0,
     time_limit: float | None = None,
+    progress: Callable[[str], Any] | bool | None = None,
 ) -> Plan:
     """Plan the lowest-cost motion that does the tasks: the least integral of half the squared joint rates.
 
@@ -82,7 +84,10 @@ def plan(
             base, the motions come from a search over exact states without a bound (see `search.cells`), which also
             passes singularities. "segments": as "global"; if no single motion does the tasks, in the fewest segments,
             between which an arm on a fixed base moves to another configuration while the tasks wait.
-        seed: Seed of inverse kinematics.
+        seed: Seed of all random numbers.
+        time_limit: Seconds after which planning ends with a SolveError; None for no limit.
+        progress: Function that is called with the name of each stage; True: a line shows it; False: nothing is shown;
+            None: a line after two seconds on a terminal or in a notebook.
 
     Returns:
         The audited plan, with all other motions found, their costs and the reasons of their rejection.
@@ -95,7 +100,7 @@ def plan(
             in how few segments they may be done (search="segments").
     """
     checked_choice("search", search, get_args(Search))
-    with time_limited(checked_time_limit(time_limit)):
+    with time_limited(checked_time_limit(time_limit)), shown_progress("plan", progress):
         return _plan(machine, tasks, horizon, start, cyclic, cost, limits, scene, search, seed)
 
 

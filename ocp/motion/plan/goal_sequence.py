@@ -202,10 +202,10 @@ def _points_inside(region: Box | Sphere | None, seed: int) -> Array:
     """Return random points of a region in world, none without one. Shape (K, 3), m."""
     if region is None:
         return np.zeros((0, 3))
-    rng = np.random.default_rng(seed)
+    rng, center = np.random.default_rng(seed), np.array(region.position, dtype=float)
     if isinstance(region, Box):
         inside = (rng.random((REGION_SAMPLES, 3)) - 0.5) * np.asarray(region.size)
-        return np.array(region.position) + inside @ np.asarray(region.rotation).T
+        return center + inside @ np.asarray(region.rotation, dtype=float).T
     directions = rng.normal(size=(REGION_SAMPLES, 3))
-    radii = region.radius * np.cbrt(rng.random((REGION_SAMPLES, 1)))
-    return np.array(region.position) + radii * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    radii = float(region.radius) * np.cbrt(rng.random((REGION_SAMPLES, 1)))
+    return center + radii * directions / np.linalg.norm(directions, axis=1, keepdims=True)
