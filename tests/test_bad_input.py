@@ -49,13 +49,10 @@ MADE_BY_THE_PACKAGE = {
     "STANDING_STARTS",
     "Schedule",
     "Section",
-    "SegmentedPlan",
     "SmoothPath",
     "Solution",
     "StepsMotion",
     "TimedProgram",
-    "WaypointPlan",
-    "Waypoints",
     "Sensitivity",
 }
 """Results, protocols and constants: their methods are in the panels, but nobody makes them."""

@@ -121,7 +121,14 @@ def subcommands(parser: argparse.ArgumentParser) -> None:
     _file(check, "--report", "also write one HTML file: pictures, curves with limits, every row")
     _force(check)
     plan = _command(commands, "plan", "plan the motion of a task file", PLAN, PLAN_EXAMPLES, run_plan)
-    plan.set_defaults(called={"missing='skip'": '[scene] meshes = "skip"', "folders=[": "[scene] folders = ["})
+    plan.set_defaults(
+        called={
+            "missing='skip'": '[scene] meshes = "skip"',
+            "folders=[": "[scene] folders = [",
+            "search='segments'": '[search] kind = "segments"',
+            "horizon='free'": '[search] pace = "free"',
+        }
+    )
     _file(plan, "task", "TOML file")
     _file(plan, "--output", "file of the plan (.npz), instead of that in the task file", short="-o")
     _file(plan, "--output-folder", "folder that contains the task's outputs (default: the task file's folder)")

@@ -31,7 +31,10 @@ from ocp.tolerances import (
     UNFIT_COSTATE_SHARE,
 )
 
-__all__ = ["Audit", "Finding", "audit", "clearance_finding"]
+__all__ = ["COST_LOST", "Audit", "Finding", "audit", "clearance_finding"]
+
+COST_LOST = "cost lost, relative"
+"""Name of the finding of how much a plan may cost above the nearest extremal."""
 
 
 @dataclass(frozen=True)
@@ -140,7 +143,7 @@ class Audit:
         if not self.optimal:
             worst = next(f for f in self.failures if f.verdict == "optimal")
             return f"may be run, but is no local minimum: {worst.name} is {worst.value:.3g}, {worst.limit:.3g} allowed"
-        share = self["cost lost, relative"].value
+        share = self[COST_LOST].value
         return f"may be run; a local minimum; at most {share:.2g} of its cost above that of the nearest extremal"
 
     def __repr__(self) -> str:
@@ -318,7 +321,7 @@ def optimality_findings(
         costates = max(COSTATE_SHARE, optimum.costate_accuracy)
     best_costates = UNFIT_COSTATE_SHARE if optimum.has_linear_control else costates
     rows = [
-        Finding("cost lost, relative", share, lost, None, f"{optimum.lost.sum():.3g} of the cost"),
+        Finding(COST_LOST, share, lost, None, f"{optimum.lost.sum():.3g} of the cost"),
         Finding("costate equation, relative", optimum.adjoint.total / errors, costates),
         Finding("costates beside the best, relative", optimum.costate_error, best_costates),
         worst(

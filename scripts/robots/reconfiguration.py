@@ -20,12 +20,14 @@ from matplotlib.colors import to_rgb
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
+import ocp
 from models import CollisionScene, FixedBase
 from models.arrays import Array
 from models.paths import rest_to_rest
-from ocp import Audit, Limits, Plan, Reconfiguration, SegmentedPlan, TipTask, inverse_kinematics
+from ocp import Audit, Limits, Reconfiguration, TipTask, inverse_kinematics
 from ocp.app.view.appearance import frames_along
 from ocp.app.view.rendering import tube
+from ocp.motion.plan.segmented_plan import SegmentedPlan
 from ocp.motion.search.charts import Charts, SelfMotionManifolds, TimeSample
 from ocp.motion.search.joint_space import JointSpace
 from ocp.motion.search.search import AtlasSearch
@@ -104,7 +106,7 @@ class InPieces:
             "robot": PANDA.name,
             "dof": self.machine.joint_size,
             "task_rows": self.task.size,
-            "duration_s": made.duration,
+            "duration_s": made.horizon,
             "cost_local": None,
             "cost_optimal": made.cost,
             "tip_error": max(self._tip_error(number) for number in range(len(made.segments))),
@@ -136,7 +138,8 @@ def ring() -> TipTask:
 def plan(coarse: bool = False) -> InPieces:
     """The task in the fewest pieces, and all postures that do it; `coarse` at fewer times."""
     machine, task = FixedBase(PANDA.read()), ring()
-    made = plan(machine, task, search="segments")
+    made = ocp.plan(machine, task, search="segments")
+    assert isinstance(made, SegmentedPlan)
     return InPieces(machine, task, made, postures(machine, task, COARSE if coarse else INSTANTS))
 
 
@@ -259,14 +262,5 @@ def _scene(example: InPieces, title: str, color: str, joints: Array, t: Array | 
 
 def _motion(made: SegmentedPlan) -> tuple[Array, Array]:
     """All joints from the beginning to the end, the ways between the pieces too, and their times, s."""
-    order: list[Plan | None] = [made.segments[0]]
-    for change, piece in zip(made.reconfigurations, made.segments[1:], strict=True):
-        order += [change.motion, piece]
-    joints, times, begin = [], [], 0.0
-    for motion in order:
-        if motion is not None:
-            t = np.linspace(0.0, motion.horizon, FINE)
-            joints.append(motion.at(t)["joints"])
-            times.append(begin + t)
-            begin += motion.horizon
-    return np.vstack(joints), np.concatenate(times)
+    times = np.linspace(0.0, made.horizon, FINE * len(made.pieces))
+    return made.at(times)["joints"], times

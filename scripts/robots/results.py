@@ -12,10 +12,10 @@ import numpy as np
 
 from models import FreeFloating, Machine
 from models.arrays import Array
-from ocp import Audit, Plan, Solution, TipTask
+from ocp import Audit, Solution, TipTask
 from ocp.curves import differentiation_matrix
 from ocp.motion.local.rates import LocalSolution
-from ocp.motion.plan.motion import Part
+from ocp.motion.plan.solved_plan import Part, SolvedPlan
 from ocp.motion.tasks.equations import task_errors
 from ocp.storage import write_text
 from scripts.robots.robots import RobotFile
@@ -76,7 +76,7 @@ class Example:
 
 def save_plan(path: Path, machine: Machine, solution: Solution, tasks: Sequence[TipTask]) -> None:
     """A solution as a plan, with its machine and what its tips are asked to do."""
-    Plan(machine, solution, (Part(0.0, solution.horizon, ""),)).with_targets(tasks).save(path)
+    SolvedPlan(machine, solution, (Part(0.0, solution.horizon, ""),)).with_targets(tasks).save(path)
 
 
 def save_motion(path: Path, names: Sequence[str], t: Array, joints: Array, rates: Array) -> None:

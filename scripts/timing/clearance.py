@@ -84,14 +84,14 @@ def plans(case: str, repeats: int) -> list[dict[str, Any]]:
     machine, task = FixedBase(file.read()), lanes(2, 0.3, 0.05, within=lean)
     clearance_constraints = plan(machine, task, search="start", scene=Scene(clearance=CLEARANCE))
     planned = partial(plan, machine, task, start=clearance_constraints.at(0.0)["joints"], search="start")
-    spent, plain = least(partial(planned, clearance=None), repeats)
+    spent, plain = least(partial(planned, scene=False), repeats)
     rows = [{"robot": case, "plan": "plain", "plan_s": spent, "ratio": 1.0, "cost": plain.cost, "held": 0}]
     around: dict[str, Sequence[Shape]] = {
         "beside what does not bind": boxes(plain),
         "beside what binds": [ball(plain, link)],
     }
     for what, obstacles in around.items():
-        spent, found = least(partial(planned, obstacles=obstacles, clearance=CLEARANCE), repeats)
+        spent, found = least(partial(planned, scene=Scene(obstacles, CLEARANCE)), repeats)
         held = found.solution.problem.declared.path.get("apart")
         rows.append({"robot": case, "plan": what, "plan_s": spent, "ratio": spent / rows[0]["plan_s"]})
         rows[-1] |= {"cost": found.cost, "held": 0 if held is None else held.size}

@@ -68,6 +68,7 @@ def task_of(kind: str, seed: int) -> tuple[FixedBase, TipTask]:
 def by_search(kind: str, seed: int) -> dict[str, Any]:
     """The global plan: its cost, bound and processor time."""
     machine, task = task_of(kind, seed)
+    row: dict[str, Any]
     begun = time.process_time()
     try:
         found = plan(machine, task, search="global", scene=False)

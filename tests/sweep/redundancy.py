@@ -18,7 +18,7 @@ import pinocchio as pin
 
 from models.arrays import Array
 from ocp import Scene, SolveError, Waypoints, plan
-from ocp.motion.plan.waypoints import WaypointPlan
+from ocp.motion.plan.path_plan import PathPlan
 from tests.models.machines.test_redundancy_benchmark import by_coal
 from tests.redundancy_benchmark import FOLDER, PROBLEMS, Benchmark, problem_of, tip_and_file
 from tests.sweep.results import Row, Sweep, parser
@@ -31,14 +31,16 @@ SECONDS, MEGABYTES = 60.0, 2000.0
 """Of one problem, at most."""
 
 
-def planned(problem: Benchmark) -> WaypointPlan:
+def planned(problem: Benchmark) -> PathPlan:
     """The shortest way, rad and m counted alike."""
     turns = turning(problem)
-    return plan(
+    found = plan(
         problem.machine,
         Waypoints(problem.positions, problem.quaternions, step=np.where(turns, REVOLUTE, PRISMATIC) * (1 - 1e-9)),
         scene=Scene(obstacles=problem.boxes, ignored=problem.ignored),
     )
+    assert isinstance(found, PathPlan)
+    return found
 
 
 def turning(problem: Benchmark) -> Array:
@@ -95,7 +97,7 @@ def result(name: str) -> Row:
         row |= {"rad": float(ways[turns].sum()), "m": float(ways[np.logical_not(turns)].sum()), "asked": asked}
         row |= {"bound": found.bound}
         wrong += faults(name, found.joints)
-        if asked is not None and row["rad"] > asked >= found.bound:
+        if asked is not None and row["rad"] > asked >= (found.bound or 0.0):
             wrong.append("longer")
     except SolveError as error:
         used = resource.getrusage(resource.RUSAGE_SELF)

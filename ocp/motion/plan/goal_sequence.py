@@ -202,10 +202,11 @@ def _points_inside(region: Box | Sphere | None, seed: int) -> Array:
     """Return random points of a region in world, none without one. Shape (K, 3), m."""
     if region is None:
         return np.zeros((0, 3))
-    rng, center = np.random.default_rng(seed), np.array(region.position, dtype=float)
+    center: Array = np.array(region.position, dtype=float)
+    rng = np.random.default_rng(seed)
     if isinstance(region, Box):
         inside = (rng.random((REGION_SAMPLES, 3)) - 0.5) * np.asarray(region.size)
-        return center + inside @ np.asarray(region.rotation, dtype=float).T
+        return np.asarray(center + inside @ np.asarray(region.rotation, dtype=float).T)
     directions = rng.normal(size=(REGION_SAMPLES, 3))
     radii = float(region.radius) * np.cbrt(rng.random((REGION_SAMPLES, 1)))
-    return center + radii * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    return np.asarray(center + radii * directions / np.linalg.norm(directions, axis=1, keepdims=True))

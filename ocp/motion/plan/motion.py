@@ -152,6 +152,16 @@ class Plan(ABC):
         accelerations, tips = self._values_at("accelerations", t), self._tips_at(t, bases, at["joints"])
         return PlanSample(t, at["joints"], at["rates"], accelerations, tips)
 
+    def task_share(self, times: Any) -> Array:
+        """Return the share of the tasks' own time that has passed at times (M,), s. Shape (M,).
+
+        It equals the share of the horizon unless the pace of the tasks is planned, or the tasks wait.
+
+        Raises:
+            ProblemError: A time is not finite or outside 0 to the horizon.
+        """
+        return np.atleast_1d(self._checked_times(times)) / self.horizon
+
     @abstractmethod
     def solved_parts(self, times: Array) -> list[tuple[Solution, str, Array]]:
         """Return the solutions of which the plan consists at increasing times (M,), s, in order.

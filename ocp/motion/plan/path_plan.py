@@ -49,7 +49,7 @@ class PathPoses(NamedTuple):
     step: Array
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class PathPlan(Plan):
     """Joint path of straight motions between configurations: through tool poses, or to a goal.
 

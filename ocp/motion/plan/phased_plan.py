@@ -21,7 +21,7 @@ __all__ = ["PhasedPlan", "parts_of_phases"]
 RATES = "velocities"
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class PhasedPlan(SolvedPlan):
     """Plan of several phases, one after the other, such as motions to several goals with different loads.
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import os
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from models import FixedBase
 from models.arrays import Array
-from ocp.audit.audit import Audit, Finding
+from ocp.audit.audit import COST_LOST, Audit, Finding
 from ocp.audit.clearance import Clearance
 from ocp.errors import ProblemError
 from ocp.motion.plan.candidate import Candidate
@@ -24,6 +25,8 @@ from ocp.solution import Solution, read_head
 __all__ = ["Reconfiguration", "SegmentedPlan"]
 
 NO_MOTION = "reconfigurations without a motion"
+JUMP_TOLERANCE = 1e-6
+"""Largest difference of a joint between the end of a motion and the start of the next one, rad or m."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +67,7 @@ class _Piece(NamedTuple):
     plan: SolvedPlan
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class SegmentedPlan(Plan):
     """Motions that do the tasks one after the other, and reconfigurations between them while the tasks wait.
 
@@ -158,6 +161,15 @@ class SegmentedPlan(Plan):
             values[rows] = piece.plan._values_at(name, local)
         return values
 
+    def task_share(self, times: Any) -> Array:
+        """Return the share of the tasks' own time that has passed; they wait during reconfigurations."""
+        pieces = self.pieces
+        waits = [piece.plan.horizon * all(piece.plan is not segment for segment in self.segments) for piece in pieces]
+        ends, lost = [piece.begin + piece.plan.horizon for piece in pieces], np.cumsum(waits)
+        t = np.atleast_1d(self._checked_times(times))
+        task_times = np.interp(t, [0.0, *ends], [0.0, *(np.array(ends) - lost)])
+        return np.asarray(np.minimum(task_times / self.task_horizon, 1.0))
+
     def solved_parts(self, times: Array) -> list[tuple[Solution, str, Array]]:
         """Return the parts of all pieces; see `Plan.solved_parts`."""
         pieces = self.pieces
@@ -171,9 +183,9 @@ class SegmentedPlan(Plan):
     # ---- audit -------------------------------------------------------------------------------------------------------
 
     def _audit(self, **settings: Any) -> Audit:
-        """Return the findings of the audits of all pieces, and the jumps of the joints between them."""
+        """Return the findings of the audits of all pieces, of the joints between them, and of the cost lost."""
         findings: list[Finding] = []
-        undecided, clearances = "", dict[str, Clearance]()
+        undecided, clearances, losses = "", dict[str, Clearance](), list[float]()
         for number, piece in enumerate(self.pieces, 1):
             audit, label = piece.plan.audit(**settings), f"motion {number}: "
             findings += [
@@ -186,11 +198,26 @@ class SegmentedPlan(Plan):
             ]
             clearances |= {label + name: clearance for name, clearance in audit.clearances.items()}
             undecided = undecided or (audit.undecided and label + audit.undecided)
+            losses += [finding.value * piece.plan.cost for finding in audit.findings if finding.name == COST_LOST]
         missing = [each for each in self.reconfigurations if each.motion is None]
         if self.reconfigurations:
             note = missing[0].failure if missing else ""
-            findings.append(Finding(NO_MOTION, float(len(missing)), 0.0, None, note))
+            findings += [Finding(NO_MOTION, float(len(missing)), 0.0, None, note), self._jump_finding()]
+        if len(losses) == len(self.pieces):
+            total = sum(piece.plan.cost for piece in self.pieces)
+            findings.append(Finding(COST_LOST, sum(losses) / total if total > 0 else 0.0, verdict="optimal"))
         return Audit("segments", tuple(findings), undecided, clearances=clearances)
+
+    def _jump_finding(self) -> Finding:
+        """Return the largest difference of the joints where one motion ends and the next one begins."""
+        pieces = self.pieces
+        jumps = [
+            np.abs(after.plan.at(0.0)["joints"] - before.plan.at(before.plan.horizon)["joints"])
+            for before, after in pairwise(pieces)
+        ]
+        row, joint = np.unravel_index(int(np.argmax(jumps)), np.shape(jumps))
+        label = f"joints between motions, {self.names[joint]!r}"
+        return Finding(label, float(jumps[row][joint]), JUMP_TOLERANCE, pieces[row + 1].begin)
 
     def __str__(self) -> str:
         count = len(self.reconfigurations)
@@ -208,56 +235,59 @@ class SegmentedPlan(Plan):
     # ---- files -------------------------------------------------------------------------------------------------------
 
     def arrays(self, path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
-        """Return the arrays of the file of the plan, which holds those of each segment and each motion between them."""
-
-        def stored(plan: SolvedPlan | None) -> Any:
-            return None if plan is None else {name: _whole(array) for name, array in plan.arrays(path).items()}
-
+        """Return the arrays of the file of the plan; those of each motion are named after it."""
         head, numbers = pack_record(
             {
-                "segments": [stored(segment) for segment in self.segments],
                 "start_times": list(self.start_times),
                 "reconfigurations": [
-                    [each.time, each.before, each.after, stored(each.motion), each.failure]
+                    [each.time, each.before, each.after, each.motion is not None, each.failure]
                     for each in self.reconfigurations
                 ],
                 "fewest": self.fewest,
             }
         )
         arrays = {"segments": np.frombuffer(json.dumps(head).encode(), np.uint8)}
-        return {**arrays, **{f"segments.{name}": values for name, values in numbers.items()}}
+        arrays |= {f"segments.{name}": values for name, values in numbers.items()}
+        motions = [each.motion for each in self.reconfigurations]
+        for kind, plans in (("segment", self.segments), ("reconfiguration", motions)):
+            for number, plan in enumerate(plans):
+                if plan is not None:
+                    arrays |= {f"{kind} {number}/{name}": array for name, array in plan.arrays(path).items()}
+        return arrays
 
     @classmethod
     def of_arrays(cls, path: str | os.PathLike[str], arrays: dict[str, np.ndarray]) -> SegmentedPlan:
         """Return the plan of the arrays of a file, which are not trusted; raise as `Plan.load`."""
 
-        def restored(record: Any) -> SolvedPlan:
-            return SolvedPlan.of_arrays(path, {str(name): np.asarray(array) for name, array in record.items()})
+        def plan_of(kind: str, number: int) -> SolvedPlan:
+            prefix = f"{kind} {number}/"
+            own = {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
+            return SolvedPlan.of_arrays(path, own)
 
         try:
             numbers = {name: arrays[f"segments.{name}"] for name in ARRAY_NAMES}
             head = unpack_record(read_head(path, arrays["segments"]), numbers)
-            segments = tuple(restored(record) for record in head["segments"])
             times = tuple(float(time) for time in head["start_times"])
+            segments = tuple(plan_of("segment", number) for number in range(len(times)))
             changes = tuple(
                 Reconfiguration(
                     *(float(time), np.asarray(before, dtype=float), np.asarray(after, dtype=float)),
-                    *(None if motion is None else restored(motion), str(failure)),
+                    *(plan_of("reconfiguration", number) if has_motion else None, str(failure)),
                 )
-                for time, before, after, motion, failure in head["reconfigurations"]
+                for number, (time, before, after, has_motion, failure) in enumerate(head["reconfigurations"])
             )
             machine, n = segments[0].machine, segments[0].machine.joint_size
             plans = [*segments, *(each.motion for each in changes if each.motion is not None)]
-            fits = all(plan.machine.joint_size == n for plan in plans)
-            fits &= all(each.before.shape == each.after.shape == (n,) for each in changes)
-            if not (fits and len(times) == len(segments) == len(changes) + 1 and isinstance(machine, FixedBase)):
+            ends = np.cumsum([segment.horizon for segment in segments])
+            if not isinstance(machine, FixedBase):
+                raise TypeError(f"its machine is a {type(machine).__name__}")
+            fits = len(times) == len(segments) == len(changes) + 1
+            fits = fits and all(plan.machine.robot.joint_names == machine.robot.joint_names for plan in plans)
+            fits = fits and all(each.before.shape == each.after.shape == (n,) for each in changes)
+            fits = fits and np.allclose(times, [0.0, *ends[:-1]]) and times[1:] == tuple(each.time for each in changes)
+            if not fits:
                 raise ValueError("its segments do not fit together")
             return cls(machine, segments, times, changes, int(head["fewest"]))
         except RECORD_ERRORS as error:
             words = f"{path}: the plan in it is damaged: {error}"
             raise ProblemError(words, name="path", value=str(path)) from error
-
-
-def _whole(array: np.ndarray) -> np.ndarray:
-    """Return an array with a type that a record holds."""
-    return array.astype(np.int64) if array.dtype.kind in "ub" else array

@@ -39,7 +39,7 @@ class Part(NamedTuple):
     suffix: str
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class SolvedPlan(Plan):
     """Plan whose motion solves one optimal control problem.
 
@@ -111,15 +111,10 @@ class SolvedPlan(Plan):
         return request_of(self.solution.problem)
 
     def task_share(self, times: Any) -> Array:
-        """Return the share of the tasks' own time that has passed at times (M,), s.
-
-        It equals the share of the horizon unless the horizon is free, in which case the pace of the tasks is planned.
-
-        Raises:
-            ProblemError: A time is not finite or outside 0 to the horizon.
-        """
-        t = np.atleast_1d(self._checked_times(times))
-        return self._fractions(self.parts[0], t) if CLOCK in self.solution.states else t / self.horizon
+        """Return the share of the tasks' own time that has passed; see `Plan.task_share`."""
+        if CLOCK not in self.solution.states:
+            return super().task_share(times)
+        return self._fractions(self.parts[0], np.atleast_1d(self._checked_times(times)))
 
     def _audit(self, **settings: Any) -> Audit:
         """Return the audit of the solution.

@@ -120,7 +120,7 @@ class DeadEnd(SolveError):
             joint whose limit obstructs most states, its position and limit; or "task".
         obstructions: What obstructs motions there, one of each kind and name with the least excess, the least first.
         relaxations: Motions that would do the task with a relaxed requirement, the smallest one found of each kind.
-        segments: Number of segments in which the task may be done, see `plan_in_segments`; None if unknown.
+        segments: Number of segments in which the task may be done, see `plan`, search="segments"; None if unknown.
     """
 
     until: float
@@ -181,7 +181,7 @@ def dead_end(
         words += f"; one exists if {', or '.join(map(str, relaxations))}"
     if segments is not None:
         count = "a reconfiguration" if segments == 2 else f"{segments - 1} reconfigurations"
-        words += f"; with {count} on the way one may: plan_in_segments"
+        words += f"; with {count} on the way one may: search='segments'"
     time, until = float(search.times[max(last, 0)]), float(search.times[last + 1])
     details = {"name": smallest.name, "value": smallest.value, "limit": smallest.limit, "time": time}
     return DeadEnd(words, until, tuple(obstructions), tuple(relaxations), segments, **details)

@@ -20,9 +20,10 @@ import numpy as np
 import pytest
 
 from models import cache as kept
-from ocp import Plan, ProblemError, SegmentedPlan, SolveError, plan
+from ocp import Plan, ProblemError, SolveError
 from ocp.app import main
 from ocp.app.files.task_file import read_task
+from ocp.motion.plan.segmented_plan import SegmentedPlan
 from ocp.progress import Progress
 from tests.ocp.app.motions import smooth, write_robot, write_table
 
@@ -242,51 +243,51 @@ LIFTED = """<robot name="lifted"><link name="ground"/><link name="column"/><link
 """The shoulder limited: on either side of a line across the elbow has to be on the other one."""
 
 
-def test_what_no_one_motion_does_is_written_in_pieces_and_the_ways_between_them_and_fails_where_one_is_missing(
+def test_what_no_one_motion_does_is_written_with_the_ways_between_its_pieces_and_fails_where_one_is_missing(
     tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made = list[SegmentedPlan]()
-
-    def kept_too(*given: Any, **options: Any) -> SegmentedPlan:
-        made.append(plan(*given, **options, search="segments"))
-        return made[0]
-
-    monkeypatch.setattr("ocp.app.run_task.plan_in_segments", kept_too)
     (tmp_path / "robot.urdf").write_text(LIFTED)
     (tmp_path / "line.toml").write_text(
         "[robot]\nurdf = 'robot.urdf'\ntip = 'tip'\n"
         "[path]\npoints = [[0.6, -0.45, 0], [0.6, 0.45, 0]]\nspeed = 0.45\ntool = 'free'\n"
-        "[search]\nkind = 'segments'\n[scene]\nlook = false\n[output]\ncsv = 'line.csv'\n"
+        "[search]\nkind = 'segments'\n[scene]\nlook = false\n[output]\ncsv = 'line.csv'\nperiod = 0.004\n"
     )
     status, out, err = run(capsys, "plan", tmp_path / "line.toml", "-o", tmp_path / "line.npz", "--json")
     assert status == 0, err
     told = json.loads(out)
     assert len(told["reconfigurations"]) == told["fewest"] == 1
-    first, motion, last = (Plan.load(tmp_path / f"line-{number}.npz") for number in (1, 2, 3))
-    names = {f"line-{number}.{kind}" for number in (1, 2, 3) for kind in ("npz", "csv")}
-    assert {Path(file).name for file in told["written"]} == names
-    assert told["duration"] == pytest.approx(first.horizon + motion.horizon + last.horizon)
-    assert first.horizon + last.horizon == pytest.approx(2.0)
+    assert told["written"] == {"csv": str(tmp_path / "line.csv"), "plan": str(tmp_path / "line.npz")}
+    made = Plan.load(tmp_path / "line.npz")
+    assert isinstance(made, SegmentedPlan)
+    first, last = made.segments
+    (change,) = made.reconfigurations
+    assert told["duration"] == pytest.approx(first.horizon + change.duration + last.horizon)
+    assert made.task_horizon == first.horizon + last.horizon == pytest.approx(2.0)
     assert told["cost"] == pytest.approx(first.cost + last.cost)
-    for before, after in ((first, motion), (motion, last)):  # each goes on where the one before ends
-        np.testing.assert_allclose(before.at(before.horizon)["joints"], after.at(0.0)["joints"], atol=1e-6)
     assert first.at(0.0)["joints"][2] * last.at(last.horizon)["joints"][2] < 0  # the elbow has changed its side
-    for file in told["written"]:
-        Path(file).unlink()
-    barred = [replace(one, motion=None, failure="the way is barred") for one in made[0].reconfigurations]
-    monkeypatch.setattr(
-        "ocp.app.run_task.plan_in_segments", lambda *_, **__: replace(made[0], reconfigurations=tuple(barred))
-    )
-    status, out, _ = run(capsys, "plan", tmp_path / "line.toml", "--json")
+    rows = np.loadtxt(tmp_path / "line.csv", delimiter=",", skiprows=1)
+    assert rows[-1, 0] == told["duration"]
+    assert np.abs(np.diff(rows[:, 1:4], axis=0)).max() < 3.0 * 0.004 * 1.01  # it goes on where each piece ends
+    barred = [replace(change, motion=None, failure="the way is barred")]
+    monkeypatch.setattr("ocp.app.run_task.plan", lambda *_, **__: replace(made, reconfigurations=tuple(barred)))
+    status, out, _ = run(capsys, "plan", tmp_path / "line.toml", "--json", "--force")
     assert status == 1  # the pieces are there, and pass
     told = json.loads(out)
-    assert (told["passed"], told["duration"], told["reconfigurations"][0]["failure"]) == (
-        False,
-        None,
-        "the way is barred",
+    assert (told["passed"], told["duration"]) == (False, pytest.approx(2.0))
+    assert told["reconfigurations"][0]["failure"] == "the way is barred"
+    assert told["verdict"].startswith("must not be run: reconfigurations without a motion")
+
+
+def test_a_dead_end_names_the_key_of_the_task_file_that_may_help(tmp_path: Path, capsys: Any) -> None:
+    (tmp_path / "robot.urdf").write_text(LIFTED)
+    (tmp_path / "line.toml").write_text(
+        "[robot]\nurdf = 'robot.urdf'\ntip = 'tip'\n"
+        "[path]\npoints = [[0.6, -0.45, 0], [0.6, 0.45, 0]]\nspeed = 0.45\ntool = 'free'\n"
+        "[search]\nkind = 'global'\n[scene]\nlook = false\n"
     )
-    assert {Path(file).name for file in told["written"]} == {"line-1.csv", "line-3.csv"}
-    assert not (tmp_path / "line-2.csv").exists()
+    status, _, err = run(capsys, "plan", tmp_path / "line.toml")
+    assert status == 1
+    assert '[search] kind = "segments"' in err
 
 
 # ---- what is printed -----------------------------------------------------------------------------------------------

@@ -20,6 +20,7 @@ from ocp.app.check.joint_limits import floating_torques, integrate_base
 from ocp.app.files import read_trajectory
 from ocp.errors import ProblemError
 from ocp.motion.local.collisions import distances_along
+from ocp.motion.plan.solved_plan import SolvedPlan
 from tests.ocp.app.motions import MIDDLE, NAMES, SWING, URDF, joint, link, smooth, write_table
 
 GALLERY = Path(__file__).resolve().parents[3] / "results" / "gallery"
@@ -271,6 +272,7 @@ def test_the_zero_moment_point_is_that_of_the_standing_machine(tmp_path: Path) -
 @pytest.mark.filterwarnings("ignore::models.errors.ModelWarning")
 def test_the_plans_of_the_gallery_are_not_accused(tmp_path: Path, name: str, clearance: float | None) -> None:
     made = Plan.load(GALLERY / f"{name}.npz")
+    assert isinstance(made, SolvedPlan)
     machine, robot = made.machine, made.machine.robot
     sample = made.sampled(np.linspace(0.0, made.horizon, round(made.horizon / 0.01) + 1))
     more = [sample.accelerations] if made.rate_name == "velocities" else []

@@ -66,7 +66,7 @@ from ocp.app.view.animation import (
 from ocp.app.view.appearance import appearance_of, frames_along
 from ocp.app.view.player import PageServer, build_page
 from ocp.motion.local.collisions import distances_along
-from ocp.motion.plan.motion import Part
+from ocp.motion.plan.solved_plan import Part, SolvedPlan
 from ocp.motion.tasks.targets import targets_along
 from tests.models.machines.armoured import armoured_arm
 
@@ -148,14 +148,14 @@ def machines(robot: Robot) -> dict[str, Machine]:
 
 
 @pytest.fixture(scope="module")
-def plans(machines: dict[str, Machine]) -> dict[str, Plan]:
+def plans(machines: dict[str, Machine]) -> dict[str, SolvedPlan]:
     return {kind: planned(machine) for kind, machine in machines.items()}
 
 
-def planned(machine: Machine, **more: Any) -> Plan:
+def planned(machine: Machine, **more: Any) -> SolvedPlan:
     problem = minimum_velocity_problem(machine, TipTask(rows=(3, 4), velocity=(0.1, -0.1)), 1.5, start=START, **more)
     solution = solve(problem, Collocation(intervals=6, degree=3))
-    return Plan(machine, solution, (Part(0.0, 1.5, ""),))
+    return SolvedPlan(machine, solution, (Part(0.0, 1.5, ""),))
 
 
 def turned(quaternion: Array) -> Array:
@@ -368,7 +368,7 @@ def test_the_nearest_bodies_are_those_of_the_plan_at_every_time(tmp_path: Path) 
         start=start,
         clearance_constraints=clearance_constraints,
     )
-    plan = Plan(machine, solve(problem, Collocation(intervals=6, degree=3)), (Part(0.0, 1.0, ""),))
+    plan = SolvedPlan(machine, solve(problem, Collocation(intervals=6, degree=3)), (Part(0.0, 1.0, ""),))
     near = animate_plan(plan).closest
     assert near is not None
     joints = plan.at(near.t)["joints"]
@@ -406,7 +406,7 @@ def test_obstacles_that_move_are_shown_where_they_are_at_every_time_and_half_spa
         start=start,
         clearance_constraints=clearance_constraints,
     )
-    plan = Plan(machine, solve(problem, Collocation(intervals=6, degree=3)), (Part(0.0, 1.0, ""),))
+    plan = SolvedPlan(machine, solve(problem, Collocation(intervals=6, degree=3)), (Part(0.0, 1.0, ""),))
     shown = animate_plan(plan)
     plane, moved = shown.obstacles
     assert plane.normal is not None

@@ -17,13 +17,12 @@ from matplotlib.figure import Figure
 from models import FixedBase, Joint, Robot, planar_chain
 from ocp import (
     Collocation,
+    Limits,
     Phases,
-    Plan,
     Problem,
     ProblemError,
     Solution,
     TipTask,
-    WaypointPlan,
     certificate,
     minimum_velocity_problem,
     plan,
@@ -33,6 +32,8 @@ from ocp import (
 from ocp.app.view.appearance import COMPARED, LIMIT, PLAN
 from ocp.motion.local.rates import LocalSolution
 from ocp.motion.plan import Candidate, Reason, Rejection
+from ocp.motion.plan.path_plan import PathPlan
+from ocp.motion.plan.solved_plan import SolvedPlan
 
 START = np.array([0.3, 0.7, 0.5])
 TASK = TipTask(rows=(3, 4), velocity=(-0.1, 0.05))
@@ -50,8 +51,10 @@ def arm() -> FixedBase:
 
 
 @cache
-def motion() -> Plan:
-    return plan(arm(), TASK, 1.0, start=START)
+def motion() -> SolvedPlan:
+    found = plan(arm(), TASK, 1.0, start=START)
+    assert isinstance(found, SolvedPlan)
+    return found
 
 
 @cache
@@ -248,7 +251,7 @@ def test_what_was_not_found_has_no_cost_in_print() -> None:
 
 
 def test_what_is_typed_at_a_prompt_is_told_in_a_line() -> None:
-    way = WaypointPlan(arm(), np.zeros((400, 3)), 2.0, 1.9, ((2.0, ""),) * 50)
+    way = PathPlan(arm(), np.zeros((400, 3)), Limits(), 2.0, bound=1.9)
     audit = sprint().audit()
     told: list[Any] = [motion(), motion().candidates[0], motion().sample(0.1), local(), way, motion().trajectory(0.1)]
     told += [

@@ -14,6 +14,7 @@ from models import FixedBase, FreeFloating, Joint, Link, Path, Robot, SmoothPath
 from models.robot.dynamics import inverse_dynamics
 from ocp import Collocation, Plan, ProblemError, TipTask, joint_path, minimum_velocity_problem, plan, solve
 from ocp.motion.builders.joint_spline import PlannedJoints
+from ocp.motion.plan.solved_plan import SolvedPlan
 from ocp.motion.schedule import JointLimits, LineLimits, schedule
 from tests.ocp.motion.schedule.check import dense, largest
 from tests.ocp.problems import Array
@@ -118,6 +119,7 @@ def test_a_plan_of_tasks_along_a_path_is_scheduled(kind: str, tmp_path: File) ->
     if kind == "loaded":
         result.save(tmp_path / "plan.npz")
         result = Plan.load(tmp_path / "plan.npz")
+    assert isinstance(result, SolvedPlan)
     assert len(result.parts) == (2 if kind == "parts" else 1)
     joints = joint_path(arm(), result, path)
     s = np.linspace(0, path.length, 50)

@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 from models import Arc, FixedBase, Helix, Link, Machine, Path, SmoothPath, merge_robots, smooth
 from models.spatial import quaternion_product
 from ocp import TipTask
-from ocp.motion.plan import Plan, plan
+from ocp.motion.plan import plan
+from ocp.motion.plan.solved_plan import SolvedPlan
 from scripts.robots.robots import UR5
 from tests.models.robot.trees import Array, numeric
 from tests.ocp.motion.plan.replay import Arm
@@ -57,16 +58,20 @@ def asked(what: Callable[[], PlanCase]) -> Callable[[], PlanCase]:
     return ASKED[what.__name__]
 
 
-def plan_bare(*asked: Any, **options: Any) -> Plan:
+def plan_bare(*asked: Any, **options: Any) -> SolvedPlan:
     """As `plan`, for laws of motions whatever the links may touch."""
-    return plan(*asked, scene=False, **options)
+    found = plan(*asked, scene=False, **options)
+    assert isinstance(found, SolvedPlan)
+    return found
 
 
 @cache
-def planned(name: str) -> Plan:
+def planned(name: str) -> SolvedPlan:
     """From the start that is the best conditioned."""
     what = ASKED[name]()
-    return plan(what.machine, what.tasks, search="start", **what.options)
+    found = plan(what.machine, what.tasks, search="start", **what.options)
+    assert isinstance(found, SolvedPlan)
+    return found
 
 
 def quaternion(axis: Any, angle: float) -> Array:

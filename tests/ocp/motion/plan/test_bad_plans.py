@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from tempfile import TemporaryDirectory
 from typing import Any
 
@@ -12,10 +12,24 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from models import CollisionScene, FixedBase, Path, SmoothPath, planar_chain, smooth
-from ocp import ClearanceConstraints, Limits, ProblemError, SolveError, TipTask, Unreachable, inverse_kinematics
+from models import CollisionScene, FixedBase, FreeFloating, Path, SmoothPath, Sphere, planar_chain, smooth
+from ocp import (
+    ClearanceConstraints,
+    Cost,
+    Goal,
+    Limits,
+    ProblemError,
+    Scene,
+    SolveError,
+    Start,
+    TipTask,
+    Unreachable,
+    Waypoints,
+    inverse_kinematics,
+)
 from ocp.app.files import log_rerun, write_mcap
-from ocp.motion.plan import Plan, plan, plan_in_segments, plan_waypoints
+from ocp.motion.builders.standing.problem import Weights
+from ocp.motion.plan import Plan, plan
 from ocp.motion.schedule import LineLimits, schedule
 from ocp.motion.tasks.tracks import path_tracks
 from tests.bad_values import (
@@ -26,6 +40,7 @@ from tests.bad_values import (
     MAPPING,
     NAN,
     NONNEGATIVE,
+    NOTHING,
     POSITIVE,
     SEQUENCE,
     TEXT,
@@ -54,7 +69,6 @@ assert GOOD.duration is not None
 PLANNED: dict[str, Any] = {"machine": ARM, "tasks": GOOD, "start": START, "search": "start"}
 AROUND = CollisionScene(FixedBase(armoured_arm()))
 POSES = ([[0.4, 0.0, 0.5], [0.4, 0.02, 0.5], [0.4, 0.04, 0.5]], [[0.0, 1.0, 0.0, 0.0]] * 3)
-WAYPOINTS: dict[str, Any] = {"machine": panda(), "positions": POSES[0], "quaternions": POSES[1], "clearance": None}
 ENDLESS = replace(GOOD, duration=None, breaks=())
 
 
@@ -68,66 +82,135 @@ def logged(**given: Any) -> None:
         write_mcap(**{"plan": made(), "file": f"{folder}/a.mcap", **given})
 
 
+PLANE = TipTask(rows=(3, 4), velocity=(0.0, 0.0))
+SCENE = {
+    "obstacles": SEQUENCE | {"array": np.ones(3)},
+    "clearance": NONNEGATIVE | NOTHING,
+    "ignored": SEQUENCE | {"unknown": [("link_1", "nobody")]},
+    "srdf": {"number": 3, "list": ["a"], "object": object(), "nowhere": "/nowhere/at/all.srdf"},
+    "folders": {"number": 3, "numbers": [1, 2], "object": object()},
+    "missing": CHOICE,
+}
+TASKS_AND_TIMES = {
+    "machine": INSTANCE | {"class": FixedBase, "robot": CHAIN},
+    "tasks": INSTANCE | SEQUENCE | {"class": TipTask, "function": lambda t: t},
+    "start": array(3) | {"matrix": np.zeros((2, 3)), "elsewhere": [0.0, 0.0, 0.0]},
+    "limits": but(INSTANCE, "None")
+    | {"class": Limits, "torque of two": Limits(torque=[1.0, 2.0]), "too many": Limits(velocity=[1.0, 2.0])},
+    "cost": but(INSTANCE, "None")
+    | {
+        "class": Cost,
+        "of two": Cost(weights=[1.0, 2.0]),
+        "of a path": Cost(velocity=0, length=1),
+        "efforts": Cost(effort=1.0),
+        "time of a fixed horizon": Cost(time=1.0),
+        "of a standing machine": Weights(),
+    },
+    "scene": but(INSTANCE, "None") | {"class": Scene, "true": True, "zero": 0, "collisions": AROUND},
+    "seed": WHOLE,
+}
 CASES = [
     Case(
         "plan",
         plan,
         PLANNED,
         {
-            "machine": INSTANCE | {"class": FixedBase, "robot": CHAIN},
-            "tasks": INSTANCE | SEQUENCE | {"class": TipTask, "function": lambda t: t},
+            **TASKS_AND_TIMES,
             "horizon": but(POSITIVE, "word") | {"word": "a", "free in words": "Free", "too short": 0.1},
-            "start": array(3) | {"matrix": np.zeros((2, 3)), "elsewhere": [0.0, 0.0, 0.0]},
-            "start_base": but(array(7), "empty") | {"of a floating base": [0, 0, 0, 1, 0, 0, 0]},
             "cyclic": FLAG | {"though it ends elsewhere": True},
-            "weights": array(3) | {"zero": [1.0, 0.0, 1.0], "negative": [1.0, -1.0, 1.0]},
-            "limits": but(INSTANCE, "None")
-            | {"class": Limits, "torque of two": Limits(torque=[1.0, 2.0]), "too many": Limits(velocity=[1.0, 2.0])},
+            "search": CHOICE,
+        },
+    ),
+    Case(
+        "plan in segments",
+        partial(plan, search="segments"),
+        {"machine": ARM, "tasks": GOOD, "start": START, "scene": False},
+        {
+            **TASKS_AND_TIMES,
+            "horizon": but(POSITIVE, "word") | {"word": "a", "free": "free", "too short": 0.1},
+            "cyclic": {"true": True},
+        },
+    ),
+    Case(
+        "plan through waypoints",
+        plan,
+        {"machine": panda(), "tasks": Waypoints(*POSES), "scene": False},
+        {
+            "machine": INSTANCE | {"class": FixedBase, "robot": CHAIN, "floating": FreeFloating(CHAIN)},
+            "horizon": {"number": 1.0, "free": "free"},
+            "start": {"joints": [0.0] * 7, "start": Start()},
+            "cyclic": {"true": True},
+            "cost": but(INSTANCE, "None")
+            | {
+                "class": Cost,
+                "velocity": Cost(),
+                "both": Cost(velocity=0, length=1, time=1),
+                "weighted time": Cost(velocity=0, time=1, weights=[1.0] * 7),
+            },
+            "limits": but(INSTANCE, "None") | {"class": Limits, "velocity": Limits(velocity=1.0)},
+            "scene": but(INSTANCE, "None") | {"class": Scene, "true": True, "zero": 0},
             "search": CHOICE,
             "seed": WHOLE,
-            "time_cost": POSITIVE,
-            "obstacles": SEQUENCE | {"array": np.ones(3)},
-            "clearance": but(NONNEGATIVE, "None"),
-            "ignored": SEQUENCE | {"unknown": [("link_1", "nobody")]},
-            "srdf": {"number": 3, "list": ["a"], "object": object(), "nowhere": "/nowhere/at/all.srdf"},
         },
     ),
     Case(
-        "plan_in_segments",
-        plan_in_segments,
-        {"machine": ARM, "tasks": GOOD, "start": START, "clearance": None},
+        "Waypoints",
+        lambda **waypoints: plan(panda(), Waypoints(**waypoints), scene=False),
+        {"positions": POSES[0], "quaternions": POSES[1]},
         {
-            "machine": INSTANCE | {"class": FixedBase, "robot": CHAIN},
-            "tasks": INSTANCE | SEQUENCE | {"class": TipTask, "function": lambda t: t},
-            "horizon": but(POSITIVE, "word") | {"word": "a", "free": "free", "too short": 0.1},
-            "start": array(3) | {"matrix": np.zeros((2, 3)), "elsewhere": [0.0, 0.0, 0.0]},
-            "weights": array(3) | {"zero": [1.0, 0.0, 1.0], "negative": [1.0, -1.0, 1.0]},
-            "limits": but(INSTANCE, "None") | {"class": Limits, "too many": Limits(velocity=[1.0, 2.0])},
-            "seed": WHOLE,
-            "obstacles": SEQUENCE | {"array": np.ones(3)},
-            "clearance": but(NONNEGATIVE, "None"),
-            "ignored": SEQUENCE | {"unknown": [("link_1", "nobody")]},
-            "srdf": {"number": 3, "list": ["a"], "object": object(), "nowhere": "/nowhere/at/all.srdf"},
-        },
-    ),
-    Case(
-        "plan_waypoints",
-        plan_waypoints,
-        WAYPOINTS,
-        {
-            "machine": INSTANCE | {"class": FixedBase, "robot": CHAIN},
             "positions": array(3, 3) | {"one": POSES[0][:1], "fewer": POSES[0][:2]},
             "quaternions": array(3, 4) | {"zero": np.zeros((3, 4)), "fewer": POSES[1][:2]},
-            "cost": CHOICE,
             "reconfigurations": CHOICE,
             "step": but(array(7), "inf") | {"zero": 0.0, "negative": -1.0, "one zero": [1.0] * 6 + [0.0]},
-            "weights": array(7) | {"zero": np.zeros(7), "negative": [1.0] * 6 + [-1.0]},
-            "limits": but(INSTANCE, "None") | {"class": Limits, "velocity": Limits(velocity=1.0)},
-            "seed": WHOLE,
-            "obstacles": SEQUENCE | {"array": np.ones(3)},
-            "clearance": but(NONNEGATIVE, "None"),
-            "ignored": SEQUENCE | {"unknown": [("link_1", "nobody")]},
-            "srdf": {"number": 3, "list": ["a"], "object": object(), "nowhere": "/nowhere/at/all.srdf"},
+        },
+    ),
+    Case("Scene", lambda **scene: plan(**PLANNED, scene=Scene(**scene)), {}, SCENE),
+    Case("Scene of waypoints", lambda **scene: plan(panda(), Waypoints(*POSES), scene=Scene(**scene)), {}, SCENE),
+    Case(
+        "Start",
+        lambda **start: plan(ARM, GOOD, start=Start(**start), search="start"),
+        {"joints": START},
+        {
+            "joints": array(3) | {"matrix": np.zeros((2, 3)), "elsewhere": [0.0, 0.0, 0.0]},
+            "base": but(array(7), "empty") | {"of a floating base": [0, 0, 0, 1, 0, 0, 0]},
+        },
+    ),
+    Case(
+        "Start of a floating base",
+        lambda **start: plan(FreeFloating(CHAIN, "planar"), PLANE, 1.0, start=Start(**start), search="start"),
+        {"joints": START, "base": [0.0, 0.0, 0.0]},
+        {"joints": array(3), "base": array(3) | {"spatial": [0, 0, 0, 1, 0, 0, 0]}},
+    ),
+    Case(
+        "Cost of tip tasks",
+        lambda **cost: plan(**PLANNED, cost=Cost(**cost)),
+        {"weights": [1.0, 2.0, 1.0]},
+        {"velocity": POSITIVE, "weights": array(3) | {"zero": [1.0, 0.0, 1.0], "negative": [1.0, -1.0, 1.0]}},
+    ),
+    Case(
+        "Cost of a free horizon",
+        lambda **cost: plan(**PLANNED, horizon="free", cost=Cost(**cost)),
+        {"time": 1.0},
+        {"time": POSITIVE},
+    ),
+    Case(
+        "Cost of waypoints",
+        lambda **cost: plan(panda(), Waypoints(*POSES), scene=False, cost=Cost(velocity=0, **cost)),
+        {"length": 1.0},
+        {"length": POSITIVE, "weights": array(7) | {"zero": np.zeros(7), "negative": [1.0] * 6 + [-1.0]}},
+    ),
+    Case(
+        "Goal",
+        Goal,
+        {"position": [0.4, 0.0, 0.5], "direction": [0.0, 0.0, -1.0]},
+        {
+            "joints": {"beside a pose": [0.0, 0.0]},
+            "orientation": {"beside a direction": [1.0, 0.0, 0.0, 0.0]},
+            "within": but(POSITIVE, "None") | {"half a turn": np.pi},
+            "tool_axis": array(3) | {"zero": [0.0, 0.0, 0.0]},
+            "region": but(INSTANCE, "None") | {"beside a position": Sphere(0.1, (0.4, 0.0, 0.5))},
+            "velocity": {"unknown": "slow", "empty": ""},
+            "name": TEXT,
         },
     ),
     Case(

@@ -6,7 +6,7 @@ import re
 from dataclasses import replace
 from functools import cache
 from pathlib import Path as File
-from typing import Any
+from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
@@ -81,7 +81,8 @@ def line(machine: Any = ARM, first: Any = FIRST, way: Any = WAY, scale: float = 
 
 @cache
 def planned(*obstacles: Any, clearance: float | None = 0.0) -> Plan:
-    return plan(ARM, line(), start=START, search="start", scene=Scene(obstacles=obstacles, clearance=clearance))
+    scene: Scene | Literal[False] = False if clearance is None else Scene(obstacles, clearance)
+    return plan(ARM, line(), start=START, search="start", scene=scene)
 
 
 def least_apart(result: Plan, obstacles: Any, samples: int = 4001) -> float:
@@ -174,7 +175,9 @@ def test_what_no_task_moves_begins_out_of_the_way_of_what_it_would_hinder() -> N
     )
     robot = Robot((*links, Link("pole", 0.5, collisions=(pole,))), (*arm.joints, flag), tip="tip")
     task = TipTask(position=lambda t: [0.6 - 0.2 * t, 0.25], rows=[3, 4], duration=1.0)
-    bare, clearance_constraints = (plan(FixedBase(robot), task, scene=Scene(clearance=each)) for each in (None, 0.01))
+    bare, clearance_constraints = (
+        plan(FixedBase(robot), task, scene=scene) for scene in (False, Scene(clearance=0.01))
+    )
     place = robot.joint_names.index("flag")
     assert bare.at(0.0)["joints"][place] == 0
     assert least_apart(bare, ()) < 0
@@ -383,17 +386,16 @@ def test_builders_take_what_to_stay_clear_of() -> None:
 
 
 BAD: dict[str, tuple[dict[str, Any], str]] = {
-    "clearance below zero": ({"clearance": -0.01}, "clearance"),
-    "clearance not a number": ({"clearance": "near"}, "clearance"),
-    "clearance nan": ({"clearance": np.nan}, "clearance"),
-    "an obstacle that is none": ({"obstacles": [object()]}, "obstacles"),
-    "pairs looked at by nobody": ({"ignored": [("link2", "link4")], "clearance": None}, "ignored"),
-    "obstacles looked at by nobody": ({"obstacles": [POST], "clearance": None}, "obstacles"),
-    "ignored links that do not exist": ({"ignored": [("link2", "nobody")], "clearance": 0.0}, "nobody"),
-    "what becomes of missing meshes": ({"missing": "perhaps", "clearance": 0.0}, "missing"),
-    "an SRDF file that is none": ({"srdf": "/nowhere/at/all.srdf", "clearance": 0.0}, "srdf"),
+    "clearance below zero": ({"scene": Scene(clearance=-0.01)}, "clearance"),
+    "clearance not a number": ({"scene": Scene(clearance="near")}, "clearance"),  # type: ignore[arg-type]
+    "clearance nan": ({"scene": Scene(clearance=np.nan)}, "clearance"),
+    "an obstacle that is none": ({"scene": Scene(obstacles=[object()])}, "obstacles"),
+    "a scene that is none": ({"scene": [POST]}, "scene"),
+    "ignored links that do not exist": ({"scene": Scene(ignored=[("link2", "nobody")])}, "nobody"),
+    "what becomes of missing meshes": ({"scene": Scene(missing="perhaps")}, "missing"),  # type: ignore[arg-type]
+    "an SRDF file that is none": ({"scene": Scene(srdf="/nowhere/at/all.srdf")}, "srdf"),
     "an obstacle that moves while time is free": (
-        {"obstacles": [MovingObstacle(POST, lambda t: (t, 0, 0))], "horizon": "free"},
+        {"scene": Scene(obstacles=[MovingObstacle(POST, lambda t: (t, 0, 0))]), "horizon": "free"},
         "obstacle",
     ),
 }

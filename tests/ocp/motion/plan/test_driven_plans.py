@@ -14,6 +14,7 @@ from models.arrays import Array
 from ocp import Limits, Plan, ProblemError, SolveError, TipTask, plan
 from ocp.app import main
 from ocp.motion.plan.actuators import ActuatorDemand
+from ocp.motion.plan.solved_plan import SolvedPlan
 from tests.ocp.app.motions import write_robot
 from tests.ocp.app.test_command import TASK
 from tests.ocp.motion.builders.test_dynamics import torques_along
@@ -70,6 +71,7 @@ def test_accelerations_are_within_their_limits_and_told_otherwise() -> None:
     task = smooth_task(FIXED)
     free = plan(FIXED, task, start=START)
     most = np.array([0.85, 9.0, 9.0])
+    assert isinstance(free, SolvedPlan)
     demand = ActuatorDemand.of(free, Limits(acceleration=most))
     assert demand is not None
     assert (demand.quantity, demand.joint, demand.allowed, demand.unit) == ("acceleration", "joint1", 0.85, "rad/s^2")

@@ -15,13 +15,13 @@ from ocp.app.check.plan_verdict import verdict_of
 from ocp.app.command import main
 from ocp.app.view.animation import animate_plan
 from ocp.app.view.report import report_of_plan
-from ocp.motion.plan.motion import Part
+from ocp.motion.plan.solved_plan import Part, SolvedPlan
 from tests.ocp.motion.plan.motions import planned
 
 pytestmark = pytest.mark.xdist_group("plan seam_ur5")
 
 
-def swing() -> Plan:
+def swing() -> SolvedPlan:
     """A plan of a UR5 whose problem knows no limits: 9 rad in 0.1 s."""
     machine, n = planned("seam_ur5").machine, 6
     problem = Problem("fast")
@@ -32,7 +32,7 @@ def swing() -> Plan:
     problem.minimize(running=rates.T @ rates)
     solution = solve(problem, Collocation(4))
     assert solution.audit().passed
-    return Plan(machine, solution, (Part(0.0, 0.1, ""),))
+    return SolvedPlan(machine, solution, (Part(0.0, 0.1, ""),))
 
 
 def test_a_problem_without_limits_does_not_excuse_a_motion_beyond_those_of_its_machine(tmp_path: Path) -> None:
@@ -90,6 +90,7 @@ def test_no_problem_of_the_file_takes_the_place_of_the_request(tmp_path: Path) -
         arrays = {**{name: seam[name] for name in seam.files}, **{k: solution[k] for k in solution.files}}
     np.savez(tmp_path / "both.npz", **arrays)
     both = Plan.load(tmp_path / "both.npz")
+    assert isinstance(both, SolvedPlan)
     assert both.request is not None
     assert both.solution.problem is not None
     assert both.solution.problem.origin is both.request
@@ -133,5 +134,6 @@ def test_a_request_that_calls_python_is_said_when_it_is_saved(tmp_path: Path) ->
     finally:
         problem.origin = kept
     again = Plan.load(tmp_path / "plan.npz")
+    assert isinstance(again, SolvedPlan)
     assert again.request is None
     assert again.audit().passed, "its problem is in the file, and its machine's limits hold"

@@ -192,10 +192,8 @@ def test_a_task_of_the_fingers_counts_as_one() -> None:
 def test_waypoints_are_planned_with_a_hand() -> None:
     places = np.array([0.45, 0.1, 0.35]) + np.linspace(0, 1, 12)[:, None] * np.array([0.0, 0.2, 0.05])
     quaternion = np.tile([0.0, 1.0, 0.0, 0.0], (12, 1))
-    given: dict[str, Any] = {"clearance": None}
     whole = FixedBase(Robot.from_urdf(PANDA_URDF, tip="panda_hand"))
-    bare = plan(panda(), Waypoints(places, quaternion, step=0.3), **given)
-    found = plan(whole, Waypoints(places, quaternion, step=0.3), **given)
+    bare, found = (plan(each, Waypoints(places, quaternion, step=0.3), scene=False) for each in (panda(), whole))
     assert found.cost == pytest.approx(bare.cost, rel=1e-3)
     assert found.bound == pytest.approx(bare.bound, rel=1e-2)
-    np.testing.assert_allclose(found.joints[:, 7], 0.02, atol=1e-9)
+    np.testing.assert_allclose(found["joints"][:, 7], 0.02, atol=1e-9)

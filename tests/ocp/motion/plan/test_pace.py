@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from models import Path, smooth
-from ocp import Limits, TipTask
+from ocp import Cost, Limits, TipTask
 from ocp.motion.plan import Plan
 from ocp.motion.tasks.tip_task import timed
 from tests.models.robot.trees import Array
@@ -44,7 +44,7 @@ def fixed(speed: float) -> Plan:
 @cache
 def free(time_cost: float, speed: float = FAST, limited: bool = False) -> Plan:
     limits = None if limited else UNLIMITED
-    options: dict[str, Any] = {"search": "start", "time_cost": time_cost, "start": first(), "limits": limits}
+    options: dict[str, Any] = {"search": "start", "cost": Cost(time=time_cost), "start": first(), "limits": limits}
     return plan_bare(angled_ur5(), asked(speed), "free", **options)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pickle
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import casadi as ca
@@ -14,8 +13,9 @@ import pytest
 from models import CollisionShape, FixedBase, Path, Sphere, smooth
 from models.arrays import Array
 from models.machines.moving_obstacle import MovingObstacle
-from ocp import DeadEnd, ProblemError, Scene, TipTask, plan, plan_in_segments
+from ocp import DeadEnd, ProblemError, Scene, TipTask, plan
 from ocp.motion.plan.piecewise import _task_between
+from ocp.motion.plan.segmented_plan import SegmentedPlan
 from tests.ocp.motion.search.test_charts import planar
 from tests.ocp.motion.search.test_reconfigurations import limited
 
@@ -38,6 +38,12 @@ def line(reach: float) -> TipTask:
     return TipTask(position=position, rows=[3, 4], duration=SECONDS)
 
 
+def in_segments(machine: FixedBase, task: TipTask, **options: Any) -> SegmentedPlan:
+    made = plan(machine, task, search="segments", **options)
+    assert isinstance(made, SegmentedPlan)
+    return made
+
+
 def posture(time: Array, reach: float, elbow: int) -> Array:
     """By the law of cosines. Shape (M, 2)."""
     x, y = 0.6, reach * (2 * time / SECONDS - 1)
@@ -56,12 +62,12 @@ def cost(first: float, last: float, reach: float, elbow: int) -> float:
 
 def test_of_two_links_the_pieces_are_the_branches_and_meet_where_that_costs_least() -> None:
     reach, machine = 0.45, arm()
-    made = plan(machine, line(reach), scene=False, search="segments")
+    made = in_segments(machine, line(reach), scene=False)
     assert made.fewest == len(made.reconfigurations) == 1
     (where,) = made.reconfigurations
     assert made.start_times == (0.0, where.time)
     assert made.segments[0].horizon == where.time
-    assert made.horizon == pytest.approx(SECONDS)
+    assert made.task_horizon == pytest.approx(SECONDS)
     spans = [(0.0, where.time, -1), (where.time, SECONDS, 1)]
     for piece, (begin, end, elbow) in zip(made.segments, spans, strict=True):
         assert piece.audit().passed
@@ -81,22 +87,23 @@ def test_of_two_links_the_pieces_are_the_branches_and_meet_where_that_costs_leas
     np.testing.assert_allclose(where.after, posture(np.array([where.time]), reach, 1)[0], atol=1e-6)
     assert where.motion is not None
     assert where.duration == pytest.approx(np.abs(where.after - where.before).max() / 3.0)
-    assert made.duration == pytest.approx(SECONDS + where.duration)
+    assert made.horizon == pytest.approx(SECONDS + where.duration)
     np.testing.assert_allclose(where.motion.at([0.0, where.duration])["joints"], [where.before, where.after], atol=1e-9)
     assert "1 reconfiguration, the fewest possible" in str(made)
     assert f"at {where.time:.4g} s the arm reconfigures" in str(made)
-    with pytest.raises(DeadEnd, match="plan_in_segments") as refused:
+    with pytest.raises(DeadEnd, match="search='segments'") as refused:
         plan(machine, line(reach), search="global", scene=False)
     assert refused.value.segments == pickle.loads(pickle.dumps(refused.value)).segments == 2
 
 
 @pytest.mark.long
 def test_what_one_motion_does_is_one_piece_and_the_plan() -> None:
-    made = plan(arm(), line(0.1), scene=False, search="segments")
+    made = in_segments(arm(), line(0.1), scene=False)
     assert (len(made.segments), made.reconfigurations, made.fewest) == (1, (), 0)
     alone = plan(arm(), line(0.1), search="global", scene=False)
     assert made.cost == pytest.approx(alone.cost, rel=1e-9)
-    assert made.duration == made.horizon == SECONDS
+    assert made.horizon == made.task_horizon == SECONDS
+    assert made.solution is made.segments[0].solution
 
 
 def with_bodies() -> FixedBase:
@@ -118,7 +125,7 @@ def with_bodies() -> FixedBase:
 def test_a_reconfiguration_goes_round_what_is_in_the_way(angle: float) -> None:
     place = 0.85 * np.array([np.cos(angle), np.sin(angle)])
     machine, ball = with_bodies(), Sphere(0.03, (*place, 0.0))
-    made = plan(machine, line(0.45), scene=Scene(obstacles=[ball], clearance=0.01), search="segments")
+    made = in_segments(machine, line(0.45), scene=Scene(obstacles=[ball], clearance=0.01))
     (where,) = made.reconfigurations
     assert all(piece.audit().passed for piece in made.segments)
     assert where.motion is not None, where.failure
@@ -161,9 +168,9 @@ def test_a_part_of_a_task_asks_for_the_same_at_its_times() -> None:
 
 
 def test_a_horizon_of_which_the_task_is_no_part_is_refused() -> None:
-    for planner in (plan_in_segments, partial(plan, search="global")):
+    for search in ("segments", "global"):
         with pytest.raises(ProblemError, match="no task is active") as refused:
-            planner(arm(), line(0.1), 1e12, start=posture(np.zeros(1), 0.1, 1)[0], clearance=None)
+            plan(arm(), line(0.1), 1e12, start=posture(np.zeros(1), 0.1, 1)[0], scene=False, search=search)
         assert refused.value.name == "horizon"
 
 

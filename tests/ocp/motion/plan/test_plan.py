@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from models import FixedBase, Path, smooth
-from ocp import Limits, TipTask
+from ocp import Cost, Limits, TipTask
 from ocp.motion.plan import Plan
 from ocp.motion.schedule import LineLimits, schedule
 from tests.families import some
@@ -136,7 +136,7 @@ START: dict[str, Any] = {"search": "start"}
 
 
 def short_motion(machine: Any = None, path: Any = SHORT, speed: Any = 0.05, **given: Any) -> Plan:
-    options = {key: given.pop(key) for key in ("weights", "limits", "start") if key in given}
+    options = {key: given.pop(key) for key in ("cost", "limits", "start") if key in given}
     task = TipTask.along(path, speed, **{"direction": DOWN, **given})
     return plan_bare(angled_ur5() if machine is None else machine, task, search="start", **options)
 
@@ -179,9 +179,9 @@ def test_the_way_back_costs_what_the_way_there_does(short: Plan) -> None:
 
 @pytest.mark.xdist_group("plan short")
 def test_weights_scale_the_cost_and_a_dear_joint_moves_less(short: Plan) -> None:
-    tripled = short_motion(weights=np.full(6, 3.0))
+    tripled = short_motion(cost=Cost(weights=np.full(6, 3.0)))
     assert tripled.cost == pytest.approx(3 * short.cost, rel=1e-6)
-    heavy = short_motion(weights=[100.0, 1, 1, 1, 1, 1])
+    heavy = short_motion(cost=Cost(weights=[100.0, 1, 1, 1, 1, 1]))
 
     def effort(found: Plan) -> float:
         return float(np.trapezoid(found.at(between(found))["rates"][:, 0] ** 2, between(found)))

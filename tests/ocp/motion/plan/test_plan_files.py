@@ -18,6 +18,7 @@ from models import FixedBase, FreeFloating, Link, Machine, Mimic, Standing, plan
 from ocp import ProblemError, Solution
 from ocp.motion.plan import Candidate, Plan, Reason, Rejection
 from ocp.motion.plan.request import restored_request, stored_request
+from ocp.motion.plan.solved_plan import SolvedPlan
 from ocp.motion.schedule import JointTrajectory
 from ocp.problem.stored import pack_record, unpack_record
 from tests.models.robot.trees import numeric
@@ -55,6 +56,7 @@ def test_a_saved_plan_is_audited_in_another_process(saved: Path) -> None:
 
 def test_a_plan_is_read_as_it_was_written(saved: Path, tmp_path: Path) -> None:
     found, again = planned("seam_ur5"), Plan.load(saved)
+    assert isinstance(again, SolvedPlan)
     for name in ("joints", "rates"):
         np.testing.assert_array_equal(again[name], found[name])
     np.testing.assert_array_equal(again.t, found.t)

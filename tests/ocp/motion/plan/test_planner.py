@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from models import FixedBase, Joint, Link, Robot
-from ocp import Limits, Plan, SolveError, TipTask, Unreachable, plan
+from ocp import Cost, Limits, Plan, SolveError, TipTask, Unreachable, plan
 
 SPEED, SECONDS, MOST = 0.4, 1.0, 0.5
 ALONG = TipTask(velocity=(SPEED,), rows=(3,))
@@ -36,7 +36,7 @@ def moved(start: Any = (0.1, 0.2), **asked: Any) -> Plan:
 @pytest.mark.parametrize("weights", [(1.0, 1.0), (1.0, 3.0), (0.5, 0.3)])
 def test_each_slide_moves_by_its_share_of_the_weights(weights: tuple[float, float]) -> None:
     """Least sum of w q'^2 / 2 with q1' + q2' = v: q' in inverse proportion to w, cost v^2 / 2 over the sum of 1 / w."""
-    found, inverse = moved(weights=weights), 1 / np.array(weights)
+    found, inverse = moved(cost=Cost(weights=weights)), 1 / np.array(weights)
     assert found.cost == pytest.approx(SPEED**2 * SECONDS / 2 / inverse.sum(), rel=1e-7)
     np.testing.assert_allclose(found["rates"], np.tile(SPEED * inverse / inverse.sum(), (len(found.t), 1)), atol=1e-6)
 
@@ -48,7 +48,7 @@ def test_a_slide_near_its_end_goes_as_far_as_it_may_at_a_steady_rate() -> None:
 
 
 def test_a_limit_of_velocity_leaves_the_rest_to_the_other() -> None:
-    found = moved(weights=(1.0, 3.0), limits=Limits(velocity=[0.25, 2.0]))
+    found = moved(cost=Cost(weights=(1.0, 3.0)), limits=Limits(velocity=[0.25, 2.0]))
     np.testing.assert_allclose(found["rates"][:, 0], 0.25, atol=1e-6)
     assert found.cost == pytest.approx((0.25**2 + 3 * 0.15**2) / 2, rel=1e-6)
 

@@ -51,7 +51,7 @@ def moved(start: Any, by: Any, seconds: float = SECONDS) -> TipTask:
 @cache
 def reached(edges: tuple[float, float] = EDGES, seconds: float = SECONDS) -> Plan:
     task = moved(first(), SHIFT, seconds)
-    return plan(machine(edges), task, seconds, start=first(), cost=Cost(weights=EFFORT))
+    return plan(machine(edges), task, seconds, start=first(), cost=EFFORT)
 
 
 def bodies(joints: Array) -> tuple[Array, Array, Array]:
@@ -142,7 +142,7 @@ def test_the_way_back_costs_no_more_than_the_way_there() -> None:
     """A film of it played backwards stands as well: reactions depend on accelerations and squares of rates."""
     there = reached()
     end = there["joints"][-1]
-    back = plan(machine(), moved(end, -SHIFT), SECONDS, start=end, cost=Cost(weights=EFFORT))
+    back = plan(machine(), moved(end, -SHIFT), SECONDS, start=end, cost=EFFORT)
     assert back.audit().passed
     assert back.cost <= there.cost * (1 + 1e-6)
 
@@ -156,14 +156,14 @@ def test_a_machine_in_another_plane_and_place_moves_alike() -> None:
     begin = ca.DM(tip_at(other, first())[[0, 2]])
     by = ca.DM([-SHIFT[0], SHIFT[1]])
     task = led(lambda t: begin + by * rest_to_rest(t / SECONDS), (3, 5))
-    found = plan(other, task, SECONDS, start=first(), cost=Cost(weights=EFFORT))
+    found = plan(other, task, SECONDS, start=first(), cost=EFFORT)
     assert found.cost == pytest.approx(reached().cost, rel=1e-5)
     times = np.linspace(0.0, SECONDS, 51)
     np.testing.assert_allclose(found.at(times)["joints"], reached().at(times)["joints"], atol=1e-4)
 
 
 def test_a_start_that_is_searched_stands_and_does_the_same() -> None:
-    found = plan(machine(), moved(first(), SHIFT), SECONDS, search="start", cost=Cost(weights=EFFORT))
+    found = plan(machine(), moved(first(), SHIFT), SECONDS, search="start", cost=EFFORT)
     assert found.audit().passed
     place = zero_moment_points(found, inside(found))[0]
     assert EDGES[0] - 1e-4 < place.min()
@@ -178,7 +178,7 @@ def test_what_moves_at_its_ends_does_not_begin_at_rest() -> None:
     """A tip at constant speed: joints are free to move at both ends."""
     begin = ca.DM(tip_at(planar_machine(SIZE), first())[1:])
     task = led(lambda t: begin + ca.DM(SHIFT) * t / SECONDS, ROWS)
-    found = plan(machine(), task, SECONDS, start=first(), cost=Cost(weights=EFFORT))
+    found = plan(machine(), task, SECONDS, start=first(), cost=EFFORT)
     assert found.audit().passed
     assert np.abs(found.at([0.0, SECONDS])["rates"]).max(axis=1).min() > 0.05
     tips = bodies(found.at([0.5, 1.5])["joints"])[2]
@@ -196,7 +196,7 @@ def test_a_saved_plan_is_the_same_motion(tmp_path: Path) -> None:
 def test_a_foot_beside_the_plane_in_which_all_moves_is_refused() -> None:
     beside = replace(machine(), support=rectangle((0.05, 0.2), EDGES), most_stable_point=None, half_widths=None)
     with pytest.raises(ProblemError, match="zero moment point"):
-        plan(beside, moved(first(), SHIFT), SECONDS, start=first(), cost=Cost(weights=EFFORT))
+        plan(beside, moved(first(), SHIFT), SECONDS, start=first(), cost=EFFORT)
 
 
 @pytest.mark.parametrize(
@@ -206,13 +206,13 @@ def test_a_foot_beside_the_plane_in_which_all_moves_is_refused() -> None:
         ("horizon", {"horizon": None}),
         ("horizon", {"horizon": "free"}),
         ("task 0", {"tasks": TipTask(position=[0.5, 1.0], rows=ROWS, begin=1.0)}),
-        ("weights", {"weights": np.ones(SIZE)}),
+        ("cost", {"cost": Cost(weights=np.ones(SIZE))}),
         ("start", {"tasks": TipTask(velocity=[0.1, 0.0], rows=ROWS), "start": None}),
         ("velocity", {"limits": Limits(velocity=[1.0, 2.0])}),
     ],
 )
 def test_what_no_standing_plan_takes_is_refused_by_name(name: str, changes: dict[str, Any]) -> None:
-    given: dict[str, Any] = {"tasks": moved(first(), SHIFT), "horizon": SECONDS, "start": first(), "weights": EFFORT}
+    given: dict[str, Any] = {"tasks": moved(first(), SHIFT), "horizon": SECONDS, "start": first(), "cost": EFFORT}
     with pytest.raises(ProblemError) as caught:
         plan(machine(), **{**given, **changes})
     assert caught.value.name == name

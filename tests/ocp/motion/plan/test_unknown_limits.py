@@ -25,9 +25,10 @@ from ocp import (
     inverse_kinematics,
     minimum_velocity_problem,
     plan,
-    plan_dynamics,
     solve,
 )
+from ocp.motion.builders.dynamics_plan import solve_dynamics
+from ocp.motion.plan.segmented_plan import SegmentedPlan
 from tests.ocp.motion.tasks.space_tasks import UR5_START, ur5
 
 START = np.array([0.4, 0.9, -0.6])
@@ -60,7 +61,9 @@ def planned(machine: FixedBase, **options: Any) -> Any:
 
 
 def in_pieces(machine: FixedBase) -> Any:
-    return [piece.cost for piece in plan(machine, task(machine), search="segments").segments]
+    made = plan(machine, task(machine), search="segments")
+    assert isinstance(made, SegmentedPlan)
+    return [piece.cost for piece in made.segments]
 
 
 def least_velocities(machine: FixedBase) -> Any:
@@ -70,7 +73,7 @@ def least_velocities(machine: FixedBase) -> Any:
 
 
 def moved(machine: FixedBase, **options: Any) -> Any:
-    solution = plan_dynamics(machine, (), 1.0, start=START, end=END, **options)
+    solution = solve_dynamics(machine, (), 1.0, start=START, end=END, **options)
     return solution.cost
 
 

@@ -15,6 +15,7 @@ from ocp import Candidate, Plan, SolveError, TipTask, Unreachable, plan
 from ocp.motion.plan.candidate import Reason, Rejection, Stage
 from ocp.motion.plan.candidate_solver import CandidateSolver
 from ocp.motion.plan.planner import checked_request
+from ocp.motion.plan.solved_plan import SolvedPlan
 from ocp.motion.search.cells import CellSearch
 from ocp.motion.search.dead_end import DeadEnd
 from ocp.motion.tasks.equations import task_errors
@@ -145,6 +146,7 @@ def test_tasks_one_after_the_other_are_searched_together() -> None:
     found = plan(machine, lines, start=START, search="global", scene=False)
     local = plan(machine, lines, start=START, search="start", scene=False)
     assert found.cost <= local.cost * (1 + 1e-6)
+    assert isinstance(found, SolvedPlan)
     assert len(found.parts) == 3
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any
+from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
@@ -14,8 +14,10 @@ from scipy.spatial.transform import Rotation, Slerp
 from models import FixedBase
 from models.arrays import Array
 from models.robot.rebuild import lock_joints
-from ocp import DeadEnd, ProblemError, TipTask, Waypoints, inverse_kinematics, plan
+from ocp import DeadEnd, ProblemError, Scene, TipTask, Waypoints, inverse_kinematics, plan
+from ocp.audit.clearance import ClosestPair
 from ocp.motion.local.closed_forms import closed_forms
+from ocp.motion.plan.path_plan import PathPlan
 from ocp.motion.search.charts import SelfMotionManifolds, TimeSample
 from ocp.motion.search.joint_space import JointSpace
 from ocp.motion.search.reconfigurations import fewest_segments, segment_ends
@@ -95,13 +97,13 @@ def of_six_joints(seed: int) -> tuple[FixedBase, Array, Array, float, list[Array
 @pytest.mark.parametrize(("seed", "count"), [(0, 1), (16, 4), (23, 0), (39, 2)])
 def test_of_six_joints_the_pieces_are_those_of_brute_force(seed: int, count: int) -> None:
     machine, places, quaternions, step, nodes = of_six_joints(seed)
-    told: dict[str, Any] = {"step": step, "clearance": None}
-    found = plan(machine, Waypoints(places, quaternions, reconfigurations="counted"), **told)
+    found = path(machine, Waypoints(places, quaternions, step, "counted"), False)
     expected = fewest(nodes, step)
     after = found.reconfigurations
     assert (len(after), expected[0]) == (count, count)
     assert found.cost == pytest.approx(expected[1], rel=1e-6)
-    assert found.bound <= found.cost
+    assert found.gap is not None
+    assert found.gap >= 0
     steps = np.abs(np.diff(found.joints, axis=0))
     assert (np.flatnonzero((steps > step + 1e-9).any(axis=1)) == after).all()
     assert found.cost == pytest.approx(np.delete(steps, after, axis=0).sum(), rel=1e-9)
@@ -110,7 +112,20 @@ def test_of_six_joints_the_pieces_are_those_of_brute_force(seed: int, count: int
     if count == 1:
         assert f"after waypoint {after[0]}" in str(found)
         with pytest.raises(DeadEnd):
-            plan(machine, Waypoints(places, quaternions), **told)
+            plan(machine, Waypoints(places, quaternions, step), scene=False)
+
+
+def path(machine: FixedBase, waypoints: Waypoints, scene: Scene | Literal[False]) -> PathPlan:
+    found = plan(machine, waypoints, scene=scene)
+    assert isinstance(found, PathPlan)
+    return found
+
+
+def closest(found: PathPlan) -> ClosestPair:
+    proof = found.clearance()
+    assert proof is not None
+    assert proof.worst is not None
+    return proof.worst
 
 
 def search_of(seed: int) -> tuple[AtlasSearch, list[Array], Array]:
@@ -196,16 +211,14 @@ def test_far_apart_parts_of_a_way_are_pieces_as_cheap_and_as_clear_as_by_themsel
             pose = machine.tip_pose((), np.array(begin) + 0.05 * k)
             rows.append(np.array(ca.DM(pose.position)).ravel())
             turns.append(Rotation.from_matrix(np.array(ca.DM(pose.rotation))).as_quat()[[3, 0, 1, 2]])
-    told: dict[str, Any] = {"step": 0.12, "obstacles": problem.boxes, "ignored": problem.ignored}
-    exclusive = [plan(machine, Waypoints(rows[k : k + 3], turns[k : k + 3]), **told) for k in (0, 3)]
-    found = plan(machine, Waypoints(rows, turns, reconfigurations="counted"), **told)
+    scene = Scene(obstacles=problem.boxes, ignored=problem.ignored)
+    exclusive = [path(machine, Waypoints(rows[k : k + 3], turns[k : k + 3], 0.12), scene) for k in (0, 3)]
+    found = path(machine, Waypoints(rows, turns, 0.12, "counted"), scene)
     assert found.reconfigurations == (2,)
     assert found.cost == pytest.approx(sum(one.cost for one in exclusive), rel=1e-6)
-    assert found.clearance is not None
-    assert found.clearance.worst is not None
-    nearest = [one.clearance.worst.distance for one in exclusive if one.clearance and one.clearance.worst]
-    assert found.clearance.worst.distance == pytest.approx(min(nearest), abs=1e-6)
-    assert not 2 < found.clearance.worst.time < 3
+    worst, *nearest = (closest(one) for one in (found, *exclusive))
+    assert worst.distance == pytest.approx(min(one.distance for one in nearest), abs=1e-6)
+    assert not 2 < worst.time < 3
 
 
 def test_pieces_are_counted_with_one_free_direction_at_most() -> None:

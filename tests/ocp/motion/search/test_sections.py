@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 from models import Box, FixedBase
 from models.arrays import Array
 from models.robot.rebuild import lock_joints
-from ocp import DeadEnd, ProblemError, Scene, SolveError, Unreachable, WaypointPlan, Waypoints, plan
+from ocp import Cost, DeadEnd, ProblemError, Scene, SolveError, Unreachable, Waypoints, plan
 from ocp.motion.plan import waypoints
+from ocp.motion.plan.path_plan import PathPlan
 from ocp.motion.plan.waypoints import WaypointSettings
 from ocp.motion.search.reconfigurations import SectionSettings, section_values
 from ocp.motion.search.search import SearchSettings
@@ -58,9 +59,16 @@ def task(count: int) -> tuple[Array, Array]:
 
 
 @cache
-def planned(count: int, **told: Any) -> WaypointPlan:
-    machine = problem_of("fetch__square").machine
-    return plan(machine, Waypoints(*task(count), step=STEP * 39 / (count - 1)), scene=False, **told)
+def planned(count: int, weights: tuple[float, ...] | None = None) -> PathPlan:
+    machine, cost = problem_of("fetch__square").machine, Cost(velocity=0.0, length=1.0, weights=weights)
+    return path(machine, Waypoints(*task(count), step=STEP * 39 / (count - 1)), cost=cost)
+
+
+def path(machine: FixedBase, waypoints: Waypoints, **options: Any) -> PathPlan:
+    """As `plan`, for paths of whatever the links may touch."""
+    found = plan(machine, waypoints, scene=False, **options)
+    assert isinstance(found, PathPlan)
+    return found
 
 
 def limit_charts(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
@@ -74,7 +82,7 @@ def test_a_way_keeps_its_poses_and_steps_and_is_no_dearer_than_with_the_lift_hel
     tips = [np.array(ca.DM(machine.tip_pose((), q).position)).ravel() for q in found.joints]
     assert np.array(tips) == pytest.approx(task(40)[0], abs=1e-6)
     assert (found.steps <= STEP + 1e-9).all()
-    assert found.bound == 0
+    assert found.bound is found.gap is None
     assert np.ptp(found.joints[:, 0]) > 0.1  # from one value to another
     for height in (0.0, 0.2, 0.38):
         arm = FixedBase(lock_joints(machine.robot, {machine.robot.joint_names[0]: height}))
@@ -86,7 +94,7 @@ def test_what_is_in_reach_at_no_one_height_of_the_lift_is_done_by_lifting() -> N
     machine, count = problem_of("fetch__square").machine, 40
     places = np.column_stack([np.full(count, 0.75), np.zeros(count), np.linspace(0.2, 1.4, count)])
     turns = np.tile((1.0, 0.0, 0.0, 0.0), (count, 1))
-    found = plan(machine, Waypoints(places, turns, step=STEP), scene=False)
+    found = path(machine, Waypoints(places, turns, step=STEP))
     assert found.joints[-1, 0] > found.joints[0, 0] + 0.1
     for height in (0.0, 0.2, 0.38):
         arm = FixedBase(lock_joints(machine.robot, {machine.robot.joint_names[0]: height}))
@@ -141,7 +149,7 @@ def test_what_is_in_the_way_is_named_with_the_waypoint() -> None:
 def test_a_handful_of_waypoints_may_be_as_far_apart_as_one_likes(count: int) -> None:
     places, turns = (rows[:count] for rows in task(40))
     machine = problem_of("fetch__square").machine
-    found = plan(machine, Waypoints(places, turns), scene=False)
+    found = path(machine, Waypoints(places, turns))
     tips = [np.array(ca.DM(machine.tip_pose((), q).position)).ravel() for q in found.joints]
     assert np.array(tips) == pytest.approx(places, abs=1e-6)
     assert found.cost == pytest.approx(np.abs(np.diff(found.joints, axis=0)).sum(), rel=1e-12)
@@ -181,9 +189,9 @@ def test_where_the_joint_is_held_at_no_value_that_does_the_waypoint_is_named(mon
 
 def test_with_one_free_direction_fewer_waypoints_are_searched_too(monkeypatch: pytest.MonkeyPatch) -> None:
     machine = problem_of("fetch_arm__s").machine
-    told: dict[str, Any] = {"clearance": None, "step": STEP}
-    found = plan(machine, Waypoints(*task(40)), **told)
+    found = path(machine, Waypoints(*task(40), step=STEP))
     limit_charts(monkeypatch, 1000)  # there are some 300 at each of 9 waypoints
-    again = plan(machine, Waypoints(*task(40)), **told)
+    again = path(machine, Waypoints(*task(40), step=STEP))
     assert again.cost == pytest.approx(found.cost, rel=0.02)
-    assert again.bound <= again.cost
+    assert again.gap is not None
+    assert again.gap >= 0
