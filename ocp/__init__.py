@@ -11,17 +11,16 @@ from ocp.motion.builders.actuator_limits import JointFriction, joint_torques
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.cts import RollObstacles, RollSettings, roll_problem, spline_targets
 from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem
-from ocp.motion.builders.dynamics_plan import dynamics_phases, plan_dynamics
+from ocp.motion.builders.dynamics_plan import dynamics_phases
 from ocp.motion.builders.joint_spline import joint_path
 from ocp.motion.builders.minimum_velocity import minimum_velocity_problem
-from ocp.motion.builders.space.capture import capture_problem, chained_capture, plan_capture
+from ocp.motion.builders.space.capture import Capture, capture_problem, chained_capture
 from ocp.motion.builders.space.grasping import Cone, Grasp
-from ocp.motion.builders.standing.plan import plan_standing, plan_steps
 from ocp.motion.builders.standing.problem import FreeTime, StandingSetup, Weights, standing_problem
 from ocp.motion.builders.standing.resolved import StepsMotion, resolve_steps, steps_motion
 from ocp.motion.builders.standing.stances import StancePhase, Steps, standing_configuration, walk
 from ocp.motion.builders.standing.steps import StepWeights, steps_problem
-from ocp.motion.builders.timing import minimum_time_problem, plan_minimum_time
+from ocp.motion.builders.timing import minimum_time_problem
 from ocp.motion.local.accelerations import Layer, Stabiliser, resolve_accelerations
 from ocp.motion.local.inverse_kinematics import Unreachable, inverse_kinematics
 from ocp.motion.local.rates import resolve
@@ -54,6 +53,7 @@ __all__ = [
     "AuditError",
     "BoundWarning",
     "Candidate",
+    "Capture",
     "Certificate",
     "ClearanceConstraints",
     "Collocation",
@@ -110,11 +110,6 @@ __all__ = [
     "minimum_time_problem",
     "minimum_velocity_problem",
     "plan",
-    "plan_capture",
-    "plan_dynamics",
-    "plan_minimum_time",
-    "plan_standing",
-    "plan_steps",
     "prepare",
     "refine",
     "resolve",

@@ -32,7 +32,7 @@ LAYERS = {
     ],
     "ocp": [
         ["errors", "curves", "status", "tolerances", "registry"],
-        ["console"],
+        ["console", "progress"],
         ["storage", "libraries", "solution_data"],
         ["problem"],
         ["solution"],

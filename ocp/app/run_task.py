@@ -50,7 +50,7 @@ def run_task(
 
     for kind, file in outputs.items():  # check the outputs before the user waits for the plan
         checked(kind, file)
-    result = plan(task.machine, task.task, **task.options)
+    result = plan(task.machine, task.task, **task.options, progress=progress)
     check_period(result, task.period)
     progress("audit")
     audit = result.audit()

@@ -15,21 +15,10 @@ import casadi as ca
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+import ocp
 from models import FreeFloating, Link, Robot, VisualShape, with_wheels
 from models.arrays import Array
-from ocp import (
-    Audit,
-    Collocation,
-    Cone,
-    Cost,
-    DynamicsSetup,
-    FreeTime,
-    Grasp,
-    Limits,
-    Solution,
-    dynamics_problem,
-    plan_capture,
-)
+from ocp import Audit, Capture, Cone, Cost, DynamicsSetup, FreeTime, Grasp, Limits, Solution, dynamics_problem
 from ocp.app.view.appearance import Frames, frames_along
 from ocp.motion.builders.space.grasping import grasp_wrench, joined, motion_of, pair_momentum
 from scripts.drawing import COLORS, DASHES
@@ -38,7 +27,7 @@ from scripts.robots.capture_family import SPINS, Member
 from scripts.robots.drawing import Scene, animate, joint_curves, page
 from scripts.robots.robots import SPACE_ARM
 
-__all__ = ["CaptureExample", "asked_for", "draw", "plan"]
+__all__ = ["CaptureExample", "draw", "plan", "request"]
 
 START = (0.3, 0.9, 0.2, -1.6, 0.3, 0.9, 0.4)  # rad
 MASS, SIZE = 300.0, (1.2, 1.2, 1.6)  # of the target, kg and m
@@ -50,7 +39,6 @@ JOINT_TORQUE = 100.0  # N m
 GRASP = Grasp(force=60.0, moment=60.0)
 CONE = Cone((0.0, 0.0, -1.0), 0.35, 0.3)
 APPROACH, DETUMBLE = FreeTime(8.0, 60.0, 15.0), FreeTime(8.0, 60.0, 40.0)
-METHOD = Collocation(12, degree=4, scheme="legendre")
 VIEW = (20.0, -70.0)  # deg
 GOLD, DARK = (0.86, 0.72, 0.40, 1.0), (0.20, 0.24, 0.36, 1.0)
 
@@ -60,11 +48,14 @@ class CaptureExample:
     """A capture that was planned.
 
     Attributes:
-        asked: What was asked, as of `plan_capture`. plan: Of both phases. audit: Of it.
+        chaser, capture, options: What was planned: machine, task and further arguments of `ocp.plan`.
+        plan: Solution of both phases. audit: Its audit.
         family: Captures in the plane over the spin of the target, see `scripts.robots.capture_family`.
     """
 
-    asked: dict[str, Any]
+    chaser: FreeFloating
+    capture: Capture
+    options: dict[str, Any]
     plan: Solution
     audit: Audit
     family: list[Member]
@@ -75,7 +66,7 @@ class CaptureExample:
         force, moment = bearing(self, self.samples("detumble", 201))
         return {
             "robot": f"{SPACE_ARM.name} with three wheels",
-            "dof": self.asked["chaser"].joint_size,
+            "dof": self.chaser.joint_size,
             "task_rows": None,
             "duration_s": float(begin.horizon + after.horizon),
             "grasp_s": float(begin.horizon),
@@ -84,7 +75,7 @@ class CaptureExample:
             "tip_error": None,
             "joint_return_rad": None,
             "audit_passed": self.audit.passed,
-            "target_momentum_Nms": float(np.linalg.norm(np.asarray(self.asked["target"].conserved_momentum)[:3])),
+            "target_momentum_Nms": float(np.linalg.norm(np.asarray(self.capture.target.conserved_momentum)[:3])),
             "wheel_momentum_largest_Nms": float(np.abs(self.wheels("detumble")).max()),
             "grasp_force_largest_N": float(np.linalg.norm(force, axis=1).max()),
             "grasp_moment_largest_Nm": float(np.linalg.norm(moment, axis=1).max()),
@@ -105,8 +96,8 @@ def chaser() -> FreeFloating:
     return FreeFloating(with_wheels(robot, np.eye(3), WHEEL, momentum=MOMENTUM, torque=TORQUE))
 
 
-def asked_for(spin: Any = SPIN) -> dict[str, Any]:
-    """What is asked of `plan_capture`, for a target of a spin, rad/s, in its own axes."""
+def request(spin: Any = SPIN) -> tuple[FreeFloating, Capture, dict[str, Any]]:
+    """Return machine, task and further arguments of `ocp.plan`, for a target of a spin, rad/s, in its own axes."""
     machine = chaser()
     joints = np.array([*START, 0.0, 0.0, 0.0])
     half = np.array(SIZE) / 2
@@ -120,14 +111,22 @@ def asked_for(spin: Any = SPIN) -> dict[str, Any]:
     center = np.array(ca.DM(tip.position)).ravel() + turn @ np.add(AWAY, (0.0, 0.0, half[2]))
     place = np.concatenate([center, quaternion(turn)])
     momentum = np.concatenate([turn @ moments @ np.asarray(spin), np.zeros(3)])
-    return {
-        "chaser": machine, "target": FreeFloating(robot, conserved_momentum=momentum), "start": joints,
-        "approach": APPROACH, "detumble": DETUMBLE, "target_base": place, "cone": CONE, "grasp": GRASP,
-        "end": [*START, np.nan, np.nan, np.nan],
+    capture = Capture(
+        FreeFloating(robot, conserved_momentum=momentum),
+        APPROACH,
+        DETUMBLE,
+        target_base=place,
+        cone=CONE,
+        grasp=GRASP,
+        end=[*START, np.nan, np.nan, np.nan],
+    )
+    options = {
+        "start": joints,
         "limits": Limits(velocity=[RATE] * 7 + [MOMENTUM / WHEEL] * 3, torque=[JOINT_TORQUE] * 7 + [TORQUE] * 3),
         "cost": Cost(velocity=0.0, effort=[0.01] * 7 + [10.0] * 3, acceleration=[100.0] * 7 + [0.0] * 3, time=0.05),
-        "method": METHOD,
-    }  # fmt: skip
+        "scene": False,
+    }
+    return machine, capture, options
 
 
 def quaternion(turn: Array) -> Array:
@@ -137,14 +136,14 @@ def quaternion(turn: Array) -> Array:
 
 def plan(coarse: bool = False) -> CaptureExample:
     """The capture, audited, and the family; `coarse`: of one spin."""
-    asked = asked_for()
-    found = plan_capture(**asked)
-    return CaptureExample(asked, found, found.audit(), capture_family.plan(SPINS[1:2] if coarse else SPINS))
+    machine, capture, options = request()
+    planned = ocp.plan(machine, capture, **options)
+    family = capture_family.plan(SPINS[1:2] if coarse else SPINS)
+    return CaptureExample(machine, capture, options, planned.solution, planned.audit(), family)
 
 
 def bearing(example: CaptureExample, along: dict[str, Array]) -> tuple[Array, Array]:
     """Force and moment that the tip gives the target while detumbling. Shape (M, 3) each, N and N m."""
-    asked = example.asked
     pair = together(example)
     free = np.full(7, np.nan)
     problem = dynamics_problem(
@@ -152,12 +151,14 @@ def bearing(example: CaptureExample, along: dict[str, Array]) -> tuple[Array, Ar
         (),
         1.0,
         start=None,
-        limits=asked["limits"],
+        limits=example.options["limits"],
         setup=DynamicsSetup(start_velocity="free", end_velocity="free", start_base=free),
     )
     second = problem.declared.controls["accelerations"].symbol
     base, joints, rates = motion_of(problem)
-    found = ca.Function("bearing", [base, joints, rates, second], list(grasp_wrench(pair, asked["target"], problem)))
+    found = ca.Function(
+        "bearing", [base, joints, rates, second], list(grasp_wrench(pair, example.capture.target, problem))
+    )
     names = ("base", "joints", "velocities", "accelerations")
     force, moment = found.map(len(along["base"]))(*(along[name].T for name in names))
     return np.array(force).T, np.array(moment).T
@@ -165,8 +166,8 @@ def bearing(example: CaptureExample, along: dict[str, Array]) -> tuple[Array, Ar
 
 def together(example: CaptureExample) -> FreeFloating:
     """Both as one machine."""
-    one, other = example.asked["chaser"], example.asked["target"]
-    start = (one.base_home(), example.asked["target_base"], example.asked["start"])
+    one, other = example.chaser, example.capture.target
+    start = (one.base_home(), example.capture.target_base, example.options["start"])
     carried = np.array(ca.DM(pair_momentum(one, other, *start))).ravel()
     return FreeFloating(joined(one.robot, other.robot), conserved_momentum=carried)
 
@@ -178,7 +179,7 @@ def scenes_of(example: CaptureExample, count: int = 161) -> list[Scene]:
         along, duration = example.samples(phase, count), example.plan.phase(phase).horizon
         frames = frames_along(pair, along["joints"], along["base"])
         if phase == "approach":
-            own = frames_along(example.asked["target"], np.zeros((count, 0)), along["target"])
+            own = frames_along(example.capture.target, np.zeros((count, 0)), along["target"])
             frames = Frames(
                 {**frames.rotations, "target": own.rotations["target"]},
                 {**frames.positions, "target": own.positions["target"]},
@@ -200,7 +201,7 @@ def draw(example: CaptureExample, folder: Path, *, animation: bool = True) -> No
     )
     spin = np.degrees(np.linalg.norm(SPIN))
     note = (
-        f"{SPACE_ARM.name} of {example.asked['chaser'].robot.total_mass:.0f} kg, a body of {MASS:.0f} kg that turns by "
+        f"{SPACE_ARM.name} of {example.chaser.robot.total_mass:.0f} kg, a body of {MASS:.0f} kg that turns by "
         f"{spin:.1f} degrees a second; earlier postures pale. Wheels of {MOMENTUM:g} N m s and {TORQUE:g} N m each, "
         f"joints of {np.degrees(RATE):.0f} degrees a second and {JOINT_TORQUE:g} N m, a hand of {GRASP.force:g} N and "
         f"{GRASP.moment:g} N m, a cone of {np.degrees(CONE.half_angle):.0f} degrees over the last {CONE.length:g} m. "

@@ -15,12 +15,13 @@ from typing import Any
 
 import numpy as np
 
+import ocp
 from models import FreeFloating, Link, Robot, planar_chain, with_wheels
-from ocp import Collocation, Cost, Limits, chained_capture, plan_capture
+from ocp import Capture, Collocation, Cost, Limits, chained_capture
 from scripts.drawing import COLORS, sheet
 from scripts.papers.run import Table, write
 
-__all__ = ["SPINS", "Member", "asked_for", "draw", "plan", "planned", "save"]
+__all__ = ["SPINS", "Member", "draw", "plan", "planned", "request", "save"]
 
 SPINS = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3)  # rad/s
 START = (1.2, -2.0, 0.6)  # rad
@@ -52,8 +53,8 @@ class Member:
     passed: bool
 
 
-def asked_for(spin: float, kind: str) -> dict[str, Any]:
-    """What is asked of `plan_capture`: the target turns to the same attitude at the grasp whatever its spin."""
+def request(spin: float, kind: str) -> tuple[FreeFloating, Capture, dict[str, Any]]:
+    """Return machine, task and further arguments; the target turns to the same attitude at the grasp at any spin."""
     hub = Link("hub", 60.0, (0, 0, 0), 6.0 * np.eye(3))
     robot = planar_chain([0.8, 0.7, 0.3], [4.0, 3.0, 1.0], base=hub, mount=MOUNT)
     carried, joints, weights, rates = [0.0, 0.0, 0.0], list(START), [1.0] * 3, [RATE] * 3
@@ -64,19 +65,18 @@ def asked_for(spin: float, kind: str) -> dict[str, Any]:
         carried[0] = -INERTIA * spin
     body = Link("target", MASS, (0, 0, 0), INERTIA * np.eye(3))
     target = Robot((body,), (), tip="target", tip_translation=(-0.4, 0, 0), name="target")
-    return {
-        "chaser": FreeFloating(robot, "planar", conserved_momentum=carried),
-        "target": FreeFloating(target, "planar", conserved_momentum=[INERTIA * spin, 0.0, 0.0]),
-        "start": joints, "approach": DURATION, "detumble": DURATION,
-        "target_base": [*GRASPED, -spin * DURATION], "cost": Cost(velocity=0.0, effort=1.0, acceleration=weights),
-        "limits": Limits(velocity=rates), "method": METHOD,
-    }  # fmt: skip
+    floating = FreeFloating(target, "planar", conserved_momentum=[INERTIA * spin, 0.0, 0.0])
+    capture = Capture(floating, DURATION, DURATION, target_base=[*GRASPED, -spin * DURATION])
+    cost = Cost(velocity=0.0, effort=1.0, acceleration=weights)
+    options = {"start": joints, "cost": cost, "limits": Limits(velocity=rates)}
+    return FreeFloating(robot, "planar", conserved_momentum=carried), capture, options
 
 
 def planned(spin: float, kind: str) -> Member:
     """Both plans of a member, audited."""
-    asked = asked_for(spin, kind)
-    together, (approach, detumble) = plan_capture(**asked), chained_capture(**asked)
+    machine, capture, options = request(spin, kind)
+    together = ocp.plan(machine, capture, scene=False, **options)
+    approach, detumble = chained_capture(machine, capture, method=METHOD, **options)
     passed = all(each.audit().passed for each in (together, approach, detumble))
     first, then = float(approach.cost), float(detumble.cost)
     return Member(spin, kind, float(together.cost), first + then, first, then, passed)

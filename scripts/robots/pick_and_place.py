@@ -17,8 +17,9 @@ import numpy as np
 
 from models import FixedBase, Link, Robot, VisualShape, attach_tool, with_load
 from models.arrays import Array
-from ocp import Audit, Collocation, Cost, Goal, Solution, TipTask, inverse_kinematics, joint_torques, plan_dynamics
+from ocp import Audit, Collocation, Cost, Goal, Solution, TipTask, inverse_kinematics, joint_torques
 from ocp.app.view.appearance import TIP_FRAME, Frames, frames_along
+from ocp.motion.builders.dynamics_plan import solve_dynamics
 from scripts.drawing import COLORS
 from scripts.robots.drawing import Scene, animate, joint_curves, page
 from scripts.robots.panda import HOME
@@ -160,7 +161,7 @@ def plan(coarse: bool = False) -> PickAndPlace:
     """Both plans, audited; on one mesh only, `coarse` or not."""
     plans, motions, audits = {}, {}, {}
     for name in KINDS:
-        plans[name] = plan_dynamics(arm(), legs(name == "load known"), start=HOME, cost=EFFORT, method=METHOD)
+        plans[name] = solve_dynamics(arm(), legs(name == "load known"), start=HOME, cost=EFFORT, method=METHOD)
         motions[name], audits[name] = motion_of(plans[name]), plans[name].audit()
     return PickAndPlace(plans, motions, audits)
 

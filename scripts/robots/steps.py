@@ -9,18 +9,18 @@ inverse sets the feet as far with the least joint rates; its zero moment point l
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+import ocp
 from models import Foot, Foothold, FreeFloating, Joint, Link, Robot, VisualShape, rectangle
 from models.arrays import Array
-from ocp import Audit, Collocation, Limits, Solution
+from ocp import Audit, Limits, Solution
 from ocp.app.view.appearance import frames_along
-from ocp.motion.builders.standing.plan import plan_steps
 from ocp.motion.builders.standing.resolved import StepsMotion, resolve_steps, steps_motion
 from ocp.motion.builders.standing.stances import StancePhase, Steps, standing_configuration, walk
 from scripts.drawing import COLORS
@@ -43,7 +43,6 @@ KINDS: dict[str, dict[str, Any]] = {
     "as a whole": {"balance": "dynamic", "margin": MARGIN, "times": (0.5, 0.6), "color": "blue"},
 }
 """What is asked of the walk in balance and of the dynamic one; durations of both feet held and of one in the air, s."""
-METHOD = Collocation(12, degree=3, scheme="legendre")
 VIEW = (9.0, -74.0)  # deg
 METAL, DARK = (0.80, 0.82, 0.86, 1.0), (0.25, 0.27, 0.31, 1.0)
 
@@ -181,7 +180,7 @@ def plan(coarse: bool = False) -> StepsExample:
     """Both walks, audited; on one mesh only, `coarse` or not."""
     walks = walks_of(planar_steps, KINDS, CLEARANCE)
     steps = walks.motions["as a whole"].steps
-    return StepsExample(**vars(walks), local=resolve_steps(steps, start=bent(steps), clearance=CLEARANCE))
+    return StepsExample(**vars(walks), local=resolve_steps(steps, start=bent(steps)))
 
 
 def walks_of(made: Callable[..., Steps], kinds: dict[str, dict[str, Any]], clearance: float) -> Walks:
@@ -194,16 +193,9 @@ def walks_of(made: Callable[..., Steps], kinds: dict[str, dict[str, Any]], clear
     """
     plans, motions = {}, {}
     for name, kind in kinds.items():
-        steps = made(2, *kind["times"])
-        plans[name] = plan_steps(
-            steps,
-            start=bent(steps),
-            balance=kind["balance"],
-            margin=kind["margin"],
-            limits=Limits(friction=FRICTION),
-            clearance=clearance,
-            method=METHOD,
-        )
+        steps = replace(made(2, *kind["times"]), balance=kind["balance"], margin=kind["margin"], clearance=clearance)
+        start = bent(steps)[steps.order(steps.stances[0])]
+        plans[name] = ocp.plan(steps.stances[0], steps, start=start, limits=Limits(friction=FRICTION)).solution
         motions[name] = steps_motion(steps, plans[name])
     return Walks(plans, motions, {name: plan.audit() for name, plan in plans.items()})
 

@@ -18,7 +18,7 @@ from models import SmoothPath, paths, scara_along, smooth
 from models.arrays import Array
 from models.paths import gauss_newton, march, path_function, predictor_corrector
 from models.paths.arc_length import arc_length, speed
-from ocp import plan_minimum_time
+from ocp.motion.builders.timing import solve_minimum_time
 from ocp.motion.schedule import LineLimits, Schedule, peak_acceleration, schedule
 from scripts import drawing
 from scripts.papers.blend.example import (
@@ -176,7 +176,7 @@ def planning(limits: LineLimits, repeats: int) -> list[dict[str, Any]]:
     rows = [{"plan": name, "ms": 1e3 * least(work, repeats), "duration_s": 0.0} for name, work in works.items()]
     for row, found in zip(rows, (*(work() for work in list(works.values())[:2]), plan), strict=True):
         row["duration_s"] = found.duration
-    best = plan_minimum_time(path, all_of_them, arm, guess=plan, intervals=100)
+    best = solve_minimum_time(path, all_of_them, arm, guess=plan, intervals=100)
     seconds = best.solution.seconds["build"] + best.solution.seconds["solve"]
     name = "the same in minimum time, optimal control"
     return [*rows, {"plan": name, "ms": 1e3 * seconds, "duration_s": best.duration}]

@@ -19,8 +19,9 @@ import numpy as np
 
 from models import FixedBase, SmoothPath, paths, smooth
 from models.arrays import Array
-from ocp import joint_path, plan_minimum_time
+from ocp import joint_path
 from ocp.motion.builders.joint_spline import PlannedJoints
+from ocp.motion.builders.timing import solve_minimum_time
 from ocp.motion.schedule import JointLimits, LineLimits, Schedule, joint_motion, schedule
 from scripts import drawing
 from scripts.papers.run import progress, text_table
@@ -166,7 +167,7 @@ def arm_row(seed: int) -> dict[str, Any]:
     """The schedule of a random arm beside the least time that optimal control finds."""
     path, joints, limits = random_arm(seed)
     plan, seconds = timed(lambda: schedule(path, limits, joints=joints))
-    best = plan_minimum_time(path, limits, joints, guess=plan, intervals=60, rounds=0)
+    best = solve_minimum_time(path, limits, joints, guess=plan, intervals=60, rounds=0)
     longer = plan.duration / best.duration - 1
     return {"seed": seed, "joints": len(joints.names), "seconds": seconds, "longer": longer} | {
         "largest_demand": largest(plan, joints)

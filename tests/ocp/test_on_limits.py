@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 
 from models import FixedBase, Joint, Robot, planar_chain
 from models.arrays import Array
-from ocp import DynamicsSetup, Limits, Problem, ProblemError, TipTask, minimum_velocity_problem, plan, plan_dynamics
+from ocp import DynamicsSetup, Limits, Problem, ProblemError, TipTask, minimum_velocity_problem, plan
 from ocp.errors import format_distinct
+from ocp.motion.builders.dynamics_plan import solve_dynamics
 
 LOW, HIGH = np.array([-0.0175, -2.0]), np.array([3.7525, 2.0])
 
@@ -40,11 +41,11 @@ def planned(joints: Array) -> float:
 
 
 def moved(joints: Array) -> float:
-    return float(plan_dynamics(MACHINE, (), 1.0, start=joints, end=[0.3, 0.9]).at(0.0)["joints"][0])
+    return float(solve_dynamics(MACHINE, (), 1.0, start=joints, end=[0.3, 0.9]).at(0.0)["joints"][0])
 
 
 def arrived(joints: Array) -> float:
-    return float(plan_dynamics(MACHINE, (), 1.0, start=[0.3, 0.9], end=joints).at(1.0)["joints"][0])
+    return float(solve_dynamics(MACHINE, (), 1.0, start=[0.3, 0.9], end=joints).at(1.0)["joints"][0])
 
 
 def declared(joints: Array) -> float:
@@ -63,12 +64,14 @@ def test_a_joint_beyond_its_limit_by_rounding_is_on_it(entry: Callable[[Array], 
 
 def test_velocities_beyond_their_limit_by_rounding_are_on_it() -> None:
     asked: dict[str, Any] = {"end": [1.5, 0.9], "limits": Limits(velocity=1.1)}
-    fast = plan_dynamics(
+    fast = solve_dynamics(
         MACHINE, (), 2.0, start=[0.3, 0.9], **asked, setup=DynamicsSetup(start_velocity=[np.nextafter(1.1, 2), 0.0])
     )
     assert fast.at(0.0)["velocities"][0] == pytest.approx(1.1, abs=1e-9)
     with pytest.raises(ProblemError, match=r"'joint1' starts at 1\.1000001, outside its limits -1\.1 \.\. 1\.1;"):
-        plan_dynamics(MACHINE, (), 2.0, start=[0.3, 0.9], **asked, setup=DynamicsSetup(start_velocity=[1.1000001, 0.0]))
+        solve_dynamics(
+            MACHINE, (), 2.0, start=[0.3, 0.9], **asked, setup=DynamicsSetup(start_velocity=[1.1000001, 0.0])
+        )
 
 
 def test_a_declared_value_just_beyond_a_bound_is_told_with_the_digits_that_differ() -> None:

@@ -51,7 +51,7 @@ from ocp.switching import WARM_START_OPTIONS, solve_at_switches
 from ocp.tightening import largest_excess, tighten
 
 __all__ = [
-    "audit_error", "breaks_of", "checked_goals", "dynamics_phases", "machines_of", "phase_names", "plan_dynamics",
+    "audit_error", "breaks_of", "checked_goals", "dynamics_phases", "machines_of", "phase_names", "solve_dynamics",
     "within_limits",
 ]  # fmt: skip
 
@@ -223,7 +223,7 @@ HOLDING = HoldingSettings()
 
 
 @interruptible
-def plan_dynamics(
+def solve_dynamics(
     machine: Motors,
     tasks: TipTask | Sequence[TipTask] | Sequence[Goal],
     horizon: float | FreeTime | None = None,
@@ -315,7 +315,7 @@ def within_limits(
     tolerances: Mapping[str, float] | None,
     machines: Mapping[str, tuple[Machine, Limits | None]],
 ) -> Solution:
-    """Return a plan that satisfies its limits between the nodes and passes its audit; see `plan_dynamics`.
+    """Return a plan that satisfies its limits between the nodes and passes its audit; see `solve_dynamics`.
 
     Args:
         declare: Declares the problem under clearance constraints.

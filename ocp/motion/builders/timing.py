@@ -41,7 +41,7 @@ from ocp.motion.schedule.profile import Array, SpeedProfile, integrate_jerk
 from ocp.problem.problem import Problem
 from ocp.solution import Solution
 
-__all__ = ["Fastest", "TimingProblem", "minimum_time_problem", "plan_minimum_time"]
+__all__ = ["Fastest", "TimingProblem", "minimum_time_problem", "solve_minimum_time"]
 
 IPOPT = {"tol": 1e-9, "constr_viol_tol": 1e-9, "max_iter": 1000}
 
@@ -147,7 +147,7 @@ class Fastest:
 
 
 @interruptible
-def plan_minimum_time(
+def solve_minimum_time(
     path: PathLike,
     limits: LineLimits,
     joints: JointPath | None = None,
@@ -200,14 +200,14 @@ def minimum_time_problem(
     guess: Schedule | None = None,
     intervals: int = 200,
 ) -> TimingProblem:
-    """Declare the problem of `plan_minimum_time`, for any method to solve.
+    """Declare the problem of `solve_minimum_time`, for any method to solve.
 
     The path constraints are "asked speed" (the line speed's limit), "centripetal acceleration", "joint velocity",
     "joint acceleration" and "joint jerk", each over its limit and only if limited. The boundary constraints are "start
     at rest" and "end at rest", "start jerk" and "end jerk".
 
     Args:
-        path, limits, joints, guess, intervals: As for `plan_minimum_time`.
+        path, limits, joints, guess, intervals: As for `solve_minimum_time`.
 
     Raises:
         ProblemError: Joint limits are given without joints; the joint jerk is limited on a path whose curvature jumps;

@@ -19,6 +19,7 @@ from ocp.errors import SolveError
 from ocp.motion.plan.candidate import Candidate, Reason, Rejection, Stage
 from ocp.motion.plan.solved_plan import SolvedPlan
 from ocp.motion.search.settings import PlannerSettings
+from ocp.progress import report
 from ocp.solution import Solution
 
 __all__ = ["CandidateQueue", "Solver"]
@@ -113,6 +114,7 @@ class CandidateQueue:
             self._push(seed)
         while self._heap:
             candidate = heappop(self._heap)[-1]
+            report(self._state)
             if (motion := self._find_motion(candidate)) is not None:
                 motion.waiting.append(candidate)
             elif (reason := self._prune(candidate)) is not None:
@@ -140,6 +142,11 @@ class CandidateQueue:
         ]
         finished.sort(key=lambda c: (c is not best, np.inf if np.isnan(c.cost) else c.cost))
         return self.solver.plan([candidate.finished() for candidate in finished])
+
+    @property
+    def _state(self) -> str:
+        best = f", lowest cost {self.cost:.6g}" if self.passed else ""
+        return f"{len(self.candidates)} of {len(self.candidates) + len(self._heap) + 1} motions done{best}"
 
     def _push(self, candidate: Candidate) -> None:
         self._pushed += 1

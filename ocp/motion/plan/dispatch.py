@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, Literal, TypeAlias, get_args
 
 from models import FixedBase, Machine, Standing
-from ocp.console import interruptible
-from ocp.errors import ProblemError, checked_choice, checked_instance
+from ocp.console import interruptible, time_limited
+from ocp.errors import ProblemError, checked_choice, checked_instance, checked_time_limit
+from ocp.motion.builders.space.capture import Capture
 from ocp.motion.builders.standing.problem import Weights
+from ocp.motion.builders.standing.stances import Steps
+from ocp.motion.builders.standing.steps import StepWeights
+from ocp.motion.plan.goal_sequence import plan_capture, plan_sequence, plan_steps
 from ocp.motion.plan.motion import Plan
 from ocp.motion.plan.path_plan import PathPlan
+from ocp.motion.plan.phased_plan import PhasedPlan
 from ocp.motion.plan.piecewise import plan_in_segments
 from ocp.motion.plan.planner import checked_request, clearance_for, plan_request
 from ocp.motion.plan.segmented_plan import SegmentedPlan
@@ -20,30 +25,35 @@ from ocp.motion.plan.solved_plan import SolvedPlan
 from ocp.motion.plan.standing import plan_to_stand
 from ocp.motion.plan.waypoints import plan_path
 from ocp.motion.tasks.cost import Cost
-from ocp.motion.tasks.goals import Waypoints
+from ocp.motion.tasks.goals import Goal, Waypoints
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.scene import Scene
 from ocp.motion.tasks.tip_task import TipTask
+from ocp.progress import shown_progress
+from ocp.solution import read_head
 from ocp.storage import read_arrays
 
 __all__ = ["Search", "load_plan", "plan"]
 
 Search: TypeAlias = Literal["start", "configurations", "global", "segments"]
+Tasks: TypeAlias = TipTask | Goal | Waypoints | Steps | Capture | Sequence[TipTask] | Sequence[Goal]
 
 
 @interruptible
 def plan(
     machine: Machine,
-    tasks: TipTask | Waypoints | Sequence[TipTask],
+    tasks: Tasks,
     horizon: float | Literal["free"] | None = None,
     *,
     start: Any = None,
     cyclic: bool = False,
-    cost: Cost | Weights | None = None,
+    cost: Cost | Weights | StepWeights | None = None,
     limits: Limits | None = None,
     scene: Scene | Literal[False] | None = None,
     search: Search = "configurations",
     seed: int = 0,
+    time_limit: float | None = None,
+    progress: Callable[[str], Any] | bool | None = None,
 ) -> Plan:
     """Plan the lowest-cost motion that does the tasks: the least integral of half the squared joint rates.
 
@@ -74,7 +84,10 @@ def plan(
             base, the motions come from a search over exact states without a bound (see `search.cells`), which also
             passes singularities. "segments": as "global"; if no single motion does the tasks, in the fewest segments,
             between which an arm on a fixed base moves to another configuration while the tasks wait.
-        seed: Seed of inverse kinematics.
+        seed: Seed of all random numbers.
+        time_limit: Seconds after which planning ends with a SolveError; None for no limit.
+        progress: Function that is called with the name of each stage; True: a line shows it; False: nothing is shown;
+            None: a line after two seconds on a terminal or in a notebook.
 
     Returns:
         The audited plan, with all other motions found, their costs and the reasons of their rejection.
@@ -87,16 +100,45 @@ def plan(
             in how few segments they may be done (search="segments").
     """
     checked_choice("search", search, get_args(Search))
+    with time_limited(checked_time_limit(time_limit)), shown_progress("plan", progress):
+        return _plan(machine, tasks, horizon, start, cyclic, cost, limits, scene, search, seed)
+
+
+def _plan(
+    machine: Machine,
+    tasks: Any,
+    horizon: Any,
+    start: Any,
+    cyclic: bool,
+    cost: Any,
+    limits: Limits | None,
+    scene: Any,
+    search: Search,
+    seed: int,
+) -> Plan:
+    """Hand the arguments of `plan` to the planner of the tasks."""
+    options: dict[str, Any] = {"cost": cost, "limits": limits, "seed": seed}
     if isinstance(tasks, Waypoints):
-        _check_unused("waypoints", horizon=horizon, start=start, cyclic=cyclic or None)
+        _check_unused("a path through waypoints", horizon=horizon, start=start, cyclic=cyclic or None)
         arm = checked_instance("machine", machine, FixedBase)
-        return plan_path(arm, tasks, cost=cost, limits=limits, scene=scene, seed=seed)
-    options: dict[str, Any] = {"start": start, "cost": cost, "limits": limits, "seed": seed}
+        return plan_path(arm, tasks, scene=scene, **options)
+    options["start"] = start
     if search == "segments":
         _check_unused("search='segments'", cyclic=cyclic or None)
         arm = checked_instance("machine", machine, FixedBase)
         return plan_in_segments(arm, tasks, horizon, scene=scene, **options)
+    if isinstance(tasks, Steps):
+        _check_unused("a walk, whose phases have durations", horizon=horizon, cyclic=cyclic or None)
+        _check_unused("a walk, whose feet stand on footholds,", scene=scene or None)
+        return plan_steps(machine, tasks, start=start, cost=cost, limits=limits)
     constraints = clearance_for(machine, limits, scene)
+    if isinstance(tasks, Capture):
+        _check_unused("a capture, whose phases have durations", horizon=horizon, cyclic=cyclic or None)
+        return plan_capture(machine, tasks, start=start, cost=cost, limits=limits, constraints=constraints)
+    goals = (tasks,) if isinstance(tasks, Goal) else tasks
+    if isinstance(goals, Sequence) and isinstance(next(iter(goals), None), Goal):
+        _check_unused("a motion to goals", cyclic=cyclic or None)
+        return plan_sequence(machine, goals, horizon, constraints=constraints, **options)
     options |= {"search": search, "cyclic": cyclic}
     if isinstance(machine, Standing):
         return plan_to_stand(machine, tasks, horizon, clearance_constraints=constraints, **options)
@@ -114,6 +156,9 @@ def _check_unused(reason: str, **arguments: Any) -> None:
 def load_plan(path: str | os.PathLike[str]) -> Plan:
     """Read the file of a plan of any kind; see `Plan.load`."""
     arrays = read_arrays(path)
-    kinds: dict[str, type[PathPlan] | type[SegmentedPlan]] = {"path": PathPlan, "segments": SegmentedPlan}
-    kind = next((kinds[name] for name in kinds if name in arrays), SolvedPlan)
-    return kind.of_arrays(path, arrays)
+    if "path" in arrays:
+        return PathPlan.of_arrays(path, arrays)
+    if "segments" in arrays:
+        return SegmentedPlan.of_arrays(path, arrays)
+    is_phased = "plan" in arrays and read_head(path, arrays["plan"]).get("phased") is True
+    return (PhasedPlan if is_phased else SolvedPlan).of_arrays(path, arrays)

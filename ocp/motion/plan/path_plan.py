@@ -1,11 +1,11 @@
-"""Joint path through a sequence of tool poses, as a plan."""
+"""Joint path of straight motions, through tool poses or to a goal, as a plan."""
 
 from __future__ import annotations
 
 import json
 import os
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -19,14 +19,13 @@ from ocp.motion.builders.clearance import ClearanceConstraints, clearance_of
 from ocp.motion.plan.candidate import Candidate
 from ocp.motion.plan.motion import Plan, tips_along
 from ocp.motion.plan.request import restored_request, stored_request
-from ocp.motion.search.steps import Homogeneous, LargestMotion, PathLength
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.targets import Target
 from ocp.problem.stored import ARRAY_NAMES, RECORD_ERRORS, pack_record, unpack_record
 from ocp.solution import Solution, read_head
 from ocp.tolerances import CLEARANCE_TOLERANCE_M
 
-__all__ = ["PathPlan"]
+__all__ = ["PathPlan", "PathPoses"]
 
 POSE_TOLERANCE = 1e-6
 """Largest pose error at a waypoint, m and rad."""
@@ -37,9 +36,22 @@ UNLIMITED_RATE = 1.0
 UNDECIDED = "a path through waypoints is compared with its lower bound, not with its neighbours"
 
 
+class PathPoses(NamedTuple):
+    """What a path through waypoints has to keep.
+
+    Attributes:
+        positions, rotations: Poses of the tip at the waypoints, in world. Shapes (N, 3), m, and (N, 3, 3).
+        step: Largest displacement of each joint between waypoints. Shape (n,), rad or m.
+    """
+
+    positions: Array
+    rotations: Array
+    step: Array
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class PathPlan(Plan):
-    """Joint path through a sequence of tool poses, straight in the joints between them.
+    """Joint path of straight motions between configurations: through tool poses, or to a goal.
 
     A path has no times of its own. The plan passes it in the least time at constant joint rates between waypoints
     within the velocity limits; `ocp.joint_path` and `schedule` time it under further limits.
@@ -47,11 +59,10 @@ class PathPlan(Plan):
     Attributes:
         machine: The arm.
         joints: Joints at the waypoints. Shape (N, n), rad or m.
-        positions, rotations: Poses of the tip at the waypoints, in world. Shapes (N, 3), m, and (N, 3, 3).
-        step: Largest displacement of each joint between waypoints. Shape (n,), rad or m.
         limits: Limits of the joints.
-        measure: Cost of a displacement between waypoints.
+        path_cost: Cost of the path, without reconfigurations.
         constraints: Collision scene; None without a collision check.
+        poses: Poses of the tip at the waypoints and largest displacements of the joints between them, or None.
         candidates, bound: As in `Plan`; the bound is that of any path with at most as many segments.
         reconfigurations: Waypoints from which the arm moves to the next one in another configuration, by a motion that
             is not planned.
@@ -59,12 +70,10 @@ class PathPlan(Plan):
 
     machine: FixedBase
     joints: Array
-    positions: Array
-    rotations: Array
-    step: Array
     limits: Limits
-    measure: Homogeneous
+    path_cost: float
     constraints: ClearanceConstraints | None = None
+    poses: PathPoses | None = None
     candidates: tuple[Candidate, ...] = ()
     bound: float | None = None
     reconfigurations: tuple[int, ...] = ()
@@ -75,8 +84,7 @@ class PathPlan(Plan):
     @property
     def cost(self) -> float:
         """Cost of the path, without reconfigurations."""
-        steps = np.delete(np.diff(self.joints, axis=0), list(self.reconfigurations), axis=0)
-        return float(self.measure.evaluate(steps, 1.0).sum())
+        return self.path_cost
 
     @property
     def solution(self) -> Solution:  # type: ignore[override]
@@ -91,7 +99,7 @@ class PathPlan(Plan):
     @property
     def targets(self) -> tuple[Target, ...]:  # type: ignore[override]
         """Poses of the waypoints."""
-        return (Target(self.t, self.positions, self.rotations),)
+        return () if self.poses is None else (Target(self.t, self.poses.positions, self.poses.rotations),)
 
     @property
     def t(self) -> Array:
@@ -153,19 +161,9 @@ class PathPlan(Plan):
             words = f"the audit of a path through waypoints has no setting {name!r}"
             raise ProblemError(words, name=name, value=settings[name])
         t, bounds = self.t, self.limits.bounds(self.machine)
-        tips = tips_along(self.machine, np.zeros((len(t), 0)), self.joints)
-        misses = np.abs(tips[:, :3] - self.positions)
-        turns = Rotation.from_quat(tips[:, [4, 5, 6, 3]]).inv() * Rotation.from_matrix(self.rotations)
         excess = np.maximum(self.joints - bounds.upper, bounds.lower - self.joints)
-        steps = np.abs(np.diff(self.joints, axis=0)) - self.step
-        steps[list(self.reconfigurations)] = 0.0
-        names = self.names
-        findings = [
-            _largest("positions of the tip", misses, POSE_TOLERANCE, t, unit="m"),
-            _largest("orientations of the tip", turns.magnitude()[:, None], POSE_TOLERANCE, t, unit="rad"),
-            _largest("joints beyond their limits", excess, STEP_TOLERANCE, t, names),
-            _largest("steps beyond the largest", steps, STEP_TOLERANCE, t, names),
-        ]
+        findings = [_largest("joints beyond their limits", excess, STEP_TOLERANCE, t, self.names)]
+        findings += self._pose_findings(self.poses) if self.poses is not None else []
         clearance = self.clearance()
         if clearance is not None:
             finding = clearance_finding(clearance, CLEARANCE_TOLERANCE_M)
@@ -173,6 +171,23 @@ class PathPlan(Plan):
         clearances = {} if clearance is None else {clearance.name: clearance}
         undecided = UNDECIDED if self.gap is None else f"{UNDECIDED}; it may cost {self.gap:.2g} too much"
         return Audit("path through waypoints", tuple(findings), undecided, clearances=clearances)
+
+    @property
+    def _counts(self) -> str:
+        return f"the best of {len(self.candidates)} paths"
+
+    def _pose_findings(self, poses: PathPoses) -> list[Finding]:
+        """Return the largest pose errors, and the largest excess of a displacement."""
+        t, tips = self.t, tips_along(self.machine, np.zeros((len(self.joints), 0)), self.joints)
+        misses = np.abs(tips[:, :3] - poses.positions)
+        turns = Rotation.from_quat(tips[:, [4, 5, 6, 3]]).inv() * Rotation.from_matrix(poses.rotations)
+        steps = np.abs(np.diff(self.joints, axis=0)) - poses.step
+        steps[list(self.reconfigurations)] = 0.0
+        return [
+            _largest("positions of the tip", misses, POSE_TOLERANCE, t, unit="m"),
+            _largest("orientations of the tip", turns.magnitude()[:, None], POSE_TOLERANCE, t, unit="rad"),
+            _largest("steps beyond the largest", steps, STEP_TOLERANCE, t, self.names),
+        ]
 
     def __str__(self) -> str:
         lines = super().__str__().split("\n")
@@ -190,12 +205,12 @@ class PathPlan(Plan):
         head, numbers = pack_record(
             {
                 "request": stored_request("", arguments),
-                "timed": isinstance(self.measure, LargestMotion),
-                "weights": self.measure.weights,
+                "cost": self.path_cost,
                 "bound": self.bound,
                 "reconfigurations": list(self.reconfigurations),
                 "candidates": [candidate.record() for candidate in self.candidates],
-                **{name: getattr(self, name) for name in ("joints", "positions", "rotations", "step")},
+                "joints": self.joints,
+                "poses": None if self.poses is None else self.poses._asdict(),
             }
         )
         arrays = {"path": np.frombuffer(json.dumps(head).encode(), np.uint8)}
@@ -210,12 +225,14 @@ class PathPlan(Plan):
             arguments = restored_request(head["request"]).arguments
             machine, limits, constraints = (arguments[name] for name in ("machine", "limits", "constraints"))
             n, count = machine.joint_size, len(head["joints"])
-            shapes = {"joints": (count, n), "positions": (count, 3), "rotations": (count, 3, 3)}
-            shapes |= {"step": (n,), "weights": (n,)}
-            values: dict[str, Any] = {name: np.asarray(head[name], dtype=float) for name in shapes}
+            shapes: dict[str, tuple[int, ...]] = {"joints": (count, n)}
+            written = {"joints": head["joints"]}
+            if head["poses"] is not None:
+                shapes |= {"positions": (count, 3), "rotations": (count, 3, 3), "step": (n,)}
+                written |= {name: head["poses"][name] for name in PathPoses._fields}
+            values = {name: np.asarray(value, dtype=float) for name, value in written.items()}
             wrong = [name for name, shape in shapes.items() if values[name].shape != shape]
-            finite = all(np.isfinite(array).all() for name, array in values.items() if name != "step")
-            weights = values.pop("weights")
+            finite = all(np.isfinite(values[name]).all() for name in values if name != "step")
             if wrong or count < 2 or not finite or not isinstance(limits, Limits) or not isinstance(machine, FixedBase):
                 raise ValueError(f"its {', '.join(wrong) or 'values'} do not fit its machine")
             if constraints is not None and not isinstance(constraints, ClearanceConstraints):
@@ -231,9 +248,10 @@ class PathPlan(Plan):
             )
             return cls(
                 machine=machine,
-                **values,
+                joints=values.pop("joints"),
+                poses=PathPoses(**values) if values else None,
                 limits=limits,
-                measure=(LargestMotion if head["timed"] else PathLength)(weights),
+                path_cost=float(head["cost"]),
                 constraints=constraints,
                 candidates=candidates,
                 bound=None if head["bound"] is None else float(head["bound"]),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +31,8 @@ class PhasedPlan(SolvedPlan):
         machine: Machine of the first phase. All phases have its joints.
         solution, parts, candidates, bound, targets: As in `SolvedPlan`.
     """
+
+    is_phased: ClassVar[bool] = True
 
     @property
     def phases(self) -> tuple[str, ...]:

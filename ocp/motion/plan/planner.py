@@ -60,6 +60,7 @@ from ocp.motion.tasks.goals import Start
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.scene import Scene
 from ocp.motion.tasks.tip_task import TipTask
+from ocp.progress import report
 
 __all__ = ["candidates_from", "checked_request", "clearance_for", "plan_from_configurations", "plan_request"]
 
@@ -83,10 +84,13 @@ def plan_from_configurations(
         _try_one_by_one(queue, solver, configurations, thorough=single and not floating)
         if queue.passed or (single and not floating):
             return queue.plan(), None
+    report(f"local motions from {len(configurations)} starts")
     motions = local_motions_from(request, configurations)
     if floating and (request.search == "global" or single):
         _search_cells(queue, solver, motions, configurations)
         return queue.plan(), None
+    if request.search == "global":
+        report("global search")
     search = TaskSearch(request, motions) if request.search == "global" else None
     if search is not None:
         _search_globally(queue, solver, search)
@@ -259,6 +263,7 @@ def plan_request(request: PlanRequest) -> SolvedPlan:
     Raises:
         ProblemError, SolveError: As in `plan`.
     """
+    report("inverse kinematics of the start")
     configurations = start_configurations(request)
     start = request.start
     if start is None:
@@ -282,6 +287,7 @@ def clearance_for(
         return None
     own = Scene() if scene is None else checked_instance("scene", scene, Scene)
     joint_limits = not isinstance(limits, Limits) or limits.joints
+    report("collision scene")
     try:
         collision_scene = CollisionScene(
             machine, own.obstacles, own.clearance, own.ignored, own.srdf, own.folders, own.missing, joint_limits

@@ -46,7 +46,7 @@ from ocp.motion.builders.actuator_limits import JointFriction
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem
 from ocp.motion.builders.dynamics_plan import dynamics_phases, machines_of
-from ocp.motion.builders.space.capture import capture_machines, capture_problem
+from ocp.motion.builders.space.capture import Capture, capture_machines, capture_problem
 from ocp.motion.builders.space.grasping import Cone, Grasp
 from ocp.motion.builders.standing.problem import FreeTime, StandingSetup, Weights, standing_problem
 from ocp.motion.builders.standing.stances import StancePhase, Steps
@@ -54,7 +54,7 @@ from ocp.motion.builders.standing.steps import StepWeights, steps_problem
 from ocp.motion.builders.tool_motion import ToolMotion, stretches_of, tool_motion_problem
 from ocp.motion.search.configurations import PlanRequest
 from ocp.motion.tasks.cost import Cost
-from ocp.motion.tasks.goals import Goal
+from ocp.motion.tasks.goals import Goal, Start
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.motion.tasks.tracks import TrackWithRate
@@ -70,19 +70,8 @@ SHAPES = (Box, Capsule, Cylinder, HalfSpace, Mesh, Sphere)
 PARTS = (Robot, Link, Joint, Mimic, CollisionShape, VisualShape, Support)
 STANDING = (Weights, FreeTime, InFoot, Pinned, IndexAtLeast, StandingSetup)
 STEPS = (Steps, StancePhase, StepWeights, Foot, Foothold)
-ARGUMENTS = (
-    TipTask,
-    Goal,
-    Limits,
-    ClearanceConstraints,
-    Cost,
-    JointFriction,
-    DynamicsSetup,
-    Cone,
-    Grasp,
-    *STANDING,
-    *STEPS,
-)
+DYNAMICS = (ClearanceConstraints, JointFriction, DynamicsSetup, Capture, Cone, Grasp)
+ARGUMENTS = (TipTask, Goal, Start, Limits, Cost, *DYNAMICS, *STANDING, *STEPS)
 MACHINES = (FixedBase, FreeFloating, Standing, Stance)
 KINDS = {kind.__name__: kind for kind in (*MACHINES, *PARTS, *SHAPES, *ARGUMENTS, MovingObstacle, Body)}
 SYMBOLS = {"SX": ca.SX, "MX": ca.MX}
@@ -196,7 +185,7 @@ def machines_of_phases(request: MotionRequest | None) -> tuple[Machine, ...]:
         steps: Steps = arguments["steps"]
         return steps.stances
     if request.builder == "capture":
-        return capture_machines(arguments["chaser"], arguments["target"])
+        return capture_machines(arguments["chaser"], arguments["capture"].target)
     return machines_of(arguments["machine"], arguments["goals"]) if request.builder == "dynamics phases" else ()
 
 

@@ -14,7 +14,7 @@ from models import FixedBase
 from models.arrays import Array
 from ocp.audit.audit import COST_LOST, Audit, Finding
 from ocp.audit.clearance import Clearance
-from ocp.errors import ProblemError, checked_instance
+from ocp.errors import ProblemError
 from ocp.motion.plan.candidate import Candidate
 from ocp.motion.plan.motion import Plan
 from ocp.motion.plan.solved_plan import SolvedPlan
@@ -276,10 +276,11 @@ class SegmentedPlan(Plan):
                 )
                 for number, (time, before, after, has_motion, failure) in enumerate(head["reconfigurations"])
             )
-            machine = checked_instance("machine", segments[0].machine, FixedBase)
-            n = machine.joint_size
+            machine, n = segments[0].machine, segments[0].machine.joint_size
             plans = [*segments, *(each.motion for each in changes if each.motion is not None)]
             ends = np.cumsum([segment.horizon for segment in segments])
+            if not isinstance(machine, FixedBase):
+                raise TypeError(f"its machine is a {type(machine).__name__}")
             fits = len(times) == len(segments) == len(changes) + 1
             fits = fits and all(plan.machine.robot.joint_names == machine.robot.joint_names for plan in plans)
             fits = fits and all(each.before.shape == each.after.shape == (n,) for each in changes)

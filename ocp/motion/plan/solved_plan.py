@@ -7,7 +7,7 @@ import os
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -48,6 +48,8 @@ class SolvedPlan(Plan):
         parts: Intervals of time with the same tasks; in the solution they run side by side.
         machine, candidates, bound, targets: As in `Plan`.
     """
+
+    is_phased: ClassVar[bool] = False
 
     machine: Machine
     solution: Solution
@@ -160,6 +162,7 @@ class SolvedPlan(Plan):
         head, numbers = pack_record(
             {
                 "request": request,
+                "phased": self.is_phased,
                 "parts": self.parts,
                 "bound": self.bound,
                 "candidates": [candidate.record() for candidate in self.candidates],

@@ -12,7 +12,7 @@ from models import Standing
 from models.arrays import Array
 from ocp.errors import ProblemError, SolveError, checked_flag, checked_instance
 from ocp.motion.builders.clearance import ClearanceConstraints
-from ocp.motion.builders.standing.plan import plan_standing
+from ocp.motion.builders.standing.plan import solve_standing
 from ocp.motion.builders.standing.problem import StandingSetup, Weights
 from ocp.motion.local.inverse_kinematics import inverse_kinematics
 from ocp.motion.plan.candidate import Candidate, Reason, Rejection, Stage
@@ -40,7 +40,7 @@ def plan_to_stand(
     seed: int,
     clearance_constraints: ClearanceConstraints | None,
 ) -> SolvedPlan:
-    """Plan a motion that does the tasks with the zero moment point inside the foot, at the cost of `plan_standing`.
+    """Plan a motion that does the tasks with the zero moment point inside the foot, at the cost of `solve_standing`.
 
     The joints start and end at rest if their tasks do; else they may move there. Candidates start from every
     configuration that inverse kinematics finds and that stands; with search "start", from the best conditioned one that
@@ -55,7 +55,7 @@ def plan_to_stand(
 
     Raises:
         ProblemError: A cyclic motion, tasks that are active only a part of the time, a horizon that is no number, or as
-            in `plan_standing`.
+            in `solve_standing`.
         SolveError: No start leads to a plan that passes its audit.
     """
     checked_flag("cyclic", cyclic)
@@ -77,7 +77,8 @@ def plan_to_stand(
         clearance_constraints=clearance_constraints,
         symbols=ca.SX if _takes_scalars(equations) else ca.MX,
     )
-    options: dict[str, Any] = {"weights": cost, "limits": limits, "setup": setup}
+    zmp = None if limits is None else checked_instance("limits", limits, Limits).zmp
+    options: dict[str, Any] = {"weights": cost, "limits": limits, "setup": setup, "zmp": zmp}
     queue = CandidateQueue(_StandingSolver(machine, all_tasks, duration, options, start is not None), PlannerSettings())
     seeds = [Candidate(joints) for joints in _start_configurations(machine, all_tasks, start, limits, seed)]
     for batch in [[candidate] for candidate in seeds] if search == "start" else [seeds]:
@@ -89,7 +90,7 @@ def plan_to_stand(
 
 @dataclass
 class _StandingSolver(Solver):
-    """Solver of the candidates of a standing machine in one stage: `plan_standing` solves, refines and audits."""
+    """Solver of the candidates of a standing machine in one stage: `solve_standing` solves, refines and audits."""
 
     machine: Standing
     tasks: list[TipTask]
@@ -104,7 +105,7 @@ class _StandingSolver(Solver):
             ProblemError, SolveError: Errors of a given start.
         """
         try:
-            solution = plan_standing(self.machine, self.tasks, self.duration, start=candidate.start, **self.options)
+            solution = solve_standing(self.machine, self.tasks, self.duration, start=candidate.start, **self.options)
         except (ProblemError, SolveError) as error:
             if self.start_is_fixed or isinstance(error.__cause__, KeyboardInterrupt):
                 raise

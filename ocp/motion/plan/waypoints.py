@@ -24,7 +24,7 @@ from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.local.collisions import Collision, distances_along, find_collisions
 from ocp.motion.local.inverse_kinematics import LARGEST_SEED, Unreachable, idle_positions
 from ocp.motion.plan.candidate import Candidate, Reason, Rejection, Stage
-from ocp.motion.plan.path_plan import PathPlan
+from ocp.motion.plan.path_plan import PathPlan, PathPoses
 from ocp.motion.plan.planner import clearance_for
 from ocp.motion.search.charts import SelfMotionManifolds, TimeSample
 from ocp.motion.search.dead_end import RelaxationKind, dead_end
@@ -266,12 +266,10 @@ class _WaypointPlanner:
         return PathPlan(
             self.machine,
             best.joints,
-            self.positions,
-            self.rotations,
-            self.step,
             self.limits,
-            self.cost,
+            best.cost,
             self.constraints,
+            PathPoses(self.positions, self.rotations, self.step),
             tuple(candidates),
             lower_bound or None,
             best.breaks,

@@ -12,6 +12,7 @@ import numpy as np
 from models import Machine, ModelWarning, Robot, Standing
 from models.arrays import Array
 from ocp.errors import NOT_NUMBERS, ProblemError, checked_flag, checked_positive, floats, real
+from ocp.motion.tasks.zmp_rules import ZmpRule
 
 __all__ = ["JointBounds", "Limits", "unknown_limits"]
 
@@ -47,6 +48,7 @@ class Limits:
         joints: Whether the position limits of the robot apply.
         vertical_force: Least vertical ground force on a standing machine, N; None for a tenth of its weight.
         friction: Friction coefficient of the ground.
+        zmp: Rule for the zero moment point of a standing machine; None keeps it inside the foot.
 
     Raises:
         ProblemError: A limit is not positive.
@@ -60,6 +62,7 @@ class Limits:
     joints: bool = True
     vertical_force: float | None = None
     friction: float = np.inf
+    zmp: ZmpRule | None = None
 
     def __post_init__(self) -> None:
         for kind in ("velocity", "acceleration", "jerk", "torque", "power"):
@@ -70,6 +73,9 @@ class Limits:
         if self.vertical_force is not None:
             checked_positive("limits: vertical_force", self.vertical_force)
         checked_flag("limits: joints", self.joints)
+        if self.zmp is not None and not isinstance(self.zmp, ZmpRule):
+            words = f"limits: zmp must be a rule such as InFoot(), not {self.zmp!r}"
+            raise ProblemError(words, name="zmp", value=self.zmp)
         if not real(self.friction) > 0:
             words = f"limits: friction must be positive, not {self.friction!r}"
             raise ProblemError(words, name="friction", value=self.friction, limit=0.0)

@@ -13,8 +13,7 @@ from models.arrays import Array
 from models.machines.scara_path import ScaraPath
 from models.paths import gamma
 from models.paths.blends import BlendKind, polynomial
-from ocp import plan_minimum_time
-from ocp.motion.builders.timing import Fastest
+from ocp.motion.builders.timing import Fastest, solve_minimum_time
 from ocp.motion.schedule import LineLimits, Schedule, peak_acceleration, schedule
 from scripts.papers.blend.example import (
     ARM,
@@ -101,7 +100,7 @@ def compute() -> Results:
     for name, (path, joints, limits) in bar:
         bar.set_description(f"minimum time, {name}")
         plan = schedule(path, limits, joints=joints)
-        plans[name] = Plan(path, joints, plan, plan_minimum_time(path, limits, joints, guess=plan))
+        plans[name] = Plan(path, joints, plan, solve_minimum_time(path, limits, joints, guess=plan))
     return Results(
         cubic,
         quintic,

@@ -34,7 +34,6 @@ from ocp.motion.local.rates import LocalSolution
 from ocp.motion.plan import Candidate, Reason, Rejection
 from ocp.motion.plan.path_plan import PathPlan
 from ocp.motion.plan.solved_plan import SolvedPlan
-from ocp.motion.search.steps import PathLength
 
 START = np.array([0.3, 0.7, 0.5])
 TASK = TipTask(rows=(3, 4), velocity=(-0.1, 0.05))
@@ -252,8 +251,7 @@ def test_what_was_not_found_has_no_cost_in_print() -> None:
 
 
 def test_what_is_typed_at_a_prompt_is_told_in_a_line() -> None:
-    turns, places = np.tile(np.eye(3), (400, 1, 1)), np.zeros((400, 3))
-    way = PathPlan(arm(), places, places, turns, np.full(3, np.inf), Limits(), PathLength(np.ones(3)), bound=0.0)
+    way = PathPlan(arm(), np.zeros((400, 3)), Limits(), 2.0, bound=1.9)
     audit = sprint().audit()
     told: list[Any] = [motion(), motion().candidates[0], motion().sample(0.1), local(), way, motion().trajectory(0.1)]
     told += [

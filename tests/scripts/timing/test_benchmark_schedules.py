@@ -13,7 +13,7 @@ from scripts.timing import schedules
 
 
 def test_schedules_are_measured_and_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(schedules, "plan_minimum_time", lambda *_, guess, **__: guess)  # which takes some 10 s
+    monkeypatch.setattr(schedules, "solve_minimum_time", lambda *_, guess, **__: guess)  # which takes some 10 s
     monkeypatch.setattr(schedules, "CASES", dict.fromkeys(schedules.CASES, ((20, 1.0, None),)))
     numbers = {
         "rows": [schedules.row(case, 20, 1) | {"goal_s": 1.0} for case in schedules.CASES],

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, TypedDict, Unpack
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -28,14 +28,14 @@ from models import FreeFloating, center_of_mass, find_wheels
 from models.arrays import Array
 from ocp.console import interruptible
 from ocp.direct.collocation import Collocation
-from ocp.errors import ProblemError, checked_instance
+from ocp.errors import ProblemError, checked_flag, checked_instance
 from ocp.motion.builders.actuator_limits import JointFriction
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem, end_velocities
 from ocp.motion.builders.dynamics_plan import within_limits
 from ocp.motion.builders.space.grasping import Cone, Grasp, checked_pair, grasp_wrench, motion_of, pair_momentum
 from ocp.motion.builders.space.guess import (
-    Start,
+    State,
     guess_approach,
     guess_braking,
     guessed_horizon,
@@ -46,45 +46,63 @@ from ocp.motion.builders.space.guess import (
 from ocp.motion.builders.standing.problem import FreeTime
 from ocp.motion.tasks.checks import checked_configuration, checked_horizon
 from ocp.motion.tasks.cost import Cost
+from ocp.motion.tasks.goals import Start
 from ocp.motion.tasks.limits import Limits
 from ocp.problem.phases import Phases
 from ocp.problem.problem import Problem, remembers_request
 from ocp.solution import Solution
 
-__all__ = ["CaptureOptions", "capture_machines", "capture_problem", "chained_capture", "plan_capture"]
+__all__ = ["Capture", "capture_machines", "capture_problem", "chained_capture", "solve_capture"]
 
 APPROACH, DETUMBLE = "approach", "detumble"
 POINTS = Collocation(8, degree=4, scheme="legendre")
 
 
-class CaptureOptions(TypedDict, total=False):
-    """Options of `capture_problem`, described there."""
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """Approach, grasp and detumbling of a tumbling body by a free-floating chaser, its tip on the grasped frame.
 
-    start_base: Any
-    target_base: Any
-    start_velocity: Any
-    limits: Limits | None
-    cost: Cost | None
-    friction: JointFriction | None
-    cone: Cone | None
-    grasp: Grasp | None
-    clearance_constraints: ClearanceConstraints | None
-    end: Any
-    rest: bool
+    Attributes:
+        target: Machine of one link without joints, on the same kind of base as the chaser, with its momentum. Its tip
+            is the grasped frame, which the chaser's tip meets axis by axis.
+        approach, detumble: Durations of the phases, s, or FreeTime(...).
+        target_base: Configuration of the target at the start; home if None. Shape (base_size,).
+        cone: Approach cone. The tip starts at twice its length or farther, or inside it.
+        grasp: Load limits of the hand during detumbling.
+        friction: Friction in the joints of the chaser.
+        end: Joints at the end of the detumbling. Shape (n,), nan where free, for example for wheels.
+        rest: Whether base and joints, except wheels, are at rest at the end.
+    """
+
+    target: FreeFloating
+    approach: float | FreeTime
+    detumble: float | FreeTime
+    target_base: Any = None
+    cone: Cone | None = None
+    grasp: Grasp | None = None
+    friction: JointFriction | None = None
+    end: Any = None
+    rest: bool = True
+
+    def __post_init__(self) -> None:
+        for name, kind in (("cone", Cone), ("grasp", Grasp), ("friction", JointFriction)):
+            if getattr(self, name) is not None:
+                checked_instance(f"capture: {name}", getattr(self, name), kind)
+        checked_flag("capture: rest", self.rest)
 
 
 @remembers_request("capture")
 @interruptible
 def capture_problem(
     chaser: FreeFloating,
-    target: FreeFloating,
-    approach: float | FreeTime,
-    detumble: float | FreeTime,
+    capture: Capture,
     *,
     start: Any,
-    **options: Unpack[CaptureOptions],
+    limits: Limits | None = None,
+    cost: Cost | None = None,
+    clearance_constraints: ClearanceConstraints | None = None,
 ) -> Phases:
-    """Declare approach, grasp and detumbling of least total effort.
+    """Declare approach, grasp and detumbling of least total cost.
 
     The phases "approach" and "detumble" have the states and controls of `dynamics_problem`. The configuration of the
     target is the state "target" of the first, and follows from that of the chaser in the second. Wheel angles count
@@ -93,18 +111,10 @@ def capture_problem(
     Args:
         chaser: Chaser with its arm, and wheels among its joints (`models.with_wheels`). Its momentum is that at the
             start, spinning wheels included.
-        target: Machine of one link without joints, on the same kind of base, with its momentum. Its tip is the grasped
-            frame, which the chaser's tip meets axis by axis.
-        approach, detumble: Durations of the phases, s, or FreeTime(...).
-        start: Joints of the chaser at the start. Shape (n,), rad or m.
-        options: start_base, target_base: Configurations of both bases at the start; home if None. Shape (base_size,).
-            start_velocity: Velocities of the chaser's joints at the start; at rest if None. Shape (n,), rad/s.
-            limits, cost, friction: Arguments of `dynamics_problem` for both phases.
-            cone: Approach cone. The tip starts at twice its length or farther, or inside it.
-            grasp: Load limits of the hand during detumbling.
-            clearance_constraints: Collision avoidance of the chaser during the approach, without the target.
-            end: Joints at the end of the detumbling. Shape (n,), nan where free, for example for wheels.
-            rest: Whether base and joints, except wheels, are at rest at the end; True by default.
+        capture: The capture.
+        start: Joints of the chaser at the start, shape (n,), rad or m, or a `Start` with base and velocities.
+        limits, cost: Arguments of `dynamics_problem` for both phases.
+        clearance_constraints: Collision avoidance of the chaser during the approach, without the target.
 
     Raises:
         ProblemError: Machines, sizes or values are invalid, see `dynamics_problem`, or the target has joints. Or with
@@ -112,106 +122,99 @@ def capture_problem(
             largest that they hold, N m s. Or with name "reach": `value` is the distance of the target and `limit` the
             reach of the arm, m.
     """
-    capture = _Capture.take(chaser, target, start, (approach, detumble), options)
-    first, second = capture.approach(approach), capture.detumbling(detumble, None)
-    capture.guess_approach(first)
-    guess_braking(second, capture.pair, *_end_of(first))
+    own = _Capture.take(chaser, capture, start, {"limits": limits, "cost": cost}, clearance_constraints)
+    first, second = own.approach(), own.detumbling(None)
+    own.guess_approach(first)
+    guess_braking(second, own.pair, *_end_of(first))
     problem = Phases("capture", {APPROACH: first, DETUMBLE: second})
     before, after = problem[APPROACH], problem[DETUMBLE]
     end = {name: before.at_end(name) for name in ("base", "target", "joints")}
     base, joints, rates = (after.at_start(name) for name in ("base", "joints", "velocities"))
-    start_times = {
-        "joints": ca.DM(capture.arm) * end["joints"], "velocities": before.at_end("velocities"),
-        "base": capture.base_after(end["base"], end["joints"], before.duration),
+    initial = {
+        "joints": ca.DM(own.arm) * end["joints"], "velocities": before.at_end("velocities"),
+        "base": own.base_after(end["base"], end["joints"], before.duration),
     }  # fmt: skip
-    problem.join(APPROACH, DETUMBLE, start_times)
-    capture.grasp(problem, base, joints, rates, end["target"])
+    problem.join(APPROACH, DETUMBLE, initial)
+    own.grasp(problem, base, joints, rates, end["target"])
     return problem
 
 
 @interruptible
-def plan_capture(
+def solve_capture(
     chaser: FreeFloating,
-    target: FreeFloating,
-    approach: float | FreeTime,
-    detumble: float | FreeTime,
+    capture: Capture,
     *,
     start: Any,
+    limits: Limits | None = None,
+    cost: Cost | None = None,
+    clearance_constraints: ClearanceConstraints | None = None,
     method: Collocation | None = None,
-    options: Mapping[str, Any] | None = None,
     tolerances: Mapping[str, float] | None = None,
-    **capture_options: Unpack[CaptureOptions],
 ) -> Solution:
-    """Solve `capture_problem` and audit the plan; the limits hold between the nodes, too, as in `plan_dynamics`.
+    """Solve `capture_problem` and audit the solution; the limits hold between the nodes, too.
 
     Args:
-        chaser, target, approach, detumble, start, capture_options: As for `capture_problem`.
+        chaser, capture, start, limits, cost, clearance_constraints: As for `capture_problem`.
         method: First mesh of both phases, with controls at the points; 8 Legendre intervals of degree 4 if None.
-        options: IPOPT options.
         tolerances: Tolerances of the audit by name.
 
     Returns:
-        The plan; `plan.phase("approach")` and `plan.phase("detumble")` are its phases over their own times.
+        The solution; its phases are "approach" and "detumble".
 
     Raises:
         ProblemError: As `capture_problem`.
-        SolveError: As `plan_dynamics`.
+        SolveError: No motion satisfies its limits.
     """
 
-    def declare(clearance: ClearanceConstraints | None) -> Problem:
-        own: CaptureOptions = {**capture_options, "clearance_constraints": clearance}
-        return capture_problem(chaser, target, approach, detumble, start=start, **own)
+    def declare(constraints: ClearanceConstraints | None) -> Problem:
+        return capture_problem(
+            chaser, capture, start=start, limits=limits, cost=cost, clearance_constraints=constraints
+        )
 
-    mesh = POINTS if method is None else method
-    machines = {phase: (chaser, capture_options.get("limits")) for phase in (APPROACH, DETUMBLE)}
-    clearance = capture_options.get("clearance_constraints")
-    return within_limits(declare, clearance, mesh, (), options, tolerances, machines)
+    machines = dict.fromkeys((APPROACH, DETUMBLE), (chaser, limits))
+    return within_limits(declare, clearance_constraints, method or POINTS, (), None, tolerances, machines)
 
 
 @interruptible
 def chained_capture(
     chaser: FreeFloating,
-    target: FreeFloating,
-    approach: float | FreeTime,
-    detumble: float | FreeTime,
+    capture: Capture,
     *,
     start: Any,
+    limits: Limits | None = None,
+    cost: Cost | None = None,
+    clearance_constraints: ClearanceConstraints | None = None,
     method: Collocation | None = None,
-    options: Mapping[str, Any] | None = None,
     tolerances: Mapping[str, float] | None = None,
-    **capture_options: Unpack[CaptureOptions],
 ) -> tuple[Solution, Solution]:
-    """Plan the approach at its own least effort, then the detumbling from its end; `plan_capture` costs less.
+    """Solve the approach at its own least cost, then the detumbling from its end; `solve_capture` costs less.
 
-    Args, Raises: As for `plan_capture`.
+    Args, Raises: As for `solve_capture`.
 
     Returns:
-        Both plans, each with its own audit.
+        Both solutions, each with its own audit.
     """
-    mesh = POINTS if method is None else method
-    limits = capture_options.get("limits")
-    capture = _Capture.take(chaser, target, start, (approach, detumble), capture_options)
-    capture.detumbling(detumble, None)  # raises before the approach is solved
+    mesh = method or POINTS
+    own = _Capture.take(chaser, capture, start, {"limits": limits, "cost": cost}, clearance_constraints)
+    own.detumbling(None)  # raises before the approach is solved
 
-    def declare_approach(clearance: ClearanceConstraints | None) -> Problem:
-        own: CaptureOptions = {**capture_options, "clearance_constraints": clearance}
-        problem = replace(capture, options=own).approach(approach)
-        capture.grasp(problem, *motion_of(problem), problem.declared.states["target"].symbol)
-        capture.guess_approach(problem)
+    def declare_approach(constraints: ClearanceConstraints | None) -> Problem:
+        problem = replace(own, clearance_constraints=constraints).approach()
+        own.grasp(problem, *motion_of(problem), problem.declared.states["target"].symbol)
+        own.guess_approach(problem)
         return problem
 
-    clearance = capture_options.get("clearance_constraints")
-    first = within_limits(declare_approach, clearance, mesh, (), options, tolerances, {"": (chaser, limits)})
+    first = within_limits(declare_approach, clearance_constraints, mesh, (), None, tolerances, {"": (chaser, limits)})
     end = dict(first.at_fraction(1.0))
-    end["joints"] = capture.arm * end["joints"]
+    end["joints"] = own.arm * end["joints"]
     end["base"] = np.array(ca.DM(_of_unit_length(chaser, end["base"]))).ravel()
 
     def declare_detumbling(_: ClearanceConstraints | None) -> Problem:
-        problem = capture.detumbling(detumble, end)
-        guess_braking(problem, capture.pair, end["joints"], end["velocities"], end["base"])
+        problem = own.detumbling(end)
+        guess_braking(problem, own.pair, end["joints"], end["velocities"], end["base"])
         return problem
 
-    return first, within_limits(declare_detumbling, None, mesh, (), options, tolerances, {"": (capture.pair, limits)})
+    return first, within_limits(declare_detumbling, None, mesh, (), None, tolerances, {"": (own.pair, limits)})
 
 
 def capture_machines(chaser: FreeFloating, target: FreeFloating) -> tuple[FreeFloating, FreeFloating]:
@@ -228,32 +231,37 @@ class _Capture:
     """Checked arguments of a capture; `pair` is both bodies as one machine, with their momentum at the start."""
 
     chaser: FreeFloating
-    target: FreeFloating
+    capture: Capture
     pair: FreeFloating
-    joints: Array
-    base: Array
-    target_base: Array
-    times: tuple[float | FreeTime, float | FreeTime]
-    options: CaptureOptions
+    start: State
+    shared: Mapping[str, Any]
+    clearance_constraints: ClearanceConstraints | None
 
     @classmethod
     def take(
-        cls, chaser: FreeFloating, target: FreeFloating, start: Any, times: tuple[Any, Any], options: CaptureOptions
+        cls,
+        chaser: FreeFloating,
+        capture: Capture,
+        start: Any,
+        shared: Mapping[str, Any],
+        clearance_constraints: ClearanceConstraints | None,
     ) -> _Capture:
+        target = checked_instance("capture", capture, Capture).target
         robot = checked_pair(chaser, target)
-        for name, kind in (("cone", Cone), ("grasp", Grasp), ("limits", Limits)):
-            if options.get(name) is not None:
-                checked_instance(f"capture: {name}", options.get(name), kind)
-        joints, base = checked_configuration(chaser, start, options.get("start_base"))
-        _, there = checked_configuration(target, np.zeros(0), options.get("target_base"))
-        momentum = np.array(ca.DM(pair_momentum(chaser, target, base, there, joints))).ravel()
+        given, joints, base = Start.of(start, chaser)
+        if joints is None:
+            raise ProblemError("capture: start is missing; give the joints of the chaser", name="start")
+        target_base = checked_configuration(target, np.zeros(0), capture.target_base)[1]
+        momentum = np.array(ca.DM(pair_momentum(chaser, target, base, target_base, joints))).ravel()
         pair = replace(chaser, robot=robot, conserved_momentum=momentum)
-        capture = cls(chaser, target, pair, joints, base, there, times, options)
-        if options.get("rest", True):
-            bounds = (options.get("limits") or Limits()).bounds(chaser)
-            capacity = wheel_capacity(chaser, bounds, capture.start, options.get("friction") is None)
-            require_capacity(chaser, momentum, capacity)
-        return capture
+        rates = end_velocities("start_velocity", given.velocity, chaser.joint_size)
+        times = (capture.approach, capture.detumble)
+        latest = [time.upper if isinstance(time, FreeTime) else checked_horizon(time) for time in times]
+        state = State(base, joints, rates, target_base, *latest)
+        if capture.rest:
+            bounds = (shared["limits"] or Limits()).bounds(chaser)
+            require_capacity(chaser, momentum, wheel_capacity(chaser, bounds, state, capture.friction is None))
+        return cls(chaser, capture, pair, state, shared, clearance_constraints)
 
     @property
     def arm(self) -> Array:
@@ -261,34 +269,20 @@ class _Capture:
         wheels = find_wheels(self.chaser.robot)
         return np.array([float(name not in wheels) for name in self.chaser.robot.joint_names])
 
-    @property
-    def start(self) -> Start:
-        """Return the state at the start, and the longest durations."""
-        value = self.options.get("start_velocity")
-        rates = end_velocities("start_velocity", "rest" if value is None else value, self.chaser.joint_size)
-        latest = [time.upper if isinstance(time, FreeTime) else checked_horizon(time) for time in self.times]
-        return Start(self.base, self.joints, rates, self.target_base, *latest)
-
-    @property
-    def shared(self) -> dict[str, Any]:
-        """Return the arguments of both phases."""
-        options: Mapping[str, Any] = self.options
-        return {name: options[name] for name in ("limits", "cost") if name in options}
-
-    def approach(self, duration: float | FreeTime) -> Problem:
+    def approach(self) -> Problem:
         """Declare the first phase, with the target's motion and the approach cone."""
-        chaser, target, options = self.chaser, self.target, self.options
+        chaser, target, duration = self.chaser, self.capture.target, self.capture.approach
         problem = dynamics_problem(
             chaser,
             (),
             duration,
-            start=self.joints,
+            start=self.start.joints,
             setup=DynamicsSetup(
                 start_velocity=self.start.velocities,
                 end_velocity="free",
-                start_base=self.base,
-                friction=options.get("friction"),
-                clearance_constraints=options.get("clearance_constraints"),
+                start_base=self.start.base,
+                friction=self.capture.friction,
+                clearance_constraints=self.clearance_constraints,
             ),
             **self.shared,
         )
@@ -296,13 +290,12 @@ class _Capture:
         require_reach(chaser, target, self.start, earliest)
         base, joints, _ = motion_of(problem)
         none = ca.DM(0, 1)
-        goal = problem.state(
-            "target", target.base_size, initial=self.target_base, guess=self.target_base, unit="m, rad"
-        )
+        begin = self.start.target_base
+        goal = problem.state("target", target.base_size, initial=begin, guess=begin, unit="m, rad")
         problem.dynamics(goal, target.base_rate(goal, none, none))
         tip, grasped = chaser.tip_pose(base, joints), target.tip_pose(goal, none)
         place = ca.mtimes(grasped.rotation.T, tip.position - grasped.position)
-        cone = options.get("cone")
+        cone = self.capture.cone
         if cone is not None:
             self._require_inside(cone)
             problem.path("cone", cone.inside(place), lower=0.0, unit="m")
@@ -310,7 +303,9 @@ class _Capture:
 
     def _require_inside(self, cone: Cone) -> None:
         """Raise ProblemError if the tip starts near the grasp but outside the cone."""
-        tip, grasped = self.chaser.tip_pose(self.base, self.joints), self.target.tip_pose(self.target_base, ca.DM(0, 1))
+        start = self.start
+        tip = self.chaser.tip_pose(start.base, start.joints)
+        grasped = self.capture.target.tip_pose(start.target_base, ca.DM(0, 1))
         place = np.array(ca.DM(ca.mtimes(grasped.rotation.T, tip.position - grasped.position)))
         inside = float(cone.inside(ca.DM(place)))
         if inside < 0:
@@ -320,22 +315,21 @@ class _Capture:
             )
             raise ProblemError(words, name="cone", value=inside, limit=0.0)
 
-    def detumbling(self, duration: float | FreeTime, start: Mapping[str, Array] | None) -> Problem:
+    def detumbling(self, start: Mapping[str, Array] | None) -> Problem:
         """Declare the second phase, from the end of an approach, or free to be joined to one."""
-        pair, options = self.pair, self.options
-        wheels = find_wheels(pair.robot)
-        rest = options.get("rest", True)
+        pair, capture = self.pair, self.capture
+        wheels, rest = find_wheels(pair.robot), capture.rest
         still = np.array([np.nan if name in wheels else 0.0 for name in pair.robot.joint_names])
         setup = DynamicsSetup(
             start_velocity="free" if start is None else start["velocities"],
             end_velocity=still if rest else "free",
             start_base=np.full(pair.base_size, np.nan) if start is None else start["base"],
-            friction=options.get("friction"),
+            friction=capture.friction,
         )
         begin = None if start is None else start["joints"]
-        problem = dynamics_problem(pair, (), duration, start=begin, end=options.get("end"), setup=setup, **self.shared)
-        grasp = options.get("grasp") or Grasp()
-        for name, value in zip(("force", "moment"), grasp_wrench(pair, self.target, problem), strict=True):
+        problem = dynamics_problem(pair, (), capture.detumble, start=begin, end=capture.end, setup=setup, **self.shared)
+        grasp = capture.grasp or Grasp()
+        for name, value in zip(("force", "moment"), grasp_wrench(pair, capture.target, problem), strict=True):
             largest = float(getattr(grasp, name))
             if np.isfinite(largest):
                 problem.path(f"grasp {name}", ca.sumsqr(value) / largest**2, upper=1.0)
@@ -346,7 +340,7 @@ class _Capture:
 
     def grasp(self, problem: Problem, base: Any, joints: Any, rates: Any, goal: Any) -> None:
         """Constrain the tip to the grasped frame with the same twist at the end of a problem."""
-        chaser, target, none = self.chaser, self.target, ca.DM(0, 1)
+        chaser, target, none = self.chaser, self.capture.target, ca.DM(0, 1)
         tip, grasped = chaser.tip_pose(base, joints), target.tip_pose(goal, none)
         turned = ca.mtimes(grasped.rotation.T, tip.rotation)
         half = ca.vertcat(turned[2, 1] - turned[1, 2], turned[0, 2] - turned[2, 0], turned[1, 0] - turned[0, 1]) / 2
@@ -366,16 +360,16 @@ class _Capture:
         chaser, size = self.chaser, len(self.chaser.twist_rows) // 2 + (self.chaser.base == "planar")
         attitude = base[size:] if chaser.base == "planar" else base[size:] / ca.norm_2(base[size:])
         there = chaser.world_from_base(ca.vertcat(ca.DM(size, 1), attitude))
-        begin = center_of_mass(chaser.robot, ca.DM(self.joints), chaser.world_from_base(ca.DM(self.base)))
+        begin = center_of_mass(chaser.robot, ca.DM(self.start.joints), chaser.world_from_base(ca.DM(self.start.base)))
         drift = np.asarray(chaser.conserved_momentum)[-size:] / chaser.robot.total_mass
         place = (begin - center_of_mass(chaser.robot, joints, there))[:size] + drift * time
         return ca.vertcat(place, attitude)
 
     def guess_approach(self, problem: Problem) -> None:
         """Set the guess of an approach."""
-        cone = self.options.get("cone")
+        cone = self.capture.cone
         out = np.zeros(3) if cone is None else cone.length * cone.direction
-        guess_approach(problem, self.chaser, self.target, self.start, out)
+        guess_approach(problem, self.chaser, self.capture.target, self.start, out)
 
 
 def _end_of(problem: Problem) -> tuple[Array, Array, Array]:

@@ -28,7 +28,7 @@ from ocp.problem.problem import Problem
 from ocp.problem.values import constant
 
 __all__ = [
-    "Start",
+    "State",
     "free_motion",
     "guess_approach",
     "guess_braking",
@@ -84,11 +84,11 @@ def free_motion(target: FreeFloating, base: Array, times: Array) -> Array:
     return np.vstack([base, np.array(moved).T])
 
 
-def guess_approach(problem: Problem, chaser: FreeFloating, target: FreeFloating, start: Start, out: Array) -> None:
+def guess_approach(problem: Problem, chaser: FreeFloating, target: FreeFloating, start: State, out: Array) -> None:
     """Set the guess of an approach; a free time gets the first duration that ends in the grasp, or the closest to it.
 
     Args:
-        start: Start of the capture; free velocities are guessed as zero.
+        start: State of the capture; free velocities are guessed as zero.
         out: Offset of the tip from the grasp before the final approach, in the grasped frame. Shape (3,), m.
     """
     joints, base = start.joints, start.base
@@ -270,8 +270,8 @@ ROUNDING = 1e-9
 """Relative tolerance, and tolerance of a momentum, N m s."""
 
 
-class Start(NamedTuple):
-    """Start of a capture, and its longest durations.
+class State(NamedTuple):
+    """State of a capture, and its longest durations.
 
     Attributes:
         base, joints, velocities: State of the chaser; nan for free velocities.
@@ -287,12 +287,12 @@ class Start(NamedTuple):
     detumble: float
 
 
-def wheel_capacity(machine: FreeFloating, bounds: JointBounds, start: Start, frictionless: bool = True) -> float:
+def wheel_capacity(machine: FreeFloating, bounds: JointBounds, start: State, frictionless: bool = True) -> float:
     """Return the largest angular momentum that the wheels of a chaser can hold while its base rests, N m s.
 
     Args:
         bounds: Limits of its joints.
-        start: Start of the capture.
+        start: State of the capture.
         frictionless: Whether only its motor acts on a wheel about its axis.
     """
     robot, time = machine.robot, start.approach + start.detumble
@@ -337,14 +337,14 @@ def require_capacity(machine: FreeFloating, momentum: Array, capacity: float) ->
         raise ProblemError(words, name="momentum", value=size, limit=capacity)
 
 
-def require_reach(chaser: FreeFloating, target: FreeFloating, start: Start, earliest: float) -> None:
+def require_reach(chaser: FreeFloating, target: FreeFloating, start: State, earliest: float) -> None:
     """Raise ProblemError if the grasp is out of reach of the arm at all times.
 
     Both centres of mass drift uniformly. The tip is never farther from the chaser's centre of mass than with the arm
     stretched.
 
     Args:
-        start: Start of the capture, with the latest time of the grasp.
+        start: State of the capture, with the latest time of the grasp.
         earliest: Earliest time of the grasp, s.
     """
     reach = _reach(chaser, target)
@@ -354,13 +354,13 @@ def require_reach(chaser: FreeFloating, target: FreeFloating, start: Start, earl
     if distance > reach * (1 + ROUNDING):
         words = (
             f"capture: the centres of mass of chaser and target are at least {distance:.4g} m apart, and the arm "
-            f"reaches at most {reach:.4g} m: {distance - reach:.4g} m are missing. Start nearer, or let them drift "
+            f"reaches at most {reach:.4g} m: {distance - reach:.4g} m are missing. State nearer, or let them drift "
             "together"
         )
         raise ProblemError(words, name="reach", value=distance, limit=reach)
 
 
-def _offset(chaser: FreeFloating, target: FreeFloating, start: Start) -> tuple[Array, Array]:
+def _offset(chaser: FreeFloating, target: FreeFloating, start: State) -> tuple[Array, Array]:
     """Return the vector from the chaser's centre of mass to the target's, m, and its rate, m/s. Shape (3,) each."""
     centers, speeds = [], []
     for machine, base, joints in ((target, start.target_base, np.zeros(0)), (chaser, start.base, start.joints)):

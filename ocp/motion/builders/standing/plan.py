@@ -1,8 +1,8 @@
 """Solve and audit standing motions and steps.
 
-`plan_standing` tries formulations and meshes until a plan passes its audit, or reports every attempt.
+`solve_standing` tries formulations and meshes until a plan passes its audit, or reports every attempt.
 
-`plan_steps` first checks on a coarse mesh whether the steps are possible in their durations, because a solver may
+`solve_steps` first checks on a coarse mesh whether the steps are possible in their durations, because a solver may
 search long for steps that are too fast. With durations that may grow, at a price that outweighs the rest of the cost, a
 solution nearly always exists: with the requested durations if possible, else with the least extension. A few intervals
 give the durations to a percent or two. The solution is a local minimum, hence no proof. Steps are therefore refused
@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal, TypedDict, Unpack
+from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
@@ -43,7 +43,7 @@ from ocp.solution import Solution
 from ocp.status import SolverStatus
 from ocp.tightening import tighten
 
-__all__ = ["Attempt", "StepOptions", "guess_in_time", "plan_standing", "plan_steps"]
+__all__ = ["Attempt", "guess_in_time", "solve_standing", "solve_steps"]
 
 COARSE = Collocation(4, degree=2, scheme="legendre")
 COARSE_IPOPT = {"tol": 1e-4, "acceptable_tol": 1e-3, "acceptable_iter": 5}
@@ -84,7 +84,7 @@ def guess_in_time(
     """Return a guess for `steps_problem` in the requested durations from a coarse mesh; None if there is none.
 
     Args:
-        step_options: Options of steps_problem.
+        step_options: Cost and limits of steps_problem.
         options: IPOPT options.
 
     Raises:
@@ -137,7 +137,7 @@ def _extensible(steps: Steps, start: Any, step_options: Mapping[str, Any], secon
         load=default.load / unit,
     )
     slower = replace(steps, phases=tuple(phases))
-    problem = steps_problem(slower, start=start, **{**step_options, "weights": weights})
+    problem = steps_problem(slower, start=start, **{**step_options, "cost": weights})
     problem.minimize(
         0, PACE.price * default.acceleration * sum(problem[name].duration / each for name, each in seconds.items())
     )
@@ -219,16 +219,6 @@ Level = Literal["position", "acceleration"]
 Trial = tuple[Level | None, Collocation | MultipleShooting]
 
 
-class StepOptions(TypedDict, total=False):
-    """Options of `steps_problem`."""
-
-    balance: Literal["dynamic", "static"]
-    margin: float
-    clearance: float
-    weights: StepWeights | None
-    limits: Limits | None
-
-
 @dataclass(frozen=True)
 class Attempt:
     """Result of one solve.
@@ -249,7 +239,7 @@ class Attempt:
 
 
 @interruptible
-def plan_standing(
+def solve_standing(
     machine: Standing,
     tasks: TipTask | Sequence[TipTask],
     horizon: float | FreeTime,
@@ -308,7 +298,7 @@ def plan_standing(
 
 
 @interruptible
-def plan_steps(
+def solve_steps(
     steps: Steps,
     *,
     start: Any,
@@ -316,17 +306,18 @@ def plan_steps(
     options: Mapping[str, Any] | None = None,
     tolerances: Mapping[str, float] | None = None,
     time_limit: float | None = None,
-    **step_options: Unpack[StepOptions],
+    cost: StepWeights | None = None,
+    limits: Limits | None = None,
 ) -> Solution:
-    """Solve `steps_problem` and audit the plan, with tightening and finer meshes as in `plan_standing`.
+    """Solve `steps_problem` and audit the plan, with tightening and finer meshes as in `solve_standing`.
 
     The first feasible plan is returned; its audit may leave its optimality undetermined. First a coarse mesh shows
     whether the steps are possible in their durations.
 
     Args:
-        steps, start, step_options: As for `steps_problem`.
+        steps, start, cost, limits: As for `steps_problem`.
         method: First mesh of each phase; 12 intervals of degree 3 if None.
-        options, tolerances: As for `plan_standing`.
+        options, tolerances: As for `solve_standing`.
         time_limit: Seconds after which the planner stops, between two iterations of a solver. None for no limit.
 
     Raises:
@@ -336,14 +327,14 @@ def plan_steps(
     """
     if method is not None:
         checked_instance("method", method, Collocation)
-    checked_instance("plan_steps: steps", steps, Steps)
-    settings = {**IPOPT, **checked_mapping("options", options)}
+    checked_instance("solve_steps: steps", steps, Steps)
+    settings, step_options = {**IPOPT, **checked_mapping("options", options)}, {"cost": cost, "limits": limits}
     trials: list[Trial] = [(None, method or STEPS)]
     judge = _Judge(tolerances, lambda _: None)
     with time_limited(checked_time_limit(time_limit)):
         guess = guess_in_time(steps, start, step_options, settings)
         return _first_accepted(
-            lambda _: steps_problem(steps, start=start, **step_options), trials, settings, judge, guess
+            lambda _: steps_problem(steps, start=start, cost=cost, limits=limits), trials, settings, judge, guess
         )
 
 
@@ -354,10 +345,10 @@ def _first_accepted(
     judge: _Judge,
     guess: Mapping[str, Any] | None = None,
 ) -> Solution:
-    """Return the first plan accepted among the formulations and meshes of `plan_standing`.
+    """Return the first plan accepted among the formulations and meshes of `solve_standing`.
 
     Raises:
-        SolveError, ProblemError: As `plan_standing`; at once if collisions are all that is wrong with a plan.
+        SolveError, ProblemError: As `solve_standing`; at once if collisions are all that is wrong with a plan.
     """
     reasons: list[str] = []
     failure = SolveError()

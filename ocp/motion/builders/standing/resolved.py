@@ -23,7 +23,7 @@ from models.machines.stance import Stance
 from models.paths import rest_to_rest
 from models.robot.kinematics import link_frames
 from models.spatial import rotation
-from ocp.errors import ProblemError, SolveError, checked_count, checked_instance, checked_nonnegative
+from ocp.errors import ProblemError, SolveError, checked_count, checked_instance
 from ocp.motion.builders.standing.stances import Steps, Swing, check_placed, foot_task
 from ocp.motion.local.rates import resolve
 from ocp.motion.tasks.checks import checked_numbers
@@ -210,17 +210,16 @@ def _function(steps: Steps, stance: Stance) -> tuple[Any, list[str]]:
     return ca.Function("motion", inputs, [ca.densify(v) for v in outputs.values()], {"cse": True}), list(outputs)
 
 
-def resolve_steps(steps: Steps, *, start: Any, clearance: float = 0.02, samples: int = SAMPLES) -> StepsMotion:
+def resolve_steps(steps: Steps, *, start: Any, samples: int = SAMPLES) -> StepsMotion:
     """Take steps with the least joint rates at every instant, by `resolve`.
 
     A lifted foot moves to its next foothold from rest to rest. Seen from above its path is straight; at the share s of
-    the path it is raised by 64 s^3 (1 - s)^3 times the clearance. A foot without a next foothold follows the others.
-    The held feet share the load so that the sum of the squared loads is least.
+    the path it is raised by 64 s^3 (1 - s)^3 times the steps' clearance. A foot without a next foothold follows the
+    others. The held feet share the load so that the sum of the squared loads is least.
 
     Args:
         steps: Robot and its stances; a free duration takes its guess.
         start: Joints in the robot's order, with the feet on their footholds. Shape (n,), rad or m.
-        clearance: Height of a sole above the line between its footholds, halfway, m.
         samples: Samples of each phase, both ends included.
 
     Raises:
@@ -228,14 +227,13 @@ def resolve_steps(steps: Steps, *, start: Any, clearance: float = 0.02, samples:
         SolveError: The motion breaks down, for example at a stretched leg; names the phase and the time in it.
     """
     checked_instance("resolve_steps: steps", steps, Steps)
-    height = checked_nonnegative("resolve_steps: clearance", clearance)
     count = checked_count("resolve_steps: samples", samples, least=2)
     joints = checked_numbers(start, steps.robot.dof, "start", "one entry for each joint")
     check_placed(steps.stances[0], joints[steps.order(steps.stances[0])])
     parts, begin = [], 0.0
     for k, stance in enumerate(steps.stances):
         t = np.linspace(0.0, steps.phases[k].seconds, count)
-        motion = _phase(steps, k, joints[steps.order(stance)], t, height)
+        motion = _phase(steps, k, joints[steps.order(stance)], t, steps.clearance)
         values = sample_stance(steps, stance, motion, _least_loads(stance, motion))
         joints = values["joints"][-1]
         parts.append({"t": begin + t, "phase": np.full(count, float(k)), **values})

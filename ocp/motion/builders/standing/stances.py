@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import Any
+from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
@@ -21,7 +21,15 @@ from models import Foot, Foothold, ModelError, Robot, Stance
 from models.arrays import Array
 from models.paths import rest_to_rest
 from ocp.direct.guess import Samples
-from ocp.errors import ProblemError, checked_each, checked_instance, checked_mapping, unknown_name
+from ocp.errors import (
+    ProblemError,
+    checked_choice,
+    checked_each,
+    checked_instance,
+    checked_mapping,
+    checked_nonnegative,
+    unknown_name,
+)
 from ocp.motion.builders.standing.problem import FreeTime
 from ocp.motion.tasks.checks import checked_horizon, checked_numbers
 from ocp.motion.tasks.equations import TaskEquations, bind
@@ -96,6 +104,12 @@ class Steps:
         feet: Feet by name.
         phases: Consecutive stances. The foothold of a foot that is held in two consecutive phases must not change.
         gravity: m/s^2, downwards.
+        balance: "static" requires the centre of mass over the support at all times, except in stances with a grip.
+        margin: Distance by which centers of pressure, and a constrained center of mass, stay inside the edges, m. It
+            must cover how far the machine leans out on compliant ground and joints, which are rigid here. It needs the
+            largest value for motions near edges and corners of a sole, as in a balanced walk.
+        clearance: Height of a sole above the ground halfway, m; at the share s of the path 64 s^3 (1 - s)^3 of it.
+            Higher ground at the landing rises in the first half of the path, lower ground falls in the second half.
 
     Raises:
         ProblemError: There are no phases; a foot is unknown; a foothold moves while its foot is held; no foot is held
@@ -106,9 +120,15 @@ class Steps:
     feet: Mapping[str, Foot]
     phases: Sequence[StancePhase]
     gravity: float = 9.81
+    balance: Literal["dynamic", "static"] = "dynamic"
+    margin: float = 0.0
+    clearance: float = 0.02
 
     def __post_init__(self) -> None:
         checked_instance("steps: robot", self.robot, Robot)
+        checked_choice("steps: balance", self.balance, ("dynamic", "static"))
+        for name in ("margin", "clearance"):
+            checked_nonnegative(f"steps: {name}", getattr(self, name))
         feet = checked_mapping("steps: feet", self.feet)
         phases = checked_each("steps: phases", self.phases, StancePhase)
         if not phases:

@@ -17,7 +17,7 @@ be stopped softly anywhere: quasi-static steps.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -28,7 +28,7 @@ from models.machines.stance import Stance
 from models.paths import rest_to_rest
 from models.robot.indices import joint_limit_index
 from ocp.console import interruptible
-from ocp.errors import ProblemError, checked_choice, checked_instance, checked_nonnegative
+from ocp.errors import ProblemError, checked_instance, checked_nonnegative
 from ocp.motion.builders.standing.problem import FreeTime, declare_horizon
 from ocp.motion.builders.standing.stances import PLACED, Steps, Swing, check_placed, first_guess, foothold_equations
 from ocp.motion.builders.standing.start import start_inside
@@ -81,16 +81,7 @@ class _Options:
 
 @remembers_request("steps")
 @interruptible
-def steps_problem(
-    steps: Steps,
-    *,
-    start: Any,
-    balance: Literal["dynamic", "static"] = "dynamic",
-    margin: float = 0.0,
-    clearance: float = 0.02,
-    weights: StepWeights | None = None,
-    limits: Limits | None = None,
-) -> Phases:
+def steps_problem(steps: Steps, *, start: Any, cost: StepWeights | None = None, limits: Limits | None = None) -> Phases:
     """Declare a motion through consecutive stances, from rest to rest, of least cost.
 
     The phases have the names `Steps.names`; joint vectors of a phase are in its stance's order. The states are "joints"
@@ -108,13 +99,7 @@ def steps_problem(
     Args:
         steps: Robot and its stances.
         start: Joints in the robot's order, with the feet on their footholds, see `standing_configuration`. Shape (n,).
-        balance: "static" requires "balance" at all times, except in stances with a grip.
-        margin: Distance by which centers of pressure, and a constrained center of mass, stay inside the edges, m. It
-            must cover how far the machine leans out on compliant ground and joints, which are rigid here. It needs the
-            largest value for motions near edges and corners of a sole, as in a balanced walk.
-        clearance: Height of a sole above the ground halfway, m; at the share s of the path 64 s^3 (1 - s)^3 of it.
-            Higher ground at the landing rises in the first half of the path, lower ground falls in the second half.
-        weights: Weights of the cost.
+        cost: Weights of the cost.
         limits: Limits of joints and ground. `vertical_force` is the least normal force of a held sole, N; 0 if None.
 
     Returns:
@@ -126,23 +111,18 @@ def steps_problem(
     """
     checked_instance("steps_problem: steps", steps, Steps)
     limits = Limits() if limits is None else checked_instance("steps_problem: limits", limits, Limits)
-    if weights is None:
-        weights = StepWeights()
-    checked_instance("steps_problem: weights", weights, StepWeights)
-    checked_choice("balance", balance, ("dynamic", "static"))
-    for name, value in (("margin", margin), ("clearance", clearance)):
-        checked_nonnegative(f"steps_problem: {name}", value)
+    weights = StepWeights() if cost is None else checked_instance("steps_problem: cost", cost, StepWeights)
     for name in ("power", "jerk"):
         if getattr(limits, name) is not None:
             words = f"limits: steps have no limit of {name}; limit torques and accelerations"
             raise ProblemError(words, name=name, value=getattr(limits, name))
     begin = checked_numbers(start, steps.robot.dof, "start", "one entry for each joint")
-    options = _Options(balance, float(margin), float(clearance), weights, limits)
+    options = _Options(steps.balance, float(steps.margin), float(steps.clearance), weights, limits)
     first = steps.stances[0]
     own = start_inside(first, begin[steps.order(first)], first.robot.lower, first.robot.upper)
     _check_start(first, own, options)
     begin = steps.in_order(first, own[None])[0]
-    guesses = first_guess(steps, begin, GUESSED_LIFT * clearance)
+    guesses = first_guess(steps, begin, GUESSED_LIFT * steps.clearance)
     problems = {}
     for k, name in enumerate(steps.names):
         try:

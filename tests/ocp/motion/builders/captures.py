@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import fields
 from typing import Any
 
 import casadi as ca
@@ -10,7 +12,7 @@ import numpy as np
 
 from models import FreeFloating, Joint, Link, Robot, planar_chain, with_wheels
 from models.spatial import quaternion_about
-from ocp import Cone, Cost, FreeTime, Grasp, Solution
+from ocp import Capture, Cone, Cost, FreeTime, Grasp, Solution
 from ocp.motion.builders.space.grasping import joined, pair_momentum
 from tests.models.robot.oracles import mujoco_model
 from tests.models.robot.trees import Array
@@ -82,6 +84,13 @@ def capture(spin: Any, inertia: Any = (5.0, 8.0, 6.0)) -> dict[str, Any]:
         "detumble": FREE, "target_base": [2.5, 0.2, 0.6, 1.0, 0.0, 0.0, 0.0], "cone": CONE, "grasp": GRASP,
         "cost": Cost(velocity=0.0, effort=1.0, acceleration=[1.0] * 6 + [0.0] * 3, time=0.05),
     }  # fmt: skip
+
+
+def called(function: Callable[..., Any], **request: Any) -> Any:
+    """Call `capture_problem`, or a function that solves it, with the fields of a Capture beside the other arguments."""
+    names = {field.name for field in fields(Capture)}
+    capture = Capture(**{name: request.pop(name) for name in names & request.keys()})
+    return function(request.pop("chaser"), capture, **request)
 
 
 def turned(axis: Any, angle: float) -> Array:

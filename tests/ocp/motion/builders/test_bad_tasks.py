@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields
+from functools import partial
 from typing import Any
 
 import casadi as ca
@@ -51,10 +52,6 @@ from ocp import (
     inverse_kinematics,
     joint_torques,
     minimum_velocity_problem,
-    plan_capture,
-    plan_dynamics,
-    plan_standing,
-    plan_steps,
     resolve,
     resolve_accelerations,
     resolve_steps,
@@ -67,6 +64,9 @@ from ocp import (
     steps_problem,
     walk,
 )
+from ocp.motion.builders.dynamics_plan import solve_dynamics
+from ocp.motion.builders.space.capture import solve_capture
+from ocp.motion.builders.standing.plan import solve_standing, solve_steps
 from ocp.motion.tasks.tracks import path_tracks, pose_line
 from tests.bad_values import (
     CALLABLE,
@@ -95,7 +95,7 @@ from tests.bad_values import (
     good_calls,
     panel,
 )
-from tests.ocp.motion.builders.captures import planar_capture
+from tests.ocp.motion.builders.captures import called, planar_capture
 from tests.ocp.motion.builders.standing_tasks import with_setup
 from tests.ocp.motion.builders.test_cts import roll_arguments
 
@@ -368,8 +368,8 @@ STANDINGS = [
         },
     ),
     Case(
-        "plan_standing",
-        plan_standing,
+        "solve_standing",
+        solve_standing,
         {"machine": STANDING, "tasks": STILL, "start": UP, "horizon": 0.2},
         {
             "machine": ASKED["machine"] | {"bolted": ARM},
@@ -517,7 +517,7 @@ DYNAMICS = [
     Case("Grasp", Grasp, {}, {"force": but(POSITIVE, "inf"), "moment": but(POSITIVE, "inf")}),
     Case(
         "capture_problem",
-        capture_problem,
+        partial(called, capture_problem),
         CAPTURE,
         {
             "chaser": INSTANCE | {"fixed": ARM},
@@ -525,7 +525,6 @@ DYNAMICS = [
             "start": array(4),
             "approach": HORIZON,
             "detumble": HORIZON,
-            "start_base": but(array(3), "None"),
             "target_base": but(array(3), "None"),
             "cone": but(INSTANCE, "None"),
             "grasp": but(INSTANCE, "None"),
@@ -534,15 +533,15 @@ DYNAMICS = [
     *(
         Case(
             name,
-            function,
+            partial(called, function),
             CAPTURE | {"method": Collocation(5, 4, scheme="legendre")},
-            {"chaser": INSTANCE, "detumble": HORIZON, "method": but(INSTANCE, "None"), "options": MAPPING},
+            {"chaser": INSTANCE, "detumble": HORIZON, "method": but(INSTANCE, "None")},
         )
-        for name, function in (("plan_capture", plan_capture), ("chained_capture", chained_capture))
+        for name, function in (("solve_capture", solve_capture), ("chained_capture", chained_capture))
     ),
     Case(
-        "plan_dynamics",
-        plan_dynamics,
+        "solve_dynamics",
+        solve_dynamics,
         {**MOVED, "end": [0.3, 0.2, 0.1]},
         {
             "total": but(HORIZON, "None"),
@@ -570,10 +569,7 @@ STEPPED: dict[str, Any] = {"steps": STEPPING, "start": [0.3, 0.4, 0.5]}
 STEP_OPTIONS: dict[str, Bad] = {
     "steps": INSTANCE,
     "start": array(3) | NOTHING,
-    "balance": CHOICE,
-    "margin": NONNEGATIVE | NOTHING | {"wide": 9.0},
-    "clearance": NONNEGATIVE | NOTHING,
-    "weights": but(INSTANCE, "None"),
+    "cost": but(INSTANCE, "None"),
     "limits": but(INSTANCE, "None") | {"jerk": Limits(jerk=1.0), "of two": Limits(velocity=[1.0, 2.0])},
 }
 STEPS = [
@@ -598,6 +594,9 @@ STEPS = [
             "feet": MAPPING | NOTHING | {"none": {}, "of words": {"base": "base"}, "lost": {"base": Foot("nobody")}},
             "phases": SEQUENCE | NOTHING | {"none": []},
             "gravity": POSITIVE | NOTHING,
+            "balance": CHOICE,
+            "margin": NONNEGATIVE | NOTHING,
+            "clearance": NONNEGATIVE | NOTHING,
         },
     ),
     Case(
@@ -613,8 +612,8 @@ STEPS = [
     ),
     Case("steps_problem", steps_problem, STEPPED, STEP_OPTIONS),
     Case(
-        "plan_steps",
-        plan_steps,
+        "solve_steps",
+        solve_steps,
         STEPPED,
         {
             **STEP_OPTIONS,
@@ -632,13 +631,8 @@ STEPS = [
     Case(
         "resolve_steps",
         resolve_steps,
-        {"steps": STEPPING, "start": STEPPED["start"], "clearance": 0.02, "samples": 5},
-        {
-            "steps": INSTANCE,
-            "start": array(3) | NOTHING,
-            "clearance": NONNEGATIVE | NOTHING,
-            "samples": COUNT | NOTHING | {"one": 1},
-        },
+        {"steps": STEPPING, "start": STEPPED["start"], "samples": 5},
+        {"steps": INSTANCE, "start": array(3) | NOTHING, "samples": COUNT | NOTHING | {"one": 1}},
     ),
     Case(
         "steps_motion",
@@ -648,7 +642,7 @@ STEPS = [
     ),
 ]
 CASES = [*TASKS, *VELOCITIES, *STANDINGS, *ROLLS, *DYNAMICS, *STEPS]
-LONG = ("along", "plan_standing", "plan_steps")
+LONG = ("along", "solve_standing", "solve_steps")
 
 
 @pytest.mark.parametrize("case", good_calls(case for case in CASES if case.what not in LONG))

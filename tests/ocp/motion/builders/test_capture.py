@@ -26,15 +26,16 @@ from ocp import (
     capture_problem,
     chained_capture,
     dynamics_problem,
-    plan_capture,
 )
+from ocp.motion.builders.space.capture import solve_capture
 from ocp.motion.builders.space.grasping import grasp_wrench, joined, pair_momentum
-from ocp.motion.builders.space.guess import Start, require_reach, wheel_capacity
+from ocp.motion.builders.space.guess import State, require_reach, wheel_capacity
 from tests.models.robot.trees import Array
 from tests.ocp.motion.builders.captures import (
     CONE,
     GRASP,
     PLANAR_START,
+    called,
     capture,
     planar_capture,
     planar_chaser,
@@ -50,7 +51,8 @@ SHORT = {"approach": 5.0, "detumble": 5.0, "method": Collocation(6, degree=4, sc
 
 @cache
 def planar() -> Solution:
-    return plan_capture(**planar_capture())
+    solution: Solution = called(solve_capture, **planar_capture())
+    return solution
 
 
 def gaps(asked: dict[str, Any], plan: Solution) -> tuple[float, float, float]:
@@ -114,7 +116,7 @@ def test_the_grasp_asks_for_nothing_that_the_dynamics_keep_anyway(planar_base: b
     asked = planar_capture() if planar_base else capture(np.array([0.01, 0.02, 0.03]))
     asked |= {"approach": 10.0, "detumble": 10.0}
     asked["chaser"] = replace(asked["chaser"], conserved_momentum=np.linspace(-0.2, 0.3, 3 if planar_base else 6))
-    problem = capture_problem(**(asked | {"rest": False}))
+    problem = called(capture_problem, **(asked | {"rest": False}))
     states = {name: variable.symbol for name, variable in problem.declared.states.items()}
     rng = np.random.default_rng(3)
     at = {name: rng.normal(size=symbol.numel()) for name, symbol in states.items()}
@@ -224,16 +226,17 @@ def test_the_momentum_of_a_pair_that_drifts_is_that_of_both_about_their_common_c
 def test_momentum_that_wheels_cannot_hold_is_refused_with_what_is_missing() -> None:
     asked = planar_capture() | {"chaser": planar_chaser(0.3)}
     with pytest.raises(ProblemError, match=r"0\.15 N m s are missing") as caught:
-        plan_capture(**asked)
+        called(solve_capture, **asked)
     assert (caught.value.name, caught.value.limit) == ("momentum", pytest.approx(0.3))
     assert caught.value.value == pytest.approx(0.45)
     asked |= {"approach": 10.0, "detumble": 10.0}
-    capture_problem(**(asked | {"rest": False}))
+    called(capture_problem, **(asked | {"rest": False}))
 
 
 @cache
 def short() -> Solution:
-    return plan_capture(**(planar_capture() | SHORT))
+    solution: Solution = called(solve_capture, **(planar_capture() | SHORT))
+    return solution
 
 
 def longer(robot: Robot, share: float) -> Robot:
@@ -266,7 +269,7 @@ def test_a_capture_in_another_unit_of_length_is_the_same() -> None:
         "grasp": Grasp(force=share * GRASP.force, moment=share**2 * GRASP.moment),
         "cost": Cost(velocity=0.0, effort=share**-4, acceleration=[1.0] * 3 + [0.0], time=0.05),
     }
-    plan = plan_capture(**asked)
+    plan = called(solve_capture, **asked)
     assert plan.cost == pytest.approx(short().cost, rel=1e-9)
     assert plan.audit().passed
 
@@ -279,7 +282,7 @@ def test_a_wheel_is_one_wherever_it_stands_among_the_joints() -> None:
         "start": np.roll(PLANAR_START, 1),
         "cost": Cost(velocity=0.0, effort=1.0, acceleration=[0.0] + [1.0] * 3, time=0.05),
     }
-    plan = plan_capture(**asked)
+    plan = called(solve_capture, **asked)
     assert plan.cost == pytest.approx(short().cost, rel=1e-9)
     assert plan.phase("detumble")["velocities"][-1, 0] == pytest.approx(0.45 / 0.02, rel=1e-9)
 
@@ -288,9 +291,9 @@ def test_three_wheels_hold_the_diagonal_of_their_box_and_no_more() -> None:
     """The base turns the momentum to where the wheels hold most."""
     most = 4.0 * np.sqrt(3.0)
     spin = np.array([most / 5.0, 0.0, 0.0])
-    capture_problem(**(capture(0.999 * spin) | {"approach": 10.0, "detumble": 10.0}))
+    called(capture_problem, **(capture(0.999 * spin) | {"approach": 10.0, "detumble": 10.0}))
     with pytest.raises(ProblemError) as caught:
-        capture_problem(**capture(1.001 * spin))
+        called(capture_problem, **capture(1.001 * spin))
     assert caught.value.limit == pytest.approx(most)
 
 
@@ -298,7 +301,7 @@ def test_a_target_out_of_reach_is_refused_unless_it_drifts_near() -> None:
     """The arm is 1.8 m long, and the centre of mass no farther than 8 kg of it take it; 0.4 m to the grasp."""
     asked = planar_capture() | {"target_base": [4.5, 0.0, 0.0], "rest": False}
     with pytest.raises(ProblemError, match="are missing") as caught:
-        capture_problem(**asked)
+        called(capture_problem, **asked)
     assert caught.value.name == "reach"
     hub = asked["chaser"].robot
     first = np.array(ca.DM(center_of_mass(hub, PLANAR_START, asked["chaser"].world_from_base(np.zeros(3))))).ravel()
@@ -308,7 +311,7 @@ def test_a_target_out_of_reach_is_refused_unless_it_drifts_near() -> None:
 
     def reach(velocity: float, latest: float) -> None:
         goal = planar_target(velocity=(velocity, 0.0))
-        start = Start(np.zeros(3), PLANAR_START, np.zeros(4), np.array([4.5, 0.0, 0.0]), latest, 5.0)
+        start = State(np.zeros(3), PLANAR_START, np.zeros(4), np.array([4.5, 0.0, 0.0]), latest, 5.0)
         require_reach(asked["chaser"], goal, start, 5.0)
 
     reach(-0.1, 40.0)
@@ -324,7 +327,7 @@ def test_wheels_about_any_axes_hold_their_farthest_sum(count: int) -> None:
     machine = FreeFloating(with_wheels(Robot((Link("hub", 60.0, (0, 0, 0), np.eye(3)),), ()), axes, 0.1, momentum=most))
     sides = most[:, None] * axes / np.linalg.norm(axes, axis=1)[:, None]
     farthest = max(float(np.linalg.norm(signs @ sides)) for signs in product((-1.0, 1.0), repeat=count))
-    start = Start(machine.base_home(), np.zeros(count), np.full(count, nan), machine.base_home(), 5.0, 5.0)
+    start = State(machine.base_home(), np.zeros(count), np.full(count, nan), machine.base_home(), 5.0, 5.0)
     assert wheel_capacity(machine, Limits().bounds(machine), start) == pytest.approx(farthest)
 
 
@@ -332,7 +335,7 @@ def test_a_wheel_on_the_arm_holds_its_momentum_to_any_side() -> None:
     asked = capture(np.zeros(3))
     robot = with_wheels(asked["chaser"].robot, [[1, 0, 0]], 0.02, momentum=2.0, link="link2", prefix="far")
     machine, size = FreeFloating(robot), robot.dof
-    start = Start(machine.base_home(), np.zeros(size), np.zeros(size), machine.base_home(), 50.0, 50.0)
+    start = State(machine.base_home(), np.zeros(size), np.zeros(size), machine.base_home(), 50.0, 50.0)
     assert wheel_capacity(machine, Limits().bounds(machine), start) == pytest.approx(4.0 * np.sqrt(3.0) + 2.0)
 
 
@@ -341,7 +344,7 @@ def test_wheels_hold_no_more_than_their_motors_give_them_in_the_time() -> None:
     slow = with_wheels(Robot((Link("hub", 60.0, (0, 0, 0), np.eye(3)),), ()), [[0, 0, 1]], 0.02, torque=0.01)
     machine = FreeFloating(slow, "planar", conserved_momentum=[0.5, 0, 0])
     rates = np.array([3.0])
-    start = Start(np.zeros(3), np.zeros(1), rates, np.zeros(3), 12.0, 8.0)
+    start = State(np.zeros(3), np.zeros(1), rates, np.zeros(3), 12.0, 8.0)
     spin = float(np.array(ca.DM(machine.base_twist(np.zeros(3), np.zeros(1), rates)))[0, 0])
     held = wheel_capacity(machine, Limits().bounds(machine), start)
     assert held == pytest.approx(0.02 * (3.0 + spin) + 0.01 * 20.0)
@@ -360,14 +363,14 @@ def test_what_cannot_be_captured_is_refused_by_name() -> None:
     ]
     for told, name in wrong:
         with pytest.raises(ProblemError) as caught:
-            capture_problem(**(asked | told))
+            called(capture_problem, **(asked | told))
         assert str(caught.value.name).rpartition(" ")[2] == name
 
 
 @pytest.mark.long
 def test_both_phases_together_cost_less_than_one_after_the_other() -> None:
     asked = planar_capture()
-    chain = chained_capture(**asked)
+    chain = called(chained_capture, **asked)
     assert planar().cost < sum(plan.cost for plan in chain) * (1 - 1e-4)
 
 
@@ -380,7 +383,7 @@ def test_what_drifts_is_caught_and_goes_on_with_the_pair() -> None:
     """
     asked = planar_capture() | {"target": planar_target(velocity=(0.02, -0.01))}
     asked["chaser"] = replace(asked["chaser"], conserved_momentum=[0.05, 0.9, -0.6])
-    plan = plan_capture(**asked)
+    plan = called(solve_capture, **asked)
     assert_captured(asked, plan, 9)
     times = np.array([0.7, 1.0])
     after = plan.phase("detumble")
@@ -417,5 +420,5 @@ def test_bodies_that_tumble_about_any_axis_are_captured(seed: int) -> None:
     spin, inertia, attitude = random_target(seed)
     asked = capture(spin, inertia)
     asked["target_base"] = [2.5, 0.2, 0.6, *attitude]
-    plan = plan_capture(**asked)
+    plan = called(solve_capture, **asked)
     assert_captured(asked, plan)

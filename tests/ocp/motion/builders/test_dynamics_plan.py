@@ -36,9 +36,9 @@ from ocp import (
     Solution,
     SolveError,
     dynamics_phases,
-    plan_dynamics,
 )
 from ocp.motion.builders.clearance import ClearanceConstraints
+from ocp.motion.builders.dynamics_plan import solve_dynamics
 from tests.ocp.motion.builders.test_dynamics import MASS, WAY, slider, torques_along
 
 MACHINE = FixedBase(planar_chain([0.5, 0.4], [2.0, 1.5]))
@@ -87,7 +87,7 @@ def least_time_along(s: Array, at: Array) -> float:
 
 @pytest.fixture(scope="module")
 def fastest() -> Solution:
-    return plan_dynamics(MACHINE, (), SOON, start=START, end=END, limits=Limits(torque=MOST), cost=LEAST_TIME)
+    return solve_dynamics(MACHINE, (), SOON, start=START, end=END, limits=Limits(torque=MOST), cost=LEAST_TIME)
 
 
 def fine(plan: Solution, times: int = 4001) -> Array:
@@ -138,9 +138,9 @@ def test_limits_that_no_mesh_holds_at_little_cost_are_held_at_what_it_takes(
     """Three meshes of low degree are too coarse; what the plan costs too much is told, about as a fine one finds it."""
     asked: dict[str, Any] = {"end": END, "limits": Limits(torque=MOST, velocity=most)}
     effort = Cost(velocity=0.0, effort=1e-4, time=1.0)
-    best = plan_dynamics(MACHINE, (), SOON, start=START, cost=effort, **asked)
+    best = solve_dynamics(MACHINE, (), SOON, start=START, cost=effort, **asked)
     method = Collocation(mesh[0], degree=mesh[1], scheme="legendre")
-    plan = plan_dynamics(MACHINE, (), SOON, start=START, cost=effort, method=method, **asked)
+    plan = solve_dynamics(MACHINE, (), SOON, start=START, cost=effort, method=method, **asked)
     audit = plan.audit()
     assert audit.feasible
     assert not audit.passed
@@ -154,8 +154,8 @@ def test_limits_that_no_mesh_holds_at_little_cost_are_held_at_what_it_takes(
 
 def test_mixtures_lie_between_their_parts(fastest: Solution) -> None:
     asked: dict[str, Any] = {"end": END, "limits": Limits(torque=MOST)}
-    mixed = plan_dynamics(MACHINE, (), SOON, start=START, cost=Cost(velocity=0.0, effort=1e-3, time=1.0), **asked)
-    easy = plan_dynamics(MACHINE, (), mixed.horizon, start=START, cost=Cost(velocity=0.0, effort=1e-3), **asked)
+    mixed = solve_dynamics(MACHINE, (), SOON, start=START, cost=Cost(velocity=0.0, effort=1e-3, time=1.0), **asked)
+    easy = solve_dynamics(MACHINE, (), mixed.horizon, start=START, cost=Cost(velocity=0.0, effort=1e-3), **asked)
     assert mixed.audit().passed
     assert mixed.horizon > fastest.horizon
     assert fine(mixed).max() <= 1 + 1e-5
@@ -164,7 +164,7 @@ def test_mixtures_lie_between_their_parts(fastest: Solution) -> None:
 
 def test_what_is_too_much_is_named() -> None:
     with pytest.raises(SolveError, match="torques of 'joint1' would have to go") as caught:
-        plan_dynamics(MACHINE, (), 0.4, start=START, end=END, limits=Limits(torque=MOST), options={"max_iter": 60})
+        solve_dynamics(MACHINE, (), 0.4, start=START, end=END, limits=Limits(torque=MOST), options={"max_iter": 60})
     assert str(caught.value.name).startswith("torques of 'joint")
     assert caught.value.time is not None
 
@@ -176,7 +176,7 @@ def test_a_point_that_is_passed_is_passed_without_a_stop() -> None:
     """A mass that passes 0.5 m at a free time on its way to 0.8 m: no dearer than straight on, which does so too."""
     passed = Goal(joints=[0.5], duration=FreeTime(0.1, 1.0, 0.6), velocity="free")
     last = Goal(joints=[0.8], duration=FreeTime(0.1, 1.0, 0.4))
-    plan = plan_dynamics(slider(), [passed, last], start=[0.0], total=1.0)
+    plan = solve_dynamics(slider(), [passed, last], start=[0.0], total=1.0)
     assert plan.cost == pytest.approx(12 * MASS**2 * WAY**2, rel=1e-7)
     first, second = plan.phase("leg 1"), plan.phase("leg 2")
     assert first.horizon + second.horizon == pytest.approx(1.0, abs=1e-9)
@@ -192,7 +192,7 @@ def test_a_floating_machine_that_picks_up_a_load_at_rest_keeps_its_momentum() ->
     loaded = FreeFloating(with_load(robot, robot.tip_link, 2.0, (0.4, 0, 0)), "planar")
     load = Goal(joints=[1.2, -0.4], duration=1.0, name="reach")
     place = Goal(joints=[0.2, 0.5], duration=1.5, machine=loaded, name="carry")
-    plan = plan_dynamics(alone, [load, place], start=[0.2, 0.5])
+    plan = solve_dynamics(alone, [load, place], start=[0.2, 0.5])
     assert plan.audit().passed
     reach, carry = plan.phase("reach"), plan.phase("carry")
     assert carry["base"][0] == pytest.approx(reach["base"][-1], abs=1e-8)
@@ -239,7 +239,7 @@ def test_what_touches_on_the_way_to_a_goal_is_held_apart_there() -> None:
 
     def way(clearance_constraints: ClearanceConstraints | None) -> Array:
         """Of the tip, there and back. Shape (402, 3)."""
-        plan = plan_dynamics(
+        plan = solve_dynamics(
             machine,
             legs,
             start=START,

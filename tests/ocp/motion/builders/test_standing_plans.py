@@ -13,7 +13,7 @@ from models import STANDING_STARTS
 from models.machines.machine import with_tip
 from models.paths import rest_to_rest
 from ocp import Collocation, ProblemError, Solution, SolveError, TipTask, resolve_accelerations, solve
-from ocp.motion.builders.standing.plan import plan_standing
+from ocp.motion.builders.standing.plan import solve_standing
 from ocp.motion.builders.standing.problem import FreeTime, StandingSetup, standing_problem
 from ocp.motion.tasks.equations import task_errors
 from ocp.motion.tasks.tip_task import timed
@@ -55,7 +55,7 @@ SWING, ASIDE = 1.5, (0.2, 0.15, -0.05)  # s; m, of the arm with a load at its ti
 
 def table_request(**changes: Any) -> Solution:
     settings = with_setup({"zmp": IN_RANGE, "limits": LIMITS, **changes})
-    return plan_standing(machine(), table_task(1), HORIZON, start=STANDING_STARTS[1], **settings)
+    return solve_standing(machine(), table_task(1), HORIZON, start=STANDING_STARTS[1], **settings)
 
 
 @pytest.mark.parametrize(
@@ -85,7 +85,7 @@ def test_the_fastest_lift_is_planned_with_linear_accelerations() -> None:
     settings: dict[str, Any] = {"limits": LIFT_LIMITS, "weights": LIFT_WEIGHTS, "zmp": IN_RANGE}
     settings["setup"] = StandingSetup(along="parameter")
     horizon = FreeTime(0.2, 3.0, 1.0)
-    solution = plan_standing(machine(), straight(0.0, 0.8), horizon, start=STANDING_STARTS[1], **settings)
+    solution = solve_standing(machine(), straight(0.0, 0.8), horizon, start=STANDING_STARTS[1], **settings)
     audit = solution.audit()
     assert audit.feasible
     assert not audit.failures
@@ -118,7 +118,9 @@ def test_an_arm_holds_its_hand_level_where_the_local_method_tips(kind: str) -> N
     task = moved_task(arm(), ARM_START, ASIDE, SWING, **turning)
     local = resolve_accelerations(arm(), task, ARM_START, SWING, step=5e-3, external=tool).motion
     assert not local.stands
-    solution = plan_standing(arm(), task, SWING, start=ARM_START, zmp=InFoot(0.005), setup=StandingSetup(external=tool))
+    solution = solve_standing(
+        arm(), task, SWING, start=ARM_START, zmp=InFoot(0.005), setup=StandingSetup(external=tool)
+    )
     assert solution.audit().passed
     motion = sampled(arm(), solution, tool)
     assert motion.foot_margin.min() > 0.004
@@ -137,7 +139,7 @@ def test_two_arms_stand_where_the_local_method_tips() -> None:
     local = resolve_accelerations(two(), tasks, TWO_START, TWO_HORIZON, step=5e-3)
     assert local.tip_error.max() < 1e-8
     assert not local.motion.stands
-    solution = plan_standing(two(), tasks, TWO_HORIZON, start=TWO_START, zmp=InFoot(0.005))
+    solution = solve_standing(two(), tasks, TWO_HORIZON, start=TWO_START, zmp=InFoot(0.005))
     assert solution.audit().passed
     motion = sampled(two(), solution)
     assert motion.foot_margin.min() > 0.004
@@ -179,7 +181,7 @@ def test_a_hand_that_turns_on_its_way_costs_less_with_its_time_law_free() -> Non
     cost = {}
     for along, what in (("time", given), ("parameter", task)):
         setup = StandingSetup(along=along)  # type: ignore[arg-type]
-        found = plan_standing(standing, what, PLANAR_HORIZON, start=start, zmp=InFoot(0.01), setup=setup)
+        found = solve_standing(standing, what, PLANAR_HORIZON, start=start, zmp=InFoot(0.01), setup=setup)
         cost[along] = found.cost
         for ours, theirs in zip(pose(standing, (), found["joints"][-1]), goal, strict=True):
             np.testing.assert_allclose(ours, theirs, atol=1e-5)
@@ -191,6 +193,6 @@ def test_a_plan_closes_a_gap_at_its_start_critically_damped() -> None:
     standing, start = planar_machine(5), planar_start(5)
     _, y, z = tip_at(standing, start)
     task = TipTask(position=(y + 0.003, z - 0.004), rows=(4, 5), gain=4.0, start_gap=0.01)
-    plan = plan_standing(standing, task, PLANAR_HORIZON, start=start, zmp=InFoot(0.01))
+    plan = solve_standing(standing, task, PLANAR_HORIZON, start=start, zmp=InFoot(0.01))
     errors = np.linalg.norm(task_errors(standing, task, plan.t, None, plan["joints"]), axis=1)
     np.testing.assert_allclose(errors, 0.005 * (1 + 4 * plan.t) * np.exp(-4 * plan.t), atol=1e-6)

@@ -15,7 +15,7 @@ import pytest
 
 from models import Foot, Foothold, Joint, Link, Robot, Stance, rectangle
 from ocp import Collocation, Limits, ProblemError, Solution, SolveError, solve
-from ocp.motion.builders.standing.plan import guess_in_time, plan_steps
+from ocp.motion.builders.standing.plan import guess_in_time, solve_steps
 from ocp.motion.builders.standing.resolved import StepsMotion, motion_of, resolve_steps, sample_stance, steps_motion
 from ocp.motion.builders.standing.stances import StancePhase, Steps, standing_configuration, walk
 from ocp.motion.builders.standing.steps import StepWeights, steps_problem
@@ -29,12 +29,18 @@ from tests.ocp.problem.test_phases import failed, moved
 
 MARGIN = 0.01
 FIRM = 0.03  # m: with this much TALOS stands still on the corner of a sole, see below; a walk in balance stays there
-GROUND: dict[str, Any] = {"margin": MARGIN, "limits": Limits(friction=FRICTION)}
+GROUND: dict[str, Any] = {"limits": Limits(friction=FRICTION)}
 
 
-def planned(steps: Steps, **asked: Any) -> tuple[Solution, StepsMotion]:
-    plan = plan_steps(steps, start=bent(steps), **{**GROUND, **asked})
+def planned(steps: Steps, method: Collocation | None = None, **asked: Any) -> tuple[Solution, StepsMotion]:
+    steps = with_margin(steps, **asked)
+    plan = solve_steps(steps, start=bent(steps), method=method, **GROUND)
     return plan, steps_motion(steps, plan)
+
+
+def with_margin(steps: Steps, **asked: Any) -> Steps:
+    """The same steps, the centers of pressure a margin inside the edges."""
+    return replace(steps, **{"margin": MARGIN, **asked})
 
 
 def assert_stands(motion: StepsMotion, planar: bool, slip: float = 3e-3, lean: float = 0.03) -> None:
@@ -122,7 +128,7 @@ def test_a_step_of_the_other_foot_is_the_mirrored_step() -> None:
     coarse = Collocation(4, degree=3, scheme="legendre")
     plans = []
     for steps in (planar_steps(1, 0.8, 0.8), mirrored(planar_steps(1, 0.8, 0.8))):
-        plan = solve(steps_problem(steps, start=bent(steps), **GROUND), coarse)
+        plan = solve(steps_problem(with_margin(steps), start=bent(steps), **GROUND), coarse)
         plans.append((plan.cost, steps_motion(steps, plan, 11)))
     (cost, right), (again, left) = plans
     assert again == pytest.approx(cost, rel=1e-7)
@@ -138,8 +144,9 @@ def test_a_machine_of_another_size_takes_the_same_steps_at_the_same_cost() -> No
     for size in (1.0, 3.0):
         unit = np.sqrt(size)
         weights = StepWeights(acceleration=0.01 * unit**3, velocity=0.01 * unit, joint_limits=1 / unit, load=0.0)
-        asked = {**GROUND, "margin": MARGIN * size, "clearance": 0.02 * size, "weights": weights}
-        plans.append(solve(steps_problem(resized(steps, size), start=start, **asked), coarse))
+        asked = {**GROUND, "cost": weights}
+        larger = with_margin(resized(steps, size), margin=MARGIN * size, clearance=0.02 * size)
+        plans.append(solve(steps_problem(larger, start=start, **asked), coarse))
     one, large = plans
     assert large.cost == pytest.approx(one.cost, rel=1e-7)
     for name in ("1 left + right.joints", "2 left.joints", "3 left + right.joints"):
@@ -169,9 +176,9 @@ def test_an_arm_docks_and_then_holds_on_by_its_hand() -> None:
     dock = Foothold(numeric(target.position).ravel(), numeric(target.rotation))
     base = Foothold.level(0.0, 0.0)
     phases = [StancePhase({"base": base}, 1.5), StancePhase({"base": base, "hand": dock}, 1.0)]
-    steps = Steps(robot, feet, phases)
+    steps = Steps(robot, feet, phases, margin=0.01)
     mesh = Collocation(5, degree=3, scheme="legendre")
-    plan = plan_steps(steps, start=start, method=mesh, margin=0.01, limits=Limits(friction=FRICTION))
+    plan = solve_steps(steps, start=start, method=mesh, limits=Limits(friction=FRICTION))
     motion = steps_motion(steps, plan)
     assert plan.audit().feasible
     docked = motion.phase == 1
@@ -189,7 +196,7 @@ def test_the_walk_of_the_pseudo_inverse_keeps_its_feet_on_their_ways_and_falls(r
     """The zero moment point leaves the soles, and the contact simulation falls soon after it did."""
     steps = planar_steps(2, 0.5, 0.6) if robot == "planar" else talos_steps(2, 0.8, 0.8)
     clearance = 0.03
-    motion = resolve_steps(steps, start=bent(steps), clearance=clearance)
+    motion = resolve_steps(replace(steps, clearance=clearance), start=bent(steps))
     for name in steps.feet:
         for k, phase in enumerate(steps.phases):
             if name in phase.footholds:
@@ -237,7 +244,7 @@ def test_a_sole_may_rest_where_it_lifts_and_lands_on_other_ground(height: float)
     feet = {side: Foothold.level(0, 0) for side in SIDES}
     phases = walk(feet, [("right", Foothold.level(0.2, 0, height=height))], shift=0.5, swing=0.8)
     steps = Steps(planar_biped(), planar_feet(), phases)
-    form = Formulation.of(steps_problem(steps, start=bent(steps), clearance=0.02))
+    form = Formulation.of(steps_problem(steps, start=bent(steps)))
     lands = standing_configuration(steps.standing(2), bent(steps)[steps.order(steps.stances[1])])
     states, controls = np.zeros((3, form.nx)), np.zeros((3, form.nu))
     states[:, form.states["2 left.joints"]] = bent(steps)[steps.order(steps.stances[1])]
@@ -284,7 +291,7 @@ def test_steps_that_cannot_be_are_refused_by_name(step: tuple[Steps, Solution, S
             lambda: steps_problem(planar_steps(1, 0.5, 0.6, length=3.0), start=start),
             "no configuration within the joint limits",
         ),
-        (lambda: steps_problem(steps, start=start, margin=0.2), "center of mass is .* outside the support"),
+        (lambda: steps_problem(replace(steps, margin=0.2), start=start), "center of mass is .* outside the support"),
         (lambda: steps_problem(steps, start=start, limits=Limits(jerk=1.0)), "have no limit of jerk"),
         (lambda: Steps(robot, feet, []), "no phases"),
         (lambda: Steps(robot, feet, [StancePhase({"lefd": here}, 1.0)]), "lefd"),
@@ -308,14 +315,14 @@ def test_a_step_that_is_too_fast_is_refused_with_the_time_that_it_takes() -> Non
     """Given that time, it can be taken."""
     fast = planar_steps(1, 0.05, 0.06)
     with pytest.raises(SolveError, match="too fast") as refusal:
-        plan_steps(fast, start=bent(fast), **GROUND)
+        solve_steps(with_margin(fast), start=bent(fast), **GROUND)
     error = refusal.value
     assert (error.name, error.limit) == ("2 left", 0.06)
     assert re.search(
         r"phase '2 left': 0\.\d+ s, 0\.06 s are requested; at their limits .*(torques|velocities)", str(error)
     )
     assert error.value > 1.3 * 0.06
-    assert guess_in_time(planar_steps(1, 0.05, 1.05 * error.value), bent(fast), GROUND, {}) is not None
+    assert guess_in_time(with_margin(planar_steps(1, 0.05, 1.05 * error.value)), bent(fast), GROUND, {}) is not None
 
 
 @pytest.mark.long
@@ -324,7 +331,7 @@ def test_steps_that_no_time_makes_possible_are_refused_with_what_would_have_to_g
     joints = tuple(replace(joint, effort=3.0) for joint in steps.robot.joints)
     weak = replace(steps, robot=replace(steps.robot, joints=joints))
     with pytest.raises(SolveError, match="no steps were found, however long they may take") as refusal:
-        plan_steps(weak, start=bent(weak), options={"max_iter": 100}, **GROUND)
+        solve_steps(with_margin(weak), start=bent(weak), options={"max_iter": 100}, **GROUND)
     error = refusal.value
     assert error.conflicts
     assert error.conflicts[0].label == error.name
@@ -335,7 +342,7 @@ def test_steps_that_no_time_makes_possible_are_refused_with_what_would_have_to_g
 def test_steps_of_talos_that_are_too_fast_are_refused() -> None:
     fast = talos_steps(2, 0.05, 0.08)
     with pytest.raises(SolveError, match="too fast") as refusal:
-        plan_steps(fast, start=bent(fast), clearance=0.04, **GROUND)
+        solve_steps(with_margin(fast, clearance=0.04), start=bent(fast), **GROUND)
     assert refusal.value.name == "4 right"
 
 
@@ -344,11 +351,11 @@ def test_steps_near_the_quickest_are_planned_in_the_time_that_they_may_have() ->
     """From the guess of a plan slower than they are, no plan is found within 300 iterations."""
     steps = planar_steps(2, 0.1, 0.2)
     coarse = Collocation(12, degree=3, scheme="legendre")
-    problem = steps_problem(steps, start=bent(steps), **GROUND)
-    guess = guess_in_time(steps, bent(steps), GROUND, {})
+    problem = steps_problem(with_margin(steps), start=bent(steps), **GROUND)
+    guess = guess_in_time(with_margin(steps), bent(steps), GROUND, {})
     assert solve(problem, coarse, guess=guess, options={"max_iter": 300}, check=False).success
     with pytest.raises(SolveError, match="12 intervals"):
-        plan_steps(steps, start=bent(steps), time_limit=2.0, **GROUND)
+        solve_steps(with_margin(steps), start=bent(steps), time_limit=2.0, **GROUND)
 
 
 # ---- two steps -------------------------------------------------------------------------------------------------------

@@ -9,9 +9,9 @@ import pytest
 
 from models import Path, Scara, SmoothPath, scara_along, smooth
 from models.machines.scara_path import ScaraPath
-from ocp import Collocation, ProblemError, minimum_time_problem, plan_minimum_time, solve
+from ocp import Collocation, ProblemError, minimum_time_problem, solve
 from ocp.motion.builders import timing_tables
-from ocp.motion.builders.timing import Fastest
+from ocp.motion.builders.timing import Fastest, solve_minimum_time
 from ocp.motion.builders.timing_tables import largest_demand, table
 from ocp.motion.schedule import JointLimits, LineLimits, Schedule, joint_motion, peak_acceleration, schedule
 from tests.models.paths.test_paths import example
@@ -46,7 +46,7 @@ def random_path(seed: int) -> tuple[SmoothPath, LineLimits]:
 def case(path: SmoothPath, limits: LineLimits, joints: ScaraPath | None = None, intervals: int = INTERVALS) -> Case:
     """The minimum time from the schedule of the same path."""
     plan = schedule(path, limits, joints=joints)
-    return Case(path, limits, joints, plan, plan_minimum_time(path, limits, joints, guess=plan, intervals=intervals))
+    return Case(path, limits, joints, plan, solve_minimum_time(path, limits, joints, guess=plan, intervals=intervals))
 
 
 @pytest.fixture(scope="module")
@@ -90,18 +90,18 @@ def test_a_line_takes_the_closed_form_whatever_the_guess(
 ) -> None:
     path, limits = line(1.0), LineLimits(speed, acceleration, jerk)
     assert schedule(path, limits).duration == pytest.approx(duration, rel=1e-9)
-    best = plan_minimum_time(path, limits, intervals=INTERVALS)
+    best = solve_minimum_time(path, limits, intervals=INTERVALS)
     assert best.duration == pytest.approx(duration, rel=1e-6)
     # a guess that knows nothing of the optimum: its nodes are elsewhere, and the jerk held on them costs time
     slow = schedule(path, LineLimits(0.3, 1.0, 10.0))
-    other = plan_minimum_time(path, limits, guess=slow, intervals=2 * INTERVALS)
+    other = solve_minimum_time(path, limits, guess=slow, intervals=2 * INTERVALS)
     assert slow.duration > 2 * duration
     assert -1e-6 < other.duration / duration - 1 < 1e-4
     assert other.demand < 1.001
 
 
 def test_without_a_jerk_limit_to_speak_of_a_line_takes_bang_bang_acceleration() -> None:
-    best = plan_minimum_time(line(1.0), LineLimits(10.0, 5.0, 1e6), intervals=INTERVALS)
+    best = solve_minimum_time(line(1.0), LineLimits(10.0, 5.0, 1e6), intervals=INTERVALS)
     assert best.duration == pytest.approx(2 * np.sqrt(1 / 5.0), rel=1e-4)
     assert best.demand < 1.001
 
@@ -111,7 +111,7 @@ def test_the_unit_of_length_does_not_matter(scale: float) -> None:
     def best(unit: float) -> float:
         corner = Path.through(unit * np.array([(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (1.0, 0.5, 0.0)]))
         limits = LineLimits(unit, 5 * unit, 200 * unit, 5 * unit)
-        return plan_minimum_time(smooth(corner, 0.1 * unit), limits, intervals=50).duration
+        return solve_minimum_time(smooth(corner, 0.1 * unit), limits, intervals=50).duration
 
     assert best(scale) == pytest.approx(best(1.0), rel=1e-6)
 
@@ -145,7 +145,7 @@ def test_more_intervals_and_no_schedule_give_the_same_minimum(limited: Case, mon
         return schedule(path, limits, joints=joints)
 
     monkeypatch.setattr(timing_tables, "schedule", none_with_joints)
-    other = plan_minimum_time(limited.path, limited.limits, limited.joints, intervals=150)
+    other = solve_minimum_time(limited.path, limited.limits, limited.joints, intervals=150)
     # held jerks lose time in proportion to the intervals' width
     assert other.duration == pytest.approx(limited.best.duration, rel=3e-3)
     assert other.demand < 1.001
@@ -224,7 +224,7 @@ def test_tables_are_exact_between_their_breaks_and_jump_at_them() -> None:
 )
 def test_broken_joints_are_named_errors(joints: Any, words: str) -> None:
     with pytest.raises(ProblemError, match=words) as caught:
-        plan_minimum_time(example("quintic"), LineLimits(1.0, 5.0, 200.0, joints=JointLimits(1.0, 1.0, 1.0)), joints)
+        solve_minimum_time(example("quintic"), LineLimits(1.0, 5.0, 200.0, joints=JointLimits(1.0, 1.0, 1.0)), joints)
     assert (caught.value.name or "unnamed") in str(caught.value)
 
 
@@ -234,7 +234,7 @@ def test_a_joint_jerk_limit_on_a_path_whose_curvature_jumps_is_refused() -> None
     limits = LineLimits(1.0, 5.0, 200.0, joints=SLOW)
     for guess in (None, schedule(path, LineLimits(1.0, 5.0, 200.0))):
         with pytest.raises(ProblemError, match="curvature jumps"):
-            plan_minimum_time(path, limits, along, guess=guess)
+            solve_minimum_time(path, limits, along, guess=guess)
 
 
 def test_a_guess_of_another_path_and_too_few_intervals_are_refused() -> None:

@@ -25,9 +25,9 @@ from ocp import (
     inverse_kinematics,
     minimum_velocity_problem,
     plan,
-    plan_dynamics,
     solve,
 )
+from ocp.motion.builders.dynamics_plan import solve_dynamics
 from ocp.motion.plan.segmented_plan import SegmentedPlan
 from tests.ocp.motion.tasks.space_tasks import UR5_START, ur5
 
@@ -73,7 +73,7 @@ def least_velocities(machine: FixedBase) -> Any:
 
 
 def moved(machine: FixedBase, **options: Any) -> Any:
-    solution = plan_dynamics(machine, (), 1.0, start=START, end=END, **options)
+    solution = solve_dynamics(machine, (), 1.0, start=START, end=END, **options)
     return solution.cost
 
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from models import FixedBase, Joint, Link, Path, Robot, Scara, scara_along, smooth
-from ocp import joint_path, minimum_time_problem, plan_minimum_time
+from ocp import joint_path, minimum_time_problem
+from ocp.motion.builders.timing import solve_minimum_time
 from ocp.motion.schedule import (
     JointLimits,
     JointTrajectory,
@@ -231,8 +232,8 @@ CASES = [
         },
     ),
     Case(
-        "plan_minimum_time",
-        plan_minimum_time,
+        "solve_minimum_time",
+        solve_minimum_time,
         {"path": PATH, "limits": LIMITS, "intervals": 10, "rounds": 0},
         {
             "path": INSTANCE,

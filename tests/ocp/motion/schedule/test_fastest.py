@@ -15,8 +15,9 @@ from scipy.optimize import linprog
 
 from models import Path, Scara, SmoothPath, scara_along, smooth
 from models.machines.scara_path import ScaraPath
-from ocp import ProblemError, plan_minimum_time
+from ocp import ProblemError
 from ocp.motion.builders.joint_spline import PlannedJoints
+from ocp.motion.builders.timing import solve_minimum_time
 from ocp.motion.schedule import (
     JointLimits,
     LineLimits,
@@ -158,7 +159,7 @@ def test_a_random_arm_is_as_fast_as_the_optimal_control_problem(seed: int) -> No
     """Which holds its jerk in intervals, and so is a little slower than the optimum itself."""
     arm, limits = random_arm(seed)
     plan = schedule(arm.path, limits, joints=arm)
-    best = plan_minimum_time(arm.path, limits, arm, guess=plan, intervals=60, rounds=1)
+    best = solve_minimum_time(arm.path, limits, arm, guess=plan, intervals=60, rounds=1)
     assert plan.duration <= 1.02 * best.duration
     assert largest(plan, arm).max() <= 1.001
 
