@@ -7,7 +7,7 @@ import io
 import json
 import os
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -15,7 +15,7 @@ import casadi as ca
 import numpy as np
 
 from models import Machine, ModelError
-from models.arrays import Array
+from models.arrays import MAX_LISTED, Array
 from models.spatial import quaternion_from_rotation
 from ocp.audit.audit import Finding
 from ocp.console import interruptible
@@ -24,6 +24,7 @@ from ocp.motion.builders.tool_motion import CLOCK, PACE, SLOPES, Stretch
 from ocp.motion.plan.candidate import Candidate
 from ocp.motion.plan.request import MotionRequest, request_of, restored_request, stored_request
 from ocp.motion.schedule.trajectory import JointTrajectory
+from ocp.motion.search.held_joints import all_joints
 from ocp.motion.tasks.targets import Target, targets_along
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.stored import ARRAY_NAMES, RECORD_ERRORS, pack_record, unpack_record
@@ -85,8 +86,12 @@ class Plan:
         solution: Solution of the optimal control problem.
         parts: Intervals of time with the same tasks; in the solution they run side by side.
         candidates: All motions found, the plan first, then by rising cost.
-        bound: Lower bound of the cost of any motion that does the tasks; None if none was computed.
+        bound: Lower bound of the cost of any motion that does the tasks with the joints in `held` where they are; None
+            if none was computed.
         targets: Poses that the tasks require along the plan, in world.
+        held: Positions of the joints that stand still, rad or m, by name. They are no variables of the `solution`: they
+            move no frame of a task, or, after a global search, carry other limbs as well (see
+            `search.held_joints`). The torque that holds them is not limited.
     """
 
     machine: Machine
@@ -95,6 +100,7 @@ class Plan:
     candidates: tuple[Candidate, ...] = ()
     bound: float | None = None
     targets: tuple[Target, ...] = ()
+    held: Mapping[str, float] = field(default_factory=dict)
     _audits: dict[str, Any] = field(default_factory=dict, repr=False)
 
     # ---- values ------------------------------------------------------------------------------------------------------
@@ -127,9 +133,13 @@ class Plan:
         if name not in self._names():
             raise unknown_name("name in a plan", name, self._names())
         if self.rate_name == SLOPES and name == "rates":
-            return np.asarray(self.solution[SLOPES] / self.solution[PACE])
+            return self._of_all_joints(name, np.asarray(self.solution[SLOPES] / self.solution[PACE]))
         own = self.rate_name if name == "rates" else name
-        return np.concatenate([self.solution[own + part.suffix] for part in self.parts])
+        return self._of_all_joints(name, np.concatenate([self.solution[own + part.suffix] for part in self.parts]))
+
+    def _of_all_joints(self, name: str, values: Array) -> Array:
+        """Return values of the solution by name, (M, m), extended by the joints that stand still."""
+        return values if name == "base" else all_joints(self.machine.robot, self.held, values, rates=name != "joints")
 
     def at(self, time: Any) -> dict[str, Array]:
         """Return "joints", "rates" and "base" at a time, each (n,), or at times (M,), each (M, n).
@@ -146,7 +156,7 @@ class Plan:
                     return sample[self.rate_name + part.suffix] / (sample[PACE] if self.rate_name == SLOPES else 1.0)
                 return sample[name + part.suffix]
 
-            return self._over(times.ravel(), values)
+            return self._of_all_joints(name, self._over(times.ravel(), values))
 
         values_by_name = {name: values_of(name) for name in self._names()}
         return {name: values[0] if times.ndim == 0 else values for name, values in values_by_name.items()}
@@ -167,7 +177,8 @@ class Plan:
         t = np.atleast_1d(self._checked_times(times))
         at = self.at(t)
         bases = at["base"] if "base" in at else np.zeros((len(t), 0))
-        accelerations, tips = self._over(t, self.accelerations), self._tips(bases, at["joints"])
+        accelerations = self._of_all_joints("accelerations", self._over(t, self.accelerations))
+        tips = self._tips(bases, at["joints"])
         return PlanSample(t, at["joints"], at["rates"], accelerations, tips)
 
     @property
@@ -228,19 +239,24 @@ class Plan:
         return f"<Plan of {self.horizon:.6g} s: {len(self.names)} joints, {self._costs}, {self._counts}>"
 
     def __str__(self) -> str:
-        """Return the cost, and the rejected motions by reason, in at most 15 lines."""
-        lines = [f"plan of {self.horizon:.6g} s for {', '.join(self.names)}: {self._costs}; {self._counts}"]
+        """Return the cost, the joints that stand still, and the rejected motions by reason, in at most 15 lines."""
+        moving = [name for name in self.names if name not in self.held]
+        lines = [f"plan of {self.horizon:.6g} s for {', '.join(moving)}: {self._costs}; {self._counts}"]
+        if self.held:
+            held = [f"{name} at {position:.4g}" for name, position in self.held.items()]
+            more = f" and {len(held) - MAX_LISTED} more" if len(held) > MAX_LISTED else ""
+            lines.append(f"  held: {', '.join(held[:MAX_LISTED])}{more}")
         costs_by_reason: dict[str, list[float]] = {}
         for candidate in self.candidates:
             costs_by_reason.setdefault(str(candidate.reason or "the plan"), []).append(candidate.cost)
-        for reason, costs in list(costs_by_reason.items())[: MAX_LINES - 2]:
+        for reason, costs in list(costs_by_reason.items())[: MAX_LINES - 3]:
             finite = [cost for cost in costs if np.isfinite(cost)] or [np.nan]
             low, high = min(finite), max(finite)
             span = f"{low:10.6g}" + (f" to {high:.6g}" if low < high else "")
             prefix = "" if len(costs) == 1 else f"{len(costs)} motions: "
             lines.append(f"  {span:<23}  {prefix}{reason}")
-        if len(costs_by_reason) > MAX_LINES - 2:
-            remaining = sum(len(costs) for costs in list(costs_by_reason.values())[MAX_LINES - 2 :])
+        if len(costs_by_reason) > MAX_LINES - 3:
+            remaining = sum(len(costs) for costs in list(costs_by_reason.values())[MAX_LINES - 3 :])
             lines.append(f"  {remaining} more, see `candidates`")
         return "\n".join(lines)
 
@@ -313,6 +329,7 @@ class Plan:
                 "request": request,
                 "parts": self.parts,
                 "bound": self.bound,
+                "held": [[name, position] for name, position in self.held.items()],
                 "candidates": [
                     [c.start.tolist(), c.cost, int(c.stage), c.reason and c.reason.record()] for c in self.candidates
                 ],
@@ -355,7 +372,8 @@ class Plan:
             )
             bound = None if head["bound"] is None else float(head["bound"])
             targets = tuple(Target(rows[:, 0], rows[:, 1:4], rows[:, 4:].reshape(-1, 3, 3)) for rows in head["targets"])
-            plan = cls(request.machine, solution, parts, candidates, bound, targets)
+            held = request.held if request.builder else {str(name): float(value) for name, value in head["held"]}
+            plan = cls(request.machine, solution, parts, candidates, bound, targets, held)
             plan._check_parts()
             return plan.with_targets(request.tasks) if request.builder and targets else plan
         except (*RECORD_ERRORS, ModelError) as error:
@@ -404,7 +422,9 @@ class Plan:
             raise ValueError(f"its parts {self.parts} do not fill the time of its solution one after the other")
         variables = {**self.solution.states, **self.solution.controls}
         sizes_by_name = {name: values.shape[1] for name, values in variables.items()}
-        sizes = {"joints": self.machine.joint_size, "base": self.machine.base_size}
+        if unknown := [name for name in self.held if name not in self.names]:
+            raise ValueError(f"the machine has no joints {unknown}, which it holds")
+        sizes = {"joints": self.machine.joint_size - len(self.held), "base": self.machine.base_size}
         for part in self.parts:
             rate_sizes = [sizes_by_name.get(name + part.suffix) for name in RATES]
             sizes_of_part = [sizes_by_name.get(name + part.suffix, 0) for name in sizes]
@@ -433,7 +453,7 @@ class Plan:
         return next(name for name in RATES if name + self.parts[0].suffix in names)
 
     def accelerations(self, part: Part, fraction: Array) -> Array:
-        """Return the joint accelerations at fractions (M,) of a part. Shape (M, n)."""
+        """Return the accelerations of the joints of the solution at fractions (M,) of a part. Shape (M, m)."""
         sample, duration = self.solution.at_fraction(fraction), part.end - part.begin
         name = self.rate_name + part.suffix
         if "accelerations" + part.suffix in sample:
