@@ -46,7 +46,6 @@ from ocp.motion.search.configurations import (
     REACH_TOLERANCE,
     PlanRequest,
     SearchKind,
-    check_clear_start,
     fix_ignorable_joints,
     largest_pose_errors,
     local_motions_from,
@@ -331,8 +330,6 @@ def plan_request(request: PlanRequest) -> Plan:
     Raises:
         ProblemError, SolveError: As in `plan`.
     """
-    if request.start is not None:
-        check_clear_start(request, request.start[None])
     whole, attempt = request, hold_idle_joints(request)
     while True:
         try:

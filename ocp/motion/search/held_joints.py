@@ -13,11 +13,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TypeVar
+from typing import Any, TypeVar
+from warnings import warn
 
 import numpy as np
 
-from models import Machine, Robot
+from models import Machine, ModelWarning, Robot
 from models.arrays import Array
 from models.shapes.bodies import RigidParts
 from ocp.errors import ProblemError, SolveError
@@ -25,6 +26,7 @@ from ocp.motion.local.inverse_kinematics import Unreachable, idle_positions, sam
 from ocp.motion.search.configurations import (
     REACH_TOLERANCE,
     PlanRequest,
+    check_clear_start,
     largest_pose_errors,
     local_motions_from,
     start_collisions,
@@ -71,61 +73,93 @@ def hold_idle_joints(request: PlanRequest) -> PlanRequest:
 def place_held_joints(whole: PlanRequest, request: PlanRequest) -> tuple[PlanRequest, Array]:
     """Return the request with its held joints well placed, and its configurations at the start, (K, m).
 
-    Held joints stay where they are if any configuration is collision-free there, and else take positions with which
-    most are. A global search may hold further joints, see `_hold_shared_joints`.
+    Held joints stay where they are if any configuration is collision-free there, and else take the nearest positions
+    found with one. A global search may hold further joints, see `_hold_shared_joints`.
 
     Args:
         whole: Request before joints were held.
         request: Request with held joints.
 
     Raises:
-        ProblemError: Two bodies collide that no joint of the request moves relative to each other; or as in
-            `start_configurations`.
+        ProblemError: The start is in collision; or as in `start_configurations`.
     """
     configurations = start_configurations(request)
     placed = _place_idle_joints(whole, request, configurations)
     _check_held_bodies(whole, placed, configurations[0])
+    if placed.start is not None:
+        check_clear_start(placed, configurations)
     narrowed = _hold_shared_joints(placed, configurations)
     return narrowed, configurations if narrowed is request else start_configurations(narrowed)
 
 
 def _place_idle_joints(whole: PlanRequest, request: PlanRequest, configurations: Array) -> PlanRequest:
-    """Return the request with the held joints where most of its configurations (K, m) are collision-free."""
-    robot, bounds = whole.machine.robot, whole.bounds
-    held = {name: position for name, position in request.held.items() if name in robot.joint_names}
-    if whole.clearance_constraints is None or whole.start is not None or not held:
-        return request
+    """Return the request with its held joints at the nearest positions with a collision-free configuration of (K, m).
 
-    def clear_count(positions: Mapping[str, float]) -> int:
-        return start_collisions(whole, all_joints(robot, positions, configurations)).count(None)
-
-    if clear_count(held):
+    If held bodies of the machine collide with each other wherever they are, that is ignored.
+    """
+    robot, bounds, own = whole.machine.robot, whole.bounds, _own_held(whole, request)
+    if whole.clearance_constraints is None or whole.start is not None or not own:
         return request
+    columns = [robot.joint_names.index(name) for name in own]
     samples = sample_starts(whole.machine, bounds.lower, bounds.upper, whole.settings.ik_starts, None, whole.seed)
-    columns = [robot.joint_names.index(name) for name in held]
-    best = max([held, *(_named(whole.machine, sample, columns) for sample in samples)], key=clear_count)
-    return request if best is held else whole.with_held(best)
+    present = np.array(list(own.values()))
+    order = np.argsort(np.abs(samples[:, columns] - present).max(axis=1), kind="stable")
+    choices = [own, *(_named(whole.machine, sample, columns) for sample in samples[order])]
+    still = _still_pairs(whole, request)
+    places = np.array([all_joints(robot, held, configurations[0]) for held in choices])
+    apart = [collision is None for collision in start_collisions(whole, places, still)]
+    allowed = [held for held, is_apart in zip(choices, apart, strict=True) if is_apart or not any(apart)]
+    pairs = np.setdiff1d(np.arange(len(whole.clearance_constraints.scene.pairs)), still).tolist()
+
+    def clear(held: Mapping[str, float]) -> bool:
+        return None in start_collisions(whole, all_joints(robot, held, configurations), pairs)
+
+    best = next(filter(clear, allowed), own)
+    return request if best is own else whole.with_held(best)
+
+
+def _own_held(whole: PlanRequest, request: PlanRequest) -> dict[str, float]:
+    """Return the positions of the joints that a request holds, and the whole one does not, by name."""
+    return {name: position for name, position in request.held.items() if name not in whole.held}
+
+
+def _still_pairs(whole: PlanRequest, request: PlanRequest) -> list[int]:
+    """Return the pairs of bodies that no joint of a request moves relative to each other."""
+    assert whole.clearance_constraints is not None
+    moving = [name not in request.held for name in whole.machine.robot.joint_names]
+    levers = whole.clearance_constraints.scene.levers.joints[:, moving]
+    return np.flatnonzero(~(levers > 0).any(axis=1)).tolist()
 
 
 def _check_held_bodies(whole: PlanRequest, request: PlanRequest, configuration: Array) -> None:
-    """Raise ProblemError if bodies collide that no joint of the request moves relative to each other."""
-    if whole.clearance_constraints is None or whole.start is not None or not request.held:
+    """Check the bodies at the start that no joint of the request moves relative to each other.
+
+    Raises:
+        ProblemError: A body collides with an obstacle.
+
+    Warns:
+        ModelWarning: Two bodies of the machine collide with each other, which changes nothing about the motion.
+    """
+    if whole.clearance_constraints is None or not request.held:
         return
     scene, robot = whole.clearance_constraints.scene, whole.machine.robot
-    moving = [name not in request.held for name in robot.joint_names]
-    still = np.flatnonzero(~(scene.levers.joints[:, moving] > 0).any(axis=1)).tolist()
-    collision = start_collisions(whole, all_joints(robot, request.held, configuration)[None], still)[0]
-    if collision is not None:
-        joints = np.flatnonzero(scene.levers.joints[collision.pair])
-        names = [robot.joint_names[joint] for joint in joints if robot.joint_names[joint] in request.held]
-        where = ", ".join(f"{name!r} at {request.held[name]:.4g}" for name in names) or "these bodies"
+    start = all_joints(robot, _own_held(whole, request), configuration)[None]
+    still = _still_pairs(whole, request)
+    with_obstacle = [pair for pair in still if scene.pairs[pair, 2] < 0]
+    for pairs in (with_obstacle, sorted({*still} - {*with_obstacle})):
+        if (collision := start_collisions(whole, start, pairs)[0]) is None:
+            continue
+        columns = np.flatnonzero(scene.levers.joints[collision.pair]).tolist()
+        names = [name for name in (robot.joint_names[column] for column in columns) if name in request.held]
+        where = ", ".join(f"{name!r} stays at {request.held[name]:.4g}" for name in names)
         words = (
-            f"{' and '.join(collision.bodies)} collide, {collision.distance:.3g} m apart: no task moves {where}, which "
-            f"stays there; give a start with other positions, or ignore this pair of bodies: "
-            f"ignored={[scene.pair_names(collision.pair)]}"
+            f"{collision}, where {where}, since no task moves it; give a start with other positions, or ignore this "
+            f"pair of bodies: ignored={[scene.pair_names(collision.pair)]}"
         )
-        details = {"value": collision.distance, "limit": scene.clearance}
-        raise ProblemError(words, name=" and ".join(collision.bodies), **details)
+        details: dict[str, Any] = {"value": collision.distance, "limit": scene.clearance}
+        if pairs is with_obstacle:
+            raise ProblemError(words, name=" and ".join(collision.bodies), **details)
+        warn(ModelWarning(words, name=" and ".join(collision.bodies), **details), stacklevel=2)
 
 
 def released(whole: PlanRequest, request: PlanRequest, error: SolveError) -> PlanRequest | None:
@@ -143,7 +177,7 @@ def released(whole: PlanRequest, request: PlanRequest, error: SolveError) -> Pla
     pairs = [pair for pair, bodies in enumerate(scene.labels) if " and ".join(bodies) == error.name]
     columns = np.unique(np.nonzero(scene.levers.joints[pairs])[1]).tolist()
     names = {whole.machine.robot.joint_names[column] for column in columns}
-    own = {name: position for name, position in request.held.items() if name not in whole.held}
+    own = _own_held(whole, request)
     held = {name: position for name, position in own.items() if name not in names}
     return whole.with_held(held) if len(held) < len(own) else None
 
