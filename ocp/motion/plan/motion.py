@@ -11,12 +11,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
-import casadi as ca
 import numpy as np
 
 from models import Machine, ModelError
 from models.arrays import MAX_LISTED, Array
-from models.spatial import quaternion_from_rotation
 from ocp.audit.audit import Finding
 from ocp.console import interruptible
 from ocp.errors import NOT_NUMBERS, ProblemError, StorageWarning, floats, sample_times, unknown_name
@@ -25,7 +23,7 @@ from ocp.motion.plan.candidate import Candidate
 from ocp.motion.plan.request import MotionRequest, request_of, restored_request, stored_request
 from ocp.motion.schedule.trajectory import JointTrajectory
 from ocp.motion.search.held_joints import all_joints
-from ocp.motion.tasks.targets import Target, targets_along
+from ocp.motion.tasks.targets import Target, targets_along, tip_poses
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.stored import ARRAY_NAMES, RECORD_ERRORS, pack_record, unpack_record
 from ocp.registry import call_registered
@@ -89,9 +87,8 @@ class Plan:
         bound: Lower bound of the cost of any motion that does the tasks with the joints in `held` where they are; None
             if none was computed.
         targets: Poses that the tasks require along the plan, in world.
-        held: Positions of the joints that stand still, rad or m, by name. They are no variables of the `solution`: they
-            move no frame of a task, or, after a global search, carry other limbs as well (see
-            `search.held_joints`). The torque that holds them is not limited.
+        held: Positions of the joints that stand still and are no variables of the solution, rad or m, by name, see
+            `search.held_joints`. The torque that holds them is not limited.
     """
 
     machine: Machine
@@ -178,7 +175,7 @@ class Plan:
         at = self.at(t)
         bases = at["base"] if "base" in at else np.zeros((len(t), 0))
         accelerations = self._of_all_joints("accelerations", self._over(t, self.accelerations))
-        tips = self._tips(bases, at["joints"])
+        tips = tip_poses(self.machine, bases, at["joints"])
         return PlanSample(t, at["joints"], at["rates"], accelerations, tips)
 
     @property
@@ -494,16 +491,6 @@ class Plan:
             result = np.empty((len(times), values.shape[1])) if result is None else result
             result[rows] = values
         return np.zeros((0, self.machine.joint_size)) if result is None else result
-
-    def _tips(self, bases: Array, joints: Array) -> Array:
-        if self.machine.robot.tip is None:
-            return np.zeros((len(joints), 7)) * np.nan
-        b, q = ca.SX.sym("b", self.machine.base_size), ca.SX.sym("q", self.machine.joint_size)
-        pose = self.machine.tip_pose(b, q)
-        function = ca.Function("tip", [b, q], [pose.position, pose.rotation])
-        position, rotation = function.map(len(joints))(bases.T, joints.T)
-        turns = np.array(rotation).reshape(3, len(joints), 3).transpose(1, 0, 2)
-        return np.column_stack([np.array(position).T, quaternion_from_rotation(turns)])
 
 
 def parts_of(stretches: Sequence[Stretch]) -> tuple[Part, ...]:
