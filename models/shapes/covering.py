@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
-from scipy.optimize import minimize
+import scipy
 
 from models.arrays import Array, ArrayInput, checked_array, checked_indices
 from models.cache import cache_key, load_value, source_version, store_value
@@ -164,7 +164,7 @@ def _fit_capsule(points: Array) -> Capsule:
     fits = []
     for k in np.argsort(volumes, kind="stable")[:2]:
         own, start = extreme_points @ bases[k], np.array([0.0, 0.0, *centres[k], np.sqrt(excess[k])])
-        result = minimize(
+        result = scipy.optimize.minimize(
             lambda x, own=own: float(_evaluate_capsules(own, x[None])[0][0]),
             start,
             method="Nelder-Mead",
