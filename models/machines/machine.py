@@ -7,9 +7,9 @@ FreeFloating machines and in every problem. A rotor is symmetric, so its angle i
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from typing import Protocol, cast
+from typing import Any, Protocol, cast
 
 import casadi as ca
 import numpy as np
@@ -28,7 +28,7 @@ from models.errors import ModelError
 from models.robot.indices import TWIST_SIZE, jacobian_manipulability
 from models.robot.kinematics import checked_vector, joint_vector, tip_jacobian, tip_pose
 from models.robot.parts import Joint, Link
-from models.robot.rebuild import move_tip
+from models.robot.rebuild import lock_joints, move_tip
 from models.robot.robot import Robot
 from models.spatial import Expression, Frame, expression, on_scalars
 
@@ -166,10 +166,24 @@ def with_tip(
     Raises:
         ModelError: Unknown link, wrong sizes, a machine that is not such a dataclass.
     """
+    return cast(Machine, replace(_with_robot(machine), robot=move_tip(machine.robot, link, translation, rotation)))
+
+
+def hold_joints(machine: Machine, positions: Mapping[str, float]) -> Machine:
+    """Return the same machine with joints, and those that follow them, locked at positions (rad or m), by name.
+
+    Raises:
+        ModelError: As `models.robot.rebuild.lock_joints`; or as `with_tip` for the machine.
+    """
+    return cast(Machine, replace(_with_robot(machine), robot=lock_joints(machine.robot, positions)))
+
+
+def _with_robot(machine: Machine) -> Any:
+    """Return the machine, a dataclass with a field `robot`; raise ModelError for any other."""
     if not is_dataclass(machine) or isinstance(machine, type) or "robot" not in {each.name for each in fields(machine)}:
-        message = f"{type(machine).__name__} is no dataclass with a field 'robot': its tip cannot be moved"
+        message = f"{type(machine).__name__} is no dataclass with a field 'robot', which cannot be replaced"
         raise ModelError(message, name="machine", value=machine)
-    return cast(Machine, replace(machine, robot=move_tip(machine.robot, link, translation, rotation)))
+    return machine
 
 
 def require_joints(robot: Robot) -> None:

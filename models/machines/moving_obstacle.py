@@ -10,7 +10,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from scipy.interpolate import BSpline
+import scipy
 
 from models.arrays import ROUNDING, Array, checked_array, checked_rotation
 from models.errors import ModelError
@@ -136,7 +136,7 @@ def _table(function: Any, inputs: list[Any]) -> list[Any]:
     order = int(degree[0][0]) if degree else 1
     if linear:  # as a spline of degree 1
         knots = np.concatenate([knots[:1], knots, knots[-1:]])
-    curve = BSpline(knots, values.reshape(len(knots) - order - 1, -1), order)
+    curve = scipy.interpolate.BSpline(knots, values.reshape(len(knots) - order - 1, -1), order)
     breaks = np.unique(knots)
     coefficients = np.array(
         [curve.derivative(k)(breaks[:-1]) / factorial(k) if k else curve(breaks[:-1]) for k in range(order + 1)]

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
-from scipy.spatial import ConvexHull
+import scipy
 
 from models.arrays import (
     ROUNDING,
@@ -247,7 +247,7 @@ def convex_hull(points: ArrayInput) -> Array:
     cloud = np.unique(np.asarray(points, dtype=float), axis=0)  # sorted by x, then y
     if np.linalg.matrix_rank(cloud - cloud[:1], tol=1e-12 * float(np.ptp(cloud, axis=0).max(initial=0.0))) < 2:
         return cloud[[0, -1]] if len(cloud) > 1 else cloud
-    return np.asarray(cloud[ConvexHull(cloud).vertices])
+    return np.asarray(cloud[scipy.spatial.ConvexHull(cloud).vertices])
 
 
 def _corners(shape: CollisionShape) -> Array:

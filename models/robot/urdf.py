@@ -24,6 +24,7 @@ import numpy as np
 from models.arrays import Array, checked_choice, warn_of_degrees
 from models.errors import ModelError, ModelWarning
 from models.input_files import INPUT_LIMITS, parse_xml, read_regular
+from models.robot.composite import floating_joint, planar_joint
 from models.robot.parts import SHAPES, CollisionShape, Joint, Kind, Link, Mimic, VisualShape
 
 Source: TypeAlias = str | os.PathLike[str]
@@ -31,6 +32,8 @@ InertiaRule: TypeAlias = Literal["warn", "as_given"]
 _Shape = TypeVar("_Shape", bound=CollisionShape)
 
 MOVING: dict[str, Kind] = {"revolute": "revolute", "continuous": "continuous", "prismatic": "prismatic"}
+COMPOSITE = ("planar", "floating")
+"""Kinds of joints with several degrees of freedom."""
 XACRO = "this is xacro, the macro language that URDF files are made from; expand it first: xacro FILE > FILE.urdf"
 BLANK = "\ufeff \t\r\n"
 """Characters that may precede the first character of a text."""
@@ -73,7 +76,9 @@ def read_urdf(source: Source, *, inertia: InertiaRule = "warn") -> Description:
     Missing data have the default values of the format: a zero origin, the axis x, no inertia. A revolute or prismatic
     joint whose <limit> has only one of lower and upper has 0 for the other; with neither, or without <limit>, it has no
     position limits. The same holds for effort and velocity. A floating joint between a massless root and its only child
-    means that the robot floats; both are omitted. A <mimic> of a fixed joint is ignored.
+    means that the robot floats: both are omitted, and the base of `FreeFloating` moves in their place. Any other
+    floating or planar joint becomes a chain of joints with one degree of freedom, without limits, see
+    `models.robot.composite`. A <mimic> of a fixed joint is ignored.
 
     Args:
         source: The text, recognised by its first character "<", or the path of a file.
@@ -97,29 +102,35 @@ def read_urdf(source: Source, *, inertia: InertiaRule = "warn") -> Description:
     if unknown := [attribute for part in parts for attribute in _unknown_attributes(part)]:
         warn(f"attributes that mean nothing in URDF are not read: {'; '.join(unknown)}", ModelWarning, 3)
     links = _links(tree, inertia, folder)
-    joints = [(name_of(each), each.get("type"), _joint(each)) for each in tree.findall("joint")]
-    for name in [name for name, kind, _ in joints if kind == "floating"]:
-        links = _without_world(name, links, joints)
-        joints = [each for each in joints if each[0] != name]
+    described = [(each, _joint(each)) for each in tree.findall("joint")]
+    joints: list[Joint] = []
+    for element, joint in described:
+        kind = element.get("type")
+        if kind == "floating" and _is_virtual(joint, links, [each for _, each in described]):
+            links = _without_world(joint, links)
+        elif kind in COMPOSITE:
+            added = floating_joint(joint) if kind == "floating" else planar_joint(joint, _axis(element))
+            links, joints = (*links, *added.links), [*joints, *added.joints]
+        else:
+            joints.append(joint)
     tip = _only(tree, "tip", "the robot")
     tip_name = None if tip is None else text_of(tip, "link", "the robot")
-    return Description(tree.get("name") or "robot", links, tuple(joint for *_, joint in joints), tip_name)
+    return Description(tree.get("name") or "robot", links, tuple(joints), tip_name)
 
 
-def _without_world(name: str, links: tuple[Link, ...], joints: list[tuple[str, str | None, Joint]]) -> tuple[Link, ...]:
+def _is_virtual(floating: Joint, links: Sequence[Link], joints: Sequence[Joint]) -> bool:
+    """Return whether a floating joint connects the whole robot to a massless root."""
+    base = next((link for link in links if link.name == floating.parent), None)
+    alone = all(joint is floating for joint in joints if floating.parent in (joint.parent, joint.child))
+    return base is not None and alone and not base.mass and not base.inertia.any()
+
+
+def _without_world(floating: Joint, links: tuple[Link, ...]) -> tuple[Link, ...]:
     """Return the links without the massless root to which a floating joint connects the robot."""
-    virtual = next(joint for each, _, joint in joints if each == name)
-    base = next((link for link in links if link.name == virtual.parent), None)
-    neighbours = [joint for *_, joint in joints if virtual.parent in (joint.parent, joint.child)]
-    if base is None or base.mass or len(neighbours) > 1 or base.inertia.any():
-        message = (
-            f"joint {name!r} is floating, which is supported only as the joint between a massless root link and "
-            "the whole robot; make it fixed, or read its two sides as two robots"
-        )
-        raise ModelError(message, name=name, value="floating")
+    base = next(link for link in links if link.name == floating.parent)
     if base.collisions:
         message = (
-            f"link {base.name!r}, from which joint {name!r} lets the robot float, is left out with its "
+            f"link {base.name!r}, from which joint {floating.name!r} lets the robot float, is left out with its "
             "<collision> shapes: give them as obstacles"
         )
         warn(ModelWarning(message, name=base.name, value=len(base.collisions)), stacklevel=4)
@@ -352,18 +363,16 @@ def _joint(element: ElementTree.Element) -> Joint:
     name = name_of(element)
     owner = f"joint {name!r}"
     kind = text_of(element, "type", owner)
-    if kind not in (*MOVING, "fixed", "floating"):
-        message = (
-            f"{owner} is of the type {kind!r}, which is not supported; use one of fixed, {', '.join(MOVING)} (a robot "
-            "whose base moves in the plane is made by FreeFloating(robot, base='planar'))"
-        )
-        raise ModelError(message, name="type", value=kind, limit=("fixed", *MOVING))
+    kinds = ("fixed", *MOVING, *COMPOSITE)
+    if kind not in kinds:
+        message = f"{owner} is of the type {kind!r}, which is not supported; use one of {', '.join(kinds)}"
+        raise ModelError(message, name="type", value=kind, limit=kinds)
     parent, child = (text_of(child_of(element, role, owner), "link", owner) for role in ("parent", "child"))
     translation, rotation = origin_of(element, owner)
     if kind not in MOVING:
         return Joint(name, "fixed", parent, child, translation, rotation)
-    axis_element = _only(element, "axis", owner)
-    axis = np.array([1.0, 0.0, 0.0]) if axis_element is None else numbers_of(axis_element, "xyz", owner, 3)
+    axis = _axis(element)
+    axis = np.array([1.0, 0.0, 0.0]) if axis is None else axis
     limits: dict[str, float] = {}
     if (limit := _only(element, "limit", owner)) is not None:
         limits = {key: number_of(limit, key, owner) for key in ATTRIBUTES["limit"] if key in limit.attrib}
@@ -376,6 +385,13 @@ def _joint(element: ElementTree.Element) -> Joint:
         numbers = {key: number_of(tie, key, owner) for key in ("multiplier", "offset") if key in tie.attrib}
         mimic = Mimic(text_of(tie, "joint", owner), **numbers)
     return Joint(name, MOVING[kind], parent, child, translation, rotation, axis, mimic=mimic, **limits)
+
+
+def _axis(element: ElementTree.Element) -> Array | None:
+    """Return the axis of a joint, shape (3,), or None."""
+    owner = f"joint {name_of(element)!r}"
+    axis = _only(element, "axis", owner)
+    return None if axis is None else numbers_of(axis, "xyz", owner, 3)
 
 
 def _unknown_attributes(owner: ElementTree.Element) -> list[str]:

@@ -1,8 +1,9 @@
 """Covers of a mesh by a few capsules or by one box, whose distances are exact and fast.
 
 First, one capsule of least volume is fitted to the mesh. Then the mesh is split across the plane that lowers the
-covered volume most, each side gets its own capsule, and so on up to a few parts. The number of parts weighs volume
-against cost. A box replaces the capsules where it is clearly smaller, because distances of boxes cost many times more.
+covered volume most, each side gets its own capsule, the largest one is split again, and so on up to a few parts. The
+number of parts weighs volume against cost. A box replaces the capsules where it is clearly smaller, because distances
+of boxes cost many times more.
 
 Every triangle, split at the planes, lies in the capsule of its part. So do all points that a closed surface encloses:
 from a point between two planes of a split, a line parallel to the planes meets the surface between them.
@@ -15,7 +16,7 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
-from scipy.optimize import minimize
+import scipy
 
 from models.arrays import Array, ArrayInput, checked_array, checked_indices
 from models.cache import cache_key, load_value, source_version, store_value
@@ -39,6 +40,7 @@ class CoverSettings:
         thinnest: Smallest thickness of a box, which must not be zero.
         directions: Initial directions of capsule axes on a hemisphere.
         extremes: Directions whose extreme points take part in a fit, a multiple of 32.
+        trial_directions, trial_extremes: The same for a split that is only tried.
         simplex: Initial steps of the simplex search: two slopes of the axis, its position across, root of the excess
             radius.
         parameter_tolerance, volume_tolerance: Termination tolerances of these parameters and of the relative volume.
@@ -56,6 +58,8 @@ class CoverSettings:
     thinnest: float = 1e-6
     directions: int = 48
     extremes: int = 256
+    trial_directions: int = 12
+    trial_extremes: int = 64
     simplex: tuple[float, ...] = (0.25, 0.25, 0.05, 0.05, 0.2)
     parameter_tolerance: float = 4e-3
     volume_tolerance: float = 4e-4
@@ -131,12 +135,12 @@ def fit_cover(triangles: Array) -> tuple[Cover, ...]:
         choices.append((score * SETTINGS.worth_a_part ** (len(parts) - 1), shapes))
         if len(parts) == SETTINGS.parts:
             break
-        others = [capsules[:k] + capsules[k + 1 :] for k in range(len(parts))]
-        splits = [_best_split(part, others[k], capsules[k], grid) for k, part in enumerate(parts)]
-        least, k = min((split[0], k) for k, split in enumerate(splits))
-        if not np.isfinite(least):
+        k = int(np.argmax([_covered_share([capsule], grid) for capsule in capsules]))
+        sides = _best_split(parts[k], capsules[:k] + capsules[k + 1 :], capsules[k], grid)
+        if len(sides) < 2:
             break
-        _, parts[k : k + 1], capsules[k : k + 1] = splits[k]
+        parts[k : k + 1] = sides
+        capsules[k : k + 1] = [_fit_capsule(_points(side)) for side in sides]
     shapes = min(choices, key=lambda each: each[0])[1]
     box = _fit_box(points, extreme_points)
     if float(np.prod(box.size)) < SETTINGS.worth_a_box * box_volume * _covered_share(shapes, grid):
@@ -161,22 +165,19 @@ def _fit_capsule(points: Array) -> Capsule:
     extreme_points = points[_extreme_indices(points, frame)]
     bases = _bases(np.concatenate([frame.T, _sphere_points(SETTINGS.directions, half=True) @ frame.T]))
     volumes, centres, excess = _approximate_capsules(extreme_points, bases)
-    fits = []
-    for k in np.argsort(volumes, kind="stable")[:2]:
-        own, start = extreme_points @ bases[k], np.array([0.0, 0.0, *centres[k], np.sqrt(excess[k])])
-        result = minimize(
-            lambda x, own=own: float(_evaluate_capsules(own, x[None])[0][0]),
-            start,
-            method="Nelder-Mead",
-            options={
-                "initial_simplex": start + np.vstack([np.zeros(5), np.diag(SETTINGS.simplex)]),
-                "xatol": SETTINGS.parameter_tolerance,
-                "fatol": SETTINGS.volume_tolerance * float(volumes[k]),
-            },
-        )
-        fits.append((float(result.fun), int(k), result.x))
-    _, k, best = min(fits, key=lambda each: each[:2])
-    return _enclosing_capsule(_capsule_from_parameters(extreme_points, best, bases[k]), points)
+    k = int(volumes.argmin())
+    own, start = extreme_points @ bases[k], np.array([0.0, 0.0, *centres[k], np.sqrt(excess[k])])
+    result = scipy.optimize.minimize(
+        lambda x: float(_evaluate_capsules(own, x[None])[0][0]),
+        start,
+        method="Nelder-Mead",
+        options={
+            "initial_simplex": start + np.vstack([np.zeros(5), np.diag(SETTINGS.simplex)]),
+            "xatol": SETTINGS.parameter_tolerance,
+            "fatol": SETTINGS.volume_tolerance * float(volumes[k]),
+        },
+    )
+    return _enclosing_capsule(_capsule_from_parameters(extreme_points, result.x, bases[k]), points)
 
 
 def _evaluate_capsules(points: Array, parameters: Array) -> tuple[Array, Array, Array, Array, Array, Array]:
@@ -186,10 +187,10 @@ def _evaluate_capsules(points: Array, parameters: Array) -> tuple[Array, Array, 
     radius larger than the enclosing cylinder's lets the caps begin earlier.
     """
     a, b, x, y, fat = parameters.T
-    one, none = np.ones_like(a), np.zeros_like(a)
-    axis = np.stack([a, b, one], axis=1) / np.sqrt(a**2 + b**2 + 1)[:, None]
-    side = np.stack([one, none, -a], axis=1) / np.sqrt(1 + a**2)[:, None]
-    other = np.cross(axis, side)
+    one, none, length, width = np.ones_like(a), np.zeros_like(a), np.sqrt(a**2 + b**2 + 1), np.sqrt(1 + a**2)
+    axis = (np.array([a, b, one]) / length).T
+    side = (np.array([one, none, -a]) / width).T
+    other = (np.array([-a * b, width**2, -b]) / (length * width)).T  # axis x side
     along = axis @ points.T
     across = (side @ points.T - x[:, None]) ** 2 + (other @ points.T - y[:, None]) ** 2
     radius = np.sqrt(across.max(axis=1)) * (1 + fat**2)
@@ -251,14 +252,10 @@ def _segment_distances(points: Array, start: Array, end: Array) -> Array:
 # ------------------------------------------------------------------------------------------------------- cuts
 
 
-def _best_split(
-    part: Array, others: list[Capsule], capsule: Capsule, grid: Array
-) -> tuple[float, list[Array], list[Capsule]]:
-    """Return the split of a part, by a plane across an axis, whose two capsules and the others cover least.
+def _best_split(part: Array, others: list[Capsule], capsule: Capsule, grid: Array) -> list[Array]:
+    """Return the sides of a plane across an axis whose two capsules and the others cover least.
 
-    Returns:
-        The share of the grid that is covered, the two sides and their capsules; inf and the part itself if no plane
-        splits it.
+    If no plane splits the part, the part itself is returned.
     """
     points = _points(part)
     frame = _principal_axes(points)
@@ -267,7 +264,7 @@ def _best_split(
     along = along / max(float(np.linalg.norm(along)), 1e-300)
     if 0 < np.abs(along @ frame).max() < 0.98:
         axes.append(along)
-    bases = _bases(np.concatenate([frame.T, _sphere_points(SETTINGS.directions // 2, half=True) @ frame.T]))
+    bases = _bases(np.concatenate([frame.T, _sphere_points(SETTINGS.trial_directions, half=True) @ frame.T]))
     triangles = _representative_triangles(part, frame)
     free = grid[np.min([exceedance(each, grid) for each in others], axis=0) > 0] if others else grid
 
@@ -278,19 +275,17 @@ def _best_split(
         sides = [_points(side) for side in split_triangles(triangles, axes[k], level) if len(side)]
         if len(sides) < 2:
             return np.inf
-        return covered([_approximate_capsule(side[_extreme_indices(side, frame)], bases) for side in sides])
+        points = [side[_extreme_indices(side, frame, SETTINGS.trial_extremes)] for side in sides]
+        return covered([_approximate_capsule(each, bases) for each in points])
 
     spans = [(float((points @ axis).min()), float(np.ptp(points @ axis))) for axis in axes]
     levels = [(k, low + share * span) for k, (low, span) in enumerate(spans) for share in SETTINGS.cuts]
-    _, k, level = min((share_of_split(k, level), k, level) for k, level in levels)
-    for share in (SETTINGS.cuts[0] / 2, SETTINGS.cuts[0] / 4):
-        step = share * spans[k][1]
-        _, level = min((share_of_split(k, each), each) for each in (level - step, level, level + step))
-    sides = [side for side in split_triangles(part, axes[k], level) if len(side)]
-    if len(sides) < 2:
-        return np.inf, [part], [capsule]
-    fits = [_fit_capsule(_points(side)) for side in sides]
-    return covered(fits), sides, fits
+    share, k, level = min((share_of_split(k, level), k, level) for k, level in levels)
+    for fraction in (SETTINGS.cuts[0] / 2, SETTINGS.cuts[0] / 4):
+        step = fraction * spans[k][1]
+        nearby = [(share_of_split(k, each), each) for each in (level - step, level + step)]
+        share, level = min([(share, level), *nearby])
+    return [side for side in split_triangles(part, axes[k], level) if len(side)]
 
 
 def _grid(points: Array) -> tuple[Array, float]:

@@ -14,10 +14,8 @@ from dataclasses import dataclass
 from threading import Thread
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from models.arrays import ROUNDING, Array, frozen
 from models.errors import ModelError
@@ -82,9 +80,9 @@ def _convex_hull(points: Array) -> Hull:
     normal = np.linalg.svd(sample - sample.mean(axis=0), full_matrices=False)[2][-1]
     try:
         if len(points) < 4 or np.ptp(centred @ normal) <= flat:
-            raise QhullError
-        qhull = ConvexHull(centred, qhull_options="Qt")
-    except QhullError as error:
+            raise scipy.spatial.QhullError
+        qhull = scipy.spatial.ConvexHull(centred, qhull_options="Qt")
+    except scipy.spatial.QhullError as error:
         message = "mesh: the vertices are coplanar, so the mesh has no volume; give a thin Box instead"
         raise ModelError(message, name="vertices", value=len(points), limit=flat * size) from error
     corners, faces = np.unique(qhull.simplices, return_inverse=True)
@@ -106,9 +104,9 @@ def _convex_hull(points: Array) -> Hull:
 
 def _distinct(normals: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return the indices of distinct directions and the position of every direction among these. Shapes (f,), (k,)."""
-    close_pairs = cKDTree(normals).query_pairs(ROUNDING, p=np.inf, output_type="ndarray")
-    links = coo_array((np.ones(len(close_pairs)), close_pairs.T), shape=(len(normals), len(normals)))
-    _, same = connected_components(links, directed=False)
+    close_pairs = scipy.spatial.cKDTree(normals).query_pairs(ROUNDING, p=np.inf, output_type="ndarray")
+    links = scipy.sparse.coo_array((np.ones(len(close_pairs)), close_pairs.T), shape=(len(normals), len(normals)))
+    _, same = scipy.sparse.csgraph.connected_components(links, directed=False)
     first = np.unique(same, return_index=True)[1]
     order = np.argsort(np.argsort(first))
     return np.sort(first), order[same]

@@ -19,8 +19,7 @@ from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
-import scipy.sparse as sp
-from scipy.linalg import LinAlgError, cho_solve_banded, cholesky, cholesky_banded, solve_triangular
+import scipy
 
 from ocp.console import reason_to_stop
 from ocp.direct.assembly import Program, Transcription
@@ -49,8 +48,8 @@ class Conditions:
         held, fixed: Which rows (m,) and variables (n,) are equalities or at a limit with a multiplier.
     """
 
-    hessian: sp.csc_array
-    jacobian: sp.csr_array
+    hessian: scipy.sparse.csc_array
+    jacobian: scipy.sparse.csr_array
     of_bounds: np.ndarray
     of_rows: np.ndarray
     held: np.ndarray
@@ -64,12 +63,14 @@ def conditions(program: Program, outcome: Outcome, arguments: dict[str, np.ndarr
     slope, jacobian = program.numbers.first(v, p)
     slope, jacobian = slope * a / c, scaled(jacobian, 1 / b, a)
     half = scaled(program.numbers.second(v, p, 1.0, lam), a / c, a)
-    hessian = half + sp.triu(half, 1).T
+    hessian = half + scipy.sparse.triu(half, 1).T
     of_rows = lam * b / c
     of_bounds = -(slope + jacobian.T @ of_rows)
     held = at_limit(outcome.rows / b, arguments["lbg"] / b, arguments["ubg"] / b, of_rows)
     fixed = at_limit(v / a, arguments["lbx"] / a, arguments["ubx"] / a, of_bounds)
-    return Conditions(sp.csc_array(hessian), sp.csr_array(jacobian), of_bounds, of_rows, held, fixed)
+    return Conditions(
+        scipy.sparse.csc_array(hessian), scipy.sparse.csr_array(jacobian), of_bounds, of_rows, held, fixed
+    )
 
 
 def scaled_values(
@@ -127,10 +128,10 @@ def at_limit(value: np.ndarray, lower: np.ndarray, upper: np.ndarray, multiplier
     return np.asarray((lower == upper) | below | above)
 
 
-def scaled(matrix: sp.csc_array, rows: np.ndarray, columns: np.ndarray) -> sp.csc_array:
+def scaled(matrix: scipy.sparse.csc_array, rows: np.ndarray, columns: np.ndarray) -> scipy.sparse.csc_array:
     """Return a matrix with its rows and columns multiplied by factors."""
     factors = rows[matrix.indices] * np.repeat(columns, np.diff(matrix.indptr))
-    return sp.csc_array((matrix.data * factors, matrix.indices, matrix.indptr), shape=matrix.shape)
+    return scipy.sparse.csc_array((matrix.data * factors, matrix.indices, matrix.indptr), shape=matrix.shape)
 
 
 @dataclass(frozen=True)
@@ -173,7 +174,7 @@ class Newton:
         row, column = (np.array(part, dtype=np.int64) for part in program.jacobian.sparsity_out(1).get_triplet())
         first, second = (np.array(part, dtype=np.int64) for part in program.hessian.sparsity_out(0).get_triplet())
         self._row, self._column, self._first, self._second = row, column, first, second
-        slopes = sp.csr_array((np.ones(len(row)), (row, column)), shape=(m, n))
+        slopes = scipy.sparse.csr_array((np.ones(len(row)), (row, column)), shape=(m, n))
         both = (slopes.T @ slopes).tocoo()
         self._order = Bordered(np.concatenate([both.row, first]), np.concatenate([both.col, second]), n)
         place = self._order.place
@@ -291,8 +292,8 @@ class Newton:
         weight = np.divide(np.sqrt(np.where(of_row > 0, of_row / largest, 1.0)), size, out=np.zeros(m), where=size > 0)
         slopes *= weight[self._row]
         penalty = SETTINGS.price * largest
-        by_row = sp.csr_array((slopes[self._by_row], self._within[0], self._starts[0]), shape=(m, n))
-        by_column = sp.csr_array((slopes[self._by_column], self._within[1], self._starts[1]), shape=(n, m))
+        by_row = scipy.sparse.csr_array((slopes[self._by_row], self._within[0], self._starts[0]), shape=(m, n))
+        by_column = scipy.sparse.csr_array((slopes[self._by_column], self._within[1], self._starts[1]), shape=(n, m))
         penalty_matrix = by_column @ by_row
         i, j = np.repeat(np.arange(n), np.diff(penalty_matrix.indptr)), penalty_matrix.indices.astype(np.int64)
         lower = np.flatnonzero(i >= j)
@@ -317,8 +318,8 @@ class _Matrix:
     """
 
     factors: Cholesky
-    by_row: sp.csr_array
-    by_column: sp.csr_array
+    by_row: scipy.sparse.csr_array
+    by_column: scipy.sparse.csr_array
     weight: np.ndarray
     price: float
 
@@ -397,10 +398,18 @@ class Bordered:
         band = values[: (self.width + 1) * n].reshape(n, self.width + 1).T
         below = values[(self.width + 1) * n :].reshape(k, self._size)
         try:
-            lower = cholesky_banded(band, overwrite_ab=True, lower=True, check_finite=False) if n else band
-            solved = cho_solve_banded((lower, True), below[:, :n].T, check_finite=False) if n and k else below[:, :n].T
-            corner = cholesky(below[:, n:] - below[:, :n] @ solved, lower=True, check_finite=False) if k else below
-        except LinAlgError:
+            lower = scipy.linalg.cholesky_banded(band, overwrite_ab=True, lower=True, check_finite=False) if n else band
+            solved = (
+                scipy.linalg.cho_solve_banded((lower, True), below[:, :n].T, check_finite=False)
+                if n and k
+                else below[:, :n].T
+            )
+            corner = (
+                scipy.linalg.cholesky(below[:, n:] - below[:, :n] @ solved, lower=True, check_finite=False)
+                if k
+                else below
+            )
+        except np.linalg.LinAlgError:
             return None
         return Cholesky(self.place, lower, below[:, :n], solved, corner)
 
@@ -426,11 +435,13 @@ class Cholesky:
     def solve(self, right: np.ndarray) -> np.ndarray:
         """Solve for a right side (n,), both in the order of :class:`Bordered`."""
         n = self.below.shape[1]
-        inner = cho_solve_banded((self.lower, True), right[:n], check_finite=False) if n else right[:n]
+        inner = scipy.linalg.cho_solve_banded((self.lower, True), right[:n], check_finite=False) if n else right[:n]
         if not len(self.below):
             return np.asarray(inner)
-        half = solve_triangular(self.corner, right[n:] - self.below @ inner, lower=True, check_finite=False)
-        last = solve_triangular(self.corner, half, trans=1, lower=True, check_finite=False)
+        half = scipy.linalg.solve_triangular(
+            self.corner, right[n:] - self.below @ inner, lower=True, check_finite=False
+        )
+        last = scipy.linalg.solve_triangular(self.corner, half, trans=1, lower=True, check_finite=False)
         return np.concatenate([inner - self.solved @ last, last])
 
 

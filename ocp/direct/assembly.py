@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
-import scipy.sparse as sp
+import scipy
 
 from ocp.console import check_time
 from ocp.curves import PiecewisePolynomial
@@ -241,7 +241,7 @@ class NumericDerivatives:
             self._at = x.copy(), p.copy()
         return self._cached
 
-    def first(self, x: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, sp.csc_array]:
+    def first(self, x: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, scipy.sparse.csc_array]:
         """Return the gradient of the cost (n,) and the Jacobian of the rows (m, n)."""
         _, slope, _, jacobian = self._evaluate(x, p)
         return slope, jacobian
@@ -255,9 +255,9 @@ class NumericDerivatives:
         """Return the gradient of the cost without evaluating the rows. Shape (n,)."""
         return np.asarray(self._gradient(x, p)[1])
 
-    def second(self, x: np.ndarray, p: np.ndarray, sigma: float, lam: np.ndarray) -> sp.csc_array:
+    def second(self, x: np.ndarray, p: np.ndarray, sigma: float, lam: np.ndarray) -> scipy.sparse.csc_array:
         """Return the upper triangle of the Hessian of sigma f + lam . g. Shape (n, n)."""
-        upper: sp.csc_array = self._hessian(x, p, np.array([sigma]), lam)[0]
+        upper: scipy.sparse.csc_array = self._hessian(x, p, np.array([sigma]), lam)[0]
         return upper
 
     def running_gradient(self, x: np.ndarray, p: np.ndarray) -> np.ndarray:
@@ -297,7 +297,9 @@ class ArrayFunction:
         if buffer.ret():
             raise RuntimeError(f"{self._function.name()} cannot be evaluated")
         return [
-            dense_column(data, index[0], shape[0]) if shape[1] == 1 else sp.csc_array((data, *index), shape=shape)
+            dense_column(data, index[0], shape[0])
+            if shape[1] == 1
+            else scipy.sparse.csc_array((data, *index), shape=shape)
             for data, index, shape in zip(outputs, self._indices, self._shapes, strict=True)
         ]
 

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import casadi as ca
 import numpy as np
-import scipy.sparse as sp
-import scipy.sparse.linalg as sla
+import scipy
 
 from ocp.direct.active_set import RESOLVED, Conditions, conditions
 from ocp.direct.assembly import Program, Transcription, assemble
@@ -181,14 +180,14 @@ def solve_system(
     active_rows = rows[:, free]
     size = np.sqrt(np.asarray(active_rows.multiply(active_rows).sum(axis=1)).ravel())
     weight = largest / np.where(size > 0, size, 1.0)
-    active_rows = sp.diags_array(weight) @ active_rows
+    active_rows = scipy.sparse.diags_array(weight) @ active_rows
     sides = np.vstack([-(slope + hessian @ dv)[free], weight[:, None] * (at_g - change - at.jacobian @ dv)[held]])
     n, m = len(free), len(held)
     system = hessian[free][:, free]
     if m:
-        system = sp.block_array([[system, active_rows.T], [active_rows, None]], format="csc")
-    softened = system - sp.diags_array(np.concatenate([np.zeros(n), np.full(m, SOFTENING * largest)]))
-    solve = sla.splu(sp.csc_array(softened))
+        system = scipy.sparse.block_array([[system, active_rows.T], [active_rows, None]], format="csc")
+    softened = system - scipy.sparse.diags_array(np.concatenate([np.zeros(n), np.full(m, SOFTENING * largest)]))
+    solve = scipy.sparse.linalg.splu(scipy.sparse.csc_array(softened))
     solution = solve.solve(sides)
     for _ in range(REFINEMENTS):
         solution += solve.solve(sides - system @ solution)

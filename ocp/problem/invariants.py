@@ -15,8 +15,7 @@ from math import comb
 
 import casadi as ca
 import numpy as np
-import scipy.linalg
-from scipy.sparse.csgraph import connected_components
+import scipy
 
 from ocp.problem.formulation import Bounds, Formulation, is_free
 from ocp.tolerances import ROUNDING_SHARE, SOLVER_SHARE
@@ -99,7 +98,7 @@ def coupled_parts(form: Formulation) -> list[np.ndarray]:
         candidates[np.flatnonzero(candidates)[alone]] = False
     states = np.flatnonzero(candidates)
     own = pattern[states].astype(int)
-    count, part = connected_components(own[:, states] + own @ own.T, directed=False)
+    count, part = scipy.sparse.csgraph.connected_components(own[:, states] + own @ own.T, directed=False)
     return [states[part == k] for k in range(count)]
 
 

@@ -165,7 +165,6 @@ def tool_motion_problem(
     time_cost: float | None = None,
     actuated: bool = False,
     clearance_constraints: ClearanceConstraints | None = None,
-    fixed_joints: Array | None = None,
 ) -> ToolMotion:
     """Declare a motion along tasks with the least integral of half the weighted squared joint rates.
 
@@ -189,7 +188,6 @@ def tool_motion_problem(
             continuous between stretches, and free at both ends like the rates. A small weight in the cost smooths
             accelerations (jerks), see FeedbackSettings.
         clearance_constraints: Collision avoidance, see `ocp.motion.builders.clearance`; None for none.
-        fixed_joints: Joints that do not move. Shape (joint_size,), bool.
 
     Raises:
         ProblemError: A cyclic motion has a task that is not closed, or several stretches with a task in the last; a
@@ -199,8 +197,6 @@ def tool_motion_problem(
     horizon = stretches[-1].end
     problem = Problem("tool motion" if time_cost is None else "tool motion in free time")
     problem.horizon(horizon)
-    if fixed_joints is not None:
-        bounds = bounds._replace(velocity=np.where(fixed_joints, 0.0, bounds.velocity))
     motion = _Motion(
         problem, machine, tuple(stretches), bounds, base, start, reference, cyclic, weights, clearance_constraints,
         actuated,

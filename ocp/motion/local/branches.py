@@ -8,7 +8,7 @@ whole turns into their limits in all possible ways.
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from models.arrays import Array
 from ocp.motion.local.closed_forms import ClosedForm, closed_forms
@@ -60,13 +60,14 @@ class IkBranches:
 
     def _sample_poses(self, form: ClosedForm, targets: Array, shares: Array) -> tuple[Array, Array]:
         """Return tip poses that do the task, the open angle at shares of a turn. Shapes (M, 3), (M, 3, 3)."""
-        angles = TURN * shares[:, None]
+        angles, rotation_type = TURN * shares[:, None], scipy.spatial.transform.Rotation
         if self._task.direction is not None:
             tool, direction = np.array(self._task.tool_axis), targets[6:9] / np.linalg.norm(targets[6:9])
-            rotated = Rotation.from_rotvec(angles * direction) * Rotation.align_vectors(direction[None], tool[None])[0]
+            rotated = rotation_type.from_rotvec(angles * direction)
+            rotated *= rotation_type.align_vectors(direction[None], tool[None])[0]
             rotations = rotated.as_matrix()
         elif self.roll_is_free:
-            rotations = Rotation.from_rotvec(angles * form.axes[form.triple[0]]).as_matrix() @ form.rotation
+            rotations = rotation_type.from_rotvec(angles * form.axes[form.triple[0]]).as_matrix() @ form.rotation
         else:
             rotations = np.repeat(targets[6:15].reshape(1, 3, 3).transpose(0, 2, 1), len(shares), axis=0)
         return np.repeat(targets[None, :3], len(shares), axis=0), rotations

@@ -11,6 +11,7 @@ import casadi as ca
 import numpy as np
 
 from models.arrays import Array
+from models.machines.machine import hold_joints
 from ocp.direct.guess import Samples
 from ocp.errors import SolveError
 from ocp.motion.builders.actuator_limits import checked_motors, joint_torques
@@ -21,7 +22,8 @@ from ocp.motion.plan.motion import CHECKED_TIMES
 from ocp.motion.plan.request import declared_motion
 from ocp.motion.plan.solved_plan import SolvedPlan
 from ocp.motion.search.configurations import PlanRequest
-from ocp.motion.tasks.limits import Limits
+from ocp.motion.search.held_joints import all_joints
+from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.problem.problem import Problem
 from ocp.solution import Solution
 
@@ -66,9 +68,14 @@ class ActuatorDemand:
 
     @classmethod
     def of(cls, plan: SolvedPlan, limits: Limits) -> ActuatorDemand | None:
-        """Return the largest demand of a plan; None if no actuator is limited."""
+        """Return the largest demand of a plan; None if no actuator is limited.
+
+        The limits are those of the joints that the plan does not hold.
+        """
         machine = checked_motors("limits", plan.machine)
-        robot, bounds = machine.robot, limits.bounds(machine)
+        robot, unlimited = machine.robot, dict.fromkeys(plan.held, np.inf)
+        own = limits.bounds(hold_joints(machine, plan.held) if plan.held else machine)
+        bounds = JointBounds(*(all_joints(robot, unlimited, values) for values in own))
         sample = plan.sampled(np.linspace(0.0, plan.horizon, CHECKED_TIMES))
         bases = plan.at(sample.t)["base"] if machine.base_size else np.zeros((CHECKED_TIMES, 0))
         symbols = [ca.SX.sym("v", size) for size in (machine.base_size, *[machine.joint_size] * 3)]
@@ -110,7 +117,8 @@ def solve_within_actuator_limits(
     assert limits is not None
     if request.start is None:
         # a joint that started elsewhere separates bodies and is not ignorable
-        start = np.where(np.isclose(unlimited.at(0.0)["joints"], start, rtol=0.0), start, np.nan)
+        initial = unlimited.solution[f"joints{request.stretches[0].suffix}"][0]
+        start = np.where(np.isclose(initial, start, rtol=0.0), start, np.nan)
 
     fractions = [(stretch.breaks - stretch.begin) / stretch.duration for stretch in request.stretches]
     breaks = np.unique(np.concatenate([np.zeros(0), *fractions])).tolist()

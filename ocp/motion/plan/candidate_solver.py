@@ -36,6 +36,7 @@ from ocp.motion.search.configurations import (
     count_clear_configurations,
     describe_alternatives,
 )
+from ocp.motion.search.held_joints import all_joints
 from ocp.problem.values import constant
 from ocp.refinement import refine_from, split
 from ocp.solution import Solution
@@ -224,7 +225,7 @@ class CandidateSolver(Solver):
         if constraints is None or not constraints.margins or self.request.start is not None:
             return self.start
         affecting = constraints.scene.levers.joints[sorted(constraints.margins)].any(axis=0)
-        return np.where(affecting & ~self.request.fixed_joints, np.nan, self.start)
+        return np.where(affecting, np.nan, self.start)
 
     def _options(
         self, motion: ToolMotion, mesh: Collocation, cost: float, options: Mapping[str, Any]
@@ -395,8 +396,11 @@ class CandidateSolver(Solver):
         parts = parts_of(self.motion.stretches)
         if self.request.time_cost is not None:
             parts = (parts[0]._replace(end=float(best.solution[CLOCK][-1, 0])),)
-        plan = SolvedPlan(self.request.machine, best.solution, parts, tuple(candidates))
-        return plan.with_targets(self.request.tasks)
+        request = self.request
+        whole = request.whole or request.machine
+        extended = [replace(c, start=all_joints(whole.robot, request.held, c.start)) for c in candidates]
+        plan = SolvedPlan(whole, best.solution, parts, tuple(extended), held=request.held)
+        return plan.with_targets(request.tasks)
 
 
 def _is_separated(candidate: Candidate) -> bool:

@@ -65,7 +65,7 @@ def plan_sequence(
         SolveError: No motion satisfies its limits.
     """
     motors, goals = checked_motors("plan", machine), checked_each("goals", goals, Goal)
-    given, joints, base = Start.of(start, motors)
+    state, joints, base = Start.of(start, motors)
     if joints is None:
         raise ProblemError("start is missing: a goal is reached from somewhere; give plan(..., start=)", name="start")
     own_limits = Limits() if limits is None else checked_instance("limits", limits, Limits)
@@ -80,7 +80,7 @@ def plan_sequence(
     machines = machines_of(motors, resolved)  # checks them before anything is solved
     smooth = own_limits.jerk is not None or (cost is not None and bool(cost.jerk))
     control: Literal["acceleration", "jerk"] = "jerk" if smooth else "acceleration"
-    setup = DynamicsSetup(start_velocity=given.velocity, start_base=base, control=control)
+    setup = DynamicsSetup(start_velocity=state.velocity, start_base=base, control=control)
 
     def declare(clearance: ClearanceConstraints | None) -> Problem:
         own = replace(setup, clearance_constraints=clearance)
@@ -186,11 +186,11 @@ def goal_configurations(
     solutions, error = list[Array](), None
     for task in tasks:
         try:
-            found = inverse_kinematics(machine, task, near=near, seed=seed, limits=limits.joints, scene=scene)
+            members = inverse_kinematics(machine, task, near=near, seed=seed, limits=limits.joints, scene=scene)
         except Unreachable as unreachable:
             error = error or unreachable
             continue
-        solutions += [solution.joints for solution in found]
+        solutions += [solution.joints for solution in members]
     if not solutions:
         assert error is not None
         raise error

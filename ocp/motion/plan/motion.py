@@ -10,25 +10,25 @@ import csv
 import io
 import os
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
-import casadi as ca
 import numpy as np
 
 from models import Machine
-from models.arrays import Array
-from models.spatial import quaternion_from_rotation
+from models.arrays import MAX_LISTED, Array
 from ocp.audit.audit import Audit, Finding
 from ocp.console import interruptible
 from ocp.errors import NOT_NUMBERS, ProblemError, floats, sample_times, unknown_name
 from ocp.motion.plan.candidate import Candidate
 from ocp.motion.schedule.trajectory import JointTrajectory
-from ocp.motion.tasks.targets import Target
+from ocp.motion.tasks.targets import Target, tip_poses
 from ocp.registry import call_registered
 from ocp.solution import Solution
 from ocp.storage import table_head, write_arrays, write_text
 
-__all__ = ["CHECKED_TIMES", "Plan", "PlanSample", "tips_along"]
+__all__ = ["CHECKED_TIMES", "Plan", "PlanSample"]
 
 MAX_LINES = 15
 """Lines of a printed plan."""
@@ -68,8 +68,11 @@ class Plan(ABC):
     Attributes:
         machine: The machine.
         candidates: All motions found, the plan first, then by rising cost.
-        bound: Lower bound of the cost of any motion that does the same; None if none was computed.
+        bound: Lower bound of the cost of any motion that does the same with the joints in `held` where they are; None
+            if none was computed.
         targets: Poses that the tasks require along the plan, in world.
+        held: Positions of the joints that stand still and are no variables of the solution, rad or m, by name, see
+            `search.held_joints`. The torque that holds them is not limited.
         solution: Solution of the optimal control problem of the motion. Plans of several motions raise ProblemError.
     """
 
@@ -77,6 +80,7 @@ class Plan(ABC):
     candidates: tuple[Candidate, ...]
     bound: float | None
     targets: tuple[Target, ...]
+    held: Mapping[str, float] = MappingProxyType({})
     solution: Solution
     _audits: dict[str, Any]
 
@@ -212,19 +216,24 @@ class Plan(ABC):
         return f"<Plan of {self.horizon:.6g} s: {len(self.names)} joints, {self._costs}, {self._counts}>"
 
     def __str__(self) -> str:
-        """Return the cost, and the rejected motions by reason, in at most 15 lines."""
-        lines = [f"plan of {self.horizon:.6g} s for {', '.join(self.names)}: {self._costs}; {self._counts}"]
+        """Return the cost, the joints that stand still, and the rejected motions by reason, in at most 15 lines."""
+        moving = [name for name in self.names if name not in self.held]
+        lines = [f"plan of {self.horizon:.6g} s for {', '.join(moving)}: {self._costs}; {self._counts}"]
+        if self.held:
+            held = [f"{name} at {position:.4g}" for name, position in self.held.items()]
+            more = f" and {len(held) - MAX_LISTED} more" if len(held) > MAX_LISTED else ""
+            lines.append(f"  held: {', '.join(held[:MAX_LISTED])}{more}")
         costs_by_reason: dict[str, list[float]] = {}
         for candidate in self.candidates:
             costs_by_reason.setdefault(str(candidate.reason or "the plan"), []).append(candidate.cost)
-        for reason, costs in list(costs_by_reason.items())[: MAX_LINES - 2]:
+        for reason, costs in list(costs_by_reason.items())[: MAX_LINES - 3]:
             finite = [cost for cost in costs if np.isfinite(cost)] or [np.nan]
             low, high = min(finite), max(finite)
             span = f"{low:10.6g}" + (f" to {high:.6g}" if low < high else "")
             prefix = "" if len(costs) == 1 else f"{len(costs)} motions: "
             lines.append(f"  {span:<23}  {prefix}{reason}")
-        if len(costs_by_reason) > MAX_LINES - 2:
-            remaining = sum(len(costs) for costs in list(costs_by_reason.values())[MAX_LINES - 2 :])
+        if len(costs_by_reason) > MAX_LINES - 3:
+            remaining = sum(len(costs) for costs in list(costs_by_reason.values())[MAX_LINES - 3 :])
             lines.append(f"  {remaining} more, see `candidates`")
         return "\n".join(lines)
 
@@ -334,16 +343,4 @@ class Plan(ABC):
 
     def _tips_at(self, times: Array, bases: Array, joints: Array) -> Array:
         """Return the poses of the tip at checked times (M,). Shape (M, 7)."""
-        return tips_along(self.machine, bases, joints)
-
-
-def tips_along(machine: Machine, bases: Array, joints: Array) -> Array:
-    """Return the poses of a machine's tip in world: position (m) and quaternion; nan without a tip. Shape (M, 7)."""
-    if machine.robot.tip is None:
-        return np.full((len(joints), 7), np.nan)
-    b, q = ca.SX.sym("b", machine.base_size), ca.SX.sym("q", machine.joint_size)
-    pose = machine.tip_pose(b, q)
-    function = ca.Function("tip", [b, q], [pose.position, pose.rotation])
-    position, rotation = function.map(len(joints))(bases.T, joints.T)
-    rotations = np.array(rotation).reshape(3, len(joints), 3).transpose(1, 0, 2)
-    return np.column_stack([np.array(position).T, quaternion_from_rotation(rotations)])
+        return tip_poses(self.machine, bases, joints)

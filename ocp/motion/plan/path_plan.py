@@ -17,10 +17,10 @@ from ocp.audit.clearance import Clearance
 from ocp.errors import ProblemError
 from ocp.motion.builders.clearance import ClearanceConstraints, clearance_of
 from ocp.motion.plan.candidate import Candidate
-from ocp.motion.plan.motion import Plan, tips_along
+from ocp.motion.plan.motion import Plan
 from ocp.motion.plan.request import restored_request, stored_request
 from ocp.motion.tasks.limits import Limits
-from ocp.motion.tasks.targets import Target
+from ocp.motion.tasks.targets import Target, tip_poses
 from ocp.problem.stored import ARRAY_NAMES, RECORD_ERRORS, pack_record, unpack_record
 from ocp.solution import Solution, read_head
 from ocp.tolerances import CLEARANCE_TOLERANCE_M
@@ -178,7 +178,7 @@ class PathPlan(Plan):
 
     def _pose_findings(self, poses: PathPoses) -> list[Finding]:
         """Return the largest pose errors, and the largest excess of a displacement."""
-        t, tips = self.t, tips_along(self.machine, np.zeros((len(self.joints), 0)), self.joints)
+        t, tips = self.t, tip_poses(self.machine, np.zeros((len(self.joints), 0)), self.joints)
         misses = np.abs(tips[:, :3] - poses.positions)
         turns = Rotation.from_quat(tips[:, [4, 5, 6, 3]]).inv() * Rotation.from_matrix(poses.rotations)
         steps = np.abs(np.diff(self.joints, axis=0)) - poses.step

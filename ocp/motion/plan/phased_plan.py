@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from models import Machine
 from models.arrays import Array
-from ocp.motion.plan.motion import tips_along
 from ocp.motion.plan.request import machines_of_phases
 from ocp.motion.plan.solved_plan import Part, SolvedPlan
+from ocp.motion.tasks.targets import tip_poses
 from ocp.solution import Solution
 
 __all__ = ["PhasedPlan", "parts_of_phases"]
@@ -85,7 +85,7 @@ class PhasedPlan(SolvedPlan):
         for number in np.unique(which):
             machine, rows = self.machines[number], which == number
             order = np.argsort(self._orders[self.phases[number]])
-            poses[rows] = tips_along(machine, bases[rows], joints[rows][:, order])
+            poses[rows] = tip_poses(machine, bases[rows], joints[rows][:, order])
         return poses
 
     def solved_parts(self, times: Array) -> list[tuple[Solution, str, Array]]:

@@ -28,7 +28,8 @@ from ocp.motion.plan.candidate import Candidate, Stage
 from ocp.motion.plan.planner import checked_request, clearance_for, plan_request
 from ocp.motion.plan.segmented_plan import Reconfiguration, SegmentedPlan
 from ocp.motion.plan.solved_plan import Part, SolvedPlan
-from ocp.motion.search.configurations import PlanRequest, fix_ignorable_joints, local_motions_from, start_configurations
+from ocp.motion.search.configurations import PlanRequest, fix_ignorable_joints, local_motions_from
+from ocp.motion.search.held_joints import hold_idle_joints, place_held_joints
 from ocp.motion.search.task_search import TaskSearch
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.scene import Scene
@@ -101,8 +102,8 @@ def plan_in_segments(
     if constraints is not None and constraints.scene.has_moving_obstacles:
         words = "moving obstacles do not wait while the arm reconfigures; give static obstacles"
         raise ProblemError(words, name="obstacles", value=constraints.scene.obstacles)
-    request = replace(request, clearance_constraints=constraints)
-    configurations = start_configurations(request)
+    whole = replace(request, clearance_constraints=constraints)
+    request, configurations = place_held_joints(whole, hold_idle_joints(whole))
     if request.start is None:
         configurations = fix_ignorable_joints(request, configurations)[1]
     search = TaskSearch(request, local_motions_from(request, configurations))
@@ -161,7 +162,10 @@ def _task_between(task: TipTask, begin: float, end: float) -> TipTask | None:
 
 def _plan_reconfiguration(request: PlanRequest, time: float, before: Array, after: Array) -> Reconfiguration:
     """Return a motion between two configurations: straight, or around obstacles."""
-    settings, limits = ReconfigurationSettings(), request.bounds.velocity
+    settings, limits, ends = ReconfigurationSettings(), request.bounds.velocity, (before, after)
+    whole = request.whole or request.machine
+    free = [name not in request.held for name in whole.robot.joint_names]
+    before, after = before[free], after[free]
     fastest = np.where(np.isfinite(limits), limits, settings.unlimited_rate)
     straight = float((np.abs(after - before) / fastest).max())
     middle, failure = (before + after) / 2, ""
@@ -180,10 +184,10 @@ def _plan_reconfiguration(request: PlanRequest, time: float, before: Array, afte
                 raise
             failure = failure or str(error).split("\n")[0]
             continue
-        candidate = Candidate(before, solution.cost, None, Stage.AUDITED, solution)
-        motion = SolvedPlan(request.machine, solution, (Part(0.0, duration, ""),), (candidate,))
-        return Reconfiguration(time, before, after, motion)
-    return Reconfiguration(time, before, after, None, failure)
+        candidate = Candidate(ends[0], solution.cost, None, Stage.AUDITED, solution)
+        motion = SolvedPlan(whole, solution, (Part(0.0, duration, ""),), (candidate,), held=request.held)
+        return Reconfiguration(time, *ends, motion)
+    return Reconfiguration(time, *ends, None, failure)
 
 
 def _via_configurations(

@@ -31,7 +31,7 @@ from ocp.errors import (
 from ocp.motion.builders.actuator_limits import checked_motors
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.tool_motion import stretches_of
-from ocp.motion.local.inverse_kinematics import LARGEST_SEED
+from ocp.motion.local.inverse_kinematics import LARGEST_SEED, Unreachable
 from ocp.motion.local.rates import LocalMotion
 from ocp.motion.plan.actuators import limits_actuators, without_actuators
 from ocp.motion.plan.candidate import Candidate, Reason, Rejection, Seed
@@ -43,14 +43,13 @@ from ocp.motion.search.configurations import (
     REACH_TOLERANCE,
     PlanRequest,
     SearchKind,
-    check_clear_start,
     fix_ignorable_joints,
     largest_pose_errors,
     local_motions_from,
     start_collisions,
-    start_configurations,
 )
 from ocp.motion.search.dead_end import DeadEnd
+from ocp.motion.search.held_joints import hold_idle_joints, place_held_joints, released, restore_error
 from ocp.motion.search.search import checked_bound
 from ocp.motion.search.task_search import TaskSearch
 from ocp.motion.tasks.checks import checked_tasks, clip_to_limits, horizon_of
@@ -263,15 +262,32 @@ def plan_request(request: PlanRequest) -> SolvedPlan:
     Raises:
         ProblemError, SolveError: As in `plan`.
     """
+    whole, attempt = request, hold_idle_joints(request)
+    while True:
+        try:
+            return _plan_attempt(whole, attempt)
+        except (SolveError, Unreachable) as error:
+            if isinstance(error, DeadEnd | Unreachable) or (freer := released(whole, attempt, error)) is None:
+                raise
+            attempt = freer
+
+
+def _plan_attempt(whole: PlanRequest, request: PlanRequest) -> SolvedPlan:
+    """Plan a request with held joints; `whole` is the request before joints were held.
+
+    Raises:
+        ProblemError, SolveError: As in `plan`.
+    """
     report("inverse kinematics of the start")
-    configurations = start_configurations(request)
+    request, configurations = place_held_joints(whole, request)
     start = request.start
     if start is None:
         start, configurations = fix_ignorable_joints(request, configurations)
-    else:
-        check_clear_start(request, configurations)
     solver = CandidateSolver(request, start, configurations[0])
-    result, bound = plan_from_configurations(request, configurations, solver)
+    try:
+        result, bound = plan_from_configurations(request, configurations, solver)
+    except (SolveError, Unreachable) as error:
+        raise restore_error(error, request) from error.__cause__
     return result if bound is None else replace(result, bound=checked_bound(bound, result.cost))
 
 

@@ -39,6 +39,7 @@ from models import (
     Support,
     VisualShape,
 )
+from models.machines.machine import hold_joints
 from models.shapes.bodies import Body, LinkMesh
 from models.spatial import expression
 from ocp.errors import ProblemError
@@ -94,7 +95,8 @@ class MotionRequest:
 
     Attributes:
         builder: Name of the builder in BUILDERS.
-        arguments: Arguments of the builder, by name.
+        arguments: Arguments of the builder, by name. All but the tasks are for the machine with the joints in "held"
+            locked at the positions there.
     """
 
     builder: str
@@ -104,6 +106,12 @@ class MotionRequest:
     def machine(self) -> Machine:
         """Machine of the problem."""
         return _machine_of(self.arguments)
+
+    @property
+    def held(self) -> Mapping[str, float]:
+        """Positions of the joints of the machine that the problem does not have, by name."""
+        held: Mapping[str, float] = self.arguments.get("held", {})
+        return held
 
     @property
     def tasks(self) -> tuple[TipTask, ...]:
@@ -148,18 +156,20 @@ def declared_motion(
         "weights": request.weights,
         "time_cost": request.time_cost,
         "actuated": limits is not None,
-        "fixed_joints": request.fixed_joints if limits is None else None,
         "clearance_constraints": constraints,
     }
     bounds = (limits or request.limits).bounds(request.machine)
     motion = tool_motion_problem(request.machine, request.stretches, bounds=bounds, **options)
-    arguments = {"machine": request.machine, "tasks": request.tasks, "horizon": request.horizon}
-    arguments |= {"limits": limits or request.limits, **options}
+    arguments = {"machine": request.whole or request.machine, "tasks": request.tasks, "horizon": request.horizon}
+    arguments |= {"held": dict(request.held), "limits": limits or request.limits, **options}
     motion.problem.origin = MotionRequest("tool motion", arguments)
     return motion
 
 
-def _tool_motion(machine: Machine, tasks: Any, horizon: float, *, limits: Limits, **options: Any) -> Problem:
+def _tool_motion(
+    machine: Machine, tasks: Any, horizon: float, *, held: Mapping[str, float], limits: Limits, **options: Any
+) -> Problem:
+    machine = hold_joints(machine, held) if held else machine
     stretches = stretches_of(machine, tasks, horizon)
     return tool_motion_problem(machine, stretches, bounds=limits.bounds(machine), **options).problem
 
@@ -223,7 +233,7 @@ def stored_request(builder: str, arguments: Mapping[str, Any]) -> dict[str, Any]
         if isinstance(value, Mesh):  # only the hull of the file is stored
             parts_in_world = {"vertices": value.hull.vertices, "position": value.position, "rotation": value.rotation}
             return {"kind": "Mesh", "fields": {name: put(part) for name, part in parts_in_world.items()}}
-        if isinstance(value, CollisionScene) and value.machine is owner:
+        if isinstance(value, CollisionScene) and (value.machine is owner or arguments.get("held")):
             scene_fields = {name: put(part) for name, part in _scene_fields(value).items()}
             return {"kind": "CollisionScene", "fields": scene_fields}
         if is_dataclass(value) and KINDS.get(type(value).__name__) is type(value):
@@ -305,7 +315,11 @@ def restored_request(record: Any) -> MotionRequest:
         machine = _machine_of({first: own})
         if not isinstance(machine, MACHINES):
             raise TypeError(f"the machine is of type {type(machine).__name__}")
-        others = {name: _read(value, functions, machine) for name, value in pool.items() if name != first}
+        held = {
+            str(name): float(position) for name, position in _read(pool.get("held", {"pool": []}), [], None).items()
+        }
+        owner = hold_joints(machine, held) if held else machine
+        others = {name: _read(value, functions, owner) for name, value in pool.items() if name != first}
         arguments = {first: own, **others}
         if record["builder"] not in BUILDERS and record["builder"] != "":
             raise ValueError(f"builder {record['builder']!r} is not known")

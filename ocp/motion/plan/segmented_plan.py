@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -98,6 +99,11 @@ class SegmentedPlan(Plan):
         """Lower bound of the cost in the same segments; None if that of a segment is not known."""
         bounds = [segment.bound for segment in self.segments]
         return None if None in bounds else float(sum(bounds))  # type: ignore[arg-type]
+
+    @property
+    def held(self) -> Mapping[str, float]:
+        """Joints that stand still in all segments."""
+        return self.segments[0].held
 
     @property
     def candidates(self) -> tuple[Candidate, ...]:  # type: ignore[override]

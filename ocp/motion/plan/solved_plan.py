@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, NamedTuple
 
@@ -19,6 +19,7 @@ from ocp.motion.builders.tool_motion import CLOCK, PACE, SLOPES, Stretch
 from ocp.motion.plan.candidate import Candidate
 from ocp.motion.plan.motion import Plan
 from ocp.motion.plan.request import MotionRequest, request_of, restored_request, stored_request
+from ocp.motion.search.held_joints import all_joints
 from ocp.motion.tasks.targets import Target, targets_along
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.stored import ARRAY_NAMES, RECORD_ERRORS, pack_record, unpack_record
@@ -46,7 +47,7 @@ class SolvedPlan(Plan):
     Attributes:
         solution: The solution.
         parts: Intervals of time with the same tasks; in the solution they run side by side.
-        machine, candidates, bound, targets: As in `Plan`.
+        machine, candidates, bound, targets, held: As in `Plan`.
     """
 
     is_phased: ClassVar[bool] = False
@@ -57,6 +58,7 @@ class SolvedPlan(Plan):
     candidates: tuple[Candidate, ...] = ()
     bound: float | None = None
     targets: tuple[Target, ...] = ()
+    held: Mapping[str, float] = field(default_factory=dict)
     _audits: dict[str, Any] = field(default_factory=dict, repr=False)
 
     # ---- values ------------------------------------------------------------------------------------------------------
@@ -81,9 +83,13 @@ class SolvedPlan(Plan):
 
     def _values(self, name: str) -> Array:
         if self.rate_name == SLOPES and name == "rates":
-            return np.asarray(self.solution[SLOPES] / self.solution[PACE])
+            return self._of_all_joints(name, np.asarray(self.solution[SLOPES] / self.solution[PACE]))
         own = self.rate_name if name == "rates" else name
-        return np.concatenate([self.solution[own + part.suffix] for part in self.parts])
+        return self._of_all_joints(name, np.concatenate([self.solution[own + part.suffix] for part in self.parts]))
+
+    def _of_all_joints(self, name: str, values: Array) -> Array:
+        """Return values of the solution by name, (M, m), extended by the joints that stand still."""
+        return values if name == "base" else all_joints(self.machine.robot, self.held, values, rates=name != "joints")
 
     def _values_at(self, name: str, times: Array) -> Array:
         def values(part: Part, fraction: Array) -> Array:
@@ -94,7 +100,7 @@ class SolvedPlan(Plan):
                 return sample[self.rate_name + part.suffix] / (sample[PACE] if self.rate_name == SLOPES else 1.0)
             return sample[name + part.suffix]
 
-        return self._over(times, values)
+        return self._of_all_joints(name, self._over(times, values))
 
     def solved_parts(self, times: Array) -> list[tuple[Solution, str, Array]]:
         """Return the solution once for each part; see `Plan.solved_parts`."""
@@ -165,6 +171,7 @@ class SolvedPlan(Plan):
                 "phased": self.is_phased,
                 "parts": self.parts,
                 "bound": self.bound,
+                "held": [[name, position] for name, position in self.held.items()],
                 "candidates": [candidate.record() for candidate in self.candidates],
                 "targets": [
                     np.column_stack([target.t, target.position, target.rotation.reshape(-1, 9)])
@@ -196,7 +203,8 @@ class SolvedPlan(Plan):
             )
             bound = None if head["bound"] is None else float(head["bound"])
             targets = tuple(Target(rows[:, 0], rows[:, 1:4], rows[:, 4:].reshape(-1, 3, 3)) for rows in head["targets"])
-            plan = cls(request.machine, solution, parts, candidates, bound, targets)
+            held = request.held if request.builder else {str(name): float(value) for name, value in head["held"]}
+            plan = cls(request.machine, solution, parts, candidates, bound, targets, held)
             plan._check_parts()
             return plan.with_targets(request.tasks) if request.builder and targets else plan
         except (*RECORD_ERRORS, ModelError) as error:
@@ -215,7 +223,9 @@ class SolvedPlan(Plan):
             raise ValueError(f"its parts {self.parts} do not fill the time of its solution one after the other")
         variables = {**self.solution.states, **self.solution.controls}
         sizes_by_name = {name: values.shape[1] for name, values in variables.items()}
-        sizes = {"joints": self.machine.joint_size, "base": self.machine.base_size}
+        if unknown := [name for name in self.held if name not in self.names]:
+            raise ValueError(f"the machine has no joints {unknown}, which it holds")
+        sizes = {"joints": self.machine.joint_size - len(self.held), "base": self.machine.base_size}
         for part in self.parts:
             rate_sizes = [sizes_by_name.get(name + part.suffix) for name in RATES]
             sizes_of_part = [sizes_by_name.get(name + part.suffix, 0) for name in sizes]
@@ -229,7 +239,7 @@ class SolvedPlan(Plan):
         return next(name for name in RATES if name + self.parts[0].suffix in names)
 
     def accelerations(self, part: Part, fraction: Array) -> Array:
-        """Return the joint accelerations at fractions (M,) of a part. Shape (M, n)."""
+        """Return the accelerations of the joints of the solution at fractions (M,) of a part. Shape (M, m)."""
         sample, duration = self.solution.at_fraction(fraction), part.end - part.begin
         name = self.rate_name + part.suffix
         if "accelerations" + part.suffix in sample:

@@ -14,8 +14,8 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 from models import FixedBase
 from models.arrays import Array
@@ -493,4 +493,4 @@ def _poses(positions: ArrayLike, quaternions: ArrayLike) -> tuple[Array, Array]:
     norms = np.linalg.norm(rotations, axis=1)
     if not (norms > 0).all():
         raise ProblemError(f"quaternion {int(norms.argmin())} is zero", name="quaternions", value=0.0)
-    return positions, np.asarray(Rotation.from_quat(rotations[:, [1, 2, 3, 0]]).as_matrix())
+    return positions, np.asarray(scipy.spatial.transform.Rotation.from_quat(rotations[:, [1, 2, 3, 0]]).as_matrix())

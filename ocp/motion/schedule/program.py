@@ -28,9 +28,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dpbtrf, dpbtrs
-from scipy.sparse import csr_array
 
 from ocp.errors import SolveError
 from ocp.motion.schedule.profile import Array
@@ -246,14 +245,14 @@ class _BandSolver:
         for firm in INTERIOR.firm:
             firmer = band.copy(order="F")
             firmer[0] *= 1 + firm
-            self.factors, failed = dpbtrf(firmer, lower=1, overwrite_ab=1)
+            self.factors, failed = scipy.linalg.lapack.dpbtrf(firmer, lower=1, overwrite_ab=1)
             if not failed:
                 return
         raise np.linalg.LinAlgError("the equations of a step are not positive definite")
 
     def solve(self, right: Array) -> Array:
         """Return the solution for a right side."""
-        return np.asarray(dpbtrs(self.factors, right, lower=1)[0])
+        return np.asarray(scipy.linalg.lapack.dpbtrs(self.factors, right, lower=1)[0])
 
 
 class _Constraints:
@@ -285,7 +284,9 @@ class _Constraints:
         self.bound[self.alone + self.jerk :] = 0.0
         ends = np.searchsorted(np.sort(interval), np.arange(self.count + 1))
         shape = self.count, len(interval)
-        self.by_interval = csr_array((np.ones(len(interval)), np.argsort(interval, kind="stable"), ends), shape)
+        self.by_interval = scipy.sparse.csr_array(
+            (np.ones(len(interval)), np.argsort(interval, kind="stable"), ends), shape
+        )
         block = self.interval // INTERIOR.block
         starts = np.diff(block, prepend=-1) != 0
         starts[self.count : self.count + 1] = True

@@ -14,8 +14,8 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter1d
 
 from ocp.errors import ProblemError, SolveError
 from ocp.motion.schedule.grid import reachable_bounds
@@ -234,7 +234,7 @@ def _tighten(window: Window, enforced: _Enforced, seam: int, checked: int) -> tu
         if slope is None:
             continue
         start = x, slope
-        near = np.flatnonzero(maximum_filter1d(affected, 2 * SETTINGS.around + 1))
+        near = np.flatnonzero(scipy.ndimage.maximum_filter1d(affected, 2 * SETTINGS.around + 1))
         free = near if accuracy == accuracies[-1] and len(near) < SETTINGS.few * len(every) else every
     worst = used[:, :checked].max(axis=(0, 2))
     place, largest = float(window.nodes[worst.argmax()]), float(worst.max())

@@ -20,8 +20,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from models import FreeFloating
 from models.arrays import Array
@@ -379,7 +379,7 @@ class _CellPass:
         points = np.hstack([layers[k].joints[paths[k]] * self.root for k in seats])
         free_directions = max(request.machine.joint_size - max(each.rows for each in self.kinematics), 1)
         count = min(self._settings.neighbours * free_directions + 1, len(cost))
-        neighbours = np.reshape(cKDTree(points).query(points, k=count)[1], (len(cost), count))
+        neighbours = np.reshape(scipy.spatial.cKDTree(points).query(points, k=count)[1], (len(cost), count))
         minima = np.flatnonzero((cost[:, None] <= cost[neighbours]).all(axis=1))
         chosen = minima[np.argsort(cost[minima])][: self._settings.classes]
         motions, ends = [], [*self._stretch_layers[1:], len(layers) - 1]

@@ -2,27 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from models import Machine
 from models.arrays import Array
+from models.machines.machine import hold_joints
 from ocp.errors import ProblemError
 from ocp.motion.builders.clearance import ClearanceConstraints
-from ocp.motion.builders.tool_motion import Stretch
+from ocp.motion.builders.tool_motion import Stretch, stretches_of
 from ocp.motion.local.collisions import Collision, distances_along
-from ocp.motion.local.inverse_kinematics import (
-    Unreachable,
-    distinct_solutions,
-    idle_positions,
-    inverse_kinematics,
-    sample_starts,
-)
+from ocp.motion.local.inverse_kinematics import Unreachable, idle_positions, inverse_kinematics, sample_starts
 from ocp.motion.local.rates import LocalMotion, track_tasks
 from ocp.motion.search.settings import PlannerSettings
 from ocp.motion.tasks.checks import ignorable_joints
@@ -58,6 +52,8 @@ class PlanRequest:
         actuator_limits: Limits that include those of the actuators; None if these are not limited.
         clearance_constraints: Clearance constraints of the motion, or None.
         settings: Settings of the planner.
+        held: Positions of the joints of `whole` that are held still and that `machine` does not have, by name.
+        whole: Machine with all its joints; None if no joint is held.
     """
 
     machine: Machine
@@ -75,16 +71,30 @@ class PlanRequest:
     actuator_limits: Limits | None = None
     clearance_constraints: ClearanceConstraints | None = None
     settings: PlannerSettings = SETTINGS
+    held: Mapping[str, float] = field(default_factory=dict)
+    whole: Machine | None = None
 
-    @cached_property
-    def idle_joints(self) -> NDArray[np.bool_]:
-        """Mask of the joints that never move a task's frame. Shape (n,)."""
-        return bind(self.machine, self.tasks).idle
-
-    @property
-    def fixed_joints(self) -> NDArray[np.bool_]:
-        """Mask of the joints that stand still: the idle ones if the search is global. Shape (n,)."""
-        return self.idle_joints & (self.search == "global")
+    def with_held(self, positions: Mapping[str, float]) -> PlanRequest:
+        """Return the request for the machine with further joints held at positions, rad or m."""
+        if not positions:
+            return self
+        free = np.array([name not in positions for name in self.machine.robot.joint_names])
+        machine, constraints = hold_joints(self.machine, positions), self.clearance_constraints
+        if constraints is not None:
+            scene = replace(constraints.scene, machine=machine)
+            constraints = ClearanceConstraints(scene) if len(scene.pairs) else None
+        return replace(
+            self,
+            machine=machine,
+            stretches=stretches_of(machine, self.tasks, self.horizon),
+            start=None if self.start is None else self.start[free],
+            weights=self.weights[free],
+            limits=self.limits.of_joints(free),
+            actuator_limits=None if self.actuator_limits is None else self.actuator_limits.of_joints(free),
+            clearance_constraints=constraints,
+            held={**self.held, **positions},
+            whole=self.whole or self.machine,
+        )
 
     @property
     def ik_options(self) -> dict[str, Any]:
@@ -109,21 +119,24 @@ def start_configurations(request: PlanRequest) -> Array:
         solutions = inverse_kinematics(request.machine, first, base=request.base, **request.ik_options)
     except Unreachable as error:
         raise locate_error(request, error, 0.0) from error
-    stationary, moving = idle_positions(request.bounds.lower, request.bounds.upper), request.machine.robot.moving_joints
-    idle = request.idle_joints
-    solutions = [replace(solution, joints=np.where(idle, stationary, solution.joints)) for solution in solutions]
-    solutions = distinct_solutions(solutions, np.array([joint.kind != "prismatic" for joint in moving]))
     joints = np.array([solution.joints for solution in solutions])
     colliding = [collision is not None for collision in start_collisions(request, joints)]
     return joints[np.argsort(colliding, kind="stable")]
 
 
-def start_collisions(request: PlanRequest, configurations: Array) -> list[Collision | None]:
-    """Return the closest pair of bodies in each configuration (K, n), or None if it keeps the clearance."""
-    if request.clearance_constraints is None:
+def start_collisions(
+    request: PlanRequest, configurations: Array, pairs: list[int] | None = None
+) -> list[Collision | None]:
+    """Return the closest pair of bodies in each configuration (K, n), or None if it keeps the clearance.
+
+    With `pairs`, the indices of the only pairs that count.
+    """
+    if request.clearance_constraints is None or pairs == []:
         return [None] * len(configurations)
     scene = request.clearance_constraints.scene
     distances = distances_along(scene, request.base, configurations, np.zeros(len(configurations)))
+    if pairs is not None:
+        distances[:, np.setdiff1d(np.arange(len(scene.pairs)), pairs)] = np.inf
     closest = zip(distances, distances.argmin(axis=1).tolist(), strict=True)
     collisions = [Collision(pair, scene.labels[pair], float(row[pair]), 0.0) for row, pair in closest]
     return [collision if collision.distance < scene.clearance else None for collision in collisions]
@@ -170,10 +183,9 @@ def fix_ignorable_joints(request: PlanRequest, configurations: Array) -> tuple[A
     """Return the joints at the start, nan where they are free, and the configurations with the others fixed.
 
     An ignorable coordinate changes nothing but the joint itself: the last joint of an arm whose roll is free turns
-    about the tool's axis, and a gripper's finger moves no task frame. If it were free, each motion would belong to a
-    family of equal cost. It is therefore fixed in the middle of its range. If that puts every configuration in
-    collision, it takes the values of a configuration, or random ones, for which most configurations are
-    collision-free.
+    about the tool's axis. If it were free, each motion would belong to a family of equal cost. It is therefore fixed in
+    the middle of its range. If that puts every configuration in collision, it takes the values of a configuration, or
+    random ones, for which most configurations are collision-free.
     """
     bounds = request.bounds
     start = np.full(request.machine.joint_size, np.nan)

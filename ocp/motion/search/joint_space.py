@@ -7,8 +7,8 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from models import Machine
 from models.arrays import Array
@@ -71,7 +71,8 @@ class JointSpace:
     def tree(self, joints: Array, layer: Indices | None = None) -> Any:
         """Return a nearest-neighbour tree of configurations (M, n), to be queried with `tree_points`."""
         box = np.append(0.0, np.where(self.periodic, FULL_TURN * self.scale, 0.0))
-        return cKDTree(self.tree_points(joints, layer), boxsize=box if self.periodic.any() else None)  # None is faster
+        periods = box if self.periodic.any() else None  # None is faster
+        return scipy.spatial.cKDTree(self.tree_points(joints, layer), boxsize=periods)
 
     def tree_points(self, joints: Array, layer: Indices | None = None) -> Array:
         """Return the coordinates of configurations (M, n) in the tree; layers lie MAX_STEP apart. Shape (M, 1 + n)."""

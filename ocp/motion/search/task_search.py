@@ -23,7 +23,7 @@ from ocp.motion.search.configurations import (
     sampled_motions,
 )
 from ocp.motion.search.dead_end import DeadEnd, dead_end
-from ocp.motion.search.joint_space import JointSpace, TasksWithFixedJoints
+from ocp.motion.search.joint_space import JointSpace
 from ocp.motion.search.reconfigurations import fewest_segments, segment_ends
 from ocp.motion.search.search import MAX_FREE_DIRECTIONS, AtlasSearch
 from ocp.motion.search.steps import SquaredRates
@@ -89,8 +89,6 @@ class TaskSearch:
         best = int(np.where(tracked | ~tracked.any(), costs, np.inf).argmin())
         self.space = JointSpace(machine, bounds.lower, bounds.upper, request.weights)
         self.bound = 0.0
-        self._fixed_joints = tuple(np.flatnonzero(request.idle_joints).tolist())
-        self._fixed_values = motions[0].joints[best, 0, list(self._fixed_joints)]
         times = list[Array]()
         for stretch, motion in zip(request.stretches, motions, strict=True):
             if (equations := stretch.equations) is None:
@@ -98,12 +96,15 @@ class TaskSearch:
             if not equations.pose_rows.all():
                 words = "search='global' needs poses, but a task gives velocities; give the tip's position=..."
                 raise ProblemError(words, name="search", value="global", time=stretch.begin)
-            free_directions = machine.joint_size - equations.size - len(self._fixed_joints)
+            free_directions = machine.joint_size - equations.size
             if free_directions > MAX_FREE_DIRECTIONS:
+                held = f" ({', '.join(request.held)} are held)" if request.held else ""
                 words = (
-                    f"at t = {stretch.begin:g} s the tasks leave {free_directions} degrees of freedom undetermined; "
-                    f"search='global' supports at most {MAX_FREE_DIRECTIONS}. "
-                    "Lock a joint, add a task, or use search='configurations'"
+                    f"at t = {stretch.begin:g} s the tasks leave {free_directions} degrees of freedom undetermined: "
+                    f"they prescribe {equations.size} rows, and {machine.joint_size} joints move: "
+                    f"{', '.join(machine.robot.joint_names)}{held}; search='global' supports at most "
+                    f"{MAX_FREE_DIRECTIONS}. Lock a joint with lock_joints(robot, {{NAME: POSITION}}), add rows or a "
+                    "task, or use search='configurations'"
                 )
                 details: dict[str, Any] = {"value": free_directions, "limit": MAX_FREE_DIRECTIONS}
                 raise ProblemError(words, name="search", **details, time=stretch.begin)
@@ -138,11 +139,9 @@ class TaskSearch:
         self._search = AtlasSearch(self.space, samples, self.times, SquaredRates(request.weights), limits, **options)
 
     def _manifolds(self, equations: TaskEquations, times: Array) -> SelfMotionManifolds:
-        """Return the self-motion manifolds at some times; idle joints stay where they are at the start."""
+        """Return the self-motion manifolds at some times."""
         targets = np.array(equations.target_function().map(len(times))(times[None, :])).T
-        fixed = TasksWithFixedJoints(equations.machine, equations.bound, self._fixed_joints)
-        targets = np.column_stack([targets, np.tile(self._fixed_values, (len(times), 1))])
-        return SelfMotionManifolds(self.space, fixed, targets)
+        return SelfMotionManifolds(self.space, equations, targets)
 
     @property
     def _equations(self) -> list[TaskEquations]:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 from warnings import warn
 
 import numpy as np
+from numpy.typing import NDArray
 
 from models import Machine, ModelWarning, Robot, Standing
 from models.arrays import Array
@@ -15,6 +16,10 @@ from ocp.errors import NOT_NUMBERS, ProblemError, checked_flag, checked_positive
 from ocp.motion.tasks.zmp_rules import ZmpRule
 
 __all__ = ["JointBounds", "Limits", "unknown_limits"]
+
+
+LIMITED = ("velocity", "acceleration", "jerk", "torque", "power")
+"""Limits that are one number for each joint, or one for all."""
 
 
 class JointBounds(NamedTuple):
@@ -65,7 +70,7 @@ class Limits:
     zmp: ZmpRule | None = None
 
     def __post_init__(self) -> None:
-        for kind in ("velocity", "acceleration", "jerk", "torque", "power"):
+        for kind in LIMITED:
             value = getattr(self, kind)
             if value is not None and not (_numbers(value) > 0).all():
                 words = f"limits: {kind} must be positive, one number or one for each joint, not {value!r}"
@@ -83,6 +88,16 @@ class Limits:
     def least_force(self, machine: Standing) -> float:
         """Least vertical ground force, N."""
         return 0.1 * machine.weight if self.vertical_force is None else float(self.vertical_force)
+
+    def of_joints(self, chosen: NDArray[np.bool_]) -> Limits:
+        """Return the limits of some joints of a machine. Shape (n,), bool."""
+        values = {kind: getattr(self, kind) for kind in LIMITED}
+        own: dict[str, Any] = {
+            kind: _numbers(value)[chosen]
+            for kind, value in values.items()
+            if value is not None and _numbers(value).size > 1
+        }
+        return replace(self, **own)
 
     def bounds(self, machine: Machine, used: Collection[str] = ()) -> JointBounds:
         """Return the joint limits of a machine; those that the robot description does not give are infinite.

@@ -1,4 +1,4 @@
-"""Target poses of tasks along a motion, in the world, for display next to the motion."""
+"""Poses along a motion in the world: those that tasks require, for display next to the motion, and the tip's."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ import numpy as np
 
 from models import Machine
 from models.arrays import Array
+from models.spatial import quaternion_from_rotation
 from ocp.motion.tasks.equations import bind
 from ocp.motion.tasks.geometry import target_size
 from ocp.motion.tasks.tip_task import TipTask
 
-__all__ = ["Target", "targets_along"]
+__all__ = ["Target", "targets_along", "tip_poses"]
 
 
 class Target(NamedTuple):
@@ -84,3 +85,19 @@ def _frames(machine: Machine, base: Array, joints: Array) -> tuple[Array, Array]
     function = ca.Function("frames", [b, q], [pose.rotation, pose.position])
     rotations, positions = (np.array(value) for value in function.map(len(joints))(base.T, joints.T))
     return rotations.reshape(3, -1, 3).transpose(1, 0, 2), positions.T
+
+
+def tip_poses(machine: Machine, bases: Array, joints: Array) -> Array:
+    """Return the poses of a machine's tip in world, nan if it has none: position and quaternion. Shape (M, 7).
+
+    Args:
+        bases, joints: Configurations. Shapes (M, base_size) and (M, n).
+    """
+    if machine.robot.tip is None:
+        return np.full((len(joints), 7), np.nan)
+    b, q = ca.SX.sym("b", machine.base_size), ca.SX.sym("q", machine.joint_size)
+    pose = machine.tip_pose(b, q)
+    function = ca.Function("tip", [b, q], [pose.position, pose.rotation])
+    position, rotation = function.map(len(joints))(bases.T, joints.T)
+    turns = np.array(rotation).reshape(3, len(joints), 3).transpose(1, 0, 2)
+    return np.column_stack([np.array(position).T, quaternion_from_rotation(turns)])

@@ -172,7 +172,8 @@ def solve_capture(
         )
 
     machines = dict.fromkeys((APPROACH, DETUMBLE), (chaser, limits))
-    return within_limits(declare, clearance_constraints, method or POINTS, (), None, tolerances, machines)
+    mesh = POINTS if method is None else method
+    return within_limits(declare, clearance_constraints, mesh, (), None, tolerances, machines)
 
 
 @interruptible
@@ -194,7 +195,7 @@ def chained_capture(
     Returns:
         Both solutions, each with its own audit.
     """
-    mesh = method or POINTS
+    mesh = POINTS if method is None else checked_instance("method", method, Collocation)
     own = _Capture.take(chaser, capture, start, {"limits": limits, "cost": cost}, clearance_constraints)
     own.detumbling(None)  # raises before the approach is solved
 
@@ -248,13 +249,13 @@ class _Capture:
     ) -> _Capture:
         target = checked_instance("capture", capture, Capture).target
         robot = checked_pair(chaser, target)
-        given, joints, base = Start.of(start, chaser)
+        begin, joints, base = Start.of(start, chaser)
         if joints is None:
             raise ProblemError("capture: start is missing; give the joints of the chaser", name="start")
         target_base = checked_configuration(target, np.zeros(0), capture.target_base)[1]
         momentum = np.array(ca.DM(pair_momentum(chaser, target, base, target_base, joints))).ravel()
         pair = replace(chaser, robot=robot, conserved_momentum=momentum)
-        rates = end_velocities("start_velocity", given.velocity, chaser.joint_size)
+        rates = end_velocities("start_velocity", begin.velocity, chaser.joint_size)
         times = (capture.approach, capture.detumble)
         latest = [time.upper if isinstance(time, FreeTime) else checked_horizon(time) for time in times]
         state = State(base, joints, rates, target_base, *latest)

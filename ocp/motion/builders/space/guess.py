@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from models import FreeFloating, Robot, center_of_mass, find_wheels, link_frames
 from models.arrays import Array
@@ -159,7 +159,9 @@ class _TipTracker:
 
 def _gap(place: Array, turn: Array, position: Array, rotation: Array) -> Array:
     """Return rotation vector and translation from one pose to another, in world axes. Shape (6,)."""
-    return np.concatenate([Rotation.from_matrix(turn @ rotation.T).as_rotvec(), place - position.ravel()])
+    return np.concatenate(
+        [scipy.spatial.transform.Rotation.from_matrix(turn @ rotation.T).as_rotvec(), place - position.ravel()]
+    )
 
 
 def _tip_path(
@@ -170,9 +172,9 @@ def _tip_path(
     pose = target.tip_pose(b, ca.DM(0, 1))
     pose_at = ca.Function("pose", [b], [pose.position, ca.vec(pose.rotation)])
 
-    def frames(configurations: Array) -> tuple[Array, Rotation]:
+    def frames(configurations: Array) -> tuple[Array, Any]:
         place, turn = (np.array(part).T for part in pose_at.map(len(configurations))(configurations.T))
-        return place, Rotation.from_matrix(turn.reshape(-1, 3, 3).transpose(0, 2, 1))
+        return place, scipy.spatial.transform.Rotation.from_matrix(turn.reshape(-1, 3, 3).transpose(0, 2, 1))
 
     share = times / times[-1]
     meeting, nearer = (
@@ -181,14 +183,15 @@ def _tip_path(
     )
     grasped, turned = frames(bases)
     own = chaser.tip_pose(start[1], start[0])
-    first, axes = np.array(ca.DM(own.position)).ravel(), Rotation.from_matrix(np.array(ca.DM(own.rotation)))
+    first = np.array(ca.DM(own.position)).ravel()
+    axes = scipy.spatial.transform.Rotation.from_matrix(np.array(ca.DM(own.rotation)))
     beside = grasped + (1 - nearer[:, None]) * turned.apply(out)
     places = first + meeting[:, None] * (beside - first)
     # turn to the final attitude, composed with the target's turn since an earlier time, which vanishes at the end
     before = times[-1] - meeting * (times[-1] - times)
     then = frames(np.column_stack([np.interp(before, times, column) for column in bases.T]))[1]
     vector = (axes.inv() * turned[-1]).as_rotvec()
-    turns = axes * Rotation.from_rotvec(meeting[:, None] * vector) * turned[-1].inv() * then
+    turns = axes * scipy.spatial.transform.Rotation.from_rotvec(meeting[:, None] * vector) * turned[-1].inv() * then
     return places, turns.as_matrix()
 
 

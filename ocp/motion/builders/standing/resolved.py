@@ -14,9 +14,8 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
-from scipy.spatial.transform import Rotation
 
 from models.arrays import Array
 from models.machines.stance import Stance
@@ -258,7 +257,7 @@ def _phase(steps: Steps, k: int, joints: Array, t: Array, clearance: float) -> t
     if local.stopped is not None:
         words = f"phase {steps.names[k]!r}: the pseudo-inverse breaks down at {local.t[-1]:.4g} s: {local.stopped}"
         raise SolveError(words, name=steps.names[k], time=float(local.t[-1]))
-    return local.joints, local.joint_rates, CubicSpline(t, local.joint_rates).derivative()(t)
+    return local.joints, local.joint_rates, scipy.interpolate.CubicSpline(t, local.joint_rates).derivative()(t)
 
 
 def _swing_task(stance: Stance, swing: Swing, seconds: float, clearance: float) -> TipTask:
@@ -267,7 +266,7 @@ def _swing_task(stance: Stance, swing: Swing, seconds: float, clearance: float) 
     assert swing.landing is not None
     lifted, landing = swing.lifted, swing.landing
     first, last = np.asarray(lifted.rotation), np.asarray(landing.rotation)
-    turn = Rotation.from_matrix(last @ first.T).as_rotvec()
+    turn = scipy.spatial.transform.Rotation.from_matrix(last @ first.T).as_rotvec()
     angle = float(np.linalg.norm(turn))
     axis = turn / angle if angle else np.array([0.0, 0.0, 1.0])
 

@@ -1,0 +1,247 @@
+"""Joints that a plan holds still: those that move no task frame, and those shared with other limbs.
+
+A gripper, a head or another arm adds joints that no task determines. They are locked at the present position, or at a
+free one near the middle of their limits, and the motion is planned for the machine that remains. Bodies that then
+cannot move relative to each other are checked once. A joint is released only if a body that it moves obstructs the
+motion.
+
+A torso that carries the arm of a task carries other limbs as well. A global search of an arm that has more free
+directions than it can cover holds such joints, so that its lower bound holds for motions with the torso where it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, TypeVar
+from warnings import warn
+
+import numpy as np
+
+from models import Machine, ModelWarning, Robot
+from models.arrays import Array
+from models.shapes.bodies import RigidParts
+from ocp.errors import ProblemError, SolveError
+from ocp.motion.local.inverse_kinematics import Unreachable, idle_positions, sample_starts
+from ocp.motion.search.configurations import (
+    REACH_TOLERANCE,
+    PlanRequest,
+    check_clear_start,
+    largest_pose_errors,
+    local_motions_from,
+    start_collisions,
+    start_configurations,
+)
+from ocp.motion.search.dead_end import DeadEnd
+from ocp.motion.search.search import MAX_FREE_DIRECTIONS
+from ocp.motion.tasks.equations import bind
+
+__all__ = ["all_joints", "hold_idle_joints", "place_held_joints", "released", "restore_error"]
+
+STIFFNESS = 1e6
+"""Weight of the rates of shared joints, relative to their own, with which a local motion leaves them nearly still."""
+Error = TypeVar("Error", bound=Exception)
+
+
+def all_joints(robot: Robot, held: Mapping[str, float], values: Array, *, rates: bool = False) -> Array:
+    """Return values of all joints of a robot, (..., n), from those of the joints that are not held, (..., m).
+
+    Args:
+        robot: Robot with all its joints.
+        held: Positions of the held joints, rad or m, by name.
+        values: Positions, or derivatives of them if `rates`, of the other joints in their order.
+    """
+    if not held:
+        return values
+    names = robot.joint_names
+    constants = np.array([0.0 if rates else held.get(name, 0.0) for name in names])
+    result = np.array(np.broadcast_to(constants, (*values.shape[:-1], len(names))))
+    result[..., [name not in held for name in names]] = values
+    return result
+
+
+def hold_idle_joints(request: PlanRequest) -> PlanRequest:
+    """Return the request with all joints held that move no frame of a task: at the start, or in their middle."""
+    idle = bind(request.machine, request.tasks).idle
+    if idle.all():
+        return request
+    bounds, start = request.bounds, request.start
+    positions = idle_positions(bounds.lower, bounds.upper) if start is None else start
+    return request.with_held(_named(request.machine, positions, np.flatnonzero(idle).tolist()))
+
+
+def place_held_joints(whole: PlanRequest, request: PlanRequest) -> tuple[PlanRequest, Array]:
+    """Return the request with its held joints well placed, and its configurations at the start, (K, m).
+
+    Held joints stay where they are if any configuration is collision-free there, and else take the nearest positions
+    found with one. A global search may hold further joints, see `_hold_shared_joints`.
+
+    Args:
+        whole: Request before joints were held.
+        request: Request with held joints.
+
+    Raises:
+        ProblemError: The start is in collision; or as in `start_configurations`.
+    """
+    configurations = start_configurations(request)
+    placed = _place_idle_joints(whole, request, configurations)
+    _check_held_bodies(whole, placed, configurations[0])
+    if placed.start is not None:
+        check_clear_start(placed, configurations)
+    narrowed = _hold_shared_joints(placed, configurations)
+    return narrowed, configurations if narrowed is request else start_configurations(narrowed)
+
+
+def _place_idle_joints(whole: PlanRequest, request: PlanRequest, configurations: Array) -> PlanRequest:
+    """Return the request with its held joints at the nearest positions with a collision-free configuration of (K, m).
+
+    If held bodies of the machine collide with each other wherever they are, that is ignored.
+    """
+    robot, bounds, own = whole.machine.robot, whole.bounds, _own_held(whole, request)
+    if whole.clearance_constraints is None or whole.start is not None or not own:
+        return request
+    columns = [robot.joint_names.index(name) for name in own]
+    samples = sample_starts(whole.machine, bounds.lower, bounds.upper, whole.settings.ik_starts, None, whole.seed)
+    present = np.array(list(own.values()))
+    order = np.argsort(np.abs(samples[:, columns] - present).max(axis=1), kind="stable")
+    choices = [own, *(_named(whole.machine, sample, columns) for sample in samples[order])]
+    still = _still_pairs(whole, request)
+    places = np.array([all_joints(robot, held, configurations[0]) for held in choices])
+    apart = [collision is None for collision in start_collisions(whole, places, still)]
+    allowed = [held for held, is_apart in zip(choices, apart, strict=True) if is_apart or not any(apart)]
+    pairs = np.setdiff1d(np.arange(len(whole.clearance_constraints.scene.pairs)), still).tolist()
+
+    def clear(held: Mapping[str, float]) -> bool:
+        return None in start_collisions(whole, all_joints(robot, held, configurations), pairs)
+
+    best = next(filter(clear, allowed), own)
+    return request if best is own else whole.with_held(best)
+
+
+def _own_held(whole: PlanRequest, request: PlanRequest) -> dict[str, float]:
+    """Return the positions of the joints that a request holds, and the whole one does not, by name."""
+    return {name: position for name, position in request.held.items() if name not in whole.held}
+
+
+def _still_pairs(whole: PlanRequest, request: PlanRequest) -> list[int]:
+    """Return the pairs of bodies that no joint of a request moves relative to each other."""
+    assert whole.clearance_constraints is not None
+    moving = [name not in request.held for name in whole.machine.robot.joint_names]
+    levers = whole.clearance_constraints.scene.levers.joints[:, moving]
+    return np.flatnonzero(~(levers > 0).any(axis=1)).tolist()
+
+
+def _check_held_bodies(whole: PlanRequest, request: PlanRequest, configuration: Array) -> None:
+    """Check the bodies at the start that no joint of the request moves relative to each other.
+
+    Raises:
+        ProblemError: A body collides with an obstacle.
+
+    Warns:
+        ModelWarning: Two bodies of the machine collide with each other, which changes nothing about the motion.
+    """
+    if whole.clearance_constraints is None or not request.held:
+        return
+    scene, robot = whole.clearance_constraints.scene, whole.machine.robot
+    start = all_joints(robot, _own_held(whole, request), configuration)[None]
+    still = _still_pairs(whole, request)
+    with_obstacle = [pair for pair in still if scene.pairs[pair, 2] < 0]
+    for pairs in (with_obstacle, sorted({*still} - {*with_obstacle})):
+        if (collision := start_collisions(whole, start, pairs)[0]) is None:
+            continue
+        columns = np.flatnonzero(scene.levers.joints[collision.pair]).tolist()
+        names = [name for name in (robot.joint_names[column] for column in columns) if name in request.held]
+        where = ", ".join(f"{name!r} stays at {request.held[name]:.4g}" for name in names)
+        words = (
+            f"{collision}, where {where}, since no task moves it; give a start with other positions, or ignore this "
+            f"pair of bodies: ignored={[scene.pair_names(collision.pair)]}"
+        )
+        details: dict[str, Any] = {"value": collision.distance, "limit": scene.clearance}
+        if pairs is with_obstacle:
+            raise ProblemError(words, name=" and ".join(collision.bodies), **details)
+        warn(ModelWarning(words, name=" and ".join(collision.bodies), **details), stacklevel=2)
+
+
+def released(whole: PlanRequest, request: PlanRequest, error: SolveError) -> PlanRequest | None:
+    """Return the request with those joints free that move a body of a collision; None if they are free already.
+
+    Args:
+        whole: Request before joints were held.
+        request: Request with held joints.
+        error: Why no motion passes. A collision is named by its two bodies.
+    """
+    constraints = whole.clearance_constraints
+    if constraints is None or not request.held or request.search == "global":
+        return None
+    scene = constraints.scene
+    pairs = [pair for pair, bodies in enumerate(scene.labels) if " and ".join(bodies) == error.name]
+    columns = np.unique(np.nonzero(scene.levers.joints[pairs])[1]).tolist()
+    names = {whole.machine.robot.joint_names[column] for column in columns}
+    own = _own_held(whole, request)
+    held = {name: position for name, position in own.items() if name not in names}
+    return whole.with_held(held) if len(held) < len(own) else None
+
+
+def _hold_shared_joints(request: PlanRequest, configurations: Array) -> PlanRequest:
+    """Return the request with so many joints held that a global search can cover the other free directions.
+
+    Only joints that carry a limb of which no task asks anything are held, those nearest to the root first: at the
+    start, or where the lowest-cost local motion begins that leaves them nearly still.
+
+    Args:
+        request: The request, without idle joints.
+        configurations: Its joints at the start. Shape (K, n).
+    """
+    sizes = [stretch.equations.size for stretch in request.stretches if stretch.equations is not None]
+    excess = request.machine.joint_size - min(sizes, default=0) - MAX_FREE_DIRECTIONS
+    columns = _shared_joints(request)[: max(excess, 0)]
+    if request.search != "global" or request.machine.base_size or excess <= 0 or len(columns) < excess:
+        return request
+    if request.start is not None:
+        return request.with_held(_named(request.machine, request.start, columns))
+    weights = request.weights.copy()
+    weights[columns] *= STIFFNESS
+    motions = local_motions_from(replace(request, weights=weights), configurations)
+    costs = np.sum([motion.cost for motion in motions], axis=0)
+    tracked = np.array(largest_pose_errors(motions)) <= REACH_TOLERANCE
+    best = int(np.where(tracked | ~tracked.any(), costs, np.inf).argmin())
+    return request.with_held(_named(request.machine, configurations[best], columns))
+
+
+def _shared_joints(request: PlanRequest) -> list[int]:
+    """Return the joints that carry, besides frames of tasks, a limb with joints of its own; the root first.
+
+    A gripper at the end of an arm is no such limb: it is fixed to the part that carries the frame.
+    """
+    machine = request.whole or request.machine
+    robot, parts = machine.robot, RigidParts.of(machine.robot)
+    bound = bind(machine, request.tasks).bound
+    ends = {parts.of_link[tip.robot.tip_link] for part in bound for tip in (part.tip, part.reference) if tip}
+    path = {step.joint.child for end in ends for step in parts.path(parts.of_link[robot.root], end)[1]}
+    limbs = [part for part, step in parts.step.items() if part not in path and step.above not in ends]
+    carriers = {step.joint.name for limb in limbs for step in parts.path(parts.of_link[robot.root], limb)[1]}
+    names, shared = request.machine.robot.joint_names, {name for name in carriers if robot.joint(name).child in path}
+    return [column for column, name in enumerate(names) if name in shared]
+
+
+def restore_error(error: Error, request: PlanRequest) -> Error:
+    """Return an error of a request with held joints with the configurations in it extended by these."""
+    if request.whole is None:
+        return error
+    robot = request.whole.robot
+
+    def restore(joints: Array) -> Array:
+        return all_joints(robot, request.held, joints)
+
+    if isinstance(error, Unreachable):
+        error.joints = restore(error.joints)
+    if isinstance(error, DeadEnd):
+        error.obstructions = tuple(
+            each._replace(before=restore(each.before), after=restore(each.after)) for each in error.obstructions
+        )
+        error.relaxations = tuple(each._replace(joints=restore(each.joints)) for each in error.relaxations)
+    return error
+
+
+def _named(machine: Machine, joints: Array, columns: list[int]) -> dict[str, float]:
+    return {machine.robot.joint_names[column]: float(joints[column]) for column in columns}
