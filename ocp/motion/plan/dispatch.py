@@ -9,11 +9,12 @@ from typing import Any, Literal, TypeAlias, get_args
 
 from models import FixedBase, Machine, Standing
 from ocp.console import interruptible, time_limited
-from ocp.errors import ProblemError, checked_choice, checked_instance, checked_time_limit
+from ocp.errors import ProblemError, checked_choice, checked_count, checked_instance, checked_time_limit
 from ocp.motion.builders.space.capture import Capture
 from ocp.motion.builders.standing.problem import Weights
 from ocp.motion.builders.standing.stances import Steps
 from ocp.motion.builders.standing.steps import StepWeights
+from ocp.motion.local.inverse_kinematics import LARGEST_SEED
 from ocp.motion.plan.goal_sequence import plan_capture, plan_sequence, plan_steps
 from ocp.motion.plan.motion import Plan
 from ocp.motion.plan.path_plan import PathPlan
@@ -100,6 +101,7 @@ def plan(
             in how few segments they may be done (search="segments").
     """
     checked_choice("search", search, get_args(Search))
+    checked_count("seed", seed, 0, LARGEST_SEED)
     with time_limited(checked_time_limit(time_limit)), shown_progress("plan", progress):
         return _plan(machine, tasks, horizon, start, cyclic, cost, limits, scene, search, seed)
 

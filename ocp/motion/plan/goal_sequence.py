@@ -69,6 +69,7 @@ def plan_sequence(
     if joints is None:
         raise ProblemError("start is missing: a goal is reached from somewhere; give plan(..., start=)", name="start")
     own_limits = Limits() if limits is None else checked_instance("limits", limits, Limits)
+    own_cost = None if cost is None else checked_instance("cost", cost, Cost)
     near, resolved = joints, list[Goal]()
     for goal in goals:
         if goal.has_pose:
@@ -78,7 +79,7 @@ def plan_sequence(
             near = np.where(np.isnan(np.asarray(goal.joints, dtype=float)), near, goal.joints)
         resolved.append(goal)
     machines = machines_of(motors, resolved)  # checks them before anything is solved
-    smooth = own_limits.jerk is not None or (cost is not None and bool(cost.jerk))
+    smooth = own_limits.jerk is not None or (own_cost is not None and bool(own_cost.jerk))
     control: Literal["acceleration", "jerk"] = "jerk" if smooth else "acceleration"
     setup = DynamicsSetup(start_velocity=state.velocity, start_base=base, control=control)
 

@@ -44,6 +44,7 @@ from tests.bad_values import (
     POSITIVE,
     SEQUENCE,
     TEXT,
+    UNKNOWN,
     WHOLE,
     Case,
     array,
@@ -52,6 +53,7 @@ from tests.bad_values import (
     good_calls,
     method,
     panel,
+    rotation,
 )
 from tests.models.machines.armoured import armoured_arm
 from tests.models.robot.trees import Array, numeric
@@ -211,6 +213,34 @@ CASES = [
             "region": but(INSTANCE, "None") | {"beside a position": Sphere(0.1, (0.4, 0.0, 0.5))},
             "velocity": {"unknown": "slow", "empty": ""},
             "name": TEXT,
+        },
+    ),
+    Case(
+        "Goal of plan",
+        lambda **goal: plan(ARM, Goal(**goal), start=START, scene=False),
+        {"position": REACHED + np.array([0.1, -0.1, 0.0]), "orientation": None, "duration": 1.0},
+        {
+            "position": array(3) | {"too far": [3.0, 0.0, 0.0]},
+            "orientation": rotation() | {"quaternion of zero": np.zeros(4)},
+            "duration": POSITIVE,
+            "tip": but(UNKNOWN, "None"),
+            "tasks": but(INSTANCE, "list", "dictionary"),
+        },
+    ),
+    Case(
+        "plan to a goal",
+        plan,
+        {"machine": ARM, "tasks": Goal(joints=[0.4, 0.5, 0.8], duration=1.0), "start": START, "scene": False},
+        {
+            "machine": INSTANCE | {"class": FixedBase, "robot": CHAIN},
+            "horizon": {"of fixed durations": 1.0},
+            "start": array(3) | {"matrix": np.zeros((2, 3))},
+            "cyclic": {"true": True},
+            "cost": but(INSTANCE, "None") | {"class": Cost, "length": Cost(velocity=0, length=1)},
+            "limits": but(INSTANCE, "None") | {"class": Limits, "too many": Limits(velocity=[1.0, 2.0])},
+            "scene": but(INSTANCE, "None") | {"class": Scene, "true": True, "zero": 0},
+            "search": CHOICE,
+            "seed": WHOLE,
         },
     ),
     Case(
