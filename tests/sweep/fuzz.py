@@ -46,6 +46,8 @@ from ocp.app.files.mcap import DEFINITIONS, STATE
 from ocp.app.files.task_file import read_obstacles, read_task
 from ocp.motion.schedule import JointTrajectory
 from tests.ocp.app.motions import NAMES, URDF, smooth
+from tests.ocp.motion.plan.test_path_plan import path
+from tests.ocp.motion.plan.test_segmented_plan import made
 
 Random: TypeAlias = np.random.Generator
 Mutator: TypeAlias = Callable[[bytes, Random], bytes]
@@ -443,6 +445,8 @@ def solution_file() -> bytes:
 
 KINDS: dict[str, Kind] = {
     "plan": Kind(".npz", plan_file, lambda file: Plan.load(file).audit(), in_archive()),
+    "path": Kind(".npz", lambda: saved(path()), lambda file: Plan.load(file).audit(), in_archive()),
+    "segments": Kind(".npz", lambda: saved(made()), lambda file: Plan.load(file).audit(), in_archive()),
     # the audit of a problem whose dynamics were changed into stiff ones may rightly take longer than a reader
     "solution": Kind(".npz", solution_file, Solution.load, in_archive()),
     "urdf": Kind(".urdf", URDF.encode, read_robot, mostly(changed_xml)),

@@ -140,24 +140,20 @@ class PathPlan(Plan):
     # ---- audit -------------------------------------------------------------------------------------------------------
 
     def clearance(self) -> Clearance | None:
-        """Return the proven clearance of straight lines between waypoints, without reconfigurations; None if unchecked.
-
-        Its times are numbers of waypoints.
-        """
+        """Return the proven clearance between waypoints, without reconfigurations; None if it is not checked."""
         if self.constraints is None:
             return None
-        numbers, last, breaks = np.arange(len(self.joints), dtype=float), len(self.joints) - 1.0, self.reconfigurations
-        rates = np.abs(np.diff(self.joints, axis=0))
-        rates[list(breaks)] = 0.0
+        t, horizon = self.t, self.horizon
+        breaks, rates = t / horizon, np.abs(np.diff(self.joints, axis=0)) / np.diff(t)[:, None]
+        rates[list(self.reconfigurations)] = 0.0
 
         def joints_at(fractions: Array) -> Array:
-            places = fractions * last
-            waiting = np.isin(np.floor(places), breaks)  # a break lasts until the next waypoint
-            places = np.where(waiting, np.floor(places), places)
-            return np.stack([np.interp(places, numbers, column) for column in self.joints.T], axis=1)
+            interval = np.clip(np.searchsorted(breaks, fractions, side="right") - 1, 0, len(t) - 2)
+            waiting = np.isin(interval, self.reconfigurations) & (fractions < 1.0)  # until the next waypoint
+            ends = t[interval + np.where(waiting, 0, 1)]
+            return self._values_at("joints", np.clip(fractions * horizon, t[interval], ends))
 
-        scene = self.constraints.scene
-        return clearance_of(scene, joints_at, numbers / last, last, rates, np.zeros_like(rates), False)
+        return clearance_of(self.constraints.scene, joints_at, breaks, horizon, rates, np.zeros_like(rates), False)
 
     def _audit(self, **settings: Any) -> Audit:
         if settings:
@@ -241,6 +237,8 @@ class PathPlan(Plan):
                 raise ValueError(f"its {', '.join(wrong) or 'values'} do not fit its machine")
             if constraints is not None and not isinstance(constraints, ClearanceConstraints):
                 raise TypeError(f"its collision scene is a {type(constraints).__name__}")
+            if constraints is not None and constraints.scene.has_moving_obstacles:
+                raise ValueError("its obstacles move, though a path has no times")
             breaks = tuple(int(number) for number in head["reconfigurations"])
             if not all(0 <= number < count - 1 for number in breaks):
                 raise ValueError(f"it reconfigures at waypoints that it has not: {breaks}")

@@ -310,7 +310,7 @@ def restored_request(record: Any) -> MotionRequest:
     try:
         functions = FunctionReader(record["functions"]).functions
         pool = dict(record["arguments"]["pool"])
-        first = next(name for name in ("steps", *MACHINE_NAMES) if name in pool)
+        first = next((name for name in ("steps", *MACHINE_NAMES) if name in pool), "machine")
         own = _read(pool[first], functions, None)
         machine = _machine_of({first: own})
         if not isinstance(machine, MACHINES):

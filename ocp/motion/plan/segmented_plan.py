@@ -23,7 +23,7 @@ from ocp.motion.tasks.targets import Target
 from ocp.problem.stored import ARRAY_NAMES, RECORD_ERRORS, pack_record, unpack_record
 from ocp.solution import Solution, read_head
 
-__all__ = ["Reconfiguration", "SegmentedPlan"]
+__all__ = ["Piece", "Reconfiguration", "SegmentedPlan"]
 
 NO_MOTION = "reconfigurations without a motion"
 JUMP_TOLERANCE = 1e-6
@@ -61,7 +61,7 @@ class Reconfiguration:
         return f"at {self.time:.4g} s the arm reconfigures, a joint by up to {largest:.3g}: {how}"
 
 
-class _Piece(NamedTuple):
+class Piece(NamedTuple):
     """Plan that begins at a time of the whole, s."""
 
     begin: float
@@ -135,13 +135,13 @@ class SegmentedPlan(Plan):
         return self.start_times[-1] + self.segments[-1].horizon
 
     @property
-    def pieces(self) -> tuple[_Piece, ...]:
+    def pieces(self) -> tuple[Piece, ...]:
         """Segments and motions between them, in order, with the times at which they begin."""
         plans: list[SolvedPlan] = [self.segments[0]]
         for reconfiguration, segment in zip(self.reconfigurations, self.segments[1:], strict=True):
             plans += [*((reconfiguration.motion,) if reconfiguration.motion is not None else ()), segment]
         begins = np.concatenate([[0.0], np.cumsum([plan.horizon for plan in plans])])
-        return tuple(_Piece(float(begin), plan) for begin, plan in zip(begins, plans, strict=False))
+        return tuple(Piece(float(begin), plan) for begin, plan in zip(begins, plans, strict=False))
 
     @property
     def horizon(self) -> float:

@@ -114,7 +114,7 @@ def plan_path(
         cost: `length`, the sum of all joint displacements with the `weights` of the joints, or `time`, s, by the
             velocity limits of the joints, from waypoint to waypoint; None for the length.
         limits: Limits of the joint positions, and of the velocities for a time; the robot's own if None.
-        scene: As in `plan`.
+        scene: As in `plan`, with static obstacles, since a path has no times.
         seed: Seed of inverse kinematics.
 
     Raises:
@@ -150,6 +150,9 @@ def plan_path(
         joint_weights = own_cost.length * _path_weights(own_cost.weights, n)
     max_step = _step(waypoints.step, n)
     constraints = clearance_for(machine, checked_limits, scene)
+    if constraints is not None and constraints.scene.has_moving_obstacles:
+        words = "a path through waypoints has no time at which obstacles would be somewhere; give static obstacles"
+        raise ProblemError(words, name="obstacles", value=constraints.scene.obstacles)
     planner = _WaypointPlanner(
         machine,
         positions,
