@@ -18,7 +18,7 @@ from ocp.motion.local.inverse_kinematics import LARGEST_SEED
 from ocp.motion.plan.goal_sequence import plan_capture, plan_sequence, plan_steps
 from ocp.motion.plan.motion import Plan
 from ocp.motion.plan.path_plan import PathPlan
-from ocp.motion.plan.phased_plan import PhasedPlan
+from ocp.motion.plan.phased_plan import PHASED, PhasedPlan
 from ocp.motion.plan.piecewise import plan_in_segments
 from ocp.motion.plan.planner import checked_request, clearance_for, plan_request
 from ocp.motion.plan.segmented_plan import SegmentedPlan
@@ -31,7 +31,6 @@ from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.scene import Scene
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.progress import shown_progress
-from ocp.solution import read_head
 from ocp.storage import read_arrays
 
 __all__ = ["Search", "load_plan", "plan"]
@@ -162,5 +161,4 @@ def load_plan(path: str | os.PathLike[str]) -> Plan:
         return PathPlan.of_arrays(path, arrays)
     if "segments" in arrays:
         return SegmentedPlan.of_arrays(path, arrays)
-    is_phased = "plan" in arrays and read_head(path, arrays["plan"]).get("phased") is True
-    return (PhasedPlan if is_phased else SolvedPlan).of_arrays(path, arrays)
+    return (PhasedPlan if PHASED in arrays else SolvedPlan).of_arrays(path, arrays)

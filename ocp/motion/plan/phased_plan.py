@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +16,10 @@ from ocp.motion.plan.solved_plan import Part, SolvedPlan
 from ocp.motion.tasks.targets import tip_poses
 from ocp.solution import Solution
 
-__all__ = ["PhasedPlan", "parts_of_phases"]
+__all__ = ["PHASED", "PhasedPlan", "parts_of_phases"]
 
+PHASED = "plan.phased"
+"""Name of an array in the files of these plans."""
 RATES = "velocities"
 
 
@@ -31,8 +33,6 @@ class PhasedPlan(SolvedPlan):
         machine: Machine of the first phase. All phases have its joints.
         solution, parts, candidates, bound, targets: As in `SolvedPlan`.
     """
-
-    is_phased: ClassVar[bool] = True
 
     @property
     def phases(self) -> tuple[str, ...]:
@@ -87,6 +87,10 @@ class PhasedPlan(SolvedPlan):
             order = np.argsort(self._orders[self.phases[number]])
             poses[rows] = tip_poses(machine, bases[rows], joints[rows][:, order])
         return poses
+
+    def arrays(self, path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
+        """Return the arrays of the file of the plan."""
+        return {**super().arrays(path), PHASED: np.ones(1)}
 
     def solved_parts(self, times: Array) -> list[tuple[Solution, str, Array]]:
         """Return nothing: the phases of one problem are not evaluated one by one."""

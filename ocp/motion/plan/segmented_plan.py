@@ -101,7 +101,7 @@ class SegmentedPlan(Plan):
         return None if None in bounds else float(sum(bounds))  # type: ignore[arg-type]
 
     @property
-    def held(self) -> Mapping[str, float]:
+    def held(self) -> Mapping[str, float]:  # type: ignore[override]
         """Joints that stand still in all segments."""
         return self.segments[0].held
 

@@ -7,7 +7,7 @@ import os
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -49,8 +49,6 @@ class SolvedPlan(Plan):
         parts: Intervals of time with the same tasks; in the solution they run side by side.
         machine, candidates, bound, targets, held: As in `Plan`.
     """
-
-    is_phased: ClassVar[bool] = False
 
     machine: Machine
     solution: Solution
@@ -168,7 +166,6 @@ class SolvedPlan(Plan):
         head, numbers = pack_record(
             {
                 "request": request,
-                "phased": self.is_phased,
                 "parts": self.parts,
                 "bound": self.bound,
                 "held": [[name, position] for name, position in self.held.items()],
