@@ -152,7 +152,7 @@ def test_the_clearance_between_waypoints_is_proven_and_an_obstacle_there_is_name
     assert not finding.passed
     assert "obstacle 0" in finding.note
     assert finding.time is not None
-    times = np.linspace(0.0, found.horizon, 4001)
+    times = np.linspace(0.0, found.horizon, 161)
     nearest = distances_along(scene, np.zeros(0), found.at(times)["joints"], times).min(axis=1)
     assert distances_along(scene, np.zeros(0), found.at([finding.time])["joints"], np.array([0.0])).min() == (
         pytest.approx(nearest.min(), abs=1e-3)
