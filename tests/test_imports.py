@@ -43,8 +43,8 @@ LAYERS = {
         ["motion"],
         ["app"],
     ],
-    "ocp.motion": [["tasks"], ["local", "schedule"], ["builders"], ["search"], ["plan"]],
-    "ocp.app": [["progress"], ["files", "batch"], ["check"], ["view"], ["run_task"], ["arguments"], ["command"]],
+    "ocp.motion": [["tasks"], ["local", "schedule"], ["builders"], ["search"], ["result"], ["plan"]],
+    "ocp.app": [["files", "batch"], ["check"], ["view"], ["run_task"], ["arguments"], ["command"]],
 }
 """Packages and single modules of each package, from the lowest layer up: each may import from lower layers only."""
 MACHINES = {"ocp.motion", "ocp.app"}

@@ -13,7 +13,7 @@ from ocp.app.files.task_file import Task
 from ocp.app.files.text_files import missing_package
 from ocp.errors import MAX_COUNT, ProblemError, checked_positive
 from ocp.motion.plan import Plan, plan
-from ocp.motion.plan.segmented_plan import SegmentedPlan
+from ocp.motion.result.segmented_plan import SegmentedPlan
 from ocp.storage import write_text
 
 __all__ = ["EXPORT_KINDS", "check_period", "export_plan", "run_task"]

@@ -27,7 +27,7 @@ from models.paths import rest_to_rest
 from ocp import Audit, Limits, Reconfiguration, TipTask, inverse_kinematics
 from ocp.app.view.appearance import frames_along
 from ocp.app.view.rendering import tube
-from ocp.motion.plan.segmented_plan import SegmentedPlan
+from ocp.motion.result.segmented_plan import SegmentedPlan
 from ocp.motion.search.charts import Charts, SelfMotionManifolds, TimeSample
 from ocp.motion.search.joint_space import JointSpace
 from ocp.motion.search.search import AtlasSearch

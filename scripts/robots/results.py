@@ -15,7 +15,7 @@ from models.arrays import Array
 from ocp import Audit, Solution, TipTask
 from ocp.curves import differentiation_matrix
 from ocp.motion.local.rates import LocalSolution
-from ocp.motion.plan.solved_plan import Part, SolvedPlan
+from ocp.motion.result.solved_plan import Part, SolvedPlan
 from ocp.motion.tasks.equations import task_errors
 from ocp.storage import write_text
 from scripts.robots.robots import RobotFile

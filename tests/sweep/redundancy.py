@@ -18,7 +18,7 @@ import pinocchio as pin
 
 from models.arrays import Array
 from ocp import Scene, SolveError, Waypoints, plan
-from ocp.motion.plan.path_plan import PathPlan
+from ocp.motion.result.path_plan import PathPlan
 from tests.models.machines.test_redundancy_benchmark import by_coal
 from tests.redundancy_benchmark import FOLDER, PROBLEMS, Benchmark, problem_of, tip_and_file
 from tests.sweep.results import Row, Sweep, parser

@@ -15,8 +15,8 @@ from ocp.app.check.verdict import Check, check_trajectory
 from ocp.app.files import RawTrajectory
 from ocp.audit.audit import Audit
 from ocp.motion.plan import Plan, PlanSample
-from ocp.motion.plan.path_plan import PathPlan
-from ocp.motion.plan.segmented_plan import Piece, SegmentedPlan
+from ocp.motion.result.path_plan import PathPlan
+from ocp.motion.result.segmented_plan import Piece, SegmentedPlan
 
 __all__ = ["PlanVerdict", "verdict_of"]
 

@@ -30,7 +30,7 @@ from ocp.app.view.appearance import (
 from ocp.app.view.rendering import PICTURE_STYLE, Camera, Floor, Layer, parts_in_world, render, tube
 from ocp.audit.clearance import separation_frames
 from ocp.motion.plan import Plan
-from ocp.motion.plan.path_plan import PathPlan
+from ocp.motion.result.path_plan import PathPlan
 from ocp.motion.tasks.limits import JointBounds
 from ocp.problem.problem import Problem
 from ocp.problem.separation import Separation

@@ -20,7 +20,7 @@ from ocp.app.view.rendering import PICTURE_STYLE
 from ocp.errors import ProblemError, checked_instance
 from ocp.motion.local.accelerations import AccelerationSolution
 from ocp.motion.local.rates import LocalSolution
-from ocp.motion.plan.motion import Plan
+from ocp.motion.result.plan import Plan
 from ocp.motion.schedule.trajectory import JointTrajectory
 from ocp.motion.tasks.limits import Limits
 from ocp.problem.formulation import Formulation

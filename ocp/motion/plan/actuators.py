@@ -18,9 +18,9 @@ from ocp.motion.builders.actuator_limits import checked_motors, joint_torques
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.dynamics_plan import within_limits
 from ocp.motion.builders.tool_motion import ToolMotion
-from ocp.motion.plan.motion import CHECKED_TIMES
-from ocp.motion.plan.request import declared_motion
-from ocp.motion.plan.solved_plan import SolvedPlan
+from ocp.motion.result.plan import CHECKED_TIMES
+from ocp.motion.result.request import declared_motion
+from ocp.motion.result.solved_plan import SolvedPlan
 from ocp.motion.search.configurations import PlanRequest
 from ocp.motion.search.held_joints import all_joints
 from ocp.motion.tasks.limits import JointBounds, Limits

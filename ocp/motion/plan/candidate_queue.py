@@ -16,8 +16,8 @@ from heapq import heappop, heappush
 import numpy as np
 
 from ocp.errors import SolveError
-from ocp.motion.plan.candidate import Candidate, Reason, Rejection, Stage
-from ocp.motion.plan.solved_plan import SolvedPlan
+from ocp.motion.result.candidate import Candidate, Reason, Rejection, Stage
+from ocp.motion.result.solved_plan import SolvedPlan
 from ocp.motion.search.settings import PlannerSettings
 from ocp.progress import report
 from ocp.solution import Solution

@@ -26,10 +26,10 @@ from ocp.motion.builders.tool_motion import CLOCK, ToolMotion
 from ocp.motion.local.collisions import Collision
 from ocp.motion.local.inverse_kinematics import Unreachable
 from ocp.motion.plan.actuators import solve_within_actuator_limits
-from ocp.motion.plan.candidate import Candidate, Reason, Rejection, Seed, Stage, collision_reason
 from ocp.motion.plan.candidate_queue import Solver
-from ocp.motion.plan.request import declared_motion
-from ocp.motion.plan.solved_plan import SolvedPlan, parts_of
+from ocp.motion.result.candidate import Candidate, Reason, Rejection, Seed, Stage, collision_reason
+from ocp.motion.result.request import declared_motion
+from ocp.motion.result.solved_plan import SolvedPlan, parts_of
 from ocp.motion.search.configurations import (
     REACH_TOLERANCE,
     PlanRequest,

@@ -16,15 +16,15 @@ from ocp.motion.builders.standing.stances import Steps
 from ocp.motion.builders.standing.steps import StepWeights
 from ocp.motion.local.inverse_kinematics import LARGEST_SEED
 from ocp.motion.plan.goal_sequence import plan_capture, plan_sequence, plan_steps
-from ocp.motion.plan.motion import Plan
-from ocp.motion.plan.path_plan import PathPlan
-from ocp.motion.plan.phased_plan import PHASED, PhasedPlan
 from ocp.motion.plan.piecewise import plan_in_segments
 from ocp.motion.plan.planner import checked_request, clearance_for, plan_request
-from ocp.motion.plan.segmented_plan import SegmentedPlan
-from ocp.motion.plan.solved_plan import SolvedPlan
 from ocp.motion.plan.standing import plan_to_stand
 from ocp.motion.plan.waypoints import plan_path
+from ocp.motion.result.path_plan import PathPlan
+from ocp.motion.result.phased_plan import PHASED, PhasedPlan
+from ocp.motion.result.plan import Plan
+from ocp.motion.result.segmented_plan import SegmentedPlan
+from ocp.motion.result.solved_plan import SolvedPlan
 from ocp.motion.tasks.cost import Cost
 from ocp.motion.tasks.goals import Goal, Waypoints
 from ocp.motion.tasks.limits import Limits

@@ -20,8 +20,8 @@ from ocp.motion.builders.standing.plan import solve_steps
 from ocp.motion.builders.standing.stances import Steps
 from ocp.motion.builders.standing.steps import StepWeights
 from ocp.motion.local.inverse_kinematics import Unreachable, inverse_kinematics
-from ocp.motion.plan.candidate import Candidate, Stage
-from ocp.motion.plan.phased_plan import PhasedPlan, parts_of_phases
+from ocp.motion.result.candidate import Candidate, Stage
+from ocp.motion.result.phased_plan import PhasedPlan, parts_of_phases
 from ocp.motion.tasks.checks import checked_numbers, clip_to_limits
 from ocp.motion.tasks.cost import Cost
 from ocp.motion.tasks.goals import Goal, Start

@@ -24,10 +24,10 @@ from ocp.motion.builders.clearance import ClearanceConstraints, collision_error,
 from ocp.motion.builders.tool_motion import stretches_of
 from ocp.motion.local.collisions import distances_along
 from ocp.motion.local.inverse_kinematics import Unreachable
-from ocp.motion.plan.candidate import Candidate, Stage
 from ocp.motion.plan.planner import checked_request, clearance_for, plan_request
-from ocp.motion.plan.segmented_plan import Reconfiguration, SegmentedPlan
-from ocp.motion.plan.solved_plan import Part, SolvedPlan
+from ocp.motion.result.candidate import Candidate, Stage
+from ocp.motion.result.segmented_plan import Reconfiguration, SegmentedPlan
+from ocp.motion.result.solved_plan import Part, SolvedPlan
 from ocp.motion.search.configurations import PlanRequest, fix_ignorable_joints, local_motions_from
 from ocp.motion.search.held_joints import hold_idle_joints, place_held_joints
 from ocp.motion.search.task_search import TaskSearch

@@ -34,10 +34,10 @@ from ocp.motion.builders.tool_motion import stretches_of
 from ocp.motion.local.inverse_kinematics import LARGEST_SEED, Unreachable
 from ocp.motion.local.rates import LocalMotion
 from ocp.motion.plan.actuators import limits_actuators, without_actuators
-from ocp.motion.plan.candidate import Candidate, Reason, Rejection, Seed
 from ocp.motion.plan.candidate_queue import CandidateQueue
 from ocp.motion.plan.candidate_solver import CandidateSolver
-from ocp.motion.plan.solved_plan import SolvedPlan
+from ocp.motion.result.candidate import Candidate, Reason, Rejection, Seed
+from ocp.motion.result.solved_plan import SolvedPlan
 from ocp.motion.search.cells import CellSearch, tracks_tasks
 from ocp.motion.search.configurations import (
     REACH_TOLERANCE,

@@ -15,9 +15,9 @@ from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.standing.plan import solve_standing
 from ocp.motion.builders.standing.problem import StandingSetup, Weights
 from ocp.motion.local.inverse_kinematics import inverse_kinematics
-from ocp.motion.plan.candidate import Candidate, Reason, Rejection, Stage
 from ocp.motion.plan.candidate_queue import CandidateQueue, Solver
-from ocp.motion.plan.solved_plan import Part, SolvedPlan
+from ocp.motion.result.candidate import Candidate, Reason, Rejection, Stage
+from ocp.motion.result.solved_plan import Part, SolvedPlan
 from ocp.motion.search.settings import PlannerSettings
 from ocp.motion.tasks.checks import check_rest, horizon_of
 from ocp.motion.tasks.equations import TaskEquations, bind

@@ -23,9 +23,9 @@ from ocp.errors import NOT_NUMBERS, ProblemError, SolveError, checked_choice, ch
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.local.collisions import Collision, distances_along, find_collisions
 from ocp.motion.local.inverse_kinematics import LARGEST_SEED, Unreachable, idle_positions
-from ocp.motion.plan.candidate import Candidate, Reason, Rejection, Stage
-from ocp.motion.plan.path_plan import PathPlan, PathPoses
 from ocp.motion.plan.planner import clearance_for
+from ocp.motion.result.candidate import Candidate, Reason, Rejection, Stage
+from ocp.motion.result.path_plan import PathPlan, PathPoses
 from ocp.motion.search.charts import SelfMotionManifolds, TimeSample
 from ocp.motion.search.dead_end import RelaxationKind, dead_end
 from ocp.motion.search.joint_space import TOLERANCE, JointSpace, TasksWithFixedJoints

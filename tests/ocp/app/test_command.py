@@ -23,7 +23,7 @@ from models import cache as kept
 from ocp import Plan, ProblemError, SolveError
 from ocp.app import main
 from ocp.app.files.task_file import read_task
-from ocp.motion.plan.segmented_plan import SegmentedPlan
+from ocp.motion.result.segmented_plan import SegmentedPlan
 from ocp.progress import Progress
 from tests.ocp.app.motions import smooth, write_robot, write_table
 

@@ -20,7 +20,7 @@ from ocp.app.check.joint_limits import floating_torques, integrate_base
 from ocp.app.files import read_trajectory
 from ocp.errors import ProblemError
 from ocp.motion.local.collisions import distances_along
-from ocp.motion.plan.solved_plan import SolvedPlan
+from ocp.motion.result.solved_plan import SolvedPlan
 from tests.ocp.app.motions import MIDDLE, NAMES, SWING, URDF, joint, link, smooth, write_table
 
 GALLERY = Path(__file__).resolve().parents[3] / "results" / "gallery"

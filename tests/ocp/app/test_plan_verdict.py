@@ -12,7 +12,7 @@ from models import FixedBase
 from ocp.app.check.plan_verdict import verdict_of
 from ocp.app.view.animation import animate_plan
 from ocp.app.view.report import report_of_plan
-from ocp.motion.plan.segmented_plan import SegmentedPlan
+from ocp.motion.result.segmented_plan import SegmentedPlan
 from tests.ocp.motion.plan.test_path_plan import path
 from tests.ocp.motion.plan.test_segmented_plan import made
 

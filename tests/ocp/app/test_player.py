@@ -66,7 +66,7 @@ from ocp.app.view.animation import (
 from ocp.app.view.appearance import appearance_of, frames_along
 from ocp.app.view.player import PageServer, build_page
 from ocp.motion.local.collisions import distances_along
-from ocp.motion.plan.solved_plan import Part, SolvedPlan
+from ocp.motion.result.solved_plan import Part, SolvedPlan
 from ocp.motion.tasks.targets import targets_along
 from tests.models.machines.armoured import armoured_arm
 

@@ -32,8 +32,8 @@ from ocp import (
 from ocp.app.view.appearance import COMPARED, LIMIT, PLAN
 from ocp.motion.local.rates import LocalSolution
 from ocp.motion.plan import Candidate, Reason, Rejection
-from ocp.motion.plan.path_plan import PathPlan
-from ocp.motion.plan.solved_plan import SolvedPlan
+from ocp.motion.result.path_plan import PathPlan
+from ocp.motion.result.solved_plan import SolvedPlan
 
 START = np.array([0.3, 0.7, 0.5])
 TASK = TipTask(rows=(3, 4), velocity=(-0.1, 0.05))

@@ -14,7 +14,7 @@ from models import FixedBase, FreeFloating, Joint, Link, Path, Robot, SmoothPath
 from models.robot.dynamics import inverse_dynamics
 from ocp import Collocation, Plan, ProblemError, TipTask, joint_path, minimum_velocity_problem, plan, solve
 from ocp.motion.builders.joint_spline import PlannedJoints
-from ocp.motion.plan.solved_plan import SolvedPlan
+from ocp.motion.result.solved_plan import SolvedPlan
 from ocp.motion.schedule import JointLimits, LineLimits, schedule
 from tests.ocp.motion.schedule.check import dense, largest
 from tests.ocp.problems import Array

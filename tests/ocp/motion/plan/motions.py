@@ -15,7 +15,7 @@ from models import Arc, FixedBase, Helix, Link, Machine, Path, SmoothPath, merge
 from models.spatial import quaternion_product
 from ocp import TipTask
 from ocp.motion.plan import plan
-from ocp.motion.plan.solved_plan import SolvedPlan
+from ocp.motion.result.solved_plan import SolvedPlan
 from scripts.robots.robots import UR5
 from tests.models.robot.trees import Array, numeric
 from tests.ocp.motion.plan.replay import Arm

@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ocp import SolveError
-from ocp.motion.plan.candidate import Candidate, Reason, Rejection, Seed, Stage
 from ocp.motion.plan.candidate_queue import CandidateQueue, Solver
+from ocp.motion.result.candidate import Candidate, Reason, Rejection, Seed, Stage
 from ocp.motion.search.settings import PlannerSettings
 
 SETTINGS = PlannerSettings(max_failures=3)

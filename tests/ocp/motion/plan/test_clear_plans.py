@@ -44,9 +44,9 @@ from ocp import (
 )
 from ocp.motion.local.collisions import distances_along
 from ocp.motion.plan import planner
-from ocp.motion.plan.candidate import Candidate, Rejection
 from ocp.motion.plan.candidate_solver import CandidateSolver
 from ocp.motion.plan.planner import checked_request
+from ocp.motion.result.candidate import Candidate, Rejection
 from tests.models.machines.armoured import armoured_arm
 from tests.ocp.motion.plan.motions import DOWN, bent_seam
 from tests.ocp.motion.search.test_charts import planar

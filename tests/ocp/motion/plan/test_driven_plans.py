@@ -14,7 +14,7 @@ from models.arrays import Array
 from ocp import Limits, Plan, ProblemError, SolveError, TipTask, plan
 from ocp.app import main
 from ocp.motion.plan.actuators import ActuatorDemand
-from ocp.motion.plan.solved_plan import SolvedPlan
+from ocp.motion.result.solved_plan import SolvedPlan
 from tests.ocp.app.motions import write_robot
 from tests.ocp.app.test_command import TASK
 from tests.ocp.motion.builders.test_dynamics import torques_along

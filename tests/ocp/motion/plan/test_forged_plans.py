@@ -15,7 +15,7 @@ from ocp.app.check.plan_verdict import verdict_of
 from ocp.app.command import main
 from ocp.app.view.animation import animate_plan
 from ocp.app.view.report import report_of_plan
-from ocp.motion.plan.solved_plan import Part, SolvedPlan
+from ocp.motion.result.solved_plan import Part, SolvedPlan
 from tests.ocp.motion.plan.motions import planned
 
 pytestmark = pytest.mark.xdist_group("plan seam_ur5")

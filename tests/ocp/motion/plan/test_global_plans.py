@@ -10,8 +10,8 @@ import pytest
 
 from models import FixedBase, planar_chain
 from ocp import BoundWarning, Candidate, Cost, Plan, ProblemError, TipTask, Unreachable, plan
-from ocp.motion.plan.candidate import Reason, Rejection
 from ocp.motion.plan.candidate_solver import CandidateSolver
+from ocp.motion.result.candidate import Reason, Rejection
 from ocp.motion.search.search import AtlasSearch, checked_bound
 from ocp.motion.search.task_search import choose_samples
 from tests.ocp.motion.search.test_charts import moved, planar

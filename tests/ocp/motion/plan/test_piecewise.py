@@ -15,7 +15,7 @@ from models.arrays import Array
 from models.machines.moving_obstacle import MovingObstacle
 from ocp import DeadEnd, ProblemError, Scene, TipTask, plan
 from ocp.motion.plan.piecewise import _task_between
-from ocp.motion.plan.segmented_plan import SegmentedPlan
+from ocp.motion.result.segmented_plan import SegmentedPlan
 from tests.ocp.motion.search.test_charts import planar
 from tests.ocp.motion.search.test_reconfigurations import limited
 

@@ -17,8 +17,8 @@ import pytest
 from models import FixedBase, FreeFloating, Link, Machine, Mimic, Standing, planar_chain, rectangle
 from ocp import ProblemError, Solution
 from ocp.motion.plan import Candidate, Plan, Reason, Rejection
-from ocp.motion.plan.request import restored_request, stored_request
-from ocp.motion.plan.solved_plan import SolvedPlan
+from ocp.motion.result.request import restored_request, stored_request
+from ocp.motion.result.solved_plan import SolvedPlan
 from ocp.motion.schedule import JointTrajectory
 from ocp.problem.stored import pack_record, unpack_record
 from tests.models.robot.trees import numeric

@@ -14,7 +14,7 @@ import pytest
 
 from ocp import Plan, ProblemError
 from ocp.audit.audit import COST_LOST
-from ocp.motion.plan.segmented_plan import SegmentedPlan
+from ocp.motion.result.segmented_plan import SegmentedPlan
 from tests.models.robot.trees import Array
 from tests.ocp.motion.plan.test_piecewise import SECONDS, arm, in_segments, line
 

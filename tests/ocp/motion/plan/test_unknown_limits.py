@@ -28,7 +28,7 @@ from ocp import (
     solve,
 )
 from ocp.motion.builders.dynamics_plan import solve_dynamics
-from ocp.motion.plan.segmented_plan import SegmentedPlan
+from ocp.motion.result.segmented_plan import SegmentedPlan
 from tests.ocp.motion.tasks.space_tasks import UR5_START, ur5
 
 START = np.array([0.4, 0.9, -0.6])

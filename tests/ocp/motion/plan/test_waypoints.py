@@ -15,7 +15,7 @@ from models.robot.rebuild import lock_joints
 from models.spatial import quaternion_from_rotation
 from ocp import Cost, DeadEnd, Limits, ProblemError, Scene, Unreachable, Waypoints, plan
 from ocp.motion.local.collisions import distances_along
-from ocp.motion.plan.path_plan import PathPlan
+from ocp.motion.result.path_plan import PathPlan
 from tests.ocp.motion.search.test_charts import planar
 from tests.ocp.motion.tasks.space_tasks import PANDA_START, UR5_START, panda, ur5
 from tests.redundancy_benchmark import problem_of

@@ -12,10 +12,10 @@ import pytest
 from models import FreeFloating, center_of_mass
 from models.papers import paper_example
 from ocp import Candidate, Plan, SolveError, TipTask, Unreachable, plan
-from ocp.motion.plan.candidate import Reason, Rejection, Stage
 from ocp.motion.plan.candidate_solver import CandidateSolver
 from ocp.motion.plan.planner import checked_request
-from ocp.motion.plan.solved_plan import SolvedPlan
+from ocp.motion.result.candidate import Reason, Rejection, Stage
+from ocp.motion.result.solved_plan import SolvedPlan
 from ocp.motion.search.cells import CellSearch
 from ocp.motion.search.dead_end import DeadEnd
 from ocp.motion.tasks.equations import task_errors

@@ -17,7 +17,7 @@ from models.robot.rebuild import lock_joints
 from ocp import DeadEnd, ProblemError, Scene, TipTask, Waypoints, inverse_kinematics, plan
 from ocp.audit.clearance import ClosestPair
 from ocp.motion.local.closed_forms import closed_forms
-from ocp.motion.plan.path_plan import PathPlan
+from ocp.motion.result.path_plan import PathPlan
 from ocp.motion.search.charts import SelfMotionManifolds, TimeSample
 from ocp.motion.search.joint_space import JointSpace
 from ocp.motion.search.reconfigurations import fewest_segments, segment_ends

@@ -16,8 +16,8 @@ from models.arrays import Array
 from models.robot.rebuild import lock_joints
 from ocp import Cost, DeadEnd, ProblemError, Scene, SolveError, Unreachable, Waypoints, plan
 from ocp.motion.plan import waypoints
-from ocp.motion.plan.path_plan import PathPlan
 from ocp.motion.plan.waypoints import WaypointSettings
+from ocp.motion.result.path_plan import PathPlan
 from ocp.motion.search.reconfigurations import SectionSettings, section_values
 from ocp.motion.search.search import SearchSettings
 from tests.redundancy_benchmark import problem_of

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from models import Machine
 from models.arrays import Array
-from ocp.motion.plan.request import machines_of_phases
-from ocp.motion.plan.solved_plan import Part, SolvedPlan
+from ocp.motion.result.request import machines_of_phases
+from ocp.motion.result.solved_plan import Part, SolvedPlan
 from ocp.motion.tasks.targets import tip_poses
 from ocp.solution import Solution
 

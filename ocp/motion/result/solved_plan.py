@@ -16,9 +16,9 @@ from models.arrays import Array
 from ocp.audit.audit import Audit
 from ocp.errors import ProblemError, StorageWarning
 from ocp.motion.builders.tool_motion import CLOCK, PACE, SLOPES, Stretch
-from ocp.motion.plan.candidate import Candidate
-from ocp.motion.plan.motion import Plan
-from ocp.motion.plan.request import MotionRequest, request_of, restored_request, stored_request
+from ocp.motion.result.candidate import Candidate
+from ocp.motion.result.plan import Plan
+from ocp.motion.result.request import MotionRequest, request_of, restored_request, stored_request
 from ocp.motion.search.held_joints import all_joints
 from ocp.motion.tasks.targets import Target, targets_along
 from ocp.motion.tasks.tip_task import TipTask

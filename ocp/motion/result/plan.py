@@ -21,7 +21,7 @@ from models.arrays import MAX_LISTED, Array
 from ocp.audit.audit import Audit, Finding
 from ocp.console import interruptible
 from ocp.errors import NOT_NUMBERS, ProblemError, floats, sample_times, unknown_name
-from ocp.motion.plan.candidate import Candidate
+from ocp.motion.result.candidate import Candidate
 from ocp.motion.schedule.trajectory import JointTrajectory
 from ocp.motion.tasks.targets import Target, tip_poses
 from ocp.registry import call_registered

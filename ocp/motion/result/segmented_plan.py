@@ -16,9 +16,9 @@ from models.arrays import Array
 from ocp.audit.audit import COST_LOST, Audit, Finding
 from ocp.audit.clearance import Clearance
 from ocp.errors import ProblemError
-from ocp.motion.plan.candidate import Candidate
-from ocp.motion.plan.motion import Plan
-from ocp.motion.plan.solved_plan import SolvedPlan
+from ocp.motion.result.candidate import Candidate
+from ocp.motion.result.plan import Plan
+from ocp.motion.result.solved_plan import SolvedPlan
 from ocp.motion.tasks.targets import Target
 from ocp.problem.stored import ARRAY_NAMES, RECORD_ERRORS, pack_record, unpack_record
 from ocp.solution import Solution, read_head

@@ -16,9 +16,9 @@ from ocp.audit.audit import Audit, Finding, clearance_finding
 from ocp.audit.clearance import Clearance
 from ocp.errors import ProblemError
 from ocp.motion.builders.clearance import ClearanceConstraints, clearance_of
-from ocp.motion.plan.candidate import Candidate
-from ocp.motion.plan.motion import Plan
-from ocp.motion.plan.request import restored_request, stored_request
+from ocp.motion.result.candidate import Candidate
+from ocp.motion.result.plan import Plan
+from ocp.motion.result.request import restored_request, stored_request
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.targets import Target, tip_poses
 from ocp.problem.stored import ARRAY_NAMES, RECORD_ERRORS, pack_record, unpack_record
