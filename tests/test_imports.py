@@ -43,7 +43,7 @@ LAYERS = {
         ["motion"],
         ["app"],
     ],
-    "ocp.motion": [["tasks"], ["local", "schedule"], ["builders"], ["search"], ["plan"]],
+    "ocp.motion": [["tasks"], ["local", "schedule"], ["builders"], ["sampling", "search"], ["plan"]],
     "ocp.app": [["progress"], ["files", "batch"], ["check"], ["view"], ["run_task"], ["arguments"], ["command"]],
 }
 """Packages and single modules of each package, from the lowest layer up: each may import from lower layers only."""

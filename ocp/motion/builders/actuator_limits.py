@@ -62,6 +62,7 @@ class Effort:
             nothing.
         acceleration: Weight of the squared accelerations, one number or one for each joint. It matters for light joints
             at the end of an arm, which need hardly any torque.
+        velocity: Weight of half the squared velocities, one number or one for each joint.
         jerk: Weight of the squared jerks, if they are the control.
         turning: Weight of the squared angular velocity of a floating base, 1/(rad/s)^2/s.
         time: Weight of the final time, 1/s.
@@ -73,12 +74,14 @@ class Effort:
     torque: Any = 1.0
     energy: float = 0.0
     acceleration: Any = 0.0
+    velocity: Any = 0.0
     jerk: float = 0.0
     turning: float = 0.0
     time: float = 0.0
 
     def __post_init__(self) -> None:
-        each = [nonnegative_each(f"effort: {name}", getattr(self, name), None) for name in ("torque", "acceleration")]
+        vectors = ("torque", "acceleration", "velocity")
+        each = [nonnegative_each(f"effort: {name}", getattr(self, name), None) for name in vectors]
         names = ("energy", "jerk", "turning", "time")
         parts = [checked_nonnegative(f"effort: {name}", getattr(self, name)) for name in names]
         if not (any(parts) or np.concatenate(each).any()):

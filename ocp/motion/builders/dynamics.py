@@ -282,6 +282,7 @@ def _declare_actuators(
         largest = bounds.torque[limited]
         problem.path("torques", torques[limited], lower=-largest, upper=largest, unit=machine.robot.effort_unit)
     running = ca.dot(ca.DM(nonnegative_each("effort: acceleration", effort.acceleration, n)), motion.second**2)
+    running += ca.dot(ca.DM(nonnegative_each("effort: velocity", effort.velocity, n)), motion.rates**2) / 2
     running += effort.jerk * ca.sumsqr(motion.jerks)
     if effort.turning and isinstance(machine, FreeFloating):
         spin = [k for k, row in enumerate(machine.twist_rows) if row < 3]

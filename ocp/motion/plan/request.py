@@ -42,6 +42,7 @@ from ocp.errors import ProblemError
 from ocp.motion.builders.actuator_limits import Effort, JointFriction
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem
+from ocp.motion.builders.joint_motion import joint_motion_problem
 from ocp.motion.builders.standing.problem import FreeTime, StandingSetup, Weights, standing_problem
 from ocp.motion.builders.tool_motion import ToolMotion, stretches_of, tool_motion_problem
 from ocp.motion.search.configurations import PlanRequest
@@ -148,6 +149,7 @@ BUILDERS: dict[str, Callable[..., Problem]] = {
     "tool motion": _tool_motion,
     "standing": standing_problem,
     "dynamics": dynamics_problem,
+    "joint motion": joint_motion_problem,
 }
 
 
