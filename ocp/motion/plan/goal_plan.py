@@ -17,7 +17,7 @@ import numpy as np
 
 from models import FixedBase
 from models.arrays import Array
-from ocp.console import TimeLimitReached, interruptible, time_left, time_limited
+from ocp.console import TimeLimitReached, interruptible, time_limited
 from ocp.direct.guess import Samples
 from ocp.errors import ProblemError, SolveError, checked_instance, checked_positive
 from ocp.motion.builders.actuator_limits import Effort
@@ -26,12 +26,13 @@ from ocp.motion.builders.dynamics import QUINTIC, DynamicsSetup, dynamics_proble
 from ocp.motion.builders.dynamics_plan import audit_error, within_limits
 from ocp.motion.builders.joint_motion import joint_motion_problem, least_durations, motion_along
 from ocp.motion.builders.standing.problem import FreeTime
+from ocp.motion.builders.stopping_motion import segment_durations, stopping_motion
 from ocp.motion.plan.actuators import limits_actuators
 from ocp.motion.plan.candidate import Candidate, Reason, Rejection, Stage
 from ocp.motion.plan.motion import Part, Plan
 from ocp.motion.sampling.path_classes import JointPath, PathSearchSettings, find_paths
 from ocp.motion.sampling.random_trees import TreeSearch
-from ocp.motion.sampling.shortening import points_along
+from ocp.motion.sampling.shortening import points_along, shortest_through_corners
 from ocp.motion.sampling.straight import StraightMotions
 from ocp.motion.search.joint_space import FULL_TURN, JointSpace
 from ocp.motion.tasks.checks import checked_configuration, checked_horizon, checked_weights, clip_to_limits
@@ -49,21 +50,25 @@ class GoalSettings:
     Attributes:
         search: Settings of the search for paths.
         time_limit: Time after which a request without its own limit is refused, s.
+        search_share: Share of the time limit after which the search for further paths ends.
         unlimited_rate: Rate of joints without a rate limit, rad/s or m/s, where the planner chooses the horizon.
         spare: Horizon of a motion within actuator limits, where the planner chooses it, relative to the least times of
             the joints along the path.
         longest: Largest horizon in free time, relative to the same.
         guess_times: Samples of a guess.
+        near_bound: Relative excess of the cost over its lower bound below which a motion counts as optimal.
         near: Pairs of bodies closer than the clearance plus this along a path are separated from the first solve on, m.
         turns: Numbers of full turns by which goals of unlimited joints are shifted, beside the nearest one.
     """
 
     search: PathSearchSettings = field(default_factory=PathSearchSettings)
     time_limit: float = 20.0
+    search_share: float = 0.75
     unlimited_rate: float = 1.0
     spare: float = 2.0
     longest: float = 20.0
     guess_times: int = 201
+    near_bound: float = 1e-3
     near: float = 0.02
     turns: int = 1
 
@@ -147,16 +152,17 @@ def plan_to_goal(request: GoalRequest) -> Plan:
     task = _checked(request)
     seconds = request.settings.time_limit if request.time_limit is None else request.time_limit
     with time_limited(checked_positive("time_limit", seconds)):
-        paths = _paths(task, seconds)
+        with time_limited(request.settings.search_share * seconds):
+            paths = _paths(task, seconds)
         task.report(f"{len(paths)} paths, the shortest of length {paths[0].length:.4g}")
         solve = _within_actuator_limits if task.is_dynamic else _at_constant_speed
         candidates: list[Candidate] = []
         for path in paths:
-            if candidates and time_left() <= 0:
+            try:
+                candidates.append(solve(task, path))
+            except TimeLimitReached:
                 reason = Reason(Rejection.NOT_TRIED, "the time limit has passed", "time_limit", limit=seconds)
                 candidates.append(Candidate(path.joints[0], reason=reason))
-                continue
-            candidates.append(solve(task, path))
             task.report(f"path of length {path.length:.4g}: {candidates[-1]}")
     return _best(task, candidates)
 
@@ -316,14 +322,39 @@ def _within_actuator_limits(task: _Task, path: JointPath) -> Candidate:
             request.machine, (), horizon, **ends, limits=request.limits, effort=task.effort, setup=setup
         )
 
+    stopping = _stopping(task, path, declare(request.clearance_constraints))
+    bound = _bound(task, stopping.solution.horizon if stopping.solution is not None else duration)
+    if stopping.passed and stopping.cost <= (1 + settings.near_bound) * bound:
+        return stopping
     machines = {"": (request.machine, request.limits)}
     try:
         solution = within_limits(declare, constraints, None, (), None, None, machines, guess=guess)
     except SolveError as error:
         if isinstance(error.__cause__, KeyboardInterrupt):
             raise
+        if stopping.passed:
+            return stopping
         return Candidate(path.joints[0], reason=Reason.of_error(Rejection.INFEASIBLE, error), stage=Stage.SEED)
-    return _audited(solution, path)
+    smooth = _audited(solution, path)
+    return min((stopping, smooth), key=lambda candidate: (not candidate.passed, candidate.cost))
+
+
+def _stopping(task: _Task, path: JointPath, problem: Problem) -> Candidate:
+    """Return the audited motion within actuator limits that stops at corners of a path."""
+    request, bounds = task.request, task.bounds
+    problem_has_power = task.effort.energy or np.isfinite(bounds.power).any()
+    corners = shortest_through_corners(task.motions, path.joints, lambda changes: segment_durations(changes, bounds))
+    try:
+        motion = stopping_motion(request.machine, corners, bounds)
+        spare = 1.0 if request.horizon is None else request.horizon / motion.duration
+        if problem_has_power or spare < 1 - 1e-9:
+            words = f"stopping at {len(corners) - 2} corners takes {motion.duration:.4g} s"
+            raise SolveError(words, name="horizon", value=motion.duration, limit=request.horizon)
+        if not task.effort.time and request.horizon is None:
+            spare = request.settings.spare
+        return _audited(motion.slower(max(spare, 1.0)).solution(problem), path)
+    except SolveError as error:
+        return Candidate(path.joints[0], reason=Reason.of_error(Rejection.ACTUATORS, error), stage=Stage.SEED)
 
 
 def _audited(solution: Solution, path: JointPath) -> Candidate:

@@ -6,6 +6,7 @@ that are proven clear and shorter, so that it never becomes longer.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +14,7 @@ import numpy as np
 from models.arrays import Array
 from ocp.motion.sampling.straight import StraightMotions
 
-__all__ = ["ShorteningSettings", "path_length", "points_along", "same_class", "shorten"]
+__all__ = ["ShorteningSettings", "path_length", "points_along", "same_class", "shorten", "shortest_through_corners"]
 
 
 @dataclass(frozen=True)
@@ -61,12 +62,16 @@ def shorten(
         scale: Metric, as of `path_length`. Shape (n,).
         random: Source of the shortcuts that are tried.
     """
-    path = _shortest_through_corners(motions, path, scale)
+
+    def lengths_of(changes: Array) -> Array:
+        return np.asarray(np.linalg.norm(changes * scale, axis=1))
+
+    path = shortest_through_corners(motions, path, lengths_of)
     lengths = [path_length(path, scale)]
     for _ in range(settings.most_batches):
         if len(path) == 2:
             break
-        path = _shortest_through_corners(motions, _cut(motions, path, scale, random, settings.batch), scale)
+        path = shortest_through_corners(motions, _cut(motions, path, scale, random, settings.batch), lengths_of)
         lengths.append(path_length(path, scale))
         if (
             len(lengths) > settings.patience
@@ -90,13 +95,20 @@ def _places(path: Array, scale: Array) -> Array:
     return np.append(0.0, np.cumsum(np.linalg.norm(np.diff(path, axis=0) * scale, axis=1)))
 
 
-def _shortest_through_corners(motions: StraightMotions, path: Array, scale: Array) -> Array:
-    """Return the shortest path from the first to the last corner along straight motions between any corners."""
+def shortest_through_corners(motions: StraightMotions, path: Array, costs_of: Callable[[Array], Array]) -> Array:
+    """Return the path of least cost from the first to the last corner along clear straight motions between corners.
+
+    Args:
+        motions: Proofs of clearance.
+        path: Configurations with clear straight motions between them. Shape (M, n).
+        costs_of: Costs (K,) of straight motions by displacements (K, n).
+    """
     count = len(path)
     first, last = np.triu_indices(count, 2)
     clear = np.eye(count, k=1, dtype=bool)
     clear[first, last] = motions.are_clear(path[first], path[last])
-    costs = np.where(clear, np.linalg.norm((path[:, None] - path[None]) * scale, axis=2), np.inf)
+    costs = np.full((count, count), np.inf)
+    costs[clear] = costs_of((path[None] - path[:, None])[clear])
     best, previous = np.full(count, np.inf), np.zeros(count, dtype=int)
     best[0] = 0.0
     for corner in range(1, count):
