@@ -142,7 +142,7 @@ def result(data: str, kind: str, seed: int) -> Row:
     try:
         constraints = ClearanceConstraints(scene)
         plan = plan_to_goal(
-            GoalRequest(scene.machine, ends[0], np.array(ends[1:]), clearance_constraints=constraints, **options)
+            GoalRequest(machine_of(data), ends[0], np.array(ends[1:]), clearance_constraints=constraints, **options)
         )
         row = {"seconds": time.perf_counter() - begin, "cpu": time.process_time() - used}
         wrong += faults(data, scene, plan)
@@ -180,7 +180,7 @@ def main() -> None:
             seconds = [row["seconds"] for row in planned]
             lengths, times = ([row[name] for row in planned] for name in ("length", "time"))
             print(
-                f"{len(planned)} planned{mode}: mean length {np.mean(lengths):.4g} rad, duration {np.mean(times):.4g} s;"
+                f"{len(planned)} planned{mode}: mean length {np.mean(lengths):.4g} rad, {np.mean(times):.4g} s;"
                 f" found in {np.median(seconds):.3g} s (median), {max(seconds):.3g} s at most"
             )
 

@@ -21,6 +21,7 @@ from models.arrays import Array
 from ocp.console import check_time
 from ocp.motion.local.collisions import Collision, find_collisions, prepared_pairs
 from ocp.problem.hulls import Frames, frames_of
+from ocp.tolerances import CLEARANCE_TOLERANCE_M
 
 Indices = NDArray[np.intp]
 
@@ -37,6 +38,8 @@ class StraightMotionSettings:
         bent: Approach within half an interval below which the second bound is evaluated, m.
         first: Largest approach of two bodies within the intervals of the first level, m: at larger ones hardly any pair
             is decided.
+        tolerance: Distance by which the clearance may be missed, m: half of what the audit allows, so that motions may
+            begin and end at the clearance itself.
         difference: Step of finite differences, rad or m: the root of the rounding error of distances, 1e-10 m.
         block: Largest number of pairs of bodies, over all configurations, that are evaluated at once.
     """
@@ -44,6 +47,7 @@ class StraightMotionSettings:
     finest: float = 1e-3
     bent: float = 0.05
     first: float = 0.4
+    tolerance: float = CLEARANCE_TOLERANCE_M / 2
     difference: float = 1e-5
     block: int = 1_000_000
 
@@ -59,12 +63,16 @@ class StraightMotions:
         self.scene = scene if scene is not None and len(scene.pairs) else None
         self.settings = settings
         if self.scene is not None:
+            self._required = self.scene.clearance - settings.tolerance
             self._placements, self._bodies = prepared_pairs(self.scene)
             self._levers, self._turns = self.scene.levers.joints, self.scene.levers.joint_turns
 
     def collisions(self, joints: Array) -> list[Collision]:
         """Return the pairs closer than the clearance in a configuration (n,), the worst first."""
-        return [] if self.scene is None else find_collisions(self.scene, np.zeros(0), joints[None], np.zeros(1))
+        if self.scene is None:
+            return []
+        collisions = find_collisions(self.scene, np.zeros(0), joints[None], np.zeros(1))
+        return [collision for collision in collisions if collision.distance < self._required]
 
     def near_pairs(self, joints: Array, reach: float) -> tuple[Indices, Indices, Array, Array]:
         """Return the pairs of bodies closer than the clearance plus a reach, m, in configurations (M, n).
@@ -126,7 +134,7 @@ class StraightMotions:
         (approach, turning), (motion, middle, width) = sizes, intervals
         interval = pair = np.zeros(0, dtype=np.intp)  # undecided pairs of the intervals, after the first level
         first = True
-        required = self.scene.clearance  # type: ignore[union-attr]
+        required = self._required
         while len(motion):
             check_time()
             frames = self._frames_on(lines, motion, middle)
