@@ -28,7 +28,7 @@ endif
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help reproduce gallery benchmark site test long sweep crowded redundancy global brute passages frauds fuzz fresh moving faults browser installed check format dev build clean anew
+.PHONY: help reproduce gallery benchmark site test long sweep crowded mbm redundancy global brute passages frauds fuzz fresh moving faults browser installed check format dev build clean anew
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-10s  %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -67,6 +67,9 @@ global: $(VENV)/test.stamp ## plan seeded tasks by search over all motions, besi
 
 redundancy: $(VENV)/test.stamp ## plan the problems of a public benchmark of redundant arms, and check them (ARGS="--only panda__1cube")
 	$(BIN)/python -W ignore -m tests.sweep.redundancy --out "$(OUT)/sweeps/redundancy.jsonl" $(ARGS)
+
+mbm: $(VENV)/test.stamp ## plan 700 problems of MotionBenchMaker, and 70 in least time (DATA=FOLDER of robot and problems; ARGS="--only cage")
+	$(BIN)/python -W ignore -m tests.sweep.motion_bench_maker --data "$(DATA)" --out "$(OUT)/sweeps/motion_bench_maker.jsonl" $(ARGS)
 
 passages: $(VENV)/test.stamp ## plan 40 paths of floating arms past singularities that can be done (ARGS="--only beyond": that cannot)
 	$(BIN)/python -W ignore -m tests.sweep.passages --out "$(OUT)/sweeps/passages.jsonl" $(ARGS)

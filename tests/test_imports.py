@@ -43,7 +43,7 @@ LAYERS = {
         ["motion"],
         ["app"],
     ],
-    "ocp.motion": [["tasks"], ["local", "schedule"], ["builders"], ["search"], ["result"], ["plan"]],
+    "ocp.motion": [["tasks"], ["local", "schedule"], ["builders"], ["sampling", "search"], ["result"], ["plan"]],
     "ocp.app": [["files", "batch"], ["check"], ["view"], ["run_task"], ["arguments"], ["command"]],
 }
 """Packages and single modules of each package, from the lowest layer up: each may import from lower layers only."""

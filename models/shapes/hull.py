@@ -1,10 +1,10 @@
 """Convex hulls of points, and the closest points of pairs of convex hulls.
 
 `convex_hull` computes one hull with its vertices, triangles and face planes. `nearest_directions` computes the closest
-points of many pairs of hulls at once. Pairs of segments, and pairs of a segment and a box, are solved in closed form.
-Other pairs are solved by the algorithm of Gilbert, Johnson and Keerthi (1988), which searches the Minkowski difference
-for its point nearest to the origin. The gap along any direction (`gap_along`) is a lower bound of the distance, so a
-result can be verified without trusting the search.
+points of many pairs of hulls at once. Pairs of points and segments, and pairs of one of these and a box, are solved in
+closed form. Other pairs are solved by the algorithm of Gilbert, Johnson and Keerthi (1988), which searches the
+Minkowski difference for its point nearest to the origin. The gap along any direction (`gap_along`) is a lower bound of
+the distance, so a result can be verified without trusting the search.
 """
 
 from __future__ import annotations
@@ -154,7 +154,15 @@ def nearest_directions(
         overlap, the vector is the direction of least overlap among the candidate axes, which are complete for segments
         and boxes, and the two points coincide inside both hulls.
     """
-    if first.shape[1] == second.shape[1] == 2:
+    if first.shape[1] == 1 and (boxes[1] or second.shape[1] == 1):
+        on_first, on_second, difference = _point_beside_box(first, second)
+    elif second.shape[1] == 1 and boxes[0]:
+        on_second, on_first, difference = _point_beside_box(second, first)
+        difference = -difference
+    elif min(first.shape[1], second.shape[1]) == 1:
+        first, second = (np.repeat(p, 2, axis=1) if p.shape[1] == 1 else p for p in (first, second))
+        return nearest_directions(first, second, boxes)
+    elif first.shape[1] == second.shape[1] == 2:
         on_first, on_second, difference = _between_segments(first, second)
     elif first.shape[1] == 2 and boxes[1]:
         on_first, on_second, difference = _segment_beside_box(first, second)
@@ -218,6 +226,20 @@ def _segment_beside_box(rod: np.ndarray, box: np.ndarray) -> tuple[np.ndarray, n
     nearest = np.clip(x, -half, half)
     on_first, on_second, difference = ((part[:, None] @ axes)[:, 0] for part in (x, nearest, nearest - x))
     return on_first + centre, on_second + centre, difference
+
+
+def _point_beside_box(point: np.ndarray, box: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the same as `_between_segments` for a point (K, 1, 3) and the corners of a box (K, 8, 3) or a point."""
+    on_point = point[:, 0]
+    if box.shape[1] == 1:
+        return on_point, box[:, 0], box[:, 0] - on_point
+    centre = (box[:, 0] + box[:, 7]) / 2
+    axes = (box[:, [4, 2, 1]] - box[:, :1]) / 2
+    offset = on_point - centre
+    shares = (axes @ offset[:, :, None])[:, :, 0] / (axes * axes).sum(axis=2)
+    beyond = shares - np.clip(shares, -1.0, 1.0)
+    difference = -(beyond[:, None] @ axes)[:, 0]
+    return on_point, on_point + difference, difference
 
 
 def _between_hulls(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

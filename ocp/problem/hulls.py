@@ -65,7 +65,7 @@ class Hull:
         """Group of hulls that are evaluated together: 0 for boxes, else the number of points, rounded up to a power of
         two.
         """
-        return 0 if is_box(self.core) else 1 << max(1, (len(self.core) - 1).bit_length())
+        return 0 if is_box(self.core) else 1 << (len(self.core) - 1).bit_length()
 
     @cached_property
     def size(self) -> float:
@@ -222,10 +222,23 @@ class BodyPairs:
         """Return distances of all pairs at all samples, shape (M, n), m; those above `near` may be lower bounds above
         `near`.
         """
-        at, pair = np.arange(len(frames.positions))[:, None], np.arange(len(self._first))
-        middles = self._in_world(frames, at, self._middles, self._frames)
-        distances = self._ball_distance(middles[:, self._second] - middles[:, self._first], pair)
+        distances = self.all_balls(frames)
         at, pair = np.nonzero(~(distances >= near))
+        distances[at, pair] = self.gaps(frames, at, pair, near)
+        return np.where(np.isfinite(distances), distances, -np.inf)
+
+    def all_balls(self, frames: Frames) -> np.ndarray:
+        """Return the gaps between the balls that contain the bodies of all pairs at all samples. Shape (M, n), m."""
+        middles = self._in_world(frames, np.arange(len(frames.positions))[:, None], self._middles, self._frames)
+        square, along_normal = np.zeros((2, len(middles), len(self._first)))
+        for axis in range(3):  # one coordinate after the other: arrays of three columns are slow
+            offset = middles[:, self._second, axis] - middles[:, self._first, axis]
+            square += offset**2
+            along_normal += offset * self._normals[:, axis]
+        return np.asarray(np.where(self._flat, along_normal, np.sqrt(square)) - self._reach)
+
+    def gaps(self, frames: Frames, at: np.ndarray, pair: np.ndarray, near: float | np.ndarray = np.inf) -> np.ndarray:
+        """Return the distances of pairs at samples, (K,), m; those above `near`, (K,), may be lower bounds above it."""
         place, row = self._covered.of(pair)
         gap, count = np.full(len(row), -np.inf), len(pair)
 
@@ -236,8 +249,7 @@ class BodyPairs:
         measure(np.arange(count, len(row)))
         covered = gap[self._covered.decisive(place, gap, count)]
         measure(np.flatnonzero(~(covered >= near)))  # hulls are costly: skip those whose covers are far enough apart
-        distances[at, pair] = gap[self._covered.decisive(place, gap, count)]
-        return np.where(np.isfinite(distances), distances, -np.inf)
+        return np.asarray(gap[self._covered.decisive(place, gap, count)])
 
     def nearest(
         self, frames: Frames, at: np.ndarray, pair: np.ndarray

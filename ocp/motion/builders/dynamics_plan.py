@@ -46,7 +46,7 @@ from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.phases import DURATION, Phases
 from ocp.problem.problem import Problem, remembers_request
 from ocp.refinement import split
-from ocp.solution import Solution
+from ocp.solution import Guess, Solution
 from ocp.switching import WARM_START_OPTIONS, solve_at_switches
 from ocp.tightening import largest_excess, tighten
 
@@ -314,6 +314,8 @@ def within_limits(
     options: Mapping[str, Any] | None,
     tolerances: Mapping[str, float] | None,
     machines: Mapping[str, tuple[Machine, Limits | None]],
+    *,
+    guess: Guess = None,
 ) -> Solution:
     """Return a plan that satisfies its limits between the nodes and passes its audit; see `solve_dynamics`.
 
@@ -321,6 +323,7 @@ def within_limits(
         declare: Declares the problem under clearance constraints.
         breaks: Fractions of the horizon that get nodes.
         machines: Machine and limits by the name of the phase, "" without phases. Messages take joint names from them.
+        guess: Guess of the first solve; that of the problem if None.
     """
     mesh = POINTS if method is None else checked_instance("method", method, Collocation)
     settings = {**IPOPT, **checked_mapping("options", options)}
@@ -328,18 +331,18 @@ def within_limits(
 
     in_collision: Solution | None = None  # the last plan, if only its clearance failed
 
-    def solve_problem(problem: Problem, guess: Solution | None) -> Solution:
+    def solve_problem(problem: Problem, begin: Guess) -> Solution:
         nonlocal in_collision
         try:
-            return _first_within_limits(problem, mesh, settings, tolerances, guess)
+            return _first_within_limits(problem, mesh, settings, tolerances, begin)
         except SolveError as error:
             in_collision = error.solution if is_clearance(error.name) else None
-            if guess is None or in_collision is not None:
+            if begin is guess or in_collision is not None:
                 raise
-        return solve_problem(problem, None)
+        return solve_problem(problem, guess)
 
     def run(clearance_constraints: Constraints) -> Solution:
-        return solve_problem(declare(clearance_constraints), in_collision)
+        return solve_problem(declare(clearance_constraints), in_collision or guess)
 
     try:
         return solve_with_clearance(clearance_constraints, run)
@@ -352,7 +355,7 @@ def _first_within_limits(
     mesh: Collocation,
     settings: Mapping[str, Any],
     tolerances: Mapping[str, float] | None,
-    guess: Solution | None,
+    begin: Guess,
 ) -> Solution:
     """Return the plan of `within_limits` from several meshes, starting from a guess.
 
@@ -360,7 +363,7 @@ def _first_within_limits(
         SolveError: As `within_limits`; at once if collisions are all that is wrong with a plan.
     """
     reasons: list[str] = []
-    failure, last, begin = SolveError(), None, guess
+    failure, last, guess = SolveError(), None, begin
     feasible, costly = list[Solution](), list[tuple[Collocation, Solution]]()
     for _ in range(HOLDING.meshes):
         for variant, plan in _attempts(problem, mesh, settings, guess):
@@ -382,7 +385,7 @@ def _first_within_limits(
             if audit.failures:
                 failure = audit_error(audit, plan)
                 reasons.append(f"{name}: {failure}")
-        if guess is None or guess is begin:
+        if guess is begin or not isinstance(guess, Solution):
             break
         mesh = _finer(mesh, guess, failure)
     tightened = list[Solution]()
@@ -406,12 +409,12 @@ def _first_within_limits(
 
 
 def _attempts(
-    problem: Problem, mesh: Collocation, settings: Mapping[str, Any], guess: Solution | None
+    problem: Problem, mesh: Collocation, settings: Mapping[str, Any], guess: Guess
 ) -> Iterator[tuple[str, Solution | SolveError]]:
     """Yield plans on a mesh that satisfy their limits, or the errors; the caller stops when one is good enough."""
     warm = {**WARM_START_OPTIONS, **settings}
     try:
-        plan = solve(problem, mesh, options=warm if guess else settings, guess=guess)
+        plan = solve(problem, mesh, options=warm if isinstance(guess, Solution) else settings, guess=guess)
     except SolveError as error:
         yield "", error
         return

@@ -21,7 +21,15 @@ from ocp.errors import ProblemError, checked_instance
 from ocp.problem.hulls import BodyPairs, Hull, frames_of
 from ocp.problem.values import Sampler
 
-__all__ = ["Collision", "checked_collision_scene", "distances_along", "find_collisions", "scene_hulls", "slide_apart"]
+__all__ = [
+    "Collision",
+    "checked_collision_scene",
+    "distances_along",
+    "find_collisions",
+    "prepared_pairs",
+    "scene_hulls",
+    "slide_apart",
+]
 
 
 class Collision(NamedTuple):
@@ -69,7 +77,7 @@ def distances_along(scene: CollisionScene, base: Array, joints: Array, times: Ar
     count = len(joints)
     if not len(scene.pairs):
         return np.zeros((count, 0))
-    placements, bodies = _prepare(scene)
+    placements, bodies = prepared_pairs(scene)
     bases = np.broadcast_to(base, (count, scene.machine.base_size))
     return bodies.distances(frames_of(placements(bases, joints, np.reshape(times, (-1, 1)))[0]), cutoff)
 
@@ -90,7 +98,7 @@ def find_collisions(scene: CollisionScene, base: Array, joints: Array, times: Ar
     return sorted(collisions, key=lambda collision: collision.distance)
 
 
-def _prepare(scene: CollisionScene) -> tuple[Sampler, BodyPairs]:
+def prepared_pairs(scene: CollisionScene) -> tuple[Sampler, BodyPairs]:
     """Return the placements as a function of base, joints and time, and all pairs of bodies, cached with the scene."""
     cached: tuple[Sampler, BodyPairs] | None = scene.__dict__.get("_prepared")
     if cached is None:

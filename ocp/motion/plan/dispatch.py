@@ -7,14 +7,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, Literal, TypeAlias, get_args
 
+import numpy as np
+
 from models import FixedBase, Machine, Standing
-from ocp.console import interruptible, time_limited
-from ocp.errors import ProblemError, checked_choice, checked_count, checked_instance, checked_time_limit
+from ocp.console import TimeLimitReached, interruptible, time_left, time_limited
+from ocp.errors import ProblemError, SolveError, checked_choice, checked_count, checked_instance, checked_time_limit
+from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.space.capture import Capture
 from ocp.motion.builders.standing.problem import Weights
 from ocp.motion.builders.standing.stances import Steps
 from ocp.motion.builders.standing.steps import StepWeights
 from ocp.motion.local.inverse_kinematics import LARGEST_SEED
+from ocp.motion.plan.goal_configurations import goal_configurations
+from ocp.motion.plan.goal_plan import GoalRequest, plan_to_goal
 from ocp.motion.plan.goal_sequence import plan_capture, plan_sequence, plan_steps
 from ocp.motion.plan.piecewise import plan_in_segments
 from ocp.motion.plan.planner import checked_request, clearance_for, plan_request
@@ -26,11 +31,11 @@ from ocp.motion.result.plan import Plan
 from ocp.motion.result.segmented_plan import SegmentedPlan
 from ocp.motion.result.solved_plan import SolvedPlan
 from ocp.motion.tasks.cost import Cost
-from ocp.motion.tasks.goals import Goal, Waypoints
+from ocp.motion.tasks.goals import Goal, Start, Waypoints
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.scene import Scene
 from ocp.motion.tasks.tip_task import TipTask
-from ocp.progress import shown_progress
+from ocp.progress import report, shown_progress
 from ocp.storage import read_arrays
 
 __all__ = ["Search", "load_plan", "plan"]
@@ -102,7 +107,13 @@ def plan(
     checked_choice("search", search, get_args(Search))
     checked_count("seed", seed, 0, LARGEST_SEED)
     with time_limited(checked_time_limit(time_limit)), shown_progress("plan", progress):
-        return _plan(machine, tasks, horizon, start, cyclic, cost, limits, scene, search, seed)
+        try:
+            return _plan(machine, tasks, horizon, start, cyclic, cost, limits, scene, search, seed)
+        except TimeLimitReached as error:
+            if time_limit is None:  # that of an outer call
+                raise
+            words = f"no motion was found within the time limit of {time_limit:g} s; raise time_limit"
+            raise SolveError(words, name="time_limit", limit=time_limit) from error
 
 
 def _plan(
@@ -139,12 +150,58 @@ def _plan(
     goals = (tasks,) if isinstance(tasks, Goal) else tasks
     if isinstance(goals, Sequence) and isinstance(next(iter(goals), None), Goal):
         _check_unused("a motion to goals", cyclic=cyclic or None)
+        if len(goals) == 1 and isinstance(machine, FixedBase) and _is_simple(goals[0]):
+            return plan_to_goal(_goal_request(machine, goals[0], horizon, constraints=constraints, **options))
         return plan_sequence(machine, goals, horizon, constraints=constraints, **options)
     options |= {"search": search, "cyclic": cyclic}
     if isinstance(machine, Standing):
         return plan_to_stand(machine, tasks, horizon, clearance_constraints=constraints, **options)
     request = checked_request(machine, tasks, horizon, **options)
     return plan_request(replace(request, clearance_constraints=constraints))
+
+
+def _is_simple(goal: Goal) -> bool:
+    """Return whether nothing is asked on the way to a goal, and the machine stays as it is."""
+    has_tasks = not (isinstance(goal.tasks, Sequence) and not goal.tasks)
+    return not has_tasks and goal.machine is None and goal.base is None
+
+
+def _goal_request(
+    machine: FixedBase,
+    goal: Goal,
+    horizon: Any,
+    *,
+    start: Any,
+    cost: Cost | None,
+    limits: Limits | None,
+    constraints: ClearanceConstraints | None,
+    seed: int,
+) -> GoalRequest:
+    """Return the request for a motion to one goal.
+
+    Raises:
+        ProblemError: The start is missing, or as in `goal_configurations`.
+    """
+    state, joints, _ = Start.of(start, machine)
+    if joints is None:
+        raise ProblemError("start is missing: a goal is reached from somewhere; give plan(..., start=)", name="start")
+    own_limits = Limits() if limits is None else checked_instance("limits", limits, Limits)
+    places: dict[str, Any] = {"limits": own_limits, "constraints": constraints, "seed": seed}
+    own_cost = Cost(time=float(horizon == "free")) if cost is None else checked_instance("cost", cost, Cost)
+    return GoalRequest(
+        machine,
+        joints,
+        goal_configurations(machine, goal, joints, **places),
+        horizon=goal.duration if horizon in (None, "free") else horizon,
+        limits=own_limits,
+        cost=own_cost,
+        start_velocity=state.velocity,
+        end_velocity=goal.velocity,
+        clearance_constraints=constraints,
+        seed=seed,
+        time_limit=time_left() if np.isfinite(time_left()) else None,
+        progress=report,
+    )
 
 
 def _check_unused(reason: str, **arguments: Any) -> None:

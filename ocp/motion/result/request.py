@@ -47,6 +47,7 @@ from ocp.motion.builders.actuator_limits import JointFriction
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem
 from ocp.motion.builders.dynamics_plan import dynamics_phases, machines_of
+from ocp.motion.builders.joint_motion import joint_motion_problem
 from ocp.motion.builders.space.capture import Capture, capture_machines, capture_problem
 from ocp.motion.builders.space.grasping import Cone, Grasp
 from ocp.motion.builders.standing.problem import FreeTime, StandingSetup, Weights, standing_problem
@@ -181,6 +182,7 @@ BUILDERS: dict[str, Callable[..., Problem]] = {
     "dynamics phases": dynamics_phases,
     "steps": steps_problem,
     "capture": capture_problem,
+    "joint motion": joint_motion_problem,
 }
 MACHINE_NAMES = ("machine", "chaser")
 """Arguments that are the machine of a motion."""

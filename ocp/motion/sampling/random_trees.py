@@ -1,0 +1,147 @@
+"""Bidirectional random trees: collision-free joint paths from a start to one of several goals.
+
+Two trees of straight motions grow from the start and from the goals towards random configurations, and towards each
+other (RRT-Connect: Kuffner & LaValle 2000). Every edge is proven clear (`ocp.motion.sampling.straight`). Many edges are
+proven at once: an edge of a Panda among boxes takes 0.5 ms in a batch and 9 ms by itself.
+
+The planners of OMPL are not used: they ask Python for one edge at a time, so that batches are impossible, and they
+accept a seed only once for each process, so that a repeated call has another result.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.arrays import Array
+from ocp.console import check_time
+from ocp.motion.sampling.straight import StraightMotions
+
+Indices = NDArray[np.intp]
+
+__all__ = ["RandomTreeSettings", "TreeSearch", "connect"]
+
+
+@dataclass(frozen=True)
+class RandomTreeSettings:
+    """Settings of the random trees.
+
+    Attributes:
+        batch: Number of random configurations towards which a tree grows at once.
+        longest: Longest edge, as a share of the diagonal of the sampled box.
+    """
+
+    batch: int = 16
+    longest: float = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class TreeSearch:
+    """Request for paths between a start and goals.
+
+    Attributes:
+        motions: Proofs of clearance.
+        lower, upper: Box from which configurations are sampled; it holds start and goals. Shape (n,), rad or m.
+        scale: Distances are lengths of scale * dq. Shape (n,).
+        settings: Settings.
+    """
+
+    motions: StraightMotions
+    lower: Array
+    upper: Array
+    scale: Array
+    settings: RandomTreeSettings = RandomTreeSettings()
+
+
+class _Tree:
+    """Tree of configurations with the index of each one's parent."""
+
+    def __init__(self, roots: Array) -> None:
+        self.nodes, self.parents = roots.copy(), np.full(len(roots), -1)
+
+    def add(self, nodes: Array, parents: Indices) -> Indices:
+        """Add nodes and return their indices."""
+        first = len(self.nodes)
+        self.nodes, self.parents = np.vstack([self.nodes, nodes]), np.append(self.parents, parents)
+        return np.arange(first, len(self.nodes))
+
+    def nearest(self, joints: Array, scale: Array) -> Indices:
+        """Return the index of the node that is nearest to each configuration (K, n)."""
+        nodes, points = self.nodes * scale, joints * scale
+        return np.asarray(((nodes**2).sum(axis=1) - 2 * points @ nodes.T).argmin(axis=1))
+
+    def branch(self, index: int) -> Array:
+        """Return the nodes from a node to its root. Shape (K, n)."""
+        indices = [index]
+        while self.parents[indices[-1]] >= 0:
+            indices.append(int(self.parents[indices[-1]]))
+        return self.nodes[indices]
+
+
+def connect(
+    search: TreeSearch, start: Array, goals: Array, random: np.random.Generator, most_nodes: int
+) -> Array | None:
+    """Return a path of straight motions, each proven clear, from the start to a goal; None if none was found.
+
+    Args:
+        search: Proofs of clearance, box and metric.
+        start: Shape (n,). goals: Shape (K, n).
+        random: Source of the samples.
+        most_nodes: Number of configurations, proven reachable or not, after which the search ends.
+
+    Returns:
+        Configurations, shape (M, n), or None after the largest number, which does not prove that there is no path.
+
+    Raises:
+        TimeLimitReached: The time limit has passed.
+    """
+    lower, upper, settings = search.lower, search.upper, search.settings
+    step = settings.longest * float(np.linalg.norm((upper - lower) * search.scale))
+    trees = _Tree(start[None]), _Tree(goals)
+    growing, tried = 0, 0
+    while tried < most_nodes:
+        check_time()
+        tried += settings.batch
+        tree, other = trees[growing], trees[1 - growing]
+        samples = lower + (upper - lower) * random.random((settings.batch, len(lower)))
+        parents = tree.nearest(samples, search.scale)
+        nodes = _towards(tree.nodes[parents], samples, step, search.scale)
+        clear = search.motions.are_clear(tree.nodes[parents], nodes)
+        new = tree.add(nodes[clear], parents[clear])
+        if len(new):
+            targets = other.nearest(tree.nodes[new], search.scale)
+            met = _grow_to(search, tree, new, other.nodes[targets], step)
+            if met is not None:
+                place, index = met
+                ends = tree.branch(index)[::-1], other.branch(int(targets[place]))[1:]
+                path = np.vstack(ends)
+                return path if growing == 0 else path[::-1].copy()
+        growing = int(len(trees[0].nodes) > len(trees[1].nodes))
+    return None
+
+
+def _towards(starts: Array, targets: Array, step: float, scale: Array) -> Array:
+    """Return configurations at most a step away from the starts (K, n), towards the targets."""
+    length = np.linalg.norm((targets - starts) * scale, axis=1, keepdims=True)
+    return np.where(length <= step, targets, starts + (targets - starts) * (step / np.maximum(length, step)))
+
+
+def _grow_to(search: TreeSearch, tree: _Tree, new: Indices, targets: Array, step: float) -> tuple[int, int] | None:
+    """Grow a tree from new nodes towards targets (K, n) of the other tree, step by step.
+
+    Returns:
+        Which of the targets is reached, and the tree's node there; None if none is.
+    """
+    places = np.arange(len(new))
+    while len(places):
+        starts = tree.nodes[new]
+        ends = _towards(starts, targets[places], step, search.scale)
+        clear = search.motions.are_clear(starts, ends)
+        places, parents, ends = places[clear], new[clear], ends[clear]
+        new = tree.add(ends, parents)
+        reached = np.flatnonzero((ends == targets[places]).all(axis=1))
+        if len(reached):
+            return int(places[reached[0]]), int(new[reached[0]])
+    return None
