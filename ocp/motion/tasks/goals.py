@@ -95,6 +95,9 @@ class Goal:
         if self.joints is not None and named:
             words = f"a goal has joints or a pose, not both: leave out joints, or {', '.join(named)}"
             raise ProblemError(words, name="joints", value=self.joints)
+        if self.tip is not None and not named:
+            words = "goal: tip names the link whose pose is meant; give a position, orientation, direction or region"
+            raise ProblemError(words, name="tip", value=self.tip)
         if self.position is not None and self.region is not None:
             words = "a goal has a position or a region in which the tip may lie, not both"
             raise ProblemError(words, name="region", value=self.region)
