@@ -1,8 +1,9 @@
 """Covers of a mesh by a few capsules or by one box, whose distances are exact and fast.
 
 First, one capsule of least volume is fitted to the mesh. Then the mesh is split across the plane that lowers the
-covered volume most, each side gets its own capsule, the largest one is split again, and so on up to a few parts. The number of parts weighs volume
-against cost. A box replaces the capsules where it is clearly smaller, because distances of boxes cost many times more.
+covered volume most, each side gets its own capsule, the largest one is split again, and so on up to a few parts. The
+number of parts weighs volume against cost. A box replaces the capsules where it is clearly smaller, because distances
+of boxes cost many times more.
 
 Every triangle, split at the planes, lies in the capsule of its part. So do all points that a closed surface encloses:
 from a point between two planes of a split, a line parallel to the planes meets the surface between them.
