@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from models import CollisionShape, FixedBase, Joint, Link, ModelWarning, Robot, Sphere, attach_tool, lock_joints
-from ocp import Limits, ProblemError, TipTask, plan
+from ocp import Limits, ProblemError, TipTask, inverse_kinematics, plan
 from ocp.motion.plan.motion import Plan
 from ocp.motion.search.held_joints import all_joints
 from tests.models.robot.pinocchio_robots import ROBOTS, urdf_file
@@ -148,14 +148,23 @@ def test_a_head_in_the_way_goes_to_the_nearest_free_position() -> None:
     assert 0 < abs(result.held["head"]) < 1.5
 
 
-def test_a_head_that_blocks_the_way_is_released() -> None:
+def test_a_head_that_blocks_the_way_is_moved_aside() -> None:
     """The middle of its range is free at the start, but the way leads through it."""
     machine = person(torso=0, ball=True)
     line = TipTask(position=lambda t: ca.DM([0.34, 0.05]) + 0.25 * t * ca.DM([0, 1]), duration=DURATION, **PLANE)
     result = plan(machine, line)
     assert result.audit().passed
+    assert abs(result.held["head"]) > 0.1
+
+
+def test_a_head_that_blocks_the_way_from_its_given_position_gives_way() -> None:
+    machine = person(torso=0, ball=True)
+    line = TipTask(position=lambda t: ca.DM([0.36, 0.0]) + 0.15 * t * ca.DM([0, 1]), duration=DURATION, **PLANE)
+    start = inverse_kinematics(machine, line, near=np.array([0.0, 0.2, 1.2, 0.9]), starts=0)[0].joints
+    result = plan(machine, line, start=np.append(0.0, start[1:]))
+    assert result.audit().passed
     assert result.held == {}
-    assert np.abs(result["joints"][:, 0]).min() > 0.1
+    assert np.ptp(result["joints"][:, 0]) > 0.1
 
 
 def test_an_obstacle_at_a_held_body_is_an_error_and_a_closed_gripper_a_warning() -> None:
