@@ -7,7 +7,7 @@ joints between that link and the bodies move them relative to each other.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,7 +25,7 @@ from models.robot.kinematics import link_frames
 from models.robot.robot import Robot
 from models.shapes.bodies import Body, LinkMesh, MissingRule, RigidParts, collision_bodies, lever_arms
 from models.shapes.distance import COLUMNS, column, distance, pair_function, soft_minimum
-from models.shapes.pairs import ASSUMED, COVERED, IGNORED, IMMOBILE, SRDF, Reason, checked_pairs
+from models.shapes.pairs import ASSUMED, COVERED, IGNORED, IMMOBILE, RIGID, SRDF, Pairs, Reason, checked_pairs
 from models.shapes.shapes import KINDS, Box, Shape, checked_shape
 from models.spatial import Expression, Frame, expression
 
@@ -67,6 +67,8 @@ class CollisionScene:
             are excluded.
         covered: Bodies that replace the meshes of links, as in `collision_bodies`; computed from the mesh
             files if None. Holds the bodies in use after construction.
+        classified: Pairs of links that are checked or not, as `checked_pairs` returns them for this machine or one
+            with more moving joints; computed if None.
         bodies: All shapes of the scene: of links, obstacles and hulls of meshes.
         pairs: Two bodies and the reference frame of each pair, -1 for the world. Shape (n, 3).
         covers: For pairs of hulls, by index, all pairs of bodies that cover the two meshes, shape (m, 2), or none if
@@ -86,6 +88,7 @@ class CollisionScene:
     missing: MissingRule = "raise"
     limits: bool = True
     covered: Mapping[tuple[str, int], tuple[Body, ...]] | None = None
+    classified: Pairs | None = field(default=None, repr=False)
     bodies: tuple[PlacedShape, ...] = field(init=False, repr=False)
     pairs: Array = field(init=False, repr=False)
     covers: dict[int, Array] = field(init=False, repr=False)
@@ -116,11 +119,24 @@ class CollisionScene:
         link_pairs, obstacle_pairs = self._ignored_pairs()
         unlimited: dict[str, Any] = {"lower": -np.inf, "upper": np.inf}
         limits = {} if checked_flag(self.limits, "scene", "limits") else unlimited
-        known = checked_pairs(robot, own, ignored=link_pairs, srdf=self.srdf, clearance=clearance, **limits)
+        known = self.classified
+        if known is None:
+            known = checked_pairs(robot, own, ignored=link_pairs, srdf=self.srdf, clearance=clearance, **limits)
+        object.__setattr__(self, "classified", known)
         object.__setattr__(self, "_parts", RigidParts.of(robot))
         with_obstacles, excluded = self._pairs_with_obstacles(own, obstacle_pairs)
-        object.__setattr__(self, "left", {**known.left, **excluded})
-        self._place(own, known.checked, with_obstacles)
+        parts = [self._parts.of_link[body.link] for body in own]
+        checked = [(i, j) for i, j in known.checked if parts[i] != parts[j]]
+        rigid = {(own[i].link, own[j].link): RIGID for i, j in known.checked if parts[i] == parts[j]}
+        object.__setattr__(self, "left", {**known.left, **rigid, **excluded})
+        self._place(own, checked, with_obstacles)
+
+    def with_locked(self, machine: Machine) -> CollisionScene:
+        """Return the scene of the same machine with some joints locked, with those of its pairs that still move.
+
+        A scene of its own would take links as adjacent that only the locked joints connect.
+        """
+        return replace(self, machine=machine)
 
     def _ignored_pairs(self) -> tuple[list[tuple[str, str]], set[tuple[str, str]]]:
         """Return the ignored pairs of two links, and those of a link and an obstacle."""

@@ -49,7 +49,7 @@ from ocp.motion.search.configurations import (
     start_collisions,
 )
 from ocp.motion.search.dead_end import DeadEnd
-from ocp.motion.search.held_joints import hold_idle_joints, place_held_joints, released, restore_error
+from ocp.motion.search.held_joints import hold_idle_joints, moved_aside, place_held_joints, released, restore_error
 from ocp.motion.search.search import checked_bound
 from ocp.motion.search.task_search import TaskSearch
 from ocp.motion.tasks.checks import checked_tasks, clip_to_limits, horizon_of
@@ -262,14 +262,17 @@ def plan_request(request: PlanRequest) -> SolvedPlan:
     Raises:
         ProblemError, SolveError: As in `plan`.
     """
-    whole, attempt = request, hold_idle_joints(request)
+    attempt, changes = hold_idle_joints(request), [moved_aside, released]
     while True:
         try:
-            return _plan_attempt(whole, attempt)
-        except (SolveError, Unreachable) as error:
-            if isinstance(error, DeadEnd | Unreachable) or (freer := released(whole, attempt, error)) is None:
+            return _plan_attempt(request, attempt)
+        except SolveError as error:
+            following = None
+            while following is None and changes:
+                following = changes.pop(0)(request, attempt, error)
+            if following is None:
                 raise
-            attempt = freer
+            attempt = following
 
 
 def _plan_attempt(whole: PlanRequest, request: PlanRequest) -> SolvedPlan:

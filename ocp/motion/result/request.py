@@ -321,7 +321,7 @@ def restored_request(record: Any) -> MotionRequest:
             str(name): float(position) for name, position in _read(pool.get("held", {"pool": []}), [], None).items()
         }
         owner = hold_joints(machine, held) if held else machine
-        others = {name: _read(value, functions, owner) for name, value in pool.items() if name != first}
+        others = {name: _read(value, functions, (machine, owner)) for name, value in pool.items() if name != first}
         arguments = {first: own, **others}
         if record["builder"] not in BUILDERS and record["builder"] != "":
             raise ValueError(f"builder {record['builder']!r} is not known")
@@ -330,9 +330,11 @@ def restored_request(record: Any) -> MotionRequest:
         raise ProblemError(f"the stored request is damaged: {error}", name="request") from error
 
 
-def _read(value: Any, functions: list[Any], machine: Machine | None) -> Any:
+def _read(value: Any, functions: list[Any], machines: tuple[Machine, Machine] | None) -> Any:
+    """Return the value of a record; `machines` are the machine and the same with its held joints locked."""
+
     def read(part: Any) -> Any:
-        return _read(part, functions, machine)
+        return _read(part, functions, machines)
 
     if isinstance(value, list):
         return tuple(read(part) for part in value)
@@ -346,9 +348,11 @@ def _read(value: Any, functions: list[Any], machine: Machine | None) -> Any:
         at = _of_time(functions[value["track"]])
         return at if "rate" not in value else TrackWithRate(at, _of_time(functions[value["rate"]]))
     fields = {name: read(part) for name, part in value["fields"].items()}
-    if value["kind"] == "CollisionScene":
+    if value["kind"] == "CollisionScene" and machines is not None:
+        whole, own = machines
         options = {name: fields[name] for name in ("obstacles", "clearance", "ignored", "limits")}
-        return CollisionScene(machine, **options, covered=_covered(fields["covered"]))  # type: ignore[arg-type]
+        scene = CollisionScene(whole, **options, covered=_covered(fields["covered"]))
+        return scene if own is whole else scene.with_locked(own)
     if fields.get("file") is not None and value["kind"] == "Mesh":
         raise ValueError("a mesh names a file, which is not read")
     return KINDS[value["kind"]](**fields)

@@ -81,7 +81,7 @@ class PlanRequest:
         free = np.array([name not in positions for name in self.machine.robot.joint_names])
         machine, constraints = hold_joints(self.machine, positions), self.clearance_constraints
         if constraints is not None:
-            scene = replace(constraints.scene, machine=machine)
+            scene = constraints.scene.with_locked(machine)
             constraints = ClearanceConstraints(scene) if len(scene.pairs) else None
         return replace(
             self,

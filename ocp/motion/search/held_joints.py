@@ -36,7 +36,7 @@ from ocp.motion.search.dead_end import DeadEnd
 from ocp.motion.search.search import MAX_FREE_DIRECTIONS
 from ocp.motion.tasks.equations import bind
 
-__all__ = ["all_joints", "hold_idle_joints", "place_held_joints", "released", "restore_error"]
+__all__ = ["all_joints", "hold_idle_joints", "moved_aside", "place_held_joints", "released", "restore_error"]
 
 STIFFNESS = 1e6
 """Weight of the rates of shared joints, relative to their own, with which a local motion leaves them nearly still."""
@@ -97,14 +97,10 @@ def _place_idle_joints(whole: PlanRequest, request: PlanRequest, configurations:
 
     If held bodies of the machine collide with each other wherever they are, that is ignored.
     """
-    robot, bounds, own = whole.machine.robot, whole.bounds, _own_held(whole, request)
+    robot, own = whole.machine.robot, _own_held(whole, request)
     if whole.clearance_constraints is None or whole.start is not None or not own:
         return request
-    columns = [robot.joint_names.index(name) for name in own]
-    samples = sample_starts(whole.machine, bounds.lower, bounds.upper, whole.settings.ik_starts, None, whole.seed)
-    present = np.array(list(own.values()))
-    order = np.argsort(np.abs(samples[:, columns] - present).max(axis=1), kind="stable")
-    choices = [own, *(_named(whole.machine, sample, columns) for sample in samples[order])]
+    choices = [own, *_nearest_positions(whole, own)]
     still = _still_pairs(whole, request)
     places = np.array([all_joints(robot, held, configurations[0]) for held in choices])
     apart = [collision is None for collision in start_collisions(whole, places, still)]
@@ -162,24 +158,66 @@ def _check_held_bodies(whole: PlanRequest, request: PlanRequest, configuration: 
         warn(ModelWarning(words, name=" and ".join(collision.bodies), **details), stacklevel=2)
 
 
-def released(whole: PlanRequest, request: PlanRequest, error: SolveError) -> PlanRequest | None:
-    """Return the request with those joints free that move a body of a collision; None if they are free already.
+def moved_aside(whole: PlanRequest, request: PlanRequest, error: SolveError) -> PlanRequest | None:
+    """Return the request with those joints elsewhere that move a body of a collision, clear of a local motion.
 
     Args:
         whole: Request before joints were held.
         request: Request with held joints.
         error: Why no motion passes. A collision is named by its two bodies.
+
+    Returns:
+        The request with the nearest such positions; None if the start is given, or there are none.
     """
-    constraints = whole.clearance_constraints
-    if constraints is None or not request.held or request.search == "global":
+    names = _obstructing(whole, request, error)
+    if not names or whole.start is not None:
         return None
-    scene = constraints.scene
+    assert whole.clearance_constraints is not None
+    robot, levers, own = whole.machine.robot, whole.clearance_constraints.scene.levers.joints, _own_held(whole, request)
+    columns = [robot.joint_names.index(name) for name in names]
+    pairs = np.flatnonzero((levers[:, columns] > 0).any(axis=1)).tolist()
+    motions = local_motions_from(request, start_configurations(request))
+    joints = np.concatenate([motion.joints for motion in motions], axis=1)
+    joints = joints[:, np.linspace(0, joints.shape[1] - 1, whole.settings.compared_samples).astype(int)]
+
+    def clear(held: Mapping[str, float]) -> bool:
+        samples = all_joints(robot, held, joints.reshape(-1, joints.shape[2]))
+        free = np.array([collision is None for collision in start_collisions(whole, samples, pairs)])
+        return bool(free.reshape(joints.shape[:2]).all(axis=1).any())
+
+    elsewhere = ({**own, **held} for held in _nearest_positions(whole, {name: own[name] for name in names}))
+    best = next(filter(clear, elsewhere), None)
+    return None if best is None else whole.with_held(best)
+
+
+def released(whole: PlanRequest, request: PlanRequest, error: SolveError) -> PlanRequest | None:
+    """Return the request with those joints free that move a body of a collision; None if they are free already.
+
+    Args: As in `moved_aside`.
+    """
+    names = _obstructing(whole, request, error)
+    if not names or request.search == "global":
+        return None
+    return whole.with_held({name: place for name, place in _own_held(whole, request).items() if name not in names})
+
+
+def _obstructing(whole: PlanRequest, request: PlanRequest, error: SolveError) -> list[str]:
+    """Return the held joints that move a body of the collision in an error."""
+    if whole.clearance_constraints is None:
+        return []
+    scene, own = whole.clearance_constraints.scene, _own_held(whole, request)
     pairs = [pair for pair, bodies in enumerate(scene.labels) if " and ".join(bodies) == error.name]
     columns = np.unique(np.nonzero(scene.levers.joints[pairs])[1]).tolist()
-    names = {whole.machine.robot.joint_names[column] for column in columns}
-    own = _own_held(whole, request)
-    held = {name: position for name, position in own.items() if name not in names}
-    return whole.with_held(held) if len(held) < len(own) else None
+    return [name for name in (whole.machine.robot.joint_names[column] for column in columns) if name in own]
+
+
+def _nearest_positions(whole: PlanRequest, held: Mapping[str, float]) -> list[dict[str, float]]:
+    """Return random positions of held joints within their limits, the nearest to the present ones first."""
+    names, bounds = whole.machine.robot.joint_names, whole.bounds
+    samples = sample_starts(whole.machine, bounds.lower, bounds.upper, whole.settings.ik_starts, None, whole.seed)
+    columns = [names.index(name) for name in held]
+    order = np.argsort(np.abs(samples[:, columns] - np.array([*held.values()])).max(axis=1), kind="stable")
+    return [_named(whole.machine, sample, columns) for sample in samples[order]]
 
 
 def _hold_shared_joints(request: PlanRequest, configurations: Array) -> PlanRequest:
