@@ -9,7 +9,7 @@ from typing import Any, Literal, TypeAlias, get_args
 
 from models import FixedBase, Machine, Standing
 from ocp.console import interruptible, time_limited
-from ocp.errors import ProblemError, checked_choice, checked_count, checked_instance, checked_time_limit
+from ocp.errors import ProblemError, checked_choice, checked_count, checked_flag, checked_instance, checked_time_limit
 from ocp.motion.builders.space.capture import Capture
 from ocp.motion.builders.standing.problem import Weights
 from ocp.motion.builders.standing.stances import Steps
@@ -100,6 +100,7 @@ def plan(
             in how few segments they may be done (search="segments").
     """
     checked_choice("search", search, get_args(Search))
+    checked_flag("cyclic", cyclic)
     checked_count("seed", seed, 0, LARGEST_SEED)
     with time_limited(checked_time_limit(time_limit)), shown_progress("plan", progress):
         return _plan(machine, tasks, horizon, start, cyclic, cost, limits, scene, search, seed)
