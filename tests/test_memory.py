@@ -27,7 +27,7 @@ VAST: Bad = {  # of which no memory is taken until they are copied
     "list of a long range": [range(10**12)],
 }
 COUNTLESS: Bad = {"countless": 10**12, "more than a machine word": 10**30}
-SEEDED = ("inverse_kinematics", "plan", "plan in segments", "plan through waypoints")
+SEEDED = ("inverse_kinematics", "plan", "plan in segments", "plan through waypoints", "plan to a goal")
 TAKEN = {("TipTask", "velocity"), *((name, "seed") for name in SEEDED)}
 """Where something vast may be taken: what is looked at when it is used, and a seed, which may be any whole number."""
 

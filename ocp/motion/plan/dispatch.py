@@ -11,7 +11,15 @@ import numpy as np
 
 from models import FixedBase, Machine, Standing
 from ocp.console import TimeLimitReached, interruptible, time_left, time_limited
-from ocp.errors import ProblemError, SolveError, checked_choice, checked_count, checked_instance, checked_time_limit
+from ocp.errors import (
+    ProblemError,
+    SolveError,
+    checked_choice,
+    checked_count,
+    checked_flag,
+    checked_instance,
+    checked_time_limit,
+)
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.space.capture import Capture
 from ocp.motion.builders.standing.problem import Weights
@@ -105,6 +113,7 @@ def plan(
             in how few segments they may be done (search="segments").
     """
     checked_choice("search", search, get_args(Search))
+    checked_flag("cyclic", cyclic)
     checked_count("seed", seed, 0, LARGEST_SEED)
     with time_limited(checked_time_limit(time_limit)), shown_progress("plan", progress):
         try:
