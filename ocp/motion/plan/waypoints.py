@@ -24,7 +24,8 @@ from ocp.console import interruptible
 from ocp.errors import NOT_NUMBERS, ProblemError, SolveError, checked_choice, checked_count, checked_instance, floats
 from ocp.motion.builders.clearance import clearance_of
 from ocp.motion.local.collisions import Collision, distances_along, find_collisions
-from ocp.motion.local.inverse_kinematics import LARGEST_SEED, Unreachable, idle_positions
+from ocp.motion.local.ik_solver import idle_positions
+from ocp.motion.local.inverse_kinematics import LARGEST_SEED, Unreachable
 from ocp.motion.plan.planner import clearance_for
 from ocp.motion.plan.waypoint_plan import WaypointPlan
 from ocp.motion.search.charts import SelfMotionManifolds, TimeSample

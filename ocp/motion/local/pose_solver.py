@@ -1,0 +1,75 @@
+"""Solvers of the inverse kinematics of six joints of a chain; the positions of further joints are given."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.arrays import Array
+from ocp.motion.local.chain import Axis, Chain, Motion, Solutions
+
+__all__ = ["PoseSolver"]
+
+
+@dataclass(frozen=True, eq=False)
+class PoseSolver(ABC):
+    """Inverse kinematics of a chain in which all joints but a few are redundant.
+
+    Attributes:
+        chain: The chain.
+        redundant: Numbers of the joints whose positions are given.
+    """
+
+    chain: Chain
+    redundant: tuple[int, ...]
+
+    @property
+    def free(self) -> list[int]:
+        """Numbers of the other joints, in the order of the chain."""
+        return [j for j in self.chain.order if j not in self.redundant]
+
+    @abstractmethod
+    def solve(self, positions: Array, rotations: Array, redundant: Array) -> tuple[Solutions, NDArray[np.bool_]]:
+        """Return all isolated solutions at M poses, and for which poses solutions may be missing. Shape (M,).
+
+        Args:
+            positions, rotations: Poses of the tip in the world. Shapes (M, 3), (M, 3, 3).
+            redundant: Positions of the redundant joints. Shape (M, len(self.redundant)).
+        """
+
+    def solutions(self, positions: Array, rotations: Array, redundant: Array) -> tuple[NDArray[np.intp], Array]:
+        """Return the poses (K,) and the joints (K, n) of all isolated solutions; see `solve`."""
+        found, _ = self.solve(positions, rotations, redundant)
+        return found.pose, found.joints
+
+    def prescribe(self, redundant: Array) -> Array:
+        """Return joints with the redundant ones (M, k) at these positions and the others at 0. Shape (M, n)."""
+        joints = np.zeros((len(redundant), len(self.chain.axes)))
+        joints[:, list(self.redundant)] = redundant
+        return joints
+
+    def refine(self, pose: NDArray[np.intp], free: Array, prescribed: Array, goal: Motion) -> Solutions:
+        """Return the solutions that Newton's method finds from candidates for the free joints (K, m) at poses (K,)."""
+        joints = prescribed[pose]
+        joints[:, self.free] = free
+        return self.chain.refine(pose, joints, self.free, goal)
+
+    def loop(self, given: Array, goal: Motion) -> tuple[list[Axis], Motion]:
+        """Return the axes of the free joints, and the motion of the tip that they make from the given joints (M, n)."""
+        chain, count = self.chain, len(given)
+        fixed, axes = Motion(np.broadcast_to(np.eye(3), (count, 3, 3)), np.zeros((count, 3))), list[Axis]()
+        for j in chain.order:
+            axis = Axis(
+                np.tile(chain.axes[j], (count, 1)), np.tile(chain.points[j], (count, 1)), bool(chain.revolute[j])
+            )
+            if self.redundant:
+                axis = axis.moved(fixed)
+            if j in self.redundant:
+                fixed = axis.by(given[:, j]).after(fixed)
+            else:
+                axes.append(axis)
+        home = Motion(np.broadcast_to(chain.rotation, (count, 3, 3)), np.tile(chain.position, (count, 1)))
+        return axes, goal.after((fixed.after(home) if self.redundant else home).inverse)
