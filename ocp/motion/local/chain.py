@@ -41,7 +41,7 @@ class NewtonSettings:
         near: Distance up to which two solutions count as one if the pose is exact halfway between them.
     """
 
-    steps: int = 12
+    steps: int = 30
     precision: float = 1e-13
     exact: float = 1e-10
     rough: float = 0.5
@@ -143,6 +143,11 @@ class Solutions(NamedTuple):
     pose: NDArray[np.intp]
     joints: Array
     singular: NDArray[np.bool_]
+
+    @classmethod
+    def none(cls, size: int) -> Solutions:
+        """Return no solution of an arm with `size` joints."""
+        return cls(np.zeros(0, dtype=np.intp), np.zeros((0, size)), np.zeros(0, dtype=bool))
 
 
 @dataclass(frozen=True, eq=False)
@@ -286,6 +291,8 @@ class Chain:
 
     def union(self, first: Solutions, second: Solutions, free: Sequence[int], goal: Motion) -> Solutions:
         """Return the solutions of two sets, each once."""
+        if not len(first.pose):
+            return second
         parts = (np.concatenate(pair) for pair in zip(first, second, strict=True))
         return self.distinct(Solutions(*parts), free, goal)
 

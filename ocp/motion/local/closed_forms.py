@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from models.arrays import Array
 from ocp.motion.local.chain import Axis, Chain, Motion, Solutions, axial, cross, dot
-from ocp.motion.local.pose_solver import PoseSolver
+from ocp.motion.local.pose_solver import Mask, PoseSolver
 
 __all__ = ["ClosedForm", "closed_forms", "is_scara"]
 
@@ -37,10 +37,12 @@ class FormSettings:
     Attributes:
         straight: Up to this much, also in rad, axes count as meeting or parallel; Newton's method refines.
         near: Residual up to which rough solutions are refined: near a double solution they are that inaccurate.
+        vanishing: Size of the coefficients of an equation below which each angle solves it.
     """
 
     straight: float = 1e-8
     near: float = 1e-3
+    vanishing: float = 1e-8
 
 
 FORMS = FormSettings()
@@ -58,15 +60,11 @@ class ClosedForm(PoseSolver):
     kind: str
     triple: tuple[int, ...]
 
-    def solve(self, positions: Array, rotations: Array, redundant: Array) -> tuple[Solutions, NDArray[np.bool_]]:
-        """Return all isolated solutions at M poses, and that none is missing; see `PoseSolver.solve`."""
-        prescribed, tips = self.prescribe(redundant), Motion(rotations, positions)
-        pose, free = self._candidates(*self.loop(prescribed, tips))
-        return self.refine(pose, free, prescribed, tips), np.zeros(len(positions), dtype=bool)
-
-    def _candidates(self, axes: list[Axis], goal: Motion) -> tuple[NDArray[np.intp], Array]:
-        """Return candidates for which the motions of the free joints about these axes multiply to the goal."""
-        free = self.free
+    def solve_regular(self, tips: Motion, redundant: Array) -> tuple[Solutions, Mask, Mask]:
+        """Return solutions; where they belong to families, some may be missing. See `PoseSolver.solve_regular`."""
+        prescribed = self.prescribe(redundant)
+        axes, goal = self.loop(prescribed, tips)
+        free, families = self.free, np.zeros(len(tips.shift), dtype=bool)
         if self.kind == "scara":
             seats = [free.index(j) for j in (*self.triple, *(j for j in free if j not in self.triple))]
             pose, angles = _solve_planar([axes[i] for i in seats[:3]], goal)
@@ -76,10 +74,11 @@ class ClosedForm(PoseSolver):
             first, back = free.index(self.triple[0]), goal.inverse
             # joints behind the triple move to the front, conjugated by the goal
             seats = [(first + 3 + i) % SIX for i in range(SIX)]
-            pose, solutions = _solve_six([axes[i].moved(back) if i < first + 3 else axes[i] for i in seats], goal, self)
+            loop = [axes[i].moved(back) if i < first + 3 else axes[i] for i in seats]
+            pose, solutions, families = _solve_six(loop, goal, self)
         positions = np.empty_like(solutions)
         positions[:, seats] = solutions
-        return pose, positions
+        return self.refine(pose, positions, prescribed, tips), np.zeros_like(families), families
 
 
 def closed_forms(chain: Chain, lockable: Sequence[int] | None = None) -> tuple[ClosedForm, ...]:
@@ -144,8 +143,11 @@ def _rotation_terms(fixed: Array, axis: Array, vector: Array) -> tuple[Array, Ar
     return constant, dot(fixed, vector) - constant, dot(fixed, cross(axis, vector))
 
 
-def _solve_six(axes: list[Axis], goal: Motion, form: ClosedForm) -> tuple[NDArray[np.intp], Array]:
-    """Return rough angles with e_x e_y e_z e_a e_b e_c = goal, where a, b, c meet or are parallel; some do not hold."""
+def _solve_six(axes: list[Axis], goal: Motion, form: ClosedForm) -> tuple[NDArray[np.intp], Array, Mask]:
+    """Return rough angles with e_x e_y e_z e_a e_b e_c = goal, where a, b, c meet or are parallel; some do not hold.
+
+    The third result says which poses have families of solutions.
+    """
     (x, y, z, a, b, c), kind, size = axes, form.kind, form.chain.size
     offsets = (x.point - y.point) / size, (z.point - y.point) / size
     if kind == "meeting":
@@ -170,7 +172,7 @@ def _solve_six(axes: list[Axis], goal: Motion, form: ClosedForm) -> tuple[NDArra
         sides = [np.zeros(len(direction)), dot(direction, point - z.point) / size - dot(ahead, end)]
     a_, b_ = (np.stack([np.stack(part[1:], axis=1) for part in side], axis=1) for side in (left, right))
     c_ = np.stack([r + part[0] - other[0] for r, part, other in zip(sides, right, left, strict=True)], axis=1)
-    pose, first, third = _angle_pairs(a_, -b_, c_)
+    pose, first, third, families = _angle_pairs(a_, -b_, c_)
     x, y, z, a, b, c = (axis.take(pose) for axis in (x, y, z, a, b, c))
     goal = goal.take(pose)
     if kind == "meeting":
@@ -179,16 +181,21 @@ def _solve_six(axes: list[Axis], goal: Motion, form: ClosedForm) -> tuple[NDArra
         start = z.by(third).rotate(direction[pose])
         end = x.by(first).inverse.rotate(ahead[pose])
     second = y.angle(start, end)
+    on_axis = np.abs(cross(y.direction, start)).max(axis=1) < FORMS.vanishing * (size if kind == "meeting" else 1.0)
+    families[pose[on_axis]] = True  # y may have any angle
     remaining = x.by(first).after(y.by(second)).after(z.by(third)).inverse.after(goal)
     which, last = (_solve_wrist if kind == "meeting" else _solve_planar)([a, b, c], remaining)
-    return pose[which], np.column_stack([first[which], second[which], third[which], last])
+    return pose[which], np.column_stack([first[which], second[which], third[which], last]), families
 
 
-def _angle_pairs(a: Array, b: Array, c: Array) -> tuple[NDArray[np.intp], Array, Array]:
-    """Return angles with a [cos, sin](first) + b [cos, sin](second) = c. Shapes (M, 2, 2), (M, 2, 2), (M, 2)."""
+def _angle_pairs(a: Array, b: Array, c: Array) -> tuple[NDArray[np.intp], Array, Array, Mask]:
+    """Return angles with a [cos, sin](first) + b [cos, sin](second) = c. Shapes (M, 2, 2), (M, 2, 2), (M, 2).
+
+    The last result says for which of the M equations an angle is not determined.
+    """
     left, size, right = np.linalg.svd(b)
     size = size + 1e-300
-    singular = size[:, 1] < FORMS.straight * size[:, 0]
+    singular = size[:, 1] <= FORMS.straight * size[:, 0]
     alpha, gamma = left.transpose(0, 2, 1) @ a, np.einsum("mji,mj->mi", left, c)
     # w(z) = gamma - delta z - conj(delta) / z with z = exp(i first), and (w_1 / s_1)^2 + (w_2 / s_2)^2 = 1
     delta = (alpha[:, :, 0] - 1j * alpha[:, :, 1]) / 2
@@ -216,7 +223,8 @@ def _angle_pairs(a: Array, b: Array, c: Array) -> tuple[NDArray[np.intp], Array,
         good = residual < FORMS.near * np.maximum(size[pose, 0], 1e-12) ** 0.5
         pairs.append((pose[good], first[good], np.arctan2(unit[good, 1], unit[good, 0])))
     poses, firsts, seconds = (np.concatenate(part) for part in zip(*pairs, strict=True))
-    return poses, firsts, seconds
+    free = np.where(singular, np.abs(rows[:, 1]).max(axis=1), np.abs(square).max(axis=1)) < FORMS.vanishing
+    return poses, firsts, seconds, free | (size[:, 0] < FORMS.vanishing)
 
 
 def _polynomial_roots(rows: Array) -> Array:

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from models.arrays import Array
 from ocp.motion.local.chain import Axis, Chain, Motion, Solutions, axial, cross, dot
-from ocp.motion.local.pose_solver import PoseSolver
+from ocp.motion.local.pose_solver import Mask, PoseSolver
 
 __all__ = ["Elimination", "elimination_of"]
 
@@ -59,7 +59,8 @@ class EliminationSettings:
         regular: Reciprocal condition number below which an eigenvalue problem counts as singular.
         real: Distance of exp(i h) from the unit circle below which an angle h may be real: the accuracy of double
             eigenvalues of an ill-conditioned problem.
-        surely_real: Distance below which an angle is real, unless rounding errors merged two of them.
+        probably_real: Distance below which a multiple eigenvalue counts as real.
+        surely_real: Distance below which a simple eigenvalue is real.
         simple: Deviation of an eigenvector from the products of one solution below which its eigenvalue is simple.
         poles: Angles h at which the half-angle may be infinite; for each pose the best-conditioned one is taken.
         trials: Number of random configurations of the trial.
@@ -70,6 +71,7 @@ class EliminationSettings:
     rank: float = 1e-9
     regular: float = 1e-11
     real: float = 3e-2
+    probably_real: float = 1e-4
     surely_real: float = 1e-7
     simple: float = 1e-4
     poles: tuple[float, ...] = (0.3, 1.9, 3.5, 5.1)
@@ -117,8 +119,8 @@ class _Candidates(NamedTuple):
     pose: NDArray[np.intp]
     free: Array
     least: NDArray[np.intp]
-    mixed: NDArray[np.bool_]
-    singular: NDArray[np.bool_]
+    mixed: Mask
+    singular: Mask
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,31 +133,28 @@ class Elimination(PoseSolver):
 
     openings: tuple[Opening, ...]
 
-    def solve(self, positions: Array, rotations: Array, redundant: Array) -> tuple[Solutions, NDArray[np.bool_]]:
-        """Return all isolated solutions at M poses, and for which poses solutions may be missing.
+    def solve_regular(self, tips: Motion, redundant: Array) -> tuple[Solutions, Mask, Mask]:
+        """Return solutions at M poses, all at regular ones; see `PoseSolver.solve_regular`.
 
-        Such are poses whose problem is singular, or at which fewer solutions than real eigenvalues or an odd number of
-        solutions were found. Multiple eigenvalues mix the products of several solutions. At such poses two openings
-        must agree.
+        Some may be missing where the problem is singular, or where fewer solutions than real eigenvalues or an odd
+        number of solutions were found. Multiple eigenvalues mix the products of several solutions, which is to be
+        confirmed. Such poses are solved with further openings.
         """
-        prescribed, tips, count = self.prescribe(redundant), Motion(rotations, positions), len(positions)
-        even = bool(self.chain.revolute[self.free].all())
-        doubtful: NDArray[np.bool_] = np.ones(count, dtype=bool)
-        pose, joints = np.zeros(0, dtype=np.intp), np.zeros((0, len(self.chain.axes)))
-        solutions = Solutions(pose, joints, np.zeros(0, dtype=bool))
+        prescribed, count = self.prescribe(redundant), len(tips.shift)
+        even, solutions = bool(self.chain.revolute[self.free].all()), Solutions.none(len(self.chain.axes))
+        doubtful, mixed = np.ones(count, dtype=bool), np.zeros(count, dtype=bool)
         for opening in self.openings:
-            chosen = np.flatnonzero(doubtful)
+            chosen = np.flatnonzero(doubtful | mixed)
             if not chosen.size:
                 break
             axes, goal = self.loop(prescribed[chosen], tips.take(chosen))
             rough = _solve_opening(axes, goal, self.chain.size, opening)
             more = self.refine(chosen[rough.pose], rough.free, prescribed, tips)
-            before, first = np.bincount(solutions.pose, minlength=count)[chosen], not len(solutions.pose)
-            solutions = more if first else self.chain.union(solutions, more, self.free, tips)
-            after = np.bincount(solutions.pose, minlength=count)[chosen]
-            doubtful[chosen] = rough.singular | (after < rough.least) | (even & (after % 2 == 1))
-            doubtful[chosen] |= rough.mixed & (after > before)
-        return solutions, doubtful
+            solutions = self.chain.union(solutions, more, self.free, tips)
+            numbers = np.bincount(solutions.pose, minlength=count)[chosen]
+            doubtful[chosen] = rough.singular | (numbers < rough.least) | (even & (numbers % 2 == 1))
+            mixed[chosen] = rough.mixed
+        return solutions, mixed, doubtful
 
 
 def elimination_of(chain: Chain, redundant: tuple[int, ...]) -> Elimination | None:
@@ -322,9 +321,9 @@ def _solve_opening(axes: list[Axis], goal: Motion, size: float, opening: Opening
     pose, column = np.nonzero(distance < ELIMINATION.real)
     upper, vector = np.abs(values[pose, column]) > 1, vectors[pose, :, column]
     half, other, misfit = _angles_of(np.where(upper[:, None], vector[:, 12:], vector[:, :12]).reshape(-1, 4, 3))
-    real = distance[pose, column] < ELIMINATION.surely_real
-    simple = misfit < ELIMINATION.simple
-    least, mixed = (np.bincount(pose[real & each], minlength=len(distance)) for each in (simple, ~simple))
+    away, simple = distance[pose, column], misfit < ELIMINATION.simple
+    least = np.bincount(pose[simple & (away < ELIMINATION.surely_real)], minlength=len(distance))
+    mixed = np.bincount(pose[~simple & (away < ELIMINATION.probably_real)], minlength=len(distance))
     angles = np.empty((len(pose), 3))
     angles[:, opening.roles] = np.column_stack([np.angle(rotation[pose, column]), half, other])
     middle = np.where(revolute[2:5], angles, size * np.tan(angles / 2))
