@@ -122,13 +122,15 @@ class ArmSolver:
         joints[:, shiftable] += TURN * np.ceil((start[shiftable] - joints[:, shiftable]) / TURN)
         good = ((joints >= lower) & (joints <= upper))[:, order].all(axis=1)
         rows, joints = np.flatnonzero(good), joints[good]
-        for j in np.flatnonzero(twice & (upper - lower >= TURN)).tolist() if turns else ():
-            parts = [(rows, joints)]
-            while len(parts[-1][0]):
-                shifted = parts[-1][1] + TURN * (np.arange(joints.shape[1]) == j)
-                inside = shifted[:, j] <= upper[j]
-                parts.append((parts[-1][0][inside], shifted[inside]))
-            rows, joints = (np.concatenate(part) for part in zip(*parts, strict=True))
+        several = np.flatnonzero(twice & (upper - lower >= TURN))
+        if turns and several.size:
+            counts = 1 + ((upper[several] - joints[:, several]) // TURN).astype(int)
+            products = np.cumprod(counts, axis=1)
+            copies = np.repeat(np.arange(len(rows)), products[:, -1])
+            number = np.arange(len(copies)) - np.repeat(np.cumsum(products[:, -1]) - products[:, -1], products[:, -1])
+            digits = number[:, None] // (products // counts)[copies] % counts[copies]
+            rows, joints = rows[copies], joints[copies]
+            joints[:, several] += TURN * digits
         joints[:, order] = np.clip(joints, self.lower, self.upper)[:, order]
         return Solutions(solutions.pose[rows], joints, solutions.singular[rows])
 

@@ -22,6 +22,10 @@ from models.arrays import Array
 __all__ = ["TURN", "Axis", "Chain", "Motion", "Solutions", "axial", "cross", "dot"]
 
 TURN = 2 * np.pi
+NEXT, AFTER = np.array([1, 2, 0]), np.array([2, 0, 1])
+SKEW = np.cross(np.eye(3)[:, None], np.eye(3)).transpose(0, 2, 1).reshape(3, 9)
+"""Maps a vector w to the matrix of w x, row by row."""
+IDENTITY = np.eye(3)
 
 
 @dataclass(frozen=True)
@@ -57,13 +61,12 @@ NEWTON = NewtonSettings()
 
 def dot(a: Array, b: Array) -> Array:
     """Return the scalar products of vectors."""
-    return np.asarray((a * b).sum(axis=-1))
+    return np.asarray(np.vecdot(a, b))
 
 
 def cross(a: Array, b: Array) -> Array:
     """Return the vector products of vectors; for small arrays faster than numpy's function."""
-    (x, y, z), (u, v, w) = (np.moveaxis(part, -1, 0) for part in (a, b))
-    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=-1)
+    return np.asarray(a[..., NEXT] * b[..., AFTER] - a[..., AFTER] * b[..., NEXT])
 
 
 def axial(turn: Array) -> Array:
@@ -119,10 +122,9 @@ class Axis(NamedTuple):
         """Return the motions of the joints by these positions (M,)."""
         if not self.revolute:
             return Motion(np.broadcast_to(np.eye(3), (len(position), 3, 3)), self.direction * position[:, None])
-        x, y, z = self.direction.T
-        zero = np.zeros_like(x)
-        skew = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
-        turn = np.eye(3) + np.sin(position)[:, None, None] * skew + (1 - np.cos(position))[:, None, None] * skew @ skew
+        skew = (self.direction @ SKEW).reshape(-1, 3, 3)
+        sine, versine = np.sin(position)[:, None, None], (1 - np.cos(position))[:, None, None]
+        turn = IDENTITY + sine * skew + versine * (skew @ skew)
         return Motion(turn, self.point - (turn @ self.point[:, :, None])[:, :, 0])
 
     def angle(self, start: Array, end: Array) -> Array:
@@ -264,30 +266,21 @@ class Chain:
             goal: Poses of the tip in the world, M of them.
         """
         joints, numbers = joints.copy(), np.array(free, dtype=int)
-        error, singular = np.full(len(joints), np.inf), np.zeros(len(joints), dtype=bool)
+        error, jacobians = np.full(len(joints), np.inf), np.zeros((len(joints), 6, len(numbers)))
         active = np.arange(len(joints))
         for step in range(NEWTON.steps + 1):
-            if not active.size:
-                break
             missed, jacobian = self.linearize(joints[active], free, goal.take(pose[active]))
-            transposed, previous = jacobian.transpose(0, 2, 1), error[active]
-            if len(numbers) < missed.shape[1]:
-                inverse = np.linalg.inv(transposed @ jacobian + NEWTON.damping * np.eye(len(numbers)))
-                change = (inverse @ transposed @ missed[:, :, None])[:, :, 0]
-            else:
-                inverse = np.linalg.inv(jacobian @ transposed + NEWTON.damping * np.eye(6))
-                change = (transposed @ inverse @ missed[:, :, None])[:, :, 0]
-            worst = np.abs(missed).max(axis=1)
-            error[active] = worst
-            singular[active] = np.trace(inverse, axis1=1, axis2=2) > 1 / NEWTON.singular**2
+            worst, previous = np.abs(missed).max(axis=1), error[active]
+            error[active], jacobians[active] = worst, jacobian
             # a solution at the limit of rounding no longer improves
             on = (worst > NEWTON.precision) & (worst < (NEWTON.rough if step == 0 else np.inf))
             on &= (worst > NEWTON.exact) | (worst < previous / 2)
-            if step < NEWTON.steps:
-                active, change = active[on], change[on]
-                joints[active[:, None], numbers] += np.clip(change, -NEWTON.largest_step, NEWTON.largest_step)
+            if step == NEWTON.steps or not on.any():
+                break
+            active, change = active[on], _damped_steps(jacobian[on], missed[on])
+            joints[active[:, None], numbers] += np.clip(change, -NEWTON.largest_step, NEWTON.largest_step)
         good = error <= NEWTON.exact
-        return self.distinct(Solutions(pose[good], joints[good], singular[good]), free, goal)
+        return self.distinct(Solutions(pose[good], joints[good], _are_singular(jacobians[good])), free, goal)
 
     def union(self, first: Solutions, second: Solutions, free: Sequence[int], goal: Motion) -> Solutions:
         """Return the solutions of two sets, each once."""
@@ -311,17 +304,44 @@ class Chain:
         order = np.argsort(pose, kind="stable")
         pose, joints, singular = pose[order], joints[order], singular[order]
         largest = int(np.bincount(pose, minlength=1).max(initial=0))
-        repeated = np.zeros(len(pose), dtype=bool)
-        for offset in range(1, largest):
-            same_pose = np.flatnonzero(pose[offset:] == pose[:-offset])
-            difference = joints[same_pose + offset] - joints[same_pose]
-            difference[:, turns] -= TURN * np.round(difference[:, turns] / TURN)
-            distance = np.abs(difference[:, free]).max(axis=1)
-            same = distance < NEWTON.same
-            if (close := np.flatnonzero(~same & (distance < NEWTON.near))).size:
-                first = same_pose[close]
-                middle = joints[first] + difference[close] / 2
-                missed, _ = self.linearize(middle, numbers, goal.take(pose[first]))
-                same[close] = np.abs(missed).max(axis=1) <= NEWTON.exact
-            repeated[same_pose[same] + offset] = True
-        return Solutions(pose[~repeated], joints[~repeated], singular[~repeated])
+        first = np.arange(len(pose))[:, None]
+        second = first + np.arange(1, largest)
+        same_pose = second < len(pose)
+        second = np.minimum(second, len(pose) - 1)
+        first, second = (part[same_pose & (pose[first] == pose[second])] for part in np.broadcast_arrays(first, second))
+        difference = joints[second] - joints[first]
+        difference[:, turns] -= TURN * np.round(difference[:, turns] / TURN)
+        distance = np.abs(difference[:, free]).max(axis=1, initial=0.0)
+        same = distance < NEWTON.same
+        if (close := np.flatnonzero(~same & (distance < NEWTON.near))).size:
+            middle = joints[first[close]] + difference[close] / 2
+            missed, _ = self.linearize(middle, numbers, goal.take(pose[first[close]]))
+            same[close] = np.abs(missed).max(axis=1) <= NEWTON.exact
+        kept = np.ones(len(pose), dtype=bool)
+        kept[second[same]] = False
+        return Solutions(pose[kept], joints[kept], singular[kept])
+
+
+def _damped_steps(jacobian: Array, missed: Array) -> Array:
+    """Return the steps of Newton's method, damped at singularities. Shapes (K, 6, m), (K, 6) to (K, m)."""
+    transposed, error = jacobian.transpose(0, 2, 1), missed[:, :, None]
+    if jacobian.shape[2] < 6:
+        normal = transposed @ jacobian + NEWTON.damping * np.eye(jacobian.shape[2])
+        return np.asarray(np.linalg.solve(normal, transposed @ error)[:, :, 0])
+    normal = jacobian @ transposed + NEWTON.damping * np.eye(6)
+    return np.asarray((transposed @ np.linalg.solve(normal, error))[:, :, 0])
+
+
+def _are_singular(jacobians: Array) -> NDArray[np.bool_]:
+    """Return which Jacobians (K, 6, m) have a singular value below the limit.
+
+    The product of the five others is at most (|J|^2 / 5)^(5 / 2), so that the determinant tells most regular ones.
+    """
+    singular = np.ones(len(jacobians), dtype=bool)
+    if jacobians.shape[2] == 6:
+        largest = ((jacobians**2).sum(axis=(1, 2)) / 5) ** 2.5
+        singular = np.abs(np.linalg.det(jacobians)) < NEWTON.singular * largest
+    if singular.any():
+        values = np.linalg.svd(jacobians[singular], compute_uv=False)
+        singular[singular] = values[:, -1] < NEWTON.singular
+    return singular

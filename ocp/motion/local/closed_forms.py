@@ -207,9 +207,8 @@ def _angle_pairs(a: Array, b: Array, c: Array) -> tuple[NDArray[np.intp], Array,
             square[:, i + j] += (scale**2 * rows[:, :, i] * rows[:, :, j]).sum(axis=1)
     square[:, 2] -= size[:, 1] ** 2
     roots = _polynomial_roots(square)
-    # an equation without the second angle has two solutions by itself
-    roots_alone = _polynomial_roots(rows[:, 1])
-    roots[singular] = np.concatenate([roots_alone, np.full_like(roots_alone, np.nan)], axis=1)[singular]
+    if singular.any():  # an equation without the second angle has two solutions by itself
+        roots[singular, :2], roots[singular, 2:] = _polynomial_roots(rows[singular, 1]), np.nan
     with np.errstate(divide="ignore", invalid="ignore"):
         pose, column = np.nonzero(np.abs(np.log(np.abs(roots))) < FORMS.near)
     first = np.angle(roots[pose, column])
