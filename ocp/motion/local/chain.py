@@ -34,6 +34,8 @@ class NewtonSettings:
 
     Attributes:
         steps: Largest number of steps.
+        trial_steps: Number of steps after which each one must make progress.
+        progress: Factor by which a step then reduces the error; near a double root it is 4.
         precision: Pose error at which the iteration ends, also in rad.
         exact: Largest pose error of a solution, also in rad.
         rough: Pose error above which a candidate is dropped, also in rad.
@@ -46,6 +48,8 @@ class NewtonSettings:
     """
 
     steps: int = 30
+    trial_steps: int = 5
+    progress: float = 1.5
     precision: float = 1e-13
     exact: float = 1e-10
     rough: float = 0.5
@@ -275,6 +279,7 @@ class Chain:
             # a solution at the limit of rounding no longer improves
             on = (worst > NEWTON.precision) & (worst < (NEWTON.rough if step == 0 else np.inf))
             on &= (worst > NEWTON.exact) | (worst < previous / 2)
+            on &= (worst < previous / NEWTON.progress) | (step < NEWTON.trial_steps)
             if step == NEWTON.steps or not on.any():
                 break
             active, change = active[on], _damped_steps(jacobian[on], missed[on])

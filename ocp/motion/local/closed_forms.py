@@ -137,10 +137,10 @@ def _kind_of(chain: Chain, triple: tuple[int, ...]) -> str:
     return "meeting" if min(sines) > FORMS.straight and distance < FORMS.straight * chain.size else ""
 
 
-def _rotation_terms(fixed: Array, axis: Array, vector: Array) -> tuple[Array, Array, Array]:
-    """Return fixed . R(axis, angle) vector as constant, cosine part and sine part, of M vectors each."""
+def _rotation_terms(fixed: Array, axis: Array, vector: Array) -> tuple[Array, Array]:
+    """Return fixed . R(axis, angle) vector as constants (...), and cosine and sine parts, (..., 2)."""
     constant = dot(fixed, axis) * dot(axis, vector)
-    return constant, dot(fixed, vector) - constant, dot(fixed, cross(axis, vector))
+    return constant, np.stack([dot(fixed, vector) - constant, dot(fixed, cross(axis, vector))], axis=-1)
 
 
 def _solve_six(axes: list[Axis], goal: Motion, form: ClosedForm) -> tuple[NDArray[np.intp], Array, Mask]:
@@ -149,41 +149,40 @@ def _solve_six(axes: list[Axis], goal: Motion, form: ClosedForm) -> tuple[NDArra
     The third result says which poses have families of solutions.
     """
     (x, y, z, a, b, c), kind, size = axes, form.kind, form.chain.size
-    offsets = (x.point - y.point) / size, (z.point - y.point) / size
+    first_offset, second_offset = (x.point - y.point) / size, (z.point - y.point) / size
+    fixed = np.stack([y.direction, y.direction, first_offset, second_offset])
+    directions = np.stack([-x.direction, z.direction, -x.direction, z.direction])
+    sides = np.zeros((2, len(goal.shift)))
     if kind == "meeting":
         point = _meeting_points(a, b, c)
         end, start = (goal.at(point) - x.point) / size, (point - z.point) / size
-        # e_z p and e_x^-1 G p have the same distance from the axis of y and the same height along it
-        left = [_rotation_terms(2 * offsets[0], -x.direction, end), _rotation_terms(y.direction, -x.direction, end)]
-        right = [_rotation_terms(2 * offsets[1], z.direction, start), _rotation_terms(y.direction, z.direction, start)]
-        sides = [
-            dot(offsets[1], offsets[1]) + dot(start, start) - dot(offsets[0], offsets[0]) - dot(end, end),
-            dot(y.direction, offsets[1] - offsets[0]),
-        ]
+        # e_z p and e_x^-1 G p have the same height along the axis of y and the same distance from it
+        vectors = np.stack([end, start, 2 * end, 2 * start])
+        sides[0] = dot(y.direction, second_offset - first_offset)
+        sides[1] = dot(second_offset, second_offset) + dot(start, start)
+        sides[1] -= dot(first_offset, first_offset) + dot(end, end)
     else:
         direction, point = a.direction, a.point
         ahead, end = goal.rotate(direction), (goal.at(point) - x.point) / size
         # the direction of the triple, and the distance of a point along it, before and after the motion
-        left = [_rotation_terms(y.direction, -x.direction, ahead), _rotation_terms(offsets[0], -x.direction, ahead)]
-        right = [
-            _rotation_terms(y.direction, z.direction, direction),
-            _rotation_terms(offsets[1], z.direction, direction),
-        ]
-        sides = [np.zeros(len(direction)), dot(direction, point - z.point) / size - dot(ahead, end)]
-    a_, b_ = (np.stack([np.stack(part[1:], axis=1) for part in side], axis=1) for side in (left, right))
-    c_ = np.stack([r + part[0] - other[0] for r, part, other in zip(sides, right, left, strict=True)], axis=1)
-    pose, first, third, families = _angle_pairs(a_, -b_, c_)
+        vectors = np.stack([ahead, direction, ahead, direction])
+        sides[1] = dot(direction, point - z.point) / size - dot(ahead, end)
+    constants, parts = _rotation_terms(fixed, directions, vectors)
+    sides += constants[1::2] - constants[::2]
+    a_, b_ = parts[::2].transpose(1, 0, 2), -parts[1::2].transpose(1, 0, 2)
+    c_ = sides.T
+    pose, first, third, families = _angle_pairs(a_, b_, c_)
     x, y, z, a, b, c = (axis.take(pose) for axis in (x, y, z, a, b, c))
     goal = goal.take(pose)
+    before, after = z.by(third), x.by(first).inverse.after(goal)
     if kind == "meeting":
-        start, end = z.by(third).at(point[pose]) - y.point, x.by(first).inverse.at(goal.at(point[pose])) - y.point
+        start, end = before.at(point[pose]) - y.point, after.at(point[pose]) - y.point
     else:
-        start = z.by(third).rotate(direction[pose])
-        end = x.by(first).inverse.rotate(ahead[pose])
+        start, end = before.rotate(direction[pose]), after.rotate(direction[pose])
     second = y.angle(start, end)
     on_axis = np.abs(cross(y.direction, start)).max(axis=1) < FORMS.vanishing * (size if kind == "meeting" else 1.0)
     families[pose[on_axis]] = True  # y may have any angle
-    remaining = x.by(first).after(y.by(second)).after(z.by(third)).inverse.after(goal)
+    remaining = y.by(second).after(before).inverse.after(after)
     which, last = (_solve_wrist if kind == "meeting" else _solve_planar)([a, b, c], remaining)
     return pose[which], np.column_stack([first[which], second[which], third[which], last]), families
 
@@ -196,33 +195,33 @@ def _angle_pairs(a: Array, b: Array, c: Array) -> tuple[NDArray[np.intp], Array,
     left, size, right = np.linalg.svd(b)
     size = size + 1e-300
     singular = size[:, 1] <= FORMS.straight * size[:, 0]
-    alpha, gamma = left.transpose(0, 2, 1) @ a, np.einsum("mji,mj->mi", left, c)
+    alpha, gamma = left.transpose(0, 2, 1) @ a, (c[:, None] @ left)[:, 0]
     # w(z) = gamma - delta z - conj(delta) / z with z = exp(i first), and (w_1 / s_1)^2 + (w_2 / s_2)^2 = 1
     delta = (alpha[:, :, 0] - 1j * alpha[:, :, 1]) / 2
-    rows = np.stack([-delta, gamma.astype(complex), -delta.conj()], axis=2)
-    scale = size[:, ::-1] / size[:, :1]
-    square = np.zeros((len(a), 5), dtype=complex)
-    for i in range(3):
-        for j in range(3):
-            square[:, i + j] += (scale**2 * rows[:, :, i] * rows[:, :, j]).sum(axis=1)
-    square[:, 2] -= size[:, 1] ** 2
+    high, middle = (size[:, ::-1] / size[:, :1] * part for part in (delta, gamma))
+    square = np.empty((len(a), 5), dtype=complex)
+    square[:, 0], square[:, 1] = (high**2).sum(axis=1), -2 * (high * middle).sum(axis=1)
+    square[:, 2] = (2 * np.abs(high) ** 2 + middle**2).sum(axis=1) - size[:, 1] ** 2
+    square[:, 3], square[:, 4] = square[:, 1].conj(), square[:, 0].conj()
+    rows = np.stack([-delta[:, 1], gamma[:, 1].astype(complex), -delta[:, 1].conj()], axis=1)
     roots = _polynomial_roots(square)
     if singular.any():  # an equation without the second angle has two solutions by itself
-        roots[singular, :2], roots[singular, 2:] = _polynomial_roots(rows[singular, 1]), np.nan
+        roots[singular, :2], roots[singular, 2:] = _polynomial_roots(rows[singular]), np.nan
     with np.errstate(divide="ignore", invalid="ignore"):
         pose, column = np.nonzero(np.abs(np.log(np.abs(roots))) < FORMS.near)
     first = np.angle(roots[pose, column])
-    remaining = gamma[pose] - np.einsum("kij,kj->ki", alpha[pose], np.column_stack([np.cos(first), np.sin(first)]))
+    direction = np.stack([np.cos(first), np.sin(first)], axis=1)
+    remaining = gamma[pose] - (alpha[pose] @ direction[:, :, None])[:, :, 0]
     cosine = np.clip(remaining[:, 0] / size[pose, 0], -1.0, 1.0)
     sine = np.sqrt(1 - cosine**2)
-    pairs = []
-    for signed_sine in (sine, -sine):
-        unit = np.einsum("kji,kj->ki", right[pose], np.column_stack([cosine, signed_sine]))
-        residual = np.abs(remaining - size[pose] * np.column_stack([cosine, signed_sine])).max(axis=1)
-        good = residual < FORMS.near * np.maximum(size[pose, 0], 1e-12) ** 0.5
-        pairs.append((pose[good], first[good], np.arctan2(unit[good, 1], unit[good, 0])))
-    poses, firsts, seconds = (np.concatenate(part) for part in zip(*pairs, strict=True))
-    free = np.where(singular, np.abs(rows[:, 1]).max(axis=1), np.abs(square).max(axis=1)) < FORMS.vanishing
+    good = np.abs(remaining - size[pose] * np.stack([cosine, sine], axis=1)).max(axis=1)
+    flipped = np.abs(remaining - size[pose] * np.stack([cosine, -sine], axis=1)).max(axis=1)
+    allowed = FORMS.near * np.maximum(size[pose, 0], 1e-12) ** 0.5
+    chosen = np.concatenate([np.flatnonzero(good < allowed), np.flatnonzero(flipped < allowed)])
+    sign = np.repeat([1.0, -1.0], [np.count_nonzero(good < allowed), np.count_nonzero(flipped < allowed)])
+    unit = np.stack([cosine[chosen], sign * sine[chosen]], axis=1)[:, None] @ right[pose[chosen]]
+    poses, firsts, seconds = pose[chosen], first[chosen], np.arctan2(unit[:, 0, 1], unit[:, 0, 0])
+    free = np.where(singular, np.abs(rows).max(axis=1), np.abs(square).max(axis=1)) < FORMS.vanishing
     return poses, firsts, seconds, free | (size[:, 0] < FORMS.vanishing)
 
 
@@ -257,9 +256,9 @@ def _middle_angles(value: Array, cosine: Array, sine: Array) -> tuple[NDArray[np
 def _solve_wrist(axes: list[Axis], goal: Motion) -> tuple[NDArray[np.intp], Array]:
     """Return two solutions of meeting axes a, b, c for a rotation, the nearest if there are none."""
     a, b, c = axes
-    constant, cosine, sine = _rotation_terms(a.direction, b.direction, c.direction)
+    constant, parts = _rotation_terms(a.direction, b.direction, c.direction)
     value = dot(a.direction, goal.rotate(c.direction)) - constant
-    pose, second = _middle_angles(value, cosine, sine)
+    pose, second = _middle_angles(value, parts[..., 0], parts[..., 1])
     return pose, _outer_angles([axis.take(pose) for axis in axes], goal.take(pose), second, None)
 
 
