@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from models import Machine
 from models.arrays import Array
 
-__all__ = ["TURN", "Axis", "Chain", "Motion", "Solutions", "axial", "cross", "dot"]
+__all__ = ["TURN", "Axis", "Chain", "Motion", "Solutions", "axial", "cross", "dot", "pick"]
 
 TURN = 2 * np.pi
 NEXT, AFTER = np.array([1, 2, 0]), np.array([2, 0, 1])
@@ -73,6 +73,11 @@ def cross(a: Array, b: Array) -> Array:
     return np.asarray(a[..., NEXT] * b[..., AFTER] - a[..., AFTER] * b[..., NEXT])
 
 
+def pick(rows: Array, chosen: NDArray[np.intp]) -> Array:
+    """Return the rows at these indices; a single row holds for all of them."""
+    return rows if len(rows) == 1 else rows[chosen]
+
+
 def axial(turn: Array) -> Array:
     """Return the axial vectors of rotations, 2 sin(angle) times their axes. Shapes (M, 3, 3) to (M, 3)."""
     return np.stack([turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], 1)
@@ -108,7 +113,10 @@ class Motion(NamedTuple):
 
 
 class Axis(NamedTuple):
-    """Axes of joints: unit directions (M, 3), points (M, 3), and whether the joint is revolute or prismatic."""
+    """Axes of joints: unit directions (M, 3), points (M, 3), and whether the joint is revolute or prismatic.
+
+    A single row, (1, 3), holds for all poses.
+    """
 
     direction: Array
     point: Array
@@ -116,7 +124,7 @@ class Axis(NamedTuple):
 
     def take(self, chosen: NDArray[np.intp]) -> Axis:
         """Return the axes at these indices."""
-        return Axis(self.direction[chosen], self.point[chosen], self.revolute)
+        return self if len(self.point) == 1 else Axis(self.direction[chosen], self.point[chosen], self.revolute)
 
     def moved(self, motion: Motion) -> Axis:
         """Return the axes moved by a motion."""
@@ -125,7 +133,7 @@ class Axis(NamedTuple):
     def by(self, position: Array) -> Motion:
         """Return the motions of the joints by these positions (M,)."""
         if not self.revolute:
-            return Motion(np.broadcast_to(np.eye(3), (len(position), 3, 3)), self.direction * position[:, None])
+            return Motion(np.broadcast_to(IDENTITY, (len(position), 3, 3)), self.direction * position[:, None])
         skew = (self.direction @ SKEW).reshape(-1, 3, 3)
         sine, versine = np.sin(position)[:, None, None], (1 - np.cos(position))[:, None, None]
         turn = IDENTITY + sine * skew + versine * (skew @ skew)
@@ -214,6 +222,17 @@ class Chain:
         screws[:, :3, :3] = np.where(revolute[:, None, None], np.cross(np.eye(3), axes[:, None]), 0.0)
         screws[:, :3, 3] = np.where(revolute[:, None], np.cross(points, axes), axes)
         return screws, screws @ screws
+
+    @cached_property
+    def constant_axes(self) -> tuple[Axis, ...]:
+        """Axes of the joints at the zero configuration, in the order of the chain."""
+        parts = ((self.axes[[j]], self.points[[j]], bool(self.revolute[j])) for j in self.order)
+        return tuple(Axis(*part) for part in parts)
+
+    @cached_property
+    def home_motion(self) -> Motion:
+        """Pose of the tip at the zero configuration, as one motion."""
+        return Motion(self.rotation[None], self.position[None])
 
     @cached_property
     def home(self) -> Array:

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.arrays import Array
-from ocp.motion.local.chain import Axis, Chain, Motion, Solutions, axial, cross, dot
+from ocp.motion.local.chain import Axis, Chain, Motion, Solutions, axial, cross, dot, pick
 from ocp.motion.local.pose_solver import Mask, PoseSolver
 
 __all__ = ["ClosedForm", "closed_forms", "is_scara"]
@@ -143,6 +143,14 @@ def _rotation_terms(fixed: Array, axis: Array, vector: Array) -> tuple[Array, Ar
     return constant, np.stack([dot(fixed, vector) - constant, dot(fixed, cross(axis, vector))], axis=-1)
 
 
+def _stack(count: int, *parts: Array) -> Array:
+    """Return vectors, (M, 3) or (1, 3) each, as one array (k, M, 3)."""
+    stacked = np.empty((len(parts), count, 3))
+    for k, part in enumerate(parts):
+        stacked[k] = part
+    return stacked
+
+
 def _solve_six(axes: list[Axis], goal: Motion, form: ClosedForm) -> tuple[NDArray[np.intp], Array, Mask]:
     """Return rough angles with e_x e_y e_z e_a e_b e_c = goal, where a, b, c meet or are parallel; some do not hold.
 
@@ -150,14 +158,15 @@ def _solve_six(axes: list[Axis], goal: Motion, form: ClosedForm) -> tuple[NDArra
     """
     (x, y, z, a, b, c), kind, size = axes, form.kind, form.chain.size
     first_offset, second_offset = (x.point - y.point) / size, (z.point - y.point) / size
-    fixed = np.stack([y.direction, y.direction, first_offset, second_offset])
-    directions = np.stack([-x.direction, z.direction, -x.direction, z.direction])
-    sides = np.zeros((2, len(goal.shift)))
+    count = len(goal.shift)
+    fixed = _stack(count, y.direction, y.direction, first_offset, second_offset)
+    directions = _stack(count, -x.direction, z.direction, -x.direction, z.direction)
+    sides = np.zeros((2, count))
     if kind == "meeting":
         point = _meeting_points(a, b, c)
         end, start = (goal.at(point) - x.point) / size, (point - z.point) / size
         # e_z p and e_x^-1 G p have the same height along the axis of y and the same distance from it
-        vectors = np.stack([end, start, 2 * end, 2 * start])
+        vectors = _stack(count, end, start, 2 * end, 2 * start)
         sides[0] = dot(y.direction, second_offset - first_offset)
         sides[1] = dot(second_offset, second_offset) + dot(start, start)
         sides[1] -= dot(first_offset, first_offset) + dot(end, end)
@@ -165,7 +174,7 @@ def _solve_six(axes: list[Axis], goal: Motion, form: ClosedForm) -> tuple[NDArra
         direction, point = a.direction, a.point
         ahead, end = goal.rotate(direction), (goal.at(point) - x.point) / size
         # the direction of the triple, and the distance of a point along it, before and after the motion
-        vectors = np.stack([ahead, direction, ahead, direction])
+        vectors = _stack(count, ahead, direction, ahead, direction)
         sides[1] = dot(direction, point - z.point) / size - dot(ahead, end)
     constants, parts = _rotation_terms(fixed, directions, vectors)
     sides += constants[1::2] - constants[::2]
@@ -176,9 +185,9 @@ def _solve_six(axes: list[Axis], goal: Motion, form: ClosedForm) -> tuple[NDArra
     goal = goal.take(pose)
     before, after = z.by(third), x.by(first).inverse.after(goal)
     if kind == "meeting":
-        start, end = before.at(point[pose]) - y.point, after.at(point[pose]) - y.point
+        start, end = before.at(pick(point, pose)) - y.point, after.at(pick(point, pose)) - y.point
     else:
-        start, end = before.rotate(direction[pose]), after.rotate(direction[pose])
+        start, end = before.rotate(pick(direction, pose)), after.rotate(pick(direction, pose))
     second = y.angle(start, end)
     on_axis = np.abs(cross(y.direction, start)).max(axis=1) < FORMS.vanishing * (size if kind == "meeting" else 1.0)
     families[pose[on_axis]] = True  # y may have any angle

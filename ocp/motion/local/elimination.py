@@ -202,7 +202,7 @@ def _open(axes: list[Axis], goal: Motion, size: float, first: int) -> _Loop:
 def _split(loop: _Loop) -> tuple[Array, NDArray[np.intp], Array]:
     """Return left singular vectors and ranks of the products of x and y, and the coefficients of those of z, a, b.
 
-    Shapes (M, 15, 15), (M,), (M, 15, 3, 3, 3).
+    Shapes (M, 15, 15), (M,), (M, 15, 3, 3, 3), the last (1, ...) if it is the same for all poses.
     """
     goal, size, c = loop.goal, loop.size, loop.joints[5]
     center = sum(axis.point for axis in loop.joints) / SIX
@@ -229,8 +229,8 @@ def _coefficients(axes: list[Axis], point: Array, direction: Array) -> Array:
     Returns:
         Coefficients of 1, cos h and sin h of each joint, those of the last one first. Shape (M, 15, 3, ...).
     """
-    weights = np.ones(1)
-    point, direction = point[:, None], direction[:, None]
+    weights, count = np.ones(1), max(len(point), *(len(axis.point) for axis in axes))
+    point, direction = (np.broadcast_to(part[:, None], (count, 1, 3)) for part in (point, direction))
     for axis in axes:
         w, p = axis.direction[:, None, None], axis.point[:, None, None]
         if axis.revolute:
@@ -260,8 +260,8 @@ def _coefficients(axes: list[Axis], point: Array, direction: Array) -> Array:
 
 def _matrices(annihilators: Array, remaining: Array, roles: tuple[int, int, int]) -> Array:
     """Return the polynomial matrix of the eigenvalue problem: coefficients of 1, cos h, sin h. Shape (M, 3, 12, 12)."""
-    count, rows = len(remaining), annihilators.shape[2]
-    equations = annihilators.transpose(0, 2, 1) @ remaining.reshape(count, 15, 27)
+    count, _, rows = annihilators.shape
+    equations = annihilators.transpose(0, 2, 1) @ remaining.reshape(-1, 15, 27)
     equations = equations.reshape(count, rows, 3, 3, 3).transpose(0, 1, *(2 + role for role in roles))
     # (pose, row, eigenvalue, half, other) -> (pose, eigenvalue, row x 2, 4 x other)
     products = equations.transpose(0, 2, 1, 4, 3).reshape(-1, 3) @ PRODUCTS.reshape(3, 8)
@@ -367,7 +367,8 @@ def _complete(loop: _Loop, pose: NDArray[np.intp], middle: Array) -> Array:
     columns, constants = list[Array](), list[Array]()
     for axis, (point, direction), sign in ((x, ends[0], -1.0), (y, ends[1], 1.0)):
         if not axis.revolute:
-            slide = np.concatenate([axis.direction / size, np.zeros_like(direction)], axis=1)
+            slide = np.zeros((len(pose), 6))
+            slide[:, :3] = axis.direction / size
             columns += [slide, np.zeros_like(slide)]
             constants.append(sign * np.concatenate([point / size, direction], axis=1))
             continue

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TypeAlias
 
 import numpy as np
@@ -49,7 +50,7 @@ class PoseSolver(ABC):
     chain: Chain
     redundant: tuple[int, ...]
 
-    @property
+    @cached_property
     def free(self) -> list[int]:
         """Numbers of the other joints, in the order of the chain."""
         return [j for j in self.chain.order if j not in self.redundant]
@@ -118,17 +119,14 @@ class PoseSolver(ABC):
 
     def loop(self, given: Array, goal: Motion) -> tuple[list[Axis], Motion]:
         """Return the axes of the free joints, and the motion of the tip that they make from the given joints (M, n)."""
-        chain, count = self.chain, len(given)
-        fixed, axes = Motion(np.broadcast_to(np.eye(3), (count, 3, 3)), np.zeros((count, 3))), list[Axis]()
-        for j in chain.order:
-            axis = Axis(
-                np.tile(chain.axes[j], (count, 1)), np.tile(chain.points[j], (count, 1)), bool(chain.revolute[j])
-            )
-            if self.redundant:
-                axis = axis.moved(fixed)
+        chain = self.chain
+        if not self.redundant:
+            return list(chain.constant_axes), goal.after(chain.home_motion.inverse)
+        fixed, axes = Motion(np.eye(3)[None], np.zeros((1, 3))), list[Axis]()
+        for j, constant in zip(chain.order, chain.constant_axes, strict=True):
+            axis = constant.moved(fixed)
             if j in self.redundant:
                 fixed = axis.by(given[:, j]).after(fixed)
             else:
                 axes.append(axis)
-        home = Motion(np.broadcast_to(chain.rotation, (count, 3, 3)), np.tile(chain.position, (count, 1)))
-        return axes, goal.after((fixed.after(home) if self.redundant else home).inverse)
+        return axes, goal.after(fixed.after(chain.home_motion).inverse)
