@@ -168,8 +168,8 @@ def elimination_of(chain: Chain, redundant: tuple[int, ...]) -> Elimination | No
     joints[:, ~chain.revolute] *= chain.size / np.pi
     solver = Elimination(chain, redundant, ())
     positions, rotations = chain.poses(joints)
-    given, tips = solver.prescribe(joints[:, list(redundant)]), Motion(rotations, positions)
-    axes, goal = solver.loop(given, tips)
+    prescribed, tips = solver.prescribe(joints[:, list(redundant)]), Motion(rotations, positions)
+    axes, goal = solver.loop(prescribed, tips)
     conditions = list[tuple[float, Opening]]()
     for first in range(SIX):
         if axes[first - 1].revolute:
@@ -183,10 +183,10 @@ def elimination_of(chain: Chain, redundant: tuple[int, ...]) -> Elimination | No
     kept, most = list[Opening](), 0
     for _, opening in regular:
         rough = _solve_opening(axes, goal, chain.size, opening)
-        found = solver.refine(rough.pose, rough.free, given, tips)
-        if len(found.pose) >= most:
-            kept = [*(kept if len(found.pose) == most else []), opening]
-            most = len(found.pose)
+        solutions = solver.refine(rough.pose, rough.free, prescribed, tips)
+        if len(solutions.pose) >= most:
+            kept = [*(kept if len(solutions.pose) == most else []), opening]
+            most = len(solutions.pose)
         if len(kept) == ELIMINATION.openings:
             break
     return Elimination(chain, redundant, tuple(kept)) if kept else None

@@ -229,10 +229,10 @@ class PreparedArm:
             positions, redundant = np.repeat(positions, samples, axis=0), np.tile(redundant, (count, 1))
         elif count > 1:
             redundant = np.repeat(redundant, count, axis=0)
-        found, doubtful = self.arm.solve(solver, positions, rotations, redundant, turns=turns)
-        pose = found.pose // samples
+        solutions, doubtful = self.arm.solve(solver, positions, rotations, redundant, turns=turns)
+        pose = solutions.pose // samples
         order = np.argsort(pose, kind="stable")
-        singular = np.bincount(pose[found.singular], minlength=count) > 0
+        singular = np.bincount(pose[solutions.singular], minlength=count) > 0
         ill = np.asarray(doubtful.reshape(count, samples).any(axis=1))
         sampled = Incompleteness(0) if self.complete else Incompleteness.SAMPLED
         reasons = [
@@ -241,7 +241,7 @@ class PreparedArm:
             | (Incompleteness.ILL_CONDITIONED if bad else Incompleteness(0))
             for here, bad in zip(singular.tolist(), ill.tolist(), strict=True)
         ]
-        joints = found.joints[order]
+        joints = solutions.joints[order]
         idle = np.ones(joints.shape[1], dtype=bool)
         idle[list(self.arm.chain.order)] = False
         if idle.any():

@@ -102,8 +102,8 @@ class PoseSolver(ABC):
 
     def solutions(self, positions: Array, rotations: Array, redundant: Array) -> tuple[NDArray[np.intp], Array]:
         """Return the poses (K,) and the joints (K, n) of all isolated solutions; see `solve`."""
-        found, _ = self.solve(positions, rotations, redundant)
-        return found.pose, found.joints
+        solutions, _ = self.solve(positions, rotations, redundant)
+        return solutions.pose, solutions.joints
 
     def prescribe(self, redundant: Array) -> Array:
         """Return joints with the redundant ones (M, k) at these positions and the others at 0. Shape (M, n)."""
@@ -117,8 +117,8 @@ class PoseSolver(ABC):
         joints[:, self.free] = free
         return self.chain.refine(pose, joints, self.free, goal)
 
-    def loop(self, given: Array, goal: Motion) -> tuple[list[Axis], Motion]:
-        """Return the axes of the free joints, and the motion of the tip that they make from the given joints (M, n)."""
+    def loop(self, prescribed: Array, goal: Motion) -> tuple[list[Axis], Motion]:
+        """Return the axes of the free joints, and the motion that they must make with the others as prescribed."""
         chain = self.chain
         if not self.redundant:
             return list(chain.constant_axes), goal.after(chain.home_motion.inverse)
@@ -126,7 +126,7 @@ class PoseSolver(ABC):
         for j, constant in zip(chain.order, chain.constant_axes, strict=True):
             axis = constant.moved(fixed)
             if j in self.redundant:
-                fixed = axis.by(given[:, j]).after(fixed)
+                fixed = axis.by(prescribed[:, j]).after(fixed)
             else:
                 axes.append(axis)
         return axes, goal.after(fixed.after(chain.home_motion).inverse)

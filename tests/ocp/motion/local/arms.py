@@ -25,7 +25,7 @@ def arm(
     links = [Link(f"link{k}") for k in range(n + 1)] + [Link("tip")]
     joints = []
     for k in range(n):
-        kind = "prismatic" if k in prismatic else "revolute" if np.isfinite(limit) else "continuous"
+        kind: Any = "prismatic" if k in prismatic else "revolute" if np.isfinite(limit) else "continuous"
         shift = points[k] - (points[k - 1] if k else 0.0)
         bounds = {} if kind == "continuous" else span
         joints.append(Joint(f"joint{k}", kind, f"link{k}", f"link{k + 1}", translation=shift, axis=axes[k], **bounds))
@@ -85,7 +85,8 @@ def crx(limit: float = np.inf) -> FixedBase:
 @cache
 def build(name: str) -> FixedBase:
     """One of the arms."""
-    return ARMS[name]()
+    machine: FixedBase = ARMS[name]()
+    return machine
 
 
 ARMS: dict[str, Any] = {
