@@ -320,8 +320,8 @@ def _solve_opening(axes: list[Axis], goal: Motion, size: float, opening: Opening
         distance[np.abs(rotation + 1) < ELIMINATION.real] = np.inf  # a prismatic joint at infinity
     pose, column = np.nonzero(distance < ELIMINATION.real)
     upper, vector = np.abs(values[pose, column]) > 1, vectors[pose, :, column]
-    half, other, misfit = _angles_of(np.where(upper[:, None], vector[:, 12:], vector[:, :12]).reshape(-1, 4, 3))
-    away, simple = distance[pose, column], misfit < ELIMINATION.simple
+    half, other, residual = _angles_of(np.where(upper[:, None], vector[:, 12:], vector[:, :12]).reshape(-1, 4, 3))
+    away, simple = distance[pose, column], residual < ELIMINATION.simple
     least = np.bincount(pose[simple & (away < ELIMINATION.surely_real)], minlength=len(distance))
     mixed = np.bincount(pose[~simple & (away < ELIMINATION.probably_real)], minlength=len(distance))
     angles = np.empty((len(pose), 3))
@@ -351,8 +351,8 @@ def _angles_of(vectors: Array) -> tuple[Array, Array, Array]:
         waves[:, :, None] * np.column_stack([np.ones(len(rows)), np.cos(other_angle), np.sin(other_angle)])[:, None]
     )
     place = rows, row, column
-    misfit = real - products * (real[place] / products[place])[:, None, None]
-    return angle, other_angle, np.abs(misfit).max(axis=(1, 2), initial=0.0)
+    residual = real - products * (real[place] / products[place])[:, None, None]
+    return angle, other_angle, np.abs(residual).max(axis=(1, 2), initial=0.0)
 
 
 def _complete(loop: _Loop, pose: NDArray[np.intp], middle: Array) -> Array:

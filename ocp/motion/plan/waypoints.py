@@ -195,9 +195,8 @@ class _WaypointPlanner:
         seed: int,
         settings: WaypointSettings = WaypointSettings(),
     ) -> None:
-        self.settings = settings
         self.machine, self.positions, self.rotations, self.step, self.scene = machine, positions, rotations, step, scene
-        self.seed, self.joint_limits, self.cost = seed, limits.joints, cost
+        self.settings, self.seed, self.joint_limits, self.cost = settings, seed, limits.joints, cost
         bounds = limits.bounds(machine)
         self.lower, self.upper = bounds.lower, bounds.upper
         self.space = JointSpace(machine, bounds.lower, bounds.upper, np.ones(machine.joint_size))

@@ -202,8 +202,7 @@ class SelfMotionManifolds:
     def seeds(self, index: int, limits: Any, seed: int) -> Array:
         """Return configurations (K, n) of a time sample within limits, on as many components as possible.
 
-        A solver of all branches lists some of every one. Iterations from random starts add others, unless all are
-        listed.
+        A solver lists some of every branch. Iterations from random starts add others, unless all are listed.
 
         Raises:
             Unreachable: No configuration was found.
@@ -217,14 +216,12 @@ class SelfMotionManifolds:
                 return listed
         options: dict[str, Any] = {"limits": limits, "seed": seed, "starts": self.settings.starts}
         try:
-            random = [
-                solution.joints for solution in inverse_kinematics_at(self.equations, self.targets[index], **options)
-            ]
+            random = inverse_kinematics_at(self.equations, self.targets[index], **options)
         except Unreachable:
             if not len(listed):
                 raise
             random = []
-        return np.vstack([listed, *random])
+        return np.vstack([listed, *(solution.joints for solution in random)])
 
     def linearize(self, layer: Indices, joints: Array) -> tuple[Array, Array]:
         """Return the task errors (M, m) and their Jacobians in the scaled joints (M, m, n)."""
