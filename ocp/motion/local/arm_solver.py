@@ -9,7 +9,9 @@ if there are still fewer than six, which must stay at zero.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +24,7 @@ from ocp.motion.local.pose_solver import PoseSolver
 
 __all__ = ["ArmSolver", "arm_solver", "sample_shares"]
 
-STEPS = np.sqrt([2.0, 3.0, 5.0, 7.0]) % 1
+STEPS = np.sqrt([2.0, 3.0, 5.0, 7.0, 11.0, 13.0]) % 1
 """Steps of the sampled parameters between samples, as shares of their ranges; irrational, so that none repeats."""
 
 
@@ -40,7 +42,7 @@ class ArmSettings:
         excess: Largest excess over a limit that counts as rounding and is clipped, rad or m.
     """
 
-    max_samples: int = 4
+    max_samples: int = 6
     max_solvers: tuple[int, int] = (6, 2)
     trials: int = 32
     seed: int = 0
@@ -78,6 +80,8 @@ class ArmSolver:
     def redundant_positions(self, solver: PoseSolver, shares: Array) -> Array:
         """Return positions of the redundant joints of a solver at shares (M, k) of their ranges."""
         joints = list(solver.redundant)
+        if not joints:
+            return shares[:, :0]
         span = np.where(self.chain.revolute[joints], np.pi, ARM.slide_range)
         low, high = self.lower[joints], self.upper[joints]
         low = np.where(np.isfinite(low), low, np.where(np.isfinite(high), high - 2 * span, -span))
@@ -112,27 +116,55 @@ class ArmSolver:
 
     def _within_limits(self, solutions: Solutions, turns: bool) -> Solutions:
         """Return the solutions within the limits, with joints shifted by whole turns that keep them."""
-        lower, upper, order = self.lower - ARM.excess, self.upper + ARM.excess, list(self.chain.order)
-        joints, below, above = solutions.joints.copy(), np.isfinite(lower), np.isfinite(upper)
-        twice = below & above & self.chain.revolute
-        start = np.where(below, lower, upper - TURN)
-        if not turns:
-            start[twice] = (lower[twice] + upper[twice]) / 2 - np.pi
-        shiftable = (below | above) & self.chain.revolute
-        joints[:, shiftable] += TURN * np.ceil((start[shiftable] - joints[:, shiftable]) / TURN)
-        good = ((joints >= lower) & (joints <= upper))[:, order].all(axis=1)
-        rows, joints = np.flatnonzero(good), joints[good]
-        several = np.flatnonzero(twice & (upper - lower >= TURN))
+        windows, order = self._windows, list(self.chain.order)
+        start, shiftable = windows.low if turns else windows.middle, windows.shiftable
+        joints = solutions.joints.copy()
+        joints[:, shiftable] += TURN * np.ceil((start - joints[:, shiftable]) / TURN)
+        good = ((joints >= windows.lower) & (joints <= windows.upper))[:, order].all(axis=1)
+        rows, joints, several = np.flatnonzero(good), joints[good], windows.several
         if turns and several.size:
-            counts = 1 + ((upper[several] - joints[:, several]) // TURN).astype(int)
+            counts = 1 + ((windows.upper[several] - joints[:, several]) // TURN).astype(int)
             products = np.cumprod(counts, axis=1)
             copies = np.repeat(np.arange(len(rows)), products[:, -1])
             number = np.arange(len(copies)) - np.repeat(np.cumsum(products[:, -1]) - products[:, -1], products[:, -1])
             digits = number[:, None] // (products // counts)[copies] % counts[copies]
             rows, joints = rows[copies], joints[copies]
             joints[:, several] += TURN * digits
-        joints[:, order] = np.clip(joints, self.lower, self.upper)[:, order]
+        joints = np.where(windows.moving, np.clip(joints, self.lower, self.upper), joints)
         return Solutions(solutions.pose[rows], joints, solutions.singular[rows])
+
+    @cached_property
+    def _windows(self) -> _Windows:
+        """Windows of a whole turn within the limits."""
+        below, above, revolute = np.isfinite(self.lower), np.isfinite(self.upper), self.chain.revolute
+        both, lower, upper = below & above & revolute, self.lower - ARM.excess, self.upper + ARM.excess
+        low = np.where(below, lower, upper - TURN)
+        middle = low.copy()
+        middle[both] = (self.lower[both] + self.upper[both]) / 2 - np.pi
+        shiftable = np.flatnonzero((below | above) & revolute)
+        moving = np.isin(np.arange(len(lower)), self.chain.order)
+        several = np.flatnonzero(both & (upper - lower >= TURN))
+        return _Windows(lower, upper, low[shiftable], middle[shiftable], shiftable, several, moving)
+
+
+class _Windows(NamedTuple):
+    """Windows of a whole turn within the limits of revolute joints.
+
+    Attributes:
+        lower, upper: Limits, beyond which lies only rounding. Shape (n,).
+        low, middle: Lower ends of the lowest windows, and of those in the middle of the limits. Shape (s,).
+        shiftable: Numbers of the joints that have a limit. Shape (s,).
+        several: Numbers of the joints that can make a whole turn within the limits.
+        moving: Which joints move the tip. Shape (n,), bool.
+    """
+
+    lower: Array
+    upper: Array
+    low: Array
+    middle: Array
+    shiftable: NDArray[np.intp]
+    several: NDArray[np.intp]
+    moving: NDArray[np.bool_]
 
 
 def arm_solver(chain: Chain, lower: Array, upper: Array, axes: Array | None = None) -> ArmSolver | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum, Flag, auto
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -230,23 +231,23 @@ class PreparedArm:
         elif count > 1:
             redundant = np.repeat(redundant, count, axis=0)
         solutions, doubtful = self.arm.solve(solver, positions, rotations, redundant, turns=turns)
-        pose = solutions.pose // samples
-        order = np.argsort(pose, kind="stable")
-        singular = np.bincount(pose[solutions.singular], minlength=count) > 0
-        ill = np.asarray(doubtful.reshape(count, samples).any(axis=1))
-        sampled = Incompleteness(0) if self.complete else Incompleteness.SAMPLED
-        reasons = [
-            sampled
-            | (Incompleteness.SINGULAR if here else Incompleteness(0))
-            | (Incompleteness.ILL_CONDITIONED if bad else Incompleteness(0))
-            for here, bad in zip(singular.tolist(), ill.tolist(), strict=True)
-        ]
-        joints = solutions.joints[order]
-        idle = np.ones(joints.shape[1], dtype=bool)
-        idle[list(self.arm.chain.order)] = False
-        if idle.any():
-            joints[:, idle] = idle_positions(self.arm.lower, self.arm.upper)[idle]
-        return joints, pose[order], tuple(reasons)
+        pose, joints = solutions.pose // samples, solutions.joints
+        if count > 1:
+            order = np.argsort(pose, kind="stable")
+            pose, joints = pose[order], joints[order]
+        if self._idle.any():
+            joints[:, self._idle] = idle_positions(self.arm.lower, self.arm.upper)[self._idle]
+        reasons = [Incompleteness(0) if self.complete else Incompleteness.SAMPLED] * count
+        for k in np.unique(solutions.pose[solutions.singular] // samples).tolist():
+            reasons[k] |= Incompleteness.SINGULAR
+        for k in np.unique(np.flatnonzero(doubtful) // samples).tolist():
+            reasons[k] |= Incompleteness.ILL_CONDITIONED
+        return joints, pose, tuple(reasons)
+
+    @cached_property
+    def _idle(self) -> NDArray[np.bool_]:
+        """Which joints do not move the tip. Shape (n,)."""
+        return np.isin(np.arange(len(self.arm.lower)), self.arm.chain.order, invert=True)
 
     def _rotations(self, shares: Array) -> Array:
         """Return rotations of the tip in its own frame at shares of the open angles. Shape (S, 3, 3)."""
