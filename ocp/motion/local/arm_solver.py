@@ -122,15 +122,13 @@ class ArmSolver:
         joints[:, shiftable] += TURN * np.ceil((start - joints[:, shiftable]) / TURN)
         good = ((joints >= windows.lower) & (joints <= windows.upper))[:, order].all(axis=1)
         rows, joints, several = np.flatnonzero(good), joints[good], windows.several
-        if turns and several.size:
-            counts = 1 + ((windows.upper[several] - joints[:, several]) // TURN).astype(int)
-            products = np.cumprod(counts, axis=1)
-            copies = np.repeat(np.arange(len(rows)), products[:, -1])
-            number = np.arange(len(copies)) - np.repeat(np.cumsum(products[:, -1]) - products[:, -1], products[:, -1])
-            digits = number[:, None] // (products // counts)[copies] % counts[copies]
+        for j in several.tolist() if turns else ():
+            counts = 1 + ((windows.upper[j] - joints[:, j]) // TURN).astype(int)
+            copies = np.repeat(np.arange(len(rows)), counts)
+            number = np.arange(len(copies)) - np.repeat(np.cumsum(counts) - counts, counts)
             rows, joints = rows[copies], joints[copies]
-            joints[:, several] += TURN * digits
-        joints = np.where(windows.moving, np.clip(joints, self.lower, self.upper), joints)
+            joints[:, j] += TURN * number
+        np.clip(joints, windows.lowest, windows.highest, out=joints)
         return Solutions(solutions.pose[rows], joints, solutions.singular[rows])
 
     @cached_property
@@ -144,7 +142,8 @@ class ArmSolver:
         shiftable = np.flatnonzero((below | above) & revolute)
         moving = np.isin(np.arange(len(lower)), self.chain.order)
         several = np.flatnonzero(both & (upper - lower >= TURN))
-        return _Windows(lower, upper, low[shiftable], middle[shiftable], shiftable, several, moving)
+        lowest, highest = np.where(moving, self.lower, -np.inf), np.where(moving, self.upper, np.inf)
+        return _Windows(lower, upper, lowest, highest, low[shiftable], middle[shiftable], shiftable, several)
 
 
 class _Windows(NamedTuple):
@@ -152,19 +151,20 @@ class _Windows(NamedTuple):
 
     Attributes:
         lower, upper: Limits, beyond which lies only rounding. Shape (n,).
+        lowest, highest: Limits of the joints that move the tip. Shape (n,).
         low, middle: Lower ends of the lowest windows, and of those in the middle of the limits. Shape (s,).
         shiftable: Numbers of the joints that have a limit. Shape (s,).
         several: Numbers of the joints that can make a whole turn within the limits.
-        moving: Which joints move the tip. Shape (n,), bool.
     """
 
     lower: Array
     upper: Array
+    lowest: Array
+    highest: Array
     low: Array
     middle: Array
     shiftable: NDArray[np.intp]
     several: NDArray[np.intp]
-    moving: NDArray[np.bool_]
 
 
 def arm_solver(chain: Chain, lower: Array, upper: Array, axes: Array | None = None) -> ArmSolver | None:
