@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.arrays import Array
-from ocp.motion.local.chain import Axis, Chain, Motion, Solutions, axial, cross, dot
+from ocp.motion.local.chain import TURN, Axis, Chain, Motion, Solutions, axial, cross, dot
 from ocp.motion.local.pose_solver import Mask, PoseSolver
 
 __all__ = ["Elimination", "elimination_of"]
@@ -63,6 +63,7 @@ class EliminationSettings:
         surely_real: Distance below which a simple eigenvalue is real.
         simple: Deviation of an eigenvector from the products of one solution below which its eigenvalue is simple.
         poles: Angles h at which the half-angle may be infinite; for each pose the best-conditioned one is taken.
+        same: Distance of a solution from a configuration of the trial below which they are the same, rad or m.
         trials: Number of random configurations of the trial.
         openings: Largest number of eigenvalue problems that are solved at a doubtful pose.
         seed: Seed of the trial.
@@ -75,6 +76,7 @@ class EliminationSettings:
     surely_real: float = 1e-7
     simple: float = 1e-4
     poles: tuple[float, ...] = (0.3, 1.9, 3.5, 5.1)
+    same: float = 1e-5
     trials: int = 12
     openings: int = 3
     seed: int = 0
@@ -160,8 +162,8 @@ class Elimination(PoseSolver):
 def elimination_of(chain: Chain, redundant: tuple[int, ...]) -> Elimination | None:
     """Return the solver of six joints of a chain; None if no eigenvalue problem of theirs is regular.
 
-    At random configurations the openings are sorted by the condition of their problems. The first ones that find these
-    configurations again, and as many solutions as any other, are taken.
+    At random configurations the openings are sorted by the condition of their problems. The first ones are taken that
+    find the most of these configurations again, and the most solutions.
     """
     rng, trials = np.random.default_rng(ELIMINATION.seed), ELIMINATION.trials
     joints = rng.uniform(-np.pi, np.pi, (trials, len(chain.axes)))
@@ -180,15 +182,20 @@ def elimination_of(chain: Chain, redundant: tuple[int, ...]) -> Elimination | No
                 condition = float(np.median(_companions(matrices)[2]))
                 conditions.append((condition, Opening(first, rank, (z, a, b))))
     regular = sorted(each for each in conditions if each[0] > ELIMINATION.regular)[::-1]
-    kept, most = list[Opening](), 0
+    kept, most = list[Opening](), (0, 0)
     for _, opening in regular:
         rough = _solve_opening(axes, goal, chain.size, opening)
         solutions = solver.refine(rough.pose, rough.free, prescribed, tips)
-        if len(solutions.pose) >= most:
-            kept = [*(kept if len(solutions.pose) == most else []), opening]
-            most = len(solutions.pose)
-        if len(kept) == ELIMINATION.openings:
+        deviation = (solutions.joints - joints[solutions.pose])[:, list(chain.order)]
+        deviation[:, chain.revolute[list(chain.order)]] %= TURN
+        same = np.minimum(deviation, TURN - deviation).max(axis=1, initial=0.0) < ELIMINATION.same
+        score = len(np.unique(solutions.pose[same])), len(solutions.pose)
+        if score >= most:
+            kept = [*(kept if score == most else []), opening]
+            most = score
+        if len(kept) >= ELIMINATION.openings and most[0] == trials:
             break
+    kept = kept[: ELIMINATION.openings]
     return Elimination(chain, redundant, tuple(kept)) if kept else None
 
 
