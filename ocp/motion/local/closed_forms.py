@@ -26,6 +26,8 @@ from ocp.motion.local.pose_solver import Mask, PoseSolver
 
 __all__ = ["ClosedForm", "closed_forms", "is_scara"]
 
+TINY = 1e-300
+"""Added to lengths that divide, so that zeros give no exception."""
 SIX, SCARA = 6, 4
 """Numbers of joints of the arms with closed forms, without redundant joints."""
 
@@ -193,7 +195,8 @@ def _solve_six(axes: list[Axis], goal: Motion, form: ClosedForm) -> tuple[NDArra
     families[pose[on_axis]] = True  # y may have any angle
     remaining = y.by(second).after(before).inverse.after(after)
     which, last = (_solve_wrist if kind == "meeting" else _solve_planar)([a, b, c], remaining)
-    return pose[which], np.column_stack([first[which], second[which], third[which], last]), families
+    outer = np.stack([first, second, third], axis=1)[which]
+    return pose[which], np.concatenate([outer, last], axis=1), families
 
 
 def _angle_pairs(a: Array, b: Array, c: Array) -> tuple[NDArray[np.intp], Array, Array, Mask]:
@@ -202,7 +205,7 @@ def _angle_pairs(a: Array, b: Array, c: Array) -> tuple[NDArray[np.intp], Array,
     The last result says for which of the M equations an angle is not determined.
     """
     left, size, right = np.linalg.svd(b)
-    size = size + 1e-300
+    size = size + TINY
     singular = size[:, 1] <= FORMS.straight * size[:, 0]
     alpha, gamma = left.transpose(0, 2, 1) @ a, (c[:, None] @ left)[:, 0]
     # w(z) = gamma - delta z - conj(delta) / z with z = exp(i first), and (w_1 / s_1)^2 + (w_2 / s_2)^2 = 1
@@ -216,8 +219,7 @@ def _angle_pairs(a: Array, b: Array, c: Array) -> tuple[NDArray[np.intp], Array,
     roots = _polynomial_roots(square)
     if singular.any():  # an equation without the second angle has two solutions by itself
         roots[singular, :2], roots[singular, 2:] = _polynomial_roots(rows[singular]), np.nan
-    with np.errstate(divide="ignore", invalid="ignore"):
-        pose, column = np.nonzero(np.abs(np.log(np.abs(roots))) < FORMS.near)
+    pose, column = np.nonzero(np.abs(np.abs(roots) - 1) < FORMS.near)
     first = np.angle(roots[pose, column])
     direction = np.stack([np.cos(first), np.sin(first)], axis=1)
     remaining = gamma[pose] - (alpha[pose] @ direction[:, :, None])[:, :, 0]
@@ -256,8 +258,7 @@ def _meeting_points(*axes: Axis) -> Array:
 
 def _middle_angles(value: Array, cosine: Array, sine: Array) -> tuple[NDArray[np.intp], Array]:
     """Return indices and both angles with cosine cos + sine sin = value, the nearest where there are none."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        share = np.clip(np.nan_to_num(value / np.hypot(cosine, sine)), -1.0, 1.0)
+    share = np.clip(value / np.maximum(np.hypot(cosine, sine), TINY), -1.0, 1.0)
     middle, half, rows = np.arctan2(sine, cosine), np.arccos(share), np.arange(len(value))
     return np.concatenate([rows, rows]), np.concatenate([middle + half, middle - half])
 
@@ -294,6 +295,7 @@ def _outer_angles(axes: list[Axis], goal: Motion, second: Array, goal_point: Arr
     else:
         start, end = motion.at(c.point) - a.point, goal_point - a.point
     first = a.angle(start, end)
-    remaining = a.by(first).after(motion).inverse.after(goal).turn
-    third = np.arctan2(dot(c.direction, axial(remaining)) / 2, (np.trace(remaining, axis1=1, axis2=2) - 1) / 2)
-    return np.column_stack([first, second, third])
+    remaining = (a.by(first).turn @ motion.turn).transpose(0, 2, 1) @ goal.turn
+    trace = remaining[:, 0, 0] + remaining[:, 1, 1] + remaining[:, 2, 2]
+    third = np.arctan2(dot(c.direction, axial(remaining)), trace - 1)
+    return np.stack([first, second, third], axis=1)
