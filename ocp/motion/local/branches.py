@@ -30,16 +30,20 @@ class IkBranches:
         self.arm, self.complete = arm, arm.complete
         self._task = equations.bound[0].task
 
-    def configurations(self, targets: Array, count: int, number: int = 0, *, turns: bool = True) -> IkConfigurations:
+    def configurations(
+        self, targets: Array, count: int, number: int = 0, *, turns: bool = True, choices: int | None = None
+    ) -> IkConfigurations:
         """Return the configurations of all branches within the limits, joints without limits between -pi and pi.
 
         Args:
             targets: Targets of the equations. Shape (size,).
-            count: Number of samples of the free parameters, over all choices of the sampled joints.
+            count: Number of samples of the free parameters, over several choices of the sampled joints.
             number: Number of the first sample; a different one gives other samples.
             turns: Whether all whole turns are listed, or only the one farthest from the limits.
+            choices: Largest number of choices of the sampled joints; None: all that have a solver. Each is singular at
+                other configurations.
         """
-        solvers = self.arm.arm.solvers
+        solvers = self.arm.arm.solvers[:choices]
         position, rotation = targets[None, :3], self._rotation(targets)[None]
         parts, names, reason = list[Array](), dict[str, None](), None
         for solver in solvers:
@@ -80,6 +84,8 @@ def ik_branches(equations: TaskEquations, lower: Array, upper: Array) -> IkBranc
     whole_position = set(task.chosen) >= set(LINEAR) and task.position is not None
     if reference is not None or not task.is_pose or not whole_position or (chain := Chain.of(tip)) is None:
         return None
+    if not equations.idle[np.isin(np.arange(len(lower)), chain.order, invert=True)].all():
+        return None  # other joints matter, for example to the balance of a standing machine
     rotation = set(task.chosen) & set(ANGULAR)
     free, axis = ToolFreedom.NONE, np.array(task.tool_axis)
     if task.direction is not None:
@@ -120,4 +126,5 @@ def ik_configurations(
     if branches is None:
         words = "ik_configurations needs the pose of the tip of an arm on a fixed base; use inverse_kinematics"
         raise ProblemError(words, name="task", value=task)
-    return branches.configurations(np.array(equations.target_function()(float(time))).ravel(), int(samples))
+    targets = np.array(equations.target_function()(float(time))).ravel()
+    return branches.configurations(targets, int(samples), choices=1)

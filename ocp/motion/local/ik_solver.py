@@ -182,7 +182,7 @@ class PreparedArm:
     ) -> PreparedArm | None:
         """Return the prepared arm; None if its base moves or no six joints determine the pose of its tip."""
         chain = Chain.of(tip)
-        if chain is None:
+        if chain is None or (free is ToolFreedom.CONE and len(chain.order) < SIX):
             return None
         axis, axes, sampled = tool_axis / np.linalg.norm(tool_axis), None, 0
         if free is ToolFreedom.ROTATION:

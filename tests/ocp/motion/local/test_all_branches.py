@@ -249,6 +249,22 @@ def test_a_direction_is_reached_with_the_roll_free(count: int) -> None:
             assert distances(joints[k : k + 1], result.joints, revolute(machine)).min() < 1e-6
 
 
+@pytest.mark.parametrize("name", ["UR5", "CRX", "Panda"])
+def test_the_tool_axis_stays_in_its_cone_and_fills_it(name: str) -> None:
+    machine, axis = build(name), np.array([0.6, 0.0, 0.8])
+    joints = np.linspace(0.3, 1.1, machine.joint_size)[None] * np.where(np.arange(machine.joint_size) % 2, -1, 1)
+    position, rotation = tip_poses(machine, joints)
+    task = TipTask(position=position[0], direction=3 * rotation[0] @ axis, tool_axis=axis, within=0.4)
+    result = ik_configurations(machine, task, limits=False, samples=200)
+    reached = tip_poses(machine, result.joints)
+    np.testing.assert_allclose(reached[0], np.tile(position[0], (len(result), 1)), atol=1e-9)
+    angles = np.arccos(np.clip(reached[1] @ axis @ (rotation[0] @ axis), -1, 1))
+    assert angles.max() <= 0.4 + 1e-9
+    assert angles.max() > 0.35
+    assert angles.min() < 0.1
+    assert result.parameters[-3:] == ("roll", "azimuth", "tilt")
+
+
 def test_inverse_kinematics_lists_what_the_solver_finds() -> None:
     for machine in (build("CRX"), build("UR5 calibrated"), ur5()):
         positions, rotations = tip_poses(machine, random_joints(machine, np.random.default_rng(2), 4))
