@@ -22,6 +22,8 @@ from ocp.motion.builders.standing.stances import StancePhase, Steps, standing_co
 from ocp.motion.builders.standing.steps import StepWeights, steps_problem
 from ocp.motion.builders.timing import minimum_time_problem
 from ocp.motion.local.accelerations import Layer, Stabiliser, resolve_accelerations
+from ocp.motion.local.branches import ik_configurations
+from ocp.motion.local.ik_solver import IkConfigurations, IkSolver, Incompleteness, ToolFreedom
 from ocp.motion.local.inverse_kinematics import Unreachable, inverse_kinematics
 from ocp.motion.local.rates import resolve
 from ocp.motion.plan import Candidate, DeadEnd, Plan, Reconfiguration, plan
@@ -66,7 +68,10 @@ __all__ = [
     "FreeTime",
     "Goal",
     "Grasp",
+    "IkConfigurations",
+    "IkSolver",
     "InFoot",
+    "Incompleteness",
     "IndexAtLeast",
     "Indirect",
     "JointFriction",
@@ -96,6 +101,7 @@ __all__ = [
     "StepsMotion",
     "StorageWarning",
     "TipTask",
+    "ToolFreedom",
     "Unreachable",
     "Waypoints",
     "Weights",
@@ -104,6 +110,7 @@ __all__ = [
     "chained_capture",
     "dynamics_phases",
     "dynamics_problem",
+    "ik_configurations",
     "inverse_kinematics",
     "joint_path",
     "joint_torques",

@@ -1,4 +1,4 @@
-"""Multi-start inverse kinematics under joint limits.
+"""Inverse kinematics under joint limits: all branches where an arm has a solver of them, else from many starts.
 
 Damped Gauss-Newton (Levenberg 1944, Marquardt 1963) from many starts at once, with bounds by projection: joints at a
 limit that a step would violate are fixed in that step. All starts share one mapped CasADi function.
@@ -18,6 +18,7 @@ from models import CollisionScene, Machine
 from models.arrays import Array
 from ocp.console import interruptible
 from ocp.errors import NOT_NUMBERS, ProblemError, checked_count, checked_flag, checked_positive, floats, real
+from ocp.motion.local.branches import ik_branches
 from ocp.motion.local.collisions import Collision, checked_collision_scene, find_collisions, slide_apart
 from ocp.motion.tasks.checks import checked_configuration
 from ocp.motion.tasks.equations import TaskEquations, bind
@@ -117,16 +118,22 @@ def inverse_kinematics(
 ) -> list[IkSolution]:
     """Return distinct joint positions at which the machine does its pose tasks, the best first.
 
-    If there are more joints than rows, the solutions form families, and each start gives one member.
+    If the task is one pose of the tip of an arm on a fixed base, its solutions are listed on all branches (see
+    `ik_configurations`, which also tells whether they are all). If there are more joints than rows, the solutions form
+    families, of which members at samples of the free parameters are listed. For other tasks and machines, and where the
+    list is not certain to be complete, damped Gauss-Newton iterations begin at random starts, of which each gives one
+    solution at most.
 
     Args:
         machine: Any machine; a floating base stays at `base`.
         task: A TipTask with a pose, or several that hold at once; velocity tasks are ignored.
         time: Time of the tasks, s.
         base: Base configuration, shape (base_size,); the machine's base_home() if None.
-        starts: Number of random starts, uniform between the limits, -pi .. pi for unlimited joints.
+        starts: Number of samples of the free parameters, and of random starts, uniform between the limits, -pi .. pi
+            for unlimited joints. Of more solutions of a redundant arm, so many are kept that are far from each other.
+            0: only the iterations from `near`.
         near: Further starts, before the random ones. Shape (joint_size,) or (k, joint_size).
-        seed: Seed of the random starts.
+        seed: Seed of the samples and of the random starts.
         limits: Whether the position limits of the robot apply.
         tolerance: Largest pose error of a solution, m and rad.
         apart: Least distance between two solutions, in the largest joint difference, angles modulo full turns.
@@ -172,7 +179,10 @@ def inverse_kinematics(
         raise ProblemError(words, name="task", value=targets, time=float(time))
 
     search = _MultiStart(equations, base_values, targets, lower, upper, tolerance, apart, int(iterations))
-    solutions = search.solve(first, int(starts))
+    listed, certain = search.list_branches(int(starts), int(seed))
+    random = 0 if certain else int(starts)
+    first = first[: len(first) - int(starts) + random]
+    solutions = search.solve(np.vstack([first[: len(first) - random], listed, first[len(first) - random :]]), random)
     if scene is None:
         return solutions
     collisions = _closest_collisions(solutions, scene, base_values, float(time))
@@ -197,7 +207,7 @@ def inverse_kinematics(
 def inverse_kinematics_at(
     equations: TaskEquations, targets: Array, *, starts: int, seed: int, limits: bool
 ) -> list[IkSolution]:
-    """Return IK solutions on a fixed base for known targets, repeatedly at low cost; see `inverse_kinematics`.
+    """Return IK solutions on a fixed base for known targets from random starts alone; see `inverse_kinematics`.
 
     Raises:
         Unreachable: No start leads to the pose.
@@ -237,6 +247,18 @@ class _MultiStart:
             nearest = int(error.argmin())
             raise unreachable_error(self.equations, q[nearest], float(error[nearest]), lower, upper)
         return self.rank(q, error)
+
+    def list_branches(self, count: int, seed: int) -> tuple[Array, bool]:
+        """Return solutions on all branches, (K, n), and whether no random start is needed besides."""
+        branches = ik_branches(self.equations, self.lower, self.upper) if count else None
+        if branches is None:
+            return np.zeros((0, len(self.lower))), False
+        configurations = branches.configurations(self.targets, count, seed * count, turns=False)
+        joints = configurations.joints
+        if len(joints) > count and not branches.complete:
+            joints = joints[spread_points(np.where(self._revolute, np.sin(joints), joints), count)]
+        certain = bool(configurations.complete[0]) if branches.complete else True
+        return joints, certain and len(joints) > 0
 
     def iterate(self, joints: Array) -> tuple[Array, Array]:
         """Return joints (K, n) and largest pose errors (K,) after the iterations from these joints."""
@@ -310,13 +332,6 @@ def sample_starts(machine: Machine, lower: Array, upper: Array, count: int, near
     return np.asarray(np.clip(starts, lower, upper))
 
 
-def idle_positions(lower: Array, upper: Array) -> Array:
-    """Return positions for joints without effect: the middle of their limits, else the value next to 0."""
-    with np.errstate(invalid="ignore"):
-        middle = (lower + upper) / 2
-    return np.asarray(np.where(np.isfinite(middle), middle, np.clip(0.0, lower, upper)))
-
-
 def gauss_newton(
     function: Any,
     starts: Array,
@@ -376,15 +391,24 @@ def distinct_solutions(
 ) -> list[IkSolution]:
     """Return the first of each group of solutions within `apart`, angles modulo full turns."""
     distinct: list[IkSolution] = []
+    kept = np.zeros((len(solutions), len(revolute)))
     for solution in solutions:
-        for previous in distinct:
-            difference = solution.joints - previous.joints
-            difference[revolute] = np.remainder(difference[revolute] + np.pi, 2 * np.pi) - np.pi
-            if np.abs(difference).max() < apart:
-                break
-        else:
+        difference = solution.joints - kept[: len(distinct)]
+        difference[:, revolute] = np.remainder(difference[:, revolute] + np.pi, 2 * np.pi) - np.pi
+        if np.abs(difference).max(axis=1).min(initial=np.inf) >= apart:
+            kept[len(distinct)] = solution.joints
             distinct.append(solution)
     return distinct
+
+
+def spread_points(points: Array, count: int) -> NDArray[np.intp]:
+    """Return the indices of `count` points (K, n) far from each other: each is the farthest from those before it."""
+    chosen = [0]
+    distance = np.linalg.norm(points - points[0], axis=1)
+    while len(chosen) < count:
+        chosen.append(int(distance.argmax()))
+        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
+    return np.array(chosen)
 
 
 def _closest_collisions(

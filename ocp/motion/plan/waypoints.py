@@ -22,7 +22,8 @@ from models.arrays import Array
 from ocp.errors import NOT_NUMBERS, ProblemError, SolveError, checked_choice, checked_count, checked_instance, floats
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.local.collisions import Collision, distances_along, find_collisions
-from ocp.motion.local.inverse_kinematics import LARGEST_SEED, Unreachable, idle_positions
+from ocp.motion.local.ik_solver import idle_positions
+from ocp.motion.local.inverse_kinematics import LARGEST_SEED, Unreachable
 from ocp.motion.plan.planner import clearance_for
 from ocp.motion.result.candidate import Candidate, Reason, Rejection, Stage
 from ocp.motion.result.path_plan import PathPlan, PathPoses

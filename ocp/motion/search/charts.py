@@ -45,7 +45,7 @@ class ChartSettings:
         flatness: Largest distance of the manifold from a chart, relative to the radius, by the number of free
             directions. With two, half the value takes two to three times as long, and twice the value loses bounds.
         halvings: Largest number of halvings of the radius; the atlas ends closer to singular configurations.
-        listed: Samples of the free parameter at which a closed form lists all configurations.
+        listed: Samples of the free parameters at which configurations on all branches are listed.
         starts: Random starts of inverse kinematics at a time sample.
         neighbours: Charts in which a point of an edge is searched.
     """
@@ -202,26 +202,26 @@ class SelfMotionManifolds:
     def seeds(self, index: int, limits: Any, seed: int) -> Array:
         """Return configurations (K, n) of a time sample within limits, on as many components as possible.
 
-        A closed form lists some of every branch; inverse kinematics from random starts adds others.
+        A solver lists some of every branch. Iterations from random starts add others, unless all are listed.
 
         Raises:
             Unreachable: No configuration was found.
         """
         listed, count = np.zeros((0, len(self.space.scale))), self.settings.listed
         if self._branches is not None:
-            solutions = self._branches.solutions(self.targets[index], count, count * index)
-            projected, good = self.project(np.full(len(solutions), index), solutions)
+            solutions = self._branches.configurations(self.targets[index], count, count * index)
+            projected, good = self.project(np.full(len(solutions), index), solutions.joints)
             listed = projected[good & self.space.within(projected)]
+            if len(listed) and solutions.complete.all():
+                return listed
         options: dict[str, Any] = {"limits": limits, "seed": seed, "starts": self.settings.starts}
         try:
-            random = [
-                solution.joints for solution in inverse_kinematics_at(self.equations, self.targets[index], **options)
-            ]
+            random = inverse_kinematics_at(self.equations, self.targets[index], **options)
         except Unreachable:
             if not len(listed):
                 raise
             random = []
-        return np.vstack([listed, *random])
+        return np.vstack([listed, *(solution.joints for solution in random)])
 
     def linearize(self, layer: Indices, joints: Array) -> tuple[Array, Array]:
         """Return the task errors (M, m) and their Jacobians in the scaled joints (M, m, n)."""

@@ -16,7 +16,8 @@ from ocp.errors import ProblemError
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.tool_motion import Stretch, stretches_of
 from ocp.motion.local.collisions import Collision, distances_along
-from ocp.motion.local.inverse_kinematics import Unreachable, idle_positions, inverse_kinematics, sample_starts
+from ocp.motion.local.ik_solver import idle_positions
+from ocp.motion.local.inverse_kinematics import Unreachable, inverse_kinematics, sample_starts
 from ocp.motion.local.rates import LocalMotion, track_tasks
 from ocp.motion.search.settings import PlannerSettings
 from ocp.motion.tasks.checks import ignorable_joints

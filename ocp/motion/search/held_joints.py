@@ -22,7 +22,8 @@ from models import Machine, ModelWarning, Robot
 from models.arrays import Array
 from models.shapes.bodies import RigidParts
 from ocp.errors import ProblemError, SolveError
-from ocp.motion.local.inverse_kinematics import Unreachable, idle_positions, sample_starts
+from ocp.motion.local.ik_solver import idle_positions
+from ocp.motion.local.inverse_kinematics import Unreachable, sample_starts
 from ocp.motion.search.configurations import (
     REACH_TOLERANCE,
     PlanRequest,

@@ -11,9 +11,9 @@ import pytest
 
 from models import CollisionScene, FixedBase, Robot
 from models.machines.machine import hold_joints
-from ocp import TipTask, plan
+from ocp import Scene, TipTask, plan
 from ocp.motion.local.collisions import distances_along
-from ocp.motion.local.inverse_kinematics import idle_positions
+from ocp.motion.local.ik_solver import idle_positions
 from ocp.motion.tasks.equations import bind
 from tests.models.robot.pinocchio_robots import DATA, urdf_file
 from tests.models.robot.trees import Array
@@ -90,7 +90,7 @@ def _follow(pose_at: Any, middle: Array, place: Array, way: Array, axis: Array) 
 )
 def test_a_seam_is_planned_with_the_file_as_it_is(name: str, search: Any) -> None:
     whole, task = robot(name), seam(robot(name), ARMS[name][4])
-    result = plan(FixedBase(whole), task, search=search, missing="skip")
+    result = plan(FixedBase(whole), task, search=search, scene=Scene(missing="skip"))
     assert result.audit().passed
     assert result["joints"].shape[1] == whole.dof
     assert len(result.held) == ARMS[name][2 if search == "configurations" else 3]

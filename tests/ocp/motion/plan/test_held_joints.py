@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from models import CollisionShape, FixedBase, Joint, Link, ModelWarning, Robot, Sphere, attach_tool, lock_joints
-from ocp import Limits, ProblemError, TipTask, inverse_kinematics, plan
-from ocp.motion.plan.motion import Plan
+from ocp import Cost, Limits, ProblemError, Scene, TipTask, inverse_kinematics, plan
+from ocp.motion.result.plan import Plan
 from ocp.motion.search.held_joints import all_joints
 from tests.models.robot.pinocchio_robots import ROBOTS, urdf_file
 from tests.models.robot.trees import Array
@@ -65,7 +65,7 @@ def panda_seam() -> TipTask:
 def test_a_gripper_that_is_locked_by_hand_gives_the_same_plan(search: Any) -> None:
     whole = whole_panda()
     locked = FixedBase(lock_joints(whole.robot, {"panda_finger_joint1": 0.02}))
-    left, by_hand = (plan(machine, panda_seam(), search=search, clearance=None) for machine in (whole, locked))
+    left, by_hand = (plan(machine, panda_seam(), search=search, scene=False) for machine in (whole, locked))
     assert left.held == {"panda_finger_joint1": 0.02}
     assert by_hand.held == {}
     assert (left.cost, left.bound) == (by_hand.cost, by_hand.bound)
@@ -80,7 +80,7 @@ def test_a_plan_with_held_joints_is_saved_and_audited_again(tmp_path: Path) -> N
     machine = person(ball=True)
     start = np.array([0.2, 0.7, 0.3, 1.1, 0.8])
     ball = Sphere(0.05, (-0.6, -0.6, 0.0))
-    result = plan(machine, straight(machine, start, (-0.1, 0.15)), start=start, obstacles=[ball])
+    result = plan(machine, straight(machine, start, (-0.1, 0.15)), start=start, scene=Scene(obstacles=[ball]))
     result.save(tmp_path / "plan.npz")
     again = Plan.load(tmp_path / "plan.npz")
     assert again.held == result.held == {"head": 0.7}
@@ -98,10 +98,10 @@ def test_limits_of_each_joint_keep_their_joint_when_others_are_held() -> None:
     task = straight(machine, start, (-0.1, 0.15))
     limits = Limits(velocity=[0.02, 5, 2, 2, 2], acceleration=[1, 5, 2, 3, 4])
     weights = np.array([1.0, 100.0, 2.0, 3.0, 4.0])
-    result = plan(machine, task, start=start, limits=limits, weights=weights)
+    result = plan(machine, task, start=start, limits=limits, cost=Cost(weights=weights))
     locked = FixedBase(lock_joints(machine.robot, {"head": 0.7}))
     own = Limits(velocity=[0.02, 2, 2, 2], acceleration=[1, 2, 3, 4])
-    expected = plan(locked, task, start=np.delete(start, 1), limits=own, weights=np.delete(weights, 1))
+    expected = plan(locked, task, start=np.delete(start, 1), limits=own, cost=Cost(weights=np.delete(weights, 1)))
     assert result.cost == expected.cost
     assert np.abs(result["rates"][:, 0]).max() <= 0.02 * (1 + 1e-6)
 
@@ -172,7 +172,7 @@ def test_an_obstacle_at_a_held_body_is_an_error_and_a_closed_gripper_a_warning()
     start = np.array([0.0, -0.4, 0.8, -0.5])
     task = straight(machine, start, (-0.1, -0.1))
     with pytest.raises(ProblemError, match="'head' stays at 0") as caught:
-        plan(machine, task, start=start, obstacles=[Sphere(0.05, (0.3, 0.3, 0.0))])
+        plan(machine, task, start=start, scene=Scene(obstacles=[Sphere(0.05, (0.3, 0.3, 0.0))]))
     assert caught.value.name == "head_link and obstacle 0"
     fingers = [
         Link(name, collisions=(CollisionShape("sphere", (0.05,), translation=(x, 0, 0)),)) for name, x in FINGERS

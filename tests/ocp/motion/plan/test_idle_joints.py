@@ -17,6 +17,7 @@ from ocp.motion.tasks.checks import ignorable_joints
 from ocp.motion.tasks.equations import bind
 from tests.models.robot.pinocchio_robots import ROBOTS, urdf_file
 from tests.models.robot.trees import Array
+from tests.ocp.motion.local.test_closed_forms import chain_of
 from tests.ocp.motion.tasks.space_tasks import PANDA_START, UR5_START, panda, ur5
 
 PANDA_URDF = urdf_file(*ROBOTS["panda"][:2])
@@ -84,7 +85,7 @@ def test_what_moves_a_frame_is_read_from_the_tree() -> None:
 def test_a_gripper_leaves_the_closed_forms_of_its_arm(arm: Any) -> None:
     bare = arm()
     hand = handed(bare.robot, GRIPPER)
-    forms, others = closed_forms(hand), closed_forms(bare)
+    forms, others = closed_forms(chain_of(hand)), closed_forms(chain_of(bare))
     assert forms
     kinds, expected = ([(one.kind, one.triple, one.redundant) for one in each] for each in (forms, others))
     assert kinds == expected
@@ -95,7 +96,7 @@ def test_a_gripper_leaves_the_closed_forms_of_its_arm(arm: Any) -> None:
         equations = bind(machine, task)
         branches = ik_branches(equations, machine.robot.lower, machine.robot.upper)
         assert branches is not None
-        found.append(branches.solutions(np.array(equations.target_function()(0.0)).ravel(), 16))
+        found.append(branches.configurations(np.array(equations.target_function()(0.0)).ravel(), 16).joints)
     np.testing.assert_allclose(found[0][:, :n], found[1], atol=1e-9)
     np.testing.assert_allclose(found[0][:, n], 0.5)  # the middle of its limits
 

@@ -20,7 +20,7 @@ from models import (
     merge_robots,
     tip_pose,
 )
-from ocp import TipTask, inverse_kinematics, plan, plan_waypoints
+from ocp import Cost, TipTask, Waypoints, inverse_kinematics, plan
 from tests.models.robot.trees import Array
 
 DURATION = 2.0
@@ -56,17 +56,17 @@ def test_a_task_on_a_locked_table_is_the_same_task_in_the_world() -> None:
     angle, place = 0.4, np.array([0.5, 0.0, 0.1])
     turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1.0]])
     locked = FixedBase(lock_joints(robot, {"table_turn": angle}))
-    on_table = plan(locked, line(first, way, relative_to="table_table"), clearance=None)
-    in_world = plan(locked, line(place + turn @ first, turn @ way), clearance=None)
+    on_table = plan(locked, line(first, way, relative_to="table_table"), scene=False)
+    in_world = plan(locked, line(place + turn @ first, turn @ way), scene=False)
     assert on_table.cost == pytest.approx(in_world.cost, rel=1e-5)
 
 
 def test_a_table_that_turns_costs_no_more_than_one_that_is_locked() -> None:
     """The table has the start of the locked one and more freedom; its global bound holds for both."""
     robot, task = with_table(), line(np.array([0.0, -0.1, 0.2]), np.array([0.1, 0.2, 0.0]), relative_to="table_table")
-    locked = plan(FixedBase(lock_joints(robot, {"table_turn": 0.0})), task, clearance=None)
+    locked = plan(FixedBase(lock_joints(robot, {"table_turn": 0.0})), task, scene=False)
     machine = FixedBase(robot)
-    free = plan(machine, task, clearance=None, search="global")
+    free = plan(machine, task, scene=False, search="global")
     assert free.audit().passed
     assert free.bound is not None
     assert free.bound <= free.cost <= locked.cost * (1 + 1e-4)
@@ -98,8 +98,8 @@ def test_inverse_kinematics_reach_the_same_place_on_a_turned_table() -> None:
 def test_a_rail_costs_no_more_than_one_that_is_locked() -> None:
     robot, task = on_rail(), line(np.array([0.4, -0.4, 0.3]), np.array([0.0, 0.8, 0.0]))
     machine = FixedBase(robot)
-    free = plan(machine, task, clearance=None, weights=WEIGHTS, search="global")
-    locked = plan(FixedBase(lock_joints(robot, {"rail_joint": 0.0})), task, clearance=None)
+    free = plan(machine, task, scene=False, search="global", cost=Cost(weights=WEIGHTS))
+    locked = plan(FixedBase(lock_joints(robot, {"rail_joint": 0.0})), task, scene=False)
     assert free.audit().passed
     assert free.bound is not None
     assert free.bound <= free.cost < 0.9 * locked.cost
@@ -109,6 +109,6 @@ def test_a_rail_costs_no_more_than_one_that_is_locked() -> None:
 def test_waypoints_are_planned_on_a_rail() -> None:
     places = np.array([0.4, -0.4, 0.3]) + np.linspace(0, 1, 8)[:, None] * np.array([0.0, 0.8, 0.0])
     quaternion = np.tile([0.0, 1.0, 0.0, 0.0], (8, 1))
-    result = plan_waypoints(FixedBase(on_rail()), places, quaternion, step=0.3, clearance=None)
+    result = plan(FixedBase(on_rail()), Waypoints(places, quaternion, step=0.3), scene=False)
     assert result.bound is not None
     assert result.bound <= result.cost

@@ -128,7 +128,7 @@ def test_halves_cover_what_they_came_from() -> None:
     machine = panda()
     task = moved(machine, PANDA_START, "pose")
     sets, times = sets_of(machine, task)
-    charts = sets.cover(*found(machine, task, times, 16, 0), 0.07, 50_000)
+    charts = sets.cover(*found(machine, task, times, 64, 0), 0.07, 50_000)
     layer, joints = found(machine, task, times, 64, 99)
     for _ in range(3):
         charts = sets.split(charts).charts

@@ -24,6 +24,7 @@ from ocp.motion.search.reconfigurations import fewest_segments, segment_ends
 from ocp.motion.search.search import AtlasSearch
 from ocp.motion.search.steps import PathLength
 from ocp.motion.tasks.equations import bind
+from tests.ocp.motion.local.test_closed_forms import chain_of
 from tests.ocp.motion.search.test_charts import planar
 from tests.ocp.motion.search.test_values import reached
 from tests.ocp.motion.tasks.space_tasks import ur5
@@ -79,7 +80,7 @@ def of_six_joints(seed: int) -> tuple[FixedBase, Array, Array, float, list[Array
     turns = Slerp([0, 1], Rotation.from_matrix([np.array(ca.DM(pose.rotation)) for pose in ends]))(
         np.linspace(0, 1, COUNT)
     )
-    (form,) = closed_forms(machine)
+    (form,) = closed_forms(chain_of(machine))
     own, joints = form.solutions(places, turns.as_matrix(), np.zeros((COUNT, 0)))
     joints = middle + np.remainder(joints - middle + np.pi, FULL_TURN) - np.pi  # less than two turns within the limits
     more = [joints]

@@ -1,0 +1,217 @@
+"""All IK solutions of an arm within its limits: which joints are solved for, which are sampled, and whole turns.
+
+Six joints are solved for at once, in closed form or by elimination. Tasks that leave the orientation of the tip open
+and arms of fewer joints are brought to that form by revolute joints that the arm does not have, between its last joint
+and the tip: one about the tool axis if the roll is open, three about the tip if the orientation is; and auxiliary ones
+if there are still fewer than six, which must stay at zero.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.arrays import Array
+from ocp.motion.local.chain import TURN, Chain, Motion, Solutions
+from ocp.motion.local.closed_forms import SCARA, SIX, closed_forms
+from ocp.motion.local.elimination import elimination_of
+from ocp.motion.local.pose_solver import PoseSolver
+
+__all__ = ["ArmSolver", "arm_solver", "sample_shares"]
+
+STEPS = np.sqrt([2.0, 3.0, 5.0, 7.0, 11.0, 13.0]) % 1
+"""Steps of the sampled parameters between samples, as shares of their ranges; irrational, so that none repeats."""
+
+
+@dataclass(frozen=True)
+class ArmSettings:
+    """Settings of the choice of the joints that are solved for.
+
+    Attributes:
+        max_samples: Largest number of sampled parameters.
+        max_solvers: Largest number of choices of the sampled joints in closed form, and by elimination.
+        trials: Number of random configurations at which choices are compared.
+        seed: Seed of these configurations and of the axes of auxiliary joints.
+        slide_range: Prismatic joints without limits are sampled this far on either side of 0, m.
+        auxiliary: Largest position of an auxiliary joint that is refined at zero, rad.
+        excess: Largest excess over a limit that counts as rounding and is clipped, rad or m.
+    """
+
+    max_samples: int = 6
+    max_solvers: tuple[int, int] = (6, 2)
+    trials: int = 32
+    seed: int = 0
+    slide_range: float = 1.0
+    auxiliary: float = 1e-3
+    excess: float = 1e-9
+
+
+ARM = ArmSettings()
+
+
+def sample_shares(first: int, count: int, dimension: int) -> Array:
+    """Return samples first, ..., first + count - 1 of a sequence that fills the unit cube evenly. (count, dimension)"""
+    return np.asarray(((first + np.arange(count) + 0.5)[:, None] * STEPS[:dimension] + 0.5) % 1)
+
+
+@dataclass(frozen=True, eq=False)
+class ArmSolver:
+    """All IK solutions of an arm within its limits. Use `arm_solver` to build it.
+
+    Attributes:
+        chain: Chain of the arm.
+        solvers: Solvers of six joints, or four of a SCARA, for several choices of the sampled joints; the
+            best-conditioned one first. Their chains have further joints at the end.
+        auxiliary: Numbers of the auxiliary joints, which must stay at zero.
+        lower, upper: Limits of the joints, infinite for unlimited ones. Shape (n,).
+    """
+
+    chain: Chain
+    solvers: tuple[PoseSolver, ...]
+    auxiliary: tuple[int, ...]
+    lower: Array
+    upper: Array
+
+    def redundant_positions(self, solver: PoseSolver, shares: Array) -> Array:
+        """Return positions of the redundant joints of a solver at shares (M, k) of their ranges."""
+        joints = list(solver.redundant)
+        if not joints:
+            return shares[:, :0]
+        span = np.where(self.chain.revolute[joints], np.pi, ARM.slide_range)
+        low, high = self.lower[joints], self.upper[joints]
+        low = np.where(np.isfinite(low), low, np.where(np.isfinite(high), high - 2 * span, -span))
+        high = np.where(np.isfinite(high), high, low + 2 * span)
+        return np.asarray(low + shares * (high - low))
+
+    def solve(
+        self, solver: PoseSolver, positions: Array, rotations: Array, redundant: Array, *, turns: bool = True
+    ) -> tuple[Solutions, NDArray[np.bool_]]:
+        """Return all isolated solutions at M poses within the limits, and for which poses some may be missing.
+
+        Revolute joints are shifted by whole turns in all ways that keep the limits; unlimited ones are between -pi and
+        pi. Joints that do not move the tip are at 0.
+
+        Args:
+            solver: One of the solvers.
+            positions, rotations: Poses of the tip in the world. Shapes (M, 3), (M, 3, 3).
+            redundant: Positions of the redundant joints of the solver. Shape (M, k).
+            turns: Whether all whole turns are listed, or only the one farthest from the limits.
+        """
+        solutions, doubtful = solver.solve(positions, rotations, redundant)
+        n, extended = len(self.chain.axes), solver.chain
+        if self.auxiliary:
+            still = (np.abs(solutions.joints[:, list(self.auxiliary)]) < ARM.auxiliary).all(axis=1)
+            joints = solutions.joints[still]
+            joints[:, list(self.auxiliary)] = 0.0
+            own = [j for j in solver.free if j not in self.auxiliary]
+            solutions = extended.refine(solutions.pose[still], joints, own, Motion(rotations, positions))
+        if len(extended.axes) > n + len(self.auxiliary):  # solutions that differ only in joints the arm does not have
+            solutions = extended.distinct(solutions, [j for j in solver.free if j < n], Motion(rotations, positions))
+        return self._within_limits(solutions._replace(joints=solutions.joints[:, :n]), turns), doubtful
+
+    def _within_limits(self, solutions: Solutions, turns: bool) -> Solutions:
+        """Return the solutions within the limits, with joints shifted by whole turns that keep them."""
+        windows, order = self._windows, list(self.chain.order)
+        start, shiftable = windows.low if turns else windows.middle, windows.shiftable
+        joints = solutions.joints.copy()
+        joints[:, shiftable] += TURN * np.ceil((start - joints[:, shiftable]) / TURN)
+        good = ((joints >= windows.lower) & (joints <= windows.upper))[:, order].all(axis=1)
+        rows, joints, several = np.flatnonzero(good), joints[good], windows.several
+        for j in several.tolist() if turns else ():
+            counts = 1 + ((windows.upper[j] - joints[:, j]) // TURN).astype(int)
+            copies = np.repeat(np.arange(len(rows)), counts)
+            number = np.arange(len(copies)) - np.repeat(np.cumsum(counts) - counts, counts)
+            rows, joints = rows[copies], joints[copies]
+            joints[:, j] += TURN * number
+        np.clip(joints, windows.lowest, windows.highest, out=joints)
+        return Solutions(solutions.pose[rows], joints, solutions.singular[rows])
+
+    @cached_property
+    def _windows(self) -> _Windows:
+        """Windows of a whole turn within the limits."""
+        below, above, revolute = np.isfinite(self.lower), np.isfinite(self.upper), self.chain.revolute
+        both, lower, upper = below & above & revolute, self.lower - ARM.excess, self.upper + ARM.excess
+        low = np.where(below, lower, upper - TURN)
+        middle = low.copy()
+        middle[both] = (self.lower[both] + self.upper[both]) / 2 - np.pi
+        shiftable = np.flatnonzero((below | above) & revolute)
+        moving = np.isin(np.arange(len(lower)), self.chain.order)
+        several = np.flatnonzero(both & (upper - lower >= TURN))
+        lowest, highest = np.where(moving, self.lower, -np.inf), np.where(moving, self.upper, np.inf)
+        return _Windows(lower, upper, lowest, highest, low[shiftable], middle[shiftable], shiftable, several)
+
+
+class _Windows(NamedTuple):
+    """Windows of a whole turn within the limits of revolute joints.
+
+    Attributes:
+        lower, upper: Limits, beyond which lies only rounding. Shape (n,).
+        lowest, highest: Limits of the joints that move the tip. Shape (n,).
+        low, middle: Lower ends of the lowest windows, and of those in the middle of the limits. Shape (s,).
+        shiftable: Numbers of the joints that have a limit. Shape (s,).
+        several: Numbers of the joints that can make a whole turn within the limits.
+    """
+
+    lower: Array
+    upper: Array
+    lowest: Array
+    highest: Array
+    low: Array
+    middle: Array
+    shiftable: NDArray[np.intp]
+    several: NDArray[np.intp]
+
+
+def arm_solver(chain: Chain, lower: Array, upper: Array, axes: Array | None = None) -> ArmSolver | None:
+    """Return the solver of an arm; None if no six of its joints have a regular problem.
+
+    Args:
+        chain: Chain of the arm.
+        lower, upper: Limits of the joints, infinite for unlimited ones. Shape (n,).
+        axes: Axes through the tip at the zero configuration about which the task leaves the orientation open. Shape
+            (k, 3).
+    """
+    virtual = np.zeros((0, 3)) if axes is None else axes
+    extended = chain.extended(virtual, np.tile(chain.position, (len(virtual), 1)))
+    count, joints = len(extended.order), tuple(chain.order)
+    if not 0 < count <= SIX + min(ARM.max_samples, len(joints)):
+        return None
+    if count == SCARA and (forms := closed_forms(extended)):
+        return ArmSolver(chain, forms, (), lower, upper)
+    auxiliary = tuple(range(len(extended.axes), len(extended.axes) + SIX - count))
+    if auxiliary:
+        rng = np.random.default_rng(ARM.seed)
+        directions = rng.normal(size=(len(auxiliary), 3))
+        directions /= np.linalg.norm(directions, axis=1)[:, None]
+        extended = extended.extended(directions, chain.position + chain.size * rng.uniform(-1, 1, directions.shape))
+    solvers: list[PoseSolver] = list(closed_forms(extended, joints))
+    conditions = _conditions(extended, [solver.redundant for solver in solvers])
+    solvers = [solvers[k] for k in np.argsort(-conditions, kind="stable")[: ARM.max_solvers[0]]]
+    if not solvers:
+        choices = list(combinations(joints, max(count - SIX, 0)))
+        for k in np.argsort(-_conditions(extended, choices), kind="stable"):
+            solver = elimination_of(extended, choices[k])
+            solvers += [] if solver is None else [solver]
+            if len(solvers) == ARM.max_solvers[1]:
+                break
+    return ArmSolver(chain, tuple(solvers), auxiliary, lower, upper) if solvers else None
+
+
+def _conditions(chain: Chain, choices: list[tuple[int, ...]]) -> Array:
+    """Return how well conditioned the problem is that each choice of redundant joints leaves.
+
+    This is the geometric mean, at random configurations, of the least singular value of the Jacobian of the others.
+    """
+    rng = np.random.default_rng(ARM.seed)
+    joints = rng.uniform(-np.pi, np.pi, (ARM.trials, len(chain.axes)))
+    joints[:, ~chain.revolute] *= chain.size / np.pi
+    positions, rotations = chain.poses(joints)
+    _, jacobian = chain.linearize(joints, chain.order, Motion(rotations, positions))
+    columns = [[k for k, j in enumerate(chain.order) if j not in redundant] for redundant in choices]
+    values = [np.linalg.svd(jacobian[:, :, each], compute_uv=False)[:, -1] for each in columns]
+    return np.exp(np.log(np.maximum(values, 1e-300)).mean(axis=1)) if values else np.zeros(0)

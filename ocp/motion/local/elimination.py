@@ -1,0 +1,397 @@
+"""All IK solutions of any six joints at a pose, by elimination (Raghavan and Roth 1993, Manocha and Canny 1994).
+
+Six joint motions close a loop, e_x e_y e_z e_a e_b e_c = G. The last, revolute joint c moves neither the points nor the
+direction of its axis, so that a point p on it and its direction l satisfy
+
+    e_z e_a e_b (p, l) = e_y^-1 e_x^-1 G (p, l).
+
+On both sides take the 15 numbers 1, p, p.p, l, p.l, p x l and p.p l - 2 p.l p: the conformal coordinates of the point
+and of the line element in it. Each joint acts on them by a matrix that is linear in cos q and sin q, or quadratic in a
+displacement: both are quadratic forms on the projective line, 1, cos h and sin h of an angle h with q = h, or
+q = size tan(h / 2). The 15 x 9 matrix of the products of x and y has a left null space of six rows, which removes x and
+y; times cos(h / 2) and sin(h / 2) of one of z, a, b they are twelve equations, linear in twelve products of that angle
+and another one and quadratic in the third: a polynomial eigenvalue problem with 24 eigenvalues. At most 16 of them are
+solutions; half-angles are rotated such that no solution is at infinity.
+
+The loop may be opened at any of its joints, and each opening leaves six ways to choose the angles. Where axes meet or
+are parallel some of these problems are singular for all poses. A trial at random configurations chooses regular ones.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import permutations
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.arrays import Array
+from ocp.motion.local.chain import TURN, Axis, Chain, Motion, Solutions, axial, cross, dot
+from ocp.motion.local.pose_solver import Mask, PoseSolver
+
+__all__ = ["Elimination", "elimination_of"]
+
+SIX = 6
+SAMPLES = 2 * np.pi / 3 * np.arange(3)
+"""Angles h that determine the coefficients of 1, cos h and sin h."""
+COEFFICIENTS = np.linalg.inv(np.stack([np.ones(3), np.cos(SAMPLES), np.sin(SAMPLES)], axis=1))
+
+
+def _half_angle_products() -> Array:
+    """Return the products of 1, cos h, sin h and cos h/2, sin h/2 in cos h/2, sin h/2, cos 3h/2, sin 3h/2. (3, 2, 4)"""
+    products = np.zeros((3, 2, 4))
+    products[0] = np.eye(2, 4)
+    products[1] = [[0.5, 0, 0.5, 0], [0, -0.5, 0, 0.5]]
+    products[2] = [[0, 0.5, 0, 0.5], [0.5, 0, -0.5, 0]]
+    return products
+
+
+PRODUCTS = _half_angle_products()
+
+
+@dataclass(frozen=True)
+class EliminationSettings:
+    """Settings of the elimination.
+
+    Attributes:
+        rank: Singular values of the eliminated products below this share of the largest count as zero.
+        regular: Reciprocal condition number below which an eigenvalue problem counts as singular.
+        real: Distance of exp(i h) from the unit circle below which an angle h may be real: the accuracy of double
+            eigenvalues of an ill-conditioned problem.
+        probably_real: Distance below which a multiple eigenvalue counts as real.
+        surely_real: Distance below which a simple eigenvalue is real.
+        simple: Deviation of an eigenvector from the products of one solution below which its eigenvalue is simple.
+        poles: Angles h at which the half-angle may be infinite; for each pose the best-conditioned one is taken.
+        same: Distance of a solution from a configuration of the trial below which they are the same, rad or m.
+        trials: Number of random configurations of the trial.
+        openings: Largest number of eigenvalue problems that are solved at a doubtful pose.
+        seed: Seed of the trial.
+    """
+
+    rank: float = 1e-9
+    regular: float = 1e-11
+    real: float = 3e-2
+    probably_real: float = 1e-4
+    surely_real: float = 1e-7
+    simple: float = 1e-4
+    poles: tuple[float, ...] = (0.3, 1.9, 3.5, 5.1)
+    same: float = 1e-5
+    trials: int = 12
+    openings: int = 3
+    seed: int = 0
+
+
+ELIMINATION = EliminationSettings()
+
+
+class Opening(NamedTuple):
+    """A choice of the joints x, y, z, a, b, c of the loop.
+
+    Attributes:
+        first: Number of the joint x; the others follow in the order of the loop.
+        rank: Number of independent products of x and y at a regular pose.
+        roles: Which of z, a, b is the eigenvalue, which has products with half-angles, and which remains.
+    """
+
+    first: int
+    rank: int
+    roles: tuple[int, int, int]
+
+
+class _Loop(NamedTuple):
+    """A loop of six joints opened somewhere: x, y, z, a, b, c multiply to the goal; poses M."""
+
+    joints: list[Axis]
+    goal: Motion
+    size: float
+
+
+class _Candidates(NamedTuple):
+    """Candidates of one opening.
+
+    Attributes:
+        pose: Pose of each candidate. Shape (K,).
+        free: Positions of the free joints. Shape (K, 6).
+        least: How many solutions each pose has at least, from simple real eigenvalues. Shape (M,).
+        mixed: Which poses have multiple real eigenvalues. Shape (M,), bool.
+        singular: Which poses have a singular problem. Shape (M,), bool.
+    """
+
+    pose: NDArray[np.intp]
+    free: Array
+    least: NDArray[np.intp]
+    mixed: Mask
+    singular: Mask
+
+
+@dataclass(frozen=True, eq=False)
+class Elimination(PoseSolver):
+    """Inverse kinematics of six joints by elimination. Use `elimination_of` to build it.
+
+    Attributes:
+        openings: Openings of the loop that have regular problems, the best first.
+    """
+
+    openings: tuple[Opening, ...]
+
+    def solve_regular(self, tips: Motion, redundant: Array) -> tuple[Solutions, Mask, Mask]:
+        """Return solutions at M poses, all at regular ones; see `PoseSolver.solve_regular`.
+
+        Some may be missing where the problem is singular, or where fewer solutions than real eigenvalues or an odd
+        number of solutions were found. Multiple eigenvalues mix the products of several solutions, which is to be
+        confirmed. Such poses are solved with further openings.
+        """
+        prescribed, count = self.prescribe(redundant), len(tips.shift)
+        even, solutions = bool(self.chain.revolute[self.free].all()), Solutions.none(len(self.chain.axes))
+        doubtful, mixed = np.ones(count, dtype=bool), np.zeros(count, dtype=bool)
+        for opening in self.openings:
+            chosen = np.flatnonzero(doubtful | mixed)
+            if not chosen.size:
+                break
+            axes, goal = self.loop(prescribed[chosen], tips.take(chosen))
+            rough = _solve_opening(axes, goal, self.chain.size, opening)
+            more = self.refine(chosen[rough.pose], rough.free, prescribed, tips)
+            solutions = self.chain.union(solutions, more, self.free, tips)
+            numbers = np.bincount(solutions.pose, minlength=count)[chosen]
+            doubtful[chosen] = rough.singular | (numbers < rough.least) | (even & (numbers % 2 == 1))
+            mixed[chosen] = rough.mixed
+        return solutions, mixed, doubtful
+
+
+def elimination_of(chain: Chain, redundant: tuple[int, ...]) -> Elimination | None:
+    """Return the solver of six joints of a chain; None if no eigenvalue problem of theirs is regular.
+
+    At random configurations the openings are sorted by the condition of their problems. The first ones are taken that
+    find the most of these configurations again, and the most solutions.
+    """
+    rng, trials = np.random.default_rng(ELIMINATION.seed), ELIMINATION.trials
+    joints = rng.uniform(-np.pi, np.pi, (trials, len(chain.axes)))
+    joints[:, ~chain.revolute] *= chain.size / np.pi
+    solver = Elimination(chain, redundant, ())
+    positions, rotations = chain.poses(joints)
+    prescribed, tips = solver.prescribe(joints[:, list(redundant)]), Motion(rotations, positions)
+    axes, goal = solver.loop(prescribed, tips)
+    conditions = list[tuple[float, Opening]]()
+    for first in range(SIX):
+        if axes[first - 1].revolute:
+            singular_vectors, ranks, remaining = _split(_open(axes, goal, chain.size, first))
+            rank = int(ranks.max())
+            for z, a, b in permutations(range(3)):
+                matrices = _matrices(singular_vectors[:, :, rank:], remaining, (z, a, b))
+                condition = float(np.median(_companions(matrices)[2]))
+                conditions.append((condition, Opening(first, rank, (z, a, b))))
+    regular = sorted(each for each in conditions if each[0] > ELIMINATION.regular)[::-1]
+    kept, most = list[Opening](), (0, 0)
+    for _, opening in regular:
+        rough = _solve_opening(axes, goal, chain.size, opening)
+        solutions = solver.refine(rough.pose, rough.free, prescribed, tips)
+        deviation = (solutions.joints - joints[solutions.pose])[:, list(chain.order)]
+        deviation[:, chain.revolute[list(chain.order)]] %= TURN
+        same = np.minimum(deviation, TURN - deviation).max(axis=1, initial=0.0) < ELIMINATION.same
+        score = len(np.unique(solutions.pose[same])), len(solutions.pose)
+        if score >= most:
+            kept = [*(kept if score == most else []), opening]
+            most = score
+        if len(kept) >= ELIMINATION.openings and most[0] == trials:
+            break
+    kept = kept[: ELIMINATION.openings]
+    return Elimination(chain, redundant, tuple(kept)) if kept else None
+
+
+def _open(axes: list[Axis], goal: Motion, size: float, first: int) -> _Loop:
+    """Return the loop opened at a joint: those before it move behind the others, conjugated by the goal."""
+    back = goal.inverse
+    joints = [axes[(first + i) % SIX] for i in range(SIX)]
+    return _Loop([axis.moved(back) if i >= SIX - first else axis for i, axis in enumerate(joints)], goal, size)
+
+
+def _split(loop: _Loop) -> tuple[Array, NDArray[np.intp], Array]:
+    """Return left singular vectors and ranks of the products of x and y, and the coefficients of those of z, a, b.
+
+    Shapes (M, 15, 15), (M,), (M, 15, 3, 3, 3), the last (1, ...) if it is the same for all poses.
+    """
+    goal, size, c = loop.goal, loop.size, loop.joints[5]
+    center = sum(axis.point for axis in loop.joints) / SIX
+    local = [axis._replace(point=(axis.point - center) / size) for axis in loop.joints]
+    remaining = _coefficients(local[4:1:-1], local[5].point, c.direction)
+    point, direction = (goal.at(c.point) - center) / size, goal.rotate(c.direction)
+    eliminated = _coefficients([_reversed(local[0]), _reversed(local[1])], point, direction)
+    left, values, _ = np.linalg.svd(eliminated.reshape(len(point), 15, 9))
+    return left, (values > ELIMINATION.rank * values[:, :1]).sum(axis=1), remaining
+
+
+def _reversed(axis: Axis) -> Axis:
+    """Return an axis of the opposite direction, whose joint moves backwards."""
+    return axis._replace(direction=-axis.direction)
+
+
+def _coefficients(axes: list[Axis], point: Array, direction: Array) -> Array:
+    """Return the coordinates of a line element moved by joints, as coefficients of the products of their angles.
+
+    Args:
+        axes: Axes of the joints, the one that moves the line element first in front.
+        point, direction: Line element. Shapes (M, 3), (M, 3).
+
+    Returns:
+        Coefficients of 1, cos h and sin h of each joint, those of the last one first. Shape (M, 15, 3, ...).
+    """
+    weights, count = np.ones(1), max(len(point), *(len(axis.point) for axis in axes))
+    point, direction = (np.broadcast_to(part[:, None], (count, 1, 3)) for part in (point, direction))
+    for axis in axes:
+        w, p = axis.direction[:, None, None], axis.point[:, None, None]
+        if axis.revolute:
+            cosine, sine = (part[:, None, None] for part in (np.cos(SAMPLES), np.sin(SAMPLES)))
+            moved = []
+            for vector in (point[:, None] - p, direction[:, None]):
+                along = dot(vector, w)[..., None] * w
+                moved.append(along + cosine * (vector - along) + sine * cross(w, vector))
+            moved[0] = moved[0] + p
+        else:
+            shifts = np.tan(SAMPLES / 2)[:, None, None] * w
+            moved = [
+                point[:, None] + shifts,
+                np.broadcast_to(direction[:, None], (len(point), 3, *direction.shape[1:])),
+            ]
+        scale = np.ones(3) if axis.revolute else np.cos(SAMPLES / 2) ** 2
+        weights = (scale[:, None] * weights).ravel()
+        point, direction = (part.reshape(len(point), -1, 3) for part in moved)
+    square, along = dot(point, point)[..., None], dot(point, direction)[..., None]
+    parts = [np.ones_like(square), point, square, direction, along, cross(point, direction)]
+    values = np.concatenate([*parts, square * direction - 2 * along * point], axis=2) * weights[:, None]
+    values = values.transpose(0, 2, 1).reshape(len(point), 15, *[3] * len(axes))
+    for k in range(len(axes)):
+        values = np.moveaxis(np.moveaxis(values, 2 + k, -1) @ COEFFICIENTS.T, -1, 2 + k)
+    return values
+
+
+def _matrices(annihilators: Array, remaining: Array, roles: tuple[int, int, int]) -> Array:
+    """Return the polynomial matrix of the eigenvalue problem: coefficients of 1, cos h, sin h. Shape (M, 3, 12, 12)."""
+    count, _, rows = annihilators.shape
+    equations = annihilators.transpose(0, 2, 1) @ remaining.reshape(-1, 15, 27)
+    equations = equations.reshape(count, rows, 3, 3, 3).transpose(0, 1, *(2 + role for role in roles))
+    # (pose, row, eigenvalue, half, other) -> (pose, eigenvalue, row x 2, 4 x other)
+    products = equations.transpose(0, 2, 1, 4, 3).reshape(-1, 3) @ PRODUCTS.reshape(3, 8)
+    products = products.reshape(count, 3, rows, 3, 2, 4).transpose(0, 1, 2, 4, 5, 3).reshape(count, 3, 2 * rows, 12)
+    if rows > SIX:
+        mix = np.linalg.qr(np.random.default_rng(ELIMINATION.seed).normal(size=(2 * rows, 12)))[0]
+        products = mix.T @ products
+    return np.asarray(products)
+
+
+def _companions(matrices: Array) -> tuple[Array, Array, Array]:
+    """Return companion matrices in tan((h - pole) / 2), the poles, and reciprocal condition numbers at the poles.
+
+    Shapes (M, 24, 24), (M,), (M,).
+    """
+    count, poles = len(matrices), np.array(ELIMINATION.poles)
+    one, cosine, sine = (matrices[:, None, k] for k in range(3))
+    at = np.cos(poles)[:, None, None] * cosine + np.sin(poles)[:, None, None] * sine
+    leading = one - at
+    with np.errstate(all="ignore"):
+        inverses = _inverses(leading)
+        conditions = 1 / (np.abs(leading).sum(axis=3).max(axis=2) * np.abs(inverses).sum(axis=3).max(axis=2))
+    conditions = np.nan_to_num(conditions)
+    best, rows = conditions.argmax(axis=1), np.arange(count)
+    pole = poles[best]
+    slope = 2 * (np.cos(pole)[:, None, None] * matrices[:, 2] - np.sin(pole)[:, None, None] * matrices[:, 1])
+    constant = (one + at)[rows, best]
+    companions = np.zeros((count, 24, 24))
+    companions[:, :12, 12:] = np.eye(12)
+    companions[:, 12:] = -np.nan_to_num(inverses[rows, best]) @ np.concatenate([constant, slope], axis=2)
+    return companions, pole, conditions[rows, best]
+
+
+def _inverses(matrices: Array) -> Array:
+    """Return the inverses of matrices, those of exactly singular ones infinite."""
+    try:
+        return np.asarray(np.linalg.inv(matrices))
+    except np.linalg.LinAlgError:
+        singular = np.linalg.det(matrices) == 0
+        inverses = np.linalg.inv(np.where(singular[..., None, None], np.eye(matrices.shape[-1]), matrices))
+        return np.asarray(np.where(singular[..., None, None], np.inf, inverses))
+
+
+def _solve_opening(axes: list[Axis], goal: Motion, size: float, opening: Opening) -> _Candidates:
+    """Return candidates from the real eigenvalues of an opening, double ones included."""
+    loop = _open(axes, goal, size, opening.first)
+    singular_vectors, ranks, remaining = _split(loop)
+    matrices = _matrices(singular_vectors[:, :, opening.rank :], remaining, opening.roles)
+    companions, pole, condition = _companions(matrices)
+    values, vectors = np.linalg.eig(companions)
+    with np.errstate(all="ignore"):
+        rotation = np.exp(1j * pole)[:, None] * (1 + 1j * values) / (1 - 1j * values)
+        distance = np.nan_to_num(np.abs(np.log(np.abs(rotation))), nan=np.inf)
+    revolute = [axis.revolute for axis in loop.joints]
+    if not revolute[2 + opening.roles[0]]:
+        distance[np.abs(rotation + 1) < ELIMINATION.real] = np.inf  # a prismatic joint at infinity
+    pose, column = np.nonzero(distance < ELIMINATION.real)
+    upper, vector = np.abs(values[pose, column]) > 1, vectors[pose, :, column]
+    half, other, residual = _angles_of(np.where(upper[:, None], vector[:, 12:], vector[:, :12]).reshape(-1, 4, 3))
+    away, simple = distance[pose, column], residual < ELIMINATION.simple
+    least = np.bincount(pose[simple & (away < ELIMINATION.surely_real)], minlength=len(distance))
+    mixed = np.bincount(pose[~simple & (away < ELIMINATION.probably_real)], minlength=len(distance))
+    angles = np.empty((len(pose), 3))
+    angles[:, opening.roles] = np.column_stack([np.angle(rotation[pose, column]), half, other])
+    middle = np.where(revolute[2:5], angles, size * np.tan(angles / 2))
+    free = np.empty((len(pose), SIX))
+    free[:, [(opening.first + i) % SIX for i in range(SIX)]] = _complete(loop, pose, middle)
+    return _Candidates(pose, free, least, mixed > 0, (condition < ELIMINATION.regular) | (ranks < opening.rank))
+
+
+def _angles_of(vectors: Array) -> tuple[Array, Array, Array]:
+    """Return both angles of products (K, 4, 3) of (cos h/2, sin h/2, cos 3h/2, sin 3h/2) and (1, cos h, sin h).
+
+    The third result is the largest deviation from such products, of which the largest is 1.
+    """
+    flat, rows = vectors.reshape(-1, 12), np.arange(len(vectors))
+    largest = flat[rows, np.abs(flat).argmax(axis=1)]
+    real = (vectors / largest[:, None, None]).real
+    column, row = np.abs(real).sum(axis=1).argmax(axis=1), np.abs(real).sum(axis=2).argmax(axis=1)
+    half, other = real[rows, :, column], real[rows, row]
+    angle = np.angle((half[:, 2] + 1j * half[:, 3]) * (half[:, 0] - 1j * half[:, 1]))
+    signed = np.where(other[:, :1] < 0, -other, other)
+    other_angle = np.arctan2(signed[:, 2], signed[:, 1])
+    multiples = angle[:, None] * [0.5, 1.5]
+    waves = np.column_stack([np.cos(multiples), np.sin(multiples)])[:, [0, 2, 1, 3]]
+    products = (
+        waves[:, :, None] * np.column_stack([np.ones(len(rows)), np.cos(other_angle), np.sin(other_angle)])[:, None]
+    )
+    place = rows, row, column
+    residual = real - products * (real[place] / products[place])[:, None, None]
+    return angle, other_angle, np.abs(residual).max(axis=(1, 2), initial=0.0)
+
+
+def _complete(loop: _Loop, pose: NDArray[np.intp], middle: Array) -> Array:
+    """Return the positions (K, 6) of all joints of a loop for those of z, a and b (K, 3).
+
+    The motions of x and y are found from e_x^-1 (G p, G l) = e_y (p', l'), which is linear in their cosines and sines.
+    """
+    x, y, z, a, b, c = (axis.take(pose) for axis in loop.joints)
+    goal, size = loop.goal.take(pose), loop.size
+    motion = z.by(middle[:, 0]).after(a.by(middle[:, 1])).after(b.by(middle[:, 2]))
+    ends = (goal.at(c.point), goal.rotate(c.direction)), (motion.at(c.point), motion.rotate(c.direction))
+    columns, constants = list[Array](), list[Array]()
+    for axis, (point, direction), sign in ((x, ends[0], -1.0), (y, ends[1], 1.0)):
+        if not axis.revolute:
+            slide = np.zeros((len(pose), 6))
+            slide[:, :3] = axis.direction / size
+            columns += [slide, np.zeros_like(slide)]
+            constants.append(sign * np.concatenate([point / size, direction], axis=1))
+            continue
+        parts = []
+        for vector, origin, unit in ((point - axis.point, axis.point, size), (direction, 0.0, 1.0)):
+            along = dot(vector, axis.direction)[:, None] * axis.direction
+            parts.append(((origin + along) / unit, (vector - along) / unit, cross(axis.direction, vector) / unit))
+        constant, cosine, sine = (np.concatenate(part, axis=1) for part in zip(*parts, strict=True))
+        columns += [sign * cosine, sine]
+        constants.append(sign * constant)
+    inverse = np.linalg.pinv(np.stack(columns, axis=2), rcond=ELIMINATION.rank)
+    solved = -(inverse @ (constants[0] + constants[1])[:, :, None])[:, :, 0]
+    first, second = (
+        np.arctan2(part[:, 1], part[:, 0]) if axis.revolute else part[:, 0]
+        for axis, part in ((x, solved[:, :2]), (y, solved[:, 2:]))
+    )
+    rest = x.by(first).after(y.by(second)).after(motion).inverse.after(goal).turn
+    last = np.arctan2(dot(c.direction, axial(rest)) / 2, (np.trace(rest, axis1=1, axis2=2) - 1) / 2)
+    return np.column_stack([first, second, middle, last])
