@@ -35,7 +35,7 @@ class StraightMotionSettings:
     Attributes:
         finest: Approach of two bodies within half an interval below which it is not halved again, m. The motion counts
             as not clear then, though bodies may keep the clearance by about the square of this over their size.
-        bent: Approach within half an interval below which the second bound is evaluated, m.
+        uneven: Approach within half an interval below which the second bound is evaluated, m.
         first: Largest approach of two bodies within the intervals of the first level, m: at larger ones hardly any pair
             is decided.
         tolerance: Distance by which the clearance may be missed, m: half of what the audit allows, so that motions may
@@ -45,7 +45,7 @@ class StraightMotionSettings:
     """
 
     finest: float = 1e-3
-    bent: float = 0.05
+    uneven: float = 0.05
     first: float = 0.4
     tolerance: float = CLEARANCE_TOLERANCE_M / 2
     difference: float = 1e-5
@@ -153,17 +153,17 @@ class StraightMotions:
             clear[motion[interval[gap < required]]] = False
             undecided = (gap < required + reach) & clear[motion[interval]]
             interval, pair, reach = interval[undecided], pair[undecided], reach[undecided]
-            bent = np.flatnonzero(reach < self.settings.bent)
-            if len(bent):
-                bow = reach[bent] * (turning[motion[interval], pair] * width[interval])[bent] / 2
-                facing, _, _ = self._bodies.nearest(frames, interval[bent], pair[bent])
+            uneven = np.flatnonzero(reach < self.settings.uneven)
+            if len(uneven):
+                bow = reach[uneven] * (turning[motion[interval], pair] * width[interval])[uneven] / 2
+                facing, _, _ = self._bodies.nearest(frames, interval[uneven], pair[uneven])
                 places = np.concatenate([middle - width / 2, middle + width / 2])
                 frames = self._frames_on(lines, np.tile(motion, 2), places)
-                chord = self._bodies.chords(facing, frames, (interval[bent], interval[bent] + len(motion)))
+                chord = self._bodies.chords(facing, frames, (interval[uneven], interval[uneven] + len(motion)))
                 open_ = chord - bow < required
-                clear[motion[interval[bent[open_ & (reach[bent] < self.settings.finest)]]]] = False
+                clear[motion[interval[uneven[open_ & (reach[uneven] < self.settings.finest)]]]] = False
                 undecided = np.ones(len(interval), dtype=bool)
-                undecided[bent] = open_
+                undecided[uneven] = open_
                 undecided &= clear[motion[interval]]
                 interval, pair = interval[undecided], pair[undecided]
             kept, index = np.unique(interval, return_inverse=True)
