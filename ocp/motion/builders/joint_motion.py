@@ -82,7 +82,7 @@ def joint_motion_problem(
 def motion_along(problem: Problem, path: Array, scale: Array, horizon: float, *, length: bool) -> Solution:
     """Return the motion of a `joint_motion_problem` along a path at constant speed.
 
-    It has no multipliers, so that the audit proves whether it is feasible, and leaves open whether it is optimal.
+    A straight motion is optimal. One with corners has no multipliers: the audit proves whether it is feasible.
 
     Args:
         problem: The problem.
@@ -103,14 +103,18 @@ def motion_along(problem: Problem, path: Array, scale: Array, horizon: float, *,
     rates = np.diff(path, axis=0) / (np.diff(breaks)[:, None] * horizon)
     ends, middle = np.array([0.0, 1.0]), np.array([0.5])
     states = PiecewisePolynomial(breaks, ends, np.stack([path[:-1], path[1:]], axis=1))
-    controls, costates = PiecewisePolynomial(breaks, middle, rates[:, None]), np.zeros_like(path)
+    controls, is_straight = PiecewisePolynomial(breaks, middle, rates[:, None]), len(rates) == 1
+    # the costates of a motion without active constraints: minus the derivative of the running cost by the rates
+    speeds = np.linalg.norm(rates * scale, axis=1, keepdims=True)
+    duals = -(scale**2) * rates / (np.maximum(speeds, np.finfo(float).tiny) if length else 1.0)
+    costates = np.vstack([duals, duals[-1:]])
     return Solution(
         name=problem.name,
         method={"type": "path at constant speed"},
         solver="path",
-        success=False,
-        status=SolverStatus.ACCEPTABLE,
-        message="it follows a path of straight motions, whose optimality no multipliers show",
+        success=is_straight,
+        status=SolverStatus.SOLVED if is_straight else SolverStatus.ACCEPTABLE,
+        message="" if is_straight else "it follows a path of straight motions, whose optimality no multipliers show",
         cost=total if length else total**2 / (2 * horizon),
         iterations=0,
         horizon=horizon,
@@ -122,7 +126,7 @@ def motion_along(problem: Problem, path: Array, scale: Array, horizon: float, *,
         cost_gradients={},
         state_interpolant=states,
         control_interpolant=controls,
-        costate_interpolant=PiecewisePolynomial(breaks, ends, np.zeros((len(breaks) - 1, 2, path.shape[1]))),
+        costate_interpolant=PiecewisePolynomial(breaks, ends, np.stack([duals, duals], axis=1)),
         variables=path.ravel(),
         multipliers=np.zeros(0),
         seconds={"build": 0.0, "solve": 0.0},

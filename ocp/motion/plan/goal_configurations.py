@@ -53,9 +53,8 @@ def goal_configurations(
     if not goal.has_pose:
         if goal.joints is None:
             raise ProblemError("a goal needs joints or a pose", name="joints", value=None)
-        joints = checked_numbers(
-            np.where(np.isnan(floats(goal.joints)), near, floats(goal.joints)), len(near), "goal", "one for each joint"
-        )
+        values = checked_numbers(np.nan_to_num(floats(goal.joints)), len(near), "goal", "one for each joint")
+        joints = np.where(np.isnan(floats(goal.joints).ravel()), near, values)
         return clip_to_limits("end", names, joints, bounds.lower, bounds.upper, "end inside them")[None]
     scene = None if constraints is None else constraints.scene
     tasks = [goal.task, *(replace(goal.task, position=point) for point in _points_inside(goal.region, seed))]
