@@ -59,15 +59,18 @@ def seam(whole: Robot, seed: int = 0) -> TipTask:
         way = np.cos(angles) * x + np.sin(angles) * y
         paths = _follow(pose_at, middles, (place, way, axis), tool)
         inside = ((paths > arm.lower) & (paths < arm.upper)).all(axis=(1, 2))
-        for k in np.flatnonzero(inside & (np.abs(np.diff(paths, axis=1)).max(axis=(1, 2)) < 0.3)).tolist():
-            if (distances_along(scene, np.zeros(0), paths[k], np.zeros(paths.shape[1])) > 0.005).all():
-                first, along = place[k] - LENGTH / 2 * way[k], SPEED * way[k]
-                return TipTask(
-                    position=lambda t, first=first, along=along: ca.DM(first) + t * ca.DM(along),
-                    direction=axis[k],
-                    tool_axis=np.eye(3)[tool],
-                    duration=LENGTH / SPEED,
-                )
+        chosen = np.flatnonzero(inside & (np.abs(np.diff(paths, axis=1)).max(axis=(1, 2)) < 0.3))
+        rows = paths[chosen].reshape(-1, arm.dof)
+        distances = distances_along(scene, np.zeros(0), rows, np.zeros(len(rows))) if len(rows) else rows
+        clear = (distances > 0.005).all(axis=1).reshape(len(chosen), paths.shape[1]).all(axis=1)
+        for k in chosen[clear].tolist():
+            first, along = place[k] - LENGTH / 2 * way[k], SPEED * way[k]
+            return TipTask(
+                position=lambda t, first=first, along=along: ca.DM(first) + t * ca.DM(along),
+                direction=axis[k],
+                tool_axis=np.eye(3)[tool],
+                duration=LENGTH / SPEED,
+            )
     raise AssertionError("no seam")
 
 
