@@ -58,7 +58,7 @@ class CoverSettings:
     thinnest: float = 1e-6
     directions: int = 48
     extremes: int = 256
-    trial_directions: int = 12
+    trial_directions: int = 24
     trial_extremes: int = 64
     simplex: tuple[float, ...] = (0.25, 0.25, 0.05, 0.05, 0.2)
     parameter_tolerance: float = 4e-3

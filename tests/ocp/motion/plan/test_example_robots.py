@@ -18,8 +18,8 @@ from ocp.motion.tasks.equations import bind
 from tests.models.robot.pinocchio_robots import DATA, urdf_file
 from tests.models.robot.trees import Array
 
-SPEED, LENGTH = 0.1, 0.3
-"""m/s; m."""
+SPEED, LENGTH, BATCH = 0.1, 0.3, 200
+"""m/s; m; configurations that are tried at once."""
 ARMS = {  # file, tip, numbers of joints held by a plan and by a global one, seed of the seam
     "z1": ("z1_description/urdf/z1.urdf", "gripperStator", 1, 1, 0),
     "panda": ("panda_description/urdf/panda.urdf", "panda_hand", 1, 1, 1),
@@ -51,37 +51,58 @@ def seam(whole: Robot, seed: int = 0) -> TipTask:
     pose = machine.tip_pose((), q)
     pose_at = ca.Function("pose", [q], [pose.position, pose.rotation, machine.tip_jacobian((), q)])
     low, high = np.maximum(arm.lower, -np.pi), np.minimum(arm.upper, np.pi)
-    for _ in range(2000):
-        middle = low + (high - low) * (0.2 + 0.6 * rng.random(arm.dof))
-        place, (x, y, axis) = np.array(pose_at(middle)[0]).ravel(), np.array(pose_at(middle)[1]).T
-        for way in (x, y, (x + y) / np.sqrt(2), (x - y) / np.sqrt(2)):
-            path = _follow(pose_at, middle, place, way, axis)
-            inside = ((path > arm.lower) & (path < arm.upper)).all() and np.abs(np.diff(path, axis=0)).max() < 0.3
-            if inside and (distances_along(scene, np.zeros(0), path, np.zeros(len(path))) > 0).all():
-                first = place - LENGTH / 2 * way
-                return TipTask(
-                    position=lambda t, first=first, way=way: ca.DM(first) + SPEED * t * ca.DM(way),
-                    direction=axis,
-                    duration=LENGTH / SPEED,
-                )
+    for tool in 20 * [2, 1, 0]:  # the axis of the tip frame that counts as the tool's
+        middles = np.tile(low + (high - low) * (0.1 + 0.8 * rng.random((BATCH, arm.dof))), (4, 1))
+        place, rotation, _ = _poses(pose_at, middles)
+        axis, x, y = (rotation[:, :, (tool + k) % 3] for k in range(3))
+        angles = np.repeat(np.arange(4) * np.pi / 4, BATCH)[:, None]
+        way = np.cos(angles) * x + np.sin(angles) * y
+        paths = _follow(pose_at, middles, (place, way, axis), tool)
+        inside = ((paths > arm.lower) & (paths < arm.upper)).all(axis=(1, 2))
+        chosen = np.flatnonzero(inside & (np.abs(np.diff(paths, axis=1)).max(axis=(1, 2)) < 0.3))
+        rows = paths[chosen].reshape(-1, arm.dof)
+        distances = distances_along(scene, np.zeros(0), rows, np.zeros(len(rows))) if len(rows) else rows
+        clear = (distances > 0.005).all(axis=1).reshape(len(chosen), paths.shape[1]).all(axis=1)
+        for k in chosen[clear].tolist():
+            first, along = place[k] - LENGTH / 2 * way[k], SPEED * way[k]
+            return TipTask(
+                position=lambda t, first=first, along=along: ca.DM(first) + t * ca.DM(along),
+                direction=axis[k],
+                tool_axis=np.eye(3)[tool],
+                duration=LENGTH / SPEED,
+            )
     raise AssertionError("no seam")
 
 
-def _follow(pose_at: Any, middle: Array, place: Array, way: Array, axis: Array) -> Array:
-    """Return joints along the seam by Newton steps, nan where they do not converge. Shape (13, n)."""
-    across = np.linalg.svd(axis[None])[2][1:]
+def _poses(pose_at: Any, joints: Array) -> tuple[Array, Array, Array]:
+    """Return positions (K, 3), rotations (K, 3, 3) and Jacobians (K, 6, n) of the tip."""
+    count, n = joints.shape
+    position, rotation, jacobian = (np.array(value) for value in pose_at.map(count)(joints.T))
+    return (
+        position.T,
+        rotation.reshape(3, count, 3).transpose(1, 0, 2),
+        jacobian.reshape(6, count, n).transpose(1, 0, 2),
+    )
+
+
+def _follow(pose_at: Any, middles: Array, seams: tuple[Array, Array, Array], tool: int) -> Array:
+    """Return joints along K seams by Newton steps, nan where they do not converge. Shape (K, 9, n)."""
+    place, way, axis = seams
+    across = np.linalg.svd(axis[:, None])[2][:, 1:]
     ends = []
     for sign in (-1, 1):
-        joints, path = middle, list[Array]()
-        for share in np.linspace(0, 1, 7)[1:]:
+        joints, path = middles, list[Array]()
+        for share in np.linspace(0, 1, 5)[1:]:
             for _ in range(6):
-                position, rotation, jacobian = (np.array(value) for value in pose_at(joints))
-                gap = place + sign * share * LENGTH / 2 * way - position.ravel()
-                error = np.concatenate([across @ np.cross(rotation[:, 2], axis), gap])
-                joints = joints + np.linalg.pinv(np.vstack([across @ jacobian[:3], jacobian[3:]]), 1e-3) @ error
-            path.append(joints if np.abs(error).max() < 1e-6 else np.full(len(joints), np.nan))
+                position, rotation, jacobian = _poses(pose_at, joints)
+                gap = place + sign * share * LENGTH / 2 * way - position
+                tilt = np.einsum("kij,kj->ki", across, np.cross(rotation[:, :, tool], axis))
+                rows = np.concatenate([across @ jacobian[:, :3], jacobian[:, 3:]], axis=1)
+                error = np.concatenate([tilt, gap], axis=1)
+                joints = joints + np.clip(np.einsum("kij,kj->ki", np.linalg.pinv(rows, 1e-3), error), -0.5, 0.5)
+            path.append(np.where(np.abs(error).max(axis=1)[:, None] < 1e-6, joints, np.nan))
         ends.append(path)
-    return np.array([*ends[0][::-1], middle, *ends[1]])
+    return np.array([*ends[0][::-1], middles, *ends[1]]).transpose(1, 0, 2)
 
 
 @pytest.mark.parametrize("search", ["configurations", "global"])
