@@ -301,7 +301,14 @@ def test_poses_that_are_none_are_refused() -> None:
     ):
         with pytest.raises(ProblemError):
             solver(positions, rotations)
-    with pytest.raises(ProblemError):
-        IkSolver(ur5(), samples=0)
+    options: list[dict[str, Any]] = [
+        {"samples": 0},
+        {"tool_axis": (0, 0, 0)},
+        {"free": ToolFreedom.CONE},
+        {"link": "no"},
+    ]
+    for option in [*options, {"free": "roll"}, {"limits": 1}]:
+        with pytest.raises(ProblemError):
+            IkSolver(ur5(), **option)
     with pytest.raises(ProblemError):
         ik_configurations(ur5(), TipTask(orientation=np.eye(3)))
