@@ -30,7 +30,7 @@ from models.arrays import Array
 from ocp.motion.local.chain import TURN, Axis, Chain, Motion, Solutions, axial, cross, dot
 from ocp.motion.local.pose_solver import Mask, PoseSolver
 
-__all__ = ["Elimination", "elimination_of"]
+__all__ = ["Elimination", "elimination_of", "solve_opening"]
 
 SIX = 6
 SAMPLES = 2 * np.pi / 3 * np.arange(3)
@@ -150,7 +150,7 @@ class Elimination(PoseSolver):
             if not chosen.size:
                 break
             axes, goal = self.loop(prescribed[chosen], tips.take(chosen))
-            rough = _solve_opening(axes, goal, self.chain.size, opening)
+            rough = solve_opening(axes, goal, self.chain.size, opening)
             more = self.refine(chosen[rough.pose], rough.free, prescribed, tips)
             solutions = self.chain.union(solutions, more, self.free, tips)
             numbers = np.bincount(solutions.pose, minlength=count)[chosen]
@@ -184,7 +184,7 @@ def elimination_of(chain: Chain, redundant: tuple[int, ...]) -> Elimination | No
     regular = sorted(each for each in conditions if each[0] > ELIMINATION.regular)[::-1]
     kept, most = list[Opening](), (0, 0)
     for _, opening in regular:
-        rough = _solve_opening(axes, goal, chain.size, opening)
+        rough = solve_opening(axes, goal, chain.size, opening)
         solutions = solver.refine(rough.pose, rough.free, prescribed, tips)
         deviation = (solutions.joints - joints[solutions.pose])[:, list(chain.order)]
         deviation[:, chain.revolute[list(chain.order)]] %= TURN
@@ -312,7 +312,7 @@ def _inverses(matrices: Array) -> Array:
         return np.asarray(np.where(singular[..., None, None], np.inf, inverses))
 
 
-def _solve_opening(axes: list[Axis], goal: Motion, size: float, opening: Opening) -> _Candidates:
+def solve_opening(axes: list[Axis], goal: Motion, size: float, opening: Opening) -> _Candidates:
     """Return candidates from the real eigenvalues of an opening, double ones included."""
     loop = _open(axes, goal, size, opening.first)
     singular_vectors, ranks, remaining = _split(loop)

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from models import Machine, ModelError
 from models.arrays import Array, ArrayInput, checked_array
 from models.machines.machine import with_tip
-from ocp.errors import ProblemError, checked_count, checked_flag
+from ocp.errors import ProblemError, checked_count, checked_flag, checked_instance, checked_positive
 from ocp.motion.local.arm_solver import ARM, ArmSolver, arm_solver, sample_shares
 from ocp.motion.local.chain import TURN, Chain
 from ocp.motion.local.closed_forms import SIX, is_scara
@@ -102,6 +102,7 @@ class IkSolver:
         point: ArrayInput = (0.0, 0.0, 0.0),
         free: ToolFreedom = ToolFreedom.NONE,
         tool_axis: ArrayInput = (0.0, 0.0, 1.0),
+        within: float = 0.0,
         limits: bool = True,
         samples: int = 36,
     ) -> None:
@@ -109,14 +110,20 @@ class IkSolver:
         Args:
             machine: Machine on a fixed base.
             link, point: Link of the tip, and its origin in the frame of the link, (3,), m; None: the tip of the robot.
-            free: What of the orientation is open. ROLL: the angle about `tool_axis`; ROTATION: all.
+            free: What of the orientation is open. ROLL: the angle about `tool_axis`; CONE: also the direction of this
+                axis, within a cone; ROTATION: all.
             tool_axis: In the frame of the tip. Shape (3,).
+            within: Half-angle of the cone, rad, between 0 and pi.
             limits: Whether the position limits of the robot apply.
             samples: Number of samples of the parameters, if there are any.
 
         Raises:
-            ProblemError: The machine has a moving base, or no six of its joints determine the pose of the tip.
+            ProblemError: The machine has a moving base, no six of its joints determine the pose of the tip, or an
+                argument is invalid.
         """
+        checked_instance("free", free, ToolFreedom)
+        if free is ToolFreedom.CONE:
+            checked_positive("within", within, below=np.pi)
         checked_flag("limits", limits)
         checked_count("samples", samples, 1)
         try:
@@ -124,9 +131,11 @@ class IkSolver:
             axis = checked_array(tool_axis, (3,), "IkSolver", "tool_axis")
         except ModelError as error:
             raise ProblemError(str(error), **vars(error)) from error
+        if not np.linalg.norm(axis) > 0:
+            raise ProblemError(f"tool_axis {axis.tolist()} has no direction", name="tool_axis", value=axis)
         unbounded = np.full(machine.joint_size, np.inf)
         lower, upper = (machine.robot.lower, machine.robot.upper) if limits else (-unbounded, unbounded)
-        prepared = PreparedArm.of(tip, lower, upper, free=free, tool_axis=axis)
+        prepared = PreparedArm.of(tip, lower, upper, free=free, tool_axis=axis, within=float(within))
         if prepared is None:
             words = f"{machine.robot.name}: no six joints on a fixed base determine the tip; use inverse_kinematics"
             raise ProblemError(words, name="machine", value=machine)
@@ -142,7 +151,8 @@ class IkSolver:
 
         Args:
             positions: Positions in the world. Shape (3,) or (N, 3), m.
-            rotations: Rotation matrices. Shape (3, 3) or (N, 3, 3).
+            rotations: Rotation matrices. Shape (3, 3) or (N, 3, 3). Of what is open their value does not matter: with a
+                free roll they give the direction of the tool axis.
 
         Raises:
             ProblemError: A shape is wrong, a value is not finite, or a matrix is not a rotation.

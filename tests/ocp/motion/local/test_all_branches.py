@@ -17,7 +17,7 @@ from models.arrays import Array
 from ocp import ProblemError, TipTask, inverse_kinematics
 from ocp.motion.local.branches import ik_configurations
 from ocp.motion.local.chain import Chain, Motion
-from ocp.motion.local.elimination import Elimination, elimination_of
+from ocp.motion.local.elimination import Elimination, elimination_of, solve_opening
 from ocp.motion.local.ik_solver import IkSolver, Incompleteness, ToolFreedom
 from ocp.motion.local.inverse_kinematics import inverse_kinematics_at
 from ocp.motion.tasks.equations import bind
@@ -101,6 +101,30 @@ def test_no_configuration_is_missing(name: str) -> None:
 @pytest.mark.parametrize("name", ARMS)
 def test_at_a_hundred_poses_no_configuration_is_missing(name: str) -> None:
     assert_none_is_missing(name, 100, 20, 600)
+
+
+@pytest.mark.parametrize("slide", [None, *range(6)])
+def test_elimination_is_accurate_before_newtons_method(slide: int | None) -> None:
+    """Every opening of the loop finds the configurations, wherever the prismatic joint is."""
+    rows = [
+        (0.1, RIGHT, 0.3),
+        (0.2, 0.5, 0.1),
+        (0.15, -RIGHT, 0.1),
+        (0.1, 0.7, 0.2),
+        (0.05, RIGHT, 0.1),
+        (0.1, 0.3, 0.1),
+    ]
+    machine = denavit_hartenberg(rows, prismatic=() if slide is None else (slide,))
+    chain, turns = chain_of(machine), revolute(machine)
+    joints = random_joints(machine, np.random.default_rng(8), 8)
+    tips = Motion(*chain.poses(joints)[::-1])
+    solver = elimination_of(chain, ())
+    assert solver is not None
+    loop = solver.loop(np.zeros((8, 6)), tips)
+    for opening in solver.openings:
+        rough = solve_opening(*loop, chain.size, opening)
+        for k in range(8):
+            assert distances(joints[k : k + 1], rough.free[rough.pose == k], turns).min() < 1e-6
 
 
 @pytest.mark.parametrize("deviation", some([1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10], 2))
@@ -301,7 +325,14 @@ def test_poses_that_are_none_are_refused() -> None:
     ):
         with pytest.raises(ProblemError):
             solver(positions, rotations)
-    with pytest.raises(ProblemError):
-        IkSolver(ur5(), samples=0)
+    options: list[dict[str, Any]] = [
+        {"samples": 0},
+        {"tool_axis": (0, 0, 0)},
+        {"free": ToolFreedom.CONE},
+        {"link": "no"},
+    ]
+    for option in [*options, {"free": "roll"}, {"limits": 1}]:
+        with pytest.raises(ProblemError):
+            IkSolver(ur5(), **option)
     with pytest.raises(ProblemError):
         ik_configurations(ur5(), TipTask(orientation=np.eye(3)))
