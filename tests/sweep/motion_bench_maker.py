@@ -134,9 +134,9 @@ def result(data: str, kind: str, seed: int) -> Row:
     motions = StraightMotions(scene)
     ends = [moved_clear(motions, joints) for joints in (start, *goals)]
     moved = float(np.abs(np.array(ends) - np.vstack([start, goals])).max())
-    options: dict[str, Any] = {"length": True}
+    options: dict[str, Any] = {"length": True, "time_limit": SECONDS - 1.0}
     if mode:
-        options = {"limits": PANDA, "effort": Effort(torque=0.0, time=1.0), "time_limit": 30.0}
+        options = {"limits": PANDA, "effort": Effort(torque=0.0, time=1.0), "time_limit": SECONDS / 2}
     begin, used = time.perf_counter(), time.process_time()
     row, wrong = Row(), list[str]()
     try:

@@ -35,6 +35,7 @@ from ocp.motion.sampling.random_trees import TreeSearch
 from ocp.motion.sampling.shortening import points_along, shortest_through_corners
 from ocp.motion.sampling.straight import StraightMotions
 from ocp.motion.search.joint_space import FULL_TURN, JointSpace
+from ocp.motion.search.search import checked_bound
 from ocp.motion.tasks.checks import checked_configuration, checked_horizon, checked_weights, clip_to_limits
 from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.problem.problem import Problem
@@ -389,7 +390,8 @@ def _best(task: _Task, candidates: list[Candidate]) -> Plan:
     listed = tuple(candidate.finished() for candidate in (best, *costlier, *failed))
     horizon = best.solution.horizon
     parts = (Part(0.0, horizon, ""),)
-    return Plan(task.request.machine, best.solution, parts, listed, _bound(task, horizon))
+    bound = checked_bound(_bound(task, horizon), best.cost)
+    return Plan(task.request.machine, best.solution, parts, listed, bound)
 
 
 def _bound(task: _Task, horizon: float) -> float:
