@@ -164,6 +164,8 @@ def stopping_motion(machine: FixedBase, path: Array, bounds: JointBounds) -> Sto
             factor = _slowdown(machine, torques, own, bounds.torque)
             own = [phase.slower(factor) for phase in own]
         phases += own
+    if not phases:  # the machine stays where it is
+        phases.append(Phase(SETTINGS.ramp, path[0], *np.zeros((3, path.shape[1]))))
     return StoppingMotion(tuple(phases))
 
 

@@ -122,6 +122,30 @@ def test_the_same_seed_gives_the_same_plan_and_stages_are_told() -> None:
     assert len(told) >= 4
 
 
+@pytest.mark.parametrize("horizon", [None, 6.0])
+def test_squared_rates_within_accelerations_are_planned_in_a_fixed_time(horizon: float | None) -> None:
+    limits = Limits(acceleration=[3.0, 2.0], torque=np.inf)
+    plan = plan_to_goal(request_of(BOX, limits=limits, horizon=horizon, time_limit=8.0))
+    assert plan.audit().feasible
+    assert horizon is None or plan.horizon == pytest.approx(horizon)
+    assert plan.bound is not None
+    assert plan.bound <= plan.cost
+    sample = plan.sampled(np.linspace(0.0, plan.horizon, 2001))
+    squares = np.trapezoid((sample.rates**2).sum(axis=1), sample.t) / 2
+    assert plan.cost == pytest.approx(squares, rel=1e-3)
+    assert gap(sample.joints, [BOX]).min() >= -1e-6
+    assert (np.abs(sample.accelerations) <= [3.003, 2.002]).all()
+
+
+@pytest.mark.parametrize("limits", [None, Limits(acceleration=1.0, torque=np.inf)])
+def test_a_goal_at_the_start_is_reached_by_rest(limits: Limits | None) -> None:
+    plan = plan_to_goal(request_of(BOX, goals=START, limits=limits))
+    assert plan.audit().feasible
+    assert plan.cost == 0
+    np.testing.assert_allclose(sampled(plan), np.tile(START, (2001, 1)), atol=1e-12)
+
+
+@pytest.mark.long
 @pytest.mark.parametrize("jerk", [None, 400.0])
 def test_least_time_of_an_arm_among_boxes_keeps_all_limits_and_its_clearance(jerk: float | None) -> None:
     machine = FixedBase(example_robot("six_axis"))
