@@ -108,6 +108,15 @@ class HullPairs:
         self.radii = np.array([first.radius + second.radius for first, second in chosen])
         self.flat = np.array([bool(first.normal.size or second.normal.size) for first, second in chosen])
         self.normals = np.array([_normal(*pair) for pair in chosen])
+        self._box_side = None if set(kinds) not in ({0, 1}, {1}) or self.flat.any() else kinds.index(min(kinds))
+        if self._box_side is not None:
+            corners = self._cores[self._box_side]
+            edges = (
+                corners[:, [4, 2, 1]] - corners[:, :1] if kinds[self._box_side] == 0 else np.zeros((len(corners), 3, 3))
+            )
+            lengths = np.linalg.norm(edges, axis=2)
+            self._halves, self._centres = lengths / 2, corners.mean(axis=1)
+            self._axes = np.where(lengths[:, :, None] > 0, edges / np.maximum(lengths, 1e-300)[:, :, None], np.eye(3))
 
     def points(self, frames: Frames, at: np.ndarray, row: np.ndarray) -> list[np.ndarray]:
         """Return points of both bodies in the frame of observation. Shapes (K, m, 3), (K, l, 3)."""
@@ -130,6 +139,21 @@ class HullPairs:
         along = np.where(self.flat[row, None], self.normals[row], along)
         gap = gap_along(along, first, second) - self.radii[row]
         return along, gap, np.stack([nearest_first, nearest_second], axis=1)
+
+    def distances(self, frames: Frames, at: np.ndarray, row: np.ndarray) -> np.ndarray:
+        """Return the distances of pairs at samples, shape (K,), m; of a ball and a box or a ball in closed form."""
+        if self._box_side is None:
+            return self.nearest(frames, at, row)[1]
+        (rotations, positions), box, ball = frames, self._box_side, 1 - self._box_side
+        frame, other = self._frames[ball][row], self._frames[box][row]
+        point = (rotations[at, frame] @ self._cores[ball][row, 0, :, None])[..., 0] + positions[at, frame]
+        if (other >= 0).any():
+            point = ((point - positions[at, other])[:, None] @ rotations[at, other])[:, 0]
+        local = (self._axes[row] @ (point - self._centres[row])[..., None])[..., 0]
+        excess = np.abs(local) - self._halves[row]
+        outside = np.maximum(excess, 0.0)
+        outside *= outside
+        return np.asarray(np.sqrt(outside.sum(axis=1)) + np.minimum(excess.max(axis=1), 0.0) - self.radii[row])
 
     def gaps(self, along: np.ndarray, frames: Frames, at: np.ndarray, row: np.ndarray) -> np.ndarray:
         """Return the gaps between both bodies along unit vectors (K, 3). Shape (K,), m."""
@@ -244,7 +268,7 @@ class BodyPairs:
 
         def measure(subset: np.ndarray) -> None:
             for kind, chosen, own in self._by_kind(row[subset]):
-                gap[subset[chosen]] = kind.nearest(frames, at[place[subset[chosen]]], own)[1]
+                gap[subset[chosen]] = kind.distances(frames, at[place[subset[chosen]]], own)
 
         measure(np.arange(count, len(row)))
         covered = gap[self._covered.decisive(place, gap, count)]

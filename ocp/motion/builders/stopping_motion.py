@@ -30,6 +30,7 @@ from ocp.problem.problem import Problem
 from ocp.problem.values import Sampler
 from ocp.solution import Solution
 from ocp.status import SolverStatus
+from ocp.tolerances import ROUNDING_SHARE
 
 __all__ = ["StoppingMotion", "segment_durations", "stopping_motion"]
 
@@ -163,6 +164,8 @@ def stopping_motion(machine: FixedBase, path: Array, bounds: JointBounds) -> Sto
             factor = _slowdown(machine, torques, own, bounds.torque)
             own = [phase.slower(factor) for phase in own]
         phases += own
+    if not phases:  # the machine stays where it is
+        phases.append(Phase(SETTINGS.ramp, path[0], *np.zeros((3, path.shape[1]))))
     return StoppingMotion(tuple(phases))
 
 
@@ -187,8 +190,9 @@ def _straight(first: Array, change: Array, bounds: JointBounds) -> list[Phase]:
         top = min(top, np.sqrt(acceleration))
         ramp, cruise = top / acceleration, 1 / top - top / acceleration
         steps = [(ramp, acceleration, 0.0), (cruise, 0.0, 0.0), (ramp, -acceleration, 0.0)]
+    total = sum(duration for duration, *_ in steps)
     for duration, value, third in steps:
-        if duration <= 0:
+        if duration <= ROUNDING_SHARE * total:
             continue
         force = force if np.isfinite(jerk) else value
         phases.append(Phase(duration, first + s * change, rate * change, force * change, third * change))

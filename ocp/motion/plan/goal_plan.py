@@ -25,7 +25,7 @@ from ocp.motion.builders.dynamics import QUINTIC, DynamicsSetup, dynamics_proble
 from ocp.motion.builders.dynamics_plan import audit_error, within_limits
 from ocp.motion.builders.joint_motion import joint_motion_problem, least_durations, motion_along
 from ocp.motion.builders.standing.problem import FreeTime
-from ocp.motion.builders.stopping_motion import segment_durations, stopping_motion
+from ocp.motion.builders.stopping_motion import StoppingMotion, segment_durations, stopping_motion
 from ocp.motion.plan.actuators import limits_actuators
 from ocp.motion.result.candidate import Candidate, Reason, Rejection, Stage
 from ocp.motion.result.solved_plan import Part, SolvedPlan
@@ -40,6 +40,7 @@ from ocp.motion.tasks.cost import Cost
 from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.problem.problem import Problem
 from ocp.solution import Solution
+from ocp.tolerances import ROUNDING_SHARE
 
 __all__ = ["GoalRequest", "GoalSettings", "plan_to_goal"]
 
@@ -53,9 +54,9 @@ class GoalSettings:
         time_limit: Time after which a request without its own limit is refused, s.
         search_share: Share of the time limit after which the search for further paths ends.
         unlimited_rate: Rate of joints without a rate limit, rad/s or m/s, where the planner chooses the horizon.
-        spare: Horizon of a motion within actuator limits, where the planner chooses it, relative to the least times of
-            the joints along the path.
-        longest: Largest horizon in free time, relative to the same.
+        spare: Horizon of a motion within actuator limits, where the planner chooses it, relative to the least time of a
+            motion that stops at corners.
+        longest: Largest and inverse of the least horizon in free time, relative to the same.
         guess_times: Samples of a guess.
         near_bound: Relative excess of the cost over its lower bound below which a motion counts as optimal.
         near: Pairs of bodies closer than the clearance plus this along a path are separated from the first solve on, m.
@@ -162,15 +163,8 @@ def plan_to_goal(request: GoalRequest) -> SolvedPlan:
         with time_limited(request.settings.search_share * seconds):
             paths = _paths(task, seconds)
         task.report(f"{len(paths)} paths, the shortest of length {paths[0].length:.4g}")
-        solve = _within_actuator_limits if task.is_dynamic else _at_constant_speed
-        candidates: list[Candidate] = []
-        for path in paths:
-            try:
-                candidates.append(solve(task, path))
-            except TimeLimitReached:
-                reason = Reason(Rejection.NOT_TRIED, "the time limit has passed", "time_limit", limit=seconds)
-                candidates.append(Candidate(path.joints[0], reason=reason))
-            task.report(f"path of length {path.length:.4g}: {candidates[-1]}")
+        candidates_of = _within_actuator_limits if task.is_dynamic else _at_constant_speed
+        candidates = candidates_of(task, paths)
     return _best(task, candidates)
 
 
@@ -282,105 +276,135 @@ def _paths(task: _Task, seconds: float) -> list[JointPath]:
     raise SolveError(words, name=name, value=worst.distance, limit=seconds if name == "time_limit" else None)
 
 
-def _at_constant_speed(task: _Task, path: JointPath) -> Candidate:
-    """Return the audited motion along a path at constant speed."""
+def _at_constant_speed(task: _Task, paths: list[JointPath]) -> list[Candidate]:
+    """Return the audited motions along paths at constant speed."""
     request = task.request
-    horizon = request.horizon
-    if horizon is None:
-        fastest = np.where(np.isfinite(task.bounds.velocity), task.bounds.velocity, request.settings.unlimited_rate)
-        changes = np.diff(path.joints, axis=0)
-        lengths = np.linalg.norm(changes * task.scale, axis=1)
-        moves = lengths > 0
-        slowest = (np.abs(changes[moves]) / fastest).max(axis=1) / lengths[moves]
-        horizon = path.length * float(slowest.max(initial=0.0)) or 1.0
-    problem = joint_motion_problem(
-        request.machine,
-        horizon,
-        start=path.joints[0],
-        end=path.joints[-1],
-        limits=request.limits,
-        weights=task.scale**2,
-        length=task.length,
-        clearance_constraints=request.clearance_constraints,
-    )
-    solution = motion_along(problem, path.joints, task.scale, horizon, length=task.length)
-    return _audited(solution, path)
+    fastest = np.where(np.isfinite(task.bounds.velocity), task.bounds.velocity, request.settings.unlimited_rate)
+    candidates = []
+    for path in paths:
+        horizon = request.horizon
+        if horizon is None:
+            changes = np.diff(path.joints, axis=0)
+            lengths = np.linalg.norm(changes * task.scale, axis=1)
+            moves = lengths > 0
+            slowest = (np.abs(changes[moves]) / fastest).max(axis=1) / lengths[moves]
+            horizon = path.length * float(slowest.max(initial=0.0)) or 1.0
+        options: dict[str, Any] = {"start": path.joints[0], "end": path.joints[-1], "length": task.length}
+        options |= {"limits": request.limits, "clearance_constraints": request.clearance_constraints}
+        problem = joint_motion_problem(request.machine, horizon, weights=task.scale**2, **options)
+        solution = motion_along(problem, path.joints, task.scale, horizon, length=task.length)
+        candidates.append(_audited(task, solution, path))
+    return candidates
 
 
-def _within_actuator_limits(task: _Task, path: JointPath) -> Candidate:
-    """Return the audited motion within actuator limits that starts from a path."""
+def _within_actuator_limits(task: _Task, paths: list[JointPath]) -> list[Candidate]:
+    """Return the audited motions within actuator limits: with stops at corners, and where time is left without."""
     request, settings, bounds = task.request, task.request.settings, task.bounds
-    fastest = bounds._replace(velocity=np.where(np.isfinite(bounds.velocity), bounds.velocity, settings.unlimited_rate))
-    travel = np.abs(np.diff(path.joints, axis=0)).sum(axis=0)
-    least = float(least_durations(np.abs(path.joints[-1] - path.joints[0]), bounds).max())
-    usual = max(float(least_durations(travel, fastest).max()), 1e-3)
-    duration = settings.spare * usual if request.horizon is None else float(request.horizon)
-    horizon: float | FreeTime = duration
-    if request.horizon is None and request.cost.time:
-        horizon = FreeTime(max(least, 1e-3 * usual), settings.longest * usual, duration)
-    times = np.linspace(0.0, duration, settings.guess_times)
-    joints = points_along(path.joints, task.scale, QUINTIC(times / duration))
-    velocities = np.gradient(joints, times, axis=0)
-    guess = {"joints": Samples(times, joints), "velocities": Samples(times, velocities), "horizon": duration}
-    constraints = request.clearance_constraints
-    if constraints is not None:
-        constraints = constraints.holding(np.unique(task.motions.near_pairs(joints, settings.near)[1]).tolist())
-    control = "jerk" if np.isfinite(bounds.jerk).any() or request.cost.jerk else "acceleration"
+    candidates, motions = list[Candidate](), list[tuple[JointPath, StoppingMotion]]()
+    for path in paths:
+        corners = shortest_through_corners(
+            task.motions, path.joints, lambda changes: segment_durations(changes, bounds)
+        )
+        try:
+            motions.append((path, stopping_motion(request.machine, corners, bounds)))
+        except SolveError as error:
+            reason = Reason.of_error(Rejection.ACTUATORS, error)
+            candidates.append(Candidate(path.joints[0], reason=reason, stage=Stage.SEED))
+    is_free = request.horizon is None and request.cost.time > 0
+    shortest = min((motion.duration for _, motion in motions), default=0.0)
+    fixed = settings.spare * shortest if request.horizon is None else float(request.horizon)
+    problems = [_ProblemOf(task, path, motion, None if is_free else fixed) for path, motion in motions]
+    stopping = [(problem, problem.stopping()) for problem in problems]
+    for problem, candidate in sorted(stopping, key=lambda pair: (not pair[1].passed, pair[1].cost)):
+        bound = _bound(task, problem.horizon_guess)
+        enough = candidate.passed and bound is not None and candidate.cost <= (1 + settings.near_bound) * bound
+        best = candidate if enough else min(candidate, problem.smooth(), key=lambda c: (not c.passed, c.cost))
+        candidates.append(best)
+        task.report(f"path of length {problem.path.length:.4g}: {best}")
+    return candidates
 
-    def declare(clearance: ClearanceConstraints | None) -> Problem:
+
+@dataclass(frozen=True, eq=False)
+class _ProblemOf:
+    """Motions within actuator limits along one path.
+
+    Attributes:
+        task: Checked request.
+        path: The path.
+        motion: Motion that stops at corners of the path.
+        fixed: Fixed horizon, s; None if it is free.
+    """
+
+    task: _Task
+    path: JointPath
+    motion: StoppingMotion
+    fixed: float | None
+
+    @property
+    def horizon_guess(self) -> float:
+        """Horizon, s, or its guess."""
+        return self.motion.duration if self.fixed is None else self.fixed
+
+    def declare(self, clearance: ClearanceConstraints | None) -> Problem:
+        """Declare the problem."""
+        task, ends = self.task, {"start": self.path.joints[0], "end": self.path.joints[-1]}
+        guess = self.horizon_guess
+        least = least_durations(np.abs(ends["end"] - ends["start"]), task.bounds).max()
+        shortest = min(max(float(least), guess / task.request.settings.longest), guess)
+        horizon = FreeTime(shortest, task.request.settings.longest * guess, guess) if self.fixed is None else guess
+        uses_jerk = np.isfinite(task.bounds.jerk).any() or task.request.cost.jerk
         setup = DynamicsSetup(
-            start_velocity=request.start_velocity,
-            end_velocity=request.end_velocity,
-            control=control,  # type: ignore[arg-type]
+            start_velocity=task.request.start_velocity,
+            end_velocity=task.request.end_velocity,
+            control="jerk" if uses_jerk else "acceleration",
             clearance_constraints=clearance,
         )
-        ends = {"start": path.joints[0], "end": path.joints[-1]}
-        return dynamics_problem(
-            request.machine, (), horizon, **ends, limits=request.limits, cost=request.cost, setup=setup
-        )
+        limits, cost = task.request.limits, task.request.cost
+        return dynamics_problem(task.request.machine, (), horizon, **ends, limits=limits, cost=cost, setup=setup)
 
-    stopping = _stopping(task, path, declare(request.clearance_constraints))
-    bound = _bound(task, stopping.solution.horizon if stopping.solution is not None else duration)
-    if stopping.passed and bound is not None and stopping.cost <= (1 + settings.near_bound) * bound:
-        return stopping
-    machines = {"": (request.machine, request.limits)}
-    try:
-        solution = within_limits(declare, constraints, None, (), None, None, machines, guess=guess)
-    except SolveError as error:
-        if isinstance(error.__cause__, KeyboardInterrupt):
-            raise
-        if stopping.passed:
-            return stopping
-        return Candidate(path.joints[0], reason=Reason.of_error(Rejection.INFEASIBLE, error), stage=Stage.SEED)
-    smooth = _audited(solution, path)
-    return min((stopping, smooth), key=lambda candidate: (not candidate.passed, candidate.cost))
+    def stopping(self) -> Candidate:
+        """Return the audited motion that stops at corners, slowed down to a fixed horizon."""
+        task, factor = self.task, self.horizon_guess / self.motion.duration
+        if task.request.cost.energy or np.isfinite(task.bounds.power).any() or task.moves:
+            words = "motions with stops are not offered where power counts, or the machine moves at an end"
+            reason = Reason(Rejection.NOT_TRIED, words)
+            return Candidate(self.path.joints[0], reason=reason)
+        if factor < 1 - ROUNDING_SHARE:
+            words = f"with stops it takes {self.motion.duration:.4g} s"
+            reason = Reason(Rejection.ACTUATORS, words, "horizon", self.motion.duration, self.horizon_guess)
+            return Candidate(self.path.joints[0], reason=reason)
+        problem = self.declare(task.request.clearance_constraints)
+        return _audited(task, self.motion.slower(factor).solution(problem), self.path)
 
-
-def _stopping(task: _Task, path: JointPath, problem: Problem) -> Candidate:
-    """Return the audited motion within actuator limits that stops at corners of a path."""
-    request, bounds = task.request, task.bounds
-    problem_has_power = request.cost.energy or np.isfinite(bounds.power).any()
-    if task.moves:
-        reason = Reason(Rejection.NOT_TRIED, "a motion that stops at the corners begins and ends at rest")
-        return Candidate(path.joints[0], reason=reason)
-    corners = shortest_through_corners(task.motions, path.joints, lambda changes: segment_durations(changes, bounds))
-    try:
-        motion = stopping_motion(request.machine, corners, bounds)
-        spare = 1.0 if request.horizon is None else request.horizon / motion.duration
-        if problem_has_power or spare < 1 - 1e-9:
-            words = f"stopping at {len(corners) - 2} corners takes {motion.duration:.4g} s"
-            raise SolveError(words, name="horizon", value=motion.duration, limit=request.horizon)
-        if not request.cost.time and request.horizon is None:
-            spare = request.settings.spare
-        return _audited(motion.slower(max(spare, 1.0)).solution(problem), path)
-    except SolveError as error:
-        return Candidate(path.joints[0], reason=Reason.of_error(Rejection.ACTUATORS, error), stage=Stage.SEED)
+    def smooth(self) -> Candidate:
+        """Return the audited motion without stops that a solver finds from the path."""
+        task, joints = self.task, self.path.joints
+        settings, duration = task.request.settings, self.horizon_guess
+        times = np.linspace(0.0, duration, settings.guess_times)
+        places = points_along(joints, task.scale, QUINTIC(times / duration))
+        velocities = np.gradient(places, times, axis=0)
+        guess = {"joints": Samples(times, places), "velocities": Samples(times, velocities), "horizon": duration}
+        constraints = task.request.clearance_constraints
+        if constraints is not None:
+            constraints = constraints.holding(np.unique(task.motions.near_pairs(places, settings.near)[1]).tolist())
+        machines = {"": (task.request.machine, task.request.limits)}
+        try:
+            solution = within_limits(self.declare, constraints, None, (), None, None, machines, guess=guess)
+        except (SolveError, TimeLimitReached) as error:
+            if isinstance(error.__cause__, KeyboardInterrupt):
+                raise
+            return Candidate(joints[0], reason=Reason.of_error(Rejection.INFEASIBLE, error), stage=Stage.SEED)
+        return _audited(task, solution, self.path)
 
 
-def _audited(solution: Solution, path: JointPath) -> Candidate:
-    """Return the candidate of a solution, with a reason if it is not feasible."""
+def _audited(task: _Task, solution: Solution, path: JointPath) -> Candidate:
+    """Return the candidate of a solution, with a reason if it is not feasible or could not be audited in time."""
     candidate = Candidate(path.joints[0], solution.cost, None, Stage.FINE, solution)
-    audit = solution.audit()
+    task.report(f"audit of a motion of cost {solution.cost:.4g} along a path of length {path.length:.4g}")
+    try:
+        audit = solution.audit()
+    except TimeLimitReached:
+        return candidate.rejected(Reason(Rejection.NOT_TRIED, "the time limit passed in its audit", "time_limit"))
     if audit.feasible:
         return replace(candidate, stage=Stage.AUDITED)
     error = collision_error(audit, solution) or audit_error(audit, solution)
@@ -410,7 +434,7 @@ def _best(task: _Task, candidates: list[Candidate]) -> SolvedPlan:
     horizon = best.solution.horizon
     parts = (Part(0.0, horizon, ""),)
     bound = _bound(task, horizon)
-    bound = None if bound is None else checked_bound(bound, best.solution.cost)
+    bound = None if bound is None else checked_bound(bound, best.cost)
     return SolvedPlan(task.request.machine, best.solution, parts, listed, bound)
 
 

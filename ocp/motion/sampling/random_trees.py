@@ -81,7 +81,7 @@ class _Tree:
 
 
 def connect(
-    search: TreeSearch, start: Array, goals: Array, random: np.random.Generator, most_nodes: int
+    search: TreeSearch, start: Array, goals: Array, random: np.random.Generator, most_samples: int
 ) -> Array | None:
     """Return a path of straight motions, each proven clear, from the start to a goal; None if none was found.
 
@@ -89,7 +89,7 @@ def connect(
         search: Proofs of clearance, box and metric.
         start: Shape (n,). goals: Shape (K, n).
         random: Source of the samples.
-        most_nodes: Number of configurations, proven reachable or not, after which the search ends.
+        most_samples: Number of random configurations after which the search ends.
 
     Returns:
         Configurations, shape (M, n), or None after the largest number, which does not prove that there is no path.
@@ -101,7 +101,7 @@ def connect(
     step = settings.longest * float(np.linalg.norm((upper - lower) * search.scale))
     trees = _Tree(start[None]), _Tree(goals)
     growing, tried = 0, 0
-    while tried < most_nodes:
+    while tried < most_samples:
         check_time()
         tried += settings.batch
         tree, other = trees[growing], trees[1 - growing]

@@ -26,14 +26,12 @@ class ShorteningSettings:
         least_gain: Relative decrease of the length, over `patience` successive batches, below which it ends.
         patience: Number of these batches.
         most_batches: Largest number of batches.
-        rungs: Number of places at which two paths are compared.
     """
 
     batch: int = 24
     least_gain: float = 1e-2
     patience: int = 3
     most_batches: int = 60
-    rungs: int = 32
 
 
 def path_length(path: Array, scale: Array) -> float:
@@ -84,7 +82,8 @@ def shorten(
 def same_class(motions: StraightMotions, first: Array, second: Array, scale: Array, rungs: int = 32) -> bool:
     """Return whether straight motions from one path (M, n) to another (K, n) are clear at equal shares of their length.
 
-    Paths of one homotopy class need not satisfy this; paths that do can replace each other as guesses.
+    Paths of one homotopy class need not satisfy this; paths that do can replace each other as guesses. They are
+    compared at as many places as there are `rungs`.
     """
     shares = np.linspace(0.0, 1.0, rungs + 2)[1:-1]
     return bool(motions.are_clear(*(points_along(path, scale, shares) for path in (first, second))).all())

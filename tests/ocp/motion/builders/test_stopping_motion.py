@@ -1,0 +1,100 @@
+"""Motions that stop at corners, and least durations of joints, beside ruckig."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from ruckig import InputParameter, Result, Ruckig, Trajectory
+
+from models import FixedBase
+from models.arrays import Array
+from models.robot.example import example_robot
+from ocp import Limits
+from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem
+from ocp.motion.builders.joint_motion import joint_motion_problem, least_durations, motion_along
+from ocp.motion.builders.stopping_motion import segment_durations, stopping_motion
+from ocp.motion.tasks.cost import Cost
+
+INF = np.inf
+
+
+def ruckig_duration(distance: float, velocity: float, acceleration: float, jerk: float) -> float:
+    request = InputParameter(1)
+    request.current_position, request.target_position = [0.0], [distance]
+    request.max_velocity, request.max_acceleration, request.max_jerk = [velocity], [acceleration], [jerk]
+    trajectory = Trajectory(1)
+    assert Ruckig(1).calculate(request, trajectory) == Result.Working
+    return float(trajectory.duration)
+
+
+def arm() -> FixedBase:
+    return FixedBase(example_robot("six_axis"))
+
+
+@pytest.mark.parametrize("kinds", ["vaj", "va", "vj", "aj", "a", "j", "v"])
+def test_least_durations_are_those_of_ruckig(kinds: str) -> None:
+    random = np.random.default_rng(0)
+    machine = arm()
+    for _ in range(30):
+        distances = 10 ** random.uniform(-3, 1, 6)
+        values = {kind: 10 ** random.uniform(*span, 6) if kind in kinds else np.full(6, INF)
+                  for kind, span in (("v", (-1, 1)), ("a", (-1, 2)), ("j", (0, 3)))}  # fmt: skip
+        bounds = Limits(velocity=values["v"], acceleration=values["a"], jerk=values["j"]).bounds(machine)
+        expected = [
+            ruckig_duration(distance, *(float(values[kind][k]) if kind in kinds else 1e15 for kind in "vaj"))
+            if kinds != "v" else distance / values["v"][k]
+            for k, distance in enumerate(distances)
+        ]  # fmt: skip
+        np.testing.assert_allclose(least_durations(distances, bounds), expected, rtol=2e-6)
+    assert (least_durations(np.zeros(6), bounds) == 0).all()
+
+
+@pytest.mark.parametrize("jerk", [INF, 100.0])
+def test_a_straight_motion_of_equal_joints_takes_the_time_of_one(jerk: float) -> None:
+    bounds = Limits(velocity=1.0, acceleration=5.0, jerk=jerk, torque=INF).bounds(arm())
+    change = np.array([0.7, -0.7, 0.7, 0.7, 0.7, -0.7])
+    expected = ruckig_duration(0.7, 1.0, 5.0, min(jerk, 1e12))
+    assert segment_durations(change[None], bounds)[0] == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize(("jerk", "factor"), [(INF, 1.0), (300.0, 1.0), (300.0, 1.7)])
+@pytest.mark.parametrize("torque", [60.0, INF])
+def test_a_motion_through_corners_passes_as_a_solution_within_all_limits(
+    jerk: float, factor: float, torque: float
+) -> None:
+    machine = arm()
+    limits = Limits(acceleration=20.0, jerk=jerk, torque=[torque, torque, torque, 28.0, 28.0, 28.0])
+    path = np.array([[0.0, 0.9, 0.5, 0.0, 0.3, 0.0], [0.5, 1.2, 0.2, 0.1, 0.0, 0.4], [0.2, 1.3, 0.4, 0.6, 0.2, 1.0]])
+    motion = stopping_motion(machine, path, limits.bounds(machine)).slower(factor)
+    control = "jerk" if np.isfinite(jerk) else "acceleration"
+    problem = dynamics_problem(
+        machine, (), motion.duration, start=path[0], end=path[-1], limits=limits,
+        cost=Cost(velocity=1.0, effort=1e-4, time=1.0, weights=[1.0, 2.0, 3.0, 1.0, 1.0, 1.0]),
+        setup=DynamicsSetup(control=control),  # type: ignore[arg-type]
+    )  # fmt: skip
+    audit = motion.solution(problem).audit()
+    assert audit.feasible, audit
+    assert audit["cost, relative"].value < 1e-6
+    durations = segment_durations(np.diff(path, axis=0), limits.bounds(machine))
+    assert motion.duration >= factor * durations.sum() * (1 - 1e-12)
+    if not np.isfinite(torque):
+        assert motion.duration == pytest.approx(factor * durations.sum())
+
+
+def corners(random: np.random.Generator) -> Array:
+    return random.uniform(-1.0, 1.0, (5, 6))
+
+
+@pytest.mark.parametrize("length", [True, False])
+def test_a_motion_along_a_path_has_the_length_or_squared_rates_of_the_closed_form(length: bool) -> None:
+    machine, path = arm(), corners(np.random.default_rng(1))
+    path = np.insert(path, 2, path[2], axis=0)  # a corner that is there twice
+    weights = np.array([1.0, 4.0, 1.0, 1.0, 0.25, 1.0])
+    scale, horizon = np.sqrt(weights), 20.0
+    problem = joint_motion_problem(machine, horizon, start=path[0], end=path[-1], weights=weights, length=length)
+    solution = motion_along(problem, path, scale, horizon, length=length)
+    total = np.linalg.norm(np.diff(path, axis=0) * scale, axis=1).sum()
+    assert solution.cost == pytest.approx(total if length else total**2 / 40.0)
+    audit = solution.audit()
+    assert audit.feasible, audit
+    assert audit["cost, relative"].value < 1e-9

@@ -1,0 +1,174 @@
+"""Plans to goal configurations: closed forms of a sliding ball, an arm among boxes, and refusals by name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from models import Box, CollisionScene, CollisionShape, FixedBase, Joint, Link, Robot
+from models.arrays import Array
+from models.robot.example import example_robot
+from ocp import Limits, Plan, ProblemError, SolveError
+from ocp.motion.builders.clearance import ClearanceConstraints
+from ocp.motion.local.collisions import distances_along
+from ocp.motion.plan.goal_plan import GoalRequest, GoalSettings, plan_to_goal
+from ocp.motion.result.candidate import Rejection
+from ocp.motion.sampling.path_classes import PathSearchSettings
+from ocp.motion.sampling.straight import StraightMotions
+from ocp.motion.tasks.cost import Cost
+from tests.ocp.motion.sampling.sliders import RADIUS, gap, slider
+
+BOX = Box((0.4, 1.4, 1.0), (0.0, 0.0, 0.0))
+START: Array = np.array([-1.0, 0.1])
+GOAL: Array = np.array([1.0, 0.1])
+
+
+def request_of(*boxes: Box, **options: Any) -> GoalRequest:
+    machine = slider()
+    constraints = ClearanceConstraints(CollisionScene(machine, boxes)) if boxes else None
+    return GoalRequest(machine, **{"start": START, "goals": GOAL, "clearance_constraints": constraints, **options})
+
+
+def sampled(plan: Plan) -> Array:
+    joints: Array = plan.at(np.linspace(0.0, plan.horizon, 2001))["joints"]
+    return joints
+
+
+@pytest.mark.parametrize("length", [True, False])
+def test_of_the_ways_around_a_box_the_shorter_is_the_plan_and_the_other_a_candidate(length: bool) -> None:
+    settings = GoalSettings(search=PathSearchSettings(classes=8))
+    plan = plan_to_goal(request_of(BOX, cost=Cost(velocity=0.0, length=1.0) if length else Cost(), settings=settings))
+    audit = plan.audit()
+    assert audit.feasible
+    assert audit.clearances["clearance"].settled
+    joints = sampled(plan)
+    assert gap(joints, [BOX]).min() >= -1e-6
+    assert joints[1000, 1] > 0.7  # the goal is nearer to the upper side
+    assert [None if c.reason is None else c.reason.kind for c in plan.candidates] == [None, Rejection.COSTLIER]
+    total = float(np.linalg.norm(np.diff(joints, axis=0), axis=1).sum())
+    cost = total if length else total**2 / (2 * plan.horizon)
+    assert plan.cost == pytest.approx(cost, rel=1e-4)
+    assert plan.bound == pytest.approx(2.0 if length else 4.0 / (2 * plan.horizon))
+    assert plan.cost < plan.candidates[1].cost
+
+
+def test_a_clear_straight_motion_has_the_cost_of_its_bound() -> None:
+    plan = plan_to_goal(request_of(cost=Cost(velocity=0.0, length=1.0), goals=[[1.5, -1.5], [0.0, 0.5]]))
+    assert plan.bound is not None
+    assert plan.cost == pytest.approx(plan.bound, rel=1e-12)
+    assert plan.cost == pytest.approx(np.hypot(1.0, 0.4))
+    assert plan.horizon == pytest.approx(1.0)  # at 1 m/s
+    np.testing.assert_allclose(sampled(plan)[[0, -1]], np.array([START, [0.0, 0.5]]), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("options", "name", "words"),
+    [
+        ({"start": [-0.2, 0.0]}, "ball and obstacle 0", "start: ball and obstacle 0 overlap by 0.1 m"),
+        ({"goals": [0.25, 0.0]}, "ball and obstacle 0", "goal: ball and obstacle 0 overlap by 0.05 m"),
+        ({"goals": [2.5, 0.0]}, "x", "end: 'x' ends at 2.5"),
+        ({"start": [-2.5, 0.0]}, "x", "start: 'x' starts at -2.5"),
+        ({"goals": np.zeros((0, 2))}, "goals", "at least one"),
+        ({"time_limit": -1.0}, "time_limit", "time_limit"),
+        ({"weights": [1.0, 0.0]}, "weights", "positive"),
+    ],
+)
+def test_a_request_that_cannot_be_met_is_refused_by_name(options: dict[str, Any], name: str, words: str) -> None:
+    with pytest.raises(ProblemError, match=words) as caught:
+        plan_to_goal(request_of(BOX, **options))
+    assert caught.value.name == name
+
+
+def test_of_goals_in_collision_and_clear_ones_the_clear_ones_are_planned() -> None:
+    plan = plan_to_goal(request_of(BOX, goals=[[0.0, 0.0], [-1.0, 1.5]], cost=Cost(velocity=0.0, length=1.0)))
+    np.testing.assert_allclose(sampled(plan)[-1], [-1.0, 1.5], atol=1e-12)
+
+
+def test_a_closed_wall_is_refused_in_time_with_what_blocks_and_without_a_claim() -> None:
+    wall = Box((0.2, 5.0, 1.0), (0.0, 0.0, 0.0))
+    with pytest.raises(SolveError, match="does not prove that there is none") as caught:
+        plan_to_goal(request_of(wall, time_limit=1.5))
+    assert caught.value.name == "time_limit"
+    assert "ball and obstacle 0 overlap by up to 0.2 m" in str(caught.value)
+
+
+def test_an_unlimited_joint_goes_the_other_way_round_if_an_obstacle_is_in_the_near_one() -> None:
+    arm = Link("arm", 1.0, collisions=(CollisionShape("sphere", (RADIUS,), translation=(1.0, 0.0, 0.0)),))
+    joint = Joint("turn", kind="continuous", parent="base", child="arm", axis=(0, 0, 1), velocity=1.0)
+    machine = FixedBase(Robot((Link("base"), arm), (joint,), tip="arm"))
+    constraints = ClearanceConstraints(CollisionScene(machine, [Box((0.1, 0.1, 0.5), (0.0, 1.0, 0.0))]))
+    plan = plan_to_goal(
+        GoalRequest(
+            machine, [0.0], [np.pi - 0.5], cost=Cost(velocity=0.0, length=1.0), clearance_constraints=constraints
+        )
+    )
+    assert plan.cost == pytest.approx(np.pi + 0.5)
+    plan = plan_to_goal(GoalRequest(machine, [0.0], [np.pi - 0.5 + 2 * np.pi], cost=Cost(velocity=0.0, length=1.0)))
+    assert plan.cost == pytest.approx(np.pi - 0.5)
+
+
+def test_a_plan_is_read_from_its_file_and_audited_again(tmp_path: Path) -> None:
+    plan = plan_to_goal(request_of(BOX, cost=Cost(velocity=0.0, length=1.0)))
+    plan.save(tmp_path / "plan.npz")
+    read = Plan.load(tmp_path / "plan.npz")
+    assert read.audit().feasible
+    assert read.cost == plan.cost
+    np.testing.assert_array_equal(sampled(read), sampled(plan))
+
+
+def test_the_same_seed_gives_the_same_plan_and_stages_are_told() -> None:
+    told: list[str] = []
+    first, again = (plan_to_goal(request_of(BOX, seed=3, progress=told.append)) for _ in range(2))
+    np.testing.assert_array_equal(sampled(first), sampled(again))
+    assert len(told) >= 4
+
+
+@pytest.mark.parametrize("horizon", [None, 6.0])
+def test_squared_rates_within_accelerations_are_planned_in_a_fixed_time(horizon: float | None) -> None:
+    limits = Limits(acceleration=[3.0, 2.0], torque=np.inf)
+    plan = plan_to_goal(request_of(BOX, limits=limits, horizon=horizon, time_limit=8.0))
+    assert plan.audit().feasible
+    assert horizon is None or plan.horizon == pytest.approx(horizon)
+    assert plan.bound is not None
+    assert plan.bound <= plan.cost
+    sample = plan.sampled(np.linspace(0.0, plan.horizon, 2001))
+    squares = np.trapezoid((sample.rates**2).sum(axis=1), sample.t) / 2
+    assert plan.cost == pytest.approx(squares, rel=1e-3)
+    assert gap(sample.joints, [BOX]).min() >= -1e-6
+    assert (np.abs(sample.accelerations) <= [3.003, 2.002]).all()
+
+
+@pytest.mark.parametrize("limits", [None, Limits(acceleration=1.0, torque=np.inf)])
+def test_a_goal_at_the_start_is_reached_by_rest(limits: Limits | None) -> None:
+    plan = plan_to_goal(request_of(BOX, goals=START, limits=limits))
+    assert plan.audit().feasible
+    assert plan.cost == 0
+    np.testing.assert_allclose(sampled(plan), np.tile(START, (2001, 1)), atol=1e-12)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("jerk", [None, 400.0])
+def test_least_time_of_an_arm_among_boxes_keeps_all_limits_and_its_clearance(jerk: float | None) -> None:
+    machine = FixedBase(example_robot("six_axis"))
+    scene = CollisionScene(machine, [Box((0.1, 0.1, 2.0), (0.5, 0.0, 0.0))])
+    starts = np.array([[-0.8, 0.6, 0.6, 0.0, 0.5, 0.0]])
+    assert not StraightMotions(scene).are_clear(starts, starts * [-1.0, 1.0, 1.0, 1.0, 1.0, 1.0])[0]
+    start, goal = np.array([-0.8, 0.6, 0.6, 0.0, 0.5, 0.0]), np.array([0.8, 0.6, 0.6, 0.0, 0.5, 0.0])
+    limits = Limits(acceleration=10.0, jerk=jerk, torque=[150.0, 150.0, 150.0, 28.0, 28.0, 28.0])
+    plan = plan_to_goal(
+        GoalRequest(
+            machine, start, goal, limits=limits, cost=Cost(velocity=0.0, time=1.0), time_limit=15.0,
+            clearance_constraints=ClearanceConstraints(scene),
+        )
+    )  # fmt: skip
+    assert plan.audit().feasible
+    assert plan.bound is not None
+    assert plan.bound <= plan.cost == pytest.approx(plan.horizon)
+    sample = plan.sampled(np.linspace(0.0, plan.horizon, 2001))
+    assert distances_along(scene, np.zeros(0), sample.joints, sample.t).min() >= -1e-6
+    assert (np.abs(sample.rates) <= machine.robot.velocity * 1.001).all()
+    assert np.abs(sample.accelerations).max() <= 10.01
+    np.testing.assert_allclose(sample.rates[[0, -1]], 0.0, atol=1e-6)
