@@ -128,8 +128,11 @@ def test_halves_cover_what_they_came_from() -> None:
     machine = panda()
     task = moved(machine, PANDA_START, "pose")
     sets, times = sets_of(machine, task)
-    charts = sets.cover(*found(machine, task, times, 64, 0), 0.07, 50_000)
+    charts = sets.cover(*found(machine, task, times, 16, 0), 0.07, 50_000)
     layer, joints = found(machine, task, times, 64, 99)
+    covered = sets.is_covered(charts, layer, joints)  # not those on small components that the seeds missed
+    layer, joints = layer[covered], joints[covered]
+    assert covered.mean() > 0.95
     for _ in range(3):
         charts = sets.split(charts).charts
         assert sets.is_covered(charts, layer, joints).all()
