@@ -32,7 +32,8 @@ ARMS = {  # file, tip, numbers of joints held by a plan and by a global one, see
     "tiago": ("tiago_description/robots/tiago.urdf", "arm_tool_link", 40, 41, 0),
     "talos": ("talos_data/robots/talos_reduced.urdf", "gripper_left_base_link", 23, 25, 0),
 }
-QUICK = ("z1", "panda")
+QUICK = [("z1", "configurations"), ("z1", "global"), ("panda", "configurations")]
+CASES = [(name, search) for name in ARMS for search in ("configurations", "global")]
 
 
 @cache
@@ -109,9 +110,8 @@ def _follow(pose_at: Any, middles: Array, seams: tuple[Array, Array, Array], too
     return np.array([*ends[0][::-1], middles, *ends[1]]).transpose(1, 0, 2)
 
 
-@pytest.mark.parametrize("search", ["configurations", "global"])
 @pytest.mark.parametrize(
-    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.long) for name in ARMS]
+    ("name", "search"), [case if case in QUICK else pytest.param(*case, marks=pytest.mark.long) for case in CASES]
 )
 def test_a_seam_is_planned_with_the_file_as_it_is(name: str, search: Any) -> None:
     whole, task = robot(name), seam(robot(name), ARMS[name][4])
