@@ -18,7 +18,7 @@ from ocp.motion.tasks.equations import bind
 from tests.models.robot.pinocchio_robots import DATA, urdf_file
 from tests.models.robot.trees import Array
 
-SPEED, LENGTH, MARGIN, BATCH = 0.1, 0.3, 0.0005, 100
+SPEED, LENGTH, CUTOFF, BATCH = 0.1, 0.3, 0.01, 100
 """m/s; m; m; configurations that are tried at once."""
 ARMS = {  # file, tip, numbers of joints held by a plan and by a global one, seed of the seam
     "z1": ("z1_description/urdf/z1.urdf", "gripperStator", 1, 1, 0),
@@ -65,8 +65,8 @@ def seam(whole: Robot, seed: int = 0) -> TipTask:
             rows = paths[chosen][:, samples]
             flat = rows.reshape(-1, arm.dof)
             if len(flat):
-                distances = distances_along(scene, np.zeros(0), flat, np.zeros(len(flat)), 2 * MARGIN)
-                clear = np.all(distances > MARGIN, axis=1).reshape(rows.shape[:2])
+                distances = distances_along(scene, np.zeros(0), flat, np.zeros(len(flat)), CUTOFF)
+                clear = np.all(distances > 0, axis=1).reshape(rows.shape[:2])
                 chosen = chosen[clear.all(axis=1)]
         for k in chosen.tolist():
             first, along = place[k] - LENGTH / 2 * way[k], SPEED * way[k]
