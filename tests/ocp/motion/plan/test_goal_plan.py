@@ -73,7 +73,7 @@ def test_a_clear_straight_motion_has_the_cost_of_its_bound() -> None:
         ({"start": [-2.5, 0.0]}, "x", "start: 'x' starts at -2.5"),
         ({"goals": np.zeros((0, 2))}, "goals", "at least one"),
         ({"time_limit": -1.0}, "time_limit", "time_limit"),
-        ({"weights": [1.0, 0.0]}, "weights", "positive"),
+        ({"cost": Cost(weights=[1.0, 0.0])}, "weights", "positive"),
     ],
 )
 def test_a_request_that_cannot_be_met_is_refused_by_name(options: dict[str, Any], name: str, words: str) -> None:
