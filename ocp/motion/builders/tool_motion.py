@@ -34,7 +34,7 @@ from ocp.tolerances import ROUNDING_SHARE
 
 __all__ = ["CLOCK", "PACE", "SLOPES", "Stretch", "ToolMotion", "stretches_of", "tool_motion_problem"]
 
-CLOCK, SLOPES, PACE = "clock", "slopes", "pace"
+CLOCK, SLOPES, PACE, ERRORS = "clock", "slopes", "pace", "task errors"
 """Names in free time: the time as a state, and the derivatives of joints and time by the tasks' own time."""
 
 
@@ -54,6 +54,7 @@ class FeedbackSettings:
     intervals: int = 8
     closed_gap: float = 1e-6
     smoothing: float = 1e-3
+    relaxation: float = 1e-5
 
 
 FEEDBACK = FeedbackSettings()
@@ -164,6 +165,7 @@ def tool_motion_problem(
     bounds: JointBounds,
     time_cost: float | None = None,
     actuated: bool = False,
+    relaxed: bool = False,
     clearance_constraints: ClearanceConstraints | None = None,
     fixed_joints: Array | None = None,
 ) -> ToolMotion:
@@ -203,7 +205,7 @@ def tool_motion_problem(
         bounds = bounds._replace(velocity=np.where(fixed_joints, 0.0, bounds.velocity))
     motion = _Motion(
         problem, machine, tuple(stretches), bounds, base, start, reference, cyclic, weights, clearance_constraints,
-        actuated,
+        actuated, relaxed,
     )  # fmt: skip
     if time_cost is not None:
         return _in_free_time(motion, time_cost)
@@ -243,6 +245,7 @@ class _Motion:
     weights: Array
     clearance_constraints: ClearanceConstraints | None
     actuated: bool
+    relaxed: bool
 
     @property
     def horizon(self) -> float:
@@ -270,6 +273,14 @@ class _Motion:
         options: dict[str, Any] = {"lower": self.bounds.lower, "upper": self.bounds.upper, "unit": machine.robot.unit()}
         options |= {"initial": self.start if begins else None, "terminal": self.start if returns else None}
         return place, self.problem.state(f"joints{stretch.suffix}", machine.joint_size, **options)
+
+    def task_errors(self, stretch: Stretch) -> tuple[Any, Any]:
+        """Declare and return the velocities by which tasks may deviate, and their running cost; 0, 0 if not relaxed."""
+        assert stretch.equations is not None
+        if not self.relaxed or not stretch.equations.size:
+            return 0, 0
+        errors = self.problem.control(f"{ERRORS}{stretch.suffix}", stretch.equations.size, guess=0.0)
+        return FEEDBACK.relaxation * errors, ca.sumsqr(errors) / 2
 
     def constrain_clearance(self, stretch: Stretch, base: Any, joints: Any, horizon: float | None) -> None:
         """Declare the clearance constraints of a stretch; the horizon is None if the time is free."""
@@ -305,7 +316,10 @@ def _declare_stretch(motion: _Motion, stretch: Stretch, known: Array | None) -> 
         rates = problem.control(f"rates{stretch.suffix}", machine.joint_size, **options)
     slack = _closure(motion) if motion.cyclic and ends else 0
     ends_at: Array | None = None
+    error_cost: Any = 0
     if stretch.equations is not None:
+        error, error_cost = motion.task_errors(stretch)
+        slack = slack + error
         required = np.ones(stretch.equations.size, dtype=bool)
         slopes = _slopes(stretch, motion.base, motion.reference)
         if known is not None:
@@ -323,7 +337,7 @@ def _declare_stretch(motion: _Motion, stretch: Stretch, known: Array | None) -> 
     states = [*([place] if machine.base_size else []), joints]
     if motion.actuated:
         states += [rates, *([second] if f"jerks{stretch.suffix}" in problem.declared.controls else [])]
-    cost = pace * (ca.dot(rates, ca.DM(motion.weights) * rates) / 2 + motion.horizon**2 * smooth)
+    cost = pace * (ca.dot(rates, ca.DM(motion.weights) * rates) / 2 + error_cost + motion.horizon**2 * smooth)
     return states, cost, ends_at
 
 

@@ -112,6 +112,7 @@ def declared_motion(
     reference: Any,
     constraints: ClearanceConstraints | None,
     limits: Limits | None = None,
+    relaxed: bool = True,
 ) -> ToolMotion:
     """Declare the problem of a motion, which keeps its origin.
 
@@ -128,6 +129,7 @@ def declared_motion(
         "weights": request.weights,
         "time_cost": request.time_cost,
         "actuated": limits is not None,
+        "relaxed": relaxed,
         "fixed_joints": request.fixed_joints if limits is None else None,
         "clearance_constraints": constraints,
     }
