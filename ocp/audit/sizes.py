@@ -149,7 +149,12 @@ def sizes_along(form: Formulation, grid: FineGrid, horizon: float, p: np.ndarray
         _change_by_variables(form, kind, grid, at, horizon, p, entries)[0][0]
         for kind, at in zip(COSTS, (spaced(grid), spaced(grid)[-1:]), strict=True)
     ]
-    watch = _watched(form, _rows_of(form, "watch", grid, horizon, p, bounds, _alike(form, entries)), horizon, integral(path_lengths, grid.t))
+    watch = _watched(
+        form,
+        _rows_of(form, "watch", grid, horizon, p, bounds, _alike(form, entries)),
+        horizon,
+        integral(path_lengths, grid.t),
+    )
     floor = SOLVER_SHARE * (horizon * by_variables[0] + by_variables[1])
     return Sizes(state, control, path, start, end, watch, max(integral_of_cost, floor))
 

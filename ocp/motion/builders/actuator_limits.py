@@ -9,12 +9,16 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from models import FixedBase, FreeFloating, Standing
+from models import FixedBase, FreeFloating, Machine, Standing
 from models.arrays import Array
 from models.robot.dynamics import GRAVITY, Wrench, inverse_dynamics
 from ocp.errors import NOT_NUMBERS, ProblemError, checked_nonnegative, floats
+from ocp.motion.tasks.limits import JointBounds
+from ocp.problem.problem import Problem
 
-__all__ = ["Effort", "JointFriction", "Motors", "checked_motors", "joint_torques", "nonnegative_each"]
+__all__ = [
+    "Effort", "JointFriction", "Motors", "checked_motors", "declare_actuators", "joint_torques", "nonnegative_each",
+]  # fmt: skip
 
 Motors = FixedBase | FreeFloating
 """Machines that are moved by the torques of their joints alone."""
@@ -148,3 +152,47 @@ def nonnegative_each(label: str, value: Any, size: int | None) -> Array:
         words = f"{label} must have one number or {size}, not {numbers.size}"
         raise ProblemError(words, name=name, value=numbers.size, limit=size)
     return np.array(np.broadcast_to(numbers, size))
+
+
+def declare_actuators(
+    problem: Problem,
+    machine: Machine,
+    motion: tuple[Any, Any, Any],
+    bounds: JointBounds,
+    *,
+    suffix: str,
+    pace: float,
+    smoothing: float,
+) -> tuple[Any, Any]:
+    """Declare accelerations within the actuator limits, and return them and the smoothing cost, (rad/s)^2.
+
+    The cost is half the squared accelerations or jerks, times powers of a duration.
+
+    Args:
+        motion: Base, joints and rates as symbols.
+        bounds: Limits of acceleration, jerk, torque and power.
+        suffix: Suffix of the declared names.
+        pace: Seconds of the motion in a second of the problem.
+        smoothing: Duration in which a control passes from limit to limit instead of jumping, s.
+    """
+    (base, joints, rates), robot, n = motion, machine.robot, machine.joint_size
+    options: dict[str, Any] = {"lower": -bounds.acceleration, "upper": bounds.acceleration, "unit": robot.unit("/s^2")}
+    if np.isfinite(bounds.jerk).any():
+        second = problem.state(f"accelerations{suffix}", n, **options)
+        jerks = problem.control(f"jerks{suffix}", n, lower=-bounds.jerk, upper=bounds.jerk, unit=robot.unit("/s^3"))
+        problem.dynamics(second, pace * jerks)
+        smooth = smoothing**2 * ca.sumsqr(jerks)
+    else:
+        second = problem.control(f"accelerations{suffix}", n, **options)
+        smooth = ca.sumsqr(second)
+    problem.dynamics(rates, pace * second)
+    if np.isfinite([bounds.torque, bounds.power]).any():
+        torques = joint_torques(checked_motors("limits", machine), base, joints, rates, second)
+        for name, values, low, high, unit in (
+            ("torques", torques, -bounds.torque, bounds.torque, robot.effort_unit),
+            ("power", torques * rates, np.full(n, -np.inf), bounds.power, "W"),
+        ):
+            rows = np.flatnonzero(np.isfinite(high)).tolist()
+            if rows:
+                problem.path(f"{name}{suffix}", values[rows], lower=low[rows], upper=high[rows], unit=unit)
+    return second, smoothing**2 / 2 * smooth

@@ -22,14 +22,16 @@ from ocp.direct.prepared import Prepared
 from ocp.errors import RefinementWarning, SolveError
 from ocp.methods import solve
 from ocp.motion.builders.clearance import APART
-from ocp.motion.builders.tool_motion import CLOCK, ToolMotion
+from ocp.motion.builders.tool_motion import CLOCK, SLOPES, ToolMotion
 from ocp.motion.local.collisions import Collision
 from ocp.motion.local.inverse_kinematics import Unreachable
+from ocp.motion.local.rates import LocalMotion
 from ocp.motion.plan.actuators import solve_within_actuator_limits
 from ocp.motion.plan.candidate import Candidate, Reason, Rejection, Seed, Stage, collision_reason
 from ocp.motion.plan.candidate_queue import Solver
 from ocp.motion.plan.motion import Plan, parts_of
 from ocp.motion.plan.request import declared_motion
+from ocp.motion.plan.singular import MotionSample, describe_shortfall, is_nearly_singular, limit_reason
 from ocp.motion.search.configurations import (
     REACH_TOLERANCE,
     PlanRequest,
@@ -78,22 +80,60 @@ class CandidateSolver(Solver):
             Stage.AUDITED: self._limit_actuators,
         }
         try:
-            integrate_jerk = steps[candidate.stage](candidate)
+            advanced = steps[candidate.stage](candidate)
         except SolveError as error:
             if isinstance(error.__cause__, KeyboardInterrupt):
                 raise
-            self.error = error
-            kind = Rejection.ACTUATORS if candidate.stage is Stage.AUDITED else Rejection.INFEASIBLE
             failed = replace(candidate, cost=np.nan, solution=error.solution, stage=max(candidate.stage, Stage.FINE))
-            return [failed.rejected(Reason.of_error(kind, error))]
-        return [integrate_jerk, *self._free_start(integrate_jerk)]
+            if candidate.stage is Stage.AUDITED:
+                self.error = error
+                return [failed.rejected(Reason.of_error(Rejection.ACTUATORS, error))]
+            advanced = failed.rejected(self._failure_reason(failed, str(error)))
+        if self._may_relax(advanced):
+            return [Candidate(candidate.start, candidate.seed.cost, seed=replace(candidate.seed, relaxed=True))]
+        return [advanced, *self._free_start(advanced)]
+
+    def is_nearly_singular(self, local: Sequence[LocalMotion]) -> bool:
+        """Return whether the tasks along a local motion are nearly dependent, so that its candidate relaxes them."""
+        return self._can_relax and is_nearly_singular(self.motion.stretches, local)
+
+    @property
+    def _can_relax(self) -> bool:
+        return self.request.time_cost is None
+
+    def _may_relax(self, candidate: Candidate) -> bool:
+        """Return whether a rejected candidate is solved again with relaxed tasks: not if bodies collided."""
+        seed, reason = candidate.seed, candidate.reason
+        if reason is None or reason.kind in (Rejection.COLLISION, Rejection.ACTUATORS) or _is_separated(candidate):
+            return False
+        return self._can_relax and seed.thorough and not seed.relaxed
+
+    def _failure_reason(self, candidate: Candidate, words: str) -> Reason:
+        """Return the reason that the solver found no motion: where the last iterate, or else the seed, fails."""
+        samples = list(map(MotionSample.of_local, self.motion.stretches, candidate.seed.local))
+        if not samples:
+            return Reason(Rejection.INFEASIBLE, words.split("\n")[0])
+        solution = candidate.solution
+        if solution is not None and candidate.seed.relaxed:
+            samples = self._motion_samples(solution)
+        return limit_reason(self.request, samples) or describe_shortfall(self.request, samples)
+
+    def _motion_samples(self, solution: Solution) -> list[MotionSample]:
+        fractions, samples = self._samples(solution), list[MotionSample]()
+        values = solution.at_fraction(fractions)
+        for stretch in self.motion.stretches:
+            base = values[f"base{stretch.suffix}"] if self.request.machine.base_size else np.zeros((len(fractions), 0))
+            rates = values[SLOPES if self.request.time_cost is not None else f"rates{stretch.suffix}"]
+            times = stretch.begin + fractions * stretch.duration
+            samples.append(MotionSample(stretch, times, base, values[f"joints{stretch.suffix}"], rates))
+        return samples
 
     # ---- stages ------------------------------------------------------------------------------------------------------
 
     def _solve_seed(self, candidate: Candidate) -> Candidate:
         seed, separated = candidate.seed, _is_separated(candidate)
         if seed.direct:
-            return self._solve(candidate, Stage.FINE, seed.guess, check=seed.thorough and not separated)
+            return self._solve(candidate, Stage.FINE, seed.guess)
         return self._solve(candidate, Stage.SEPARATED if separated else Stage.COARSE, seed.guess)
 
     def _separate(self, candidate: Candidate) -> Candidate:
@@ -131,7 +171,8 @@ class CandidateSolver(Solver):
         solution, audit = self._audit_and_refine(motion, mesh, candidate.solution, check=not _is_separated(candidate))
         if np.isnan(self._start(candidate)).any() and audit.feasible and audit.optimal is None:
             start = solution[joints_name][0]
-            fixed = declared_motion(self.request, start=start, reference=self.reference, constraints=constraints)
+            options = {"constraints": constraints, "relaxed": candidate.seed.relaxed}
+            fixed = declared_motion(self.request, start=start, reference=self.reference, **options)
             current_mesh = _mesh_of(mesh, solution)
             options = self._options(fixed, current_mesh, solution.cost, {})
             fixed_solution = solve(fixed.problem, current_mesh, guess=solution, options=options)
@@ -171,12 +212,13 @@ class CandidateSolver(Solver):
 
     # ---- solves ------------------------------------------------------------------------------------------------------
 
-    def _solve(self, candidate: Candidate, stage: Stage, guess: Any, check: bool = False) -> Candidate:
+    def _solve(self, candidate: Candidate, stage: Stage, guess: Any) -> Candidate:
         cost = guess.cost if isinstance(guess, Solution) else np.inf
-        solution = self.prepared(candidate, stage >= Stage.FINE, cost)[2].solve(guess=guess, check=check)
+        solution = self.prepared(candidate, stage >= Stage.FINE, cost)[2].solve(guess=guess, check=False)
+        solved = replace(candidate, stage=stage, cost=solution.cost, solution=solution)
         if solution.success:
-            return replace(candidate, stage=stage, cost=solution.cost, solution=solution)
-        reason = Reason(Rejection.INFEASIBLE, str(solution.status))
+            return solved
+        reason = self._failure_reason(solved, str(solution.status))
         return replace(candidate, cost=np.nan, solution=None).rejected(reason)
 
     def _separate_pairs(self, candidate: Candidate, stage: Stage, collisions: list[Collision]) -> Candidate:
@@ -200,13 +242,13 @@ class CandidateSolver(Solver):
         margins: tuple[Any, ...] = ()
         if candidate.constraints is not None and separated:
             margins = tuple(sorted(candidate.constraints.margins.items()))
-        key = margins, fine, tuple(candidate.start) if candidate.seed.fixed else ()
+        key = margins, fine, candidate.seed.relaxed, tuple(candidate.start) if candidate.seed.fixed else ()
         if key not in self._prepared:
             start, motion = self._start(candidate), self.motion
-            if margins or candidate.seed.fixed:
+            if margins or candidate.seed.fixed or candidate.seed.relaxed:
                 reference = candidate.start if candidate.seed.fixed else self.reference
-                constraints = candidate.constraints
-                motion = declared_motion(self.request, start=start, reference=reference, constraints=constraints)
+                variant = {"constraints": candidate.constraints, "relaxed": candidate.seed.relaxed}
+                motion = declared_motion(self.request, start=start, reference=reference, **variant)
             min_intervals = settings.separated_intervals if margins and not fine else settings.min_intervals
             degree = settings.fine_degree if fine else settings.coarse_degree
             count = min_intervals if len(motion.breaks) < min_intervals else 1

@@ -126,7 +126,8 @@ def candidates_from(
     for index in np.lexsort((costs, ~tracked)).tolist():
         local = [motion.take(slice(index, index + 1)) for motion in motions]
         guess = solver.motion.guess(local, 0)
-        seed = Seed(guess, float(costs[index]), local, bool(tracked[index]), **options)
+        relaxed = solver.is_nearly_singular(local)
+        seed = Seed(guess, float(costs[index]), local, bool(tracked[index]), relaxed=relaxed, **options)
         constraints = solver.request.clearance_constraints
         candidates.append(Candidate(configurations[index], seed.cost, seed=seed, constraints=constraints))
     return candidates

@@ -112,7 +112,7 @@ def declared_motion(
     reference: Any,
     constraints: ClearanceConstraints | None,
     limits: Limits | None = None,
-    relaxed: bool = True,
+    relaxed: bool = False,
 ) -> ToolMotion:
     """Declare the problem of a motion, which keeps its origin.
 
@@ -120,6 +120,7 @@ def declared_motion(
         request: The request.
         start, reference, constraints: As in `tool_motion_problem`.
         limits: Limits that include those of the actuators, if these are limited; else None.
+        relaxed: As in `tool_motion_problem`.
     """
     options: dict[str, Any] = {
         "base": request.base,
