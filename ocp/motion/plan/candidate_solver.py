@@ -118,6 +118,20 @@ class CandidateSolver(Solver):
             samples = self._motion_samples(solution)
         return limit_reason(self.request, samples) or describe_shortfall(self.request, samples)
 
+    def _turned_over(self, solution: Solution) -> Reason | None:
+        """Return the reason that a tool points the opposite way at a free start, where the equations hold as well."""
+        if self.request.start is not None:
+            return None
+        for sample in self._motion_samples(solution):
+            equations = sample.stretch.equations
+            if equations is not None and equations.pose_rows.any():
+                targets = np.array(equations.target_function()(sample.t[0])).ravel()
+                angle = equations.misses(sample.base[0], sample.joints[0], targets)[1]
+                if angle > np.pi / 2:
+                    words = f"at {sample.t[0]:.4g} s the tool is turned by {angle:.3g} rad from its target"
+                    return Reason(Rejection.UNTRACKED, words, "task", angle, np.pi / 2, float(sample.t[0]))
+        return None
+
     def _motion_samples(self, solution: Solution) -> list[MotionSample]:
         fractions, samples = self._samples(solution), list[MotionSample]()
         values = solution.at_fraction(fractions)
@@ -152,6 +166,8 @@ class CandidateSolver(Solver):
             return self._separate_pairs(candidate, Stage.FINE, collisions)
         motion, mesh, _ = self.prepared(candidate, fine=True)
         assert candidate.solution is not None
+        if (reason := self._turned_over(candidate.solution)) is not None:
+            return candidate.rejected(reason)
         solution = self._refine_for_tasks(motion, mesh, candidate.solution, check=not _is_separated(candidate))
         if (deviation := self._deviations(motion, solution).max()) > self.settings.max_deviation:
             words = f"the tips deviate by {deviation:.2g} (m or rad) on finer meshes as well"
@@ -171,8 +187,7 @@ class CandidateSolver(Solver):
         solution, audit = self._audit_and_refine(motion, mesh, candidate.solution, check=not _is_separated(candidate))
         if np.isnan(self._start(candidate)).any() and audit.feasible and audit.optimal is None:
             start = solution[joints_name][0]
-            options = {"constraints": constraints, "relaxed": candidate.seed.relaxed}
-            fixed = declared_motion(self.request, start=start, reference=self.reference, **options)
+            fixed = self._declare(candidate, start, self.reference)
             current_mesh = _mesh_of(mesh, solution)
             options = self._options(fixed, current_mesh, solution.cost, {})
             fixed_solution = solve(fixed.problem, current_mesh, guess=solution, options=options)
@@ -192,6 +207,10 @@ class CandidateSolver(Solver):
         if not audit.failures:
             return candidate.rejected(Reason(Rejection.UNDETERMINED, audit.undecided))
         worst = audit.failures[0]
+        if candidate.seed.relaxed and not audit.feasible:
+            samples = self._motion_samples(solution)
+            reason = limit_reason(self.request, samples) or describe_shortfall(self.request, samples)
+            return candidate.rejected(replace(reason, kind=Rejection.AUDIT))
         words = f"{worst.name} {worst.value:.2g}"
         return candidate.rejected(Reason(Rejection.AUDIT, words, worst.name, worst.value, worst.limit, worst.time))
 
@@ -247,8 +266,7 @@ class CandidateSolver(Solver):
             start, motion = self._start(candidate), self.motion
             if margins or candidate.seed.fixed or candidate.seed.relaxed:
                 reference = candidate.start if candidate.seed.fixed else self.reference
-                variant = {"constraints": candidate.constraints, "relaxed": candidate.seed.relaxed}
-                motion = declared_motion(self.request, start=start, reference=reference, **variant)
+                motion = self._declare(candidate, start, reference)
             min_intervals = settings.separated_intervals if margins and not fine else settings.min_intervals
             degree = settings.fine_degree if fine else settings.coarse_degree
             count = min_intervals if len(motion.breaks) < min_intervals else 1
@@ -257,6 +275,11 @@ class CandidateSolver(Solver):
             options = self._options(motion, mesh, cost, base_options)
             self._prepared[key] = motion, mesh, mesh.prepare(motion.problem, options=options)
         return self._prepared[key]
+
+    def _declare(self, candidate: Candidate, start: Array, reference: Array) -> ToolMotion:
+        constraints, relaxed = candidate.constraints, candidate.seed.relaxed
+        options: dict[str, Any] = {"start": start, "reference": reference, "constraints": constraints}
+        return declared_motion(self.request, **options, relaxed=relaxed)
 
     def _start(self, candidate: Candidate) -> Array:
         """Return the joints at the start, nan where free; joints that move separated bodies are not ignorable."""

@@ -10,6 +10,7 @@ import numpy as np
 
 from models.arrays import Array
 from ocp.motion.builders.tool_motion import Stretch
+from ocp.motion.local.inverse_kinematics import describe_miss
 from ocp.motion.local.rates import LocalMotion
 from ocp.motion.plan.candidate import Reason, Rejection
 from ocp.motion.search.configurations import PlanRequest
@@ -86,56 +87,59 @@ class MotionSample:
 
 
 def limit_reason(request: PlanRequest, samples: Sequence[MotionSample]) -> Reason | None:
-    """Return the reason that a motion exceeds the limit of a joint's rate, by the largest share; None if it does not."""
-    bounds, names = request.bounds, request.machine.robot.joint_names
-    worst: Reason | None = None
-    largest = 1.0 + SINGULAR.at_limit
+    """Return the reason that a motion exceeds the limit of a joint's rate by the largest share, or None."""
+    reasons = []
     for sample in samples:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            shares = np.nan_to_num(np.abs(sample.rates) / bounds.velocity, nan=0.0)
-        k, joint = np.unravel_index(int(shares.argmax()), shares.shape)
-        if shares[k, joint] > largest:
-            largest = float(shares[k, joint])
-            rate, limit, time = float(abs(sample.rates[k, joint])), float(bounds.velocity[joint]), float(sample.t[k])
-            unit = request.machine.robot.moving_joints[int(joint)]
-            unit_name = "m/s" if unit.kind == "prismatic" else "rad/s"
+        shares = _rate_shares(request, sample.rates)
+        k, joint = (int(i) for i in np.unravel_index(int(shares.argmax()), shares.shape))
+        if shares[k, joint] > 1 + SINGULAR.at_limit:
+            name, unit = _joint(request, joint)
+            rate, limit = float(abs(sample.rates[k, joint])), float(request.bounds.velocity[joint])
             words = (
-                f"at {time:.4g} s {names[joint]!r} would have to move at {rate:.4g} {unit_name}, its limit is "
-                f"{limit:.4g} {unit_name}; lengthen the horizon or start elsewhere"
+                f"at {sample.t[k]:.4g} s {name!r} would have to move at {rate:.4g} {unit}/s, its limit is {limit:.4g} "
+                f"{unit}/s; lengthen the horizon or start elsewhere"
             )
-            worst = Reason(Rejection.INFEASIBLE, words, names[joint], rate, limit, time)
-    return worst
+            reasons.append((rate / limit, Reason(Rejection.INFEASIBLE, words, name, rate, limit, float(sample.t[k]))))
+    return max(reasons, key=lambda entry: entry[0])[1] if reasons else None
 
 
 def describe_shortfall(request: PlanRequest, samples: Sequence[MotionSample]) -> Reason:
-    """Return the reason that a motion misses its tasks: when, by how much, and which joint is at its limit there.
-
-    The motion is the one that misses its tasks least among those near the guess.
-    """
-    bounds, robot = request.bounds, request.machine.robot
-    sample, k, position, angle = samples[0], 0, 0.0, 0.0
+    """Return the reason that a motion misses its tasks: when, by how much, and which joint is at its limit there."""
+    sample, k, misses = samples[0], 0, (0.0, 0.0)
     for each in samples:
-        positions, angles = each.misses()
-        i = int((positions + angles).argmax())
-        if positions[i] + angles[i] > position + angle:
-            sample, k, position, angle = each, i, float(positions[i]), float(angles[i])
-    time = float(sample.t[k])
-    words = f"at {time:.4g} s the tip misses its task by {position:.3g} m and {angle:.3g} rad"
-    joints, rates, width = sample.joints[k], sample.rates[k], bounds.upper - bounds.lower
-    slack = np.where(np.isfinite(width), SINGULAR.at_limit * width, 0.0)
-    for joint, name in enumerate(robot.joint_names):
-        unit = "m" if robot.moving_joints[joint].kind == "prismatic" else "rad"
-        for limit in (bounds.lower[joint], bounds.upper[joint]):
-            if np.isfinite(limit) and abs(joints[joint] - limit) <= slack[joint]:
-                words = f"{words}, with {name!r} at its limit {limit:.5g} {unit}; start elsewhere or leave a row free"
-                return Reason(Rejection.INFEASIBLE, words, name, float(joints[joint]), float(limit), time)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        shares = np.nan_to_num(np.abs(rates) / bounds.velocity, nan=0.0)
+        distances, angles = each.misses()
+        i = int((distances + angles).argmax())
+        if distances[i] + angles[i] > sum(misses):
+            sample, k, misses = each, i, (float(distances[i]), float(angles[i]))
+    bounds, joints, time = request.bounds, sample.joints[k], float(sample.t[k])
+    words = f"at {time:.4g} s the tip misses its task by {describe_miss(*misses)}"
+    with np.errstate(invalid="ignore"):
+        slack = np.nan_to_num(SINGULAR.at_limit * (bounds.upper - bounds.lower), nan=0.0, posinf=0.0)
+    for limits in (bounds.lower, bounds.upper):
+        for joint in np.flatnonzero(np.abs(joints - limits) <= slack).tolist():
+            name, unit = _joint(request, joint)
+            words = (
+                f"{words}, with {name!r} at its limit {limits[joint]:.5g} {unit}; start elsewhere or leave a row free"
+            )
+            return Reason(Rejection.INFEASIBLE, words, name, float(joints[joint]), float(limits[joint]), time)
+    shares = _rate_shares(request, sample.rates[k])
     fastest = int(shares.argmax())
-    if shares[fastest] >= 1 - SINGULAR.at_limit:
-        name, limit = robot.joint_names[fastest], float(bounds.velocity[fastest])
-        unit = "m/s" if robot.moving_joints[fastest].kind == "prismatic" else "rad/s"
-        words = f"{words}, with {name!r} at the limit of its rate, {limit:.5g} {unit}; lengthen the horizon"
-        return Reason(Rejection.INFEASIBLE, words, name, float(abs(rates[fastest])), limit, time)
-    words = f"{words}, where the arm is singular: no joint moves the tip in that direction; start elsewhere"
-    return Reason(Rejection.INFEASIBLE, words, "tip", max(position, angle), 0.0, time)
+    name, unit = _joint(request, fastest)
+    value, limit = float(abs(sample.rates[k, fastest])), float(bounds.velocity[fastest])
+    at_limit = shares[fastest] >= 1 - SINGULAR.at_limit
+    words += (
+        f", with {name!r} {'at the limit of its rate' if at_limit else 'as the fastest joint'}, {value:.4g} {unit}/s"
+    )
+    return Reason(Rejection.INFEASIBLE, f"{words}; lengthen the horizon or start elsewhere", name, value, limit, time)
+
+
+def _rate_shares(request: PlanRequest, rates: Array) -> Array:
+    """Return rates relative to their limits, zero for joints that do not move."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.nan_to_num(np.abs(rates) / request.bounds.velocity, nan=0.0)
+
+
+def _joint(request: PlanRequest, joint: int) -> tuple[str, str]:
+    """Return the name of a joint and the unit of its position."""
+    moving = request.machine.robot.moving_joints[joint]
+    return moving.name, "m" if moving.kind == "prismatic" else "rad"
