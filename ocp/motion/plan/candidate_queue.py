@@ -54,7 +54,11 @@ class Solver:
         last = next((candidate.solution for candidate in candidates if candidate.solution is not None), None)
         words, cause = f"no motion passes its audit:\n{listed}", self.error
         if cause is None:
-            return SolveError(words, last, name="plan")
+            located = (c.reason for c in candidates if c.reason is not None and c.reason.time is not None)
+            if (reason := next(located, None)) is None:
+                return SolveError(words, last, name="plan")
+            fields = {"name": reason.name, "value": reason.value, "limit": reason.limit, "time": reason.time}
+            return SolveError(words, last, **fields)
         details = {"name": cause.name or "plan", "value": cause.value, "limit": cause.limit, "time": cause.time}
         return SolveError(f"{words}\n{cause}", cause.solution or last, cause.conflicts, **details)
 
