@@ -34,8 +34,12 @@ DAMPING, STEPS, FEEDBACK, TOLERANCE = 1e-3, 800, 0.5, 1e-5
 """Damping in the units of the Jacobian, steps, share of the error that a step corrects, and m or rad of the error."""
 URDF = {"ur5": "ur5_robot.urdf", "panda": "panda.urdf", "z1": "z1.urdf"}
 TIPS = {"ur5": "tool0", "panda": "panda_link8", "z1": "link06"}
-LOCKED = {"ur5": (), "panda": ("panda_finger_joint1", "panda_finger_joint2"), "z1": ("jointGripper",)}
-STARTS = {
+LOCKED: dict[str, tuple[str, ...]] = {
+    "ur5": (),
+    "panda": ("panda_finger_joint1", "panda_finger_joint2"),
+    "z1": ("jointGripper",),
+}
+STARTS: dict[str, dict[str, tuple[float, ...]]] = {
     "ur5": {
         "straight": (0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
         "wrist": (0.3, -1.2, 1.5, -0.9, 0.0, 0.4),

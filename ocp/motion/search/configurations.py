@@ -283,10 +283,10 @@ def _check_reach(request: PlanRequest, motions: list[LocalMotion]) -> None:
         if not poses:
             continue
         for time in np.unique(motion.worst_time[motion.pose_error > REACH_TOLERANCE]).tolist():
-            if (
-                error := end_of_reach(request.machine, poses, (stretch.begin, stretch.end), time, **options)
-            ) is not None:
-                raise error
+            interval = stretch.begin, stretch.end
+            if (error := end_of_reach(request.machine, poses, interval, time, **options)) is not None:
+                assert error.time is not None
+                raise locate_error(request, error, error.time)
 
 
 def locate_error(request: PlanRequest, error: Unreachable, time: float) -> Unreachable:

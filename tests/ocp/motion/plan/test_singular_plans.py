@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import casadi as ca
 import numpy as np
 import pytest
 
+from models import FixedBase, planar_chain
 from models.arrays import Array
-from ocp import SolveError, TipTask, Unreachable, bind, inverse_kinematics
+from ocp import SolveError, TipTask, Unreachable, inverse_kinematics
 from ocp.errors import ProblemError
 from ocp.motion.builders.tool_motion import ERRORS
 from ocp.motion.tasks.checks import CHECKS, clip_to_limits
+from ocp.motion.tasks.equations import bind
 from tests.families import some
 from tests.ocp.motion.plan.motions import plan_bare
-from tests.sweep.singular import PERTURBED, Motion, machine, motions, result
+from tests.sweep.singular import PERTURBED, Motion, damped_cost, machine, motions, result
 
 DAILY = (
     Motion("ur5", "straight", "in", False, 3.0),
@@ -34,13 +37,7 @@ def test_singular_motions_cost_no_more_than_damped_ones_and_the_same_if_moved_by
 
 @pytest.mark.long
 def test_damped_least_squares_does_at_least_forty_of_the_motions() -> None:
-    assert sum(np.isfinite(damped) for damped in map(_damped, motions())) >= 40
-
-
-def _damped(motion: Motion) -> float:
-    from tests.sweep.singular import damped_cost
-
-    return damped_cost(motion)
+    assert sum(np.isfinite(damped_cost(motion)) for motion in motions()) >= 40
 
 
 def test_a_relaxed_motion_does_its_task_within_the_bound() -> None:
@@ -85,16 +82,21 @@ def test_the_end_of_the_reach_is_the_one_of_a_dense_sweep_for_every_search(
 ) -> None:
     """Inverse kinematics from many starts finds poses right before the end, and none right behind it."""
     task, ends = leaving(arm, start, displacement, held), list[float]()
-    for options in ({"start": np.array(start)}, {"start": np.array(start), "search": "global"}, {}):
+    searches: tuple[dict[str, Any], ...] = (
+        {"start": np.array(start)},
+        {"start": np.array(start), "search": "global"},
+        {},
+    )
+    for asked in searches:
         with pytest.raises(Unreachable, match="the reach ends") as caught:
-            plan_bare(machine(arm), task, **options)
+            plan_bare(machine(arm), task, **asked)
         found = caught.value
         assert found.time is not None
         assert found.distance > 0
         assert np.isfinite(found.angle)
         ends.append(found.time)
     assert np.ptp(ends) < 1e-4
-    options = {"near": found.joints, "starts": 256, "tolerance": 1e-6}
+    options: dict[str, Any] = {"near": found.joints, "starts": 256, "tolerance": 1e-6}
     for time in found.time - np.geomspace(1e-3, 0.3, 5):
         assert inverse_kinematics(machine(arm), task, time=float(time), **options)
     for time in found.time + np.geomspace(1e-3, 0.1, 5):
@@ -102,13 +104,20 @@ def test_the_end_of_the_reach_is_the_one_of_a_dense_sweep_for_every_search(
             inverse_kinematics(machine(arm), task, time=float(time), **options)
 
 
-def test_a_joint_at_its_limit_ends_the_reach_by_name() -> None:
-    """The last joint turns by two turns at most, and the tool is turned farther."""
-    task = turning(14.0, 10.0)
-    with pytest.raises(Unreachable) as caught:
-        plan_bare(machine("panda"), task)
-    assert caught.value.name in machine("panda").robot.joint_names
-    assert caught.value.limit is not None
+def test_a_joint_at_its_limit_ends_the_reach_where_it_says() -> None:
+    """Two links whose elbow bends by half a radian at least reach |l1 + l2 exp(i/2)|, a closed form."""
+    robot = planar_chain([1.0, 0.8], [1.0, 1.0])
+    shoulder, elbow = robot.joints
+    bent = FixedBase(replace(robot, joints=(shoulder, replace(elbow, lower=0.5, upper=2.5))))
+    task = TipTask(
+        position=lambda t: np.array([1.0, 0.2, 0.0]) + t * np.array([1.0, 0.0, 0.0]), rows=(3, 4), duration=1.0
+    )
+    farthest = np.sqrt(1.0 + 0.64 + 1.6 * np.cos(0.5))
+    with pytest.raises(Unreachable, match=f"'{elbow.name}' is at its limit 0.5 rad") as caught:
+        plan_bare(bent, task)
+    assert caught.value.time == pytest.approx(np.sqrt(farthest**2 - 0.04) - 1.0, abs=1e-5)
+    assert (caught.value.name, caught.value.limit) == (elbow.name, 0.5)
+    assert caught.value.angle == 0.0
 
 
 def turning(angle: float, duration: float) -> TipTask:
