@@ -28,7 +28,7 @@ endif
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help reproduce gallery benchmark site test long sweep crowded mbm redundancy global brute passages frauds fuzz fresh moving faults browser installed check format dev build clean anew
+.PHONY: help reproduce gallery benchmark site test long sweep crowded mbm redundancy global brute passages singular frauds fuzz fresh moving faults browser installed check format dev build clean anew
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-10s  %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -73,6 +73,9 @@ mbm: $(VENV)/test.stamp ## plan 700 problems of MotionBenchMaker, and 70 in leas
 
 passages: $(VENV)/test.stamp ## plan 40 paths of floating arms past singularities that can be done (ARGS="--only beyond": that cannot)
 	$(BIN)/python -W ignore -m tests.sweep.passages --out "$(OUT)/sweeps/passages.jsonl" $(ARGS)
+
+singular: $(VENV)/test.stamp ## plan motions from singular configurations, moved by 1e-12, beside damped least squares (ARGS="--only ur5")
+	$(BIN)/python -W ignore -m tests.sweep.singular --out "$(OUT)/sweeps/singular.jsonl" $(ARGS)
 
 frauds: $(VENV)/test.stamp ## edit eight plans 264 times and audit them: what passes is looked at without the audit (ARGS="--only arm")
 	$(BIN)/python -W ignore -m tests.sweep.frauds --out "$(OUT)/sweeps/frauds.jsonl" $(ARGS)

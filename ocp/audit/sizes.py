@@ -19,7 +19,7 @@ from ocp.curves import lagrange
 from ocp.problem.declarations import Variable
 from ocp.problem.formulation import Bounds, Formulation, Rows
 from ocp.solution import Solution
-from ocp.tolerances import HELD_SHARE, MACHINE_SHARE, ROUNDING_SHARE, SOLVER_SHARE, STANDSTILL
+from ocp.tolerances import HELD_SHARE, LIMIT_SHARE, MACHINE_SHARE, ROUNDING_SHARE, SOLVER_SHARE, STANDSTILL
 
 __all__ = [
     "FineGrid",
@@ -142,14 +142,19 @@ def sizes_along(form: Formulation, grid: FineGrid, horizon: float, p: np.ndarray
     outputs = [form.running, form.path.expression, form.watch_reference_rate]
     running, rows, path_lengths = form.sampled(outputs, *point, cache_as="along a plan")
     path = _rows_of(form, "path", grid, horizon, p, bounds, entries, rows)
-    start, end, watch = (_rows_of(form, k, grid, horizon, p, bounds, entries) for k in ("start", "end", "watch"))
+    start, end = (_rows_of(form, kind, grid, horizon, p, bounds, entries) for kind in ("start", "end"))
     absolute = np.where(np.isfinite(running), np.abs(running), 0.0)[:, 0]
     integral_of_cost = float(np.sum(np.diff(grid.t) * (absolute[:-1] + absolute[1:]) / 2))
     by_variables = [
         _change_by_variables(form, kind, grid, at, horizon, p, entries)[0][0]
         for kind, at in zip(COSTS, (spaced(grid), spaced(grid)[-1:]), strict=True)
     ]
-    watch = _watched(form, watch, horizon, integral(path_lengths, grid.t))
+    watch = _watched(
+        form,
+        _rows_of(form, "watch", grid, horizon, p, bounds, _alike(form, entries)),
+        horizon,
+        integral(path_lengths, grid.t),
+    )
     floor = SOLVER_SHARE * (horizon * by_variables[0] + by_variables[1])
     return Sizes(state, control, path, start, end, watch, max(integral_of_cost, floor))
 
@@ -252,6 +257,18 @@ def _rows_of(
         own_rows = rows.of(name)
         size[own_rows] = _floored(size[own_rows], is_constant[own_rows], nearest[own_rows], threshold[own_rows])[0]
     return np.asarray(size)
+
+
+def _alike(form: Formulation, entries: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Return sizes of states and controls among which none is small beside others of its unit.
+
+    A held row is judged by the change that its variables could cause. At a singular configuration the joints that move
+    may have no effect on it, and those with an effect stand still: their rounding errors are no measure of the row.
+    """
+    size, declared = entries[0].copy(), form.problem.declared
+    share_sizes(size[: form.nx], form.states, declared.states, LIMIT_SHARE)
+    share_sizes(size[form.nx :], form.controls, declared.controls, LIMIT_SHARE)
+    return size, np.ones_like(entries[1])
 
 
 def _watched(form: Formulation, by_variables: np.ndarray, horizon: float, path_lengths: np.ndarray) -> np.ndarray:

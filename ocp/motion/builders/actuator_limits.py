@@ -7,13 +7,16 @@ from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
+import numpy as np
 
-from models import FixedBase, FreeFloating, Standing
+from models import FixedBase, FreeFloating, Machine, Standing
 from models.robot.dynamics import GRAVITY, Wrench, inverse_dynamics
 from ocp.errors import ProblemError, checked_nonnegative
 from ocp.motion.tasks.checks import nonnegative_each
+from ocp.motion.tasks.limits import JointBounds
+from ocp.problem.problem import Problem
 
-__all__ = ["JointFriction", "Motors", "checked_motors", "joint_torques"]
+__all__ = ["JointFriction", "Motors", "checked_motors", "declare_actuators", "joint_torques"]
 
 Motors = FixedBase | FreeFloating
 """Machines that are moved by the torques of their joints alone."""
@@ -96,3 +99,47 @@ def checked_motors(name: str, machine: Any) -> Motors:
         words += "standing_problem for a standing machine"
         raise ProblemError(words, name="machine", value=machine)
     return machine
+
+
+def declare_actuators(
+    problem: Problem,
+    machine: Machine,
+    motion: tuple[Any, Any, Any],
+    bounds: JointBounds,
+    *,
+    suffix: str,
+    pace: float,
+    smoothing: float,
+) -> tuple[Any, Any]:
+    """Declare accelerations within the actuator limits, and return them and the smoothing cost, (rad/s)^2.
+
+    The cost is half the squared accelerations or jerks, times powers of a duration.
+
+    Args:
+        motion: Base, joints and rates as symbols.
+        bounds: Limits of acceleration, jerk, torque and power.
+        suffix: Suffix of the declared names.
+        pace: Seconds of the motion in a second of the problem.
+        smoothing: Duration in which a control passes from limit to limit instead of jumping, s.
+    """
+    (base, joints, rates), robot, n = motion, machine.robot, machine.joint_size
+    options: dict[str, Any] = {"lower": -bounds.acceleration, "upper": bounds.acceleration, "unit": robot.unit("/s^2")}
+    if np.isfinite(bounds.jerk).any():
+        second = problem.state(f"accelerations{suffix}", n, **options)
+        jerks = problem.control(f"jerks{suffix}", n, lower=-bounds.jerk, upper=bounds.jerk, unit=robot.unit("/s^3"))
+        problem.dynamics(second, pace * jerks)
+        smooth = smoothing**2 * ca.sumsqr(jerks)
+    else:
+        second = problem.control(f"accelerations{suffix}", n, **options)
+        smooth = ca.sumsqr(second)
+    problem.dynamics(rates, pace * second)
+    if np.isfinite([bounds.torque, bounds.power]).any():
+        torques = joint_torques(checked_motors("limits", machine), base, joints, rates, second)
+        for name, values, low, high, unit in (
+            ("torques", torques, -bounds.torque, bounds.torque, robot.effort_unit),
+            ("power", torques * rates, np.full(n, -np.inf), bounds.power, "W"),
+        ):
+            rows = np.flatnonzero(np.isfinite(high)).tolist()
+            if rows:
+                problem.path(f"{name}{suffix}", values[rows], lower=low[rows], upper=high[rows], unit=unit)
+    return second, smoothing**2 / 2 * smooth

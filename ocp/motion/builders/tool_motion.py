@@ -21,7 +21,7 @@ from models import Machine
 from models.arrays import Array
 from ocp.direct.guess import Samples
 from ocp.errors import ProblemError
-from ocp.motion.builders.actuator_limits import checked_motors, joint_torques
+from ocp.motion.builders.actuator_limits import declare_actuators
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.local.rates import LocalMotion
 from ocp.motion.tasks.checks import check_closed, check_speed
@@ -36,6 +36,8 @@ __all__ = ["CLOCK", "PACE", "SLOPES", "Stretch", "ToolMotion", "stretches_of", "
 
 CLOCK, SLOPES, PACE = "clock", "slopes", "pace"
 """Names in free time: the time as a state, and the derivatives of joints and time by the tasks' own time."""
+ERRORS, START_ERRORS = "task errors", "start errors"
+"""Names of the scaled velocity errors of a relaxed task, and of its pose errors at a free start."""
 
 
 @dataclass(frozen=True)
@@ -47,12 +49,14 @@ class FeedbackSettings:
             finer mesh, for errors that are zero if the tasks begin at their poses.
         intervals: Least number of intervals of the mesh in a stretch.
         closed_gap: Pose error at the beginning of a task below which there is no gap to close, m and rad.
+        relaxation: Velocity error of a relaxed task, m/s or rad/s, that costs as much as a joint rate of 1 rad/s.
         smoothing: Share of the horizon in which controlled accelerations pass from limit to limit instead of jumping.
     """
 
     decay: float = 4.0
     intervals: int = 8
     closed_gap: float = 1e-6
+    relaxation: float = 1e-5
     smoothing: float = 1e-3
 
 
@@ -164,6 +168,7 @@ def tool_motion_problem(
     bounds: JointBounds,
     time_cost: float | None = None,
     actuated: bool = False,
+    relaxed: bool = False,
     clearance_constraints: ClearanceConstraints | None = None,
 ) -> ToolMotion:
     """Declare a motion along tasks with the least integral of half the weighted squared joint rates.
@@ -187,6 +192,11 @@ def tool_motion_problem(
             "torques" and "power" are added, and the tasks are constrained by their accelerations. Velocities are
             continuous between stretches, and free at both ends like the rates. A small weight in the cost smooths
             accelerations (jerks), see FeedbackSettings.
+        relaxed: Whether tasks may deviate at a quadratic cost, J u - b = relaxation S with the cost |S|^2 / 2 and the
+            control S, ERRORS. The constraints then stay independent where the rows of J depend on each other. If a
+            motion of cost c does the tasks within the limits, the errors of the optimum satisfy |S|^2 / 2 <= c when
+            integrated, so that a tip strays by less than relaxation sqrt(2 c horizon). Only with the tasks' own time
+            and without actuator limits.
         clearance_constraints: Collision avoidance, see `ocp.motion.builders.clearance`; None for none.
 
     Raises:
@@ -199,7 +209,7 @@ def tool_motion_problem(
     problem.horizon(horizon)
     motion = _Motion(
         problem, machine, tuple(stretches), bounds, base, start, reference, cyclic, weights, clearance_constraints,
-        actuated,
+        actuated, relaxed,
     )  # fmt: skip
     if time_cost is not None:
         return _in_free_time(motion, time_cost)
@@ -219,7 +229,8 @@ def tool_motion_problem(
     if cyclic and motion.free and before and first:
         place = 1 if machine.base_size else 0
         problem.end("cyclic", before[place] - problem.at_start(first[place]), 0, 0, unit=machine.robot.unit())
-    problem.minimize(running=running)
+    start_errors = [state.symbol for name, state in problem.declared.states.items() if name.startswith(START_ERRORS)]
+    problem.minimize(running=running, terminal=sum((ca.sumsqr(errors) / 2 for errors in start_errors), start=0))
     inside = [(stretch.breaks - stretch.begin) / stretch.duration for stretch in stretches]
     return ToolMotion(problem, tuple(stretches), horizon, np.unique(np.concatenate(inside)))
 
@@ -239,6 +250,7 @@ class _Motion:
     weights: Array
     clearance_constraints: ClearanceConstraints | None
     actuated: bool
+    relaxed: bool
 
     @property
     def horizon(self) -> float:
@@ -266,6 +278,14 @@ class _Motion:
         options: dict[str, Any] = {"lower": self.bounds.lower, "upper": self.bounds.upper, "unit": machine.robot.unit()}
         options |= {"initial": self.start if begins else None, "terminal": self.start if returns else None}
         return place, self.problem.state(f"joints{stretch.suffix}", machine.joint_size, **options)
+
+    def task_errors(self, stretch: Stretch) -> tuple[Any, Any]:
+        """Declare and return the velocities by which tasks may deviate, and their running cost; 0, 0 if not relaxed."""
+        assert stretch.equations is not None
+        if not self.relaxed or not stretch.equations.size:
+            return 0, 0
+        errors = self.problem.control(f"{ERRORS}{stretch.suffix}", stretch.equations.size, guess=0.0)
+        return FEEDBACK.relaxation * errors, ca.sumsqr(errors) / 2
 
     def constrain_clearance(self, stretch: Stretch, base: Any, joints: Any, horizon: float | None) -> None:
         """Declare the clearance constraints of a stretch; the horizon is None if the time is free."""
@@ -296,12 +316,17 @@ def _declare_stretch(motion: _Motion, stretch: Stretch, known: Array | None) -> 
     second, smooth = None, 0
     if motion.actuated:
         rates = problem.state(f"velocities{stretch.suffix}", machine.joint_size, **options)
-        second, smooth = _declare_actuators(motion, stretch, place, joints, rates)
+        variables = problem, machine, (place, joints, rates)
+        duration = FEEDBACK.smoothing * motion.horizon
+        second, smooth = declare_actuators(*variables, bounds, suffix=stretch.suffix, pace=pace, smoothing=duration)
     else:
         rates = problem.control(f"rates{stretch.suffix}", machine.joint_size, **options)
     slack = _closure(motion) if motion.cyclic and ends else 0
     ends_at: Array | None = None
+    error_cost: Any = 0
     if stretch.equations is not None:
+        error, error_cost = motion.task_errors(stretch)
+        slack = slack + error
         required = np.ones(stretch.equations.size, dtype=bool)
         slopes = _slopes(stretch, motion.base, motion.reference)
         if known is not None:
@@ -319,38 +344,8 @@ def _declare_stretch(motion: _Motion, stretch: Stretch, known: Array | None) -> 
     states = [*([place] if machine.base_size else []), joints]
     if motion.actuated:
         states += [rates, *([second] if f"jerks{stretch.suffix}" in problem.declared.controls else [])]
-    cost = pace * (ca.dot(rates, ca.DM(motion.weights) * rates) / 2 + motion.horizon**2 * smooth)
+    cost = pace * (ca.dot(rates, ca.DM(motion.weights) * rates) / 2 + error_cost + smooth)
     return states, cost, ends_at
-
-
-def _declare_actuators(motion: _Motion, stretch: Stretch, base: Any, joints: Any, rates: Any) -> tuple[Any, Any]:
-    """Declare accelerations within the actuator limits, and return them and the smoothing cost.
-
-    The cost is half the squared accelerations or jerks, in units of squared rates over squared horizons.
-    """
-    problem, machine, bounds, suffix = motion.problem, motion.machine, motion.bounds, stretch.suffix
-    robot, n, pace = machine.robot, machine.joint_size, motion.pace(stretch)
-    options: dict[str, Any] = {"lower": -bounds.acceleration, "upper": bounds.acceleration, "unit": robot.unit("/s^2")}
-    share = FEEDBACK.smoothing**2 / 2
-    if np.isfinite(bounds.jerk).any():
-        second = problem.state(f"accelerations{suffix}", n, **options)
-        jerks = problem.control(f"jerks{suffix}", n, lower=-bounds.jerk, upper=bounds.jerk, unit=robot.unit("/s^3"))
-        problem.dynamics(second, pace * jerks)
-        smooth = (FEEDBACK.smoothing * motion.horizon) ** 2 * ca.sumsqr(jerks)
-    else:
-        second = problem.control(f"accelerations{suffix}", n, **options)
-        smooth = ca.sumsqr(second)
-    problem.dynamics(rates, pace * second)
-    if np.isfinite([bounds.torque, bounds.power]).any():
-        torques = joint_torques(checked_motors("limits", machine), base, joints, rates, second)
-        for name, values, low, high, unit in (
-            ("torques", torques, -bounds.torque, bounds.torque, robot.effort_unit),
-            ("power", torques * rates, np.full(n, -np.inf), bounds.power, "W"),
-        ):
-            rows = np.flatnonzero(np.isfinite(high)).tolist()
-            if rows:
-                problem.path(f"{name}{suffix}", values[rows], lower=low[rows], upper=high[rows], unit=unit)
-    return second, share * smooth
 
 
 def _in_free_time(motion: _Motion, time_cost: float) -> ToolMotion:
@@ -473,6 +468,9 @@ def _declare_tasks(
     # a velocity task has no pose: at the start of the motion its tip is where the reference has it
     fixed = [] if stretch.begin else [equations.holding(base, joints, motion.base, motion.reference)]
     if (condition := ca.vertcat(error, *fixed)).numel():
+        if motion.relaxed:
+            start_errors = problem.free_parameter(f"{START_ERRORS}{suffix}", condition.numel(), guess=0.0)
+            condition -= FEEDBACK.relaxation * start_errors
         problem.start(f"start pose{suffix}", condition, 0, 0, unit=equations.unit("", ""))
 
 

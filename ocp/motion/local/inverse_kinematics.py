@@ -25,7 +25,7 @@ from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.geometry import pose_in_reference
 from ocp.motion.tasks.tip_task import ANGULAR, TipTask
 
-__all__ = ["IkSolution", "Unreachable", "inverse_kinematics", "inverse_kinematics_at"]
+__all__ = ["IkSolution", "Unreachable", "describe_miss", "inverse_kinematics", "inverse_kinematics_at"]
 
 LARGEST_SEED = 2**64
 
@@ -88,12 +88,23 @@ class Unreachable(ProblemError):
     Attributes:
         joints: The nearest miss. Shape (joint_size,).
         pose_error: Its pose error, m or rad (2 sin(angle / 2)).
+        distance: Largest distance of a tip from its target then, m; nan if it does not apply.
+        angle: Largest angle of a tip from its target then, rad; nan if it does not apply.
     """
 
-    def __init__(self, message: str, joints: Array, pose_error: float, **details: Any) -> None:
+    def __init__(
+        self,
+        message: str,
+        joints: Array,
+        pose_error: float,
+        *,
+        distance: float = np.nan,
+        angle: float = np.nan,
+        **details: Any,
+    ) -> None:
         super().__init__(message, **details)
-        self.joints = joints
-        self.pose_error = pose_error
+        self.joints, self.pose_error = joints, pose_error
+        self.distance, self.angle = distance, angle
 
     def __reduce__(self) -> Any:
         """Pickle the arguments together with the fields."""
@@ -205,7 +216,14 @@ def inverse_kinematics(
 
 
 def inverse_kinematics_at(
-    equations: TaskEquations, targets: Array, *, starts: int, seed: int, limits: bool
+    equations: TaskEquations,
+    targets: Array,
+    *,
+    starts: int,
+    seed: int,
+    limits: bool,
+    near: Array | None = None,
+    tolerance: float = IK_SETTINGS.tolerance,
 ) -> list[IkSolution]:
     """Return IK solutions on a fixed base for known targets from random starts alone; see `inverse_kinematics`.
 
@@ -214,8 +232,8 @@ def inverse_kinematics_at(
     """
     machine, unbounded = equations.machine, np.full(equations.machine.joint_size, np.inf)
     lower, upper = (machine.robot.lower, machine.robot.upper) if limits else (-unbounded, unbounded)
-    first = sample_starts(machine, lower, upper, starts, None, seed)
-    return _MultiStart(equations, np.zeros(0), targets, lower, upper).solve(first, starts)
+    first = sample_starts(machine, lower, upper, starts, near, seed)
+    return _MultiStart(equations, np.zeros(0), targets, lower, upper, tolerance).solve(first, starts)
 
 
 @dataclass(frozen=True)
@@ -245,7 +263,8 @@ class _MultiStart:
         q[last, wrap] = np.remainder(q[last, wrap] + np.pi, 2 * np.pi) - np.pi
         if not (error <= self.tolerance).any():
             nearest = int(error.argmin())
-            raise unreachable_error(self.equations, q[nearest], float(error[nearest]), lower, upper)
+            misses = self.equations.misses(self.base, q[nearest], self.targets)
+            raise unreachable_error(self.equations, q[nearest], float(error[nearest]), lower, upper, misses=misses)
         return self.rank(q, error)
 
     def list_branches(self, count: int, seed: int) -> tuple[Array, bool]:
@@ -445,18 +464,37 @@ def _collision_free(
 
 
 def unreachable_error(
-    equations: TaskEquations, joints: Array, pose_error: float, lower: Array, upper: Array
+    equations: TaskEquations,
+    joints: Array,
+    pose_error: float,
+    lower: Array,
+    upper: Array,
+    *,
+    misses: tuple[float, float],
 ) -> Unreachable:
-    """Return the error for a pose without solution, with the nearest miss."""
+    """Return the error for a pose without solution, with the nearest miss.
+
+    Args:
+        misses: Distance, m, and angle, rad, of the nearest miss.
+    """
     names = [part.task.link or part.tip.robot.tip_link for part in equations.bound]
     limited = np.flatnonzero((joints <= lower) | (joints >= upper))
     at_limit = [equations.machine.robot.joint_names[k] for k in limited]
     where = f", with {at_limit} at their limits" if at_limit else ""
+    distance, angle = misses
     return Unreachable(
-        f"no joint positions put {names} where the task wants them: the nearest miss is {pose_error:.3g} (m or rad) at "
+        f"no joint positions put {names} where the task wants them: the nearest miss is {describe_miss(*misses)} at "
         f"{np.round(joints, 6).tolist()}{where}; ask for a pose within reach, leave a row free, or raise starts",
         joints,
         pose_error,
+        distance=distance,
+        angle=angle,
         name=names[0],
         value=pose_error,
     )
+
+
+def describe_miss(distance: float, angle: float) -> str:
+    """Return the words for a distance, m, and an angle, rad; without the one that is only rounding beside the other."""
+    parts = [(distance, "m"), (angle, "rad")]
+    return " and ".join(f"{value:.3g} {unit}" for value, unit in parts if value > 1e-9 * (distance + angle)) or "0 m"

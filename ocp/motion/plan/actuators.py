@@ -6,6 +6,7 @@ A motion without these limits is the guess of the same problem with acceleration
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -125,7 +126,7 @@ def solve_within_actuator_limits(
 
     def solve_from(initial: Array) -> Solution:
         def declare(constraints: ClearanceConstraints | None) -> Problem:
-            guess = {"start": initial, "reference": reference}
+            guess: dict[str, Any] = {"start": initial, "reference": reference}
             motion = declared_motion(request, **guess, constraints=constraints, limits=limits)
             _set_guess(motion, unlimited)
             return motion.problem

@@ -8,10 +8,12 @@ wait, and if the first is rejected, the next one continues in its place.
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from heapq import heappop, heappush
+from typing import Any
 
 import numpy as np
 
@@ -55,7 +57,16 @@ class Solver:
         last = next((candidate.solution for candidate in candidates if candidate.solution is not None), None)
         words, cause = f"no motion passes its audit:\n{listed}", self.error
         if cause is None:
-            return SolveError(words, last, name="plan")
+            located = (c.reason for c in candidates if c.reason is not None and c.reason.time is not None)
+            if (reason := next(located, None)) is None:
+                return SolveError(words, last, name="plan")
+            fields: dict[str, Any] = {
+                "name": reason.name,
+                "value": reason.value,
+                "limit": reason.limit,
+                "time": reason.time,
+            }
+            return SolveError(words, last, **fields)
         details = {"name": cause.name or "plan", "value": cause.value, "limit": cause.limit, "time": cause.time}
         return SolveError(f"{words}\n{cause}", cause.solution or last, cause.conflicts, **details)
 
@@ -80,7 +91,7 @@ class CandidateQueue:
     """
 
     def __init__(self, solver: Solver, settings: PlannerSettings) -> None:
-        self.solver, self.settings = solver, settings
+        self.solver, self.settings, self._began = solver, settings, time.thread_time()
         self.candidates: list[Candidate] = []
 
     @property
@@ -97,6 +108,12 @@ class CandidateQueue:
     def collided(self) -> bool:
         """Whether a candidate was rejected for a collision."""
         return any(c.reason is not None and c.reason.kind is Rejection.COLLISION for c in self.candidates)
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether candidates have failed, none has passed, and the time for refusals is over."""
+        seconds = time.thread_time() - self._began
+        return seconds > self.settings.refusal_time and bool(self.candidates) and not (self.passed or self.collided)
 
     def run(self, seeds: Iterable[Candidate], include_costlier: bool = False) -> None:
         """Advance a batch of seeds until no candidate can become cheaper than the best that passed.
@@ -115,7 +132,10 @@ class CandidateQueue:
         while self._heap:
             candidate = heappop(self._heap)[-1]
             report(self._state)
-            if (motion := self._find_motion(candidate)) is not None:
+            if self.exhausted:
+                words = f"{len(self.candidates)} candidates failed in {self.settings.refusal_time:g} s before it"
+                self.candidates.append(candidate.rejected(Reason(Rejection.NOT_TRIED, words)))
+            elif (motion := self._find_motion(candidate)) is not None:
                 motion.waiting.append(candidate)
             elif (reason := self._prune(candidate)) is not None:
                 self.candidates.append(candidate.rejected(reason))

@@ -22,11 +22,13 @@ from ocp.direct.prepared import Prepared
 from ocp.errors import RefinementWarning, SolveError
 from ocp.methods import solve
 from ocp.motion.builders.clearance import APART
-from ocp.motion.builders.tool_motion import CLOCK, ToolMotion
+from ocp.motion.builders.tool_motion import CLOCK, SLOPES, ToolMotion
 from ocp.motion.local.collisions import Collision
 from ocp.motion.local.inverse_kinematics import Unreachable
+from ocp.motion.local.rates import LocalMotion
 from ocp.motion.plan.actuators import solve_within_actuator_limits
 from ocp.motion.plan.candidate_queue import Solver
+from ocp.motion.plan.singular import MotionSample, describe_shortfall, is_nearly_singular, limit_reason
 from ocp.motion.result.candidate import Candidate, Reason, Rejection, Seed, Stage, collision_reason
 from ocp.motion.result.request import declared_motion
 from ocp.motion.result.solved_plan import SolvedPlan, parts_of
@@ -79,22 +81,74 @@ class CandidateSolver(Solver):
             Stage.AUDITED: self._limit_actuators,
         }
         try:
-            integrate_jerk = steps[candidate.stage](candidate)
+            advanced = steps[candidate.stage](candidate)
         except SolveError as error:
             if isinstance(error.__cause__, KeyboardInterrupt):
                 raise
-            self.error = error
-            kind = Rejection.ACTUATORS if candidate.stage is Stage.AUDITED else Rejection.INFEASIBLE
             failed = replace(candidate, cost=np.nan, solution=error.solution, stage=max(candidate.stage, Stage.FINE))
-            return [failed.rejected(Reason.of_error(kind, error))]
-        return [integrate_jerk, *self._free_start(integrate_jerk)]
+            if candidate.stage is Stage.AUDITED:
+                self.error = error
+                return [failed.rejected(Reason.of_error(Rejection.ACTUATORS, error))]
+            advanced = failed.rejected(self._failure_reason(failed, str(error)))
+        if self._may_relax(advanced):
+            return [Candidate(candidate.start, candidate.seed.cost, seed=replace(candidate.seed, relaxed=True))]
+        return [advanced, *self._free_start(advanced)]
+
+    def is_nearly_singular(self, local: Sequence[LocalMotion]) -> bool:
+        """Return whether the tasks along a local motion are nearly dependent, so that its candidate relaxes them."""
+        return self._can_relax and is_nearly_singular(self.motion.stretches, local)
+
+    @property
+    def _can_relax(self) -> bool:
+        return self.request.time_cost is None
+
+    def _may_relax(self, candidate: Candidate) -> bool:
+        """Return whether a rejected candidate is solved again with relaxed tasks: not if bodies collided."""
+        seed, reason = candidate.seed, candidate.reason
+        if reason is None or reason.kind in (Rejection.COLLISION, Rejection.ACTUATORS) or _is_separated(candidate):
+            return False
+        return self._can_relax and seed.thorough and not seed.relaxed
+
+    def _failure_reason(self, candidate: Candidate, words: str) -> Reason:
+        """Return the reason that the solver found no motion: where the last iterate, or else the seed, fails."""
+        samples = list(map(MotionSample.of_local, self.motion.stretches, candidate.seed.local))
+        if not samples:
+            return Reason(Rejection.INFEASIBLE, words.split("\n")[0])
+        solution = candidate.solution
+        if solution is not None and candidate.seed.relaxed:
+            samples = self._motion_samples(solution)
+        return limit_reason(self.request, samples) or describe_shortfall(self.request, samples)
+
+    def _turned_over(self, solution: Solution) -> Reason | None:
+        """Return the reason that a tool points the opposite way at a free start, where the equations hold as well."""
+        if self.request.start is not None:
+            return None
+        for sample in self._motion_samples(solution):
+            equations = sample.stretch.equations
+            if equations is not None and equations.pose_rows.any():
+                targets = np.array(equations.target_function()(sample.t[0])).ravel()
+                angle = equations.misses(sample.base[0], sample.joints[0], targets)[1]
+                if angle > np.pi / 2:
+                    words = f"at {sample.t[0]:.4g} s the tool is turned by {angle:.3g} rad from its target"
+                    return Reason(Rejection.UNTRACKED, words, "task", angle, np.pi / 2, float(sample.t[0]))
+        return None
+
+    def _motion_samples(self, solution: Solution) -> list[MotionSample]:
+        fractions, samples = self._samples(solution), list[MotionSample]()
+        values = solution.at_fraction(fractions)
+        for stretch in self.motion.stretches:
+            base = values[f"base{stretch.suffix}"] if self.request.machine.base_size else np.zeros((len(fractions), 0))
+            rates = values[SLOPES if self.request.time_cost is not None else f"rates{stretch.suffix}"]
+            times = stretch.begin + fractions * stretch.duration
+            samples.append(MotionSample(stretch, times, base, values[f"joints{stretch.suffix}"], rates))
+        return samples
 
     # ---- stages ------------------------------------------------------------------------------------------------------
 
     def _solve_seed(self, candidate: Candidate) -> Candidate:
         seed, separated = candidate.seed, _is_separated(candidate)
         if seed.direct:
-            return self._solve(candidate, Stage.FINE, seed.guess, check=seed.thorough and not separated)
+            return self._solve(candidate, Stage.FINE, seed.guess)
         return self._solve(candidate, Stage.SEPARATED if separated else Stage.COARSE, seed.guess)
 
     def _separate(self, candidate: Candidate) -> Candidate:
@@ -113,6 +167,8 @@ class CandidateSolver(Solver):
             return self._separate_pairs(candidate, Stage.FINE, collisions)
         motion, mesh, _ = self.prepared(candidate, fine=True)
         assert candidate.solution is not None
+        if (reason := self._turned_over(candidate.solution)) is not None:
+            return candidate.rejected(reason)
         solution = self._refine_for_tasks(motion, mesh, candidate.solution, check=not _is_separated(candidate))
         if (deviation := self._deviations(motion, solution).max()) > self.settings.max_deviation:
             words = f"the tips deviate by {deviation:.2g} (m or rad) on finer meshes as well"
@@ -132,7 +188,7 @@ class CandidateSolver(Solver):
         solution, audit = self._audit_and_refine(motion, mesh, candidate.solution, check=not _is_separated(candidate))
         if np.isnan(self._start(candidate)).any() and audit.feasible and audit.optimal is None:
             start = solution[joints_name][0]
-            fixed = declared_motion(self.request, start=start, reference=self.reference, constraints=constraints)
+            fixed = self._declare(candidate, start, self.reference)
             current_mesh = _mesh_of(mesh, solution)
             options = self._options(fixed, current_mesh, solution.cost, {})
             fixed_solution = solve(fixed.problem, current_mesh, guess=solution, options=options)
@@ -152,6 +208,10 @@ class CandidateSolver(Solver):
         if not audit.failures:
             return candidate.rejected(Reason(Rejection.UNDETERMINED, audit.undecided))
         worst = audit.failures[0]
+        if candidate.seed.relaxed and not audit.feasible:
+            samples = self._motion_samples(solution)
+            reason = limit_reason(self.request, samples) or describe_shortfall(self.request, samples)
+            return candidate.rejected(replace(reason, kind=Rejection.AUDIT))
         words = f"{worst.name} {worst.value:.2g}"
         return candidate.rejected(Reason(Rejection.AUDIT, words, worst.name, worst.value, worst.limit, worst.time))
 
@@ -172,12 +232,13 @@ class CandidateSolver(Solver):
 
     # ---- solves ------------------------------------------------------------------------------------------------------
 
-    def _solve(self, candidate: Candidate, stage: Stage, guess: Any, check: bool = False) -> Candidate:
+    def _solve(self, candidate: Candidate, stage: Stage, guess: Any) -> Candidate:
         cost = guess.cost if isinstance(guess, Solution) else np.inf
-        solution = self.prepared(candidate, stage >= Stage.FINE, cost)[2].solve(guess=guess, check=check)
+        solution = self.prepared(candidate, stage >= Stage.FINE, cost)[2].solve(guess=guess, check=False)
+        solved = replace(candidate, stage=stage, cost=solution.cost, solution=solution)
         if solution.success:
-            return replace(candidate, stage=stage, cost=solution.cost, solution=solution)
-        reason = Reason(Rejection.INFEASIBLE, str(solution.status))
+            return solved
+        reason = self._failure_reason(solved, str(solution.status))
         return replace(candidate, cost=np.nan, solution=None).rejected(reason)
 
     def _separate_pairs(self, candidate: Candidate, stage: Stage, collisions: list[Collision]) -> Candidate:
@@ -201,13 +262,12 @@ class CandidateSolver(Solver):
         margins: tuple[Any, ...] = ()
         if candidate.constraints is not None and separated:
             margins = tuple(sorted(candidate.constraints.margins.items()))
-        key = margins, fine, tuple(candidate.start) if candidate.seed.fixed else ()
+        key = margins, fine, candidate.seed.relaxed, tuple(candidate.start) if candidate.seed.fixed else ()
         if key not in self._prepared:
             start, motion = self._start(candidate), self.motion
-            if margins or candidate.seed.fixed:
+            if margins or candidate.seed.fixed or candidate.seed.relaxed:
                 reference = candidate.start if candidate.seed.fixed else self.reference
-                constraints = candidate.constraints
-                motion = declared_motion(self.request, start=start, reference=reference, constraints=constraints)
+                motion = self._declare(candidate, start, reference)
             min_intervals = settings.separated_intervals if margins and not fine else settings.min_intervals
             degree = settings.fine_degree if fine else settings.coarse_degree
             count = min_intervals if len(motion.breaks) < min_intervals else 1
@@ -216,6 +276,11 @@ class CandidateSolver(Solver):
             options = self._options(motion, mesh, cost, base_options)
             self._prepared[key] = motion, mesh, mesh.prepare(motion.problem, options=options)
         return self._prepared[key]
+
+    def _declare(self, candidate: Candidate, start: Array, reference: Array) -> ToolMotion:
+        constraints, relaxed = candidate.constraints, candidate.seed.relaxed
+        options: dict[str, Any] = {"start": start, "reference": reference, "constraints": constraints}
+        return declared_motion(self.request, **options, relaxed=relaxed)
 
     def _start(self, candidate: Candidate) -> Array:
         """Return the joints at the start, nan where free; joints that move separated bodies are not ignorable."""

@@ -81,7 +81,7 @@ def plan_from_configurations(
     floating, single = request.machine.base_size > 0, len(configurations) == 1
     if request.search == "start" or (request.search == "configurations" and single):
         _try_one_by_one(queue, solver, configurations, thorough=single and not floating)
-        if queue.passed or (single and not floating):
+        if queue.passed or queue.exhausted or (single and not floating):
             return queue.plan(), None
     report(f"local motions from {len(configurations)} starts")
     motions = local_motions_from(request, configurations)
@@ -99,7 +99,7 @@ def plan_from_configurations(
     queue.run(seeds)
     if not queue.passed and queue.collided and not solver.no_clear_configuration:
         _try_alternatives(queue, solver, seeds)
-    if not queue.passed and not queue.collided:  # try other guesses and diagnose conflicts
+    if not queue.passed and not queue.collided and not queue.exhausted:  # try other guesses and diagnose conflicts
         if floating:
             _search_cells(queue, solver, motions, configurations)
         else:
@@ -129,7 +129,8 @@ def candidates_from(
     for index in np.lexsort((costs, ~tracked)).tolist():
         local = [motion.take(slice(index, index + 1)) for motion in motions]
         guess = solver.motion.guess(local, 0)
-        seed = Seed(guess, float(costs[index]), local, bool(tracked[index]), **options)
+        relaxed = solver.is_nearly_singular(local)
+        seed = Seed(guess, float(costs[index]), local, bool(tracked[index]), relaxed=relaxed, **options)
         constraints = solver.request.clearance_constraints
         candidates.append(Candidate(configurations[index], seed.cost, seed=seed, constraints=constraints))
     return candidates
@@ -147,7 +148,7 @@ def _try_one_by_one(queue: CandidateQueue, solver: CandidateSolver, configuratio
         if request.machine.base_size and not tracks_tasks(request, motions)[0]:
             continue  # solving from such a guess is slow and fails
         queue.run(candidates_from(solver, motions, joints[None], direct=True, thorough=thorough))
-        if queue.passed:
+        if queue.passed or queue.exhausted:
             return
 
 

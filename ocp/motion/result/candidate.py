@@ -107,7 +107,8 @@ class Seed:
         tracked: Whether the local motion does the tasks.
         direct: Whether the first solve is on the fine mesh.
         fixed: Whether the start is fixed, though it could move along its self-motion.
-        thorough: Whether a failed solve is repeated from other guesses and diagnosed.
+        thorough: Whether a motion that fails is solved again with relaxed tasks.
+        relaxed: Whether the tasks are relaxed, see `tool_motion_problem`.
     """
 
     guess: Any = None
@@ -117,6 +118,7 @@ class Seed:
     direct: bool = False
     fixed: bool = False
     thorough: bool = False
+    relaxed: bool = False
 
 
 @dataclass(frozen=True, eq=False)

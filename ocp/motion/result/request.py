@@ -141,6 +141,7 @@ def declared_motion(
     reference: Any,
     constraints: ClearanceConstraints | None,
     limits: Limits | None = None,
+    relaxed: bool = False,
 ) -> ToolMotion:
     """Declare the problem of a motion, which keeps its origin.
 
@@ -148,6 +149,7 @@ def declared_motion(
         request: The request.
         start, reference, constraints: As in `tool_motion_problem`.
         limits: Limits that include those of the actuators, if these are limited; else None.
+        relaxed: As in `tool_motion_problem`.
     """
     options: dict[str, Any] = {
         "base": request.base,
@@ -157,6 +159,7 @@ def declared_motion(
         "weights": request.weights,
         "time_cost": request.time_cost,
         "actuated": limits is not None,
+        "relaxed": relaxed,
         "clearance_constraints": constraints,
     }
     bounds = (limits or request.limits).bounds(request.machine)

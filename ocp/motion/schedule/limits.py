@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from ocp.errors import NOT_NUMBERS, ProblemError, checked_instance, floats
 from ocp.motion.schedule.profile import Array, LineMotion
 from ocp.motion.schedule.settings import SETTINGS
+from ocp.tolerances import ROUNDING_SHARE
 
 __all__ = [
     "JointLimits", "JointPath", "JointRates", "LineLimits", "PathLike", "Rows", "ToolLimits", "TorqueRates",
@@ -81,10 +82,10 @@ class JointPath(Protocol):
 class JointLimits:
     """Symmetric limits of joint velocities (rad/s or m/s), accelerations, jerks and torques (Nm or N).
 
-    Each is one number, or has shape (n,).
+    Each is one number, or has shape (n,). Velocity, acceleration and jerk may be 0 for joints that do not move.
 
     Raises:
-        ProblemError: A limit is not positive; it may be infinite.
+        ProblemError: A limit is negative, or a torque is 0; it may be infinite.
     """
 
     velocity: ArrayLike = np.inf
@@ -94,7 +95,7 @@ class JointLimits:
 
     def __post_init__(self) -> None:
         for name in ("velocity", "acceleration", "jerk", "torque"):
-            _check(f"joint {name}", getattr(self, name), False)
+            _check(f"joint {name}", getattr(self, name), False, zero=name != "torque")
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,8 +155,12 @@ class LineLimits:
                 checked_instance("joint limits" if name == "joints" else "tool limits", getattr(self, name), kind)
 
     def of_joints(self, count: int) -> Array:
-        """Return velocity, acceleration and jerk limits of `count` joints. Shape (3, count)."""
-        return self._of_joints(count, ("velocity", "acceleration", "jerk"))
+        """Return velocity, acceleration and jerk limits of `count` joints, infinite instead of 0. Shape (3, count).
+
+        Joints with a limit of 0 do not move, see `check_line`.
+        """
+        values = self._of_joints(count, ("velocity", "acceleration", "jerk"))
+        return np.where(values == 0, np.inf, values)
 
     def torques(self, count: int) -> Array:
         """Return torque limits of `count` joints. Shape (count,)."""
@@ -174,8 +179,11 @@ class LineLimits:
         return np.array(rows)
 
 
-def _check(name: str, value: ArrayLike, finite: bool, dimensions: int = 1) -> None:
-    """Raise ProblemError unless a limit is positive, of at most these dimensions, and finite if `finite`."""
+def _check(name: str, value: ArrayLike, finite: bool, dimensions: int = 1, *, zero: bool = False) -> None:
+    """Raise ProblemError unless a limit is positive, of at most these dimensions, and finite if `finite`.
+
+    With `zero` it may also be 0.
+    """
     try:
         array = floats(value)
     except NOT_NUMBERS as error:
@@ -183,14 +191,14 @@ def _check(name: str, value: ArrayLike, finite: bool, dimensions: int = 1) -> No
     if array.ndim > dimensions:
         message = f"{name} limit has shape {array.shape}; give one number{', or a row' if dimensions else ''}"
         raise ProblemError(message, name=name, value=array.shape)
-    invalid = ~(array > 0) | (finite & ~np.isfinite(array))
+    invalid = ~((array > 0) | (zero & (array == 0))) | (finite & ~np.isfinite(array))
     if array.size == 0 or invalid.any():
         value_at_fault = float(array[invalid].flat[0]) if array.size else np.nan
         message = f"{name} limit {value_at_fault:g} must be positive{' and finite' if finite else ''}"
         raise ProblemError(message, name=name, value=value_at_fault, limit=0.0)
     numbers = np.finfo(float)
     low, high = (float(end) ** 0.2 for end in (numbers.tiny, numbers.max))  # products of five are numbers
-    extreme = array[np.isfinite(array) & ~((low < array) & (array < high))]
+    extreme = array[np.isfinite(array) & (array != 0) & ~((low < array) & (array < high))]
     if extreme.size:
         message = f"{name} limit {extreme[0]:g} is outside the range of sizes {low:.0e} to {high:.0e}: check its unit"
         raise ProblemError(message, name=name, value=float(extreme[0]), limit=(low, high))
@@ -210,10 +218,30 @@ def check_line(path: PathLike, limits: LineLimits, joints: JointPath | None) -> 
     checked_instance("limits", limits, LineLimits)
     if joints is not None:
         check_joints(joints)
+        _check_still(path, limits, joints)
     elif limits.joints is not None:
         message = "joint limits need the joints along the path: joints=scara_along(arm, path)"
         raise ProblemError(message, name="joints")
     return joints if limits.joints is not None else None
+
+
+def _check_still(path: PathLike, limits: LineLimits, joints: JointPath) -> None:
+    """Raise ProblemError if a joint moves along the path whose velocity, acceleration or jerk is limited to 0."""
+    given, count = limits.joints or JointLimits(), len(joints.names)
+    for name in ("velocity", "acceleration", "jerk"):
+        zero = np.broadcast_to(np.asarray(getattr(given, name), dtype=float) == 0, (count,))
+        if not zero.any():
+            continue
+        places = path.sample_distances()
+        slopes = np.abs(np.asarray(rates_along(joints, places).first, dtype=float))
+        moves = zero & (slopes.max(axis=0) > ROUNDING_SHARE * slopes.max())
+        if moves.any():
+            column = int(moves.argmax())
+            joint, fastest = joints.names[column], int(slopes[:, column].argmax())
+            words = (
+                f"joint {joint!r} moves along the path, at {places[fastest]:.4g} m, but the limit of its {name} is 0"
+            )
+            raise ProblemError(words, name=joint, value=float(slopes[fastest, column]), limit=0.0)
 
 
 def check_joints(joints: JointPath) -> None:

@@ -19,6 +19,7 @@ from ocp.motion.local.collisions import Collision, distances_along
 from ocp.motion.local.ik_solver import idle_positions
 from ocp.motion.local.inverse_kinematics import Unreachable, inverse_kinematics, sample_starts
 from ocp.motion.local.rates import LocalMotion, track_tasks
+from ocp.motion.search.reach import end_of_reach
 from ocp.motion.search.settings import PlannerSettings
 from ocp.motion.tasks.checks import ignorable_joints
 from ocp.motion.tasks.equations import bind
@@ -288,18 +289,17 @@ def _check_reach(request: PlanRequest, motions: list[LocalMotion]) -> None:
     """Raise Unreachable if no joints reach a pose that all motions miss; only for a fixed base."""
     if request.machine.base_size:
         return
+    options = request.ik_options
     for stretch, motion in zip(request.stretches, motions, strict=True):
         tasks = [request.tasks[i] for i in stretch.tasks]
         poses = [task for task in tasks if task.is_pose and task.start_gap <= REACH_TOLERANCE]
         if not poses:
             continue
         for time in np.unique(motion.worst_time[motion.pose_error > REACH_TOLERANCE]).tolist():
-            near = motion.joints[:, int(np.searchsorted(motion.t, time))]
-            options: dict[str, Any] = {"near": near, "limits": request.limits.joints, "tolerance": REACH_TOLERANCE}
-            try:
-                inverse_kinematics(request.machine, poses, time=time, **options)
-            except Unreachable as error:
-                raise locate_error(request, error, time) from error
+            interval = stretch.begin, stretch.end
+            if (error := end_of_reach(request.machine, poses, interval, time, **options)) is not None:
+                assert error.time is not None
+                raise locate_error(request, error, error.time)
 
 
 def locate_error(request: PlanRequest, error: Unreachable, time: float) -> Unreachable:

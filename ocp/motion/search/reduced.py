@@ -322,7 +322,9 @@ def check_floating_reach(
             solutions = candidates[reached][:STARTS]
             return None
         best = int(errors.argmin())
-        return unreachable_error(equations, candidates[best, :n], float(errors[best]), lower, upper)
+        place = ca.Function("base", [z], [base_then])(candidates[best])
+        misses = equations.misses(place, candidates[best, :n], targets)
+        return unreachable_error(equations, candidates[best, :n], float(errors[best]), lower, upper, misses=misses)
 
     reached = begin
     for time in np.linspace(begin, end, samples).tolist():

@@ -34,6 +34,8 @@ class PlannerSettings:
         least_progress: Largest share of the deviation that a refinement may leave if the task may be out of reach.
         max_failures: Failed candidates of a batch after which no further one is repaired; also the number of sorted
             seeds that are tried, and of motions that are audited if all are requested.
+        refusal_time: Processor time after which no further candidate is tried if those before failed for other reasons
+            than collisions, s.
         batch: Seeds that are solved before the best of them is audited, if each takes seconds.
         max_separations: Solves of one candidate with more, or wider, separation constraints.
         max_cost_ratio: A local motion whose cost exceeds that of the best solve by this factor is not solved.
@@ -63,6 +65,7 @@ class PlannerSettings:
     max_intervals: int = 400
     least_progress: float = 0.9
     max_failures: int = 8
+    refusal_time: float = 20.0
     batch: int = 4
     max_separations: int = 12
     max_cost_ratio: float = 10.0

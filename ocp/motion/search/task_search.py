@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -19,11 +19,12 @@ from ocp.motion.search.configurations import (
     REACH_TOLERANCE,
     PlanRequest,
     largest_pose_errors,
+    local_motions_from,
     locate_error,
     sampled_motions,
 )
 from ocp.motion.search.dead_end import DeadEnd, dead_end
-from ocp.motion.search.joint_space import JointSpace
+from ocp.motion.search.joint_space import FULL_TURN, JointSpace
 from ocp.motion.search.reconfigurations import fewest_segments, segment_ends
 from ocp.motion.search.search import MAX_FREE_DIRECTIONS, AtlasSearch
 from ocp.motion.search.steps import SquaredRates
@@ -84,9 +85,14 @@ class TaskSearch:
             words = "search='global' needs a machine on a fixed base; use search='configurations'"
             raise ProblemError(words, name="search", value="global")
         costs = np.sum([motion.cost for motion in motions], axis=0)
-        tracked = np.array(largest_pose_errors(motions)) <= REACH_TOLERANCE
+        tracked = passing = np.array(largest_pose_errors(motions)) <= REACH_TOLERANCE
         self._known_cost = float(costs[tracked].min()) if tracked.any() else np.inf
-        best = int(np.where(tracked | ~tracked.any(), costs, np.inf).argmin())
+        if not tracked.any():  # a motion that stops at a limit does not show how far its joints turn
+            unlimited = replace(request, limits=replace(request.limits, joints=False))
+            motions = local_motions_from(unlimited, motions[0].joints[:, 0])
+            costs = np.sum([motion.cost for motion in motions], axis=0)
+            passing = np.array(largest_pose_errors(motions)) <= REACH_TOLERANCE
+        best = int(np.where(tracked | passing | ~(tracked | passing).any(), costs, np.inf).argmin())
         self.space = JointSpace(machine, bounds.lower, bounds.upper, request.weights)
         self.bound = 0.0
         times = list[Array]()
@@ -110,7 +116,8 @@ class TaskSearch:
                 raise ProblemError(words, name="search", **details, time=stretch.begin)
             steps = int(np.ceil(settings.steps * stretch.duration / request.horizon))
             lost = settings.lost[max(free_directions, 0)]
-            chosen = choose_samples(motion.t, motion.joints[best], request.weights, lost, steps)
+            joints, periodic = motion.joints[best], self.space.periodic
+            chosen = choose_samples(motion.t, joints, request.weights, lost, steps, periodic=periodic)
             shared = bool(times) and chosen[0] <= times[-1][-1]  # the stretch before ends there
             times.append(chosen[1:] if shared else chosen)
         if not times:
@@ -242,10 +249,13 @@ class TaskSearch:
         return motions
 
 
-def choose_samples(t: Array, joints: Array, weights: Array, share: float, min_steps: int) -> Array:
+def choose_samples(
+    t: Array, joints: Array, weights: Array, share: float, min_steps: int, *, periodic: NDArray[np.bool_]
+) -> Array:
     """Return as few times of a motion (M,) as possible such that straight steps lose at most a share of its cost.
 
-    Times are left out greedily, the one that loses least first; at least `min_steps` steps remain.
+    Times are left out greedily, the one that loses least first; at least `min_steps` steps remain. Joints that are
+    `periodic`, (n,), turn by at most a quarter of a turn in a step, so that it is known which way round they go.
     """
     chosen = list(range(len(t)))
 
@@ -254,6 +264,8 @@ def choose_samples(t: Array, joints: Array, weights: Array, share: float, min_st
 
     def loss(i: int) -> float:
         a, b, c = chosen[i - 1 : i + 2]
+        if np.abs(joints[c] - joints[a])[periodic].max(initial=0.0) > FULL_TURN / 4:
+            return np.inf
         return cost(a, b) + cost(b, c) - cost(a, c)
 
     budget = share * sum(cost(a, b) for a, b in pairwise(chosen))
@@ -261,7 +273,7 @@ def choose_samples(t: Array, joints: Array, weights: Array, share: float, min_st
     while len(chosen) > min_steps + 1:
         i = int(np.argmin(losses))
         budget -= losses[i]
-        if budget < 0:
+        if not budget >= 0:
             break
         del chosen[i], losses[i]
         for k in (i - 1, i):

@@ -34,7 +34,8 @@ class CheckSettings:
         closed: Largest gap of a closed path, m and rad.
         ignorable: Relative change below which a joint counts as without effect.
         ignorable_samples: Random configurations in which that is evaluated.
-        rounding: Relative tolerance of a joint limit, absolute (rad or m) for limits below 1.
+        rounding: Tolerance of a joint limit, relative to the range between the limits; without one, to the limit, and
+            absolute (rad or m) for limits below 1.
         still: Largest task velocity where the joints are to be at rest, m/s and rad/s.
     """
 
@@ -105,7 +106,10 @@ def clip_to_limits(what: str, names: Sequence[str], joints: Array, lower: Array,
         ProblemError: A joint is outside its limits by more than rounding.
     """
     for name, value, low, high in zip(names, joints.tolist(), lower.tolist(), upper.tolist(), strict=True):
-        if value < low - CHECKS.rounding * max(1.0, abs(low)) or value > high + CHECKS.rounding * max(1.0, abs(high)):
+        size = (
+            high - low if np.isfinite(high - low) else max(1.0, *(abs(x) for x in (low, high) if np.isfinite(x)), 1.0)
+        )
+        if value < low - CHECKS.rounding * size or value > high + CHECKS.rounding * size:
             at, least, greatest = format_distinct(value, low, high)
             verb = "ends" if what.startswith("end") else "starts"
             words = f"{what}: {name!r} {verb} at {at}, outside its limits {least} .. {greatest}; {hint}"

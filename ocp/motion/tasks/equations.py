@@ -294,6 +294,24 @@ class TaskEquations:
                 rows.append(task_rows(part, base, joints, ca.vertcat(ca.DM(3, 1), error[3:6]))[linear])
         return ca.densify(ca.vertcat(*rows))
 
+    def misses(self, base: Any, joints: Any, targets: Any) -> tuple[float, float]:
+        """Return the largest distance, m, and the largest angle, rad, of a tip from its target pose at numbers."""
+        distance = angle = 0.0
+        for part, target in self._with_targets(ca.DM(targets)):
+            task = part.task
+            if not task.is_pose:
+                continue
+            residual = TaskEquations(self.machine, (part,)).pose_residual(ca.DM(base), ca.DM(joints), target)
+            values = np.array(residual).ravel()
+            turning = len(values) - (0 if task.position is None else len(task.linear))
+            distance = max(distance, float(np.linalg.norm(values[turning:])))
+            if task.within is not None:
+                turned = np.arccos(np.clip(np.cos(task.within) - values[:turning].sum(), -1.0, 1.0)) - task.within
+            else:
+                turned = 2 * np.arcsin(min(float(np.linalg.norm(values[:turning])) / 2, 1.0))
+            angle = max(angle, float(turned))
+        return distance, angle
+
     @on_scalars
     def cone_cosines(self, base: Any, joints: Any, targets: Any) -> Any:
         """Return the cosine of the angle between tool axis and direction for each task with `within`. Shape (k, 1)."""

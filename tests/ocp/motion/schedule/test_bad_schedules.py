@@ -10,6 +10,7 @@ import pytest
 
 from models import FixedBase, Joint, Link, Path, Robot, Scara, scara_along, smooth
 from ocp import joint_path, minimum_time_problem
+from ocp.errors import ProblemError
 from ocp.motion.builders.timing import solve_minimum_time
 from ocp.motion.schedule import (
     JointLimits,
@@ -121,7 +122,13 @@ CASES = [
         {},
         dict.fromkeys(("acceleration", "jerk"), EACH | NOTHING) | {"turn_rate": LIMIT | NOTHING},
     ),
-    Case("JointLimits", JointLimits, {}, dict.fromkeys(("velocity", "acceleration", "jerk", "torque"), EACH | NOTHING)),
+    Case(
+        "JointLimits",
+        JointLimits,
+        {},
+        dict.fromkeys(("velocity", "acceleration", "jerk"), but(EACH, "zero", "one of them zero") | NOTHING)
+        | {"torque": EACH | NOTHING},
+    ),
     Case(
         "schedule",
         schedule,
@@ -275,3 +282,21 @@ def test_a_file_that_is_no_trajectory_is_refused_by_name(text: str, tmp_path: An
     file = tmp_path / "joints.csv"
     file.write_text(text)
     assert_refused(Case("read_csv", JointTrajectory.read_csv, {}, {"path": {"text": file}}), "path")
+
+
+@pytest.mark.parametrize("name", ["velocity", "acceleration", "jerk"])
+def test_a_limit_of_zero_stops_no_joint_that_stands_still_and_names_the_one_that_moves(name: str) -> None:
+    """The height of the path is constant: one joint of the arm stands still."""
+    slopes = np.abs(ARM.at(np.linspace(0.0, PATH.length, 101)).first).max(axis=0)
+    assert (slopes < 1e-12).any()
+    for joint, slope in enumerate(slopes):
+        values = np.full(len(slopes), 50.0)
+        free = schedule(PATH, LineLimits(0.5, 2.0, 50.0, joints=JointLimits(**{name: values})), joints=ARM)
+        values[joint] = 0.0
+        limits = LineLimits(0.5, 2.0, 50.0, joints=JointLimits(**{name: values}))
+        if slope < 1e-12:
+            assert schedule(PATH, limits, joints=ARM).duration == pytest.approx(free.duration, rel=1e-9)
+        else:
+            with pytest.raises(ProblemError, match=f"'{ARM.names[joint]}' moves along the path") as caught:
+                schedule(PATH, limits, joints=ARM)
+            assert (caught.value.name, caught.value.limit) == (ARM.names[joint], 0.0)
