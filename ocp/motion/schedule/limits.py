@@ -227,9 +227,9 @@ def check_line(path: PathLike, limits: LineLimits, joints: JointPath | None) -> 
 
 def _check_still(path: PathLike, limits: LineLimits, joints: JointPath) -> None:
     """Raise ProblemError if a joint moves along the path whose velocity, acceleration or jerk is limited to 0."""
-    given, count = limits.joints or JointLimits(), len(joints.names)
+    own, count = limits.joints or JointLimits(), len(joints.names)
     for name in ("velocity", "acceleration", "jerk"):
-        zero = np.broadcast_to(np.asarray(getattr(given, name), dtype=float) == 0, (count,))
+        zero = np.broadcast_to(np.asarray(getattr(own, name), dtype=float) == 0, (count,))
         if not zero.any():
             continue
         places = path.sample_distances()
