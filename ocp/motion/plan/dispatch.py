@@ -77,7 +77,8 @@ def plan(
         horizon: s; None: until the last task ends. "free": the tasks may be done more slowly than they say, never
             faster; their pace is planned together with the self-motion, for the least sum of duration and joint rates.
         start: Joints at the start, rad or m, shape (n,), or a `Start` with the configuration of a floating base; None:
-            any joints that do the first tasks, which are searched.
+            any joints that do the first tasks, which are searched. Joints that move no task frame, such as a gripper's,
+            are held there, or at the nearest free position, see `Plan.held`.
         cyclic: Whether the joints end where they start.
         cost: Weights of the cost. For tip tasks, `velocity` with the `weights` of the joints, and `time` if the horizon
             is free (1 if `cost` is None), in (rad/s)^2: the larger, the closer to the least time. For waypoints,
@@ -92,11 +93,11 @@ def plan(
         search: "start": from the given start, or from the best conditioned solution of inverse kinematics.
             "configurations": from all solutions of inverse kinematics; each may slide along its self-motion.
             "global": among all motions in the tasks' own time. On a fixed base, the plan has a lower `bound`; the tasks
-            must be poses that leave at most two directions free, and joints that move no task frame, such as a
-            gripper's, stand still in `start` or in the middle of their limits (see `search.search`). On a floating
-            base, the motions come from a search over exact states without a bound (see `search.cells`), which also
-            passes singularities. "segments": as "global"; if no single motion does the tasks, in the fewest segments,
-            between which an arm on a fixed base moves to another configuration while the tasks wait.
+            must be poses that leave at most two directions free. If more are free, joints that also carry another limb,
+            such as a torso, are held (see `search.search`). On a floating base, the motions come from a search over
+            exact states without a bound (see `search.cells`), which also passes singularities. "segments": as "global";
+            if no single motion does the tasks, in the fewest segments, between which an arm on a fixed base moves to
+            another configuration while the tasks wait.
         seed: Seed of all random numbers.
         time_limit: Seconds after which planning ends with a SolveError; None for no limit.
         progress: Function that is called with the name of each stage; True: a line shows it; False: nothing is shown;
