@@ -73,11 +73,23 @@ class MotionSample:
         return cls(stretch, motion.t, motion.base[0], motion.joints[0], motion.rates[0])
 
     def misses(self) -> tuple[Array, Array]:
-        """Return the position errors, m, and the orientation errors, rad, of the worst task. Shapes (M,)."""
+        """Return the position errors, m, and the orientation errors, rad, of the worst task. Shapes (M,).
+
+        The error of a velocity task is the integral of its velocity error.
+        """
         equations, worst = self.stretch.equations, np.zeros((2, len(self.t)))
         if equations is None:
             return worst[0], worst[1]
         errors = np.nan_to_num(equations.errors(self.t, self.base, self.joints), nan=np.inf)
+        if not equations.pose_rows.all():
+            targets = np.array(equations.target_function().map(len(self.t))(self.t[None, :]))
+            columns, right = (
+                np.array(part) for part in equations.function.map(len(self.t))(self.base.T, self.joints.T, targets)[:2]
+            )
+            jacobians = columns.reshape(equations.size, *self.joints.shape)
+            velocities = np.einsum("mkn,kn->km", jacobians, self.rates) - right.T
+            strayed = np.cumsum(velocities[:-1] * np.diff(self.t)[:, None], axis=0)
+            errors = np.where(equations.pose_rows, errors, np.vstack([np.zeros((1, equations.size)), strayed]))
         ends = np.cumsum([0, *(part.task.size for part in equations.bound)]).tolist()
         for begin, end in pairwise(ends):
             turning = equations.turning[begin:end]
