@@ -7,7 +7,7 @@ in the opposite direction, without a corner. It extends beyond the vertex by 1.3
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any, Literal, TypeAlias
@@ -83,13 +83,23 @@ class Path:
         Args:
             points: In world, at least two. Shape (n, 3), m.
             orientations: Unit quaternions at the points; None: the tool does not turn. Shape (n, 4).
+
+        Raises:
+            ModelError: Wrong sizes or values; or two successive points are equal, and the tool does not turn there.
         """
         corners = checked_array(points, ("points", 3), "path", "points", least=2)
-        if orientations is None:
-            return cls(tuple(Line(a, b) for a, b in pairwise(corners)))
-        turns = checked_array(orientations, (len(corners), 4), "path", "orientations")
-        ends: Iterable[Any] = zip(corners[:-1], corners[1:], turns[:-1], turns[1:], strict=True)
-        return cls(tuple(Line(*each) for each in ends))
+        ends: list[Any] = [corners[:-1], corners[1:]]
+        if orientations is not None:
+            turns = checked_array(orientations, (len(corners), 4), "path", "orientations")
+            ends += [turns[:-1], turns[1:]]
+        lines = []
+        for number, each in enumerate(zip(*ends, strict=True)):
+            try:
+                lines.append(Line(*each))
+            except ModelError as error:
+                words = f"points[{number}] to points[{number + 1}]: {error}"
+                raise ModelError(words, name=f"points[{number + 1}]", value=error.value, limit=error.limit) from error
+        return cls(tuple(lines))
 
     @property
     def length(self) -> float:

@@ -51,3 +51,11 @@ def test_the_quintic_blend_keeps_the_curvature_continuous_where_the_cubic_does_n
 def test_a_path_with_a_gap_is_a_named_error() -> None:
     with pytest.raises(ModelError, match=r"gap|begins|meet|end"):
         Path((Line((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)), Line((1.1, 0.0, 0.0), (1.1, 1.0, 0.0))))
+
+
+@pytest.mark.parametrize("twice", [0, 1, 2])
+def test_a_point_given_twice_is_named_by_its_number(twice: int) -> None:
+    points = np.array([[0.0, 0, 0], [1.0, 0, 0], [1.0, 1.0, 0]])
+    with pytest.raises(ModelError, match=rf"points\[{twice}\] to points\[{twice + 1}\]: .*length 0") as caught:
+        Path.through(np.insert(points, twice, points[twice], axis=0))
+    assert caught.value.name == f"points[{twice + 1}]"
