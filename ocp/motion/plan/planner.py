@@ -97,14 +97,8 @@ def plan_from_configurations(
             return queue.plan(), search.bound
     seeds = candidates_from(solver, motions, configurations)
     queue.run(seeds)
-    if not queue.passed and queue.collided and not solver.no_clear_configuration:
-        _try_alternatives(queue, solver, seeds)
-    if not queue.passed and not queue.collided and not queue.exhausted:  # try other guesses and diagnose conflicts
-        if floating:
-            _search_cells(queue, solver, motions, configurations)
-        else:
-            motions = local_motions_from(request, configurations[:1])
-            queue.run(candidates_from(solver, motions, configurations[:1], direct=True, thorough=True))
+    if not queue.passed:
+        _repair(queue, solver, motions, configurations, seeds)
     try:
         return queue.plan(), None if search is None else search.bound
     except SolveError as error:
@@ -134,6 +128,25 @@ def candidates_from(
         constraints = solver.request.clearance_constraints
         candidates.append(Candidate(configurations[index], seed.cost, seed=seed, constraints=constraints))
     return candidates
+
+
+def _repair(
+    queue: CandidateQueue,
+    solver: CandidateSolver,
+    motions: Sequence[LocalMotion],
+    configurations: Array,
+    seeds: list[Candidate],
+) -> None:
+    """Try seeds again that collided; if none did, try other guesses, and diagnose conflicts."""
+    if queue.collided and not solver.no_clear_configuration:
+        _try_alternatives(queue, solver, seeds)
+    if queue.passed or queue.collided or queue.exhausted:
+        return
+    if solver.request.machine.base_size:
+        _search_cells(queue, solver, motions, configurations)
+    else:
+        motions = local_motions_from(solver.request, configurations[:1])
+        queue.run(candidates_from(solver, motions, configurations[:1], direct=True, thorough=True))
 
 
 def _try_one_by_one(queue: CandidateQueue, solver: CandidateSolver, configurations: Array, thorough: bool) -> None:

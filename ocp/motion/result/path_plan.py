@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -224,21 +225,10 @@ class PathPlan(Plan):
             head = unpack_record(read_head(path, arrays["path"]), numbers)
             arguments = restored_request(head["request"]).arguments
             machine, limits, constraints = (arguments[name] for name in ("machine", "limits", "constraints"))
-            n, count = machine.joint_size, len(head["joints"])
-            shapes: dict[str, tuple[int, ...]] = {"joints": (count, n)}
-            written = {"joints": head["joints"]}
-            if head["poses"] is not None:
-                shapes |= {"positions": (count, 3), "rotations": (count, 3, 3), "step": (n,)}
-                written |= {name: head["poses"][name] for name in PathPoses._fields}
-            values = {name: np.asarray(value, dtype=float) for name, value in written.items()}
-            wrong = [name for name, shape in shapes.items() if values[name].shape != shape]
-            finite = all(np.isfinite(values[name]).all() for name in values if name != "step")
-            if wrong or count < 2 or not finite or not isinstance(limits, Limits) or not isinstance(machine, FixedBase):
-                raise ValueError(f"its {', '.join(wrong) or 'values'} do not fit its machine")
-            if constraints is not None and not isinstance(constraints, ClearanceConstraints):
-                raise TypeError(f"its collision scene is a {type(constraints).__name__}")
-            if constraints is not None and constraints.scene.has_moving_obstacles:
-                raise ValueError("its obstacles move, though a path has no times")
+            if not isinstance(limits, Limits) or not isinstance(machine, FixedBase):
+                raise TypeError(f"its machine is a {type(machine).__name__}, its limits a {type(limits).__name__}")
+            count, values = len(head["joints"]), _checked_values(head, machine.joint_size)
+            _check_constraints(constraints)
             breaks = tuple(int(number) for number in head["reconfigurations"])
             if not all(0 <= number < count - 1 for number in breaks):
                 raise ValueError(f"it reconfigures at waypoints that it has not: {breaks}")
@@ -260,6 +250,30 @@ class PathPlan(Plan):
         except (*RECORD_ERRORS, ModelError, ProblemError) as error:
             words = f"{path}: the plan in it is damaged: {error}"
             raise ProblemError(words, name="path", value=str(path)) from error
+
+
+def _checked_values(head: Mapping[str, Any], size: int) -> dict[str, Array]:
+    """Return the joints and poses of a file; raise ValueError if they do not fit a machine of this many joints."""
+    count = len(head["joints"])
+    shapes: dict[str, tuple[int, ...]] = {"joints": (count, size)}
+    written = {"joints": head["joints"]}
+    if head["poses"] is not None:
+        shapes |= {"positions": (count, 3), "rotations": (count, 3, 3), "step": (size,)}
+        written |= {name: head["poses"][name] for name in PathPoses._fields}
+    values = {name: np.asarray(value, dtype=float) for name, value in written.items()}
+    wrong = [name for name, shape in shapes.items() if values[name].shape != shape]
+    finite = all(np.isfinite(values[name]).all() for name in values if name != "step")
+    if wrong or count < 2 or not finite:
+        raise ValueError(f"its {', '.join(wrong) or 'values'} do not fit its machine")
+    return values
+
+
+def _check_constraints(constraints: Any) -> None:
+    """Raise TypeError or ValueError unless these are the clearance constraints of a path, or None."""
+    if constraints is not None and not isinstance(constraints, ClearanceConstraints):
+        raise TypeError(f"its collision scene is a {type(constraints).__name__}")
+    if constraints is not None and constraints.scene.has_moving_obstacles:
+        raise ValueError("its obstacles move, though a path has no times")
 
 
 def _largest(
