@@ -43,12 +43,14 @@ class StoppingSettings:
     """Settings of the motions.
 
     Attributes:
+        still: Duration of a motion that stays where it is, s, since problems have a positive one.
         ramp: Time in which joints without an acceleration limit reach their largest rate, s.
         unlimited_rate: Rate of joints without a rate limit, rad/s or m/s.
         samples: Samples of each phase at which torques are evaluated.
         torque_share: Share of the torque limits that is used there, since torques may be larger between the samples.
     """
 
+    still: float = 1e-3
     ramp: float = 0.2
     unlimited_rate: float = 1.0
     samples: int = 16
@@ -165,7 +167,7 @@ def stopping_motion(machine: FixedBase, path: Array, bounds: JointBounds) -> Sto
             own = [phase.slower(factor) for phase in own]
         phases += own
     if not phases:  # the machine stays where it is
-        phases.append(Phase(SETTINGS.ramp, path[0], *np.zeros((3, path.shape[1]))))
+        phases.append(Phase(SETTINGS.still, path[0], *np.zeros((3, path.shape[1]))))
     return StoppingMotion(tuple(phases))
 
 

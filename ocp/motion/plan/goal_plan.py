@@ -317,7 +317,8 @@ def _within_actuator_limits(task: _Task, paths: list[JointPath]) -> list[Candida
     stopping = [(problem, problem.stopping()) for problem in problems]
     for problem, candidate in sorted(stopping, key=lambda pair: (not pair[1].passed, pair[1].cost)):
         bound = _bound(task, problem.horizon_guess)
-        enough = candidate.passed and bound is not None and candidate.cost <= (1 + settings.near_bound) * bound
+        is_near = bound is not None and candidate.cost <= (1 + settings.near_bound) * bound
+        enough = candidate.passed and (is_near or problem.path.length == 0)
         best = candidate if enough else min(candidate, problem.smooth(), key=lambda c: (not c.passed, c.cost))
         candidates.append(best)
         task.report(f"path of length {problem.path.length:.4g}: {best}")

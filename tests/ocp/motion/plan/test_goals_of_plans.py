@@ -68,6 +68,15 @@ def test_the_fastest_motion_takes_the_time_of_the_joint_that_needs_longest() -> 
     assert motion.at([0.0, motion.horizon])["rates"] == pytest.approx(0.0, abs=1e-9)
 
 
+@pytest.mark.parametrize("cost", [Cost(), LENGTH, TIME])
+def test_to_stay_where_it_is_takes_no_time_and_no_search(cost: Cost) -> None:
+    limits = Limits(acceleration=5.0) if cost.time else None
+    motion = plan(arm(), Goal(joints=START), start=START, cost=cost, limits=limits, scene=False, time_limit=5.0)
+    assert motion.audit().feasible
+    assert motion.cost <= 1e-3 * (1 + 1e-9)
+    assert np.abs(motion.at(np.linspace(0.0, motion.horizon, 5))["joints"] - START).max() == 0
+
+
 def test_a_moving_start_and_end_are_met() -> None:
     rates = 0.2 * (END - START)
     motion = plan(
