@@ -26,7 +26,7 @@ from ocp.motion.local.branches import ik_configurations
 from ocp.motion.local.ik_solver import IkConfigurations, IkSolver, Incompleteness, ToolFreedom
 from ocp.motion.local.inverse_kinematics import Unreachable, inverse_kinematics
 from ocp.motion.local.rates import resolve
-from ocp.motion.plan import Candidate, DeadEnd, Plan, Reconfiguration, plan
+from ocp.motion.plan import Candidate, DeadEnd, Plan, Reconfiguration, plan, plan_problem
 from ocp.motion.tasks.cost import Cost
 from ocp.motion.tasks.goals import Goal, Start, Waypoints
 from ocp.motion.tasks.limits import Limits
@@ -117,6 +117,7 @@ __all__ = [
     "minimum_time_problem",
     "minimum_velocity_problem",
     "plan",
+    "plan_problem",
     "prepare",
     "refine",
     "resolve",

@@ -1,9 +1,12 @@
 """The front door: a machine and its tasks in, the lowest-cost motion that passes its audit out."""
 
+from ocp.motion.plan.declaration import plan_problem
 from ocp.motion.plan.dispatch import plan
 from ocp.motion.result.candidate import Candidate, Reason, Rejection
 from ocp.motion.result.plan import Plan, PlanSample
 from ocp.motion.result.segmented_plan import Reconfiguration
 from ocp.motion.search.dead_end import DeadEnd
 
-__all__ = ["Candidate", "DeadEnd", "Plan", "PlanSample", "Reason", "Reconfiguration", "Rejection", "plan"]
+__all__ = [
+    "Candidate", "DeadEnd", "Plan", "PlanSample", "Reason", "Reconfiguration", "Rejection", "plan", "plan_problem",
+]  # fmt: skip

@@ -84,7 +84,7 @@ def plan(
             is free (1 if `cost` is None), in (rad/s)^2: the larger, the closer to the least time. For waypoints,
             `length`, the sum of all joint displacements with the `weights` of the joints, or `time`, s, by the
             velocity limits. `Weights` for a standing machine. None: half the squared joint velocities, the length of a
-            path through waypoints.
+            path through waypoints, the squared torques of a motion to several goals.
         limits: Limits of joint positions and rates; the robot's own if None. Limits of acceleration, jerk, torque or
             power, if given, hold at all times together with the robot's own torque limits, at the same cost (see
             `plan.actuators`). Rates are then continuous. A machine starts or ends at rest only if its tasks require it.

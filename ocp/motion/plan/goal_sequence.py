@@ -66,6 +66,8 @@ def plan_sequence(
         raise ProblemError("start is missing: a goal is reached from somewhere; give plan(..., start=)", name="start")
     own_limits = Limits() if limits is None else checked_instance("limits", limits, Limits)
     own_cost = None if cost is None else checked_instance("cost", cost, Cost)
+    if len(goals) == 1 and goals[0].duration is None:  # one motion has the horizon
+        goals, total = [replace(goals[0], duration=total)], None
     near, resolved = joints, list[Goal]()
     for goal in goals:
         if goal.has_pose:

@@ -223,17 +223,17 @@ class Plan(ABC):
             held = [f"{name} at {position:.4g}" for name, position in self.held.items()]
             more = f" and {len(held) - MAX_LISTED} more" if len(held) > MAX_LISTED else ""
             lines.append(f"  held: {', '.join(held[:MAX_LISTED])}{more}")
-        costs_by_reason: dict[str, list[float]] = {}
+        most, costs_by_reason = MAX_LINES - 1 - len(lines), dict[str, list[float]]()
         for candidate in self.candidates:
             costs_by_reason.setdefault(str(candidate.reason or "the plan"), []).append(candidate.cost)
-        for reason, costs in list(costs_by_reason.items())[: MAX_LINES - 3]:
+        for reason, costs in list(costs_by_reason.items())[:most]:
             finite = [cost for cost in costs if np.isfinite(cost)] or [np.nan]
             low, high = min(finite), max(finite)
             span = f"{low:10.6g}" + (f" to {high:.6g}" if low < high else "")
             prefix = "" if len(costs) == 1 else f"{len(costs)} motions: "
             lines.append(f"  {span:<23}  {prefix}{reason}")
-        if len(costs_by_reason) > MAX_LINES - 3:
-            remaining = sum(len(costs) for costs in list(costs_by_reason.values())[MAX_LINES - 3 :])
+        if len(costs_by_reason) > most:
+            remaining = sum(len(costs) for costs in list(costs_by_reason.values())[most:])
             lines.append(f"  {remaining} more, see `candidates`")
         return "\n".join(lines)
 

@@ -12,7 +12,21 @@ import pytest
 
 from models import Box, FixedBase, HalfSpace, Sphere, example_robot
 from models.arrays import Array
-from ocp import Cost, Goal, Limits, Plan, ProblemError, Scene, Start, plan
+from ocp import (
+    Collocation,
+    Cost,
+    Goal,
+    Limits,
+    Phases,
+    Plan,
+    ProblemError,
+    Scene,
+    Start,
+    TipTask,
+    plan,
+    plan_problem,
+    solve,
+)
 
 START = np.array([0.0, -0.6, 1.2, 0.0, 0.9, 0.0])
 END = START + np.array([0.8, 0.3, -0.4, 0.2, 0.1, 0.5])
@@ -126,6 +140,26 @@ def test_obstacles_are_avoided_at_a_cost_and_proven() -> None:
     smooth = plan(arm(), Goal(joints=there), start=START, cost=TIME, limits=Limits(acceleration=6.0), scene=scene)
     assert smooth.audit().feasible
     assert smooth.cost >= smooth.bound  # type: ignore[operator]
+
+
+def test_the_problem_of_a_motion_has_its_cost() -> None:
+    """What `plan` solves can be declared, changed and solved by oneself."""
+    straight = solve(plan_problem(arm(), Goal(joints=END), 2.0, start=START, scene=False), Collocation(8, degree=3))
+    assert straight.cost == pytest.approx(((END - START) ** 2).sum() / 4, rel=1e-6)
+    limits, cost = Limits(acceleration=6.0), Cost(velocity=1.0, acceleration=0.1)
+    problem = plan_problem(arm(), Goal(joints=END), 2.0, start=START, limits=limits, cost=cost, scene=False)
+    motion = plan(arm(), Goal(joints=END), 2.0, start=START, limits=limits, cost=cost, scene=False)
+    assert solve(problem, Collocation(20, degree=5)).cost == pytest.approx(motion.cost, rel=1e-3)
+    task = TipTask(
+        position=lambda t: tip(START)[0] + 0.05 * t * np.array([0.0, 1.0, 0.0]), duration=1.0, rows=(3, 4, 5)
+    )
+    problem = plan_problem(arm(), task, start=START, scene=False)
+    own = solve(problem, Collocation(12, degree=4))
+    assert own.cost == pytest.approx(plan(arm(), task, start=START, scene=False).cost, rel=1e-4)
+    several = plan_problem(
+        arm(), [Goal(joints=END, duration=1.0), Goal(joints=START, duration=1.0)], start=START, scene=False
+    )
+    assert isinstance(several, Phases)
 
 
 def test_the_same_seed_gives_the_same_motion_and_files_keep_it(tmp_path: Path) -> None:
