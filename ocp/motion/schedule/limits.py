@@ -229,9 +229,10 @@ def _check_still(path: PathLike, limits: LineLimits, joints: JointPath) -> None:
     """Raise ProblemError if a joint moves along the path whose velocity, acceleration or jerk is limited to 0."""
     own, count = limits.joints or JointLimits(), len(joints.names)
     for name in ("velocity", "acceleration", "jerk"):
-        zero = np.broadcast_to(np.asarray(getattr(own, name), dtype=float) == 0, (count,))
-        if not zero.any():
+        is_zero = np.asarray(getattr(own, name), dtype=float).ravel() == 0
+        if not is_zero.any() or is_zero.size not in (1, count):  # other sizes are refused with the limits
             continue
+        zero = np.broadcast_to(is_zero, (count,))
         places = path.sample_distances()
         slopes = np.abs(np.asarray(rates_along(joints, places).first, dtype=float))
         moves = zero & (slopes.max(axis=0) > ROUNDING_SHARE * slopes.max())

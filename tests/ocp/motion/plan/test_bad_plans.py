@@ -233,10 +233,10 @@ CASES = [
         {"machine": ARM, "tasks": Goal(joints=[0.4, 0.5, 0.8], duration=1.0), "start": START, "scene": False},
         {
             "machine": INSTANCE | {"class": FixedBase, "robot": CHAIN},
-            "horizon": {"of fixed durations": 1.0},
+            "horizon": {"negative": -1.0, "text": "soon"},
             "start": array(3) | {"matrix": np.zeros((2, 3))},
             "cyclic": {"true": True},
-            "cost": but(INSTANCE, "None") | {"class": Cost, "length": Cost(velocity=0, length=1)},
+            "cost": but(INSTANCE, "None") | {"class": Cost, "length and time": Cost(velocity=0, length=1, time=1)},
             "limits": but(INSTANCE, "None") | {"class": Limits, "too many": Limits(velocity=[1.0, 2.0])},
             "scene": but(INSTANCE, "None") | {"class": Scene, "true": True, "zero": 0},
             "search": CHOICE,

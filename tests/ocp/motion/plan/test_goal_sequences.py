@@ -154,7 +154,7 @@ def other_machine() -> Machine:
     ("arguments", "name", "words"),
     [
         ({"tasks": list(GOALS)}, "start", "start is missing"),
-        ({"tasks": [Goal(joints=[1.0, 0.0])], "start": START}, "duration", "needs a duration"),
+        ({"tasks": [GOALS[0], Goal(joints=[1.0, 0.0])], "start": START}, "duration", "needs a duration"),
         ({"tasks": [GOALS[0], replace(GOALS[1], joints=[9.0])], "start": START}, None, "2 numbers"),
         ({"tasks": list(GOALS), "start": START, "cyclic": True}, "cyclic", "takes no cyclic"),
         ({"tasks": planar_steps(1, 0.8, 0.8), "start": START}, "machine", "first stance"),

@@ -14,8 +14,10 @@ from models import CollisionShape, FixedBase, Path, Sphere, smooth
 from models.arrays import Array
 from models.machines.moving_obstacle import MovingObstacle
 from ocp import DeadEnd, ProblemError, Scene, TipTask, plan
+from ocp.motion.plan import piecewise
 from ocp.motion.plan.piecewise import _task_between
 from ocp.motion.result.segmented_plan import SegmentedPlan
+from ocp.motion.search.task_search import TaskSearch
 from tests.ocp.motion.search.test_charts import planar
 from tests.ocp.motion.search.test_reconfigurations import limited
 
@@ -60,8 +62,17 @@ def cost(first: float, last: float, reach: float, elbow: int) -> float:
     return float((np.diff(posture(times, reach, elbow), axis=0) ** 2).sum() / 2 / (times[1] - times[0]))
 
 
-def test_of_two_links_the_pieces_are_the_branches_and_meet_where_that_costs_least() -> None:
-    reach, machine = 0.45, arm()
+def test_of_two_links_the_pieces_are_the_branches_and_meet_where_that_costs_least(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    searches, reach, machine = list[TaskSearch](), 0.45, arm()
+
+    class Recorded(TaskSearch):
+        def __init__(self, request: Any, motions: Any) -> None:
+            super().__init__(request, motions)
+            searches.append(self)
+
+    monkeypatch.setattr(piecewise, "TaskSearch", Recorded)
     made = in_segments(machine, line(reach), scene=False)
     assert made.fewest == len(made.reconfigurations) == 1
     (where,) = made.reconfigurations
@@ -77,12 +88,11 @@ def test_of_two_links_the_pieces_are_the_branches_and_meet_where_that_costs_leas
         assert piece.cost == pytest.approx(cost(begin, end, reach, elbow), rel=1e-5)
         assert piece.bound is not None
         assert piece.bound <= piece.cost
-    # of all times at which the elbow may change side, none is cheaper but for the instants that are looked at
-    inside = [t for t in np.linspace(0, SECONDS, 401) if all(
+    # the elbow may change side at the samples of the search; at none of them that costs less
+    inside = [t for t in searches[0].times if all(
         (np.abs(posture(np.array([t]), reach, elbow)) <= HIGH).all() for elbow in (-1, 1)
     )]  # fmt: skip
-    best = min(cost(0, t, reach, -1) + cost(t, SECONDS, reach, 1) for t in inside)
-    assert best * (1 - 1e-5) <= made.cost <= best * 1.002
+    assert made.cost == pytest.approx(min(cost(0, t, reach, -1) + cost(t, SECONDS, reach, 1) for t in inside), rel=1e-4)
     np.testing.assert_allclose(where.before, posture(np.array([where.time]), reach, -1)[0], atol=1e-6)
     np.testing.assert_allclose(where.after, posture(np.array([where.time]), reach, 1)[0], atol=1e-6)
     assert where.motion is not None
