@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from models import Machine, ModelError
+from models import FixedBase, Machine, ModelError
 from models.arrays import Array, ArrayInput, checked_array
 from models.machines.machine import with_tip
 from ocp.errors import ProblemError, checked_count, checked_flag, checked_instance, checked_positive
@@ -121,6 +121,7 @@ class IkSolver:
             ProblemError: The machine has a moving base, no six of its joints determine the pose of the tip, or an
                 argument is invalid.
         """
+        checked_instance("machine", machine, FixedBase)
         checked_instance("free", free, ToolFreedom)
         if free is ToolFreedom.CONE:
             checked_positive("within", within, below=np.pi)

@@ -55,6 +55,10 @@ def plan_problem(
     if isinstance(tasks, Waypoints):
         raise ProblemError("a path through waypoints has no optimal control problem", name="tasks", value=tasks)
     own: Any = cost
+    if not isinstance(machine, FixedBase | FreeFloating):
+        raise ProblemError(f"a machine is expected, not a {type(machine).__name__}", name="machine", value=machine)
+    if limits is not None:
+        checked_instance("limits", limits, Limits)
     if isinstance(tasks, Steps):
         joints = Start.of(start, tasks.stances[0])[1]
         begin = None if joints is None else tasks.in_order(tasks.stances[0], joints[None])[0]

@@ -197,12 +197,15 @@ def _goal_request(
         raise ProblemError("start is missing: a goal is reached from somewhere; give plan(..., start=)", name="start")
     own_limits = Limits() if limits is None else checked_instance("limits", limits, Limits)
     places: dict[str, Any] = {"limits": own_limits, "constraints": constraints, "seed": seed}
-    own_cost = Cost(time=float(horizon == "free")) if cost is None else checked_instance("cost", cost, Cost)
+    is_free = isinstance(horizon, str)
+    if is_free:
+        checked_choice("horizon", horizon, ("free",))
+    own_cost = Cost(time=float(is_free)) if cost is None else checked_instance("cost", cost, Cost)
     return GoalRequest(
         machine,
         joints,
         goal_configurations(machine, goal, joints, **places),
-        horizon=goal.duration if horizon in (None, "free") else horizon,
+        horizon=goal.duration if horizon is None or is_free else horizon,
         limits=own_limits,
         cost=own_cost,
         start_velocity=state.velocity,

@@ -10,7 +10,7 @@ import numpy as np
 
 from models import Box, Machine, Sphere
 from models.arrays import ArrayInput
-from ocp.errors import ProblemError, checked_choice, checked_positive, checked_text
+from ocp.errors import NOT_NUMBERS, ProblemError, checked_choice, checked_positive, checked_text, floats
 from ocp.motion.tasks.checks import checked_configuration
 from ocp.motion.tasks.tip_task import TipTask
 
@@ -108,6 +108,12 @@ class Goal:
             checked_positive("goal: within", self.within, below=np.pi)
         if isinstance(self.velocity, str):
             checked_choice("goal: velocity", self.velocity, ("rest", "free"))
+        else:
+            try:
+                floats(self.velocity)
+            except NOT_NUMBERS as error:
+                words = f"goal: velocity must be numbers, 'rest' or 'free', not {self.velocity!r}"
+                raise ProblemError(words, name="velocity", value=self.velocity) from error
         if self.has_pose:
             _ = self.task  # checks the pose
 

@@ -12,11 +12,22 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from models import CollisionScene, FixedBase, FreeFloating, Path, SmoothPath, Sphere, planar_chain, smooth
+from models import (
+    CollisionScene,
+    FixedBase,
+    FreeFloating,
+    Path,
+    SmoothPath,
+    Sphere,
+    example_robot,
+    planar_chain,
+    smooth,
+)
 from ocp import (
     ClearanceConstraints,
     Cost,
     Goal,
+    IkSolver,
     Limits,
     ProblemError,
     Scene,
@@ -25,7 +36,9 @@ from ocp import (
     TipTask,
     Unreachable,
     Waypoints,
+    ik_configurations,
     inverse_kinematics,
+    plan_problem,
 )
 from ocp.app.files import log_rerun, write_mcap
 from ocp.motion.builders.standing.problem import Weights
@@ -34,6 +47,7 @@ from ocp.motion.schedule import LineLimits, schedule
 from ocp.motion.tasks.tracks import path_tracks
 from tests.bad_values import (
     CHOICE,
+    COUNT,
     FINITE,
     FLAG,
     INSTANCE,
@@ -41,6 +55,7 @@ from tests.bad_values import (
     NAN,
     NONNEGATIVE,
     NOTHING,
+    NUMBER,
     POSITIVE,
     SEQUENCE,
     TEXT,
@@ -70,6 +85,7 @@ GOOD = TipTask.along(LINE, 0.2, rows=(3, 4))
 assert GOOD.duration is not None
 PLANNED: dict[str, Any] = {"machine": ARM, "tasks": GOOD, "start": START, "search": "start"}
 AROUND = CollisionScene(FixedBase(armoured_arm()))
+SIX = FixedBase(example_robot("six_axis"))
 POSES = ([[0.4, 0.0, 0.5], [0.4, 0.02, 0.5], [0.4, 0.04, 0.5]], [[0.0, 1.0, 0.0, 0.0]] * 3)
 ENDLESS = replace(GOOD, duration=None, breaks=())
 
@@ -250,6 +266,41 @@ CASES = [
         {
             "scene": INSTANCE,
             "margins": MAPPING | {"unknown": {99: 0.01}, "negative": {0: -1.0}, "nan": {0: NAN}, "word": {"a": 0.1}},
+        },
+    ),
+    Case(
+        "plan_problem",
+        plan_problem,
+        {"machine": ARM, "tasks": Goal(joints=[0.4, 0.5, 0.8]), "horizon": 1.0, "start": START, "scene": False},
+        {
+            "machine": INSTANCE,
+            "tasks": {
+                "a pose": Goal(position=(0.5, 0.2, 0.6)),
+                "waypoints": Waypoints(np.zeros((2, 3)), np.ones((2, 4))),
+            },
+            "horizon": {"negative": -1.0, "text": "soon"},
+            "start": array(3),
+            "limits": but(INSTANCE, "None"),
+            "scene": but(INSTANCE, "None"),
+        },
+    ),
+    Case(
+        "ik_configurations",
+        ik_configurations,
+        {"machine": SIX, "task": TipTask(position=(0.4, 0.1, 0.3), direction=(0, 0, -1)), "time": 0.0, "limits": True},
+        {"task": INSTANCE, "time": NUMBER, "samples": COUNT, "limits": FLAG},
+    ),
+    Case(
+        "IkSolver",
+        IkSolver,
+        {"machine": SIX},
+        {
+            "machine": INSTANCE,
+            "link": TEXT | {"unknown": "nobody"},
+            "free": INSTANCE,
+            "tool_axis": array(3) | {"zero": np.zeros(3)},
+            "samples": COUNT,
+            "limits": FLAG,
         },
     ),
     Case(
