@@ -60,7 +60,7 @@ def plan_to_stand(
     """
     checked_flag("cyclic", cyclic)
     if cyclic:
-        words = "a standing motion cannot be cyclic; give plan_standing the joints at the end, StandingSetup(end=...)"
+        words = "a standing motion cannot be cyclic; declare standing_problem with StandingSetup(end=...)"
         raise ProblemError(words, name="cyclic", value=cyclic)
     if cost is not None:
         checked_instance("cost", cost, Weights)
