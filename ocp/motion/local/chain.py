@@ -22,6 +22,7 @@ from models.arrays import Array
 __all__ = ["TURN", "Axis", "Chain", "Motion", "Solutions", "axial", "cross", "dot", "pick"]
 
 TURN = 2 * np.pi
+"""Full turn, rad."""
 NEXT, AFTER = np.array([1, 2, 0]), np.array([2, 0, 1])
 SKEW = np.cross(np.eye(3)[:, None], np.eye(3)).transpose(0, 2, 1).reshape(3, 9)
 """Maps a vector w to the matrix of w x, row by row."""

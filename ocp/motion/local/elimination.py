@@ -28,11 +28,11 @@ from numpy.typing import NDArray
 
 from models.arrays import Array
 from ocp.motion.local.chain import TURN, Axis, Chain, Motion, Solutions, axial, cross, dot
+from ocp.motion.local.closed_forms import SIX
 from ocp.motion.local.pose_solver import Mask, PoseSolver
 
 __all__ = ["Elimination", "elimination_of", "solve_opening"]
 
-SIX = 6
 SAMPLES = 2 * np.pi / 3 * np.arange(3)
 """Angles h that determine the coefficients of 1, cos h and sin h."""
 COEFFICIENTS = np.linalg.inv(np.stack([np.ones(3), np.cos(SAMPLES), np.sin(SAMPLES)], axis=1))

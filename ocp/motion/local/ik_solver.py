@@ -27,7 +27,7 @@ ROTATION_TOLERANCE = 1e-6
 
 
 class ToolFreedom(Enum):
-    """What a task leaves open of the orientation of the tip."""
+    """Freedom that a task leaves in the orientation of the tip."""
 
     NONE = "none"
     ROLL = "roll"

@@ -162,7 +162,7 @@ class CandidateSolver(Solver):
         return self._separate_pairs(candidate, Stage.SEPARATED, collisions)
 
     def _refine(self, candidate: Candidate) -> Candidate:
-        """Separate the bodies that collide on the fine mesh; without collisions refine it for the tips."""
+        """Separate the bodies that collide on the fine mesh; without collisions refine it for tips and joint limits."""
         if collisions := self.collisions(candidate):
             return self._separate_pairs(candidate, Stage.FINE, collisions)
         motion, mesh, _ = self.prepared(candidate, fine=True)
@@ -171,7 +171,9 @@ class CandidateSolver(Solver):
             return candidate.rejected(reason)
         solution = self._refine_for_tasks(motion, mesh, candidate.solution, check=not _is_separated(candidate))
         if (deviation := self._deviations(motion, solution).max()) > self.settings.max_deviation:
-            words = f"the tips deviate by {deviation:.2g} (m or rad) on finer meshes as well"
+            words = (
+                f"tips deviate, or joints exceed their limits, by {deviation:.2g} (m or rad) on finer meshes as well"
+            )
             limit = self.settings.tip_tolerance
             return candidate.rejected(Reason(Rejection.UNTRACKED, words, "task", float(deviation), limit))
         return replace(candidate, stage=Stage.REFINED, cost=solution.cost, solution=solution)
@@ -338,7 +340,7 @@ class CandidateSolver(Solver):
         return solution, audit
 
     def _refine_for_tasks(self, motion: ToolMotion, mesh: Collocation, solution: Solution, check: bool) -> Solution:
-        """Refine the mesh where the tips deviate from their tasks, as long as that may reduce the deviation."""
+        """Refine the mesh where tips deviate or joints exceed their limits, as long as that may reduce the error."""
         settings, deviations = self.settings, self._deviations(motion, solution)
         for _ in range(settings.max_refinements):
             if deviations.max() <= settings.tip_tolerance:
@@ -359,13 +361,17 @@ class CandidateSolver(Solver):
         return solution
 
     def _deviations(self, motion: ToolMotion, solution: Solution) -> Array:
-        """Return the largest deviation of the tips from their tasks in each mesh interval, m and rad. Shape (N,)."""
+        """Return the largest error in each mesh interval: of the tips, or of joints beyond limits, m and rad. (N,)"""
         fractions, samples = self._samples(solution), self.settings.samples_per_interval
         sample, worst = solution.at_fraction(fractions), np.zeros(len(fractions))
+        robot = self.request.machine.robot
         for stretch in motion.stretches:
+            joints = sample[f"joints{stretch.suffix}"]
+            excess = np.maximum(robot.lower - joints, joints - robot.upper)
+            worst = np.maximum(worst, excess.max(axis=1, initial=0.0))
             if stretch.equations is not None:
                 base = sample[f"base{stretch.suffix}"] if self.request.machine.base_size else None
-                times, joints = stretch.begin + fractions * stretch.duration, sample[f"joints{stretch.suffix}"]
+                times = stretch.begin + fractions * stretch.duration
                 sizes = np.cumsum([part.task.size for part in stretch.equations.bound])[:-1]
                 errors = np.split(stretch.equations.errors(times, base, joints), sizes, axis=1)
                 for part, error in zip(stretch.equations.bound, errors, strict=True):

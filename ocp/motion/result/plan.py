@@ -25,13 +25,11 @@ from ocp.motion.result.candidate import Candidate
 from ocp.motion.schedule.trajectory import JointTrajectory
 from ocp.motion.tasks.targets import Target, tip_poses
 from ocp.registry import call_registered
-from ocp.solution import Solution
+from ocp.solution import MAX_LINES, Solution
 from ocp.storage import table_head, write_arrays, write_text
 
 __all__ = ["CHECKED_TIMES", "Plan", "PlanSample"]
 
-MAX_LINES = 15
-"""Lines of a printed plan."""
 LIMIT_TOLERANCE = 1e-3
 """Largest relative excess over a joint limit, as in the audit."""
 CHECKED_TIMES = 2001
