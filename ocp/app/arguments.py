@@ -295,7 +295,7 @@ def run_check(options: argparse.Namespace, progress: Progress) -> tuple[int, str
     )
     if options.report is not None:
         progress("report")
-        from ocp.app.view.pictures import obstacles_of_shapes
+        from ocp.app.view.appearance import obstacles_of_shapes
         from ocp.app.view.report import report_of_check  # imports matplotlib, which is slow
 
         machine = FreeFloating(robot) if options.floating else FixedBase(robot, translation, rotation)

@@ -27,7 +27,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from models.errors import ModelError
-from ocp.app.batch.content import Payload, canonical_text, digest_of, pack_result, unpack_result
+from ocp.app.batch.result_store import Payload, canonical_text, digest_of, pack_result, unpack_result
 from ocp.errors import DetailedError, ProblemError, SolveError
 
 __all__ = [

@@ -10,19 +10,30 @@ import os
 import sys
 import textwrap
 from collections import Counter, defaultdict, deque
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from functools import cache
 from typing import Any, Literal
 
+import numpy as np
+from scipy.spatial import cKDTree
 from tqdm import tqdm
 
-from ocp.app.batch.content import Payload, canonical_text, digest_of, key_of, neighbours
+from models.arrays import Array
 from ocp.app.batch.engine import Engine, Function, Job, checked_cluster, failed
-from ocp.app.batch.result_store import STATUSES, ResultStore
+from ocp.app.batch.result_store import STATUSES, Payload, ResultStore, canonical_text, digest_of, key_of
 from ocp.app.batch.table import Batch, Result, row_of
-from ocp.errors import MAX_COUNT, NOT_NUMBERS, ProblemError, check_entries, checked_choice, checked_count, checked_text
+from ocp.errors import (
+    MAX_COUNT,
+    NOT_NUMBERS,
+    ProblemError,
+    check_entries,
+    checked_choice,
+    checked_count,
+    checked_text,
+    floats,
+)
 
-__all__ = ["run_batch"]
+__all__ = ["neighbours", "run_batch"]
 
 MAX_WORKERS = 4096
 
@@ -60,7 +71,7 @@ def run_batch(
             tasks and need this package and the function's module; results are sent to this process. Use workers with
             one thread: the threads of a process take turns.
         near: Names of numbers in the tasks. If given, ``function(task, guess)`` is called with the result of a similar
-            task for a warm start, or None. The tasks alone determine which one (:mod:`ocp.app.batch.content`).
+            task for a warm start, or None. The tasks alone determine which one (:func:`neighbours`).
         again: Status of the results to compute again in any case: ``"failed"``, ``"killed"``, or both. Otherwise a
             failed task is repeated if the source of the function's module has changed, or a file that an argument of
             :func:`cached` names.
@@ -221,9 +232,6 @@ class PendingTasks:
         self.ready.extend(self.after.pop(key, ()))
 
 
-# ---- arguments ---------------------------------------------------------------------------------------------------
-
-
 def texts_of(tasks: Any) -> dict[str, str]:
     """Return the canonical text of each distinct task by its key.
 
@@ -306,3 +314,55 @@ def source_version(function: Any) -> str:
     except (OSError, TypeError, SyntaxError):
         return ""
     return hashlib.sha256(ast.dump(tree).encode()).hexdigest()[:12]
+
+
+def neighbours(tasks: Mapping[str, Any], names: Sequence[str]) -> dict[str, str | None]:
+    """Return the key of each task's neighbour, in an order in which neighbours come first; None for the first task.
+
+    The tasks alone determine the neighbours. Ordered by their keys, which looks random, they form generations of 1, 1,
+    2, 4, 8, ... tasks, and the neighbour of a task is the nearest task of all earlier generations. Neighbours thus come
+    closer as the tasks get denser, the tasks of one generation can run in parallel, and no chain is longer than log2 of
+    the number of tasks.
+
+    Args:
+        tasks: Tasks by key.
+        names: Names of the numbers (or lists of numbers) in the tasks that span the space of the distance; each is
+            divided by its range.
+
+    Raises:
+        ProblemError: A task lacks these numbers, or has not as many as the others; names the task.
+    """
+    order = sorted(tasks)
+    rows = [coordinates_of(tasks[key], names) for key in order]
+    for key, row in zip(order, rows, strict=True):
+        if len(row) != len(rows[0]):
+            words = f"near: {len(row)} numbers in the task {tasks[key]!r}, {len(rows[0])} in another"
+            raise ProblemError(words, name="near", value=len(row), limit=len(rows[0]))
+    points = np.array(rows)
+    ranges = np.ptp(points, axis=0) if order else np.ones(0)
+    points = points / np.where(ranges > 0, ranges, 1.0)
+    parents: dict[str, str | None] = {}
+    begin, end = 0, 1
+    while begin < len(order):
+        keys = order[begin:end]
+        if begin:
+            nearest = cKDTree(points[:begin]).query(points[begin:end])[1]
+            parents |= {key: order[int(i)] for key, i in zip(keys, nearest, strict=True)}
+        else:
+            parents |= dict.fromkeys(keys)
+        begin, end = end, 2 * end
+    return parents
+
+
+def coordinates_of(task: Any, names: Sequence[str]) -> Array:
+    """Return the numbers of a task from which its distance to others is computed. Shape (n,)."""
+    parts = []
+    for name in names:
+        value = task.get(name) if isinstance(task, Mapping) else None
+        try:
+            part = floats(value).ravel()
+        except NOT_NUMBERS as error:
+            words = f"near: {name!r} is not a number or list of numbers in the task {task!r}"
+            raise ProblemError(words, name=name, value=value) from error
+        parts.append(part)
+    return np.concatenate(parts) if parts else np.zeros(0)

@@ -22,7 +22,7 @@ from ocp.app.check.joint_limits import Row, audit_rows, floating_torques, integr
 from ocp.app.check.plan_verdict import PlanVerdict, verdict_of
 from ocp.app.check.verdict import bounds_of
 from ocp.app.files import RawTrajectory
-from ocp.app.view.pictures import Obstacle, obstacles_of, obstacles_of_plan
+from ocp.app.view.appearance import Obstacle, obstacles_of, obstacles_of_plan
 from ocp.audit.audit import Audit
 from ocp.audit.clearance import closest_pairs_along
 from ocp.errors import ProblemError, unknown_name
