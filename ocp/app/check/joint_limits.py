@@ -10,10 +10,10 @@ momentum is conserved.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import casadi as ca
 import numpy as np
@@ -22,18 +22,22 @@ from models import FixedBase, FreeFloating, Robot, Standing, inverse_dynamics, m
 from models.arrays import Array
 from models.machines.standing import center_of_pressure
 from models.spatial import cross, rotation_from_quaternion
-from ocp.app.check.data_checks import Fault
+from ocp.app.check.data_checks import CleanedTrajectory, Fault
 from ocp.app.check.interpolation import Indices, Motion, MotionQuantity, polynomial_maxima
 from ocp.audit.audit import Audit
-from ocp.motion.tasks.limits import JointBounds
+from ocp.errors import ProblemError, checked_mapping, real, unknown_name
+from ocp.motion.tasks.limits import JointBounds, unknown_limits
 from ocp.problem.values import Sampler
 from ocp.tolerances import MOMENTUM_SHARE, ROUNDING_SHARE
 
 __all__ = [
     "ORDERS",
+    "Limit",
     "Row",
     "RowVerdict",
     "audit_rows",
+    "bounds_of",
+    "effort_rows",
     "floating_base_rows",
     "floating_torques",
     "integrate_base",
@@ -85,6 +89,46 @@ class Row:
     time: float | None
     verdict: RowVerdict
     note: str = ""
+
+
+Limit: TypeAlias = float | Mapping[str, float] | None
+"""One number for all joints, or numbers by name with "" for all other joints. None: the robot's own limit."""
+
+
+def bounds_of(
+    robot: Robot,
+    velocity: Limit = None,
+    acceleration: Limit = None,
+    jerk: Limit = None,
+    torque: Limit = None,
+    notes: list[str] | None = None,
+) -> JointBounds:
+    """Return the limits of the joint vector: the given ones, else the robot's own.
+
+    A limit of 0 in the robot's description means none; it is added to `notes`.
+    """
+    free = np.full(robot.dof, np.inf)
+    limits = {}
+    for quantity, own, override in (
+        ("velocity", robot.velocity, velocity),
+        ("acceleration", free, acceleration),
+        ("jerk", free, jerk),
+        ("torque", robot.effort, torque),
+    ):
+        values = own.copy()
+        if notes is not None and (names := unknown_limits(robot, quantity)):
+            notes.append(f"the robot gives {', '.join(names)} a {quantity} limit of 0: treated as none")
+        by_name = override if isinstance(override, Mapping) else {} if override is None else {"": override}
+        for name, value in checked_mapping(quantity, by_name).items():
+            if not real(value) > 0:
+                words = f"{quantity} of {name or 'all joints'} must be a number above 0, not {value!r}"
+                raise ProblemError(words, name=quantity, value=value, limit=0.0)
+            if name and name not in robot.joint_names:
+                raise unknown_name(f"joint in {quantity}", name, robot.joint_names)
+        for k, name in enumerate(robot.joint_names):
+            values[k] = by_name.get(name, by_name.get("", values[k]))
+        limits[quantity] = values
+    return JointBounds(robot.lower, robot.upper, power=free, **limits)
 
 
 def limit_rows(
@@ -208,6 +252,29 @@ def _check_limits(
     much = f", {100 * share_over:.3g} % beyond" if 1e-4 < share_over < 10 else ""
     text = f"{value:.5g} {unit} at {time:.6g} s{between}, limit {allowed:.5g}{much}{stretches}"
     return row, "", [Fault(order, name, text, time, first, value, allowed, unit)]
+
+
+def effort_rows(
+    cleaned: CleanedTrajectory, robot: Robot, bounds: JointBounds, share: float
+) -> tuple[list[Row], list[Fault]]:
+    """Check the torques in the file, at its samples."""
+    rows: list[Row] = []
+    faults: list[Fault] = []
+    if cleaned.efforts is None:
+        return rows, faults
+    for column, joint in enumerate(cleaned.joints):
+        name = robot.joint_names[joint]
+        unit, limit = robot.joint(name).effort_unit, float(bounds.torque[joint])
+        k = int(np.abs(cleaned.efforts[:, column]).argmax())
+        value, time = float(cleaned.efforts[k, column]), float(cleaned.motion.t[k])
+        failed = abs(value) > limit * (1 + share)
+        verdict = RowVerdict.FAILED if failed else RowVerdict.OK if np.isfinite(limit) else RowVerdict.UNLIMITED
+        row_limit = limit if np.isfinite(limit) else None
+        rows.append(Row(f"given torque of {name}", value, row_limit, unit, time, verdict, "as given in the file"))
+        if failed:
+            text = f"the file has {value:.5g} {unit} at {time:.6g} s, limit {limit:.5g}"
+            faults.append(Fault("torque", name, text, time, time, value, limit, unit))
+    return rows, faults
 
 
 def torque_rows(

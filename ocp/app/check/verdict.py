@@ -1,15 +1,15 @@
-"""Check a joint trajectory from any source: all quantities in one table, and a verdict in one sentence."""
+"""Check a joint trajectory from any source, or a plan: all quantities in one table, and a verdict in one sentence."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
-from models import CollisionScene, FixedBase, FreeFloating, Robot, Standing, Support, footprint
+from models import CollisionScene, FixedBase, FreeFloating, Machine, Robot, Standing, Support, footprint
 from models.arrays import Array, ArrayInput
 from models.robot.dynamics import GRAVITY
 from models.shapes.mesh_files import find_mesh
@@ -17,30 +17,32 @@ from models.shapes.shapes import Shape
 from ocp.app.check.collisions import clearance_rows, path_rows, with_wide_limits
 from ocp.app.check.data_checks import CleanedTrajectory, Fault, clean_trajectory
 from ocp.app.check.interpolation import Rule
-from ocp.app.check.joint_limits import Row, RowVerdict, floating_base_rows, limit_rows, standing_rows, torque_rows
+from ocp.app.check.joint_limits import (
+    Limit,
+    Row,
+    RowVerdict,
+    bounds_of,
+    effort_rows,
+    floating_base_rows,
+    limit_rows,
+    standing_rows,
+    torque_rows,
+)
 from ocp.app.check.suspicions import doubtful_times, exchanged_joints
 from ocp.app.files import RawTrajectory, Waypoints
 from ocp.app.files.trajectory import UNITS
+from ocp.audit.audit import Audit
 from ocp.console import check_time, interruptible
-from ocp.errors import (
-    ProblemError,
-    checked_choice,
-    checked_instance,
-    checked_mapping,
-    checked_nonnegative,
-    checked_positive,
-    real,
-    unknown_name,
-)
-from ocp.motion.tasks.limits import JointBounds, unknown_limits
+from ocp.errors import ProblemError, checked_choice, checked_instance, checked_nonnegative, checked_positive, real
+from ocp.motion.plan import Plan, PlanSample
+from ocp.motion.result.path_plan import PathPlan
+from ocp.motion.result.segmented_plan import Piece, SegmentedPlan
 from ocp.tolerances import LIMIT_SHARE, ORIENTATION_TOLERANCE_RAD
 from ocp.tolerances import path_tolerance as default_tolerance
 
-__all__ = ["BaseKind", "Check", "Fault", "Limit", "Row", "bounds_of", "check_trajectory"]
+__all__ = ["BaseKind", "Check", "Fault", "PlanVerdict", "Row", "check_trajectory", "verdict_of"]
 
 BaseKind: TypeAlias = Literal["fixed", "standing", "floating"]
-Limit: TypeAlias = float | Mapping[str, float] | None
-"""One number for all joints, or numbers by name with "" for all other joints. None: the robot's own limit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,7 +240,7 @@ def check_trajectory(
     limit_table, limit_faults, unlimited_orders = limit_rows(motion, robot, cleaned.joints, bounds, share)
     add((limit_table, limit_faults))
     unchecked += unlimited_orders
-    add(_efforts(cleaned, robot, bounds, share))
+    add(effort_rows(cleaned, robot, bounds, share))
     if not complete:
         unchecked.append("torques, clearance and the tip, because joints are missing")
     else:
@@ -336,65 +338,6 @@ def _missing_meshes(robot: Robot, folders: Sequence[str | Path]) -> list[str]:
     return [f"clearance of {', '.join(dict.fromkeys(names))}, whose meshes are missing"] if names else []
 
 
-def bounds_of(
-    robot: Robot,
-    velocity: Limit = None,
-    acceleration: Limit = None,
-    jerk: Limit = None,
-    torque: Limit = None,
-    notes: list[str] | None = None,
-) -> JointBounds:
-    """Return the limits of the joint vector: the given ones, else the robot's own.
-
-    A limit of 0 in the robot's description means none; it is added to `notes`.
-    """
-    free = np.full(robot.dof, np.inf)
-    limits = {}
-    for quantity, own, override in (
-        ("velocity", robot.velocity, velocity),
-        ("acceleration", free, acceleration),
-        ("jerk", free, jerk),
-        ("torque", robot.effort, torque),
-    ):
-        values = own.copy()
-        if notes is not None and (names := unknown_limits(robot, quantity)):
-            notes.append(f"the robot gives {', '.join(names)} a {quantity} limit of 0: treated as none")
-        by_name = override if isinstance(override, Mapping) else {} if override is None else {"": override}
-        for name, value in checked_mapping(quantity, by_name).items():
-            if not real(value) > 0:
-                words = f"{quantity} of {name or 'all joints'} must be a number above 0, not {value!r}"
-                raise ProblemError(words, name=quantity, value=value, limit=0.0)
-            if name and name not in robot.joint_names:
-                raise unknown_name(f"joint in {quantity}", name, robot.joint_names)
-        for k, name in enumerate(robot.joint_names):
-            values[k] = by_name.get(name, by_name.get("", values[k]))
-        limits[quantity] = values
-    return JointBounds(robot.lower, robot.upper, power=free, **limits)
-
-
-def _efforts(
-    cleaned: CleanedTrajectory, robot: Robot, bounds: JointBounds, share: float
-) -> tuple[list[Row], list[Fault]]:
-    """Check the torques in the file, at its samples."""
-    rows: list[Row] = []
-    faults: list[Fault] = []
-    if cleaned.efforts is None:
-        return rows, faults
-    for column, joint in enumerate(cleaned.joints):
-        name = robot.joint_names[joint]
-        unit, limit = robot.joint(name).effort_unit, float(bounds.torque[joint])
-        k = int(np.abs(cleaned.efforts[:, column]).argmax())
-        value, time = float(cleaned.efforts[k, column]), float(cleaned.motion.t[k])
-        failed = abs(value) > limit * (1 + share)
-        verdict = RowVerdict.FAILED if failed else RowVerdict.OK if np.isfinite(limit) else RowVerdict.UNLIMITED
-        row_limit = limit if np.isfinite(limit) else None
-        rows.append(Row(f"given torque of {name}", value, row_limit, unit, time, verdict, "as given in the file"))
-        if failed:
-            text = f"the file has {value:.5g} {unit} at {time:.6g} s, limit {limit:.5g}"
-            faults.append(Fault("torque", name, text, time, time, value, limit, unit))
-    return rows, faults
-
-
 def _unlimited(rows: Sequence[Row]) -> tuple[str, ...]:
     """Return the quantities without a limit, joints of one kind together."""
     joints: dict[str, list[str]] = {}
@@ -408,3 +351,104 @@ def _unlimited(rows: Sequence[Row]) -> tuple[str, ...]:
         f"{quantity} of {'every joint' if len(names) == counts[quantity] and len(names) > 1 else ', '.join(names)}"
         for quantity, names in joints.items()
     )
+
+
+@dataclass(frozen=True, eq=False)
+class PlanVerdict:
+    """Audit and check of a plan. A plan that breaks a limit of its machine must not be run, even if its task allows it.
+
+    Attributes:
+        audit: Audit of the plan against its problem.
+        check: Check of its samples against the machine's limits of joints, velocities and torques.
+    """
+
+    audit: Audit
+    check: Check
+
+    @property
+    def passed(self) -> bool:
+        """Whether the plan is feasible, a local minimum, and within the limits of its machine."""
+        return self.audit.passed and self.check.passed
+
+    @property
+    def sentence(self) -> str:
+        """The verdict in one sentence."""
+        if not self.audit.feasible or self.check.passed:
+            return self.audit.sentence
+        first, count = self.check.faults[0], len(self.check.faults)
+        more = f"; {count - 1} more" if count > 1 else ""
+        return f"must not be run: it breaks the limits of its machine, {first}{more}"
+
+
+def verdict_of(plan: Plan, sample: PlanSample, name: str, **settings: Any) -> PlanVerdict:
+    """Return the verdict on a plan.
+
+    Args:
+        plan: The plan.
+        sample: Its samples at the times at which the limits of the machine are checked.
+        name: Name of the plan.
+        settings: Settings of the audit.
+    """
+    return PlanVerdict(plan.audit(**settings), _check(plan, sample, name))
+
+
+def _check(plan: Plan, sample: PlanSample, name: str) -> Check:
+    """Return the check of a plan between the times at which its rates jump, where no acceleration is defined."""
+    if isinstance(plan, SegmentedPlan):
+        return _worst([_check_piece(piece, sample.t, name) for piece in plan.pieces])
+    if isinstance(plan, PathPlan):  # constant rates between waypoints
+        joints = tuple(replace(joint, effort=np.inf) for joint in plan.machine.robot.joints)
+        times = np.union1d(sample.t, plan.t)
+        robot = replace(plan.machine.robot, joints=joints)
+        return _check_samples(plan.machine, robot, (times, plan.at(times)["joints"], None, None), name)
+    values = (sample.t, sample.joints, sample.rates, sample.accelerations)
+    return _check_samples(plan.machine, plan.machine.robot, values, name)
+
+
+def _check_piece(piece: Piece, times: Array, name: str) -> Check:
+    """Return the check of one motion of a plan in segments at those of the times that it covers, and at its ends."""
+    plan, local = piece.plan, times - piece.begin
+    inside = local[(local > 0) & (local < plan.horizon)]
+    sample = plan.sampled(np.concatenate([[0.0], inside, [plan.horizon]]))
+    values = (sample.t + piece.begin, sample.joints, sample.rates, sample.accelerations)
+    return _check_samples(plan.machine, plan.machine.robot, values, name)
+
+
+def _check_samples(
+    machine: Machine, robot: Robot, values: tuple[Array, Array, Array | None, Array | None], name: str
+) -> Check:
+    """Return the check of times (M,), joints, rates and accelerations (M, n), the last two or None."""
+    raw = RawTrajectory(tuple(robot.joint_names), *values, None, np.arange(1, len(values[0]) + 1), True, (), name)
+    base: Any = "floating" if isinstance(machine, FreeFloating) else "fixed"
+    options: dict[str, Any] = {} if machine.base_size else _mount(machine)
+    options |= {"time_unit": "s", "names_confirmed": True}  # both are certain for a plan
+    return check_trajectory(robot, raw, base=base, clearance=None, **options)
+
+
+def _worst(checks: Sequence[Check]) -> Check:
+    """Return the checks of several motions as one: all faults, and the worst row of each quantity."""
+    rows: dict[str, Row] = {}
+    for row in (row for check in checks for row in check.rows):
+        if row.name not in rows or _severity(row) > _severity(rows[row.name]):
+            rows[row.name] = row
+    joined: dict[str, Any] = {
+        name: tuple(dict.fromkeys(each for check in checks for each in getattr(check, name)))
+        for name in ("suspicions", "unlimited", "unchecked", "notes", "faults")
+    }
+    samples, duration = (sum(getattr(check, name) for check in checks) for name in ("samples", "duration"))
+    return replace(checks[0], rows=tuple(rows.values()), samples=samples, duration=duration, **joined)
+
+
+def _severity(row: Row) -> tuple[bool, bool, float]:
+    """Return a key by which rows of one quantity are compared."""
+    size = abs(row.limit) if row.limit else 1.0
+    return row.verdict is RowVerdict.FAILED, row.verdict is RowVerdict.UNDECIDED, abs(row.value) / size
+
+
+def _mount(machine: Machine) -> dict[str, Array]:
+    """Return the pose of a fixed base."""
+    frame = machine.world_from_base(())
+    return {
+        "translation": np.array(frame.position, dtype=float).ravel(),
+        "rotation": np.array(frame.rotation, dtype=float),
+    }

@@ -37,7 +37,7 @@ from ocp.app.files.gcode_words import (
     read_blocks,
 )
 from ocp.app.files.program import Cut, Note, Pause, Program, Rapid, Section, checked_reversal
-from ocp.app.files.text_files import FileName, line_error, read_lines
+from ocp.app.files.safe_files import FileName, line_error, read_lines
 from ocp.errors import ProblemError, checked_choice, checked_flag, checked_positive
 
 __all__ = ["read_gcode"]

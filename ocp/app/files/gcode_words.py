@@ -23,7 +23,7 @@ from models.input_files import INPUT_LIMITS
 from models.paths import Arc, Helix
 from models.paths.segments import SHORTEST_SEGMENT
 from models.spatial import FULL_TURN
-from ocp.app.files.text_files import FileName, line_error
+from ocp.app.files.safe_files import FileName, line_error
 from ocp.tolerances import STANDSTILL
 
 __all__ = [

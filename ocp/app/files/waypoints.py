@@ -31,7 +31,7 @@ from models.paths.orientation import product, rotation_vector
 from models.paths.path import Reversal
 from models.paths.segments import SHORTEST_SEGMENT
 from ocp.app.files.program import DEFAULT_TOLERANCE_M, checked_reversal, smoothed
-from ocp.app.files.text_files import FileName, is_number, line_error, read_lines, split_cells
+from ocp.app.files.safe_files import FileName, is_number, line_error, read_lines, split_cells
 from ocp.errors import ProblemError, checked_choice, checked_each, checked_positive
 
 __all__ = ["Waypoints", "read_waypoints"]

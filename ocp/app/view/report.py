@@ -17,9 +17,8 @@ import numpy as np
 from models import Machine
 from models.arrays import Array
 from ocp.app.check.interpolation import Motion
-from ocp.app.check.joint_limits import Row, RowVerdict, audit_rows
-from ocp.app.check.plan_verdict import verdict_of
-from ocp.app.check.verdict import Check, bounds_of
+from ocp.app.check.joint_limits import Row, RowVerdict, audit_rows, bounds_of
+from ocp.app.check.verdict import Check, verdict_of
 from ocp.app.view.appearance import PLAN, SCENE, TIP, Obstacle, appearance_of, frames_along, obstacles_of_plan, part_of
 from ocp.app.view.plots import draw_curves
 from ocp.app.view.rendering import PICTURE_STYLE, Camera, Floor, Layer, parts_in_world, render, tube
