@@ -7,22 +7,37 @@ import json
 import sys
 import webbrowser
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from models import FixedBase, FreeFloating, Robot, cache, lock_joints, rectangle, with_load
+from models import (
+    FixedBase,
+    FreeFloating,
+    Machine,
+    Robot,
+    Standing,
+    cache,
+    footprint,
+    lock_joints,
+    rectangle,
+    with_load,
+)
 from models.arrays import Array
 from models.spatial import rotation_from_rpy
-from ocp.app.check.joint_limits import bounds_of
-from ocp.app.check.verdict import check_trajectory
-from ocp.app.files import read_trajectory, read_waypoints, write_mcap
+from ocp.app.check.data_checks import PLANAR_BASE, clean_trajectory
+from ocp.app.check.joint_limits import limits_by_name
+from ocp.app.check.verdict import CheckTolerances, Interpretation, check_trajectory
+from ocp.app.files import RawTrajectory, read_trajectory, read_waypoints, write_mcap
 from ocp.app.files.safe_files import MARK, SUFFIXES, checked_output, missing_package
 from ocp.app.files.task_file import Task, read_obstacles, read_task
 from ocp.errors import MAX_COUNT, ProblemError, checked_positive
 from ocp.motion.plan import Plan, plan
 from ocp.motion.result.segmented_plan import SegmentedPlan
+from ocp.motion.tasks.limits import Limits
+from ocp.motion.tasks.scene import Scene
 from ocp.progress import Progress
 from ocp.storage import write_text
 
@@ -50,47 +65,60 @@ def run_check(options: argparse.Namespace, progress: Progress) -> tuple[int, str
         checked_output("report", options.report, force=options.force)
     progress("reading the robot")
     robot = read_robot(options)
-    translation, rotation = base_pose(options)
+    by_name = {kind: dict(getattr(options, kind)) for kind in ("velocity", "acceleration", "jerk", "torque")}
+    limits = replace(limits_by_name(robot, {kind: of for kind, of in by_name.items() if of}), friction=options.friction)
+    obstacles = read_obstacles(options.obstacles) if options.obstacles else ()
+    scene = Scene(
+        obstacles,
+        options.clearance,
+        tuple(options.ignore),
+        options.srdf,
+        tuple(options.folder),
+        "skip" if options.no_meshes else "raise",
+    )
     progress("reading the trajectory")
     joint_names = [joint.name for joint in robot.joints if joint.moves]
     columns = None if options.columns is None else [name.strip() for name in options.columns.split(",")]
     raw = read_trajectory(
         options.trajectory, columns=columns, period=options.period, topic=options.topic, joints=joint_names
     )
-    foot = rectangle(options.foot[:2], options.foot[2:]) if options.foot else None
-    limits: dict[str, Any] = {
-        kind: dict(getattr(options, kind)) or None for kind in ("velocity", "acceleration", "jerk", "torque")
-    }
-    obstacles = read_obstacles(options.obstacles) if options.obstacles else ()
-    direct = ("friction", "srdf", "path_tolerance", "path_angle", "share", "rule", "time_unit", "unwrap")
+    machine, notes = machine_of(options, robot, raw)
     check = check_trajectory(
-        robot,
+        machine,
         raw,
-        **limits,
-        **{name: getattr(options, name) for name in (*direct, "names_confirmed")},
-        base="standing" if options.standing else "floating" if options.floating else "fixed",
-        translation=translation,
-        rotation=rotation,
-        foot=foot,
-        obstacles=obstacles,
-        clearance=None if options.no_clearance else options.clearance,
-        ignored=tuple(options.ignore),
-        folders=tuple(options.folder),
-        missing="skip" if options.no_meshes else "raise",
+        limits=limits,
+        scene=False if options.no_clearance else scene,
         path=read_waypoints(options.path) if options.path else None,
+        interpretation=Interpretation(options.rule, options.time_unit, options.unwrap, options.names_confirmed),
+        tolerances=CheckTolerances(options.share, options.path_tolerance, options.path_angle),
         progress=progress,
     )
+    check = replace(check, notes=(*check.notes, *notes))
     if options.report is not None:
         progress("report")
-        from ocp.app.view.appearance import obstacles_of_shapes
         from ocp.app.view.report import report_of_check  # imports matplotlib, which is slow
 
-        machine = FreeFloating(robot) if options.floating else FixedBase(robot, translation, rotation)
-        report = report_of_check(
-            check, machine, bounds_of(robot, **limits), obstacles_of_shapes(obstacles), tuple(options.folder)
-        )
+        report = report_of_check(check, machine, limits, scene)
         write_text(checked_output("report", options.report, force=options.force), report.html())
     return (0 if check.passed else 1), str(check), check.to_dict()
+
+
+def machine_of(options: argparse.Namespace, robot: Robot, raw: RawTrajectory) -> tuple[Machine, list[str]]:
+    """Return the robot on the base of the options, and what was assumed about its feet."""
+    if options.floating:
+        return FreeFloating(robot, "planar" if set(PLANAR_BASE) <= set(raw.names) else "spatial"), []
+    translation, rotation = base_pose(options)
+    if not options.standing:
+        return FixedBase(robot, translation, rotation), []
+    if options.foot:
+        foot = rectangle(options.foot[:2], options.foot[2:])
+        return Standing(robot=robot, translation=translation, rotation=rotation, support=foot), []
+    cleaned = clean_trajectory(raw, robot, Limits().bounds(FixedBase(robot)))
+    start = np.zeros(robot.dof)
+    start[cleaned.joints] = cleaned.motion.q[0]
+    contact = footprint(robot, q=start, rotation=rotation)
+    machine = Standing(robot=robot, translation=contact.translation, rotation=rotation, support=contact.support)
+    return machine, [f"it stands on {', '.join(contact.links)}"]
 
 
 def run_plan(options: argparse.Namespace, progress: Progress) -> tuple[int, str, Any]:

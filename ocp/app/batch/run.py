@@ -43,7 +43,6 @@ def run_batch(
     tasks: Iterable[Any],
     folder: str | os.PathLike[str],
     *,
-    workers: int | None = None,
     cluster: Any = None,
     near: Sequence[str] = (),
     again: str | Collection[str] = (),
@@ -65,11 +64,10 @@ def run_batch(
             the other tasks continue.
         tasks: Data: parameters by name, a seed, the text of a task file. Equal tasks count once.
         folder: New, empty, or that of an earlier call with this function.
-        workers: Number of processes on this machine, in a Dask cluster that is started and ended here; None: one for
-            each core.
-        cluster: Address of a Dask scheduler, ``"tcp://host:8786"``, or a `distributed.Client`. Its workers run the
-            tasks and need this package and the function's module; results are sent to this process. Use workers with
-            one thread: the threads of a process take turns.
+        cluster: Number of processes of a Dask cluster that is started on this machine and ended here; None: one for
+            each core. Or the address of a Dask scheduler, ``"tcp://host:8786"``, or a `distributed.Client`. Its workers
+            run the tasks and need this package and the function's module; results are sent to this process. Use workers
+            with one thread: the threads of a process take turns.
         near: Names of numbers in the tasks. If given, ``function(task, guess)`` is called with the result of a similar
             task for a warm start, or None. The tasks alone determine which one (:func:`neighbours`).
         again: Status of the results to compute again in any case: ``"failed"``, ``"killed"``, or both. Otherwise a
@@ -93,7 +91,10 @@ def run_batch(
     """
     name = name_of(function)
     texts = texts_of(tasks)
-    count = workers_of(workers, cluster)
+    is_count = cluster is None or isinstance(cluster, int)
+    count = worker_count(cluster) if is_count else MAX_WORKERS
+    if not is_count:
+        checked_cluster(cluster)
     names = names_of("near", near)
     statuses = names_of("again", (again,) if isinstance(again, str) else again)
     for status in statuses:
@@ -124,9 +125,10 @@ def run_batch(
         try:
             with store.locked():
                 results |= recorded([key for key in texts if key not in results])  # by the driver that held the lock
-                pending = PendingTasks(store, texts, parents, results, source)
+                pending = _PendingTasks(store, texts, parents, results, source)
                 if len(results) < len(texts):
-                    with Engine(function, bool(names), min(count, len(texts) - len(results)), cluster) as engine:
+                    count = min(count, len(texts) - len(results))
+                    with Engine(function, near=bool(names), cluster=count if is_count else cluster) as engine:
                         pending.run(engine)
         except OSError as error:
             if isinstance(error, ConnectionError):
@@ -141,7 +143,7 @@ def run_batch(
     return batch
 
 
-class PendingTasks:
+class _PendingTasks:
     """Tasks of a batch without a result."""
 
     def __init__(
@@ -255,17 +257,12 @@ def texts_of(tasks: Any) -> dict[str, str]:
     return texts
 
 
-def workers_of(workers: Any, cluster: Any) -> int:
-    """Return the number of workers; raise ProblemError for an invalid cluster."""
-    if workers is None:
-        if cluster is not None:
-            checked_cluster(cluster)
+def worker_count(count: int | None) -> int:
+    """Return the number of processes to start; None: one for each core that this process may use."""
+    if count is None:
         return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    if cluster is not None:
-        words = "a cluster has its own workers; pass only one of the two"
-        raise ProblemError(words, name="workers", value=workers)
-    checked_count("workers", workers, 1, MAX_WORKERS)
-    return int(workers)
+    checked_count("cluster", count, 1, MAX_WORKERS)
+    return count
 
 
 def names_of(argument: str, names: Any) -> tuple[str, ...]:

@@ -10,10 +10,10 @@ momentum is conserved.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -21,27 +21,28 @@ import numpy as np
 from models import FixedBase, FreeFloating, Robot, Standing, inverse_dynamics, momentum, robot_inertia, simplify
 from models.arrays import Array
 from models.machines.standing import center_of_pressure
+from models.robot.dynamics import GRAVITY
 from models.spatial import cross, rotation_from_quaternion
 from ocp.app.check.data_checks import CleanedTrajectory, Fault
 from ocp.app.check.interpolation import Indices, Motion, MotionQuantity, polynomial_maxima
 from ocp.audit.audit import Audit
-from ocp.errors import ProblemError, checked_mapping, real, unknown_name
-from ocp.motion.tasks.limits import JointBounds, unknown_limits
+from ocp.console import check_time
+from ocp.errors import ProblemError, real, unknown_name
+from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.problem.values import Sampler
 from ocp.tolerances import MOMENTUM_SHARE, ROUNDING_SHARE
 
 __all__ = [
     "ORDERS",
-    "Limit",
     "Row",
     "RowVerdict",
     "audit_rows",
-    "bounds_of",
     "effort_rows",
     "floating_base_rows",
     "floating_torques",
     "integrate_base",
     "limit_rows",
+    "limits_by_name",
     "standing_rows",
     "torque_rows",
     "torque_samples",
@@ -91,48 +92,33 @@ class Row:
     note: str = ""
 
 
-Limit: TypeAlias = float | Mapping[str, float] | None
-"""One number for all joints, or numbers by name with "" for all other joints. None: the robot's own limit."""
+def limits_by_name(robot: Robot, limits: Mapping[str, Mapping[str, float]]) -> Limits:
+    """Return limits that are given by joint; those of other joints are the robot's own.
 
+    Args:
+        robot: The robot.
+        limits: For "velocity", "acceleration", "jerk" or "torque" the limits by name of the joint; "" stands for all
+            joints that are not named.
 
-def bounds_of(
-    robot: Robot,
-    velocity: Limit = None,
-    acceleration: Limit = None,
-    jerk: Limit = None,
-    torque: Limit = None,
-    notes: list[str] | None = None,
-) -> JointBounds:
-    """Return the limits of the joint vector: the given ones, else the robot's own.
-
-    A limit of 0 in the robot's description means none; it is added to `notes`.
+    Raises:
+        ProblemError: A joint is unknown, or a limit is not a number above 0.
     """
-    free = np.full(robot.dof, np.inf)
-    limits = {}
-    for quantity, own, override in (
-        ("velocity", robot.velocity, velocity),
-        ("acceleration", free, acceleration),
-        ("jerk", free, jerk),
-        ("torque", robot.effort, torque),
-    ):
-        values = own.copy()
-        if notes is not None and (names := unknown_limits(robot, quantity)):
-            notes.append(f"the robot gives {', '.join(names)} a {quantity} limit of 0: treated as none")
-        by_name = override if isinstance(override, Mapping) else {} if override is None else {"": override}
-        for name, value in checked_mapping(quantity, by_name).items():
+    own = Limits().bounds(FixedBase(robot))
+    values: dict[str, Any] = {}
+    for quantity, by_name in limits.items():
+        for name, value in by_name.items():
             if not real(value) > 0:
                 words = f"{quantity} of {name or 'all joints'} must be a number above 0, not {value!r}"
                 raise ProblemError(words, name=quantity, value=value, limit=0.0)
             if name and name not in robot.joint_names:
                 raise unknown_name(f"joint in {quantity}", name, robot.joint_names)
-        for k, name in enumerate(robot.joint_names):
-            values[k] = by_name.get(name, by_name.get("", values[k]))
-        limits[quantity] = values
-    return JointBounds(robot.lower, robot.upper, power=free, **limits)
+        defaults = zip(robot.joint_names, getattr(own, quantity), strict=True)
+        values[quantity] = np.array([by_name.get(name, by_name.get("", default)) for name, default in defaults])
+    return Limits(**values)
 
 
 def limit_rows(
-    motion: Motion, robot: Robot, joints: Indices, bounds: JointBounds, share: float
+    motion: Motion, robot: Robot, joints: Indices, bounds: JointBounds, *, share: float
 ) -> tuple[list[Row], list[Fault], list[str]]:
     """Return rows and faults of all limits of the joints, and the quantities that could not be checked.
 
@@ -278,12 +264,7 @@ def effort_rows(
 
 
 def torque_rows(
-    motion: Motion,
-    machine: FixedBase | FreeFloating,
-    bounds: JointBounds,
-    gravity: Array,
-    share: float,
-    check: Callable[[], None],
+    motion: Motion, machine: FixedBase | FreeFloating | Standing, bounds: JointBounds, share: float
 ) -> tuple[list[Row], list[Fault]]:
     """Return rows and faults of the torques by inverse dynamics, evaluated five times in every interval.
 
@@ -297,12 +278,13 @@ def torque_rows(
         torque = floating_torques(machine, q, v, a)
     else:
         bodies = simplify(robot, frozenset())
+        gravity = getattr(machine, "gravity_in_world", GRAVITY)
         torque = inverse_dynamics(bodies, q, v, a, (), gravity, machine.world_from_base())
     sampler = Sampler([q, v, a], [torque])
     times, *values = torque_samples(motion)
     if not len(times):
         return [], []
-    check()
+    check_time()
     torques = sampler(*values)[0]
     mean = motion.q.mean(axis=0)
     # torques are linear in accelerations

@@ -83,13 +83,13 @@ def read_lines(
         raise ProblemError(message, name="file", value=len(lines), limit=INPUT_LIMITS.text_lines)
     if longest is not None and max(len(line) for line in lines) > longest:
         i = next(i for i, line in enumerate(lines) if len(line) > longest)
-        raise line_error(path, i + 1, lines[i], f"longer than {longest} characters; break it", longest)
+        raise line_error(path, i + 1, lines[i], f"longer than {longest} characters; break it", limit=longest)
     if not text.strip():
         raise ProblemError(f"{path}: the file is empty", name="file", value=str(path))
     return lines
 
 
-def line_error(file: Any, number: int, text: str, why: str, limit: Any = None) -> ProblemError:
+def line_error(file: Any, number: int, text: str, why: str, *, limit: Any = None) -> ProblemError:
     """Return the error of a line, counted from 1, with its text, what is wrong and what to do."""
     quoted = text.strip()
     quoted = quoted if len(quoted) <= QUOTED_CHARACTERS else quoted[:QUOTED_CHARACTERS] + " ..."

@@ -173,7 +173,7 @@ def _numbers(file: FileName, rows: list[str], numbers: list[int], delimiter: str
                 cells.pop()
             if len(cells) != width:
                 why = f"{len(cells)} columns, the header has {width}; complete the row"
-                raise line_error(file, number, row, why, width)
+                raise line_error(file, number, row, why, limit=width)
     try:
         return np.array(split, dtype=float)
     except ValueError:

@@ -53,22 +53,23 @@ DASHES: tuple[Any, ...] = ((0, (1, 1)), (0, (5, 1.5)), (0, (4, 1.2, 1, 1.2)))
 
 
 def draw_curves(
-    motion: Motion, names: Sequence[str], units: Sequence[str], bounds: JointBounds, faults: Sequence[Any]
+    motion: Motion, bounds: JointBounds, *, names: Sequence[str], units: Sequence[str], faults: Sequence[Any] = ()
 ) -> str:
     """Return an SVG of position, velocity and acceleration of every joint with its limits and faults."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(PICTURE_STYLE.width, 0.4 + 1.15 * len(names)), layout="constrained")
-    draw_joints(figure, {"": motion}, names, units, bounds, faults)
+    draw_joints(figure, {"": motion}, bounds, names=names, units=units, faults=faults)
     return as_svg(figure)
 
 
 def draw_joints(
     figure: Any,
     motions: Mapping[str, Motion],
+    bounds: JointBounds,
+    *,
     names: Sequence[str],
     units: Sequence[str],
-    bounds: JointBounds,
     faults: Sequence[Any] = (),
 ) -> None:
     """Draw position, velocity and acceleration of every joint over time into an empty figure, with limits and faults.
@@ -187,7 +188,7 @@ def plot_plan(plan: Plan, against: Any = None, figure: Any = None) -> Any:
     target = _figure(figure, (PICTURE_STYLE.width, 0.9 + 1.15 * len(names)))
     robot = plan.machine.robot
     units = [joint.unit for joint in robot.moving_joints]
-    draw_joints(target, motions, names, units, Limits().bounds(plan.machine))
+    draw_joints(target, motions, Limits().bounds(plan.machine), names=names, units=units)
     costs = "".join(f", that of {name} {cost:.4g}" for name, (_, cost) in others.items() if cost is not None)
     target.suptitle(f"{robot.name}: cost {plan.cost:.4g} in {plan.horizon:.4g} s{costs}", fontsize=9.5)
     return target

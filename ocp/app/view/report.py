@@ -17,13 +17,24 @@ import numpy as np
 from models import Machine
 from models.arrays import Array
 from ocp.app.check.interpolation import Motion
-from ocp.app.check.joint_limits import Row, RowVerdict, audit_rows, bounds_of
+from ocp.app.check.joint_limits import Row, RowVerdict, audit_rows
 from ocp.app.check.verdict import Check, verdict_of
-from ocp.app.view.appearance import PLAN, SCENE, TIP, Obstacle, appearance_of, frames_along, obstacles_of_plan, part_of
+from ocp.app.view.appearance import (
+    PLAN,
+    SCENE,
+    TIP,
+    Obstacle,
+    appearance_of,
+    frames_along,
+    obstacles_of_plan,
+    obstacles_of_shapes,
+    part_of,
+)
 from ocp.app.view.plots import draw_curves
 from ocp.app.view.rendering import PICTURE_STYLE, Camera, Floor, Layer, parts_in_world, render, tube
 from ocp.motion.plan import Plan
-from ocp.motion.tasks.limits import JointBounds
+from ocp.motion.tasks.limits import JointBounds, Limits
+from ocp.motion.tasks.scene import Scene
 
 __all__ = ["Report", "draw_scene", "report_of_check", "report_of_plan"]
 
@@ -128,19 +139,18 @@ def _table(rows: Sequence[Row]) -> str:
     return f"<div class=scroll><table>{head}<th></th><th></th></tr>{''.join(lines)}</table></div>"
 
 
-def report_of_check(
-    check: Check, machine: Machine, bounds: JointBounds, obstacles: Sequence[Obstacle] = (), folders: Sequence[Any] = ()
-) -> Report:
-    """Return the report of a check, with the limits of the check."""
+def report_of_check(check: Check, machine: Machine, limits: Limits, scene: Scene) -> Report:
+    """Return the report of a check with these limits and this scene."""
     motion, robot = check.cleaned.motion, machine.robot
     complete = len(check.joints) == robot.dof
     base_path = check.cleaned.base if machine.base_size else None
     if machine.base_size and base_path is None:
         base_path = np.repeat(machine.base_home()[None], len(motion.t), axis=0)
     columns = check.cleaned.joints
-    own_bounds = JointBounds(*(item[columns] for item in bounds))
+    bounds = JointBounds(*(item[columns] for item in limits.bounds(machine)))
     units = [robot.joint(name).unit for name in check.joints]
-    picture = draw_scene(machine, motion, base_path, obstacles, folders) if complete else b""
+    obstacles = obstacles_of_shapes(scene.obstacles)
+    picture = draw_scene(machine, motion, base_path, obstacles, folders=scene.folders) if complete else b""
     limited = [row for row in check.rows if row.verdict is not RowVerdict.UNLIMITED]
     return Report(
         f"{check.file} for {robot.name}",
@@ -149,7 +159,7 @@ def report_of_check(
         (f"{check.samples} samples", f"{check.duration:.5g} s", f"{len(check.joints)} joints", f"{check.rule} between"),
         tuple(str(fault) for fault in check.faults),
         picture,
-        draw_curves(motion, check.joints, units, own_bounds, check.faults),
+        draw_curves(motion, bounds, names=check.joints, units=units, faults=check.faults),
         (("Checked quantities", tuple(limited)),),
         (
             *(f"unlimited: {item}" for item in check.unlimited),
@@ -166,7 +176,7 @@ def report_of_plan(plan: Plan, period: float, title: str) -> Report:
     motion = Motion(sample.t, sample.joints, sample.rates, sample.accelerations)
     verdict = verdict_of(plan, sample, title)
     audit, check = verdict.audit, verdict.check
-    bounds = bounds_of(robot)
+    bounds = Limits().bounds(machine)
     base_path = plan.at(sample.t)["base"] if machine.base_size else None
     units = [joint.unit for joint in robot.moving_joints]
     cost = f"cost {plan.cost:.5g}" + ("" if plan.bound is None else f", none below {plan.bound:.5g}")
@@ -178,14 +188,14 @@ def report_of_plan(plan: Plan, period: float, title: str) -> Report:
         (robot.name, f"{plan.horizon:.5g} s", f"{robot.dof} joints", cost, f"{len(plan.candidates)} candidates"),
         tuple(str(fault) for fault in check.faults),
         draw_scene(machine, motion, base_path, obstacles_of_plan(plan, sample.t)),
-        draw_curves(motion, plan.names, units, bounds, check.faults),
+        draw_curves(motion, bounds, names=plan.names, units=units, faults=check.faults),
         (("The audit", tuple(audit_rows(audit))), (f"Samples every {period:g} s against the limits", tuple(limited))),
         tuple(f"unlimited: {one}" for one in check.unlimited),
     )
 
 
 def draw_scene(
-    machine: Machine, motion: Motion, bases: Array | None, obstacles: Sequence[Obstacle], folders: Sequence[Any] = ()
+    machine: Machine, motion: Motion, bases: Array | None, obstacles: Sequence[Obstacle], *, folders: Sequence[Any] = ()
 ) -> bytes:
     """Return a PNG of the robot at several times (the last one solid), its tip path, and obstacles.
 

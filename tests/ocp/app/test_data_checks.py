@@ -21,7 +21,7 @@ from ocp.app.files import read_trajectory
 from ocp.errors import ProblemError
 from ocp.motion.local.collisions import distances_along
 from ocp.motion.result.solved_plan import SolvedPlan
-from tests.ocp.app.motions import MIDDLE, NAMES, SWING, URDF, joint, link, smooth, write_table
+from tests.ocp.app.motions import MIDDLE, NAMES, SWING, URDF, check_motion, joint, link, smooth, write_table
 
 GALLERY = Path(__file__).resolve().parents[3] / "results" / "gallery"
 SPINNING = (
@@ -47,7 +47,7 @@ SPINNING = (
 def checked(folder: Path, urdf: str, names: tuple[str, ...], t: Any, *values: Any, **options: Any) -> Check:
     robot = Robot.from_urdf(urdf, tip="finger" if urdf == URDF else None)
     file = write_table(folder / "m.csv", t, *values, names=names)
-    return check_trajectory(robot, read_trajectory(file, joints=robot.joint_names), **options)
+    return check_motion(robot, read_trajectory(file, joints=robot.joint_names), **options)
 
 
 # ---- enclosures ----------------------------------------------------------------------------------------------------
@@ -266,26 +266,21 @@ def test_the_zero_moment_point_is_that_of_the_standing_machine(tmp_path: Path) -
 
 
 @pytest.mark.parametrize(
-    ("name", "clearance"),
-    [("ur5", 0.0), ("panda", None), ("space_arm", None), ("mobile_manipulator", None), ("pushing", None)],
+    ("name", "self_collision"),
+    [("ur5", True), ("panda", False), ("space_arm", False), ("mobile_manipulator", False), ("pushing", False)],
 )
 @pytest.mark.filterwarnings("ignore::models.errors.ModelWarning")
-def test_the_plans_of_the_gallery_are_not_accused(tmp_path: Path, name: str, clearance: float | None) -> None:
+def test_the_plans_of_the_gallery_are_not_accused(tmp_path: Path, name: str, self_collision: bool) -> None:
     made = Plan.load(GALLERY / f"{name}.npz")
     assert isinstance(made, SolvedPlan)
     machine, robot = made.machine, made.machine.robot
     sample = made.sampled(np.linspace(0.0, made.horizon, round(made.horizon / 0.01) + 1))
     more = [sample.accelerations] if made.rate_name == "velocities" else []
-    place = {} if machine.base_size else {"translation": machine.translation, "rotation": machine.rotation}  # type: ignore[attr-defined]
+    base = machine if machine.base_size else FixedBase(robot, machine.translation, machine.rotation)  # type: ignore[attr-defined]
     for values in ([sample.joints], [sample.joints, sample.rates], [sample.joints, sample.rates, *more]):
         file = write_table(tmp_path / "m.csv", sample.t, *values, names=made.names)
-        found = check_trajectory(
-            robot,
-            read_trajectory(file, joints=robot.joint_names),
-            base="floating" if machine.base_size else "fixed",
-            clearance=clearance,
-            **place,
-        )
+        raw = read_trajectory(file, joints=robot.joint_names)
+        found = check_trajectory(base, raw, scene=None if self_collision else False)
         assert found.passed, found
 
 
@@ -298,11 +293,12 @@ def test_the_plans_of_the_gallery_are_not_accused(tmp_path: Path, name: str, cle
         ({"velocity": {"nobody": 1.0}}, "nobody"),
         ({"acceleration": -1.0}, "acceleration"),
         ({"jerk": "much"}, "jerk"),
-        ({"torque": [1.0]}, "torque"),
-        ({"base": "flying"}, "base"),
+        ({"torque": [1.0, 2.0]}, "torque"),
+        ({"rule": "septic"}, "rule"),
+        ({"time_unit": "min"}, "time_unit"),
         ({"share": -1.0}, "share"),
-        ({"path_tolerance": 0.0}, "path_tolerance"),
-        ({"path_angle": np.nan}, "path_angle"),
+        ({"tip_distance": 0.0}, "tip_distance"),
+        ({"tip_angle": np.nan}, "tip_angle"),
         ({"friction": 0.0}, "friction"),
     ],
 )
