@@ -10,7 +10,7 @@ import pytest
 
 from models import Box, CollisionScene, CollisionShape, FixedBase, Joint, Link, Robot
 from models.arrays import Array
-from models.robot.example import example_robot
+from models.examples import example_robot
 from ocp import Limits, Plan, ProblemError, SolveError
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.local.collisions import distances_along

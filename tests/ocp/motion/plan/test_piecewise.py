@@ -12,7 +12,7 @@ import pytest
 
 from models import CollisionShape, FixedBase, Path, Sphere, smooth
 from models.arrays import Array
-from models.machines.moving_obstacle import MovingObstacle
+from models.shapes.shapes import MovingObstacle
 from ocp import DeadEnd, ProblemError, Scene, TipTask, plan
 from ocp.motion.plan import piecewise
 from ocp.motion.plan.piecewise import _task_between

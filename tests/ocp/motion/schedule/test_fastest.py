@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from scipy.optimize import linprog
 
 from models import Path, Scara, SmoothPath, scara_along, smooth
-from models.machines.scara_path import ScaraPath
+from models.machines.scara import ScaraPath
 from ocp import ProblemError
 from ocp.motion.builders.joint_spline import PlannedJoints
 from ocp.motion.builders.timing import solve_minimum_time
