@@ -13,19 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from models import (
-    FixedBase,
-    FreeFloating,
-    Machine,
-    Robot,
-    Standing,
-    cache,
-    footprint,
-    lock_joints,
-    rectangle,
-    with_load,
-)
+from models import FixedBase, FreeFloating, Machine, Robot, Standing, footprint, lock_joints, rectangle, with_load
 from models.arrays import Array
+from models.files import cache_files, cache_folder
 from models.spatial import rotation_from_rpy
 from ocp.app.check.data_checks import PLANAR_BASE, clean_trajectory
 from ocp.app.check.joint_limits import limits_by_name
@@ -212,21 +202,21 @@ def motions_of(options: argparse.Namespace) -> list[Any]:
 
 def run_cache(options: argparse.Namespace, progress: Progress) -> tuple[int, str, Any]:
     """Run `selfmotion cache`."""
-    files = cache.files()
+    files = cache_files()
     size = sum(file.stat().st_size for file in files)
     if options.action == "clear":
         for file in files:
             file.unlink(missing_ok=True)
     state = "cleared" if options.action == "clear" else "in use"
     data = {
-        "folder": str(cache.cache_folder()),
+        "folder": str(cache_folder()),
         "files": len(files),
         "libraries": sum(file.suffix == ".so" for file in files),
         "bytes": size,
         "cleared": options.action == "clear",
     }
     summary = f"{len(files)} files, {data['libraries']} of them compiled functions, {size / 1e6:.3g} MB {state}"
-    return 0, f"{cache.cache_folder()}: {summary}", data
+    return 0, f"{cache_folder()}: {summary}", data
 
 
 def run_completion(options: argparse.Namespace, progress: Progress) -> tuple[int, str, Any]:

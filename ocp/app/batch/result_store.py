@@ -29,7 +29,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from models.input_files import INPUT_LIMITS
+from models.files import INPUT_LIMITS
 from ocp.console import LOG
 from ocp.errors import ProblemError
 from ocp.motion.plan import Plan

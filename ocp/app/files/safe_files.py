@@ -20,7 +20,7 @@ from os import PathLike, fspath
 from pathlib import Path
 from typing import Any
 
-from models.input_files import INPUT_LIMITS, UnfitFile, open_regular, read_regular
+from models.files import INPUT_LIMITS, UnfitFile, open_regular, read_regular
 from ocp.errors import ProblemError
 from ocp.storage import read_arrays, table_joints
 
