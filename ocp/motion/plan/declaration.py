@@ -11,18 +11,15 @@ from ocp.errors import ProblemError, checked_instance
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem
 from ocp.motion.builders.dynamics_plan import dynamics_phases
-from ocp.motion.builders.joint_motion import joint_motion_problem
-from ocp.motion.builders.minimum_velocity import minimum_velocity_problem
+from ocp.motion.builders.joint_motion import joint_motion_problem, minimum_velocity_problem
 from ocp.motion.builders.space.capture import Capture, capture_problem
 from ocp.motion.builders.standing.problem import StandingSetup, Weights, standing_problem
 from ocp.motion.builders.standing.stances import Steps
 from ocp.motion.builders.standing.steps import StepWeights, steps_problem
 from ocp.motion.plan.actuators import limits_actuators
 from ocp.motion.plan.planner import clearance_for
-from ocp.motion.tasks.cost import Cost
-from ocp.motion.tasks.goals import Goal, Start, Waypoints
+from ocp.motion.tasks.goals import Cost, Goal, Scene, Start, Waypoints
 from ocp.motion.tasks.limits import Limits
-from ocp.motion.tasks.scene import Scene
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.problem import Problem
 

@@ -38,10 +38,8 @@ from ocp.motion.result.phased_plan import PHASED, PhasedPlan
 from ocp.motion.result.plan import Plan
 from ocp.motion.result.segmented_plan import SegmentedPlan
 from ocp.motion.result.solved_plan import SolvedPlan
-from ocp.motion.tasks.cost import Cost
-from ocp.motion.tasks.goals import Goal, Start, Waypoints
+from ocp.motion.tasks.goals import Cost, Goal, Scene, Start, Waypoints
 from ocp.motion.tasks.limits import Limits
-from ocp.motion.tasks.scene import Scene
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.progress import report, shown_progress
 from ocp.storage import read_arrays
