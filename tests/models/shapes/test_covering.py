@@ -293,14 +293,14 @@ def test_a_version_changes_with_a_module_and_all_that_it_imports(
     }
     for name, text in texts.items():
         (package / f"{name}.py").write_text(text, encoding="utf-8")
-    found = [cache.source_version("whole.a")]
+    found = [files.source_version("whole.a")]
     for name in "abcd":
         (package / f"{name}.py").write_text(texts[name] + "\n", encoding="utf-8")
-        cache.source_version.cache_clear()
-        found.append(cache.source_version("whole.a"))
+        files.source_version.cache_clear()
+        found.append(files.source_version("whole.a"))
     assert len(set(found)) == 4
     assert found[3] == found[4]
-    kinds = [cache.source_version(f"models.shapes.{name}") for name in ("hull", "covering", "pairs")]
+    kinds = [files.source_version(f"models.shapes.{name}") for name in ("hull", "covering", "pairs")]
     assert len(set(kinds)) == 3
 
 
