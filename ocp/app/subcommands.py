@@ -26,8 +26,8 @@ from ocp.app.files.task_file import Task, read_obstacles, read_task
 from ocp.errors import MAX_COUNT, ProblemError, checked_positive
 from ocp.motion.plan import Plan, plan
 from ocp.motion.result.segmented_plan import SegmentedPlan
+from ocp.motion.tasks.goals import Scene
 from ocp.motion.tasks.limits import Limits
-from ocp.motion.tasks.scene import Scene
 from ocp.progress import Progress
 from ocp.storage import write_text
 

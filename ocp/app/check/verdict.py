@@ -33,8 +33,8 @@ from ocp.errors import ProblemError, checked_choice, checked_instance, checked_n
 from ocp.motion.plan import Plan, PlanSample
 from ocp.motion.result.path_plan import PathPlan
 from ocp.motion.result.segmented_plan import Piece, SegmentedPlan
+from ocp.motion.tasks.goals import Scene
 from ocp.motion.tasks.limits import Limits, unknown_limits
-from ocp.motion.tasks.scene import Scene
 from ocp.tolerances import LIMIT_SHARE, ORIENTATION_TOLERANCE_RAD
 from ocp.tolerances import path_tolerance as default_tolerance
 

@@ -33,8 +33,8 @@ from ocp.app.view.appearance import (
 from ocp.app.view.plots import draw_curves
 from ocp.app.view.rendering import PICTURE_STYLE, Camera, Floor, Layer, parts_in_world, render, tube
 from ocp.motion.plan import Plan
+from ocp.motion.tasks.goals import Scene
 from ocp.motion.tasks.limits import JointBounds, Limits
-from ocp.motion.tasks.scene import Scene
 
 __all__ = ["Report", "draw_scene", "report_of_check", "report_of_plan"]
 
