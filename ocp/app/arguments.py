@@ -20,8 +20,8 @@ from ocp.app.files.outputs import SUFFIXES, checked_output
 from ocp.app.files.task_file import read_obstacles, read_task
 from ocp.app.files.text_files import missing_package
 from ocp.app.run_task import EXPORT_KINDS, check_period, export_plan, run_task
+from ocp.console import Progress
 from ocp.motion.plan import Plan
-from ocp.progress import Progress
 from ocp.storage import write_text
 from ocp.tolerances import LIMIT_SHARE, ORIENTATION_TOLERANCE_RAD
 

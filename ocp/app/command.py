@@ -19,8 +19,8 @@ from typing import Any
 
 from models import ModelError, ModelWarning
 from ocp.app.arguments import CommandFunction, subcommands
+from ocp.console import Progress
 from ocp.errors import AuditError, ProblemError, SolveError, checked_each
-from ocp.progress import Progress
 
 __all__ = ["main", "parser"]
 

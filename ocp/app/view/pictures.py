@@ -32,8 +32,8 @@ from ocp.audit.clearance import separation_frames
 from ocp.motion.plan import Plan
 from ocp.motion.result.path_plan import PathPlan
 from ocp.motion.tasks.limits import JointBounds
+from ocp.problem.hulls import Separation
 from ocp.problem.problem import Problem
-from ocp.problem.separation import Separation
 from ocp.solution import Solution
 
 __all__ = [

@@ -14,12 +14,12 @@ import numpy as np
 from models import FixedBase
 from models.arrays import Array
 from ocp.curves import PiecewisePolynomial
+from ocp.errors import SolverStatus
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.tasks.checks import checked_configuration, checked_horizon, checked_weights, clip_to_limits
 from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.problem.problem import Problem, remembers_request
 from ocp.solution import Solution
-from ocp.status import SolverStatus
 
 __all__ = ["joint_motion_problem", "least_durations", "motion_along"]
 

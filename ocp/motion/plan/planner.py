@@ -19,6 +19,7 @@ import numpy as np
 
 from models import CollisionScene, Machine, ModelError
 from models.arrays import Array
+from ocp.console import report
 from ocp.errors import (
     ProblemError,
     SolveError,
@@ -59,7 +60,6 @@ from ocp.motion.tasks.goals import Start
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.scene import Scene
 from ocp.motion.tasks.tip_task import TipTask
-from ocp.progress import report
 
 __all__ = ["candidates_from", "checked_request", "clearance_for", "plan_from_configurations", "plan_request"]
 
