@@ -29,8 +29,7 @@ from ocp.motion.builders.standing.stances import StancePhase, Steps, standing_co
 from ocp.motion.builders.standing.steps import StepWeights, steps_problem
 from ocp.motion.builders.timing import minimum_time_problem
 from ocp.motion.local.accelerations import Layer, Stabiliser, resolve_accelerations
-from ocp.motion.local.branches import ik_configurations
-from ocp.motion.local.ik_solver import IkConfigurations, IkSolver, Incompleteness, ToolFreedom
+from ocp.motion.local.ik_solver import IkConfigurations, IkSolver, Incompleteness, ToolFreedom, ik_configurations
 from ocp.motion.local.inverse_kinematics import Unreachable, inverse_kinematics
 from ocp.motion.local.rates import resolve
 from ocp.motion.plan import Candidate, DeadEnd, Plan, Reconfiguration, plan, plan_problem

@@ -1,7 +1,7 @@
 """C code of a problem: compiled derivatives of its blocks, and its export for controllers.
 
 Derivatives are compiled into shared libraries, each identified by its source data, the compiler and its flags, so that
-meshes, processes and runs share it (:mod:`models.cache`). Compiled functions return exactly the numbers of interpreted
+meshes, processes and runs share it (:mod:`models.files`). Compiled functions return exactly the numbers of interpreted
 ones: the same operations in the same order, without fused operations. The compiler is that of the environment's CC,
 else `cc`; without one, functions are interpreted.
 
@@ -42,7 +42,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from models import cache
+from models import files as cache
 from ocp.console import LOG, casadi_silenced, check_time
 from ocp.direct import assembly
 from ocp.direct.assembly import SIZES, Derivatives, Transcription, assemble, derivatives, gather

@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 
 from models.arrays import Array
 from ocp.motion.local.chain import TURN, Chain, Motion, Solutions
-from ocp.motion.local.closed_forms import SCARA, SIX, closed_forms
+from ocp.motion.local.closed_forms import SCARA, SIX, PoseSolver, closed_forms
 from ocp.motion.local.elimination import elimination_of
-from ocp.motion.local.pose_solver import PoseSolver
 
 __all__ = ["ArmSolver", "arm_solver", "sample_shares"]
 

@@ -1,4 +1,6 @@
-"""All IK solutions of an arm at a pose, in closed form if its geometry has one.
+"""Solvers of the inverse kinematics of six joints, and the closed forms of arms whose geometry has one.
+
+A `PoseSolver` solves for six joints of a chain; further joints are redundant, and their positions are given.
 
 Six revolute joints have a closed form if the axes of three consecutive joints meet in a point or are parallel (Pieper
 1968): arms with spherical wrists or shoulders and arms with three parallel axes. The joint motions multiply to the
@@ -7,24 +9,141 @@ joints can be taken as the last ones, a, b, c, and the others as x, y, z. The in
 direction and the distance along it, gives two equations that are linear in the cosines and sines of the angles of x and
 z: a polynomial of degree four with at most four pairs. The angle of y follows, and a, b, c have two solutions each: at
 most eight in all (subproblems like those of Elias and Wen 2022, IK-Geo). For four joints along one direction, three
-revolute and one prismatic (SCARA), the last step alone remains. Further joints are redundant: their positions are
-given.
+revolute and one prismatic (SCARA), the last step alone remains.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations, pairwise
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from models.arrays import Array
 from ocp.motion.local.chain import Axis, Chain, Motion, Solutions, axial, cross, dot, pick
-from ocp.motion.local.pose_solver import Mask, PoseSolver
 
-__all__ = ["ClosedForm", "closed_forms", "is_scara"]
+__all__ = ["ClosedForm", "Mask", "PoseSolver", "closed_forms", "is_scara"]
+
+Mask: TypeAlias = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class NearbySettings:
+    """Settings of the poses near doubtful ones.
+
+    Attributes:
+        pairs: Number of pairs of poses.
+        distance: Their typical distance, rad and share of the size of the arm.
+        seed: Seed of their directions.
+    """
+
+    pairs: int = 2
+    distance: float = 1e-3
+    seed: int = 0
+
+
+NEARBY = NearbySettings()
+
+
+@dataclass(frozen=True, eq=False)
+class PoseSolver(ABC):
+    """Inverse kinematics of a chain in which all joints but a few are redundant.
+
+    Attributes:
+        chain: The chain.
+        redundant: Numbers of the joints whose positions are given.
+    """
+
+    chain: Chain
+    redundant: tuple[int, ...]
+
+    @cached_property
+    def free(self) -> list[int]:
+        """Numbers of the other joints, in the order of the chain."""
+        return [j for j in self.chain.order if j not in self.redundant]
+
+    @abstractmethod
+    def solve_regular(self, tips: Motion, redundant: Array) -> tuple[Solutions, Mask, Mask]:
+        """Return solutions at M poses, all at regular ones.
+
+        Args:
+            tips: Poses of the tip in the world.
+            redundant: Positions of the redundant joints. Shape (M, len(self.redundant)).
+
+        Returns:
+            The solutions; for which poses it is to be confirmed that they are all; and for which some may be missing.
+            Shapes (M,), bool.
+        """
+
+    def solve(self, positions: Array, rotations: Array, redundant: Array) -> tuple[Solutions, Mask]:
+        """Return all isolated solutions at M poses, and for which poses solutions may be missing. Shape (M,).
+
+        Where they may be, and at singularities, solutions at poses nearby are candidates too: isolated solutions depend
+        continuously on the pose, and of a family some members are found.
+
+        Args:
+            positions, rotations: Poses of the tip in the world. Shapes (M, 3), (M, 3, 3).
+            redundant: Positions of the redundant joints. Shape (M, len(self.redundant)).
+        """
+        tips, count = Motion(rotations, positions), len(positions)
+        solutions, unconfirmed, doubtful = self.solve_regular(tips, redundant)
+        again = unconfirmed | doubtful
+        again[solutions.pose[solutions.singular]] = True
+        if again.any():
+            chosen, before = np.flatnonzero(again), np.bincount(solutions.pose, minlength=count)
+            for nearby in self._nearby(tips.take(chosen)):
+                more, _, _ = self.solve_regular(nearby, redundant[chosen])
+                refined = self.chain.refine(chosen[more.pose], more.joints, self.free, tips)
+                solutions = self.chain.union(solutions, refined, self.free, tips)
+            doubtful = doubtful | (unconfirmed & (np.bincount(solutions.pose, minlength=count) > before))
+        return solutions, doubtful
+
+    def _nearby(self, tips: Motion) -> Iterator[Motion]:
+        """Iterate over poses near others, on opposite sides of them."""
+        rng = np.random.default_rng(NEARBY.seed)
+        for _ in range(NEARBY.pairs):
+            turn, shift = NEARBY.distance * rng.normal(size=(2, 3))
+            for sign in (1.0, -1.0):
+                rotation = Rotation.from_rotvec(sign * turn).as_matrix()
+                yield Motion(tips.turn @ rotation, tips.shift + sign * self.chain.size * shift)
+
+    def solutions(self, positions: Array, rotations: Array, redundant: Array) -> tuple[NDArray[np.intp], Array]:
+        """Return the poses (K,) and the joints (K, n) of all isolated solutions; see `solve`."""
+        solutions, _ = self.solve(positions, rotations, redundant)
+        return solutions.pose, solutions.joints
+
+    def prescribe(self, redundant: Array) -> Array:
+        """Return joints with the redundant ones (M, k) at these positions and the others at 0. Shape (M, n)."""
+        joints = np.zeros((len(redundant), len(self.chain.axes)))
+        joints[:, list(self.redundant)] = redundant
+        return joints
+
+    def refine(self, pose: NDArray[np.intp], free: Array, prescribed: Array, goal: Motion) -> Solutions:
+        """Return the solutions that Newton's method finds from candidates for the free joints (K, m) at poses (K,)."""
+        joints = prescribed[pose]
+        joints[:, self.free] = free
+        return self.chain.refine(pose, joints, self.free, goal)
+
+    def loop(self, prescribed: Array, goal: Motion) -> tuple[list[Axis], Motion]:
+        """Return the axes of the free joints, and the motion that they must make with the others as prescribed."""
+        chain = self.chain
+        if not self.redundant:
+            return list(chain.constant_axes), goal.after(chain.home_motion.inverse)
+        fixed, axes = Motion(np.eye(3)[None], np.zeros((1, 3))), list[Axis]()
+        for j, constant in zip(chain.order, chain.constant_axes, strict=True):
+            axis = constant.moved(fixed)
+            if j in self.redundant:
+                fixed = axis.by(prescribed[:, j]).after(fixed)
+            else:
+                axes.append(axis)
+        return axes, goal.after(fixed.after(chain.home_motion).inverse)
+
 
 TINY = 1e-300
 """Added to lengths that divide, so that zeros give no exception."""

@@ -28,8 +28,7 @@ from numpy.typing import NDArray
 
 from models.arrays import Array
 from ocp.motion.local.chain import TURN, Axis, Chain, Motion, Solutions, axial, cross, dot
-from ocp.motion.local.closed_forms import SIX
-from ocp.motion.local.pose_solver import Mask, PoseSolver
+from ocp.motion.local.closed_forms import SIX, Mask, PoseSolver
 
 __all__ = ["Elimination", "elimination_of", "solve_opening"]
 

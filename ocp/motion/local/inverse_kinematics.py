@@ -18,8 +18,8 @@ from models import CollisionScene, Machine
 from models.arrays import Array
 from ocp.console import interruptible
 from ocp.errors import NOT_NUMBERS, ProblemError, checked_count, checked_flag, checked_positive, floats, real
-from ocp.motion.local.branches import ik_branches
 from ocp.motion.local.collisions import Collision, checked_collision_scene, find_collisions, slide_apart
+from ocp.motion.local.ik_solver import ik_branches
 from ocp.motion.tasks.checks import checked_configuration
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.geometry import pose_in_reference

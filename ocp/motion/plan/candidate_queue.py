@@ -21,7 +21,7 @@ from ocp.console import report
 from ocp.errors import SolveError
 from ocp.motion.result.candidate import Candidate, Reason, Rejection, Stage
 from ocp.motion.result.solved_plan import SolvedPlan
-from ocp.motion.search.settings import PlannerSettings
+from ocp.motion.search.configurations import PlannerSettings
 from ocp.solution import Solution
 
 __all__ = ["CandidateQueue", "Solver"]

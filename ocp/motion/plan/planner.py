@@ -44,13 +44,19 @@ from ocp.motion.search.configurations import (
     REACH_TOLERANCE,
     PlanRequest,
     SearchKind,
-    fix_ignorable_joints,
     largest_pose_errors,
     local_motions_from,
     start_collisions,
 )
 from ocp.motion.search.dead_end import DeadEnd
-from ocp.motion.search.held_joints import hold_idle_joints, moved_aside, place_held_joints, released, restore_error
+from ocp.motion.search.held_joints import (
+    fix_ignorable_joints,
+    hold_idle_joints,
+    moved_aside,
+    place_held_joints,
+    released,
+    restore_error,
+)
 from ocp.motion.search.search import checked_bound
 from ocp.motion.search.task_search import TaskSearch
 from ocp.motion.tasks.checks import checked_tasks, clip_to_limits, horizon_of

@@ -15,7 +15,7 @@ import numpy as np
 
 from models import ModelError, SmoothPath
 from models.arrays import Array, ArrayInput, checked_array
-from models.robot.indices import checked_rows
+from models.robot.kinematics import checked_rows
 from models.spatial import expression
 from ocp.errors import ProblemError, checked_choice, checked_nonnegative, checked_positive, checked_text
 from ocp.motion.tasks.tracks import Track, path_tracks, reparametrized

@@ -11,7 +11,8 @@ import pytest
 import trimesh
 from scipy import spatial
 
-from models import ModelError, cache
+from models import ModelError
+from models import files as cache
 from models.arrays import Array
 from models.shapes import covering
 from models.shapes.bodies import capsule_around
