@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from models.arrays import NOT_NUMBERS, check_entries, floats
-from models.input_files import INPUT_LIMITS
+from models.files import INPUT_LIMITS
 
 __all__ = [
     "MAX_COUNT",

@@ -1,7 +1,7 @@
 """C code of functions, compiled once by the machine's compiler into shared libraries that are cached between runs.
 
 A library is identified by its source data, the compiler and its flags, so meshes, processes and runs share it (see
-`models.cache`). Compiled functions return exactly the numbers of interpreted ones: the same operations in the same
+`models.files`). Compiled functions return exactly the numbers of interpreted ones: the same operations in the same
 order, without fused operations. The compiler is that of the environment's CC, else `cc`; without one, functions are
 interpreted.
 """
@@ -25,7 +25,7 @@ from typing import Any
 
 import casadi as ca
 
-from models import cache
+from models import files as cache
 from ocp.console import LOG, casadi_silenced, check_time
 
 __all__ = ["CompilerError", "Library", "build_library", "generate_c", "generate_code"]

@@ -11,7 +11,8 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from models import FixedBase, FreeFloating, Robot, cache, lock_joints, rectangle, with_load
+from models import FixedBase, FreeFloating, Robot, lock_joints, rectangle, with_load
+from models import files as cache
 from models.arrays import Array
 from models.spatial import rotation_from_rpy
 from ocp.app.check.verdict import bounds_of, check_trajectory
@@ -397,7 +398,7 @@ def motions_of(options: argparse.Namespace) -> list[Any]:
 
 def run_cache(options: argparse.Namespace, progress: Progress) -> tuple[int, str, Any]:
     """Run `selfmotion cache`."""
-    files = cache.files()
+    files = cache.cache_files()
     size = sum(file.stat().st_size for file in files)
     if options.action == "clear":
         for file in files:

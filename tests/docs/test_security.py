@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from models.input_files import INPUT_LIMITS
+from models.files import INPUT_LIMITS
 from ocp import storage
 from ocp.motion.schedule import trajectory
 from ocp.problem import function_reader

@@ -62,7 +62,7 @@ import os, signal, subprocess, sys, threading, time
 import casadi as ca
 import numpy as np
 import ocp
-from models import papers
+from models import examples as papers
 from models.paths import segments
 from ocp import *
 from tests.ocp.problems import van_der_pol

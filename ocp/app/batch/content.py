@@ -24,7 +24,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from models.arrays import Array
-from models.input_files import INPUT_LIMITS
+from models.files import INPUT_LIMITS
 from ocp.errors import NOT_NUMBERS, ProblemError, floats
 from ocp.motion.plan import Plan
 from ocp.solution import Solution

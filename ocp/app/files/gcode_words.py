@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from models.arrays import Array
-from models.input_files import INPUT_LIMITS
+from models.files import INPUT_LIMITS
 from models.paths import Arc, Helix
 from models.paths.segments import SHORTEST_SEGMENT
 from models.spatial import FULL_TURN

@@ -16,7 +16,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from models.input_files import INPUT_LIMITS, open_regular
+from models.files import INPUT_LIMITS, open_regular
 from ocp.app.files.text_files import missing_package
 from ocp.errors import ProblemError, checked_instance, checked_text
 from ocp.motion.plan import Plan

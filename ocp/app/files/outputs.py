@@ -11,7 +11,7 @@ import re
 import sys
 from pathlib import Path
 
-from models.input_files import open_regular
+from models.files import open_regular
 from ocp.errors import ProblemError
 from ocp.storage import read_arrays, table_joints
 

@@ -82,9 +82,8 @@ from ocp.app.files.toml_table import REQUIRED, TomlTable, read_toml
 from ocp.app.files.waypoints import read_waypoints
 from ocp.errors import NOT_NUMBERS, ProblemError, floats
 from ocp.motion.schedule import LineLimits, schedule
-from ocp.motion.tasks.cost import Cost
+from ocp.motion.tasks.goals import Cost, Scene
 from ocp.motion.tasks.limits import Limits
-from ocp.motion.tasks.scene import Scene
 from ocp.motion.tasks.tip_task import TipTask
 
 __all__ = ["OUTPUTS", "Task", "obstacles_of", "read_obstacles", "read_task", "rotation_of"]

@@ -13,7 +13,7 @@ from os import PathLike, fspath
 from pathlib import Path
 from typing import Any
 
-from models.input_files import INPUT_LIMITS, UnfitFile, read_regular
+from models.files import INPUT_LIMITS, UnfitFile, read_regular
 from ocp.errors import ProblemError
 
 __all__ = [

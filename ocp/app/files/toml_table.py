@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from models.input_files import INPUT_LIMITS
+from models.files import INPUT_LIMITS
 from ocp.app.files.text_files import FileName, checked_depth, line_error, read_lines
 from ocp.errors import NOT_NUMBERS, ProblemError, floats, real
 

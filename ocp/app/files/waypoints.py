@@ -27,9 +27,8 @@ from numpy.typing import NDArray
 from models import ModelError, Path, SmoothPath
 from models.arrays import ROUNDING, Array, warn_of_degrees, warn_of_millimetres
 from models.paths import Line, split_at_reversals
-from models.paths.orientation import product, rotation_vector
 from models.paths.path import Reversal
-from models.paths.segments import SHORTEST_SEGMENT
+from models.paths.segments import SHORTEST_SEGMENT, product, rotation_vector
 from ocp.app.files.program import DEFAULT_TOLERANCE_M, checked_reversal, smoothed
 from ocp.app.files.text_files import FileName, is_number, line_error, read_lines, split_cells
 from ocp.errors import ProblemError, checked_choice, checked_each, checked_positive

@@ -17,8 +17,8 @@ import numpy as np
 
 from models.arrays import Array
 from models.machines.standing import External, Standing, StandingMotion, evaluate_motion, motion_function, wrenches_at
-from models.robot.indices import joint_limit_index, manipulability_of
-from models.robot.kinematics import center_of_mass_motion, momentum
+from models.robot.dynamics import momentum
+from models.robot.kinematics import center_of_mass_motion, joint_limit_index, manipulability_of
 from ocp.console import interruptible
 from ocp.curves import rk4_step
 from ocp.errors import (
@@ -32,9 +32,9 @@ from ocp.errors import (
 from ocp.motion.local.rates import least_rates
 from ocp.motion.tasks.checks import check_length, checked_configuration, checked_horizon, checked_numbers, checked_tasks
 from ocp.motion.tasks.equations import TaskEquations, bind
+from ocp.motion.tasks.limits import checked_point, is_finite
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.motion.tasks.tracks import on_symbols
-from ocp.motion.tasks.zmp_rules import checked_point, is_finite
 
 __all__ = [
     "AccelerationSolution", "Law", "Layer", "Stabiliser", "Stop", "accelerations", "checked_law",

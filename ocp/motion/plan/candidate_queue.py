@@ -20,7 +20,7 @@ import numpy as np
 from ocp.errors import SolveError
 from ocp.motion.result.candidate import Candidate, Reason, Rejection, Stage
 from ocp.motion.result.solved_plan import SolvedPlan
-from ocp.motion.search.settings import PlannerSettings
+from ocp.motion.search.configurations import PlannerSettings
 from ocp.progress import report
 from ocp.solution import Solution
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from models import cache as kept
+from models import files as kept
 from ocp import Plan, ProblemError, SolveError
 from ocp.app import main
 from ocp.app.files.task_file import read_task

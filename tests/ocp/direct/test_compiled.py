@@ -19,7 +19,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from models import cache
+from models import files as cache
 from ocp import Collocation, MultipleShooting, Problem, SolveError, libraries, prepare
 from ocp.console import TimeLimitReached, time_limited
 from ocp.direct import controller

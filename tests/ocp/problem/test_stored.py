@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import ocp
-from models import papers
+from models import examples as papers
 from ocp import (
     AuditError,
     Collocation,

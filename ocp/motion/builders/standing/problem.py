@@ -37,7 +37,7 @@ import numpy as np
 from models.arrays import Array
 from models.machines.standing import External, Standing, StandingMotion, center_of_pressure, wrenches_at
 from models.robot.dynamics import Wrench
-from models.robot.indices import joint_limit_index
+from models.robot.kinematics import joint_limit_index
 from models.robot.robot import Robot
 from ocp.console import interruptible
 from ocp.errors import ProblemError, checked_choice, checked_instance, checked_nonnegative
@@ -59,12 +59,12 @@ from ocp.motion.tasks.checks import (
     rates_at_rest,
 )
 from ocp.motion.tasks.equations import TaskEquations, bind
-from ocp.motion.tasks.limits import JointBounds, Limits
-from ocp.motion.tasks.tip_task import TipTask
-from ocp.motion.tasks.zmp_rules import (
+from ocp.motion.tasks.limits import (
     Following,
     IndexAtLeast,
     InFoot,
+    JointBounds,
+    Limits,
     Pinned,
     ZmpRule,
     check_rule,
@@ -72,6 +72,7 @@ from ocp.motion.tasks.zmp_rules import (
     index_rows,
     is_finite,
 )
+from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.problem import Problem, remembers_request
 
 __all__ = ["FreeTime", "StandingSetup", "Weights", "declare_horizon", "motion_cost", "standing_problem"]

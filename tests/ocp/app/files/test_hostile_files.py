@@ -19,7 +19,7 @@ from mcap.data_stream import RecordBuilder
 from mcap.records import Chunk
 
 from models import ModelError, Robot, planar_chain
-from models.input_files import INPUT_LIMITS, UnfitFile, open_regular, parse_xml, read_regular
+from models.files import INPUT_LIMITS, UnfitFile, open_regular, parse_xml, read_regular
 from models.shapes.mesh_files import read_mesh
 from models.shapes.pairs import checked_pairs
 from ocp import ProblemError, Solution
