@@ -10,7 +10,7 @@ from typing import Any, Literal, TypeAlias, get_args
 import numpy as np
 
 from models import FixedBase, FreeFloating, Machine, Standing
-from ocp.console import TimeLimitReached, interruptible, time_left, time_limited
+from ocp.console import TimeLimitReached, interruptible, report, shown_progress, time_left, time_limited
 from ocp.errors import (
     ProblemError,
     SolveError,
@@ -44,7 +44,6 @@ from ocp.motion.tasks.goals import Cost, Goal, Scene, Start, Waypoints
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.problem import Problem
-from ocp.progress import report, shown_progress
 from ocp.storage import read_arrays
 
 __all__ = ["Search", "load_plan", "plan", "plan_problem"]
