@@ -28,7 +28,6 @@ from ocp.console import interruptible
 from ocp.direct.collocation import Collocation
 from ocp.errors import ProblemError, SolveError, checked_each, checked_instance, checked_mapping
 from ocp.methods import solve
-from ocp.motion.builders.actuator_limits import Motors, checked_motors
 from ocp.motion.builders.clearance import (
     ClearanceConstraints,
     Constraints,
@@ -36,11 +35,10 @@ from ocp.motion.builders.clearance import (
     is_clearance,
     solve_with_clearance,
 )
-from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem
+from ocp.motion.builders.dynamics import DynamicsSetup, Motors, checked_motors, dynamics_problem
 from ocp.motion.builders.standing.problem import FreeTime
 from ocp.motion.tasks.checks import checked_horizon
-from ocp.motion.tasks.cost import Cost
-from ocp.motion.tasks.goals import Goal
+from ocp.motion.tasks.goals import Cost, Goal
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.phases import DURATION, Phases

@@ -11,9 +11,8 @@ import numpy as np
 from models import Box, FreeFloating, Machine, Sphere, Stance
 from models.arrays import Array
 from ocp.errors import ProblemError, checked_each, checked_instance, floats
-from ocp.motion.builders.actuator_limits import checked_motors
 from ocp.motion.builders.clearance import ClearanceConstraints
-from ocp.motion.builders.dynamics import DynamicsSetup
+from ocp.motion.builders.dynamics import DynamicsSetup, checked_motors
 from ocp.motion.builders.dynamics_plan import dynamics_phases, machines_of, phase_names, within_limits
 from ocp.motion.builders.space.capture import Capture, solve_capture
 from ocp.motion.builders.standing.plan import solve_steps
@@ -23,9 +22,8 @@ from ocp.motion.local.inverse_kinematics import Unreachable, inverse_kinematics
 from ocp.motion.result.candidate import Candidate, Stage
 from ocp.motion.result.solved_plan import PhasedPlan, parts_of_phases
 from ocp.motion.tasks.checks import checked_numbers, clip_to_limits
-from ocp.motion.tasks.cost import Cost
 from ocp.motion.tasks.equations import bind
-from ocp.motion.tasks.goals import Goal, Start
+from ocp.motion.tasks.goals import Cost, Goal, Start
 from ocp.motion.tasks.limits import Limits
 from ocp.problem.problem import Problem
 from ocp.solution import Solution

@@ -25,9 +25,8 @@ from ocp.motion.result.solved_plan import SolvedPlan
 from ocp.motion.search.configurations import PlanRequest, local_motions_from
 from ocp.motion.search.held_joints import fix_ignorable_joints, hold_idle_joints, place_held_joints
 from ocp.motion.search.task_search import TaskSearch
-from ocp.motion.tasks.cost import Cost
+from ocp.motion.tasks.goals import Cost, Scene
 from ocp.motion.tasks.limits import Limits
-from ocp.motion.tasks.scene import Scene
 from ocp.motion.tasks.tip_task import TipTask, timed
 
 __all__ = ["plan_in_segments"]
