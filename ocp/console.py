@@ -188,7 +188,7 @@ def check_time() -> None:
 class IterationMonitor(ca.Callback):  # type: ignore[misc]
     """Iteration callback: shows one line on the terminal, can stop the solver, and stores the iterate."""
 
-    def __init__(self, n: int, m: int, np_: int, title: str, show: bool) -> None:
+    def __init__(self, n: int, m: int, np_: int, *, title: str, show: bool) -> None:
         ca.Callback.__init__(self)
         self.sizes = {"x": n, "f": 1, "g": m, "lam_x": n, "lam_g": m, "lam_p": np_}
         self.title, self.show = title, show
