@@ -27,6 +27,7 @@ from models.shapes.pairs import (
     SRDF,
     Pairs,
     _BodyPair,
+    _PlacedBody,
     _random_configurations,
     checked_pairs,
 )
@@ -146,7 +147,8 @@ def test_bodies_are_where_the_kinematics_have_them(seed: int) -> None:
     known = gaps(robot, bodies, every, 10)
     for (i, j), row in zip(every, known, strict=True):
         one, other = bodies[i].shape, bodies[j].shape
-        between = _BodyPair(robot, one, other, *parts.path(bodies[i].link, bodies[j].link))
+        placed = _PlacedBody(one), _PlacedBody(other)
+        between = _BodyPair(robot, *placed, *parts.path(bodies[i].link, bodies[j].link))
         turn, shift = between._relative(postures)
         np.testing.assert_allclose(exact_distances(one, other, turn, shift), row, atol=1e-9)
         assert (between.bounds(postures)[0] <= row + 1e-9).all()
@@ -227,7 +229,7 @@ def test_a_mesh_on_a_link_that_is_fixed_lies_where_it_is_fixed(shift: tuple[floa
 
 def bound(one: Shape, other: Shape, turn: Array, shift: Array) -> Array:
     """Distances as the proof has them."""
-    return _BodyPair(chain(0.1)[0], one, other, [], []).distance_bounds(turn, shift)
+    return _BodyPair(chain(0.1)[0], _PlacedBody(one), _PlacedBody(other), [], []).distance_bounds(turn, shift)
 
 
 def exact_distances(one: Shape, other: Shape, turn: Array, shift: Array) -> Array:
