@@ -525,6 +525,8 @@ def far_meshes(gap: float) -> tuple[Robot, tuple[Body, ...]]:
 def test_meshes_are_checked_where_their_covers_always_touch_and_their_hulls_do_not() -> None:
     robot, bodies = far_meshes(0.02)
     assert (0, 3) in checked_pairs(robot, bodies).checked
+    beside = Body("link3", Sphere(0.05, (0.0, 0.0, 0.12)))  # beside a mesh, 0.02 m from its hull
+    assert (0, 3) in checked_pairs(robot, (*bodies[:3], beside)).checked
     robot, bodies = far_meshes(-0.02)
     found = checked_pairs(robot, bodies)
     assert (0, 3) not in found.checked
