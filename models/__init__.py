@@ -4,32 +4,41 @@ from models.cts.best_roll import optimal_inverse
 from models.cts.rig import Rig, Tunnel
 from models.cts.table import solve_table
 from models.errors import ModelError, ModelWarning
+from models.examples import (
+    STANDING_STARTS,
+    example_robot,
+    paper_example,
+    reference_rig,
+    reference_tunnel,
+    standing_example,
+)
 from models.machines.collision_scene import CollisionScene
 from models.machines.free_floating import FreeFloating
 from models.machines.machine import FixedBase, Machine, find_wheels, with_wheels
-from models.machines.moving_obstacle import MovingObstacle
-from models.machines.scara import Scara
-from models.machines.scara_path import scara_along
+from models.machines.scara import Scara, scara_along
 from models.machines.stance import Foot, Foothold, Stance
 from models.machines.standing import Standing
 from models.machines.support import Footprint, Support, footprint, rectangle
-from models.papers import STANDING_STARTS, paper_example, reference_rig, reference_tunnel, standing_example
 from models.paths import Arc, Helix, Line, Path, SmoothPath, smooth
-from models.robot.dynamics import Wrench, base_reaction, inverse_dynamics, mass_matrix
-from models.robot.example import example_robot
+from models.robot.dynamics import (
+    Wrench,
+    base_reaction,
+    center_of_mass_jacobian,
+    inverse_dynamics,
+    mass_matrix,
+    momentum,
+    momentum_matrix,
+    momentum_rate,
+    robot_inertia,
+)
 from models.robot.kinematics import (
     center_of_mass,
-    center_of_mass_jacobian,
     center_of_mass_motion,
     centers_of_mass,
     frame_jacobian,
     link_frames,
     link_jacobians,
     link_motions,
-    momentum,
-    momentum_matrix,
-    momentum_rate,
-    robot_inertia,
     tip_jacobian,
     tip_pose,
 )
@@ -47,7 +56,7 @@ from models.robot.rebuild import (
     with_load,
 )
 from models.robot.robot import Robot, planar_chain
-from models.shapes.shapes import Box, Capsule, Cylinder, HalfSpace, Mesh, Sphere
+from models.shapes.shapes import Box, Capsule, Cylinder, HalfSpace, Mesh, MovingObstacle, Sphere
 from models.spatial import Frame
 
 __all__ = [

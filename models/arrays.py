@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.errors import ModelError, ModelWarning
-from models.input_files import INPUT_LIMITS
+from models.files import INPUT_LIMITS
 
 __all__ = ["NOT_NUMBERS", "check_entries", "floats"]
 

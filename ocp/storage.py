@@ -18,7 +18,7 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from models.input_files import UnfitFile, open_regular
+from models.files import UnfitFile, open_regular
 from ocp.errors import ProblemError
 
 MAX_FILE_BYTES = 2**28  # of all arrays of a file, unpacked: 30 million numbers

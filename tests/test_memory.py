@@ -10,7 +10,7 @@ import pytest
 
 from models import Robot
 from models.arrays import check_entries, floats
-from models.input_files import INPUT_LIMITS
+from models.files import INPUT_LIMITS
 from ocp import Solution
 from tests.bad_values import WHOLE, Bad, Case, refusal
 from tests.models.robot.test_bad_urdf import TEXTS, URDF

@@ -17,16 +17,15 @@ import numpy as np
 
 from models.arrays import Array, checked_flag, checked_indices, checked_nonnegative
 from models.errors import ModelError
-from models.input_files import INPUT_LIMITS
+from models.files import INPUT_LIMITS
 from models.machines.machine import Machine
-from models.machines.moving_obstacle import MovingObstacle
 from models.machines.pair_gradients import WORLD, PlacedShape, distance_gradients
 from models.robot.kinematics import link_frames
 from models.robot.robot import Robot
 from models.shapes.bodies import Body, LinkMesh, MissingRule, RigidParts, collision_bodies, lever_arms
 from models.shapes.distance import COLUMNS, column, distance, pair_function, soft_minimum
 from models.shapes.pairs import ASSUMED, COVERED, IGNORED, IMMOBILE, RIGID, SRDF, Pairs, Reason, checked_pairs
-from models.shapes.shapes import KINDS, Box, Shape, checked_shape
+from models.shapes.shapes import KINDS, Box, MovingObstacle, Shape, checked_shape
 from models.spatial import Expression, Frame, expression
 
 MIN_SOFTNESS_M = 1e-6

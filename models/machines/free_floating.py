@@ -24,20 +24,18 @@ import numpy as np
 
 from models.arrays import Array, ArrayInput, checked_array, checked_choice, checked_instance
 from models.errors import ModelError
-from models.robot.dynamics import inverse_dynamics
-from models.robot.indices import TWIST_SIZE, jacobian_manipulability
+from models.robot.dynamics import inverse_dynamics, joint_momenta, robot_inertia, subtree_moments
+from models.robot.dynamics import momentum_matrix as joint_momentum_matrix
 from models.robot.kinematics import (
+    TWIST_SIZE,
     center_of_mass,
     checked_vector,
     frames_and_axes,
-    joint_momenta,
+    jacobian_manipulability,
     joint_vector,
     point_jacobian,
-    robot_inertia,
-    subtree_moments,
     tip_frame,
 )
-from models.robot.kinematics import momentum_matrix as joint_momentum_matrix
 from models.robot.parts import massless_error
 from models.robot.robot import Robot
 from models.spatial import (

@@ -25,8 +25,14 @@ from models.arrays import (
     checked_text,
 )
 from models.errors import ModelError
-from models.robot.indices import TWIST_SIZE, jacobian_manipulability
-from models.robot.kinematics import checked_vector, joint_vector, tip_jacobian, tip_pose
+from models.robot.kinematics import (
+    TWIST_SIZE,
+    checked_vector,
+    jacobian_manipulability,
+    joint_vector,
+    tip_jacobian,
+    tip_pose,
+)
 from models.robot.parts import Joint, Link
 from models.robot.rebuild import lock_joints, move_tip
 from models.robot.robot import Robot

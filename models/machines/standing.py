@@ -20,8 +20,14 @@ from models.errors import ModelError
 from models.machines.machine import FixedBase
 from models.machines.support import Support
 from models.robot.dynamics import Wrench, base_reaction, checked_wrenches, external_wrench, inverse_dynamics
-from models.robot.indices import joint_excess, joint_limit_index, manipulability_of
-from models.robot.kinematics import center_of_mass, checked_vector, joint_vector
+from models.robot.kinematics import (
+    center_of_mass,
+    checked_vector,
+    joint_excess,
+    joint_limit_index,
+    joint_vector,
+    manipulability_of,
+)
 from models.robot.parts import massless_error
 from models.robot.rebuild import simplify
 from models.robot.robot import Robot

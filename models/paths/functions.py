@@ -9,6 +9,7 @@ the first sample inside a blend the state is (0, 0) and the steps are (0, distan
 from __future__ import annotations
 
 from functools import lru_cache
+from math import factorial
 from typing import Any
 
 import casadi as ca
@@ -24,10 +25,10 @@ from models.arrays import (
     checked_instance,
 )
 from models.errors import ModelError
-from models.paths.arc_length import GAUSS_NODES, GAUSS_WEIGHTS, gauss_rule, speed
-from models.paths.orientation import orientation_function
+from models.paths.blends import GAUSS_NODES, GAUSS_WEIGHTS, gauss_rule, speed
 from models.paths.segments import screw_axes
-from models.paths.smooth_path import SmoothPath
+from models.paths.smooth_path import SERIES_TERMS, SmoothPath
+from models.spatial import angular_velocity_from_quaternion, quaternion_product
 
 __all__ = ["gauss_newton", "march", "path_function", "predictor_corrector", "turn_function"]
 
@@ -257,3 +258,38 @@ def _symbols(degree: int) -> tuple[Any, Any, Any, Any]:
 
 def _predicted(state: Any, steps: Any, rate: Any) -> Any:
     return state[0] + (steps[0] + steps[1]) / rate  # eq. (15)
+
+
+def exponential(vector: Any) -> Any:
+    """Return the unit quaternion of a rotation vector (rad), a casadi expression. Shape (4, 1).
+
+    A power series in the squared angle, without branches or roots, which is smooth at zero and accurate to rounding for
+    angles up to 2 pi.
+    """
+    square = ca.dot(vector, vector) / 4
+    cosine: Any = 0
+    sinc: Any = 0
+    for k in reversed(range(SERIES_TERMS)):
+        cosine = (-1) ** k / factorial(2 * k) + square * cosine
+        sinc = (-1) ** k / factorial(2 * k + 1) + square * sinc
+    return ca.vertcat(cosine, sinc / 2 * vector)
+
+
+@lru_cache(maxsize=1)
+def orientation_function() -> Any:
+    """Return the casadi Function of the orientation on a piece and its rates, for any number of samples as columns.
+
+    Inputs: reference (4); theta (3, 6) as 18 entries column by column, ascending powers of distance over length; length
+    (m); distance over length. Outputs: unit quaternion (4); in world axes the angular rate per metre (3, rad/m), its
+    first and second derivatives by the distance (rad/m^2, rad/m^3).
+    """
+    reference, theta = ca.SX.sym("reference", 4), ca.SX.sym("theta", 18)
+    length, fraction = ca.SX.sym("length"), ca.SX.sym("fraction")
+    powers = ca.vertcat(*[fraction**k for k in range(6)])
+    quaternion = quaternion_product(reference, exponential(ca.mtimes(ca.reshape(theta, 3, 6), powers)))
+    outputs = [quaternion]
+    rate = angular_velocity_from_quaternion(quaternion, ca.jacobian(quaternion, fraction) / length)
+    for _ in range(3):
+        outputs.append(rate)
+        rate = ca.jacobian(rate, fraction) / length
+    return ca.Function("orientation", [reference, theta, length, fraction], ca.cse(outputs))

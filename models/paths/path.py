@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any, Literal, TypeAlias
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,8 +28,8 @@ from models.arrays import (
     checked_numbers,
 )
 from models.errors import ModelError
-from models.paths.orientation import product, rotation_matrix, rotation_vector, unit_quaternion
-from models.paths.segments import Arc, Helix, Line, Segment, screw
+from models.paths.segments import Arc, Helix, Line, Segment, product, rotation_vector, screw, unit_quaternion
+from models.spatial import rotation_from_quaternion
 
 __all__ = ["Path", "Reversal", "split_at_reversals"]
 
@@ -140,7 +141,7 @@ class Path:
         """
         origin = checked_array(position, (3,), "path", "position")
         rotation = unit_quaternion(orientation, "path: orientation")
-        matrix = rotation_matrix(rotation)
+        matrix = np.array(ca.DM(rotation_from_quaternion(rotation)))
         moved_segments: list[Segment] = []
         for i, segment in enumerate(self.segments):
             fields: dict[str, Any] = {"start": origin + matrix @ segment.start}

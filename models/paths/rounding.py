@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from models.arrays import Array, ArrayInput, checked_broadcast, checked_choice, checked_instance
 from models.errors import ModelError, ModelWarning
-from models.paths.arc_length import cells
 from models.paths.blends import (
     PAPER_SHAPE,
     BlendKind,
     Ends,
     best_shape,
+    cells,
     checked_shape,
     corner_shape,
     cubic,

@@ -12,13 +12,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from math import atan2, hypot
 from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 
-from models.arrays import Array, ArrayInput, checked_array, checked_number
+from models.arrays import Array, ArrayInput, checked_array, checked_number, frozen
 from models.errors import ModelError
-from models.paths.orientation import rotation_vector, unit_quaternion
 from models.spatial import FULL_TURN
 
 __all__ = ["Arc", "Helix", "Line", "Segment", "screw", "screw_axes"]
@@ -335,3 +335,54 @@ def _set_orientations(segment: Segment, owner: str) -> None:
             object.__setattr__(segment, name, unit_quaternion(getattr(segment, name), f"{owner}: {name}"))
     if segment.start_orientation is not None and segment.end_orientation is not None:
         rotation_vector(segment.start_orientation, segment.end_orientation, owner)  # refuses half turns
+
+
+LARGEST_TURN = np.pi - 1e-3
+"""Largest angle (rad) between two orientations; near pi the shorter rotation between them is ambiguous."""
+
+
+def unit_quaternion(value: ArrayInput, what: str) -> Array:
+    """Return `value` as a read-only unit quaternion [w, x, y, z]; raise a ModelError if its norm is not 1."""
+    quaternion = checked_array(value, (4,), what, "quaternion")
+    norm = float(np.linalg.norm(quaternion))
+    if abs(norm - 1) > 1e-6:
+        message = f"{what}: quaternion {quaternion.tolist()} has the norm {norm:g}; give a unit quaternion"
+        raise ModelError(message, name=what, value=quaternion, limit=1.0)
+    return frozen(quaternion / norm)
+
+
+def rotation_vector(first: ArrayInput, second: ArrayInput, owner: str = "orientation") -> Array:
+    """Return the shorter rotation from `first` to `second`, in the axes of `first`: second = first exp(vector).
+
+    Shape (3,), rad.
+
+    Raises:
+        ModelError: The orientations differ by nearly half a turn, so the shorter rotation is ambiguous.
+    """
+    # plain floats: a path has many segments, and numpy is slow for three entries
+    p0, p1, p2, p3 = np.asarray(first, dtype=float).tolist()
+    q0, q1, q2, q3 = np.asarray(second, dtype=float).tolist()
+    scalar = p0 * q0 + p1 * q1 + p2 * q2 + p3 * q3
+    x = p0 * q1 - q0 * p1 - (p2 * q3 - p3 * q2)
+    y = p0 * q2 - q0 * p2 - (p3 * q1 - p1 * q3)
+    z = p0 * q3 - q0 * p3 - (p1 * q2 - p2 * q1)
+    if scalar < 0:
+        scalar, x, y, z = -scalar, -x, -y, -z
+    norm = hypot(x, y, z)
+    angle = 2 * atan2(norm, scalar)
+    if angle > LARGEST_TURN:
+        message = (
+            f"{owner}: the tool turns by {np.degrees(angle):.4g} deg in one segment, so the sense of rotation is "
+            "ambiguous; split the segment"
+        )
+        raise ModelError(message, name=owner, value=angle, limit=LARGEST_TURN)
+    factor = angle / norm if norm > 0 else 2.0
+    return np.array([x * factor, y * factor, z * factor])
+
+
+def product(first: ArrayInput, second: ArrayInput) -> Array:
+    """Return the quaternion product of rows or single quaternions: `second` in axes of `first`. Shape (..., 4)."""
+    p, q = np.asarray(first, dtype=float), np.asarray(second, dtype=float)
+    scalar = p[..., :1] * q[..., :1] - (p[..., 1:] * q[..., 1:]).sum(axis=-1, keepdims=True)
+    vector = p[..., :1] * q[..., 1:] + q[..., :1] * p[..., 1:] + np.cross(p[..., 1:], q[..., 1:])
+    return np.concatenate([scalar, vector], axis=-1)

@@ -1,10 +1,17 @@
-"""Paths with rounded corners as functions of the distance along them."""
+"""Paths with rounded corners as functions of the distance along them.
+
+On each piece of a path the tool orientation is q(s) = reference exp(theta(s)) with a polynomial theta of the distance.
+A segment that turns at a constant rate about a fixed axis is linear in this chart, whether the reference is its start
+or the vertex at its end. A quintic in the chart of a vertex therefore joins two segments with continuous rate and
+acceleration.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from math import factorial
 from typing import NamedTuple
 
 import numpy as np
@@ -12,9 +19,7 @@ from numpy.typing import NDArray
 
 from models.arrays import Array, ArrayInput, checked_array, checked_broadcast, checked_count
 from models.errors import ModelError
-from models.paths.arc_length import Cells, parameter
-from models.paths.blends import BlendKind, curvature, derivatives_by_arc_length, quintic
-from models.paths.orientation import along_piece
+from models.paths.blends import BlendKind, Cells, curvature, derivatives_by_arc_length, parameter, polynomial, quintic
 from models.paths.path import Path
 
 __all__ = ["Blend", "PathPoint", "SmoothPath", "Turn"]
@@ -309,3 +314,61 @@ def _in_blocks(function: Callable[[Array], tuple[Array, ...]], s: Array, widths:
         for result, values in zip(results, function(s[part]), strict=True):
             result[part] = values
     return results
+
+
+SERIES_TERMS = 18
+
+
+def along_piece(reference: Array, theta: Array, length: Array, fraction: Array) -> tuple[Array, Array, Array, Array]:
+    """Return the same as `orientation_function`, in numpy, for M samples.
+
+    omega = theta' + B theta x theta' + C theta x (theta x theta'), with B = (1 - cos a)/a^2, C = (a - sin a)/a^3 and
+    a = |theta|, in the axes of the reference. B and C are entire functions of a^2.
+
+    Args:
+        reference: Shape (M, 4).
+        theta: Shape (M, 6, 3).
+        length, fraction: Shape (M,).
+
+    Returns:
+        Unit quaternion (M, 4); rate, acceleration and jerk by the distance (M, 3).
+    """
+    t0, t1, t2, t3 = (polynomial(theta, fraction, order) / length[:, None] ** order for order in range(4))
+    square = _dot(t0, t0)
+    first, second = 2 * _dot(t0, t1), 2 * (_dot(t1, t1) + _dot(t0, t2))
+    a0, a1 = np.cross(t0, t1), np.cross(t0, t2)
+    a2 = np.cross(t1, t2) + np.cross(t0, t3)
+    b0, b1 = np.cross(t0, a0), np.cross(t1, a0) + np.cross(t0, a1)
+    b2 = np.cross(t2, a0) + 2 * np.cross(t1, a1) + np.cross(t0, a2)
+    omega = [t1, t2, t3]
+    for start, (v0, v1, v2) in ((2, (a0, a1, a2)), (3, (b0, b1, b2))):
+        f0, f1, f2 = _series(start, square)
+        f2 = f2 * first**2 + f1 * second
+        f1 = f1 * first
+        omega[0] = omega[0] + f0 * v0
+        omega[1] = omega[1] + f1 * v0 + f0 * v1
+        omega[2] = omega[2] + f2 * v0 + 2 * f1 * v1 + f0 * v2
+    half = np.sqrt(square) / 2
+    scalar, vector = np.cos(half)[:, 0], np.sinc(half / np.pi) / 2 * t0
+    w, v = reference[:, 0], reference[:, 1:]
+    product = w[:, None] * vector + scalar[:, None] * v + np.cross(v, vector)
+    quaternion = np.column_stack([w * scalar - (v * vector).sum(axis=1), product])
+    rates = []
+    for value in omega:
+        twist = 2 * np.cross(v, value)
+        rates.append(value + w[:, None] * twist + np.cross(v, twist))
+    return quaternion, rates[0], rates[1], rates[2]
+
+
+def _dot(a: Array, b: Array) -> Array:
+    return np.asarray((a * b).sum(axis=1, keepdims=True))
+
+
+def _series(start: int, square: Array) -> tuple[Array, Array, Array]:
+    """Return the sum of (-x)^k / (2 k + start)! and its two derivatives by x."""
+    value, first, second = (np.zeros_like(square) for _ in range(3))
+    for k in reversed(range(SERIES_TERMS)):
+        second = second * square + 2 * first
+        first = first * square + value
+        value = value * square + (-1) ** k / factorial(2 * k + start)
+    return value, first, second

@@ -1,16 +1,19 @@
-"""Inverse dynamics of robots: joint torques, base reaction and mass matrix, with external wrenches.
+"""Dynamics of robots: momentum, joint torques, base reaction and mass matrix, with external wrenches.
 
-Recursive Newton-Euler algorithm (Luh, Walker, Paul 1980; Featherstone 2008, chapter 5) in link axes, where the inertias
-are constant: less than half the operations of world axes, and a quarter for derivatives. The base is at rest unless its
-motion is given. Joint positions, velocities and accelerations have shape (dof, 1) in the order of `robot.joint_names`,
-as SX, MX, DM or numbers, all of one kind: wrenches with SX entries need SX positions. All functions raise ModelError
-for wrong sizes and for a wrench on an unknown link.
+Joint positions, velocities and accelerations have shape (dof, 1) in the order of `robot.joint_names`, as SX, MX, DM or
+numbers. The base is at rest unless its motion is given; moments are about points at rest in the world. All functions
+raise ModelError for wrong sizes and for a wrench on an unknown link.
+
+Inverse dynamics is the recursive Newton-Euler algorithm (Luh, Walker, Paul 1980; Featherstone 2008, chapter 5) in link
+axes, where the inertias are constant: less than half the operations of world axes, and a quarter for derivatives. Its
+arguments are of one kind: wrenches with SX entries need SX positions.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -26,9 +29,9 @@ from models.robot.kinematics import (
     frames_and_axes,
     joint_frames,
     link_frames,
-    subtree_moments,
+    propagate_motions,
 )
-from models.robot.parts import Link
+from models.robot.parts import Link, massless_error
 from models.robot.rebuild import simplify
 from models.robot.robot import Robot
 from models.spatial import Expression, Frame, cross, on_scalars, skew
@@ -275,3 +278,132 @@ def _field(spin: Expression, turning: Expression) -> Expression:
     """Return [alpha x] + [omega x]^2. Shape (3, 3)."""
     squares = ca.mtimes(spin, spin.T)
     return skew(turning) + squares - ca.trace(squares) * ca.DM.eye(3)
+
+
+class MassMoments(NamedTuple):
+    """Mass, first and second moments of a set of bodies about the world's origin: their spatial inertia in ten numbers.
+
+    Attributes:
+        mass: kg.
+        first: Sum of m c. Shape (3, 1), kg m.
+        second: Rotational inertia about the origin, lower triangle only. Shape (3, 3), kg m^2.
+    """
+
+    mass: float
+    first: Expression
+    second: Expression
+
+    def plus(self, other: MassMoments) -> MassMoments:
+        """Return the moments of the union of two sets of bodies."""
+        return MassMoments(self.mass + other.mass, self.first + other.first, self.second + other.second)
+
+    def momentum(self, angular: Expression, linear: Expression) -> tuple[Expression, Expression]:
+        """Return (moment of momentum about the origin, linear momentum) for a common motion vector."""
+        angular_momentum = ca.mtimes(ca.tril2symm(self.second), angular)
+        return angular_momentum + cross(self.first, linear), self.mass * linear - cross(self.first, angular)
+
+    def spatial_inertia(self) -> Expression:
+        """Return the spatial inertia about the origin. Shape (6, 6)."""
+        arm = skew(self.first)
+        return ca.vertcat(ca.horzcat(ca.tril2symm(self.second), arm), ca.horzcat(arm.T, self.mass * ca.DM.eye(3)))
+
+
+def center_of_mass_jacobian(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> Expression:
+    """Return the Jacobian of the whole robot's centre of mass, world axes. Shape (3, dof)."""
+    matrix = momentum_matrix(robot, q, world_from_base)
+    if robot.total_mass == 0:
+        raise massless_error("hence no centre of mass")
+    return matrix[3:6, :] / robot.total_mass
+
+
+def momentum_matrix(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> Expression:
+    """Return the map from joint rates to (moment of momentum about the world's origin, linear momentum).
+
+    The base is at rest. Shape (6, dof).
+    """
+    frames, axes = frames_and_axes(robot, q, world_from_base)
+    moments = subtree_moments(robot, frames)
+    return ca.densify(joint_momenta(robot, axes, moments))
+
+
+def robot_inertia(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> Expression:
+    """Return the spatial inertia with locked joints about the world's origin, world axes. Shape (6, 6)."""
+    frames = link_frames(robot, q, world_from_base)
+    return ca.densify(subtree_moments(robot, frames)[robot.root].spatial_inertia())
+
+
+def subtree_moments(robot: Robot, frames: dict[str, Frame]) -> dict[str, MassMoments]:
+    """Return the moments of each link with all links that it carries, by link name, about the world's origin."""
+    moments: dict[str, MassMoments] = {}
+    for link in robot.links:
+        turn, center = frames[link.name].rotation, frames[link.name].point(link.center_of_mass)
+        inertia: Expression = ca.mtimes(turn, constant(link.inertia))
+        second = [[ca.mtimes(inertia[i, :], turn[j, :].T) for j in range(i + 1)] for i in range(3)]
+        own = ca.vertcat(*(ca.horzcat(*row, ca.DM(1, 2 - i)) for i, row in enumerate(second)))
+        arm = ca.dot(center, center) * ca.DM.eye(3) - ca.tril(ca.mtimes(center, center.T))
+        moments[link.name] = MassMoments(link.mass, link.mass * center, own + link.mass * arm)
+    for joint in reversed(robot.joints):
+        moments[joint.parent] = moments[joint.parent].plus(moments[joint.child])
+    return moments
+
+
+def joint_momenta(
+    robot: Robot, axes: dict[str, tuple[Expression, Expression]], moments: dict[str, MassMoments]
+) -> Expression:
+    """Return momentum_matrix from the axes of frames_and_axes and the moments of subtree_moments."""
+    children = {joint.name: moments[joint.child] for joint in robot.joints if joint.moves}
+    momenta = {name: ca.vertcat(*children[name].momentum(*axis)) for name, axis in axes.items()}
+    return ca.horzcat(ca.DM(6, 0), *by_joint_vector(robot, momenta))
+
+
+@on_scalars
+def momentum(
+    robot: Robot,
+    q: Expression,
+    qd: Expression,
+    about: Expression = (0.0, 0.0, 0.0),
+    world_from_base: Placement | None = None,
+) -> Expression:
+    """Return (moment of momentum about a point of the world, linear momentum). Shape (6, 1), N m s and N s."""
+    frames, axes = frames_and_axes(robot, q, world_from_base)
+    motions = propagate_motions(robot, frames, axes, qd, ca.DM(robot.dof, 1))
+    place = checked_vector(about, 3, "about", "a point of the world")
+    total: Expression = ca.DM(6, 1)
+    for link in robot.links:
+        motion, inertia = motions[link.name], inertia_in_world(link, frames)
+        push = link.mass * motion.velocity
+        spin = ca.mtimes(inertia, motion.angular_velocity)
+        total = total + ca.vertcat(spin + cross(motion.center - place, push), push)
+    return ca.densify(total)
+
+
+@on_scalars
+def momentum_rate(
+    robot: Robot,
+    q: Expression,
+    qd: Expression,
+    qdd: Expression,
+    about: Expression = (0.0, 0.0, 0.0),
+    world_from_base: Placement | None = None,
+) -> Expression:
+    """Return the time derivative of :func:`momentum` about a point at rest. Shape (6, 1), N m and N.
+
+    It is the same about a point that moves with the centre of mass, whose velocity is parallel to the momentum.
+    """
+    frames, axes = frames_and_axes(robot, q, world_from_base)
+    motions = propagate_motions(robot, frames, axes, qd, qdd)
+    place = checked_vector(about, 3, "about", "a point of the world")
+    total: Expression = ca.DM(6, 1)
+    for link in robot.links:
+        motion, inertia = motions[link.name], inertia_in_world(link, frames)
+        spin = motion.angular_velocity
+        force = link.mass * motion.acceleration
+        moment = ca.mtimes(inertia, motion.angular_acceleration) + cross(spin, ca.mtimes(inertia, spin))
+        total = total + ca.vertcat(moment + cross(motion.center, force), force)
+    return ca.densify(ca.vertcat(total[0:3] - cross(place, total[3:6]), total[3:6]))
+
+
+def inertia_in_world(link: Link, frames: dict[str, Frame]) -> Expression:
+    """Return the rotational inertia about the centre of mass, world axes. Shape (3, 3)."""
+    turn = frames[link.name].rotation
+    return ca.mtimes([turn, ca.sparsify(ca.DM(link.inertia)), turn.T])

@@ -1,9 +1,8 @@
-"""Kinematics of robots: frames, Jacobians, motion of the links, centre of mass, momentum and its rate.
+"""Kinematics of robots: frames, Jacobians, motion of links and centre of mass, performance indices.
 
 Joint positions q, velocities qd and accelerations qdd have shape (dof, 1) in the order of `robot.joint_names`, as SX,
 MX, DM or numbers; followers move with their leaders. `world_from_base` = (rotation, position) is the pose of the root
-link in the world, the identity if None. The base is at rest unless stated otherwise, and moments are about points at
-rest in the world.
+link in the world, the identity if None. The base is at rest.
 
 Everything is written in world axes, so that what a planar machine cannot do stays a structural zero. All functions
 raise ModelError for vectors of a wrong size and unknown links, and for a massless robot if they divide by its mass.
@@ -11,17 +10,17 @@ raise ModelError for vectors of a wrong size and unknown links, and for a massle
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 
-from models.arrays import NOT_NUMBERS, Array, checked_instance
+from models.arrays import NOT_NUMBERS, Array, check_entries, checked_instance, floats
 from models.errors import ModelError
-from models.robot.parts import Link, massless_error
+from models.robot.parts import massless_error
 from models.robot.robot import Robot
-from models.spatial import Expression, Frame, cross, expression, on_scalars, rotation, skew
+from models.spatial import Expression, Frame, cross, determinant, expression, on_scalars, rotation
 
 Placement = tuple[Expression, Expression]
 
@@ -32,34 +31,6 @@ class _Turn(NamedTuple):
     before: Expression
     axis: Array
     angle: Expression
-
-
-class MassMoments(NamedTuple):
-    """Mass, first and second moments of a set of bodies about the world's origin: their spatial inertia in ten numbers.
-
-    Attributes:
-        mass: kg.
-        first: Sum of m c. Shape (3, 1), kg m.
-        second: Rotational inertia about the origin, lower triangle only. Shape (3, 3), kg m^2.
-    """
-
-    mass: float
-    first: Expression
-    second: Expression
-
-    def plus(self, other: MassMoments) -> MassMoments:
-        """Return the moments of the union of two sets of bodies."""
-        return MassMoments(self.mass + other.mass, self.first + other.first, self.second + other.second)
-
-    def momentum(self, angular: Expression, linear: Expression) -> tuple[Expression, Expression]:
-        """Return (moment of momentum about the origin, linear momentum) for a common motion vector."""
-        angular_momentum = ca.mtimes(ca.tril2symm(self.second), angular)
-        return angular_momentum + cross(self.first, linear), self.mass * linear - cross(self.first, angular)
-
-    def spatial_inertia(self) -> Expression:
-        """Return the spatial inertia about the origin. Shape (6, 6)."""
-        arm = skew(self.first)
-        return ca.vertcat(ca.horzcat(ca.tril2symm(self.second), arm), ca.horzcat(arm.T, self.mass * ca.DM.eye(3)))
 
 
 def joint_vector(robot: Robot, q: Expression, name: str = "q") -> Expression:
@@ -204,54 +175,6 @@ def tip_jacobian(robot: Robot, q: Expression, world_from_base: Placement | None 
     return frame_jacobian(robot, q, tip, robot.tip_translation, world_from_base)
 
 
-def center_of_mass_jacobian(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> Expression:
-    """Return the Jacobian of the whole robot's centre of mass, world axes. Shape (3, dof)."""
-    matrix = momentum_matrix(robot, q, world_from_base)
-    if robot.total_mass == 0:
-        raise massless_error("hence no centre of mass")
-    return matrix[3:6, :] / robot.total_mass
-
-
-def momentum_matrix(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> Expression:
-    """Return the map from joint rates to (moment of momentum about the world's origin, linear momentum).
-
-    The base is at rest. Shape (6, dof).
-    """
-    frames, axes = frames_and_axes(robot, q, world_from_base)
-    moments = subtree_moments(robot, frames)
-    return ca.densify(joint_momenta(robot, axes, moments))
-
-
-def robot_inertia(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> Expression:
-    """Return the spatial inertia with locked joints about the world's origin, world axes. Shape (6, 6)."""
-    frames = link_frames(robot, q, world_from_base)
-    return ca.densify(subtree_moments(robot, frames)[robot.root].spatial_inertia())
-
-
-def subtree_moments(robot: Robot, frames: dict[str, Frame]) -> dict[str, MassMoments]:
-    """Return the moments of each link with all links that it carries, by link name, about the world's origin."""
-    moments: dict[str, MassMoments] = {}
-    for link in robot.links:
-        turn, center = frames[link.name].rotation, frames[link.name].point(link.center_of_mass)
-        inertia: Expression = ca.mtimes(turn, constant(link.inertia))
-        second = [[ca.mtimes(inertia[i, :], turn[j, :].T) for j in range(i + 1)] for i in range(3)]
-        own = ca.vertcat(*(ca.horzcat(*row, ca.DM(1, 2 - i)) for i, row in enumerate(second)))
-        arm = ca.dot(center, center) * ca.DM.eye(3) - ca.tril(ca.mtimes(center, center.T))
-        moments[link.name] = MassMoments(link.mass, link.mass * center, own + link.mass * arm)
-    for joint in reversed(robot.joints):
-        moments[joint.parent] = moments[joint.parent].plus(moments[joint.child])
-    return moments
-
-
-def joint_momenta(
-    robot: Robot, axes: dict[str, tuple[Expression, Expression]], moments: dict[str, MassMoments]
-) -> Expression:
-    """Return momentum_matrix from the axes of frames_and_axes and the moments of subtree_moments."""
-    children = {joint.name: moments[joint.child] for joint in robot.joints if joint.moves}
-    momenta = {name: ca.vertcat(*children[name].momentum(*axis)) for name, axis in axes.items()}
-    return ca.horzcat(ca.DM(6, 0), *by_joint_vector(robot, momenta))
-
-
 def point_jacobian(
     robot: Robot, axes: dict[str, tuple[Expression, Expression]], link: str, point: Expression
 ) -> Expression:
@@ -372,53 +295,6 @@ def center_of_mass_motion(
     return CenterOfMassMotion(*(ca.densify(part / robot.total_mass) for part in sums))
 
 
-@on_scalars
-def momentum(
-    robot: Robot,
-    q: Expression,
-    qd: Expression,
-    about: Expression = (0.0, 0.0, 0.0),
-    world_from_base: Placement | None = None,
-) -> Expression:
-    """Return (moment of momentum about a point of the world, linear momentum). Shape (6, 1), N m s and N s."""
-    frames, axes = frames_and_axes(robot, q, world_from_base)
-    motions = propagate_motions(robot, frames, axes, qd, ca.DM(robot.dof, 1))
-    place = checked_vector(about, 3, "about", "a point of the world")
-    total: Expression = ca.DM(6, 1)
-    for link in robot.links:
-        motion, inertia = motions[link.name], inertia_in_world(link, frames)
-        push = link.mass * motion.velocity
-        spin = ca.mtimes(inertia, motion.angular_velocity)
-        total = total + ca.vertcat(spin + cross(motion.center - place, push), push)
-    return ca.densify(total)
-
-
-@on_scalars
-def momentum_rate(
-    robot: Robot,
-    q: Expression,
-    qd: Expression,
-    qdd: Expression,
-    about: Expression = (0.0, 0.0, 0.0),
-    world_from_base: Placement | None = None,
-) -> Expression:
-    """Return the time derivative of :func:`momentum` about a point at rest. Shape (6, 1), N m and N.
-
-    It is the same about a point that moves with the centre of mass, whose velocity is parallel to the momentum.
-    """
-    frames, axes = frames_and_axes(robot, q, world_from_base)
-    motions = propagate_motions(robot, frames, axes, qd, qdd)
-    place = checked_vector(about, 3, "about", "a point of the world")
-    total: Expression = ca.DM(6, 1)
-    for link in robot.links:
-        motion, inertia = motions[link.name], inertia_in_world(link, frames)
-        spin = motion.angular_velocity
-        force = link.mass * motion.acceleration
-        moment = ca.mtimes(inertia, motion.angular_acceleration) + cross(spin, ca.mtimes(inertia, spin))
-        total = total + ca.vertcat(moment + cross(motion.center, force), force)
-    return ca.densify(ca.vertcat(total[0:3] - cross(place, total[3:6]), total[3:6]))
-
-
 def propagate_motions(
     robot: Robot,
     frames: dict[str, Frame],
@@ -456,7 +332,78 @@ def propagate_motions(
     return motions
 
 
-def inertia_in_world(link: Link, frames: dict[str, Frame]) -> Expression:
-    """Return the rotational inertia about the centre of mass, world axes. Shape (3, 3)."""
-    turn = frames[link.name].rotation
-    return ca.mtimes([turn, ca.sparsify(ca.DM(link.inertia)), turn.T])
+TWIST_SIZE = 6
+
+
+def joint_limit_index(robot: Robot, q: Expression) -> Expression:
+    """Return the sum of ((q - middle) / range)^2 over the joints with two limits, (23) of Yoo et al. 2004.
+
+    Each joint adds 0 at the middle of its range and 1/4 at a limit; a joint without limits adds nothing. Shape (1, 1).
+    """
+    q = joint_vector(robot, q)
+    width = robot.upper - robot.lower
+    limited = np.flatnonzero(np.isfinite(width) & (width > 0)).tolist()
+    middle = (robot.upper[limited] + robot.lower[limited]) / 2
+    return ca.sumsqr((q[limited] - ca.DM(middle)) / ca.DM(width[limited])) if limited else type(q)(1, 1)
+
+
+def joint_excess(robot: Robot, q: Expression) -> Expression:
+    """Return the largest violation of a position limit, negative inside, -inf without limits. Shape (1, 1)."""
+    q = joint_vector(robot, q)
+    lower, upper = np.flatnonzero(np.isfinite(robot.lower)).tolist(), np.flatnonzero(np.isfinite(robot.upper)).tolist()
+    if not lower and not upper:
+        return ca.DM(-np.inf)
+    return ca.mmax(ca.densify(ca.vertcat(ca.DM(robot.lower[lower]) - q[lower], q[upper] - ca.DM(robot.upper[upper]))))
+
+
+@on_scalars
+def jacobian_manipulability(jacobian: Expression, rows: Sequence[int] = range(TWIST_SIZE)) -> Expression:
+    """Return sqrt(det(G_r G_r')) of the rows r of a tip Jacobian G (Yoshikawa 1985), zero where the task is singular.
+
+    Args:
+        jacobian: Shape (6, n).
+        rows: Rows of the twist that the task fixes: angular 0..2, linear 3..5.
+
+    Returns:
+        Shape (1, 1).
+
+    Raises:
+        ModelError: Rows out of range, repeated, or none.
+    """
+    return manipulability_of(ca.densify(expression(jacobian))[checked_rows(rows), :])
+
+
+@on_scalars
+def manipulability_of(task: Expression) -> Expression:
+    """Return sqrt(det(G G')) of a task Jacobian G of shape (m, n). Shape (1, 1)."""
+    square = ca.mtimes(task, task.T)
+    if square.shape[0] <= 7:  # division-free
+        volume = determinant(square)
+    else:  # several arms: the expansion would be long
+        diagonal, _, _ = ca.ldl(ca.densify(square), False)
+        volume = 1
+        for entry in ca.vertsplit(ca.vec(diagonal)):
+            volume = volume * entry
+    return ca.sqrt(ca.fmax(volume, 0))  # rounding can make a zero negative
+
+
+def checked_rows(rows: Sequence[int]) -> list[int]:
+    """Return `rows` as a list; raise ModelError unless they are distinct indices 0..5 of a twist, and not empty."""
+    try:
+        check_entries(rows)
+        numbers = floats(list(rows))
+    except NOT_NUMBERS:
+        numbers = np.array([np.nan])
+    integral = numbers.ndim == 1 and bool((numbers == np.round(numbers)).all())
+    indices = numbers.astype(int).tolist() if integral else []
+    if not integral:
+        message = f"rows must be a list of the twist rows 0..5, not {rows!r}"
+    elif not indices:
+        message = "rows is empty; a task fixes at least one of the twist rows 0..5"
+    elif len(set(indices)) < len(indices):
+        message = f"rows {indices} name a twist row more than once"
+    elif not all(0 <= row < TWIST_SIZE for row in indices):
+        message = f"rows {indices} are not all among the twist rows 0..5 (angular 0..2, linear 3..5)"
+    else:
+        return indices
+    raise ModelError(message, name="rows", value=rows, limit=(0, TWIST_SIZE - 1))

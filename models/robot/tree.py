@@ -1,8 +1,12 @@
-"""Kinematic trees: root and order of the joints, change of the root, and followers (joints with <mimic> in URDF).
+"""Kinematic trees: root and order of the joints, change of the root, followers, joints with several degrees of freedom.
 
-The position of a follower is multiplier times that of the joint it follows, plus offset. Followers may follow each
-other in a chain. The joint at its end, which follows none, is the leader; only leaders have an entry in the joint
-vector.
+The position of a follower (a joint with <mimic> in URDF) is multiplier times that of the joint it follows, plus
+offset. Followers may follow each other in a chain. The joint at its end, which follows none, is the leader; only
+leaders have an entry in the joint vector.
+
+Planar and floating joints become chains of joints with one degree of freedom on massless links, "NAME_x" and so on.
+A planar joint has the coordinates x, y and angle, as a `FreeFloating` machine with a planar base. A floating joint has
+x, y, z, yaw, pitch and roll, with the rotation Rz(yaw) Ry(pitch) Rx(roll), singular at a pitch of +-pi/2.
 """
 
 from __future__ import annotations
@@ -17,7 +21,7 @@ import numpy as np
 
 from models.arrays import MAX_LISTED, Array
 from models.errors import ModelError
-from models.robot.parts import Joint, Link, Mimic
+from models.robot.parts import Joint, Kind, Link, Mimic
 
 
 def unknown_name(kind: str, name: object, known: Iterable[str]) -> ModelError:
@@ -268,3 +272,53 @@ def joint_limits(joints: Sequence[Joint], couplings: Mapping[str, JointCoupling]
             )
             raise ModelError(message, name=name, value=(lower, upper), limit=(leader.lower, leader.upper))
     return limits
+
+
+X, Y, Z = np.eye(3)
+
+
+class JointChain(NamedTuple):
+    """Joints from one link to another, and the massless links between them."""
+
+    links: tuple[Link, ...]
+    joints: tuple[Joint, ...]
+
+
+def planar_joint(place: Joint, axis: Array | None) -> JointChain:
+    """Return the joints "NAME_x", "NAME_y" and "NAME_angle" of a planar joint.
+
+    The plane is the one through the joint frame across the axis, the xy plane without an axis. For any other axis, the
+    frame is turned by the least rotation that takes its z axis to the axis or the opposite direction.
+
+    Args:
+        place: Fixed joint with the name, links and frame of the planar one.
+        axis: Normal of the plane in the joint frame, of any nonzero length, shape (3,); or None.
+    """
+    normal = Z if axis is None or not np.any(axis) else axis / np.linalg.norm(axis)
+    normal = normal if normal[2] >= 0 else -normal
+    cross = np.cross(Z, normal)
+    skew = np.cross(cross, np.eye(3)).T
+    tilt = np.eye(3) + skew + skew @ skew / (1 + normal[2])
+    steps: list[tuple[str, Kind, Array]] = [("x", "prismatic", tilt @ X), ("y", "prismatic", tilt @ Y)]
+    return _chain(place, [*steps, ("angle", "continuous", normal)])
+
+
+def floating_joint(place: Joint) -> JointChain:
+    """Return the joints "NAME_x" to "NAME_z", "NAME_yaw", "NAME_pitch" and "NAME_roll" of a floating joint.
+
+    Args:
+        place: Fixed joint with the name, links and frame of the floating one.
+    """
+    slides: list[tuple[str, Kind, Array]] = [("x", "prismatic", X), ("y", "prismatic", Y), ("z", "prismatic", Z)]
+    return _chain(place, [*slides, ("yaw", "continuous", Z), ("pitch", "continuous", Y), ("roll", "continuous", X)])
+
+
+def _chain(place: Joint, steps: Sequence[tuple[str, Kind, Array]]) -> JointChain:
+    """Return the chain of joints with one degree of freedom, given by suffix, kind and axis."""
+    links = [Link(f"{place.name}_{suffix}_link") for suffix, *_ in steps[:-1]]
+    ends = [place.parent, *(link.name for link in links), place.child]
+    joints = []
+    for k, (suffix, kind, axis) in enumerate(steps):
+        frame = {"translation": place.translation, "rotation": place.rotation} if k == 0 else {}
+        joints.append(Joint(f"{place.name}_{suffix}", kind, ends[k], ends[k + 1], axis=axis, **frame))
+    return JointChain(tuple(links), tuple(joints))

@@ -23,9 +23,9 @@ import numpy as np
 
 from models.arrays import Array, checked_choice, warn_of_degrees
 from models.errors import ModelError, ModelWarning
-from models.input_files import INPUT_LIMITS, parse_xml, read_regular
-from models.robot.composite import floating_joint, planar_joint
+from models.files import INPUT_LIMITS, parse_xml, read_regular
 from models.robot.parts import SHAPES, CollisionShape, Joint, Kind, Link, Mimic, VisualShape
+from models.robot.tree import floating_joint, planar_joint
 
 Source: TypeAlias = str | os.PathLike[str]
 InertiaRule: TypeAlias = Literal["warn", "as_given"]
@@ -78,7 +78,7 @@ def read_urdf(source: Source, *, inertia: InertiaRule = "warn") -> Description:
     position limits. The same holds for effort and velocity. A floating joint between a massless root and its only child
     means that the robot floats: both are omitted, and the base of `FreeFloating` moves in their place. Any other
     floating or planar joint becomes a chain of joints with one degree of freedom, without limits, see
-    `models.robot.composite`. A <mimic> of a fixed joint is ignored.
+    `models.robot.tree`. A <mimic> of a fixed joint is ignored.
 
     Args:
         source: The text, recognised by its first character "<", or the path of a file.

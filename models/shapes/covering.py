@@ -19,8 +19,8 @@ import numpy as np
 import scipy
 
 from models.arrays import Array, ArrayInput, checked_array, checked_indices
-from models.cache import cache_key, load_value, source_version, store_value
 from models.errors import ModelError
+from models.files import cache_key, load_value, source_version, store_value
 from models.shapes.hull import convex_hull, nearest_directions
 from models.shapes.shapes import Box, Capsule
 
@@ -90,7 +90,7 @@ class Cover:
 def cover(vertices: ArrayInput, faces: ArrayInput) -> tuple[Cover, ...]:
     """Return capsules, or one box, that together contain every point of a mesh.
 
-    The result is deterministic. It is cached in a file by the content of the mesh, see `models.cache`.
+    The result is deterministic. It is cached in a file by the content of the mesh, see `models.files`.
 
     Args:
         vertices: Shape (n, 3), m.

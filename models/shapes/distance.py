@@ -22,7 +22,7 @@ import numpy as np
 
 from models.arrays import Array, checked_array, checked_instance, checked_nonnegative, checked_number
 from models.errors import ModelError
-from models.input_files import INPUT_LIMITS
+from models.files import INPUT_LIMITS
 from models.shapes.cores import (
     BoxCore,
     SegmentCore,

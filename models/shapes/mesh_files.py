@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from models.arrays import Array, checked_text
 from models.errors import ModelError
-from models.input_files import INPUT_LIMITS, UnfitFile, parse_xml, read_regular
+from models.files import INPUT_LIMITS, UnfitFile, parse_xml, read_regular
 
 __all__ = ["read_collada"]
 

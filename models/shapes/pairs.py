@@ -22,8 +22,8 @@ from models.arrays import (
     checked_instance,
     checked_nonnegative,
 )
-from models.cache import cache_key, load_value, source_version, store_value
 from models.errors import ModelError, ModelWarning
+from models.files import cache_key, load_value, source_version, store_value
 from models.robot.robot import Robot
 from models.robot.urdf import parse_urdf, text_of
 from models.shapes.bodies import Body, JointStep, RigidParts, lever_arms

@@ -1,4 +1,4 @@
-"""Shapes of bodies and obstacles: spheres, capsules, cylinders, boxes, half-spaces and meshes.
+"""Shapes of bodies and obstacles: spheres, capsules, cylinders, boxes, half-spaces and meshes, and moving obstacles.
 
 Every bounded shape is the convex hull of a few points, its core, swept by a sphere. `models.shapes.distance` computes
 distances from this representation. The coordinates of an obstacle are in world, those of a link's body in the link's
@@ -7,6 +7,7 @@ frame.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -14,6 +15,7 @@ from math import cos, pi
 from pathlib import Path
 from typing import Any, Self, TypeAlias, cast
 
+import casadi as ca
 import numpy as np
 
 from models.arrays import (
@@ -29,6 +31,7 @@ from models.arrays import (
 )
 from models.errors import ModelError
 from models.shapes.hull import Hull, convex_hull
+from models.spatial import Expression, Frame, expand_tables, expression
 
 SIDES = 16
 """Number of sides of the prism that circumscribes a cylinder."""
@@ -361,3 +364,76 @@ def _place(value: ArrayInput, owner: str, what: str = "position") -> Array:
 def _motion(rotation: ArrayInput, translation: ArrayInput) -> tuple[Array, Array]:
     turn = checked_rotation(rotation, "shape", "rotation")
     return turn, checked_array(translation, (3,), "shape", "translation")
+
+
+@dataclass(frozen=True, eq=False)
+class MovingObstacle:
+    """An obstacle with a prescribed motion, such as a part on a conveyor or a tumbling target.
+
+    Attributes:
+        shape: Shape in a frame of its own; not a half-space.
+        position: Function from time (s, a CasADi symbol) to the origin of that frame in world, shape (3,), m. Tables
+            with one argument (`casadi.interpolant`, "linear" or "bspline") are converted to polynomials.
+        rotation: The same for its axes, as columns. Shape (3, 3). None: those of the world.
+
+    Raises:
+        ModelError: An invalid shape, a half-space, functions that return something else or depend on more than time, an
+            invalid rotation.
+    """
+
+    shape: Shape
+    position: Callable[[Any], Any]
+    rotation: Callable[[Any], Any] | None = None
+    _at: Any = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if isinstance(checked_shape(self.shape, "moving", "shape"), HalfSpace):
+            message = "moving: a half-space cannot move; give a box that is large enough"
+            raise ModelError(message, name="shape", value=self.shape)
+        time = ca.SX.sym("time")
+        parts = []
+        for name, function, shape in (("position", self.position, (3, 1)), ("rotation", self.rotation, (3, 3))):
+            if function is None and name == "rotation":
+                parts.append(ca.SX.eye(3))
+                continue
+            if not callable(function):
+                message = f"moving: {name} must be a function of time, not {function!r}"
+                raise ModelError(message, name=name, value=function)
+            try:
+                value = expand_tables(ca.densify(ca.SX(expression(function(time)))))
+            except Exception as error:  # also errors inside the function
+                message = f"moving: {name} is no function of a casadi symbol, the time: {error}"
+                raise ModelError(message, name=name, value=function) from error
+            if value.shape != shape or any(not ca.is_equal(symbol, time) for symbol in ca.symvar(value)):
+                message = (
+                    f"moving: {name} gives {value.shape} of {ca.symvar(value)}; {shape} of the time alone expected"
+                )
+                raise ModelError(message, name=name, value=value.shape, limit=shape)
+            parts.append(value)
+        object.__setattr__(self, "_at", ca.Function("moving", [time], [parts[1], parts[0]]))
+        for name, part in zip(("position", "rotation"), parts, strict=True):
+            if not ca.symvar(part):
+                checked_array(ca.DM(part).full(), part.shape, "moving", name)
+        turn = self._at(0.0)[0].full()
+        if np.isfinite(turn).all():
+            checked_rotation(turn, "moving", "rotation")
+
+    def frame(self, time: Expression) -> Frame:
+        """Return the frame of the shape in world at a time (s)."""
+        return Frame(*self._at(time))
+
+    def check(self, begin: float, end: float) -> None:
+        """Raise ModelError if the pose is invalid at a sampled time between `begin` and `end` (s)."""
+        times = np.linspace(begin, end, 513)
+        turns, places = (np.array(part) for part in self._at(times[None]))
+        broken = ~np.isfinite(places).all(axis=0)
+        if broken.any():
+            time = float(times[broken.argmax()])
+            value = places[:, broken.argmax()].tolist()
+            message = f"moving: position {value} is not finite, at {time:g} s"
+            raise ModelError(message, name="position", value=value, time=time)
+        for turn, time in zip(turns.reshape(3, -1, 3).transpose(1, 0, 2), times.tolist(), strict=True):
+            try:
+                checked_rotation(turn, "moving", "rotation")
+            except ModelError as error:
+                raise ModelError(f"{error}, at {time:g} s", **{**vars(error), "time": time}) from error

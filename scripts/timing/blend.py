@@ -17,7 +17,7 @@ import numpy as np
 from models import SmoothPath, paths, scara_along, smooth
 from models.arrays import Array
 from models.paths import gauss_newton, march, path_function, predictor_corrector
-from models.paths.arc_length import arc_length, speed
+from models.paths.blends import arc_length, speed
 from ocp.motion.builders.timing import solve_minimum_time
 from ocp.motion.schedule import LineLimits, Schedule, peak_acceleration, schedule
 from scripts import drawing

@@ -76,8 +76,7 @@ from models import Path as ToolPath
 from models.arrays import Array
 from models.shapes.shapes import Shape
 from models.spatial import rotation_from_rpy
-from ocp.app.files.outputs import SUFFIXES, checked_output
-from ocp.app.files.text_files import FileName
+from ocp.app.files.safe_files import SUFFIXES, FileName, checked_output
 from ocp.app.files.toml_table import REQUIRED, TomlTable, read_toml
 from ocp.app.files.waypoints import read_waypoints
 from ocp.errors import NOT_NUMBERS, ProblemError, floats

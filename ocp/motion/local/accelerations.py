@@ -17,8 +17,8 @@ import numpy as np
 
 from models.arrays import Array
 from models.machines.standing import External, Standing, StandingMotion, evaluate_motion, motion_function, wrenches_at
-from models.robot.indices import joint_limit_index, manipulability_of
-from models.robot.kinematics import center_of_mass_motion, momentum
+from models.robot.dynamics import momentum
+from models.robot.kinematics import center_of_mass_motion, joint_limit_index, manipulability_of
 from ocp.console import interruptible
 from ocp.curves import rk4_step
 from ocp.errors import (

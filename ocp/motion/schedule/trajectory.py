@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from models.input_files import read_regular
+from models.files import read_regular
 from ocp.errors import NOT_NUMBERS, ProblemError, checked_each, checked_instance, floats
 from ocp.motion.schedule.limits import JointPath, check_joints, rates_along
 from ocp.motion.schedule.planner import Schedule

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from models import FixedBase, FreeFloating, Machine, ModelError, Robot, Standing
 from models.arrays import Array
 from models.machines.machine import with_tip
-from models.robot.indices import manipulability_of
+from models.robot.kinematics import manipulability_of
 from models.spatial import on_scalars
 from ocp.errors import ProblemError, checked_each
 from ocp.motion.tasks.tip_task import (

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from models import FreeFloating, Machine, ModelError, SmoothPath, center_of_mass
 from models.arrays import Array, ArrayInput, checked_array
-from models.robot.indices import checked_rows
+from models.robot.kinematics import checked_rows
 from models.spatial import Frame, expression, on_scalars, rotation_from_quaternion, skew
 from ocp.errors import ProblemError, checked_choice, checked_nonnegative, checked_positive, checked_text
 from ocp.motion.tasks.tracks import Track, path_tracks, reparametrized

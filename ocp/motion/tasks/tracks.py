@@ -16,8 +16,7 @@ import numpy as np
 from models import ModelError
 from models.arrays import Array, ArrayInput
 from models.paths.blends import rest_to_rest
-from models.paths.functions import path_function, turn_function
-from models.paths.orientation import exponential
+from models.paths.functions import exponential, path_function, turn_function
 from models.paths.smooth_path import SmoothPath
 from models.spatial import expression, rotation_from_quaternion
 from ocp.errors import NOT_NUMBERS, ProblemError, checked_choice, checked_positive, floats, real

@@ -9,8 +9,7 @@ import numpy as np
 from models import SmoothPath
 from models.arrays import Array
 from models.paths import Blend, gauss_newton, march, predictor_corrector
-from models.paths.arc_length import arc_length
-from models.paths.blends import BlendKind, polynomial
+from models.paths.blends import BlendKind, arc_length, polynomial
 from ocp.motion.schedule import Schedule, SpeedProfile
 from scripts.papers.blend.example import MM, PERIOD, SHAPE, SPEED, corner
 from scripts.papers.run import Row

@@ -10,7 +10,7 @@ from tqdm import tqdm
 
 from models import SmoothPath, scara_along, smooth
 from models.arrays import Array
-from models.machines.scara_path import ScaraPath
+from models.machines.scara import ScaraPath
 from models.paths import gamma
 from models.paths.blends import BlendKind, polynomial
 from ocp.motion.builders.timing import Fastest, solve_minimum_time

@@ -20,7 +20,7 @@ import numpy as np
 
 from models import ModelError
 from models.arrays import Array, ArrayInput, checked_array
-from models.robot.indices import checked_rows
+from models.robot.kinematics import checked_rows
 from scripts.papers.free_floating.recursion import D, J, dD, dJ
 from scripts.papers.free_floating.virtual_chain import VirtualChain
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from models import FixedBase, FreeFloating, Joint, Link, Machine, ModelError, Robot, paper_example, planar_chain
-from models.robot.indices import jacobian_manipulability
+from models.robot.kinematics import jacobian_manipulability
 from tests.models.robot.trees import (
     Base,
     few,

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from models import Arc, Line, ModelError, Path, Scara, scara_along, smooth, tip_jacobian, tip_pose
-from models.machines.scara_path import ScaraPath
+from models.machines.scara import ScaraPath
 from ocp import ProblemError
 from ocp.motion.schedule import JointLimits, LineLimits, schedule
 from tests.models.paths.task_paths import random_arm_path, seeds, turned

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from models import Arc, Helix, Line, ModelError, Path, Scara, scara_along, smooth
-from models.machines.scara_path import ScaraPath
+from models.machines.scara import ScaraPath
 from models.paths import Segment
 from models.paths.blends import cubic, curvature, quintic
 

@@ -17,8 +17,7 @@ from scipy.spatial import cKDTree
 
 from models import Arc, Line, ModelError, ModelWarning, Path, SmoothPath, smooth
 from models.paths import blends, gamma, rest_to_rest, rounding
-from models.paths.arc_length import arc_length
-from models.paths.blends import LARGEST_SHAPE, polynomial
+from models.paths.blends import LARGEST_SHAPE, arc_length, polynomial
 from tests.models.paths.task_paths import peak_curvature, random_path, seeds
 
 pytestmark = pytest.mark.filterwarnings("ignore:overlap='shrink'")  # blends of random paths may overlap
@@ -100,7 +99,7 @@ def test_a_step_towards_an_arc_length_cubes_the_error(
 ) -> None:
     path, found = corner(degrees, 0.3, kind, shape), list[Any]()
     for steps in (0, 1, 4):
-        monkeypatch.setattr("models.paths.arc_length.MAX_STEPS", steps)
+        monkeypatch.setattr("models.paths.blends.MAX_STEPS", steps)
         found.append(path.parameter(path.sample_distances(40)))
     before, after = (np.nanmax(np.abs(each - found[2])) for each in found[:2])
     assert 1e-4 < before < 1e-2

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from models import ModelError, Path, SmoothPath, smooth
 from models.paths import Blend, gauss_newton, march, path_function, predictor_corrector, turn_function
-from models.paths.arc_length import arc_length
-from models.paths.blends import polynomial
+from models.paths.blends import arc_length, polynomial
 from ocp.motion.schedule import LineLimits, SpeedProfile, peak_acceleration, schedule
 from tests.models.paths.task_paths import random_path
 from tests.models.paths.test_paths import example

@@ -15,7 +15,7 @@ import trimesh
 
 from models import ModelError
 from models.arrays import Array
-from models.input_files import INPUT_LIMITS
+from models.files import INPUT_LIMITS
 from models.shapes import mesh_files
 from models.shapes.mesh_files import Faces, find_mesh, read_mesh, read_painted_mesh
 from tests.models.robot.pinocchio_robots import collection

@@ -37,7 +37,7 @@ import numpy as np
 from models.arrays import Array
 from models.machines.standing import External, Standing, StandingMotion, center_of_pressure, wrenches_at
 from models.robot.dynamics import Wrench
-from models.robot.indices import joint_limit_index
+from models.robot.kinematics import joint_limit_index
 from models.robot.robot import Robot
 from ocp.console import interruptible
 from ocp.errors import ProblemError, checked_choice, checked_instance, checked_nonnegative

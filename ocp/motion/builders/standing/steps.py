@@ -26,7 +26,7 @@ from models.arrays import Array
 from models.errors import ModelError
 from models.machines.stance import Stance
 from models.paths import rest_to_rest
-from models.robot.indices import joint_limit_index
+from models.robot.kinematics import joint_limit_index
 from ocp.console import interruptible
 from ocp.errors import ProblemError, checked_instance, checked_nonnegative
 from ocp.motion.builders.standing.problem import FreeTime, declare_horizon

@@ -8,7 +8,7 @@ from ruckig import InputParameter, Result, Ruckig, Trajectory
 
 from models import FixedBase
 from models.arrays import Array
-from models.robot.example import example_robot
+from models.examples import example_robot
 from ocp import Limits
 from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem
 from ocp.motion.builders.joint_motion import joint_motion_problem, least_durations, motion_along

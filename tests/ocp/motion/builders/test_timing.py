@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from models import Path, Scara, SmoothPath, scara_along, smooth
-from models.machines.scara_path import ScaraPath
+from models.machines.scara import ScaraPath
 from ocp import Collocation, ProblemError, minimum_time_problem, solve
 from ocp.motion.builders import timing_tables
 from ocp.motion.builders.timing import Fastest, solve_minimum_time

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 
 from models import STANDING_STARTS, FixedBase, ModelError, Standing, momentum
-from models.robot.indices import jacobian_manipulability, joint_limit_index
+from models.robot.kinematics import jacobian_manipulability, joint_limit_index
 from ocp import ProblemError, TipTask, resolve, resolve_accelerations
 from ocp.motion.local.accelerations import AccelerationSolution, Law, Layer, Stabiliser, accelerations
 from ocp.motion.tasks.equations import bind, task_errors

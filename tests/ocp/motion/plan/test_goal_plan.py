@@ -10,13 +10,13 @@ import pytest
 
 from models import Box, CollisionScene, CollisionShape, FixedBase, Joint, Link, Robot
 from models.arrays import Array
-from models.robot.example import example_robot
+from models.examples import example_robot
 from ocp import Limits, Plan, ProblemError, SolveError
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.local.collisions import distances_along
 from ocp.motion.plan.goal_plan import GoalRequest, GoalSettings, plan_to_goal
 from ocp.motion.result.candidate import Rejection
-from ocp.motion.sampling.path_classes import PathSearchSettings
+from ocp.motion.sampling.path_search import PathSearchSettings
 from ocp.motion.sampling.straight import StraightMotions
 from ocp.motion.tasks.goals import Cost
 from tests.ocp.motion.sampling.sliders import RADIUS, gap, slider

@@ -7,7 +7,7 @@ import pytest
 
 from models import Box, Capsule, CollisionScene, Cylinder, FixedBase, HalfSpace, Sphere
 from models.arrays import Array
-from models.robot.example import example_robot
+from models.examples import example_robot
 from models.shapes.shapes import Shape
 from ocp.motion.local.collisions import distances_along
 from ocp.motion.sampling.straight import StraightMotions

@@ -15,7 +15,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from models import Arc, Line, Path, Scara, scara_along, smooth
-from models.machines.scara_path import ScaraPath
+from models.machines.scara import ScaraPath
 from ocp import ProblemError
 from ocp.motion.schedule import (
     JointLimits,

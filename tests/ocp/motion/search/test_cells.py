@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from models import FreeFloating, center_of_mass
-from models.papers import paper_example
+from models.examples import paper_example
 from ocp import Candidate, Plan, SolveError, TipTask, Unreachable, plan
 from ocp.motion.plan.candidate_solver import CandidateSolver
 from ocp.motion.plan.planner import checked_request

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from models import FixedBase, Robot
-from models.robot.composite import planar_joint
 from models.robot.kinematics import link_frames
 from models.robot.parts import Joint
+from models.robot.tree import planar_joint
 from ocp import TipTask, inverse_kinematics, plan
 from tests.models.robot.trees import Array, few, random_rotation, seeds
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from models import cache
+from models import files as cache
 
 KEY = cache.cache_key("1", "an input")
 
@@ -40,7 +40,7 @@ def given_away(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_the_folder_is_made_for_its_owner_alone(place: Path) -> None:
     assert cache.load_value(KEY) is None
-    assert cache.files() == []
+    assert cache.cache_files() == []
     assert not place.exists()  # looking makes nothing
     place.parent.mkdir()
     old = os.umask(0)
@@ -62,7 +62,7 @@ def test_a_folder_that_others_may_write_is_not_used(place: Path, mode: int, capl
         assert cache.store_library("b" * 64, b"compiled") is None
         with cache.exclusive(KEY):
             assert sorted(place.iterdir()) == sorted([value, library])
-    assert cache.files() == []
+    assert cache.cache_files() == []
     (record,) = caplog.records
     assert "other users may write it" in record.getMessage()
     assert str(place) in record.getMessage()
@@ -94,7 +94,7 @@ def test_a_link_is_not_followed(place: Path, tmp_path: Path) -> None:
     other = tmp_path / "other"
     place.rename(other)
     place.symlink_to(other)
-    assert cache.files() == []
+    assert cache.cache_files() == []
 
 
 @pytest.mark.parametrize("how", ["somebody else's", "others may write", "pipe"])

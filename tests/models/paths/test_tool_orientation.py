@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from models import Line, ModelError, Path, smooth
-from models.paths.orientation import rotation_vector
+from models.paths.segments import rotation_vector
 from tests.models.paths.task_paths import product, random_path, seeds, turned
 
 few = settings(max_examples=40)

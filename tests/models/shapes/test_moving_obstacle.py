@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from models import ModelError, MovingObstacle, Sphere
-from models.machines.moving_obstacle import expand_tables
+from models.spatial import expand_tables
 
 BALL = Sphere(0.1, (0, 0, 0))
 
