@@ -258,7 +258,7 @@ def local_motions_from(request: PlanRequest, configurations: Array) -> list[Loca
                     motions[-1] = _straight_motion(motions[-1], joints)
             steps = int(np.ceil(settings.local_steps * stretch.duration / request.horizon))
             steps = max(steps, settings.min_intervals)
-            times = np.union1d(np.linspace(stretch.begin, stretch.end, steps + 1), stretch.breaks)
+            times = np.union1d(np.linspace(stretch.begin, stretch.end, steps + 1), stretch.nodes)
             equations = stretch.equations
             if equations is None:
                 motions.append(LocalMotion.stationary(times, base, joints))
