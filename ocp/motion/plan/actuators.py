@@ -24,11 +24,18 @@ from ocp.motion.result.request import declared_motion
 from ocp.motion.result.solved_plan import SolvedPlan
 from ocp.motion.search.configurations import PlanRequest
 from ocp.motion.search.held_joints import all_joints
+from ocp.motion.tasks.cost import Cost
 from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.problem.problem import Problem
 from ocp.solution import Solution
 
-__all__ = ["ActuatorDemand", "limits_actuators", "solve_within_actuator_limits", "without_actuators"]
+__all__ = [
+    "ActuatorDemand",
+    "limits_actuators",
+    "solve_within_actuator_limits",
+    "weights_actuators",
+    "without_actuators",
+]
 
 ACTUATOR_LIMITS = ("acceleration", "jerk", "torque", "power")
 
@@ -36,6 +43,11 @@ ACTUATOR_LIMITS = ("acceleration", "jerk", "torque", "power")
 def limits_actuators(limits: Limits) -> bool:
     """Return whether anything but positions and rates is limited."""
     return any(getattr(limits, quantity) is not None for quantity in ACTUATOR_LIMITS)
+
+
+def weights_actuators(cost: Cost) -> bool:
+    """Return whether a cost weights torques, work, accelerations or jerks."""
+    return bool({"effort", "energy", "acceleration", "jerk"} & set(cost.terms))
 
 
 def without_actuators(limits: Limits) -> Limits:

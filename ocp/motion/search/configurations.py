@@ -110,6 +110,7 @@ class PlanRequest:
         limits: Limits of joint positions and rates.
         time_cost: Cost of a second if the horizon is free; else None.
         search: How the start is searched.
+        rests: Whether the joints are at rest at the start and at the end, if their accelerations are planned.
         actuator_limits: Limits that include those of the actuators; None if these are not limited.
         clearance_constraints: Clearance constraints of the motion, or None.
         settings: Settings of the planner.
@@ -129,6 +130,7 @@ class PlanRequest:
     seed: int
     time_cost: float | None
     search: SearchKind = "configurations"
+    rests: tuple[bool, bool] = (False, False)
     actuator_limits: Limits | None = None
     clearance_constraints: ClearanceConstraints | None = None
     settings: PlannerSettings = field(default_factory=PlannerSettings)
