@@ -32,7 +32,7 @@ from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.problem import Problem
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = ["CLOCK", "PACE", "SLOPES", "Stretch", "ToolMotion", "stretches_of", "tool_motion_problem"]
+__all__ = ["CLOCK", "PACE", "SLOPES", "Actuation", "Stretch", "ToolMotion", "stretches_of", "tool_motion_problem"]
 
 CLOCK, SLOPES, PACE = "clock", "slopes", "pace"
 """Names in free time: the time as a state, and the derivatives of joints and time by the tasks' own time."""
@@ -61,6 +61,23 @@ class FeedbackSettings:
 
 
 FEEDBACK = FeedbackSettings()
+
+
+@dataclass(frozen=True, eq=False)
+class Actuation:
+    """Options of a motion whose controls are accelerations, or jerks if these are limited or weighted.
+
+    The states "velocities" (and "accelerations") with the suffix of each stretch replace the rates, path constraints
+    "torques" and "power" are added, and the tasks are constrained by their accelerations. Velocities are continuous
+    between stretches. A small weight in the cost smooths accelerations (jerks), see FeedbackSettings.
+
+    Attributes:
+        cost: Weights of all terms but the time, which replace those of the squared rates; None for the latter.
+        rests: Whether the joints are at rest at the start and at the end; else they are free to move there.
+    """
+
+    cost: Cost | None = None
+    rests: tuple[bool, bool] = (False, False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,7 +184,7 @@ def tool_motion_problem(
     weights: Array,
     bounds: JointBounds,
     time_cost: float | None = None,
-    actuated: bool = False,
+    actuation: Actuation | None = None,
     relaxed: bool = False,
     clearance_constraints: ClearanceConstraints | None = None,
 ) -> ToolMotion:
@@ -187,11 +204,8 @@ def tool_motion_problem(
         time_cost: Cost of a second, if the tasks may be executed more slowly. The horizon of the problem is then the
             tasks' own. Its states over it are "joints", "base" and CLOCK, the time; its controls are SLOPES, the
             derivatives of the joints, and PACE, that of the time, at least 1. None keeps the tasks' own time.
-        actuated: Whether accelerations (jerks if these are limited) are the control, within the actuator limits. States
-            "velocities" (and "accelerations") with the suffix of each stretch replace the rates, path constraints
-            "torques" and "power" are added, and the tasks are constrained by their accelerations. Velocities are
-            continuous between stretches, and free at both ends like the rates. A small weight in the cost smooths
-            accelerations (jerks), see FeedbackSettings.
+        actuation: Options of a motion with accelerations as the control, within the limits of the actuators; None for
+            rates as the control.
         relaxed: Whether tasks may deviate at a quadratic cost, J u - b = relaxation S with the cost |S|^2 / 2 and the
             control S, ERRORS. The constraints then stay independent where the rows of J depend on each other. If a
             motion of cost c does the tasks within the limits, the errors of the optimum satisfy |S|^2 / 2 <= c when
@@ -209,7 +223,7 @@ def tool_motion_problem(
     problem.horizon(horizon)
     motion = _Motion(
         problem, machine, tuple(stretches), bounds, base, start, reference, cyclic, weights, clearance_constraints,
-        actuated, relaxed,
+        actuation, relaxed,
     )  # fmt: skip
     if time_cost is not None:
         return _in_free_time(motion, time_cost)
@@ -223,7 +237,7 @@ def tool_motion_problem(
         running += cost
         if before is not None:
             here = ca.vertcat(*[problem.at_start(state) for state in states])
-            unit = "" if machine.base_size or actuated else machine.robot.unit()
+            unit = "" if machine.base_size or actuation else machine.robot.unit()
             problem.end(f"passage at {stretch.begin:g} s", here - ca.vertcat(*before), 0, 0, unit=unit)
         before, first = states, first or states
     if cyclic and motion.free and before and first:
@@ -249,7 +263,7 @@ class _Motion:
     cyclic: bool
     weights: Array
     clearance_constraints: ClearanceConstraints | None
-    actuated: bool
+    actuation: Actuation | None
     relaxed: bool
 
     @property
@@ -278,6 +292,22 @@ class _Motion:
         options: dict[str, Any] = {"lower": self.bounds.lower, "upper": self.bounds.upper, "unit": machine.robot.unit()}
         options |= {"initial": self.start if begins else None, "terminal": self.start if returns else None}
         return place, self.problem.state(f"joints{stretch.suffix}", machine.joint_size, **options)
+
+    def velocities(self, stretch: Stretch, place: Any, joints: Any, pace: Any) -> tuple[Any, Any, Any]:
+        """Declare velocities as states; return them, the accelerations and the running cost in a second of motion."""
+        assert self.actuation is not None
+        machine, bounds, (rests, stops) = self.machine, self.bounds, self.actuation.rests
+        options: dict[str, Any] = {"lower": -bounds.velocity, "upper": bounds.velocity, "unit": machine.robot.unit("/s")}
+        options |= {"initial": 0.0 if rests and stretch is self.stretches[0] else None}
+        options |= {"terminal": 0.0 if stops and stretch is self.stretches[-1] else None}
+        rates = self.problem.state(f"velocities{stretch.suffix}", machine.joint_size, **options)
+        cost = self.actuation.cost or Cost(weights=self.weights)
+        smoothing = FEEDBACK.smoothing * self.horizon
+        second, running = declare_actuators(
+            self.problem, machine, (place, joints, rates), bounds, cost, suffix=stretch.suffix, pace=pace,
+            smoothing=smoothing,
+        )  # fmt: skip
+        return rates, second, running
 
     def task_errors(self, stretch: Stretch) -> tuple[Any, Any]:
         """Declare and return the velocities by which tasks may deviate, and their running cost; 0, 0 if not relaxed."""
@@ -311,16 +341,13 @@ def _declare_stretch(motion: _Motion, stretch: Stretch, known: Array | None) -> 
     problem, machine, bounds, pace = motion.problem, motion.machine, motion.bounds, motion.pace(stretch)
     begins, ends = stretch is motion.stretches[0], stretch is motion.stretches[-1]
     place, joints = motion.states(stretch)
-    unit = machine.robot.unit("/s")
-    options: dict[str, Any] = {"lower": -bounds.velocity, "upper": bounds.velocity, "unit": unit}
-    second, smooth = None, 0
-    if motion.actuated:
-        rates = problem.state(f"velocities{stretch.suffix}", machine.joint_size, **options)
-        variables = problem, machine, (place, joints, rates)
-        duration = FEEDBACK.smoothing * motion.horizon
-        second, smooth = declare_actuators(*variables, bounds, suffix=stretch.suffix, pace=pace, smoothing=duration)
+    second: Any = None
+    if motion.actuation is not None:
+        rates, second, running = motion.velocities(stretch, place, joints, pace)
     else:
+        options: dict[str, Any] = {"lower": -bounds.velocity, "upper": bounds.velocity, "unit": machine.robot.unit("/s")}
         rates = problem.control(f"rates{stretch.suffix}", machine.joint_size, **options)
+        running = ca.dot(rates, ca.DM(motion.weights) * rates) / 2
     slack = _closure(motion) if motion.cyclic and ends else 0
     ends_at: Array | None = None
     error_cost: Any = 0
@@ -332,7 +359,9 @@ def _declare_stretch(motion: _Motion, stretch: Stretch, known: Array | None) -> 
         if known is not None:
             rest = slopes - slopes @ np.linalg.pinv(known, rcond=ROUNDING_SHARE) @ known  # not led there before
             required = ~(np.linalg.norm(rest, axis=1) <= ROUNDING_SHARE * np.linalg.norm(slopes, axis=1))
-        rate_derivatives = None if second is None else (second, machine.base_rate(place, joints, rates))
+        rate_derivatives = None
+        if second is not None:
+            rate_derivatives = [(place, machine.base_rate(place, joints, rates)), (joints, rates), (rates, second)]
         free = not begins or motion.free
         _declare_tasks(motion, stretch, (place, joints, rates), pace, slack, free, required, rate_derivatives)
         placed = np.concatenate([is_holonomic(part) for part in stretch.equations.bound]).astype(bool)
@@ -342,10 +371,9 @@ def _declare_stretch(motion: _Motion, stretch: Stretch, known: Array | None) -> 
     problem.dynamics(joints, pace * rates)
     motion.constrain_clearance(stretch, place, joints, motion.horizon)
     states = [*([place] if machine.base_size else []), joints]
-    if motion.actuated:
+    if motion.actuation is not None:
         states += [rates, *([second] if f"jerks{stretch.suffix}" in problem.declared.controls else [])]
-    cost = pace * (ca.dot(rates, ca.DM(motion.weights) * rates) / 2 + error_cost + smooth)
-    return states, cost, ends_at
+    return states, pace * (running + error_cost), ends_at
 
 
 def _in_free_time(motion: _Motion, time_cost: float) -> ToolMotion:
@@ -355,9 +383,6 @@ def _in_free_time(motion: _Motion, time_cost: float) -> ToolMotion:
     z)) ds, which is convex in q' and z. The tasks, J q' = v(s), and the rate limits, |q'| <= v z, are linear in them.
     """
     machine, problem, stretches, bounds = motion.machine, motion.problem, motion.stretches, motion.bounds
-    if motion.actuated:
-        words = "a free horizon excludes actuator limits; give a horizon in s, or limits of velocity alone"
-        raise ProblemError(words, name="horizon")
     if len(stretches) > 1 or stretches[0].equations is None:
         words = "with a free horizon all tasks must begin and end together; give a horizon in s, or one task"
         raise ProblemError(words, name="horizon", value=len(stretches))
@@ -368,21 +393,32 @@ def _in_free_time(motion: _Motion, time_cost: float) -> ToolMotion:
     (stretch,) = stretches
     clock = problem.state(CLOCK, initial=0.0, lower=0.0, unit="s", guess=lambda s: s)
     place, joints = motion.states(stretch)
-    unit = machine.robot.unit("/s")
-    slopes = problem.control(SLOPES, machine.joint_size, unit=unit)
-    pace = problem.control(PACE, lower=1.0, guess=1.0)
     slack = _closure(motion) if motion.cyclic else 0
-    _declare_tasks(motion, stretch, (place, joints, slopes), 1.0, slack, motion.free)
-    limited = np.flatnonzero(np.isfinite(bounds.velocity)).tolist()
-    if limited:
-        largest = ca.DM(bounds.velocity[limited]) * pace
-        problem.path("rates", ca.vertcat(largest - slopes[limited], largest + slopes[limited]), lower=0, unit=unit)
+    if motion.actuation is None:
+        pace = problem.control(PACE, lower=1.0, guess=1.0)
+        slopes = problem.control(SLOPES, machine.joint_size, unit=machine.robot.unit("/s"))
+        _declare_tasks(motion, stretch, (place, joints, slopes), 1.0, slack, motion.free)
+        limited = np.flatnonzero(np.isfinite(bounds.velocity)).tolist()
+        if limited:
+            largest = ca.DM(bounds.velocity[limited]) * pace
+            excess = ca.vertcat(largest - slopes[limited], largest + slopes[limited])
+            problem.path("rates", excess, lower=0, unit=machine.robot.unit("/s"))
+        running = ca.dot(slopes, ca.DM(motion.weights) * slopes) / (2 * pace)
+    else:
+        pace = problem.state(PACE, lower=1.0, guess=1.0)
+        change = problem.control("pace change", guess=0.0, unit="1/s")
+        problem.dynamics(pace, change)
+        rates, second, running = motion.velocities(stretch, place, joints, pace)
+        slopes, base_slopes = pace * rates, machine.base_rate(place, joints, pace * rates)
+        derivatives = [(place, base_slopes), (joints, slopes), (rates, pace * second), (pace, change)]
+        _declare_tasks(motion, stretch, (place, joints, slopes), 1.0, slack, motion.free, rate_derivatives=derivatives)
+        running = pace * running + (FEEDBACK.smoothing * motion.horizon * change) ** 2 / 2
     problem.dynamics(clock, pace)
     if machine.base_size:
         problem.dynamics(place, machine.base_rate(place, joints, slopes))
     problem.dynamics(joints, slopes)
     motion.constrain_clearance(stretch, place, joints, None)
-    problem.minimize(running=time_cost * pace + ca.dot(slopes, ca.DM(motion.weights) * slopes) / (2 * pace))
+    problem.minimize(running=time_cost * pace + running)
     if motion.cyclic and motion.free:
         problem.end("cyclic", joints - problem.at_start(joints), 0, 0, unit=machine.robot.unit())
     return ToolMotion(problem, stretches, stretch.end, stretch.breaks / stretch.end)
@@ -418,14 +454,14 @@ def _declare_tasks(
     closure: Any,
     free: bool,
     required: NDArray[np.bool_] | None = None,
-    rate_derivatives: tuple[Any, Any] | None = None,
+    rate_derivatives: Sequence[tuple[Any, Any]] | None = None,
 ) -> None:
     """Constrain a stretch to its tasks, with base, joints and rates as symbols.
 
     `closure` is the deviation of a closed task. If `free`, the tasks that begin here must be at their start poses,
     except in rows that are not `required`, (size,), to which the stretch before leads. With `rate_derivatives`, the
-    joint accelerations and the base rate, accelerations constrain the tasks, and tasks begin with their velocities,
-    too.
+    states with their derivatives by the time of the tasks, accelerations constrain the tasks, and tasks begin with
+    their velocities, too.
     """
     problem, equations, suffix, (base, joints, rates) = motion.problem, stretch.equations, stretch.suffix, symbols
     assert equations is not None
@@ -438,19 +474,17 @@ def _declare_tasks(
     begins = np.repeat(stretch.new, [part.task.size for part in equations.bound])
     begins &= True if required is None else required
     if equations.size and rate_derivatives is not None:
-        second, drift = rate_derivatives
-        at, along = [joints, rates], [rates, second]
+        at, along = ([pair[k] for pair in rate_derivatives if pair[0].numel()] for k in (0, 1))
         if not constant:
             time = ca.MX.sym("time")
             change_at = ca.Function("change", [time], [ca.jtimes(targets_at(time), time, 1)])
             at.append(targets)
             along.append(problem.signal(f"target rates{suffix}", lambda t: change_at(stretch.begin + pace * t)))
-        if equations.machine.base_size:
-            at, along = [base, *at], [drift, *along]
         gains = np.repeat([float(part.task.gain) for part in equations.bound], [p.task.size for p in equations.bound])
         gap = ca.jtimes(residual, ca.vertcat(*at), ca.vertcat(*along)) + ca.DM(gains) * (residual - closure)
         problem.path(f"task{suffix}", ca.cse(gap), lower=0, upper=0, unit=equations.unit("/s^2", "/s^2"))
-        if begins.any():
+        at_rest = motion.actuation is not None and motion.actuation.rests[0] and stretch is motion.stretches[0]
+        if begins.any() and not at_rest:
             rows = np.flatnonzero(begins).tolist()
             problem.start(f"start velocity{suffix}", (residual - closure)[rows], 0, 0, unit=equations.unit())
     elif equations.size:
