@@ -44,7 +44,7 @@ LAYERS = {
         ["app"],
     ],
     "ocp.motion": [["tasks"], ["local", "schedule"], ["builders"], ["sampling", "search"], ["result"], ["plan"]],
-    "ocp.app": [["files", "batch"], ["check"], ["view"], ["run_task"], ["arguments"], ["command"]],
+    "ocp.app": [["files", "batch"], ["check"], ["view"], ["subcommands"], ["command"]],
 }
 """Packages and single modules of each package, from the lowest layer up: each may import from lower layers only."""
 MACHINES = {"ocp.motion", "ocp.app"}

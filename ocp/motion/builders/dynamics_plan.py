@@ -28,7 +28,6 @@ from ocp.console import interruptible
 from ocp.direct.collocation import Collocation
 from ocp.errors import ProblemError, SolveError, checked_each, checked_instance, checked_mapping
 from ocp.methods import solve
-from ocp.motion.builders.actuator_limits import Motors, checked_motors
 from ocp.motion.builders.clearance import (
     ClearanceConstraints,
     Constraints,
@@ -38,9 +37,9 @@ from ocp.motion.builders.clearance import (
 )
 from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem
 from ocp.motion.builders.standing.problem import FreeTime
+from ocp.motion.builders.torques import Motors, checked_motors
 from ocp.motion.tasks.checks import checked_horizon
-from ocp.motion.tasks.cost import Cost
-from ocp.motion.tasks.goals import Goal
+from ocp.motion.tasks.goals import Cost, Goal
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.phases import DURATION, Phases

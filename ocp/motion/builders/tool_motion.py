@@ -21,18 +21,18 @@ from models import Machine
 from models.arrays import Array
 from ocp.direct.guess import Samples
 from ocp.errors import ProblemError
-from ocp.motion.builders.actuator_limits import declare_actuators
 from ocp.motion.builders.clearance import ClearanceConstraints
+from ocp.motion.builders.torques import Actuation, declare_actuators
 from ocp.motion.local.rates import LocalMotion
 from ocp.motion.tasks.checks import check_closed, check_speed
 from ocp.motion.tasks.equations import TaskEquations, bind
-from ocp.motion.tasks.geometry import is_holonomic
+from ocp.motion.tasks.goals import Cost
 from ocp.motion.tasks.limits import JointBounds
-from ocp.motion.tasks.tip_task import TipTask
+from ocp.motion.tasks.tip_task import TipTask, is_holonomic
 from ocp.problem.problem import Problem
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = ["CLOCK", "PACE", "SLOPES", "Actuation", "Stretch", "ToolMotion", "stretches_of", "tool_motion_problem"]
+__all__ = ["CLOCK", "PACE", "SLOPES", "Stretch", "ToolMotion", "stretches_of", "tool_motion_problem"]
 
 CLOCK, SLOPES, PACE = "clock", "slopes", "pace"
 """Names in free time: the time as a state, and the derivatives of joints and time by the tasks' own time."""
@@ -42,7 +42,7 @@ ERRORS, START_ERRORS = "task errors", "start errors"
 
 @dataclass(frozen=True)
 class FeedbackSettings:
-    """Settings of the pose-error feedback and of the smoothness of accelerations.
+    """Settings of the pose-error feedback and of relaxed tasks.
 
     Attributes:
         decay: Largest decay of a pose error over an interval of the mesh, as a power of e. Faster feedback would need a
@@ -50,34 +50,15 @@ class FeedbackSettings:
         intervals: Least number of intervals of the mesh in a stretch.
         closed_gap: Pose error at the beginning of a task below which there is no gap to close, m and rad.
         relaxation: Velocity error of a relaxed task, m/s or rad/s, that costs as much as a joint rate of 1 rad/s.
-        smoothing: Share of the horizon in which controlled accelerations pass from limit to limit instead of jumping.
     """
 
     decay: float = 4.0
     intervals: int = 8
     closed_gap: float = 1e-6
     relaxation: float = 1e-5
-    smoothing: float = 1e-3
 
 
 FEEDBACK = FeedbackSettings()
-
-
-@dataclass(frozen=True, eq=False)
-class Actuation:
-    """Options of a motion whose controls are accelerations, or jerks if these are limited or weighted.
-
-    The states "velocities" (and "accelerations") with the suffix of each stretch replace the rates, path constraints
-    "torques" and "power" are added, and the tasks are constrained by their accelerations. Velocities are continuous
-    between stretches. A small weight in the cost smooths accelerations (jerks), see FeedbackSettings.
-
-    Attributes:
-        cost: Weights of all terms but the time, which replace those of the squared rates; None for the latter.
-        rests: Whether the joints are at rest at the start and at the end; else they are free to move there.
-    """
-
-    cost: Cost | None = None
-    rests: tuple[bool, bool] = (False, False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,8 +185,9 @@ def tool_motion_problem(
         time_cost: Cost of a second, if the tasks may be executed more slowly. The horizon of the problem is then the
             tasks' own. Its states over it are "joints", "base" and CLOCK, the time; its controls are SLOPES, the
             derivatives of the joints, and PACE, that of the time, at least 1. None keeps the tasks' own time.
-        actuation: Options of a motion with accelerations as the control, within the limits of the actuators; None for
-            rates as the control.
+        actuation: Options of a motion with accelerations (jerks) as the control, within the limits of the actuators;
+            None for rates as the control. The states "velocities" replace the rates, the tasks are constrained by their
+            accelerations, and velocities are continuous between stretches.
         relaxed: Whether tasks may deviate at a quadratic cost, J u - b = relaxation S with the cost |S|^2 / 2 and the
             control S, ERRORS. The constraints then stay independent where the rows of J depend on each other. If a
             motion of cost c does the tasks within the limits, the errors of the optimum satisfy |S|^2 / 2 <= c when
@@ -294,20 +276,13 @@ class _Motion:
         return place, self.problem.state(f"joints{stretch.suffix}", machine.joint_size, **options)
 
     def velocities(self, stretch: Stretch, place: Any, joints: Any, pace: Any) -> tuple[Any, Any, Any]:
-        """Declare velocities as states; return them, the accelerations and the running cost in a second of motion."""
+        """Declare velocities as states; return them, the accelerations and the cost in a second of motion."""
         assert self.actuation is not None
-        machine, bounds, (rests, stops) = self.machine, self.bounds, self.actuation.rests
-        options: dict[str, Any] = {"lower": -bounds.velocity, "upper": bounds.velocity, "unit": machine.robot.unit("/s")}
-        options |= {"initial": 0.0 if rests and stretch is self.stretches[0] else None}
-        options |= {"terminal": 0.0 if stops and stretch is self.stretches[-1] else None}
-        rates = self.problem.state(f"velocities{stretch.suffix}", machine.joint_size, **options)
+        begins, ends = (rests and stretch is self.stretches[-k] for k, rests in enumerate(self.actuation.rests))
         cost = self.actuation.cost or Cost(weights=self.weights)
-        smoothing = FEEDBACK.smoothing * self.horizon
-        second, running = declare_actuators(
-            self.problem, machine, (place, joints, rates), bounds, cost, suffix=stretch.suffix, pace=pace,
-            smoothing=smoothing,
-        )  # fmt: skip
-        return rates, second, running
+        own = replace(self.actuation, cost=cost, rests=(begins, ends))
+        options: dict[str, Any] = {"horizon": self.horizon, "pace": pace, "suffix": stretch.suffix}
+        return declare_actuators(self.problem, self.machine, (place, joints), self.bounds, actuation=own, **options)
 
     def task_errors(self, stretch: Stretch) -> tuple[Any, Any]:
         """Declare and return the velocities by which tasks may deviate, and their running cost; 0, 0 if not relaxed."""
@@ -345,8 +320,8 @@ def _declare_stretch(motion: _Motion, stretch: Stretch, known: Array | None) -> 
     if motion.actuation is not None:
         rates, second, running = motion.velocities(stretch, place, joints, pace)
     else:
-        options: dict[str, Any] = {"lower": -bounds.velocity, "upper": bounds.velocity, "unit": machine.robot.unit("/s")}
-        rates = problem.control(f"rates{stretch.suffix}", machine.joint_size, **options)
+        limits: dict[str, Any] = {"lower": -bounds.velocity, "upper": bounds.velocity}
+        rates = problem.control(f"rates{stretch.suffix}", machine.joint_size, unit=machine.robot.unit("/s"), **limits)
         running = ca.dot(rates, ca.DM(motion.weights) * rates) / 2
     slack = _closure(motion) if motion.cyclic and ends else 0
     ends_at: Array | None = None
@@ -359,11 +334,11 @@ def _declare_stretch(motion: _Motion, stretch: Stretch, known: Array | None) -> 
         if known is not None:
             rest = slopes - slopes @ np.linalg.pinv(known, rcond=ROUNDING_SHARE) @ known  # not led there before
             required = ~(np.linalg.norm(rest, axis=1) <= ROUNDING_SHARE * np.linalg.norm(slopes, axis=1))
-        rate_derivatives = None
+        derivatives = None
         if second is not None:
-            rate_derivatives = [(place, machine.base_rate(place, joints, rates)), (joints, rates), (rates, second)]
+            derivatives = [(joints, rates), (rates, second), (place, machine.base_rate(place, joints, rates))]
         free = not begins or motion.free
-        _declare_tasks(motion, stretch, (place, joints, rates), pace, slack, free, required, rate_derivatives)
+        _declare_tasks(motion, stretch, (place, joints, rates), pace, slack, free, required, derivatives)
         placed = np.concatenate([is_holonomic(part) for part in stretch.equations.bound]).astype(bool)
         ends_at = slopes[stretch.equations.pose_rows | (placed & (begins | ~required))]
     if machine.base_size:
@@ -381,13 +356,14 @@ def _in_free_time(motion: _Motion, time_cost: float) -> ToolMotion:
 
     With q' = dq/ds and z = dt/ds the cost is the integral of (time_cost + q. W q. / 2) dt = (time_cost z + q' W q'/(2
     z)) ds, which is convex in q' and z. The tasks, J q' = v(s), and the rate limits, |q'| <= v z, are linear in them.
+    With accelerations as the control, z is a state, and q' = z q.
     """
     machine, problem, stretches, bounds = motion.machine, motion.problem, motion.stretches, motion.bounds
     if len(stretches) > 1 or stretches[0].equations is None:
         words = "with a free horizon all tasks must begin and end together; give a horizon in s, or one task"
         raise ProblemError(words, name="horizon", value=len(stretches))
-    momentum = getattr(machine, "conserved_momentum", None)
-    if momentum is not None and np.any(np.asarray(momentum) != 0):
+    momentum = getattr(machine, "conserved_momentum", 0)
+    if np.any(np.asarray(momentum) != 0):
         words = "with a free horizon the base must not drift, but it has momentum; give a horizon in s"
         raise ProblemError(words, name="conserved_momentum", value=momentum)
     (stretch,) = stretches
@@ -398,21 +374,20 @@ def _in_free_time(motion: _Motion, time_cost: float) -> ToolMotion:
         pace = problem.control(PACE, lower=1.0, guess=1.0)
         slopes = problem.control(SLOPES, machine.joint_size, unit=machine.robot.unit("/s"))
         _declare_tasks(motion, stretch, (place, joints, slopes), 1.0, slack, motion.free)
-        limited = np.flatnonzero(np.isfinite(bounds.velocity)).tolist()
-        if limited:
-            largest = ca.DM(bounds.velocity[limited]) * pace
-            excess = ca.vertcat(largest - slopes[limited], largest + slopes[limited])
-            problem.path("rates", excess, lower=0, unit=machine.robot.unit("/s"))
+        if limited := np.flatnonzero(np.isfinite(bounds.velocity)).tolist():
+            own, largest = slopes[limited], ca.DM(bounds.velocity[limited]) * pace
+            problem.path("rates", ca.vertcat(largest - own, largest + own), lower=0, unit=machine.robot.unit("/s"))
         running = ca.dot(slopes, ca.DM(motion.weights) * slopes) / (2 * pace)
     else:
         pace = problem.state(PACE, lower=1.0, guess=1.0)
         change = problem.control("pace change", guess=0.0, unit="1/s")
         problem.dynamics(pace, change)
         rates, second, running = motion.velocities(stretch, place, joints, pace)
-        slopes, base_slopes = pace * rates, machine.base_rate(place, joints, pace * rates)
-        derivatives = [(place, base_slopes), (joints, slopes), (rates, pace * second), (pace, change)]
-        _declare_tasks(motion, stretch, (place, joints, slopes), 1.0, slack, motion.free, rate_derivatives=derivatives)
-        running = pace * running + (FEEDBACK.smoothing * motion.horizon * change) ** 2 / 2
+        slopes = pace * rates
+        drift = machine.base_rate(place, joints, slopes)
+        derivatives = [(joints, slopes), (rates, pace * second), (pace, change), (place, drift)]
+        _declare_tasks(motion, stretch, (place, joints, slopes), 1.0, slack, motion.free, derivatives=derivatives)
+        running = pace * running + (motion.actuation.smoothing * motion.horizon * change) ** 2 / 2
     problem.dynamics(clock, pace)
     if machine.base_size:
         problem.dynamics(place, machine.base_rate(place, joints, slopes))
@@ -454,14 +429,13 @@ def _declare_tasks(
     closure: Any,
     free: bool,
     required: NDArray[np.bool_] | None = None,
-    rate_derivatives: Sequence[tuple[Any, Any]] | None = None,
+    derivatives: Sequence[tuple[Any, Any]] | None = None,
 ) -> None:
     """Constrain a stretch to its tasks, with base, joints and rates as symbols.
 
     `closure` is the deviation of a closed task. If `free`, the tasks that begin here must be at their start poses,
-    except in rows that are not `required`, (size,), to which the stretch before leads. With `rate_derivatives`, the
-    states with their derivatives by the time of the tasks, accelerations constrain the tasks, and tasks begin with
-    their velocities, too.
+    except in rows that are not `required`, (size,), to which the stretch before leads. With `derivatives`, of states by
+    the time of the tasks, the base last, accelerations constrain the tasks, and tasks begin with their velocities, too.
     """
     problem, equations, suffix, (base, joints, rates) = motion.problem, stretch.equations, stretch.suffix, symbols
     assert equations is not None
@@ -473,8 +447,9 @@ def _declare_tasks(
     residual = ca.cse(equations.residual(base, joints, rates, targets))
     begins = np.repeat(stretch.new, [part.task.size for part in equations.bound])
     begins &= True if required is None else required
-    if equations.size and rate_derivatives is not None:
-        at, along = ([pair[k] for pair in rate_derivatives if pair[0].numel()] for k in (0, 1))
+    if equations.size and derivatives is not None:
+        moving = derivatives if equations.machine.base_size else derivatives[:-1]
+        at, along = [state for state, _ in moving], [derivative for _, derivative in moving]
         if not constant:
             time = ca.MX.sym("time")
             change_at = ca.Function("change", [time], [ca.jtimes(targets_at(time), time, 1)])

@@ -22,8 +22,7 @@ from ocp.motion.local.collisions import Collision, checked_collision_scene, find
 from ocp.motion.local.ik_solver import ik_branches
 from ocp.motion.tasks.checks import checked_configuration
 from ocp.motion.tasks.equations import TaskEquations, bind
-from ocp.motion.tasks.geometry import pose_in_reference
-from ocp.motion.tasks.tip_task import ANGULAR, TipTask
+from ocp.motion.tasks.tip_task import ANGULAR, TipTask, pose_in_reference
 
 __all__ = ["IkSolution", "Unreachable", "describe_miss", "inverse_kinematics", "inverse_kinematics_at"]
 

@@ -19,16 +19,16 @@ from models.arrays import Array
 from models.machines.machine import hold_joints
 from ocp.direct.guess import Samples
 from ocp.errors import SolveError
-from ocp.motion.builders.actuator_limits import checked_motors, joint_torques
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.dynamics_plan import within_limits
-from ocp.motion.builders.tool_motion import CLOCK, PACE, SLOPES, Actuation, ToolMotion
+from ocp.motion.builders.tool_motion import CLOCK, PACE, SLOPES, ToolMotion
+from ocp.motion.builders.torques import Actuation, checked_motors, joint_torques, running_cost, weights_torques
 from ocp.motion.result.plan import CHECKED_TIMES
 from ocp.motion.result.request import declared_motion
 from ocp.motion.result.solved_plan import SolvedPlan
 from ocp.motion.search.configurations import PlanRequest
 from ocp.motion.search.held_joints import all_joints
-from ocp.motion.tasks.cost import Cost
+from ocp.motion.tasks.goals import Cost
 from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.problem.problem import Problem
 from ocp.solution import Solution
@@ -66,11 +66,17 @@ def cost_of_motion(plan: SolvedPlan, cost: Cost) -> float:
     sample = plan.sampled(np.linspace(0.0, plan.horizon, CHECKED_TIMES))
     free = [name not in plan.held for name in plan.names]
     bases = plan.at(sample.t)["base"] if machine.base_size else np.zeros((CHECKED_TIMES, 0))
-    symbols = [ca.SX.sym("v", size) for size in (machine.base_size, *[machine.joint_size] * 4)]
-    running = ca.Function("cost", symbols, [running_cost(machine, cost, *symbols)])
+    base, *motion = (ca.SX.sym("v", size) for size in (machine.base_size, *[machine.joint_size] * 4))
+    torques: Any = None
+    if weights_torques(cost):
+        torques = joint_torques(checked_motors("cost", machine), base, *motion[:3])
+    running = running_cost(machine, cost, (base, *motion[:3]), jerks=motion[3], torques=torques)
+    if cost.energy:
+        running += cost.energy * ca.sum1(ca.fmax(torques * motion[1], 0.0))
+    running_at = ca.Function("cost", [base, *motion], [running])
     joints, rates, accelerations = (values[:, free] for values in sample[1:4])
     jerks = np.gradient(accelerations, sample.t, axis=0)
-    values = running.map(CHECKED_TIMES)(bases.T, joints.T, rates.T, accelerations.T, jerks.T)
+    values = running_at.map(CHECKED_TIMES)(bases.T, joints.T, rates.T, accelerations.T, jerks.T)
     return float(np.trapezoid(np.array(values)[0], sample.t) + cost.time * plan.horizon)
 
 
@@ -132,9 +138,7 @@ class ActuatorDemand:
         return None if largest is None else largest[1]
 
 
-def solve_with_accelerations(
-    request: PlanRequest, start: Array, reference: Array, unlimited: SolvedPlan
-) -> Solution:
+def solve_with_accelerations(request: PlanRequest, start: Array, reference: Array, unlimited: SolvedPlan) -> Solution:
     """Return a motion within the actuator limits and at the cost of a request, from one without.
 
     Args:

@@ -21,8 +21,7 @@ from ocp.errors import (
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem
 from ocp.motion.builders.dynamics_plan import dynamics_phases
-from ocp.motion.builders.joint_motion import joint_motion_problem
-from ocp.motion.builders.minimum_velocity import minimum_velocity_problem
+from ocp.motion.builders.joint_motion import joint_motion_problem, minimum_velocity_problem
 from ocp.motion.builders.space.capture import Capture, capture_problem
 from ocp.motion.builders.standing.problem import StandingSetup, Weights, standing_problem
 from ocp.motion.builders.standing.stances import Steps
@@ -38,10 +37,8 @@ from ocp.motion.result.path_plan import PathPlan
 from ocp.motion.result.plan import Plan
 from ocp.motion.result.segmented_plan import SegmentedPlan, SequencePlan
 from ocp.motion.result.solved_plan import PHASED, PhasedPlan, SolvedPlan
-from ocp.motion.tasks.cost import Cost
-from ocp.motion.tasks.goals import Goal, Start, Waypoints
+from ocp.motion.tasks.goals import Cost, Goal, Scene, Start, Waypoints
 from ocp.motion.tasks.limits import Limits
-from ocp.motion.tasks.scene import Scene
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.problem import Problem
 from ocp.progress import shown_progress

@@ -12,7 +12,6 @@ from models import Box, FixedBase, FreeFloating, Machine, Sphere, Stance
 from models.arrays import Array
 from ocp.console import time_left
 from ocp.errors import ProblemError, checked_choice, checked_each, checked_instance, floats
-from ocp.motion.builders.actuator_limits import checked_motors
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.dynamics import DynamicsSetup
 from ocp.motion.builders.dynamics_plan import dynamics_phases, machines_of, phase_names, within_limits
@@ -20,14 +19,14 @@ from ocp.motion.builders.space.capture import Capture, solve_capture
 from ocp.motion.builders.standing.plan import solve_steps
 from ocp.motion.builders.standing.stances import Steps
 from ocp.motion.builders.standing.steps import StepWeights
+from ocp.motion.builders.torques import checked_motors
 from ocp.motion.local.inverse_kinematics import Unreachable, inverse_kinematics
 from ocp.motion.plan.goal_plan import GoalRequest, plan_to_goal
 from ocp.motion.result.candidate import Candidate, Stage
 from ocp.motion.result.solved_plan import PhasedPlan, SolvedPlan, parts_of_phases
 from ocp.motion.tasks.checks import checked_numbers, clip_to_limits
-from ocp.motion.tasks.cost import Cost
 from ocp.motion.tasks.equations import bind
-from ocp.motion.tasks.goals import Goal, Start
+from ocp.motion.tasks.goals import Cost, Goal, Start
 from ocp.motion.tasks.limits import Limits
 from ocp.problem.problem import Problem
 from ocp.progress import report

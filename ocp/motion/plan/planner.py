@@ -28,9 +28,9 @@ from ocp.errors import (
     checked_flag,
     checked_instance,
 )
-from ocp.motion.builders.actuator_limits import checked_motors
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.tool_motion import stretches_of
+from ocp.motion.builders.torques import checked_motors
 from ocp.motion.local.inverse_kinematics import LARGEST_SEED, Unreachable
 from ocp.motion.local.rates import LocalMotion
 from ocp.motion.plan.actuators import limits_actuators, weights_actuators, without_actuators
@@ -59,11 +59,9 @@ from ocp.motion.search.held_joints import (
 from ocp.motion.search.search import checked_bound
 from ocp.motion.search.task_search import TaskSearch
 from ocp.motion.tasks.checks import checked_tasks, clip_to_limits, horizon_of
-from ocp.motion.tasks.cost import Cost
 from ocp.motion.tasks.equations import bind
-from ocp.motion.tasks.goals import Start
+from ocp.motion.tasks.goals import Cost, Scene, Start
 from ocp.motion.tasks.limits import Limits
-from ocp.motion.tasks.scene import Scene
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.progress import report
 

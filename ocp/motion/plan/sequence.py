@@ -22,9 +22,9 @@ import numpy as np
 from models import FixedBase, Machine
 from models.arrays import Array
 from ocp.errors import ProblemError, SolveError, checked_instance, floats
-from ocp.motion.builders.actuator_limits import checked_motors
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.tool_motion import Stretch, stretches_of
+from ocp.motion.builders.torques import checked_motors
 from ocp.motion.local.inverse_kinematics import Unreachable
 from ocp.motion.plan.actuators import limits_actuators, weights_actuators
 from ocp.motion.plan.goal_plan import GoalRequest, plan_to_goal
@@ -36,11 +36,9 @@ from ocp.motion.search.configurations import PlanRequest, local_motions_from
 from ocp.motion.search.held_joints import fix_ignorable_joints, hold_idle_joints, place_held_joints
 from ocp.motion.search.task_search import TaskSearch
 from ocp.motion.tasks.checks import check_rest
-from ocp.motion.tasks.cost import Cost
 from ocp.motion.tasks.equations import TaskEquations, bind
-from ocp.motion.tasks.goals import Goal, Start
+from ocp.motion.tasks.goals import Cost, Goal, Scene, Start
 from ocp.motion.tasks.limits import Limits
-from ocp.motion.tasks.scene import Scene
 from ocp.motion.tasks.tip_task import TipTask, timed
 
 __all__ = ["SequenceRequest", "plan_consecutive", "plan_in_segments"]

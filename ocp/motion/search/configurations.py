@@ -19,6 +19,7 @@ from ocp.motion.local.collisions import Collision, distances_along
 from ocp.motion.local.inverse_kinematics import Unreachable, describe_miss, inverse_kinematics, inverse_kinematics_at
 from ocp.motion.local.rates import LocalMotion, track_tasks
 from ocp.motion.tasks.equations import TaskEquations, bind
+from ocp.motion.tasks.goals import Cost
 from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.motion.tasks.tip_task import TipTask
 

@@ -33,9 +33,8 @@ from ocp.motion.builders.standing.stances import Steps
 from ocp.motion.builders.standing.steps import StepWeights, steps_problem
 from ocp.motion.tasks.checks import checked_horizon
 from ocp.motion.tasks.equations import bind, task_errors
-from ocp.motion.tasks.limits import Limits
+from ocp.motion.tasks.limits import Limits, ZmpRule
 from ocp.motion.tasks.tip_task import TipTask
-from ocp.motion.tasks.zmp_rules import ZmpRule
 from ocp.problem.formulation import Formulation
 from ocp.problem.phases import DURATION, Phases
 from ocp.problem.problem import Problem
