@@ -1,12 +1,19 @@
 """Optimal control: declare a problem, transcribe it, solve it, audit it; ready problems and plans for machines."""
 
 from ocp.audit.audit import Audit, Finding
-from ocp.audit.certificate import Certificate
 from ocp.direct.collocation import Collocation
 from ocp.direct.shooting import MultipleShooting
-from ocp.errors import AuditError, BoundWarning, ProblemError, RefinementWarning, SolveError, StorageWarning
+from ocp.errors import (
+    AuditError,
+    BoundWarning,
+    ProblemError,
+    RefinementWarning,
+    SolveError,
+    SolverStatus,
+    StorageWarning,
+)
 from ocp.indirect.method import Indirect
-from ocp.methods import certificate, prepare, solve
+from ocp.methods import Certificate, certificate, prepare, solve
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.cts import RollObstacles, RollSettings, roll_problem, spline_targets
 from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem
@@ -30,10 +37,9 @@ from ocp.motion.tasks.limits import Anywhere, Following, IndexAtLeast, InFoot, L
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.phases import Phases
 from ocp.problem.problem import Problem
-from ocp.refinement import refine
-from ocp.registry import register as _register
+from ocp.refinement import RefinementSettings, refine
 from ocp.solution import Sensitivity, Solution
-from ocp.status import SolverStatus
+from ocp.solution_data import register as _register
 from ocp.tightening import tighten
 
 __version__ = "0.1.0"
@@ -79,6 +85,7 @@ __all__ = [
     "Problem",
     "ProblemError",
     "Reconfiguration",
+    "RefinementSettings",
     "RefinementWarning",
     "RollObstacles",
     "RollSettings",

@@ -32,8 +32,8 @@ from ocp.app.subcommands import (
     run_report,
     run_view,
 )
+from ocp.console import Progress
 from ocp.errors import AuditError, ProblemError, SolveError, checked_each
-from ocp.progress import Progress
 from ocp.tolerances import LIMIT_SHARE, ORIENTATION_TOLERANCE_RAD
 
 __all__ = ["main", "parser"]

@@ -23,12 +23,12 @@ from ocp.app.check.verdict import CheckTolerances, Interpretation, check_traject
 from ocp.app.files import RawTrajectory, read_trajectory, read_waypoints, write_mcap
 from ocp.app.files.safe_files import MARK, SUFFIXES, checked_output, missing_package
 from ocp.app.files.task_file import Task, read_obstacles, read_task
+from ocp.console import Progress
 from ocp.errors import MAX_COUNT, ProblemError, checked_positive
 from ocp.motion.plan import Plan, plan
 from ocp.motion.result.segmented_plan import SegmentedPlan
 from ocp.motion.tasks.goals import Scene
 from ocp.motion.tasks.limits import Limits
-from ocp.progress import Progress
 from ocp.storage import write_text
 
 __all__ = [

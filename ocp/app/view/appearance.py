@@ -25,8 +25,8 @@ from models.shapes.shapes import Shape
 from ocp.audit.clearance import separation_frames
 from ocp.motion.plan import Plan
 from ocp.motion.result.path_plan import PathPlan
+from ocp.problem.hulls import Separation
 from ocp.problem.problem import Problem
-from ocp.problem.separation import Separation
 from ocp.problem.values import Sampler
 from ocp.solution import Solution
 

@@ -20,7 +20,7 @@ from models import FixedBase, Machine
 from models.arrays import Array
 from ocp.console import interruptible
 from ocp.curves import PiecewisePolynomial
-from ocp.errors import ProblemError, checked_each, checked_flag, checked_instance, checked_positive
+from ocp.errors import ProblemError, SolverStatus, checked_each, checked_flag, checked_instance, checked_positive
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.tool_motion import ToolMotion, stretches_of, tool_motion_problem
 from ocp.motion.local.inverse_kinematics import inverse_kinematics
@@ -38,7 +38,6 @@ from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.problem import Problem, remembers_request
 from ocp.solution import Solution
-from ocp.status import SolverStatus
 
 __all__ = ["joint_motion_problem", "least_durations", "minimum_velocity_problem", "motion_along"]
 

@@ -21,7 +21,7 @@ import numpy as np
 from models import FixedBase
 from models.arrays import Array
 from ocp.curves import PiecewisePolynomial
-from ocp.errors import SolveError
+from ocp.errors import SolveError, SolverStatus
 from ocp.motion.builders.torques import joint_torques
 from ocp.motion.schedule.ramps import fastest_motion
 from ocp.motion.tasks.limits import JointBounds
@@ -29,7 +29,6 @@ from ocp.problem.formulation import Formulation
 from ocp.problem.problem import Problem
 from ocp.problem.values import Sampler
 from ocp.solution import Solution
-from ocp.status import SolverStatus
 from ocp.tolerances import ROUNDING_SHARE
 
 __all__ = ["StoppingMotion", "segment_durations", "stopping_motion"]

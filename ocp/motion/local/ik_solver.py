@@ -260,9 +260,9 @@ class PreparedArm:
         if self._idle.any():
             joints[:, self._idle] = idle_positions(self.arm.lower, self.arm.upper)[self._idle]
         reasons = [Incompleteness(0) if self.complete else Incompleteness.SAMPLED] * count
-        for k in np.unique(solutions.pose[solutions.singular] // samples).tolist():
+        for k in set((solutions.pose[solutions.singular] // samples).tolist()):
             reasons[k] |= Incompleteness.SINGULAR
-        for k in np.unique(np.flatnonzero(doubtful) // samples).tolist():
+        for k in set((np.flatnonzero(doubtful) // samples).tolist()):
             reasons[k] |= Incompleteness.ILL_CONDITIONED
         return joints, pose, tuple(reasons)
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any, Literal, TypeAlias, get_args
 
 from models import FixedBase, FreeFloating, Machine, Standing
-from ocp.console import TimeLimitReached, interruptible, time_limited
+from ocp.console import TimeLimitReached, interruptible, shown_progress, time_limited
 from ocp.errors import (
     ProblemError,
     SolveError,
@@ -41,7 +41,6 @@ from ocp.motion.tasks.goals import Cost, Goal, Scene, Start, Waypoints
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.problem import Problem
-from ocp.progress import shown_progress
 from ocp.storage import read_arrays
 
 __all__ = ["Search", "load_plan", "plan", "plan_problem"]

@@ -10,7 +10,7 @@ import numpy as np
 
 from models import Box, FixedBase, FreeFloating, Machine, Sphere, Stance
 from models.arrays import Array
-from ocp.console import time_left
+from ocp.console import report, time_left
 from ocp.errors import ProblemError, checked_choice, checked_each, checked_instance, floats
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.dynamics import DynamicsSetup
@@ -29,7 +29,6 @@ from ocp.motion.tasks.equations import bind
 from ocp.motion.tasks.goals import Cost, Goal, Start
 from ocp.motion.tasks.limits import Limits
 from ocp.problem.problem import Problem
-from ocp.progress import report
 from ocp.solution import Solution
 
 __all__ = ["goal_configurations", "plan_capture", "plan_goal", "plan_sequence", "plan_steps", "with_joints"]

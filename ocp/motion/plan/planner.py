@@ -19,6 +19,7 @@ import numpy as np
 
 from models import CollisionScene, Machine, ModelError
 from models.arrays import Array
+from ocp.console import report
 from ocp.errors import (
     ProblemError,
     SolveError,
@@ -63,7 +64,6 @@ from ocp.motion.tasks.equations import bind
 from ocp.motion.tasks.goals import Cost, Scene, Start
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.tip_task import TipTask
-from ocp.progress import report
 
 __all__ = ["candidates_from", "checked_request", "clearance_for", "plan_from_configurations", "plan_request"]
 

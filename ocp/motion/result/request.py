@@ -58,10 +58,9 @@ from ocp.motion.tasks.goals import Cost, Goal, Start
 from ocp.motion.tasks.limits import IndexAtLeast, InFoot, Limits, Pinned
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.motion.tasks.tracks import TrackWithRate
-from ocp.problem.function_reader import FunctionReader
-from ocp.problem.function_writer import FunctionWriter
 from ocp.problem.problem import Problem
-from ocp.problem.stored import RECORD_ERRORS
+from ocp.problem.record_reader import RECORD_ERRORS, FunctionReader
+from ocp.problem.record_writer import FunctionWriter
 
 __all__ = ["MotionRequest", "declared_motion", "request_of", "restored_request", "stored_request"]
 

@@ -23,8 +23,8 @@ from models import files as kept
 from ocp import Plan, ProblemError, SolveError
 from ocp.app import main
 from ocp.app.files.task_file import read_task
+from ocp.console import Progress
 from ocp.motion.result.segmented_plan import SegmentedPlan
-from ocp.progress import Progress
 from tests.ocp.app.motions import smooth, write_robot, write_table
 
 TASK = """# a seam
@@ -328,8 +328,8 @@ class Terminal(io.StringIO):
 def test_long_work_says_that_it_goes_on(monkeypatch: pytest.MonkeyPatch, terminal: bool) -> None:
     stream = Terminal() if terminal else io.StringIO()
     monkeypatch.setattr(sys, "stderr", stream)
-    monkeypatch.setattr("ocp.progress.LOG_PERIOD_S", 0.05)
-    monkeypatch.setattr("ocp.progress.TERMINAL_DELAY_S", 0.05)
+    monkeypatch.setattr("ocp.console.LOG_PERIOD_S", 0.05)
+    monkeypatch.setattr("ocp.console.TERMINAL_DELAY_S", 0.05)
     with Progress("work") as progress:
         progress("half of it")
         while "half of it" not in stream.getvalue():
