@@ -22,7 +22,7 @@ from ocp.console import interruptible, time_limited
 from ocp.direct.collocation import Collocation
 from ocp.direct.guess import Samples
 from ocp.direct.shooting import MultipleShooting
-from ocp.errors import ProblemError, SolveError, checked_flag, checked_time_limit
+from ocp.errors import ProblemError, SolveError, checked_time_limit, require
 from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.problem import Problem, checked_problem
 from ocp.solution import ByName, Guess, Solution
@@ -110,8 +110,8 @@ def prepare(
         raise ProblemError(
             f"a method such as Collocation(...) is expected, not {method!r}", name="method", value=method
         )
-    checked_flag("prepare: compiled", compiled)
-    checked_flag("prepare: scaling", scaling)
+    require.flag("prepare: compiled", compiled)
+    require.flag("prepare: scaling", scaling)
     return method.prepare(problem, solver=solver, options=options, compiled=compiled, scaling=scaling)
 
 
@@ -155,7 +155,7 @@ def solve(
             worst residuals by constraint, state and time. Or the plan is not a minimum, and no minimum was found near
             it.
     """
-    checked_flag("solve: check", check)
+    require.flag("solve: check", check)
     with time_limited(checked_time_limit(time_limit)):
         prepared = prepare(problem, method, solver=solver, options=options, scaling=scaling)
         solution = prepared.solve(parameters, guess, check)
@@ -255,7 +255,7 @@ def certificate(
         ProblemError: Fewer than two solutions, solutions of other problems or other parameters; no direct one for a
             second solver.
     """
-    if not checked_flag("certificate: second_solver", second_solver):
+    if not require.flag("certificate: second_solver", second_solver):
         return comparison.certificate(problem, solutions, tolerance=tolerance)
     by_name = comparison.checked_solutions(solutions)
     direct = [name for name, solution in by_name.items() if solution.method["type"] in METHODS]

@@ -15,16 +15,7 @@ from ocp.audit.audit import audit as judge
 from ocp.console import TimeLimitReached, time_left, time_limited
 from ocp.direct.mesh import check_meshed
 from ocp.direct.prepared import DirectMethod
-from ocp.errors import (
-    ProblemError,
-    RefinementWarning,
-    SolveError,
-    checked_count,
-    checked_mapping,
-    checked_time_limit,
-    error_names,
-    unknown_name,
-)
+from ocp.errors import ProblemError, RefinementWarning, SolveError, checked_time_limit, error_names, require
 from ocp.methods import solve
 from ocp.problem.formulation import Formulation
 from ocp.problem.problem import Problem
@@ -115,13 +106,13 @@ def refine(
     """
     check_meshed("refine", method, tolerance)
     checked_time_limit(time_limit)
-    settings = checked_mapping("refine: limits", limits)
+    settings = require.mapping("refine: limits", limits)
     for name in settings:
         if name not in LIMITS:
-            raise unknown_name("limit of the audit", name, LIMITS)
-    max_intervals = checked_count("refine: max_intervals", max_intervals)
+            raise require.unknown("limit of the audit", name, LIMITS)
+    max_intervals = require.count("refine: max_intervals", max_intervals)
     form = Formulation.of(problem)
-    p = form.parameter_vector(checked_mapping("parameters", parameters))
+    p = form.parameter_vector(require.mapping("parameters", parameters))
     method = method.with_nodes_at(_fractions(form, p, breaks))
     if max_intervals < method.intervals:
         raise ProblemError(

@@ -9,7 +9,7 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from ocp.errors import ProblemError, unknown_name
+from ocp.errors import ProblemError, require
 from ocp.status import SolverStatus
 from ocp.tolerances import ROUNDING_SHARE
 
@@ -41,7 +41,7 @@ class Sample(dict[str, np.ndarray]):
     """States and controls at one time (each (n,)) or at several (each (M, n)), by name."""
 
     def __missing__(self, name: str) -> np.ndarray:
-        raise unknown_name("state or control", name, self)
+        raise require.unknown("state or control", name, self)
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ def read_status(path: Any, word: Any) -> SolverStatus:
 def entry_named(kind: str, name: Any, pool: Mapping[str, T]) -> T:
     """Return an entry of a pool; raise ProblemError, which lists similar names, if there is none."""
     if not isinstance(name, str) or name not in pool:
-        raise unknown_name(kind, name, pool)
+        raise require.unknown(kind, name, pool)
     return pool[name]
 
 

@@ -15,7 +15,7 @@ from ocp.console import interruptible, time_left, time_limited
 from ocp.direct.assembly import Transcription
 from ocp.direct.mesh import check_meshed
 from ocp.direct.prepared import DirectMethod
-from ocp.errors import SolveError, checked_mapping, checked_time_limit
+from ocp.errors import SolveError, checked_time_limit, require
 from ocp.problem.formulation import Formulation
 from ocp.problem.problem import Problem
 from ocp.solution import NODE_TOLERANCE, ByName, Guess, Solution
@@ -83,7 +83,7 @@ def tighten(
     with time_limited(checked_time_limit(time_limit)):
         prepared = method.prepare(problem, solver=solver, options=options)
         form, transcription = prepared.formulation, prepared.transcription
-        p = form.parameter_vector(checked_mapping("tighten: parameters", parameters))
+        p = form.parameter_vector(require.mapping("tighten: parameters", parameters))
         bounds = form.bound_values(p)
         index = np.concatenate([form.bounds.places[kind] for kind in ("state", "control", "path")])
         low, high = bounds[0][index], bounds[1][index]

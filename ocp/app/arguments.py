@@ -13,7 +13,7 @@ import numpy as np
 
 from models import FixedBase, FreeFloating, Robot, lock_joints, rectangle, with_load
 from models import files as cache
-from models.arrays import Array
+from models.checks import Array
 from models.spatial import rotation_from_rpy
 from ocp.app.check.verdict import bounds_of, check_trajectory
 from ocp.app.files import read_trajectory, read_waypoints

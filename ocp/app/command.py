@@ -19,7 +19,7 @@ from typing import Any
 
 from models import ModelError, ModelWarning
 from ocp.app.arguments import CommandFunction, subcommands
-from ocp.errors import AuditError, ProblemError, SolveError, checked_each
+from ocp.errors import AuditError, ProblemError, SolveError, require
 from ocp.progress import Progress
 
 __all__ = ["main", "parser"]
@@ -64,7 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     if isinstance(arguments, str):
         raise ProblemError(f"arguments must be a list of texts, not {arguments!r}", name="arguments", value=arguments)
-    arguments = None if arguments is None else checked_each("arguments", arguments, str)
+    arguments = None if arguments is None else require.each("arguments", arguments, str)
     options = parser().parse_args(arguments)
     try:
         return _run(options)

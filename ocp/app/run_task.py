@@ -7,11 +7,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from models.files import INPUT_LIMITS
 from ocp.app.files import write_mcap
 from ocp.app.files.outputs import MARK, SUFFIXES, checked_output
 from ocp.app.files.task_file import Task
 from ocp.app.files.text_files import missing_package
-from ocp.errors import MAX_COUNT, ProblemError, checked_positive
+from ocp.errors import ProblemError, require
 from ocp.motion.plan import Plan, plan
 from ocp.motion.result.segmented_plan import SegmentedPlan
 from ocp.storage import write_text
@@ -113,13 +114,12 @@ def export_plan(plan: Plan, file: Path, period: float, force: bool = False) -> N
 
 
 def check_period(plan: Plan, period: float) -> None:
-    """Raise ProblemError if a sampling period is not positive or gives more than MOST samples."""
-    checked_positive("period", period)
-    if plan.horizon / period > MAX_COUNT:
-        words = (
-            f"a period of {period:g} s gives {plan.horizon / period:.3g} samples; at most {MAX_COUNT} can be written"
-        )
-        raise ProblemError(words, name="period", value=period, limit=plan.horizon / MAX_COUNT)
+    """Raise ProblemError if a sampling period is not positive or gives more than INPUT_LIMITS.count samples."""
+    require.positive("period", period)
+    most = INPUT_LIMITS.count
+    if plan.horizon / period > most:
+        words = f"a period of {period:g} s gives {plan.horizon / period:.3g} samples; at most {most} can be written"
+        raise ProblemError(words, name="period", value=period, limit=plan.horizon / most)
 
 
 def _yaml(plan: Plan, file: Path, period: float) -> None:

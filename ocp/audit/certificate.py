@@ -11,7 +11,7 @@ import numpy as np
 
 from ocp.audit.audit import Audit, audit
 from ocp.console import interruptible
-from ocp.errors import ProblemError, checked_each, checked_mapping, checked_positive
+from ocp.errors import ProblemError, require
 from ocp.problem.formulation import Formulation
 from ocp.problem.problem import Problem
 from ocp.solution import Solution, check_variables_match
@@ -124,7 +124,7 @@ def certificate(
     Raises:
         ProblemError: Fewer than two solutions, a solution of another problem, or different parameters.
     """
-    checked_positive("certificate: tolerance", tolerance)
+    require.positive("certificate: tolerance", tolerance)
     named = checked_solutions(solutions)
     if len(named) < 2:
         words = f"a certificate compares at least two solutions, not {len(named)}"
@@ -170,9 +170,9 @@ def certificate(
 def checked_solutions(solutions: Any) -> dict[str, Solution]:
     """Return solutions by name, those of a sequence by their methods; raise ProblemError for anything else."""
     if not isinstance(solutions, Mapping):
-        return name_by_method(checked_each("certificate: solutions", solutions, Solution))
-    named = checked_mapping("certificate: solutions", solutions)
-    checked_each("certificate: solutions", named.values(), Solution)
+        return name_by_method(require.each("certificate: solutions", solutions, Solution))
+    named = require.mapping("certificate: solutions", solutions)
+    require.each("certificate: solutions", named.values(), Solution)
     return named
 
 

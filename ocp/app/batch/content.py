@@ -23,9 +23,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from models.arrays import Array
+from models.checks import NOT_NUMBERS, Array, floats
 from models.files import INPUT_LIMITS
-from ocp.errors import NOT_NUMBERS, ProblemError, floats
+from ocp.errors import ProblemError
 from ocp.motion.plan import Plan
 from ocp.solution import Solution
 from ocp.storage import open_unlinked

@@ -16,11 +16,13 @@ from typing import Any, Literal
 
 from tqdm import tqdm
 
+from models.checks import NOT_NUMBERS, check_entries
+from models.files import INPUT_LIMITS
 from ocp.app.batch.content import Payload, canonical_text, digest_of, key_of, neighbours
 from ocp.app.batch.engine import Engine, Function, Job, checked_cluster, failed
 from ocp.app.batch.result_store import STATUSES, ResultStore
 from ocp.app.batch.table import Batch, Result, row_of
-from ocp.errors import MAX_COUNT, NOT_NUMBERS, ProblemError, check_entries, checked_choice, checked_count, checked_text
+from ocp.errors import ProblemError, require
 
 __all__ = ["run_batch"]
 
@@ -86,9 +88,9 @@ def run_batch(
     names = names_of("near", near)
     statuses = names_of("again", (again,) if isinstance(again, str) else again)
     for status in statuses:
-        checked_choice("again", status, STATUSES[1:])
-    checked_choice("failures", failures, ("raise", "return"))
-    function_version = source_version(function) if version is None else checked_text("version", version)
+        require.choice("again", status, STATUSES[1:])
+    require.choice("failures", failures, ("raise", "return"))
+    function_version = source_version(function) if version is None else require.text("version", version)
     store = ResultStore.of(folder, name, function_version, version is not None)
     parents: dict[str, str | None] = dict.fromkeys(texts)
     if names:
@@ -236,8 +238,10 @@ def texts_of(tasks: Any) -> dict[str, str]:
     try:
         check_entries(tasks)
         for i, task in enumerate(tasks):
-            if i >= MAX_COUNT:
-                raise ProblemError(f"tasks: at most {MAX_COUNT} at a time", name="tasks", limit=MAX_COUNT)
+            if i >= INPUT_LIMITS.count:
+                raise ProblemError(
+                    f"tasks: at most {INPUT_LIMITS.count} at a time", name="tasks", limit=INPUT_LIMITS.count
+                )
             text = canonical_text(task, f"tasks[{i}]")
             texts[key_of(text)] = text
     except ProblemError:
@@ -256,7 +260,7 @@ def workers_of(workers: Any, cluster: Any) -> int:
     if cluster is not None:
         words = "a cluster has its own workers; pass only one of the two"
         raise ProblemError(words, name="workers", value=workers)
-    checked_count("workers", workers, 1, MAX_WORKERS)
+    require.count("workers", workers, 1, MAX_WORKERS)
     return int(workers)
 
 
@@ -264,7 +268,7 @@ def names_of(argument: str, names: Any) -> tuple[str, ...]:
     """Return a tuple of names."""
     if isinstance(names, str) or not isinstance(names, Collection):
         raise ProblemError(f"{argument} must be a list of names, not {names!r}", name=argument, value=names)
-    return tuple(checked_text(argument, name) for name in names)
+    return tuple(require.text(argument, name) for name in names)
 
 
 def name_of(function: Any) -> str:

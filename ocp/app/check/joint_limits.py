@@ -19,7 +19,7 @@ import casadi as ca
 import numpy as np
 
 from models import FixedBase, FreeFloating, Robot, Standing, inverse_dynamics, momentum, robot_inertia, simplify
-from models.arrays import Array
+from models.checks import Array
 from models.machines.standing import center_of_pressure
 from models.spatial import cross, rotation_from_quaternion
 from ocp.app.check.data_checks import Fault

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from models import FreeFloating, Machine, Robot
-from models.arrays import Array
+from models.checks import Array
 from ocp.app.check.joint_limits import Row, RowVerdict
 from ocp.app.check.verdict import Check, check_trajectory
 from ocp.app.files import RawTrajectory

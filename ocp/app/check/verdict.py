@@ -10,7 +10,7 @@ from typing import Any, Literal, TypeAlias, get_args
 import numpy as np
 
 from models import CollisionScene, FixedBase, FreeFloating, Robot, Standing, Support, footprint
-from models.arrays import Array, ArrayInput
+from models.checks import Array, ArrayInput, real
 from models.robot.dynamics import GRAVITY
 from models.shapes.mesh_files import find_mesh
 from models.shapes.shapes import Shape
@@ -22,16 +22,7 @@ from ocp.app.check.suspicions import doubtful_times, exchanged_joints
 from ocp.app.files import RawTrajectory, Waypoints
 from ocp.app.files.trajectory import UNITS
 from ocp.console import check_time, interruptible
-from ocp.errors import (
-    ProblemError,
-    checked_choice,
-    checked_instance,
-    checked_mapping,
-    checked_nonnegative,
-    checked_positive,
-    real,
-    unknown_name,
-)
+from ocp.errors import ProblemError, require
 from ocp.motion.tasks.limits import JointBounds, unknown_limits
 from ocp.tolerances import LIMIT_SHARE, ORIENTATION_TOLERANCE_RAD
 from ocp.tolerances import path_tolerance as default_tolerance
@@ -206,13 +197,13 @@ def check_trajectory(
     Raises:
         ProblemError, ModelError: An argument does not fit the robot, or no sample is valid.
     """
-    checked_instance("robot", robot, Robot)
-    checked_instance("trajectory", trajectory, RawTrajectory)
-    checked_choice("base", base, ("fixed", "standing", "floating"))
-    checked_nonnegative("share", share)
+    require.instance("robot", robot, Robot)
+    require.instance("trajectory", trajectory, RawTrajectory)
+    require.choice("base", base, ("fixed", "standing", "floating"))
+    require.nonnegative("share", share)
     if path_tolerance is None:
         path_tolerance = default_tolerance(np.zeros((1, 3)) if path is None else path.positions)
-    checked_positive("path_tolerance", path_tolerance)
+    require.positive("path_tolerance", path_tolerance)
     for name, value in (("path_angle", path_angle), ("friction", friction)):
         if not real(value) > 0:  # infinity is allowed
             raise ProblemError(f"{name} must be a number above 0, not {value!r}", name=name, value=value, limit=0.0)
@@ -223,7 +214,7 @@ def check_trajectory(
         trajectory = replace(trajectory, t=trajectory.t * _seconds(time_unit))
     cleaned = clean_trajectory(trajectory, robot, *bounds[:3], time_unit is not None, unwrap)
     if rule is not None:
-        checked_choice("rule", rule, get_args(Rule))
+        require.choice("rule", rule, get_args(Rule))
         cleaned = replace(cleaned, motion=cleaned.motion.by(rule))
     motion, complete = cleaned.motion, len(cleaned.joints) == robot.dof
     rows: list[Row] = []
@@ -301,8 +292,8 @@ def check_trajectory(
 def _seconds(time_unit: str | float) -> float:
     """Return a time unit in s."""
     if isinstance(time_unit, str):
-        return UNITS[checked_choice("time_unit", time_unit, ("s", "ms", "us", "ns"))]
-    return checked_positive("time_unit", time_unit)
+        return UNITS[require.choice("time_unit", time_unit, ("s", "ms", "us", "ns"))]
+    return require.positive("time_unit", time_unit)
 
 
 def _machine_of(
@@ -360,12 +351,12 @@ def bounds_of(
         if notes is not None and (names := unknown_limits(robot, quantity)):
             notes.append(f"the robot gives {', '.join(names)} a {quantity} limit of 0: treated as none")
         by_name = override if isinstance(override, Mapping) else {} if override is None else {"": override}
-        for name, value in checked_mapping(quantity, by_name).items():
+        for name, value in require.mapping(quantity, by_name).items():
             if not real(value) > 0:
                 words = f"{quantity} of {name or 'all joints'} must be a number above 0, not {value!r}"
                 raise ProblemError(words, name=quantity, value=value, limit=0.0)
             if name and name not in robot.joint_names:
-                raise unknown_name(f"joint in {quantity}", name, robot.joint_names)
+                raise require.unknown(f"joint in {quantity}", name, robot.joint_names)
         for k, name in enumerate(robot.joint_names):
             values[k] = by_name.get(name, by_name.get("", values[k]))
         limits[quantity] = values

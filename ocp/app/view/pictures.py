@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models import HalfSpace, Machine, MovingObstacle
-from models.arrays import Array
+from models.checks import Array
 from models.shapes.hull import convex_hull
 from models.shapes.shapes import Shape
 from ocp.app.check.interpolation import Motion

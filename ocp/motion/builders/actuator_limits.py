@@ -11,8 +11,7 @@ import numpy as np
 
 from models import FixedBase, FreeFloating, Machine, Standing
 from models.robot.dynamics import GRAVITY, Wrench, inverse_dynamics
-from ocp.errors import ProblemError, checked_nonnegative
-from ocp.motion.tasks.checks import nonnegative_each
+from ocp.errors import ProblemError, require
 from ocp.motion.tasks.limits import JointBounds
 from ocp.problem.problem import Problem
 
@@ -41,15 +40,15 @@ class JointFriction:
 
     def __post_init__(self) -> None:
         for name in ("viscous", "coulomb"):
-            nonnegative_each(f"friction: {name}", getattr(self, name), None)
-        if not checked_nonnegative("friction: slip", self.slip) > 0:
-            raise ProblemError("friction: slip must be positive", name="slip", value=self.slip, limit=0.0)
+            require.array(f"friction: {name}", getattr(self, name), ("joints",), sign="nonnegative")
+        require.positive("friction: slip", self.slip)
 
     def torques(self, rates: Any) -> Any:
         """Return the joint torques that overcome the friction. Shape (n, 1)."""
         n = rates.numel()
         viscous, coulomb = (
-            ca.DM(nonnegative_each(f"friction: {name}", getattr(self, name), n)) for name in ("viscous", "coulomb")
+            ca.DM(require.broadcast(f"friction: {name}", getattr(self, name), n, "joints", sign="nonnegative"))
+            for name in ("viscous", "coulomb")
         )
         return viscous * rates + coulomb * ca.tanh(rates / self.slip)
 

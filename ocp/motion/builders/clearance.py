@@ -17,10 +17,10 @@ import casadi as ca
 import numpy as np
 
 from models import CollisionScene, ModelError
-from models.arrays import Array
+from models.checks import Array
 from ocp.audit.audit import Audit
 from ocp.audit.clearance import Clearance, Track, clearance_along
-from ocp.errors import ProblemError, SolveError, checked_instance, checked_mapping, checked_nonnegative
+from ocp.errors import ProblemError, SolveError, require
 from ocp.motion.local.collisions import Collision, find_collisions, scene_hulls
 from ocp.problem.declarations import Variable
 from ocp.problem.hulls import frames_of
@@ -71,9 +71,9 @@ class ClearanceConstraints:
     margins: Mapping[int, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        checked_instance("clearance_constraints: scene", self.scene, CollisionScene)
-        for pair, margin in checked_mapping("clearance_constraints: margins", self.margins).items():
-            checked_nonnegative("clearance_constraints: margins", margin)
+        require.instance("clearance_constraints: scene", self.scene, CollisionScene)
+        for pair, margin in require.mapping("clearance_constraints: margins", self.margins).items():
+            require.nonnegative("clearance_constraints: margins", margin)
             if (
                 isinstance(pair, bool)
                 or not isinstance(pair, int | np.integer)

@@ -22,11 +22,11 @@ import casadi as ca
 import numpy as np
 
 from models import FreeFloating, Robot, find_wheels
-from models.arrays import Array
+from models.checks import NOT_NUMBERS, Array, floats
 from models.robot.dynamics import Wrench
 from models.spatial import quaternion_product
 from ocp.console import interruptible
-from ocp.errors import NOT_NUMBERS, ProblemError, checked_choice, checked_each, checked_instance, floats
+from ocp.errors import ProblemError, require
 from ocp.motion.builders.actuator_limits import JointFriction, Motors, checked_motors, joint_torques
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.standing.problem import FreeTime, declare_horizon
@@ -34,10 +34,8 @@ from ocp.motion.tasks.checks import (
     check_length,
     check_rest,
     checked_configuration,
-    checked_horizon,
     checked_tasks,
     clip_to_limits,
-    nonnegative_each,
     rates_at_rest,
 )
 from ocp.motion.tasks.cost import Cost
@@ -117,24 +115,24 @@ def dynamics_problem(
             although tasks fix the time.
     """
     checked_motors("dynamics_problem", machine)
-    limits = Limits() if limits is None else checked_instance("dynamics_problem: limits", limits, Limits)
-    cost = Cost(velocity=0.0, effort=1.0) if cost is None else checked_instance("dynamics_problem: cost", cost, Cost)
-    setup = DynamicsSetup() if setup is None else checked_instance("dynamics_problem: setup", setup, DynamicsSetup)
+    limits = Limits() if limits is None else require.instance("dynamics_problem: limits", limits, Limits)
+    cost = Cost(velocity=0.0, effort=1.0) if cost is None else require.instance("dynamics_problem: cost", cost, Cost)
+    setup = DynamicsSetup() if setup is None else require.instance("dynamics_problem: setup", setup, DynamicsSetup)
     for option, kind in (("friction", JointFriction), ("clearance_constraints", ClearanceConstraints)):
         if getattr(setup, option) is not None:
-            checked_instance(f"dynamics_problem: {option}", getattr(setup, option), kind)
+            require.instance(f"dynamics_problem: {option}", getattr(setup, option), kind)
     if cost.length:
         words = "cost: the length of a motion under dynamics is not smooth at rest; weight its velocity instead"
         raise ProblemError(words, name="length", value=cost.length, limit=0.0)
-    control = checked_choice("control", setup.control, ("acceleration", "jerk"))
+    control = require.choice("control", setup.control, ("acceleration", "jerk"))
     bounds = limits.bounds(machine, ("velocity", "torque"))
     if control == "acceleration" and (np.isfinite(bounds.jerk).any() or cost.jerk):
         words = "the jerk is limited or weighted, but the control is the acceleration; set control='jerk'"
         raise ProblemError(words, name="control", value=control, limit="jerk")
     free = isinstance(horizon, FreeTime)
-    duration = checked_horizon(horizon.guess if isinstance(horizon, FreeTime) else horizon)
+    duration = require.positive("horizon", horizon.guess if isinstance(horizon, FreeTime) else horizon)
     ends = _Ends.take(machine, bounds, (start, end), (setup.start_velocity, setup.end_velocity), setup.start_base)
-    tasks = (tasks,) if isinstance(tasks, TipTask) else checked_each("tasks", tasks, TipTask)
+    tasks = (tasks,) if isinstance(tasks, TipTask) else require.each("tasks", tasks, TipTask)
     equations = bind(machine, tasks) if tasks else None
     if equations is not None:
         if free:
@@ -279,14 +277,17 @@ def _declare_actuators(
     if limited:
         largest = bounds.torque[limited]
         problem.path("torques", torques[limited], lower=-largest, upper=largest, unit=machine.robot.effort_unit)
-    running = ca.dot(ca.DM(nonnegative_each("cost: acceleration", cost.acceleration, n)), motion.second**2)
+    weights = require.broadcast("cost: acceleration", cost.acceleration, n, "joints", sign="nonnegative")
+    running = ca.dot(ca.DM(weights), motion.second**2)
     if cost.velocity:
         running += ca.dot(ca.DM(cost.joint_weights(n)), motion.rates**2) / 2
     running += cost.jerk * ca.sumsqr(motion.jerks)
     if cost.turning and isinstance(machine, FreeFloating):
         spin = [k for k, row in enumerate(machine.twist_rows) if row < 3]
         running += cost.turning * ca.sumsqr(machine.base_twist(motion.base, motion.joints, motion.rates)[spin])
-    running += ca.dot(ca.DM(nonnegative_each("cost: effort", cost.effort, n)), torques**2)
+    running += ca.dot(
+        ca.DM(require.broadcast("cost: effort", cost.effort, n, "joints", sign="nonnegative")), torques**2
+    )
     if cost.energy or np.isfinite(bounds.power).any():
         power = problem.control("power", n, lower=0.0, upper=bounds.power, unit="W")
         problem.path("power", power - torques * motion.rates, lower=0.0, unit="W")
@@ -343,7 +344,7 @@ def end_velocities(name: str, value: Any, n: int) -> Array:
         ProblemError: The value is neither "rest" nor "free" nor n numbers.
     """
     if isinstance(value, str):
-        return np.full(n, 0.0 if checked_choice(name, value, ("rest", "free")) == "rest" else np.nan)
+        return np.full(n, 0.0 if require.choice(name, value, ("rest", "free")) == "rest" else np.nan)
     if value is None:
         raise ProblemError(f"{name} must be 'rest', 'free' or velocities, not None", name=name, value=value)
     return _checked_end(name, value, n)

@@ -12,10 +12,11 @@ import casadi as ca
 import numpy as np
 
 from models import FixedBase
-from models.arrays import Array
+from models.checks import Array
 from ocp.curves import PiecewisePolynomial
+from ocp.errors import require
 from ocp.motion.builders.clearance import ClearanceConstraints
-from ocp.motion.tasks.checks import checked_configuration, checked_horizon, checked_weights, clip_to_limits
+from ocp.motion.tasks.checks import checked_configuration, checked_weights, clip_to_limits
 from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.problem.problem import Problem, remembers_request
 from ocp.solution import Solution
@@ -64,7 +65,7 @@ def joint_motion_problem(
         ends.append(clip_to_limits(name, machine.robot.joint_names, joints, bounds.lower, bounds.upper, hint))
     scale = ca.DM(checked_weights(weights, n))
     problem = Problem("joint motion")
-    problem.horizon(checked_horizon(horizon))
+    problem.horizon(require.positive("horizon", horizon))
     joints = problem.state(
         "joints", n, initial=ends[0], terminal=ends[1], lower=bounds.lower, upper=bounds.upper,
         unit=machine.robot.unit(),

@@ -19,7 +19,7 @@ import casadi as ca
 import numpy as np
 
 from models import FixedBase
-from models.arrays import Array
+from models.checks import Array
 from ocp.curves import PiecewisePolynomial
 from ocp.errors import SolveError
 from ocp.motion.builders.actuator_limits import joint_torques

@@ -6,8 +6,8 @@ import numpy as np
 import scipy
 
 from models import Machine
-from models.arrays import Array
-from ocp.errors import ProblemError, checked_count, checked_flag, real
+from models.checks import Array, real
+from ocp.errors import ProblemError, require
 from ocp.motion.local.arm_solver import sample_shares
 from ocp.motion.local.chain import Chain
 from ocp.motion.local.closed_forms import is_scara
@@ -121,8 +121,8 @@ def ik_configurations(
     Raises:
         ProblemError: The task is not of this kind, or the machine has no such solver: use `inverse_kinematics`.
     """
-    checked_count("samples", samples, 1)
-    checked_flag("limits", limits)
+    require.count("samples", samples, 1)
+    require.flag("limits", limits)
     if not np.isfinite(real(time)):
         raise ProblemError(f"time must be a finite number of seconds, not {time!r}", name="time", value=time)
     equations, unbounded = bind(machine, task), np.full(machine.joint_size, np.inf)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models import Machine
-from models.arrays import Array
+from models.checks import Array
 
 __all__ = ["TURN", "Axis", "Chain", "Motion", "Solutions", "axial", "cross", "dot", "pick"]
 

@@ -20,7 +20,7 @@ from itertools import combinations, pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from models.arrays import Array
+from models.checks import Array
 from ocp.motion.local.chain import Axis, Chain, Motion, Solutions, axial, cross, dot, pick
 from ocp.motion.local.pose_solver import Mask, PoseSolver
 

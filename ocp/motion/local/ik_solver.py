@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from models import FixedBase, Machine, ModelError
-from models.arrays import Array, ArrayInput, checked_array
+from models.checks import Array, ArrayInput
 from models.machines.machine import with_tip
-from ocp.errors import ProblemError, checked_count, checked_flag, checked_instance, checked_positive
+from ocp.errors import ProblemError, require
 from ocp.motion.local.arm_solver import ARM, ArmSolver, arm_solver, sample_shares
 from ocp.motion.local.chain import TURN, Chain
 from ocp.motion.local.closed_forms import SIX, is_scara
@@ -121,15 +121,15 @@ class IkSolver:
             ProblemError: The machine has a moving base, no six of its joints determine the pose of the tip, or an
                 argument is invalid.
         """
-        checked_instance("machine", machine, FixedBase)
-        checked_instance("free", free, ToolFreedom)
+        require.instance("machine", machine, FixedBase)
+        require.instance("free", free, ToolFreedom)
         if free is ToolFreedom.CONE:
-            checked_positive("within", within, below=np.pi)
-        checked_flag("limits", limits)
-        checked_count("samples", samples, 1)
+            require.positive("within", within, below=np.pi)
+        require.flag("limits", limits)
+        require.count("samples", samples, 1)
         try:
-            tip = machine if link is None else with_tip(machine, link, checked_array(point, (3,), "IkSolver", "point"))
-            axis = checked_array(tool_axis, (3,), "IkSolver", "tool_axis")
+            tip = machine if link is None else with_tip(machine, link, require.array("IkSolver: point", point, (3,)))
+            axis = require.array("IkSolver: tool_axis", tool_axis, (3,))
         except ModelError as error:
             raise ProblemError(str(error), **vars(error)) from error
         if not np.linalg.norm(axis) > 0:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from models.arrays import Array
+from models.checks import Array
 from ocp.motion.local.chain import Axis, Chain, Motion, Solutions
 
 __all__ = ["Mask", "PoseSolver"]

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any, Literal
 
 from models import FixedBase, FreeFloating, Machine, Standing
-from ocp.errors import ProblemError, checked_instance
+from ocp.errors import ProblemError, require
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem
 from ocp.motion.builders.dynamics_plan import dynamics_phases
@@ -58,7 +58,7 @@ def plan_problem(
     if not isinstance(machine, FixedBase | FreeFloating):
         raise ProblemError(f"a machine is expected, not a {type(machine).__name__}", name="machine", value=machine)
     if limits is not None:
-        checked_instance("limits", limits, Limits)
+        require.instance("limits", limits, Limits)
     if isinstance(tasks, Steps):
         joints = Start.of(start, tasks.stances[0])[1]
         begin = None if joints is None else tasks.in_order(tasks.stances[0], joints[None])[0]
@@ -66,7 +66,7 @@ def plan_problem(
     constraints = clearance_for(machine, limits, scene)
     shared: dict[str, Any] = {"limits": limits, "clearance_constraints": constraints}
     if isinstance(tasks, Capture):
-        chaser = checked_instance("machine", machine, FreeFloating)
+        chaser = require.instance("machine", machine, FreeFloating)
         return capture_problem(chaser, tasks, start=start, cost=own, **shared)
     goals: Any = (tasks,) if isinstance(tasks, Goal) else tasks
     if isinstance(goals, Sequence) and isinstance(next(iter(goals), None), Goal):
@@ -76,7 +76,7 @@ def plan_problem(
         setup, zmp = StandingSetup(clearance_constraints=constraints), None if limits is None else limits.zmp
         options: dict[str, Any] = {"start": joints, "zmp": zmp, "weights": own, "limits": limits, "setup": setup}
         return standing_problem(machine, goals, horizon, **options)
-    weights = None if own is None else checked_instance("cost", own, Cost).joint_weights(machine.joint_size)
+    weights = None if own is None else require.instance("cost", own, Cost).joint_weights(machine.joint_size)
     options = {"start": joints, "start_base": base, "cyclic": cyclic, "weights": weights}
     return minimum_velocity_problem(machine, goals, horizon, **options, **shared)
 

@@ -11,15 +11,7 @@ import numpy as np
 
 from models import FixedBase, Machine, Standing
 from ocp.console import TimeLimitReached, interruptible, time_left, time_limited
-from ocp.errors import (
-    ProblemError,
-    SolveError,
-    checked_choice,
-    checked_count,
-    checked_flag,
-    checked_instance,
-    checked_time_limit,
-)
+from ocp.errors import ProblemError, SolveError, checked_time_limit, require
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.space.capture import Capture
 from ocp.motion.builders.standing.problem import Weights
@@ -113,9 +105,9 @@ def plan(
             the motions of a global search end, what obstructs them, by how much the tasks would have to be relaxed, and
             in how few segments they may be done (search="segments").
     """
-    checked_choice("search", search, get_args(Search))
-    checked_flag("cyclic", cyclic)
-    checked_count("seed", seed, 0, LARGEST_SEED)
+    require.choice("search", search, get_args(Search))
+    require.flag("cyclic", cyclic)
+    require.count("seed", seed, 0, LARGEST_SEED)
     with time_limited(checked_time_limit(time_limit)), shown_progress("plan", progress):
         try:
             return _plan(machine, tasks, horizon, start, cyclic, cost, limits, scene, search, seed)
@@ -142,12 +134,12 @@ def _plan(
     options: dict[str, Any] = {"cost": cost, "limits": limits, "seed": seed}
     if isinstance(tasks, Waypoints):
         _check_unused("a path through waypoints", horizon=horizon, start=start, cyclic=cyclic or None)
-        arm = checked_instance("machine", machine, FixedBase)
+        arm = require.instance("machine", machine, FixedBase)
         return plan_path(arm, tasks, scene=scene, **options)
     options["start"] = start
     if search == "segments":
         _check_unused("search='segments'", cyclic=cyclic or None)
-        arm = checked_instance("machine", machine, FixedBase)
+        arm = require.instance("machine", machine, FixedBase)
         return plan_in_segments(arm, tasks, horizon, scene=scene, **options)
     if isinstance(tasks, Steps):
         _check_unused("a walk, whose phases have durations", horizon=horizon, cyclic=cyclic or None)
@@ -195,12 +187,12 @@ def _goal_request(
     state, joints, _ = Start.of(start, machine)
     if joints is None:
         raise ProblemError("start is missing: a goal is reached from somewhere; give plan(..., start=)", name="start")
-    own_limits = Limits() if limits is None else checked_instance("limits", limits, Limits)
+    own_limits = Limits() if limits is None else require.instance("limits", limits, Limits)
     places: dict[str, Any] = {"limits": own_limits, "constraints": constraints, "seed": seed}
     is_free = isinstance(horizon, str)
     if is_free:
-        checked_choice("horizon", horizon, ("free",))
-    own_cost = Cost(time=float(is_free)) if cost is None else checked_instance("cost", cost, Cost)
+        require.choice("horizon", horizon, ("free",))
+    own_cost = Cost(time=float(is_free)) if cost is None else require.instance("cost", cost, Cost)
     return GoalRequest(
         machine,
         joints,

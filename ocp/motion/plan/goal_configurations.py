@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from models import Box, Machine, Sphere
-from models.arrays import Array
-from ocp.errors import ProblemError, floats
+from models.checks import Array, floats
+from ocp.errors import ProblemError, require
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.local.inverse_kinematics import Unreachable, inverse_kinematics
-from ocp.motion.tasks.checks import checked_numbers, clip_to_limits
+from ocp.motion.tasks.checks import clip_to_limits
 from ocp.motion.tasks.equations import bind
 from ocp.motion.tasks.goals import Goal
 from ocp.motion.tasks.limits import Limits
@@ -53,7 +53,7 @@ def goal_configurations(
     if not goal.has_pose:
         if goal.joints is None:
             raise ProblemError("a goal needs joints or a pose", name="joints", value=None)
-        values = checked_numbers(np.nan_to_num(floats(goal.joints)), len(near), "goal", "one for each joint")
+        values = require.array("goal", np.nan_to_num(floats(goal.joints)), (len(near),), meaning="one for each joint")
         joints = np.where(np.isnan(floats(goal.joints).ravel()), near, values)
         return clip_to_limits("end", names, joints, bounds.lower, bounds.upper, "end inside them")[None]
     scene = None if constraints is None else constraints.scene

@@ -9,8 +9,8 @@ from typing import Any, Literal
 import numpy as np
 
 from models import FreeFloating, Machine, Stance
-from models.arrays import Array
-from ocp.errors import ProblemError, checked_each, checked_instance
+from models.checks import Array
+from ocp.errors import ProblemError, require
 from ocp.motion.builders.actuator_limits import checked_motors
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.dynamics import DynamicsSetup
@@ -60,12 +60,12 @@ def plan_sequence(
         ProblemError: As `dynamics_phases`; or the start is missing.
         SolveError: No motion satisfies its limits.
     """
-    motors, goals = checked_motors("plan", machine), checked_each("goals", goals, Goal)
+    motors, goals = checked_motors("plan", machine), require.each("goals", goals, Goal)
     state, joints, base = Start.of(start, motors)
     if joints is None:
         raise ProblemError("start is missing: a goal is reached from somewhere; give plan(..., start=)", name="start")
-    own_limits = Limits() if limits is None else checked_instance("limits", limits, Limits)
-    own_cost = None if cost is None else checked_instance("cost", cost, Cost)
+    own_limits = Limits() if limits is None else require.instance("limits", limits, Limits)
+    own_cost = None if cost is None else require.instance("cost", cost, Cost)
     if len(goals) == 1 and goals[0].duration is None:  # one motion has the horizon
         goals, total = [replace(goals[0], duration=total)], None
     near, resolved = joints, list[Goal]()
@@ -129,7 +129,7 @@ def plan_capture(
         ProblemError: As `capture_problem`.
         SolveError: No motion satisfies its limits.
     """
-    chaser = checked_instance("machine", machine, FreeFloating)
+    chaser = require.instance("machine", machine, FreeFloating)
     options: dict[str, Any] = {"cost": cost, "limits": limits, "clearance_constraints": constraints}
     solution = solve_capture(chaser, capture, start=start, **options)
     return _phased(chaser, solution, np.asarray(Start.of(start, chaser)[1]))

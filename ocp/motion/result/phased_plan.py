@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models import Machine
-from models.arrays import Array
+from models.checks import Array
 from ocp.motion.result.request import machines_of_phases
 from ocp.motion.result.solved_plan import Part, SolvedPlan
 from ocp.motion.tasks.targets import tip_poses

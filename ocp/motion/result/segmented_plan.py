@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from models import FixedBase
-from models.arrays import Array
+from models.checks import Array
 from ocp.audit.audit import COST_LOST, Audit, Finding
 from ocp.audit.clearance import Clearance
 from ocp.errors import ProblemError

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from models import Machine, ModelError
-from models.arrays import Array
+from models.checks import Array
 from ocp.audit.audit import Audit
 from ocp.errors import ProblemError, StorageWarning
 from ocp.motion.builders.tool_motion import CLOCK, PACE, SLOPES, Stretch

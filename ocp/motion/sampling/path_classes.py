@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from models.arrays import Array
+from models.checks import Array
 from ocp.console import TimeLimitReached
 from ocp.motion.sampling.path_optimisation import PathOptimisationSettings, optimise_length
 from ocp.motion.sampling.random_trees import TreeSearch, connect

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import nnls
 
-from models.arrays import Array
+from models.checks import Array
 from ocp.console import check_time
 from ocp.motion.sampling.shortening import path_length, points_along
 from ocp.motion.sampling.straight import StraightMotions

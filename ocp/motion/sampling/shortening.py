@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.arrays import Array
+from models.checks import Array
 from ocp.motion.sampling.straight import StraightMotions
 
 __all__ = ["ShorteningSettings", "path_length", "points_along", "same_class", "shorten", "shortest_through_corners"]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from models import Machine
-from models.arrays import Array
+from models.checks import Array
 from ocp.motion.local.inverse_kinematics import Unreachable, describe_miss, inverse_kinematics_at
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.tip_task import TipTask

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from models.arrays import Array
-from ocp.errors import ProblemError, checked_nonnegative
-from ocp.motion.tasks.checks import checked_weights, nonnegative_each
+from models.checks import Array
+from ocp.errors import ProblemError, require
+from ocp.motion.tasks.checks import checked_weights
 
 __all__ = ["Cost"]
 
@@ -50,8 +50,10 @@ class Cost:
     weights: Any = None
 
     def __post_init__(self) -> None:
-        each = [nonnegative_each(f"cost: {name}", getattr(self, name), None) for name in PER_JOINT]
-        single = [checked_nonnegative(f"cost: {name}", getattr(self, name)) for name in self._single]
+        each = [
+            require.array(f"cost: {name}", getattr(self, name), ("joints",), sign="nonnegative") for name in PER_JOINT
+        ]
+        single = [require.nonnegative(f"cost: {name}", getattr(self, name)) for name in self._single]
         if not (any(single) or np.concatenate(each).any()):
             raise ProblemError("cost: at least one weight must be above zero", name="cost", value=self, limit=0.0)
 

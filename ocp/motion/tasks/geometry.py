@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models import FreeFloating, Machine, center_of_mass
-from models.arrays import Array
+from models.checks import Array
 from models.spatial import Frame, on_scalars, rotation_from_quaternion, skew
 from ocp.errors import ProblemError
 from ocp.motion.tasks.tip_task import ANGULAR, TipTask

@@ -9,8 +9,8 @@ from typing import Any, Literal
 import numpy as np
 
 from models import Box, Machine, Sphere
-from models.arrays import ArrayInput
-from ocp.errors import NOT_NUMBERS, ProblemError, checked_choice, checked_positive, checked_text, floats
+from models.checks import NOT_NUMBERS, ArrayInput, floats
+from ocp.errors import ProblemError, require
 from ocp.motion.tasks.checks import checked_configuration
 from ocp.motion.tasks.tip_task import TipTask
 
@@ -89,7 +89,7 @@ class Goal:
     name: str = ""
 
     def __post_init__(self) -> None:
-        checked_text("goal: name", self.name)
+        require.text("goal: name", self.name)
         pose = {name: getattr(self, name) for name in ("position", "orientation", "direction", "region")}
         named = [name for name, value in pose.items() if value is not None]
         if self.joints is not None and named:
@@ -105,9 +105,9 @@ class Goal:
             words = f"goal: region must be a Box or a Sphere in world, not a {type(self.region).__name__}"
             raise ProblemError(words, name="region", value=self.region)
         if self.within is not None:
-            checked_positive("goal: within", self.within, below=np.pi)
+            require.positive("goal: within", self.within, below=np.pi)
         if isinstance(self.velocity, str):
-            checked_choice("goal: velocity", self.velocity, ("rest", "free"))
+            require.choice("goal: velocity", self.velocity, ("rest", "free"))
         else:
             try:
                 floats(self.velocity)

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models import Machine, ModelWarning, Robot, Standing
-from models.arrays import Array
-from ocp.errors import NOT_NUMBERS, ProblemError, checked_flag, checked_positive, floats, real
+from models.checks import NOT_NUMBERS, Array, floats, real
+from ocp.errors import ProblemError, require
 from ocp.motion.tasks.zmp_rules import ZmpRule
 
 __all__ = ["JointBounds", "Limits", "unknown_limits"]
@@ -76,8 +76,8 @@ class Limits:
                 words = f"limits: {kind} must be positive, one number or one for each joint, not {value!r}"
                 raise ProblemError(words, name=kind, value=value, limit=0.0)
         if self.vertical_force is not None:
-            checked_positive("limits: vertical_force", self.vertical_force)
-        checked_flag("limits: joints", self.joints)
+            require.positive("limits: vertical_force", self.vertical_force)
+        require.flag("limits: joints", self.joints)
         if self.zmp is not None and not isinstance(self.zmp, ZmpRule):
             words = f"limits: zmp must be a rule such as InFoot(), not {self.zmp!r}"
             raise ProblemError(words, name="zmp", value=self.zmp)

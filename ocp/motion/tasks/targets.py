@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from models import Machine
-from models.arrays import Array
+from models.checks import Array
 from models.spatial import quaternion_from_rotation
 from ocp.motion.tasks.equations import bind
 from ocp.motion.tasks.geometry import target_size

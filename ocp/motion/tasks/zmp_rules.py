@@ -9,10 +9,10 @@ from typing import Any, TypeAlias, get_args
 import casadi as ca
 import numpy as np
 
-from models.arrays import Array
+from models.checks import NOT_NUMBERS, Array, real
 from models.machines.standing import Standing
 from models.spatial import expression
-from ocp.errors import NOT_NUMBERS, ProblemError, real
+from ocp.errors import ProblemError
 
 __all__ = [
     "Anywhere", "Following", "InFoot", "IndexAtLeast", "Pinned", "ZmpRule", "check_rule", "checked_point",

@@ -11,8 +11,9 @@ import pytest
 import trimesh
 from scipy import spatial
 
-from models import ModelError, cache
-from models.arrays import Array
+from models import ModelError
+from models import files as cache
+from models.checks import Array
 from models.shapes import covering
 from models.shapes.bodies import capsule_around
 from models.shapes.covering import Cover, cover, exceedance, fit_cover, split_triangles

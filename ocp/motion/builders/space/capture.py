@@ -25,10 +25,10 @@ import casadi as ca
 import numpy as np
 
 from models import FreeFloating, center_of_mass, find_wheels
-from models.arrays import Array
+from models.checks import Array
 from ocp.console import interruptible
 from ocp.direct.collocation import Collocation
-from ocp.errors import ProblemError, checked_flag, checked_instance
+from ocp.errors import ProblemError, require
 from ocp.motion.builders.actuator_limits import JointFriction
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem, end_velocities
@@ -44,7 +44,7 @@ from ocp.motion.builders.space.guess import (
     wheel_capacity,
 )
 from ocp.motion.builders.standing.problem import FreeTime
-from ocp.motion.tasks.checks import checked_configuration, checked_horizon
+from ocp.motion.tasks.checks import checked_configuration
 from ocp.motion.tasks.cost import Cost
 from ocp.motion.tasks.goals import Start
 from ocp.motion.tasks.limits import Limits
@@ -87,8 +87,8 @@ class Capture:
     def __post_init__(self) -> None:
         for name, kind in (("cone", Cone), ("grasp", Grasp), ("friction", JointFriction)):
             if getattr(self, name) is not None:
-                checked_instance(f"capture: {name}", getattr(self, name), kind)
-        checked_flag("capture: rest", self.rest)
+                require.instance(f"capture: {name}", getattr(self, name), kind)
+        require.flag("capture: rest", self.rest)
 
 
 @remembers_request("capture")
@@ -195,7 +195,7 @@ def chained_capture(
     Returns:
         Both solutions, each with its own audit.
     """
-    mesh = POINTS if method is None else checked_instance("method", method, Collocation)
+    mesh = POINTS if method is None else require.instance("method", method, Collocation)
     own = _Capture.take(chaser, capture, start, {"limits": limits, "cost": cost}, clearance_constraints)
     own.detumbling(None)  # raises before the approach is solved
 
@@ -247,7 +247,7 @@ class _Capture:
         shared: Mapping[str, Any],
         clearance_constraints: ClearanceConstraints | None,
     ) -> _Capture:
-        target = checked_instance("capture", capture, Capture).target
+        target = require.instance("capture", capture, Capture).target
         robot = checked_pair(chaser, target)
         begin, joints, base = Start.of(start, chaser)
         if joints is None:
@@ -257,7 +257,7 @@ class _Capture:
         pair = replace(chaser, robot=robot, conserved_momentum=momentum)
         rates = end_velocities("start_velocity", begin.velocity, chaser.joint_size)
         times = (capture.approach, capture.detumble)
-        latest = [time.upper if isinstance(time, FreeTime) else checked_horizon(time) for time in times]
+        latest = [time.upper if isinstance(time, FreeTime) else require.positive("horizon", time) for time in times]
         state = State(base, joints, rates, target_base, *latest)
         if capture.rest:
             bounds = (shared["limits"] or Limits()).bounds(chaser)

@@ -14,9 +14,10 @@ import casadi as ca
 import numpy as np
 
 from models import FreeFloating, ModelError, Robot, attach_tool, center_of_mass
+from models.checks import NOT_NUMBERS, floats, real
 from models.machines.machine import with_tip
 from models.spatial import Expression, cross
-from ocp.errors import NOT_NUMBERS, ProblemError, checked_instance, checked_positive, floats, real
+from ocp.errors import ProblemError, require
 from ocp.problem.problem import Problem
 
 __all__ = ["Cone", "Grasp", "checked_pair", "grasp_wrench", "joined", "motion_of", "pair_momentum"]
@@ -51,11 +52,11 @@ class Cone:
             words = f"cone: direction must be three numbers, not all zero, not {self.direction!r}"
             raise ProblemError(words, name="direction", value=self.direction)
         object.__setattr__(self, "direction", direction / np.linalg.norm(direction))
-        if not checked_positive("cone: half_angle", self.half_angle) < np.pi / 2:
+        if not require.positive("cone: half_angle", self.half_angle) < np.pi / 2:
             words = f"cone: half_angle must be below pi/2, not {self.half_angle}"
             raise ProblemError(words, name="half_angle", value=self.half_angle, limit=np.pi / 2)
-        checked_positive("cone: length", self.length)
-        checked_positive("cone: depth", self.depth)
+        require.positive("cone: length", self.length)
+        require.positive("cone: depth", self.depth)
 
     def inside(self, place: Expression) -> Expression:
         """Return a function that is not negative inside the cone, m. Shape (1, 1).
@@ -108,7 +109,7 @@ def checked_pair(chaser: Any, target: Any) -> Robot:
         ProblemError: Machines of other kinds, without tips, with links of the same name, or a target with joints.
     """
     for name, machine in (("chaser", chaser), ("target", target)):
-        if checked_instance(f"capture: {name}", machine, FreeFloating).robot.tip is None:
+        if require.instance(f"capture: {name}", machine, FreeFloating).robot.tip is None:
             raise ProblemError(f"capture: the robot of the {name} needs a tip", name=name, value=machine)
     if target.base != chaser.base:
         words = f"capture: the chaser floats on a {chaser.base} base, the target on a {target.base} one"

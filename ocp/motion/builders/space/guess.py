@@ -20,7 +20,7 @@ import numpy as np
 import scipy
 
 from models import FreeFloating, Robot, center_of_mass, find_wheels, link_frames
-from models.arrays import Array
+from models.checks import Array
 from ocp.errors import ProblemError
 from ocp.motion.builders.dynamics import QUINTIC
 from ocp.motion.tasks.limits import JointBounds

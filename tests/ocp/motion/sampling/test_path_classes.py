@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from models import Box, CollisionScene
-from models.arrays import Array
+from models.checks import Array
 from ocp.console import TimeLimitReached, time_limited
 from ocp.motion.sampling.path_classes import JointPath, PathSearchSettings, find_paths
 from ocp.motion.sampling.path_optimisation import optimise_length
