@@ -291,7 +291,7 @@ def test_a_guess_without_costates_is_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("guess", "message"), [(3, "guess must be"), ({"speed": 1.0}, "variable in guess .* does not exist")]
+    ("guess", "message"), [(3, "guess must be"), ({"speed": 1.0}, "variable in guess")]
 )
 def test_what_is_no_guess_is_refused(guess: Any, message: str) -> None:
     with pytest.raises(ProblemError, match=message):
