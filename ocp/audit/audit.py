@@ -183,8 +183,6 @@ def audit(
     constraints: float = LIMIT_SHARE,
     lost: float = LIMIT_SHARE,
     costates: float | None = None,
-    stationarity: float | None = None,
-    drift: float | None = None,
     tolerances: Mapping[str, float] | None = None,
 ) -> Audit:
     """Check a plan independently of the solver that made it.
@@ -212,10 +210,6 @@ def audit(
         lost: Largest excess cost over the nearest extremal, as a share of the cost.
         costates: Largest error of the costate equation over the whole plan, and of the conditions at the ends, as a
             share of the cost. None: 1e-2, or the root of the share that the plan loses if that is larger.
-        stationarity: Largest reduced gradient of the Hamiltonian, relative to its parts. None: it is only reported,
-            since the lost cost judges it.
-        drift: Largest change of the Hamiltonian of an autonomous problem, relative to its parts. None: it is only
-            reported.
         tolerances: Largest violation by name of a state, control, constraint or separation, in its own unit.
 
     Raises:
@@ -224,9 +218,8 @@ def audit(
         TimeLimitReached: Only inside :func:`ocp.console.time_limited`, after its limit.
     """
     limits = require.mapping("audit: tolerances", tolerances)
-    required = {"integration": integration, "constraints": constraints, "lost": lost, **limits}
-    optional = {"costates": costates, "stationarity": stationarity, "drift": drift}
-    for name, limit in {**required, **{k: v for k, v in optional.items() if v is not None}}.items():
+    judged = {"integration": integration, "constraints": constraints, "lost": lost, **limits}
+    for name, limit in {**judged, **({} if costates is None else {"costates": costates})}.items():
         if isinstance(limit, bool) or not isinstance(limit, int | float | np.number) or not limit >= 0:
             words = f"audit: tolerance {name!r} must be a number, zero or positive, not {limit!r}"
             raise ProblemError(words, name=name, value=limit)
@@ -272,7 +265,7 @@ def audit(
     # an infeasible plan needs no best multipliers
     optimum = optimality(form, solution, p, bounds, along=along, allowed=lost if is_sound else np.inf)
     excess = cost.value if cost.passed and solution.cost > running + final else 0.0
-    findings += optimality_findings(form, optimum, excess, lost, costates, stationarity, drift)
+    findings += optimality_findings(form, optimum, excess, lost, costates=costates)
     undecided = optimum.curvature.flat
     if not solution.success:
         undecided = f"the solver says {solution.message or solution.status}"
@@ -301,13 +294,7 @@ def horizon_finding(form: Formulation, solution: Solution, bounds: Bounds) -> Fi
 
 
 def optimality_findings(
-    form: Formulation,
-    optimum: Optimality,
-    excess: float,
-    lost: float,
-    costates: float | None,
-    stationarity: float | None,
-    drift: float | None,
+    form: Formulation, optimum: Optimality, excess: float, lost: float, *, costates: float | None
 ) -> list[Finding]:
     """Return the findings of the first and second order conditions.
 
@@ -337,11 +324,11 @@ def optimality_findings(
     limit = None if second.upwards is None or not share <= lost else 0.0
     rows.append(Finding("curvature downwards, relative", downwards, limit, second.time, note))
     if form.nu:
-        rows.append(worst("stationarity, relative", optimum.stationarity, optimum.t, stationarity))
-    change, limit = optimum.hamiltonian.drift, drift if form.autonomous else None
+        rows.append(worst("stationarity, relative", optimum.stationarity, optimum.t, None))
+    change = optimum.hamiltonian.drift
     name = "Hamiltonian drift, relative" if form.autonomous else "Hamiltonian change, relative"
     note = f"{change:.2e} in cost per second" + ("" if form.autonomous else "; time enters the problem")
-    rows.append(Finding(name, change / optimum.hamiltonian.scale, limit, None, note))
+    rows.append(Finding(name, change / optimum.hamiltonian.scale, None, None, note))
     return [replace(row, verdict="optimal") for row in rows]
 
 

@@ -25,7 +25,7 @@ from ocp.console import reason_to_stop
 from ocp.direct.assembly import Program, Transcription
 from ocp.direct.nlp import SOLVER_RESIDUAL, Outcome
 from ocp.direct.scaling import Scales
-from ocp.status import SolverStatus
+from ocp.errors import SolverStatus
 from ocp.tolerances import ROUNDING_SHARE
 
 __all__ = ["RESOLVED", "Conditions", "Newton", "active_sides", "conditions"]

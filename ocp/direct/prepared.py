@@ -17,10 +17,9 @@ import numpy as np
 from ocp.console import TimeLimitReached, check_time, interruptible, time_limited
 from ocp.direct.active_set import Newton, active_sides
 from ocp.direct.assembly import Program, assemble
-from ocp.direct.controller import block_derivatives, write_controller
+from ocp.direct.code_generation import block_derivatives, write_controller
 from ocp.direct.diagnosis import Elastic, diagnosis, elastic_plan
 from ocp.direct.guess import STARTS, alternative_starts, guessed_names, initial_point, shifted_indices
-from ocp.direct.mesh import MeshedMethod
 from ocp.direct.nlp import (
     SOLVERS,
     Outcome,
@@ -41,12 +40,12 @@ from ocp.direct.scaling import (
     sizes_along,
     unit_scales,
 )
-from ocp.errors import Interrupted, ProblemError, SolveError, checked_time_limit, require
+from ocp.direct.transcription import MeshedMethod
+from ocp.errors import Interrupted, ProblemError, SolveError, SolverStatus, checked_time_limit, require
 from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.invariants import bounds_to_solve
 from ocp.problem.problem import Problem
 from ocp.solution import ByName, Guess, Solution
-from ocp.status import SolverStatus
 from ocp.storage import checked_path
 
 __all__ = ["DirectMethod", "Prepared"]
@@ -170,7 +169,7 @@ class Prepared:
 
     @interruptible
     def to_c(self, folder: str | os.PathLike[str], parameters: ByName = None, guess: Guess = None) -> Path:
-        """Write the problem's functions as C, with a plan and a program that uses it; see :mod:`ocp.direct.controller`.
+        """Write a plan, its functions and a program that uses them as C; see :mod:`ocp.direct.code_generation`.
 
         Args:
             folder: Folder that is created and returned; files of the same names are replaced.

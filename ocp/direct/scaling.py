@@ -25,8 +25,8 @@ import numpy as np
 
 from ocp.direct.assembly import Program, Transcription
 from ocp.direct.nlp import SOLVER_RESIDUAL, Outcome
+from ocp.errors import SolverStatus
 from ocp.problem.formulation import Bounds, Formulation
-from ocp.status import SolverStatus
 
 __all__ = [
     "SCALING",

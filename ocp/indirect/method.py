@@ -25,17 +25,15 @@ from ocp.console import interruptible, time_limited
 from ocp.curves import PiecewisePolynomial
 from ocp.direct.collocation import Collocation
 from ocp.direct.nlp import SOLVERS
-from ocp.errors import Interrupted, ProblemError, SolveError, checked_time_limit, require
+from ocp.errors import Interrupted, ProblemError, SolveError, SolverStatus, checked_time_limit, require
 from ocp.indirect.boundary import LOBATTO, BoundaryProblem, NewtonResult, newton
-from ocp.indirect.hamiltonian import Hamiltonian
+from ocp.indirect.hamiltonian import Extremal, Hamiltonian, cost_gradient
 from ocp.indirect.seed import ControlArcs, read_arcs, read_unknowns
-from ocp.indirect.sensitivity import Extremal, cost_gradient
 from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.invariants import bounds_to_solve
 from ocp.problem.problem import Problem
 from ocp.problem.values import evaluate_at_samples
 from ocp.solution import ByName, Guess, Solution, check_variables_match
-from ocp.status import SolverStatus
 from ocp.tolerances import FLAT_SHARE, ROUNDING_SHARE, SOLVER_SHARE
 
 __all__ = ["Indirect", "PreparedIndirect", "hamiltonian_defect"]

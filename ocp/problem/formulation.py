@@ -5,7 +5,6 @@ Time is the fraction ``s`` of the horizon, ``t = s * T``, so that a free final t
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, lru_cache
@@ -112,8 +111,8 @@ class Formulation:
         separations: Poses of the frames of separated bodies, by the name of the separation. Shape (12 F, 1) each.
         watch_integral: Which watched rows bound the integral over time. Shape (rows,), bool.
         watch_reference_rate: Rates of their reference path lengths, zero if there is none. Shape (rows, 1).
-        states, controls, parameters: Slices of the vectors by name. state_labels, control_labels: A name for every
-            entry.
+        states, controls, parameters: Slices of the vectors by name. state_labels, control_labels, parameter_labels: A
+            name for every entry.
         units: Units of states, controls and constraints by name; empty if undeclared, or if a constraint and a variable
             of one name have different units.
         bounds: The bound table.
@@ -137,7 +136,8 @@ class Formulation:
         self.states = slices(declared.states)
         self.controls = slices(declared.controls)
         self.parameters = slices(declared.parameters)
-        self.state_labels, self.control_labels = labels(declared.states), labels(declared.controls)
+        pools = declared.states, declared.controls, declared.parameters
+        self.state_labels, self.control_labels, self.parameter_labels = map(labels, pools)
         self.units = units(declared)
         self.nx, self.nu, self.np = (total(s) for s in (self.states, self.controls, self.parameters))
         self.x, self.u, self.p = sym("x", self.nx), sym("u", self.nu), sym("p", self.np)
@@ -161,9 +161,7 @@ class Formulation:
         self.indifferent = not ca.symvar(ca.vertcat(self.running, self.terminal))
         self.bounds = self._bound_table()
         self.path = self._rows("path", declared.path)
-        if (
-            declared.phases and problem.symbols is ca.SX
-        ):  # phases were substituted one by one, so common subexpressions are duplicated
+        if declared.phases and problem.symbols is ca.SX:  # substituted one by one, so subexpressions are duplicated
             self.f, self.running, rows = ca.cse([self.f, self.running, self.path.expression])
             self.path = replace(self.path, expression=rows)
         self.start = self._rows("start", declared.start, 0.0)
@@ -188,11 +186,7 @@ class Formulation:
         """Return the formulation cached in a problem, or a new one if the declarations have changed."""
         cached: Formulation | None = checked_problem(problem).formulated
         entries = entries_of(problem.declared)
-        if (
-            cached is None
-            or len(cached._entries) != len(entries)
-            or not all(map(operator.is_, cached._entries, entries))
-        ):
+        if cached is None or list(map(id, cached._entries)) != list(map(id, entries)):
             cached = problem.formulated = cls(problem)
         return cached
 

@@ -27,8 +27,8 @@ import numpy as np
 
 from ocp.errors import ProblemError, error_names, require
 from ocp.problem.declarations import Constraint, PhaseTimes, Variable
+from ocp.problem.hulls import Separation
 from ocp.problem.problem import Problem, checked_problem
-from ocp.problem.separation import Separation
 from ocp.problem.values import constant, identity, is_symbolic, numeric
 
 __all__ = ["Phase", "Phases"]

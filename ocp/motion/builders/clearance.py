@@ -23,9 +23,8 @@ from ocp.audit.clearance import Clearance, Track, clearance_along
 from ocp.errors import ProblemError, SolveError, require
 from ocp.motion.local.collisions import Collision, find_collisions, scene_hulls
 from ocp.problem.declarations import Variable
-from ocp.problem.hulls import frames_of
+from ocp.problem.hulls import Separation, frames_of
 from ocp.problem.problem import Problem
-from ocp.problem.separation import Separation
 from ocp.problem.values import Sampler, constant
 from ocp.solution import Solution
 
@@ -136,7 +135,7 @@ class ClearanceConstraints:
             _evaluated(scene.placements, base, joints, time),
             scene_hulls(scene),
             scene.pairs,
-            np.full(len(scene.pairs), scene.clearance),
+            least=np.full(len(scene.pairs), scene.clearance),
             levers={name: pair[0] for name, pair in moved.items()},
             turns={name: pair[1] for name, pair in moved.items()},
             covers=scene.covers,

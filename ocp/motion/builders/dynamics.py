@@ -1,4 +1,4 @@
-"""Point-to-point and tool motions of fixed and free-floating arms within actuator limits.
+"""Joint torques, and motions of fixed and free-floating arms within actuator limits.
 
 Joint accelerations (or jerks) are the control. The joint torques follow from inverse dynamics,
 
@@ -8,26 +8,25 @@ with viscous friction d and Coulomb friction c, smoothed below the speed w. A fl
 as the joints make it move, and the torques are those of the joints alone. No mass matrix is inverted, and torque limits
 are ordinary path constraints (Featherstone 2008, chapter 5; Betts 2010, section 4.10).
 
-Motions through waypoints, and motions with changing loads, are :class:`~ocp.problem.phases.Phases` of such problems,
-see `ocp.motion.builders.dynamics_plan`.
+`ocp.motion.builders.dynamics_plan` declares motions to several goals, and with changing loads, as phases.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import casadi as ca
 import numpy as np
 
-from models import FreeFloating, Robot, find_wheels
+from models import FixedBase, FreeFloating, Machine, Robot, Standing, find_wheels
 from models.checks import NOT_NUMBERS, Array, floats
-from models.robot.dynamics import Wrench
+from models.robot.dynamics import GRAVITY, Wrench, inverse_dynamics
 from models.spatial import quaternion_product
 from ocp.console import interruptible
 from ocp.errors import ProblemError, require
-from ocp.motion.builders.actuator_limits import JointFriction, Motors, checked_motors, joint_torques
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.standing.problem import FreeTime, declare_horizon
 from ocp.motion.tasks.checks import (
@@ -38,13 +37,145 @@ from ocp.motion.tasks.checks import (
     clip_to_limits,
     rates_at_rest,
 )
-from ocp.motion.tasks.cost import Cost
 from ocp.motion.tasks.equations import TaskEquations, bind
+from ocp.motion.tasks.goals import Cost
 from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.problem import Problem, remembers_request
 
-__all__ = ["DynamicsSetup", "dynamics_problem", "end_velocities"]
+__all__ = [
+    "DynamicsSetup", "JointFriction", "Motors", "checked_motors", "declare_actuators", "dynamics_problem",
+    "end_velocities", "joint_torques",
+]  # fmt: skip
+
+Motors = FixedBase | FreeFloating
+"""Machines that are moved by the torques of their joints alone."""
+
+
+@dataclass(frozen=True)
+class JointFriction:
+    """Friction in the joints.
+
+    Attributes:
+        viscous: Viscous coefficient, one number or one for each joint, N m s/rad or N s/m.
+        coulomb: Coulomb friction, one number or one for each joint, N m or N.
+        slip: Speed at which the smoothed Coulomb friction reaches three quarters of its value, rad/s or m/s.
+
+    Raises:
+        ProblemError: A coefficient is negative, or `slip` is not positive.
+    """
+
+    viscous: Any = 0.0
+    coulomb: Any = 0.0
+    slip: float = 0.01
+
+    def __post_init__(self) -> None:
+        for name in ("viscous", "coulomb"):
+            require.array(f"friction: {name}", getattr(self, name), ("joints",), sign="nonnegative")
+        require.positive("friction: slip", self.slip)
+
+    def torques(self, rates: Any) -> Any:
+        """Return the joint torques that overcome the friction. Shape (n, 1)."""
+        n = rates.numel()
+        viscous, coulomb = (
+            ca.DM(require.broadcast(f"friction: {name}", getattr(self, name), n, "joints", sign="nonnegative"))
+            for name in ("viscous", "coulomb")
+        )
+        return viscous * rates + coulomb * ca.tanh(rates / self.slip)
+
+
+def joint_torques(
+    machine: Motors,
+    base: Any,
+    joints: Any,
+    rates: Any,
+    accelerations: Any,
+    *,
+    friction: JointFriction | None = None,
+    wrenches: Sequence[Wrench] = (),
+    gravity: Any = None,
+) -> Any:
+    """Return the joint torques (forces of prismatic joints) of a motion. Shape (n, 1), N m or N.
+
+    Args:
+        machine: Machine on a fixed base, or floating freely.
+        base, joints, rates: Configuration of the base, joints and their rates. Shapes (base_size, 1) and (n, 1).
+            Symbols for a floating machine, because they are differentiated.
+        accelerations: Joint accelerations. Shape (n, 1).
+        friction: Friction in the joints; None for none.
+        wrenches: External wrenches, on a fixed base only.
+        gravity: Acceleration of free fall, m/s^2, on a fixed base only; GRAVITY if None.
+
+    Raises:
+        ProblemError: The machine is of another kind, or external forces act on a floating one.
+    """
+    robot = checked_motors("joint_torques", machine).robot
+    if isinstance(machine, FixedBase):
+        fall = GRAVITY if gravity is None else gravity
+        torques = inverse_dynamics(robot, joints, rates, accelerations, wrenches, fall, machine.world_from_base(base))
+    else:
+        if wrenches or gravity is not None:
+            words = "external wrenches and gravity need a fixed base: a free-floating machine conserves its momentum"
+            raise ProblemError(words, name="wrenches" if wrenches else "gravity", value=wrenches or gravity)
+        torques = machine.joint_torques(base, joints, rates, accelerations)
+    return torques if friction is None else torques + friction.torques(rates)
+
+
+def checked_motors(name: str, machine: Any) -> Motors:
+    """Return the machine; raise ProblemError unless its joint torques alone move it."""
+    if not isinstance(machine, FixedBase | FreeFloating) or isinstance(machine, Standing):
+        words = f"{name}: a FixedBase or a FreeFloating is expected, not a {type(machine).__name__}; use "
+        words += "standing_problem for a standing machine"
+        raise ProblemError(words, name="machine", value=machine)
+    return machine
+
+
+def declare_actuators(
+    problem: Problem,
+    machine: Machine,
+    motion: tuple[Any, Any, Any],
+    bounds: JointBounds,
+    *,
+    suffix: str,
+    pace: float,
+    smoothing: float,
+) -> tuple[Any, Any]:
+    """Declare accelerations within the actuator limits, and return them and the smoothing cost, (rad/s)^2.
+
+    The cost is half the squared accelerations or jerks, times powers of a duration.
+
+    Args:
+        motion: Base, joints and rates as symbols.
+        bounds: Limits of acceleration, jerk, torque and power.
+        suffix: Suffix of the declared names.
+        pace: Seconds of the motion in a second of the problem.
+        smoothing: Duration in which a control passes from limit to limit instead of jumping, s.
+    """
+    (base, joints, rates), robot, n = motion, machine.robot, machine.joint_size
+    options: dict[str, Any] = {"lower": -bounds.acceleration, "upper": bounds.acceleration, "unit": robot.unit("/s^2")}
+    if np.isfinite(bounds.jerk).any():
+        second = problem.state(f"accelerations{suffix}", n, **options)
+        jerks = problem.control(f"jerks{suffix}", n, lower=-bounds.jerk, upper=bounds.jerk, unit=robot.unit("/s^3"))
+        problem.dynamics(second, pace * jerks)
+        smooth = smoothing**2 * ca.sumsqr(jerks)
+    else:
+        second = problem.control(f"accelerations{suffix}", n, **options)
+        smooth = ca.sumsqr(second)
+    problem.dynamics(rates, pace * second)
+    if np.isfinite([bounds.torque, bounds.power]).any():
+        torques = joint_torques(checked_motors("limits", machine), base, joints, rates, second)
+        _limit_torques(problem, robot, torques, bounds.torque, suffix)
+        if rows := np.flatnonzero(np.isfinite(bounds.power)).tolist():
+            problem.path(f"power{suffix}", (torques * rates)[rows], upper=bounds.power[rows], unit="W")
+    return second, smoothing**2 / 2 * smooth
+
+
+def _limit_torques(problem: Problem, robot: Robot, torques: Any, largest: Array, suffix: str = "") -> None:
+    """Declare the path constraint of the joints whose torque is limited."""
+    if rows := np.flatnonzero(np.isfinite(largest)).tolist():
+        bounds = {"lower": -largest[rows], "upper": largest[rows]}
+        problem.path(f"torques{suffix}", torques[rows], unit=robot.effort_unit, **bounds)
+
 
 QUINTIC = np.polynomial.Polynomial([0, 0, 0, 10, -15, 6])
 
@@ -137,16 +268,16 @@ def dynamics_problem(
     if equations is not None:
         if free:
             raise ProblemError("tasks fix the time: give a horizon in s, not a free one", name="horizon")
-        ends = ends.ending_with(equations)
+        if ends.rests[1]:
+            ends = replace(ends, last_rates=rates_at_rest(equations, ends.base, ends.end))
 
     problem = Problem("dynamics", setup.symbols)
     final = declare_horizon(problem, horizon)
     motion = _declare_motion(problem, machine, ends, bounds, duration, control)
     if setup.end_base is not None:
         _declare_end_base(problem, machine, motion.base, setup.end_base)
-    torques = joint_torques(
-        machine, *motion[:4], friction=setup.friction, wrenches=setup.wrenches, gravity=setup.gravity
-    )
+    loads: dict[str, Any] = {"friction": setup.friction, "wrenches": setup.wrenches, "gravity": setup.gravity}
+    torques = joint_torques(machine, *motion[:4], **loads)
     running = _declare_actuators(problem, machine, motion, torques, bounds, cost)
     if equations is not None:
         _declare_tasks(problem, equations, ends, motion, duration)
@@ -185,19 +316,17 @@ class _Ends:
     def take(
         cls, machine: Motors, bounds: JointBounds, joints: tuple[Any, Any], velocities: tuple[Any, Any], base: Any
     ) -> _Ends:
-        robot, n, hint = machine.robot, machine.joint_size, "keep within them, or leave that end free with nan"
+        names, n, hint = machine.robot.joint_names, machine.joint_size, "keep within them, or leave that end free: nan"
         first, last = (
-            clip_to_limits(name, robot.joint_names, _checked_end(name, value, n), bounds.lower, bounds.upper, hint)
+            clip_to_limits(name, names, _checked_end(name, value, n), bounds.lower, bounds.upper, hint)
             for name, value in zip(("start", "end"), joints, strict=True)
         )
         first_rates, last_rates = (
-            clip_to_limits(
-                name, robot.joint_names, end_velocities(name, value, n), -bounds.velocity, bounds.velocity, hint
-            )
+            clip_to_limits(name, names, end_velocities(name, value, n), -bounds.velocity, bounds.velocity, hint)
             for name, value in zip(("start_velocity", "end_velocity"), velocities, strict=True)
-        )  # fmt: skip
+        )
         known = np.clip(np.where(np.isnan(first), np.nan_to_num(last), first), bounds.lower, bounds.upper)
-        free = _is_free(base)
+        free = base is not None and bool(np.isnan(_checked_end("start_base", base, machine.base_size)).all())
         _, home = checked_configuration(machine, known, None if free else base)
         rests = bool((first_rates == 0).all()), bool((last_rates == 0).all())
         return cls(first, last, first_rates, last_rates, rests, home, joints[0] is None or free, known)
@@ -206,11 +335,6 @@ class _Ends:
     def end(self) -> Array:
         """Return the end of the joints' guess. Shape (n,)."""
         return np.where(np.isnan(self.last), self.start, self.last)
-
-    def ending_with(self, equations: TaskEquations) -> _Ends:
-        """Return these ends with the velocities that the tasks require of joints that rest at the end."""
-        rates = rates_at_rest(equations, self.base, self.end)
-        return replace(self, last_rates=rates) if self.rests[1] else self
 
     def quintic(self, duration: float, order: int) -> Any:
         """Return the quintic rest-to-rest motion of the joints, or a derivative, as a function of time."""
@@ -273,10 +397,8 @@ def _declare_actuators(
     problem: Problem, machine: Motors, motion: _Motion, torques: Any, bounds: JointBounds, cost: Cost
 ) -> Any:
     """Declare the limits of torque and power, and return the running cost."""
-    n, limited = machine.joint_size, np.flatnonzero(np.isfinite(bounds.torque)).tolist()
-    if limited:
-        largest = bounds.torque[limited]
-        problem.path("torques", torques[limited], lower=-largest, upper=largest, unit=machine.robot.effort_unit)
+    n = machine.joint_size
+    _limit_torques(problem, machine.robot, torques, bounds.torque)
     weights = require.broadcast("cost: acceleration", cost.acceleration, n, "joints", sign="nonnegative")
     running = ca.dot(ca.DM(weights), motion.second**2)
     if cost.velocity:
@@ -295,14 +417,6 @@ def _declare_actuators(
     return running
 
 
-def _is_free(base: Any) -> bool:
-    """Return whether a configuration of the base is free: given, and all nan."""
-    try:
-        return base is not None and bool(np.isnan(floats(base)).all())
-    except NOT_NUMBERS:
-        return False
-
-
 def _checked_end(name: str, value: Any, n: int) -> Array:
     """Return joints or their velocities at an end, nan where free. Shape (n,).
 
@@ -311,14 +425,11 @@ def _checked_end(name: str, value: Any, n: int) -> Array:
     """
     if value is None:
         return np.full(n, np.nan)
-    try:
+    with suppress(*NOT_NUMBERS):
         numbers = floats(value).reshape(-1)
-    except NOT_NUMBERS as error:
-        raise ProblemError(f"{name} must be {n} numbers, not {value!r}", name=name, value=value) from error
-    if numbers.shape != (n,) or np.isinf(numbers).any():
-        words = f"{name} must be {n} numbers, nan where free, not {numbers.tolist()}"
-        raise ProblemError(words, name=name, value=numbers, limit=n)
-    return numbers
+        if numbers.shape == (n,) and not np.isinf(numbers).any():
+            return numbers
+    raise ProblemError(f"{name} must be {n} numbers, nan where free, not {value!r}", name=name, value=value, limit=n)
 
 
 def _wheel_scales(robot: Robot, bounds: JointBounds, duration: float) -> Array:
@@ -338,11 +449,7 @@ def _wheel_scales(robot: Robot, bounds: JointBounds, duration: float) -> Array:
 
 
 def end_velocities(name: str, value: Any, n: int) -> Array:
-    """Return joint velocities at an end, nan where free. Shape (n,).
-
-    Raises:
-        ProblemError: The value is neither "rest" nor "free" nor n numbers.
-    """
+    """Return joint velocities at an end, nan where free, shape (n,); ProblemError unless numbers, "rest" or "free"."""
     if isinstance(value, str):
         return np.full(n, 0.0 if require.choice(name, value, ("rest", "free")) == "rest" else np.nan)
     if value is None:

@@ -21,15 +21,14 @@ import numpy as np
 from models import FixedBase
 from models.checks import Array
 from ocp.curves import PiecewisePolynomial
-from ocp.errors import SolveError
-from ocp.motion.builders.actuator_limits import joint_torques
+from ocp.errors import SolveError, SolverStatus
+from ocp.motion.builders.dynamics import joint_torques
 from ocp.motion.schedule.ramps import fastest_motion
 from ocp.motion.tasks.limits import JointBounds
 from ocp.problem.formulation import Formulation
 from ocp.problem.problem import Problem
 from ocp.problem.values import Sampler
 from ocp.solution import Solution
-from ocp.status import SolverStatus
 from ocp.tolerances import ROUNDING_SHARE
 
 __all__ = ["StoppingMotion", "segment_durations", "stopping_motion"]

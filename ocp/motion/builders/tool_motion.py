@@ -21,14 +21,13 @@ from models import Machine
 from models.checks import Array
 from ocp.direct.guess import Samples
 from ocp.errors import ProblemError
-from ocp.motion.builders.actuator_limits import declare_actuators
 from ocp.motion.builders.clearance import ClearanceConstraints
+from ocp.motion.builders.dynamics import declare_actuators
 from ocp.motion.local.rates import LocalMotion
 from ocp.motion.tasks.checks import check_closed, check_speed
 from ocp.motion.tasks.equations import TaskEquations, bind
-from ocp.motion.tasks.geometry import is_holonomic
 from ocp.motion.tasks.limits import JointBounds
-from ocp.motion.tasks.tip_task import TipTask
+from ocp.motion.tasks.tip_task import TipTask, is_holonomic
 from ocp.problem.problem import Problem
 from ocp.tolerances import ROUNDING_SHARE
 

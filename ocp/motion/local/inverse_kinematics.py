@@ -18,12 +18,11 @@ from models import CollisionScene, Machine
 from models.checks import NOT_NUMBERS, Array, floats, real
 from ocp.console import interruptible
 from ocp.errors import ProblemError, require
-from ocp.motion.local.branches import ik_branches
 from ocp.motion.local.collisions import Collision, checked_collision_scene, find_collisions, slide_apart
+from ocp.motion.local.ik_solver import ik_branches
 from ocp.motion.tasks.checks import checked_configuration
 from ocp.motion.tasks.equations import TaskEquations, bind
-from ocp.motion.tasks.geometry import pose_in_reference
-from ocp.motion.tasks.tip_task import ANGULAR, TipTask
+from ocp.motion.tasks.tip_task import ANGULAR, TipTask, pose_in_reference
 
 __all__ = ["IkSolution", "Unreachable", "describe_miss", "inverse_kinematics", "inverse_kinematics_at"]
 

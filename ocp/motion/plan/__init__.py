@@ -1,7 +1,6 @@
 """The front door: a machine and its tasks in, the lowest-cost motion that passes its audit out."""
 
-from ocp.motion.plan.declaration import plan_problem
-from ocp.motion.plan.dispatch import plan
+from ocp.motion.plan.dispatch import plan, plan_problem
 from ocp.motion.result.candidate import Candidate, Reason, Rejection
 from ocp.motion.result.plan import Plan, PlanSample
 from ocp.motion.result.segmented_plan import Reconfiguration

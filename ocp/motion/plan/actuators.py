@@ -15,8 +15,8 @@ from models.checks import Array
 from models.machines.machine import hold_joints
 from ocp.direct.guess import Samples
 from ocp.errors import SolveError
-from ocp.motion.builders.actuator_limits import checked_motors, joint_torques
 from ocp.motion.builders.clearance import ClearanceConstraints
+from ocp.motion.builders.dynamics import checked_motors, joint_torques
 from ocp.motion.builders.dynamics_plan import within_limits
 from ocp.motion.builders.tool_motion import ToolMotion
 from ocp.motion.result.plan import CHECKED_TIMES

@@ -17,11 +17,11 @@ from typing import Any
 
 import numpy as np
 
+from ocp.console import report
 from ocp.errors import SolveError
 from ocp.motion.result.candidate import Candidate, Reason, Rejection, Stage
 from ocp.motion.result.solved_plan import SolvedPlan
-from ocp.motion.search.settings import PlannerSettings
-from ocp.progress import report
+from ocp.motion.search.configurations import PlannerSettings
 from ocp.solution import Solution
 
 __all__ = ["CandidateQueue", "Solver"]

@@ -1,6 +1,6 @@
 """Motions from a start to one of several goal configurations, around obstacles.
 
-A sampling-based search finds collision-free paths of several homotopy classes (`ocp.motion.sampling.path_classes`).
+A sampling-based search finds collision-free paths of several homotopy classes (`ocp.motion.sampling.path_search`).
 Without actuator limits, each path at constant speed is a candidate whose clearance is proven. Within actuator limits,
 each path is the guess of an optimal control problem, which stays in its class. The candidates are audited. The one of
 least cost is the plan, the others are listed with the reason.
@@ -29,14 +29,13 @@ from ocp.motion.builders.stopping_motion import StoppingMotion, segment_duration
 from ocp.motion.plan.actuators import limits_actuators
 from ocp.motion.result.candidate import Candidate, Reason, Rejection, Stage
 from ocp.motion.result.solved_plan import Part, SolvedPlan
-from ocp.motion.sampling.path_classes import JointPath, PathSearchSettings, find_paths
-from ocp.motion.sampling.random_trees import TreeSearch
+from ocp.motion.sampling.path_search import JointPath, PathSearchSettings, TreeSearch, find_paths
 from ocp.motion.sampling.shortening import points_along, shortest_through_corners
 from ocp.motion.sampling.straight import StraightMotions
 from ocp.motion.search.joint_space import FULL_TURN, JointSpace
 from ocp.motion.search.search import checked_bound
 from ocp.motion.tasks.checks import checked_configuration, checked_weights, clip_to_limits
-from ocp.motion.tasks.cost import Cost
+from ocp.motion.tasks.goals import Cost
 from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.problem.problem import Problem
 from ocp.solution import Solution

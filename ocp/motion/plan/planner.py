@@ -19,9 +19,10 @@ import numpy as np
 
 from models import CollisionScene, Machine, ModelError
 from models.checks import Array
+from ocp.console import report
 from ocp.errors import ProblemError, SolveError, require
-from ocp.motion.builders.actuator_limits import checked_motors
 from ocp.motion.builders.clearance import ClearanceConstraints
+from ocp.motion.builders.dynamics import checked_motors
 from ocp.motion.builders.tool_motion import stretches_of
 from ocp.motion.local.inverse_kinematics import LARGEST_SEED, Unreachable
 from ocp.motion.local.rates import LocalMotion
@@ -35,23 +36,26 @@ from ocp.motion.search.configurations import (
     REACH_TOLERANCE,
     PlanRequest,
     SearchKind,
-    fix_ignorable_joints,
     largest_pose_errors,
     local_motions_from,
     start_collisions,
 )
 from ocp.motion.search.dead_end import DeadEnd
-from ocp.motion.search.held_joints import hold_idle_joints, moved_aside, place_held_joints, released, restore_error
+from ocp.motion.search.held_joints import (
+    fix_ignorable_joints,
+    hold_idle_joints,
+    moved_aside,
+    place_held_joints,
+    released,
+    restore_error,
+)
 from ocp.motion.search.search import checked_bound
 from ocp.motion.search.task_search import TaskSearch
 from ocp.motion.tasks.checks import checked_tasks, clip_to_limits, horizon_of
-from ocp.motion.tasks.cost import Cost
 from ocp.motion.tasks.equations import bind
-from ocp.motion.tasks.goals import Start
+from ocp.motion.tasks.goals import Cost, Scene, Start
 from ocp.motion.tasks.limits import Limits
-from ocp.motion.tasks.scene import Scene
 from ocp.motion.tasks.tip_task import TipTask
-from ocp.progress import report
 
 __all__ = ["candidates_from", "checked_request", "clearance_for", "plan_from_configurations", "plan_request"]
 

@@ -18,7 +18,7 @@ from ocp.motion.local.inverse_kinematics import inverse_kinematics
 from ocp.motion.plan.candidate_queue import CandidateQueue, Solver
 from ocp.motion.result.candidate import Candidate, Reason, Rejection, Stage
 from ocp.motion.result.solved_plan import Part, SolvedPlan
-from ocp.motion.search.settings import PlannerSettings
+from ocp.motion.search.configurations import PlannerSettings
 from ocp.motion.tasks.checks import check_rest, horizon_of
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.limits import Limits

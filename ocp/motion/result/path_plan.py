@@ -22,7 +22,8 @@ from ocp.motion.result.plan import Plan
 from ocp.motion.result.request import restored_request, stored_request
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.targets import Target, tip_poses
-from ocp.problem.stored import ARRAY_NAMES, RECORD_ERRORS, pack_record, unpack_record
+from ocp.problem.record_reader import ARRAY_NAMES, RECORD_ERRORS, unpack_record
+from ocp.problem.record_writer import pack_record
 from ocp.solution import Solution, read_head
 from ocp.tolerances import CLEARANCE_TOLERANCE_M
 

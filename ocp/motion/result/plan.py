@@ -24,14 +24,13 @@ from ocp.errors import ProblemError, require, sample_times
 from ocp.motion.result.candidate import Candidate
 from ocp.motion.schedule.trajectory import JointTrajectory
 from ocp.motion.tasks.targets import Target, tip_poses
-from ocp.registry import call_registered
 from ocp.solution import MAX_LINES, Solution
+from ocp.solution_data import call_registered
 from ocp.storage import table_head, write_arrays, write_text
+from ocp.tolerances import LIMIT_SHARE
 
 __all__ = ["CHECKED_TIMES", "Plan", "PlanSample"]
 
-LIMIT_TOLERANCE = 1e-3
-"""Largest relative excess over a joint limit, as in the audit."""
 CHECKED_TIMES = 2001
 """Samples at which joint limits are checked, besides the times of the plan."""
 TIME_TOLERANCE = 1e-9
@@ -206,7 +205,7 @@ class Plan(ABC):
             unit = ("rad", "m")[robot.moving_joints[joint].kind == "prismatic"] + ("/s" if name == "rates" else "")
             label = f"{name} of the machine, {self.names[joint]!r}"
             value = max(float(excess[row, joint]), 0.0)
-            limit = LIMIT_TOLERANCE * (size if np.isfinite(size) else 1.0)
+            limit = LIMIT_SHARE * (size if np.isfinite(size) else 1.0)
             findings.append(Finding(label, value, limit, float(t[row]), unit=unit))
         return findings
 

@@ -43,28 +43,23 @@ from models.machines.machine import hold_joints
 from models.shapes.bodies import Body, LinkMesh
 from models.spatial import expression
 from ocp.errors import ProblemError
-from ocp.motion.builders.actuator_limits import JointFriction
 from ocp.motion.builders.clearance import ClearanceConstraints
-from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem
+from ocp.motion.builders.dynamics import DynamicsSetup, JointFriction, dynamics_problem
 from ocp.motion.builders.dynamics_plan import dynamics_phases, machines_of
 from ocp.motion.builders.joint_motion import joint_motion_problem
-from ocp.motion.builders.space.capture import Capture, capture_machines, capture_problem
-from ocp.motion.builders.space.grasping import Cone, Grasp
+from ocp.motion.builders.space.capture import Capture, Cone, Grasp, capture_machines, capture_problem
 from ocp.motion.builders.standing.problem import FreeTime, StandingSetup, Weights, standing_problem
 from ocp.motion.builders.standing.stances import StancePhase, Steps
 from ocp.motion.builders.standing.steps import StepWeights, steps_problem
 from ocp.motion.builders.tool_motion import ToolMotion, stretches_of, tool_motion_problem
 from ocp.motion.search.configurations import PlanRequest
-from ocp.motion.tasks.cost import Cost
-from ocp.motion.tasks.goals import Goal, Start
-from ocp.motion.tasks.limits import Limits
+from ocp.motion.tasks.goals import Cost, Goal, Start
+from ocp.motion.tasks.limits import IndexAtLeast, InFoot, Limits, Pinned
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.motion.tasks.tracks import TrackWithRate
-from ocp.motion.tasks.zmp_rules import IndexAtLeast, InFoot, Pinned
-from ocp.problem.function_reader import FunctionReader
-from ocp.problem.function_writer import FunctionWriter
 from ocp.problem.problem import Problem
-from ocp.problem.stored import RECORD_ERRORS
+from ocp.problem.record_reader import RECORD_ERRORS, FunctionReader
+from ocp.problem.record_writer import FunctionWriter
 
 __all__ = ["MotionRequest", "declared_motion", "request_of", "restored_request", "stored_request"]
 

@@ -20,7 +20,8 @@ from ocp.motion.result.candidate import Candidate
 from ocp.motion.result.plan import Plan
 from ocp.motion.result.solved_plan import SolvedPlan
 from ocp.motion.tasks.targets import Target
-from ocp.problem.stored import ARRAY_NAMES, RECORD_ERRORS, pack_record, unpack_record
+from ocp.problem.record_reader import ARRAY_NAMES, RECORD_ERRORS, unpack_record
+from ocp.problem.record_writer import pack_record
 from ocp.solution import Solution, read_head
 
 __all__ = ["Piece", "Reconfiguration", "SegmentedPlan"]

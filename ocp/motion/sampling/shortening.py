@@ -1,7 +1,16 @@
 """Shortening of collision-free joint paths, and their homotopy classes.
 
-A path is a sequence of configurations with straight motions between them. Parts of it are replaced by straight motions
-that are proven clear and shorter, so that it never becomes longer.
+A path is a sequence of configurations with straight motions between them. `shorten` replaces parts of it by straight
+motions that are proven clear and shorter, so that it never becomes longer. `optimise_length` moves all corners towards
+a locally shortest path by a sequence of convex problems. If the lengths of its motions are h now, then the length of a
+path is at most
+
+    sum over the motions (|scale * dq|^2 / h + h) / 2,
+
+and equal to it now. Each step minimises this bound, so that the length decreases, under linearised clearance
+constraints at the ends and the middles of the motions. This least-distance problem is solved by its dual, a nonnegative
+least-squares problem (Lawson & Hanson 1974, chapter 23). A motion that a step does not leave provably clear stays where
+it was, so that all paths are proven clear.
 """
 
 from __future__ import annotations
@@ -10,11 +19,16 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import nnls
 
 from models.checks import Array
+from ocp.console import check_time
 from ocp.motion.sampling.straight import StraightMotions
 
-__all__ = ["ShorteningSettings", "path_length", "points_along", "same_class", "shorten", "shortest_through_corners"]
+__all__ = [
+    "LengthSettings", "ShorteningSettings", "optimise_length", "path_length", "points_along", "same_class", "shorten",
+    "shortest_through_corners",
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -138,3 +152,162 @@ def _cut(motions: StraightMotions, path: Array, scale: Array, random: np.random.
     positions = np.concatenate([places[outside], ends[taken].ravel()])
     corners = np.concatenate([path[outside], *([begins[k], stops[k]] for k in taken)]) if taken else path
     return np.asarray(corners[np.argsort(positions, kind="stable")]) if taken else path
+
+
+@dataclass(frozen=True)
+class LengthSettings:
+    """Settings of the optimisation.
+
+    Attributes:
+        motion: Length of the straight motions, in the metric of the path.
+        fewest, most: Bounds of the number of these motions.
+        reach: Distance beyond the clearance within which pairs of bodies are constrained, m.
+        margin: Distance beyond the clearance that is required where it is constrained, m, since straight motions come
+            closer between these places.
+        inertia, most_inertia: First and largest weight of the squared step, relative to that of the squared motions.
+        braking: Factor of the inertia after a step that had to be shortened; its inverse after others.
+        least_share: Mean share of a step below which it counts as shortened.
+        smallest_share: Share of a step below which a configuration stays where it is.
+        shortest: Least length of a motion that the bound assumes, relative to the mean.
+        least_gain, patience: It ends after more than `patience` successive steps that decrease the length by less,
+            relative to it.
+        most_steps: Largest number of steps.
+    """
+
+    motion: float = 0.15
+    fewest: int = 12
+    most: int = 64
+    reach: float = 0.05
+    margin: float = 1e-3
+    inertia: float = 0.02
+    most_inertia: float = 10.0
+    braking: float = 4.0
+    least_share: float = 0.75
+    smallest_share: float = 0.1
+    shortest: float = 0.05
+    least_gain: float = 2e-4
+    patience: int = 2
+    most_steps: int = 20
+
+
+def optimise_length(
+    motions: StraightMotions,
+    path: Array,
+    scale: Array,
+    limits: tuple[Array, Array],
+    settings: LengthSettings = LengthSettings(),
+) -> Array:
+    """Return a path of at most the same length, each straight motion of which is proven clear.
+
+    Args:
+        motions: Proofs of clearance.
+        path: Configurations with clear straight motions between them. Shape (M, n).
+        scale: The length of a displacement is |scale * dq|. Shape (n,).
+        limits: Lower and upper limits of the joints. Shape (n,) each.
+        settings: Settings.
+    """
+    if len(path) == 2:
+        return path
+    length = path_length(path, scale)
+    count = int(np.clip(np.ceil(length / settings.motion), settings.fewest, settings.most))
+    chain = _resampled(motions, path, scale, count)
+    best, best_length, inertia, idle = path, length, settings.inertia, 0
+    for _ in range(settings.most_steps):
+        check_time()
+        step = _step(motions, chain, scale, limits, inertia, settings)
+        moved, shares = _clear_step(motions, chain, chain + step, settings.smallest_share)
+        length = path_length(moved, scale)
+        gain = 1 - length / best_length
+        if gain > 0:
+            best, best_length = moved, length
+        shortened = shares.mean() < settings.least_share
+        inertia *= settings.braking if shortened else 1 / settings.braking
+        idle = idle + 1 if gain < settings.least_gain else 0
+        if idle > settings.patience or inertia > settings.most_inertia:
+            break
+        chain = _resampled(motions, best, scale, count)
+    return best
+
+
+def _resampled(motions: StraightMotions, path: Array, scale: Array, count: int) -> Array:
+    """Return a path of about equal motions that are proven clear, with old corners where that needs them.
+
+    It is the old path if the motions cannot be proven, since halves of a proven motion need not be.
+    """
+    shares = np.linspace(0.0, 1.0, count + 1)
+    chain = points_along(path, scale, shares)
+    blocked = np.flatnonzero(~motions.are_clear(chain[:-1], chain[1:]))
+    if not len(blocked):
+        return chain
+    places = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(path, axis=0) * scale, axis=1)))
+    places /= places[-1]
+    inside = ((places > shares[blocked, None]) & (places < shares[blocked + 1, None])).any(axis=0)
+    order = np.argsort(np.concatenate([shares, places[inside]]), kind="stable")
+    chain = np.concatenate([chain, path[inside]])[order]
+    return chain if motions.are_clear(chain[:-1], chain[1:]).all() else path
+
+
+def _step(
+    motions: StraightMotions,
+    chain: Array,
+    scale: Array,
+    limits: tuple[Array, Array],
+    inertia: float,
+    settings: LengthSettings,
+) -> Array:
+    """Return the step of the chain (m + 1, n) to the minimum of the energy under linearised constraints."""
+    inner, n = len(chain) - 2, chain.shape[1]
+    places = np.empty((2 * len(chain) - 1, n))
+    places[::2], places[1::2] = chain, (chain[:-1] + chain[1:]) / 2
+    at, _, distance, gradient = motions.near_pairs(places[1:-1], settings.reach)
+    weights = np.zeros((len(at), len(chain)))  # of the chain's configurations at the place of each row
+    weights[np.arange(len(at)), (at + 1) // 2] += 0.5
+    weights[np.arange(len(at)), (at + 2) // 2] += 0.5
+    rows = (weights[:, 1:-1, None] * (gradient / scale)[:, None]).reshape(len(at), inner * n)
+    least = settings.margin - distance
+    flat = np.tile(scale, inner)
+    for sign, limit in zip((1.0, -1.0), limits, strict=True):
+        room = (sign * (chain[1:-1] - limit)).ravel()
+        close = np.flatnonzero(room < 0.5)
+        rows = np.vstack([rows, sign * np.eye(inner * n)[close] / flat])
+        least = np.append(least, -room[close])
+    # for the scaled step y of the inner configurations: y' H y / 2 + slope' y, with H the same for all joints
+    changes = np.diff(chain * scale, axis=0)
+    lengths = np.linalg.norm(changes, axis=1)
+    stiffness = 1 / np.maximum(lengths / lengths.mean(), settings.shortest)
+    hessian = np.diag(stiffness[:-1] + stiffness[1:] + inertia)
+    hessian -= np.diag(stiffness[1:-1], 1) + np.diag(stiffness[1:-1], -1)
+    factor = np.linalg.cholesky(hessian)
+    slope = -np.diff(stiffness[:, None] * changes, axis=0)
+    target = -np.linalg.solve(factor, slope)  # in z = factor' y the energy is |z - target|^2
+    turned = np.asarray(np.linalg.solve(factor, rows.reshape(len(rows), inner, n)), dtype=float)
+    z = _nearest_point(target.ravel(), turned.reshape(len(rows), -1), np.minimum(least, 0.0))
+    return np.vstack([np.zeros(n), np.linalg.solve(factor.T, z.reshape(inner, n)) / scale, np.zeros(n)])
+
+
+def _nearest_point(target: Array, rows: Array, least: Array) -> Array:
+    """Return the point z nearest to a target with rows z >= least, which z = 0 satisfies."""
+    needed = least - rows @ target
+    active = np.flatnonzero(needed > -np.inf)
+    if not len(active) or needed.max() <= 0:
+        return target
+    size = float(np.abs(needed).max())
+    matrix = np.vstack([rows.T, needed[None] / size])
+    right = np.append(np.zeros(len(target)), 1.0)
+    multipliers, _ = nnls(matrix, right, maxiter=10 * matrix.shape[1])
+    residual = matrix @ multipliers - right
+    if residual[-1] >= 0:
+        return np.zeros_like(target)
+    return np.asarray(target - residual[:-1] / residual[-1] * size)
+
+
+def _clear_step(motions: StraightMotions, chain: Array, moved: Array, smallest: float) -> tuple[Array, Array]:
+    """Return the chain with steps shortened, each by itself, so that its motions stay clear, and the shares taken."""
+    shares = np.ones(len(chain))
+    while True:
+        trial = chain + shares[:, None] * (moved - chain)
+        blocked = ~motions.are_clear(trial[:-1], trial[1:])
+        if not blocked.any():
+            return trial, shares
+        ends = np.append(blocked, False) | np.append(False, blocked)
+        shares = np.where(ends, np.where(shares > smallest, shares / 2, 0.0), shares)

@@ -15,12 +15,60 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ocp.errors import ProblemError
-from ocp.motion.schedule.limits import JointPath, LineLimits, PathLike, Rows, check_smooth, limit_names, limit_rows
+from ocp.motion.schedule.limits import (
+    BLOCK_SIZE,
+    JointPath,
+    LineLimits,
+    PathLike,
+    Rows,
+    check_smooth,
+    limit_names,
+    limit_rows,
+)
 from ocp.motion.schedule.profile import Array, segment_index
-from ocp.motion.schedule.settings import SETTINGS
 from ocp.tolerances import ROUNDING_SHARE
 
 __all__ = ["Grid", "coarse_grid", "make_grid", "reachable_bounds"]
+
+
+@dataclass(frozen=True)
+class GridSettings:
+    """Settings of the grids. Shares are relative.
+
+    Attributes:
+        halvings: Largest number of halvings of an interval of the first grid.
+        shortest: Share of the path below which a segment is merged with the next, and an interval is not halved.
+        uneven, uneven_speed: Largest interpolation error of a row between two nodes, over its limit; that of the rows
+            of speed, which are enforced at nodes only.
+        cells, segments: Intervals of the first grid in each cell of a blend, and at least on all segments together.
+        closest: Ratio of neighbouring intervals below which their node is dropped, unless segments meet there.
+        build_up, ramp: Duration of an interval over the time in which the acceleration builds up, or, if longer, over
+            that in which the top speed is reached.
+        turn, least_build_up: Upper bound as a share of the ramp time, since the speed must not change much in an
+            interval; lower bound as a share of the build-up, since with low jerks no motion gets near the acceleration
+            limits.
+        parts: Largest number of parts into which an interval that resolves the limits is split.
+        growth: Ratio of neighbouring distances from rest, where the speed grows as their power 2/3.
+        first: Duration of the first and last interval, of constant jerk, over that of the build-up.
+    """
+
+    halvings: int = 8
+    shortest: float = 1e-7
+    uneven: float = 0.2
+    uneven_speed: float = 0.02
+    cells: int = 4
+    segments: int = 64
+    closest: float = 0.05
+    build_up: float = 0.5
+    ramp: float = 0.05
+    turn: float = 0.25
+    least_build_up: float = 0.05
+    parts: int = 32
+    growth: float = 1.2
+    first: float = 0.3
+
+
+SETTINGS = GridSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +108,7 @@ class Grid:
 
     def parts(self) -> list[tuple[int, int]]:
         """Return the first and last nodes of parts of bounded length."""
-        ends = [*range(0, len(self.requested), SETTINGS.block), len(self.requested)]
+        ends = [*range(0, len(self.requested), BLOCK_SIZE), len(self.requested)]
         return list(pairwise(ends))
 
 
@@ -100,8 +148,8 @@ def make_grid(path: PathLike, limits: LineLimits, joints: JointPath | None) -> G
     sample_distances = path.sample_distances(SETTINGS.cells, max(1, SETTINGS.segments // len(bounds)))
     first = _separate(np.concatenate([sample_distances, nodes]), nodes)
     parts = [
-        _halved(path, limits, joints, first[begin : begin + SETTINGS.block + 1], (bounds, requested))
-        for begin in range(0, len(first) - 1, SETTINGS.block)
+        _halved(path, limits, joints, first[begin : begin + BLOCK_SIZE + 1], (bounds, requested))
+        for begin in range(0, len(first) - 1, BLOCK_SIZE)
     ]
     cells = _Cells(*(np.concatenate(kind) for kind in zip(*parts, strict=True)))
     s = _separate(np.concatenate([_time_nodes(cells, path.length), nodes]), nodes)

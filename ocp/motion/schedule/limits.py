@@ -21,14 +21,16 @@ from numpy.typing import ArrayLike, NDArray
 from models.checks import NOT_NUMBERS, floats
 from ocp.errors import ProblemError, require
 from ocp.motion.schedule.profile import Array, LineMotion
-from ocp.motion.schedule.settings import SETTINGS
 from ocp.tolerances import ROUNDING_SHARE
 
 __all__ = [
-    "JointLimits", "JointPath", "JointRates", "LineLimits", "PathLike", "Rows", "ToolLimits", "TorqueRates",
-    "check_joints", "check_line", "check_smooth", "curvature_along", "limit_names", "limit_rows", "rates_along",
-    "tool_along", "torque_rows", "torques_along",
+    "BLOCK_SIZE", "JointLimits", "JointPath", "JointRates", "LineLimits", "PathLike", "Rows", "ToolLimits",
+    "TorqueRates", "check_joints", "check_line", "check_smooth", "curvature_along", "limit_names", "limit_rows",
+    "rates_along", "tool_along", "torque_rows", "torques_along",
 ]  # fmt: skip
+
+BLOCK_SIZE = 20_000
+"""Places whose limits are evaluated at once, which bounds the memory of a long path."""
 
 
 class PathLike(Protocol):
@@ -433,16 +435,16 @@ def limit_rows(
     Raises:
         ProblemError: Curvature or joints are not finite, as at a singular arm, or have a wrong shape.
     """
-    if len(distance) <= SETTINGS.block:
+    if len(distance) <= BLOCK_SIZE:
         return _block_rows(path, limits, joints, distance, torques)
     # fill preallocated arrays: concatenating the parts of a long path takes twice the memory
     speed, acceleration, jerk = (len(kind) for kind in _names_by_kind(limits, joints))
     shapes = ((speed,), (acceleration, 3), (jerk, 3))
     whole = Rows(*(np.empty((len(distance), *shape)) for shape in shapes))
-    for first in range(0, len(distance), SETTINGS.block):
-        part = _block_rows(path, limits, joints, distance[first : first + SETTINGS.block], torques)
+    for first in range(0, len(distance), BLOCK_SIZE):
+        part = _block_rows(path, limits, joints, distance[first : first + BLOCK_SIZE], torques)
         for kind, rows in zip(whole, part, strict=True):
-            kind[first : first + SETTINGS.block] = rows
+            kind[first : first + BLOCK_SIZE] = rows
     return whole
 
 

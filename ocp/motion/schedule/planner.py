@@ -19,15 +19,53 @@ from numpy.typing import ArrayLike, NDArray
 from ocp.console import interruptible
 from ocp.errors import ProblemError, require, sample_times
 from ocp.motion.schedule.grid import Grid, coarse_grid, make_grid
-from ocp.motion.schedule.limits import JointPath, LineLimits, PathLike, check_line, curvature_along, limit_names
+from ocp.motion.schedule.limits import (
+    BLOCK_SIZE,
+    JointPath,
+    LineLimits,
+    PathLike,
+    check_line,
+    curvature_along,
+    limit_names,
+)
 from ocp.motion.schedule.profile import Array, LineMotion, SpeedProfile, join_profiles, segment_index
 from ocp.motion.schedule.ramps import Zones, plan_zones, ramp_distance
-from ocp.motion.schedule.settings import SETTINGS
-from ocp.motion.schedule.stretch import fastest_profile
+from ocp.motion.schedule.stretch import ACTIVE_SHARE, fastest_profile
 from ocp.motion.schedule.window import Stretch
 from ocp.tolerances import ROUNDING_SHARE
 
 __all__ = ["Dip", "Schedule", "plan_below_velocity_curve", "schedule"]
+
+
+@dataclass(frozen=True)
+class ScheduleSettings:
+    """Settings of the schedules.
+
+    Attributes:
+        curve_halvings: Largest number of halvings of an interval of the velocity curve, whose minima are sharp.
+        reached: Relative reduction of the requested speed above which a motion counts as slower.
+        leaving: Relative reduction accepted near the ends of a stretch that is long enough.
+        long_path: Number of segments from which a path with centripetal limits alone uses ramps, at a fiftieth of the
+            work.
+        speed_error: Relative error of the permitted speed between two places of the velocity curve, which is
+            subtracted.
+        speed_change: Largest relative change of it between two places; the lower value holds between them.
+        spread: Largest ratio of permitted speeds in a stretch of one speed.
+        zone_rounds, thorough_from: Largest number of rounds, and the round from which every place gets its own speed.
+    """
+
+    curve_halvings: int = 12
+    reached: float = 1e-4
+    leaving: float = 1e-5
+    long_path: int = 400
+    speed_error: float = 2e-4
+    speed_change: float = 0.1
+    spread: float = 1.2
+    zone_rounds: int = 200
+    thorough_from: int = 40
+
+
+SETTINGS = ScheduleSettings()
 
 
 def plan_below_velocity_curve(path: PathLike, limits: LineLimits) -> SpeedProfile:
@@ -51,10 +89,10 @@ def _velocity_curve(path: PathLike, limits: LineLimits) -> tuple[Array, Array, A
     of_pieces, bounds = path.by_piece(limits.speed), np.asarray(path.bounds, dtype=float)
     first = np.unique(np.concatenate([path.sample_distances(8, 2), bounds]))
     parts = []
-    for begin in range(0, len(of_pieces), SETTINGS.block):
-        ends = bounds[begin : begin + SETTINGS.block + 1]
+    for begin in range(0, len(of_pieces), BLOCK_SIZE):
+        ends = bounds[begin : begin + BLOCK_SIZE + 1]
         low, high = np.searchsorted(first, ends[[0, -1]])
-        parts.append(_refined(path, limits, first[low : high + 1], ends, of_pieces[begin : begin + SETTINGS.block]))
+        parts.append(_refined(path, limits, first[low : high + 1], ends, of_pieces[begin : begin + BLOCK_SIZE]))
     s = np.concatenate([part[0][:-1] for part in parts] + [first[-1:]])
     permitted = np.concatenate([part[1][:-1] for part in parts] + [parts[-1][1][-1:]])
     # where two parts meet, both sides count
@@ -117,9 +155,7 @@ def _constant_zones(s: Array, speed: Array, limits: LineLimits) -> Zones:
 
 def _lower_speeds(s: Array, permitted: Array, speed: Array, profile: SpeedProfile, everywhere: bool) -> bool:
     """Lower speeds, in place, where a profile is faster than permitted; return whether there was any."""
-    speeds = np.concatenate(
-        [profile.at_distance(part).speed for part in np.array_split(s, len(s) // SETTINGS.block + 1)]
-    )
+    speeds = np.concatenate([profile.at_distance(part).speed for part in np.array_split(s, len(s) // BLOCK_SIZE + 1)])
     top = np.maximum(speeds[:-1], speeds[1:])
     peaks = profile.peaks()
     np.maximum.at(top, segment_index(s, peaks.distance), peaks.speed)
@@ -388,7 +424,7 @@ def _find_dips(grid: Grid, profile: SpeedProfile, names: tuple[str, ...]) -> tup
         line = usage[:, line_rows].max(axis=1, initial=0.0)
         usage[:, line_rows] = 0.0
         cause[part], largest = usage.argmax(axis=1), usage.max(axis=1)
-        binding[part] &= (largest > SETTINGS.binding) & (largest >= line - (1 - SETTINGS.binding))
+        binding[part] &= (largest > ACTIVE_SHARE) & (largest >= line - (1 - ACTIVE_SHARE))
         steady[part] = np.minimum(*(rows.steady()[0] for rows in sides))
     permitted = np.minimum(steady, grid.requested)
     changes = (np.diff(binding) != 0) | (np.diff(cause) != 0) | (np.diff(grid.requested) != 0)

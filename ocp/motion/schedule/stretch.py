@@ -10,8 +10,6 @@ solved in windows; each comes to rest at its end, so that a motion beyond the ne
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -23,123 +21,63 @@ from ocp.motion.schedule.limits import Rows
 from ocp.motion.schedule.profile import Array, SpeedProfile, join_profiles
 from ocp.motion.schedule.program import Program, Spline, SplineRows, least_time
 from ocp.motion.schedule.ramps import reachability_passes
-from ocp.motion.schedule.settings import SETTINGS
-from ocp.motion.schedule.window import HELD, INSIDE, Ends, Motion, Stretch, Window, limit_usage, motion_profile
+from ocp.motion.schedule.window import (
+    HELD,
+    INSIDE,
+    Ends,
+    EnforcedRows,
+    Margins,
+    Motion,
+    Stretch,
+    Window,
+    limit_usage,
+    motion_profile,
+)
+from ocp.motion.schedule.window import SETTINGS as WINDOW_SETTINGS
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = ["fastest_profile"]
+__all__ = ["ACTIVE_SHARE", "fastest_profile"]
+
+ACTIVE_SHARE = 0.98
+"""Share of a limit above which it counts as active; rows below it in every motion are left out at first."""
 
 
-class _Margins(NamedTuple):
-    """Shares of the bounds of speed, and of each row of acceleration and jerk, that intervals may use.
-
-    Shape (N,), (N, L) and (N, P).
-    """
-
-    speed: Array
-    acceleration: Array
-    jerk: Array
-
-    def take(self, part: slice) -> _Margins:
-        """Return views of the margins of some intervals."""
-        return _Margins(*(margin[part] for margin in self))
-
-    def times(self, share: Array) -> _Margins:
-        """Return the margins times a share for each interval. Shape (N,)."""
-        return _Margins(self.speed * share, self.acceleration * share[:, None], self.jerk * share[:, None])
-
-
-@dataclass(eq=False)
-class _Enforced:
-    """Rows that are enforced in a window, and their margins.
+@dataclass(frozen=True)
+class StretchSettings:
+    """Settings of the fastest motion. Shares are relative.
 
     Attributes:
-        margins: Shares of the bounds, lowered where bounds are violated although their rows are enforced there.
-        times: Number of reductions.
-        held: Rows enforced at the `HELD` places of each interval, upwards and downwards. Shape (4, 2, N, K + L + P).
-        speeds: Speeds at these places over those that the jerk there is proportional to. Shape (4, N).
-        inherited: Number of intervals taken over from the previous window.
+        rounds: Largest number of rounds of tightening.
+        accuracies: Relative accuracy of the time of a window in each round, no finer than the rows still change; the
+            last value serves all later rounds.
+        around, few: Intervals on either side of a violated one that are planned again with it; only these are planned
+            if their share is at most `few`.
+        window, overlap: Intervals of a window, which bounds the memory, and those at its end that the next one plans
+            again.
+        seam: Share of the bounds that a window uses behind its seam, so that the next one has freedom.
+        start, again: Initial squared speed over that of a fastest steady motion with bounded acceleration, and over
+            that of the solution of a similar program.
+        again_inside: Further factor if that start fails.
+        center, center_again: Initial complementarity over the time for these starts.
+        dive: Least squared speed inside an interval over that at its beginning, for rough splines.
     """
 
-    margins: _Margins
-    times: _Margins
-    held: NDArray[np.bool_]
-    speeds: Array
-    inherited: int = 0
+    rounds: int = 20
+    accuracies: tuple[float, ...] = (0.05, 1e-3, 1e-5, 1e-8)
+    around: int = 40
+    few: float = 1 / 6
+    window: int = 2000
+    overlap: int = 200
+    seam: float = 0.999
+    start: float = 0.5
+    again: float = 0.9
+    again_inside: float = 0.3
+    center: float = 1.0
+    center_again: float = 0.1
+    dive: float = 0.01
 
-    @classmethod
-    def build(cls, window: Window) -> _Enforced:
-        """Return the initial state of a window."""
-        count, rows = window.last - window.first, window.rows[0]
-        shapes = (count,), (count, rows.acceleration.shape[1]), (count, rows.jerk.shape[1])
-        margins, times = (_Margins(*(np.full(shape, x) for shape in shapes)) for x in (1 - SETTINGS.room, 0.0))
-        held = np.zeros((len(HELD), 2, count, rows.total), dtype=bool)
-        return cls(margins, times, held, np.ones((len(HELD), count)))
 
-    def part(self, first: int, last: int) -> _Enforced:
-        """Return a view of some intervals."""
-        part = slice(first, last)
-        return _Enforced(self.margins.take(part), self.times.take(part), self.held[:, :, part], self.speeds[:, part])
-
-    def hold_near(self, used: Array, values: Array, jerks: Array) -> None:
-        """Enforce rows close to their bounds, there and in neighbouring intervals, and some row of jerk in each.
-
-        Args:
-            used, values: Usage of the limits, see `limit_usage`.
-            jerks: Coefficients of the jerk in its rows. Shape (N, P).
-        """
-        close = used > SETTINGS.near
-        close[:, 1:] |= close[:, :-1].copy()
-        close[:, :-1] |= close[:, 1:].copy()
-        self.held[[0, -1]] |= close
-        self.hold(close, values)
-        self.hold_jerk(jerks)
-
-    def release(self, values: Array, jerks: Array, seam: int) -> None:
-        """Release rows that stay away from their bounds, keeping some row of jerk in every interval.
-
-        Intervals shared with the previous or next window keep all rows.
-        """
-        own = slice(self.inherited, seam)
-        self.held[:, :, own] &= np.stack([values, -values], axis=1)[:, :, own] > SETTINGS.near
-        self.hold_jerk(jerks)
-
-    def hold_jerk(self, jerks: Array) -> None:
-        """Enforce some row of jerk in every interval, since otherwise the second derivative is unbounded there."""
-        first = self.held.shape[3] - jerks.shape[1]
-        sign, free = np.nonzero(~self.held[:, :, :, first:].any(axis=(0, 3)))
-        self.held[1, sign, free, first + np.abs(jerks[free]).argmax(axis=1)] = True
-
-    def hold(self, rows: NDArray[np.bool_], values: Array) -> NDArray[np.bool_]:
-        """Enforce rows (2, N, K + L + P) where they are used most; return which of them already were."""
-        already = np.zeros(rows.shape, dtype=bool)
-        sign, at, row = np.nonzero(rows)
-        place = (values[:, at, row] * (1 - 2 * sign)).argmax(axis=0)
-        already[sign, at, row] = self.held[place, sign, at, row]
-        self.held[place, sign, at, row] = True
-        return already
-
-    def lower(self, used: Array, held: NDArray[np.bool_], rows: Rows, seam: int) -> None:
-        """Lower bounds violated by enforced rows (those of speed always are), more each time.
-
-        Args:
-            used: Usage of the limits. Shape (2, N, K + L + P).
-            held: Which rows are enforced. Shape (2, N, K + L + P).
-            rows: Rows of the window.
-            seam: Interval at which the next window begins.
-        """
-        ends = np.cumsum([0, *(kind.shape[1] for kind in rows)])
-        largest = np.where(held, np.minimum(used, SETTINGS.lowered), 0.0).max(axis=0)
-        largest[:, : ends[1]] = np.minimum(used[0, :, : ends[1]], SETTINGS.lowered)
-        for margin, times, (a, z) in zip(self.margins, self.times, pairwise(ends), strict=True):
-            ratio = largest[:, a:z] if margin.ndim == 2 else largest[:, a:z].max(axis=1, initial=0.0)
-            at = np.nonzero(ratio > 1)
-            margin[at] /= np.minimum(1 + (ratio[at] - 1 + SETTINGS.room / 2) * 2.0 ** times[at], SETTINGS.lowered)
-            times[at] += 1
-            if margin.ndim == 2:
-                # the next window starts on this motion with these margins and must keep them at all places
-                inherited = at[0] >= seam
-                self.held[:, :, at[0][inherited], a + at[1][inherited]] = True
+SETTINGS = StretchSettings()
 
 
 def fastest_profile(stretch: Stretch) -> SpeedProfile:
@@ -166,8 +104,8 @@ def fastest_profile(stretch: Stretch) -> SpeedProfile:
 
 
 def _solve_window(
-    window: Window, seam: int, before: _Enforced | None
-) -> tuple[SpeedProfile, tuple[float, float], _Enforced]:
+    window: Window, seam: int, before: EnforcedRows | None
+) -> tuple[SpeedProfile, tuple[float, float], EnforcedRows]:
     """Return the motion of a window up to its seam, tightened until it keeps all limits there and well beyond.
 
     Args:
@@ -178,7 +116,7 @@ def _solve_window(
     Returns:
         The motion, squared speed and slope at the seam, and the rows enforced behind it.
     """
-    enforced = _Enforced.build(window)
+    enforced = EnforcedRows.build(window)
     if before is not None:
         for margin, previous in zip(enforced.margins, before.margins, strict=True):
             margin[: len(previous)] = previous
@@ -191,7 +129,7 @@ def _solve_window(
     return motion_profile(window, x[: to_seam + 1], slope), state, enforced.part(to_seam, window.last - window.first)
 
 
-def _tighten(window: Window, enforced: _Enforced, seam: int, checked: int) -> tuple[Array, Array | None]:
+def _tighten(window: Window, enforced: EnforcedRows, seam: int, checked: int) -> tuple[Array, Array | None]:
     """Return squared speeds and, with jerk limits, slopes at the nodes of a motion that keeps all limits.
 
     If few intervals still violate them, these are planned again with their neighbours, between fixed motions.
@@ -247,7 +185,7 @@ def _seam_shares(window: Window, seam: int) -> Array:
     return np.where(np.arange(window.first, window.last) < seam, 1.0, SETTINGS.seam)
 
 
-def _without_jerk(window: Window, margins: _Margins) -> Array:
+def _without_jerk(window: Window, margins: Margins) -> Array:
     """Return squared speeds at the nodes by exact passes."""
     grid = window.grid
     left, right = window.rows[0], window.rows[-1]
@@ -274,7 +212,7 @@ def _node_minimum(of_intervals: Array) -> Array:
 
 
 def _with_jerk(
-    window: Window, enforced: _Enforced, seam: int, known: Motion | None, accuracy: float, free: NDArray[np.intp]
+    window: Window, enforced: EnforcedRows, seam: int, known: Motion | None, accuracy: float, free: NDArray[np.intp]
 ) -> Motion:
     """Return squared speeds and slopes at the nodes of a window by a convex program."""
     begin, end, ends, grid, nodes = window.first, window.last, window.ends, window.grid, window.nodes
@@ -393,7 +331,7 @@ def _spline_rows(
     held: NDArray[np.bool_],
     caps: Array,
     implied: Array,
-    shares: _Margins,
+    shares: Margins,
     speeds: Array,
     in_motion: tuple[bool, bool],
 ) -> SplineRows:
@@ -404,7 +342,7 @@ def _spline_rows(
         held: Which of them are enforced, at the `HELD` places. Shape (4, 2, N, K + L + P).
         caps, implied: Greatest squared speed at nodes by the rows of speed, and by coefficient bounds. Shape (N + 1,).
         shares: Shares of the bounds, in the intervals.
-        speeds: Speed ratios at the `HELD` places, see `_Enforced`. Shape (4, N).
+        speeds: Speed ratios at the `HELD` places, see `EnforcedRows`. Shape (4, N).
         in_motion: Whether the program begins and ends with a known motion, whose own rows are left out.
     """
     count, first = len(caps) - 1, places[0].speed.shape[1]
@@ -412,7 +350,7 @@ def _spline_rows(
     nodes = np.flatnonzero((caps < implied * (1 - ROUNDING_SHARE)) & np.isfinite(caps))
     nodes = nodes[(nodes >= int(in_motion[0])) & (nodes <= count - int(in_motion[1]))]
     parts = [_speed_rows(np.minimum(nodes, count - 1), (nodes == count).astype(float), 1 / caps[nodes])]
-    slow = np.flatnonzero(shares.speed < SETTINGS.seam * (1 - SETTINGS.room))
+    slow = np.flatnonzero(shares.speed < SETTINGS.seam * (1 - WINDOW_SETTINGS.room))
     for inside, rows in zip(INSIDE, places[1:-1], strict=True):
         most = (rows.speed[slow].max(axis=1, initial=0.0) / shares.speed[slow]) ** 2
         parts.append(_speed_rows(slow, np.full(len(slow), inside), most))
@@ -463,7 +401,7 @@ def _speed_rows(interval: NDArray[np.intp], fraction: Array, of: Array) -> Splin
     return SplineRows(interval, fraction, fraction, coefficients, np.ones(len(of)), none)
 
 
-def _reachable_rows(rows: Rows, squares: Array, rates: Array, shares: _Margins) -> NDArray[np.bool_]:
+def _reachable_rows(rows: Rows, squares: Array, rates: Array, shares: Margins) -> NDArray[np.bool_]:
     """Return which rows of acceleration and jerk a motion may reach. Shape (N, K + L + P).
 
     Args:
@@ -479,5 +417,5 @@ def _reachable_rows(rows: Rows, squares: Array, rates: Array, shares: _Margins) 
         sharp = np.where(j[:, :, 0] > 0, (1 + without_jerk) / j[:, :, 0], np.inf).min(axis=1, initial=np.inf)
         jerk = np.where(j[:, :, 0] > 0, j[:, :, 0] * sharp[:, None], 0.0) + without_jerk
     none = np.zeros(rows.speed.shape, dtype=bool)
-    most = SETTINGS.binding
+    most = ACTIVE_SHARE
     return np.concatenate([none, acceleration > most * shares.acceleration, jerk > most * shares.jerk], axis=1)

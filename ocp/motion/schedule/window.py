@@ -1,9 +1,10 @@
-"""Windows of a grid that are solved at once: their rows inside the intervals, and the usage of limits by a motion."""
+"""Windows of a grid that are solved at once: their rows, those that are enforced, and the usage of limits."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TypeAlias
+from itertools import pairwise
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,9 +12,36 @@ from numpy.typing import NDArray
 from ocp.motion.schedule.grid import Grid
 from ocp.motion.schedule.limits import Rows, limit_rows, torque_rows
 from ocp.motion.schedule.profile import Array, LineMotion, SpeedProfile, profile_through
-from ocp.motion.schedule.settings import SETTINGS
 
-__all__ = ["HELD", "INSIDE", "Ends", "Motion", "Stretch", "Window", "limit_usage", "motion_profile"]
+__all__ = [
+    "HELD", "INSIDE", "Ends", "EnforcedRows", "Margins", "Motion", "Stretch", "Window", "limit_usage", "motion_profile",
+]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class WindowSettings:
+    """Settings of the windows. Shares are of the limits.
+
+    Attributes:
+        room: Share of the limits reserved for what happens between the places where rows are enforced: half of the
+            promised accuracy of 1e-3.
+        near: Once a motion is known, rows that use less than this share in an interval and beside it are left out.
+        lowered: Largest factor by which a bound is lowered in a round.
+        bend: Share of the limits by which a row may deviate from a parabola before more places are evaluated.
+        vertex_usage: Share of a bound used at one of three places above which the vertex between them is evaluated: a
+            parabola exceeds the greatest of three values by a quarter at most.
+        fine: Parts into which an interval is split for that evaluation; even, so that the middle is an end of one.
+    """
+
+    room: float = 5e-4
+    near: float = 0.9
+    lowered: float = 1.5
+    bend: float = 1e-4
+    vertex_usage: float = 0.75
+    fine: int = 16
+
+
+SETTINGS = WindowSettings()
 
 INSIDE = (0.25, 0.5, 0.75)
 """Places in each interval where rows are evaluated between its ends, as shares of its length."""
@@ -100,6 +128,118 @@ class Window(Stretch):
     def nodes(self) -> Array:
         """Distances of the nodes. Shape (N + 1,), m."""
         return self.grid.distance[self.first : self.last + 1]
+
+
+class Margins(NamedTuple):
+    """Shares of the bounds of speed, and of each row of acceleration and jerk, that intervals may use.
+
+    Shape (N,), (N, L) and (N, P).
+    """
+
+    speed: Array
+    acceleration: Array
+    jerk: Array
+
+    def take(self, part: slice) -> Margins:
+        """Return views of the margins of some intervals."""
+        return Margins(*(margin[part] for margin in self))
+
+    def times(self, share: Array) -> Margins:
+        """Return the margins times a share for each interval. Shape (N,)."""
+        return Margins(self.speed * share, self.acceleration * share[:, None], self.jerk * share[:, None])
+
+
+@dataclass(eq=False)
+class EnforcedRows:
+    """Rows that are enforced in a window, and their margins.
+
+    Attributes:
+        margins: Shares of the bounds, lowered where bounds are violated although their rows are enforced there.
+        times: Number of reductions.
+        held: Rows enforced at the `HELD` places of each interval, upwards and downwards. Shape (4, 2, N, K + L + P).
+        speeds: Speeds at these places over those that the jerk there is proportional to. Shape (4, N).
+        inherited: Number of intervals taken over from the previous window.
+    """
+
+    margins: Margins
+    times: Margins
+    held: NDArray[np.bool_]
+    speeds: Array
+    inherited: int = 0
+
+    @classmethod
+    def build(cls, window: Window) -> EnforcedRows:
+        """Return the initial state of a window."""
+        count, rows = window.last - window.first, window.rows[0]
+        shapes = (count,), (count, rows.acceleration.shape[1]), (count, rows.jerk.shape[1])
+        margins, times = (Margins(*(np.full(shape, x) for shape in shapes)) for x in (1 - SETTINGS.room, 0.0))
+        held = np.zeros((len(HELD), 2, count, rows.total), dtype=bool)
+        return cls(margins, times, held, np.ones((len(HELD), count)))
+
+    def part(self, first: int, last: int) -> EnforcedRows:
+        """Return a view of some intervals."""
+        part = slice(first, last)
+        return EnforcedRows(self.margins.take(part), self.times.take(part), self.held[:, :, part], self.speeds[:, part])
+
+    def hold_near(self, used: Array, values: Array, jerks: Array) -> None:
+        """Enforce rows close to their bounds, there and in neighbouring intervals, and some row of jerk in each.
+
+        Args:
+            used, values: Usage of the limits, see `limit_usage`.
+            jerks: Coefficients of the jerk in its rows. Shape (N, P).
+        """
+        close = used > SETTINGS.near
+        close[:, 1:] |= close[:, :-1].copy()
+        close[:, :-1] |= close[:, 1:].copy()
+        self.held[[0, -1]] |= close
+        self.hold(close, values)
+        self.hold_jerk(jerks)
+
+    def release(self, values: Array, jerks: Array, seam: int) -> None:
+        """Release rows that stay away from their bounds, keeping some row of jerk in every interval.
+
+        Intervals shared with the previous or next window keep all rows.
+        """
+        own = slice(self.inherited, seam)
+        self.held[:, :, own] &= np.stack([values, -values], axis=1)[:, :, own] > SETTINGS.near
+        self.hold_jerk(jerks)
+
+    def hold_jerk(self, jerks: Array) -> None:
+        """Enforce some row of jerk in every interval, since otherwise the second derivative is unbounded there."""
+        first = self.held.shape[3] - jerks.shape[1]
+        sign, free = np.nonzero(~self.held[:, :, :, first:].any(axis=(0, 3)))
+        self.held[1, sign, free, first + np.abs(jerks[free]).argmax(axis=1)] = True
+
+    def hold(self, rows: NDArray[np.bool_], values: Array) -> NDArray[np.bool_]:
+        """Enforce rows (2, N, K + L + P) where they are used most; return which of them already were."""
+        already = np.zeros(rows.shape, dtype=bool)
+        sign, at, row = np.nonzero(rows)
+        place = (values[:, at, row] * (1 - 2 * sign)).argmax(axis=0)
+        already[sign, at, row] = self.held[place, sign, at, row]
+        self.held[place, sign, at, row] = True
+        return already
+
+    def lower(self, used: Array, held: NDArray[np.bool_], rows: Rows, seam: int) -> None:
+        """Lower bounds violated by enforced rows (those of speed always are), more each time.
+
+        Args:
+            used: Usage of the limits. Shape (2, N, K + L + P).
+            held: Which rows are enforced. Shape (2, N, K + L + P).
+            rows: Rows of the window.
+            seam: Interval at which the next window begins.
+        """
+        ends = np.cumsum([0, *(kind.shape[1] for kind in rows)])
+        largest = np.where(held, np.minimum(used, SETTINGS.lowered), 0.0).max(axis=0)
+        largest[:, : ends[1]] = np.minimum(used[0, :, : ends[1]], SETTINGS.lowered)
+        for margin, times, (a, z) in zip(self.margins, self.times, pairwise(ends), strict=True):
+            ratio = largest[:, a:z] if margin.ndim == 2 else largest[:, a:z].max(axis=1, initial=0.0)
+            at = np.nonzero(ratio > 1)
+            margin[at] /= np.minimum(1 + (ratio[at] - 1 + SETTINGS.room / 2) * 2.0 ** times[at], SETTINGS.lowered)
+            times[at] += 1
+            if margin.ndim == 2:
+                # the next window starts on this motion with these margins and must keep them at all places
+                inherited = at[0] >= seam
+                self.held[:, :, at[0][inherited], a + at[1][inherited]] = True
 
 
 def motion_profile(stretch: Stretch, x: Array, slope: Array | None) -> SpeedProfile:

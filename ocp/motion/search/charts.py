@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from models.checks import Array
 from ocp.errors import ProblemError
-from ocp.motion.local.branches import IkBranches, ik_branches
+from ocp.motion.local.ik_solver import IkBranches, ik_branches
 from ocp.motion.local.inverse_kinematics import Unreachable, inverse_kinematics_at
 from ocp.motion.search.joint_space import TOLERANCE, JointSpace
 from ocp.motion.tasks.equations import TaskEquations

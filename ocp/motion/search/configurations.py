@@ -1,4 +1,4 @@
-"""Start configurations of a motion, and the local motions that resolved-rate control tracks from them."""
+"""Requests of plans, their start configurations, local motions by resolved-rate control, and the end of the reach."""
 
 from __future__ import annotations
 
@@ -16,26 +16,85 @@ from ocp.errors import ProblemError
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.tool_motion import Stretch, stretches_of
 from ocp.motion.local.collisions import Collision, distances_along
-from ocp.motion.local.ik_solver import idle_positions
-from ocp.motion.local.inverse_kinematics import Unreachable, inverse_kinematics, sample_starts
+from ocp.motion.local.inverse_kinematics import Unreachable, describe_miss, inverse_kinematics, inverse_kinematics_at
 from ocp.motion.local.rates import LocalMotion, track_tasks
-from ocp.motion.search.reach import end_of_reach
-from ocp.motion.search.settings import PlannerSettings
-from ocp.motion.tasks.checks import ignorable_joints
-from ocp.motion.tasks.equations import bind
+from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.motion.tasks.tip_task import TipTask
 
 __all__ = [
-    "REACH_TOLERANCE", "PlanRequest", "SearchKind", "check_clear_start", "count_clear_configurations",
-    "describe_alternatives", "fix_ignorable_joints", "largest_pose_errors", "local_motions_from", "locate_error",
+    "REACH_TOLERANCE", "PlanRequest", "PlannerSettings", "SearchKind", "check_clear_start",
+    "count_clear_configurations", "describe_alternatives", "largest_pose_errors", "local_motions_from", "locate_error",
     "sampled_motions", "start_collisions", "start_configurations",
 ]  # fmt: skip
 
-SETTINGS = PlannerSettings()
 SearchKind: TypeAlias = Literal["start", "configurations", "global"]
 REACH_TOLERANCE = 1e-4
 """m or rad: a pose with a larger error may be out of reach."""
+
+
+@dataclass(frozen=True)
+class PlannerSettings:
+    """Settings of `ocp.motion.plan.plan`, chosen by the problem families of tests/sweep where no law gives them.
+
+    Attributes:
+        ik_starts: Random starts of inverse kinematics.
+        local_steps: Steps of a local motion, besides the breaks of its tasks.
+        dampings: Dampings of local motions, relative to the singular values; the next one is tried if none tracks.
+        min_intervals: Least number of mesh intervals.
+        coarse_degree, fine_degree: Degrees of collocation. One interval of the fine degree represents a smooth segment
+            to rounding.
+        separated_intervals: Intervals of a coarse mesh with separation constraints, which hold only at its points.
+        coarse_options, fine_options: Options of IPOPT. A coarse solve starts from a guess that does its tasks.
+        barriers: Default mu_init of IPOPT, and the tolerance at which the barrier parameter ends.
+        samples_per_interval: Samples of an interval at which collisions and deviations are checked.
+        compared_samples: Samples at which two motions are compared.
+        same_cost, same_path: Two candidates count as one motion if either difference is smaller: relative; rad or m.
+        negligible_rate: (rad/s)^2 or (m/s)^2: smaller mean squared rates are rounding errors of a motion at rest.
+        tip_tolerance: m and rad: largest deviation of a tip from its task at any time, over all rows.
+        max_deviation: m and rad: a motion with a larger deviation on its last mesh is rejected without an audit.
+        max_refinements, max_splits, max_intervals: Meshes refined for the deviation of the tips; parts into which one
+            refinement splits an interval; intervals of the last mesh.
+        least_progress: Largest share of the deviation that a refinement may leave if the task may be out of reach.
+        max_failures: Failed candidates of a batch after which no further one is repaired; also the number of sorted
+            seeds that are tried, and of motions that are audited if all are requested.
+        refusal_time: Processor time after which no further candidate is tried if those before failed for other reasons
+            than collisions, s.
+        batch: Seeds that are solved before the best of them is audited, if each takes seconds.
+        max_separations: Solves of one candidate with more, or wider, separation constraints.
+        max_cost_ratio: A local motion whose cost exceeds that of the best solve by this factor is not solved.
+        gain: Relative cost reduction that a motion must promise to be solved with its start fixed.
+        near_bound: A plan whose cost is within this factor of its lower bound is accepted.
+    """
+
+    ik_starts: int = 64
+    local_steps: int = 64
+    dampings: tuple[float, ...] = (0.01, 0.1, 1.0)
+    min_intervals: int = 8
+    coarse_degree: int = 2
+    fine_degree: int = 7
+    separated_intervals: int = 24
+    coarse_options: Mapping[str, Any] = field(default_factory=lambda: {"max_iter": 60, "tol": 1e-4, "mu_init": 1e-3})
+    fine_options: Mapping[str, Any] = field(default_factory=lambda: {"max_iter": 150})
+    barriers: tuple[float, float] = (0.1, 1e-10)
+    samples_per_interval: int = 16
+    compared_samples: int = 33
+    same_cost: float = 1e-5
+    same_path: float = 0.1
+    negligible_rate: float = 1e-12
+    tip_tolerance: float = 1e-6
+    max_deviation: float = float("inf")
+    max_refinements: int = 6
+    max_splits: int = 4
+    max_intervals: int = 400
+    least_progress: float = 0.9
+    max_failures: int = 8
+    refusal_time: float = 20.0
+    batch: int = 4
+    max_separations: int = 12
+    max_cost_ratio: float = 10.0
+    gain: float = 0.01
+    near_bound: float = 1.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +131,7 @@ class PlanRequest:
     search: SearchKind = "configurations"
     actuator_limits: Limits | None = None
     clearance_constraints: ClearanceConstraints | None = None
-    settings: PlannerSettings = SETTINGS
+    settings: PlannerSettings = field(default_factory=PlannerSettings)
     held: Mapping[str, float] = field(default_factory=dict)
     whole: Machine | None = None
 
@@ -181,34 +240,6 @@ def describe_alternatives(count: int | Unreachable | None) -> list[str]:
     return [f"{count} other configuration{plural} collision-free then, but no motion found passes through them"]
 
 
-def fix_ignorable_joints(request: PlanRequest, configurations: Array) -> tuple[Array, Array]:
-    """Return the joints at the start, nan where they are free, and the configurations with the others fixed.
-
-    An ignorable coordinate changes nothing but the joint itself: the last joint of an arm whose roll is free turns
-    about the tool's axis. If it were free, each motion would belong to a family of equal cost. It is therefore fixed in
-    the middle of its range. If that puts every configuration in collision, it takes the values of a configuration, or
-    random ones, for which most configurations are collision-free.
-    """
-    bounds = request.bounds
-    start = np.full(request.machine.joint_size, np.nan)
-    ignorable = np.ones(request.machine.joint_size, dtype=bool)
-    for stretch in request.stretches:
-        if stretch.equations is not None:
-            ignorable &= ignorable_joints(stretch.equations, request.base)
-    bounded = np.isfinite(bounds.upper - bounds.lower)
-    start[ignorable] = np.where(bounded, idle_positions(bounds.lower, bounds.upper), configurations[0])[ignorable]
-
-    def clear_count(values: Array) -> int:
-        return start_collisions(request, np.where(ignorable, values, configurations)).count(None)
-
-    if ignorable.any() and not clear_count(start):
-        samples = sample_starts(
-            request.machine, bounds.lower, bounds.upper, request.settings.ik_starts, None, request.seed
-        )
-        start[ignorable] = max((start, *configurations, *samples), key=clear_count)[ignorable]
-    return start, np.where(ignorable, start, configurations)
-
-
 def local_motions_from(request: PlanRequest, configurations: Array) -> list[LocalMotion]:
     """Track the tasks from all configurations (K, n) by resolved-rate control; return one result per stretch.
 
@@ -311,3 +342,131 @@ def locate_error(request: PlanRequest, error: Unreachable, time: float) -> Unrea
             places.append(f"task {number} is at {np.round(targets[:3], 6).tolist()} m")
     where = f" ({', '.join(places)})" if places else ""
     return Unreachable(f"at {time:.4g} s{where}: {error}", **{**vars(error), "time": time})
+
+
+# ---- end of the reach ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ReachSettings:
+    """Settings of the search for the end of the reach.
+
+    Attributes:
+        intervals: Intervals of the stretch of time, at whose ends the reach is evaluated before the bisection. They do
+            not depend on where a planner failed, so that every search names the same end.
+        bisections: Number of bisections of one interval.
+        tolerance: Pose error up to which a pose is within reach, m or rad. The distance that it adds to the reach is
+            below the repeatability of an arm.
+        continued: Number of solutions from which the next time is tried before random starts.
+    """
+
+    intervals: int = 32
+    bisections: int = 24
+    tolerance: float = 1e-6
+    continued: int = 16
+
+
+REACH = ReachSettings()
+
+
+@dataclass
+class _Reach:
+    """IK solutions of tasks over time, each continued from those of the time before."""
+
+    equations: TaskEquations
+    options: dict[str, Any]
+    solutions: Array
+
+    def __post_init__(self) -> None:
+        self._targets = self.equations.target_function()
+
+    def unreachable_at(self, time: float, limits: bool) -> Unreachable | None:
+        """Return the error at a time, or None and keep the solutions."""
+        targets = np.array(self._targets(time)).ravel()
+        options = {**self.options, "limits": limits, "tolerance": REACH.tolerance}
+        for starts in (0, self.options["starts"]):
+            if not starts and not len(self.solutions):
+                continue
+            try:
+                options["starts"] = starts
+                solved = inverse_kinematics_at(self.equations, targets, near=self.solutions, **options)
+            except Unreachable as error:
+                unreachable = error
+            else:
+                self.solutions = np.array([solution.joints for solution in solved[: REACH.continued]])
+                return None
+        return unreachable
+
+
+def end_of_reach(
+    machine: Machine,
+    tasks: Sequence[TipTask],
+    interval: tuple[float, float],
+    failed: float,
+    *,
+    limits: bool,
+    starts: int,
+    seed: int,
+) -> Unreachable | None:
+    """Return an error that names the end of the reach of a machine on a fixed base, and what ends it.
+
+    The end is the first time at which no joint positions within the limits do the tasks. A joint ends the reach if it
+    is at its limit there, and the pose would be within reach without limits. Otherwise the pose is too far or too near,
+    or turned in a way that the arm cannot follow: the Jacobian of the tasks is singular at the end.
+
+    Args:
+        machine: The machine.
+        tasks: Its pose tasks during the interval.
+        interval: Begin and end of the stretch of time, s.
+        failed: Time at which no solution was found, s.
+        limits, starts, seed: As in `inverse_kinematics`.
+
+    Returns:
+        The error with the fields time (the end), name (the joint, or the frame), value, limit, distance and angle (the
+        nearest miss at the next of the evaluated times). None if the pose at `failed` is within reach after all.
+    """
+    begin, end = interval
+    reach = _Reach(bind(machine, tasks), {"starts": starts, "seed": seed}, np.zeros((0, machine.joint_size)))
+    grid = np.linspace(begin, end, REACH.intervals + 1)
+    within, miss = begin, None
+    for beyond in (*grid[grid < failed].tolist(), failed, *grid[grid > failed].tolist()):
+        if (miss := reach.unreachable_at(beyond, limits)) is not None:
+            break
+        if beyond >= failed:
+            return None
+        within = beyond
+    assert miss is not None
+    first, nearest = beyond, miss
+    for _ in range(REACH.bisections if beyond > within else 0):
+        middle = (within + beyond) / 2
+        if (error := reach.unreachable_at(middle, limits)) is None:
+            within = middle
+        else:
+            beyond, nearest = middle, error
+    for time in grid[grid > within][:1].tolist():
+        if (error := reach.unreachable_at(time, limits)) is not None:
+            first, miss = time, error
+    details: dict[str, Any] = {"name": miss.name, "value": miss.pose_error}
+    cause = f"no joint limit ends it, the arm is singular there with joints {np.round(nearest.joints, 6).tolist()}"
+    free = _Reach(reach.equations, reach.options, np.vstack([reach.solutions, nearest.joints]))
+    if limits and free.unreachable_at(within + (first - within) / REACH.intervals, limits=False) is None:
+        cause, joint = _joint_at_limit(machine, nearest.joints)
+        details |= joint
+    words = (
+        f"the reach ends, {cause}; at {first:.4g} s the nearest miss is {describe_miss(miss.distance, miss.angle)}; "
+        "ask for poses within reach or leave a row free"
+    )
+    details |= {"distance": miss.distance, "angle": miss.angle, "time": within}
+    return Unreachable(words, nearest.joints, miss.pose_error, **details)
+
+
+def _joint_at_limit(machine: Machine, joints: Array) -> tuple[str, dict[str, Any]]:
+    """Return the words and fields about the joint that is nearest to its limit, if the limits end the reach."""
+    moving = machine.robot.moving_joints
+    limits = [
+        min((joint.lower, joint.upper), key=lambda x: abs(x - q)) for joint, q in zip(moving, joints, strict=True)
+    ]
+    nearest = int(np.abs(joints - limits).argmin())
+    joint, unit = moving[nearest], "m" if moving[nearest].kind == "prismatic" else "rad"
+    fields = {"name": joint.name, "value": float(joints[nearest]), "limit": float(limits[nearest])}
+    return f"{joint.name!r} is at its limit {limits[nearest]:.5g} {unit}", fields

@@ -35,9 +35,18 @@ from ocp.motion.search.configurations import (
 )
 from ocp.motion.search.dead_end import DeadEnd
 from ocp.motion.search.search import MAX_FREE_DIRECTIONS
+from ocp.motion.tasks.checks import ignorable_joints
 from ocp.motion.tasks.equations import bind
 
-__all__ = ["all_joints", "hold_idle_joints", "moved_aside", "place_held_joints", "released", "restore_error"]
+__all__ = [
+    "all_joints",
+    "fix_ignorable_joints",
+    "hold_idle_joints",
+    "moved_aside",
+    "place_held_joints",
+    "released",
+    "restore_error",
+]
 
 STIFFNESS = 1e6
 """Weight of the rates of shared joints, relative to their own, with which a local motion leaves them nearly still."""
@@ -157,6 +166,34 @@ def _check_held_bodies(whole: PlanRequest, request: PlanRequest, configuration: 
         if pairs is with_obstacle:
             raise ProblemError(words, name=" and ".join(collision.bodies), **details)
         warn(ModelWarning(words, name=" and ".join(collision.bodies), **details), stacklevel=2)
+
+
+def fix_ignorable_joints(request: PlanRequest, configurations: Array) -> tuple[Array, Array]:
+    """Return the joints at the start, nan where they are free, and the configurations with the others fixed.
+
+    An ignorable coordinate changes nothing but the joint itself: the last joint of an arm whose roll is free turns
+    about the tool's axis. If it were free, each motion would belong to a family of equal cost. It is therefore fixed in
+    the middle of its range. If that puts every configuration in collision, it takes the values of a configuration, or
+    random ones, for which most configurations are collision-free.
+    """
+    bounds = request.bounds
+    start = np.full(request.machine.joint_size, np.nan)
+    ignorable = np.ones(request.machine.joint_size, dtype=bool)
+    for stretch in request.stretches:
+        if stretch.equations is not None:
+            ignorable &= ignorable_joints(stretch.equations, request.base)
+    bounded = np.isfinite(bounds.upper - bounds.lower)
+    start[ignorable] = np.where(bounded, idle_positions(bounds.lower, bounds.upper), configurations[0])[ignorable]
+
+    def clear_count(values: Array) -> int:
+        return start_collisions(request, np.where(ignorable, values, configurations)).count(None)
+
+    if ignorable.any() and not clear_count(start):
+        samples = sample_starts(
+            request.machine, bounds.lower, bounds.upper, request.settings.ik_starts, None, request.seed
+        )
+        start[ignorable] = max((start, *configurations, *samples), key=clear_count)[ignorable]
+    return start, np.where(ignorable, start, configurations)
 
 
 def moved_aside(whole: PlanRequest, request: PlanRequest, error: SolveError) -> PlanRequest | None:

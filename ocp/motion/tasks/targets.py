@@ -12,8 +12,7 @@ from models import Machine
 from models.checks import Array
 from models.spatial import quaternion_from_rotation
 from ocp.motion.tasks.equations import bind
-from ocp.motion.tasks.geometry import target_size
-from ocp.motion.tasks.tip_task import TipTask
+from ocp.motion.tasks.tip_task import TipTask, target_size
 
 __all__ = ["Target", "targets_along", "tip_poses"]
 

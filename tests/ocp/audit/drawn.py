@@ -10,8 +10,8 @@ import numpy as np
 
 from ocp import Audit, Problem, Solution
 from ocp.curves import PiecewisePolynomial
+from ocp.errors import SolverStatus
 from ocp.problem.formulation import Formulation
-from ocp.status import SolverStatus
 from tests.ocp.problems import Array
 
 Curve: TypeAlias = Any

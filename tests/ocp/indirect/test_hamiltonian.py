@@ -290,9 +290,7 @@ def test_a_guess_without_costates_is_refused() -> None:
         solve(energy(), Indirect(), guess=replace(seed, costates={"q": seed.costates["q"]}))
 
 
-@pytest.mark.parametrize(
-    ("guess", "message"), [(3, "guess must be"), ({"speed": 1.0}, "variable in guess")]
-)
+@pytest.mark.parametrize(("guess", "message"), [(3, "guess must be"), ({"speed": 1.0}, "variable in guess")])
 def test_what_is_no_guess_is_refused(guess: Any, message: str) -> None:
     with pytest.raises(ProblemError, match=message):
         solve(energy(), Indirect(), guess=guess)

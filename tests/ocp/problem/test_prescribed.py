@@ -11,8 +11,7 @@ import pytest
 
 from ocp import Problem, ProblemError
 from ocp.problem.enclosures import PrescribedMotion
-from ocp.problem.hulls import Hull
-from ocp.problem.separation import Separation
+from ocp.problem.hulls import Hull, Separation
 
 T = ca.SX.sym("t")
 EYE = ca.DM.eye(3).reshape((9, 1))
@@ -96,5 +95,5 @@ def test_what_cannot_be_proven_is_refused_by_name() -> None:
         (ca.vertcat(EYE, problem.time, p, 0), 0, "observed from the world"),
     ):
         with pytest.raises(ProblemError, match=word):
-            problem.separate("apart", ca.vertcat(frame, other), hulls, [[0, 1, seen]], 0.0, **told)
-    problem.separate("apart", ca.vertcat(frame, EYE, p * problem.time, p, 0), hulls, [[0, 1, -1]], 0.0, **told)
+            problem.separate("apart", ca.vertcat(frame, other), hulls, [[0, 1, seen]], least=0.0, **told)
+    problem.separate("apart", ca.vertcat(frame, EYE, p * problem.time, p, 0), hulls, [[0, 1, -1]], least=0.0, **told)

@@ -52,12 +52,12 @@ from ocp.motion.builders.standing.start import (
 )
 from ocp.motion.tasks.checks import check_length, check_rest, checked_configuration, checked_tasks, rates_at_rest
 from ocp.motion.tasks.equations import TaskEquations, bind
-from ocp.motion.tasks.limits import JointBounds, Limits
-from ocp.motion.tasks.tip_task import TipTask
-from ocp.motion.tasks.zmp_rules import (
+from ocp.motion.tasks.limits import (
     Following,
     IndexAtLeast,
     InFoot,
+    JointBounds,
+    Limits,
     Pinned,
     ZmpRule,
     check_rule,
@@ -65,6 +65,7 @@ from ocp.motion.tasks.zmp_rules import (
     index_rows,
     is_finite,
 )
+from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.problem import Problem, remembers_request
 
 __all__ = ["FreeTime", "StandingSetup", "Weights", "declare_horizon", "motion_cost", "standing_problem"]

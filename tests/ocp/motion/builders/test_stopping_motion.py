@@ -13,7 +13,7 @@ from ocp import Limits
 from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem
 from ocp.motion.builders.joint_motion import joint_motion_problem, least_durations, motion_along
 from ocp.motion.builders.stopping_motion import segment_durations, stopping_motion
-from ocp.motion.tasks.cost import Cost
+from ocp.motion.tasks.goals import Cost
 
 INF = np.inf
 

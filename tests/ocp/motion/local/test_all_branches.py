@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 from models import FixedBase, lock_joints
 from models.checks import Array
 from ocp import ProblemError, TipTask, inverse_kinematics
-from ocp.motion.local.branches import ik_configurations
 from ocp.motion.local.chain import Chain, Motion
 from ocp.motion.local.elimination import Elimination, elimination_of, solve_opening
-from ocp.motion.local.ik_solver import IkSolver, Incompleteness, ToolFreedom
+from ocp.motion.local.ik_solver import IkSolver, Incompleteness, ToolFreedom, ik_configurations
 from ocp.motion.local.inverse_kinematics import inverse_kinematics_at
 from ocp.motion.tasks.equations import bind
 from tests.families import some

@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 from models import FixedBase, Joint, Mimic, Robot
 from models.checks import Array
 from ocp import TipTask, inverse_kinematics
-from ocp.motion.local.branches import ik_branches
 from ocp.motion.local.chain import Chain
 from ocp.motion.local.closed_forms import ClosedForm
 from ocp.motion.local.closed_forms import closed_forms as closed_forms_of
+from ocp.motion.local.ik_solver import ik_branches
 from ocp.motion.tasks.equations import bind
 from tests.ocp.motion.local.arms import arm
 from tests.ocp.motion.tasks.space_tasks import panda, ur5

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from ocp import SolveError
 from ocp.motion.plan.candidate_queue import CandidateQueue, Solver
 from ocp.motion.result.candidate import Candidate, Reason, Rejection, Seed, Stage
-from ocp.motion.search.settings import PlannerSettings
+from ocp.motion.search.configurations import PlannerSettings
 
 SETTINGS = PlannerSettings(max_failures=3)
 FAILS = Reason(Rejection.AUDIT, "row 2", "row", 2.0, 1.0, 0.5)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,12 +12,13 @@ import numpy as np
 import pytest
 
 from models import Box, FixedBase, MovingObstacle, Sphere, planar_chain
-from ocp import Collocation, Limits, Plan, Problem, Scene, StorageWarning, TipTask, plan, solve
-from ocp.app.check.plan_verdict import verdict_of
+from ocp import Collocation, Limits, Plan, Problem, ProblemError, Scene, StorageWarning, TipTask, plan, solve
+from ocp.app.check.verdict import verdict_of
 from ocp.app.command import main
 from ocp.app.view.animation import animate_plan
 from ocp.app.view.report import report_of_plan
 from ocp.motion.result.solved_plan import Part, SolvedPlan
+from tests.ocp.motion.plan import test_path_plan, test_segmented_plan
 from tests.ocp.motion.plan.motions import planned
 
 pytestmark = pytest.mark.xdist_group("plan seam_ur5")
@@ -137,3 +140,49 @@ def test_a_request_that_calls_python_is_said_when_it_is_saved(tmp_path: Path) ->
     assert isinstance(again, SolvedPlan)
     assert again.request is None
     assert again.audit().passed, "its problem is in the file, and its machine's limits hold"
+
+
+FORGED_PATHS: dict[str, Callable[[dict[str, Any]], Any]] = {
+    "no machine": lambda head: head["request"]["arguments"]["pool"].pop(0),
+    "no limits": lambda head: head["request"]["arguments"]["pool"].pop(1),
+    "limits that are none": lambda head: head["request"]["arguments"]["pool"][1].__setitem__(1, 3),
+    "a scene that is none": lambda head: head["request"]["arguments"]["pool"][2].__setitem__(1, [1.0]),
+    "no joints": lambda head: head.pop("joints"),
+    "joints of another number": lambda head: head.update(joints=head["poses"]["rotations"]),
+    "a step for none": lambda head: head["poses"].update(step=head["joints"]),
+    "no positions": lambda head: head["poses"].pop("positions"),
+    "poses that are a number": lambda head: head.update(poses=3),
+    "a bound that is a word": lambda head: head.update(bound="low"),
+    "a reconfiguration after the end": lambda head: head.update(reconfigurations=[test_path_plan.COUNT - 1]),
+    "a reconfiguration before the start": lambda head: head.update(reconfigurations=[-1]),
+    "reconfigurations that are a number": lambda head: head.update(reconfigurations=3),
+    "a candidate of nothing": lambda head: head.update(candidates=[[]]),
+}
+FORGED_SEGMENTS: dict[str, Callable[[dict[str, Any]], Any]] = {
+    "no times": lambda head: head.pop("start_times"),
+    "no segments": lambda head: head.update(start_times=[]),
+    "a segment more": lambda head: head.update(start_times=[0.0, 1.0, 2.0]),
+    "another time": lambda head: head["start_times"].__setitem__(1, 0.5),
+    "times that are words": lambda head: head.update(start_times=["a", "b"]),
+    "another time of the reconfiguration": lambda head: head["reconfigurations"][0].__setitem__(0, 0.5),
+    "no reconfigurations": lambda head: head.update(reconfigurations=[]),
+    "a reconfiguration of nothing": lambda head: head.update(reconfigurations=[[]]),
+    "joints of another number": lambda head: head["reconfigurations"][0].__setitem__(1, [0.0]),
+    "a number of words": lambda head: head.update(fewest="few"),
+}
+FORGED = {
+    **{("path", what): (test_path_plan.arrays, change) for what, change in FORGED_PATHS.items()},
+    **{("segments", what): (test_segmented_plan.arrays, change) for what, change in FORGED_SEGMENTS.items()},
+}
+
+
+@pytest.mark.parametrize(("head_name", "what"), FORGED)
+def test_a_file_that_does_not_fit_together_is_refused(head_name: str, what: str, tmp_path: Path) -> None:
+    arrays_of, change = FORGED[head_name, what]
+    head = json.loads(arrays_of()[head_name].tobytes())
+    change(head)
+    forged: dict[str, Any] = {**arrays_of(), head_name: np.frombuffer(json.dumps(head).encode(), np.uint8)}
+    np.savez(tmp_path / "forged.npz", **forged)
+    with pytest.raises(ProblemError, match=r"forged\.npz") as refused:
+        Plan.load(tmp_path / "forged.npz")
+    assert refused.value.name

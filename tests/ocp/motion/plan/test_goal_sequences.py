@@ -13,7 +13,7 @@ import pytest
 from models import FixedBase, Machine, planar_chain, with_load
 from ocp import Cost, FreeTime, Goal, Limits, Plan, ProblemError, TipTask, Unreachable, Waypoints, plan
 from ocp.motion.builders.space.capture import Capture
-from ocp.motion.result.phased_plan import PhasedPlan
+from ocp.motion.result.solved_plan import PhasedPlan
 from scripts.robots.steps import bent, planar_steps
 from tests.ocp.motion.builders.bipeds import FRICTION
 from tests.ocp.motion.builders.captures import planar_capture

@@ -11,8 +11,8 @@ import pytest
 from models import FixedBase, FreeFloating, Link, Robot, Sphere, attach_tool, merge_robots, planar_chain
 from models.robot.kinematics import link_frames
 from ocp import Scene, TipTask, Waypoints, plan
-from ocp.motion.local.branches import ik_branches
 from ocp.motion.local.closed_forms import closed_forms
+from ocp.motion.local.ik_solver import ik_branches
 from ocp.motion.tasks.checks import ignorable_joints
 from ocp.motion.tasks.equations import bind
 from tests.models.robot.pinocchio_robots import ROBOTS, urdf_file

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -16,7 +15,7 @@ from ocp import Plan, ProblemError
 from ocp.audit.audit import COST_LOST
 from ocp.motion.result.segmented_plan import SegmentedPlan
 from tests.models.robot.trees import Array
-from tests.ocp.motion.plan.test_piecewise import SECONDS, arm, in_segments, line
+from tests.ocp.motion.plan.test_segments import SECONDS, arm, in_segments, line
 
 pytestmark = pytest.mark.xdist_group("segmented plan")  # one process, so that it is planned once
 
@@ -191,31 +190,6 @@ def test_it_is_read_as_it_was_written(plan: Callable[[], SegmentedPlan], tmp_pat
     again.write_csv(tmp_path / "line.csv", 0.05)
     rows = np.loadtxt(tmp_path / "line.csv", delimiter=",", skiprows=1)
     np.testing.assert_array_equal(rows[:, 1:3], again.at(rows[:, 0])["joints"])
-
-
-FORGED: dict[str, Callable[[dict[str, Any]], Any]] = {
-    "no times": lambda head: head.pop("start_times"),
-    "no segments": lambda head: head.update(start_times=[]),
-    "a segment more": lambda head: head.update(start_times=[0.0, 1.0, 2.0]),
-    "another time": lambda head: head["start_times"].__setitem__(1, 0.5),
-    "times that are words": lambda head: head.update(start_times=["a", "b"]),
-    "another time of the reconfiguration": lambda head: head["reconfigurations"][0].__setitem__(0, 0.5),
-    "no reconfigurations": lambda head: head.update(reconfigurations=[]),
-    "a reconfiguration of nothing": lambda head: head.update(reconfigurations=[[]]),
-    "joints of another number": lambda head: head["reconfigurations"][0].__setitem__(1, [0.0]),
-    "a number of words": lambda head: head.update(fewest="few"),
-}
-
-
-@pytest.mark.parametrize("what", FORGED)
-def test_a_file_that_does_not_fit_together_is_refused(what: str, tmp_path: Path) -> None:
-    head = json.loads(arrays()["segments"].tobytes())
-    FORGED[what](head)
-    forged: dict[str, Any] = {**arrays(), "segments": np.frombuffer(json.dumps(head).encode(), np.uint8)}
-    np.savez(tmp_path / "forged.npz", **forged)
-    with pytest.raises(ProblemError, match=r"forged\.npz") as refused:
-        Plan.load(tmp_path / "forged.npz")
-    assert refused.value.name
 
 
 @pytest.mark.parametrize("missing", ["segment 0/", "segment 1/plan", "reconfiguration 0/head", "segments.numbers"])

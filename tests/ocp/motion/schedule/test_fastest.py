@@ -32,7 +32,6 @@ from ocp.motion.schedule import grid as grids
 from ocp.motion.schedule import stretch as stretches
 from ocp.motion.schedule.profile import integrate_jerk, profile_through
 from ocp.motion.schedule.ramps import reachability_passes
-from ocp.motion.schedule.settings import SETTINGS
 from scripts.timing.schedules import JOINTS, panda_path
 from tests.families import some
 from tests.models.paths.task_paths import random_arm_path, seeds, turned
@@ -169,8 +168,8 @@ def test_a_finer_grid_is_hardly_faster(seed: int, monkeypatch: pytest.MonkeyPatc
     """The first two lose most of fifty."""
     arm, limits = random_arm(seed)
     plan = schedule(arm.path, limits, joints=arm)
-    finer = {name: getattr(SETTINGS, name) / 4 for name in ("build_up", "ramp", "turn", "uneven", "uneven_speed")}
-    monkeypatch.setattr(grids, "SETTINGS", replace(SETTINGS, growth=1.05, **finer))
+    finer = {name: getattr(grids.SETTINGS, name) / 4 for name in ("build_up", "ramp", "turn", "uneven", "uneven_speed")}
+    monkeypatch.setattr(grids, "SETTINGS", replace(grids.SETTINGS, growth=1.05, **finer))
     fine = schedule(arm.path, limits, joints=arm)
     assert len(fine.profile.jerk) > 1.5 * len(plan.profile.jerk)
     assert fine.duration * (1 - 2e-4) <= plan.duration <= fine.duration * 1.005
@@ -238,7 +237,7 @@ def test_higher_limits_are_never_slower_and_all_are_kept(seed: int) -> None:
 def test_windows_change_the_time_by_next_to_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     joints, limits = swinging(5)
     whole = schedule(straight(), replace(LINE, joints=limits), joints=joints)
-    monkeypatch.setattr(stretches, "SETTINGS", replace(SETTINGS, window=120, overlap=60))
+    monkeypatch.setattr(stretches, "SETTINGS", replace(stretches.SETTINGS, window=120, overlap=60))
     cut = schedule(straight(), replace(LINE, joints=limits), joints=joints)
     assert cut.duration == pytest.approx(whole.duration, rel=2e-3)
     assert largest(cut, joints).max() <= 1.001
@@ -249,7 +248,7 @@ def panda() -> tuple[SmoothPath, PlannedJoints, Schedule]:
     """Short lines with rounded corners, the joints along them, and their schedule in one window."""
     path, joints = panda_path(20)
     plan = schedule(path, LineLimits(0.5, 5.0, 200.0, 5.0, PANDA), joints=joints)
-    assert len(plan.profile.jerk) < SETTINGS.window
+    assert len(plan.profile.jerk) < stretches.SETTINGS.window
     return path, joints, plan
 
 
@@ -259,7 +258,7 @@ def test_seam_after_seam_a_panda_keeps_limits_of_all_kinds_and_loses_no_time(
 ) -> None:
     """Of the line, and of the joints' velocity, acceleration, jerk and torque, each of which binds somewhere."""
     path, joints, whole = panda
-    monkeypatch.setattr(stretches, "SETTINGS", replace(SETTINGS, window=window, overlap=overlap))
+    monkeypatch.setattr(stretches, "SETTINGS", replace(stretches.SETTINGS, window=window, overlap=overlap))
     plan = schedule(path, whole.limits, joints=joints)
     assert len(plan.profile.jerk) > 10 * window
     assert plan.duration == pytest.approx(whole.duration, rel=0.01)

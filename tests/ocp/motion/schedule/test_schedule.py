@@ -28,7 +28,7 @@ from ocp.motion.schedule import (
     ramps,
     schedule,
 )
-from ocp.motion.schedule.settings import SETTINGS
+from ocp.motion.schedule.planner import SETTINGS
 from tests.models.paths.task_paths import random_path, seeds
 from tests.models.paths.test_paths import example
 

@@ -14,8 +14,8 @@ from models import CollisionShape, FixedBase, Path, Sphere, smooth
 from models.checks import Array
 from models.shapes.shapes import MovingObstacle
 from ocp import DeadEnd, ProblemError, Scene, TipTask, plan
-from ocp.motion.plan import piecewise
-from ocp.motion.plan.piecewise import _task_between
+from ocp.motion.plan import sequence
+from ocp.motion.plan.sequence import _task_between
 from ocp.motion.result.segmented_plan import SegmentedPlan
 from ocp.motion.search.task_search import TaskSearch
 from tests.ocp.motion.search.test_charts import planar
@@ -72,7 +72,7 @@ def test_of_two_links_the_pieces_are_the_branches_and_meet_where_that_costs_leas
             super().__init__(request, motions)
             searches.append(self)
 
-    monkeypatch.setattr(piecewise, "TaskSearch", Recorded)
+    monkeypatch.setattr(sequence, "TaskSearch", Recorded)
     made = in_segments(machine, line(reach), scene=False)
     assert made.fewest == len(made.reconfigurations) == 1
     (where,) = made.reconfigurations

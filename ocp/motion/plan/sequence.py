@@ -22,12 +22,11 @@ from ocp.motion.plan.goal_plan import GoalRequest, plan_to_goal
 from ocp.motion.plan.planner import checked_request, clearance_for, plan_request
 from ocp.motion.result.segmented_plan import Reconfiguration, SegmentedPlan
 from ocp.motion.result.solved_plan import SolvedPlan
-from ocp.motion.search.configurations import PlanRequest, fix_ignorable_joints, local_motions_from
-from ocp.motion.search.held_joints import hold_idle_joints, place_held_joints
+from ocp.motion.search.configurations import PlanRequest, local_motions_from
+from ocp.motion.search.held_joints import fix_ignorable_joints, hold_idle_joints, place_held_joints
 from ocp.motion.search.task_search import TaskSearch
-from ocp.motion.tasks.cost import Cost
+from ocp.motion.tasks.goals import Cost, Scene
 from ocp.motion.tasks.limits import Limits
-from ocp.motion.tasks.scene import Scene
 from ocp.motion.tasks.tip_task import TipTask, timed
 
 __all__ = ["plan_in_segments"]

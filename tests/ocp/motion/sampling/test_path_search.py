@@ -8,10 +8,8 @@ import pytest
 from models import Box, CollisionScene
 from models.checks import Array
 from ocp.console import TimeLimitReached, time_limited
-from ocp.motion.sampling.path_classes import JointPath, PathSearchSettings, find_paths
-from ocp.motion.sampling.path_optimisation import optimise_length
-from ocp.motion.sampling.random_trees import TreeSearch, connect
-from ocp.motion.sampling.shortening import path_length, points_along, same_class, shorten
+from ocp.motion.sampling.path_search import JointPath, PathSearchSettings, TreeSearch, connect, find_paths
+from ocp.motion.sampling.shortening import optimise_length, path_length, points_along, same_class, shorten
 from ocp.motion.sampling.straight import StraightMotions
 from tests.ocp.motion.sampling.sliders import RADIUS, dense, gap, slider
 
