@@ -9,6 +9,7 @@ least cost is the plan, the others are listed with the reason.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import Any
@@ -17,20 +18,28 @@ import numpy as np
 
 from models import FixedBase
 from models.arrays import Array
-from ocp.console import TimeLimitReached, interruptible, time_limited
+from ocp.console import TimeLimitReached, interruptible, time_left, time_limited
 from ocp.direct.guess import Samples
 from ocp.errors import ProblemError, SolveError, checked_instance, checked_positive
-from ocp.motion.builders.clearance import ClearanceConstraints, collision_error
-from ocp.motion.builders.dynamics import QUINTIC, DynamicsSetup, dynamics_problem
+from ocp.motion.builders.clearance import ClearanceConstraints
+from ocp.motion.builders.constant_jerk import (
+    ConstantJerkMotion,
+    TorqueLimits,
+    least_durations,
+    segment_durations,
+    stopping_motion,
+    synchronised_motion,
+)  # fmt: skip
+from ocp.motion.builders.dynamics import QUINTIC, DynamicsSetup, dynamics_problem, end_velocities
 from ocp.motion.builders.dynamics_plan import audit_error, within_limits
-from ocp.motion.builders.joint_motion import joint_motion_problem, least_durations, motion_along
+from ocp.motion.builders.joint_motion import joint_motion_problem, motion_along
 from ocp.motion.builders.standing.problem import FreeTime
-from ocp.motion.builders.stopping_motion import StoppingMotion, segment_durations, stopping_motion
 from ocp.motion.plan.actuators import limits_actuators
 from ocp.motion.result.candidate import Candidate, Reason, Rejection, Stage
 from ocp.motion.result.solved_plan import Part, SolvedPlan
+from ocp.motion.sampling.fastest_motion import FastestMotionSettings, MotionLimits, fastest_motion_near
 from ocp.motion.sampling.path_search import JointPath, PathSearchSettings, TreeSearch, find_paths
-from ocp.motion.sampling.shortening import points_along, shortest_through_corners
+from ocp.motion.sampling.shortening import path_length, points_along, shortest_through_corners
 from ocp.motion.sampling.straight import StraightMotions
 from ocp.motion.search.joint_space import FULL_TURN, JointSpace
 from ocp.motion.search.search import checked_bound
@@ -58,6 +67,9 @@ class GoalSettings:
         longest: Largest and inverse of the least horizon in free time, relative to the same.
         guess_times: Samples of a guess.
         near_bound: Relative excess of the cost over its lower bound below which a motion counts as optimal.
+        phase_samples: Samples of each phase of a motion at which its clearance is checked before the audit.
+        margins: Largest number of margins, each twice the one before, that are tried for the clearance between samples.
+        fastest: Settings of the fastest motions near a path.
         near: Pairs of bodies closer than the clearance plus this along a path are separated from the first solve on, m.
         turns: Numbers of full turns by which goals of unlimited joints are shifted, beside the nearest one.
     """
@@ -70,6 +82,9 @@ class GoalSettings:
     longest: float = 20.0
     guess_times: int = 201
     near_bound: float = 1e-3
+    phase_samples: int = 9
+    margins: int = 4
+    fastest: FastestMotionSettings = field(default_factory=FastestMotionSettings)
     near: float = 0.02
     turns: int = 1
 
@@ -121,6 +136,7 @@ class _Task:
     scale: Array
     motions: StraightMotions
     space: JointSpace
+    torques: TorqueLimits
 
     @property
     def limits(self) -> Limits:
@@ -134,8 +150,18 @@ class _Task:
     @property
     def moves(self) -> bool:
         """Whether the machine moves at the start or at the end."""
-        ends = (self.request.start_velocity, self.request.end_velocity)
-        return not all(isinstance(velocity, str) and velocity == "rest" for velocity in ends)
+        return not all(isinstance(velocity, str) and velocity == "rest" for velocity in self.end_velocities)
+
+    @property
+    def end_velocities(self) -> tuple[Any, Any]:
+        """Requested joint velocities at the start and at the end."""
+        return self.request.start_velocity, self.request.end_velocity
+
+    @property
+    def is_fastest(self) -> bool:
+        """Whether the time alone is the cost, and free, and no power is limited."""
+        is_free = self.request.horizon is None and self.request.cost.terms == ("time",)
+        return is_free and not np.isfinite(self.bounds.power).any()
 
     @property
     def length(self) -> bool:
@@ -159,11 +185,16 @@ def plan_to_goal(request: GoalRequest) -> SolvedPlan:
     task = _checked(request)
     seconds = request.settings.time_limit if request.time_limit is None else request.time_limit
     with time_limited(checked_positive("time_limit", seconds)):
-        with time_limited(request.settings.search_share * seconds):
-            paths = _paths(task, seconds)
-        task.report(f"{len(paths)} paths, the shortest of length {paths[0].length:.4g}")
-        candidates_of = _within_actuator_limits if task.is_dynamic else _at_constant_speed
-        candidates = candidates_of(task, paths)
+        candidates = _synchronised(task) if task.is_fastest else []
+        if not any(_attains_bound(task, candidate) for candidate in candidates):
+            try:
+                with time_limited(request.settings.search_share * seconds):
+                    paths = _paths(task, seconds)
+                task.report(f"{len(paths)} paths, the shortest of length {paths[0].length:.4g}")
+                candidates += _along(task, paths)
+            except SolveError:
+                if not any(candidate.passed for candidate in candidates):
+                    raise
     return _best(task, candidates)
 
 
@@ -176,6 +207,8 @@ def _checked(request: GoalRequest) -> _Task:
     machine = checked_instance("machine", request.machine, FixedBase)
     limits = Limits() if request.limits is None else checked_instance("limits", request.limits, Limits)
     bounds = limits.bounds(machine, ("velocity",))
+    unlimited = np.isinf([bounds.velocity, bounds.acceleration, bounds.jerk, bounds.torque]).all(axis=0)
+    bounds = bounds._replace(velocity=np.where(unlimited, request.settings.unlimited_rate, bounds.velocity))
     if request.horizon is not None:
         checked_horizon(request.horizon)
     scene = None if request.clearance_constraints is None else request.clearance_constraints.scene
@@ -207,7 +240,7 @@ def _checked(request: GoalRequest) -> _Task:
     if not kept:
         raise errors[0]
     turned = [shifted for goal in kept for shifted in _turned(space, bounds, start, goal, request.settings.turns)]
-    return _Task(request, bounds, start, np.array(turned), scale, motions, space)
+    return _Task(request, bounds, start, np.array(turned), scale, motions, space, TorqueLimits(machine, bounds))
 
 
 def _checked_end(machine: FixedBase, name: str, value: Any, bounds: JointBounds) -> Array:
@@ -296,16 +329,66 @@ def _at_constant_speed(task: _Task, paths: list[JointPath]) -> list[Candidate]:
     return candidates
 
 
+def _along(task: _Task, paths: list[JointPath]) -> list[Candidate]:
+    """Return the audited motions along paths."""
+    if task.is_fastest:
+        return [_fastest(task, path) for path in paths]
+    return _within_actuator_limits(task, paths) if task.is_dynamic else _at_constant_speed(task, paths)
+
+
+def _synchronised(task: _Task) -> list[Candidate]:
+    """Return the audited fastest motion to a goal without obstacles if it is clear of them; a list of at most one.
+
+    No motion is faster unless torques slow it down.
+    """
+    durations = least_durations(np.abs(task.goals - task.start), task.bounds).max(axis=1)
+    for goal in np.argsort(durations, kind="stable").tolist():
+        if task.moves:
+            break
+        motion = synchronised_motion(task.start, task.goals[goal], task.bounds)
+        with suppress(SolveError):
+            motion = task.torques.slowed(motion)
+            samples = motion.sampled(np.linspace(0.0, 1.0, task.request.settings.phase_samples))[0]
+            samples = samples.reshape(-1, len(task.start))
+            if task.motions.are_clear(samples[:-1], samples[1:]).all():
+                joints = np.array([task.start, task.goals[goal]])
+                path = JointPath(joints, goal, path_length(samples, task.scale))
+                return [_ProblemOf(task, path, motion, None).candidate("synchronises the joints")]
+    return []
+
+
+def _fastest(task: _Task, path: JointPath) -> Candidate:
+    """Return the audited locally fastest motion near a path, or one that stops at corners if none is found."""
+    settings = task.request.settings.fastest
+    ends = (end_velocities("", velocity, len(task.start)) for velocity in task.end_velocities)
+    limits = MotionLimits(task.motions, task.bounds, task.torques, *ends)
+    try:
+        for _ in range(task.request.settings.margins):
+            with time_limited(task.request.settings.search_share * time_left()):
+                motion = fastest_motion_near(limits, path.joints, settings)
+            candidate = _ProblemOf(task, path, motion, None).candidate("is a locally fastest spline")
+            task.report(f"path of length {path.length:.4g}: {candidate}")
+            if candidate.passed or candidate.reason is None or candidate.reason.kind is not Rejection.COLLISION:
+                break
+            settings = replace(settings, margin=2 * settings.margin)
+    except (SolveError, TimeLimitReached) as error:
+        candidate = Candidate(path.joints[0], reason=Reason.of_error(Rejection.INFEASIBLE, error), stage=Stage.SEED)
+    if not candidate.passed:
+        with suppress(TimeLimitReached):
+            return next((other for other in _within_actuator_limits(task, [path]) if other.passed), candidate)
+    return candidate
+
+
 def _within_actuator_limits(task: _Task, paths: list[JointPath]) -> list[Candidate]:
     """Return the audited motions within actuator limits: with stops at corners, and where time is left without."""
     request, settings, bounds = task.request, task.request.settings, task.bounds
-    candidates, motions = list[Candidate](), list[tuple[JointPath, StoppingMotion]]()
+    candidates, motions = list[Candidate](), list[tuple[JointPath, ConstantJerkMotion]]()
     for path in paths:
         corners = shortest_through_corners(
             task.motions, path.joints, lambda changes: segment_durations(changes, bounds)
         )
         try:
-            motions.append((path, stopping_motion(request.machine, corners, bounds)))
+            motions.append((path, stopping_motion(corners, bounds, task.torques)))
         except SolveError as error:
             reason = Reason.of_error(Rejection.ACTUATORS, error)
             candidates.append(Candidate(path.joints[0], reason=reason, stage=Stage.SEED))
@@ -315,13 +398,19 @@ def _within_actuator_limits(task: _Task, paths: list[JointPath]) -> list[Candida
     problems = [_ProblemOf(task, path, motion, None if is_free else fixed) for path, motion in motions]
     stopping = [(problem, problem.stopping()) for problem in problems]
     for problem, candidate in sorted(stopping, key=lambda pair: (not pair[1].passed, pair[1].cost)):
-        bound = _bound(task, problem.horizon_guess)
-        is_near = bound is not None and candidate.cost <= (1 + settings.near_bound) * bound
-        enough = candidate.passed and (is_near or problem.path.length == 0)
+        enough = _attains_bound(task, candidate) or (candidate.passed and (problem.path.length == 0 or task.is_fastest))
         best = candidate if enough else min(candidate, problem.smooth(), key=lambda c: (not c.passed, c.cost))
         candidates.append(best)
         task.report(f"path of length {problem.path.length:.4g}: {best}")
     return candidates
+
+
+def _attains_bound(task: _Task, candidate: Candidate) -> bool:
+    """Return whether a candidate passed its audit and costs hardly more than any motion does."""
+    if not candidate.passed or candidate.solution is None:
+        return False
+    bound = _bound(task, candidate.solution.horizon)
+    return bound is not None and candidate.cost <= (1 + task.request.settings.near_bound) * bound
 
 
 @dataclass(frozen=True, eq=False)
@@ -331,13 +420,13 @@ class _ProblemOf:
     Attributes:
         task: Checked request.
         path: The path.
-        motion: Motion that stops at corners of the path.
+        motion: Feasible motion, such as one that stops at corners of the path.
         fixed: Fixed horizon, s; None if it is free.
     """
 
     task: _Task
     path: JointPath
-    motion: StoppingMotion
+    motion: ConstantJerkMotion
     fixed: float | None
 
     @property
@@ -349,7 +438,7 @@ class _ProblemOf:
         """Declare the problem."""
         task, ends = self.task, {"start": self.path.joints[0], "end": self.path.joints[-1]}
         guess = self.horizon_guess
-        least = least_durations(np.abs(ends["end"] - ends["start"]), task.bounds).max()
+        least = 0.0 if task.moves else least_durations(np.abs(ends["end"] - ends["start"]), task.bounds).max()
         shortest = min(max(float(least), guess / task.request.settings.longest), guess)
         horizon = FreeTime(shortest, task.request.settings.longest * guess, guess) if self.fixed is None else guess
         uses_jerk = np.isfinite(task.bounds.jerk).any() or task.request.cost.jerk
@@ -373,8 +462,12 @@ class _ProblemOf:
             words = f"with stops it takes {self.motion.duration:.4g} s"
             reason = Reason(Rejection.ACTUATORS, words, "horizon", self.motion.duration, self.horizon_guess)
             return Candidate(self.path.joints[0], reason=reason)
-        problem = self.declare(task.request.clearance_constraints)
-        return _audited(task, self.motion.slower(factor).solution(problem), self.path)
+        return replace(self, motion=self.motion.slower(factor)).candidate("stops at the corners of a path")
+
+    def candidate(self, method: str) -> Candidate:
+        """Return the audited motion; `method` says what it does."""
+        problem = self.declare(self.task.request.clearance_constraints)
+        return _audited(self.task, self.motion.solution(problem, method), self.path)
 
     def smooth(self) -> Candidate:
         """Return the audited motion without stops that a solver finds from the path."""
@@ -407,8 +500,12 @@ def _audited(task: _Task, solution: Solution, path: JointPath) -> Candidate:
         return candidate.rejected(Reason(Rejection.NOT_TRIED, "the time limit passed in its audit", "time_limit"))
     if audit.feasible:
         return replace(candidate, stage=Stage.AUDITED)
-    error = collision_error(audit, solution) or audit_error(audit, solution)
-    return candidate.rejected(Reason.of_error(Rejection.AUDIT, error))
+    collision = next((row for row in audit.failures if row.name in audit.clearances), None)
+    if collision is not None:
+        words = f"{audit.clearances[collision.name].worst}"
+        reason = Reason(Rejection.COLLISION, words, collision.name, collision.value, collision.limit, collision.time)
+        return candidate.rejected(reason)
+    return candidate.rejected(Reason.of_error(Rejection.AUDIT, audit_error(audit, solution)))
 
 
 def _best(task: _Task, candidates: list[Candidate]) -> SolvedPlan:
