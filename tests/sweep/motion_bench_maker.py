@@ -135,7 +135,7 @@ def result(data: str, kind: str, seed: int) -> Row:
     moved = float(np.abs(np.array(ends) - np.vstack([start, goals])).max())
     options: dict[str, Any] = {"cost": Cost(velocity=0.0, length=1.0), "time_limit": SECONDS - 1.0}
     if mode:
-        options = {"limits": PANDA, "cost": Cost(velocity=0.0, time=1.0), "time_limit": SECONDS / 2}
+        options = {"limits": PANDA, "cost": Cost(velocity=0.0, time=1.0), "time_limit": SECONDS - 1.0}
     begin, used = time.perf_counter(), time.process_time()
     row, wrong = Row(), list[str]()
     try:

@@ -276,7 +276,7 @@ def synchronised_motion(start: Array, goal: Array, bounds: JointBounds) -> Const
     own = _profiles(np.abs(change), bounds)
     duration = float(own.duration.max())
     straight = _straight(start, change, bounds)
-    if straight.duration <= (1 + ROUNDING_SHARE) * duration:
+    if duration == 0 or straight.duration <= (1 + ROUNDING_SHARE) * duration:
         return straight
     return _joint_phases(start, np.sign(change), own, duration)
 

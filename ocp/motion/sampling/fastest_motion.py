@@ -263,15 +263,15 @@ class _Search:
         """Set the free control points, and the others as `fixed` + T `moving`: at rest, or at a constant velocity."""
         free = np.ones((self.count, self.size), dtype=bool)
         self.fixed, self.moving = np.zeros((self.count, self.size)), np.zeros((self.count, self.size))
-        weight = np.append(0.0, np.cumsum(1 / -self.derivatives[1].diagonal()))[: self.degree]
-        ends = ((slice(0, self.degree), 1.0, self.start, self.limits.start_velocity),
-                (slice(self.count - 1, self.count - 1 - self.degree, -1), -1.0, self.end, self.limits.end_velocity))  # fmt: skip
-        for points, sign, joints, velocity in ends:
+        away = np.append(0.0, np.cumsum(-1 / self.derivatives[1].diagonal()))[: self.degree]  # equal at both ends
+        limits, index = self.limits, np.arange(self.degree)
+        ends = (index, away, self.start, limits.start_velocity), (-1 - index, -away, self.end, limits.end_velocity)
+        for points, shares, joints, velocity in ends:
             known = ~np.isnan(velocity)
             free[points] = ~known
-            free[points.start] = False
+            free[points[0]] = False
             self.fixed[points] = joints
-            self.moving[points] = sign * weight[:, None] * np.where(known, velocity, 0.0)
+            self.moving[points] = shares[:, None] * np.where(known, velocity, 0.0)
         self.free = np.flatnonzero(free.ravel())
         self.fixed[free], self.moving[free] = 0.0, 0.0
 
