@@ -1,43 +1,45 @@
 """Optimal control: declare a problem, transcribe it, solve it, audit it; ready problems and plans for machines."""
 
 from ocp.audit.audit import Audit, Finding
-from ocp.audit.certificate import Certificate
 from ocp.direct.collocation import Collocation
 from ocp.direct.shooting import MultipleShooting
-from ocp.errors import AuditError, BoundWarning, ProblemError, RefinementWarning, SolveError, StorageWarning
+from ocp.errors import (
+    AuditError,
+    BoundWarning,
+    ProblemError,
+    RefinementWarning,
+    SolveError,
+    SolverStatus,
+    StorageWarning,
+)
 from ocp.indirect.method import Indirect
-from ocp.methods import certificate, prepare, solve
-from ocp.motion.builders.actuator_limits import JointFriction, joint_torques
+from ocp.methods import Certificate, certificate, prepare, solve
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.cts import RollObstacles, RollSettings, roll_problem, spline_targets
 from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem
 from ocp.motion.builders.dynamics_plan import dynamics_phases
+from ocp.motion.builders.joint_motion import minimum_velocity_problem
 from ocp.motion.builders.joint_spline import joint_path
-from ocp.motion.builders.minimum_velocity import minimum_velocity_problem
-from ocp.motion.builders.space.capture import Capture, capture_problem, chained_capture
-from ocp.motion.builders.space.grasping import Cone, Grasp
+from ocp.motion.builders.space.capture import Capture, Cone, Grasp, capture_problem, chained_capture
 from ocp.motion.builders.standing.problem import FreeTime, StandingSetup, Weights, standing_problem
 from ocp.motion.builders.standing.resolved import StepsMotion, resolve_steps, steps_motion
 from ocp.motion.builders.standing.stances import StancePhase, Steps, standing_configuration, walk
 from ocp.motion.builders.standing.steps import StepWeights, steps_problem
 from ocp.motion.builders.timing import minimum_time_problem
+from ocp.motion.builders.torques import JointFriction, joint_torques
 from ocp.motion.local.accelerations import Layer, Stabiliser, resolve_accelerations
 from ocp.motion.local.ik_solver import IkConfigurations, IkSolver, Incompleteness, ToolFreedom, ik_configurations
 from ocp.motion.local.inverse_kinematics import Unreachable, inverse_kinematics
 from ocp.motion.local.rates import resolve
 from ocp.motion.plan import Candidate, DeadEnd, Plan, Reconfiguration, plan, plan_problem
-from ocp.motion.tasks.cost import Cost
-from ocp.motion.tasks.goals import Goal, Start, Waypoints
-from ocp.motion.tasks.limits import Limits
-from ocp.motion.tasks.scene import Scene
+from ocp.motion.tasks.goals import Cost, Goal, Scene, Start, Waypoints
+from ocp.motion.tasks.limits import Anywhere, Following, IndexAtLeast, InFoot, Limits, Pinned
 from ocp.motion.tasks.tip_task import TipTask
-from ocp.motion.tasks.zmp_rules import Anywhere, Following, IndexAtLeast, InFoot, Pinned
 from ocp.problem.phases import Phases
 from ocp.problem.problem import Problem
-from ocp.refinement import refine
-from ocp.registry import register as _register
+from ocp.refinement import RefinementSettings, refine
 from ocp.solution import Sensitivity, Solution
-from ocp.status import SolverStatus
+from ocp.solution_data import register as _register
 from ocp.tightening import tighten
 
 __version__ = "0.1.0"
@@ -83,6 +85,7 @@ __all__ = [
     "Problem",
     "ProblemError",
     "Reconfiguration",
+    "RefinementSettings",
     "RefinementWarning",
     "RollObstacles",
     "RollSettings",

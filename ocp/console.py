@@ -1,4 +1,4 @@
-"""Ctrl-C, time limits, progress lines and CasADi's output during a call.
+"""Ctrl-C, time limits, progress and CasADi's output during a call.
 
 A public call runs in its own thread, for which the main thread waits. So Ctrl-C reaches Python at once, whatever CasADi
 is doing, and never CasADi itself, which would turn it into a RuntimeError that looks like a numerical failure.
@@ -16,14 +16,18 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import partial, wraps
-from typing import Any, ParamSpec, TypeVar
+from types import TracebackType
+from typing import Any, ParamSpec, Self, TypeVar
 
 import casadi as ca
 import numpy as np
-from tqdm import tqdm
 
-from ocp.status import SolverStatus
+from ocp.errors import ProblemError, SolverStatus
+
+__all__ = ["IterationMonitor", "report", "shown_progress"]
+
 
 LOG = logging.getLogger("ocp")
 P = ParamSpec("P")
@@ -177,98 +181,6 @@ def check_time() -> None:
         raise TimeLimitReached(str(SolverStatus.TIME_LIMIT))
 
 
-# ---- progress ----------------------------------------------------------------------------------------------------
-
-
-class Progress(ca.Callback):  # type: ignore[misc]
-    """Iteration callback: shows one line on the terminal, can stop the solver, and stores the iterate."""
-
-    def __init__(self, n: int, m: int, np_: int, title: str, show: bool) -> None:
-        ca.Callback.__init__(self)
-        self.sizes = {"x": n, "f": 1, "g": m, "lam_x": n, "lam_g": m, "lam_p": np_}
-        self.title, self.show = title, show
-        self.stopped: SolverStatus | None = None
-        self.iterate, self.iterations = np.zeros(n), 0
-        self.bar: Any = None
-        self.construct("progress", {})
-
-    def open(self, lower: np.ndarray, upper: np.ndarray) -> None:
-        """Begin a solve with these bounds of the rows. The line appears after a second, on a terminal only."""
-        self.lower, self.upper = lower, upper
-        self.stopped, self.iterations = None, 0
-        disable = None if self.show else True
-        form = "{desc}: {n_fmt} iterations, {elapsed}{postfix}"
-        self.bar = tqdm(desc=self.title, bar_format=form, disable=disable, delay=1.0, leave=False, file=sys.stderr)
-
-    def get_n_in(self) -> int:
-        return int(ca.nlpsol_n_out())
-
-    def get_n_out(self) -> int:
-        return 1
-
-    def get_name_in(self, i: int) -> str:
-        return str(ca.nlpsol_out(i))
-
-    def get_sparsity_in(self, i: int) -> Any:
-        return ca.Sparsity.dense(self.sizes[ca.nlpsol_out(i)], 1)
-
-    def eval(self, arguments: list[Any]) -> list[int]:
-        try:
-            if self.bar is not None and not self.bar.disable:
-                g = np.asarray(arguments[2].full()).reshape(-1)
-                worst = float(np.max(np.maximum(self.lower - g, g - self.upper), initial=0.0))
-                words = f"cost {float(arguments[1]):.6g}, infeasibility {worst:.1e}"
-                self.bar.set_postfix_str(words, refresh=False)
-                self.bar.update()
-            self.stopped = reason_to_stop()
-        except KeyboardInterrupt:  # CasADi would turn it into another error
-            self.stopped = SolverStatus.INTERRUPTED
-        self.iterations, self.iterate = self.iterations + 1, np.asarray(arguments[0].full()).reshape(-1)
-        return [int(bool(self.stopped))]
-
-    def close(self) -> None:
-        if self.bar is not None:
-            self.bar.close()
-
-
-class FatropMonitor(ca.Callback):  # type: ignore[misc]
-    """Function of an iterate that is 1 to continue and 0 to stop the solver, and stores the iterate.
-
-    It serves fatrop's plugin, which has no iteration callback.
-    """
-
-    def __init__(self, n: int, title: str) -> None:
-        ca.Callback.__init__(self)
-        self.n, self.title = n, title
-        self.stopped: SolverStatus | None = None
-        self.iterate, self.iterations = np.zeros(n), 0
-        self.construct("watch", {})
-
-    def open(self, lower: np.ndarray, upper: np.ndarray) -> None:
-        """Begin a solve."""
-        self.stopped, self.iterations = None, 0
-
-    def close(self) -> None:
-        """End a solve."""
-
-    def get_n_in(self) -> int:
-        return 1
-
-    def get_n_out(self) -> int:
-        return 1
-
-    def get_sparsity_in(self, i: int) -> Any:
-        return ca.Sparsity.dense(self.n, 1)
-
-    def eval(self, arguments: list[Any]) -> list[float]:
-        try:
-            self.stopped = self.stopped or reason_to_stop()
-        except KeyboardInterrupt:
-            self.stopped = SolverStatus.INTERRUPTED
-        self.iterations, self.iterate = self.iterations + 1, np.asarray(arguments[0].full()).reshape(-1)
-        return [float(not self.stopped)]
-
-
 # ---- CasADi's output --------------------------------------------------------------------------------------------
 
 
@@ -315,3 +227,213 @@ def casadi_silenced() -> Iterator[None]:
             stream.silent = +stream.silent
             if not stream.silent and sys.stderr is stream:
                 sys.stderr = stream.real
+
+
+# ---- progress of long calls --------------------------------------------------------------------------------------
+
+LOG_PERIOD_S = 30.0
+"""Time between two lines in a log."""
+TERMINAL_DELAY_S = 0.5
+"""Time before the line of a command appears on a terminal, and between its updates."""
+SOLVE_DELAY_S = 1.0
+"""Time before the line of a solver appears."""
+CALL_DELAY_S = 2.0
+"""Time before the line of a call appears."""
+
+_LISTENER: ContextVar[Callable[[str], Any] | None] = ContextVar("listener", default=None)
+
+
+def report(stage: str) -> None:
+    """Tell the listener of the current call, if there is one, what is being done."""
+    listener = _LISTENER.get()
+    if listener is not None:
+        listener(stage)
+
+
+@contextmanager
+def shown_progress(title: str, progress: Any) -> Iterator[None]:
+    """Show the stages that are reported inside.
+
+    Args:
+        title: Name of the call.
+        progress: Function that is called with the name of each stage; True: a line on the terminal; False: nothing.
+            None: a line after two seconds, if there is a terminal or a notebook and nobody else shows the call.
+
+    Raises:
+        ProblemError: `progress` is something else.
+    """
+    if progress is None and (_LISTENER.get() is not None or not _is_interactive()):
+        yield
+        return
+    if progress is None or isinstance(progress, bool):
+        line = Progress(title, quiet=progress is False, delay=CALL_DELAY_S)
+    elif callable(progress):
+        line = None
+    else:
+        words = f"progress must be a function of a stage's name, True, False or None, not {progress!r}"
+        raise ProblemError(words, name="progress", value=progress)
+    token = _LISTENER.set(progress if line is None else line)
+    try:
+        if line is None:
+            yield
+        else:
+            with line:
+                yield
+    finally:
+        _LISTENER.reset(token)
+
+
+def _is_interactive() -> bool:
+    """Return whether standard error is a terminal or the output of a notebook."""
+    return sys.stderr.isatty() or "ipykernel" in sys.modules
+
+
+class Progress:
+    """Progress line of a command or call; in a log, lines at the start, every 30 s, and at the end.
+
+    The line appears on a terminal or in a notebook after `delay` seconds.
+    """
+
+    def __init__(self, title: str, quiet: bool = False, delay: float = TERMINAL_DELAY_S) -> None:
+        self.title, self.stage, self.began, self.delay = title, "", time.monotonic(), delay
+        self.shown, self.quiet, self.terminal = False, quiet, _is_interactive()
+        self._ended = threading.Event()
+        self._lock = threading.Lock()
+
+    def __call__(self, stage: str) -> None:
+        """Set the name of the next stage."""
+        self.stage = stage
+        if self.terminal and self.seconds > self.delay:
+            self._draw()
+
+    @property
+    def seconds(self) -> float:
+        """Time since the start, s."""
+        return time.monotonic() - self.began
+
+    def say(self, text: str) -> None:
+        """Print a line of its own, for example a warning."""
+        with self._lock:
+            self._wipe()
+            print(f"{self.title}: {text}", file=sys.stderr, flush=True)
+
+    def __enter__(self) -> Self:
+        if not self.quiet:
+            if not self.terminal:
+                self.say("started")
+            threading.Thread(target=self._watch, daemon=True).start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._ended.set()
+        with self._lock:
+            self._wipe()
+        if not self.quiet and not self.terminal:
+            self.say(f"{'done' if kind is None else 'ended'} after {self.seconds:.3g} s")
+
+    def _watch(self) -> None:
+        while not self._ended.wait(TERMINAL_DELAY_S if self.terminal else LOG_PERIOD_S):
+            if self.terminal:
+                if self.seconds > self.delay:
+                    self._draw()
+            else:
+                self.say(f"{self.stage or 'at work'}, {self.seconds:.0f} s")
+
+    def _draw(self) -> None:
+        with self._lock:
+            if not self.quiet and not self._ended.is_set():
+                self.shown = True
+                print(f"\r\x1b[K{self.title}: {self.stage} ({self.seconds:.0f} s)", end="", file=sys.stderr, flush=True)
+
+    def _wipe(self) -> None:
+        if self.shown:
+            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+            self.shown = False
+
+
+# ---- solver iterations -------------------------------------------------------------------------------------------
+
+
+class _Monitor(ca.Callback):  # type: ignore[misc]
+    """Callback of a solver: it stores the iterate, and stops the solver on Ctrl-C or at the time limit."""
+
+    def __init__(self, n: int, title: str, name: str) -> None:
+        ca.Callback.__init__(self)
+        self.title, self.iterate, self.iterations = title, np.zeros(n), 0
+        self.stopped: SolverStatus | None = None
+        self.construct(name, {})
+
+    def open(self, lower: np.ndarray, upper: np.ndarray) -> None:
+        """Begin a solve with these bounds of the rows."""
+        self.lower, self.upper = lower, upper
+        self.stopped, self.iterations = None, 0
+
+    def close(self) -> None:
+        """End a solve."""
+
+    def get_n_out(self) -> int:
+        return 1
+
+    def _store(self, iterate: Any) -> None:
+        """Store an iterate, and whether the solver is to stop."""
+        try:
+            self.stopped = self.stopped or reason_to_stop()
+        except KeyboardInterrupt:  # CasADi would turn it into another error
+            self.stopped = SolverStatus.INTERRUPTED
+        self.iterations, self.iterate = self.iterations + 1, np.asarray(iterate.full()).reshape(-1)
+
+
+class IterationMonitor(_Monitor):
+    """Iteration callback, which also shows a line on a terminal after a second, unless a listener shows the call."""
+
+    def __init__(self, n: int, m: int, np_: int, *, title: str, show: bool) -> None:
+        self.sizes = {"x": n, "f": 1, "g": m, "lam_x": n, "lam_g": m, "lam_p": np_}
+        self.show, self.line = show, Progress(title, quiet=True)
+        super().__init__(n, title, "progress")
+
+    def open(self, lower: np.ndarray, upper: np.ndarray) -> None:
+        super().open(lower, upper)
+        quiet = not self.show or not _is_interactive() or _LISTENER.get() is not None
+        self.line = Progress(self.title, quiet=quiet, delay=SOLVE_DELAY_S)
+        self.line.__enter__()
+
+    def close(self) -> None:
+        self.line.__exit__(None, None, None)
+
+    def get_n_in(self) -> int:
+        return int(ca.nlpsol_n_out())
+
+    def get_name_in(self, i: int) -> str:
+        return str(ca.nlpsol_out(i))
+
+    def get_sparsity_in(self, i: int) -> Any:
+        return ca.Sparsity.dense(self.sizes[ca.nlpsol_out(i)], 1)
+
+    def eval(self, arguments: list[Any]) -> list[int]:
+        if not self.line.quiet:
+            g = np.asarray(arguments[2].full()).reshape(-1)
+            worst = float(np.max(np.maximum(self.lower - g, g - self.upper), initial=0.0))
+            cost = f"cost {float(arguments[1]):.6g}, infeasibility {worst:.1e}"
+            self.line.stage = f"{self.iterations + 1} iterations, {cost}"
+        self._store(arguments[0])
+        return [int(bool(self.stopped))]
+
+
+class FatropMonitor(_Monitor):
+    """Function of an iterate that is 1 to continue and 0 to stop the solver: fatrop has no iteration callback."""
+
+    def __init__(self, n: int, title: str) -> None:
+        self.size = n
+        super().__init__(n, title, "watch")
+
+    def get_n_in(self) -> int:
+        return 1
+
+    def get_sparsity_in(self, i: int) -> Any:
+        return ca.Sparsity.dense(self.size, 1)
+
+    def eval(self, arguments: list[Any]) -> list[float]:
+        self._store(arguments[0])
+        return [float(not self.stopped)]

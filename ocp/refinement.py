@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from inspect import Parameter, signature
 from typing import Any, NamedTuple
 
@@ -13,45 +13,55 @@ import numpy as np
 from ocp.audit.audit import Audit, Finding
 from ocp.audit.audit import audit as judge
 from ocp.console import TimeLimitReached, time_left, time_limited
-from ocp.direct.mesh import check_meshed
 from ocp.direct.prepared import DirectMethod
+from ocp.direct.transcription import check_meshed
 from ocp.errors import (
     ProblemError,
     RefinementWarning,
     SolveError,
+    SolverStatus,
     checked_count,
+    checked_instance,
     checked_mapping,
     checked_time_limit,
-    error_names,
     unknown_name,
 )
 from ocp.methods import solve
 from ocp.problem.formulation import Formulation
 from ocp.problem.problem import Problem
-from ocp.problem.values import numeric
 from ocp.solution import ByName, Guess, Refinement, Solution, stack
-from ocp.status import SolverStatus
 from ocp.tolerances import ROUNDING_SHARE, SOLVER_SHARE
 
-__all__ = ["refine", "refine_from", "split"]
+__all__ = ["RefinementSettings", "refine", "refine_from", "split"]
+
 
 LIMITS = [name for name, entry in signature(judge).parameters.items() if entry.kind is Parameter.KEYWORD_ONLY]
 KINDS = ("integration", "equalities", "limits", "cost", "other")
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class RefinementSettings:
     """Settings of the refinement.
 
     Attributes:
+        limits: Limits of the rows of the audit other than the integration error, as keywords of
+            :func:`ocp.audit.audit.audit`: ``{"constraints": 1e-6}``. By default the audit's own.
+        max_intervals: Maximum number of intervals.
+        solver: As for :func:`ocp.methods.prepare`.
         target: Value of a row, relative to its limit, aimed at by splitting: half, as the order of an error is
             uncertain.
         max_parts: Maximum number of parts into which an interval is split at once.
         least_width: Smallest width of an interval, relative to the horizon: less is rounding.
         rounds: Maximum number of rounds. patience: Rounds without progress of any row before it stops.
         nearer: Ratio to its best value to which a row must fall to count as progress.
+
+    Raises:
+        ProblemError: An unknown limit of the audit, or max_intervals is no positive integer.
     """
 
+    limits: Mapping[str, Any] = field(default_factory=dict)
+    max_intervals: int = 400
+    solver: str = "ipopt"
     target: float = 0.5
     max_parts: int = 4
     least_width: float = ROUNDING_SHARE
@@ -59,8 +69,11 @@ class RefinementSettings:
     patience: int = 2
     nearer: float = 0.8
 
-
-SETTINGS = RefinementSettings()
+    def __post_init__(self) -> None:
+        for name in checked_mapping("RefinementSettings: limits", self.limits):
+            if name not in LIMITS:
+                raise unknown_name("limit of the audit", name, LIMITS)
+        checked_count("RefinementSettings: max_intervals", self.max_intervals)
 
 
 def refine(
@@ -68,13 +81,10 @@ def refine(
     method: DirectMethod,
     *,
     tolerance: float = SOLVER_SHARE,
-    limits: ByName = None,
-    breaks: Sequence[float] = (),
-    max_intervals: int = 400,
     parameters: ByName = None,
-    solver: str = "ipopt",
     options: ByName = None,
     guess: Guess = None,
+    settings: RefinementSettings = RefinementSettings(),
     time_limit: float | None = None,
 ) -> Solution:
     """Solve, and split intervals until every row of the audit is within its limit.
@@ -86,15 +96,12 @@ def refine(
     kept. Every round starts from the previous plan.
 
     Args:
-        problem, parameters, solver, options, guess: As for :func:`ocp.methods.solve`.
-        method: The method with the initial mesh.
+        problem, parameters, options, guess: As for :func:`ocp.methods.solve`.
+        method: The method with the initial mesh. Where the problem has a jump or kink in time, give it a node:
+            ``method.with_nodes_at(fractions)``.
         tolerance: Largest integration error, relative to the size of each state: over the whole horizon, or summed over
             the intervals if the motion is unstable and the error over the horizon is meaningless.
-        limits: Limits of the audit's other rows, as of :func:`ocp.audit.audit.audit`: ``{"constraints": 1e-6}``. By
-            default the audit's own.
-        breaks: Times of required nodes, because of a jump or kink there, s. Only for a fixed horizon; for a free one
-            give ``method.with_nodes_at(fractions)``.
-        max_intervals: Maximum number of intervals.
+        settings: Limits of the other rows, the maximum number of intervals, the solver, constants of the algorithm.
         time_limit: Time in s for all rounds and their audits, after which it stops: a solve at the next iteration, an
             audit after the current part. None for no limit.
 
@@ -103,8 +110,7 @@ def refine(
         the audit passes in the end.
 
     Raises:
-        ProblemError: tolerance not positive, an unknown limit of the audit, breaks outside the horizon or with a free
-            horizon, max_intervals below the initial mesh, an invalid time limit.
+        ProblemError: tolerance not positive, max_intervals below the initial mesh, an invalid time limit.
         SolveError: A round failed, or the time limit was reached before there was an audited plan; then it names
             ``time_limit`` and carries the plan as an unsuccessful one.
 
@@ -115,37 +121,30 @@ def refine(
     """
     check_meshed("refine", method, tolerance)
     checked_time_limit(time_limit)
-    settings = checked_mapping("refine: limits", limits)
-    for name in settings:
-        if name not in LIMITS:
-            raise unknown_name("limit of the audit", name, LIMITS)
-    max_intervals = checked_count("refine: max_intervals", max_intervals)
-    form = Formulation.of(problem)
-    p = form.parameter_vector(checked_mapping("parameters", parameters))
-    method = method.with_nodes_at(_fractions(form, p, breaks))
-    if max_intervals < method.intervals:
+    checked_instance("refine: settings", settings, RefinementSettings)
+    if settings.max_intervals < method.intervals:
         raise ProblemError(
-            f"refine: max_intervals {max_intervals} is below the {method.intervals} intervals given",
+            f"refine: max_intervals {settings.max_intervals} is below the {method.intervals} intervals given",
             name="max_intervals",
-            value=max_intervals,
+            value=settings.max_intervals,
             limit=method.intervals,
         )
-    arguments = {"parameters": parameters, "solver": solver, "options": options}
+    arguments = {"parameters": parameters, "options": options, "solver": settings.solver}
     with time_limited(time_limit):
         first = _first(problem, method, {**arguments, "guess": guess}, settings, time_limit)
-        return _refined(problem, method, first, tolerance, arguments, settings, max_intervals)[0]
+        return _refined(problem, method, first, tolerance, arguments, settings)[0]
 
 
 def refine_from(
-    problem: Problem, method: DirectMethod, solution: Solution, audit: Audit, options: ByName = None, check: bool = True
+    problem: Problem, method: DirectMethod, plan: tuple[Solution, Audit], *, options: ByName = None, check: bool = True
 ) -> tuple[Solution, Audit]:
-    """Refine a plan that was solved on the method's mesh and audited; return the last plan with its audit.
+    """Refine a plan, solved on the method's mesh, with its audit; return the last plan with its audit.
 
     Without `check`, a round that fails from the previous plan is neither restarted nor diagnosed: see
     :func:`ocp.methods.solve`.
     """
     arguments = {"options": options, "check": check}
-    return _refined(problem, method, (solution, audit), SOLVER_SHARE, arguments, {}, 400)
+    return _refined(problem, method, plan, SOLVER_SHARE, arguments, RefinementSettings())
 
 
 def _refined(
@@ -154,8 +153,7 @@ def _refined(
     first: tuple[Solution, Audit],
     tolerance: float,
     arguments: dict[str, Any],
-    settings: dict[str, Any],
-    max_intervals: int,
+    settings: RefinementSettings,
 ) -> tuple[Solution, Audit]:
     """Return the last of the plans and its audit, with the RefinementWarning of `refine`."""
     solution, audit = first
@@ -171,11 +169,13 @@ def _refined(
         intervals.append(method.intervals)
         for kind, values in errors.items():
             values.append(max((row.value for row in rows if row.kind == kind), default=0.0))
-        nearer = [row for row in beyond if row.value < SETTINGS.nearer * best.get(row.name, np.inf)]
+        nearer = [row for row in beyond if row.value < settings.nearer * best.get(row.name, np.inf)]
         best |= {row.name: min(row.value, best.get(row.name, np.inf)) for row in rows}
         idle = 0 if nearer else idle + 1
-        finer = split(method.fractions, *_parts_per_interval(beyond, rows, method.fractions), max_intervals)
-        spent = idle == SETTINGS.patience or len(intervals) == SETTINGS.rounds
+        finer = split(
+            method.fractions, *_parts_per_interval(beyond, rows, method.fractions, settings), settings.max_intervals
+        )
+        spent = idle == settings.patience or len(intervals) == settings.rounds
         if not beyond or spent or len(finer) == method.intervals + 1:
             break
         method = method.with_mesh(finer)
@@ -184,13 +184,13 @@ def _refined(
             late = True
             break
         solution, audit = result
-    stopped = f"refinement of {problem.name!r} stopped at {intervals[-1]} of at most {max_intervals} intervals"
-    idles = idle == SETTINGS.patience and not late
+    stopped = f"refinement of {problem.name!r} stopped at {intervals[-1]} of at most {settings.max_intervals} intervals"
+    idles = idle == settings.patience and not late
     if (warning := _shortfall(stopped, late, idles, beyond, audit, form)) is not None:
         warnings.warn(warning, stacklevel=2)
     history = {kind: tuple(values) for kind, values in errors.items()}
     refinement = Refinement(tuple(intervals), history, tolerance, audit.passed and not beyond)
-    return dataclasses.replace(solution, refinement=refinement), audit
+    return replace(solution, refinement=refinement), audit
 
 
 def _shortfall(
@@ -219,25 +219,25 @@ def _first(
     problem: Problem,
     method: DirectMethod,
     arguments: dict[str, Any],
-    settings: dict[str, Any],
+    settings: RefinementSettings,
     time_limit: float | None,
 ) -> tuple[Solution, Audit]:
     """Return the plan on the first mesh, and its audit; raise SolveError at the time limit or if the solve fails."""
     solution = solve(problem, method, **arguments)
     try:
-        return solution, judge(problem, solution, **settings)
+        return solution, judge(problem, solution, **settings.limits)
     except TimeLimitReached as error:
         words = f"{SolverStatus.TIME_LIMIT}: raise time_limit"
         raise SolveError(
             f"refinement of {problem.name!r} ended in the audit of its first plan with {words}",
-            dataclasses.replace(solution, success=False, status=SolverStatus.TIME_LIMIT, message=words),
+            replace(solution, success=False, status=SolverStatus.TIME_LIMIT, message=words),
             name="time_limit",
             value=time_limit,
         ) from error
 
 
 def _next(
-    problem: Problem, method: DirectMethod, arguments: dict[str, Any], settings: dict[str, Any]
+    problem: Problem, method: DirectMethod, arguments: dict[str, Any], settings: RefinementSettings
 ) -> tuple[Solution, Audit] | None:
     """Return the plan on a finer mesh, and its audit; None if the time limit is reached first."""
     if time_left() <= 0:
@@ -246,7 +246,7 @@ def _next(
         solution = solve(problem, method, **arguments)
         if not solution.success:
             raise SolveError(f"refinement of {problem.name!r} failed: {solution.status}", solution)
-        return solution, judge(problem, solution, **settings)
+        return solution, judge(problem, solution, **settings.limits)
     except (SolveError, TimeLimitReached) as error:
         if isinstance(error, SolveError) and time_left() > 0:
             raise
@@ -337,22 +337,24 @@ def _violations(
     return violations
 
 
-def _parts_per_interval(beyond: list[_Row], rows: list[_Row], mesh: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _parts_per_interval(
+    beyond: list[_Row], rows: list[_Row], mesh: np.ndarray, settings: RefinementSettings
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the number of parts into which each interval is split, and its largest error. Shape (N,) each."""
     n = len(mesh) - 1
     parts, error = np.ones(n, int), np.zeros(n)
     for row in beyond:
         if row.errors is not None:
             with np.errstate(over="ignore"):
-                count = np.ceil((row.errors / SETTINGS.target) ** (1.0 / row.order))
-            parts = np.maximum(parts, np.clip(count, 1, SETTINGS.max_parts).astype(int))
+                count = np.ceil((row.errors / settings.target) ** (1.0 / row.order))
+            parts = np.maximum(parts, np.clip(count, 1, settings.max_parts).astype(int))
             error = np.maximum(error, row.errors)
     if np.all(parts == 1):  # the rows beyond their limits cannot be attributed to intervals
         for row in rows:
             error = error if row.errors is None else np.maximum(error, row.errors)
         severe = max((row.value for row in beyond), default=0.0) > 2.0
         parts[severe | (error >= np.median(error))] = 2
-    parts[np.diff(mesh) < 2 * SETTINGS.least_width] = 1
+    parts[np.diff(mesh) < 2 * settings.least_width] = 1
     return parts, error
 
 
@@ -370,19 +372,3 @@ def split(mesh: np.ndarray, parts: np.ndarray, error: np.ndarray, max_intervals:
         parts[k] = max(1, parts[k] - excess)
     nodes = [np.linspace(mesh[k], mesh[k + 1], n + 1)[:-1] for k, n in enumerate(parts)]
     return np.concatenate([*nodes, mesh[-1:]])
-
-
-def _fractions(form: Formulation, p: np.ndarray, breaks: Sequence[float]) -> np.ndarray:
-    """Return times as fractions of a fixed horizon."""
-    with error_names("breaks"):
-        times = numeric("refine: breaks", breaks)
-    if not times.size:
-        return times
-    if form.horizon_is_free:
-        words = "refine: breaks in s need a fixed horizon; give method.with_nodes_at(fractions)"
-        raise ProblemError(words, name="breaks", value=times.tolist())
-    horizon = float(form.horizon_at(p))
-    if not np.all((times >= 0) & (times <= horizon)):
-        words = f"refine: breaks must lie within the horizon, 0 to {horizon:g} s, not {times.tolist()}"
-        raise ProblemError(words, name="breaks", value=times.tolist(), limit=(0.0, horizon))
-    return np.asarray(times / horizon)

@@ -15,12 +15,12 @@ import numpy as np
 
 from ocp.console import interruptible
 from ocp.curves import PiecewisePolynomial
-from ocp.errors import NOT_NUMBERS, AuditError, ProblemError, StorageWarning, floats
+from ocp.errors import NOT_NUMBERS, AuditError, ProblemError, SolverStatus, StorageWarning, floats
 from ocp.problem.formulation import Formulation
 from ocp.problem.phases import parts_of_phase
 from ocp.problem.problem import Problem
-from ocp.problem.stored import ARRAY_NAMES, RECORD_ERRORS, pack_record, unpack_record
-from ocp.registry import call_registered
+from ocp.problem.record_reader import ARRAY_NAMES, RECORD_ERRORS, unpack_record
+from ocp.problem.record_writer import pack_record
 from ocp.solution_data import (
     ARRAY_FIELDS,
     CURVE_FIELDS,
@@ -32,6 +32,7 @@ from ocp.solution_data import (
     Refinement,
     Sample,
     Sensitivity,
+    call_registered,
     check_finite,
     check_structure,
     check_variables_match,
@@ -44,7 +45,6 @@ from ocp.solution_data import (
     tightening_at,
     unstack,
 )
-from ocp.status import SolverStatus
 from ocp.storage import read_arrays, write_arrays
 
 __all__ = [

@@ -1,17 +1,25 @@
-"""Parts of a solution besides the class itself, and checks of their consistency."""
+"""Parts of a solution besides the class itself, checks of their consistency, and the registry of its methods.
+
+`Solution.audit`, `Solution.sensitivity` and the `plot` methods belong to classes, but their work is done by packages
+that import `Solution`. These packages register their functions here by name, and the methods look them up, so that
+imports run in one direction. A function is imported on its first call.
+"""
 
 from __future__ import annotations
 
+import importlib
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from ocp.errors import ProblemError, unknown_name
-from ocp.status import SolverStatus
+from ocp.errors import ProblemError, SolverStatus, unknown_name
 from ocp.tolerances import ROUNDING_SHARE
+
+__all__ = ["call_registered", "register"]
+
 
 T = TypeVar("T")
 MAX_HEAD_BYTES = 2**24  # a mesh of half a million intervals
@@ -308,3 +316,23 @@ def check_finite(solution: Any) -> None:
     for name, values in parts.items():
         if not np.all(np.isfinite(values)):
             raise ProblemError(f"plan {solution.name!r}: {name} is not finite", name=name)
+
+
+_FUNCTIONS: dict[str, str] = {}
+
+
+def register(operation: str, module: str) -> None:
+    """Register the function called `operation` of a module under its own name."""
+    _FUNCTIONS[operation] = module
+
+
+def call_registered(operation: str, *args: Any, **options: Any) -> Any:
+    """Call a registered function.
+
+    Raises:
+        LookupError: No package has registered a function of that name.
+    """
+    if operation not in _FUNCTIONS:
+        raise LookupError(f"no package has registered {operation!r}; import ocp, which registers all of them")
+    function: Callable[..., Any] = getattr(importlib.import_module(_FUNCTIONS[operation]), operation)
+    return function(*args, **options)

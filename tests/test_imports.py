@@ -31,20 +31,20 @@ LAYERS = {
         ["examples"],
     ],
     "ocp": [
-        ["errors", "curves", "status", "tolerances", "registry"],
-        ["console", "progress"],
-        ["storage", "libraries", "solution_data"],
+        ["errors", "curves", "tolerances"],
+        ["console"],
+        ["storage", "solution_data"],
         ["problem"],
         ["solution"],
         ["direct", "audit"],
         ["indirect"],
         ["methods"],
-        ["refinement", "switching", "tightening"],
+        ["refinement", "tightening"],
         ["motion"],
         ["app"],
     ],
     "ocp.motion": [["tasks"], ["local", "schedule"], ["builders"], ["sampling", "search"], ["result"], ["plan"]],
-    "ocp.app": [["files", "batch"], ["check"], ["view"], ["run_task"], ["arguments"], ["command"]],
+    "ocp.app": [["files", "batch"], ["check"], ["view"], ["subcommands"], ["command"]],
 }
 """Packages and single modules of each package, from the lowest layer up: each may import from lower layers only."""
 MACHINES = {"ocp.motion", "ocp.app"}

@@ -183,8 +183,6 @@ def audit(
     constraints: float = LIMIT_SHARE,
     lost: float = LIMIT_SHARE,
     costates: float | None = None,
-    stationarity: float | None = None,
-    drift: float | None = None,
     tolerances: Mapping[str, float] | None = None,
 ) -> Audit:
     """Check a plan independently of the solver that made it.
@@ -212,10 +210,6 @@ def audit(
         lost: Largest excess cost over the nearest extremal, as a share of the cost.
         costates: Largest error of the costate equation over the whole plan, and of the conditions at the ends, as a
             share of the cost. None: 1e-2, or the root of the share that the plan loses if that is larger.
-        stationarity: Largest reduced gradient of the Hamiltonian, relative to its parts. None: it is only reported,
-            since the lost cost judges it.
-        drift: Largest change of the Hamiltonian of an autonomous problem, relative to its parts. None: it is only
-            reported.
         tolerances: Largest violation by name of a state, control, constraint or separation, in its own unit.
 
     Raises:
@@ -224,9 +218,8 @@ def audit(
         TimeLimitReached: Only inside :func:`ocp.console.time_limited`, after its limit.
     """
     limits = checked_mapping("audit: tolerances", tolerances)
-    required = {"integration": integration, "constraints": constraints, "lost": lost, **limits}
-    optional = {"costates": costates, "stationarity": stationarity, "drift": drift}
-    for name, limit in {**required, **{k: v for k, v in optional.items() if v is not None}}.items():
+    judged = {"integration": integration, "constraints": constraints, "lost": lost, **limits}
+    for name, limit in {**judged, **({} if costates is None else {"costates": costates})}.items():
         if isinstance(limit, bool) or not isinstance(limit, int | float | np.number) or not limit >= 0:
             words = f"audit: tolerance {name!r} must be a number, zero or positive, not {limit!r}"
             raise ProblemError(words, name=name, value=limit)
@@ -237,18 +230,18 @@ def audit(
     p = form.parameter_vector(solution.parameters)
     bounds = form.bound_values(p)
     grid = fine_grid(solution)
-    size = sizes_along(form, grid, solution.horizon, p, bounds)
-    along = Linearisation(form, solution, p, bounds, size)
+    size = sizes_along(form, grid, solution.horizon, p=p, bounds=bounds)
+    along = Linearisation(form, solution, p, bounds, sizes=size)
     motion = reintegrate(along, grid)
     check_time()
 
     findings = []
     is_unstable = motion.is_unstable(integration)
     findings.append(integration_finding(motion, integration, is_unstable))
-    findings.append(worst("integration error of one interval", motion.local_errors, motion.t, integration))
+    findings.append(_worst("integration error of one interval", motion.local_errors, motion.t, integration))
     judged_states, running = (motion.local, motion.local_cost) if is_unstable else (motion.states, motion.cost)
-    final = form.terminal_cost(judged_states[-1], judged_states[0], motion.controls[0], solution.horizon, p)
-    cost = cost_finding(solution, running, final, size, integration)
+    final = form.terminal_cost(judged_states[-1], judged_states[0], motion.controls[0], horizon=solution.horizon, p=p)
+    cost = _cost_finding(solution, running, final, size, integration)
     findings.append(cost)
     findings.append(reported_finding(solution, size, integration))
     findings.append(horizon_finding(form, solution, bounds))
@@ -266,13 +259,15 @@ def audit(
 
     clearances = {name: clearance(form, each, solution, p) for name, each in problem.declared.apart.items()}
     findings += [clearance_finding(each, limits.get(name, CLEARANCE_TOLERANCE_M)) for name, each in clearances.items()]
-    findings.append(jump("state jump, relative", solution.state_interpolant, solution.horizon, size.state, integration))
-    findings.append(jump("control jump, relative", solution.control_interpolant, solution.horizon, size.control, None))
+    findings.append(
+        _jump("state jump, relative", solution.state_interpolant, solution.horizon, size.state, integration)
+    )
+    findings.append(_jump("control jump, relative", solution.control_interpolant, solution.horizon, size.control, None))
     is_sound = all(finding.passed for finding in findings)
     # an infeasible plan needs no best multipliers
     optimum = optimality(form, solution, p, bounds, along=along, allowed=lost if is_sound else np.inf)
     excess = cost.value if cost.passed and solution.cost > running + final else 0.0
-    findings += optimality_findings(form, optimum, excess, lost, costates, stationarity, drift)
+    findings += optimality_findings(form, optimum, excess, lost, costates=costates)
     undecided = optimum.curvature.flat
     if not solution.success:
         undecided = f"the solver says {solution.message or solution.status}"
@@ -301,13 +296,7 @@ def horizon_finding(form: Formulation, solution: Solution, bounds: Bounds) -> Fi
 
 
 def optimality_findings(
-    form: Formulation,
-    optimum: Optimality,
-    excess: float,
-    lost: float,
-    costates: float | None,
-    stationarity: float | None,
-    drift: float | None,
+    form: Formulation, optimum: Optimality, excess: float, lost: float, *, costates: float | None
 ) -> list[Finding]:
     """Return the findings of the first and second order conditions.
 
@@ -324,7 +313,7 @@ def optimality_findings(
         Finding(COST_LOST, share, lost, None, f"{optimum.lost.sum():.3g} of the cost"),
         Finding("costate equation, relative", optimum.adjoint.total / errors, costates),
         Finding("costates beside the best, relative", optimum.costate_error, best_costates),
-        worst(
+        _worst(
             "costates between the nodes, relative", optimum.adjoint.between / errors, optimum.adjoint.t[:-1], costates
         ),
         Finding("transversality, relative", optimum.adjoint.ends.transversality / errors, costates),
@@ -337,11 +326,11 @@ def optimality_findings(
     limit = None if second.upwards is None or not share <= lost else 0.0
     rows.append(Finding("curvature downwards, relative", downwards, limit, second.time, note))
     if form.nu:
-        rows.append(worst("stationarity, relative", optimum.stationarity, optimum.t, stationarity))
-    change, limit = optimum.hamiltonian.drift, drift if form.autonomous else None
+        rows.append(_worst("stationarity, relative", optimum.stationarity, optimum.t, None))
+    change = optimum.hamiltonian.drift
     name = "Hamiltonian drift, relative" if form.autonomous else "Hamiltonian change, relative"
     note = f"{change:.2e} in cost per second" + ("" if form.autonomous else "; time enters the problem")
-    rows.append(Finding(name, change / optimum.hamiltonian.scale, limit, None, note))
+    rows.append(Finding(name, change / optimum.hamiltonian.scale, None, None, note))
     return [replace(row, verdict="optimal") for row in rows]
 
 
@@ -358,19 +347,19 @@ def integration_finding(motion: Reintegration, limit: float, is_unstable: bool) 
     if is_unstable:
         notes.append(f"unstable dynamics amplify {motion.added[-1]:.2g}, the sum of the defects of the intervals")
     effective_limit = None if is_unstable else limit
-    return worst("integration error, relative", motion.errors, motion.t, effective_limit, "; ".join(notes))
+    return _worst("integration error, relative", motion.errors, motion.t, effective_limit, "; ".join(notes))
 
 
 def violation_finding(violation: Violation, constraints: float, tolerance: float | None) -> Finding:
     """Return the largest violation, relative to the size or, with a given tolerance, in its own unit."""
     if tolerance is not None:
-        return worst(violation.label, violation.excess, violation.t, tolerance)
+        return _worst(violation.label, violation.excess, violation.t, tolerance)
     k = int(np.argmax(violation.shares))
     size, share = float(violation.sizes[k]), float(violation.shares[k])
     return Finding(violation.label, share * size, constraints * size, float(violation.t[k]) if share > 0 else None)
 
 
-def worst(name: str, values: np.ndarray, times: np.ndarray, limit: float | None, note: str = "") -> Finding:
+def _worst(name: str, values: np.ndarray, times: np.ndarray, limit: float | None, note: str = "") -> Finding:
     """Return the finding of the largest value; nan counts as the largest."""
     if values.size == 0:
         return Finding(name, 0.0, limit, None, note)
@@ -379,7 +368,7 @@ def worst(name: str, values: np.ndarray, times: np.ndarray, limit: float | None,
     return Finding(name, float(clean[k]), limit, float(times[k]) if clean[k] > 0 else None, note)
 
 
-def cost_finding(solution: Solution, running: float, final: float, sizes: Sizes, limit: float) -> Finding:
+def _cost_finding(solution: Solution, running: float, final: float, sizes: Sizes, limit: float) -> Finding:
     """Compare the cost of the re-integrated plan, along it and at its end, with the reported cost."""
     cost = running + final
     size = max(abs(cost), abs(final), abs(solution.cost), sizes.cost)  # parts of the cost may cancel
@@ -400,10 +389,10 @@ def reported_finding(solution: Solution, sizes: Sizes, limit: float) -> Finding:
         values = stack(pool, len(errors))
         sides = np.abs(curve(at).reshape(2, len(errors), -1 if values.size else 0) - values) / size
         errors = np.maximum(errors, sides.max(axis=2, initial=0.0).min(axis=0))
-    return worst("reported values, relative", errors, solution.t, limit)
+    return _worst("reported values, relative", errors, solution.t, limit)
 
 
-def jump(
+def _jump(
     name: str, interpolant: PiecewisePolynomial, horizon: float, sizes: np.ndarray, limit: float | None
 ) -> Finding:
     """Return the largest jump between two segments of a curve, relative to the sizes of its entries."""
@@ -413,4 +402,4 @@ def jump(
     right = interpolant.within(segments[1:], np.zeros(n - 1))
     jumps = np.abs(right - left)
     note = f"{np.max(jumps, initial=0.0):.3g} in its own unit"
-    return worst(name, (jumps / sizes).max(axis=1, initial=0.0), interpolant.breaks[1:-1] * horizon, limit, note)
+    return _worst(name, (jumps / sizes).max(axis=1, initial=0.0), interpolant.breaks[1:-1] * horizon, limit, note)

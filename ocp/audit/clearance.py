@@ -1,7 +1,7 @@
 """Verified clearance: lower bounds of the distances of bodies along a motion at all times, also between samples.
 
 For a fixed direction n the gap between two convex hulls is the smallest gap between their points, and the curvature of
-each point's gap over time is bounded by the acceleration of the point (:mod:`ocp.problem.separation`). On an interval
+each point's gap over time is bounded by the acceleration of the point (:mod:`ocp.problem.hulls`). On an interval
 of length h the gap is therefore at least
 
     min(gap at the start, gap at the end) - h^2 / 8 acceleration,
@@ -25,9 +25,8 @@ from ocp.console import check_time
 from ocp.curves import PiecewisePolynomial
 from ocp.problem.enclosures import PrescribedMotion
 from ocp.problem.formulation import Formulation
-from ocp.problem.hulls import BodyPairs, Frames, frames_of
+from ocp.problem.hulls import BodyPairs, Frames, Separation, frames_of
 from ocp.problem.problem import Problem
-from ocp.problem.separation import Separation
 from ocp.solution import Solution, check_variables_match, match_order
 
 __all__ = [
@@ -233,7 +232,7 @@ def _track_of(form: Formulation, apart: Separation, solution: Solution, p: np.nd
         controls = np.zeros((len(at), form.nu))
         return frames_of(form.sampled(outputs, curve(at), controls, at * horizon, horizon, p, cache_as=kept)[0])
 
-    prescribed = PrescribedMotion(apart, form.separations[apart.name], form.t, [form.p], [p])
+    prescribed = PrescribedMotion(apart, form.separations[apart.name], form.t, parameters=[form.p], values=[p])
     return Track(curve.breaks, horizon, *_rate_bounds(curve, columns, horizon), False, frames, prescribed)
 
 

@@ -15,14 +15,13 @@ from typing import Any, Protocol
 import casadi as ca
 import numpy as np
 
-from ocp.console import Progress, stop_requests_polled, time_left
+from ocp.console import IterationMonitor, stop_requests_polled, time_left
 from ocp.direct.assembly import Program, Transcription, sparse
 from ocp.direct.nlp import Outcome
 from ocp.direct.scaling import SCALING, Scales
-from ocp.errors import Interrupted, SolveError
+from ocp.errors import Interrupted, SolveError, SolverStatus
 from ocp.problem.formulation import Formulation
 from ocp.problem.problem import Problem
-from ocp.status import SolverStatus
 from ocp.tolerances import RESOLVED_SHARE, SOLVER_SHARE
 
 __all__ = ["Elastic", "diagnosis", "elastic_plan", "variable_names"]
@@ -67,6 +66,7 @@ def diagnosis(
     built: Built,
     outcome: Outcome,
     arguments: dict[str, np.ndarray],
+    *,
     horizon: float,
     solution: Any,
     elastic: Elastic | None,
@@ -221,7 +221,7 @@ class Elastic:
 
 
 def elastic_plan(
-    built: Built, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales, horizon: float
+    built: Built, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales, *, horizon: float
 ) -> Elastic | None:
     """Return the plan that satisfies dynamics and fixed ends and violates the other constraints least.
 
@@ -258,7 +258,7 @@ def elastic_plan(
     jac = ca.horzcat(ca.mtimes(rows, jacobian), ca.DM(rows.shape[0], k)) + columns
     hessian = program.hessian(v, p, weight * sigma, ca.mtimes(rows.T, lam))
     title = f"conflicts in {built.problem.name}"
-    progress = Progress(n + k, rows.shape[0], p.numel(), title, show=True)
+    progress = IterationMonitor(n + k, rows.shape[0], p.numel(), title=title, show=True)
     options = {
         "grad_f": ca.Function("g", [x, p], [f, ca.vertcat(weight * slope, soft.prices)], ["x", "p"], ["f", "g"]),
         "jac_g": ca.Function("j", [x, p], [g, jac], ["x", "p"], ["g", "j"]),

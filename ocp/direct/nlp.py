@@ -14,13 +14,12 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ocp.console import LOG, FatropMonitor, Progress, casadi_silenced, stop_requests_polled
+from ocp.console import LOG, FatropMonitor, IterationMonitor, casadi_silenced, stop_requests_polled
 from ocp.curves import PiecewisePolynomial
 from ocp.direct.assembly import Program, Stages, Transcription
-from ocp.errors import ProblemError, SolveError
+from ocp.errors import ProblemError, SolveError, SolverStatus
 from ocp.problem.formulation import Formulation
 from ocp.solution import Solution
-from ocp.status import SolverStatus
 
 __all__ = [
     "SOLVERS",
@@ -106,8 +105,8 @@ class Outcome:
 
 
 def build_solver(
-    program: Program, solver: str, options: dict[str, Any], stages: Stages | None, title: str
-) -> tuple[Any, Progress | FatropMonitor]:
+    program: Program, solver: str, options: dict[str, Any], *, stages: Stages | None, title: str
+) -> tuple[Any, IterationMonitor | FatropMonitor]:
     """Return the casadi solver of a program, and the callback that stops it.
 
     Raises:
@@ -120,9 +119,9 @@ def build_solver(
     if not solver_options.get("print_level", 0) and "max_iter" in solver_options:
         settings["show_eval_warnings"] = False
     nlp = program.nlp
-    progress: Progress | FatropMonitor
+    progress: IterationMonitor | FatropMonitor
     if solver in ("ipopt", "sleqp"):
-        progress = Progress(n, m, n_p, title, not solver_options["print_level"])
+        progress = IterationMonitor(n, m, n_p, title=title, show=not solver_options["print_level"])
         settings["iteration_callback"] = progress
     if solver == "ipopt":
         settings["no_nlp_grad"] = True  # compiled functions only have the given derivatives
@@ -195,7 +194,7 @@ def finite(expression: Any) -> Any:
     return ca.MX(expression.sparsity(), ca.fmax(ca.fmin(expression.nz[:], 1e20), -1e20))
 
 
-def call_solver(solver: Any, progress: Progress | FatropMonitor, arguments: dict[str, np.ndarray]) -> Outcome:
+def call_solver(solver: Any, progress: IterationMonitor | FatropMonitor, arguments: dict[str, np.ndarray]) -> Outcome:
     """Run a solver; Ctrl-C and a time limit stop it between two iterations, at its last iterate."""
     began = time.monotonic()
     name = KINDS[solver.class_name()]
@@ -235,7 +234,9 @@ def call_solver(solver: Any, progress: Progress | FatropMonitor, arguments: dict
     return Outcome(*result_values, status, message, iterations, seconds, regularised(stats), name)
 
 
-def stopped(solver: Any, progress: Progress | FatropMonitor, arguments: dict[str, np.ndarray], began: float) -> Outcome:
+def stopped(
+    solver: Any, progress: IterationMonitor | FatropMonitor, arguments: dict[str, np.ndarray], began: float
+) -> Outcome:
     """Return the last iterate of a solver that was stopped or failed without a result; its multipliers are unknown."""
     cost, rows = (np.asarray(v.full()).reshape(-1) for v in solver.oracle()(progress.iterate, arguments["p"]))
     unknown, seconds = np.full(rows.shape, np.nan), time.monotonic() - began
@@ -304,7 +305,7 @@ def horizon_of(form: Formulation, transcription: Transcription, outcome: Outcome
 
 
 def solution_of(
-    form: Formulation, transcription: Transcription, program: Program, outcome: Outcome, p: np.ndarray, **fields: Any
+    form: Formulation, transcription: Transcription, program: Program, outcome: Outcome, *, p: np.ndarray, **fields: Any
 ) -> Solution:
     """Return the solution that belongs to an outcome.
 
@@ -319,7 +320,7 @@ def solution_of(
     at = mesh[interval] + np.diff(mesh)[interval] * place
     at[-1] = 1.0
     costates = costates_of(program, transcription, outcome, p)
-    gradient = cost_gradient(form, program, transcription, outcome, p) if form.np else np.zeros(0)
+    gradient = _cost_gradient(form, program, transcription, outcome, p) if form.np else np.zeros(0)
     x, u = v[transcription.report_states], controls_at(controls, transcription, interval, place)
     return Solution(
         name=form.name,
@@ -374,7 +375,7 @@ def costates_of(program: Program, transcription: Transcription, outcome: Outcome
     return np.asarray(costates)
 
 
-def cost_gradient(
+def _cost_gradient(
     form: Formulation, program: Program, transcription: Transcription, outcome: Outcome, p: np.ndarray
 ) -> np.ndarray:
     """Return the derivative of the optimal cost in the parameters, also through every active bound."""

@@ -6,17 +6,21 @@ variables, rows and blocks, imposes conditions at nodes and ends, and numbers th
 
 from __future__ import annotations
 
+import dataclasses
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Self
 
 import casadi as ca
 import numpy as np
 
 from ocp.direct.assembly import Block, Interpolants, Stages, Transcription
-from ocp.errors import ProblemError
+from ocp.errors import NOT_NUMBERS, ProblemError, checked_count, checked_positive, error_names, floats
 from ocp.problem.formulation import Formulation, Rows
+from ocp.problem.values import numeric
+from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = ["TranscriptionBuilder"]
+__all__ = ["MeshedMethod", "TranscriptionBuilder", "check_meshed"]
 
 
 @dataclass(frozen=True)
@@ -59,7 +63,9 @@ def plain_layout(intervals: int, node_size: int, interval_size: int, free_horizo
     return Layout(size + free_horizon, node, node[:, 1:], grid[node_size:], horizon, initial)
 
 
-def staged_layout(intervals: int, node_size: int, interval_size: int, free_horizon: bool, keep_initial: bool) -> Layout:
+def _staged_layout(
+    intervals: int, node_size: int, interval_size: int, free_horizon: bool, keep_initial: bool
+) -> Layout:
     """Return the layout by stages: node k, copies of horizon and start, interval k, copy of its end."""
     carried = node_size + free_horizon + node_size * keep_initial
     inputs = interval_size + node_size
@@ -109,7 +115,7 @@ class TranscriptionBuilder:
         form = self.formulation
         size = form.nx + self.node_controls
         shape = (self.intervals, size, self.interval_size, form.horizon_is_free)
-        self.layout: Layout = staged_layout(*shape, form.ties_ends) if self.staged else plain_layout(*shape)
+        self.layout: Layout = _staged_layout(*shape, form.ties_ends) if self.staged else plain_layout(*shape)
         self.variable_bounds = np.full(self.layout.size, form.bounds.places["free"][0])
         self.variable_role = np.full(self.layout.size, "", dtype="<U8")
         self.variable_entry = np.zeros(self.layout.size, dtype=int)
@@ -196,7 +202,7 @@ class TranscriptionBuilder:
         self._linear.append((targets.ravel(), variables.ravel(), entries.ravel().astype(float)))
 
     def path_rows(
-        self, rows: Rows, states: np.ndarray, controls: np.ndarray, stages: np.ndarray, at: np.ndarray
+        self, rows: Rows, states: np.ndarray, controls: np.ndarray, stages: np.ndarray, *, at: np.ndarray
     ) -> None:
         """Impose path rows at K points with fractions ``at``, states (nx, K) and controls (nu, K)."""
         if len(rows) == 0 or len(at) == 0:
@@ -216,9 +222,9 @@ class TranscriptionBuilder:
         states = self.layout.node[: self.formulation.nx]
         undetermined = (rows.uses_state & ~self.formulation.initial_is_fixed).any(axis=1) | rows.uses_control
         first = nodes[:1]
-        self.path_rows(rows.select(undetermined), states[:, first], controls[:, first], first, self.mesh[first])
+        self.path_rows(rows.select(undetermined), states[:, first], controls[:, first], first, at=self.mesh[first])
         if not first_only:
-            self.path_rows(rows, states[:, 1:], controls[:, 1:], nodes[1:], self.mesh[1:])
+            self.path_rows(rows, states[:, 1:], controls[:, 1:], nodes[1:], at=self.mesh[1:])
 
     def ends(
         self, basis: tuple[np.ndarray, np.ndarray], first: np.ndarray, last: np.ndarray, *, at_nodes: bool
@@ -291,6 +297,7 @@ class TranscriptionBuilder:
         report: tuple[np.ndarray, np.ndarray],
         report_states: np.ndarray,
         costate_rows: np.ndarray,
+        *,
         costate_nodes: np.ndarray,
         costate_scale: np.ndarray,
         interpolants: Interpolants,
@@ -331,3 +338,113 @@ class TranscriptionBuilder:
             interpolants=interpolants,
             stages=stages,
         )
+
+
+class MeshedMethod(ABC):
+    """A method that turns a problem into a nonlinear program on a mesh of intervals.
+
+    Attributes:
+        intervals: Number of intervals.
+        control: Shape of the controls inside an interval.
+        mesh: Ends of the intervals as fractions 0..1, N + 1 of them; None for equal intervals.
+    """
+
+    intervals: int
+    control: str
+    mesh: tuple[float, ...] | None
+
+    @property
+    @abstractmethod
+    def order(self) -> int:
+        """Order of the integration error of one interval in its width."""
+
+    @property
+    @abstractmethod
+    def control_order(self) -> int:
+        """Order of the interpolation error of a smooth control in the width."""
+
+    @abstractmethod
+    def transcribe(self, form: Formulation, *, staged: bool = False) -> Transcription:
+        """Return the nonlinear program of a problem; ``staged`` orders it for a structure-exploiting solver."""
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The method as stored in a solution: its type, and its attributes other than None."""
+        values = {k: v for k, v in dataclasses.asdict(self).items() if v is not None}  # type: ignore[call-overload]
+        return {"type": type(self).__name__, **values}
+
+    @property
+    def fractions(self) -> np.ndarray:
+        """Ends of the intervals as fractions of the horizon. Shape (N + 1,)."""
+        return np.linspace(0.0, 1.0, self.intervals + 1) if self.mesh is None else np.asarray(self.mesh, dtype=float)
+
+    def with_mesh(self, mesh: np.ndarray) -> Self:
+        """Return the method on another mesh (N + 1,)."""
+        return dataclasses.replace(self, intervals=len(mesh) - 1, mesh=tuple(mesh.tolist()))  # type: ignore[type-var]
+
+    def halved(self) -> Self:
+        """Return the method with every interval halved."""
+        if self.mesh is None:
+            return dataclasses.replace(self, intervals=2 * self.intervals)  # type: ignore[type-var]
+        nodes = self.fractions
+        return self.with_mesh(np.union1d(nodes, (nodes[1:] + nodes[:-1]) / 2))
+
+    def with_nodes_at(self, fractions: Any) -> Self:
+        """Return the method with additional nodes at fractions 0..1 of the horizon, where the problem has jumps or
+        kinks.
+
+        A given mesh keeps its nodes. Without one the intervals between the fractions are equal and no wider than
+        before.
+
+        Raises:
+            ProblemError: The fractions are not numbers from 0 to 1.
+        """
+        details: dict[str, Any] = {"name": "fractions", "value": fractions}
+        with error_names("fractions"):
+            added = numeric("with_nodes_at: fractions", fractions)
+        if not np.all((added >= 0.0) & (added <= 1.0)):
+            raise ProblemError(f"with_nodes_at: fractions must be numbers from 0 to 1, not {fractions!r}", **details)
+        if not added.size:
+            return self
+        nodes = np.array([0.0, 1.0]) if self.mesh is None else self.fractions
+        is_node = np.abs(added[:, None] - nodes).min(axis=1) < ROUNDING_SHARE
+        added = np.unique(added[~is_node])
+        nodes = np.union1d(nodes, added[np.diff(added, prepend=-1.0) >= ROUNDING_SHARE])
+        if self.mesh is None:
+            counts = np.maximum(np.ceil(np.diff(nodes) * self.intervals - ROUNDING_SHARE), 1).astype(int)
+            segments = [np.linspace(a, b, n + 1)[:-1] for a, b, n in zip(nodes[:-1], nodes[1:], counts, strict=True)]
+            nodes = np.concatenate([*segments, [1.0]])
+        return self.with_mesh(nodes)
+
+    def _check_mesh(self, count: str, largest: int | None = None) -> None:
+        """Check the mesh and the whole number named ``count``, and convert them to plain Python for storage.
+
+        Raises:
+            ProblemError: A number is no positive integer, or the mesh does not increase from 0 to 1 in so many
+                intervals.
+        """
+        name_of_method = type(self).__name__
+        for name, limit in (("intervals", None), (count, largest)):
+            object.__setattr__(self, name, checked_count(f"{name_of_method}: {name}", getattr(self, name), most=limit))
+        if self.mesh is None:
+            return
+        details: dict[str, Any] = {"name": "mesh", "value": self.mesh}
+        try:
+            mesh = floats(self.mesh)
+        except NOT_NUMBERS as error:
+            text = f"{name_of_method}: mesh must be fractions from 0 to 1, not {self.mesh!r}"
+            raise ProblemError(text, **details) from error
+        if mesh.shape != (self.intervals + 1,):
+            text = f"{name_of_method}: mesh has {mesh.size} entries, {self.intervals + 1} expected (fractions 0 to 1)"
+            raise ProblemError(text, **details)
+        if not (mesh[0] == 0.0 and mesh[-1] == 1.0 and np.all(np.diff(mesh) > 0)):
+            raise ProblemError(f"{name_of_method}: mesh must increase from 0 to 1, not {mesh.tolist()}", **details)
+        object.__setattr__(self, "mesh", tuple(mesh.tolist()))
+
+
+def check_meshed(caller: str, method: Any, tolerance: Any) -> None:
+    """Raise ProblemError unless a method has a mesh of intervals, and the tolerance is positive and finite."""
+    if not isinstance(method, MeshedMethod):
+        words = f"{caller}: Collocation(...) or MultipleShooting(...) is expected, not {method!r}"
+        raise ProblemError(words, name="method", value=method)
+    checked_positive(f"{caller}: tolerance", tolerance)

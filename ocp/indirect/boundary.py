@@ -14,12 +14,11 @@ import numpy as np
 
 from ocp.console import casadi_silenced, reason_to_stop, stop_requests_polled
 from ocp.curves import integrator
-from ocp.errors import ProblemError
+from ocp.errors import ProblemError, SolverStatus
 from ocp.indirect.hamiltonian import Hamiltonian, numeric_bounds
 from ocp.indirect.seed import ControlArcs
 from ocp.problem.formulation import Formulation
 from ocp.problem.values import symbols_of
-from ocp.status import SolverStatus
 
 __all__ = ["LOBATTO", "BoundaryProblem", "NewtonResult", "newton"]
 
@@ -305,6 +304,7 @@ def newton(
     system: tuple[Any, ...],
     start: np.ndarray,
     data: np.ndarray,
+    *,
     scale: float,
     tolerance: float,
     settings: NewtonSettings = NewtonSettings(),

@@ -29,6 +29,7 @@ from ocp.errors import (
     Interrupted,
     ProblemError,
     SolveError,
+    SolverStatus,
     checked_choice,
     checked_count,
     checked_mapping,
@@ -36,15 +37,13 @@ from ocp.errors import (
     checked_time_limit,
 )
 from ocp.indirect.boundary import LOBATTO, BoundaryProblem, NewtonResult, newton
-from ocp.indirect.hamiltonian import Hamiltonian
+from ocp.indirect.hamiltonian import Extremal, Hamiltonian, cost_gradient
 from ocp.indirect.seed import ControlArcs, read_arcs, read_unknowns
-from ocp.indirect.sensitivity import Extremal, cost_gradient
 from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.invariants import bounds_to_solve
 from ocp.problem.problem import Problem
 from ocp.problem.values import evaluate_at_samples
 from ocp.solution import ByName, Guess, Solution, check_variables_match
-from ocp.status import SolverStatus
 from ocp.tolerances import FLAT_SHARE, ROUNDING_SHARE, SOLVER_SHARE
 
 __all__ = ["Indirect", "PreparedIndirect", "hamiltonian_defect"]
@@ -243,12 +242,14 @@ class PreparedIndirect:
             note = f"; seeded by its own direct solution ({seed.method['type']}, {direct.intervals} intervals)"
         began = time.monotonic()
         try:
-            arcs = read_arcs(self.hamiltonian, self.boundary.outputs, seed, p, bounds, self.method.segments)
+            arcs = read_arcs(
+                self.hamiltonian, self.boundary.outputs, seed, p, bounds=bounds, segments=self.method.segments
+            )
         except SolveError as error:
             return self._no_seed("", error, seed, check)
         system = self.boundary.system(arcs)
-        start, data = read_unknowns(self.hamiltonian, seed, arcs, p, bounds, backward=self.boundary.backward)
-        root = newton(system, start, data, float(max(1.0, np.max(np.abs(start)))), self.method.residual)
+        start, data = read_unknowns(self.hamiltonian, seed, arcs, p, bounds=bounds, backward=self.boundary.backward)
+        root = newton(system, start, data, scale=float(max(1.0, np.max(np.abs(start)))), tolerance=self.method.residual)
         root = self._check_order(root, arcs, bounds)
         solution = self._solution(root, arcs, data, p, bounds, note, time.monotonic() - began)
         if root.status is SolverStatus.INTERRUPTED:
@@ -328,7 +329,7 @@ class PreparedIndirect:
         columns = [value.T if np.ndim(value) else value for value in arguments]
         control, multiplier = evaluate_at_samples(self.boundary.outputs, *columns)[:2]
         ends = flat[-1, : form.nx], flat[0, : form.nx], np.zeros(form.nu)
-        cost += form.terminal_cost(*ends, horizon, p)
+        cost += form.terminal_cost(*ends, horizon=horizon, p=p)
 
         shape = (len(segments), len(LOBATTO))
         nu_start, nu_end = self.boundary.end_multipliers(root.unknowns, arcs)

@@ -26,9 +26,8 @@ import casadi as ca
 import numpy as np
 
 from ocp.errors import ProblemError
-from ocp.problem.hulls import CoveredPairs
+from ocp.problem.hulls import WORLD, CoveredPairs, Separation
 from ocp.problem.intervals import RULES, Interval, check_instructions, constant, decided, evaluate, multiple_of
-from ocp.problem.separation import WORLD, Separation
 from ocp.problem.values import identity, table
 
 __all__ = ["Enclosure", "Enclosures", "PrescribedMotion"]
@@ -255,7 +254,7 @@ class PrescribedMotion:
     """
 
     def __init__(
-        self, separation: Separation, placements: Any, time: Any, parameters: Sequence[Any], values: Sequence[Any]
+        self, separation: Separation, placements: Any, time: Any, *, parameters: Sequence[Any], values: Sequence[Any]
     ) -> None:
         what = f"separation {separation.name!r}"
         parts = [placements[k : k + FRAME_ENTRIES] for k in range(0, placements.numel(), FRAME_ENTRIES)]

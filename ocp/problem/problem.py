@@ -16,12 +16,26 @@ import casadi as ca
 import numpy as np
 
 from ocp.errors import ProblemError, checked_count, checked_text, error_names, unknown_name
-from ocp.problem.declarations import ENDS, Constraint, Declarations, Guess, Horizon, PhaseTimes, Signal, Variable
+from ocp.problem.declarations import (
+    ENDS,
+    Constraint,
+    Declarations,
+    ExpressionReader,
+    Guess,
+    Horizon,
+    PhaseTimes,
+    Signal,
+    Value,
+    Variable,
+    check_guess,
+    number_of_entries,
+    read_scale,
+    signal_function,
+)
 from ocp.problem.enclosures import PrescribedMotion
-from ocp.problem.expressions import ExpressionReader, Value, check_guess, number_of_entries, read_scale, signal_function
-from ocp.problem.hulls import Hull
-from ocp.problem.separation import Separation, index_rows, stack_motion_bounds
-from ocp.problem.stored import from_record, to_record
+from ocp.problem.hulls import Hull, Separation, index_rows, stack_motion_bounds
+from ocp.problem.record_reader import from_record
+from ocp.problem.record_writer import to_record
 from ocp.problem.values import check_inside, constant, identity
 
 __all__ = ["Problem", "checked_problem", "remembers_request"]
@@ -54,18 +68,11 @@ def remembers_request(builder: str) -> Callable[[Callable[Arguments, Declared]],
 
     def decorate(declare: Callable[Arguments, Declared]) -> Callable[Arguments, Declared]:
         parameters = signature(declare)
-        options = [name for name, each in parameters.parameters.items() if each.kind is each.VAR_KEYWORD]
-
-        def bound(*args: Any, **kwargs: Any) -> dict[str, Any]:
-            arguments = dict(parameters.bind(*args, **kwargs).arguments)
-            for name in options:
-                arguments |= arguments.pop(name, {})
-            return arguments
 
         @wraps(declare)
         def declared(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Declared:
             problem = declare(*args, **kwargs)
-            problem.origin = builder, bound(*args, **kwargs)
+            problem.origin = builder, dict(parameters.bind(*args, **kwargs).arguments)
             return problem
 
         return declared
@@ -101,7 +108,7 @@ class Problem:
     # ---- copies and files ------------------------------------------------------------------------------------
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the problem as data, without guesses that are functions; see :func:`ocp.problem.stored.to_record`."""
+        """Return the problem as data, without guesses that are functions; see `to_record`."""
         return to_record(self.name, self.symbols, self.time, self.declared)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -266,7 +273,7 @@ class Problem:
         with error_names("horizon"):
             if self.declared.horizon is not None:
                 raise ProblemError(f"{what} is declared twice")
-            self.declared.horizon = self._reader.horizon(what, value, lower, upper, guess)
+            self.declared.horizon = self._reader.horizon(what, value, lower, upper, guess=guess)
         return self.declared.horizon.symbol
 
     def at_start(self, variable: Any) -> Any:
@@ -364,8 +371,8 @@ class Problem:
         placements: Value,
         hulls: Mapping[str, Hull],
         pairs: Any,
-        least: Any,
         *,
+        least: Any,
         levers: Mapping[str, Any],
         turns: Mapping[str, Any],
         covers: Mapping[int, Any] | None = None,
@@ -375,16 +382,10 @@ class Problem:
 
         Args:
             name: Unique among the constraints.
-            placements: Poses of F frames in world, each as the rotation column by column, then the position. Each frame
-                depends on states and parameters, or on time and parameters. Shape (12 F, 1).
-            hulls: The bodies by name, on these frames or in world.
-            pairs: Two indices of bodies in ``hulls``, and the index of the frame from which the relative motion is
-                observed, -1 for the world. Shape (n, 3).
+            placements, hulls, pairs, covers, assumed: As of :class:`ocp.problem.hulls.Separation`.
             least: Minimum distance. Shape (n,) or a number, m.
             levers, turns: By the name of a state, upper bounds of the displacement and of the rotation of one body
-                relative to the other per unit of the state; see :mod:`ocp.problem.separation`. Shape (n, size) each.
-            covers: By the index of a pair, pairs of bodies that together contain its two bodies. Shape (m, 2) each.
-            assumed: Pairs that are left out by assumption, by description, with the reason; the audit reports them.
+                relative to the other per unit of the state; see :mod:`ocp.problem.hulls`. Shape (n, size) each.
         """
         self.declared.check_new_constraint("separation", name)
         states = self.declared.states
@@ -401,7 +402,9 @@ class Problem:
         parts |= {"covers": {} if covers is None else covers, "assumed": {} if assumed is None else assumed}
         separation = Separation(name, frames, dict(hulls), pairs, least, movers, **parts)
         zeros = [ca.DM.zeros(parameter.shape) for parameter in parameters]
-        PrescribedMotion(separation, frames, self.time, parameters, zeros)  # raises if a motion has no bounds
+        PrescribedMotion(
+            separation, frames, self.time, parameters=parameters, values=zeros
+        )  # raises if a motion has no bounds
         self.declared.apart[name] = separation
 
     def minimize(self, running: Value = 0, terminal: Value = 0) -> None:
@@ -496,4 +499,6 @@ class Problem:
     ) -> Constraint:
         """Return a new constraint on the symbols inside the horizon and on the ``known`` ones."""
         self.declared.check_new_constraint(f"{kind} constraint", name)
-        return self._reader.constraint(kind, name, expression, [*self._inner(), *known], bounds, unit, tolerance)
+        return self._reader.constraint(
+            kind, name, expression, [*self._inner(), *known], bounds=bounds, unit=unit, tolerance=tolerance
+        )

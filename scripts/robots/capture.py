@@ -20,7 +20,7 @@ from models import FreeFloating, Link, Robot, VisualShape, with_wheels
 from models.arrays import Array
 from ocp import Audit, Capture, Cone, Cost, DynamicsSetup, FreeTime, Grasp, Limits, Solution, dynamics_problem
 from ocp.app.view.appearance import Frames, frames_along
-from ocp.motion.builders.space.grasping import grasp_wrench, joined, motion_of, pair_momentum
+from ocp.motion.builders.space.pair import grasp_wrench, joined, motion_of, pair_momentum
 from scripts.drawing import COLORS, DASHES
 from scripts.robots import capture_family
 from scripts.robots.capture_family import SPINS, Member

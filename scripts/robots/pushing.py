@@ -19,8 +19,7 @@ from models import CollisionScene, Footprint, Standing, Wrench, footprint, with_
 from models.machines.standing import External
 from ocp import ClearanceConstraints, Collocation, Problem, TipTask, resolve_accelerations, solve
 from ocp.motion.builders.standing.problem import StandingSetup, standing_problem
-from ocp.motion.tasks.limits import Limits
-from ocp.motion.tasks.zmp_rules import InFoot
+from ocp.motion.tasks.limits import InFoot, Limits
 from scripts.robots import standing
 from scripts.robots.drawing import animate
 from scripts.robots.mobile_manipulator import StandingExample, save

@@ -23,9 +23,8 @@ from models.paths import rest_to_rest
 from ocp import ClearanceConstraints, Collocation, Problem, Solution, TipTask, resolve_accelerations, solve
 from ocp.app.view.appearance import frames_along
 from ocp.motion.builders.standing.problem import StandingSetup, Weights, standing_problem
-from ocp.motion.tasks.limits import Limits
+from ocp.motion.tasks.limits import InFoot, Limits
 from ocp.motion.tasks.tip_task import timed
-from ocp.motion.tasks.zmp_rules import InFoot
 from scripts.drawing import COLORS, DASHES
 from scripts.robots.drawing import Scene, page
 

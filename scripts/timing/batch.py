@@ -43,8 +43,7 @@ def places(count: int) -> list[dict[str, float]]:
 
 def plans(workers: int | str, count: int, folder: Path) -> tuple[Batch, float]:
     """Plans by so many workers, or by a cluster at an address, and the wall time, s."""
-    engine: dict[str, Any] = {"cluster": workers} if isinstance(workers, str) else {"workers": workers}
-    return timed(lambda: run_batch(placed, places(count), folder / str(len(list(folder.iterdir()))), **engine))
+    return timed(lambda: run_batch(placed, places(count), folder / str(len(list(folder.iterdir()))), cluster=workers))
 
 
 def each(tasks: list[dict[str, float]]) -> None:
@@ -94,7 +93,7 @@ def run(repeats: int = 5) -> dict[str, Any]:
             runs.append(ways(PLANS, Path(name)))
             alone.append({way: plain(processes, PLANS) for processes, way in PLAIN.items()})
         short = Path(name) / "short"
-        run_batch(nothing, [{"x": float(i)} for i in range(SHORT)], short, workers=1)
+        run_batch(nothing, [{"x": float(i)} for i in range(SHORT)], short, cluster=1)
         written = pace(short)
     least = {way: min(run[way][1] for run in runs) for way in runs[0]}
     bare = {way: min(times[way] for times in alone) for way in PLAIN.values()}

@@ -18,7 +18,7 @@ import numpy as np
 from models import FixedBase
 from models.arrays import Array
 from ocp import Collocation, Problem, inverse_kinematics, prepare
-from ocp.motion.builders.minimum_velocity import minimum_velocity_problem
+from ocp.motion.builders.joint_motion import minimum_velocity_problem
 from ocp.problem.formulation import Formulation
 from scripts.papers.free_floating.formulations import problem as free_floating
 from scripts.robots.panda import HOME, LAP, circling

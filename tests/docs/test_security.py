@@ -8,7 +8,7 @@ from pathlib import Path
 from models.files import INPUT_LIMITS
 from ocp import storage
 from ocp.motion.schedule import trajectory
-from ocp.problem import function_reader
+from ocp.problem import record_reader
 
 ROOT = Path(__file__).parents[2]
 MB = 2**20
@@ -29,9 +29,9 @@ LIMITS = {
     "a record or chunk of it, unpacked": INPUT_LIMITS.log_record_bytes / MB,
     "its messages of joints": INPUT_LIMITS.log_message_bytes / MB,
     "plan or solution, as it is and unpacked": storage.MAX_FILE_BYTES / MB,
-    "elementary operations of its expressions": function_reader.MAX_OPERATIONS,
-    "entries of the arguments and results of its functions": function_reader.MAX_ENTRIES,
-    "operations of one evaluation, calls included": function_reader.MAX_WORK,
+    "elementary operations of its expressions": record_reader.MAX_OPERATIONS,
+    "entries of the arguments and results of its functions": record_reader.MAX_ENTRIES,
+    "operations of one evaluation, calls included": record_reader.MAX_WORK,
     "characters of a name of a link or joint": INPUT_LIMITS.name_characters,
 }
 

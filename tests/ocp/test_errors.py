@@ -75,7 +75,7 @@ def test_a_failure_carries_what_would_have_to_give_way(method: Any) -> None:
         (lambda p: solve(energy(), Collocation(2), parameters={"mass": 1.0}), "mass", None),
         (lambda p: solve(with_parameter(2), Collocation(2), parameters={"mass": np.ones(3)}), "mass", 3),
         (lambda p: solve(energy(), Collocation(2)).at(2.0), "time", 2.0),
-        (lambda p: solve(energy(), Collocation(2)).audit(drift=-1.0), "drift", -1.0),
+        (lambda p: solve(energy(), Collocation(2)).audit(lost=-1.0), "lost", -1.0),
         (lambda p: solve(energy(), Collocation(2)).audit(tolerances={"spin": 1.0}), "spin", None),
     ],
 )

@@ -25,6 +25,7 @@ from ocp import (
     MultipleShooting,
     Problem,
     ProblemError,
+    RefinementSettings,
     RefinementWarning,
     SolveError,
     prepare,
@@ -34,8 +35,7 @@ from ocp import (
 )
 from ocp.console import TimeLimitReached, casadi_silenced, check_time, interruptible, time_left, time_limited
 from ocp.direct.prepared import Prepared
-from ocp.errors import Interrupted
-from ocp.status import SolverStatus
+from ocp.errors import Interrupted, SolverStatus
 from tests.ocp.problems import SOLVERS, energy, van_der_pol
 from tests.ocp.test_tightening import beyond, walled
 
@@ -122,7 +122,8 @@ interrupted("what conflicts", conflicts.solve, 1.0)
 sleqp = prepare(long, Collocation(120, 4), solver="sleqp")
 interrupted("sleqp", sleqp.solve, 0.2)
 interrupted("prepare", lambda: prepare(long, Collocation(20000, 4)))
-interrupted("refine", lambda: refine(long, Collocation(150), tolerance=1e-13, max_intervals=4000))
+many = RefinementSettings(max_intervals=4000)
+interrupted("refine", lambda: refine(long, Collocation(150), tolerance=1e-13, settings=many))
 interrupted("tighten", lambda: tighten(long, Collocation(1500)))
 plan = solve(long, Collocation(300))
 print(plan.success, ipopt.solve(guess=plan, check=False, time_limit=0.2).success)
@@ -363,7 +364,9 @@ def overtaken(monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, call: int,
 
 def test_refinement_ends_at_its_time_limit_with_the_plan_that_it_has() -> None:
     with pytest.warns(RefinementWarning, match="the time limit is reached: raise time_limit") as told:
-        plan = refine(long(), Collocation(20), tolerance=1e-13, max_intervals=100_000, time_limit=1.0)
+        plan = refine(
+            long(), Collocation(20), tolerance=1e-13, settings=RefinementSettings(max_intervals=100_000), time_limit=1.0
+        )
     assert plan.success
     assert plan.refinement is not None
     assert not plan.refinement.reached
@@ -381,12 +384,14 @@ def test_refinement_keeps_the_last_audited_plan_whatever_the_limit_meets(
 ) -> None:
     problem = van_der_pol()
     with pytest.warns(RefinementWarning):
-        cut = refine(problem, Collocation(3), tolerance=1e-8, max_intervals=400, limits={"lost": 0.0})
+        cut = refine(problem, Collocation(3), tolerance=1e-8, settings=RefinementSettings(limits={"lost": 0.0}))
     assert cut.refinement is not None
     assert len(cut.refinement.intervals) > rounds
     overtaken(monkeypatch, ocp.refinement, slow, rounds + 1)
     with pytest.warns(RefinementWarning, match="time_limit"):
-        plan = refine(problem, Collocation(3), tolerance=1e-8, limits={"lost": 0.0}, time_limit=100.0)
+        plan = refine(
+            problem, Collocation(3), tolerance=1e-8, settings=RefinementSettings(limits={"lost": 0.0}), time_limit=100.0
+        )
     assert plan.refinement is not None
     assert plan.refinement.intervals == cut.refinement.intervals[:rounds]
     assert {len(values) for values in plan.refinement.errors.values()} == {rounds}

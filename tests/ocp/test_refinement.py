@@ -28,7 +28,7 @@ from ocp import (
     refinement,
     solve,
 )
-from ocp.refinement import SETTINGS, split
+from ocp.refinement import RefinementSettings, split
 from tests.ocp.problems import (
     SWING,
     LogarithmicRegulator,
@@ -85,7 +85,7 @@ def test_the_tolerance_is_reached(method: str) -> None:
 def test_from_a_plan_that_is_audited_already_it_goes_the_same_way(method: str) -> None:
     """As from its first solve; and the audit that comes with it is that of the plan."""
     first = solve(van_der_pol(), START[method])
-    found, audit = refinement.refine_from(first.problem, START[method], first, first.audit())
+    found, audit = refinement.refine_from(first.problem, START[method], (first, first.audit()))
     whole = refined(method)
     assert found.refinement is not None
     assert whole.refinement is not None
@@ -109,7 +109,7 @@ def test_a_round_that_fails_is_begun_elsewhere_only_where_that_is_asked(
 
     monkeypatch.setattr(refinement, "solve", briefly)
     with pytest.raises(SolveError, match="from the guess: " if check else "^refinement of .* failed: ") as failed:
-        refinement.refine_from(first.problem, method, first, first.audit(), {"max_iter": 1}, check)
+        refinement.refine_from(first.problem, method, (first, first.audit()), options={"max_iter": 1}, check=check)
     assert asked == [check]
     assert failed.value.solution is not None
     assert not failed.value.solution.success
@@ -129,7 +129,10 @@ def test_every_round_tells_the_errors_of_each_kind_as_shares_of_their_limits(met
 
 def test_a_tighter_tolerance_takes_more_intervals_and_brings_the_cost_nearer() -> None:
     exact = solve(van_der_pol(), Collocation(40, 5)).cost
-    loose, tight = (refine(van_der_pol(), Collocation(2, 2), tolerance=t, max_intervals=900) for t in (1e-3, 1e-6))
+    loose, tight = (
+        refine(van_der_pol(), Collocation(2, 2), tolerance=t, settings=RefinementSettings(max_intervals=900))
+        for t in (1e-3, 1e-6)
+    )
     assert loose.refinement is not None
     assert tight.refinement is not None
     assert tight.refinement.intervals[-1] > loose.refinement.intervals[-1]
@@ -188,7 +191,7 @@ def test_linear_controls_keep_to_the_task_between_the_points_too() -> None:
     problem, method = chain_in_a_circle(), MultipleShooting(10, control="linear")
     best = solve(problem, Collocation(80, 4)).cost
     assert solve(problem, method).cost < 0.95 * best
-    solution = refine(problem, method, max_intervals=100)
+    solution = refine(problem, method, settings=RefinementSettings(max_intervals=100))
     audit = solution.audit()
     assert audit.feasible
     assert solution.cost == pytest.approx(best, rel=1e-3)
@@ -219,7 +222,7 @@ def test_the_cost_that_held_and_linear_controls_lose_is_brought_under_a_thousand
 def test_the_cost_is_as_near_to_a_known_optimum_as_is_asked(lost: float) -> None:
     regulator = LogarithmicRegulator(horizon=3.0, z0=1.5)
     for method in (MultipleShooting(6, control="linear"), Collocation(6, control="held")):
-        solution = refine(regulator.build(), method, tolerance=1e-6, limits={"lost": lost})
+        solution = refine(regulator.build(), method, tolerance=1e-6, settings=RefinementSettings(limits={"lost": lost}))
         assert solution.refinement is not None
         assert solution.refinement.reached
         assert abs(solution.cost / regulator.cost - 1) <= 1.1 * lost
@@ -227,7 +230,7 @@ def test_the_cost_is_as_near_to_a_known_optimum_as_is_asked(lost: float) -> None
 
 def test_limits_of_the_audit_can_be_asked_for() -> None:
     problem = chain_in_a_circle()
-    solution = refine(problem, Collocation(5), limits={"constraints": 1e-6})
+    solution = refine(problem, Collocation(5), settings=RefinementSettings(limits={"constraints": 1e-6}))
     assert solution.refinement is not None
     assert solution.refinement.reached
     assert solution.audit().constraints["task"] <= 1e-6
@@ -348,7 +351,13 @@ def test_reached_means_that_the_audit_passes(method: str) -> None:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RefinementWarning)
             given = SWING if declare is swing else None
-            solution = refine(declare(), START[method], tolerance=1e-4, max_intervals=60, parameters=given)
+            solution = refine(
+                declare(),
+                START[method],
+                tolerance=1e-4,
+                settings=RefinementSettings(max_intervals=60),
+                parameters=given,
+            )
         assert solution.refinement is not None
         audit = solution.audit()
         if solution.refinement.reached:
@@ -369,7 +378,7 @@ def kinked(place: float = 0.37) -> Problem:
 
 
 def test_a_break_becomes_a_node_and_saves_intervals() -> None:
-    plain, broken = refine(kinked(), Collocation(4)), refine(kinked(), Collocation(4), breaks=[0.37])
+    plain, broken = refine(kinked(), Collocation(4)), refine(kinked(), Collocation(4).with_nodes_at([0.37]))
     assert plain.refinement is not None
     assert broken.refinement is not None
     assert broken.refinement.reached
@@ -382,34 +391,17 @@ def test_a_break_becomes_a_node_and_saves_intervals() -> None:
 @pytest.mark.parametrize("method", [Collocation(4, 4), Collocation(4, 4, "legendre")], ids=str)
 def test_a_break_where_nothing_breaks_changes_nothing(method: Method) -> None:
     """The optimum of least energy is a cubic, which the polynomials hold whatever their nodes are."""
-    plain, broken = refine(energy(), method), refine(energy(), method, breaks=[0.31, 0.62])
+    plain, broken = refine(energy(), method), refine(energy(), method.with_nodes_at([0.31, 0.62]))
     t = np.linspace(0, 1, 101)
     assert broken.cost == pytest.approx(plain.cost, rel=1e-12)
     for name in ("q", "v", "u"):
         np.testing.assert_allclose(broken.at(t)[name], plain.at(t)[name], atol=1e-9)
 
 
-def test_breaks_are_times_of_the_horizon() -> None:
-    solution = refine(van_der_pol(horizon=2.0), Collocation(4), tolerance=1e-3, breaks=[0.6, 1.7])
+def test_given_nodes_are_kept() -> None:
+    solution = refine(van_der_pol(horizon=2.0), Collocation(4).with_nodes_at([0.3, 0.85]), tolerance=1e-3)
     for time in (0.6, 1.7):
         assert np.abs(solution.t - time).min() < 1e-12
-
-
-@pytest.mark.parametrize(
-    ("declare", "breaks"),
-    [
-        (energy, [1.5]),
-        (energy, [-0.1]),
-        (energy, [np.nan]),
-        (energy, "soon"),
-        (energy, [None]),
-        (lambda: hurried()[0], [0.5]),
-    ],
-)
-def test_breaks_that_cannot_be_are_refused(declare: Callable[[], Problem], breaks: Any) -> None:
-    with pytest.raises(ProblemError, match="breaks") as caught:
-        refine(declare(), Collocation(4), breaks=breaks)
-    assert caught.value.name == "breaks"
 
 
 @pytest.mark.parametrize("method", [Collocation(10), MultipleShooting(10, control="linear")], ids=str)
@@ -458,7 +450,7 @@ def test_the_cost_that_is_lost_falls_with_twice_the_order_of_the_controls(method
     """
     past = refined(method).refinement
     assert past is not None
-    assert past.intervals[1] == SETTINGS.max_parts * past.intervals[0]
+    assert past.intervals[1] == RefinementSettings().max_parts * past.intervals[0]
     assert order(1 / np.array(past.intervals[:2]), np.array(past.errors["cost"][:2])) > least
 
 
@@ -529,7 +521,9 @@ def test_intervals_gather_where_the_costates_are_wrong() -> None:
     problem, x, u = plant("falls", initial=1.0)
     problem.dynamics(x, u)
     problem.minimize(running=(x**2 + width**2 * u**2) / 2)
-    solution = refine(problem, Collocation(6, 3), tolerance=1.0, limits={"costates": asked})
+    solution = refine(
+        problem, Collocation(6, 3), tolerance=1.0, settings=RefinementSettings(limits={"costates": asked})
+    )
     assert solution.refinement is not None
     assert solution.refinement.reached
     count, mesh = solution.refinement.intervals[-1], solution.control_interpolant.breaks
@@ -543,7 +537,7 @@ def test_intervals_gather_where_the_costates_are_wrong() -> None:
 
 def test_a_stop_at_the_cap_is_warned_of_and_told() -> None:
     with pytest.warns(RefinementWarning, match=r"'layer' stopped at \d+ of at most 12 intervals .*raise max_intervals"):
-        solution = refine(layer(), Collocation(4), tolerance=1e-10, max_intervals=12)
+        solution = refine(layer(), Collocation(4), tolerance=1e-10, settings=RefinementSettings(max_intervals=12))
     assert solution.refinement is not None
     assert not solution.refinement.reached
     assert solution.refinement.intervals[-1] <= 12
@@ -553,7 +547,7 @@ def test_a_stop_at_the_cap_is_warned_of_and_told() -> None:
 
 def test_the_first_mesh_may_be_the_last() -> None:
     with pytest.warns(RefinementWarning):
-        solution = refine(layer(), Collocation(4), tolerance=1e-10, max_intervals=4)
+        solution = refine(layer(), Collocation(4), tolerance=1e-10, settings=RefinementSettings(max_intervals=4))
     assert solution.refinement is not None
     assert solution.refinement.intervals == (4,)
 
@@ -565,9 +559,9 @@ def test_everything_is_passed_on_to_the_solves() -> None:
         Collocation(8),
         tolerance=1e-4,
         parameters=SWING,
-        solver="fatrop",
         options={"max_iter": 200},
         guess=reference,
+        settings=RefinementSettings(solver="fatrop"),
     )
     assert solution.solver == "fatrop"
     assert solution.cost == pytest.approx(reference.cost, rel=1e-4)
@@ -594,24 +588,26 @@ def test_a_round_that_fails_raises_what_solving_raises() -> None:
         ({"tolerance": np.inf}, "tolerance"),
         ({"tolerance": None}, "tolerance"),
         ({"tolerance": "tight"}, "tolerance"),
-        ({"max_intervals": 2}, "max_intervals 2 is below the 3 intervals given"),
-        ({"max_intervals": "many"}, "max_intervals"),
-        ({"max_intervals": np.nan}, "max_intervals"),
-        ({"limits": {"constraint": 1e-6}}, "unknown limit of the audit 'constraint'; did you mean constraints"),
-        ({"limits": {"constraints": -1.0}}, "'constraints' must be a number"),
-        ({"limits": [1e-6]}, "limits must be a dictionary"),
-        ({"limits": {"tolerances": {"y": 1.0}}}, "unknown name in tolerances 'y'"),
-        ({"breaks": [3.0]}, "breaks must lie within the horizon"),
+        ({"settings": {"max_intervals": 2}}, "max_intervals 2 is below the 3 intervals given"),
+        ({"settings": {"max_intervals": "many"}}, "max_intervals"),
+        ({"settings": {"max_intervals": np.nan}}, "max_intervals"),
+        (
+            {"settings": {"limits": {"constraint": 1e-6}}},
+            "unknown limit of the audit 'constraint'; did you mean constraints",
+        ),
+        ({"settings": {"limits": {"constraints": -1.0}}}, "'constraints' must be a number"),
+        ({"settings": {"limits": [1e-6]}}, "limits must be a dictionary"),
+        ({"settings": {"limits": {"tolerances": {"y": 1.0}}}}, "unknown name in tolerances 'y'"),
         ({"method": None}, "refine: .* expected, not None"),
         ({"method": Collocation}, "refine: .* expected"),
-        ({"solver": "snopt"}, "solver must be"),
+        ({"settings": {"solver": "snopt"}}, "solver must be"),
         ({"parameters": {"p": 1.0}}, "unknown parameter"),
     ],
 )
 def test_bad_arguments_are_named(arguments: dict[str, Any], message: str) -> None:
     given = {"method": Collocation(3), **arguments}
     with pytest.raises(ProblemError, match=message):
-        refine(van_der_pol(), **given)
+        refine(van_der_pol(), **{**given, "settings": RefinementSettings(**given.get("settings", {}))})
 
 
 # ---- splitting ---------------------------------------------------------------------------------------------------

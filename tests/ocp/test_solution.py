@@ -24,6 +24,7 @@ from ocp import (
     MultipleShooting,
     Problem,
     ProblemError,
+    RefinementSettings,
     RefinementWarning,
     Solution,
     refine,
@@ -197,7 +198,9 @@ def test_a_plan_comes_back_from_its_file_bit_by_bit(method: str, tmp_path: Path)
 def test_a_refinement_comes_back_too(tmp_path: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RefinementWarning)
-        solution = refine(van_der_pol(), Collocation(2, 2), tolerance=1e-9, max_intervals=7)
+        solution = refine(
+            van_der_pol(), Collocation(2, 2), tolerance=1e-9, settings=RefinementSettings(max_intervals=7)
+        )
     solution.save(tmp_path / "plan.npz")
     loaded = Solution.load(tmp_path / "plan.npz")
     assert loaded.refinement == solution.refinement

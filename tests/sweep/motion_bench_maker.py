@@ -24,7 +24,7 @@ import pinocchio as pin
 from models import Box, CollisionScene, Cylinder, FixedBase, Robot, Sphere
 from models.arrays import Array
 from ocp import Cost, Limits, Plan, SolveError
-from ocp.app.files.text_files import read_tree
+from ocp.app.files.safe_files import read_tree
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.plan.goal_plan import GoalRequest, plan_to_goal
 from ocp.motion.sampling.straight import StraightMotions

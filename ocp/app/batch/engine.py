@@ -27,7 +27,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from models.errors import ModelError
-from ocp.app.batch.content import Payload, canonical_text, digest_of, pack_result, unpack_result
+from ocp.app.batch.result_store import Payload, canonical_text, digest_of, pack_result, unpack_result
 from ocp.errors import DetailedError, ProblemError, SolveError
 
 __all__ = [
@@ -216,8 +216,7 @@ class Engine:
     Args:
         function: Sent to the workers by Dask: by name, or by code if it is defined in the script.
         near: Whether it takes a neighbour's result.
-        workers: Number of processes to start if no cluster is given.
-        cluster: As returned by :func:`checked_cluster`, or None.
+        cluster: Number of processes to start, or a cluster as returned by :func:`checked_cluster`.
         settings: Settings.
 
     Raises:
@@ -227,7 +226,7 @@ class Engine:
     """
 
     def __init__(
-        self, function: Function, near: bool, workers: int, cluster: Any, settings: EngineSettings = EngineSettings()
+        self, function: Function, *, near: bool, cluster: Any, settings: EngineSettings = EngineSettings()
     ) -> None:
         try:
             import distributed
@@ -235,7 +234,7 @@ class Engine:
             words = f"run_batch: Dask is not installed; {INSTALL}"
             raise ProblemError(words, name="cluster", value=cluster) from error
         self._dask: Any = distributed
-        self._function, self._near, self._workers, self._cluster = function, near, workers, cluster
+        self._function, self._near, self._cluster = function, near, cluster
         self.settings = settings
         self._lost = (distributed.CancelledError, TimeoutError, self._dask.comm.CommClosedError)
         self._local_cluster: Any = None
@@ -250,11 +249,11 @@ class Engine:
         self._chunk_size = 1  # tasks sent together
 
     def __enter__(self) -> Engine:
-        if self._cluster is not None and not isinstance(self._cluster, str):
+        if not isinstance(self._cluster, int | str):
             self._client = self._cluster
             return self
         try:
-            address = self._begin() if self._cluster is None else self._cluster
+            address = self._begin() if isinstance(self._cluster, int) else self._cluster
             patience = self.settings.patience
             self._client = self._dask.Client(address, timeout=patience, set_as_default=False)
         except (OSError, ValueError) as error:
@@ -285,17 +284,17 @@ class Engine:
                 silence_logs=logging.CRITICAL,
                 security=security,
             )
-            self._local_cluster.scale(self._workers)
+            self._local_cluster.scale(self._cluster)
             self._local_cluster.sync(lambda: self._local_cluster)  # waits for the cluster and its workers
             if any(nanny.status != self._dask.Status.running for nanny in self._local_cluster.workers.values()):
                 raise RuntimeError("they ended immediately")
         except ImportError as error:
             words = f"run_batch: {error}; {INSTALL}"
-            raise ProblemError(words, name="workers", value=self._workers) from error
+            raise ProblemError(words, name="cluster", value=self._cluster) from error
         except RuntimeError as error:
             self.__exit__()
             words = f"workers: none can be started: {error}; see their output"
-            raise ProblemError(words, name="workers", value=self._workers) from error
+            raise ProblemError(words, name="cluster", value=self._cluster) from error
         except BaseException:  # Ctrl-C
             self.__exit__()
             raise
@@ -422,5 +421,6 @@ def checked_cluster(cluster: Any) -> Any:
         return cluster
     if isinstance(cluster, str) and cluster.partition("://")[0] in SCHEMES and cluster.partition("://")[2]:
         return cluster
-    words = f"cluster must be the address of a scheduler such as tcp://host:8786, or a Client, not {cluster!r}"
+    words = "cluster must be a number of processes, the address of a scheduler such as tcp://host:8786, or a Client, "
+    words += f"not {cluster!r}"
     raise ProblemError(words, name="cluster", value=cluster)

@@ -10,19 +10,30 @@ import os
 import sys
 import textwrap
 from collections import Counter, defaultdict, deque
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from functools import cache
 from typing import Any, Literal
 
+import numpy as np
+from scipy.spatial import cKDTree
 from tqdm import tqdm
 
-from ocp.app.batch.content import Payload, canonical_text, digest_of, key_of, neighbours
+from models.arrays import Array
 from ocp.app.batch.engine import Engine, Function, Job, checked_cluster, failed
-from ocp.app.batch.result_store import STATUSES, ResultStore
+from ocp.app.batch.result_store import STATUSES, Payload, ResultStore, canonical_text, digest_of, key_of
 from ocp.app.batch.table import Batch, Result, row_of
-from ocp.errors import MAX_COUNT, NOT_NUMBERS, ProblemError, check_entries, checked_choice, checked_count, checked_text
+from ocp.errors import (
+    MAX_COUNT,
+    NOT_NUMBERS,
+    ProblemError,
+    check_entries,
+    checked_choice,
+    checked_count,
+    checked_text,
+    floats,
+)
 
-__all__ = ["run_batch"]
+__all__ = ["neighbours", "run_batch"]
 
 MAX_WORKERS = 4096
 
@@ -32,7 +43,6 @@ def run_batch(
     tasks: Iterable[Any],
     folder: str | os.PathLike[str],
     *,
-    workers: int | None = None,
     cluster: Any = None,
     near: Sequence[str] = (),
     again: str | Collection[str] = (),
@@ -54,13 +64,12 @@ def run_batch(
             the other tasks continue.
         tasks: Data: parameters by name, a seed, the text of a task file. Equal tasks count once.
         folder: New, empty, or that of an earlier call with this function.
-        workers: Number of processes on this machine, in a Dask cluster that is started and ended here; None: one for
-            each core.
-        cluster: Address of a Dask scheduler, ``"tcp://host:8786"``, or a `distributed.Client`. Its workers run the
-            tasks and need this package and the function's module; results are sent to this process. Use workers with
-            one thread: the threads of a process take turns.
+        cluster: Number of processes of a Dask cluster that is started on this machine and ended here; None: one for
+            each core. Or the address of a Dask scheduler, ``"tcp://host:8786"``, or a `distributed.Client`. Its workers
+            run the tasks and need this package and the function's module; results are sent to this process. Use workers
+            with one thread: the threads of a process take turns.
         near: Names of numbers in the tasks. If given, ``function(task, guess)`` is called with the result of a similar
-            task for a warm start, or None. The tasks alone determine which one (:mod:`ocp.app.batch.content`).
+            task for a warm start, or None. The tasks alone determine which one (:func:`neighbours`).
         again: Status of the results to compute again in any case: ``"failed"``, ``"killed"``, or both. Otherwise a
             failed task is repeated if the source of the function's module has changed, or a file that an argument of
             :func:`cached` names.
@@ -82,7 +91,10 @@ def run_batch(
     """
     name = name_of(function)
     texts = texts_of(tasks)
-    count = workers_of(workers, cluster)
+    is_count = cluster is None or isinstance(cluster, int)
+    count = worker_count(cluster) if is_count else MAX_WORKERS
+    if not is_count:
+        checked_cluster(cluster)
     names = names_of("near", near)
     statuses = names_of("again", (again,) if isinstance(again, str) else again)
     for status in statuses:
@@ -113,9 +125,10 @@ def run_batch(
         try:
             with store.locked():
                 results |= recorded([key for key in texts if key not in results])  # by the driver that held the lock
-                pending = PendingTasks(store, texts, parents, results, source)
+                pending = _PendingTasks(store, texts, parents, results, source)
                 if len(results) < len(texts):
-                    with Engine(function, bool(names), min(count, len(texts) - len(results)), cluster) as engine:
+                    count = min(count, len(texts) - len(results))
+                    with Engine(function, near=bool(names), cluster=count if is_count else cluster) as engine:
                         pending.run(engine)
         except OSError as error:
             if isinstance(error, ConnectionError):
@@ -130,7 +143,7 @@ def run_batch(
     return batch
 
 
-class PendingTasks:
+class _PendingTasks:
     """Tasks of a batch without a result."""
 
     def __init__(
@@ -221,9 +234,6 @@ class PendingTasks:
         self.ready.extend(self.after.pop(key, ()))
 
 
-# ---- arguments ---------------------------------------------------------------------------------------------------
-
-
 def texts_of(tasks: Any) -> dict[str, str]:
     """Return the canonical text of each distinct task by its key.
 
@@ -247,17 +257,12 @@ def texts_of(tasks: Any) -> dict[str, str]:
     return texts
 
 
-def workers_of(workers: Any, cluster: Any) -> int:
-    """Return the number of workers; raise ProblemError for an invalid cluster."""
-    if workers is None:
-        if cluster is not None:
-            checked_cluster(cluster)
+def worker_count(count: int | None) -> int:
+    """Return the number of processes to start; None: one for each core that this process may use."""
+    if count is None:
         return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    if cluster is not None:
-        words = "a cluster has its own workers; pass only one of the two"
-        raise ProblemError(words, name="workers", value=workers)
-    checked_count("workers", workers, 1, MAX_WORKERS)
-    return int(workers)
+    checked_count("cluster", count, 1, MAX_WORKERS)
+    return count
 
 
 def names_of(argument: str, names: Any) -> tuple[str, ...]:
@@ -306,3 +311,55 @@ def source_version(function: Any) -> str:
     except (OSError, TypeError, SyntaxError):
         return ""
     return hashlib.sha256(ast.dump(tree).encode()).hexdigest()[:12]
+
+
+def neighbours(tasks: Mapping[str, Any], names: Sequence[str]) -> dict[str, str | None]:
+    """Return the key of each task's neighbour, in an order in which neighbours come first; None for the first task.
+
+    The tasks alone determine the neighbours. Ordered by their keys, which looks random, they form generations of 1, 1,
+    2, 4, 8, ... tasks, and the neighbour of a task is the nearest task of all earlier generations. Neighbours thus come
+    closer as the tasks get denser, the tasks of one generation can run in parallel, and no chain is longer than log2 of
+    the number of tasks.
+
+    Args:
+        tasks: Tasks by key.
+        names: Names of the numbers (or lists of numbers) in the tasks that span the space of the distance; each is
+            divided by its range.
+
+    Raises:
+        ProblemError: A task lacks these numbers, or has not as many as the others; names the task.
+    """
+    order = sorted(tasks)
+    rows = [coordinates_of(tasks[key], names) for key in order]
+    for key, row in zip(order, rows, strict=True):
+        if len(row) != len(rows[0]):
+            words = f"near: {len(row)} numbers in the task {tasks[key]!r}, {len(rows[0])} in another"
+            raise ProblemError(words, name="near", value=len(row), limit=len(rows[0]))
+    points = np.array(rows)
+    ranges = np.ptp(points, axis=0) if order else np.ones(0)
+    points = points / np.where(ranges > 0, ranges, 1.0)
+    parents: dict[str, str | None] = {}
+    begin, end = 0, 1
+    while begin < len(order):
+        keys = order[begin:end]
+        if begin:
+            nearest = cKDTree(points[:begin]).query(points[begin:end])[1]
+            parents |= {key: order[int(i)] for key, i in zip(keys, nearest, strict=True)}
+        else:
+            parents |= dict.fromkeys(keys)
+        begin, end = end, 2 * end
+    return parents
+
+
+def coordinates_of(task: Any, names: Sequence[str]) -> Array:
+    """Return the numbers of a task from which its distance to others is computed. Shape (n,)."""
+    parts = []
+    for name in names:
+        value = task.get(name) if isinstance(task, Mapping) else None
+        try:
+            part = floats(value).ravel()
+        except NOT_NUMBERS as error:
+            words = f"near: {name!r} is not a number or list of numbers in the task {task!r}"
+            raise ProblemError(words, name=name, value=value) from error
+        parts.append(part)
+    return np.concatenate(parts) if parts else np.zeros(0)

@@ -152,7 +152,7 @@ def _sampled(scene: CollisionScene, motion: Motion, bases: Array) -> tuple[list[
 
 
 def path_rows(
-    machine: Machine, motion: Motion, bases: Array | None, path: Waypoints, tolerance: float, angle: float
+    machine: Machine, motion: Motion, bases: Array | None, path: Waypoints, *, tolerance: float, angle: float
 ) -> tuple[list[Row], list[Fault]]:
     """Return rows and faults of the distances between the tip's path and the waypoints, and of the tool axis.
 

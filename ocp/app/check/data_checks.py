@@ -19,8 +19,10 @@ from models.arrays import Array
 from ocp.app.check.interpolation import Indices, Motion, half_digits
 from ocp.app.files import RawTrajectory
 from ocp.errors import ProblemError
+from ocp.motion.tasks.limits import JointBounds
 
 __all__ = [
+    "PLANAR_BASE",
     "SMALL_UNITS",
     "THRESHOLDS",
     "CleanedTrajectory",
@@ -122,26 +124,21 @@ class CleanedTrajectory:
     samples: int = 0
 
 
-BASES = (("base.x", "base.y", "base.z", "base.qw", "base.qx", "base.qy", "base.qz"), ("base.x", "base.y", "base.angle"))
+PLANAR_BASE = ("base.x", "base.y", "base.angle")
+BASES = (("base.x", "base.y", "base.z", "base.qw", "base.qx", "base.qy", "base.qz"), PLANAR_BASE)
 """Columns of the configuration of a floating base."""
 
 
 def clean_trajectory(
-    raw: RawTrajectory,
-    robot: Robot,
-    lower: Array,
-    upper: Array,
-    velocity: Array,
-    stated: bool = False,
-    unwrap: bool = False,
+    raw: RawTrajectory, robot: Robot, bounds: JointBounds, *, unit_known: bool = False, unwrap: bool = False
 ) -> CleanedTrajectory:
     """Return the usable part of a trajectory, with its faults.
 
     Args:
         raw: The trajectory as written.
         robot: The robot that it moves.
-        lower, upper, velocity: Limits of the joint vector, infinite if there are none. Shape (dof,) each.
-        stated: Whether the times are known to be in seconds.
+        bounds: Limits of the joint vector.
+        unit_known: Whether the times are known to be in seconds.
         unwrap: Unwrap joints with limits; wrapped values are then a note instead of a fault.
 
     Raises:
@@ -168,8 +165,8 @@ def clean_trajectory(
     base = raw.positions[rows][:, used[len(columns) :]] if base_names else None
     names = [robot.joint_names[k] for k in joints]
     kinds = [robot.joint(name).kind for name in names]
-    limits = lower[joints], upper[joints], velocity[joints]
-    t = t if stated else _in_seconds(t, q, limits[2], faults)
+    limits = bounds.lower[joints], bounds.upper[joints], bounds.velocity[joints]
+    t = t if unit_known else _in_seconds(t, q, limits[2], faults)
     q, v, a = _in_units(t, q, v, a, names, kinds, limits, faults)
     if len(t) == 1:
         notes.append("one sample is a configuration, not a motion: it is checked as a rest of one second")
@@ -180,7 +177,7 @@ def clean_trajectory(
     faults += [] if unwrap else wrapped
     notes += [f"{fault.name} {fault.text}" for fault in wrapped] if unwrap else []
     t = _time_by_velocities(t, q, v, names, faults)
-    _jumps(t, q, names, kinds, velocity[joints], faults)
+    _jumps(t, q, names, kinds, limits[2], faults)
     _followers(raw, robot, rows, faults)
     return CleanedTrajectory(joints, Motion(t, q, v, a), faults, notes, base, efforts, len(raw.t))
 

@@ -10,7 +10,7 @@ momentum is conserved.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, NamedTuple
@@ -21,11 +21,14 @@ import numpy as np
 from models import FixedBase, FreeFloating, Robot, Standing, inverse_dynamics, momentum, robot_inertia, simplify
 from models.arrays import Array
 from models.machines.standing import center_of_pressure
+from models.robot.dynamics import GRAVITY
 from models.spatial import cross, rotation_from_quaternion
-from ocp.app.check.data_checks import Fault
+from ocp.app.check.data_checks import CleanedTrajectory, Fault
 from ocp.app.check.interpolation import Indices, Motion, MotionQuantity, polynomial_maxima
 from ocp.audit.audit import Audit
-from ocp.motion.tasks.limits import JointBounds
+from ocp.console import check_time
+from ocp.errors import ProblemError, real, unknown_name
+from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.problem.values import Sampler
 from ocp.tolerances import MOMENTUM_SHARE, ROUNDING_SHARE
 
@@ -34,10 +37,12 @@ __all__ = [
     "Row",
     "RowVerdict",
     "audit_rows",
+    "effort_rows",
     "floating_base_rows",
     "floating_torques",
     "integrate_base",
     "limit_rows",
+    "limits_by_name",
     "standing_rows",
     "torque_rows",
     "torque_samples",
@@ -87,8 +92,33 @@ class Row:
     note: str = ""
 
 
+def limits_by_name(robot: Robot, limits: Mapping[str, Mapping[str, float]]) -> Limits:
+    """Return limits that are given by joint; those of other joints are the robot's own.
+
+    Args:
+        robot: The robot.
+        limits: For "velocity", "acceleration", "jerk" or "torque" the limits by name of the joint; "" stands for all
+            joints that are not named.
+
+    Raises:
+        ProblemError: A joint is unknown, or a limit is not a number above 0.
+    """
+    own = Limits().bounds(FixedBase(robot))
+    values: dict[str, Any] = {}
+    for quantity, by_name in limits.items():
+        for name, value in by_name.items():
+            if not real(value) > 0:
+                words = f"{quantity} of {name or 'all joints'} must be a number above 0, not {value!r}"
+                raise ProblemError(words, name=quantity, value=value, limit=0.0)
+            if name and name not in robot.joint_names:
+                raise unknown_name(f"joint in {quantity}", name, robot.joint_names)
+        defaults = zip(robot.joint_names, getattr(own, quantity), strict=True)
+        values[quantity] = np.array([by_name.get(name, by_name.get("", default)) for name, default in defaults])
+    return Limits(**values)
+
+
 def limit_rows(
-    motion: Motion, robot: Robot, joints: Indices, bounds: JointBounds, share: float
+    motion: Motion, robot: Robot, joints: Indices, bounds: JointBounds, *, share: float
 ) -> tuple[list[Row], list[Fault], list[str]]:
     """Return rows and faults of all limits of the joints, and the quantities that could not be checked.
 
@@ -210,13 +240,31 @@ def _check_limits(
     return row, "", [Fault(order, name, text, time, first, value, allowed, unit)]
 
 
+def effort_rows(
+    cleaned: CleanedTrajectory, robot: Robot, bounds: JointBounds, share: float
+) -> tuple[list[Row], list[Fault]]:
+    """Check the torques in the file, at its samples."""
+    rows: list[Row] = []
+    faults: list[Fault] = []
+    if cleaned.efforts is None:
+        return rows, faults
+    for column, joint in enumerate(cleaned.joints):
+        name = robot.joint_names[joint]
+        unit, limit = robot.joint(name).effort_unit, float(bounds.torque[joint])
+        k = int(np.abs(cleaned.efforts[:, column]).argmax())
+        value, time = float(cleaned.efforts[k, column]), float(cleaned.motion.t[k])
+        failed = abs(value) > limit * (1 + share)
+        verdict = RowVerdict.FAILED if failed else RowVerdict.OK if np.isfinite(limit) else RowVerdict.UNLIMITED
+        row_limit = limit if np.isfinite(limit) else None
+        rows.append(Row(f"given torque of {name}", value, row_limit, unit, time, verdict, "as given in the file"))
+        if failed:
+            text = f"the file has {value:.5g} {unit} at {time:.6g} s, limit {limit:.5g}"
+            faults.append(Fault("torque", name, text, time, time, value, limit, unit))
+    return rows, faults
+
+
 def torque_rows(
-    motion: Motion,
-    machine: FixedBase | FreeFloating,
-    bounds: JointBounds,
-    gravity: Array,
-    share: float,
-    check: Callable[[], None],
+    motion: Motion, machine: FixedBase | FreeFloating | Standing, bounds: JointBounds, share: float
 ) -> tuple[list[Row], list[Fault]]:
     """Return rows and faults of the torques by inverse dynamics, evaluated five times in every interval.
 
@@ -230,12 +278,13 @@ def torque_rows(
         torque = floating_torques(machine, q, v, a)
     else:
         bodies = simplify(robot, frozenset())
+        gravity = getattr(machine, "gravity_in_world", GRAVITY)
         torque = inverse_dynamics(bodies, q, v, a, (), gravity, machine.world_from_base())
     sampler = Sampler([q, v, a], [torque])
     times, *values = torque_samples(motion)
     if not len(times):
         return [], []
-    check()
+    check_time()
     torques = sampler(*values)[0]
     mean = motion.q.mean(axis=0)
     # torques are linear in accelerations

@@ -1,46 +1,53 @@
-"""Check a joint trajectory from any source: all quantities in one table, and a verdict in one sentence."""
+"""Check a joint trajectory from any source, or a plan: all quantities in one table, and a verdict in one sentence."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, TypeAlias, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
-from models import CollisionScene, FixedBase, FreeFloating, Robot, Standing, Support, footprint
-from models.arrays import Array, ArrayInput
-from models.robot.dynamics import GRAVITY
+from models import CollisionScene, FixedBase, FreeFloating, Machine, Robot, Standing
+from models.arrays import Array
 from models.shapes.mesh_files import find_mesh
-from models.shapes.shapes import Shape
 from ocp.app.check.collisions import clearance_rows, path_rows, with_wide_limits
 from ocp.app.check.data_checks import CleanedTrajectory, Fault, clean_trajectory
 from ocp.app.check.interpolation import Rule
-from ocp.app.check.joint_limits import Row, RowVerdict, floating_base_rows, limit_rows, standing_rows, torque_rows
+from ocp.app.check.joint_limits import (
+    Row,
+    RowVerdict,
+    effort_rows,
+    floating_base_rows,
+    limit_rows,
+    standing_rows,
+    torque_rows,
+)
 from ocp.app.check.suspicions import doubtful_times, exchanged_joints
 from ocp.app.files import RawTrajectory, Waypoints
 from ocp.app.files.trajectory import UNITS
+from ocp.audit.audit import Audit
 from ocp.console import check_time, interruptible
-from ocp.errors import (
-    ProblemError,
-    checked_choice,
-    checked_instance,
-    checked_mapping,
-    checked_nonnegative,
-    checked_positive,
-    real,
-    unknown_name,
-)
-from ocp.motion.tasks.limits import JointBounds, unknown_limits
+from ocp.errors import ProblemError, checked_choice, checked_instance, checked_nonnegative, checked_positive, real
+from ocp.motion.plan import Plan, PlanSample
+from ocp.motion.result.path_plan import PathPlan
+from ocp.motion.result.segmented_plan import ConsecutivePlans, Piece
+from ocp.motion.tasks.goals import Scene
+from ocp.motion.tasks.limits import Limits, unknown_limits
 from ocp.tolerances import LIMIT_SHARE, ORIENTATION_TOLERANCE_RAD
 from ocp.tolerances import path_tolerance as default_tolerance
 
-__all__ = ["BaseKind", "Check", "Fault", "Limit", "Row", "bounds_of", "check_trajectory"]
-
-BaseKind: TypeAlias = Literal["fixed", "standing", "floating"]
-Limit: TypeAlias = float | Mapping[str, float] | None
-"""One number for all joints, or numbers by name with "" for all other joints. None: the robot's own limit."""
+__all__ = [
+    "Check",
+    "CheckTolerances",
+    "Fault",
+    "Interpretation",
+    "PlanVerdict",
+    "Row",
+    "check_trajectory",
+    "verdict_of",
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,60 +147,11 @@ FAULT_ORDER = {
 """Kinds of faults that explain others, in the order of reporting."""
 
 
-@interruptible
-def check_trajectory(
-    robot: Robot,
-    trajectory: RawTrajectory,
-    *,
-    velocity: Limit = None,
-    acceleration: Limit = None,
-    jerk: Limit = None,
-    torque: Limit = None,
-    base: BaseKind = "fixed",
-    translation: ArrayInput = (0.0, 0.0, 0.0),
-    rotation: ArrayInput = None,
-    gravity: ArrayInput = GRAVITY,
-    foot: Support | None = None,
-    friction: float = np.inf,
-    obstacles: Sequence[Shape] = (),
-    clearance: float | None = 0.0,
-    ignored: Sequence[tuple[str, str]] = (),
-    srdf: str | Path | None = None,
-    folders: Sequence[str | Path] = (),
-    missing: Literal["raise", "skip"] = "raise",
-    path: Waypoints | None = None,
-    path_tolerance: float | None = None,
-    path_angle: float = ORIENTATION_TOLERANCE_RAD,
-    share: float = LIMIT_SHARE,
-    rule: Rule | None = None,
-    time_unit: str | float | None = None,
-    unwrap: bool = False,
-    names_confirmed: bool = False,
-    progress: Callable[[str], None] = lambda name: None,
-) -> Check:
-    """Check a joint trajectory for a robot.
+@dataclass(frozen=True)
+class Interpretation:
+    """How a controller and the reader of a trajectory file interpret its numbers.
 
-    Between samples the motion is interpolated as controllers do, see `check.interpolation`. Positions, velocities,
-    accelerations and jerks are bounded there at all times, and clearance is proven. Torques, the zero moment point and
-    the tip are evaluated several times between two samples.
-
-    Args:
-        robot: With its limits.
-        trajectory: As read by `read_trajectory`.
-        velocity, acceleration, jerk, torque: Limits in addition to, or instead of, those of the robot, rad/s or m/s,
-            ...
-        base: "fixed"; "standing" on the ground without fastening; "floating" in space, from rest.
-        translation, rotation: Pose of a base that does not float, in world.
-        gravity: m/s^2, in world.
-        foot: Contact area; None: from the collision shapes.
-        friction: Coefficient of friction of the ground.
-        obstacles, clearance, ignored, srdf, folders, missing: As in `ocp.plan`. clearance=None: clearance is not
-            checked.
-        path: Waypoints that the tip must follow on straight lines.
-        path_tolerance: Allowed distance from the path, m. None: the smaller of 0.1 mm and a thousandth of the path's
-            extent.
-        path_angle: Allowed angle of the tip's z axis from that of the waypoints, rad.
-        share: Tolerance relative to a limit.
+    Attributes:
         rule: Interpolation of the controller, "linear", "cubic" or "quintic". None: the highest that the data allow; a
             velocity, acceleration or jerk between samples then counts only as far as every motion through them needs
             it.
@@ -201,30 +159,112 @@ def check_trajectory(
             None: seconds, unless they look otherwise.
         unwrap: Whether joints with limits are unwrapped by whole turns.
         names_confirmed: Whether the order of the columns is certain.
+
+    Raises:
+        ProblemError: A value is unknown.
+    """
+
+    rule: Rule | None = None
+    time_unit: str | float | None = None
+    unwrap: bool = False
+    names_confirmed: bool = False
+
+    def __post_init__(self) -> None:
+        if self.rule is not None:
+            checked_choice("rule", self.rule, get_args(Rule))
+        if isinstance(self.time_unit, str):
+            checked_choice("time_unit", self.time_unit, ("s", "ms", "us", "ns"))
+        elif self.time_unit is not None:
+            checked_positive("time_unit", self.time_unit)
+
+    @property
+    def seconds(self) -> float:
+        """Time unit, s."""
+        unit = self.time_unit
+        return UNITS[unit] if isinstance(unit, str) else 1.0 if unit is None else float(unit)
+
+
+@dataclass(frozen=True)
+class CheckTolerances:
+    """Tolerances of a check.
+
+    Attributes:
+        share: Tolerance relative to a limit.
+        tip_distance: Allowed distance of the tip from its path, m. None: the smaller of 0.1 mm and a thousandth of the
+            path's extent.
+        tip_angle: Allowed angle of the tip's z axis from that of the waypoints, rad; infinite for no limit.
+
+    Raises:
+        ProblemError: A tolerance is not positive, or the share is negative.
+    """
+
+    share: float = LIMIT_SHARE
+    tip_distance: float | None = None
+    tip_angle: float = ORIENTATION_TOLERANCE_RAD
+
+    def __post_init__(self) -> None:
+        checked_nonnegative("share", self.share)
+        if self.tip_distance is not None:
+            checked_positive("tip_distance", self.tip_distance)
+        if not real(self.tip_angle) > 0:  # infinity is allowed
+            words = f"tip_angle must be a number above 0, not {self.tip_angle!r}"
+            raise ProblemError(words, name="tip_angle", value=self.tip_angle, limit=0.0)
+
+
+@interruptible
+def check_trajectory(
+    machine: Machine | Robot,
+    trajectory: RawTrajectory,
+    *,
+    limits: Limits | None = None,
+    scene: Scene | Literal[False] | None = None,
+    path: Waypoints | None = None,
+    interpretation: Interpretation = Interpretation(),
+    tolerances: CheckTolerances = CheckTolerances(),
+    progress: Callable[[str], None] = lambda name: None,
+) -> Check:
+    """Check a joint trajectory of a machine.
+
+    Between samples the motion is interpolated as controllers do, see `check.interpolation`. Positions, velocities,
+    accelerations and jerks are bounded there at all times, and clearance is proven. Torques, the zero moment point and
+    the tip are evaluated several times between two samples.
+
+    A floating base starts at rest. On a standing machine the ground may not pull, the zero moment point stays in the
+    foot, and the foot does not slip.
+
+    Args:
+        machine: The machine, or a robot whose base is fixed at the world's origin.
+        trajectory: As read by `read_trajectory`.
+        limits: Limits that replace those of the robot, and the friction of the ground; None: those of the robot. Power
+            is not checked.
+        scene: Obstacles and clearance, as in `ocp.plan`. None: the machine's own links; False: no distance is checked.
+        path: Waypoints that the tip must follow on straight lines.
+        interpretation: How the numbers of the file are interpreted.
+        tolerances: Tolerances of limits and of the path.
         progress: Is called with the name of each stage.
 
     Raises:
-        ProblemError, ModelError: An argument does not fit the robot, or no sample is valid.
+        ProblemError, ModelError: An argument does not fit the machine, or no sample is valid.
     """
-    checked_instance("robot", robot, Robot)
+    if isinstance(machine, Robot):
+        machine = FixedBase(machine)
+    if not isinstance(machine, FixedBase | FreeFloating | Standing):
+        words = f"machine must be a robot on a fixed, floating or standing base, not {machine!r}"
+        raise ProblemError(words, name="machine", value=machine)
     checked_instance("trajectory", trajectory, RawTrajectory)
-    checked_choice("base", base, ("fixed", "standing", "floating"))
-    checked_nonnegative("share", share)
-    if path_tolerance is None:
-        path_tolerance = default_tolerance(np.zeros((1, 3)) if path is None else path.positions)
-    checked_positive("path_tolerance", path_tolerance)
-    for name, value in (("path_angle", path_angle), ("friction", friction)):
-        if not real(value) > 0:  # infinity is allowed
-            raise ProblemError(f"{name} must be a number above 0, not {value!r}", name=name, value=value, limit=0.0)
-    notes: list[str] = []
-    bounds = bounds_of(robot, velocity, acceleration, jerk, torque, notes)
+    robot, limits = machine.robot, checked_instance("limits", Limits() if limits is None else limits, Limits)
+    bounds = limits.bounds(machine)
+    notes = [
+        f"the robot gives {', '.join(names)} a {quantity} limit of 0: treated as none"
+        for quantity in ("velocity", "torque")
+        if (names := unknown_limits(robot, quantity))
+    ]
     progress("reading")
-    if time_unit is not None:
-        trajectory = replace(trajectory, t=trajectory.t * _seconds(time_unit))
-    cleaned = clean_trajectory(trajectory, robot, *bounds[:3], time_unit is not None, unwrap)
-    if rule is not None:
-        checked_choice("rule", rule, get_args(Rule))
-        cleaned = replace(cleaned, motion=cleaned.motion.by(rule))
+    trajectory = replace(trajectory, t=trajectory.t * interpretation.seconds)
+    unit_known = interpretation.time_unit is not None
+    cleaned = clean_trajectory(trajectory, robot, bounds, unit_known=unit_known, unwrap=interpretation.unwrap)
+    if interpretation.rule is not None:
+        cleaned = replace(cleaned, motion=cleaned.motion.by(interpretation.rule))
     motion, complete = cleaned.motion, len(cleaned.joints) == robot.dof
     rows: list[Row] = []
     faults, unchecked = list(cleaned.faults), []
@@ -235,51 +275,54 @@ def check_trajectory(
         check_time()
 
     progress("limits")
-    limit_table, limit_faults, unlimited_orders = limit_rows(motion, robot, cleaned.joints, bounds, share)
+    limit_table, limit_faults, unlimited_orders = limit_rows(
+        motion, robot, cleaned.joints, bounds, share=tolerances.share
+    )
     add((limit_table, limit_faults))
     unchecked += unlimited_orders
-    add(_efforts(cleaned, robot, bounds, share))
+    add(effort_rows(cleaned, robot, bounds, tolerances.share))
     if not complete:
         unchecked.append("torques, clearance and the tip, because joints are missing")
     else:
-        gravity = np.asarray(gravity, dtype=float)
-        pose = (
-            np.asarray(translation, dtype=float),
-            np.asarray(np.eye(3) if rotation is None else rotation, dtype=float),
-        )
-        machine = _machine_of(robot, cleaned, base, pose, gravity, foot, notes)
         bases = None
-        if base == "floating":
+        if isinstance(machine, FreeFloating):
             progress("momentum")
+            if cleaned.base is not None and cleaned.base.shape[1] != machine.base_size:
+                words = (
+                    f"the file gives {cleaned.base.shape[1]} entries of the base, the machine has {machine.base_size}"
+                )
+                raise ProblemError(words, name="base", value=cleaned.base.shape[1], limit=machine.base_size)
             bases, base_rows, base_faults = floating_base_rows(machine, motion, cleaned.base)
             add((base_rows, base_faults))
-        elif base == "standing":
+        elif isinstance(machine, Standing):
             progress("ground")
-            add(standing_rows(machine, motion, friction))
+            add(standing_rows(machine, motion, limits.friction))
         if robot.total_mass == 0:
             unchecked.append("torques, because the robot has no masses")
         else:
             progress("torques")
-            add(torque_rows(motion, machine, bounds, gravity, share, check_time))
+            add(torque_rows(motion, machine, bounds, tolerances.share))
         if path is not None:
             progress("path")
-            add(path_rows(machine, motion, bases, path, path_tolerance, path_angle))
+            default = default_tolerance(path.positions)
+            tolerance = default if tolerances.tip_distance is None else tolerances.tip_distance
+            add(path_rows(machine, motion, bases, path, tolerance=tolerance, angle=tolerances.tip_angle))
         progress("clearance")
-        if clearance is None:
+        if scene is False:
             unchecked.append("clearance, as requested")
         elif not any(link.collisions for link in robot.links):
             unchecked.append("clearance, because the robot has no collision shapes")
         else:
-            unchecked += _missing_meshes(robot, folders) if missing == "skip" else []
-            wide, others = with_wide_limits(machine, motion), tuple(obstacles)
-            scene = CollisionScene(wide, others, clearance, tuple(ignored), srdf, tuple(folders), missing)
-            add(clearance_rows(scene, motion, bases if others else None))
+            place: Scene = checked_instance("scene", Scene() if scene is None else scene, Scene)
+            unchecked += _missing_meshes(robot, place.folders) if place.missing == "skip" else []
+            collisions = CollisionScene(with_wide_limits(machine, motion), **vars(place))
+            add(clearance_rows(collisions, motion, bases if collisions.obstacles else None))
     suspicions: list[Fault] = []
-    if time_unit is None and not any(fault.kind == "units" and fault.name == "time" for fault in faults):
+    if not unit_known and not any(fault.kind == "units" and fault.name == "time" for fault in faults):
         suspicions += doubtful_times(motion, bounds.velocity[cleaned.joints])
-    if not names_confirmed:
-        suspicions += exchanged_joints(motion, robot, cleaned.joints, complete and base != "floating")
-    unlimited = _unlimited(rows)
+    if not interpretation.names_confirmed:
+        is_fixed = complete and not isinstance(machine, FreeFloating)
+        suspicions += exchanged_joints(motion, robot, cleaned.joints, is_fixed)
     faults.sort(key=lambda fault: FAULT_ORDER.get(fault.kind, len(FAULT_ORDER)))
     return Check(
         trajectory.file,
@@ -291,42 +334,11 @@ def check_trajectory(
         tuple(rows),
         tuple(faults),
         tuple(suspicions),
-        unlimited,
+        _unlimited(rows),
         tuple(unchecked),
         (*cleaned.notes, *notes),
         cleaned,
     )
-
-
-def _seconds(time_unit: str | float) -> float:
-    """Return a time unit in s."""
-    if isinstance(time_unit, str):
-        return UNITS[checked_choice("time_unit", time_unit, ("s", "ms", "us", "ns"))]
-    return checked_positive("time_unit", time_unit)
-
-
-def _machine_of(
-    robot: Robot,
-    cleaned: CleanedTrajectory,
-    base: BaseKind,
-    pose: tuple[Array, Array],
-    gravity: Array,
-    foot: Support | None,
-    notes: list[str],
-) -> Any:
-    """Return the robot on its base."""
-    if base == "floating":
-        planar = cleaned.base is not None and cleaned.base.shape[1] == 3
-        return FreeFloating(robot, "planar" if planar else "spatial")
-    translation, rotation = pose
-    if base == "fixed":
-        return FixedBase(robot, translation, rotation)
-    if foot is None:
-        contact = footprint(robot, q=cleaned.motion.q[0], rotation=rotation)
-        foot, translation = contact.support, contact.translation
-        notes.append(f"it stands on {', '.join(contact.links)}")
-    down = -float(gravity[2])
-    return Standing(robot=robot, translation=translation, rotation=rotation, support=foot, gravity=down)
 
 
 def _missing_meshes(robot: Robot, folders: Sequence[str | Path]) -> list[str]:
@@ -334,65 +346,6 @@ def _missing_meshes(robot: Robot, folders: Sequence[str | Path]) -> list[str]:
     shapes = [(link.name, shape) for link in robot.links for shape in link.collisions if shape.kind == "mesh"]
     names = [name for name, shape in shapes if find_mesh(shape.file, shape.folder or None, folders) is None]
     return [f"clearance of {', '.join(dict.fromkeys(names))}, whose meshes are missing"] if names else []
-
-
-def bounds_of(
-    robot: Robot,
-    velocity: Limit = None,
-    acceleration: Limit = None,
-    jerk: Limit = None,
-    torque: Limit = None,
-    notes: list[str] | None = None,
-) -> JointBounds:
-    """Return the limits of the joint vector: the given ones, else the robot's own.
-
-    A limit of 0 in the robot's description means none; it is added to `notes`.
-    """
-    free = np.full(robot.dof, np.inf)
-    limits = {}
-    for quantity, own, override in (
-        ("velocity", robot.velocity, velocity),
-        ("acceleration", free, acceleration),
-        ("jerk", free, jerk),
-        ("torque", robot.effort, torque),
-    ):
-        values = own.copy()
-        if notes is not None and (names := unknown_limits(robot, quantity)):
-            notes.append(f"the robot gives {', '.join(names)} a {quantity} limit of 0: treated as none")
-        by_name = override if isinstance(override, Mapping) else {} if override is None else {"": override}
-        for name, value in checked_mapping(quantity, by_name).items():
-            if not real(value) > 0:
-                words = f"{quantity} of {name or 'all joints'} must be a number above 0, not {value!r}"
-                raise ProblemError(words, name=quantity, value=value, limit=0.0)
-            if name and name not in robot.joint_names:
-                raise unknown_name(f"joint in {quantity}", name, robot.joint_names)
-        for k, name in enumerate(robot.joint_names):
-            values[k] = by_name.get(name, by_name.get("", values[k]))
-        limits[quantity] = values
-    return JointBounds(robot.lower, robot.upper, power=free, **limits)
-
-
-def _efforts(
-    cleaned: CleanedTrajectory, robot: Robot, bounds: JointBounds, share: float
-) -> tuple[list[Row], list[Fault]]:
-    """Check the torques in the file, at its samples."""
-    rows: list[Row] = []
-    faults: list[Fault] = []
-    if cleaned.efforts is None:
-        return rows, faults
-    for column, joint in enumerate(cleaned.joints):
-        name = robot.joint_names[joint]
-        unit, limit = robot.joint(name).effort_unit, float(bounds.torque[joint])
-        k = int(np.abs(cleaned.efforts[:, column]).argmax())
-        value, time = float(cleaned.efforts[k, column]), float(cleaned.motion.t[k])
-        failed = abs(value) > limit * (1 + share)
-        verdict = RowVerdict.FAILED if failed else RowVerdict.OK if np.isfinite(limit) else RowVerdict.UNLIMITED
-        row_limit = limit if np.isfinite(limit) else None
-        rows.append(Row(f"given torque of {name}", value, row_limit, unit, time, verdict, "as given in the file"))
-        if failed:
-            text = f"the file has {value:.5g} {unit} at {time:.6g} s, limit {limit:.5g}"
-            faults.append(Fault("torque", name, text, time, time, value, limit, unit))
-    return rows, faults
 
 
 def _unlimited(rows: Sequence[Row]) -> tuple[str, ...]:
@@ -408,3 +361,97 @@ def _unlimited(rows: Sequence[Row]) -> tuple[str, ...]:
         f"{quantity} of {'every joint' if len(names) == counts[quantity] and len(names) > 1 else ', '.join(names)}"
         for quantity, names in joints.items()
     )
+
+
+@dataclass(frozen=True, eq=False)
+class PlanVerdict:
+    """Audit and check of a plan. A plan that breaks a limit of its machine must not be run, even if its task allows it.
+
+    Attributes:
+        audit: Audit of the plan against its problem.
+        check: Check of its samples against the machine's limits of joints, velocities and torques.
+    """
+
+    audit: Audit
+    check: Check
+
+    @property
+    def passed(self) -> bool:
+        """Whether the plan is feasible, a local minimum, and within the limits of its machine."""
+        return self.audit.passed and self.check.passed
+
+    @property
+    def sentence(self) -> str:
+        """The verdict in one sentence."""
+        if not self.audit.feasible or self.check.passed:
+            return self.audit.sentence
+        first, count = self.check.faults[0], len(self.check.faults)
+        more = f"; {count - 1} more" if count > 1 else ""
+        return f"must not be run: it breaks the limits of its machine, {first}{more}"
+
+
+def verdict_of(plan: Plan, sample: PlanSample, name: str, **settings: Any) -> PlanVerdict:
+    """Return the verdict on a plan.
+
+    Args:
+        plan: The plan.
+        sample: Its samples at the times at which the limits of the machine are checked.
+        name: Name of the plan.
+        settings: Settings of the audit.
+    """
+    return PlanVerdict(plan.audit(**settings), _check(plan, sample, name))
+
+
+def _check(plan: Plan, sample: PlanSample, name: str) -> Check:
+    """Return the check of a plan between the times at which its rates jump, where no acceleration is defined."""
+    if isinstance(plan, ConsecutivePlans):
+        return _worst([_check_piece(piece, sample.t, name) for piece in plan.pieces])
+    if isinstance(plan, PathPlan):  # constant rates between waypoints
+        joints = tuple(replace(joint, effort=np.inf) for joint in plan.machine.robot.joints)
+        times = np.union1d(sample.t, plan.t)
+        robot = replace(plan.machine.robot, joints=joints)
+        return _check_samples(plan.machine, robot, (times, plan.at(times)["joints"], None, None), name)
+    values = (sample.t, sample.joints, sample.rates, sample.accelerations)
+    return _check_samples(plan.machine, plan.machine.robot, values, name)
+
+
+def _check_piece(piece: Piece, times: Array, name: str) -> Check:
+    """Return the check of one motion of consecutive ones at those of the times that it covers, and at its ends."""
+    plan, local = piece.plan, times - piece.begin
+    inside = local[(local > 0) & (local < plan.horizon)]
+    sample = plan.sampled(np.concatenate([[0.0], inside, [plan.horizon]]))
+    values = (sample.t + piece.begin, sample.joints, sample.rates, sample.accelerations)
+    return _check_samples(plan.machine, plan.machine.robot, values, name)
+
+
+def _check_samples(
+    machine: Machine, robot: Robot, values: tuple[Array, Array, Array | None, Array | None], name: str
+) -> Check:
+    """Return the check of times (M,), joints, rates and accelerations (M, n), the last two or None."""
+    raw = RawTrajectory(tuple(robot.joint_names), *values, None, np.arange(1, len(values[0]) + 1), True, (), name)
+    if not isinstance(machine, FreeFloating):  # the forces on a standing machine are those of its problem
+        frame = machine.world_from_base(())
+        position, rotation = np.array(frame.position, dtype=float).ravel(), np.array(frame.rotation, dtype=float)
+        machine = FixedBase(robot, position, rotation)
+    certain = Interpretation(time_unit="s", names_confirmed=True)
+    return check_trajectory(replace(machine, robot=robot), raw, scene=False, interpretation=certain)
+
+
+def _worst(checks: Sequence[Check]) -> Check:
+    """Return the checks of several motions as one: all faults, and the worst row of each quantity."""
+    rows: dict[str, Row] = {}
+    for row in (row for check in checks for row in check.rows):
+        if row.name not in rows or _severity(row) > _severity(rows[row.name]):
+            rows[row.name] = row
+    joined: dict[str, Any] = {
+        name: tuple(dict.fromkeys(each for check in checks for each in getattr(check, name)))
+        for name in ("suspicions", "unlimited", "unchecked", "notes", "faults")
+    }
+    samples, duration = (sum(getattr(check, name) for check in checks) for name in ("samples", "duration"))
+    return replace(checks[0], rows=tuple(rows.values()), samples=samples, duration=duration, **joined)
+
+
+def _severity(row: Row) -> tuple[bool, bool, float]:
+    """Return a key by which rows of one quantity are compared."""
+    size = abs(row.limit) if row.limit else 1.0
+    return row.verdict is RowVerdict.FAILED, row.verdict is RowVerdict.UNDECIDED, abs(row.value) / size

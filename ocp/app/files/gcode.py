@@ -37,7 +37,7 @@ from ocp.app.files.gcode_words import (
     read_blocks,
 )
 from ocp.app.files.program import Cut, Note, Pause, Program, Rapid, Section, checked_reversal
-from ocp.app.files.text_files import FileName, line_error, read_lines
+from ocp.app.files.safe_files import FileName, line_error, read_lines
 from ocp.errors import ProblemError, checked_choice, checked_flag, checked_positive
 
 __all__ = ["read_gcode"]
@@ -163,7 +163,7 @@ class _Reader:
 
     def _refuse(self, why: str, limit: Any = None) -> NoReturn:
         """Raise ProblemError for the current line."""
-        raise line_error(self.file, self.block.number, self.block.text, why, limit)
+        raise line_error(self.file, self.block.number, self.block.text, why, limit=limit)
 
     def _note(self, text: str) -> None:
         """Note something about the current line."""
@@ -381,7 +381,8 @@ class _Reader:
         if radius is not None:
             if center_words:
                 self._refuse("the arc has both a radius R and a centre; remove one")
-            center = center_from_radius(start[in_plane], target[in_plane], radius * unit, clockwise, gap)
+            ends = start[in_plane], target[in_plane]
+            center = center_from_radius(*ends, radius * unit, clockwise=clockwise, gap=gap)
         else:
             if center_words.pop(plane[2], 0.0) != 0.0:
                 self._refuse(f"{OFFSETS[plane[2]]} is not in the plane of {code_name(self.plane)}; remove it")
@@ -393,7 +394,8 @@ class _Reader:
                 whole[i] = value
             center = (whole + (self.offset if self.absolute_centers else self.position))[in_plane]
         self.position = target
-        self._add(arcs_about_center(start, target, center, clockwise, int(turns), plane, gap), target)
+        arcs = arcs_about_center(start, target, center, clockwise=clockwise, turns=int(turns), plane=plane, gap=gap)
+        self._add(arcs, target)
 
     def _add(self, segments: Sequence[Segment], reached: Array) -> None:
         """Append segments at the current feed."""

@@ -23,7 +23,7 @@ from models.files import INPUT_LIMITS
 from models.paths import Arc, Helix
 from models.paths.segments import SHORTEST_SEGMENT
 from models.spatial import FULL_TURN
-from ocp.app.files.text_files import FileName, line_error
+from ocp.app.files.safe_files import FileName, line_error
 from ocp.tolerances import STANDSTILL
 
 __all__ = [
@@ -64,7 +64,7 @@ class ArcError(Exception):
         self.why, self.size, self.limit = why, size, limit
 
 
-def center_from_radius(start: Array, end: Array, radius: float, clockwise: bool, gap: float) -> Array:
+def center_from_radius(start: Array, end: Array, radius: float, *, clockwise: bool, gap: float) -> Array:
     """Return the centre, shape (2,), m, of an arc in its plane; a negative radius selects the longer arc.
 
     Raises:
@@ -83,7 +83,7 @@ def center_from_radius(start: Array, end: Array, radius: float, clockwise: bool,
 
 
 def arcs_about_center(
-    start: Array, end: Array, center: Array, clockwise: bool, turns: int, plane: tuple[int, int, int], gap: float
+    start: Array, end: Array, center: Array, *, clockwise: bool, turns: int, plane: tuple[int, int, int], gap: float
 ) -> list[Arc | Helix]:
     """Return arcs or helices from start to end: one, or two halves if no single centre serves both ends.
 

@@ -17,7 +17,7 @@ from typing import IO, Any
 import numpy as np
 
 from models.files import INPUT_LIMITS, open_regular
-from ocp.app.files.text_files import missing_package
+from ocp.app.files.safe_files import missing_package
 from ocp.errors import ProblemError, checked_instance, checked_text
 from ocp.motion.plan import Plan
 from ocp.storage import write_whole
@@ -78,7 +78,7 @@ def write_mcap(plan: Plan, file: str | os.PathLike[str], period: float = 0.01, *
 
     def write(stream: IO[bytes]) -> None:
         writer: Any = Writer(stream)
-        writer.add_metadata("selfmotion", {})  # at the start of the file, where `outputs` looks for it
+        writer.add_metadata("selfmotion", {})  # at the start of the file, where `checked_output` reads it
         if np.isfinite(sample.tip).all():
             poses = [
                 {

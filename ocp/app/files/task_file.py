@@ -76,15 +76,13 @@ from models import Path as ToolPath
 from models.arrays import Array
 from models.shapes.shapes import Shape
 from models.spatial import rotation_from_rpy
-from ocp.app.files.outputs import SUFFIXES, checked_output
-from ocp.app.files.text_files import FileName
+from ocp.app.files.safe_files import SUFFIXES, FileName, checked_output
 from ocp.app.files.toml_table import REQUIRED, TomlTable, read_toml
 from ocp.app.files.waypoints import read_waypoints
 from ocp.errors import NOT_NUMBERS, ProblemError, floats
 from ocp.motion.schedule import LineLimits, schedule
-from ocp.motion.tasks.cost import Cost
+from ocp.motion.tasks.goals import Cost, Scene
 from ocp.motion.tasks.limits import Limits
-from ocp.motion.tasks.scene import Scene
 from ocp.motion.tasks.tip_task import TipTask
 
 __all__ = ["OUTPUTS", "Task", "obstacles_of", "read_obstacles", "read_task", "rotation_of"]

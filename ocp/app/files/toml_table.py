@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from models.files import INPUT_LIMITS
-from ocp.app.files.text_files import FileName, checked_depth, line_error, read_lines
+from ocp.app.files.safe_files import FileName, checked_depth, line_error, read_lines
 from ocp.errors import NOT_NUMBERS, ProblemError, floats, real
 
 __all__ = ["TomlTable", "read_toml"]
@@ -31,7 +31,7 @@ class TomlTable:
         place: Keys and indices that lead from the root to the table.
     """
 
-    def __init__(self, file: str, texts: Sequence[str], lines: dict[Place, int], place: Place, values: Any) -> None:
+    def __init__(self, file: str, values: Any, *, place: Place, texts: Sequence[str], lines: dict[Place, int]) -> None:
         self.file, self.place = file, place
         self._texts, self._lines, self._values = texts, lines, values
         self._read_names: list[str] = []
@@ -150,7 +150,11 @@ class TomlTable:
     def table(self, name: str, expected: str = "a table", default: Any = None) -> TomlTable | None:
         """Return a table within this one, or None if it is missing."""
         values = self._read(name, default, expected, lambda value: isinstance(value, dict))
-        return None if values is None else TomlTable(self.file, self._texts, self._lines, (*self.place, name), values)
+        return None if values is None else self._inner(values, name)
+
+    def _inner(self, values: Any, *place: Any) -> TomlTable:
+        """Return the table of these values at a place within this one."""
+        return TomlTable(self.file, values, place=(*self.place, *place), texts=self._texts, lines=self._lines)
 
     def tables(self, name: str) -> list[TomlTable]:
         """Return the tables under [[name]]."""
@@ -160,10 +164,7 @@ class TomlTable:
             f"tables, each headed [[{name}]]",
             lambda value: isinstance(value, list) and all(isinstance(values, dict) for values in value),
         )
-        return [
-            TomlTable(self.file, self._texts, self._lines, (*self.place, name, k), values)
-            for k, values in enumerate(tables)
-        ]
+        return [self._inner(values, name, k) for k, values in enumerate(tables)]
 
     def only(self, *names: str) -> None:
         """Reject entries with other names than these, before any is read.
@@ -203,7 +204,7 @@ def read_toml(file: FileName) -> TomlTable:
         # the time of the parser grows quadratically with the parts of a name
         if any(part.count(".") > INPUT_LIMITS.nesting for part in BETWEEN.split(text)):
             why = f"a name has more than {INPUT_LIMITS.nesting} parts"
-            raise line_error(file, number, text, why, INPUT_LIMITS.nesting)
+            raise line_error(file, number, text, why, limit=INPUT_LIMITS.nesting)
     try:
         values = checked_depth(tomllib.loads("\n".join(texts)))
     except tomllib.TOMLDecodeError as error:
@@ -213,7 +214,7 @@ def read_toml(file: FileName) -> TomlTable:
         raise line_error(file, number, texts[number - 1], f"invalid TOML: {why}; write name = value") from error
     except (RecursionError, ValueError) as error:  # ValueError: also for numbers with more digits than Python accepts
         raise ProblemError(f"{file} is not valid TOML: {error}", name="file", value=str(file)) from error
-    return TomlTable(str(file), texts, _places(texts), (), values)
+    return TomlTable(str(file), values, place=(), texts=texts, lines=_places(texts))
 
 
 def _places(texts: Sequence[str]) -> dict[Place, int]:

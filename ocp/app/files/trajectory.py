@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from models.arrays import Array
 from ocp.app.files.mcap import read_joint_messages
-from ocp.app.files.text_files import FileName, children_of, is_number, line_error, read_lines, read_tree, split_cells
+from ocp.app.files.safe_files import FileName, children_of, is_number, line_error, read_lines, read_tree, split_cells
 from ocp.errors import NOT_NUMBERS, ProblemError, checked_choice, checked_each, checked_positive, checked_text
 from ocp.storage import table_joints
 
@@ -173,7 +173,7 @@ def _numbers(file: FileName, rows: list[str], numbers: list[int], delimiter: str
                 cells.pop()
             if len(cells) != width:
                 why = f"{len(cells)} columns, the header has {width}; complete the row"
-                raise line_error(file, number, row, why, width)
+                raise line_error(file, number, row, why, limit=width)
     try:
         return np.array(split, dtype=float)
     except ValueError:

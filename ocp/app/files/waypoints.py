@@ -30,7 +30,7 @@ from models.paths import Line, split_at_reversals
 from models.paths.path import Reversal
 from models.paths.segments import SHORTEST_SEGMENT, product, rotation_vector
 from ocp.app.files.program import DEFAULT_TOLERANCE_M, checked_reversal, smoothed
-from ocp.app.files.text_files import FileName, is_number, line_error, read_lines, split_cells
+from ocp.app.files.safe_files import FileName, is_number, line_error, read_lines, split_cells
 from ocp.errors import ProblemError, checked_choice, checked_each, checked_positive
 
 __all__ = ["Waypoints", "read_waypoints"]
@@ -112,7 +112,7 @@ class Waypoints:
                 lines.append(Line(self.positions[last], self.positions[i], *ends))
             except ModelError as error:
                 why = f"from line {self.lines[last]} to here {error}"
-                raise line_error(self.file, int(self.lines[i]), self._description(i), why, error.limit) from error
+                raise line_error(self.file, int(self.lines[i]), self._description(i), why, limit=error.limit) from error
             last = i
         if not lines:
             message = f"{self.file}: all waypoints are at one place; a path needs two distinct ones"
@@ -161,7 +161,7 @@ class Waypoints:
             turn = float(np.linalg.norm(rotation_vector(self.orientations[last], self.orientations[i])))
         if turn > ROUNDING:
             why = f"the tool turns by {np.degrees(turn):.4g} deg in place; turn it along the path, or drop the line"
-            raise line_error(self.file, int(self.lines[i]), self._description(i), why, ROUNDING)
+            raise line_error(self.file, int(self.lines[i]), self._description(i), why, limit=ROUNDING)
 
     def _description(self, i: int) -> str:
         return f"waypoint {i} at {self.positions[i].tolist()} m"
@@ -323,7 +323,9 @@ def _table(file: FileName, rows: list[tuple[int, str, list[str]]], used: Sequenc
     table = np.zeros((len(rows), width))
     for i, (number, text, cells) in enumerate(rows):
         if len(cells) < width or any(cells[width:]):
-            raise line_error(file, number, text, f"{len(cells)} columns, expected {width}; complete the row", width)
+            raise line_error(
+                file, number, text, f"{len(cells)} columns, expected {width}; complete the row", limit=width
+            )
         for k in range(width):
             if used[k]:
                 try:
@@ -345,7 +347,7 @@ def _quaternions(file: FileName, values: Array, lines: NDArray[np.intp], texts: 
     if invalid.any():
         i = int(invalid.argmax())
         why = f"the quaternion has the norm {norm[i]:.6g}; give a unit quaternion"
-        raise line_error(file, int(lines[i]), texts[i], why, norm_tolerance)
+        raise line_error(file, int(lines[i]), texts[i], why, limit=norm_tolerance)
     return np.asarray(values / norm[:, None])
 
 

@@ -19,35 +19,24 @@ from models.machines.standing import center_of_pressure
 from models.robot.dynamics import GRAVITY
 from ocp.app.check.data_checks import clean_trajectory
 from ocp.app.check.joint_limits import Row, audit_rows, floating_torques, integrate_base
-from ocp.app.check.plan_verdict import PlanVerdict, verdict_of
-from ocp.app.check.verdict import bounds_of
+from ocp.app.check.verdict import PlanVerdict, verdict_of
 from ocp.app.files import RawTrajectory
-from ocp.app.view.pictures import Obstacle, obstacles_of, obstacles_of_plan
+from ocp.app.view.appearance import Obstacle, obstacles_of, obstacles_of_plan
 from ocp.audit.audit import Audit
 from ocp.audit.clearance import closest_pairs_along
 from ocp.errors import ProblemError, unknown_name
 from ocp.motion.plan import Plan
-from ocp.motion.tasks.limits import JointBounds
+from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.motion.tasks.targets import Target
 from ocp.problem.formulation import Formulation
 from ocp.problem.values import Sampler
 from ocp.solution import Solution, match_order
 
 __all__ = [
-    "PAGE_SETTINGS",
-    "Animation",
-    "ClosestPairs",
-    "Curve",
-    "GroundContact",
-    "PageSettings",
-    "animate_plan",
-    "animate_solution",
-    "animate_trajectory",
-    "cumulative_integral",
-    "ground_contact",
-    "joint_curves",
-    "machine_curves",
-]
+    "PAGE_SETTINGS", "Animation", "ClosestPairs", "Curve", "GroundContact", "MotionSamples", "PageSettings",
+    "animate_plan", "animate_solution", "animate_trajectory", "cumulative_integral", "ground_contact",
+    "joint_curves", "machine_curves",
+]  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +59,25 @@ class Curve:
     upper: float = np.inf
 
 
+class MotionSamples(NamedTuple):
+    """Samples of a motion at M times.
+
+    Attributes:
+        t: s. Shape (M,).
+        joints, rates: Shape (M, n).
+        accelerations: Shape (M, n), or None if the motion is not smooth enough.
+        base: Shape (M, base_size).
+        base_rates: Shape (M, base_size), or None if they are unknown.
+    """
+
+    t: Array
+    joints: Array
+    rates: Array
+    accelerations: Array | None
+    base: Array
+    base_rates: Array | None
+
+
 @dataclass(frozen=True, eq=False)
 class GroundContact:
     """Contact of a standing machine with the ground.
@@ -85,18 +93,16 @@ class GroundContact:
     forces: bool
 
 
-def joint_curves(
-    machine: Machine, bounds: JointBounds, joints: Array, rates: Array, accelerations: Array | None
-) -> list[Curve]:
-    """Return curves of positions, velocities and torques of all joints, shape (M, n) each, with their limits."""
+def joint_curves(machine: Machine, bounds: JointBounds, samples: MotionSamples) -> list[Curve]:
+    """Return curves of positions, velocities and torques of all joints with their limits."""
     robot, curves = machine.robot, []
-    torques = None if accelerations is None else _torques(machine, joints, rates, accelerations)
+    torques = _torques(machine, samples)
     torque_group = "Torques, without external forces" if isinstance(machine, Standing) else "Torques"
     for k, joint in enumerate(robot.moving_joints):
-        curves.append(Curve("Joints", joint.name, joint.unit, joints[:, k], bounds.lower[k], bounds.upper[k]))
+        curves.append(Curve("Joints", joint.name, joint.unit, samples.joints[:, k], bounds.lower[k], bounds.upper[k]))
     for k, joint in enumerate(robot.moving_joints):
         limit = float(bounds.velocity[k])
-        curves.append(Curve("Joint velocities", joint.name, f"{joint.unit}/s", rates[:, k], -limit, limit))
+        curves.append(Curve("Joint velocities", joint.name, f"{joint.unit}/s", samples.rates[:, k], -limit, limit))
     for k, joint in enumerate(robot.moving_joints if torques is not None else ()):
         assert torques is not None
         limit = float(bounds.torque[k])
@@ -104,10 +110,10 @@ def joint_curves(
     return curves
 
 
-def _torques(machine: Machine, joints: Array, rates: Array, accelerations: Array) -> Array | None:
-    """Return torques by inverse dynamics, shape (M, n); None for a robot without masses."""
+def _torques(machine: Machine, samples: MotionSamples) -> Array | None:
+    """Return torques by inverse dynamics, shape (M, n); None without accelerations or masses."""
     robot = machine.robot
-    if robot.total_mass == 0:
+    if samples.accelerations is None or robot.total_mass == 0:
         return None
     q, v, a = (ca.SX.sym(name, robot.dof) for name in ("q", "v", "a"))
     if isinstance(machine, FreeFloating):
@@ -116,13 +122,14 @@ def _torques(machine: Machine, joints: Array, rates: Array, accelerations: Array
         gravity = getattr(machine, "gravity_in_world", GRAVITY)
         frame = machine.world_from_base(())
         torque = inverse_dynamics(simplify(robot), q, v, a, (), gravity, frame)
-    torques: Array = Sampler([q, v, a], [torque])(joints, rates, accelerations)[0]
+    torques: Array = Sampler([q, v, a], [torque])(samples.joints, samples.rates, samples.accelerations)[0]
     return torques
 
 
-def machine_curves(machine: Machine, base: Array, joints: Array, rates: Array, base_rates: Array | None) -> list[Curve]:
+def machine_curves(machine: Machine, samples: MotionSamples) -> list[Curve]:
     """Return curves of manipulability and tip speed, and of the momentum of a floating machine with base rates."""
     robot, curves = machine.robot, []
+    base, joints, rates, base_rates = samples.base, samples.joints, samples.rates, samples.base_rates
     b, q, v = ca.SX.sym("b", machine.base_size), ca.SX.sym("q", robot.dof), ca.SX.sym("v", robot.dof)
     if robot.tip is not None:
         rows = range(6) if robot.dof >= 6 else range(3, 6) if robot.dof >= 3 else (3, 4)
@@ -151,13 +158,13 @@ def machine_curves(machine: Machine, base: Array, joints: Array, rates: Array, b
 
 
 def ground_contact(
-    machine: Standing, joints: Array, rates: Array, accelerations: Array, inside: Sequence[Curve] = ()
+    machine: Standing, samples: MotionSamples, inside: Sequence[Curve] = ()
 ) -> tuple[GroundContact, list[Curve]]:
     """Return the zero moment points and a curve of their distance from the edge of the foot.
 
     Args:
         machine: The machine.
-        joints, rates, accelerations: Shape (M, n) each.
+        samples: Samples of the motion, with accelerations.
         inside: Distances inside each edge, up to a constant margin, from a problem that includes external forces.
             Without them the external forces are unknown.
     """
@@ -175,7 +182,9 @@ def ground_contact(
             return GroundContact(corners, points, True), [margin]
     q, v, a = (ca.SX.sym(name, machine.joint_size) for name in ("q", "v", "a"))
     point = center_of_pressure(machine.ground_reaction(q, v, a))
-    points, margins = Sampler([q, v, a], [point, machine.support.margin(point)])(joints, rates, accelerations)
+    points, margins = Sampler([q, v, a], [point, machine.support.margin(point)])(
+        samples.joints, samples.rates, samples.accelerations
+    )
     name = "zero moment point from the edge of the foot, without external forces"
     return GroundContact(corners, points, False), [Curve("Standing", name, "m", margins[:, 0], 0.0)]
 
@@ -278,7 +287,6 @@ def animate_plan(plan: Plan, name: str = "plan", **settings: Any) -> Animation:
     if len(parts) == 1:
         solution, _, solution_times = parts[0]
         own_curves = _problem_curves(solution, solution_times / solution.horizon, solution_times)
-    derivatives = sample.joints, sample.rates, sample.accelerations
     details: dict[str, Any] = {
         "closest": _closest_pairs(plan.solved_parts(times_of_pairs), plan.horizon),
         "obstacles": tuple(obstacles_of_plan(plan, times)),
@@ -287,7 +295,8 @@ def animate_plan(plan: Plan, name: str = "plan", **settings: Any) -> Animation:
     }
     details |= _audited([part[0] for part in parts], lambda: verdict_of(plan, sample, name, **settings))
     base_rates = np.gradient(base, times, axis=0, edge_order=2) if base.shape[1] else base
-    return _animation(name, plan.machine, times, base, *derivatives, base_rates, own_curves, **details)
+    samples = MotionSamples(times, sample.joints, sample.rates, sample.accelerations, base, base_rates)
+    return _animation(name, plan.machine, samples, own_curves, **details)
 
 
 def animate_solution(
@@ -338,7 +347,8 @@ def animate_solution(
     details["closest"] = _closest_pairs([(solution, "", times_of_pairs)], solution.horizon)
     smooth = _torque_like(solution, joints)
     own_curves = _problem_curves(solution, fractions, times)
-    return _animation(name, machine, times, base_path, q, v, a if smooth else None, base_rates, own_curves, **details)
+    samples = MotionSamples(times, q, v, a if smooth else None, base_path, base_rates)
+    return _animation(name, machine, samples, own_curves, **details)
 
 
 def animate_trajectory(raw: RawTrajectory, machine: Machine, name: str = "") -> Animation:
@@ -348,8 +358,7 @@ def animate_trajectory(raw: RawTrajectory, machine: Machine, name: str = "") -> 
         ProblemError: The trajectory lacks joints of the machine, or has no valid sample.
     """
     robot = machine.robot
-    bounds = bounds_of(robot)
-    cleaned = clean_trajectory(raw, robot, bounds.lower, bounds.upper, bounds.velocity)
+    cleaned = clean_trajectory(raw, robot, Limits().bounds(machine))
     if len(cleaned.joints) < robot.dof:
         missing = [joint for k, joint in enumerate(robot.joint_names) if k not in cleaned.joints]
         words = f"{raw.file} does not move {missing}; lock them: --lock {missing[0]}=VALUE"
@@ -368,7 +377,8 @@ def animate_trajectory(raw: RawTrajectory, machine: Machine, name: str = "") -> 
         else:
             base_rates = _between(begin + times, motion.t, np.gradient(base_path, motion.t, axis=0))
         base = _between(begin + times, motion.t, base_path)
-    return _animation(name or raw.file, machine, times, base, joints, rates, accelerations, base_rates, [])
+    samples = MotionSamples(times, joints, rates, accelerations, base, base_rates)
+    return _animation(name or raw.file, machine, samples, [])
 
 
 def _between(times: Array, t: Array, values: Array) -> Array:
@@ -377,38 +387,27 @@ def _between(times: Array, t: Array, values: Array) -> Array:
 
 
 def _animation(
-    name: str,
-    machine: Machine,
-    t: Array,
-    base: Array,
-    joints: Array,
-    rates: Array,
-    accelerations: Array | None,
-    base_rates: Array | None,
-    own_curves: Sequence[Curve],
-    **details: Any,
+    name: str, machine: Machine, samples: MotionSamples, own_curves: Sequence[Curve], **details: Any
 ) -> Animation:
     """Return a motion with the curves that every motion has."""
-    effort = cumulative_integral(t, (rates**2).sum(axis=1) / 2)
+    t, relative = samples.t, PAGE_SETTINGS.same_cost
+    effort = cumulative_integral(t, (samples.rates**2).sum(axis=1) / 2)
     curves = [Curve("Cost", "integral of half the squared joint velocities", "", effort)]
     costs = [one for one in own_curves if one.group == "Cost"]
-    curves += [
-        one for one in costs if abs(one.values[-1] - effort[-1]) > PAGE_SETTINGS.same_cost * max(abs(effort[-1]), 1e-12)
-    ]
-    curves += machine_curves(machine, base, joints, rates, base_rates)
+    curves += [one for one in costs if abs(one.values[-1] - effort[-1]) > relative * max(abs(effort[-1]), 1e-12)]
+    curves += machine_curves(machine, samples)
     closest = details.get("closest")
     if closest is not None:
         distances = np.interp(t, closest.t, closest.distances)
         curves.append(Curve("The motion", "closest two bodies", "m", distances, float(closest.required.min())))
     footing = None
-    if isinstance(machine, Standing) and accelerations is not None:
-        footing, more = ground_contact(
-            machine, joints, rates, accelerations, [one for one in own_curves if one.group == ZMP_CONSTRAINT]
-        )
+    if isinstance(machine, Standing) and samples.accelerations is not None:
+        inside = [one for one in own_curves if one.group == ZMP_CONSTRAINT]
+        footing, more = ground_contact(machine, samples, inside)
         curves += more
-    curves += joint_curves(machine, bounds_of(machine.robot), joints, rates, accelerations)
+    curves += joint_curves(machine, Limits().bounds(machine), samples)
     curves += _margins([one for one in own_curves if one.group != "Cost"])
-    return Animation(name, machine, t, joints, base, tuple(curves), footing=footing, **details)
+    return Animation(name, machine, t, samples.joints, samples.base, tuple(curves), footing=footing, **details)
 
 
 def _times(horizon: float) -> Array:

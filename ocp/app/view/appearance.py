@@ -1,4 +1,4 @@
-"""Surfaces of a robot's links, their frames along a motion, and the colours of all pictures.
+"""Surfaces of robots and obstacles, their frames along a motion, and the colours of all pictures.
 
 A link is shown by its visual shapes, or without them by its collision shapes. A mesh that is not found is reported and
 replaced by the collision shapes. These are transparent if the description gives other links visual shapes and this one
@@ -9,18 +9,26 @@ The colours are distinguishable with every kind of colour vision (Okabe, Ito 200
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from models import CollisionShape, Machine, ModelError, Robot, link_frames
+from models import CollisionShape, HalfSpace, Machine, ModelError, MovingObstacle, Robot, link_frames
 from models.arrays import Array
+from models.shapes.hull import convex_hull
 from models.shapes.mesh_files import Triangles, find_mesh, join_meshes, read_painted_mesh, without_colors
+from models.shapes.shapes import Shape
+from ocp.audit.clearance import separation_frames
+from ocp.motion.plan import Plan
+from ocp.motion.result.path_plan import PathPlan
+from ocp.problem.hulls import Separation
+from ocp.problem.problem import Problem
 from ocp.problem.values import Sampler
+from ocp.solution import Solution
 
 __all__ = [
     "COMPARED",
@@ -33,12 +41,15 @@ __all__ = [
     "TIP_FRAME",
     "Appearance",
     "Frames",
+    "Obstacle",
     "Part",
+    "Solid",
     "SurfaceStyle",
     "appearance_of",
-    "chain",
     "frames_along",
-    "frames_function",
+    "obstacles_of",
+    "obstacles_of_plan",
+    "obstacles_of_shapes",
     "part_of",
     "rod",
 ]
@@ -294,17 +305,21 @@ def part_of(link: str, vertices: Array, faces: NDArray[np.intp], color: Any) -> 
 
 PLAN = "#0072B2"
 """Colour of the plan, or of the main motion."""
+
 COMPARED = "#D55E00"
 """Colour of motions compared with it: the pseudo-inverse, the method of a paper, another plan."""
+
 LIMIT = "#6E6E6E"
 """Colour of limits; dashed."""
+
 FAULT = "#CC79A7"
 """Colour of violations."""
+
 TIP = "#009E73"
 """Colour of the tip path."""
+
 SCENE = "#6E6E6E"
 """Colour of obstacles."""
-
 
 TIP_FRAME = "the tip frame"
 """Key of the tip among the frames; no drawn link can have this name."""
@@ -328,35 +343,6 @@ class Frames:
         return self.positions[TIP_FRAME]
 
 
-def frames_function(machine: Machine) -> Callable[[Any, Any], Frames]:
-    """Return `frames_along` as a function of (joints, base), to be evaluated many times."""
-    robot = machine.robot
-    q, b = ca.SX.sym("q", robot.dof), ca.SX.sym("b", machine.base_size)
-    frames_of_links = link_frames(robot, q, machine.world_from_base(b))
-    names = [*frames_of_links]
-    entries = [ca.vertcat(ca.vec(frame.rotation), frame.position) for frame in frames_of_links.values()]
-    if robot.tip is not None:
-        tip = machine.tip_pose(b, q)
-        entries.append(ca.vertcat(ca.vec(tip.rotation), tip.position))
-        names.append(TIP_FRAME)
-    sampler = Sampler([b, q], [ca.densify(ca.SX(ca.vertcat(*entries)))])
-
-    def frames(joints: Any, base: Any) -> Frames:
-        angles = np.atleast_2d(np.asarray(joints, dtype=float))
-        count = len(angles)
-        place = np.zeros((count, 0)) if base is None else np.atleast_2d(np.asarray(base, dtype=float))
-        if angles.shape[1] != robot.dof or place.shape != (count, machine.base_size):
-            raise ModelError(
-                f"joints and base of the shapes {angles.shape}, {place.shape} do not fit {robot.dof} joints "
-                f"{list(robot.joint_names)} and a base of {machine.base_size} entries"
-            )
-        values = sampler(place, angles)[0].reshape(count, len(names), 12)
-        rotations = {name: values[:, i, :9].reshape(-1, 3, 3).transpose(0, 2, 1) for i, name in enumerate(names)}
-        return Frames(rotations, {name: values[:, i, 9:] for i, name in enumerate(names)})
-
-    return frames
-
-
 def frames_along(machine: Machine, joints: Any, base: Any = None) -> Frames:
     """Return the frames of all links, and of the tip if the robot has one.
 
@@ -368,9 +354,126 @@ def frames_along(machine: Machine, joints: Any, base: Any = None) -> Frames:
     Raises:
         ModelError: A size is wrong.
     """
-    return frames_function(machine)(joints, base)
+    robot = machine.robot
+    angles = np.atleast_2d(np.asarray(joints, dtype=float))
+    count = len(angles)
+    place = np.zeros((count, 0)) if base is None else np.atleast_2d(np.asarray(base, dtype=float))
+    if angles.shape[1] != robot.dof or place.shape != (count, machine.base_size):
+        raise ModelError(
+            f"joints and base of the shapes {angles.shape}, {place.shape} do not fit {robot.dof} joints "
+            f"{list(robot.joint_names)} and a base of {machine.base_size} entries"
+        )
+    q, b = ca.SX.sym("q", robot.dof), ca.SX.sym("b", machine.base_size)
+    frames = link_frames(robot, q, machine.world_from_base(b))
+    if robot.tip is not None:
+        frames = {**frames, TIP_FRAME: machine.tip_pose(b, q)}
+    entries = [ca.vertcat(ca.vec(frame.rotation), frame.position) for frame in frames.values()]
+    values = Sampler([b, q], [ca.densify(ca.SX(ca.vertcat(*entries)))])(place, angles)[0].reshape(count, -1, 12)
+    rotations = {name: values[:, i, :9].reshape(-1, 3, 3).transpose(0, 2, 1) for i, name in enumerate(frames)}
+    return Frames(rotations, {name: values[:, i, 9:] for i, name in enumerate(frames)})
 
 
-def chain(robot: Robot) -> list[str]:
-    """Return the links from the root to the tip, and TIP_FRAME: the arm as a polyline."""
-    return [robot.root, *(joint.child for joint in robot.path_to(robot.tip_link)), TIP_FRAME]
+Solid = tuple[Array, NDArray[np.intp]]
+"""Corners (k, 3), m, and triangles as their indices (f, 3)."""
+
+
+class Obstacle(NamedTuple):
+    """A body, the convex hull of points inflated by a radius, or a half-space.
+
+    Attributes:
+        core: Points. Shape (k, 3), m; for a half-space one point of its plane.
+        radius: m.
+        normal: Outward normal of a half-space, shape (3,); otherwise None.
+        rotations, positions: Frame of the body in world at the times of a motion, shapes (M, 3, 3) and (M, 3), m; None
+            if it is static, with points in world.
+    """
+
+    core: Array
+    radius: float = 0.0
+    normal: Array | None = None
+    rotations: Array | None = None
+    positions: Array | None = None
+
+    def solid(self, points: Array) -> Solid:
+        """Return the surface in the body's own frame; for a half-space a square near points (k, 3)."""
+        if self.normal is None:
+            offsets = np.zeros((1, 3))
+            if self.radius > 0:
+                u, v = np.meshgrid(np.linspace(0, 2 * np.pi, 13)[:-1], np.linspace(-np.pi / 2, np.pi / 2, 7))
+                unit = np.stack([np.cos(v) * np.cos(u), np.cos(v) * np.sin(u), np.sin(v)], axis=-1)
+                offsets = self.radius * unit.reshape(-1, 3)
+            hull = convex_hull((np.asarray(self.core)[:, None] + offsets).reshape(-1, 3))
+            return np.asarray(hull.vertices), hull.faces
+        low, high = points.min(axis=0), points.max(axis=0)
+        middle = (low + high) / 2
+        middle = middle - self.normal * (self.normal @ (middle - self.core[0]))
+        side = np.cross(self.normal, np.eye(3)[int(np.abs(self.normal).argmin())])
+        side /= np.linalg.norm(side)
+        sides = SURFACE_STYLE.patch * float(np.linalg.norm(high - low)) * np.stack([side, np.cross(self.normal, side)])
+        return middle + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) @ sides, np.array([[0, 1, 2], [0, 2, 3]])
+
+
+def obstacles_of_shapes(shapes: Iterable[Shape]) -> list[Obstacle]:
+    """Return static obstacles of shapes in world."""
+    return [
+        Obstacle(np.asarray(shape.point, dtype=float)[None], 0.0, np.asarray(shape.normal, dtype=float))
+        if isinstance(shape, HalfSpace)
+        else Obstacle(np.asarray(shape.core), shape.swept_radius)
+        for shape in shapes
+    ]
+
+
+def obstacles_of(parts: Sequence[tuple[Solution, str, Array]]) -> list[Obstacle]:
+    """Return the obstacles in the problems of solutions.
+
+    A moving obstacle is attached to a frame that depends on time but on no state.
+
+    Args:
+        parts: Parts of a motion in sequence: a solution, whose problem declares the separations; the suffix of the
+            names of its states, "" for a single part; and the times in the solution, shape (K,), s, to evaluate.
+    """
+    static: dict[str, Obstacle] = {}
+    moving: dict[str, list[tuple[Any, Array, Array]]] = {}
+    for solution, suffix, times in parts:
+        problem = solution.problem
+        if problem is None:
+            continue
+        placements: list[tuple[Separation, Any]] | None = None
+        for separation in problem.declared.apart.values():
+            if not all(name.endswith(suffix) for name in separation.movers):
+                continue
+            frames_of_hulls = {hull.frame for hull in separation.hulls.values()}
+            moving_frames = [frame for frame in frames_of_hulls if _moves(problem, separation, frame)]
+            for name, hull in separation.hulls.items():
+                if hull.frame < 0:
+                    static[name] = Obstacle(hull.core, hull.radius, hull.normal if hull.normal.size else None)
+                elif hull.frame in moving_frames:
+                    if placements is None:
+                        placements = separation_frames(problem, solution, times, suffix)
+                    frames = next(frames for one, frames in placements if one is separation)
+                    poses = frames.rotations[:, hull.frame], frames.positions[:, hull.frame]
+                    moving.setdefault(name, []).append((hull, *poses))
+    obstacles = list(static.values())
+    for segments in moving.values():
+        hull = segments[0][0]
+        rotations, positions = (np.concatenate([segment[k] for segment in segments]) for k in (1, 2))
+        if len(positions) == sum(len(times) for *_, times in parts):
+            obstacles.append(Obstacle(hull.core, hull.radius, None, rotations, positions))
+    return obstacles
+
+
+def obstacles_of_plan(plan: Plan, times: Array) -> list[Obstacle]:
+    """Return the obstacles of a plan at increasing times (M,), s."""
+    if isinstance(plan, PathPlan):
+        obstacles = () if plan.constraints is None else plan.constraints.scene.obstacles
+        return obstacles_of_shapes(shape for shape in obstacles if not isinstance(shape, MovingObstacle))
+    return obstacles_of(plan.solved_parts(times))
+
+
+def _moves(problem: Problem, separation: Separation, frame: int) -> bool:
+    """Return whether a frame moves by time alone."""
+    if frame < 0:
+        return False
+    rows = separation.placements[12 * frame : 12 * frame + 12]
+    states = ca.vertcat(*(ca.vec(state.symbol) for state in problem.declared.states.values()))
+    return bool(ca.depends_on(rows, problem.time)) and not ca.depends_on(rows, states)

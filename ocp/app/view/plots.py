@@ -6,7 +6,8 @@ displays them, and `figure.savefig` writes them. A figure of pyplot can be passe
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import io
+from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
 
@@ -15,19 +16,148 @@ from matplotlib.figure import Figure
 
 from models.arrays import Array
 from ocp.app.check.interpolation import Motion
-from ocp.app.view.pictures import STYLE, add_legend, as_svg, draw_joints, draw_limits, line_style
+from ocp.app.view.appearance import COMPARED, FAULT, LIMIT, PLAN
 from ocp.app.view.rendering import PICTURE_STYLE
 from ocp.errors import ProblemError, checked_instance
 from ocp.motion.local.accelerations import AccelerationSolution
 from ocp.motion.local.rates import LocalSolution
 from ocp.motion.result.plan import Plan
 from ocp.motion.schedule.trajectory import JointTrajectory
-from ocp.motion.tasks.limits import Limits
+from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.problem.formulation import Formulation
 from ocp.solution import Solution
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = ["Picture", "html_of_plan", "html_of_solution", "plot_plan", "plot_solution"]
+__all__ = [
+    "STYLE",
+    "Picture",
+    "add_legend",
+    "as_svg",
+    "draw_curves",
+    "draw_joints",
+    "draw_limits",
+    "html_of_plan",
+    "html_of_solution",
+    "line_style",
+    "plot_plan",
+    "plot_solution",
+]
+
+STYLE: Any = {"font.size": 7.5, "axes.titlesize": 8.5, "axes.spines.top": False, "axes.spines.right": False}
+"""Settings of matplotlib."""
+
+STYLE |= {"text.parse_math": False}  # a joint's name may contain a dollar
+
+DASHES: tuple[Any, ...] = ((0, (1, 1)), (0, (5, 1.5)), (0, (4, 1.2, 1, 1.2)))
+"""Line styles of the motions compared with a plan, so that colour is not the only distinction."""
+
+
+def draw_curves(
+    motion: Motion, bounds: JointBounds, *, names: Sequence[str], units: Sequence[str], faults: Sequence[Any] = ()
+) -> str:
+    """Return an SVG of position, velocity and acceleration of every joint with its limits and faults."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(PICTURE_STYLE.width, 0.4 + 1.15 * len(names)), layout="constrained")
+    draw_joints(figure, {"": motion}, bounds, names=names, units=units, faults=faults)
+    return as_svg(figure)
+
+
+def draw_joints(
+    figure: Any,
+    motions: Mapping[str, Motion],
+    bounds: JointBounds,
+    *,
+    names: Sequence[str],
+    units: Sequence[str],
+    faults: Sequence[Any] = (),
+) -> None:
+    """Draw position, velocity and acceleration of every joint over time into an empty figure, with limits and faults.
+
+    The first of several motions is the plan; the others are compared with it.
+    """
+    import matplotlib
+
+    kinds = [("position", ""), ("velocity", "/s"), ("acceleration", "/s²")]
+    with matplotlib.rc_context(STYLE):
+        grid: Any = figure.subplots(len(names), 3, squeeze=False, sharex=True)
+        for column, (kind, per) in enumerate(kinds):
+            samples = []
+            for number, motion in reversed([*enumerate(motions.values())]):  # the plan last, on top
+                own_times = motion.t[:: len(motion.t) // PICTURE_STYLE.curve_points + 1]
+                times = np.unique(
+                    np.concatenate([np.linspace(motion.t[0], motion.t[-1], PICTURE_STYLE.curve_points), own_times])
+                )
+                quantity = motion.quantity(kind)
+                samples.append((number, times, None if quantity is None else quantity.pieces.at(times)))
+            limit = getattr(bounds, kind, None)
+            lower, upper = (bounds.lower, bounds.upper) if limit is None else (-limit, limit)
+            min_range = PICTURE_STYLE.flat * max(
+                (np.abs(values).max() for _, _, values in samples if values is not None), default=1.0
+            )
+            grid[0, column].set_title(kind)
+            for row, name in enumerate(names):
+                ax = grid[row, column]
+                for number, times, values in samples:
+                    if values is not None:
+                        ax.plot(times, values[:, row], **line_style(number))
+                draw_limits(ax, lower[row], upper[row], min_range)
+                for fault in faults:
+                    if fault.name == name and fault.kind == kind and fault.time is not None:
+                        ax.axvline(fault.time, color=FAULT, lw=1.6)
+                ax.set_ylabel(f"{name if column == 0 else ''}\n{units[row]}{per}", fontsize=7)
+                ax.margins(x=0.01)
+        for ax in grid[-1]:
+            ax.set_xlabel("time, s")
+        if len(motions) > 1:
+            add_legend(figure, list(motions))
+
+
+def draw_limits(ax: Any, lower: float, upper: float, min_range: float) -> None:
+    """Draw the limits of the curves in an axes: dashed if they are close, as text if they are far.
+
+    Curves with a range smaller than `min_range` are drawn as constant.
+    """
+    low, high = ax.dataLim.y0, ax.dataLim.y1
+    if not np.isfinite([low, high]).all():
+        low = high = 0.0
+    span = max(high - low, min_range) or 1.0
+    distant = []
+    for limit in (lower, upper):
+        if low - PICTURE_STYLE.limit_distance * span <= limit <= high + PICTURE_STYLE.limit_distance * span:
+            ax.axhline(limit, color=LIMIT, lw=0.9, ls=(0, (5, 2)))
+            low, high = min(low, limit), max(high, limit)
+        elif np.isfinite(limit):
+            distant.append(f"{limit:.3g}")
+    if distant:
+        words = f"limit{'s' if len(distant) > 1 else ''} {', '.join(distant)}"
+        ax.annotate(words, (0.99, 0.97), xycoords="axes fraction", ha="right", va="top", color=LIMIT, fontsize=6)
+    margin = max(0.06 * (high - low), 0.55 * (span - (high - low)))
+    ax.set_ylim(low - margin, high + margin + (0.1 * span if distant else 0.0))
+
+
+def line_style(number: int) -> dict[str, Any]:
+    """Return the line style of a plan, number 0, or of a motion compared with it."""
+    return {"color": PLAN, "lw": 1.4} if number == 0 else {"color": COMPARED, "lw": 1.1, "ls": DASHES[number % 3]}
+
+
+def add_legend(figure: Any, names: Sequence[str]) -> None:
+    """Add a legend below a figure: the name of the plan, and those of the motions compared with it."""
+    from matplotlib.lines import Line2D
+
+    lines = [Line2D([], [], **line_style(number)) for number in range(len(names))]
+    figure.legend(lines, names, loc="outside lower center", ncols=len(names), frameon=False, fontsize=8)
+
+
+def as_svg(figure: Any) -> str:
+    """Return a figure as an `svg` element for a page."""
+    import matplotlib
+
+    stream = io.StringIO()
+    with matplotlib.rc_context({"svg.hashsalt": "selfmotion"}):
+        figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
+    text = stream.getvalue()
+    return text[text.index("<svg") :]
 
 
 class Picture(Figure):
@@ -35,9 +165,6 @@ class Picture(Figure):
 
     def _repr_svg_(self) -> str:
         return as_svg(self)
-
-
-# ---- plans -------------------------------------------------------------------------------------------------------
 
 
 def plot_plan(plan: Plan, against: Any = None, figure: Any = None) -> Any:
@@ -61,7 +188,7 @@ def plot_plan(plan: Plan, against: Any = None, figure: Any = None) -> Any:
     target = _figure(figure, (PICTURE_STYLE.width, 0.9 + 1.15 * len(names)))
     robot = plan.machine.robot
     units = [joint.unit for joint in robot.moving_joints]
-    draw_joints(target, motions, names, units, Limits().bounds(plan.machine))
+    draw_joints(target, motions, Limits().bounds(plan.machine), names=names, units=units)
     costs = "".join(f", that of {name} {cost:.4g}" for name, (_, cost) in others.items() if cost is not None)
     target.suptitle(f"{robot.name}: cost {plan.cost:.4g} in {plan.horizon:.4g} s{costs}", fontsize=9.5)
     return target
@@ -113,9 +240,6 @@ def _compared(name: str, other: Any, names: tuple[str, ...]) -> tuple[Motion, fl
         )
         raise ProblemError(words, name="against", value=joints, limit=names)
     return motion, cost
-
-
-# ---- solutions ---------------------------------------------------------------------------------------------------
 
 
 def plot_solution(solution: Solution, against: Any = None, figure: Any = None) -> Any:
@@ -234,9 +358,6 @@ def _bounds(solution: Solution) -> tuple[dict[str, Array], dict[str, str]]:
     for kind, pool in (("state", form.states), ("control", form.controls)):
         bounds |= {name: both[:, form.bounds.places[kind]][:, place] for name, place in pool.items()}
     return bounds, form.units
-
-
-# ---- both --------------------------------------------------------------------------------------------------------
 
 
 def _named(against: Any) -> dict[str, Any]:

@@ -95,7 +95,7 @@ class Camera(NamedTuple):
 
     @classmethod
     def around(
-        cls, points: Any, size: tuple[int, int], elevation: float = 22.0, azimuth: float = -58.0, room: float = 0.04
+        cls, points: Any, size: tuple[int, int], elevation: float = 22.0, azimuth: float = -58.0, *, room: float = 0.04
     ) -> Camera:
         """Return the closest camera with a given direction of view that sees all points (k, 3), m; angles in degrees.
 

@@ -6,6 +6,7 @@ The page loads nothing from another host.
 from __future__ import annotations
 
 import base64
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
@@ -14,18 +15,32 @@ from typing import Any
 import numpy as np
 
 from models import Machine
+from models.arrays import Array
 from ocp.app.check.interpolation import Motion
 from ocp.app.check.joint_limits import Row, RowVerdict, audit_rows
-from ocp.app.check.plan_verdict import verdict_of
-from ocp.app.check.verdict import Check, bounds_of
-from ocp.app.view.pictures import Obstacle, draw_curves, draw_scene, obstacles_of_plan
+from ocp.app.check.verdict import Check, verdict_of
+from ocp.app.view.appearance import (
+    PLAN,
+    SCENE,
+    TIP,
+    Obstacle,
+    appearance_of,
+    frames_along,
+    obstacles_of_plan,
+    obstacles_of_shapes,
+    part_of,
+)
+from ocp.app.view.plots import draw_curves
+from ocp.app.view.rendering import PICTURE_STYLE, Camera, Floor, Layer, parts_in_world, render, tube
 from ocp.motion.plan import Plan
-from ocp.motion.tasks.limits import JointBounds
+from ocp.motion.tasks.goals import Scene
+from ocp.motion.tasks.limits import JointBounds, Limits
 
-__all__ = ["Report", "report_of_check", "report_of_plan"]
+__all__ = ["Report", "draw_scene", "report_of_check", "report_of_plan"]
 
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 """Content security policy of the page: no script runs, and nothing is loaded."""
+
 STYLE = """
 :root { color-scheme: light dark; --ink: #1b1f24; --paper: #fff; --soft: #f3f5f7; --line: #d5dae0;
   --good: #00734f; --bad: #b23b00 }
@@ -124,19 +139,18 @@ def _table(rows: Sequence[Row]) -> str:
     return f"<div class=scroll><table>{head}<th></th><th></th></tr>{''.join(lines)}</table></div>"
 
 
-def report_of_check(
-    check: Check, machine: Machine, bounds: JointBounds, obstacles: Sequence[Obstacle] = (), folders: Sequence[Any] = ()
-) -> Report:
-    """Return the report of a check, with the limits of the check."""
+def report_of_check(check: Check, machine: Machine, limits: Limits, scene: Scene) -> Report:
+    """Return the report of a check with these limits and this scene."""
     motion, robot = check.cleaned.motion, machine.robot
     complete = len(check.joints) == robot.dof
     base_path = check.cleaned.base if machine.base_size else None
     if machine.base_size and base_path is None:
         base_path = np.repeat(machine.base_home()[None], len(motion.t), axis=0)
     columns = check.cleaned.joints
-    own_bounds = JointBounds(*(item[columns] for item in bounds))
+    bounds = JointBounds(*(item[columns] for item in limits.bounds(machine)))
     units = [robot.joint(name).unit for name in check.joints]
-    picture = draw_scene(machine, motion, base_path, obstacles, folders) if complete else b""
+    obstacles = obstacles_of_shapes(scene.obstacles)
+    picture = draw_scene(machine, motion, base_path, obstacles, folders=scene.folders) if complete else b""
     limited = [row for row in check.rows if row.verdict is not RowVerdict.UNLIMITED]
     return Report(
         f"{check.file} for {robot.name}",
@@ -145,7 +159,7 @@ def report_of_check(
         (f"{check.samples} samples", f"{check.duration:.5g} s", f"{len(check.joints)} joints", f"{check.rule} between"),
         tuple(str(fault) for fault in check.faults),
         picture,
-        draw_curves(motion, check.joints, units, own_bounds, check.faults),
+        draw_curves(motion, bounds, names=check.joints, units=units, faults=check.faults),
         (("Checked quantities", tuple(limited)),),
         (
             *(f"unlimited: {item}" for item in check.unlimited),
@@ -162,7 +176,7 @@ def report_of_plan(plan: Plan, period: float, title: str) -> Report:
     motion = Motion(sample.t, sample.joints, sample.rates, sample.accelerations)
     verdict = verdict_of(plan, sample, title)
     audit, check = verdict.audit, verdict.check
-    bounds = bounds_of(robot)
+    bounds = Limits().bounds(machine)
     base_path = plan.at(sample.t)["base"] if machine.base_size else None
     units = [joint.unit for joint in robot.moving_joints]
     cost = f"cost {plan.cost:.5g}" + ("" if plan.bound is None else f", none below {plan.bound:.5g}")
@@ -174,7 +188,50 @@ def report_of_plan(plan: Plan, period: float, title: str) -> Report:
         (robot.name, f"{plan.horizon:.5g} s", f"{robot.dof} joints", cost, f"{len(plan.candidates)} candidates"),
         tuple(str(fault) for fault in check.faults),
         draw_scene(machine, motion, base_path, obstacles_of_plan(plan, sample.t)),
-        draw_curves(motion, plan.names, units, bounds, check.faults),
+        draw_curves(motion, bounds, names=plan.names, units=units, faults=check.faults),
         (("The audit", tuple(audit_rows(audit))), (f"Samples every {period:g} s against the limits", tuple(limited))),
         tuple(f"unlimited: {one}" for one in check.unlimited),
     )
+
+
+def draw_scene(
+    machine: Machine, motion: Motion, bases: Array | None, obstacles: Sequence[Obstacle], *, folders: Sequence[Any] = ()
+) -> bytes:
+    """Return a PNG of the robot at several times (the last one solid), its tip path, and obstacles.
+
+    Moving obstacles are drawn at the final time; `obstacles` has them at uniform times of the motion.
+    """
+    from matplotlib.colors import to_rgb
+    from matplotlib.image import imsave
+
+    times = np.linspace(motion.t[0], motion.t[-1], PICTURE_STYLE.curve_points)
+    base = None if bases is None else np.column_stack([np.interp(times, motion.t, column) for column in bases.T])
+    frames = frames_along(machine, motion.position.at(times), base)
+    appearance = appearance_of(machine.robot, folders)
+    poses = [
+        parts_in_world(appearance, frames, int(k))
+        for k in np.linspace(0, PICTURE_STYLE.curve_points - 1, PICTURE_STYLE.poses)
+    ]
+    points = [part.vertices for parts in poses for part in parts]
+    robot_points, static = np.vstack(points), []
+    for obstacle in obstacles:
+        corners, faces = obstacle.solid(robot_points)
+        if obstacle.rotations is not None and obstacle.positions is not None:
+            corners = corners @ obstacle.rotations[-1].T + obstacle.positions[-1]
+        static.append(part_of("", corners, faces, (*to_rgb(SCENE), 1.0)))
+        if obstacle.normal is None:
+            points.append(corners)
+    if machine.robot.tip is not None:
+        points.append(frames.tip)
+    all_points = np.vstack(points)
+    low, high = all_points.min(axis=0), all_points.max(axis=0)
+    size = float((high - low).max())
+    if machine.robot.tip is not None:
+        static.append(tube(frames.tip, PICTURE_STYLE.line * size, to_rgb(TIP)))
+    transparent = [Layer(parts, 0.12 + 0.08 * k, to_rgb(PLAN)) for k, parts in enumerate(poses[:-1])]
+    floor = None if machine.base_size else Floor(low[2], tuple((low + high)[:2] / 2), 1.1 * size, 0.1)
+    layers = [Layer(poses[-1]), Layer(static), *transparent]
+    picture = render(layers, Camera.around(all_points, PICTURE_STYLE.size), floor=floor)
+    stream = io.BytesIO()
+    imsave(stream, picture, format="png")
+    return stream.getvalue()

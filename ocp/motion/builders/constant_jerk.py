@@ -30,14 +30,13 @@ import numpy as np
 from models import FixedBase
 from models.arrays import Array
 from ocp.curves import PiecewisePolynomial
-from ocp.errors import SolveError
-from ocp.motion.builders.actuator_limits import joint_torques
+from ocp.errors import SolveError, SolverStatus
+from ocp.motion.builders.torques import joint_torques
 from ocp.motion.tasks.limits import JointBounds
 from ocp.problem.formulation import Formulation
 from ocp.problem.problem import Problem
 from ocp.problem.values import Sampler
 from ocp.solution import Solution
-from ocp.status import SolverStatus
 from ocp.tolerances import ROUNDING_SHARE
 
 __all__ = [
@@ -180,7 +179,7 @@ class ConstantJerkMotion:
         at = (breaks[:-1, None] + np.diff(breaks)[:, None] * (nodes + 1) / 2).ravel()
         shares = (np.diff(breaks)[:, None] * weights / 2).ravel()
         running = form.sampled([form.running], state_curve(at), control_curve(at), at * horizon, horizon, p)[0][:, 0]
-        final = form.terminal_cost(rows[-1], rows[0], controls[0], horizon, p)
+        final = form.terminal_cost(rows[-1], rows[0], controls[0], horizon=horizon, p=p)
         columns = {name: slice(*entries.indices(form.nx)) for name, entries in form.states.items()}
         return Solution(
             name=problem.name,

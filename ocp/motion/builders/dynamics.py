@@ -1,4 +1,4 @@
-"""Point-to-point and tool motions of fixed and free-floating arms within actuator limits.
+"""Joint torques, and motions of fixed and free-floating arms within actuator limits.
 
 Joint accelerations (or jerks) are the control. The joint torques follow from inverse dynamics,
 
@@ -8,28 +8,36 @@ with viscous friction d and Coulomb friction c, smoothed below the speed w. A fl
 as the joints make it move, and the torques are those of the joints alone. No mass matrix is inverted, and torque limits
 are ordinary path constraints (Featherstone 2008, chapter 5; Betts 2010, section 4.10).
 
-Motions through waypoints, and motions with changing loads, are :class:`~ocp.problem.phases.Phases` of such problems,
-see `ocp.motion.builders.dynamics_plan`.
+`ocp.motion.builders.dynamics_plan` declares motions to several goals, and with changing loads, as phases.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import casadi as ca
 import numpy as np
 
-from models import FreeFloating, Robot, find_wheels
+from models import Robot, find_wheels
 from models.arrays import Array
 from models.robot.dynamics import Wrench
 from models.spatial import quaternion_product
 from ocp.console import interruptible
-from ocp.errors import NOT_NUMBERS, ProblemError, checked_choice, checked_each, checked_instance, floats
-from ocp.motion.builders.actuator_limits import JointFriction, Motors, checked_motors, joint_torques
+from ocp.errors import NOT_NUMBERS, ProblemError, checked_choice, checked_each, checked_instance, floats  # fmt: skip
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.standing.problem import FreeTime, declare_horizon
+from ocp.motion.builders.torques import (
+    JointFriction,
+    Motors,
+    checked_motors,
+    joint_torques,
+    limit_torques,
+    positive_power,
+    running_cost,
+)
 from ocp.motion.tasks.checks import (
     check_length,
     check_rest,
@@ -37,11 +45,10 @@ from ocp.motion.tasks.checks import (
     checked_horizon,
     checked_tasks,
     clip_to_limits,
-    nonnegative_each,
     rates_at_rest,
-)
-from ocp.motion.tasks.cost import Cost
+)  # fmt: skip
 from ocp.motion.tasks.equations import TaskEquations, bind
+from ocp.motion.tasks.goals import Cost
 from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.problem import Problem, remembers_request
@@ -139,16 +146,16 @@ def dynamics_problem(
     if equations is not None:
         if free:
             raise ProblemError("tasks fix the time: give a horizon in s, not a free one", name="horizon")
-        ends = ends.ending_with(equations)
+        if ends.rests[1]:
+            ends = replace(ends, last_rates=rates_at_rest(equations, ends.base, ends.end))
 
     problem = Problem("dynamics", setup.symbols)
     final = declare_horizon(problem, horizon)
     motion = _declare_motion(problem, machine, ends, bounds, duration, control)
     if setup.end_base is not None:
         _declare_end_base(problem, machine, motion.base, setup.end_base)
-    torques = joint_torques(
-        machine, *motion[:4], friction=setup.friction, wrenches=setup.wrenches, gravity=setup.gravity
-    )
+    loads: dict[str, Any] = {"friction": setup.friction, "wrenches": setup.wrenches, "gravity": setup.gravity}
+    torques = joint_torques(machine, *motion[:4], **loads)
     running = _declare_actuators(problem, machine, motion, torques, bounds, cost)
     if equations is not None:
         _declare_tasks(problem, equations, ends, motion, duration)
@@ -187,19 +194,17 @@ class _Ends:
     def take(
         cls, machine: Motors, bounds: JointBounds, joints: tuple[Any, Any], velocities: tuple[Any, Any], base: Any
     ) -> _Ends:
-        robot, n, hint = machine.robot, machine.joint_size, "keep within them, or leave that end free with nan"
+        names, n, hint = machine.robot.joint_names, machine.joint_size, "keep within them, or leave that end free: nan"
         first, last = (
-            clip_to_limits(name, robot.joint_names, _checked_end(name, value, n), bounds.lower, bounds.upper, hint)
+            clip_to_limits(name, names, _checked_end(name, value, n), bounds.lower, bounds.upper, hint)
             for name, value in zip(("start", "end"), joints, strict=True)
         )
         first_rates, last_rates = (
-            clip_to_limits(
-                name, robot.joint_names, end_velocities(name, value, n), -bounds.velocity, bounds.velocity, hint
-            )
+            clip_to_limits(name, names, end_velocities(name, value, n), -bounds.velocity, bounds.velocity, hint)
             for name, value in zip(("start_velocity", "end_velocity"), velocities, strict=True)
-        )  # fmt: skip
+        )
         known = np.clip(np.where(np.isnan(first), np.nan_to_num(last), first), bounds.lower, bounds.upper)
-        free = _is_free(base)
+        free = base is not None and bool(np.isnan(_checked_end("start_base", base, machine.base_size)).all())
         _, home = checked_configuration(machine, known, None if free else base)
         rests = bool((first_rates == 0).all()), bool((last_rates == 0).all())
         return cls(first, last, first_rates, last_rates, rests, home, joints[0] is None or free, known)
@@ -208,11 +213,6 @@ class _Ends:
     def end(self) -> Array:
         """Return the end of the joints' guess. Shape (n,)."""
         return np.where(np.isnan(self.last), self.start, self.last)
-
-    def ending_with(self, equations: TaskEquations) -> _Ends:
-        """Return these ends with the velocities that the tasks require of joints that rest at the end."""
-        rates = rates_at_rest(equations, self.base, self.end)
-        return replace(self, last_rates=rates) if self.rests[1] else self
 
     def quintic(self, duration: float, order: int) -> Any:
         """Return the quintic rest-to-rest motion of the joints, or a derivative, as a function of time."""
@@ -275,31 +275,11 @@ def _declare_actuators(
     problem: Problem, machine: Motors, motion: _Motion, torques: Any, bounds: JointBounds, cost: Cost
 ) -> Any:
     """Declare the limits of torque and power, and return the running cost."""
-    n, limited = machine.joint_size, np.flatnonzero(np.isfinite(bounds.torque)).tolist()
-    if limited:
-        largest = bounds.torque[limited]
-        problem.path("torques", torques[limited], lower=-largest, upper=largest, unit=machine.robot.effort_unit)
-    running = ca.dot(ca.DM(nonnegative_each("cost: acceleration", cost.acceleration, n)), motion.second**2)
-    if cost.velocity:
-        running += ca.dot(ca.DM(cost.joint_weights(n)), motion.rates**2) / 2
-    running += cost.jerk * ca.sumsqr(motion.jerks)
-    if cost.turning and isinstance(machine, FreeFloating):
-        spin = [k for k, row in enumerate(machine.twist_rows) if row < 3]
-        running += cost.turning * ca.sumsqr(machine.base_twist(motion.base, motion.joints, motion.rates)[spin])
-    running += ca.dot(ca.DM(nonnegative_each("cost: effort", cost.effort, n)), torques**2)
+    limit_torques(problem, machine.robot, torques, bounds.torque)
+    running = running_cost(machine, cost, motion[:4], jerks=motion.jerks, torques=torques)
     if cost.energy or np.isfinite(bounds.power).any():
-        power = problem.control("power", n, lower=0.0, upper=bounds.power, unit="W")
-        problem.path("power", power - torques * motion.rates, lower=0.0, unit="W")
-        running += cost.energy * ca.sum1(power)
+        running += cost.energy * positive_power(problem, torques * motion.rates, bounds)
     return running
-
-
-def _is_free(base: Any) -> bool:
-    """Return whether a configuration of the base is free: given, and all nan."""
-    try:
-        return base is not None and bool(np.isnan(floats(base)).all())
-    except NOT_NUMBERS:
-        return False
 
 
 def _checked_end(name: str, value: Any, n: int) -> Array:
@@ -310,14 +290,11 @@ def _checked_end(name: str, value: Any, n: int) -> Array:
     """
     if value is None:
         return np.full(n, np.nan)
-    try:
+    with suppress(*NOT_NUMBERS):
         numbers = floats(value).reshape(-1)
-    except NOT_NUMBERS as error:
-        raise ProblemError(f"{name} must be {n} numbers, not {value!r}", name=name, value=value) from error
-    if numbers.shape != (n,) or np.isinf(numbers).any():
-        words = f"{name} must be {n} numbers, nan where free, not {numbers.tolist()}"
-        raise ProblemError(words, name=name, value=numbers, limit=n)
-    return numbers
+        if numbers.shape == (n,) and not np.isinf(numbers).any():
+            return numbers
+    raise ProblemError(f"{name} must be {n} numbers, nan where free, not {value!r}", name=name, value=value, limit=n)
 
 
 def _wheel_scales(robot: Robot, bounds: JointBounds, duration: float) -> Array:
@@ -337,11 +314,7 @@ def _wheel_scales(robot: Robot, bounds: JointBounds, duration: float) -> Array:
 
 
 def end_velocities(name: str, value: Any, n: int) -> Array:
-    """Return joint velocities at an end, nan where free. Shape (n,).
-
-    Raises:
-        ProblemError: The value is neither "rest" nor "free" nor n numbers.
-    """
+    """Return joint velocities at an end, nan where free, shape (n,); ProblemError unless numbers, "rest" or "free"."""
     if isinstance(value, str):
         return np.full(n, 0.0 if checked_choice(name, value, ("rest", "free")) == "rest" else np.nan)
     if value is None:

@@ -1,9 +1,9 @@
 """Solve and audit motions within actuator limits, to one or several goals.
 
 A plan must satisfy its limits between the nodes of the mesh, too. A smooth plan of least effort needs few intervals. A
-plan of least time switches from limit to limit and gets nodes at its switches (`ocp.switching`). Where a limit is still
-exceeded between the nodes, it is tightened there (`ocp.tightening`). If that costs too much, the mesh is refined where
-the tightening is expensive: the excess of a smooth plan decreases with the square of the interval.
+plan of least time switches from limit to limit and gets nodes at its switches. Where a limit is still exceeded
+between the nodes, it is tightened there (`ocp.tightening`). If that costs too much, the mesh is refined
+where the tightening is expensive: the excess of a smooth plan decreases with the square of the interval.
 
 A motion to several goals may pick up and put down loads there. The motion to each goal is a phase with its own machine,
 declared by `dynamics_problem`. Joints and base are continuous between phases, so are the velocities if the machine does
@@ -28,7 +28,6 @@ from ocp.console import interruptible
 from ocp.direct.collocation import Collocation
 from ocp.errors import ProblemError, SolveError, checked_each, checked_instance, checked_mapping
 from ocp.methods import solve
-from ocp.motion.builders.actuator_limits import Motors, checked_motors
 from ocp.motion.builders.clearance import (
     ClearanceConstraints,
     Constraints,
@@ -38,17 +37,16 @@ from ocp.motion.builders.clearance import (
 )
 from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem
 from ocp.motion.builders.standing.problem import FreeTime
+from ocp.motion.builders.torques import Motors, checked_motors
 from ocp.motion.tasks.checks import checked_horizon
-from ocp.motion.tasks.cost import Cost
-from ocp.motion.tasks.goals import Goal
+from ocp.motion.tasks.goals import Cost, Goal
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.phases import DURATION, Phases
 from ocp.problem.problem import Problem, remembers_request
 from ocp.refinement import split
 from ocp.solution import Guess, Solution
-from ocp.switching import WARM_START_OPTIONS, solve_at_switches
-from ocp.tightening import largest_excess, tighten
+from ocp.tightening import WARM_START_OPTIONS, largest_excess, solve_at_switches, tighten
 
 __all__ = [
     "audit_error", "breaks_of", "checked_goals", "dynamics_phases", "machines_of", "phase_names", "solve_dynamics",

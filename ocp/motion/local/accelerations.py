@@ -32,9 +32,9 @@ from ocp.errors import (
 from ocp.motion.local.rates import least_rates
 from ocp.motion.tasks.checks import check_length, checked_configuration, checked_horizon, checked_numbers, checked_tasks
 from ocp.motion.tasks.equations import TaskEquations, bind
+from ocp.motion.tasks.limits import checked_point, is_finite
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.motion.tasks.tracks import on_symbols
-from ocp.motion.tasks.zmp_rules import checked_point, is_finite
 
 __all__ = [
     "AccelerationSolution", "Law", "Layer", "Stabiliser", "Stop", "accelerations", "checked_law",

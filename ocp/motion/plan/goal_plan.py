@@ -44,7 +44,7 @@ from ocp.motion.sampling.straight import StraightMotions
 from ocp.motion.search.joint_space import FULL_TURN, JointSpace
 from ocp.motion.search.search import checked_bound
 from ocp.motion.tasks.checks import checked_configuration, checked_horizon, checked_weights, clip_to_limits
-from ocp.motion.tasks.cost import Cost
+from ocp.motion.tasks.goals import Cost
 from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.problem.problem import Problem
 from ocp.solution import Solution

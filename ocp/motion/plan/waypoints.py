@@ -35,11 +35,9 @@ from ocp.motion.search.search import MAX_FREE_DIRECTIONS, AtlasSearch, SearchSet
 from ocp.motion.search.steps import Homogeneous, LargestMotion, PathLength
 from ocp.motion.search.value import shorten_path
 from ocp.motion.tasks.checks import checked_numbers
-from ocp.motion.tasks.cost import Cost
 from ocp.motion.tasks.equations import bind
-from ocp.motion.tasks.goals import Waypoints
+from ocp.motion.tasks.goals import Cost, Scene, Waypoints
 from ocp.motion.tasks.limits import Limits
-from ocp.motion.tasks.scene import Scene
 from ocp.motion.tasks.tip_task import TipTask
 
 __all__ = ["Reconfigurations", "plan_path"]

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from models import FixedBase, ModelError
 from models.arrays import Array
@@ -22,7 +22,8 @@ from ocp.motion.result.plan import Plan
 from ocp.motion.result.request import restored_request, stored_request
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.targets import Target, tip_poses
-from ocp.problem.stored import ARRAY_NAMES, RECORD_ERRORS, pack_record, unpack_record
+from ocp.problem.record_reader import ARRAY_NAMES, RECORD_ERRORS, unpack_record
+from ocp.problem.record_writer import pack_record
 from ocp.solution import Solution, read_head
 from ocp.tolerances import CLEARANCE_TOLERANCE_M
 
@@ -181,7 +182,9 @@ class PathPlan(Plan):
         """Return the largest pose errors, and the largest excess of a displacement."""
         t, tips = self.t, tip_poses(self.machine, np.zeros((len(self.joints), 0)), self.joints)
         misses = np.abs(tips[:, :3] - poses.positions)
-        turns = Rotation.from_quat(tips[:, [4, 5, 6, 3]]).inv() * Rotation.from_matrix(poses.rotations)
+        turns = scipy.spatial.transform.Rotation.from_quat(
+            tips[:, [4, 5, 6, 3]]
+        ).inv() * scipy.spatial.transform.Rotation.from_matrix(poses.rotations)
         steps = np.abs(np.diff(self.joints, axis=0)) - poses.step
         steps[list(self.reconfigurations)] = 0.0
         return [

@@ -24,8 +24,8 @@ from ocp.errors import NOT_NUMBERS, ProblemError, floats, sample_times, unknown_
 from ocp.motion.result.candidate import Candidate
 from ocp.motion.schedule.trajectory import JointTrajectory
 from ocp.motion.tasks.targets import Target, tip_poses
-from ocp.registry import call_registered
 from ocp.solution import MAX_LINES, Solution
+from ocp.solution_data import call_registered
 from ocp.storage import table_head, write_arrays, write_text
 from ocp.tolerances import LIMIT_SHARE
 

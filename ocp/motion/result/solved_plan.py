@@ -24,7 +24,8 @@ from ocp.motion.result.request import MotionRequest, machines_of_phases, request
 from ocp.motion.search.held_joints import all_joints
 from ocp.motion.tasks.targets import Target, targets_along, tip_poses
 from ocp.motion.tasks.tip_task import TipTask
-from ocp.problem.stored import ARRAY_NAMES, RECORD_ERRORS, pack_record, unpack_record
+from ocp.problem.record_reader import ARRAY_NAMES, RECORD_ERRORS, unpack_record
+from ocp.problem.record_writer import pack_record
 from ocp.solution import Solution, read_head
 
 __all__ = ["PHASED", "Part", "PhasedPlan", "SolvedPlan", "parts_of", "parts_of_phases"]

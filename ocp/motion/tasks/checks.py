@@ -14,8 +14,7 @@ from models import Joint, Machine
 from models.arrays import Array, warn_of_degrees
 from ocp.errors import NOT_NUMBERS, ProblemError, checked_positive, floats, format_distinct
 from ocp.motion.tasks.equations import TaskEquations
-from ocp.motion.tasks.geometry import BoundTask, is_holonomic, target_size
-from ocp.motion.tasks.tip_task import ANGULAR, TipTask
+from ocp.motion.tasks.tip_task import ANGULAR, BoundTask, TipTask, is_holonomic, target_size
 
 __all__ = [
     "check_closed", "check_length", "check_rest", "check_speed", "checked_configuration", "checked_horizon",

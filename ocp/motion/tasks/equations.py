@@ -21,8 +21,10 @@ from models.machines.machine import with_tip
 from models.robot.kinematics import manipulability_of
 from models.spatial import on_scalars
 from ocp.errors import ProblemError, checked_each
-from ocp.motion.tasks.geometry import (
+from ocp.motion.tasks.tip_task import (
+    ANGULAR,
     BoundTask,
+    TipTask,
     angular_velocity,
     closing_combinations,
     cross_product,
@@ -40,7 +42,6 @@ from ocp.motion.tasks.geometry import (
     target_twist,
     task_rows,
 )
-from ocp.motion.tasks.tip_task import ANGULAR, TipTask
 from ocp.motion.tasks.tracks import on_symbols, track_expression
 
 __all__ = ["TaskEquations", "bind", "task_errors"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from models.machines.standing import StandingMotion
-from ocp.motion.tasks.zmp_rules import Anywhere, IndexAtLeast, InFoot, Pinned, ZmpRule
+from ocp.motion.tasks.limits import Anywhere, IndexAtLeast, InFoot, Pinned, ZmpRule
 from scripts.papers.run import Row
 from scripts.papers.standing.cases import machine
 from scripts.papers.standing.plans import FINER, LIFT_LIMITS, LIMITS, METHOD_NAMES, Plan

@@ -14,8 +14,7 @@ from models.machines.standing import StandingMotion, standing_motion
 from ocp import Audit, Collocation, MultipleShooting, Problem, Solution, TipTask, solve, tighten
 from ocp.motion.builders.standing.problem import FreeTime, StandingSetup, Weights, standing_problem
 from ocp.motion.tasks.equations import task_errors
-from ocp.motion.tasks.limits import Limits
-from ocp.motion.tasks.zmp_rules import Anywhere, IndexAtLeast, InFoot, Pinned, ZmpRule
+from ocp.motion.tasks.limits import Anywhere, IndexAtLeast, InFoot, Limits, Pinned, ZmpRule
 from scripts.papers.run import Row, progress
 from scripts.papers.standing.cases import HORIZON, ROWS, Array, led, machine, spring, start_tip, table_task
 

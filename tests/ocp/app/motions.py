@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from models import Machine, Robot
+from ocp import Scene
+from ocp.app import Check, check_trajectory
+from ocp.app.check.joint_limits import limits_by_name
+from ocp.app.check.verdict import CheckTolerances, Interpretation
+from ocp.app.files import RawTrajectory
 
 NAMES = ("shoulder", "elbow", "wrist", "slide")
 MIDDLE, SWING = np.array([0.3, 0.8, -0.5, 0.15]), np.array([0.4, 0.3, 0.5, 0.05])
@@ -70,3 +78,20 @@ def write_table(file: Path, t: Any, q: Any, v: Any = None, a: Any = None, *, nam
     rows = np.column_stack(columns).tolist()
     file.write_text("\n".join([",".join(head), *(",".join(map(repr, row)) for row in rows)]) + "\n")
     return file
+
+
+def check_motion(machine: Machine | Robot, raw: RawTrajectory, **options: Any) -> Check:
+    """The check of a trajectory, with all limits, tolerances and interpretations as options; see check_trajectory."""
+    robot = machine if isinstance(machine, Robot) else machine.robot
+
+    def group(*names: str) -> dict[str, Any]:
+        return {name: options.pop(name) for name in names if name in options}
+
+    limits = group("velocity", "acceleration", "jerk", "torque")
+    by_name = {name: limits.pop(name) for name in [*limits] if isinstance(limits[name], dict)}
+    bounds = replace(limits_by_name(robot, by_name), **limits, **group("friction"))
+    interpretation = Interpretation(**group("rule", "time_unit", "unwrap", "names_confirmed"))
+    tolerances = CheckTolerances(**group("share", "tip_distance", "tip_angle"))
+    scene = Scene(**group("obstacles", "clearance", "ignored", "srdf", "folders", "missing"))
+    details: dict[str, Any] = {"interpretation": interpretation, "tolerances": tolerances, **options}
+    return check_trajectory(machine, raw, limits=bounds, **({"scene": scene} | details))

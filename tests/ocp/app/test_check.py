@@ -9,13 +9,12 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from models import FixedBase, FreeFloating, Robot, Sphere, Standing, inverse_dynamics
+from models import FixedBase, Robot, Sphere, inverse_dynamics
 from ocp import Plan
 from ocp.app import Check, Fault, check_trajectory
-from ocp.app.check.verdict import BaseKind
 from ocp.app.files import read_trajectory, read_waypoints
 from ocp.errors import ProblemError
-from tests.ocp.app.motions import MIDDLE, NAMES, SWING, TURNS, URDF, smooth, write_table
+from tests.ocp.app.motions import MIDDLE, NAMES, SWING, TURNS, URDF, check_motion, smooth, write_table
 
 AT = 1.7
 
@@ -24,7 +23,7 @@ def checked(folder: Path, t: Any, q: Any, v: Any = None, a: Any = None, **option
     names = options.pop("names", NAMES)
     file = write_table(folder / "motion.csv", t, q, v, a, names=names)
     robot = Robot.from_urdf(URDF, tip="finger")
-    return check_trajectory(robot, read_trajectory(file, joints=robot.joint_names), **options)
+    return check_motion(robot, read_trajectory(file, joints=robot.joint_names), **options)
 
 
 def the(check: Check, kind: str, name: str) -> Fault:
@@ -186,7 +185,7 @@ def test_an_arm_beyond_its_limits_is_looked_at_there(tmp_path: Path) -> None:
     endless = URDF.replace('lower="0" upper="0.3" velocity="0.5"', 'lower="-inf" upper="inf" velocity="0.5"')
     robot = Robot.from_urdf(endless, tip="finger")
     raw = read_trajectory(tmp_path / "motion.csv", joints=robot.joint_names)
-    free = check_trajectory(robot, raw, obstacles=[wall])
+    free = check_motion(robot, raw, obstacles=[wall])
     assert {fault.kind for fault in free.faults} == {"clearance"}
 
 
@@ -227,8 +226,8 @@ def test_a_tool_that_leans_from_the_axes_of_its_path(tmp_path: Path) -> None:
         "x,y,z,ax,ay,az\n" + "\n".join(",".join(map(repr, row)) for row in rows.tolist())
     )
     path = read_waypoints(tmp_path / "path.csv")
-    assert checked(tmp_path, t, q, v, a, path=path, path_angle=0.11).passed
-    fault = the(checked(tmp_path, t, q, v, a, path=path, path_angle=0.05), "path", "finger")
+    assert checked(tmp_path, t, q, v, a, path=path, tip_angle=0.11).passed
+    fault = the(checked(tmp_path, t, q, v, a, path=path, tip_angle=0.05), "path", "finger")
     near(fault, AT)
     assert fault.value == pytest.approx(0.1, abs=2e-3)
 
@@ -311,7 +310,6 @@ def test_a_torque(tmp_path: Path, with_rates: int) -> None:
 
 
 GALLERY = Path(__file__).resolve().parents[3] / "results" / "gallery"
-BASES: dict[type, BaseKind] = {FixedBase: "fixed", FreeFloating: "floating", Standing: "standing"}
 
 
 @pytest.mark.parametrize(
@@ -325,6 +323,6 @@ def test_plans_of_the_gallery_are_not_accused(name: str, tmp_path: Path) -> None
     plan = Plan.load(GALLERY / f"{name}.npz")
     robot, file = plan.machine.robot, tmp_path / "plan.csv"
     plan.write_csv(file)
-    found = check_trajectory(robot, read_trajectory(file, joints=robot.joint_names), base=BASES[type(plan.machine)])
+    found = check_trajectory(plan.machine, read_trajectory(file, joints=robot.joint_names))
     assert found.passed, found
     assert found.faults == ()

@@ -16,9 +16,10 @@ from scipy.optimize import linprog
 from toppra.algorithm import TOPPRA
 from toppra.constraint import JointAccelerationConstraint, JointVelocityConstraint
 
-from ocp.app import Check, check_trajectory
+from ocp.app import Check
 from ocp.app.check.interpolation import Motion
 from ocp.app.files import RawTrajectory
+from tests.ocp.app.motions import check_motion
 from tests.ocp.app.test_check_toppra import arm
 
 FASTER = 1.1
@@ -147,7 +148,7 @@ def checked(sampled: Sampled, period: float, rates: int, faster: float = 1.0, **
     limits: dict[str, Any] = {
         what: dict(zip(robot.joint_names, one.tolist(), strict=True)) for what, one in most.items()
     }
-    return check_trajectory(robot, raw, **limits, clearance=None, **options)
+    return check_motion(robot, raw, **limits, scene=False, **options)
 
 
 @pytest.mark.parametrize("rates", [1, 2, 3])
@@ -180,6 +181,6 @@ def test_far_waypoints_are_still_held_to_their_cubics() -> None:
     robot = arm(np.full(6, 1.2))
     lines = np.arange(1, 5)
     raw = RawTrajectory(robot.joint_names, t, q, 0 * q, None, None, lines, True, (), "far")
-    found = check_trajectory(robot, raw, clearance=None, time_unit="s")
+    found = check_motion(robot, raw, scene=False, time_unit="s")
     assert {fault.kind for fault in found.faults} == {"velocity"}
     assert [abs(fault.value or 0.0) for fault in found.faults] == pytest.approx([1.5] * 6)

@@ -16,9 +16,8 @@ from toppra.algorithm import TOPPRA
 from toppra.constraint import JointAccelerationConstraint, JointVelocityConstraint
 
 from models import Robot
-from ocp.app import check_trajectory
 from ocp.app.files import read_trajectory
-from tests.ocp.app.motions import joint, link, write_table
+from tests.ocp.app.motions import check_motion, joint, link, write_table
 
 SEED, DOF, POSTURES = 9, 7, 5
 SHARE = 1e-3
@@ -58,7 +57,7 @@ def test_what_toppra_breaks_is_found(with_rates: int, tmp_path: Path) -> None:
     file = write_table(tmp_path / "motion.csv", t, *[motion(t, k) for k in range(with_rates)], names=robot.joint_names)
     limit = dict(zip(robot.joint_names, acceleration.tolist(), strict=True))
     read = read_trajectory(file, joints=robot.joint_names)
-    found = check_trajectory(robot, read, acceleration=limit, clearance=None, share=SHARE)
+    found = check_motion(robot, read, acceleration=limit, scene=False, share=SHARE)
     told = {(fault.kind, fault.name): fault for fault in found.faults}
     fine = np.linspace(0.0, motion.duration, 50_001)
     broken = set()

@@ -23,8 +23,8 @@ from models import files as kept
 from ocp import Plan, ProblemError, SolveError
 from ocp.app import main
 from ocp.app.files.task_file import read_task
+from ocp.console import Progress
 from ocp.motion.result.segmented_plan import SegmentedPlan
-from ocp.progress import Progress
 from tests.ocp.app.motions import smooth, write_robot, write_table
 
 TASK = """# a seam
@@ -224,7 +224,7 @@ def test_a_place_out_of_reach_is_bad_input_and_no_motion_is_a_failure(
         raise SolveError("no motion passes its audit", name="plan")
 
     (tmp_path / "seam.toml").write_text(TASK)
-    monkeypatch.setattr("ocp.app.run_task.plan", nothing)
+    monkeypatch.setattr("ocp.app.subcommands.plan", nothing)
     status, out, err = run(capsys, "plan", tmp_path / "seam.toml", "--json")
     assert status == 1
     assert json.loads(out)["error"] == "no motion passes its audit"
@@ -269,7 +269,7 @@ def test_what_no_one_motion_does_is_written_with_the_ways_between_its_pieces_and
     assert rows[-1, 0] == told["duration"]
     assert np.abs(np.diff(rows[:, 1:4], axis=0)).max() < 3.0 * 0.004 * 1.01  # it goes on where each piece ends
     barred = [replace(change, motion=None, failure="the way is barred")]
-    monkeypatch.setattr("ocp.app.run_task.plan", lambda *_, **__: replace(made, reconfigurations=tuple(barred)))
+    monkeypatch.setattr("ocp.app.subcommands.plan", lambda *_, **__: replace(made, reconfigurations=tuple(barred)))
     status, out, _ = run(capsys, "plan", tmp_path / "line.toml", "--json", "--force")
     assert status == 1  # the pieces are there, and pass
     told = json.loads(out)
@@ -328,8 +328,8 @@ class Terminal(io.StringIO):
 def test_long_work_says_that_it_goes_on(monkeypatch: pytest.MonkeyPatch, terminal: bool) -> None:
     stream = Terminal() if terminal else io.StringIO()
     monkeypatch.setattr(sys, "stderr", stream)
-    monkeypatch.setattr("ocp.progress.LOG_PERIOD_S", 0.05)
-    monkeypatch.setattr("ocp.progress.TERMINAL_DELAY_S", 0.05)
+    monkeypatch.setattr("ocp.console.LOG_PERIOD_S", 0.05)
+    monkeypatch.setattr("ocp.console.TERMINAL_DELAY_S", 0.05)
     with Progress("work") as progress:
         progress("half of it")
         while "half of it" not in stream.getvalue():

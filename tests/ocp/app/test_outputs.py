@@ -21,7 +21,7 @@ from models import Joint, Link, ModelError, Robot
 from ocp import Plan, ProblemError
 from ocp.app import main
 from ocp.app.files import read_trajectory
-from ocp.app.files.outputs import SUFFIXES, checked_output
+from ocp.app.files.safe_files import SUFFIXES, checked_output
 from ocp.app.view.player import PageServer
 from ocp.app.view.report import POLICY
 from ocp.motion.schedule import JointTrajectory

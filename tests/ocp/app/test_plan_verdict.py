@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from models import FixedBase
-from ocp.app.check.plan_verdict import verdict_of
+from ocp.app.check.verdict import verdict_of
 from ocp.app.view.animation import animate_plan
 from ocp.app.view.report import report_of_plan
 from ocp.motion.result.segmented_plan import SegmentedPlan

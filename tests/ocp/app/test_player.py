@@ -58,6 +58,7 @@ from ocp.app.view import appearance, player
 from ocp.app.view.animation import (
     PAGE_SETTINGS,
     Curve,
+    MotionSamples,
     animate_plan,
     animate_solution,
     animate_trajectory,
@@ -435,11 +436,12 @@ def test_where_the_ground_pushes_is_found_from_the_rows_of_the_problem(robot: Ro
     offsets = (machine.support.normals * machine.support.vertices).sum(axis=1)
     rows = points @ machine.support.normals.T - offsets - 0.02
     inside = [Curve("zero moment point", str(k), "m", row, 0.0) for k, row in enumerate(rows.T)]
-    found, (margin,) = ground_contact(machine, joints, still, still, inside)
+    samples = MotionSamples(np.arange(5.0), joints, still, still, np.zeros((5, 0)), None)
+    found, (margin,) = ground_contact(machine, samples, inside)
     np.testing.assert_allclose(found.points, points, atol=1e-12)
     np.testing.assert_allclose(margin.values, rows.min(axis=1) + 0.02, atol=1e-12)
     assert found.forces
-    rest, _ = ground_contact(machine, joints, still, still)
+    rest, _ = ground_contact(machine, samples)
     centers = centers_of_mass(robot, ca.DM(START))
     weighed = np.array([robot.link(name).mass * np.array(ca.DM(c)).ravel() for name, c in centers.items()])
     middle = weighed.sum(axis=0) / robot.total_mass

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 from models import FixedBase, Robot
-from ocp.app import Check, check_trajectory, main
+from ocp.app import Check, main
 from ocp.app.check.interpolation import Motion
 from ocp.app.check.suspicions import exchanged_joints
 from ocp.app.files import RawTrajectory
 from ocp.errors import ProblemError
-from tests.ocp.app.motions import write_table
+from tests.ocp.app.motions import check_motion, write_table
 
 HOME = np.array([0.3, -1.2, 1.4, -1.7, -1.5, 0.4])
 SWINGS = [6, 5, 6, 4, 5, 6]
@@ -38,7 +38,7 @@ def checked(of: Robot, t: Any, *values: Any, **options: Any) -> Check:
     v = values[1] if len(values) > 1 else None
     lines = np.arange(1, len(t) + 1)
     raw = RawTrajectory(of.joint_names, np.asarray(t), values[0], v, None, None, lines, False, (), "motion")
-    return check_trajectory(of, raw, clearance=None, **options)
+    return check_motion(of, raw, scene=False, **options)
 
 
 def swings(size: float = 0.8, step: float = 0.02, duration: float = 3.0) -> tuple[Any, Any, Any]:

@@ -22,7 +22,7 @@ from ocp import (
     solve,
 )
 from ocp.curves import PiecewisePolynomial
-from ocp.status import SolverStatus
+from ocp.errors import SolverStatus
 from scripts.papers.free_floating.formulations import null_space_problem
 from scripts.papers.free_floating.formulations import problem as paper_problem
 from tests.ocp.indirect.extremals import EXTREMA

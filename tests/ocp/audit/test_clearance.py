@@ -17,8 +17,7 @@ from numpy.testing import assert_allclose
 from models.shapes.hull import gap_along, nearest_directions
 from ocp import Collocation, MultipleShooting, Problem, ProblemError, Solution, solve
 from ocp.audit.clearance import Clearance, ProofSettings, Track, clearance_along, closest_pairs_along
-from ocp.problem.hulls import Frames, Hull, frames_of
-from ocp.problem.separation import Separation
+from ocp.problem.hulls import Frames, Hull, Separation, frames_of
 
 EYE = np.eye(3).ravel()
 
@@ -41,7 +40,7 @@ def flight(
         ca.vertcat(EYE, q),
         hulls,
         pairs,
-        least,
+        least=least,
         levers={"q": np.ones((count, 3))},
         turns={"q": np.zeros((count, 3))},
         **more,
@@ -167,7 +166,7 @@ def test_what_time_alone_moves() -> None:
     post = ca.vertcat(EYE, 0.5, 1.0 - 2.0 * problem.time, 0.0)
     hulls = {"ball": BALL, "post": Hull(1, np.zeros((1, 3)), 0.1)}
     problem.separate(
-        "clearance", ca.vertcat(EYE, q, post), hulls, [[0, 1, -1]], 0.0,
+        "clearance", ca.vertcat(EYE, q, post), hulls, [[0, 1, -1]], least=0.0,
         levers={"q": np.ones((1, 3))}, turns={"q": np.zeros((1, 3))},
     )  # fmt: skip
     found = proof(problem, 3)
@@ -555,7 +554,7 @@ def test_kinks_are_proven_spikes_of_a_microsecond_are_found_and_jumps_are_named(
     post = ca.vertcat(EYE, 0.4, motion(problem.time), 0.0)
     hulls = {"ball": BALL, "post": Hull(1, np.zeros((1, 3)), 0.1)}
     problem.separate(
-        "clearance", ca.vertcat(EYE, q, post), hulls, [[0, 1, -1]], 0.0,
+        "clearance", ca.vertcat(EYE, q, post), hulls, [[0, 1, -1]], least=0.0,
         levers={"q": np.ones((1, 3))}, turns={"q": np.zeros((1, 3))},
     )  # fmt: skip
     found = proof(problem, 3)

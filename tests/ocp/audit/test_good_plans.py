@@ -16,6 +16,7 @@ from ocp import (
     InFoot,
     MultipleShooting,
     Problem,
+    RefinementSettings,
     minimum_velocity_problem,
     refine,
     solve,
@@ -343,7 +344,7 @@ def test_a_refined_plan_says_that_it_is_reached_only_where_its_audit_passes() ->
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         for method in (Collocation(4), MultipleShooting(8), Collocation(6, 2, control="held")):
-            plan = refine(problem, method, tolerance=1e-4, max_intervals=160)
+            plan = refine(problem, method, tolerance=1e-4, settings=RefinementSettings(max_intervals=160))
             assert plan.refinement is not None
             if plan.refinement.reached:
                 holds(plan.audit())

@@ -20,11 +20,11 @@ import numpy as np
 import pytest
 
 from models import files as cache
-from ocp import Collocation, MultipleShooting, Problem, SolveError, libraries, prepare
+from ocp import Collocation, MultipleShooting, Problem, SolveError, prepare
 from ocp.console import TimeLimitReached, time_limited
-from ocp.direct import controller
+from ocp.direct import code_generation
 from ocp.direct.assembly import Derivatives, derivatives
-from ocp.libraries import CompilerError, Library, build_library
+from ocp.direct.code_generation import CompilerError, Library, build_library
 from ocp.problem.formulation import Formulation
 from tests.conformance import brachistochrone, bryson_denham
 from tests.conformance.case import Case
@@ -37,7 +37,7 @@ ROOT = Path(__file__).parents[3]
 def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty cache, and notices that have not been given yet."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    libraries.warn_interpreted.cache_clear()
+    code_generation.warn_interpreted.cache_clear()
     return tmp_path / "cache" / "selfmotion"
 
 
@@ -97,7 +97,7 @@ def test_compiled_functions_are_the_interpreted_ones_to_the_last_bit(shared: Pat
     random = np.random.default_rng(0)
     seen = 0
     blocks = method.transcribe(form).blocks
-    for block, own in zip(blocks, controller.block_derivatives(method.transcribe(form), True), strict=True):
+    for block, own in zip(blocks, code_generation.block_derivatives(method.transcribe(form), True), strict=True):
         for name, plain, other in zip(Derivatives._fields, derivatives(block.function), own, strict=True):
             seen += other.class_name() == "External"
             for _ in range(5):
@@ -149,7 +149,7 @@ def test_what_cannot_hold_together_is_named_in_the_same_words(shared: Path, solv
 
 
 def test_no_optimization_changes_no_number(shared: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(libraries, "SIZES", libraries.CodeSizes(optimized=0))
+    monkeypatch.setattr(code_generation, "CODE_SIZES", code_generation.CodeSizes(optimized=0))
     plans = [prepare(van_der_pol(), Collocation(6), compiled=how).solve() for how in (True, False)]
     np.testing.assert_array_equal(plans[0].variables, plans[1].variables)
 
@@ -173,7 +173,7 @@ import ctypes, sys, threading, time, types
 for face in ("models", "ocp"):  # what the faces show is not needed, and takes a second
     sys.modules[face] = types.ModuleType(face)
     sys.modules[face].__path__ = [face]
-from ocp.libraries import Library, build_library
+from ocp.direct.code_generation import Library, build_library
 def number(value):
     return Library((f"number {value}",), lambda: f"int number(void) {{ return {value}; }}")
 """
@@ -207,7 +207,7 @@ def test_compilers_and_contents_are_told_apart(own: Path, tmp_path: Path, monkey
     newer = (tmp_path / "another").read_text().replace("ours 1", "ours 2")
     (tmp_path / "another").write_text(newer)
     assert one.key == keys[-1]  # asked once a process for its version
-    libraries._version.cache_clear()
+    code_generation._version.cache_clear()
     keys.append(one.key)
     assert len(set(keys)) == len(keys) == 4
 
@@ -298,7 +298,7 @@ def test_what_is_not_defined_is_no_library() -> None:
 
 
 def test_what_is_too_long_is_not_compiled(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(libraries, "SIZES", libraries.CodeSizes(accepted=10))
+    monkeypatch.setattr(code_generation, "CODE_SIZES", code_generation.CodeSizes(accepted=10))
     with pytest.raises(CompilerError, match="characters"):
         build_library(number(8))
 

@@ -18,7 +18,7 @@ import pytest
 
 from ocp import Collocation, MultipleShooting, Problem, ProblemError, SolveError, prepare, solve
 from ocp.direct import nlp, prepared
-from ocp.status import SolverStatus
+from ocp.errors import SolverStatus
 from tests.ocp.problems import METHODS, SOLVERS, SWING, Method, energy, plant, relative, swing, van_der_pol
 
 FINE: dict[str, Method] = {

@@ -136,9 +136,9 @@ def test_a_scaled_program_is_the_program_in_other_variables() -> None:
     np.testing.assert_allclose(curved, program.hessian(x, p, 1.5 / c, lam / b).full() * a * a[:, None], rtol=1e-13)
 
 
-def told(problem: Problem, method: Any, **settings: Any) -> str:
+def told(problem: Problem, method: Any, scaling: bool = True) -> str:
     with pytest.raises(SolveError) as caught:
-        solve(problem, method, **settings)
+        prepare(problem, method, scaling=scaling).solve()
     return str(caught.value)
 
 

@@ -10,9 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ocp import Problem
-from ocp.indirect.hamiltonian import Hamiltonian
+from ocp.indirect.hamiltonian import Extremal, Hamiltonian
 from ocp.indirect.method import hamiltonian_defect, null_space
-from ocp.indirect.sensitivity import Extremal
 from ocp.problem.formulation import Formulation
 from tests.ocp.problems import Array
 

@@ -15,6 +15,7 @@ from ocp import (
     MultipleShooting,
     Phases,
     Problem,
+    RefinementSettings,
     Solution,
     certificate,
     prepare,
@@ -309,6 +310,7 @@ START: Bad = {
     "number as name": {3: 1.0},
 }
 FRONT: dict[str, Bad] = {"problem": INSTANCE | {"unfinished": blank()}, "solver": CHOICE, "options": OPTIONS}
+WITHOUT_SOLVER = {name: bad for name, bad in FRONT.items() if name != "solver"}
 SOLVED = {"method": PLAN, "parameters": {"p": 1.0}}
 
 
@@ -320,38 +322,34 @@ def on_line(call: Any, good: dict[str, Any], /, **bad: Bad) -> Case:
 FRONTS = [
     on_line(prepare, {"method": PLAN}, **FRONT, method=INSTANCE, compiled=FLAG, scaling=FLAG),
     on_line(
-        solve,
-        SOLVED,
-        **FRONT,
-        method=INSTANCE,
-        parameters=PARAMETERS,
-        guess=START,
-        check=FLAG,
-        scaling=FLAG,
-        time_limit=POSITIVE,
+        solve, SOLVED, **FRONT, method=INSTANCE, parameters=PARAMETERS, guess=START, check=FLAG, time_limit=POSITIVE
     ),
     on_line(
         refine,
         SOLVED,
-        **FRONT,
+        **WITHOUT_SOLVER,
         method=INSTANCE | {"indirect": Indirect()},
         parameters=PARAMETERS,
         guess=START,
         tolerance=POSITIVE | NOTHING,
-        max_intervals=COUNT | NOTHING | {"few": 2},
-        limits=MAPPING | {"unknown": {"no_such": 1.0}, "nan": {"lost": NAN}, "negative": {"lost": -1.0}},
-        breaks={"number": 3, "word": "a", "outside": [9.0], "nan": [NAN], "texts": ["0.5"], "None": None},
+        settings=INSTANCE,
         time_limit=POSITIVE,
     ),
     on_line(
         tighten,
         SOLVED,
-        **FRONT,
+        **WITHOUT_SOLVER,
         method=INSTANCE | {"indirect": Indirect()},
         parameters=PARAMETERS,
         guess=START,
         tolerance=POSITIVE | NOTHING,
         time_limit=POSITIVE,
+    ),
+    Case(
+        "RefinementSettings",
+        RefinementSettings,
+        {},
+        {"max_intervals": COUNT | NOTHING, "limits": MAPPING | {"unknown": {"no_such": 1.0}}},
     ),
     Case(
         "Indirect.prepare",
@@ -405,8 +403,6 @@ FRONTS = [
         constraints=but(NONNEGATIVE, "inf", "huge") | NOTHING,
         lost=but(NONNEGATIVE, "inf", "huge") | NOTHING,
         costates=but(NONNEGATIVE, "inf", "huge"),  # None: by what the plan loses
-        stationarity=but(NONNEGATIVE, "inf", "huge"),  # None: it is told, and judged by no limit
-        drift=but(NONNEGATIVE, "inf", "huge"),
     ),
     method(plan, "save", {"path": "/dev/null/x"}, path={"None": None, "number": 3, "list": [], "object": object()}),
     Case(

@@ -15,8 +15,8 @@ import pytest
 from hypothesis import given, strategies
 
 from ocp import ProblemError
-from ocp.problem.function_reader import BINARY, MAX_ENTRIES, MAX_OPERATIONS, MAX_WORK, OPERATIONS, UNARY, FunctionReader
-from ocp.problem.function_writer import FunctionWriter
+from ocp.problem.record_reader import BINARY, MAX_ENTRIES, MAX_OPERATIONS, MAX_WORK, OPERATIONS, UNARY, FunctionReader
+from ocp.problem.record_writer import FunctionWriter
 
 GRID = np.linspace(0.0, 1.0, 5)
 TABLE = ca.interpolant("table", "linear", [GRID, GRID], np.outer(GRID, GRID**2).ravel())

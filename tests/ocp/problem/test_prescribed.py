@@ -11,8 +11,7 @@ import pytest
 
 from ocp import Problem, ProblemError
 from ocp.problem.enclosures import PrescribedMotion
-from ocp.problem.hulls import Hull
-from ocp.problem.separation import Separation
+from ocp.problem.hulls import Hull, Separation
 
 T = ca.SX.sym("t")
 EYE = ca.DM.eye(3).reshape((9, 1))
@@ -42,7 +41,7 @@ def motion_of(frame: Any) -> PrescribedMotion:
     hulls = {"body": Hull(0, CORE, 0.02), "post": Hull(-1, np.zeros((1, 3)))}
     nothing = np.zeros((1, 0))
     apart = Separation("apart", frame, hulls, np.array([[0, 1, -1]]), np.zeros(1), {}, nothing, nothing)
-    return PrescribedMotion(apart, frame, T, [], [])
+    return PrescribedMotion(apart, frame, T, parameters=[], values=[])
 
 
 @pytest.mark.parametrize("name", MOTIONS)
@@ -96,5 +95,5 @@ def test_what_cannot_be_proven_is_refused_by_name() -> None:
         (ca.vertcat(EYE, problem.time, p, 0), 0, "observed from the world"),
     ):
         with pytest.raises(ProblemError, match=word):
-            problem.separate("apart", ca.vertcat(frame, other), hulls, [[0, 1, seen]], 0.0, **told)
-    problem.separate("apart", ca.vertcat(frame, EYE, p * problem.time, p, 0), hulls, [[0, 1, -1]], 0.0, **told)
+            problem.separate("apart", ca.vertcat(frame, other), hulls, [[0, 1, seen]], least=0.0, **told)
+    problem.separate("apart", ca.vertcat(frame, EYE, p * problem.time, p, 0), hulls, [[0, 1, -1]], least=0.0, **told)

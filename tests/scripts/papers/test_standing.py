@@ -15,7 +15,7 @@ from models import STANDING_STARTS
 from models.machines.standing import StandingMotion
 from ocp import MultipleShooting, resolve_accelerations, solve
 from ocp.motion.builders.standing.problem import motion_cost
-from ocp.motion.tasks.zmp_rules import Anywhere, Following, IndexAtLeast, InFoot, Pinned
+from ocp.motion.tasks.limits import Anywhere, Following, IndexAtLeast, InFoot, Pinned
 from scripts import standing
 from scripts.papers.standing import plans
 from scripts.papers.standing.cases import HORIZON, LOCAL, fails, machine, table_task

@@ -6,8 +6,8 @@ Chaser and target both float. The target has no joints and no external forces ac
 
 and its tip is the grasped frame. The chaser's tip reaches that frame with the same twist, at a time that may be free.
 From then on both are one machine, with the target a link on the chaser's tip. Base and joints are continuous, and the
-momentum is that of both (`space.grasping`), a constant known in advance. At the end neither joints nor base turn. The
-wheels then hold the momentum, and must be able to (`ocp.motion.builders.space.guess`). Rest is relative to the centre
+momentum is that of both (`space.pair`), a constant known in advance. At the end neither joints nor base turn. The
+wheels then hold the momentum, and must be able to (`ocp.motion.builders.space.pair`). Rest is relative to the centre
 of mass of the pair, which moves on at P / m.
 
 Virgili-Llop and Romano 2019 (Frontiers in Robotics and AI 6:14) also plan both objectives together, but without wheels:
@@ -26,36 +26,107 @@ import numpy as np
 
 from models import FreeFloating, center_of_mass, find_wheels
 from models.arrays import Array
+from models.spatial import Expression
 from ocp.console import interruptible
 from ocp.direct.collocation import Collocation
-from ocp.errors import ProblemError, checked_flag, checked_instance
-from ocp.motion.builders.actuator_limits import JointFriction
+from ocp.errors import NOT_NUMBERS, ProblemError, checked_flag, checked_instance, checked_positive, floats, real
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem, end_velocities
 from ocp.motion.builders.dynamics_plan import within_limits
-from ocp.motion.builders.space.grasping import Cone, Grasp, checked_pair, grasp_wrench, motion_of, pair_momentum
-from ocp.motion.builders.space.guess import (
+from ocp.motion.builders.space.pair import (
     State,
+    checked_pair,
+    grasp_wrench,
     guess_approach,
     guess_braking,
     guessed_horizon,
+    motion_of,
+    pair_momentum,
     require_capacity,
     require_reach,
     wheel_capacity,
 )
 from ocp.motion.builders.standing.problem import FreeTime
+from ocp.motion.builders.torques import JointFriction
 from ocp.motion.tasks.checks import checked_configuration, checked_horizon
-from ocp.motion.tasks.cost import Cost
-from ocp.motion.tasks.goals import Start
+from ocp.motion.tasks.goals import Cost, Start
 from ocp.motion.tasks.limits import Limits
 from ocp.problem.phases import Phases
 from ocp.problem.problem import Problem, remembers_request
 from ocp.solution import Solution
 
-__all__ = ["Capture", "capture_machines", "capture_problem", "chained_capture", "solve_capture"]
+__all__ = ["Capture", "Cone", "Grasp", "capture_machines", "capture_problem", "chained_capture", "solve_capture"]
 
 APPROACH, DETUMBLE = "approach", "detumble"
 POINTS = Collocation(8, degree=4, scheme="legendre")
+
+
+@dataclass(frozen=True)
+class Cone:
+    """Approach cone: region of the chaser's tip near the grasp, in the grasped frame.
+
+    Attributes:
+        direction: Direction from the grasp to the approaching tip, in the grasped frame. Shape (3,).
+        half_angle: Half opening angle of the cone, rad.
+        length: Distance from the grasp up to which it is a cone, m. At twice this distance it is open to all
+            directions.
+        depth: Distance of the apex behind the grasp, m. It leaves play at the grasp itself.
+
+    Raises:
+        ProblemError: The direction is zero, the angle is not between 0 and pi/2, or a length is not positive.
+    """
+
+    direction: Any
+    half_angle: float
+    length: float
+    depth: float = 0.01
+
+    def __post_init__(self) -> None:
+        try:
+            direction = floats(self.direction).ravel()
+        except NOT_NUMBERS:
+            direction = np.zeros(0)
+        if direction.shape != (3,) or not np.isfinite(direction).all() or not np.linalg.norm(direction) > 0:
+            words = f"cone: direction must be three numbers, not all zero, not {self.direction!r}"
+            raise ProblemError(words, name="direction", value=self.direction)
+        object.__setattr__(self, "direction", direction / np.linalg.norm(direction))
+        if not checked_positive("cone: half_angle", self.half_angle) < np.pi / 2:
+            words = f"cone: half_angle must be below pi/2, not {self.half_angle}"
+            raise ProblemError(words, name="half_angle", value=self.half_angle, limit=np.pi / 2)
+        checked_positive("cone: length", self.length)
+        checked_positive("cone: depth", self.depth)
+
+    def inside(self, place: Expression) -> Expression:
+        """Return a function that is not negative inside the cone, m. Shape (1, 1).
+
+        Args:
+            place: Position of the tip in the grasped frame. Shape (3, 1), m.
+        """
+        from_apex = place + self.depth * ca.DM(self.direction)
+        share = ca.fmin(ca.fmax((ca.sumsqr(place) / self.length**2 - 1) / 3, 0), 1)
+        opened = share**2 * (3 - 2 * share)
+        least = np.cos(self.half_angle) * (1 - opened) - 2 * opened
+        return ca.dot(ca.DM(self.direction), from_apex) - least * ca.norm_2(from_apex)
+
+
+@dataclass(frozen=True)
+class Grasp:
+    """Load limits of the hand that holds the target.
+
+    Attributes:
+        force, moment: Largest norms at the tip, N and N m; inf for no limit.
+
+    Raises:
+        ProblemError: A limit is not positive.
+    """
+
+    force: float = np.inf
+    moment: float = np.inf
+
+    def __post_init__(self) -> None:
+        for name, limit in vars(self).items():
+            if not real(limit) > 0:
+                raise ProblemError(f"grasp: {name} must be positive, not {limit!r}", name=name, value=limit, limit=0.0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,7 +24,7 @@ from ocp.audit.audit import Audit
 from ocp.console import interruptible, time_left, time_limited
 from ocp.direct.collocation import Collocation
 from ocp.direct.shooting import MultipleShooting
-from ocp.errors import ProblemError, SolveError, checked_instance, checked_mapping, checked_time_limit
+from ocp.errors import ProblemError, SolveError, SolverStatus, checked_instance, checked_mapping, checked_time_limit
 from ocp.methods import solve
 from ocp.motion.builders.clearance import ClearanceConstraints, collision_error, solve_with_clearance
 from ocp.motion.builders.dynamics_plan import audit_error, breaks_of
@@ -33,14 +33,12 @@ from ocp.motion.builders.standing.stances import Steps
 from ocp.motion.builders.standing.steps import StepWeights, steps_problem
 from ocp.motion.tasks.checks import checked_horizon
 from ocp.motion.tasks.equations import bind, task_errors
-from ocp.motion.tasks.limits import Limits
+from ocp.motion.tasks.limits import Limits, ZmpRule
 from ocp.motion.tasks.tip_task import TipTask
-from ocp.motion.tasks.zmp_rules import ZmpRule
 from ocp.problem.formulation import Formulation
 from ocp.problem.phases import DURATION, Phases
 from ocp.problem.problem import Problem
 from ocp.solution import Solution
-from ocp.status import SolverStatus
 from ocp.tightening import tighten
 
 __all__ = ["Attempt", "guess_in_time", "solve_standing", "solve_steps"]

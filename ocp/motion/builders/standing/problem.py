@@ -59,12 +59,12 @@ from ocp.motion.tasks.checks import (
     rates_at_rest,
 )
 from ocp.motion.tasks.equations import TaskEquations, bind
-from ocp.motion.tasks.limits import JointBounds, Limits
-from ocp.motion.tasks.tip_task import TipTask
-from ocp.motion.tasks.zmp_rules import (
+from ocp.motion.tasks.limits import (
     Following,
     IndexAtLeast,
     InFoot,
+    JointBounds,
+    Limits,
     Pinned,
     ZmpRule,
     check_rule,
@@ -72,6 +72,7 @@ from ocp.motion.tasks.zmp_rules import (
     index_rows,
     is_finite,
 )
+from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.problem import Problem, remembers_request
 
 __all__ = ["FreeTime", "StandingSetup", "Weights", "declare_horizon", "motion_cost", "standing_problem"]

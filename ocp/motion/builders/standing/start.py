@@ -23,10 +23,9 @@ from ocp.errors import ProblemError
 from ocp.motion.local.accelerations import resolve_accelerations
 from ocp.motion.tasks.checks import clip_to_limits
 from ocp.motion.tasks.equations import TaskEquations
-from ocp.motion.tasks.limits import JointBounds
+from ocp.motion.tasks.limits import Following, IndexAtLeast, JointBounds, Pinned, ZmpRule, foot_edges
 from ocp.motion.tasks.tip_task import timed
 from ocp.motion.tasks.tracks import on_symbols
-from ocp.motion.tasks.zmp_rules import Following, IndexAtLeast, Pinned, ZmpRule, foot_edges
 
 __all__ = ["check_freedom", "check_loads", "check_slope", "local_guess", "start_inside", "task_demand"]
 

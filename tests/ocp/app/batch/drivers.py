@@ -176,7 +176,7 @@ def check_disturbed(folder: Path, number: int, every: int) -> int:
     assert ended == 2
     assert killed >= number // every // 2
     before = stored(folder)
-    batch = run_batch(functions.square, tasks, folder, workers=1)
+    batch = run_batch(functions.square, tasks, folder, cluster=1)
     assert stored(folder) == before
     assert len(before) == len(batch) == number
     assert batch.counts == {"done": number}
@@ -207,7 +207,7 @@ def check_killed_cluster(folder: Path, number: int, wait: float, address: str, p
     assert caught.value.name == "cluster"
     before = stored(folder)
     assert number // 2 <= len(before) < number
-    batch = run_batch(functions.square, tasks, folder, workers=2)
+    batch = run_batch(functions.square, tasks, folder, cluster=2)
     after = stored(folder)
     assert {name: after[name] for name in before} == before
     assert [result.cost for result in batch] == [math.sin(i) ** 2 for i in range(number)]

@@ -116,7 +116,7 @@ def main() -> None:
     """A driver: `python -m tests.ocp.app.batch.functions '{"folder": ..., "tasks": [...], "workers": 2}'`."""
     signal.signal(signal.SIGINT, signal.default_int_handler)  # shells start background jobs with Ctrl-C ignored
     asked = json.loads(sys.argv[1])
-    done = run_batch(square, asked["tasks"], asked["folder"], workers=asked["workers"])
+    done = run_batch(square, asked["tasks"], asked["folder"], cluster=asked["workers"])
     print(done, flush=True)
 
 

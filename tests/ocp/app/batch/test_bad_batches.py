@@ -78,7 +78,7 @@ FOLDER: Bad = {
 }
 PATH: Bad = {"None": None, "number": 3, "bytes": b"a", "list": ["a"], "object": object(), "folder": "/"}
 NAMES: Bad = {"None": None, "text": "x", "number": 3, "numbers": [1], "object": object()}
-CLUSTER: Bad = {"number": 3, "word": "host", "scheme": "http://a", "no host": "tcp://", "object": object(), "list": []}
+CLUSTER: Bad = {"word": "host", "scheme": "http://a", "no host": "tcp://", "object": object(), "list": []}
 FUNCTION: Bad = (
     CALLABLE | NOTHING | {"lambda": lambda task: task, "method": DEEP.append, "class": NOTHING.__class__.get}
 )
@@ -115,8 +115,7 @@ CASES = [
             "function": FUNCTION,
             "tasks": TASKS,
             "folder": FOLDER,
-            "workers": COUNT | {"both": "2", "too many": 10**6},
-            "cluster": CLUSTER,
+            "cluster": COUNT | CLUSTER | {"too many": 10**6},
             "near": NAMES | {"unknown": ["nobody"], "no number": ["z"], "one of two": ["x", "nobody"]},
             "again": NAMES | {"unknown": ["nobody"], "done": ["done"], "word": "done"},
             "failures": TEXT | {"unknown": "ignore"},

@@ -68,7 +68,7 @@ def said_to(stranger: ssl.SSLContext | None, address: str) -> bytes:
 
 def test_no_other_user_of_the_machine_reaches_the_workers_of_a_batch() -> None:
     """They have no certificate of this batch's, one of their own does not help, and no page answers without one."""
-    with Engine(functions.square, False, 1, None) as engine:
+    with Engine(functions.square, near=False, cluster=1) as engine:
         own = engine._local_cluster
         (nanny,) = own.workers.values()
         nobody = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
@@ -88,7 +88,7 @@ def test_no_other_user_of_the_machine_reaches_the_workers_of_a_batch() -> None:
 
 def test_processes_that_the_caller_began_meanwhile_outlive_the_workers() -> None:
     before = set(multiprocessing.active_children())
-    with Engine(functions.square, False, 1, None):
+    with Engine(functions.square, near=False, cluster=1):
         mine = multiprocessing.get_context("spawn").Process(target=signal.pause)
         mine.start()
         workers = set(multiprocessing.active_children()) - before - {mine}

@@ -28,7 +28,7 @@ def joints(task):
     return cached(arm, "robot.urdf").joint_size + task["x"]
 
 if __name__ == "__main__":
-    run_batch(joints, [{"x": i} for i in range(20)], "b", workers=1).write_csv("b.csv")
+    run_batch(joints, [{"x": i} for i in range(20)], "b", cluster=1).write_csv("b.csv")
 """
 URDF = """<robot name="r"><link name="base"/><link name="tool0"/><joint name="j" type="continuous"><parent link="base"/>
 <child link="tool0"/></joint></robot>"""
@@ -101,7 +101,7 @@ def helper(x):
 def double(task):
     {function}
 if __name__ == "__main__":
-    print(run_batch(double, [1.5, 2.5], "b", workers=1))
+    print(run_batch(double, [1.5, 2.5], "b", cluster=1))
 """
         (tmp_path / "script.py").write_text(source)
         return started(tmp_path)

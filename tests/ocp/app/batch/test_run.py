@@ -168,12 +168,12 @@ def test_errors_and_numbers_that_are_none_are_failures_with_their_reason_and_not
 def test_a_task_that_always_ends_its_worker_is_set_aside_and_the_others_are_done(tmp_path: Path) -> None:
     log = tmp_path / "log"
     tasks = [{"x": i, "kill": i == 2, "log": str(log)} for i in range(6)]
-    batch = run_batch(functions.deadly, tasks, tmp_path / "b", workers=1, failures="return")
+    batch = run_batch(functions.deadly, tasks, tmp_path / "b", cluster=1, failures="return")
     assert batch.counts == {"done": 5, "killed": 1}
     assert log.read_text() == 3 * "killed\n"
     assert batch[2].message == "it ended 3 workers"
     with pytest.raises(BatchError, match="5 done, 1 failed, first: killed: it ended 3 workers"):
-        run_batch(functions.deadly, tasks, tmp_path / "b", workers=1)
+        run_batch(functions.deadly, tasks, tmp_path / "b", cluster=1)
     assert log.read_text() == 3 * "killed\n"
 
 
@@ -208,7 +208,7 @@ def test_a_function_that_no_worker_finds_is_refused(tmp_path: Path) -> None:
     assert not (tmp_path / "b").exists()
 
 
-GUARD = "if __name__ == '__main__':\n    print(run_batch(double, [1.5, 2.5], 'b', workers=1), end='')\n"
+GUARD = "if __name__ == '__main__':\n    print(run_batch(double, [1.5, 2.5], 'b', cluster=1), end='')\n"
 SCRIPT = "from ocp.app.batch import run_batch\ndef double(task):\n    return 2 * task\n"
 
 

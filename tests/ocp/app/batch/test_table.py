@@ -10,14 +10,15 @@ from urllib.parse import unquote
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from pyarrow import parquet
 
 from ocp import Collocation, Problem, Solution, solve
 from ocp.app.batch import Batch, read_batch
-from ocp.app.batch.content import as_data, canonical_text, key_of, neighbours, pack_result, unpack_result
 from ocp.app.batch.engine import failed
-from ocp.app.batch.result_store import ResultStore
-from ocp.app.batch.run import source_version
+from ocp.app.batch.result_store import ResultStore, as_data, canonical_text, key_of, pack_result, unpack_result
+from ocp.app.batch.run import neighbours, source_version
 
 
 def written(folder: Path, results: list[tuple[Any, Any]]) -> Batch:
@@ -171,3 +172,11 @@ def test_a_version_changes_with_the_code_and_not_with_its_comments(
     versions = [source_version(__import__(f"batch_{name}").f) for name in ("one", "two", "three")]
     assert versions[0] == versions[1] != versions[2]
     assert source_version(len) == ""
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(1e-4, 1e4))
+def test_neighbours_do_not_depend_on_units(seed: int, unit: float) -> None:
+    places = np.random.default_rng(seed).random((40, 2))
+    one: dict[str, Any] = {f"{k:02}": {"x": x, "y": y} for k, (x, y) in enumerate(places)}
+    other = {key: {"x": unit * task["x"], "y": task["y"]} for key, task in one.items()}
+    assert neighbours(one, ["x", "y"]) == neighbours(other, ["x", "y"])

@@ -23,9 +23,9 @@ from models.files import INPUT_LIMITS, UnfitFile, open_regular, parse_xml, read_
 from models.shapes.mesh_files import read_mesh
 from models.shapes.pairs import checked_pairs
 from ocp import ProblemError, Solution
-from ocp.app.files import read_gcode, read_trajectory, read_waypoints, text_files
+from ocp.app.files import read_gcode, read_trajectory, read_waypoints, safe_files
+from ocp.app.files.safe_files import read_tree
 from ocp.app.files.task_file import read_obstacles, read_task
-from ocp.app.files.text_files import read_tree
 from ocp.motion.schedule import JointTrajectory
 
 READERS: dict[str, tuple[str, Callable[[Any], Any]]] = {
@@ -157,7 +157,7 @@ BOMBS = {
 def test_a_tree_of_yaml_is_bounded(bomb: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     if bomb == "many values":
-        monkeypatch.setattr(text_files, "INPUT_LIMITS", replace(INPUT_LIMITS, tree_values=10_000))
+        monkeypatch.setattr(safe_files, "INPUT_LIMITS", replace(INPUT_LIMITS, tree_values=10_000))
     (tmp_path / "a.yaml").write_text(BOMBS[bomb])
     with pytest.raises(ProblemError):
         read_trajectory(tmp_path / "a.yaml")

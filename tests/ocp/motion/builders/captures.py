@@ -13,7 +13,7 @@ import numpy as np
 from models import FreeFloating, Joint, Link, Robot, planar_chain, with_wheels
 from models.spatial import quaternion_about
 from ocp import Capture, Cone, Cost, FreeTime, Grasp, Solution
-from ocp.motion.builders.space.grasping import joined, pair_momentum
+from ocp.motion.builders.space.pair import joined, pair_momentum
 from tests.models.robot.oracles import mujoco_model
 from tests.models.robot.trees import Array
 

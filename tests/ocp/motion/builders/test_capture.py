@@ -28,8 +28,7 @@ from ocp import (
     dynamics_problem,
 )
 from ocp.motion.builders.space.capture import solve_capture
-from ocp.motion.builders.space.grasping import grasp_wrench, joined, pair_momentum
-from ocp.motion.builders.space.guess import State, require_reach, wheel_capacity
+from ocp.motion.builders.space.pair import State, grasp_wrench, joined, pair_momentum, require_reach, wheel_capacity
 from tests.models.robot.trees import Array
 from tests.ocp.motion.builders.captures import (
     CONE,

@@ -19,7 +19,7 @@ from ocp.motion.builders.constant_jerk import (
 )  # fmt: skip
 from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem
 from ocp.motion.builders.joint_motion import joint_motion_problem, motion_along
-from ocp.motion.tasks.cost import Cost
+from ocp.motion.tasks.goals import Cost
 from ocp.motion.tasks.limits import JointBounds
 
 INF = np.inf

@@ -12,7 +12,7 @@ import pytest
 import models
 from models import FixedBase, FreeFloating, Joint, Link, Machine, Robot, paper_example, planar_chain
 from ocp import Collocation, Limits, Problem, ProblemError, Solution, TipTask, minimum_velocity_problem, resolve, solve
-from ocp.motion.builders import minimum_velocity
+from ocp.motion.builders import joint_motion
 from ocp.motion.local.rates import LocalSolution
 from tests.models.robot.trees import numeric, seven_joint_arm
 from tests.ocp.motion.local.test_rates import ASKED, PAPER_START, REFUSED
@@ -174,7 +174,7 @@ def test_the_guess_is_the_local_motion_in_steps_of_first_order(monkeypatch: pyte
     machine, errors = paper_example(), []
     local = resolve(machine, TASK, PAPER_START, 5.0)
     for steps in (64, 256, 1024):
-        monkeypatch.setattr(minimum_velocity, "GUESS_STEPS", steps)
+        monkeypatch.setattr(joint_motion, "GUESS_STEPS", steps)
         states = minimum_velocity_problem(machine, TASK, 5.0, start=PAPER_START, guess_damping=1e-4).declared.states
         apart = [
             np.abs(states[name].guess(time) - local.at(time)[name]).max()

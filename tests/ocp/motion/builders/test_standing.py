@@ -25,8 +25,7 @@ from ocp import (
 )
 from ocp.motion.builders.standing.problem import FreeTime, StandingSetup, Weights, motion_cost, standing_problem
 from ocp.motion.local.accelerations import Stabiliser
-from ocp.motion.tasks.limits import Limits
-from ocp.motion.tasks.zmp_rules import Anywhere, Following, IndexAtLeast, InFoot, Pinned
+from ocp.motion.tasks.limits import Anywhere, Following, IndexAtLeast, InFoot, Limits, Pinned
 from tests.families import some
 from tests.models.machines.standing_machines import planar_machine
 from tests.models.robot.trees import numeric

@@ -14,8 +14,7 @@ from models.paths import rest_to_rest
 from ocp import Collocation, ProblemError, Solution, TipTask, resolve_accelerations, solve
 from ocp.motion.builders.standing.problem import StandingSetup, Weights, standing_problem
 from ocp.motion.local.accelerations import Law
-from ocp.motion.tasks.limits import Limits
-from ocp.motion.tasks.zmp_rules import Anywhere, Following, IndexAtLeast, InFoot, Pinned, ZmpRule
+from ocp.motion.tasks.limits import Anywhere, Following, IndexAtLeast, InFoot, Limits, Pinned, ZmpRule
 from tests.models.machines.standing_machines import planar_machine
 from tests.models.robot.trees import Array, numeric
 from tests.ocp.motion.builders.standing_tasks import (

@@ -16,9 +16,9 @@ from ocp import Collocation, ProblemError, Solution, SolveError, TipTask, resolv
 from ocp.motion.builders.standing.plan import solve_standing
 from ocp.motion.builders.standing.problem import FreeTime, StandingSetup, standing_problem
 from ocp.motion.tasks.equations import task_errors
+from ocp.motion.tasks.limits import IndexAtLeast, InFoot, Pinned, ZmpRule
 from ocp.motion.tasks.tip_task import timed
 from ocp.motion.tasks.tracks import pose_line
-from ocp.motion.tasks.zmp_rules import IndexAtLeast, InFoot, Pinned, ZmpRule
 from tests.models.machines.standing_machines import planar_machine
 from tests.ocp.motion.builders.standing_replay import assert_stands
 from tests.ocp.motion.builders.standing_tasks import (

@@ -21,8 +21,7 @@ from models.machines.standing import StandingMotion
 from ocp import Collocation, ProblemError, Solution, resolve_accelerations, solve
 from ocp.motion.builders.standing.problem import standing_problem
 from ocp.motion.tasks.equations import task_errors
-from ocp.motion.tasks.limits import Limits
-from ocp.motion.tasks.zmp_rules import Anywhere, Pinned
+from ocp.motion.tasks.limits import Anywhere, Limits, Pinned
 from scripts.robots import pushing
 from scripts.robots import standing as gallery
 from tests.models.robot.pinocchio_robots import Peer, State

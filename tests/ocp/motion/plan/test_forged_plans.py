@@ -13,7 +13,7 @@ import pytest
 
 from models import Box, FixedBase, MovingObstacle, Sphere, planar_chain
 from ocp import Collocation, Limits, Plan, Problem, ProblemError, Scene, StorageWarning, TipTask, plan, solve
-from ocp.app.check.plan_verdict import verdict_of
+from ocp.app.check.verdict import verdict_of
 from ocp.app.command import main
 from ocp.app.view.animation import animate_plan
 from ocp.app.view.report import report_of_plan

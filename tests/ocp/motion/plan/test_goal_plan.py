@@ -18,7 +18,7 @@ from ocp.motion.plan.goal_plan import GoalRequest, GoalSettings, plan_to_goal
 from ocp.motion.result.candidate import Rejection
 from ocp.motion.sampling.path_search import PathSearchSettings
 from ocp.motion.sampling.straight import StraightMotions
-from ocp.motion.tasks.cost import Cost
+from ocp.motion.tasks.goals import Cost
 from tests.ocp.motion.sampling.sliders import RADIUS, gap, slider
 
 BOX = Box((0.4, 1.4, 1.0), (0.0, 0.0, 0.0))

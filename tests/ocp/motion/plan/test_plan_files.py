@@ -20,7 +20,8 @@ from ocp.motion.plan import Candidate, Plan, Reason, Rejection
 from ocp.motion.result.request import restored_request, stored_request
 from ocp.motion.result.solved_plan import SolvedPlan
 from ocp.motion.schedule import JointTrajectory
-from ocp.problem.stored import pack_record, unpack_record
+from ocp.problem.record_reader import unpack_record
+from ocp.problem.record_writer import pack_record
 from tests.models.robot.trees import numeric
 from tests.ocp.motion.plan.motions import planned
 from tests.ocp.motion.tasks.space_tasks import floating_manipulator, floating_panda, panda, two_pandas

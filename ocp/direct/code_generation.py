@@ -1,13 +1,14 @@
-"""C code of functions, compiled once by the machine's compiler into shared libraries that are cached between runs.
+"""C code of functions: derivatives of a program, compiled once into shared libraries that are cached between runs.
 
-A library is identified by its source data, the compiler and its flags, so meshes, processes and runs share it (see
-`models.files`). Compiled functions return exactly the numbers of interpreted ones: the same operations in the same
-order, without fused operations. The compiler is that of the environment's CC, else `cc`; without one, functions are
-interpreted.
+A library is identified by its source data, the compiler and its flags, so that meshes, processes and runs share it
+(:mod:`models.files`). Compiled functions return exactly the numbers of interpreted ones: the same operations in the
+same order, without fused operations. The compiler is that of the environment's CC, else `cc`; without one, functions
+are interpreted.
 """
 
 from __future__ import annotations
 
+import hashlib
 import os
 import platform
 import re
@@ -27,8 +28,11 @@ import casadi as ca
 
 from models import files as cache
 from ocp.console import LOG, casadi_silenced, check_time
+from ocp.direct import assembly
+from ocp.direct.assembly import SIZES, Derivatives, Transcription, derivatives
 
-__all__ = ["CompilerError", "Library", "build_library", "generate_c", "generate_code"]
+__all__ = ["CompilerError", "Library", "block_derivatives", "build_library", "generate_code"]
+
 
 VERSION = "1"  # of the generated code
 FLAGS = ("-fPIC", "-shared", "-w", "-ffp-contract=off", *(("-Wl,-z,defs",) if sys.platform == "linux" else ()))
@@ -52,8 +56,7 @@ class CodeSizes:
     """Limits on the C code, in characters.
 
     Attributes:
-        optimized: Largest code that is optimised: more takes minutes, and without optimisation it runs half as long
-            again.
+        optimized: Largest code that is optimised, which takes minutes for more and saves a third of the running time.
         accepted: Largest code that is compiled: gcc takes 130 bytes of memory for each character.
     """
 
@@ -61,33 +64,10 @@ class CodeSizes:
     accepted: int = 8_000_000
 
 
-SIZES = CodeSizes()
+CODE_SIZES = CodeSizes()
 
 
 # ---- libraries ---------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Library:
-    """A shared library.
-
-    Attributes:
-        contents: The data that determine its C code, such as serialised functions. text: Generates the C code; not
-            called if the library is in the cache.
-    """
-
-    contents: tuple[str, ...]
-    text: Callable[[], str]
-
-    @property
-    def key(self) -> str:
-        """Its name in the cache.
-
-        Raises:
-            CompilerError: There is no compiler.
-        """
-        machine = (platform.machine(), sys.platform, ca.__version__, str(SIZES.optimized))
-        return cache.cache_key(VERSION, *machine, *compiler(), *FLAGS, LINK, *self.contents)
 
 
 def generate_code(functions: Iterable[Any]) -> str:
@@ -96,29 +76,38 @@ def generate_code(functions: Iterable[Any]) -> str:
     Raises:
         CompilerError: One of them has no C code.
     """
-    return generate_c(functions, "unit", header=False)[0]
-
-
-def generate_c(functions: Iterable[Any], name: str, *, header: bool = True) -> list[str]:
-    """Return the texts of NAME.c and NAME.h of casadi Functions.
-
-    Raises:
-        CompilerError: One of them has no C code.
-    """
-    files = [f"{name}.c", f"{name}.h"] if header else [f"{name}.c"]
     try:
         with tempfile.TemporaryDirectory() as place, casadi_silenced():
-            generator = ca.CodeGenerator(files[0], {"with_header": header})
+            generator = ca.CodeGenerator("unit.c")
             for function in functions:
                 generator.add(function)
             generator.generate(f"{place}/")
-            texts = [(Path(place) / file).read_text(encoding="utf-8") for file in files]
+            text = (Path(place) / "unit.c").read_text(encoding="utf-8")
     except RuntimeError as error:
         raise CompilerError(str(error).strip().splitlines()[-1]) from error
-    if gap := re.search(r"^ *#error (.*)", texts[0], re.MULTILINE):
+    if gap := re.search(r"^ *#error (.*)", text, re.MULTILINE):
         raise CompilerError(gap[1])
     # for an empty map CasADi adds to a null pointer, which is an error for gcc from version 14 on
-    return [text.replace("0+ i*0", "0") for text in texts]
+    return text.replace("0+ i*0", "0")
+
+
+@dataclass(frozen=True)
+class Library:
+    """A shared library.
+
+    Attributes:
+        contents: The data that determine its C code, such as serialised functions.
+        text: Generates the C code; not called if the library is in the cache.
+    """
+
+    contents: tuple[str, ...]
+    text: Callable[[], str]
+
+    @property
+    def key(self) -> str:
+        """Its name in the cache; raises CompilerError if there is no compiler."""
+        machine = (platform.machine(), sys.platform, ca.__version__, str(CODE_SIZES.optimized))
+        return cache.cache_key(VERSION, *machine, *compiler(), *FLAGS, LINK, *self.contents)
 
 
 def build_library(library: Library) -> Path:
@@ -136,7 +125,7 @@ def build_library(library: Library) -> Path:
         path = _OWN.get(key) or cache.load_library(key)  # another process may have compiled it meanwhile
         if path is not None:
             return path
-        content = _compile(library)
+        content = _compile(library.text())
         path = cache.store_library(key, content)
     if path is None:  # for this process only
         path = Path(_own_folder().name) / f"{key}.so"
@@ -181,19 +170,18 @@ def _version(command: str, path: str) -> str:
         return ""
 
 
-def _compile(library: Library) -> bytes:
-    """Return the shared library that the compiler makes of the C code; raise as :func:`build_library`."""
-    text = library.text()
-    if len(text) > SIZES.accepted:
-        raise CompilerError(f"{len(text)} characters of C are more than {SIZES.accepted}")
-    speed = "-O1" if len(text) <= SIZES.optimized else "-O0"
+def _compile(text: str) -> bytes:
+    """Return the shared library that the compiler makes of C code; raise as :func:`build_library`."""
+    if len(text) > CODE_SIZES.accepted:
+        raise CompilerError(f"{len(text)} characters of C are more than {CODE_SIZES.accepted}")
+    speed = "-O1" if len(text) <= CODE_SIZES.optimized else "-O0"
     place = Path(tempfile.mkdtemp(prefix="selfmotion-"))
     process = None
     try:
         (place / "unit.c").write_text(text, encoding="utf-8")
         words = [*shlex.split(compiler()[0]), speed, *FLAGS, "unit.c", "-o", "unit.so", LINK]
-        process = start_process(words, place)
-        if exit_status(process):
+        process = _start_process(words, place)
+        if _exit_status(process):
             output = (place / "words").read_text(errors="replace").strip().splitlines()
             raise CompilerError(f"{words[0]} fails: {output[-1] if output else 'without a message'}")
         return (place / "unit.so").read_bytes()
@@ -206,7 +194,7 @@ def _compile(library: Library) -> bytes:
         shutil.rmtree(place, ignore_errors=True)
 
 
-def start_process(words: list[str], place: Path) -> subprocess.Popen[bytes]:
+def _start_process(words: list[str], place: Path) -> subprocess.Popen[bytes]:
     """Run a command in a folder, which also receives its output, until its input is closed."""
     with open(place / "words", "wb") as output:
         return subprocess.Popen(
@@ -220,7 +208,7 @@ def start_process(words: list[str], place: Path) -> subprocess.Popen[bytes]:
         )
 
 
-def exit_status(process: subprocess.Popen[bytes]) -> int:
+def _exit_status(process: subprocess.Popen[bytes]) -> int:
     """Wait for a process, checking the time limit every 50 ms, and return its exit status."""
     while True:
         check_time()
@@ -240,3 +228,39 @@ def function_key(function: Any) -> str:
 def warn_interpreted(reason: str) -> None:
     """Log once why functions are interpreted."""
     LOG.warning("functions are interpreted, which is slower: %s", reason)
+
+
+# ---- derivatives of blocks ---------------------------------------------------------------------------------------
+
+RECIPE = hashlib.sha256(Path(assembly.__file__).read_bytes()).hexdigest()
+"""Hash of the code that derives block functions: part of the key of a compiled library."""
+
+
+def block_derivatives(transcription: Transcription, compiled: bool) -> list[Derivatives]:
+    """Return the derivatives of each block; blocks with the same function share them.
+
+    Args:
+        transcription: The program.
+        compiled: Whether to compile. Functions that cannot be compiled are interpreted, with one warning.
+
+    Raises:
+        TimeLimitReached: The time limit is over.
+    """
+    texts = [function_key(block.function) for block in transcription.blocks]
+    by_text: dict[str, Derivatives] = {}
+    for text, block in zip(texts, transcription.blocks, strict=True):
+        if text not in by_text:
+            is_short = block.function.is_a("SXFunction") and block.function.n_instructions() <= SIZES.called
+            is_compiled = compiled and text.startswith(SERIALISED) and not is_short
+            by_text[text] = _compiled(block.function, text) if is_compiled else derivatives(block.function)
+    return [by_text[text] for text in texts]
+
+
+def _compiled(function: Any, text: str) -> Derivatives:
+    """Return the derivatives of a function from a compiled library, or interpreted if compilation fails."""
+    try:
+        path = build_library(Library((RECIPE, text), lambda: generate_code(derivatives(function))))
+        return Derivatives(*(ca.external(name, str(path)) for name in Derivatives._fields))
+    except (CompilerError, RuntimeError) as error:
+        warn_interpreted(str(error))
+        return derivatives(function)

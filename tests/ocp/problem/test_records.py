@@ -30,7 +30,8 @@ from ocp import (
     prepare,
     solve,
 )
-from ocp.problem.stored import pack_record, unpack_record
+from ocp.problem.record_reader import unpack_record
+from ocp.problem.record_writer import pack_record
 from tests.ocp.problems import SWING, energy, plant, swing, van_der_pol
 from tests.ocp.test_faults import run
 

@@ -1,4 +1,8 @@
-"""First guess of a capture, and bounds that refuse impossible ones.
+"""Chaser and target of a capture: both as one machine, bounds that refuse impossible captures, and the first guess.
+
+The twists match at the grasp, so that there is no impact. The momentum of the pair about its common centre of mass is
+
+    P = P1 + P2,    L = L1 + L2 + (c2 - c1) x (m1 P2 - m2 P1) / (m1 + m2).
 
 The target's motion is known, whatever the chaser does. The guess moves the tip by the damped pseudo-inverse of the
 generalized Jacobian from its start onto the path of the grasped frame, first beside it, at last along the approach
@@ -19,9 +23,11 @@ import casadi as ca
 import numpy as np
 import scipy
 
-from models import FreeFloating, Robot, center_of_mass, find_wheels, link_frames
+from models import FreeFloating, ModelError, Robot, attach_tool, center_of_mass, find_wheels, link_frames
 from models.arrays import Array
-from ocp.errors import ProblemError
+from models.machines.machine import with_tip
+from models.spatial import Expression, cross
+from ocp.errors import ProblemError, checked_instance
 from ocp.motion.builders.dynamics import QUINTIC
 from ocp.motion.tasks.limits import JointBounds
 from ocp.problem.problem import Problem
@@ -29,14 +35,96 @@ from ocp.problem.values import constant
 
 __all__ = [
     "State",
+    "checked_pair",
     "free_motion",
+    "grasp_wrench",
     "guess_approach",
     "guess_braking",
     "guessed_horizon",
+    "joined",
+    "motion_of",
+    "pair_momentum",
     "require_capacity",
     "require_reach",
     "wheel_capacity",
 ]
+
+
+def joined(chaser: Robot, target: Robot) -> Robot:
+    """Return the chaser's robot with the target as a link on its tip, at the target's tip frame.
+
+    Raises:
+        ModelError: A robot has no tip, or links have the same name.
+    """
+    turn = np.asarray(target.tip_rotation).T
+    shift = -turn @ np.asarray(target.tip_translation)
+    return attach_tool(chaser, target, None, shift, rotation=turn, keep_tip=True)
+
+
+def checked_pair(chaser: Any, target: Any) -> Robot:
+    """Return the robot of both, see `joined`.
+
+    Raises:
+        ProblemError: Machines of other kinds, without tips, with links of the same name, or a target with joints.
+    """
+    for name, machine in (("chaser", chaser), ("target", target)):
+        if checked_instance(f"capture: {name}", machine, FreeFloating).robot.tip is None:
+            raise ProblemError(f"capture: the robot of the {name} needs a tip", name=name, value=machine)
+    if target.base != chaser.base:
+        words = f"capture: the chaser floats on a {chaser.base} base, the target on a {target.base} one"
+        raise ProblemError(words, name="target", value=target.base, limit=chaser.base)
+    if target.joint_size or len(target.robot.links) != 1:
+        words = "capture: the target must be one body without joints; use simplified(locked(robot, ...))"
+        raise ProblemError(words, name="target", value=target)
+    if not chaser.joint_size:
+        raise ProblemError("capture: the chaser has no joints to reach with", name="chaser", value=chaser)
+    try:
+        return joined(chaser.robot, target.robot)
+    except ModelError as error:
+        raise ProblemError(f"capture: {error}", name="target", value=error.value) from error
+
+
+def pair_momentum(chaser: FreeFloating, target: FreeFloating, base: Any, target_base: Any, joints: Any) -> Expression:
+    """Return the momentum of chaser and target about their common centre of mass.
+
+    It has the order of `FreeFloating.conserved_momentum`.
+
+    Args:
+        base, target_base: Configurations of both bases. Shape (base_size,).
+        joints: Joints of the chaser. Shape (n,).
+    """
+    rows = ca.DM.eye(6)[:, chaser.twist_rows]
+    own = rows @ ca.vertcat(chaser.conserved_momentum)
+    theirs = rows @ ca.vertcat(target.conserved_momentum)
+    m1, m2 = chaser.robot.total_mass, target.robot.total_mass
+    arm = center_of_mass(target.robot, ca.DM(0, 1), target.world_from_base(target_base))
+    arm -= center_of_mass(chaser.robot, joints, chaser.world_from_base(base))
+    crossed = cross(arm, (m1 * theirs[3:6] - m2 * own[3:6]) / (m1 + m2))
+    return ca.vertcat(own[0:3] + theirs[0:3] + crossed, own[3:6] + theirs[3:6])[chaser.twist_rows]
+
+
+def motion_of(problem: Problem) -> tuple[Any, Any, Any]:
+    """Return the symbols of base, joints and velocities."""
+    states = problem.declared.states
+    return states["base"].symbol, states["joints"].symbol, states["velocities"].symbol
+
+
+def grasp_wrench(pair: FreeFloating, target: FreeFloating, problem: Problem) -> tuple[Any, Any]:
+    """Return force and moment about the tip that the hand applies to the target, in world axes. Shape (3, 1) each.
+
+    They are the rates of the target's momentum, m c'' and (I w)' about its centre of mass.
+    """
+    base, joints, rates = motion_of(problem)
+    body = target.robot.links[0]
+    middle = with_tip(pair, body.name, body.center_of_mass)
+    center, twist = middle.tip_pose(base, joints), middle.tip_twist(base, joints, rates)
+    inertia = ca.mtimes([center.rotation, ca.DM(np.asarray(body.inertia)), center.rotation.T])
+    at = ca.vertcat(base, joints, rates)
+    state_rates = ca.vertcat(*(problem.declared.dynamics[name] for name in ("base", "joints", "velocities")))
+    rate = ca.jtimes(ca.vertcat(ca.mtimes(inertia, twist[0:3]), body.mass * twist[3:6]), at, state_rates)
+    arm = center.position - pair.tip_pose(base, joints).position
+    return rate[3:6], rate[0:3] + cross(arm, rate[3:6])
+
 
 Guesses = dict[str, Any]
 """Functions of time by the names of states and controls."""
@@ -357,7 +445,7 @@ def require_reach(chaser: FreeFloating, target: FreeFloating, start: State, earl
     if distance > reach * (1 + ROUNDING):
         words = (
             f"capture: the centres of mass of chaser and target are at least {distance:.4g} m apart, and the arm "
-            f"reaches at most {reach:.4g} m: {distance - reach:.4g} m are missing. State nearer, or let them drift "
+            f"reaches at most {reach:.4g} m: {distance - reach:.4g} m are missing. Start nearer, or let them drift "
             "together"
         )
         raise ProblemError(words, name="reach", value=distance, limit=reach)

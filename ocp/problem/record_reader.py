@@ -1,4 +1,4 @@
-"""Reader of CasADi functions from data: lists of elementary operations, each checked before the function is built.
+"""Read problems and CasADi functions from untrusted data; every part is checked before it is built.
 
 A function is a list of scalar operations, each of which may use the results of earlier ones. It may call functions that
 precede it, so calls are never recursive. Functions that are not scalar arithmetic (a look-up table, a spline, an
@@ -8,7 +8,7 @@ CasADi's own reader of serialised functions, which can load libraries and run a 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -17,7 +17,7 @@ import numpy as np
 
 from ocp.errors import ProblemError
 
-__all__ = ["FunctionReader"]
+__all__ = ["ARRAY_NAMES", "RECORD_ERRORS", "FunctionReader", "from_record", "unpack_record"]
 
 UNARY = (
     "NEG", "EXP", "LOG", "SQRT", "SQ", "TWICE", "SIN", "COS", "TAN", "ASIN", "ACOS", "ATAN", "NOT", "FLOOR", "CEIL",
@@ -325,3 +325,89 @@ BUILDERS: dict[str, Callable[[Mapping[str, Any], Sequence[Any]], Any]] = {
     "interpolant": _interpolant,
     "integrator": _integrator,
 }
+
+
+# ---- records of problems and of other data ---------------------------------------------------------------------------
+
+SYMBOLS = {"SX": ca.SX, "MX": ca.MX}
+RECORD_ERRORS = (
+    AttributeError, IndexError, KeyError, NotImplementedError, OverflowError, RecursionError, RuntimeError, TypeError,
+    ValueError,
+)  # fmt: skip
+"""Errors raised by rebuilding objects from damaged data."""
+ARRAY_NAMES = ("integers", "numbers")
+"""Names of the arrays into which a record is packed."""
+
+
+def from_record(record: Mapping[str, Any], kinds: Sequence[type]) -> tuple[str, Any, Any, Any]:
+    """Return the name, the type of symbols, the symbol of time and all declarations, with new symbols.
+
+    Args:
+        record: As :func:`to_record` returns it, from an untrusted source.
+        kinds: The dataclasses that may occur in it.
+
+    Raises:
+        ProblemError: The record is damaged.
+    """
+    try:
+        return _from_record(record, {kind.__name__: kind for kind in kinds})
+    except (*RECORD_ERRORS, ProblemError) as error:
+        raise ProblemError(f"the saved problem is damaged: {error}", name="problem") from error
+
+
+def _from_record(record: Mapping[str, Any], kinds: Mapping[str, type]) -> tuple[str, Any, Any, Any]:
+    symbols, functions = SYMBOLS[record["symbols"]], FunctionReader(record["functions"]).functions
+    expressions = functions[record["expressions"]]
+    time = symbols.sym("time")
+    inputs: list[Any] = [time] + [None] * (expressions.n_in() - 1)
+    for symbol in _symbols_in(record["declared"]):
+        if inputs[symbol["input"]] is not None or not isinstance(symbol["name"], str):
+            raise ValueError(f"symbol {symbol['input']} occurs twice")
+        size = expressions.size_in(symbol["input"])
+        if size != (symbol["size"], 1):
+            raise ValueError(
+                f"symbol {symbol['name']!r} has {symbol['size']} entries, the input of the function {size}"
+            )
+        inputs[symbol["input"]] = symbols.sym(symbol["name"], size[0])
+    outputs = expressions.call(inputs, True, False)
+
+    def read(value: Any) -> Any:
+        if not isinstance(value, dict):
+            return value
+        if "input" in value:
+            return inputs[value["input"]]
+        if "output" in value:
+            return outputs[value["output"]]
+        if "function" in value:
+            return functions[value["function"]]
+        if "pool" in value:
+            return {key: read(item) for key, item in value["pool"]}
+        return kinds[value["kind"]](**{key: read(part) for key, part in value["fields"].items()})
+
+    return str(record["name"]), symbols, time, read(record["declared"])
+
+
+def _symbols_in(value: Any) -> Iterator[dict[str, Any]]:
+    """Yield the records of symbols in a record of declarations."""
+    if isinstance(value, dict) and "input" in value:
+        yield value
+    elif isinstance(value, dict | list):
+        for part in value.values() if isinstance(value, dict) else value:
+            yield from _symbols_in(part)
+
+
+def unpack_record(structure: Any, arrays: Mapping[str, np.ndarray]) -> Any:
+    """Return the record whose parts :func:`pack_record` returned.
+
+    Raises:
+        ValueError, KeyError, TypeError: The parts are damaged.
+    """
+    if isinstance(structure, dict) and structure.get("array") in ARRAY_NAMES:
+        shape, begin = [int(size) for size in structure["shape"]], int(structure["begin"])
+        size = int(np.prod(shape, dtype=object))
+        if begin < 0 or min(shape, default=0) < 0 or begin + size > arrays[structure["array"]].size:
+            raise ValueError("an array exceeds the numbers of the file")
+        return arrays[structure["array"]][begin : begin + size].reshape(shape)
+    if isinstance(structure, dict):
+        return {key: unpack_record(part, arrays) for key, part in structure.items()}
+    return [unpack_record(part, arrays) for part in structure] if isinstance(structure, list) else structure

@@ -1,4 +1,4 @@
-"""Writer of CasADi functions as data: lists of elementary operations, which :mod:`ocp.problem.function_reader` reads.
+"""Write problems and CasADi functions as data, which :mod:`ocp.problem.record_reader` reads.
 
 A function of matrices is expanded to scalars, operation by operation. The numbers that define tables, splines and
 integrators come from CasADi's debugging output of a function in memory, never from a file.
@@ -7,13 +7,15 @@ integrators come from CasADi's debugging output of a function in memory, never f
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import fields, is_dataclass
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from ocp.errors import ProblemError
-from ocp.problem.function_reader import (
+from ocp.problem.record_reader import (
+    ARRAY_NAMES,
     BUILDERS,
     CALL,
     CONSTANT,
@@ -25,7 +27,7 @@ from ocp.problem.function_reader import (
     from_entries,
 )
 
-__all__ = ["FunctionWriter"]
+__all__ = ["FunctionWriter", "pack_record", "to_record"]
 
 
 class FunctionWriter:
@@ -354,3 +356,81 @@ def _integrator_record(function: Any, oracle: int) -> dict[str, Any]:
         "times": numbers["Integrator::tout"],
         "options": {option: numbers[name] for option, (name, _) in INTEGRATOR_OPTIONS.items() if name in numbers},
     }
+
+
+# ---- records of problems and of other data ---------------------------------------------------------------------------
+
+
+def to_record(name: str, symbols: Any, time: Any, declared: Any) -> dict[str, Any]:
+    """Return a problem as names, numbers and arrays. Guesses that are functions are left out.
+
+    Args:
+        name: Name of the problem.
+        symbols: ``casadi.SX`` or ``casadi.MX``.
+        time: Its symbol of time.
+        declared: A dataclass of expressions, values, dictionaries and such dataclasses. Fields called ``symbol`` and
+            the entries of ``at_start`` are symbols; all other expressions depend on them.
+
+    Raises:
+        ProblemError: An expression calls a function that is not elementary, such as a Python callback.
+    """
+    inputs, outputs, writer = [time], list[Any](), FunctionWriter()
+
+    def put(value: Any, is_symbol: bool = False) -> Any:
+        if is_symbol:
+            inputs.append(value)
+            return {"input": len(inputs) - 1, "size": value.numel(), "name": symbol_name(value)}
+        if isinstance(value, ca.SX | ca.MX):
+            outputs.append(value)
+            return {"output": len(outputs) - 1}
+        if isinstance(value, ca.Function):
+            return {"function": writer.write(value)}
+        if value is None or callable(value):
+            return None
+        if isinstance(value, Mapping):
+            return {"pool": [[key, put(item)] for key, item in value.items()]}
+        if is_dataclass(value):
+            parts = {f.name: getattr(value, f.name) for f in fields(value)}
+            inside = {key: put(part, is_symbol=key == "symbol") for key, part in parts.items() if key != "at_start"}
+            if "at_start" in parts:
+                inside["at_start"] = {
+                    "pool": [[key, put(item, is_symbol=True)] for key, item in parts["at_start"].items()]
+                }
+            return {"kind": type(value).__name__, "fields": inside}
+        if isinstance(value, str | bool | int | float):
+            return value
+        return np.asarray(value.full() if isinstance(value, ca.DM) else value, dtype=float)
+
+    try:
+        record = {"name": name, "symbols": symbols.__name__, "declared": put(declared)}
+        record["expressions"] = writer.write(ca.Function("expressions", inputs, outputs))
+    except (ProblemError, RuntimeError) as error:
+        words = f"problem {name!r} cannot be written: {str(error).strip().splitlines()[-1]}"
+        raise ProblemError(words, name=name) from error
+    return {**record, "functions": writer.records}
+
+
+def symbol_name(symbol: Any) -> str:
+    """Return the name with which a symbol was created."""
+    first = str(ca.symvar(symbol)[0].name())
+    return first.rpartition("_")[0] if isinstance(symbol, ca.SX) and symbol.numel() > 1 else first
+
+
+def pack_record(record: Any) -> tuple[Any, dict[str, np.ndarray]]:
+    """Return the structure of a record, which JSON can hold, and its arrays, concatenated by type."""
+    chunks: dict[str, list[np.ndarray]] = {name: [] for name in ARRAY_NAMES}
+    lengths = dict.fromkeys(chunks, 0)
+
+    def pack(value: Any) -> Any:
+        if isinstance(value, np.ndarray):
+            name = dict(zip("if", ARRAY_NAMES, strict=True))[value.dtype.kind]
+            chunks[name].append(value.ravel())
+            lengths[name] += value.size
+            return {"array": name, "begin": lengths[name] - value.size, "shape": list(value.shape)}
+        if isinstance(value, dict):
+            return {key: pack(part) for key, part in value.items()}
+        return [pack(part) for part in value] if isinstance(value, list | tuple) else value
+
+    structure = pack(record)
+    empty = {"integers": np.zeros(0, dtype=np.int64), "numbers": np.zeros(0)}
+    return structure, {name: np.concatenate([empty[name], *parts]) for name, parts in chunks.items()}

@@ -1,24 +1,35 @@
-"""Read text files line by line, and JSON and YAML files as trees of bounded size and depth; name the line of an error.
+"""Read text files of strangers safely, and check where outputs may be written.
 
-A tree consists of mappings, lists, texts and numbers. An alias of YAML counts with all the values that it stands for,
-so that a walk through the tree ends in bounded time.
+Text is read line by line, JSON and YAML as trees of bounded size and depth, and errors name the line. A tree consists
+of mappings, lists, texts and numbers. An alias of YAML counts with all the values that it stands for, so that a walk
+through the tree ends in bounded time.
+
+An output lies below its folder, has the suffix of its kind and never replaces a foreign file. The contents of a file
+show whether selfmotion wrote it: formats with a place for it name the program; the header of a table or of a message
+has a fixed form; a plan is read.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import re
+import sys
 from collections.abc import Mapping
 from os import PathLike, fspath
 from pathlib import Path
 from typing import Any
 
-from models.files import INPUT_LIMITS, UnfitFile, read_regular
+from models.files import INPUT_LIMITS, UnfitFile, open_regular, read_regular
 from ocp.errors import ProblemError
+from ocp.storage import read_arrays, table_joints
 
 __all__ = [
+    "MARK",
+    "SUFFIXES",
     "FileName",
     "checked_depth",
+    "checked_output",
     "children_of",
     "is_number",
     "line_error",
@@ -29,7 +40,9 @@ __all__ = [
 ]
 
 FileName = str | PathLike[str]
+
 BEFORE_UNIT = re.compile(r"(?<!\s)\s+(?=[\[(])")
+
 QUOTED_CHARACTERS = 120
 """A message quotes at most so much of a line."""
 
@@ -70,13 +83,13 @@ def read_lines(
         raise ProblemError(message, name="file", value=len(lines), limit=INPUT_LIMITS.text_lines)
     if longest is not None and max(len(line) for line in lines) > longest:
         i = next(i for i, line in enumerate(lines) if len(line) > longest)
-        raise line_error(path, i + 1, lines[i], f"longer than {longest} characters; break it", longest)
+        raise line_error(path, i + 1, lines[i], f"longer than {longest} characters; break it", limit=longest)
     if not text.strip():
         raise ProblemError(f"{path}: the file is empty", name="file", value=str(path))
     return lines
 
 
-def line_error(file: Any, number: int, text: str, why: str, limit: Any = None) -> ProblemError:
+def line_error(file: Any, number: int, text: str, why: str, *, limit: Any = None) -> ProblemError:
     """Return the error of a line, counted from 1, with its text, what is wrong and what to do."""
     quoted = text.strip()
     quoted = quoted if len(quoted) <= QUOTED_CHARACTERS else quoted[:QUOTED_CHARACTERS] + " ..."
@@ -107,6 +120,7 @@ def is_number(cell: str) -> bool:
 
 
 NUMBER = re.compile(r"[-+]?(?:\d[\d_]*(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?")
+
 SCALARS: dict[str, Any] = {
     **dict.fromkeys(("", "~", "null", "Null", "NULL")),
     **{
@@ -115,8 +129,11 @@ SCALARS: dict[str, Any] = {
     **{word: float(word.replace(".", "")) for word in (".inf", "+.inf", "-.inf", ".nan")},
 }
 """Values of plain YAML scalars that are neither numbers nor texts."""
+
 TAGS = {None, "!", *(f"tag:yaml.org,2002:{kind}" for kind in ("str", "int", "float", "bool", "null", "seq", "map"))}
+
 TOO_DEEP = f"values are nested more than {INPUT_LIMITS.nesting} deep"
+
 _NO_KEY = object()
 
 
@@ -245,3 +262,68 @@ def checked_depth(tree: Any) -> Any:
 def children_of(value: Any) -> list[Any]:
     """Return the values of a mapping or list, and an empty list for anything else."""
     return list(value.values()) if isinstance(value, Mapping) else value if isinstance(value, list) else []
+
+
+MARK = "written by selfmotion"
+
+SUFFIXES = {
+    "plan": (".npz",),
+    "csv": (".csv",),
+    "json": (".json",),
+    "yaml": (".yaml", ".yml"),
+    "mcap": (".mcap",),
+    "urdf": (".urdf",),
+    "report": (".html", ".htm"),
+}
+
+SIGNATURES = {
+    "json": re.compile(rb'\{"header": \{"stamp": \{"sec": 0, "nanosec": 0\}, "frame_id": ""\}, "joint_names": \['),
+    "yaml": re.compile(rf"# {MARK}\n".encode()),
+    "mcap": re.compile(rb"\x89MCAP0\r\n\x01.{8}\x04\0\0\0ros2.{4}[ -~]{1,99}\x0c.{8}\x0a\0\0\0selfmotion", re.DOTALL),
+    "urdf": re.compile(rf"<\?xml [^>]*>\n<!-- {MARK} -->\n".encode()),
+    "report": re.compile(rb'<!doctype html>\n<html[^>]*>\s*<head>\s*<meta name="generator" content="selfmotion">'),
+}
+"""First bytes of files that selfmotion writes, by kind."""
+
+
+def checked_output(kind: str, file: str | os.PathLike[str], folder: Path | None = None, force: bool = False) -> Path:
+    """Return the path to which an output is written, with links resolved.
+
+    Args:
+        kind: Key of SUFFIXES.
+        file: Requested name.
+        folder: Folder in or below which the output must be; None: anywhere.
+        force: Whether a file that selfmotion did not write may be overwritten.
+
+    Raises:
+        ProblemError: The name has a wrong suffix or unprintable characters, is outside of the folder, or belongs to a
+            foreign file.
+    """
+    if not str(file).isprintable():
+        raise ProblemError(f"{str(file)!r} is not a valid file name; use printable characters", name=kind, value=file)
+    path = Path(os.path.realpath(file))
+    if path.suffix.lower() not in SUFFIXES[kind]:
+        link = "" if path.name == Path(file).name else f" (a link to {path})"
+        message = f"{file}{link} does not have the suffix of a {kind}; end it with {' or '.join(SUFFIXES[kind])}"
+        raise ProblemError(message, name=kind, value=str(file), limit=SUFFIXES[kind])
+    if folder is not None and not path.is_relative_to(os.path.realpath(folder)):
+        message = f"{file} is outside of {folder}; name a file below it, or choose another folder with --output-folder"
+        raise ProblemError(message, name=kind, value=str(file), limit=str(folder))
+    if not force and os.path.lexists(path) and not _is_own(kind, path):
+        message = f"{file} exists and was not written by selfmotion; name another file, or overwrite it with --force"
+        raise ProblemError(message, name=kind, value=str(file))
+    return path
+
+
+def _is_own(kind: str, path: Path) -> bool:
+    """Return whether selfmotion wrote the file."""
+    try:
+        if kind == "plan":
+            return "head" in read_arrays(path)
+        with open_regular(path, sys.maxsize) as stream:
+            start = stream.read(2**20)  # enough for the header of a table with some thousand joints
+    except (OSError, ProblemError):
+        return False
+    if kind == "csv":
+        return bool(table_joints(start.partition(b"\n")[0].decode(errors="replace").split(",")))
+    return SIGNATURES[kind].match(start) is not None

@@ -1,0 +1,377 @@
+"""Run the subcommands of `selfmotion`: options in; exit status, text and contents of JSON out."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import webbrowser
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from models import FixedBase, FreeFloating, Machine, Robot, Standing, footprint, lock_joints, rectangle, with_load
+from models.arrays import Array
+from models.files import cache_files, cache_folder
+from models.spatial import rotation_from_rpy
+from ocp.app.check.data_checks import PLANAR_BASE, clean_trajectory
+from ocp.app.check.joint_limits import limits_by_name
+from ocp.app.check.verdict import CheckTolerances, Interpretation, check_trajectory
+from ocp.app.files import RawTrajectory, read_trajectory, read_waypoints, write_mcap
+from ocp.app.files.safe_files import MARK, SUFFIXES, checked_output, missing_package
+from ocp.app.files.task_file import Task, read_obstacles, read_task
+from ocp.console import Progress
+from ocp.errors import MAX_COUNT, ProblemError, checked_positive
+from ocp.motion.plan import Plan, plan
+from ocp.motion.result.segmented_plan import SegmentedPlan
+from ocp.motion.tasks.goals import Scene
+from ocp.motion.tasks.limits import Limits
+from ocp.storage import write_text
+
+__all__ = [
+    "EXPORT_KINDS",
+    "base_pose",
+    "check_period",
+    "export_plan",
+    "motions_of",
+    "read_robot",
+    "run_cache",
+    "run_check",
+    "run_completion",
+    "run_export",
+    "run_plan",
+    "run_report",
+    "run_task",
+    "run_view",
+]
+
+
+def run_check(options: argparse.Namespace, progress: Progress) -> tuple[int, str, Any]:
+    """Run `selfmotion check`."""
+    if options.report is not None:
+        checked_output("report", options.report, force=options.force)
+    progress("reading the robot")
+    robot = read_robot(options)
+    by_name = {kind: dict(getattr(options, kind)) for kind in ("velocity", "acceleration", "jerk", "torque")}
+    limits = replace(limits_by_name(robot, {kind: of for kind, of in by_name.items() if of}), friction=options.friction)
+    obstacles = read_obstacles(options.obstacles) if options.obstacles else ()
+    scene = Scene(
+        obstacles,
+        options.clearance,
+        tuple(options.ignore),
+        options.srdf,
+        tuple(options.folder),
+        "skip" if options.no_meshes else "raise",
+    )
+    progress("reading the trajectory")
+    joint_names = [joint.name for joint in robot.joints if joint.moves]
+    columns = None if options.columns is None else [name.strip() for name in options.columns.split(",")]
+    raw = read_trajectory(
+        options.trajectory, columns=columns, period=options.period, topic=options.topic, joints=joint_names
+    )
+    machine, notes = machine_of(options, robot, raw)
+    check = check_trajectory(
+        machine,
+        raw,
+        limits=limits,
+        scene=False if options.no_clearance else scene,
+        path=read_waypoints(options.path) if options.path else None,
+        interpretation=Interpretation(options.rule, options.time_unit, options.unwrap, options.names_confirmed),
+        tolerances=CheckTolerances(options.share, options.path_tolerance, options.path_angle),
+        progress=progress,
+    )
+    check = replace(check, notes=(*check.notes, *notes))
+    if options.report is not None:
+        progress("report")
+        from ocp.app.view.report import report_of_check  # imports matplotlib, which is slow
+
+        report = report_of_check(check, machine, limits, scene)
+        write_text(checked_output("report", options.report, force=options.force), report.html())
+    return (0 if check.passed else 1), str(check), check.to_dict()
+
+
+def machine_of(options: argparse.Namespace, robot: Robot, raw: RawTrajectory) -> tuple[Machine, list[str]]:
+    """Return the robot on the base of the options, and what was assumed about its feet."""
+    if options.floating:
+        return FreeFloating(robot, "planar" if set(PLANAR_BASE) <= set(raw.names) else "spatial"), []
+    translation, rotation = base_pose(options)
+    if not options.standing:
+        return FixedBase(robot, translation, rotation), []
+    if options.foot:
+        foot = rectangle(options.foot[:2], options.foot[2:])
+        return Standing(robot=robot, translation=translation, rotation=rotation, support=foot), []
+    cleaned = clean_trajectory(raw, robot, Limits().bounds(FixedBase(robot)))
+    start = np.zeros(robot.dof)
+    start[cleaned.joints] = cleaned.motion.q[0]
+    contact = footprint(robot, q=start, rotation=rotation)
+    machine = Standing(robot=robot, translation=contact.translation, rotation=rotation, support=contact.support)
+    return machine, [f"it stands on {', '.join(contact.links)}"]
+
+
+def run_plan(options: argparse.Namespace, progress: Progress) -> tuple[int, str, Any]:
+    """Run `selfmotion plan`."""
+    progress("reading the task")
+    task = read_task(options.task, options.output_folder)
+    progress("planning")
+    return run_task(task, options.output, progress, options.force)
+
+
+def run_export(options: argparse.Namespace, progress: Progress) -> tuple[int, str, Any]:
+    """Run `selfmotion export`."""
+    progress("writing")
+    export_plan(Plan.load(options.plan), options.file, options.period, options.force)
+    return 0, f"written: {options.file}", {"written": str(options.file)}
+
+
+def run_report(options: argparse.Namespace, progress: Progress) -> tuple[int, str, Any]:
+    """Run `selfmotion report`."""
+    from ocp.app.view.report import report_of_plan
+
+    file = checked_output("report", options.file, force=options.force)
+    plan = Plan.load(options.plan)
+    check_period(plan, options.period)
+    progress("audit")
+    report = report_of_plan(plan, options.period, options.title or str(options.plan))
+    write_text(file, report.html())
+    data = {"written": str(options.file), "passed": report.passed, "verdict": report.verdict}
+    return (0 if report.passed else 1), f"{report.verdict}\nwritten: {options.file}", data
+
+
+def run_view(options: argparse.Namespace, progress: Progress) -> tuple[int, str, Any]:
+    """Run `selfmotion view`."""
+    from ocp.app.view.player import PageServer, build_page
+
+    if options.page is not None:
+        checked_output("report", options.page, force=options.force)
+    progress("reading the motions")
+    motions = motions_of(options)
+    progress("drawing")
+    html, missing = build_page(
+        motions, title=options.title or options.plan.name, folders=options.folder, meshes=not options.no_meshes
+    )
+    for name, reason in missing.items():
+        progress.say(f"{name} is not shown: {reason}")
+    main = motions[0]
+    data = {"passed": main.passed, "verdict": main.verdict, "duration": float(main.t[-1]), "missing": missing}
+    status = 1 if main.passed is False else 0
+    if options.page is not None:
+        write_text(checked_output("report", options.page, force=options.force), html)
+        data |= {"written": str(options.page), "bytes": len(html.encode())}
+        return status, f"{main.verdict}\nwritten: {options.page}".strip(), data
+    with PageServer(html, options.port) as served:
+        print(f"{options.plan.name} on {served.address}; Ctrl-C ends it", file=sys.stderr, flush=True)
+        if options.open:
+            webbrowser.open(served.address)
+        served.wait()
+    return status, main.verdict, {**data, "address": served.address}
+
+
+def motions_of(options: argparse.Namespace) -> list[Any]:
+    """Return the motions in the files of `view`, the plan first."""
+    from ocp.app.view.animation import animate_plan, animate_solution, animate_trajectory
+    from ocp.solution import Solution
+
+    files = [options.plan, *options.beside]
+    base_names = [file.name for file in files]
+    names = [file.name if base_names.count(file.name) == 1 else str(file) for file in files]
+    names[: len(options.name)] = options.name[: len(files)]
+
+    machine: Any = None
+    tolerances: dict[str, Any] = {"tolerances": dict(options.tolerance)} if options.tolerance else {}
+    if options.robot is not None:
+        robot = read_robot(options)
+        machine = FreeFloating(robot) if options.floating else FixedBase(robot, *base_pose(options))
+        states = {"joints": options.joints, "base": options.base}
+        motions = [animate_solution(Solution.load(options.plan), machine, names[0], **states, **tolerances)]
+    else:
+        plan = Plan.load(options.plan)
+        machine, motions = plan.machine, [animate_plan(plan, names[0], **tolerances)]
+    for file, name in zip(options.beside, names[1:], strict=True):
+        if file.suffix.lower() != ".npz":
+            joint_names = [joint.name for joint in machine.robot.joints if joint.moves]
+            motions.append(animate_trajectory(read_trajectory(file, joints=joint_names), machine, name))
+        elif options.robot is not None:
+            motions.append(animate_solution(Solution.load(file), machine, name, **states, **tolerances))
+        else:
+            motions.append(animate_plan(Plan.load(file), name, **tolerances))
+    return motions
+
+
+def run_cache(options: argparse.Namespace, progress: Progress) -> tuple[int, str, Any]:
+    """Run `selfmotion cache`."""
+    files = cache_files()
+    size = sum(file.stat().st_size for file in files)
+    if options.action == "clear":
+        for file in files:
+            file.unlink(missing_ok=True)
+    state = "cleared" if options.action == "clear" else "in use"
+    data = {
+        "folder": str(cache_folder()),
+        "files": len(files),
+        "libraries": sum(file.suffix == ".so" for file in files),
+        "bytes": size,
+        "cleared": options.action == "clear",
+    }
+    summary = f"{len(files)} files, {data['libraries']} of them compiled functions, {size / 1e6:.3g} MB {state}"
+    return 0, f"{cache_folder()}: {summary}", data
+
+
+def run_completion(options: argparse.Namespace, progress: Progress) -> tuple[int, str, Any]:
+    """Run `selfmotion completion`."""
+    try:
+        import shtab
+    except ImportError as error:
+        raise missing_package("shell completion", "shtab", "completion") from error
+    script = shtab.complete(options.whole, options.shell)
+    return 0, script, {"shell": options.shell, "script": script}
+
+
+def read_robot(options: argparse.Namespace) -> Robot:
+    """Return the robot of the options, with locked joints and load."""
+    robot = Robot.from_urdf(options.robot, tip=options.tip)
+    if options.lock:
+        robot = lock_joints(robot, dict(options.lock))
+    if options.load is not None:
+        robot = with_load(robot, robot.tip_link, options.load, robot.tip_translation)
+    return robot
+
+
+def base_pose(options: argparse.Namespace) -> tuple[Array, Array]:
+    """Return translation (3,), m, and rotation (3, 3) of the base in world."""
+    numbers = options.mount or [0.0] * 6
+    return np.array(numbers[:3]), np.array(rotation_from_rpy(*numbers[3:]), dtype=float)
+
+
+FINDING_FIELDS = ("name", "value", "limit", "unit", "time", "passed", "verdict", "note")
+"""Fields of the audit's findings that JSON shows."""
+
+
+def run_task(
+    task: Task, output: Path | None, progress: Callable[[str], None], force: bool = False
+) -> tuple[int, str, Any]:
+    """Plan, audit and write; return the exit status, a text, and the contents of JSON.
+
+    Args:
+        task: Contents of the task file.
+        output: File of the plan, anywhere; None: as in the task.
+        progress: Is called with the name of each stage.
+        force: Whether files that selfmotion did not write are overwritten.
+
+    Raises:
+        ProblemError: The task is infeasible or invalid, or an output may not be written.
+        SolveError: No motion passes its audit; the message gives the reasons.
+    """
+    outputs = task.outputs if output is None else task.outputs | {"plan": output}
+    unrestricted = () if output is None else ("plan",)
+
+    def checked(kind: str, file: Path) -> Path:
+        return checked_output(kind, file, None if kind in unrestricted else task.output_folder, force)
+
+    def write(result: Plan, files: dict[str, Path]) -> None:
+        for kind, path in {kind: checked(kind, file) for kind, file in files.items()}.items():
+            progress(f"writing {path.name}")
+            WRITERS[kind](result, path, task.period, task.file)
+
+    for kind, file in outputs.items():  # check the outputs before the user waits for the plan
+        checked(kind, file)
+    result = plan(task.machine, task.task, **task.options, progress=progress)
+    check_period(result, task.period)
+    progress("audit")
+    audit = result.audit()
+    write(result, outputs)
+    lines = [str(result), f"The plan {audit.sentence}.", *_output_lines(list(outputs.values()))]
+    data = {
+        "passed": audit.passed,
+        "verdict": audit.sentence,
+        "cost": result.cost,
+        "bound": result.bound,
+        "duration": result.horizon,
+        "joints": result.names,
+        "start": result.at(0.0)["joints"],
+        "candidates": [
+            {"cost": candidate.cost, "reason": None if candidate.reason is None else str(candidate.reason)}
+            for candidate in result.candidates
+        ],
+        "audit": [{name: getattr(finding, name) for name in FINDING_FIELDS} for finding in audit.findings],
+        **_segments(result),
+        "written": {kind: str(file) for kind, file in outputs.items()},
+    }
+    return (0 if audit.passed else 1), "\n".join(lines), data
+
+
+def _segments(result: Plan) -> dict[str, Any]:
+    """Return the segments of a plan, and the motions between them, if it has several."""
+    if not isinstance(result, SegmentedPlan):
+        return {}
+    names = ("time", "before", "after", "duration", "failure")
+    return {
+        "fewest": result.fewest,
+        "segments": [
+            {"begin": begin, "duration": segment.horizon, "cost": segment.cost, "bound": segment.bound}
+            for begin, segment in zip(result.start_times, result.segments, strict=True)
+        ],
+        "reconfigurations": [{name: getattr(each, name) for name in names} for each in result.reconfigurations],
+    }
+
+
+def _output_lines(files: list[Path]) -> list[str]:
+    hint = "no file is written: give -o FILE.npz, or [output] in the task file"
+    return [f"written: {file}" for file in files] or [hint]
+
+
+def export_plan(plan: Plan, file: Path, period: float, force: bool = False) -> None:
+    """Write a plan in the format of the file's suffix.
+
+    Raises:
+        ProblemError: The suffix is unknown, the period is not positive, or selfmotion did not write an existing file
+            and `force` is False.
+    """
+    kind = next((kind for kind in EXPORT_KINDS if file.suffix.lower() in SUFFIXES[kind]), None)
+    if kind is None:
+        known = tuple(SUFFIXES[kind][0] for kind in EXPORT_KINDS)
+        words = f"{file}: a plan can be exported as {', '.join(known)}; end the name with one of these"
+        raise ProblemError(words, name="file", value=str(file), limit=known)
+    path = checked_output(kind, file, force=force)
+    check_period(plan, period)
+    WRITERS[kind](plan, path, period, "")
+
+
+def check_period(plan: Plan, period: float) -> None:
+    """Raise ProblemError if a sampling period is not positive or gives more than MOST samples."""
+    checked_positive("period", period)
+    if plan.horizon / period > MAX_COUNT:
+        words = (
+            f"a period of {period:g} s gives {plan.horizon / period:.3g} samples; at most {MAX_COUNT} can be written"
+        )
+        raise ProblemError(words, name="period", value=period, limit=plan.horizon / MAX_COUNT)
+
+
+def _yaml(plan: Plan, file: Path, period: float) -> None:
+    try:
+        import yaml
+    except ImportError as error:
+        raise missing_package("writing YAML", "pyyaml", "yaml") from error
+    write_text(file, f"# {MARK}\n{yaml.safe_dump(plan.to_ros(period), sort_keys=False)}")
+
+
+def _report(plan: Plan, file: Path, period: float, title: str) -> None:
+    from ocp.app.view.report import report_of_plan  # imports matplotlib, which is slow
+
+    write_text(file, report_of_plan(plan, period, title).html())
+
+
+WRITERS: dict[str, Callable[[Plan, Path, float, str], Any]] = {
+    "plan": lambda plan, file, period, title: plan.save(file),
+    "csv": lambda plan, file, period, title: plan.write_csv(file, period),
+    "json": lambda plan, file, period, title: write_text(file, json.dumps(plan.to_ros(period)) + "\n"),
+    "yaml": lambda plan, file, period, title: _yaml(plan, file, period),
+    "mcap": lambda plan, file, period, title: write_mcap(plan, file, period),
+    "urdf": lambda plan, file, period, title: write_text(file, plan.machine.robot.to_urdf()),
+    "report": _report,
+}
+"""Writers of each kind of output; arguments are the plan, the file, the sampling period in s, and a title."""
+
+EXPORT_KINDS = ("csv", "json", "yaml", "mcap", "urdf")
