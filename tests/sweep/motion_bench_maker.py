@@ -26,7 +26,8 @@ from models.arrays import Array
 from ocp import Cost, Limits, Plan, SolveError
 from ocp.app.files.safe_files import read_tree
 from ocp.motion.builders.clearance import ClearanceConstraints
-from ocp.motion.plan.goal_plan import GoalRequest, plan_to_goal
+from ocp.motion.plan.goal_motions import GoalRequest
+from ocp.motion.plan.goal_plan import plan_to_goal
 from ocp.motion.sampling.straight import StraightMotions
 from tests.sweep.results import Row, Sweep, parser
 
