@@ -95,7 +95,7 @@ SOLVER: dict[str, Any] = {
 
 @dataclass(frozen=True, eq=False)
 class MotionLimits:
-    """What a motion must keep.
+    """Constraints of a motion.
 
     Attributes:
         motions: Proofs of clearance.
@@ -116,6 +116,8 @@ def fastest_motion_near(
 ) -> ConstantJerkMotion:
     """Return a locally fastest motion in the neighbourhood of a path, with the first and the last joints of the path.
 
+    A motion from rest to rest keeps the torque limits between the knots, too: it is slowed down where it does not.
+
     Args:
         limits: Limits, clearance and rates at the ends.
         path: Configurations with straight motions between them. Shape (M, n).
@@ -135,7 +137,9 @@ def fastest_motion_near(
         if not search.add_places(state):
             break
         state = search.evaluate(state.points, state.duration)
-    return limits.torques.slowed(search.motion(state))
+    motion = search.motion(state)
+    rests = not (np.any(limits.start_velocity) or np.any(limits.end_velocity))
+    return limits.torques.slowed(motion) if rests else motion
 
 
 def _local_optimum(search: _Search, state: _State, region: float) -> tuple[_State, float]:
@@ -217,9 +221,9 @@ class _Search:
         self.start, self.end, self.size = path[0], path[-1], path.shape[1]
         self.degree = 3 if np.isfinite(bounds.jerk).any() else 2
         spread = np.ptp(path, axis=0).max()
-        self.own = (bounds.velocity, bounds.acceleration, bounds.jerk)[: self.degree]
-        self.is_fast = np.isfinite(bounds.velocity)
-        self.spread = np.where(self.is_fast, 0.0, spread)
+        self.largest = (bounds.velocity, bounds.acceleration, bounds.jerk)[: self.degree]
+        self.has_rate_limit = np.isfinite(bounds.velocity)
+        self.spread = np.where(self.has_rate_limit, 0.0, spread)
         self.breaks = self._breaks(path)
         self.knots = np.concatenate([np.zeros(self.degree), self.breaks, np.ones(self.degree)])
         self.count = len(self.breaks) - 1 + self.degree
@@ -242,7 +246,7 @@ class _Search:
         bounds, settings = self.limits.bounds, self.settings
         with np.errstate(divide="ignore", invalid="ignore"):
             build_up = np.where(np.isfinite(bounds.acceleration), bounds.acceleration / bounds.jerk, 0.0).max()
-            least = np.where(self.is_fast, np.abs(self.end - self.start) / bounds.velocity, 0.0).max()
+            least = np.where(self.has_rate_limit, np.abs(self.end - self.start) / bounds.velocity, 0.0).max()
         first = min(max(build_up / least if least > 0 else 0.0, settings.shortest), 1 / settings.intervals)
         short = [first]
         while self.degree == 3 and short[-1] * settings.growth < 1 / settings.intervals:
@@ -282,12 +286,12 @@ class _Search:
         top = 1 / (1 - ramp)
         share = top * np.where(at < ramp, at**2 / (2 * ramp), at - ramp / 2)
         share = np.where(at > 1 - ramp, 1 - top * (1 - at) ** 2 / (2 * ramp), share)
-        speed = np.where(self.is_fast, self.limits.bounds.velocity, 1.0)
+        speed = np.where(self.has_rate_limit, self.limits.bounds.velocity, 1.0)
         points = points_along(path, 1 / speed, np.clip(share, 0.0, 1.0))
         points[:p], points[-p:] = path[0], path[-1]
         duration = 0.0
         for order in range(1, p + 1):
-            used = np.abs(self.derivatives[order] @ points) / self.own[order - 1]
+            used = np.abs(self.derivatives[order] @ points) / self.largest[order - 1]
             duration = max(duration, float(used.max()) ** (1 / order))
         return points, duration if duration > 0 else 1.0
 
@@ -312,11 +316,11 @@ class _Search:
     def _derivative_rows(self, points: Array, duration: float) -> Iterator[_Rows]:
         """Yield the rows of velocity, acceleration and jerk, each in both directions."""
         for order in range(1, self.degree + 1):
-            limited = np.flatnonzero(np.isfinite(self.own[order - 1]))
+            limited = np.flatnonzero(np.isfinite(self.largest[order - 1]))
             if not len(limited):
                 continue
             derivative = self.derivatives[order]
-            scale = 1 / (self.own[order - 1][limited] * duration**order)
+            scale = 1 / (self.largest[order - 1][limited] * duration**order)
             pick = sp.csr_array((scale, (np.arange(len(limited)), limited)), shape=(len(limited), self.size))
             matrix, usages = sp.kron(derivative, pick), ((derivative @ points)[:, limited] * scale).ravel()
             by_duration = np.full(len(usages), -float(order))
@@ -356,7 +360,7 @@ class _Search:
     def step(self, state: _State, region: float) -> _State | None:
         """Return the motion after a step within a trust region; None if the program has no solution."""
         settings, bounds, count = self.settings, self.limits.bounds, len(self.free)
-        travel = np.where(self.is_fast, bounds.velocity * state.duration, self.spread) * region
+        travel = np.where(self.has_rate_limit, bounds.velocity * state.duration, self.spread) * region
         points = state.points.ravel()[self.free]
         joint = self.free % self.size
         lower = np.concatenate([np.maximum(-travel[joint], bounds.lower[joint] - points), [-settings.change, 0.0]])
