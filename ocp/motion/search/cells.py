@@ -28,13 +28,7 @@ from models.checks import Array
 from ocp.motion.local.collisions import distances_along
 from ocp.motion.local.inverse_kinematics import Unreachable
 from ocp.motion.local.rates import LocalMotion
-from ocp.motion.search.configurations import (
-    REACH_TOLERANCE,
-    PlanRequest,
-    largest_pose_errors,
-    locate_error,
-    sampled_motions,
-)
+from ocp.motion.search.configurations import REACH_TOLERANCE, PlanRequest, largest_pose_errors, locate_error
 from ocp.motion.search.dead_end import DeadEnd
 from ocp.motion.search.reduced import LimitSide, ReducedKinematics, TaskKinematics, check_floating_reach, limit_rates
 
@@ -395,4 +389,4 @@ class _CellPass:
         base = np.stack([layer.base[row] for layer, row in zip(layers, paths, strict=True)], axis=1)
         joints = np.stack([layer.joints[row] for layer, row in zip(layers, paths, strict=True)], axis=1)
         joints = np.clip(joints, self.request.bounds.lower, self.request.bounds.upper)
-        return sampled_motions(times, base, joints, self.request.weights)
+        return LocalMotion.through(times, base, joints, self.request.weights)

@@ -285,7 +285,7 @@ def _hold_shared_joints(request: PlanRequest, configurations: Array) -> PlanRequ
     costs = np.sum([motion.cost for motion in motions], axis=0)
     tracked = np.array(largest_pose_errors(motions)) <= REACH_TOLERANCE
     best = int(np.where(tracked | ~tracked.any(), costs, np.inf).argmin())
-    return request.with_held(_named(request.machine, configurations[best], columns))
+    return request.with_held(_named(request.machine, motions[0].joints[best, 0], columns))
 
 
 def _shared_joints(request: PlanRequest) -> list[int]:

@@ -21,7 +21,6 @@ from ocp.motion.search.configurations import (
     largest_pose_errors,
     local_motions_from,
     locate_error,
-    sampled_motions,
 )
 from ocp.motion.search.dead_end import DeadEnd, dead_end
 from ocp.motion.search.joint_space import FULL_TURN, JointSpace
@@ -245,7 +244,7 @@ class TaskSearch:
                 samples = manifolds.project(indices, samples.reshape(-1, n))[0].reshape(samples.shape)
             samples = np.clip(samples, request.bounds.lower, request.bounds.upper)
             base = np.zeros((count, len(times), 0))
-            motions.append(sampled_motions(times, base, samples, request.weights))
+            motions.append(LocalMotion.through(times, base, samples, request.weights))
         return motions
 
 
