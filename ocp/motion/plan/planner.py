@@ -257,22 +257,23 @@ def _try_alternatives(queue: CandidateQueue, solver: CandidateSolver, seeds: lis
     request, max_tries = solver.request, solver.settings.max_failures
     finished_by_seed = {id(candidate.seed): candidate for candidate in queue.candidates}
     rerouted = []
+    local = {id(seed): solver.local_collisions(seed.seed) for seed in seeds}
+    distances = {key: min((each.distance for each in found), default=np.inf) for key, found in local.items()}
     for seed in seeds:
         finished = finished_by_seed[id(seed.seed)]
         colliding = solver.collisions(finished)
         if finished.constraints is not None and (colliding or finished.constraints.margins):
-            local = solver.local_collisions(seed.seed)
-            constraints = finished.constraints.separating([*colliding, *local])
-            distance = min((collision.distance for collision in local), default=np.inf)
-            rerouted.append((distance, replace(seed, constraints=constraints)))
-    alternatives = [seed for _, seed in sorted(rerouted, key=lambda entry: -entry[0])[:max_tries]]
+            constraints = finished.constraints.separating([*colliding, *local[id(seed)]])
+            rerouted.append((distances[id(seed)], replace(seed, constraints=constraints)))
+    alternatives = sorted(rerouted, key=lambda entry: -entry[0])[:max_tries]
     if request.start is None:
         collisions = start_collisions(request, np.array([seed.start for seed in seeds]))
         clear_starts = [seed for seed, collision in zip(seeds, collisions, strict=True) if collision is None]
         tracked = [c for c in clear_starts if max(largest_pose_errors([*c.seed.local])) <= REACH_TOLERANCE]
         tracked.sort(key=lambda candidate: candidate.seed.cost)
-        alternatives += [replace(c, seed=replace(c.seed, direct=True, fixed=True)) for c in tracked[:max_tries]]
-    for seed in alternatives:
+        fixed = [(c, replace(c.seed, direct=True, fixed=True)) for c in tracked[:max_tries]]
+        alternatives += [(distances[id(c)], replace(c, seed=seed)) for c, seed in fixed]
+    for _, seed in sorted(alternatives, key=lambda entry: -entry[0]):
         start = seed.start
         queue.candidates = [c for c in queue.candidates if c.start is not start]  # it finishes again
         queue.run([seed])
