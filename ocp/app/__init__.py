@@ -3,7 +3,7 @@
 No other package draws.
 """
 
-from ocp.app.check.verdict import Check, Fault, Row, check_trajectory
+from ocp.app.check.verdict import Check, CheckTolerances, Fault, Interpretation, Row, check_trajectory
 from ocp.app.command import main
 
-__all__ = ["Check", "Fault", "Row", "check_trajectory", "main"]
+__all__ = ["Check", "CheckTolerances", "Fault", "Interpretation", "Row", "check_trajectory", "main"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import casadi as ca
@@ -96,7 +97,7 @@ def check_horizon(what: str, value: np.ndarray) -> None:
         raise ProblemError(words, value=float(value[0]))
 
 
-BLOCK_SIZES = (512, 32)  # samples per call: one map of all samples takes longer to build than to evaluate
+BLOCK_SIZES = (512, 32, 8, 1)  # samples per call: one map of all samples takes longer to build than to evaluate
 
 
 class Sampler:
@@ -108,7 +109,8 @@ class Sampler:
     """
 
     def __init__(self, symbols: list[Any], outputs: list[Any]) -> None:
-        self._inputs, self._outputs = ([part.numel() for part in parts] for parts in (symbols, outputs))
+        self._inputs = [part.numel() for part in symbols]
+        self._ends = np.cumsum([output.numel() for output in outputs], dtype=int).tolist()
         packed, results = ca.vertcat(*symbols), ca.vertcat(*[ca.densify(ca.vec(output)) for output in outputs])
         if isinstance(packed, ca.MX):  # the inputs of an MX function must be symbols
             inner = ca.Function("inner", symbols, [results], {"cse": True})
@@ -126,23 +128,22 @@ class Sampler:
         """
         values = [np.asarray(column, dtype=float) for column in columns]
         count = next(len(value) for value in values if value.ndim == 2)
-        padded = -(-count // BLOCK_SIZES[-1]) * BLOCK_SIZES[-1]
-        arguments, results = np.empty((padded, sum(self._inputs))), np.empty((padded, self._filled.size))
+        arguments, results = np.empty((count, sum(self._inputs))), np.empty((count, self._filled.size))
         first = 0
         for size, value in zip(self._inputs, values, strict=True):
-            arguments[:count, first : first + size] = value
+            arguments[:, first : first + size] = value
             first += size
-        arguments[count:] = arguments[count - 1 : count]  # pad the last block with the last sample
         begin = 0
         for size in BLOCK_SIZES:
-            end = padded - (padded - begin) % size
+            end = count - (count - begin) % size
             if end > begin:
                 block = self._maps.get(size) or self._maps.setdefault(size, self._function.map(size))
                 evaluate_in_blocks(block, size, arguments[begin:end], [results[begin:end]])
             begin = end
-        values_out = np.zeros((padded, sum(self._outputs)))
-        values_out[:, self._filled] = results
-        return np.split(values_out[:count], np.cumsum(self._outputs[:-1]), axis=1)
+        if self._filled.size < self._ends[-1]:
+            filled, results = results, np.zeros((count, self._ends[-1]))
+            results[:, self._filled] = filled
+        return [results[:, begin:end] for begin, end in pairwise((0, *self._ends))]
 
 
 def evaluate_in_blocks(

@@ -22,7 +22,7 @@ from models import FixedBase
 from models.arrays import Array
 from ocp.curves import PiecewisePolynomial
 from ocp.errors import SolveError, SolverStatus
-from ocp.motion.builders.dynamics import joint_torques
+from ocp.motion.builders.torques import joint_torques
 from ocp.motion.schedule.ramps import fastest_motion
 from ocp.motion.tasks.limits import JointBounds
 from ocp.problem.formulation import Formulation

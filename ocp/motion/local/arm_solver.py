@@ -9,7 +9,7 @@ if there are still fewer than six, which must stay at zero.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import combinations
 from typing import NamedTuple
 
@@ -121,12 +121,12 @@ class ArmSolver:
         joints[:, shiftable] += TURN * np.ceil((start - joints[:, shiftable]) / TURN)
         good = ((joints >= windows.lower) & (joints <= windows.upper))[:, order].all(axis=1)
         rows, joints, several = np.flatnonzero(good), joints[good], windows.several
-        for j in several.tolist() if turns else ():
-            counts = 1 + ((windows.upper[j] - joints[:, j]) // TURN).astype(int)
-            copies = np.repeat(np.arange(len(rows)), counts)
-            number = np.arange(len(copies)) - np.repeat(np.cumsum(counts) - counts, counts)
+        if turns and several.size:
+            counts = 1 + ((windows.upper[several] - joints[:, several]) // TURN).astype(int)
+            shifts = list(map(_whole_turns, map(tuple, counts.tolist())))
+            copies = np.repeat(np.arange(len(rows)), [len(each) for each in shifts])
             rows, joints = rows[copies], joints[copies]
-            joints[:, j] += TURN * number
+            joints[:, several] += np.concatenate(shifts) if shifts else 0.0
         np.clip(joints, windows.lowest, windows.highest, out=joints)
         return Solutions(solutions.pose[rows], joints, solutions.singular[rows])
 
@@ -143,6 +143,12 @@ class ArmSolver:
         several = np.flatnonzero(both & (upper - lower >= TURN))
         lowest, highest = np.where(moving, self.lower, -np.inf), np.where(moving, self.upper, np.inf)
         return _Windows(lower, upper, lowest, highest, low[shiftable], middle[shiftable], shiftable, several)
+
+
+@lru_cache(maxsize=256)
+def _whole_turns(counts: tuple[int, ...]) -> Array:
+    """Return all combinations of 0, 1, ..., count - 1 whole turns of some joints, rad. Shape (product, joints)."""
+    return np.asarray(TURN * np.indices(counts).reshape(len(counts), -1).T)
 
 
 class _Windows(NamedTuple):

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import NamedTuple
+from functools import cached_property, lru_cache
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -18,15 +18,13 @@ from numpy.typing import NDArray
 
 from models import Machine
 from models.arrays import Array
+from models.spatial import Frame, cross, expression, rotation
+from ocp.problem.values import Sampler
 
-__all__ = ["TURN", "Axis", "Chain", "Motion", "Solutions", "axial", "cross", "dot", "pick"]
+__all__ = ["TURN", "Chain", "Motion", "Solutions", "SymbolicAxis", "compose", "inverse"]
 
 TURN = 2 * np.pi
 """Full turn, rad."""
-NEXT, AFTER = np.array([1, 2, 0]), np.array([2, 0, 1])
-SKEW = np.cross(np.eye(3)[:, None], np.eye(3)).transpose(0, 2, 1).reshape(3, 9)
-"""Maps a vector w to the matrix of w x, row by row."""
-IDENTITY = np.eye(3)
 
 
 @dataclass(frozen=True)
@@ -64,26 +62,6 @@ class NewtonSettings:
 NEWTON = NewtonSettings()
 
 
-def dot(a: Array, b: Array) -> Array:
-    """Return the scalar products of vectors."""
-    return np.asarray(np.vecdot(a, b))
-
-
-def cross(a: Array, b: Array) -> Array:
-    """Return the vector products of vectors; for small arrays faster than numpy's function."""
-    return np.asarray(a[..., NEXT] * b[..., AFTER] - a[..., AFTER] * b[..., NEXT])
-
-
-def pick(rows: Array, chosen: NDArray[np.intp]) -> Array:
-    """Return the rows at these indices; a single row holds for all of them."""
-    return rows if len(rows) == 1 else rows[chosen]
-
-
-def axial(turn: Array) -> Array:
-    """Return the axial vectors of rotations, 2 sin(angle) times their axes. Shapes (M, 3, 3) to (M, 3)."""
-    return np.stack([turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], 1)
-
-
 class Motion(NamedTuple):
     """Rigid motions v -> turn v + shift. Shapes (M, 3, 3), (M, 3)."""
 
@@ -113,37 +91,49 @@ class Motion(NamedTuple):
         return Motion(turn, -(turn @ self.shift[:, :, None])[:, :, 0])
 
 
-class Axis(NamedTuple):
-    """Axes of joints: unit directions (M, 3), points (M, 3), and whether the joint is revolute or prismatic.
+class SymbolicAxis(NamedTuple):
+    """Axis of a joint as expressions: its unit direction and a point on it. Shapes (3, 1)."""
 
-    A single row, (1, 3), holds for all poses.
-    """
+    direction: Any
+    point: Any
+    revolute: bool
 
-    direction: Array
-    point: Array
-    revolute: bool = True
+    @classmethod
+    def of(cls, direction: Array, point: Array, revolute: bool) -> SymbolicAxis:
+        """Return a constant axis."""
+        return cls(expression(direction), expression(point), revolute)
 
-    def take(self, chosen: NDArray[np.intp]) -> Axis:
-        """Return the axes at these indices."""
-        return self if len(self.point) == 1 else Axis(self.direction[chosen], self.point[chosen], self.revolute)
+    def moved(self, motion: Frame) -> SymbolicAxis:
+        """Return the axis moved by a motion."""
+        return self._replace(direction=ca.mtimes(motion.rotation, self.direction), point=motion.point(self.point))
 
-    def moved(self, motion: Motion) -> Axis:
-        """Return the axes moved by a motion."""
-        return Axis(motion.rotate(self.direction), motion.at(self.point), self.revolute)
-
-    def by(self, position: Array) -> Motion:
-        """Return the motions of the joints by these positions (M,)."""
+    def frame(self, position: Any) -> Frame:
+        """Return the motion of the joint by a position."""
         if not self.revolute:
-            return Motion(np.broadcast_to(IDENTITY, (len(position), 3, 3)), self.direction * position[:, None])
-        skew = (self.direction @ SKEW).reshape(-1, 3, 3)
-        sine, versine = np.sin(position)[:, None, None], (1 - np.cos(position))[:, None, None]
-        turn = IDENTITY + sine * skew + versine * (skew @ skew)
-        return Motion(turn, self.point - (turn @ self.point[:, :, None])[:, :, 0])
+            return Frame(ca.DM.eye(3), self.direction * position)
+        turn = rotation(self.direction, position)
+        return Frame(turn, self.point - ca.mtimes(turn, self.point))
 
-    def angle(self, start: Array, end: Array) -> Array:
-        """Return the angles by which joints rotate vectors (M, 3) towards others, as seen along the axes."""
-        across = start - dot(start, self.direction)[:, None] * self.direction
-        return np.arctan2(dot(self.direction, cross(across, end)), dot(across, end))
+    def angle(self, start: Any, end: Any) -> Any:
+        """Return the angle by which the joint rotates a vector towards another."""
+        across = start - ca.dot(start, self.direction) * self.direction
+        return ca.atan2(ca.dot(self.direction, cross(across, end)), ca.dot(across, end))
+
+    def terms(self, fixed: Any, vector: Any, sign: int = 1) -> Any:
+        """Return the constant, cosine and sine parts of fixed . R(sign angle) vector. Shape (1, 3)."""
+        constant = ca.dot(fixed, self.direction) * ca.dot(self.direction, vector)
+        sine = sign * ca.dot(fixed, cross(self.direction, vector))
+        return ca.horzcat(constant, ca.dot(fixed, vector) - constant, sine)
+
+
+def compose(first: Frame, second: Frame) -> Frame:
+    """Return the motion that applies the second one, then the first."""
+    return Frame(ca.mtimes(first.rotation, second.rotation), first.point(second.position))
+
+
+def inverse(frame: Frame) -> Frame:
+    """Return the inverse motion."""
+    return Frame(frame.rotation.T, -ca.mtimes(frame.rotation.T, frame.position))
 
 
 class Solutions(NamedTuple):
@@ -215,50 +205,37 @@ class Chain:
         )
 
     @cached_property
-    def screws(self) -> tuple[Array, Array]:
-        """Screws of the joints in the order of the chain, and their squares. Shapes (k, 4, 4)."""
-        order = list(self.order)
-        axes, points, revolute = self.axes[order], self.points[order], self.revolute[order]
-        screws = np.zeros((len(order), 4, 4))
-        screws[:, :3, :3] = np.where(revolute[:, None, None], np.cross(np.eye(3), axes[:, None]), 0.0)
-        screws[:, :3, 3] = np.where(revolute[:, None], np.cross(points, axes), axes)
-        return screws, screws @ screws
+    def home(self) -> Frame:
+        """Pose of the tip at the zero configuration, as constants."""
+        return Frame(expression(self.rotation), expression(self.position))
 
     @cached_property
-    def constant_axes(self) -> tuple[Axis, ...]:
-        """Axes of the joints at the zero configuration, in the order of the chain."""
-        parts = ((self.axes[[j]], self.points[[j]], bool(self.revolute[j])) for j in self.order)
-        return tuple(Axis(*part) for part in parts)
-
-    @cached_property
-    def home_motion(self) -> Motion:
-        """Pose of the tip at the zero configuration, as one motion."""
-        return Motion(self.rotation[None], self.position[None])
-
-    @cached_property
-    def home(self) -> Array:
-        """Pose of the tip at the zero configuration. Shape (4, 4)."""
-        home = np.eye(4)
-        home[:3, :3], home[:3, 3] = self.rotation, self.position
-        return home
-
-    def frames(self, joints: Array) -> Array:
-        """Return the motions of the joints' axes and of the tip from the zero configuration. Shape (k + 1, K, 4, 4)."""
-        order = list(self.order)
-        position, turns = joints[:, order].T, self.revolute[order][:, None]
-        sine, versine = np.where(turns, np.sin(position), position), np.where(turns, 1 - np.cos(position), 0.0)
-        screws, squares = self.screws
-        steps = np.eye(4) + sine[:, :, None, None] * screws[:, None] + versine[:, :, None, None] * squares[:, None]
-        frames = np.empty((len(order) + 1, len(joints), 4, 4))
-        frames[0] = np.eye(4)
-        for k in range(len(order)):
-            np.matmul(frames[k], steps[k], out=frames[k + 1])
-        return frames
+    def _tip_function(self) -> Sampler:
+        """Function of all joints, the rows of a rotation and a position -> error, Jacobian and pose of the tip."""
+        joints, turn, shift = ca.SX.sym("q", len(self.axes)), ca.SX.sym("turn", 9), ca.SX.sym("shift", 3)
+        frame, moved = Frame(ca.DM.eye(3), ca.DM(3, 1)), list[SymbolicAxis]()
+        for j in self.order:
+            axis = SymbolicAxis.of(self.axes[j], self.points[j], bool(self.revolute[j]))
+            moved.append(axis.moved(frame))
+            frame = compose(frame, axis.frame(joints[j]))
+        tip = compose(frame, self.home)
+        columns = [
+            ca.vertcat(axis.direction, cross(axis.direction, tip.position - axis.point) / self.size)
+            if axis.revolute
+            else ca.vertcat(ca.DM(3, 1), axis.direction / self.size)
+            for axis in moved
+        ]
+        error = ca.mtimes(ca.reshape(turn, 3, 3).T, tip.rotation.T)
+        axial = ca.vertcat(*((error[i, j] - error[j, i]) / 2 for i, j in ((2, 1), (0, 2), (1, 0))))
+        axial = ca.if_else(ca.trace(error) < 1, 3.0, axial)
+        errors = ca.vertcat(axial, (shift - tip.position) / self.size)
+        outputs = [errors, ca.horzcat(*columns), tip.position, tip.rotation.T]
+        return Sampler([joints, turn, shift], outputs)
 
     def poses(self, joints: Array) -> tuple[Array, Array]:
         """Return the poses of the tip at joints (K, n). Shapes (K, 3), (K, 3, 3)."""
-        tips = self.frames(joints)[-1] @ self.home
-        return tips[:, :3, 3], tips[:, :3, :3]
+        _, _, positions, rotations = self._tip_function(joints, np.zeros(9), np.zeros(3))
+        return positions, rotations.reshape(-1, 3, 3)
 
     def linearize(self, joints: Array, free: Sequence[int], goal: Motion) -> tuple[Array, Array]:
         """Return pose errors (K, 6) of joints (K, n) and the Jacobian of the tip in the free joints (K, 6, m).
@@ -266,19 +243,11 @@ class Chain:
         The errors are the rotation as the axial vector 2 sin(angle) / 2, or (3, 3, 3) beyond a right angle, and the
         displacement as a share of the size of the arm.
         """
-        frames = self.frames(joints)
-        tips = frames[-1] @ self.home
-        rows, numbers = [self.order.index(j) for j in free], list(free)
-        turns = frames[rows, :, :3, :3]
-        directions = (turns @ self.axes[numbers][:, None, :, None])[..., 0]
-        points = (turns @ self.points[numbers][:, None, :, None])[..., 0] + frames[rows, :, :3, 3]
-        revolute = self.revolute[numbers][:, None, None]
-        moments = np.where(revolute, cross(directions, tips[:, :3, 3] - points), directions) / self.size
-        jacobian = np.concatenate([np.where(revolute, directions, 0.0), moments], axis=2).transpose(1, 2, 0)
-        turn = goal.turn @ tips[:, :3, :3].transpose(0, 2, 1)
-        rotation = axial(turn) / 2
-        rotation[turn[:, 0, 0] + turn[:, 1, 1] + turn[:, 2, 2] < 1] = 3.0
-        return np.concatenate([rotation, (goal.shift - tips[:, :3, 3]) / self.size], axis=1), jacobian
+        errors, jacobians, _, _ = self._tip_function(joints, goal.turn.reshape(-1, 9), goal.shift)
+        jacobians = jacobians.reshape(len(joints), len(self.order), 6)
+        if tuple(free) != self.order:
+            jacobians = jacobians[:, [self.order.index(j) for j in free]]
+        return errors, jacobians.transpose(0, 2, 1)
 
     def refine(self, pose: NDArray[np.intp], joints: Array, free: Sequence[int], goal: Motion) -> Solutions:
         """Refine candidates by Newton's method in the free joints; return each solution once.
@@ -328,12 +297,7 @@ class Chain:
         joints[:, turns] -= TURN * np.round(joints[:, turns] / TURN)
         order = np.argsort(pose, kind="stable")
         pose, joints, singular = pose[order], joints[order], singular[order]
-        largest = int(np.bincount(pose, minlength=1).max(initial=0))
-        first = np.arange(len(pose))[:, None]
-        second = first + np.arange(1, largest)
-        same_pose = second < len(pose)
-        second = np.minimum(second, len(pose) - 1)
-        first, second = (part[same_pose & (pose[first] == pose[second])] for part in np.broadcast_arrays(first, second))
+        first, second = _pairs_of_one_pose(pose)
         difference = joints[second] - joints[first]
         difference[:, turns] -= TURN * np.round(difference[:, turns] / TURN)
         distance = np.abs(difference[:, free]).max(axis=1, initial=0.0)
@@ -345,6 +309,24 @@ class Chain:
         kept = np.ones(len(pose), dtype=bool)
         kept[second[same]] = False
         return Solutions(pose[kept], joints[kept], singular[kept])
+
+
+def _pairs_of_one_pose(pose: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the pairs of solutions, sorted by pose, that belong to the same pose. Shapes (P,)."""
+    if not len(pose) or pose[0] == pose[-1]:
+        return _pairs(len(pose))
+    first = np.arange(len(pose))[:, None]
+    second = first + np.arange(1, int(np.bincount(pose).max()))
+    same_pose = second < len(pose)
+    second = np.minimum(second, len(pose) - 1)
+    first, second = (part[same_pose & (pose[first] == pose[second])] for part in np.broadcast_arrays(first, second))
+    return first, second
+
+
+@lru_cache(maxsize=64)
+def _pairs(count: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return all pairs of so many things. Shapes (P,)."""
+    return np.triu_indices(count, 1)
 
 
 def _damped_steps(jacobian: Array, missed: Array) -> Array:

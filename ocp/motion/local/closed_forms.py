@@ -17,16 +17,20 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import combinations, pairwise
-from typing import TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
+import casadi as ca
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from models.arrays import Array
-from ocp.motion.local.chain import Axis, Chain, Motion, Solutions, axial, cross, dot, pick
+from models.cts.trigonometric import Harmonics, polish, roots, square_of_first_harmonic
+from models.spatial import Frame, cross
+from ocp.motion.local.chain import Chain, Motion, Solutions, SymbolicAxis, compose, inverse
+from ocp.problem.values import Sampler
 
 __all__ = ["ClosedForm", "Mask", "PoseSolver", "closed_forms", "is_scara"]
 
@@ -110,39 +114,13 @@ class PoseSolver(ABC):
         for _ in range(NEARBY.pairs):
             turn, shift = NEARBY.distance * rng.normal(size=(2, 3))
             for sign in (1.0, -1.0):
-                rotation = Rotation.from_rotvec(sign * turn).as_matrix()
+                rotation = scipy.spatial.transform.Rotation.from_rotvec(sign * turn).as_matrix()
                 yield Motion(tips.turn @ rotation, tips.shift + sign * self.chain.size * shift)
 
     def solutions(self, positions: Array, rotations: Array, redundant: Array) -> tuple[NDArray[np.intp], Array]:
         """Return the poses (K,) and the joints (K, n) of all isolated solutions; see `solve`."""
         solutions, _ = self.solve(positions, rotations, redundant)
         return solutions.pose, solutions.joints
-
-    def prescribe(self, redundant: Array) -> Array:
-        """Return joints with the redundant ones (M, k) at these positions and the others at 0. Shape (M, n)."""
-        joints = np.zeros((len(redundant), len(self.chain.axes)))
-        joints[:, list(self.redundant)] = redundant
-        return joints
-
-    def refine(self, pose: NDArray[np.intp], free: Array, prescribed: Array, goal: Motion) -> Solutions:
-        """Return the solutions that Newton's method finds from candidates for the free joints (K, m) at poses (K,)."""
-        joints = prescribed[pose]
-        joints[:, self.free] = free
-        return self.chain.refine(pose, joints, self.free, goal)
-
-    def loop(self, prescribed: Array, goal: Motion) -> tuple[list[Axis], Motion]:
-        """Return the axes of the free joints, and the motion that they must make with the others as prescribed."""
-        chain = self.chain
-        if not self.redundant:
-            return list(chain.constant_axes), goal.after(chain.home_motion.inverse)
-        fixed, axes = Motion(np.eye(3)[None], np.zeros((1, 3))), list[Axis]()
-        for j, constant in zip(chain.order, chain.constant_axes, strict=True):
-            axis = constant.moved(fixed)
-            if j in self.redundant:
-                fixed = axis.by(prescribed[:, j]).after(fixed)
-            else:
-                axes.append(axis)
-        return axes, goal.after(fixed.after(chain.home_motion).inverse)
 
 
 TINY = 1e-300
@@ -159,11 +137,13 @@ class FormSettings:
         straight: Up to this much, also in rad, axes count as meeting or parallel; Newton's method refines.
         near: Residual up to which rough solutions are refined: near a double solution they are that inaccurate.
         vanishing: Size of the coefficients of an equation below which each angle solves it.
+        nearby: Distance up to which two roots may be close to each other, rad.
     """
 
     straight: float = 1e-8
     near: float = 1e-3
     vanishing: float = 1e-8
+    nearby: float = 0.05
 
 
 FORMS = FormSettings()
@@ -183,23 +163,115 @@ class ClosedForm(PoseSolver):
 
     def solve_regular(self, tips: Motion, redundant: Array) -> tuple[Solutions, Mask, Mask]:
         """Return solutions; where they belong to families, some may be missing. See `PoseSolver.solve_regular`."""
-        prescribed = self.prescribe(redundant)
-        axes, goal = self.loop(prescribed, tips)
-        free, families = self.free, np.zeros(len(tips.shift), dtype=bool)
+        arguments = np.concatenate([redundant, tips.turn.reshape(-1, 9), tips.shift], axis=1)
+        count, families = len(arguments), np.zeros(len(arguments), dtype=bool)
         if self.kind == "scara":
-            seats = [free.index(j) for j in (*self.triple, *(j for j in free if j not in self.triple))]
-            pose, angles = _solve_planar([axes[i] for i in seats[:3]], goal)
-            slide = dot(axes[seats[3]].direction, goal.at(axes[seats[0]].point) - axes[seats[0]].point)
-            solutions = np.column_stack([angles, slide[pose]])
+            pose, positions, excess = np.arange(count), *self._planar_function(arguments)
         else:
-            first, back = free.index(self.triple[0]), goal.inverse
-            # joints behind the triple move to the front, conjugated by the goal
-            seats = [(first + 3 + i) % SIX for i in range(SIX)]
-            loop = [axes[i].moved(back) if i < first + 3 else axes[i] for i in seats]
-            pose, solutions, families = _solve_six(loop, goal, self)
-        positions = np.empty_like(solutions)
-        positions[:, seats] = solutions
-        return self.refine(pose, positions, prescribed, tips), np.zeros_like(families), families
+            pairs, residuals, determination = self._pair_function(arguments)
+            families = determination[:, 0] < FORMS.vanishing
+            pose, column = np.nonzero(residuals < FORMS.near)
+            arguments = np.concatenate([arguments[pose], pairs.reshape(count, -1, 2)[pose, column]], axis=1)
+            positions, excess, arm = self._triple_function(arguments)
+            families[pose[arm[:, 0] < FORMS.vanishing]] = True  # the joint between the pair may have any angle
+            excess[arm < FORMS.near] = 0.0  # its angle is inaccurate, so that the excess is too
+        within = np.flatnonzero(np.repeat(excess[:, 0] < FORMS.near, 2))
+        joints = np.zeros((len(within), len(self.chain.axes)))
+        pose = pose[within // 2]
+        joints[:, list(self.redundant)] = redundant[pose]
+        joints[:, self.free] = positions.reshape(-1, len(self.free))[within]
+        return self.chain.refine(pose, joints, self.free, tips), np.zeros_like(families), families
+
+    def _loop(self) -> _SymbolicLoop:
+        """Return the loop of the free joints as expressions, with the joints behind the triple at the front."""
+        chain = self.chain
+        symbols, fixed = ca.SX.sym("pose", len(self.redundant) + 12), Frame(ca.DM.eye(3), ca.DM(3, 1))
+        points, axes = chain.points.copy(), list[SymbolicAxis]()
+        if self.kind == "meeting":
+            points[list(self.triple)] = _meeting_point(chain, self.triple)[0]
+        for j in chain.order:
+            axis = SymbolicAxis.of(chain.axes[j], points[j], bool(chain.revolute[j]))
+            if j in self.redundant:
+                fixed = compose(fixed, axis.frame(symbols[self.redundant.index(j)]))
+            else:
+                axes.append(axis.moved(fixed))
+        tip = Frame(ca.reshape(symbols[-12:-3], 3, 3).T, symbols[-3:])
+        goal = compose(tip, inverse(compose(fixed, chain.home)))
+        last = self.free.index(self.triple[-1]) + 1
+        axes = [*(axis.moved(goal) for axis in axes[last:]), *axes[:last]]
+        return _SymbolicLoop(symbols, axes, [*self.free[last:], *self.free[:last]], goal)
+
+    def _positions(self, order: list[int], solutions: list[list[Any]]) -> Any:
+        """Return solutions as one column, each in the order of the free joints."""
+        return ca.vertcat(*(each[order.index(j)] for each in solutions for j in self.free))
+
+    @cached_property
+    def _planar_function(self) -> Sampler:
+        """Function of a pose -> two solutions of a SCARA, excess."""
+        symbols, axes, order, goal = self._loop()
+        triple = [axes[order.index(j)] for j in self.triple]
+        slide = next(axis for axis in axes if not axis.revolute)
+        shift = ca.dot(slide.direction, goal.point(triple[0].point) - triple[0].point)
+        solutions, excess = _solve_triple(triple, goal, meeting=False)
+        numbers = [*self.triple, *(j for j in self.free if j not in self.triple)]
+        return Sampler([symbols], [self._positions(numbers, [[*each, shift] for each in solutions]), excess])
+
+    @cached_property
+    def _pair_function(self) -> Sampler:
+        """Function of a pose -> pairs of angles of x and z, residuals, and determination; see `_pair_solver`."""
+        symbols, (x, y, z, a, *_), _, goal = self._loop()
+        size = self.chain.size
+        offsets = (x.point - y.point) / size, (z.point - y.point) / size
+        end = (goal.point(a.point) - x.point) / size
+        if self.kind == "meeting":
+            start = (a.point - z.point) / size
+            # e_z p and e_x^-1 G p have the same height along the axis of y and the same distance from it
+            images, vectors = (end, 2 * end), (start, 2 * start)
+            height = ca.dot(y.direction, offsets[1] - offsets[0])
+            lengths = [ca.sumsqr(part) for part in (offsets[1], start, offsets[0], end)]
+            sides = ca.vertcat(height, lengths[0] + lengths[1] - lengths[2] - lengths[3])
+        else:
+            ahead = ca.mtimes(goal.rotation, a.direction)
+            # the direction of the triple, and the distance of a point along it, before and after the motion
+            images, vectors = (ahead, ahead), (a.direction, a.direction)
+            sides = ca.vertcat(0, ca.dot(a.direction, a.point - z.point) / size - ca.dot(ahead, end))
+        of_x = ca.vertcat(*map(x.terms, (y.direction, offsets[0]), images, (-1, -1)))
+        of_z = ca.vertcat(*map(z.terms, (y.direction, offsets[1]), vectors))
+        c = sides + of_z[:, 0] - of_x[:, 0]
+        first, second, residuals, determination = _pair_solver()(of_x[:, 1:], -of_z[:, 1:], c)
+        return Sampler([symbols], [ca.horzcat(first, second).T, residuals, determination])
+
+    @cached_property
+    def _triple_function(self) -> Sampler:
+        """Function of a pose and angles of x and z -> two solutions, their excess, and the lever arm of y."""
+        symbols, (x, y, z, *triple), order, goal = self._loop()
+        angles, meeting = ca.SX.sym("angles", 2), self.kind == "meeting"
+        before, after = z.frame(angles[1]), compose(inverse(x.frame(angles[0])), goal)
+        if meeting:
+            start, end = (part.point(triple[0].point) - y.point for part in (before, after))
+        else:
+            start, end = (ca.mtimes(part.rotation, triple[0].direction) for part in (before, after))
+        second = y.angle(start, end)
+        solutions, excess = _solve_triple(triple, compose(inverse(compose(y.frame(second), before)), after), meeting)
+        arm = ca.norm_2(cross(y.direction, start)) / (self.chain.size if meeting else 1.0)
+        positions = self._positions(order, [[angles[0], second, angles[1], *each] for each in solutions])
+        return Sampler([ca.vertcat(symbols, angles)], [positions, excess, arm])
+
+
+class _SymbolicLoop(NamedTuple):
+    """A loop of joint motions that multiply to a goal, as expressions.
+
+    Attributes:
+        symbols: Positions of the redundant joints, rows of the rotation of the tip, its position. Shape (k + 12,).
+        axes: Axes of the joints.
+        order: Numbers of the joints.
+        goal: The goal.
+    """
+
+    symbols: Any
+    axes: list[SymbolicAxis]
+    order: list[int]
+    goal: Frame
 
 
 def closed_forms(chain: Chain, lockable: Sequence[int] | None = None) -> tuple[ClosedForm, ...]:
@@ -251,170 +323,121 @@ def _kind_of(chain: Chain, triple: tuple[int, ...]) -> str:
         offsets = [points[j] - points[i] for i, j in pairwise(triple)]
         offsets = [offset - offset @ axes[triple[0]] * axes[triple[0]] for offset in offsets]
         return "parallel" if min(map(np.linalg.norm, offsets)) > FORMS.straight * chain.size else ""
-    projectors = np.eye(3) - axes[list(triple), :, None] * axes[list(triple), None, :]
-    projected = np.einsum("kij,kj->ki", projectors, points[list(triple)])
-    point = np.linalg.lstsq(projectors.sum(axis=0), projected.sum(axis=0), rcond=FORMS.straight)[0]
-    distance = np.linalg.norm(np.einsum("kij,j->ki", projectors, point) - projected, axis=1).max()
+    distance = _meeting_point(chain, triple)[1]
     return "meeting" if min(sines) > FORMS.straight and distance < FORMS.straight * chain.size else ""
 
 
-def _rotation_terms(fixed: Array, axis: Array, vector: Array) -> tuple[Array, Array]:
-    """Return fixed . R(axis, angle) vector as constants (...), and cosine and sine parts, (..., 2)."""
-    constant = dot(fixed, axis) * dot(axis, vector)
-    return constant, np.stack([dot(fixed, vector) - constant, dot(fixed, cross(axis, vector))], axis=-1)
+def _meeting_point(chain: Chain, triple: tuple[int, ...]) -> tuple[Array, float]:
+    """Return the point nearest to three axes, and its largest distance from one of them."""
+    axes, points = chain.axes[list(triple)], chain.points[list(triple)]
+    projectors = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    projected = np.einsum("kij,kj->ki", projectors, points)
+    point = np.linalg.lstsq(projectors.sum(axis=0), projected.sum(axis=0), rcond=FORMS.straight)[0]
+    return point, float(np.linalg.norm(np.einsum("kij,j->ki", projectors, point) - projected, axis=1).max())
 
 
-def _stack(count: int, *parts: Array) -> Array:
-    """Return vectors, (M, 3) or (1, 3) each, as one array (k, M, 3)."""
-    stacked = np.empty((len(parts), count, 3))
-    for k, part in enumerate(parts):
-        stacked[k] = part
-    return stacked
+@cache
+def _pair_solver() -> Any:
+    """Return the CasADi function of two equations -> pairs of angles that solve them, residuals, and determination.
 
+    The equations are a [cos, sin](first) + b [cos, sin](second) = c. The singular value decomposition b = L diag(s) R,
+    in closed form, separates them: with a' = L' a and c' = L' c the remainders w = c' - a' [cos, sin](first) satisfy
+    (w_1 / s_1)^2 + (w_2 / s_2)^2 = 1, a trigonometric polynomial of two harmonics.
 
-def _solve_six(axes: list[Axis], goal: Motion, form: ClosedForm) -> tuple[NDArray[np.intp], Array, Mask]:
-    """Return rough angles with e_x e_y e_z e_a e_b e_c = goal, where a, b, c meet or are parallel; some do not hold.
-
-    The third result says which poses have families of solutions.
+    The inputs are a, b and c, of shapes (2, 2), (2, 2) and (2, 1). The outputs are sixteen first and second angles,
+    some of which do not hold; how far each pair is from a solution; and a number that vanishes where an angle is not
+    determined.
     """
-    (x, y, z, a, b, c), kind, size = axes, form.kind, form.chain.size
-    first_offset, second_offset = (x.point - y.point) / size, (z.point - y.point) / size
-    count = len(goal.shift)
-    fixed = _stack(count, y.direction, y.direction, first_offset, second_offset)
-    directions = _stack(count, -x.direction, z.direction, -x.direction, z.direction)
-    sides = np.zeros((2, count))
-    if kind == "meeting":
-        point = _meeting_points(a, b, c)
-        end, start = (goal.at(point) - x.point) / size, (point - z.point) / size
-        # e_z p and e_x^-1 G p have the same height along the axis of y and the same distance from it
-        vectors = _stack(count, end, start, 2 * end, 2 * start)
-        sides[0] = dot(y.direction, second_offset - first_offset)
-        sides[1] = dot(second_offset, second_offset) + dot(start, start)
-        sides[1] -= dot(first_offset, first_offset) + dot(end, end)
-    else:
-        direction, point = a.direction, a.point
-        ahead, end = goal.rotate(direction), (goal.at(point) - x.point) / size
-        # the direction of the triple, and the distance of a point along it, before and after the motion
-        vectors = _stack(count, ahead, direction, ahead, direction)
-        sides[1] = dot(direction, point - z.point) / size - dot(ahead, end)
-    constants, parts = _rotation_terms(fixed, directions, vectors)
-    sides += constants[1::2] - constants[::2]
-    a_, b_ = parts[::2].transpose(1, 0, 2), -parts[1::2].transpose(1, 0, 2)
-    c_ = sides.T
-    pose, first, third, families = _angle_pairs(a_, b_, c_)
-    x, y, z, a, b, c = (axis.take(pose) for axis in (x, y, z, a, b, c))
-    goal = goal.take(pose)
-    before, after = z.by(third), x.by(first).inverse.after(goal)
-    if kind == "meeting":
-        start, end = before.at(pick(point, pose)) - y.point, after.at(pick(point, pose)) - y.point
-    else:
-        start, end = before.rotate(pick(direction, pose)), after.rotate(pick(direction, pose))
-    second = y.angle(start, end)
-    on_axis = np.abs(cross(y.direction, start)).max(axis=1) < FORMS.vanishing * (size if kind == "meeting" else 1.0)
-    families[pose[on_axis]] = True  # y may have any angle
-    remaining = y.by(second).after(before).inverse.after(after)
-    which, last = (_solve_wrist if kind == "meeting" else _solve_planar)([a, b, c], remaining)
-    outer = np.stack([first, second, third], axis=1)[which]
-    return pose[which], np.concatenate([outer, last], axis=1), families
+    a, b, c = ca.SX.sym("a", 2, 2), ca.SX.sym("b", 2, 2), ca.SX.sym("c", 2)
+    mean, difference = (b[0, 0] + b[1, 1]) / 2, (b[0, 0] - b[1, 1]) / 2
+    turn, shear = (b[1, 0] - b[0, 1]) / 2, (b[1, 0] + b[0, 1]) / 2
+    larger, smaller = ca.hypot(mean, turn), ca.hypot(difference, shear)
+    sizes = larger + smaller + TINY, larger - smaller
+    sum_angle, difference_angle = ca.atan2(shear, difference), ca.atan2(turn, mean)
+    left, right = (difference_angle + sum_angle) / 2, (difference_angle - sum_angle) / 2
+    rotated = ca.mtimes(_rotation(left).T, ca.horzcat(a, c))
+    equations = [(rotated[i, 2], -rotated[i, 0], -rotated[i, 1]) for i in (0, 1)]
+    singular = ca.fabs(sizes[1]) <= FORMS.straight * sizes[0]
+    share = sizes[1] / sizes[0]
+    squares = (square_of_first_harmonic(*(f * part for part in e)) for e, f in zip(equations, (share, 1), strict=True))
+    ellipse = Harmonics(*(one + other for one, other in zip(*squares, strict=True)))
+    ellipse = ellipse._replace(a0=ellipse.a0 - sizes[1] ** 2)
+    # an equation without the second angle has two solutions by itself
+    middle, half = _middle_and_half(-equations[1][0], *equations[1][1:])
+    alone = ca.vertcat(middle + half, middle - half)
+    first = ca.if_else(singular, ca.vertcat(alone, alone, alone, alone), _close_roots(ellipse))
+    repeated = ca.if_else(singular, ca.vertcat(0, 0, *[1] * 6), ca.DM.zeros(8))
+    w = [e[0] + e[1] * ca.cos(first) + e[2] * ca.sin(first) for e in equations]
+    cosine = ca.fmin(ca.fmax(w[0] / sizes[0], -1.0), 1.0)
+    firsts, seconds, residuals = [], [], []
+    for sine in (ca.sqrt(1 - cosine**2), -ca.sqrt(1 - cosine**2)):
+        residual = ca.fmax(ca.fabs(w[0] - sizes[0] * cosine), ca.fabs(w[1] - sizes[1] * sine))
+        firsts.append(first)
+        seconds.append(ca.atan2(sine, cosine) - right)
+        residuals.append(residual / ca.sqrt(ca.fmax(sizes[0], 1e-12)) + repeated)
+    largest = ca.fmax(ca.fabs(ellipse.a0), ca.fmax(ca.hypot(*ellipse[1:3]), ca.hypot(*ellipse[3:5])) / 2)
+    linear = ca.fmax(ca.fabs(equations[1][0]), ca.hypot(*equations[1][1:]) / 2)
+    determination = ca.fmin(ca.if_else(singular, linear, largest), sizes[0])
+    outputs = [ca.vertcat(*part) for part in (firsts, seconds, residuals)]
+    return ca.Function("pairs", [a, b, c], [*outputs, determination])
 
 
-def _angle_pairs(a: Array, b: Array, c: Array) -> tuple[NDArray[np.intp], Array, Array, Mask]:
-    """Return angles with a [cos, sin](first) + b [cos, sin](second) = c. Shapes (M, 2, 2), (M, 2, 2), (M, 2).
+def _rotation(angle: Any) -> Any:
+    """Return the rotation of the plane by an angle."""
+    cosine, sine = ca.cos(angle), ca.sin(angle)
+    return ca.vertcat(ca.horzcat(cosine, -sine), ca.horzcat(sine, cosine))
 
-    The last result says for which of the M equations an angle is not determined.
+
+def _close_roots(f: Harmonics) -> Any:
+    """Return eight angles that include the roots of a trigonometric polynomial, close ones each. Shape (8, 1).
+
+    Of two roots close to each other the general method may find only one. The parabola of the same value, slope and
+    curvature there has both.
     """
-    left, size, right = np.linalg.svd(b)
-    size = size + TINY
-    singular = size[:, 1] <= FORMS.straight * size[:, 0]
-    alpha, gamma = left.transpose(0, 2, 1) @ a, (c[:, None] @ left)[:, 0]
-    # w(z) = gamma - delta z - conj(delta) / z with z = exp(i first), and (w_1 / s_1)^2 + (w_2 / s_2)^2 = 1
-    delta = (alpha[:, :, 0] - 1j * alpha[:, :, 1]) / 2
-    high, middle = (size[:, ::-1] / size[:, :1] * part for part in (delta, gamma))
-    square = np.empty((len(a), 5), dtype=complex)
-    square[:, 0], square[:, 1] = (high**2).sum(axis=1), -2 * (high * middle).sum(axis=1)
-    square[:, 2] = (2 * np.abs(high) ** 2 + middle**2).sum(axis=1) - size[:, 1] ** 2
-    square[:, 3], square[:, 4] = square[:, 1].conj(), square[:, 0].conj()
-    rows = np.stack([-delta[:, 1], gamma[:, 1].astype(complex), -delta[:, 1].conj()], axis=1)
-    roots = _polynomial_roots(square)
-    if singular.any():  # an equation without the second angle has two solutions by itself
-        roots[singular, :2], roots[singular, 2:] = _polynomial_roots(rows[singular]), np.nan
-    pose, column = np.nonzero(np.abs(np.abs(roots) - 1) < FORMS.near)
-    first = np.angle(roots[pose, column])
-    direction = np.stack([np.cos(first), np.sin(first)], axis=1)
-    remaining = gamma[pose] - (alpha[pose] @ direction[:, :, None])[:, :, 0]
-    cosine = np.clip(remaining[:, 0] / size[pose, 0], -1.0, 1.0)
-    sine = np.sqrt(1 - cosine**2)
-    good = np.abs(remaining - size[pose] * np.stack([cosine, sine], axis=1)).max(axis=1)
-    flipped = np.abs(remaining - size[pose] * np.stack([cosine, -sine], axis=1)).max(axis=1)
-    allowed = FORMS.near * np.maximum(size[pose, 0], 1e-12) ** 0.5
-    chosen = np.concatenate([np.flatnonzero(good < allowed), np.flatnonzero(flipped < allowed)])
-    sign = np.repeat([1.0, -1.0], [np.count_nonzero(good < allowed), np.count_nonzero(flipped < allowed)])
-    unit = np.stack([cosine[chosen], sign * sine[chosen]], axis=1)[:, None] @ right[pose[chosen]]
-    poses, firsts, seconds = pose[chosen], first[chosen], np.arctan2(unit[:, 0, 1], unit[:, 0, 0])
-    free = np.where(singular, np.abs(rows).max(axis=1), np.abs(square).max(axis=1)) < FORMS.vanishing
-    return poses, firsts, seconds, free | (size[:, 0] < FORMS.vanishing)
+    size = TINY + sum(map(ca.fabs, f))
+    f = Harmonics(*(part / size for part in f))
+    slope = f.derivative()
+    start = tuple(ca.vertcat(*part) for part in zip(*roots(f, steps=0), strict=True))
+    point = polish(start, lambda c, s: (f.value(c, s), slope.value(c, s)), floor=np.finfo(float).eps)
+    value, rate, curvature = f.value(*point), slope.value(*point), slope.derivative().value(*point)
+    root = ca.sqrt(ca.fmax(rate**2 - 2 * value * curvature, 0.0))
+    double = rate + ca.if_else(rate < 0, -root, root)
+    steps = -2 * value * double / (double**2 + TINY), -double * curvature / (curvature**2 + TINY)
+    angle = ca.atan2(point[1], point[0])
+    return ca.vertcat(*(angle + ca.fmin(ca.fmax(step, -FORMS.nearby), FORMS.nearby) for step in steps))
 
 
-def _polynomial_roots(rows: Array) -> Array:
-    """Return the roots (M, d) of polynomials (M, d + 1), highest powers first; nan for those that are zero."""
-    degree, size = rows.shape[1] - 1, np.abs(rows).max(axis=1)
-    good = size > 0
-    lead = rows[:, 0] + np.where(np.abs(rows[:, 0]) < 1e-14 * size, 1e-14 * size, 0.0)
-    companion = np.zeros((len(rows), degree, degree), dtype=complex)
-    companion[:, 1:, :-1] = np.eye(degree - 1)
-    companion[good, 0] = -rows[good, 1:] / lead[good, None]
-    roots = np.linalg.eigvals(companion)
-    roots[~good] = np.nan
-    return np.asarray(roots)
+def _middle_and_half(value: Any, cosine: Any, sine: Any) -> tuple[Any, Any]:
+    """Return the angles with cosine cos + sine sin = value, or the nearest, as their middle and half their distance."""
+    share = value / ca.fmax(ca.hypot(cosine, sine), TINY)
+    return ca.atan2(sine, cosine), ca.acos(ca.fmin(ca.fmax(share, -1.0), 1.0))
 
 
-def _meeting_points(*axes: Axis) -> Array:
-    """Return the points where axes meet. Shape (M, 3)."""
-    projectors = [np.eye(3) - axis.direction[:, :, None] * axis.direction[:, None, :] for axis in axes]
-    projected = sum(np.einsum("mij,mj->mi", part, axis.point) for part, axis in zip(projectors, axes, strict=True))
-    return np.asarray(np.linalg.solve(sum(projectors), np.asarray(projected)[:, :, None])[:, :, 0])
+def _solve_triple(axes: list[SymbolicAxis], goal: Frame, meeting: bool) -> tuple[list[list[Any]], Any]:
+    """Return two solutions of meeting axes for a rotation, or of parallel ones for a planar motion.
 
-
-def _middle_angles(value: Array, cosine: Array, sine: Array) -> tuple[NDArray[np.intp], Array]:
-    """Return indices and both angles with cosine cos + sine sin = value, the nearest where there are none."""
-    share = np.clip(value / np.maximum(np.hypot(cosine, sine), TINY), -1.0, 1.0)
-    middle, half, rows = np.arctan2(sine, cosine), np.arccos(share), np.arange(len(value))
-    return np.concatenate([rows, rows]), np.concatenate([middle + half, middle - half])
-
-
-def _solve_wrist(axes: list[Axis], goal: Motion) -> tuple[NDArray[np.intp], Array]:
-    """Return two solutions of meeting axes a, b, c for a rotation, the nearest if there are none."""
+    The second result is the share by which the motion exceeds what the axes can do; the solutions are then the nearest.
+    """
     a, b, c = axes
-    constant, parts = _rotation_terms(a.direction, b.direction, c.direction)
-    value = dot(a.direction, goal.rotate(c.direction)) - constant
-    pose, second = _middle_angles(value, parts[..., 0], parts[..., 1])
-    return pose, _outer_angles([axis.take(pose) for axis in axes], goal.take(pose), second, None)
-
-
-def _solve_planar(axes: list[Axis], goal: Motion) -> tuple[NDArray[np.intp], Array]:
-    """Return two solutions of parallel axes a, b, c for a planar motion, the nearest if there are none."""
-    a, b, c = axes
-    along = a.direction
-    goal_point = goal.at(c.point)
-    arm, reach = b.point - a.point, c.point - b.point
-    to_goal = goal_point - a.point
-    parts = [part - dot(part, along)[:, None] * along for part in (to_goal, arm, reach)]
-    value = (dot(parts[0], parts[0]) - dot(parts[1], parts[1]) - dot(parts[2], parts[2])) / 2
-    cosine, sine = dot(parts[1], parts[2]), dot(parts[1], cross(b.direction, parts[2]))
-    pose, second = _middle_angles(value, cosine, sine)
-    return pose, _outer_angles([axis.take(pose) for axis in axes], goal.take(pose), second, goal_point[pose])
-
-
-def _outer_angles(axes: list[Axis], goal: Motion, second: Array, goal_point: Array | None) -> Array:
-    """Return the angles of a, b, c for a known angle of b: a from the image of c or its point, c from the rest."""
-    a, b, c = axes
-    motion = b.by(second)
-    if goal_point is None:
-        start, end = (part.rotate(c.direction) for part in (motion, goal))
+    goal_point = goal.point(c.point)
+    if meeting:
+        constant, cosine, sine = ca.horzsplit(b.terms(a.direction, c.direction))
+        value = ca.dot(a.direction, ca.mtimes(goal.rotation, c.direction)) - constant
     else:
-        start, end = motion.at(c.point) - a.point, goal_point - a.point
-    first = a.angle(start, end)
-    remaining = (a.by(first).turn @ motion.turn).transpose(0, 2, 1) @ goal.turn
-    trace = remaining[:, 0, 0] + remaining[:, 1, 1] + remaining[:, 2, 2]
-    third = np.arctan2(dot(c.direction, axial(remaining)), trace - 1)
-    return np.stack([first, second, third], axis=1)
+        distances = goal_point - a.point, b.point - a.point, c.point - b.point
+        to_goal, arm, reach = (part - ca.dot(part, a.direction) * a.direction for part in distances)
+        value = (ca.sumsqr(to_goal) - ca.sumsqr(arm) - ca.sumsqr(reach)) / 2
+        cosine, sine = ca.dot(arm, reach), ca.dot(arm, cross(b.direction, reach))
+    middle, half = _middle_and_half(value, cosine, sine)
+    solutions = []
+    for second in (middle + half, middle - half):
+        motion = b.frame(second)
+        if meeting:
+            start, end = (ca.mtimes(part.rotation, c.direction) for part in (motion, goal))
+        else:
+            start, end = motion.point(c.point) - a.point, goal_point - a.point
+        first = a.angle(start, end)
+        remaining = ca.mtimes(ca.mtimes(a.frame(first).rotation, motion.rotation).T, goal.rotation)
+        axial = ca.vertcat(*(remaining[i, j] - remaining[j, i] for i, j in ((2, 1), (0, 2), (1, 0))))
+        solutions.append([first, second, ca.atan2(ca.dot(c.direction, axial), ca.trace(remaining) - 1)])
+    return solutions, ca.fabs(value) / ca.fmax(ca.hypot(cosine, sine), TINY) - 1

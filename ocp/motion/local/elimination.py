@@ -27,13 +27,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.arrays import Array
-from ocp.motion.local.chain import TURN, Axis, Chain, Motion, Solutions, axial, cross, dot
+from ocp.motion.local.chain import TURN, Chain, Motion, Solutions
 from ocp.motion.local.closed_forms import SIX, Mask, PoseSolver
 
 __all__ = ["Elimination", "elimination_of", "solve_opening"]
 
 SAMPLES = 2 * np.pi / 3 * np.arange(3)
 """Angles h that determine the coefficients of 1, cos h and sin h."""
+NEXT, AFTER = np.array([1, 2, 0]), np.array([2, 0, 1])
+SKEW = np.cross(np.eye(3)[:, None], np.eye(3)).transpose(0, 2, 1).reshape(3, 9)
+"""Maps a vector w to the matrix of w x, row by row."""
 COEFFICIENTS = np.linalg.inv(np.stack([np.ones(3), np.cos(SAMPLES), np.sin(SAMPLES)], axis=1))
 
 
@@ -82,6 +85,49 @@ class EliminationSettings:
 
 
 ELIMINATION = EliminationSettings()
+
+
+def dot(a: Array, b: Array) -> Array:
+    """Return the scalar products of vectors."""
+    return np.asarray(np.vecdot(a, b))
+
+
+def cross(a: Array, b: Array) -> Array:
+    """Return the vector products of vectors; for small arrays faster than numpy's function."""
+    return np.asarray(a[..., NEXT] * b[..., AFTER] - a[..., AFTER] * b[..., NEXT])
+
+
+def axial(turn: Array) -> Array:
+    """Return the axial vectors of rotations, 2 sin(angle) times their axes. Shapes (M, 3, 3) to (M, 3)."""
+    return np.stack([turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], 1)
+
+
+class Axis(NamedTuple):
+    """Axes of joints: unit directions (M, 3), points (M, 3), and whether the joint is revolute or prismatic.
+
+    A single row, (1, 3), holds for all poses.
+    """
+
+    direction: Array
+    point: Array
+    revolute: bool = True
+
+    def take(self, chosen: NDArray[np.intp]) -> Axis:
+        """Return the axes at these indices."""
+        return self if len(self.point) == 1 else Axis(self.direction[chosen], self.point[chosen], self.revolute)
+
+    def moved(self, motion: Motion) -> Axis:
+        """Return the axes moved by a motion."""
+        return Axis(motion.rotate(self.direction), motion.at(self.point), self.revolute)
+
+    def by(self, position: Array) -> Motion:
+        """Return the motions of the joints by these positions (M,)."""
+        if not self.revolute:
+            return Motion(np.broadcast_to(np.eye(3), (len(position), 3, 3)), self.direction * position[:, None])
+        skew = (self.direction @ SKEW).reshape(-1, 3, 3)
+        sine, versine = np.sin(position)[:, None, None], (1 - np.cos(position))[:, None, None]
+        turn = np.eye(3) + sine * skew + versine * (skew @ skew)
+        return Motion(turn, self.point - (turn @ self.point[:, :, None])[:, :, 0])
 
 
 class Opening(NamedTuple):
@@ -156,6 +202,30 @@ class Elimination(PoseSolver):
             doubtful[chosen] = rough.singular | (numbers < rough.least) | (even & (numbers % 2 == 1))
             mixed[chosen] = rough.mixed
         return solutions, mixed, doubtful
+
+    def prescribe(self, redundant: Array) -> Array:
+        """Return joints with the redundant ones (M, k) at these positions and the others at 0. Shape (M, n)."""
+        joints = np.zeros((len(redundant), len(self.chain.axes)))
+        joints[:, list(self.redundant)] = redundant
+        return joints
+
+    def refine(self, pose: NDArray[np.intp], free: Array, prescribed: Array, goal: Motion) -> Solutions:
+        """Return the solutions that Newton's method finds from candidates for the free joints (K, m) at poses (K,)."""
+        joints = prescribed[pose]
+        joints[:, self.free] = free
+        return self.chain.refine(pose, joints, self.free, goal)
+
+    def loop(self, prescribed: Array, goal: Motion) -> tuple[list[Axis], Motion]:
+        """Return the axes of the free joints, and the motion that they must make with the others as prescribed."""
+        chain, fixed, axes = self.chain, Motion(np.eye(3)[None], np.zeros((1, 3))), list[Axis]()
+        for j in chain.order:
+            axis = Axis(chain.axes[[j]], chain.points[[j]], bool(chain.revolute[j])).moved(fixed)
+            if j in self.redundant:
+                fixed = axis.by(prescribed[:, j]).after(fixed)
+            else:
+                axes.append(axis)
+        home = Motion(chain.rotation[None], chain.position[None])
+        return axes, goal.after(fixed.after(home).inverse)
 
 
 def elimination_of(chain: Chain, redundant: tuple[int, ...]) -> Elimination | None:
