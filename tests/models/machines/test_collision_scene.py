@@ -335,7 +335,7 @@ def hooked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FixedBase:
 
 
 def test_a_mesh_near_a_primitive_is_checked_by_its_hull(hooked: FixedBase, tmp_path: Path) -> None:
-    """Its distance is at least that of the covers, and more where they fill the notch of the hook less than the hull."""
+    """Its distance is at least that of the covers, and more where they fill the notch less than the hull."""
     links = [replace(link, collisions=(CollisionShape("sphere", (0.05,), translation=(0, 0, 0.4)),)) if k == 2 else link
              for k, link in enumerate(hooked.robot.links)]  # fmt: skip
     machine = FixedBase(Robot(tuple(links), hooked.robot.joints, tip="link4"))
@@ -352,11 +352,11 @@ def test_a_mesh_near_a_primitive_is_checked_by_its_hull(hooked: FixedBase, tmp_p
     only = distances_along(scene, np.zeros(0), postures, np.zeros(40), pairs=[pair])
     assert_allclose(only[:, pair], distances[:, pair], atol=1e-12)
     assert np.isinf(np.delete(only, pair, axis=1)).all()
-    for posture, distance in zip(postures, distances[:, pair], strict=True):
+    for posture, expected in zip(postures, distances[:, pair], strict=True):
         for collision in find_collisions(scene, np.zeros(0), posture[None], np.zeros(1)):
             if collision.pair == pair:
                 least = float(covers(posture))
-                assert collision.protrusion == pytest.approx(distance - least, abs=1e-5)
+                assert collision.protrusion == pytest.approx(expected - least, abs=1e-5)
 
 
 def test_meshes_up_to_three_joints_apart_are_looked_at_as_their_hulls(hooked: FixedBase, tmp_path: Path) -> None:
