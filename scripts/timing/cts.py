@@ -60,8 +60,8 @@ def run(repeats: int = 5) -> dict[str, Any]:
     for name, function in cases.items():
         for on, rows_in in (("sweep", targets), ("random", spread)):
             if has_compiler():
-                found, mean, worst = compiled_inverse(function, rows_in, repeats)
-                add(f"compiled, {name}", on, mean, float(np.mean(found[:, 8] == 0)), worst)
+                result, mean, worst = compiled_inverse(function, rows_in, repeats)
+                add(f"compiled, {name}", on, mean, float(np.mean(result[:, 8] == 0)), worst)
             many = function.map(COUNT)
             inputs = [ca.DM(rows_in.T), ca.DM.zeros(1, COUNT)]
             status = np.array(many.call(inputs)[3])
@@ -107,11 +107,11 @@ def compiled_inverse(function: Any, targets: Array, repeats: int = 5) -> tuple[A
     previous = np.zeros((1, 1))
     with compiled(function) as rows:
         # short runs: one of many is undisturbed
-        found, mean = rows([targets, previous], max(1, 2000 // len(targets)), 10 * repeats)
+        result, mean = rows([targets, previous], max(1, 2000 // len(targets)), 10 * repeats)
         # calls from Python, only to find the slowest
         alone = [rows([target, previous], 1, 20)[1] for target in targets]
         slowest = np.tile(targets[int(np.argmax(alone))], (100, 1))
-        return found, mean, rows([slowest, previous], 20, 10 * repeats)[1]
+        return result, mean, rows([slowest, previous], 20, 10 * repeats)[1]
 
 
 def peer_times(targets: Array) -> list[dict[str, Any]] | None:
@@ -134,16 +134,16 @@ def peer_times(targets: Array) -> list[dict[str, Any]] | None:
         ((rig.pitch_link, 0, rig.yaw_offset), (0, 0, 0), False),
         ((0, 0, 0), (half, 0, 0), False),
     ]
-    made = [links.OriginLink()]
+    results = [links.OriginLink()]
     for k, (shift, turn, slides) in enumerate(rows):
         axis: dict[str, Any] = (
             {"translation": [0, 0, 1], "joint_type": "prismatic"} if slides else {"rotation": [0, 0, 1]}
         )
         bounds = (LIMITS["lower"][k], LIMITS["upper"][k])
-        made.append(links.URDFLink(f"joint {k + 1}", shift, turn, bounds=bounds, **axis))
+        results.append(links.URDFLink(f"joint {k + 1}", shift, turn, bounds=bounds, **axis))
     tool = ((rig.goose_neck, 0, rig.sting), (0, -half, 0))
-    made.append(links.URDFLink("tool", *tool, joint_type="fixed"))
-    chain = chains.Chain(made, active_links_mask=[False, *[True] * 6, False])
+    results.append(links.URDFLink("tool", *tool, joint_type="fixed"))
+    chain = chains.Chain(results, active_links_mask=[False, *[True] * 6, False])
     home = np.array([0, 0.5, -half, 0.0, 0.0, half, 0.0, 0])
     q = np.array([0.4, -1.8, 0.3, 0.1, 1.4, 0.7])
     ours = np.array(ca.DM(forward(rig, ca.DM(q))))[:3, 0]
@@ -155,8 +155,8 @@ def peer_times(targets: Array) -> list[dict[str, Any]] | None:
         for x, y, z, yaw, pitch in targets:
             direction = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)])
             aim = {"target_orientation": direction, "orientation_mode": mode} if mode else {}
-            found = chain.inverse_kinematics([x, y, z], initial_position=home, **aim)
-            pose = chain.forward_kinematics(found)
+            solutions = chain.inverse_kinematics([x, y, z], initial_position=home, **aim)
+            pose = chain.forward_kinematics(solutions)
             there = np.abs(pose[:3, 3] - [x, y, z]).max() < 1e-4
             good += bool(there and (not mode or np.abs(pose[:3, 0] - direction).max() < 1e-3))
         seconds = (time.perf_counter() - began) / len(targets)

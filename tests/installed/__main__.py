@@ -100,7 +100,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory(prefix="selfmotion-installed-") as folder:
         home = Path(folder)
         wheel = options.wheel.resolve() if options.wheel else built(home)
-        told = read_on(home, wheel)
+        report = read_on(home, wheel)
         venv.create(home / "env", with_pip=True)
         user = User(home / "user", home / "env" / "bin")
         user.home.mkdir()
@@ -108,7 +108,7 @@ def main() -> int:
         user.holds(f"pip install {wheel.name}[{EXTRAS}]", done.returncode == 0, done.stderr)
         if not user.told:
             used(user)
-        user.told += told
+        user.told += report
     for failure in user.told:
         print(f"FAILED: {failure}", file=sys.stderr)
     print(f"{len(user.told)} failures")
@@ -154,8 +154,8 @@ def used(user: User) -> None:
     for ending in ("csv", "json", "yaml", "mcap", "urdf"):
         user.does("export", "seam.npz", f"out.{ending}", makes=f"out.{ending}")
     for ending in ("json", "yaml", "mcap"):
-        said = json.loads(user.does("check", "out.urdf", f"out.{ending}", "--json"))
-        user.holds(f"out.{ending} passes its check", said["passed"] is True, str(said.get("faults")))
+        message = json.loads(user.does("check", "out.urdf", f"out.{ending}", "--json"))
+        user.holds(f"out.{ending} passes its check", message["passed"] is True, str(message.get("faults")))
     user.does("view", "seam.npz", "--page", "seam.html", makes="seam.html")
     text = (user.home / "seam.html").read_text(encoding="utf-8")
     user.holds("the page has at most 8 MB, and the meshes", 500_000 < len(text) < 8_000_000, f"{len(text)} bytes")

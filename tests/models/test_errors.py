@@ -22,9 +22,9 @@ def test_a_pickled_error_keeps_its_message_and_its_fields() -> None:
 
 
 def test_arrays_are_read_only_copies_and_free_dimensions_take_any_length() -> None:
-    given = np.ones((4, 3))
-    array = checked_array(given, ("points", 3), "path", "points", least=2, positive=True)
-    given[0, 0] = 7.0
+    options = np.ones((4, 3))
+    array = checked_array(options, ("points", 3), "path", "points", least=2, positive=True)
+    options[0, 0] = 7.0
     assert array.shape == (4, 3)
     assert array.max() == 1.0
     with pytest.raises(ValueError, match="read-only"):
@@ -53,7 +53,7 @@ def test_arrays_are_read_only_copies_and_free_dimensions_take_any_length() -> No
         (lambda: checked_choice("c", "de", "a", "b"), r"'c' is unknown; use one of \['d', 'e'\]", "b", ("d", "e")),
     ],
 )  # fmt: skip
-def test_a_check_names_what_is_wrong(check: Callable[[], Any], message: str, name: str, limit: Any) -> None:
+def test_a_check_names_the_invalid_value(check: Callable[[], Any], message: str, name: str, limit: Any) -> None:
     with pytest.raises(ModelError, match=message) as caught:
         check()
     assert (caught.value.name, caught.value.limit) == (name, limit)

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from ocp import Problem, Solution
-from tests.ocp.audit.drawn import drawn
+from tests.ocp.audit.drawn import random_program
 from tests.ocp.problems import Array
 
 __all__ = ["KINDS", "Quadratic", "random_quadratic"]
@@ -134,7 +134,7 @@ class Quadratic:
 
         held = {} if self.push is None else {"w": 1.0}
         states, costates = {"x": lambda t: along(t)[:, :n]}, {"x": lambda t: along(t)[:, n:]}
-        return drawn(problem, states, {"u": controls, **held}, costates, self.horizon, 40)
+        return random_program(problem, states, {"u": controls, **held}, costates, self.horizon, 40)
 
 
 def random_quadratic(seed: int) -> tuple[Quadratic, bool, str]:
@@ -206,25 +206,25 @@ def controllable(problem: Quadratic) -> bool:
     return bool(sizes[n - 1] > 0.05 * sizes[0])
 
 
-def least_curvature(problem: Quadratic, plan: Solution, pieces: int = 160) -> float:
+def least_curvature(problem: Quadratic, plan: Solution, segments: int = 160) -> float:
     """Least curvature of the cost over controls that are held on equal pieces, where the plan is inside its bounds.
 
     Dense and independent: exact steps of the linear system, the cost by Simpson's rule, ends that are given taken out
     by a singular value decomposition. Relative to the least curvature in the controls alone.
     """
     n, m = problem.b.shape
-    step = problem.horizon / pieces
+    step = problem.horizon / segments
     whole = np.zeros((n + m, n + m))
     whole[:n, :n], whole[:n, n:] = problem.a, problem.b
     half, full = expm(whole * step / 2), expm(whole * step)
-    middle_times = (np.arange(pieces) + 0.5) / pieces
+    middle_times = (np.arange(segments) + 0.5) / segments
     values = plan.at_fraction(middle_times)["u"]
-    edges = [plan.at_fraction(np.clip(middle_times + shift / pieces, 0, 1))["u"] for shift in (-0.45, 0.45)]
+    edges = [plan.at_fraction(np.clip(middle_times + shift / segments, 0, 1))["u"] for shift in (-0.45, 0.45)]
     inside = np.all([np.abs(v) < problem.bound * (1 - 1e-4) for v in (values, *edges)], axis=0)
-    cost = np.zeros((pieces * m, pieces * m))
-    reach = np.zeros((n, pieces * m))
-    for k in range(pieces):
-        own = np.zeros((m, pieces * m))
+    cost = np.zeros((segments * m, segments * m))
+    reach = np.zeros((n, segments * m))
+    for k in range(segments):
+        own = np.zeros((m, segments * m))
         own[:, k * m : (k + 1) * m] = np.eye(m)
         middle, after = half[:n, :n] @ reach + half[:n, n:] @ own, full[:n, :n] @ reach + full[:n, n:] @ own
         for share, x in ((1, reach), (4, middle), (1, after)):

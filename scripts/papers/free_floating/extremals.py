@@ -139,8 +139,8 @@ def search(make: MakeProblem, horizon: float, start_base: Array, start_joints: A
             sound = _joined(sound, replace(group, plan=settled.plan))
     extremals = sorted((_polished(problem, group, meshes[id(group.plan)]) for group in sound), key=lambda e: e.cost)
     best = next((e for e in extremals if e.verdict == CONFIRMED), None)
-    found = sum(group.count for group in sound)
-    yield Search(horizon, STARTS, solved, solved - found, tuple(replace(e, best=e is best) for e in extremals))
+    result = sum(group.count for group in sound)
+    yield Search(horizon, STARTS, solved, solved - result, tuple(replace(e, best=e is best) for e in extremals))
 
 
 def _starts(

@@ -220,14 +220,14 @@ def fine_motion(request: Request, solution: Solution) -> tuple[StandingMotion, A
 
 def held_plans(plans: Mapping[str, Mapping[str, Plan]]) -> dict[str, dict[str, Held]]:
     """The plans as the reference has them, accelerations held over as many intervals. By task and summary key."""
-    found: dict[str, dict[str, Held]] = {}
+    by_name: dict[str, dict[str, Held]] = {}
     for task, group in plans.items():
         there = {one.request.rule: one.solution for one in group.values() if one.request.transcription == "held"}
         for key, plan in progress(group.items(), f"held, {task}"):
             request = replace(plan.request, transcription="held", intervals=HELD[task])
             solution = there.get(request.rule) or solved(request)
-            found.setdefault(task, {})[key] = Held(solution, fine_motion(request, solution)[0])
-    return found
+            by_name.setdefault(task, {})[key] = Held(solution, fine_motion(request, solution)[0])
+    return by_name
 
 
 def convergence_rows(plans: Mapping[str, Mapping[str, Plan]], held: Mapping[str, Mapping[str, Held]]) -> list[Row]:
@@ -245,8 +245,8 @@ def convergence_rows(plans: Mapping[str, Mapping[str, Plan]], held: Mapping[str,
     costs: dict[tuple[str, str, Transcription, int], float] = {}
     for item in progress(work, "convergence"):
         task, key, kind, intervals = item
-        found = known.get(item) or solved(replace(PLANS[task][key], transcription=kind, intervals=intervals))
-        costs[item] = found.cost
+        result = known.get(item) or solved(replace(PLANS[task][key], transcription=kind, intervals=intervals))
+        costs[item] = result.cost
     rows: list[Row] = []
     for (task, key, kind, intervals), cost in costs.items():
         best: Transcription = "linear" if task == "minimum_time" else "points"
