@@ -201,7 +201,7 @@ class CollisionScene:
             cover_pairs[len(pairs)] = tuple(replaced_pairs)
             if self.left.get((first.link, second.link)) not in ASSUMED:
                 covers[len(pairs)] = np.array([(i, j) for i in covering[0] for j in covering[1]])
-            pairs.append((*sides, indices[self._reference_link(first, second)]))
+            pairs.append((sides[0], sides[1], indices[self._reference_link(first, second)]))
         pairs += [(i, len(own) + number, WORLD) for i, number in with_obstacles]
         object.__setattr__(self, "_carriers", tuple(frames))
         object.__setattr__(self, "bodies", tuple(bodies))

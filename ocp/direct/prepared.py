@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import threading
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +17,7 @@ import numpy as np
 from ocp.console import TimeLimitReached, check_time, interruptible, time_limited
 from ocp.direct.active_set import Newton, active_sides
 from ocp.direct.assembly import Program, assemble
-from ocp.direct.code_generation import block_derivatives
+from ocp.direct.code_generation import block_derivatives, write_controller
 from ocp.direct.diagnosis import Elastic, diagnosis, elastic_plan
 from ocp.direct.guess import STARTS, alternative_starts, guessed_names, initial_point, shifted_indices
 from ocp.direct.nlp import (
@@ -53,6 +55,7 @@ from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.invariants import bounds_to_solve
 from ocp.problem.problem import Problem
 from ocp.solution import ByName, Guess, Solution
+from ocp.storage import checked_path
 
 __all__ = ["DirectMethod", "Prepared"]
 
@@ -175,6 +178,29 @@ class Prepared:
             raise ProblemError(words, name="shift", value=shift)
         with time_limited(checked_time_limit(time_limit)), self._lock:
             return self._solve(parameters, guess, check, tighter, ahead)
+
+    @interruptible
+    def to_c(self, folder: str | os.PathLike[str], parameters: ByName = None, guess: Guess = None) -> Path:
+        """Write a plan, its functions and a program that uses them as C; see :mod:`ocp.direct.code_generation`.
+
+        Args:
+            folder: Folder that is created and returned; files of the same names are replaced.
+            parameters: Values at which the guess is evaluated.
+            guess: As of :meth:`solve`. A solution of this prepared problem is written as it is.
+
+        Raises:
+            ProblemError: Wrong arguments, or a part of the problem has no C, such as cvodes.
+            OSError: The folder cannot be written.
+        """
+        form, transcription = self.formulation, self.transcription
+        place = Path(checked_path(folder))
+        bounds = form.bound_values(form.parameter_vector(checked_mapping("parameters", parameters)))
+        with self._lock:
+            point = initial_point(form, transcription, guess, bounds)
+            if isinstance(guess, Solution) and guess.method == self.method.settings:
+                # on this grid; a staged layout has more variables than a plain one
+                point = guess.variables if guess.variables.size == point.size else point
+            return write_controller(form, transcription, point, place)
 
     def _solve(
         self, parameters: ByName, guess: Guess, check: bool, tighter: Mapping[str, np.ndarray] | None, shift: int

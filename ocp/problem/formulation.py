@@ -111,8 +111,8 @@ class Formulation:
         separations: Poses of the frames of separated bodies, by the name of the separation. Shape (12 F, 1) each.
         watch_integral: Which watched rows bound the integral over time. Shape (rows,), bool.
         watch_reference_rate: Rates of their reference path lengths, zero if there is none. Shape (rows, 1).
-        states, controls, parameters: Slices of the vectors by name. state_labels, control_labels: A name for every
-            entry.
+        states, controls, parameters: Slices of the vectors by name. state_labels, control_labels, parameter_labels: A
+            name for every entry.
         units: Units of states, controls and constraints by name; empty if undeclared, or if a constraint and a variable
             of one name have different units.
         bounds: The bound table.
@@ -136,7 +136,8 @@ class Formulation:
         self.states = slices(declared.states)
         self.controls = slices(declared.controls)
         self.parameters = slices(declared.parameters)
-        self.state_labels, self.control_labels = labels(declared.states), labels(declared.controls)
+        pools = declared.states, declared.controls, declared.parameters
+        self.state_labels, self.control_labels, self.parameter_labels = map(labels, pools)
         self.units = units(declared)
         self.nx, self.nu, self.np = (total(s) for s in (self.states, self.controls, self.parameters))
         self.x, self.u, self.p = sym("x", self.nx), sym("u", self.nu), sym("p", self.np)

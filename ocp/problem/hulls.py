@@ -262,7 +262,8 @@ class BodyPairs:
         `near`. With `pairs`, the indices of the only pairs that count, the others are infinite.
         """
         distances = self.all_balls(frames)
-        excluded = [] if pairs is None else np.setdiff1d(np.arange(distances.shape[1]), pairs)
+        count = distances.shape[1]
+        excluded = np.setdiff1d(np.arange(count), np.arange(count) if pairs is None else pairs)
         distances[:, excluded] = np.inf
         at, pair = np.nonzero(~(distances >= near))
         distances[at, pair] = self.gaps(frames, at, pair, near)

@@ -233,7 +233,7 @@ def tool_motion_problem(
         problem.end("cyclic", before[place] - problem.at_start(first[place]), 0, 0, unit=machine.robot.unit())
     start_errors = [state.symbol for name, state in problem.declared.states.items() if name.startswith(START_ERRORS)]
     problem.minimize(running=running, terminal=sum((ca.sumsqr(errors) / 2 for errors in start_errors), start=0))
-    times = [stretch.breaks if actuated else stretch.nodes for stretch in stretches]
+    times = [stretch.breaks if actuation else stretch.nodes for stretch in stretches]
     inside = [(at - stretch.begin) / stretch.duration for stretch, at in zip(stretches, times, strict=True)]
     return ToolMotion(problem, tuple(stretches), horizon, np.unique(np.concatenate(inside)))
 

@@ -335,7 +335,7 @@ def hooked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FixedBase:
 
 
 def test_a_mesh_near_a_primitive_is_checked_by_its_hull(hooked: FixedBase, tmp_path: Path) -> None:
-    """Its distance is at least that of the covers, and more where they fill the notch of the hook less than the hull."""
+    """Its distance is at least that of the covers, and more where they fill the notch less than the hull."""
     links = [replace(link, collisions=(CollisionShape("sphere", (0.05,), translation=(0, 0, 0.4)),)) if k == 2 else link
              for k, link in enumerate(hooked.robot.links)]  # fmt: skip
     machine = FixedBase(Robot(tuple(links), hooked.robot.joints, tip="link4"))
@@ -343,20 +343,20 @@ def test_a_mesh_near_a_primitive_is_checked_by_its_hull(hooked: FixedBase, tmp_p
     pair = next(k for k, label in enumerate(scene.labels) if label[0].startswith("link0") and label[1] == "link2")
     assert isinstance(scene.bodies[scene.pairs[pair, 0]].shape, Mesh)
     assert [scene.bodies[j].name for _, j in scene.cover_pairs[pair]] == ["link2", "link2"]
-    configurations_2 = np.random.default_rng(4).uniform(-2.5, 2.5, (40, 4))
+    samples = np.random.default_rng(4).uniform(-2.5, 2.5, (40, 4))
     q = ca.SX.sym("q", 4)
     covers = ca.Function("covers", [q], [scene.distances((), q, pairs=[pair])])
-    by_covers = np.array(covers.map(40)(configurations_2.T)).ravel()
-    distances = distances_along(scene, np.zeros(0), configurations_2, np.zeros(40))
+    by_covers = np.array(covers.map(40)(samples.T)).ravel()
+    distances = distances_along(scene, np.zeros(0), samples, np.zeros(40))
     assert (distances[:, pair] >= by_covers - 1e-5).all()
-    only = distances_along(scene, np.zeros(0), configurations_2, np.zeros(40), pairs=[pair])
+    only = distances_along(scene, np.zeros(0), samples, np.zeros(40), pairs=[pair])
     assert_allclose(only[:, pair], distances[:, pair], atol=1e-12)
     assert np.isinf(np.delete(only, pair, axis=1)).all()
-    for configuration, distance in zip(configurations_2, distances[:, pair], strict=True):
+    for configuration, expected in zip(samples, distances[:, pair], strict=True):
         for collision in find_collisions(scene, np.zeros(0), configuration[None], np.zeros(1)):
             if collision.pair == pair:
                 least = float(covers(configuration))
-                assert collision.protrusion == pytest.approx(distance - least, abs=1e-5)
+                assert collision.protrusion == pytest.approx(expected - least, abs=1e-5)
 
 
 def test_meshes_up_to_three_joints_apart_are_checked_as_hulls(hooked: FixedBase, tmp_path: Path) -> None:
