@@ -121,8 +121,8 @@ def samples(path: SmoothPath, plan: Schedule, repeats: int) -> list[dict[str, An
     add("SmoothPath.parameter", "numpy", 1e9 * least(lambda: path.parameter(s), repeats) / count, path.parameter(s))
     knots = np.linspace(0, 1, TABLE)
     table = arc_length(blend.coefficients, knots)
-    looked_up = np.interp(x, table, knots)
-    add("table lookup", "numpy", 1e9 * least(lambda: np.interp(x, table, knots), repeats) / count, looked_up)
+    interpolated = np.interp(x, table, knots)
+    add("table lookup", "numpy", 1e9 * least(lambda: np.interp(x, table, knots), repeats) / count, interpolated)
     root = roots(blend.coefficients)
     if root is not None:
         result = np.array([root(value) for value in x])

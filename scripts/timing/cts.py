@@ -77,12 +77,12 @@ def run(repeats: int = 5) -> dict[str, Any]:
     jacobian = null_space(rigs["reach"], tunnel, targets, first, gain=20.0)
     seconds = least(lambda: null_space(rigs["reach"], tunnel, targets, first, gain=20.0), 2) / COUNT
     add("Jacobian of Table 3, gain 20, Python", "sweep", seconds, float(jacobian.converged.mean()))
-    found_by = {(row["method"], row["targets"]): row["ns_per_target"] for row in rows}
+    times_by = {(row["method"], row["targets"]): row["ns_per_target"] for row in rows}
     goals = {
-        "compiled_limits_off_ns": {"figure": found_by.get(("compiled, I1, limits off", "sweep")), "goal": 250.0},
-        "compiled_joint_limits_ns": {"figure": found_by.get(("compiled, I1, joint limits", "random")), "goal": 1000.0},
+        "compiled_limits_off_ns": {"figure": times_by.get(("compiled, I1, limits off", "sweep")), "goal": 250.0},
+        "compiled_joint_limits_ns": {"figure": times_by.get(("compiled, I1, joint limits", "random")), "goal": 1000.0},
     }
-    if compiled_ns := found_by.get(("compiled, I1, reach", "sweep")):
+    if compiled_ns := times_by.get(("compiled, I1, reach", "sweep")):
         ratio = PAPER_TIMES["combined"] / (COUNT * 1e-9 * compiled_ns)
         goals["paper_time_over_compiled"] = {"figure": ratio, "goal": 100.0}
     peers = peer_times(random_reachable(PEER_COUNT))
@@ -149,7 +149,7 @@ def peer_times(targets: Array) -> list[dict[str, Any]] | None:
     ours = np.array(ca.DM(forward(rig, ca.DM(q))))[:3, 0]
     if np.abs(chain.forward_kinematics([0, *q, 0])[:3, 3] - ours).max() > 1e-9:
         raise RuntimeError("the chain given to ikpy is not the rig")
-    made_of: list[dict[str, Any]] = []
+    sources: list[dict[str, Any]] = []
     for task, mode in (("position", None), ("position and direction", "X")):
         good, began = 0, time.perf_counter()
         for x, y, z, yaw, pitch in targets:
@@ -161,8 +161,8 @@ def peer_times(targets: Array) -> list[dict[str, Any]] | None:
             good += bool(there and (not mode or np.abs(pose[:3, 0] - direction).max() < 1e-3))
         seconds = (time.perf_counter() - began) / len(targets)
         named = {"name": "ikpy", "version": version, "task": task}
-        made_of.append({**named, "seconds": seconds, "success": good / len(targets), "optimal_roll": False})
-    return made_of
+        sources.append({**named, "seconds": seconds, "success": good / len(targets), "optimal_roll": False})
+    return sources
 
 
 def report(summary: dict[str, Any]) -> str:

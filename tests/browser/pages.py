@@ -42,12 +42,12 @@ class Look:
 
     browser: Any
     folder: Path
-    told: list[str] = field(default_factory=list)
+    messages: list[str] = field(default_factory=list)
 
     def check(self, holds: object, words: str) -> None:
         """Tell what does not hold."""
         if not holds:
-            self.told.append(words)
+            self.messages.append(words)
 
     @contextmanager
     def opened(self, address: str, name: str, **settings: Any) -> Iterator[Any]:
@@ -65,7 +65,7 @@ class Look:
             opened.goto(address)
             yield opened
         except Exception as error:  # of the driver: what did not come in time
-            self.told.append(f"{name}: {type(error).__name__}: {str(error).splitlines()[0]}")
+            self.messages.append(f"{name}: {type(error).__name__}: {str(error).splitlines()[0]}")
         finally:
             context.close()
 
@@ -108,7 +108,7 @@ def failures(look: Look, root: Path) -> list[str]:
                 ready(opened)
                 look.picture(opened, "panda_dark")
     site(look, root / "build" / "site")
-    return look.told
+    return look.messages
 
 
 def ready(opened: Any) -> None:

@@ -68,7 +68,7 @@ class User:
     """
 
     def __init__(self, home: Path, bin: Path) -> None:
-        self.home, self.bin, self.told = home, bin, list[str]()
+        self.home, self.bin, self.messages = home, bin, list[str]()
 
     def run(self, *words: str) -> subprocess.CompletedProcess[str]:
         """A program of the environment, in the folder, with nothing of this process's paths."""
@@ -82,7 +82,7 @@ class User:
         """Say whether something holds."""
         print(f"{'ok' if good else 'FAILED'}  {what}", flush=True)
         if not good:
-            self.told.append(f"{what}: {shown}")
+            self.messages.append(f"{what}: {shown}")
 
     def does(self, *words: str, makes: str = "") -> str:
         """Run `selfmotion`; it succeeds, and leaves a file."""
@@ -106,13 +106,13 @@ def main() -> int:
         user.home.mkdir()
         done = user.run("python", "-m", "pip", "install", "--quiet", f"{wheel}[{EXTRAS}]")
         user.holds(f"pip install {wheel.name}[{EXTRAS}]", done.returncode == 0, done.stderr)
-        if not user.told:
+        if not user.messages:
             used(user)
-        user.told += report
-    for failure in user.told:
+        user.messages += report
+    for failure in user.messages:
         print(f"FAILED: {failure}", file=sys.stderr)
-    print(f"{len(user.told)} failures")
-    return 1 if user.told else 0
+    print(f"{len(user.messages)} failures")
+    return 1 if user.messages else 0
 
 
 def read_on(folder: Path, wheel: Path) -> list[str]:
@@ -131,7 +131,7 @@ def read_on(folder: Path, wheel: Path) -> list[str]:
         if step.words:
             done = user.run(*step.words)
             user.holds(f"README: {' '.join(step.words)}", done.returncode == 0, f"{done.stdout}\n{done.stderr}")
-    return user.told
+    return user.messages
 
 
 def built(folder: Path) -> Path:

@@ -350,13 +350,13 @@ def test_reached_means_that_the_audit_passes(method: str) -> None:
     for declare in (swing, layer, van_der_pol):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RefinementWarning)
-            given = SWING if declare is swing else None
+            options = SWING if declare is swing else None
             solution = refine(
                 declare(),
                 START[method],
                 tolerance=1e-4,
                 settings=RefinementSettings(max_intervals=60),
-                parameters=given,
+                parameters=options,
             )
         assert solution.refinement is not None
         audit = solution.audit()
@@ -605,9 +605,9 @@ def test_a_failed_round_raises_the_error_of_solving() -> None:
     ],
 )
 def test_bad_arguments_are_named(arguments: dict[str, Any], message: str) -> None:
-    given = {"method": Collocation(3), **arguments}
+    options = {"method": Collocation(3), **arguments}
     with pytest.raises(ProblemError, match=message):
-        refine(van_der_pol(), **{**given, "settings": RefinementSettings(**given.get("settings", {}))})
+        refine(van_der_pol(), **{**options, "settings": RefinementSettings(**options.get("settings", {}))})
 
 
 # ---- splitting ---------------------------------------------------------------------------------------------------

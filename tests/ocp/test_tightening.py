@@ -81,10 +81,10 @@ def test_the_plan_stores_the_tightening_of_its_bounds(method: Any) -> None:
     jumps = [False, False, *[getattr(method, "control", "") != "linear"] * 2]
     below, above = np.where(jumps, tight.bound_tightening[:, owner], shared)
     points = isinstance(method, Collocation) and method.control == "points"  # where all of it is asked
-    looked_at = slice(None) if points else slice(2, 3)
+    checked = slice(None) if points else slice(2, 3)
     inside = (at > 0) & (at < 1)  # the ends of q and v are given
-    assert (values >= lower + below - 1e-7)[inside, looked_at].all()
-    assert (values <= upper - above + 1e-7)[inside, looked_at].all()
+    assert (values >= lower + below - 1e-7)[inside, checked].all()
+    assert (values <= upper - above + 1e-7)[inside, checked].all()
 
 
 @pytest.mark.parametrize("method", METHODS, ids=str)

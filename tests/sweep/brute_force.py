@@ -127,7 +127,7 @@ def main() -> None:
         shown.append(row)
         if row["wrong"]:
             print(row, flush=True)
-    print(f"{sweep.told(shown)}; {sum(np.isfinite(row['steps']) for row in shown)} have a motion")
+    print(f"{sweep.summary(shown)}; {sum(np.isfinite(row['steps']) for row in shown)} have a motion")
 
 
 if __name__ == "__main__":

@@ -188,7 +188,7 @@ def main() -> int:
     for row in sweep.rows(lambda robot, seed, _: result(robot, seed, options.postures)):
         shown.append(row)
         print(row, flush=True)
-    print(f"{sweep.told(shown)}; {sum('cost' in row for row in shown)} solved")
+    print(f"{sweep.summary(shown)}; {sum('cost' in row for row in shown)} solved")
     return int(any("touches" in row["wrong"] for row in shown))
 
 

@@ -443,7 +443,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         own = [row for row in rows if row["kind"] == kind]
         matches = [f"{sum(row['outcome'] == word for row in own)} {word}" for word in ("caught", "refused", "harmless")]
         print(f"{kind:<10} {', '.join(matches)}, {sum(bool(row['wrong']) for row in own)} wrong")
-    print(sweep.told(rows))
+    print(sweep.summary(rows))
     return int(any(row["wrong"] for row in rows))
 
 

@@ -129,7 +129,7 @@ def main() -> None:
             f"{row['bound'] / row['cost']:.4f}  time {row['seconds'] / row['starts_seconds']:.3f}  {row['wrong']}",
             flush=True,
         )
-    print(sweep.told(shown))
+    print(sweep.summary(shown))
 
 
 if __name__ == "__main__":

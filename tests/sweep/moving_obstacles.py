@@ -107,31 +107,31 @@ def _turned(angle: Any) -> Any:
 def _once(share: Callable[[float, float], Callable[[Any], Any]], low: float = -5.0, high: float = -0.5) -> Any:
     """A motion from far to aim by a share, with an event at one time, of a random width in powers of ten, s."""
 
-    def made(rng: np.random.Generator, when: float, aim: np.ndarray, far: np.ndarray) -> Any:
+    def trajectory(rng: np.random.Generator, when: float, aim: np.ndarray, far: np.ndarray) -> Any:
         width = float(10 ** rng.uniform(low, high))
         return _between(far, aim, share(when, width)), None, [(when, 2 * width)]
 
-    return made
+    return trajectory
 
 
 def _again(share: Callable[[float, float], Callable[[Any], Any]], low: float, high: float) -> Any:
     """A motion of a random rate between two, from far to aim by a share, which is there at one time."""
 
-    def made(rng: np.random.Generator, when: float, aim: np.ndarray, far: np.ndarray) -> Any:
+    def trajectory(rng: np.random.Generator, when: float, aim: np.ndarray, far: np.ndarray) -> Any:
         return _between(far, aim, share(rng.uniform(low, high), when)), None, [(when, 0.05)]
 
-    return made
+    return trajectory
 
 
 def _table(kind: str) -> Any:
-    def made(rng: np.random.Generator, when: float, aim: np.ndarray, far: np.ndarray) -> Any:
+    def trajectory(rng: np.random.Generator, when: float, aim: np.ndarray, far: np.ndarray) -> Any:
         knots = np.unique([0.0, *rng.uniform(0, SECONDS, 8), when - 0.02, when, when + 0.02, SECONDS])
         values = np.clip(rng.normal(0.2, 0.3, len(knots)), -0.5, 0.8)
         values[knots == when] = 1.0
         table = ca.interpolant("table", kind, [knots.tolist()], values.tolist())
         return _between(far, aim, lambda t: table(t)), None, [(when, 0.03)]
 
-    return made
+    return trajectory
 
 
 def _spinning(rng: np.random.Generator, when: float, aim: np.ndarray, far: np.ndarray) -> Any:
@@ -232,7 +232,7 @@ def main() -> int:
         shown.append(row)
         print(row, flush=True)
     message = Counter(row["said"] for row in shown)
-    print(f"{sweep.told(shown)}; {', '.join(f'{count} {what}' for what, count in sorted(message.items()))}")
+    print(f"{sweep.summary(shown)}; {', '.join(f'{count} {what}' for what, count in sorted(message.items()))}")
     return int(any(row["wrong"] for row in shown))
 
 

@@ -148,7 +148,7 @@ def main() -> None:
     for row in sweep.rows(lambda kind, seed, _: result(kind, seed)):
         shown.append(row)
         print(row, flush=True)
-    print(f"{sweep.told(shown)}; {sum('cost' in row for row in shown)} planned")
+    print(f"{sweep.summary(shown)}; {sum('cost' in row for row in shown)} planned")
 
 
 if __name__ == "__main__":

@@ -74,13 +74,13 @@ def faults(name: str, joints: Array) -> list[str]:
     if not ((joints >= robot.lower - 1e-9) & (joints <= robot.upper + 1e-9)).all():
         outcome.append("joints pass their limits")
     paths = {link.name: {joint.name for joint in robot.path_to(link.name) if joint.moves} for link in robot.links}
-    looked_at = {
+    checked = {
         pair: values
         for pair, values in by_coal(problem, joints).items()
         if not pair <= paths.keys()
         or len(set.symmetric_difference(*(paths[link] for link in pair))) > 1  # not neighbours
     }
-    nearest = min((float(values.min()), sorted(pair)) for pair, values in looked_at.items())
+    nearest = min((float(values.min()), sorted(pair)) for pair, values in checked.items())
     if nearest[0] < 0:
         outcome.append(f"{nearest[1]} overlap by {-nearest[0]:.2g} m")
     return outcome
@@ -119,7 +119,7 @@ def main() -> None:
     for row in sweep.rows(apart):
         shown.append(row)
         print(row, flush=True)
-    print(sweep.told(shown))
+    print(sweep.summary(shown))
 
 
 if __name__ == "__main__":

@@ -75,7 +75,7 @@ class Sweep:
         ]
         return matches[: self.given.count]
 
-    def told(self, rows: list[Row]) -> str:
+    def summary(self, rows: list[Row]) -> str:
         """How many of some rows are of this code, how many of older, and how many of each are wrong."""
         words = []
         for what, own in (("this code", True), ("older code", False)):

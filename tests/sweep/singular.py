@@ -201,7 +201,7 @@ def main() -> None:
         print(row, flush=True)
     done = sum("damped" in row for row in shown)
     planned = sum("damped" in row and "cost" in row for row in shown)
-    print(f"{sweep.told(shown)}; damped least squares does {done}, of which {planned} are planned")
+    print(f"{sweep.summary(shown)}; damped least squares does {done}, of which {planned} are planned")
 
 
 if __name__ == "__main__":

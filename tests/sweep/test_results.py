@@ -31,7 +31,7 @@ def test_recorded_cases_are_repeated_on_request_or_for_changed_code(tmp_path: Pa
     sweep, rows, done = swept(file)
     assert done == cases[2:]
     assert [row["code"] == sweep.code for row in rows] == [False, False, True, True]
-    assert sweep.told(rows) == "4 of 4 cases: 2 of this code, 0 of them wrong; 2 of older code, 1 of them wrong"
+    assert sweep.summary(rows) == "4 of 4 cases: 2 of this code, 0 of them wrong; 2 of older code, 1 of them wrong"
     assert swept(file, "--again", "--minutes", "0")[2] == []
     sweep, rows, done = swept(file, "--again")
     assert done == cases[:2]

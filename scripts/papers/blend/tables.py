@@ -151,7 +151,7 @@ def summary(results: Results) -> dict[str, Any]:
     def of(rows: Sequence[Row], key: str, **wanted: Any) -> float:
         return float(next(row[key] for row in rows if all(row[name] == value for name, value in wanted.items())))
 
-    def found(mapping: str, key: str, blend: str = "line-line") -> float:
+    def value_of(mapping: str, key: str, blend: str = "line-line") -> float:
         return of(results.mappings, key, mapping=mapping, blend=blend, period_ms=2)
 
     def drift(mapping: str, remaining: float) -> float:
@@ -172,13 +172,13 @@ def summary(results: Results) -> dict[str, Any]:
         "blend_times_paper_s": PAPER_TIMES,
         "speed_error_mm_s": {
             "paper": PAPER_SPEED_ERROR,
-            "predictor_corrector_2ms": found("predictor_corrector", "chord_speed_error_mm_s"),
-            "predictor_corrector_2ms_true": found("predictor_corrector", "true_speed_error_mm_s"),
-            "predictor_corrector_2ms_line_arc": found("predictor_corrector", "chord_speed_error_mm_s", "line-arc"),
+            "predictor_corrector_2ms": value_of("predictor_corrector", "chord_speed_error_mm_s"),
+            "predictor_corrector_2ms_true": value_of("predictor_corrector", "true_speed_error_mm_s"),
+            "predictor_corrector_2ms_line_arc": value_of("predictor_corrector", "chord_speed_error_mm_s", "line-arc"),
             "predictor_corrector_2ms_blend_ends": exit_steps(results),
-            "gauss_2ms": found("gauss_newton", "true_speed_error_mm_s"),
-            "gauss_2ms_line_arc": found("gauss_newton", "true_speed_error_mm_s", "line-arc"),
-            "gauss_2ms_chord": found("gauss_newton", "chord_speed_error_mm_s"),
+            "gauss_2ms": value_of("gauss_newton", "true_speed_error_mm_s"),
+            "gauss_2ms_line_arc": value_of("gauss_newton", "true_speed_error_mm_s", "line-arc"),
+            "gauss_2ms_chord": value_of("gauss_newton", "chord_speed_error_mm_s"),
         },
         "drift_mm": {
             f"{name}_1ms_{remaining}mm": drift(mapping, remaining)

@@ -353,8 +353,8 @@ def test_the_momentum_equals_that_of_pinocchio(name: str) -> None:
     path = urdf_file(package, ending)
     robot = Robot.from_urdf(path, **report)
     peer, rng = Peer.of(path, robot), np.random.default_rng(7)
-    given = rng.normal(size=6)
-    machine = FreeFloating(robot, conserved_momentum=given)
+    options = rng.normal(size=6)
+    machine = FreeFloating(robot, conserved_momentum=options)
     b, q, rates = (ca.SX.sym(n, k) for n, k in (("b", 7), ("q", robot.dof), ("r", robot.dof)))
     moved = ca.Function("f", [b, q, rates], [machine.base_twist(b, q, rates), machine.tip_twist(b, q, rates)])
     frame = peer.model.getFrameId(robot.tip_link)
@@ -364,7 +364,7 @@ def test_the_momentum_equals_that_of_pinocchio(name: str) -> None:
         state = replace(state, base_twist=twist)
         configuration, velocity = peer.configuration(state), peer.velocity(state)
         momentum = pinocchio.computeCentroidalMomentum(peer.model, peer.data, configuration, velocity)
-        np.testing.assert_allclose(swapped(np.array(momentum.vector)), given, atol=1e-9)
+        np.testing.assert_allclose(swapped(np.array(momentum.vector)), options, atol=1e-9)
         pinocchio.forwardKinematics(peer.model, peer.data, configuration, velocity)
         world = pinocchio.ReferenceFrame.LOCAL_WORLD_ALIGNED
         result = pinocchio.getFrameVelocity(peer.model, peer.data, frame, world).vector

@@ -71,8 +71,8 @@ def test_collisions_equal_those_of_coal(name: str) -> None:
     base, q = ca.SX(0, 1), ca.SX.sym("q", problem.machine.joint_size)
     exact = np.array(ca.Function("exact", [q], [around.distances(base, q)]).map(len(joints))(joints.T)).T
     seen = distances_along(around, np.zeros(0), joints, np.zeros(len(joints)))
-    looked_at = {frozenset(label) for label in around.labels}
-    assert looked_at <= expected.keys()
+    checked = {frozenset(label) for label in around.labels}
+    assert checked <= expected.keys()
     for k, label in enumerate(around.labels):
         by_others = expected[frozenset(label)]
         assert_allclose(exact[:, k], by_others, atol=1e-6)
@@ -80,10 +80,10 @@ def test_collisions_equal_those_of_coal(name: str) -> None:
         assert_allclose(seen[apart, k], by_others[apart], atol=1e-6)
         assert np.all(seen[by_others < -1e-6, k] < 0)
     some = {frozenset(pair): why for pair, why in around.left.items()}
-    for pair in expected.keys() - looked_at:
+    for pair in expected.keys() - checked:
         assert some[pair] in (NEIGHBOURS, RIGID, ALWAYS, NEVER, "neither moves")
         assert some[pair] != NEVER or expected[pair].min() > 0
         assert some[pair] != ALWAYS or expected[pair].max() <= 0
-    colliding = np.min([expected[pair] for pair in looked_at], axis=0) < 0
+    colliding = np.min([expected[pair] for pair in checked], axis=0) < 0
     assert colliding.any()
     assert not colliding.all()

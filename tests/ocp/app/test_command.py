@@ -119,11 +119,11 @@ class Page(HTMLParser):
 
     def __init__(self) -> None:
         super().__init__()
-        self.asked: list[str] = []
+        self.requests: list[str] = []
         self.open: list[str] = []
 
     def handle_starttag(self, tag: str, attrs: Any) -> None:
-        self.asked += [value for name, value in attrs if name in ("src", "href", "action", "srcset") and value]
+        self.requests += [value for name, value in attrs if name in ("src", "href", "action", "srcset") and value]
         if tag in ("table", "figure", "ul", "ol", "div", "svg", "body", "html"):
             self.open.append(tag)
 
@@ -140,7 +140,7 @@ def test_a_report_stands_alone(capsys: Any) -> None:
     page = Page()
     page.feed(text)
     assert page.open == []
-    assert all(one.startswith(("data:", "#")) for one in page.asked), page.asked
+    assert all(one.startswith(("data:", "#")) for one in page.requests), page.requests
     assert "url(http" not in text
     assert "@import" not in text
     assert "Seam &lt;4&gt;" in text

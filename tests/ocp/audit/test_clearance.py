@@ -497,9 +497,9 @@ BAD: dict[str, dict[str, Any]] = {
 
 @pytest.mark.parametrize("case", BAD)
 def test_invalid_declarations(case: str) -> None:
-    given = {**GOOD, **BAD[case]}
+    options = {**GOOD, **BAD[case]}
     with pytest.raises(ProblemError):
-        flight([0, 0, 0], [1, 0, 0], given.pop("hulls"), given.pop("pairs"), given.pop("least"), **given)
+        flight([0, 0, 0], [1, 0, 0], options.pop("hulls"), options.pop("pairs"), options.pop("least"), **options)
 
 
 @pytest.mark.parametrize(

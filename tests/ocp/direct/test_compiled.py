@@ -423,17 +423,17 @@ def is_gone(pid: int) -> bool:
 def test_a_result_is_the_same_with_an_empty_cache_a_warm_one_and_without_a_compiler(
     own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def found() -> list[bytes | str | int]:
+    def contents() -> list[bytes | str | int]:
         one = prepare(van_der_pol(), Collocation(8, 3)).solve()
         other = prepare(van_der_pol((1.0, 0.0), upper=1.0, lower=-1.0), MultipleShooting(8)).solve()
         parts = [(each.variables.tobytes(), each.multipliers.tobytes(), each.solver) for each in (one, other)]
         return [*parts[0], *parts[1], one.iterations, other.iterations]
 
-    empty = found()
+    empty = contents()
     prepare(van_der_pol(), Collocation(8, 3), compiled=True)
     assert list(own.rglob("*.so")), "the cache is warm now"
-    assert found() == empty
+    assert contents() == empty
     monkeypatch.setenv("CC", "false")
-    assert found() == empty
+    assert contents() == empty
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "another"))
-    assert found() == empty
+    assert contents() == empty

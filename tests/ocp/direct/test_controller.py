@@ -64,7 +64,7 @@ def test_the_program_tells_the_plan_and_its_functions_are_those_solved_with(case
     words = ["cc", "-shared", "-fPIC", "-w", "-ffp-contract=off", str(program.parent / "plan.c"), "-o", str(library)]
     subprocess.run([*words, "-lm"], check=True)
 
-    def made_of(name: str, *options: Any) -> list[Array]:
+    def values_of(name: str, *options: Any) -> list[Array]:
         result = ca.external(f"plan_{name}", str(library)).call([ca.DM(each) for each in options])
         return [np.asarray(each.full()) for each in result]
 
@@ -76,12 +76,14 @@ def test_the_program_tells_the_plan_and_its_functions_are_those_solved_with(case
         ("constraints", prepared.program.jacobian, (x, p)),
         ("hessian", prepared.program.hessian, (x, p, sigma, lam)),
     ):
-        for ours, theirs in zip(made_of(name, *options), function.call([ca.DM(each) for each in options]), strict=True):
+        for ours, theirs in zip(
+            values_of(name, *options), function.call([ca.DM(each) for each in options]), strict=True
+        ):
             np.testing.assert_array_equal(ours, theirs.full())
     lower, upper = prepared.formulation.bound_values(p)
     transcription = prepared.transcription
     expected = [side[at] for at in (transcription.variable_bounds, transcription.row_bounds) for side in (lower, upper)]
-    for ours, theirs in zip(made_of("bounds", p), expected, strict=True):
+    for ours, theirs in zip(values_of("bounds", p), expected, strict=True):
         np.testing.assert_array_equal(ours.ravel(), theirs)
 
 

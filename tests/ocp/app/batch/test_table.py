@@ -136,8 +136,8 @@ def test_the_cost_is_that_of_the_function_or_of_the_only_plan() -> None:
 
 
 def test_data_are_plain_and_their_own() -> None:
-    given = {"a": (np.int64(1), np.arange(2.0)), "b": [np.bool_(True)]}
-    assert as_data(given, "task") == {"a": [1, [0.0, 1.0]], "b": [True]}
+    options = {"a": (np.int64(1), np.arange(2.0)), "b": [np.bool_(True)]}
+    assert as_data(options, "task") == {"a": [1, [0.0, 1.0]], "b": [True]}
     assert canonical_text({"b": 1, "a": {"d": 1, "c": 2}}, "task") == '{"a":{"c":2,"d":1},"b":1}'
     assert len({key_of(canonical_text(value, "task")) for value in (0.1, 0.1 + 1e-18, np.float64(0.1))}) == 1
     assert len({key_of(canonical_text(value, "task")) for value in (0.1, np.nextafter(0.1, 1), np.float32(0.1))}) == 3

@@ -281,7 +281,7 @@ def test_a_speed_or_jerk_that_is_not_positive_is_a_named_error(bad: float) -> No
 
 
 @pytest.mark.parametrize(
-    ("given", "message"),
+    ("options", "message"),
     [
         ({"speed": []}, "speed"),
         ({"speed": "fast"}, "not numeric"),
@@ -292,9 +292,9 @@ def test_a_speed_or_jerk_that_is_not_positive_is_a_named_error(bad: float) -> No
         ({"joints": 3.0}, "JointLimits"),
     ],
 )
-def test_limits_that_are_none_are_named_errors(given: dict[str, Any], message: str) -> None:
+def test_limits_that_are_none_are_named_errors(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ProblemError, match=message) as caught:
-        replace(LIMITS, **given)
+        replace(LIMITS, **options)
     assert (caught.value.name or "unnamed") in str(caught.value)
 
 

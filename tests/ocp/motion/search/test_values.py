@@ -225,17 +225,17 @@ def test_lower_bounds_of_a_step_hold_on_curved_solution_sets(kind: Any, free: in
     cost, scale = kind(weights), np.sqrt(weights) if kind is SquaredRates else np.ones(n)
     rim = np.broadcast_to(half * _rim(free), (count, len(_rim(free)), free))
 
-    def bent() -> tuple[Charts, Any]:
+    def curved_charts() -> tuple[Charts, Any]:
         """Charts, and how far the sets are from places (P, g, r) on them. Shape (P, g, n)."""
         bends, cubes = rng.normal(size=(count, n, free, free)), 0.02 * rng.normal(size=(count, n, free))
 
-        def stray(at: Array) -> Array:
+        def deviation(at: Array) -> Array:
             cubic = np.einsum("pna,pga->pgn", cubes, (at / half) ** 3)
             return np.asarray(np.einsum("pga,pnab,pgb->pgn", at, bends, at) / 2 + cubic)
 
-        return replace(flat_charts(rng, count, scale, free, half), deviations=stray(rim)), stray
+        return replace(flat_charts(rng, count, scale, free, half), deviations=deviation(rim)), deviation
 
-    (out, away), (into, beyond) = bent(), bent()
+    (out, away), (into, beyond) = curved_charts(), curved_charts()
     after = QuadraticBounds(rng.normal(size=count), rng.normal(size=(count, free)), np.zeros((count, free, free)))
     delta = 0.3 * rng.normal(size=(count, n))
     steps = cost.lower_bounds(
@@ -268,16 +268,16 @@ def test_losses_of_steps_between_curved_sets_are_of_higher_order(free: int, orde
         along, across, none = paths[:, :, :free], paths[:, :, free:], np.zeros(count, dtype=np.intp)
         rim, box = np.broadcast_to(half * _rim(free), (count, len(_rim(free)), free)), np.full((count, free), half)
 
-        def bent() -> tuple[Charts, Any]:
+        def curved_charts() -> tuple[Charts, Any]:
             bends = 0.2 * rng.normal(size=(count, n - free, free, free))
             bends = np.einsum("pnc,pcab->pnab", across, bends + bends.transpose(0, 1, 3, 2))
 
-            def stray(at: Array) -> Array:
+            def deviation(at: Array) -> Array:
                 return np.asarray(np.einsum("pga,pnab,pgb->pgn", at, bends, at) / 2)
 
-            return Charts(none, np.zeros((count, n)), along, box[:, 0], -box, box, stray(rim)), stray
+            return Charts(none, np.zeros((count, n)), along, box[:, 0], -box, box, deviation(rim)), deviation
 
-        (out, away), (into, beyond) = bent(), bent()
+        (out, away), (into, beyond) = curved_charts(), curved_charts()
         after = QuadraticBounds(np.zeros(count), rng.normal(size=(count, free)), np.zeros((count, free, free)))
         delta, cost = 0.3 * rng.normal(size=(count, n)), SquaredRates(weights)
         steps = cost.lower_bounds(
