@@ -144,15 +144,15 @@ def dymos(statement: Statement, intervals: int) -> Posed:
                 columns = np.broadcast_to(columns if list(sizes)[k] not in shared else columns[:1], (n, m, width))
                 self.declare_partials(names[i], list(sizes)[k], rows=rows, cols=columns.ravel())
 
-        def given(self, inputs: Any) -> list[Any]:
+        def columns_of(self, inputs: Any) -> list[Any]:
             return [ca.DM(inputs[name] if name in shared else inputs[name].T) for name in sizes]
 
         def compute(self, inputs: Any, outputs: Any) -> None:
-            for name, value in zip(names, self.mapped[0].call(self.given(inputs)), strict=True):
+            for name, value in zip(names, self.mapped[0].call(self.columns_of(inputs)), strict=True):
                 outputs[name] = value.full().T
 
         def compute_partials(self, inputs: Any, partials: Any) -> None:
-            outcome = self.mapped[1].call(self.given(inputs))
+            outcome = self.mapped[1].call(self.columns_of(inputs))
             for (i, k), slope in zip(pairs, outcome, strict=True):  # n matrices (m, width) side by side
                 of = slope.full().reshape(values[i].numel(), -1, symbols[k].numel())
                 partials[names[i], list(sizes)[k]] = of.transpose(1, 0, 2).ravel()

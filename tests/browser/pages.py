@@ -196,14 +196,14 @@ def poses(look: Look, opened: Any, name: str, first: Animation) -> None:
     robot = first.machine.robot
     links = [robot.root, *(joint.child for joint in robot.joints if joint.moves), TIP_FRAME]
     for time in np.random.default_rng(0).uniform(0.0, first.t[-1], 5):
-        picture = np.array(opened.evaluate("(time) => [...player.motions[0].at(time)]", time)).reshape(-1, 7)
+        displayed = np.array(opened.evaluate("(time) => [...player.motions[0].at(time)]", time)).reshape(-1, 7)
         joints, base = (
             np.array([[np.interp(time, first.t, column) for column in values.T]])
             for values in (first.joints, first.base)
         )
         frames = frames_along(first.machine, joints, base)
         wanted = np.array([frames.positions[link][0] for link in links])
-        off = float(np.abs(picture[:, :3] - wanted).max())
+        off = float(np.abs(displayed[:, :3] - wanted).max())
         look.check(off < 2e-3, f"{name}: at {time:.3f} s a link is drawn {off:.2g} m from where it is")
 
 

@@ -144,10 +144,10 @@ def test_a_limit_violated_between_points_is_tightened_at_once(monkeypatch: pytes
 
 
 def test_a_node_is_tightened_by_the_larger_of_both_sides() -> None:
-    picture = np.zeros((2, 3, 1))
-    picture[0, :, 0], picture[1, :, 0] = [1.0, 3.0, 2.0], [0.0, 0.0, 5.0]
+    tightening = np.zeros((2, 3, 1))
+    tightening[0, :, 0], tightening[1, :, 0] = [1.0, 3.0, 2.0], [0.0, 0.0, 5.0]
     mesh = np.array([0.0, 0.2, 0.7, 1.0])
-    below, above = tightening_at(picture, mesh, np.array([0.0, 0.1, 0.2, 0.5, 0.7, 0.9, 1.0]))[:, :, 0]
+    below, above = tightening_at(tightening, mesh, np.array([0.0, 0.1, 0.2, 0.5, 0.7, 0.9, 1.0]))[:, :, 0]
     assert below.tolist() == [1, 1, 3, 3, 3, 2, 2]
     assert above.tolist() == [0, 0, 0, 0, 5, 5, 5]
 
@@ -165,16 +165,16 @@ def test_tightened_bounds_are_read_from_a_file(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("damage", ["intervals", "entries", "negative", "nan", "inf", "words", "flat"])
 def test_a_damaged_file_of_tightened_bounds_is_refused(damage: str, tmp_path: Path) -> None:
-    picture = tightened(METHODS[0]).bound_tightening
-    assert picture is not None
+    tightening = tightened(METHODS[0]).bound_tightening
+    assert tightening is not None
     bad = {
-        "intervals": picture[:, 1:],
-        "entries": picture[:, :, :2],
-        "negative": picture - 1.0,
-        "nan": picture * np.nan,
-        "inf": picture + np.inf,
-        "words": picture.astype(str),
-        "flat": picture[0],
+        "intervals": tightening[:, 1:],
+        "entries": tightening[:, :, :2],
+        "negative": tightening - 1.0,
+        "nan": tightening * np.nan,
+        "inf": tightening + np.inf,
+        "words": tightening.astype(str),
+        "flat": tightening[0],
     }[damage]
     replace(tightened(METHODS[0]), bound_tightening=bad).save(tmp_path / "plan.npz")
     with pytest.raises(ProblemError, match="bound_tightening") as caught:

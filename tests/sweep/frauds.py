@@ -321,7 +321,7 @@ def tightened(options: Subject, rng: Any, size: float) -> Solution:
     if not options.others:
         return replace(options.plan, bound_tightening=np.full(random_shape(options), size))
     other = options.others[rng.integers(len(options.others))]
-    picture = np.zeros(random_shape(options))
+    tightening = np.zeros(random_shape(options))
     form, narrow = Formulation.of(options.problem), Formulation.of(other.problem)
     index = np.concatenate([form.bounds.places[kind] for kind in ("state", "control", "path")])
     p = form.parameter_vector(other.parameters)
@@ -329,8 +329,8 @@ def tightened(options: Subject, rng: Any, size: float) -> Solution:
         wide, own = form.bound_values(p)[side][index], narrow.bound_values(p)[side][index]
         with np.errstate(invalid="ignore"):
             by = np.nan_to_num(sign * (wide - own), nan=0.0, posinf=0.0, neginf=0.0)
-        picture[side] = np.maximum(by, 0.0)
-    result = replace(other, problem=options.problem, bound_tightening=picture)
+        tightening[side] = np.maximum(by, 0.0)
+    result = replace(other, problem=options.problem, bound_tightening=tightening)
     return without_multipliers(result) if rng.random() < 0.5 else result
 
 

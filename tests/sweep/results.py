@@ -40,10 +40,10 @@ class Sweep:
         """
         Args:
             file: Of the module that does them.
-            given: Of `parser`.
+            options: Of `parser`.
             counts: Cases of each kind.
         """
-        self.given, self.counts, self.code = options, counts, code_of(Path(file))
+        self.options, self.counts, self.code = options, counts, code_of(Path(file))
 
     def rows(self, result: Callable[[str, int, Row | None], Row]) -> Iterator[Row]:
         """Every case, from the file or done now and added to it; the kinds in turn.
@@ -52,7 +52,7 @@ class Sweep:
             result: Of a case, given what the file has of it, None where it has nothing. What is promised and broken is
                 its ``wrong``, a list of words.
         """
-        options, known, end = self.given, rows_of(self.given.out), time.time() + MINUTE * self.given.minutes
+        options, known, end = self.options, rows_of(self.options.out), time.time() + MINUTE * self.options.minutes
         for kind, seed in self.cases():
             row = known.get((kind, seed))
             old = row is None or (options.again and row["code"] != self.code)
@@ -66,14 +66,14 @@ class Sweep:
 
     def cases(self) -> list[Case]:
         """Kinds and seeds, in the order in which they are done."""
-        counts = {kind: count for kind, count in self.counts.items() if kind in (self.given.only or self.counts)}
+        counts = {kind: count for kind, count in self.counts.items() if kind in (self.options.only or self.counts)}
         matches = [
             (kind, seed)
             for seed in range(max(counts.values()))
             for kind, count in counts.items()
-            if seed < count and (self.given.seed is None or seed == self.given.seed)
+            if seed < count and (self.options.seed is None or seed == self.options.seed)
         ]
-        return matches[: self.given.count]
+        return matches[: self.options.count]
 
     def summary(self, rows: list[Row]) -> str:
         """How many of some rows are of this code, how many of older, and how many of each are wrong."""

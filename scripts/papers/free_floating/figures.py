@@ -265,7 +265,7 @@ def _costs(ax: Any, searches: Sequence[Search]) -> None:
         for e in one.extremals:  # by cost: a label that would cover the one below moves up
             height = PANEL * np.log(e.cost / low) / np.log(high / low)
             above = max(height, above + LINE)
-            text, place = f"{e.cost:.5f} ({e.found}×)", (8, above - height)
+            text, place = f"{e.cost:.5f} ({e.guess_count}×)", (8, above - height)
             ax.annotate(text, (e.horizon, e.cost), place, textcoords="offset points", fontsize=7.5, va="center")
     ax.set(xlabel="horizon, s", ylabel="cost J, rad$^2$/s")
     ax.set_title(f"Extremals from {searches[0].starts} first guesses at each horizon (how often each was found)")

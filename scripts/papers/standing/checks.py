@@ -52,7 +52,7 @@ def check(key: str, plan: Plan) -> Row:
         "method": METHOD_NAMES[request.transcription],
         "intervals": request.intervals,
         "instants": request.intervals * FINER,
-        "drawn": request.drawn,
+        "drawn": request.has_figure,
         **by_name,
         "zmp_min_m": float(motion.zero_moment_point[:, 1].min()),
         "zmp_max_m": float(motion.zero_moment_point[:, 1].max()),

@@ -193,8 +193,8 @@ def _draw_spring(folder: Path, two: Mapping[str, Local], best: Mapping[str, Plan
 def _draw_plans(folder: Path, plans: Mapping[str, Mapping[str, Plan]]) -> None:
     """Write the figures of the plans of each task."""
     for task in ("table1", "table2"):
-        picture = [plan for plan in plans[task].values() if plan.request.drawn]
-        shown = [curve_of(plan, *STYLES[plan.request.title]) for plan in picture]
+        plotted = [plan for plan in plans[task].values() if plan.request.has_figure]
+        shown = [curve_of(plan, *STYLES[plan.request.title]) for plan in plotted]
         _draw_task(folder / f"optimal_{task}.png", f"Table {task[-1]}", shown)
     _draw_lift(folder, plans["minimum_time"])
 

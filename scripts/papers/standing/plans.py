@@ -66,7 +66,7 @@ class Request:
             between the nodes, limits drawn in to hold there too, for plans that switch; ``held``: held over the
             intervals, as the reference has them, which costs more where a constraint of the ground is active.
         intervals: Of the plan.
-        drawn: Whether figures and animations show it; such plans must stand every check and their audit.
+        has_figure: Whether figures and animations show it; such plans must stand every check and their audit.
     """
 
     task: Task
@@ -74,7 +74,7 @@ class Request:
     rule: ZmpRule
     transcription: Transcription = "points"
     intervals: int = 100
-    drawn: bool = True
+    has_figure: bool = True
 
 
 @dataclass(frozen=True)
@@ -109,14 +109,16 @@ PLANS: Mapping[str, Mapping[str, Request]] = {
         "optimal_range": Request("table1", "in the foot less 0.02 m", InFoot(MARGIN)),
         "optimal_index_half": Request("table1", "index ≥ 0.5", IndexAtLeast(0.5)),
         "optimal_index_nine_tenths": Request("table1", "index ≥ 0.9", IndexAtLeast(0.9)),
-        "optimal_pinned": Request("table1", "pinned at 0, held", Pinned(), "held", HELD["table1"], drawn=False),
+        "optimal_pinned": Request("table1", "pinned at 0, held", Pinned(), "held", HELD["table1"], has_figure=False),
         "optimal_pinned_points": Request("table1", "pinned at 0", Pinned()),
         "optimal_free": Request("table1", "no ZMP rule", Anywhere()),
     },
     "table2": {
         "optimal_spring": Request("table2", "in the foot less 0.02 m", InFoot(MARGIN)),
         "optimal_spring_index_nine_tenths": Request("table2", "index ≥ 0.9", IndexAtLeast(0.9)),
-        "optimal_spring_pinned": Request("table2", "pinned at 0, held", Pinned(), "held", HELD["table2"], drawn=False),
+        "optimal_spring_pinned": Request(
+            "table2", "pinned at 0, held", Pinned(), "held", HELD["table2"], has_figure=False
+        ),
         "optimal_spring_pinned_points": Request("table2", "pinned at 0", Pinned()),
         "optimal_spring_free": Request("table2", "no ZMP rule", Anywhere()),
     },

@@ -112,8 +112,8 @@ def files(results: Results) -> Mapping[str, Content]:
 def sound(results: Results) -> bool:
     """Whether every drawn plan holds what it must between its nodes and its audit finds nothing beyond its limit."""
     held = all(row["holds"] for row in results.checks if row["drawn"])
-    picture = [plan for group in results.plans.values() for plan in group.values() if plan.request.drawn]
-    return held and not any(plan.audit.failures for plan in picture)
+    plotted = [plan for group in results.plans.values() for plan in group.values() if plan.request.has_figure]
+    return held and not any(plan.audit.failures for plan in plotted)
 
 
 def report(results: Results) -> str:
@@ -188,16 +188,16 @@ def summary(results: Results) -> dict[str, Any]:
                 "undecided": plan.audit.undecided,
                 "held": held_numbers(results.held[task][key]),
                 "holds_between_nodes": row["holds"],
-                "drawn": plan.request.drawn,
+                "drawn": plan.request.has_figure,
             }
     for key, plan in results.plans["minimum_time"].items():
         content["minimum_time"][f"{key}_s"] = plan.solution.horizon
     content["convergence"] = results.convergence
-    picture = [row for row in results.checks if row["drawn"]]
+    plotted = [row for row in results.checks if row["drawn"]]
     content["checks"] = {
         "allowed": ALLOWED,
-        "worst_of_drawn_plans": {name: max(row[name] for row in picture) for name in ALLOWED},
-        "all_drawn_plans_hold": all(row["holds"] for row in picture),
+        "worst_of_drawn_plans": {name: max(row[name] for row in plotted) for name in ALLOWED},
+        "all_drawn_plans_hold": all(row["holds"] for row in plotted),
         "sound": sound(results),
     }
     return content

@@ -109,7 +109,7 @@ def arm() -> Scara:
 BOLTED_CASES = [
     Case(
         "CollisionScene",
-        lambda **given: CollisionScene(**given),
+        lambda **options: CollisionScene(**options),
         {"machine": ARMOURED, "obstacles": [Sphere(0.1, (2.0, 0.0, 0.0))], "clearance": 0.01},
         {
             "obstacles": SEQUENCE | {"array": np.ones(3), "two": [Sphere(0.1, (2.0, 0.0, 0.0)), 1.0]},

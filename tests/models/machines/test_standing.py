@@ -132,8 +132,8 @@ def test_zmp_ground_force_and_torque_equal_an_independent_library(
     other = robot.links[int(rng.integers(size + 1))].name
     wrenches = [hand(rng, machine), Wrench(other, rng.normal(scale=5, size=3), point=rng.normal(size=3))]
     # the library's root is at its origin: everything in the axes of the foot
-    given = [Wrench(w.link, turn.T @ numeric(w.force), turn.T @ numeric(w.moment), w.point) for w in wrenches]
-    torques, own = library(robot, q, qd, qdd, given, turn.T @ machine.gravity_in_world)
+    rotated = [Wrench(w.link, turn.T @ numeric(w.force), turn.T @ numeric(w.moment), w.point) for w in wrenches]
+    torques, own = library(robot, q, qd, qdd, rotated, turn.T @ machine.gravity_in_world)
     force = turn @ own[3:]
     reaction = np.concatenate([turn @ own[:3] + np.cross(place, force), force])
     close(machine.zero_moment_point(q, qd, qdd, wrenches), pressure_point(reaction))

@@ -95,8 +95,8 @@ def test_power_of_the_torques_and_wrenches_is_the_rate_of_energy(seed: int, size
     wrench = hand_wrench(rng, robot.tip_link)
     torques = inverse_dynamics(robot, q, qd, qdd, [wrench], gravity, placement)
     jacobian = frame_jacobian(robot, q, wrench.link, wrench.point, placement)
-    given = ca.dot(ca.vertcat(wrench.moment, wrench.force), ca.mtimes(jacobian, qd))
-    balance = ca.Function("balance", [q, qd, qdd], [along(energy, q, qd, qdd), ca.dot(qd, torques) + given])
+    power = ca.dot(ca.vertcat(wrench.moment, wrench.force), ca.mtimes(jacobian, qd))
+    balance = ca.Function("balance", [q, qd, qdd], [along(energy, q, qd, qdd), ca.dot(qd, torques) + power])
     rate, power = (float(value) for value in balance(*random_motion(rng, robot.dof)))
     assert rate == pytest.approx(power, rel=1e-9, abs=1e-8)
 

@@ -39,8 +39,8 @@ def test_reach_is_the_distance_of_the_farthest_point(kind: type) -> None:
     shape, point = random_shape(kind, rng), rng.normal(size=3)
     shares = rng.dirichlet(np.full(len(shape.core), 0.05), 4000)
     away = rng.normal(size=(4000, 3))
-    picture = shares @ shape.core + shape.swept_radius * away / np.linalg.norm(away, axis=1, keepdims=True)
-    farthest = np.linalg.norm(picture - point, axis=1).max()
+    inside = shares @ shape.core + shape.swept_radius * away / np.linalg.norm(away, axis=1, keepdims=True)
+    farthest = np.linalg.norm(inside - point, axis=1).max()
     assert farthest <= shape.reach(point) + 1e-9
     assert farthest >= 0.95 * shape.reach(point)
 

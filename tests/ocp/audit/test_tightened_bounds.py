@@ -27,9 +27,9 @@ def push(limit: float) -> Problem:
 def under(limit: float, method: Collocation | MultipleShooting, declared: float = 10.0) -> Solution:
     """The plan of a smaller limit that claims to be one of the declared limit, tightened."""
     plan = solve(push(limit), method)
-    picture = np.zeros((2, method.intervals, 3))
-    picture[:, :, 2] = declared - limit
-    return replace(plan, problem=push(declared), bound_tightening=picture)
+    tightening = np.zeros((2, method.intervals, 3))
+    tightening[:, :, 2] = declared - limit
+    return replace(plan, problem=push(declared), bound_tightening=tightening)
 
 
 def without_multipliers(plan: Solution) -> Solution:
@@ -110,10 +110,10 @@ def test_a_tightened_bound_makes_no_minimum_of_a_maximum(width: float) -> None:
         return problem
 
     plan = solve(hump(width), Collocation(10, control="held"))
-    picture = np.zeros((2, 10, 2))
-    picture[:, :, 1] = 1.5 - width
+    tightening = np.zeros((2, 10, 2))
+    tightening[:, :, 1] = 1.5 - width
     assert replace(plan, problem=hump(width)).audit().feasible
-    assert not replace(plan, problem=hump(1.5), bound_tightening=picture).audit().passed
+    assert not replace(plan, problem=hump(1.5), bound_tightening=tightening).audit().passed
 
 
 def test_tightening_without_the_path_rows_is_none_of_these() -> None:

@@ -356,13 +356,13 @@ FRONTS = [
     ),
     Case(
         "Indirect.prepare",
-        lambda **given: Indirect().prepare(**{"problem": declared(), **given}),
+        lambda **options: Indirect().prepare(**{"problem": declared(), **options}),
         {},
         {"problem": INSTANCE | {"unfinished": blank()}, "solver": CHOICE, "options": MAPPING},
     ),
     Case(
         "certificate",
-        lambda **given: certificate(**{"problem": declared(), "solutions": [plan(), plan()], **given}),
+        lambda **options: certificate(**{"problem": declared(), "solutions": [plan(), plan()], **options}),
         {},
         {
             "problem": INSTANCE | {"another": blank()},
@@ -373,7 +373,9 @@ FRONTS = [
     ),
     Case(
         "certificate by a second solver",
-        lambda **given: certificate(**{"problem": declared(), "solutions": [plan()], "second_solver": True, **given}),
+        lambda **options: certificate(
+            **{"problem": declared(), "solutions": [plan()], "second_solver": True, **options}
+        ),
         {},
         {
             "problem": INSTANCE | {"another": blank()},

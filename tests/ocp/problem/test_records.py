@@ -222,11 +222,11 @@ def test_a_record_that_was_changed_is_refused(part: str) -> None:
 
 def test_units_outputs_tightened_bounds_and_starts_survive_the_file(tmp_path: Path) -> None:
     plan = solve(mapped(), Collocation(5))
-    picture = replace(plan, bound_tightening=np.full((2, 5, 6), 0.25), start="zeros", regularised=True)
-    picture.save(tmp_path / "plan.npz")
+    tightening = replace(plan, bound_tightening=np.full((2, 5, 6), 0.25), start="zeros", regularised=True)
+    tightening.save(tmp_path / "plan.npz")
     loaded = Solution.load(tmp_path / "plan.npz")
     assert (loaded.start, loaded.regularised) == ("zeros", True)
-    np.testing.assert_array_equal(loaded.bound_tightening, picture.bound_tightening)
+    np.testing.assert_array_equal(loaded.bound_tightening, tightening.bound_tightening)
     assert loaded.problem.declared.states["x"].unit == "rad"
     assert loaded.problem.declared.start["third"].unit == "rad"
     watched = loaded.problem.declared.watch["drift"]

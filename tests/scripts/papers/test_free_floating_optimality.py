@@ -169,7 +169,7 @@ def test_best_is_the_confirmed_extremal_of_least_cost_at_each_horizon(run: Run[R
 def test_every_start_is_accounted_for(run: Run[Results]) -> None:
     for one in run.results.searches:
         assert one.starts == STARTS
-        assert one.rejected + sum(extremal.found for extremal in one.extremals) == one.solved <= one.starts
+        assert one.rejected + sum(extremal.guess_count for extremal in one.extremals) == one.solved <= one.starts
 
 
 def test_extremals_of_one_horizon_are_different_motions(run: Run[Results]) -> None:

@@ -220,7 +220,7 @@ def test_the_audit_of_every_plan_that_is_drawn_finds_it_feasible_and_no_worse_th
     for task, key, plan in plans_of(run):
         assert f"{task}, {key}:" in text
         audit = plan.audit
-        if not plan.request.drawn:
+        if not plan.request.has_figure:
             assert plan.request.transcription == "held"
             assert "zero moment point" in {name for name, _, _ in failures(plan)}  # pinned, and held accelerations
             assert not audit.feasible

@@ -334,7 +334,7 @@ CASES = [
     Case("write_mcap", logged, {"period": 0.1}, {"plan": INSTANCE, "period": POSITIVE, "frame": TEXT}),
     Case(
         "log_rerun",
-        lambda **given: log_rerun(**{"plan": valid_plan(), **given}),
+        lambda **options: log_rerun(**{"plan": valid_plan(), **options}),
         {"rerun": recorder(), "period": 0.1},
         {"plan": INSTANCE, "rerun": INSTANCE, "period": POSITIVE, "entity": TEXT, "timeline": TEXT},
     ),

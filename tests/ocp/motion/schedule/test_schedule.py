@@ -100,9 +100,9 @@ changes = st.tuples(*[st.floats(0, 1)] * 2, st.floats(0.05, 2), *[st.floats(-1, 
 """First and last speed over the top one, distance over that of the ramps by the top speed; 10^x of the limits."""
 
 
-def change(picture: tuple[float, ...]) -> tuple[float, ...]:
+def change(sample: tuple[float, ...]) -> tuple[float, ...]:
     """Distance, first, last, top speed, acceleration and jerk: a distance that is enough, if barely."""
-    first, last, share, x, y = picture
+    first, last, share, x, y = sample
     acceleration, jerk = 10**x, 10 ** (x + y)
     least = ramp_distance(first, last, acceleration, jerk)
     most = ramp_distance(first, 1, acceleration, jerk) + ramp_distance(1, last, acceleration, jerk)
@@ -110,8 +110,8 @@ def change(picture: tuple[float, ...]) -> tuple[float, ...]:
 
 
 @given(changes)
-def test_the_fastest_motion_ends_where_it_must_whether_ruckig_finds_it_or_two_ramps_make_it(drawn: Any) -> None:
-    request = change(drawn)
+def test_the_fastest_motion_ends_where_it_must_whether_ruckig_finds_it_or_two_ramps_make_it(sample: Any) -> None:
+    request = change(sample)
     distance, first, last, top, acceleration, jerk = request
     result = ramps.fastest_motion(*request)
     with pytest.MonkeyPatch.context() as patched:
