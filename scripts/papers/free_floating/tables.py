@@ -80,7 +80,8 @@ def _extremals(results: Results) -> str:
     rows = [{name: row[name] for name in columns} for row in extremals.table(results.searches, PEAKS)]
     lines = ["Extremals at other horizons, from seeded first guesses", text_table(rows)]
     lines += [
-        f"  {one.horizon:g} s: best J = {one.best.indirect_cost:.9f}, from {one.best.guess_count} of {one.starts} guesses; "
+        f"  {one.horizon:g} s: best J = {one.best.indirect_cost:.9f}, "
+        f"from {one.best.guess_count} of {one.starts} guesses; "
         f"{len(one.extremals)} extremals, {one.rejected} plans jump or change on a finer mesh"
         for one in results.searches
     ]
