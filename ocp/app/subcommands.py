@@ -340,7 +340,7 @@ def export_plan(plan: Plan, file: Path, period: float, force: bool = False) -> N
 
 
 def check_period(plan: Plan, period: float) -> None:
-    """Raise ProblemError if a sampling period is not positive or gives more than MOST samples."""
+    """Raise ProblemError if a sampling period is not positive or gives too many samples."""
     checked_positive("period", period)
     if plan.horizon / period > MAX_COUNT:
         words = (
@@ -373,5 +373,4 @@ WRITERS: dict[str, Callable[[Plan, Path, float, str], Any]] = {
     "report": _report,
 }
 """Writers of each kind of output; arguments are the plan, the file, the sampling period in s, and a title."""
-
 EXPORT_KINDS = ("csv", "json", "yaml", "mcap", "urdf")
