@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models import CollisionScene, Machine
-from models.arrays import Array
+from models.checks import NOT_NUMBERS, Array, floats, real
 from ocp.console import interruptible
-from ocp.errors import NOT_NUMBERS, ProblemError, checked_count, checked_flag, checked_positive, floats, real
+from ocp.errors import ProblemError, require
 from ocp.motion.local.collisions import Collision, checked_collision_scene, find_collisions, slide_apart
 from ocp.motion.local.ik_solver import ik_branches
 from ocp.motion.tasks.checks import checked_configuration
@@ -169,11 +169,11 @@ def inverse_kinematics(
         raise ProblemError(words, name="task")
     equations = TaskEquations(machine, pose_tasks)
     for name, number in (("starts", starts), ("iterations", iterations)):
-        checked_count(name, number, least=int(name == "iterations"))
+        require.count(name, number, least=int(name == "iterations"))
     for name, value in (("tolerance", tolerance), ("apart", apart)):
-        checked_positive(name, value)
-    checked_count("seed", seed, 0, LARGEST_SEED)
-    checked_flag("limits", limits)
+        require.positive(name, value)
+    require.count("seed", seed, 0, LARGEST_SEED)
+    require.flag("limits", limits)
     if scene is not None:
         checked_collision_scene(scene, machine, limits)
     if not np.isfinite(real(time)):

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from models.arrays import Array
+from models.checks import Array
 from ocp.audit.audit import Audit, Finding
 from ocp.audit.clearance import ClosestPair
 from ocp.direct.collocation import Collocation

@@ -18,17 +18,9 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from models import CollisionScene, Machine, ModelError
-from models.arrays import Array
+from models.checks import Array
 from ocp.console import report
-from ocp.errors import (
-    ProblemError,
-    SolveError,
-    checked_choice,
-    checked_count,
-    checked_each,
-    checked_flag,
-    checked_instance,
-)
+from ocp.errors import ProblemError, SolveError, require
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.tool_motion import stretches_of
 from ocp.motion.builders.torques import checked_motors
@@ -342,7 +334,7 @@ def clearance_for(
     """
     if scene is False:
         return None
-    own = Scene() if scene is None else checked_instance("scene", scene, Scene)
+    own = Scene() if scene is None else require.instance("scene", scene, Scene)
     joint_limits = not isinstance(limits, Limits) or limits.joints
     report("collision scene")
     try:
@@ -371,15 +363,15 @@ def checked_request(
     Raises:
         ProblemError: As in `plan`.
     """
-    checked_choice("search", search, get_args(SearchKind))
-    checked_flag("cyclic", cyclic)
-    checked_count("seed", seed, 0, LARGEST_SEED)
-    all_tasks = (tasks,) if isinstance(tasks, TipTask) else checked_each("tasks", tasks, TipTask)
+    require.choice("search", search, get_args(SearchKind))
+    require.flag("cyclic", cyclic)
+    require.count("seed", seed, 0, LARGEST_SEED)
+    all_tasks = (tasks,) if isinstance(tasks, TipTask) else require.each("tasks", tasks, TipTask)
     bind(machine, all_tasks)  # checks the tasks against the machine
-    checked_limits = Limits() if limits is None else checked_instance("limits", limits, Limits)
+    checked_limits = Limits() if limits is None else require.instance("limits", limits, Limits)
     free = isinstance(horizon, str)
     if free:
-        checked_choice("horizon", horizon, ("free",))
+        require.choice("horizon", horizon, ("free",))
         if search == "global":
             words = "search='global' needs a fixed horizon; give it in s, or use search='configurations'"
             raise ProblemError(words, name="search", value="global")
@@ -421,7 +413,7 @@ def _checked_cost(machine: Machine, cost: Any, free: bool) -> Cost:
     """
     if cost is None:
         return Cost(time=float(free))
-    own = checked_instance("cost", cost, Cost)
+    own = require.instance("cost", cost, Cost)
     if weights_actuators(own):
         checked_motors("plan: cost", machine)
     if own.turning and not machine.base_size:

@@ -10,7 +10,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from models import Machine
-from models.arrays import Array
+from models.checks import Array
 from models.machines.machine import hold_joints
 from ocp.errors import ProblemError
 from ocp.motion.builders.clearance import ClearanceConstraints

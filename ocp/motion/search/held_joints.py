@@ -19,7 +19,7 @@ from warnings import warn
 import numpy as np
 
 from models import Machine, ModelWarning, Robot
-from models.arrays import Array
+from models.checks import Array
 from models.shapes.bodies import RigidParts
 from ocp.errors import ProblemError, SolveError
 from ocp.motion.local.ik_solver import idle_positions
