@@ -342,9 +342,10 @@ def export_plan(plan: Plan, file: Path, period: float, force: bool = False) -> N
 def check_period(plan: Plan, period: float) -> None:
     """Raise ProblemError if a sampling period is not positive or gives too many samples."""
     require.positive("period", period)
-    if plan.horizon / period > INPUT_LIMITS.count:
-        words = f"a period of {period:g} s gives {plan.horizon / period:.3g} samples; at most {INPUT_LIMITS.count} can be written"
-        raise ProblemError(words, name="period", value=period, limit=plan.horizon / INPUT_LIMITS.count)
+    count, most = plan.horizon / period, INPUT_LIMITS.count
+    if count > most:
+        words = f"a period of {period:g} s gives {count:.3g} samples; at most {most} can be written"
+        raise ProblemError(words, name="period", value=period, limit=plan.horizon / most)
 
 
 def _yaml(plan: Plan, file: Path, period: float) -> None:
