@@ -92,11 +92,11 @@ def assert_inside(values: Any, low: float, high: float, parts: tuple[Any, ...] =
     assert lower.shape == upper.shape == (1, values.shape[0])
     times = np.unique(np.concatenate([np.linspace(low, high, 101), [low, high]]).clip(low, high))
     every = ca.densify(ca.vertcat(values, *parts))
-    found = np.array(ca.Function("f", [T], [every])(times[None])).reshape(every.shape[0], -1, order="F")
-    sound = ~np.isnan(found[values.shape[0] :]).any(axis=0)
+    result = np.array(ca.Function("f", [T], [every])(times[None])).reshape(every.shape[0], -1, order="F")
+    sound = ~np.isnan(result[values.shape[0] :]).any(axis=0)
     for entry in range(values.shape[0]):
-        kept = sound & np.isfinite(found[entry])
-        row, when = found[entry][kept], times[kept]
+        kept = sound & np.isfinite(result[entry])
+        row, when = result[entry][kept], times[kept]
         assert (row >= lower[0, entry]).all(), (lower, row.min())
         assert (row <= upper[0, entry]).all(), (upper, row.max())
         for stride in (1, 7, 50):
@@ -129,12 +129,12 @@ def random_expression(rng: np.random.Generator, depth: int, parts: list[Any]) ->
     if depth == 0:
         return T if rng.random() < 0.7 else ca.SX(round(float(rng.normal()), 2))
     if rng.random() < 0.4:
-        found = ONE[str(rng.choice(list(ONE)))](random_expression(rng, depth - 1, parts))
+        result = ONE[str(rng.choice(list(ONE)))](random_expression(rng, depth - 1, parts))
     else:
         both = random_expression(rng, depth - 1, parts), random_expression(rng, depth - 1, parts)
-        found = TWO[str(rng.choice(list(TWO)))](*both)
-    parts.append(found)
-    return found
+        result = TWO[str(rng.choice(list(TWO)))](*both)
+    parts.append(result)
+    return result
 
 
 @given(st.integers(0, 2**32 - 1), intervals)
@@ -250,7 +250,7 @@ def test_both_kinds_of_symbols_have_the_same_bounds() -> None:
         np.testing.assert_allclose(one, other, rtol=1e-12)
 
 
-def test_what_has_no_bounds_is_named() -> None:
+def test_unbounded_expressions_are_named() -> None:
     assert len(RULES) > 40
     with pytest.raises(ProblemError, match="operation 'erf' has no bounds") as caught:
         bounds(ca.erf(T), T, 0, 1)
