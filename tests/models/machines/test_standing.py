@@ -101,7 +101,7 @@ def test_a_machine_at_rest_presses_below_its_centre_of_mass(case: Case) -> None:
 def test_the_zero_moment_point_is_that_of_the_sums_over_links(case: Case) -> None:
     """(2)-(3), with the force of (35)-(36) corrected: it enters as a moment, and the vertical one below the line."""
     _, machine, motion, wrench = case
-    motions = link_motions(machine.robot, *motion, machine.world_from_base())
+    motions = link_motions(machine.robot, *motion, world_from_base=machine.world_from_base())
     frames = link_frames(machine.robot, motion[0], machine.world_from_base())
     numerator, denominator = np.zeros(2), 0.0
     for link in machine.robot.links:
@@ -252,7 +252,7 @@ def test_a_sampled_motion_is_evaluated_point_by_point(case: Case) -> None:
     def external(time: Any, tip: Any) -> list[Wrench]:
         return [machine.tip_wrench(time * ca.DM(pull) - 2 * tip)]
 
-    found = standing_motion(machine, t, q, qd, qdd, external)
+    found = standing_motion(machine, t, q, qd, joint_accelerations=qdd, external=external)
     for k in range(4):
         push = t[k] * pull - 2 * flat(machine.tip_pose((), q[k]).position)
         motion = q[k], qd[k], qdd[k], [machine.tip_wrench(push)]
@@ -278,17 +278,17 @@ def test_the_joint_limit_index_and_excess_have_their_closed_forms() -> None:
     lower, upper = EXAMPLE.robot.lower, EXAMPLE.robot.upper
     beyond = upper + np.array([0, 0, 0.2, 0, 0])
     q = np.array([lower, upper, (lower + upper) / 2, beyond])
-    found = standing_motion(EXAMPLE, np.arange(4.0), q, 0 * q, 0 * q)
+    found = standing_motion(EXAMPLE, np.arange(4.0), q, 0 * q, joint_accelerations=0 * q)
     np.testing.assert_allclose(found.joint_limit_index[:3], [5 / 4, 5 / 4, 0], atol=1e-12)
     np.testing.assert_allclose(found.joint_excess[[0, 1, 3]], [0, 0, 0.2], atol=1e-12)
     assert found.joint_excess[2] < 0
     assert not found.stays_in_limits
-    assert standing_motion(EXAMPLE, np.arange(3.0), q[:3], 0 * q[:3], 0 * q[:3]).stays_in_limits
+    assert standing_motion(EXAMPLE, np.arange(3.0), q[:3], 0 * q[:3], joint_accelerations=0 * q[:3]).stays_in_limits
 
 
 def test_a_joint_without_limits_adds_nothing_to_the_index() -> None:
     free = Standing(planar_chain([1.0, 1.0], [1.0, 1.0]), support=FOOT)
-    found = standing_motion(free, [0.0], [[5.0, -9.0]], [[0.0, 0.0]], [[0.0, 0.0]])
+    found = standing_motion(free, [0.0], [[5.0, -9.0]], [[0.0, 0.0]], joint_accelerations=[[0.0, 0.0]])
     assert found.joint_limit_index.tolist() == [0.0]
     assert found.joint_excess.tolist() == [-np.inf]
 
@@ -313,7 +313,7 @@ def test_machines_that_cannot_stand_are_refused(changes: dict[str, Any], message
 
 def test_a_motion_of_a_wrong_shape_is_refused() -> None:
     with pytest.raises(ModelError, match=r"joint_velocities has shape \(2, 4\), expected \(2, 5\)"):
-        standing_motion(EXAMPLE, [0, 1], np.zeros((2, 5)), np.zeros((2, 4)), np.zeros((2, 5)))
+        standing_motion(EXAMPLE, [0, 1], np.zeros((2, 5)), np.zeros((2, 4)), joint_accelerations=np.zeros((2, 5)))
 
 
 def test_a_negative_mass_is_refused_by_the_name_of_its_link() -> None:
@@ -335,4 +335,4 @@ def test_wrenches_that_are_no_list_are_refused() -> None:
 def test_a_motion_of_no_times_is_refused(times: Any) -> None:
     rest = np.zeros((len(times), 5))
     with pytest.raises(ModelError, match="motion: "):
-        standing_motion(EXAMPLE, times, rest, rest, rest)
+        standing_motion(EXAMPLE, times, rest, rest, joint_accelerations=rest)

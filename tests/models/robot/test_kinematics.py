@@ -83,7 +83,9 @@ def test_jacobian_of_any_link_point_is_the_derivative_of_its_frame(seed: int, si
     found, expected = [], []
     for link in robot.links:
         frame = frames[link.name]
-        found.append(ca.mtimes(frame_jacobian(robot, q, link.name, point, world_from_base), rates))
+        found.append(
+            ca.mtimes(frame_jacobian(robot, q, link.name, point=point, world_from_base=world_from_base), rates)
+        )
         expected.append(twist_by_differentiation(frame.rotation, frame.point(point), q, rates))
     tip = tip_pose(robot, q, world_from_base)
     found.append(ca.mtimes(tip_jacobian(robot, q, world_from_base), rates))
@@ -204,7 +206,7 @@ def test_symbols_of_both_kinds_give_the_numeric_values(symbols: Any) -> None:
             *(part for link in link_frames(robot, q, frame).values() for part in link),
             *tip_pose(robot, q, frame),
             tip_jacobian(robot, q, frame),
-            frame_jacobian(robot, q, "link2", (0.1, 0.2, 0.3), frame),
+            frame_jacobian(robot, q, "link2", point=(0.1, 0.2, 0.3), world_from_base=frame),
             center_of_mass(robot, q, frame),
             center_of_mass_jacobian(robot, q, frame),
             momentum_matrix(robot, q, frame),

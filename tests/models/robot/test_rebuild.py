@@ -67,7 +67,7 @@ def dynamics(robot: Robot, rng: np.random.Generator, place: Any) -> list[Array]:
     """Inertia, momentum per joint rate, tip, its Jacobian, torques and reaction of some motion."""
     q, qd, qdd = (rng.normal(size=robot.dof) for _ in range(3))
     motion, push = rng.normal(size=6), rng.normal(size=6)
-    moving: Any = {"world_from_base": place, "base_twist": motion, "base_acceleration": push}
+    moving: Any = {"world_from_base": place, "base_motion": (motion, push)}
     found = [robot_inertia(robot, q, place), momentum_matrix(robot, q, place), *tip_pose(robot, q, place)]
     found += [tip_jacobian(robot, q, place), inverse_dynamics(robot, q, qd, qdd, **moving)]
     return [numeric(each) for each in (*found, base_reaction(robot, q, qd, qdd, **moving))]
