@@ -211,10 +211,10 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     (asked_for((1.0, np.nan)), "velocity .* not finite"),
     (asked_for(lambda t: [t, ca.SX.sym("stranger")]), r"depends on \['stranger'\]"),
     (asked_for(lambda t: "fast"), "velocity gives 'fast'"),
-    ({"start_joints": (0.0, 1.0)}, "start_joints has 2 entries, expected 3"),
+    ({"start_joints": (0.0, 1.0)}, "start_joints has shape .2,., expected .3,."),
     ({"start_joints": (0.0, 1.0, np.inf)}, "start_joints .* not finite"),
     ({"start_joints": "home"}, "start_joints 'home' is not numeric"),
-    ({"start_base": (0.0,) * 7}, "start_base has 7 entries, expected 3"),
+    ({"start_base": (0.0,) * 7}, "start_base has shape .7,., expected .3,."),
     ({"horizon": 0.0}, "horizon must be positive and finite"),
     ({"horizon": np.inf}, "horizon must be positive and finite"),
 ]
