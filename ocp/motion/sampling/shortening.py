@@ -19,7 +19,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import nnls
+import scipy
 
 from models.checks import Array
 from ocp.console import check_time
@@ -63,6 +63,7 @@ def shorten(
     motions: StraightMotions,
     path: Array,
     scale: Array,
+    *,
     random: np.random.Generator,
     settings: ShorteningSettings = ShorteningSettings(),
 ) -> Array:
@@ -93,7 +94,7 @@ def shorten(
     return path
 
 
-def same_class(motions: StraightMotions, first: Array, second: Array, scale: Array, rungs: int = 32) -> bool:
+def same_class(motions: StraightMotions, first: Array, second: Array, scale: Array, *, rungs: int = 32) -> bool:
     """Return whether straight motions from one path (M, n) to another (K, n) are clear at equal shares of their length.
 
     Paths of one homotopy class need not satisfy this; paths that do can replace each other as guesses. They are
@@ -194,6 +195,7 @@ def optimise_length(
     motions: StraightMotions,
     path: Array,
     scale: Array,
+    *,
     limits: tuple[Array, Array],
     settings: LengthSettings = LengthSettings(),
 ) -> Array:
@@ -294,7 +296,7 @@ def _nearest_point(target: Array, rows: Array, least: Array) -> Array:
     size = float(np.abs(needed).max())
     matrix = np.vstack([rows.T, needed[None] / size])
     right = np.append(np.zeros(len(target)), 1.0)
-    multipliers, _ = nnls(matrix, right, maxiter=10 * matrix.shape[1])
+    multipliers, _ = scipy.optimize.nnls(matrix, right, maxiter=10 * matrix.shape[1])
     residual = matrix @ multipliers - right
     if residual[-1] >= 0:
         return np.zeros_like(target)
