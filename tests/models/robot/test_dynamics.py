@@ -149,8 +149,8 @@ def test_link_motions_are_the_derivatives_of_the_link_frames(seed: int, size: in
         pairs.append((motion.center, center))
     function = ca.Function("pairs", [q, qd, qdd], [ca.densify(part) for pair in pairs for part in pair])
     values = [numeric(value) for value in function(*random_motion(rng, robot.dof))]
-    for found, expected in zip(values[::2], values[1::2], strict=True):
-        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+    for result, expected in zip(values[::2], values[1::2], strict=True):
+        np.testing.assert_allclose(result, expected, rtol=1e-9, atol=1e-9)
 
 
 @given(seeds, st.integers(1, 6))
@@ -223,7 +223,7 @@ def test_a_planar_machine_keeps_its_structural_zeros() -> None:
         ({"base_motion": (np.zeros(6), np.zeros(3))}, r"base_acceleration has shape \(3, 1\), expected \(6, 1\)"),
     ],
 )
-def test_what_does_not_fit_is_refused(changes: dict[str, Any], message: str) -> None:
+def test_arguments_that_do_not_fit_are_refused(changes: dict[str, Any], message: str) -> None:
     arguments: dict[str, Any] = {"q": np.zeros(2), "qd": np.zeros(2), "qdd": np.zeros(2), **changes}
     for function in (inverse_dynamics, base_reaction):
         with refused(message):
