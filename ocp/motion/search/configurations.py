@@ -384,11 +384,9 @@ class ReachSettings:
     """Settings of the search for the end of the reach.
 
     Attributes:
-        intervals: Intervals of the stretch of time, at whose ends the reach is evaluated before the bisection. They do
-            not depend on where a planner failed, so that every search names the same end.
+        intervals: Intervals of the stretch of time, at whose ends the reach is evaluated before the bisection.
         bisections: Number of bisections of one interval.
-        tolerance: Pose error up to which a pose is within reach, m or rad. The distance that it adds to the reach is
-            below the repeatability of an arm.
+        tolerance: Pose error up to which a pose is within reach, m or rad: below the repeatability of arms.
         continued: Number of solutions from which the next time is tried before random starts.
     """
 
@@ -443,8 +441,7 @@ def end_of_reach(
     """Return an error that names the end of the reach of a machine on a fixed base, and what ends it.
 
     The end is the first time at which no joint positions within the limits do the tasks. A joint ends the reach if it
-    is at its limit there, and the pose would be within reach without limits. Otherwise the pose is too far or too near,
-    or turned in a way that the arm cannot follow: the Jacobian of the tasks is singular at the end.
+    is at its limit there and the pose would be within reach without limits. Otherwise the tasks' Jacobian is singular.
 
     Args:
         machine: The machine.
