@@ -45,9 +45,8 @@ class PlannerSettings:
         local_steps: Steps of a local motion, besides the breaks of its tasks.
         dampings: Dampings of local motions, relative to the singular values; the next one is tried if none tracks.
         min_intervals: Least number of mesh intervals.
-        coarse_degree, fine_degree: Degrees of collocation. One interval of the fine degree represents a smooth segment
-            to rounding.
-        separated_intervals: Intervals of a coarse mesh with separation constraints, which hold only at its points.
+        coarse_degree, fine_degree: Degrees of collocation; the fine one represents a smooth segment to rounding.
+        separated_intervals: Intervals of a coarse mesh with separation constraints.
         coarse_options, fine_options: Options of IPOPT. A coarse solve starts from a guess that does its tasks.
         barriers: Default mu_init of IPOPT, and the tolerance at which the barrier parameter ends.
         samples_per_interval: Samples of an interval at which collisions and deviations are checked.
