@@ -207,7 +207,7 @@ class Search:
         target, previous = _inputs(ca.SX)
         f = self._index(target)
         c, s = least_point(f)
-        check = check_constraints(self.rig, target, self._configuration(target, c, s), c, s)
+        check = check_constraints(self.rig, target, self._configuration(target, c, s), c=c, s=s)
         best, evaluations, _ = self._compare(target, previous, [Candidate(c, s, 0)], NO_INCUMBENT)
         status = ca.if_else(ca.logic_and(check.slide(), check.angles()), 0, 4)
         status = ca.if_else(check.pitch, ca.if_else(check.yaw, status, 3), 2)
@@ -310,7 +310,7 @@ class Search:
         near_level = ca.Function("rough", [target, suspect], ca.cse([stack(RoughRoll, points)]))
 
         def polished(at: Expression, end: RoughRoll) -> Point:
-            return polish_to_level(self.rig, chart, at, end.value, end.side, (end.c, end.s))
+            return polish_to_level(self.rig, chart, at, value=end.value, above=end.side, point=(end.c, end.s))
 
         x, before = _inputs(ca.MX)
         first, column = ca.MX.sym("best", INCUMBENT_SIZE), ca.MX.sym("suspect", len(LevelBound._fields))
@@ -338,7 +338,7 @@ class Search:
         near_limit = ca.Function("rough", [target, points], ca.cse([stack(RoughRoll, ends)]))
 
         def polished(at: Expression, end: RoughRoll) -> Point:
-            return polish_to_value(chart, at, 2, end.value, (end.c, end.s))
+            return polish_to_value(chart, at, 2, value=end.value, point=(end.c, end.s))
 
         x, before = _inputs(ca.MX)
         best = ca.MX.sym("best", INCUMBENT_SIZE)
@@ -407,7 +407,7 @@ class Search:
             if self.gain:
                 value += self.gain * (unwrap_roll(self.rig, point.c, point.s, previous) - previous) ** 2
             configuration = self._configuration(target, point.c, point.s)
-            check = check_constraints(self.rig, target, configuration, point.c, point.s)
+            check = check_constraints(self.rig, target, configuration, c=point.c, s=point.s)
             all_but_slide = check.all_but_slide()
             better = ca.logic_and(ca.logic_and(all_but_slide, check.slide()), value < cost)
             least = ca.fmin(least, value)
@@ -424,7 +424,7 @@ class Search:
         return index_harmonics(self.rig, self.tunnel, target)
 
     def _configuration(self, target: Expression, c: Expression, s: Expression) -> RigConfiguration:
-        return configuration_at(self.rig, target, c, s, self.branch)
+        return configuration_at(self.rig, target, c, s, branch=self.branch)
 
     # ---- answers ---------------------------------------------------------------------------------------------
 

@@ -126,6 +126,8 @@ class ClearanceSearch:
     """Settings of the search for a collision-free roll.
 
     Attributes:
+        samples: Number of rolls of the grid.
+        softness: Width of the smooth minimum of all distances, m; see `soft_minimum`.
         minima: Number of local minima of the grid that are refined.
         steps, shrink: Number of steps of the pattern search, and ratio of their sizes: 0.62^44 = 7e-10 of the grid's.
         penalty: Penalty on missing clearance in the merit function, 1/m.
@@ -133,6 +135,8 @@ class ClearanceSearch:
         active_tolerance: Distance from the least clearance below which the constraint counts as active, m.
     """
 
+    samples: int = 72
+    softness: float = 2e-3
     minima: int = 4
     steps: int = 44
     shrink: float = 0.62
@@ -239,29 +243,43 @@ def checked_clearance(clearance: float) -> float:
     return clearance
 
 
+@dataclass(frozen=True)
+class Avoidance:
+    """How the rig avoids obstacles: clearance as a constraint, as a term of the index, or both.
+
+    Attributes:
+        scene: Obstacles.
+        clearance: Least distance of the rig from the scene, m; -inf for no constraint.
+        weight, width: Of the term weight exp(-gap / width) of the index; width in m.
+        radii: Radii of the rig's capsules; the default ones if None.
+
+    Raises:
+        ModelError: A clearance that is nan or inf, a negative weight, a width that is not positive.
+    """
+
+    scene: CollisionScene
+    clearance: float = -np.inf
+    weight: float = 0.0
+    width: float = 0.05
+    radii: Radii | None = None
+
+    def __post_init__(self) -> None:
+        require.instance("avoidance: scene", self.scene, CollisionScene)
+        checked_clearance(self.clearance)
+        require.nonnegative("avoidance: weight", self.weight)
+        require.positive("avoidance: width", self.width, unit="m")
+        if self.radii is not None:
+            require.instance("avoidance: radii", self.radii, Radii)
+
+
 def collision_free_inverse(
-    rig: Rig,
-    tunnel: Tunnel,
-    scene: CollisionScene,
-    branch: Branch = HOME,
-    *,
-    clearance: float = -np.inf,
-    weight: float = 0.0,
-    width: float = 0.05,
-    rate_weight: float = 0.0,
-    samples: int = 72,
-    softness: float = 2e-3,
-    radii: Radii | None = None,
+    rig: Rig, tunnel: Tunnel, avoidance: Avoidance, branch: Branch = HOME, *, rate_weight: float = 0.0
 ) -> Any:
     """Return the Function (target, previous) -> (joints, cost, active, status, gap): `optimal_inverse` among obstacles.
 
     Args:
-        clearance: Least distance of the rig from the scene, m; -inf for no constraint.
-        weight, width: Of the term weight exp(-gap / width) of the index.
+        avoidance: Obstacles, clearance and proximity term.
         rate_weight: w4 of I2; 0 for I1.
-        samples: Rolls of the grid, at least 8.
-        softness: Width of the smooth minimum of all distances, m; see `soft_minimum`.
-        radii: Radii of the rig's capsules.
 
     Returns:
         A casadi Function with the outputs of `optimal_inverse` and the smooth least distance, m. `active` is
@@ -269,23 +287,23 @@ def collision_free_inverse(
         status "clearance" means that a roll reaches the target within limits, but none without collision.
 
     Raises:
-        ModelError: A weight, width, clearance or number of samples is out of range.
+        ModelError: The rate weight is out of range, or the scene is empty.
     """
     gain = checked_gain(rate_weight)
     require.instance("rig: rig", rig, Rig)
     require.instance("rig: tunnel", tunnel, Tunnel)
     branch = checked_branch(branch)
-    checked_clearance(clearance)
-    require.count("rig: samples", samples, 8)
+    clearance = require.instance("rig: avoidance", avoidance, Avoidance).clearance
+    samples = SEARCH.samples
     target, previous, angle = ca.SX.sym("target", 5), ca.SX.sym("previous"), ca.SX.sym("angle")
     c, s = ca.cos(angle), ca.sin(angle)
-    configuration = configuration_at(rig, target, c, s, branch)
+    configuration = configuration_at(rig, target, c, s, branch=branch)
     roll = unwrap_roll(rig, c, s, previous)
     joints = joints_of(rig, target, roll, configuration)
-    gap = soft_minimum(list(clearances(rig, joints, scene, radii).values()), softness)
+    gap = soft_minimum(list(clearances(rig, joints, avoidance.scene, avoidance.radii).values()), SEARCH.softness)
     cost = index_harmonics(rig, tunnel, target).value(c, s) + gain * (roll - previous) ** 2
-    cost += proximity_cost(gap, weight, width)
-    check = check_constraints(rig, target, configuration, c, s)
+    cost += proximity_cost(gap, avoidance.weight, avoidance.width)
+    check = check_constraints(rig, target, configuration, c=c, s=s)
     within_limits = ca.logic_and(check.all_but_slide(), check.slide())
     feasible = ca.logic_and(within_limits, gap >= clearance)
     inputs = [target, previous, angle]

@@ -231,7 +231,7 @@ def corner_circle(rig: Rig, target: Expression) -> tuple[Expression, Expression,
     return axle, ca.vertcat(c_yaw * s_pitch, s_yaw * s_pitch, c_pitch), ca.vertcat(s_yaw, -c_yaw, zero)
 
 
-def configuration_at(rig: Rig, target: Expression, c: Expression, s: Expression, branch: Branch) -> RigConfiguration:
+def configuration_at(rig: Rig, target: Expression, c: Expression, s: Expression, *, branch: Branch) -> RigConfiguration:
     """Return the configuration for a roll given by its cosine and sine: (23), (25), (27)."""
     corner = corner_of_roll(rig, target, c, s)
     c_yaw, s_yaw = ca.cos(target[3]), ca.sin(target[3])
@@ -258,7 +258,7 @@ def inverse(rig: Rig, target: Expression, roll: Expression, branch: Branch = HOM
         q3, q5 complete the target's yaw and pitch, unless the limits require another turn.
     """
     target, roll = expression(target), expression(roll)
-    configuration = configuration_at(rig, target, ca.cos(roll), ca.sin(roll), branch)
+    configuration = configuration_at(rig, target, ca.cos(roll), ca.sin(roll), branch=branch)
     reach = ca.vertcat(1 - ca.fabs(configuration.sin4), 1 - ca.fabs(configuration.cos2))
     return joints_of(rig, target, roll, configuration), reach
 

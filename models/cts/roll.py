@@ -135,7 +135,7 @@ def index_harmonics(rig: Rig, tunnel: Tunnel, target: Expression) -> Harmonics:
 
 
 def check_constraints(
-    rig: Rig, target: Expression, configuration: RigConfiguration, c: Expression, s: Expression
+    rig: Rig, target: Expression, configuration: RigConfiguration, *, c: Expression, s: Expression
 ) -> ConstraintCheck:
     """Return the constraints that a configuration satisfies. Angles are compared by their cosine from mid-range."""
     p = configuration
@@ -161,8 +161,8 @@ def infeasibility_code(rig: Rig, target: Expression, branch: Branch) -> Expressi
     points += [(end.c, end.s) for end in arc_ends(rig, target, branch)]
     yaw: Expression = 0
     for c, s in points:
-        configuration = configuration_at(rig, target, c, s, branch)
-        yaw = ca.logic_or(yaw, check_constraints(rig, target, configuration, c, s).all_but_slide())
+        configuration = configuration_at(rig, target, c, s, branch=branch)
+        yaw = ca.logic_or(yaw, check_constraints(rig, target, configuration, c=c, s=s).all_but_slide())
     return ca.if_else(pitch, ca.if_else(yaw, 4, 3), 2)
 
 
@@ -173,7 +173,11 @@ def arc_ends(rig: Rig, target: Expression, branch: Branch) -> list[Candidate]:
     for level in yaw_levels(rig, target, branch):
         for point in level_points(rig, target, level.cosine):
             above = 1 if level.above else -1
-            ends.append(Candidate(*polish_to_level(rig, chart, target, level.cosine, above, point), level.code))
+            ends.append(
+                Candidate(
+                    *polish_to_level(rig, chart, target, value=level.cosine, above=above, point=point), level.code
+                )
+            )
     return ends
 
 
@@ -239,7 +243,8 @@ def level_points(rig: Rig, target: Expression, cosine: Expression) -> list[Point
     slope = f.derivative()
     # at a double root a Newton step is mostly rounding error: hence the small step limit
     return [
-        polish(p, lambda c, s: (f.value(c, s), slope.value(c, s)), 2, SQUARED_POLISH_STEP) for p in roots(f, steps=0)
+        polish(p, lambda c, s: (f.value(c, s), slope.value(c, s)), steps=2, max_polish_step=SQUARED_POLISH_STEP)
+        for p in roots(f, steps=0)
     ]
 
 
@@ -283,27 +288,27 @@ def _allows(rig: Rig, joint: int, angle: float) -> bool:
 def yaw_chart(rig: Rig, branch: Branch) -> Any:
     """Return the Function (target, cosine, sine of roll) -> cos q2, its slope by roll, q1, its slope, cos q4."""
     t, c, s = ca.SX.sym("target", 5), ca.SX.sym("c"), ca.SX.sym("s")
-    configuration = configuration_at(rig, t, c, s, branch)
+    configuration = configuration_at(rig, t, c, s, branch=branch)
     values = ca.vertcat(configuration.cos2, configuration.q1)
     slope = ca.jacobian(values, c) * -s + ca.jacobian(values, s) * c
     return ca.Function("chart", [t, c, s], [values[0], slope[0], values[1], slope[1], configuration.cos4])
 
 
-def polish_to_value(chart: Any, target: Expression, output: int, value: Expression, point: Point) -> Point:
+def polish_to_value(chart: Any, target: Expression, output: int, *, value: Expression, point: Point) -> Point:
     """Return the point polished until cos q2 (output 0 of the chart) or q1 (output 2) takes a value."""
     return polish(point, chart_residual(chart, target, output, value))
 
 
-def polish_to_level(rig: Rig, chart: Any, target: Expression, value: Expression, above: Any, point: Point) -> Point:
+def polish_to_level(rig: Rig, chart: Any, target: Expression, *, value: Expression, above: Any, point: Point) -> Point:
     """Return the point polished until cos q2 takes a value, on its feasible side by a bound of the rounding errors.
 
     Near a stretched pitch link the rounding error of sin q4 is amplified by 1 / cos q4. `above` is 1 if the constraint
     holds above the value, -1 if below.
     """
-    c, s = polish_to_value(chart, target, 0, value, point)
+    c, s = polish_to_value(chart, target, 0, value=value, point=point)
     cos4 = ca.fabs(chart(target, c, s)[4])
     margin = SINE_ROUNDING * rig.pitch_link / rig.yaw_link_1 / (cos4 + 1e-8)
-    return polish((c, s), chart_residual(chart, target, 0, value + above * margin), 1)
+    return polish((c, s), chart_residual(chart, target, 0, value + above * margin), steps=1)
 
 
 def chart_residual(chart: Any, target: Expression, output: int, value: Expression) -> Slope:

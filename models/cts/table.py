@@ -19,7 +19,7 @@ import numpy as np
 
 from models.checks import Array, ArrayInput, require, warn_of_degrees
 from models.cts.best_roll import optimal_inverse
-from models.cts.clearance import CollisionScene, collision_free_inverse
+from models.cts.clearance import Avoidance, collision_free_inverse
 from models.cts.rig import (
     BRANCHES,
     HOME,
@@ -72,10 +72,7 @@ def solve_table(
     previous: ArrayInput = 0.0,
     in_sequence: bool = False,
     rate_weight: float = 0.0,
-    scene: CollisionScene | None = None,
-    clearance: float = -np.inf,
-    clearance_weight: float = 0.0,
-    clearance_width: float = 0.05,
+    avoidance: Avoidance | None = None,
 ) -> Table:
     """Return the joints of least index for every target; rows without a solution do not affect the others.
 
@@ -86,8 +83,7 @@ def solve_table(
         in_sequence: Whether each row's roll is the previous one of the next, as in a motion; rows without a solution
             are skipped.
         rate_weight: w4 of I2; 0 for I1.
-        scene: Obstacles, None for none. The least distance is `clearance`, m, and the index has a term
-            clearance_weight exp(-distance / clearance_width); see `collision_free_inverse`.
+        avoidance: Obstacles to avoid, as in `collision_free_inverse`; None for none.
 
     Raises:
         ModelError: The table is empty or has a wrong shape, there is no branch or an unknown one, or a previous roll is
@@ -103,12 +99,12 @@ def solve_table(
         raise ModelError(message, name="branches", value=branches)
     count = len(rows)
     before = require.broadcast("table: previous", previous, count, "targets")
-    if scene is None:
+    if avoidance is None:
         functions = [optimal_inverse(rig, tunnel, branch, rate_weight=rate_weight) for branch in branches]
     else:
-        options: dict[str, Any] = {"clearance": clearance, "weight": clearance_weight, "width": clearance_width}
-        options["rate_weight"] = rate_weight
-        functions = [collision_free_inverse(rig, tunnel, scene, branch, **options) for branch in branches]
+        functions = [
+            collision_free_inverse(rig, tunnel, avoidance, branch, rate_weight=rate_weight) for branch in branches
+        ]
     if in_sequence:
         roll, results = float(before[0]), []
         for row in rows:
@@ -204,7 +200,7 @@ def roll_interval_functions(rig: Rig, branch: Branch = HOME) -> tuple[Any, Any]:
             parts.append(ca.vertcat(slide_ends(rig, branch, upper)(x), ca.DM.ones(1, 8) * limit_code(1, upper)))
     ends = ca.Function("arc_ends", [x], [ca.horzcat(*parts)], ["target"], ["points"])
     c, s = ca.cos(roll), ca.sin(roll)
-    meets = check_constraints(rig, target, configuration_at(rig, target, c, s, branch), c, s)
+    meets = check_constraints(rig, target, configuration_at(rig, target, c, s, branch=branch), c=c, s=s)
     inside = ca.logic_and(meets.all_but_slide(), meets.slide())
     return ends, ca.Function("feasible", [target, roll], [inside], ["target", "roll"], ["feasible"])
 

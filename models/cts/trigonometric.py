@@ -141,7 +141,7 @@ def roots(f: Harmonics, polish_function: Slope | None = None, steps: int = ROOTS
     sharp = polish_function or (lambda c, s: (f.value(c, s), slope.value(c, s)))
     # f has size 1: a slope below the square root of the machine precision is a rounding error, as at a double root
     floor = SMALLEST_DIVISOR if polish_function else np.finfo(float).eps
-    return [polish(point, sharp, steps, floor=floor) for point in points]
+    return [polish(point, sharp, steps=steps, floor=floor) for point in points]
 
 
 def _axes(f: Harmonics, shift: Expression) -> tuple[Expression, Expression, Expression, Expression, Expression]:
@@ -199,6 +199,7 @@ def least_point(f: Harmonics) -> Point:
 def polish(
     point: Point,
     function: Slope,
+    *,
     steps: int = ROOTS.polish_steps,
     max_polish_step: float = ROOTS.max_polish_step,
     floor: float = SMALLEST_DIVISOR,

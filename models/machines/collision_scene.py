@@ -119,11 +119,10 @@ class CollisionScene:
         own = collision_bodies(robot, folders=folders, missing=self.missing, covered=self.covered)
         object.__setattr__(self, "covered", _by_mesh(robot, own))
         link_pairs, obstacle_pairs = self._ignored_pairs()
-        unlimited: dict[str, Any] = {"lower": -np.inf, "upper": np.inf}
-        limits = {} if require.flag("scene: limits", self.limits) else unlimited
+        limits = None if require.flag("scene: limits", self.limits) else (-np.inf, np.inf)
         known = self.classified
         if known is None:
-            known = checked_pairs(robot, own, ignored=link_pairs, srdf=self.srdf, clearance=clearance, **limits)
+            known = checked_pairs(robot, own, ignored=link_pairs, srdf=self.srdf, clearance=clearance, limits=limits)
         object.__setattr__(self, "classified", known)
         object.__setattr__(self, "_parts", RigidParts.of(robot))
         with_obstacles, excluded = self._pairs_with_obstacles(own, obstacle_pairs)
@@ -311,7 +310,9 @@ class CollisionScene:
         indices, rounding = self._checked_request(pairs, rounding)
         groups = [self.cover_pairs.get(pair, (tuple(self.pairs[pair, :2].tolist()),)) for pair in indices]
         softness = rounding / 4 + MIN_SOFTNESS_M
-        return distance_gradients(self.machine, self.bodies, self._carriers, self._moving, groups, rounding, softness)
+        return distance_gradients(
+            self.machine, self.bodies, self._carriers, self._moving, groups=groups, rounding=rounding, softness=softness
+        )
 
     def _checked_request(self, pairs: Sequence[int] | None, rounding: float) -> tuple[list[int], float]:
         """Return the indices of pairs, all if None, and a rounding, checked."""
@@ -391,7 +392,7 @@ class CollisionScene:
         infinite = np.full(robot.dof, np.inf)
         low, high = (robot.lower, robot.upper) if self.limits else (-infinite, infinite)
         shape = placed.shape.placed(*parts.pose[link])
-        lengths, reach = lever_arms(robot, [(step, True) for step in path], shape, low, high)
+        lengths, reach = lever_arms(robot, [(step, True) for step in path], shape, low=low, high=high)
         for (joint, *_), arm in zip(path, lengths, strict=True):
             column, ratio, _ = robot.couplings[joint.name]
             slides = joint.kind == "prismatic"

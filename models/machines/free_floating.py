@@ -225,8 +225,7 @@ class FreeFloating:
         second = ca.mtimes(plane.T, ca.jtimes(twist, ca.vertcat(momentum, q, joint_rates), along))
         second = ca.mtimes(plane, second) + ca.vertcat(ca.DM(3, 1), cross(spin, twist[3:6]))
         torques = inverse_dynamics(
-            self.robot, q, joint_rates, accelerations, gravity=(0.0, 0.0, 0.0), base_twist=twist,
-            base_acceleration=second,
+            self.robot, q, joint_rates, accelerations, gravity=(0.0, 0.0, 0.0), base_motion=(twist, second)
         )  # fmt: skip
         if carried is None:
             return torques

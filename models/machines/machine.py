@@ -7,6 +7,7 @@ FreeFloating machines and in every problem. A rotor is symmetric, so its angle i
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cached_property
@@ -214,9 +215,10 @@ def with_wheels(
     mass: ArrayInput = 0.0,
     translations: ArrayInput | None = None,
     link: str | None = None,
-    prefix: str = "wheel",
 ) -> Robot:
-    """Return the robot with reaction wheels; their joints "wheel1", ... come last, and the tip is unchanged.
+    """Return the robot with reaction wheels; their joints come last, and the tip is unchanged.
+
+    The joints are called "wheel1", ..., without names that exist already, and the links "wheel1_rotor", ...
 
     Args:
         axes: Axes of the wheels in the link that carries them, of any non-zero length. Shape (k, 3).
@@ -228,10 +230,9 @@ def with_wheels(
         mass: Mass of each rotor, one number or (k,), kg.
         translations: Positions of the rotors in the link. Shape (k, 3), m; its origin if None.
         link: Link that carries them; the root if None.
-        prefix: Prefix of the names of the joints, and with "_rotor" of the links.
 
     Raises:
-        ModelError: Sizes that differ, an axis of zero length, numbers that are not positive, names that already exist.
+        ModelError: Sizes that differ, an axis of zero length, numbers that are not positive.
     """
     owner = "reaction wheels"
     robot = require.instance(f"{owner}: robot", robot, Robot)
@@ -240,7 +241,6 @@ def with_wheels(
         if not np.linalg.norm(axis) > 0:
             raise ModelError(f"{owner}: axis {axis.tolist()} has no direction", name="axes", value=axis)
     count = len(directions)
-    require.text(f"{owner}: prefix", prefix)
     carrier = robot.root if link is None else robot.link(link).name
     inertias = require.broadcast(f"{owner}: inertia", inertia, count, "wheels", sign="positive")
     momenta = require.broadcast(f"{owner}: momentum", momentum, count, "wheels", entries="numbers", sign="positive")
@@ -249,8 +249,9 @@ def with_wheels(
     positions = np.zeros((count, 3)) if translations is None else translations
     positions = require.array(f"{owner}: translations", positions, (count, 3))
     links, joints = [*robot.links], [*robot.joints]
-    for k in range(count):
-        name = f"{prefix}{k + 1}"
+    taken = {joint.name for joint in joints}
+    names = (name for name in map("wheel{}".format, itertools.count(1)) if name not in taken)
+    for k, name in zip(range(count), names, strict=False):
         joint = Joint(name, "continuous", carrier, f"{name}_rotor", positions[k], axis=directions[k])
         joints.append(replace(joint, velocity=float(momenta[k] / inertias[k]), effort=float(torques[k])))
         transverse = np.eye(3) - np.outer(joint.axis, joint.axis)

@@ -44,6 +44,7 @@ def distance_gradients(
     bodies: Sequence[PlacedShape],
     carriers: Sequence[str],
     moving: Callable[[Expression], list[Frame]],
+    *,
     groups: Sequence[Sequence[tuple[int, int]]],
     rounding: float,
     softness: float,

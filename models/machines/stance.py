@@ -203,7 +203,15 @@ class Stance(FixedBase):
         self, q: Expression, qd: Expression, qdd: Expression, others: Mapping[str, Expression]
     ) -> dict[str, Expression]:
         """Return the loads of all standing feet in a motion from those of the other feet; the first bears the rest."""
-        reaction = base_reaction(self.bodies, q, qd, qdd, self._wrenches(others), self._gravity, self.world_from_base())
+        reaction = base_reaction(
+            self.bodies,
+            q,
+            qd,
+            qdd,
+            wrenches=self._wrenches(others),
+            gravity=self._gravity,
+            world_from_base=self.world_from_base(),
+        )
         first = next(iter(self.footholds))
         moment, force = reaction[:3], reaction[3:]
         first_load = ca.vertcat(moment - cross(ca.DM(self.footholds[first].position), force), force)
@@ -213,7 +221,15 @@ class Stance(FixedBase):
         self, q: Expression, qd: Expression, qdd: Expression, others: Mapping[str, Expression]
     ) -> Expression:
         """Return the torques (forces) of the joints by inverse dynamics with the other feet's loads. Shape (n, 1)."""
-        return inverse_dynamics(self.bodies, q, qd, qdd, self._wrenches(others), self._gravity, self.world_from_base())
+        return inverse_dynamics(
+            self.bodies,
+            q,
+            qd,
+            qdd,
+            wrenches=self._wrenches(others),
+            gravity=self._gravity,
+            world_from_base=self.world_from_base(),
+        )
 
     @property
     def _gravity(self) -> Array:
@@ -248,7 +264,9 @@ class Stance(FixedBase):
             if name == next(iter(self.footholds)):
                 continue
             q = ca.SX.sym("q", self.joint_size)
-            matrix = frame_jacobian(self.bodies, q, foot.link, foot.translation, self.world_from_base())
+            matrix = frame_jacobian(
+                self.bodies, q, foot.link, point=foot.translation, world_from_base=self.world_from_base()
+            )
             function = ca.Function("jacobian", [q], [matrix])
             jacobians = [np.array(function(rng.normal(size=self.joint_size))) for _ in range(SAMPLES)]
             magnitudes = np.max([np.abs(sample).max(axis=1) for sample in jacobians], axis=0)

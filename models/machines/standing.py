@@ -133,7 +133,9 @@ class Standing(FixedBase):
     ) -> Expression:
         """Return the ground's wrench on the foot: (moment about the world's origin, force). Shape (6, 1), N m, N."""
         robot = self.bodies(wrenches)
-        return base_reaction(robot, q, qd, qdd, wrenches, self.gravity_in_world, self.world_from_base())
+        return base_reaction(
+            robot, q, qd, qdd, wrenches=wrenches, gravity=self.gravity_in_world, world_from_base=self.world_from_base()
+        )
 
     def zero_moment_point(
         self, q: Expression, qd: Expression, qdd: Expression, wrenches: Sequence[Wrench] = ()
@@ -149,7 +151,9 @@ class Standing(FixedBase):
     ) -> Expression:
         """Return the torques (forces) of the joints by inverse dynamics. Shape (n, 1), N m or N."""
         robot = self.bodies(wrenches)
-        return inverse_dynamics(robot, q, qd, qdd, wrenches, self.gravity_in_world, self.world_from_base())
+        return inverse_dynamics(
+            robot, q, qd, qdd, wrenches=wrenches, gravity=self.gravity_in_world, world_from_base=self.world_from_base()
+        )
 
     def stability_index(self, point: Expression) -> Expression:
         """Return 1 - ((point - most stable point) / half-width)^2 for x and y, (5)-(6). Shape (2, 1)."""
@@ -372,6 +376,7 @@ def standing_motion(
     t: ArrayInput,
     joints: ArrayInput,
     joint_velocities: ArrayInput,
+    *,
     joint_accelerations: ArrayInput,
     external: External | None = None,
     rows: Rows = (3, 4, 5),
@@ -392,10 +397,11 @@ def standing_motion(
     arrays = {"joints": joints, "joint_velocities": joint_velocities, "joint_accelerations": joint_accelerations}
     shape = (len(times), machine.joint_size)
     parts = [require.array(f"motion: {name}", part, shape, entries="numbers") for name, part in arrays.items()]
-    return StandingMotion(times, *parts, **evaluate_motion(motion_function(machine, external, rows), times, *parts))
+    function = motion_function(machine, external, rows)
+    return StandingMotion(times, *parts, **evaluate_motion(function, times, *parts[:2], qdd=parts[2]))
 
 
-def evaluate_motion(function: Any, t: Array, q: Array, qd: Array, qdd: Array) -> dict[str, Array]:
+def evaluate_motion(function: Any, t: Array, q: Array, qd: Array, *, qdd: Array) -> dict[str, Array]:
     """Return the outputs of a motion function at M times, by name: (M, k), or (M,) for scalars."""
     outputs = function.map(len(t))(t[None, :], q.T, qd.T, qdd.T)
     names = [function.name_out(i) for i in range(function.n_out())]

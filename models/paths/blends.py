@@ -61,6 +61,7 @@ __all__ = [
 
 BlendKind: TypeAlias = Literal["cubic", "quintic"]
 Ends: TypeAlias = tuple[Array, Array, Array, Array, Array, Array]
+End: TypeAlias = tuple[Array, Array, Array]
 PAPER_SHAPE = 3.0
 """Shape factor of the cubic in the paper, for continuous curvature between lines."""
 LARGEST_SHAPE: dict[str, float] = {"cubic": 6.0, "quintic": 30 / 7}
@@ -106,16 +107,15 @@ def cubic(start: Array, start_rate: Array, end: Array, end_rate: Array) -> Array
     return np.stack([start, start_rate, second, third, zero, zero], axis=-2)
 
 
-def quintic(
-    start: Array, start_rate: Array, start_second: Array, end: Array, end_rate: Array, end_second: Array
-) -> Array:
+def quintic(start: End, end: End) -> Array:
     """Return the quintic with given ends, first and second derivatives by u. Shapes (..., 3) to (..., 6, 3)."""
-    value = end - start - start_rate - start_second / 2
+    (start_value, start_rate, start_second), (end_value, end_rate, end_second) = start, end
+    value = end_value - start_value - start_rate - start_second / 2
     rate = end_rate - start_rate - start_second
     bend = end_second - start_second
     return np.stack(
         [
-            start,
+            start_value,
             start_rate,
             start_second / 2,
             10 * value - 4 * rate + bend / 2,
@@ -249,7 +249,7 @@ def _search_shapes(ends: Sequence[Array], remaining: Array, samples: int) -> Arr
 
     def peak(logarithm: Array) -> Array:
         rate = (np.exp(logarithm) * remaining)[:, None]
-        curve = quintic(start, rate * tangent, rate**2 * bend, end, rate * end_tangent, rate**2 * end_bend)
+        curve = quintic((start, rate * tangent, rate**2 * bend), (end, rate * end_tangent, rate**2 * end_bend))
         first, second = (polynomial(curve[:, None], u, order) for order in (1, 2))
         square = np.einsum("vui,vui->vu", first, first)
         # |F' x F''|^2 = |F'|^2 |F''|^2 - (F' F'')^2, over |F'|^6
@@ -383,7 +383,7 @@ def cells(coefficients: Array) -> Cells:
     return Cells(columns[0][order].astype(np.intp), *(column[order] for column in columns[1:]))
 
 
-def parameter(coefficients: Array, start: Array, width: Array, length: Array, distance: Array) -> Array:
+def parameter(coefficients: Array, start: Array, width: Array, *, length: Array, distance: Array) -> Array:
     """Return the u at which the arc length from the cell's start is `distance`.
 
     Shapes: coefficients (M, 6, 3), all others (M,). A cubic Hermite guess from the cell's ends is refined by Chebyshev

@@ -115,7 +115,7 @@ class Path:
         index = require.indices("path: index", index, len(self.segments))
         along = require.array("path: distance", distance)
         frame = self.start[index], self.tangent[index], self.normal[index]
-        return screw(*frame, self.curvature[index], self.torsion[index], along)
+        return screw(*frame, curvature=self.curvature[index], torsion=self.torsion[index], distance=along)
 
     def corner_angles(self) -> Array:
         """Return the interior angle at each vertex, pi for a continuous tangent. Shape (n - 1,), rad."""
@@ -218,7 +218,7 @@ def interior_angles(segments: Sequence[Segment]) -> Array:
     start, tangent, normal, k, w, length = (
         np.array([getattr(each, name) for each in segments]) for name in (*FRAME, "length")
     )
-    return _angles(screw(start, tangent, normal, k, w, length)[1][:-1], tangent[1:])
+    return _angles(screw(start, tangent, normal, curvature=k, torsion=w, distance=length)[1][:-1], tangent[1:])
 
 
 def _angles(before: Array, after: Array) -> Array:
@@ -272,8 +272,9 @@ def split_at_reversals(
 
 def bulb_turn(segment: Segment, width: float) -> tuple[Arc, Arc, Arc]:
     """Return the arcs of a bulb turn at the end of a segment, in a horizontal plane unless the segment is vertical."""
-    frame = np.asarray(segment.start), segment.tangent, segment.normal, segment.curvature, segment.torsion
-    _, ahead, bend, _ = screw(*frame, segment.length)
+    frame = np.asarray(segment.start), segment.tangent, segment.normal
+    bends: Any = {"curvature": segment.curvature, "torsion": segment.torsion}
+    _, ahead, bend, _ = screw(*frame, **bends, distance=segment.length)
     vertex = np.asarray(segment.end)
     across = bend if bend.any() else np.cross([0.0, 0.0, 1.0], ahead)
     if np.linalg.norm(across) < 1e-9:

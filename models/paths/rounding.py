@@ -99,7 +99,7 @@ class _Corners(NamedTuple):
         rate = (self.shape * remaining)[:, None]
         if self.kind == "cubic":
             return cubic(p0, rate * n0, p1, rate * n1)
-        return quintic(p0, rate * n0, rate**2 * k0, p1, rate * n1, rate**2 * k1)
+        return quintic((p0, rate * n0, rate**2 * k0), (p1, rate * n1, rate**2 * k1))
 
     def with_best_shape(self, remaining: Array) -> _Corners:
         """Return the corners with the shape factor that is best for each."""
@@ -324,19 +324,19 @@ def _distance_to_helix(path: Path, index: NDArray[np.intp], points: Array, first
         parts = [slice(k, k + SETTINGS.block) for k in range(0, len(index), SETTINGS.block)]
         return np.concatenate([_distance_to_helix(path, index[p], points[p], first[p], last[p]) for p in parts])
     frame = path.start[index][:, None], path.tangent[index][:, None], path.normal[index][:, None]
-    bends = path.curvature[index][:, None], path.torsion[index][:, None]
-    turns = float((np.hypot(*bends)[:, 0] * (last - first)).max()) / FULL_TURN
+    bends = {"curvature": path.curvature[index][:, None], "torsion": path.torsion[index][:, None]}
+    turns = float((np.hypot(*bends.values())[:, 0] * (last - first)).max()) / FULL_TURN
     share = np.linspace(0, 1, int(SETTINGS.samples * (1 + turns)))
     places = first[:, None] + (last - first)[:, None] * share
-    curve_points = screw(*frame, *bends, places)[0] - frame[0]
+    curve_points = screw(*frame, **bends, distance=places)[0] - frame[0]
     square = (curve_points**2).sum(axis=-1)[:, None] - 2 * (points - frame[0]) @ curve_points.transpose(0, 2, 1)
     s = np.take_along_axis(places, square.argmin(axis=2), axis=1)
     for _ in range(SETTINGS.newton_iterations):
-        at, tangent, bend, _ = screw(*frame, *bends, s)
+        at, tangent, bend, _ = screw(*frame, **bends, distance=s)
         slope = 1 + ((at - points) * bend).sum(axis=-1)
         s = s - ((at - points) * tangent).sum(axis=-1) / np.maximum(slope, SETTINGS.least_slope)
         s = np.clip(s, first[:, None], last[:, None])
-    return np.asarray(np.linalg.norm(screw(*frame, *bends, s)[0] - points, axis=-1))
+    return np.asarray(np.linalg.norm(screw(*frame, **bends, distance=s)[0] - points, axis=-1))
 
 
 def smooth(

@@ -96,7 +96,7 @@ class _Circular:
     def end(self: Any) -> Array:
         """End point in world. Shape (3,), m."""
         frame = self.start, self.tangent, self.normal
-        return np.asarray(screw(*frame, self.curvature, self.torsion, self.length)[0])
+        return np.asarray(screw(*frame, curvature=self.curvature, torsion=self.torsion, distance=self.length)[0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,6 +143,7 @@ class Arc(_Circular):
         center: ArrayInput,
         axis: ArrayInput,
         sweep: float,
+        *,
         start_orientation: ArrayInput | None = None,
         end_orientation: ArrayInput | None = None,
     ) -> Arc:
@@ -157,6 +158,7 @@ class Arc(_Circular):
         start: ArrayInput,
         via: ArrayInput,
         end: ArrayInput,
+        *,
         start_orientation: ArrayInput | None = None,
         end_orientation: ArrayInput | None = None,
     ) -> Arc:
@@ -262,6 +264,7 @@ def screw(
     start: Array,
     tangent: Array,
     normal: Array,
+    *,
     curvature: float | Array,
     torsion: float | Array,
     distance: float | Array,

@@ -238,7 +238,7 @@ class SmoothPath:
         curve, length = self.cells.curve[cell], self.cells.length[cell]
         inside = np.clip(s - self.cell_bounds[cell], 0.0, length)
         return curve, parameter(
-            self.coefficients[curve], self.cells.start[cell], self.cells.width[cell], length, inside
+            self.coefficients[curve], self.cells.start[cell], self.cells.width[cell], length=length, distance=inside
         )
 
     def _at(self, s: Array) -> tuple[Array, ...]:
@@ -302,7 +302,7 @@ class SmoothPath:
         away, length = self.remaining[:, None], lengths[blends][:, None]
         before, after = rate[:-1], rate[1:]
         none = np.zeros_like(before)
-        theta[blends] = quintic(-before * away, before * length, none, after * away, after * length, none)
+        theta[blends] = quintic((-before * away, before * length, none), (after * away, after * length, none))
         return reference, theta
 
 

@@ -76,12 +76,11 @@ def inverse_dynamics(
     q: Expression,
     qd: Expression,
     qdd: Expression,
+    *,
     wrenches: Sequence[Wrench] = (),
     gravity: Expression = GRAVITY,
     world_from_base: Placement | None = None,
-    *,
-    base_twist: Expression | None = None,
-    base_acceleration: Expression | None = None,
+    base_motion: tuple[Expression, Expression] | None = None,
 ) -> Expression:
     """Return the joint torques (forces of prismatic joints) of a motion. Shape (dof, 1), N m or N.
 
@@ -90,11 +89,11 @@ def inverse_dynamics(
     Args:
         wrenches: External wrenches.
         gravity: In world axes. Shape (3,), m/s^2.
-        base_twist, base_acceleration: Motion of the base, zero if None: (angular velocity, velocity of the origin of
-            the root link's frame) and its time derivative, world axes. Shape (6, 1).
+        base_motion: Twist of the base, (angular velocity, velocity of the origin of the root link's frame), and its
+            time derivative, world axes. Shape (6, 1) each; at rest if None.
     """
     stacked, links = stacked_wrenches(robot, wrenches), tuple(wrench.link for wrench in wrenches)
-    return _efforts(robot, q, qd, qdd, stacked, links, gravity, world_from_base, base_twist, base_acceleration)[0]
+    return _efforts(robot, q, qd, qdd, stacked, links, gravity, world_from_base, *_twist_and_rate(base_motion))[0]
 
 
 def base_reaction(
@@ -102,12 +101,11 @@ def base_reaction(
     q: Expression,
     qd: Expression,
     qdd: Expression,
+    *,
     wrenches: Sequence[Wrench] = (),
     gravity: Expression = GRAVITY,
     world_from_base: Placement | None = None,
-    *,
-    base_twist: Expression | None = None,
-    base_acceleration: Expression | None = None,
+    base_motion: tuple[Expression, Expression] | None = None,
 ) -> Expression:
     """Return the wrench that the ground exerts on the root link: (moment about the world's origin, force).
 
@@ -116,7 +114,7 @@ def base_reaction(
     Shape (6, 1), N m and N.
     """
     stacked, links = stacked_wrenches(robot, wrenches), tuple(wrench.link for wrench in wrenches)
-    return _efforts(robot, q, qd, qdd, stacked, links, gravity, world_from_base, base_twist, base_acceleration)[1]
+    return _efforts(robot, q, qd, qdd, stacked, links, gravity, world_from_base, *_twist_and_rate(base_motion))[1]
 
 
 @on_scalars
@@ -172,6 +170,15 @@ def _parts(stacked: Expression, column: int) -> tuple[Expression, Expression, Ex
     """Return moment, force and point of a wrench."""
     moment, force, point = (stacked[3 * i : 3 * i + 3, column] for i in range(3))
     return moment, force, point
+
+
+def _twist_and_rate(base_motion: tuple[Expression, Expression] | None) -> tuple[Expression | None, Expression | None]:
+    """Return the two parts of a motion of the base; raise ModelError if they are not two."""
+    if base_motion is None:
+        return None, None
+    if not isinstance(base_motion, tuple | list) or len(base_motion) != 2:
+        raise require.invalid("base_motion", "a pair (twist, acceleration)", base_motion)
+    return base_motion[0], base_motion[1]
 
 
 @on_scalars
@@ -361,12 +368,13 @@ def momentum(
     robot: Robot,
     q: Expression,
     qd: Expression,
+    *,
     about: Expression = (0.0, 0.0, 0.0),
     world_from_base: Placement | None = None,
 ) -> Expression:
     """Return (moment of momentum about a point of the world, linear momentum). Shape (6, 1), N m s and N s."""
     frames, axes = frames_and_axes(robot, q, world_from_base)
-    motions = propagate_motions(robot, frames, axes, qd, ca.DM(robot.dof, 1))
+    motions = propagate_motions(robot, frames, axes, qd=qd, qdd=ca.DM(robot.dof, 1))
     place = checked_vector("about", about, 3, "a point of the world")
     total: Expression = ca.DM(6, 1)
     for link in robot.links:
@@ -383,6 +391,7 @@ def momentum_rate(
     q: Expression,
     qd: Expression,
     qdd: Expression,
+    *,
     about: Expression = (0.0, 0.0, 0.0),
     world_from_base: Placement | None = None,
 ) -> Expression:
@@ -391,7 +400,7 @@ def momentum_rate(
     It is the same about a point that moves with the centre of mass, whose velocity is parallel to the momentum.
     """
     frames, axes = frames_and_axes(robot, q, world_from_base)
-    motions = propagate_motions(robot, frames, axes, qd, qdd)
+    motions = propagate_motions(robot, frames, axes, qd=qd, qdd=qdd)
     place = checked_vector("about", about, 3, "a point of the world")
     total: Expression = ca.DM(6, 1)
     for link in robot.links:

@@ -140,6 +140,7 @@ def frame_jacobian(
     robot: Robot,
     q: Expression,
     link: str,
+    *,
     point: Expression = (0.0, 0.0, 0.0),
     world_from_base: Placement | None = None,
 ) -> Expression:
@@ -172,7 +173,7 @@ def tip_jacobian(robot: Robot, q: Expression, world_from_base: Placement | None 
     It maps joint rates to (angular, linear) velocity in world axes. Shape (6, dof).
     """
     tip = require.instance("kinematics: robot", robot, Robot).tip_link
-    return frame_jacobian(robot, q, tip, robot.tip_translation, world_from_base)
+    return frame_jacobian(robot, q, tip, point=robot.tip_translation, world_from_base=world_from_base)
 
 
 def point_jacobian(
@@ -275,21 +276,21 @@ class CenterOfMassMotion(NamedTuple):
 
 
 def link_motions(
-    robot: Robot, q: Expression, qd: Expression, qdd: Expression, world_from_base: Placement | None = None
+    robot: Robot, q: Expression, qd: Expression, qdd: Expression, *, world_from_base: Placement | None = None
 ) -> dict[str, LinkMotion]:
     """Return the motion of every link, by name, root first."""
     frames, axes = frames_and_axes(robot, q, world_from_base)
-    return propagate_motions(robot, frames, axes, qd, qdd)
+    return propagate_motions(robot, frames, axes, qd=qd, qdd=qdd)
 
 
 @on_scalars
 def center_of_mass_motion(
-    robot: Robot, q: Expression, qd: Expression, qdd: Expression, world_from_base: Placement | None = None
+    robot: Robot, q: Expression, qd: Expression, qdd: Expression, *, world_from_base: Placement | None = None
 ) -> CenterOfMassMotion:
     """Return the motion of the centre of mass; raise ModelError if the robot has no mass."""
     if require.instance("kinematics: robot", robot, Robot).total_mass == 0:
         raise massless_error("hence no centre of mass")
-    motions = link_motions(robot, q, qd, qdd, world_from_base)
+    motions = link_motions(robot, q, qd, qdd, world_from_base=world_from_base)
     weighted = [[link.mass * part for part in motions[link.name][:3]] for link in robot.links]
     sums = (sum(parts, start=ca.DM(3, 1)) for parts in zip(*weighted, strict=True))
     return CenterOfMassMotion(*(ca.densify(part / robot.total_mass) for part in sums))
@@ -299,6 +300,7 @@ def propagate_motions(
     robot: Robot,
     frames: dict[str, Frame],
     axes: dict[str, tuple[Expression, Expression]],
+    *,
     qd: Expression,
     qdd: Expression,
 ) -> dict[str, LinkMotion]:

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Literal, TypeAlias, get_args
+from typing import Any, Literal, TypeAlias, get_args
 from warnings import warn
 
 import numpy as np
@@ -169,8 +169,8 @@ class Robot:
 
         See `models.robot.urdf.urdf_text` for how other readers interpret it. The file is replaced atomically.
         """
-        place = np.asarray(self.tip_translation), np.asarray(self.tip_rotation)
-        text = urdf_text(self.name, self.links, self.joints, self.tip, *place)
+        place: dict[str, Any] = {"translation": self.tip_translation, "rotation": self.tip_rotation}
+        text = urdf_text(self.name, self.links, self.joints, self.tip, **place)
         if file is not None:
             if not isinstance(file, str | os.PathLike):
                 raise ModelError(f"to_urdf: file must be a path, not {file!r}", name="file", value=file)

@@ -138,7 +138,7 @@ def _without_world(floating: Joint, links: tuple[Link, ...]) -> tuple[Link, ...]
 
 
 def urdf_text(
-    name: str, links: Sequence[Link], joints: Sequence[Joint], tip: str | None, translation: Array, rotation: Array
+    name: str, links: Sequence[Link], joints: Sequence[Joint], tip: str | None, *, translation: Array, rotation: Array
 ) -> str:
     """Return a robot as URDF text, from which `read_urdf` recreates links, joints and tip with all digits.
 

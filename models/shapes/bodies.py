@@ -292,7 +292,7 @@ class RigidParts:
 
 
 def lever_arms(
-    robot: Robot, chain: Sequence[tuple[JointStep, bool]], end: Shape, low: Array, high: Array
+    robot: Robot, chain: Sequence[tuple[JointStep, bool]], end: Shape, *, low: Array, high: Array
 ) -> tuple[list[float], float]:
     """Return upper bounds of the distances of a body's points from the joint axes of the chain that carries it.
 

@@ -89,8 +89,7 @@ def checked_pairs(
     *,
     ignored: Iterable[tuple[str, str]] = (),
     srdf: str | os.PathLike[str] | None = None,
-    lower: ArrayInput = None,
-    upper: ArrayInput = None,
+    limits: tuple[ArrayInput, ArrayInput] | None = None,
     clearance: float = 0.0,
     seed: int = 0,
     samples: int = 1000,
@@ -112,7 +111,8 @@ def checked_pairs(
         bodies: As `collision_bodies` returns them.
         ignored: Pairs of links that are not checked.
         srdf: SRDF file, as path or text, whose <disable_collisions> pairs are not checked.
-        lower, upper: Limits of the joint vector, rad or m; a number or shape (dof,). None: the robot's own.
+        limits: Lower and upper limits of the joint vector, rad or m, each a number or of shape (dof,); the robot's own
+            if None.
         clearance: Pairs that may come this close are checked, m.
         seed: Seed of the random configurations.
         samples: Number of random configurations.
@@ -129,10 +129,12 @@ def checked_pairs(
     bodies = require.each(f"{owner}: bodies", bodies, Body)
     for body in bodies:
         robot.link(body.link)
-    limits = {"lower": robot.lower if lower is None else lower, "upper": robot.upper if upper is None else upper}
+    pair = (robot.lower, robot.upper) if limits is None else require.instance(f"{owner}: limits", limits, tuple)
+    if len(pair) != 2:
+        raise require.invalid(f"{owner}: limits", "a pair (lower, upper)", pair)
     low, high = (
         require.broadcast(f"{owner}: {name}", limit, robot.dof, "joints", entries="numbers")
-        for name, limit in limits.items()
+        for name, limit in zip(("lower", "upper"), pair, strict=True)
     )
     if (low > high).any():
         k = int(np.flatnonzero(low > high)[0])
@@ -450,8 +452,8 @@ class _BodyPair:
         """Return the levers of the joints between the bodies, each with the shorter arm of both sides."""
         chain = [*((step, False) for step in self.up), *((step, True) for step in self.down)]
         reverse = [(step, not down) for step, down in chain[::-1]]
-        arms_second, _ = lever_arms(self.robot, chain, self.second.shape, low, high)
-        arms_first = lever_arms(self.robot, reverse, self.first.shape, low, high)[0][::-1]
+        arms_second, _ = lever_arms(self.robot, chain, self.second.shape, low=low, high=high)
+        arms_first = lever_arms(self.robot, reverse, self.first.shape, low=low, high=high)[0][::-1]
         levers = []
         for (step, _), *arms in zip(chain, arms_second, arms_first, strict=True):
             column, ratio, _ = self.robot.couplings[step.joint.name]

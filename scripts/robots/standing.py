@@ -149,7 +149,15 @@ def sampled(machine: Standing, solution: Solution, external: External, count: in
     share = np.linspace(0.0, 1.0, count)
     values = solution.at_fraction(share)
     joints, velocities, accelerations = (values[name] for name in ("joints", "velocities", "accelerations"))
-    return standing_motion(machine, share * solution.horizon, joints, velocities, accelerations, external, ROWS)
+    return standing_motion(
+        machine,
+        share * solution.horizon,
+        joints,
+        velocities,
+        joint_accelerations=accelerations,
+        external=external,
+        rows=ROWS,
+    )
 
 
 def plan() -> Results:

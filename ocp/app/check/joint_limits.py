@@ -279,7 +279,9 @@ def torque_rows(
     else:
         bodies = simplify(robot, frozenset())
         gravity = getattr(machine, "gravity_in_world", GRAVITY)
-        torque = inverse_dynamics(bodies, q, v, a, (), gravity, machine.world_from_base())
+        torque = inverse_dynamics(
+            bodies, q, v, a, wrenches=(), gravity=gravity, world_from_base=machine.world_from_base()
+        )
     sampler = Sampler([q, v, a], [torque])
     times, *values = torque_samples(motion)
     if not len(times):
@@ -319,7 +321,9 @@ def floating_torques(machine: FreeFloating, q: ca.SX, v: ca.SX, a: ca.SX) -> ca.
     change = ca.jtimes(twist, ca.vertcat(base, q, v), ca.vertcat(rate, v, a))
     motion_of_base = {"base_twist": twist, "base_acceleration": change}
     frame, no_gravity = machine.world_from_base(base), (0.0, 0.0, 0.0)
-    torque = inverse_dynamics(machine.robot, q, v, a, (), no_gravity, frame, **motion_of_base)
+    torque = inverse_dynamics(
+        machine.robot, q, v, a, wrenches=(), gravity=no_gravity, world_from_base=frame, **motion_of_base
+    )
     return ca.substitute(torque, base, ca.SX(ca.DM(machine.base_home())))
 
 

@@ -121,7 +121,7 @@ def _torques(machine: Machine, samples: MotionSamples) -> Array | None:
     else:
         gravity = getattr(machine, "gravity_in_world", GRAVITY)
         frame = machine.world_from_base(())
-        torque = inverse_dynamics(simplify(robot), q, v, a, (), gravity, frame)
+        torque = inverse_dynamics(simplify(robot), q, v, a, wrenches=(), gravity=gravity, world_from_base=frame)
     torques: Array = Sampler([q, v, a], [torque])(samples.joints, samples.rates, samples.accelerations)[0]
     return torques
 

@@ -216,7 +216,7 @@ def roll_problem(
     symbols, largest, fastest = settings.symbols, settings.acceleration_limit, settings.rate_limit
     x, phi = ca.SX.sym("target", 5), ca.SX.sym("roll")
     c, s = ca.cos(phi), ca.sin(phi)
-    solution = configuration_at(rig, x, c, s, settings.branch)
+    solution = configuration_at(rig, x, c, s, branch=settings.branch)
     joints = joints_of(rig, x, phi, solution)
     limited_joints = [k for k in range(5) if np.isfinite([rig.lower[k], rig.upper[k]]).any()]
     limited = ca.vertcat(*[joints[k] for k in limited_joints])

@@ -89,8 +89,9 @@ def joint_torques(
     """
     robot = checked_motors("joint_torques", machine).robot
     if isinstance(machine, FixedBase):
-        fall = GRAVITY if gravity is None else gravity
-        torques = inverse_dynamics(robot, joints, rates, accelerations, wrenches, fall, machine.world_from_base(base))
+        load: dict[str, Any] = {"wrenches": wrenches, "gravity": GRAVITY if gravity is None else gravity}
+        ground = machine.world_from_base(base)
+        torques = inverse_dynamics(robot, joints, rates, accelerations, **load, world_from_base=ground)
     else:
         if wrenches or gravity is not None:
             words = "external wrenches and gravity need a fixed base: a free-floating machine conserves its momentum"

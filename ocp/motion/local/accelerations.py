@@ -201,10 +201,10 @@ def _stabilising_task(machine: Standing, gains: Stabiliser, q: Any, qd: Any, pla
     a, b, c = gains.poles
     k2, k1, k0 = a + b + c, a * b + b * c + c * a, a * b * c / machine.weight
     rest = ca.DM.zeros(machine.joint_size)
-    motion = center_of_mass_motion(machine.robot, q, qd, rest, machine.world_from_base())
+    motion = center_of_mass_motion(machine.robot, q, qd, rest, world_from_base=machine.world_from_base())
     rows = ca.jacobian(motion.position, q)[:2, :]
     pivot = ca.vertcat(place, 0)
-    angular_momentum = momentum(machine.robot, q, qd, pivot, machine.world_from_base())
+    angular_momentum = momentum(machine.robot, q, qd, about=pivot, world_from_base=machine.world_from_base())
     momentum_xy = ca.vertcat(-angular_momentum[1], angular_momentum[0])  # grows as the machine falls towards -x, -y
     target = -k2 * motion.velocity[:2] + k1 * right / machine.weight + k0 * momentum_xy - motion.acceleration[:2]
     directions = ca.DM(machine.moving_directions)
@@ -450,7 +450,7 @@ class _Recorder:
         n = states.shape[1] // 2
         q, qd = states[:, :n], states[:, n:]
         qdd, gap = (np.array(part).T for part in self._law.map(len(times))(times[None, :], q.T, qd.T))
-        outputs = evaluate_motion(self._motion, times, q, qd, qdd)
+        outputs = evaluate_motion(self._motion, times, q, qd, qdd=qdd)
         not_finite = ~np.isfinite(np.hstack([states, qdd, outputs["ground_force"]])).all(axis=1)
         vertical = outputs["ground_force"][:, 2]
         speed = np.abs(qd).max(axis=1)

@@ -217,7 +217,7 @@ def fine_motion(request: Request, solution: Solution) -> tuple[StandingMotion, A
     q, qd, qdd = values["joints"], values["velocities"], values["accelerations"]
     external = spring() if request.task == "table2" else None
     progress = values["path"][:, 0] if request.task == "minimum_time" else times
-    return standing_motion(machine(), times, q, qd, qdd, external, ROWS), progress
+    return standing_motion(machine(), times, q, qd, joint_accelerations=qdd, external=external, rows=ROWS), progress
 
 
 def held_plans(plans: Mapping[str, Mapping[str, Plan]]) -> dict[str, dict[str, Held]]:

@@ -61,5 +61,7 @@ def printed_law(
     states = np.vstack([start, np.array(step.mapaccum("steps", steps)(start, times[None, :-1])).T])
     joints, velocities = states[:, :n], states[:, n:]
     accelerations, gaps = law.map(steps + 1)(times[None, :], joints.T, velocities.T)
-    motion = standing_motion(machine, times, joints, velocities, np.array(accelerations).T, rows=task.chosen)
+    motion = standing_motion(
+        machine, times, joints, velocities, joint_accelerations=np.array(accelerations).T, rows=task.chosen
+    )
     return motion, float(np.max(np.array(gaps)))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from models import Box, Rig, Tunnel, optimal_inverse, reference_rig, reference_tunnel, solve_table
-from models.cts.clearance import CollisionScene, Radii, clearances, collision_free_inverse
+from models.cts.clearance import Avoidance, CollisionScene, Radii, clearances, collision_free_inverse
 from models.cts.rig import INCH, Branch
 from models.cts.table import all_joint_sets, reachable_rolls
 from tests.bad_values import (
@@ -33,10 +33,6 @@ RIG, TUNNEL = reference_rig(), reference_tunnel()
 TARGET = INCH * np.array([100.0, 6.0, -15.0, 0.0, 0.0])
 BRANCH: Bad = INSTANCE | {"no sign": Branch(2, 0), "text": ("a", "b")}
 WALLS = CollisionScene(walls=Box((10, 10, 10)))
-CLEAR: dict[str, Bad] = {
-    "scene": but(INSTANCE, "None") | {"empty": CollisionScene()},
-    "clearance": but(FINITE, "minus inf") | NOTHING,
-}
 CASES = [
     Case(
         "Rig",
@@ -77,34 +73,31 @@ CASES = [
             "previous": FINITE | NOTHING | {"two": [0.0, 0.0]},
             "in_sequence": FLAG,
             "rate_weight": NONNEGATIVE | NOTHING,
-            "scene": but(INSTANCE, "None") | {"empty": CollisionScene()},
+            "avoidance": but(INSTANCE, "None") | {"empty": Avoidance(CollisionScene())},
         },
     ),
     Case(
-        "solve_table beside walls",
-        solve_table,
-        {"rig": RIG, "tunnel": TUNNEL, "targets": [TARGET], "scene": WALLS},
+        "Avoidance",
+        Avoidance,
+        {"scene": WALLS},
         {
+            "scene": INSTANCE,
             "clearance": but(FINITE, "minus inf") | NOTHING,
-            "clearance_weight": NONNEGATIVE | NOTHING,
-            "clearance_width": POSITIVE | NOTHING,
+            "weight": NONNEGATIVE | NOTHING,
+            "width": POSITIVE | NOTHING,
+            "radii": but(INSTANCE, "None"),
         },
     ),
     Case(
         "collision_free_inverse",
         collision_free_inverse,
-        {"rig": RIG, "tunnel": TUNNEL, "scene": WALLS},
+        {"rig": RIG, "tunnel": TUNNEL, "avoidance": Avoidance(WALLS)},
         {
             "rig": INSTANCE,
             "tunnel": INSTANCE,
             "branch": BRANCH,
-            **CLEAR,
-            "weight": NONNEGATIVE | NOTHING,
-            "width": POSITIVE | NOTHING,
+            "avoidance": INSTANCE | {"empty": Avoidance(CollisionScene())},
             "rate_weight": NONNEGATIVE | NOTHING,
-            "samples": FINITE | {"few": 7, "half": 8.5},
-            "softness": POSITIVE | NOTHING,
-            "radii": but(INSTANCE, "None"),
         },
     ),
     Case(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from models import Box, ModelError, optimal_inverse, reference_rig, reference_tunnel, solve_table
-from models.cts.clearance import CollisionScene, clearances, collision_free_inverse
+from models.cts.clearance import Avoidance, CollisionScene, clearances, collision_free_inverse
 from models.cts.rig import HOME, INCH, inverse
 from models.cts.roll import ACTIVE, STATUS
 from models.shapes.distance import soft_minimum
@@ -42,9 +42,7 @@ def grid_costs(weight: float, width: float, rate_weight: float = 0.0) -> tuple[A
     ("clearance", "weight", "rate_weight"), [(0.15, 0.0, 0.0), (-np.inf, 0.3, 0.0), (0.1, 0.05, 0.5)]
 )
 def test_no_roll_of_a_dense_grid_is_clear_and_better(clearance: float, weight: float, rate_weight: float) -> None:
-    function = collision_free_inverse(
-        RIG, TUNNEL, AROUND, clearance=clearance, weight=weight, width=0.1, rate_weight=rate_weight
-    )
+    function = collision_free_inverse(RIG, TUNNEL, Avoidance(AROUND, clearance, weight, 0.1), rate_weight=rate_weight)
     costs, distances = grid_costs(weight, 0.1, rate_weight)
     for row, cost, distance in zip(TARGETS, costs, distances, strict=True):
         joints, result, _, status, gap = function(row, 0.0)
@@ -59,7 +57,7 @@ def test_no_roll_of_a_dense_grid_is_clear_and_better(clearance: float, weight: f
 def test_the_best_roll_is_found_where_the_best_clear_roll_of_the_grid_is_elsewhere() -> None:
     """Between two boxes: the best roll is in another basin than the best roll of the grid that is clear."""
     boxes = (Box((0.054, 0.154, 0.19), (2.009, -0.165, 0.153)), Box((0.088, 0.168, 0.084), (1.919, -0.022, -0.091)))
-    function = collision_free_inverse(RIG, TUNNEL, CollisionScene(solids=boxes), clearance=0.03)
+    function = collision_free_inverse(RIG, TUNNEL, Avoidance(CollisionScene(solids=boxes), 0.03))
     for target, known in (
         ((2.598, 0.156, 0.078, 0.167, 0.076), 0.0172392516),
         ((2.585, 0.092, -0.055, 0.147, 0.053), 0.0468053923),
@@ -70,7 +68,7 @@ def test_the_best_roll_is_found_where_the_best_clear_roll_of_the_grid_is_elsewhe
 
 
 def test_the_constraint_that_holds_the_roll_is_named() -> None:
-    table = solve_table(RIG, TUNNEL, TARGETS, scene=AROUND, clearance=0.15)
+    table = solve_table(RIG, TUNNEL, TARGETS, avoidance=Avoidance(AROUND, 0.15))
     free = solve_table(RIG, TUNNEL, TARGETS)
     assert table.status == ("ok",) * 4
     assert table.active[2] == "clearance"
@@ -79,7 +77,7 @@ def test_the_constraint_that_holds_the_roll_is_named() -> None:
 
 def test_far_from_everything_it_is_the_closed_form() -> None:
     far = CollisionScene(solids=(Box((2.0, 2, 2), (80.0, 0, 0)),))
-    function, closed = collision_free_inverse(RIG, TUNNEL, far, clearance=0.1), optimal_inverse(RIG, TUNNEL)
+    function, closed = collision_free_inverse(RIG, TUNNEL, Avoidance(far, 0.1)), optimal_inverse(RIG, TUNNEL)
     for row in TARGETS:
         np.testing.assert_allclose(np.array(function(row, 0.3)[0]), np.array(closed(row, 0.3)[0]), atol=1e-7)
 
@@ -87,8 +85,8 @@ def test_far_from_everything_it_is_the_closed_form() -> None:
 def test_a_target_that_is_never_clear_is_marked_and_leaves_the_others_alone() -> None:
     rows = np.vstack([TARGETS, [[np.nan] * 5], [[9.0, 9, 9, 0, 0]]])
     shut = CollisionScene(walls=Box((np.inf, 0.02, 0.02)))
-    assert solve_table(RIG, TUNNEL, TARGETS, scene=shut, clearance=0.0).status == ("clearance",) * 4
-    table = solve_table(RIG, TUNNEL, rows, scene=AROUND, clearance=0.1)
+    assert solve_table(RIG, TUNNEL, TARGETS, avoidance=Avoidance(shut, 0.0)).status == ("clearance",) * 4
+    table = solve_table(RIG, TUNNEL, rows, avoidance=Avoidance(AROUND, 0.1))
     assert table.status == ("ok",) * 4 + ("not a number", "pitch link out of reach")
     assert np.isnan(table.joints[4:]).all()
     assert STATUS[-1] == ACTIVE[-1] == "clearance"
@@ -100,13 +98,13 @@ def test_a_target_that_is_never_clear_is_marked_and_leaves_the_others_alone() ->
         ({"weight": -1.0}, "weight"),
         ({"width": 0.0}, "width"),
         ({"clearance": np.nan}, "clearance"),
-        ({"samples": 3}, "samples"),
-        ({"rate_weight": np.inf}, "rate_weight"),
-        ({"softness": 0.0}, "width"),
+        ({"radii": 3}, "radii"),
     ],
 )
 def test_invalid_requests_are_refused_by_name(options: dict[str, Any], reason: str) -> None:
     with pytest.raises(ModelError, match=reason):
-        collision_free_inverse(RIG, TUNNEL, AROUND, **options)
+        Avoidance(AROUND, **options)
+    with pytest.raises(ModelError, match="rate_weight"):
+        collision_free_inverse(RIG, TUNNEL, Avoidance(AROUND), rate_weight=np.inf)
     with pytest.raises(ModelError, match="empty"):
-        collision_free_inverse(RIG, TUNNEL, CollisionScene())
+        collision_free_inverse(RIG, TUNNEL, Avoidance(CollisionScene()))

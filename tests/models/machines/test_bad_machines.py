@@ -191,7 +191,6 @@ ACTUATOR_CASES = [
             "mass": NONNEGATIVE,
             "translations": array(3, 3),
             "link": but(UNKNOWN, "None"),
-            "prefix": but(NAME, "empty"),
         },
     ),
     Case("find_wheels", find_wheels, {"robot": CHAIN}, {"robot": INSTANCE}),

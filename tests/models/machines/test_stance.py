@@ -36,7 +36,7 @@ def test_a_robot_bears_the_same_whatever_link_it_is_rooted_at(seed: int, size: i
     place = random_frame(rng)
     torques = numeric(inverse_dynamics(robot, q, qd, qdd, world_from_base=place)).ravel()
     held = numeric(base_reaction(robot, q, qd, qdd, world_from_base=place)).ravel()
-    motion = link_motions(robot, q, qd, qdd, place)[root]
+    motion = link_motions(robot, q, qd, qdd, world_from_base=place)[root]
     frame = numeric_poses(robot, q, place)[root]
     spin, change = numeric(motion.angular_velocity).ravel(), numeric(motion.angular_acceleration).ravel()
     arm = frame[1] - numeric(motion.center).ravel()
@@ -49,9 +49,9 @@ def test_a_robot_bears_the_same_whatever_link_it_is_rooted_at(seed: int, size: i
         "base_acceleration": np.concatenate([change, acceleration]),
     }
     scale = max(1.0, np.abs(held).max(), np.abs(torques).max())
-    again = numeric(inverse_dynamics(turned, q[order], qd[order], qdd[order], [at_old], **moving)).ravel()
+    again = numeric(inverse_dynamics(turned, q[order], qd[order], qdd[order], wrenches=[at_old], **moving)).ravel()
     np.testing.assert_allclose(again, torques[order], rtol=0, atol=1e-9 * scale)
-    left = numeric(base_reaction(turned, q[order], qd[order], qdd[order], [at_old], **moving)).ravel()
+    left = numeric(base_reaction(turned, q[order], qd[order], qdd[order], wrenches=[at_old], **moving)).ravel()
     np.testing.assert_allclose(left, 0, rtol=0, atol=1e-9 * scale)
 
 
@@ -75,7 +75,7 @@ def test_the_feet_bear_the_rate_of_momentum_that_pinocchio_finds(held: tuple[str
         q, qd, qdd = rng.normal(size=(3, stance.joint_size))
         loads = stance.loads(q, qd, qdd, random_loads(rng, stance))
         turn, position = numeric_poses(stance.robot, q, stance.world_from_base())[steps.robot.root]
-        motion = link_motions(stance.robot, q, qd, qdd, stance.world_from_base())[steps.robot.root]
+        motion = link_motions(stance.robot, q, qd, qdd, world_from_base=stance.world_from_base())[steps.robot.root]
         spin, change = (numeric(part).ravel() for part in (motion.angular_velocity, motion.angular_acceleration))
         arm = position - numeric(motion.center).ravel()
         speed = turn.T @ (numeric(motion.velocity).ravel() + np.cross(spin, arm))

@@ -93,7 +93,7 @@ def peak_curvature(shape: float, angle: float, remaining: float, kind: str = "cu
     if kind == "cubic":
         curve = cubic(start, rate * n1, end, rate * n2)
     else:
-        curve = quintic(start, rate * n1, zero, end, rate * n2, zero)
+        curve = quintic((start, rate * n1, zero), (end, rate * n2, zero))
     low, high, best = 0.0, 1.0, 0.0
     for _ in range(5):
         u = np.linspace(low, high, 2001)

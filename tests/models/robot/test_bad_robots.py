@@ -47,8 +47,7 @@ MOTION: dict[str, Bad] = {"q": array(2), "qd": array(2), "qdd": array(2)}
 DYNAMICS: dict[str, Bad] = {
     "wrenches": SEQUENCE | {"unknown link": [Wrench("nobody")]},
     "gravity": SPATIAL,
-    "base_twist": array(6),
-    "base_acceleration": array(6),
+    "base_motion": but(SEQUENCE, "None") | {"short": (np.zeros(6),), "no twist": (np.zeros(3), np.zeros(6))},
 }
 
 

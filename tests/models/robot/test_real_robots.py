@@ -240,7 +240,7 @@ def test_inverse_dynamics_on_a_fixed_and_on_a_moving_base(case: Case) -> None:
     q, qd, qdd = (ca.SX.sym(name, robot.dof) for name in ("q", "qd", "qdd"))
     position, turn = ca.SX.sym("p", 3), ca.SX.sym("R", 3, 3)
     twist, push = ca.SX.sym("twist", 6), ca.SX.sym("push", 6)
-    place, moving = (turn, position), {"base_twist": twist, "base_acceleration": push}
+    place, moving = (turn, position), {"base_motion": (twist, push)}
     outputs = [
         inverse_dynamics(robot, q, qd, qdd, world_from_base=place),
         inverse_dynamics(robot, q, qd, qdd, world_from_base=place, **moving),

@@ -74,7 +74,7 @@ def test_limits_prove_that_bodies_never_collide() -> None:
     """Folded by less than needed: with the middle link of 0.3 and joints of at most 60 degrees nothing comes back."""
     robot, bodies = chain(0.3, 0.3, 0.3, limit=np.deg2rad(60))
     assert checked_pairs(robot, bodies).left["link0", "link2"] == NEVER
-    assert checked_pairs(robot, bodies, lower=-3.0, upper=3.0).checked == ((0, 2),)
+    assert checked_pairs(robot, bodies, limits=(-3.0, 3.0)).checked == ((0, 2),)
     assert checked_pairs(robot, bodies, clearance=0.5).checked == ((0, 2),)
 
 
@@ -478,9 +478,11 @@ BAD: list[tuple[dict[str, Any], str]] = [
     ({"srdf": "<srdf/>"}, "the given text"),
     ({"srdf": "absent.srdf"}, "file 'absent.srdf'"),
     ({"srdf": "<robot><disable_collisions link1='link0'/></robot>"}, "link2"),
-    ({"lower": [0.0]}, "lower"),
-    ({"lower": np.nan}, "lower"),
-    ({"lower": 2.0, "upper": 1.0}, "lower"),
+    ({"limits": ([0.0], 1.0)}, "lower"),
+    ({"limits": (np.nan, 1.0)}, "lower"),
+    ({"limits": (1.0,)}, "limits"),
+    ({"limits": 1.0}, "limits"),
+    ({"limits": (2.0, 1.0)}, "lower"),
     ({"clearance": -0.1}, "clearance"),
     ({"seed": -1}, "seed"),
     ({"samples": 0}, "samples"),
@@ -537,7 +539,7 @@ def test_a_joint_whose_limits_are_equal_but_for_the_sign_of_zero_is_no_error() -
     robot, bodies = chain(0.3, 0.3, 0.3, 0.3)
     low, high = np.full(robot.dof, -3.0), np.full(robot.dof, 3.0)
     low[0], high[0] = 0.0, -0.0
-    assert checked_pairs(robot, bodies, lower=low, upper=high).checked == ((0, 3), (1, 3))
+    assert checked_pairs(robot, bodies, limits=(low, high)).checked == ((0, 3), (1, 3))
 
 
 def test_the_bound_is_exact_where_a_ball_lies_off_a_corner() -> None:

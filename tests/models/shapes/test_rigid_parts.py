@@ -33,15 +33,15 @@ def test_the_reach_of_a_stretched_chain_is_exact() -> None:
         ]
     )
     rod = Capsule(0.05, (0.1, 0, 0), (0.6, 0, 0))
-    own, reach = lever_arms(robot, [(step, True) for step in steps], rod, robot.lower, robot.upper)
+    own, reach = lever_arms(robot, [(step, True) for step in steps], rod, low=robot.lower, high=robot.upper)
     end = 0.6 + 0.05
     assert own == pytest.approx([0.3 + 0.5 + 0.4 + end, 0.0 + end, end])
     assert reach == pytest.approx(0.2 + 0.3 + 0.5 + 0.4 + end)
     # the other way round: a rod on the first link, seen from behind the last joint
     start = Capsule(0.05, (0.1, 0, 0), (-0.6, 0, 0))
-    own, _ = lever_arms(robot, [(step, False) for step in steps[::-1]], start, robot.lower, robot.upper)
+    own, _ = lever_arms(robot, [(step, False) for step in steps[::-1]], start, low=robot.lower, high=robot.upper)
     assert own == pytest.approx([0.4 + 0.5 + 0.3 + 0.2 + end, 0.2 + end, 0.2 + end])
-    own, reach = lever_arms(robot, [], rod, robot.lower, robot.upper)
+    own, reach = lever_arms(robot, [], rod, low=robot.lower, high=robot.upper)
     assert not own
     assert reach == pytest.approx(end)
 
@@ -57,7 +57,7 @@ def test_over_a_fork_it_is_as_far_as_its_joints_are_from_each_other() -> None:
     robot = Robot(links, joints, tip="right")
     up, down = RigidParts.of(robot).path("left", "right")
     chain = [(up[0], False), (down[0], True)]
-    own, _ = lever_arms(robot, chain, Sphere(0.1, (0.5, 0, 0)), robot.lower, robot.upper)
+    own, _ = lever_arms(robot, chain, Sphere(0.1, (0.5, 0, 0)), low=robot.lower, high=robot.upper)
     assert own == pytest.approx([3.0 + 0.6, 0.6])
     assert RigidParts.of(robot).common_part("left", "right") == "base"
 
@@ -73,7 +73,9 @@ def test_a_slide_that_follows_goes_as_far_as_it_follows() -> None:
     )
     robot = Robot(links, joints)
     steps = RigidParts.of(robot).path("link0", "link3")[1]
-    own, _ = lever_arms(robot, [(step, True) for step in steps], Sphere(0.1, (0, 0, 0)), robot.lower, robot.upper)
+    own, _ = lever_arms(
+        robot, [(step, True) for step in steps], Sphere(0.1, (0, 0, 0)), low=robot.lower, high=robot.upper
+    )
     assert own == pytest.approx([0.6 + 0.4 + 0.1, 0.4 + 0.1, 0.1])
 
 
@@ -86,7 +88,7 @@ def test_lever_arms_are_zero_along_the_axis_and_full_across_it() -> None:
         ]
     )
     box = Box((0.2, 0.6, 0.8))
-    own, reach = lever_arms(robot, [(step, True) for step in steps], box, robot.lower, robot.upper)
+    own, reach = lever_arms(robot, [(step, True) for step in steps], box, low=robot.lower, high=robot.upper)
     assert own == pytest.approx([4.0 + np.hypot(0.5, 0.1), 0.5])
     assert reach == pytest.approx(np.hypot(0.2, 0.1) + 5.0 + np.hypot(0.5, 0.1))
 
@@ -110,11 +112,11 @@ def test_no_configuration_exceeds_the_distance_bounds_from_an_axis(seed: int) ->
     first = Box(rng.uniform(0.1, 1, 3), rng.normal(size=3))
     axis = np.asarray(above[-1][0].rotation @ above[-1][0].joint.axis)
     away = np.linalg.norm(np.cross(first.core - above[-1][0].translation, axis), axis=1).max()
-    assert lever_arms(robot, above, first, robot.lower, robot.upper)[0][-1] == pytest.approx(away, rel=1e-12)
+    assert lever_arms(robot, above, first, low=robot.lower, high=robot.upper)[0][-1] == pytest.approx(away, rel=1e-12)
     up, down = RigidParts.of(robot).path("link3", "link5")
     chain = [*((step, False) for step in up), *((step, True) for step in down)]
     end = Box(rng.uniform(0.1, 1, 3), rng.normal(size=3)) if seed % 2 else Capsule(0.2, *rng.normal(size=(2, 3)))
-    own, _ = lever_arms(robot, chain, end, robot.lower, robot.upper)
+    own, _ = lever_arms(robot, chain, end, low=robot.lower, high=robot.upper)
     assert len(own) == 5
     result = farthest(robot, [step for step, _ in chain], "link5", end, rng)
     assert (result <= np.array(own) + 1e-9).all()

@@ -248,7 +248,7 @@ def test_degree_may_be_a_numpy_integer_and_the_mesh_an_array(scheme: str) -> Non
         (("4",), "intervals"),
         ((True,), "intervals"),
         ((None,), "intervals"),
-        ((3, 0), "degree must be 1 to 9, not 0"),
+        ((3, 0), "degree must be a whole number, 1 to 9, not 0"),
         ((3, 10), "degree"),
         ((3, 2.0), "degree"),
         ((3, True), "degree"),

@@ -184,8 +184,8 @@ def test_an_unsuccessful_or_loaded_solution_is_a_guess_too(tmp_path: Any) -> Non
     ("guess", "message"),
     [
         ({"z": 1.0}, "variable in guess 'z' does not exist"),
-        ({"X": 1.0}, "variable in guess 'X' does not exist; known: x, u, horizon, t"),
-        ({3: 1.0}, "unknown variable in guess 3"),
+        ({"X": 1.0}, "variable in guess 'X' does not exist; did you mean 'x'"),
+        ({3: 1.0}, "variable in guess 3 does not exist"),
         ([1.0], "guess must be a Solution, a dictionary or None, not list"),
         ("x", "guess must be a Solution, a dictionary or None, not str"),
         ({"x": [1.0, 2.0, 3.0]}, "guess of 'x' has 3 entries, 2 expected"),

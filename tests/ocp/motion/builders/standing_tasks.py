@@ -166,7 +166,13 @@ def sampled(
     values = solution.at_fraction((np.arange(count) + 0.5) / count)
     times = (np.arange(count) + 0.5) / count * solution.horizon
     return standing_motion(
-        standing, times, values["joints"], values["velocities"], values["accelerations"], external, rows
+        standing,
+        times,
+        values["joints"],
+        values["velocities"],
+        joint_accelerations=values["accelerations"],
+        external=external,
+        rows=rows,
     )
 
 

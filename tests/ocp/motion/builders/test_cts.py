@@ -171,7 +171,7 @@ def test_a_table_of_targets_is_followed_through_its_spline() -> None:
         ({"rate_limit": -1.0}, "rate_limit"),
         ({"clearance_weight": -1.0}, "clearance_weight"),
         ({"clearance_width": 0.0}, "clearance_width"),
-        ({"clearance": np.nan}, "clearance nan"),
+        ({"clearance": np.nan}, "clearance must be a number, not nan"),
     ],
 )
 def test_impossible_plans_are_refused_by_name(options: dict[str, Any], message: str) -> None:

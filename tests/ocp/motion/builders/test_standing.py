@@ -165,7 +165,7 @@ def test_the_reported_cost_is_that_of_the_sampled_motion_and_local_laws_cost_mor
     times = np.linspace(0, HORIZON, 2001)
     values = solution.at_fraction(times / HORIZON)
     motion = standing_motion(
-        machine(), times, values["joints"], values["velocities"], values["accelerations"], rows=ROWS
+        machine(), times, values["joints"], values["velocities"], joint_accelerations=values["accelerations"], rows=ROWS
     )
     assert motion_cost(motion) == pytest.approx(solution.cost, abs=1e-5)
     costs = {}
@@ -306,7 +306,7 @@ def excess(standing: Standing, solution: Solution, limits: Limits, external: Any
     at = ((np.arange(count)[:, None] + inside) / count).ravel()
     values = solution.at_fraction(at)
     q, qd, qdd = (values[name] for name in ("joints", "velocities", "accelerations"))
-    motion = standing_motion(standing, at * solution.horizon, q, qd, qdd, external)
+    motion = standing_motion(standing, at * solution.horizon, q, qd, joint_accelerations=qdd, external=external)
     bounds = limits.bounds(standing)
     sizes = (motion.joint_velocities, motion.joint_accelerations, motion.joint_torques)
     most = {"velocity": bounds.velocity, "acceleration": bounds.acceleration, "torque": bounds.torque}

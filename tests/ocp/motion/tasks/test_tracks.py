@@ -31,7 +31,7 @@ def turning() -> SmoothPath:
     q = np.roll(q, 1, axis=1)
     center = np.array([0.6, 0.5, 0.0])
     lines = (Line((0, 0, 0), (0.6, 0, 0.0), q[0], q[1]), Line((0.6, 0, 0), (0.6, 0.3, 0.0), q[1], q[2]))
-    arc = Arc.about((0.6, 0.3, 0), center, (1, 0, 0), np.pi / 2, q[2], q[3])
+    arc = Arc.about((0.6, 0.3, 0), center, (1, 0, 0), np.pi / 2, start_orientation=q[2], end_orientation=q[3])
     return smooth(Path((*lines, arc)), deviation=0.02)
 
 
