@@ -45,9 +45,8 @@ class PlannerSettings:
         local_steps: Steps of a local motion, besides the breaks of its tasks.
         dampings: Dampings of local motions, relative to the singular values; the next one is tried if none tracks.
         min_intervals: Least number of mesh intervals.
-        coarse_degree, fine_degree: Degrees of collocation. One interval of the fine degree represents a smooth segment
-            to rounding.
-        separated_intervals: Intervals of a coarse mesh with separation constraints, which hold only at its points.
+        coarse_degree, fine_degree: Degrees of collocation; the fine one represents a smooth segment to rounding.
+        separated_intervals: Intervals of a coarse mesh with separation constraints.
         coarse_options, fine_options: Options of IPOPT. A coarse solve starts from a guess that does its tasks.
         barriers: Default mu_init of IPOPT, and the tolerance at which the barrier parameter ends.
         samples_per_interval: Samples of an interval at which collisions and deviations are checked.
@@ -384,11 +383,9 @@ class ReachSettings:
     """Settings of the search for the end of the reach.
 
     Attributes:
-        intervals: Intervals of the stretch of time, at whose ends the reach is evaluated before the bisection. They do
-            not depend on where a planner failed, so that every search names the same end.
+        intervals: Intervals of the stretch of time, at whose ends the reach is evaluated before the bisection.
         bisections: Number of bisections of one interval.
-        tolerance: Pose error up to which a pose is within reach, m or rad. The distance that it adds to the reach is
-            below the repeatability of an arm.
+        tolerance: Pose error up to which a pose is within reach, m or rad: below the repeatability of arms.
         continued: Number of solutions from which the next time is tried before random starts.
     """
 
@@ -443,8 +440,7 @@ def end_of_reach(
     """Return an error that names the end of the reach of a machine on a fixed base, and what ends it.
 
     The end is the first time at which no joint positions within the limits do the tasks. A joint ends the reach if it
-    is at its limit there, and the pose would be within reach without limits. Otherwise the pose is too far or too near,
-    or turned in a way that the arm cannot follow: the Jacobian of the tasks is singular at the end.
+    is at its limit there and the pose would be within reach without limits. Otherwise the tasks' Jacobian is singular.
 
     Args:
         machine: The machine.
