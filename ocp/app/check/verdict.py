@@ -32,7 +32,7 @@ from ocp.console import check_time, interruptible
 from ocp.errors import ProblemError, checked_choice, checked_instance, checked_nonnegative, checked_positive, real
 from ocp.motion.plan import Plan, PlanSample
 from ocp.motion.result.path_plan import PathPlan
-from ocp.motion.result.segmented_plan import Piece, SegmentedPlan
+from ocp.motion.result.segmented_plan import ConsecutivePlans, Piece
 from ocp.motion.tasks.goals import Scene
 from ocp.motion.tasks.limits import Limits, unknown_limits
 from ocp.tolerances import LIMIT_SHARE, ORIENTATION_TOLERANCE_RAD
@@ -404,7 +404,7 @@ def verdict_of(plan: Plan, sample: PlanSample, name: str, **settings: Any) -> Pl
 
 def _check(plan: Plan, sample: PlanSample, name: str) -> Check:
     """Return the check of a plan between the times at which its rates jump, where no acceleration is defined."""
-    if isinstance(plan, SegmentedPlan):
+    if isinstance(plan, ConsecutivePlans):
         return _worst([_check_piece(piece, sample.t, name) for piece in plan.pieces])
     if isinstance(plan, PathPlan):  # constant rates between waypoints
         joints = tuple(replace(joint, effort=np.inf) for joint in plan.machine.robot.joints)
@@ -416,7 +416,7 @@ def _check(plan: Plan, sample: PlanSample, name: str) -> Check:
 
 
 def _check_piece(piece: Piece, times: Array, name: str) -> Check:
-    """Return the check of one motion of a plan in segments at those of the times that it covers, and at its ends."""
+    """Return the check of one motion of consecutive ones at those of the times that it covers, and at its ends."""
     plan, local = piece.plan, times - piece.begin
     inside = local[(local > 0) & (local < plan.horizon)]
     sample = plan.sampled(np.concatenate([[0.0], inside, [plan.horizon]]))

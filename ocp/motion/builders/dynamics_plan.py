@@ -35,8 +35,9 @@ from ocp.motion.builders.clearance import (
     is_clearance,
     solve_with_clearance,
 )
-from ocp.motion.builders.dynamics import DynamicsSetup, Motors, checked_motors, dynamics_problem
+from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem
 from ocp.motion.builders.standing.problem import FreeTime
+from ocp.motion.builders.torques import Motors, checked_motors
 from ocp.motion.tasks.checks import checked_horizon
 from ocp.motion.tasks.goals import Cost, Goal
 from ocp.motion.tasks.limits import Limits

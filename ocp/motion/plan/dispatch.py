@@ -7,10 +7,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, Literal, TypeAlias, get_args
 
-import numpy as np
-
 from models import FixedBase, FreeFloating, Machine, Standing
-from ocp.console import TimeLimitReached, interruptible, report, shown_progress, time_left, time_limited
+from ocp.console import TimeLimitReached, interruptible, shown_progress, time_limited
 from ocp.errors import (
     ProblemError,
     SolveError,
@@ -30,15 +28,14 @@ from ocp.motion.builders.standing.stances import Steps
 from ocp.motion.builders.standing.steps import StepWeights, steps_problem
 from ocp.motion.local.inverse_kinematics import LARGEST_SEED
 from ocp.motion.plan.actuators import limits_actuators
-from ocp.motion.plan.goal_plan import GoalRequest, plan_to_goal
-from ocp.motion.plan.goal_sequence import goal_configurations, plan_capture, plan_sequence, plan_steps
+from ocp.motion.plan.goal_sequence import plan_capture, plan_goal, plan_sequence, plan_steps
 from ocp.motion.plan.planner import checked_request, clearance_for, plan_request
-from ocp.motion.plan.sequence import plan_in_segments
+from ocp.motion.plan.sequence import SequenceRequest, plan_consecutive, plan_in_segments
 from ocp.motion.plan.standing import plan_to_stand
 from ocp.motion.plan.waypoints import plan_path
 from ocp.motion.result.path_plan import PathPlan
 from ocp.motion.result.plan import Plan
-from ocp.motion.result.segmented_plan import SegmentedPlan
+from ocp.motion.result.segmented_plan import SegmentedPlan, SequencePlan
 from ocp.motion.result.solved_plan import PHASED, PhasedPlan, SolvedPlan
 from ocp.motion.tasks.goals import Cost, Goal, Scene, Start, Waypoints
 from ocp.motion.tasks.limits import Limits
@@ -49,7 +46,8 @@ from ocp.storage import read_arrays
 __all__ = ["Search", "load_plan", "plan", "plan_problem"]
 
 Search: TypeAlias = Literal["start", "configurations", "global", "segments"]
-Tasks: TypeAlias = TipTask | Goal | Waypoints | Steps | Capture | Sequence[TipTask] | Sequence[Goal]
+Parts: TypeAlias = Sequence[Goal | TipTask | Sequence[TipTask]]
+Tasks: TypeAlias = TipTask | Goal | Waypoints | Steps | Capture | Sequence[TipTask] | Sequence[Goal] | Parts
 
 
 @interruptible
@@ -153,6 +151,12 @@ def _plan(
         _check_unused("a walk, whose phases have durations", horizon=horizon, cyclic=cyclic or None)
         _check_unused("a walk, whose feet stand on footholds,", scene=scene or None)
         return plan_steps(machine, tasks, start=start, cost=cost, limits=limits)
+    if _is_sequence(tasks):
+        if horizon is not None:
+            checked_choice("horizon", horizon, ("free",))
+        _check_unused("a sequence of goals and tasks", cyclic=cyclic or None)
+        own = SequenceRequest(machine, start, horizon is not None, cost, limits, scene, search, seed)
+        return plan_consecutive(own, tasks)
     constraints = clearance_for(machine, limits, scene)
     if isinstance(tasks, Capture):
         _check_unused("a capture, whose phases have durations", horizon=horizon, cyclic=cyclic or None)
@@ -160,8 +164,8 @@ def _plan(
     goals = (tasks,) if isinstance(tasks, Goal) else tasks
     if isinstance(goals, Sequence) and isinstance(next(iter(goals), None), Goal):
         _check_unused("a motion to goals", cyclic=cyclic or None)
-        if len(goals) == 1 and isinstance(machine, FixedBase) and _is_simple(goals[0]):
-            return plan_to_goal(_goal_request(machine, goals[0], horizon, constraints=constraints, **options))
+        if len(goals) == 1:
+            return plan_goal(machine, goals[0], horizon, constraints=constraints, **options)
         return plan_sequence(machine, goals, horizon, constraints=constraints, **options)
     options |= {"search": search, "cyclic": cyclic}
     if isinstance(machine, Standing):
@@ -170,51 +174,26 @@ def _plan(
     return plan_request(replace(request, clearance_constraints=constraints))
 
 
-def _is_simple(goal: Goal) -> bool:
-    """Return whether nothing is asked on the way to a goal, and the machine stays as it is."""
-    has_tasks = not (isinstance(goal.tasks, Sequence) and not goal.tasks)
-    return not has_tasks and goal.machine is None and goal.base is None
-
-
-def _goal_request(
-    machine: FixedBase,
-    goal: Goal,
-    horizon: Any,
-    *,
-    start: Any,
-    cost: Cost | None,
-    limits: Limits | None,
-    constraints: ClearanceConstraints | None,
-    seed: int,
-) -> GoalRequest:
-    """Return the request for a motion to one goal.
+def _is_sequence(tasks: Any) -> bool:
+    """Return whether parts are done one after the other of which not all are goals, or which are tasks at once.
 
     Raises:
-        ProblemError: The start is missing, or as in `goal_configurations`.
+        ProblemError: A part is neither a goal nor tasks.
     """
-    state, joints, _ = Start.of(start, machine)
-    if joints is None:
-        raise ProblemError("start is missing: a goal is reached from somewhere; give plan(..., start=)", name="start")
-    own_limits = Limits() if limits is None else checked_instance("limits", limits, Limits)
-    places: dict[str, Any] = {"limits": own_limits, "constraints": constraints, "seed": seed}
-    is_free = isinstance(horizon, str)
-    if is_free:
-        checked_choice("horizon", horizon, ("free",))
-    own_cost = Cost(time=float(is_free)) if cost is None else checked_instance("cost", cost, Cost)
-    return GoalRequest(
-        machine,
-        joints,
-        goal_configurations(machine, goal, joints, **places),
-        horizon=goal.duration if horizon is None or is_free else horizon,
-        limits=own_limits,
-        cost=own_cost,
-        start_velocity=state.velocity,
-        end_velocity=goal.velocity,
-        clearance_constraints=constraints,
-        seed=seed,
-        time_limit=time_left() if np.isfinite(time_left()) else None,
-        progress=report,
-    )
+    if not isinstance(tasks, Sequence) or isinstance(tasks, str):
+        return False
+    goals = [isinstance(part, Goal) for part in tasks]
+    if all(goals) or all(isinstance(part, TipTask) for part in tasks):
+        return False
+    if not any(goals) and not all(isinstance(part, TipTask | Sequence) for part in tasks):
+        return False  # refused as tasks
+    for number, part in enumerate(tasks, 1):
+        each = part if isinstance(part, Sequence) and not isinstance(part, str) else (part,)
+        if not each or not (isinstance(part, Goal) or all(isinstance(task, TipTask) for task in each)):
+            words = f"part {number} of the sequence is neither a Goal nor TipTasks, but {part!r}; waypoints have no "
+            words += "times: give a TipTask.along(smooth(path), speed) through them, or plan them alone"
+            raise ProblemError(words, name=f"part {number}", value=part)
+    return True
 
 
 def _check_unused(reason: str, **arguments: Any) -> None:
@@ -318,6 +297,7 @@ def load_plan(path: str | os.PathLike[str]) -> Plan:
     arrays = read_arrays(path)
     if "path" in arrays:
         return PathPlan.of_arrays(path, arrays)
-    if "segments" in arrays:
-        return SegmentedPlan.of_arrays(path, arrays)
+    for kind in (SegmentedPlan, SequencePlan):
+        if kind.kind in arrays:
+            return kind.of_arrays(path, arrays)
     return (PhasedPlan if PHASED in arrays else SolvedPlan).of_arrays(path, arrays)

@@ -8,19 +8,22 @@ from typing import Any, Literal
 
 import numpy as np
 
-from models import Box, FreeFloating, Machine, Sphere, Stance
+from models import Box, FixedBase, FreeFloating, Machine, Sphere, Stance
 from models.arrays import Array
-from ocp.errors import ProblemError, checked_each, checked_instance, floats
+from ocp.console import report, time_left
+from ocp.errors import ProblemError, checked_choice, checked_each, checked_instance, floats
 from ocp.motion.builders.clearance import ClearanceConstraints
-from ocp.motion.builders.dynamics import DynamicsSetup, checked_motors
+from ocp.motion.builders.dynamics import DynamicsSetup
 from ocp.motion.builders.dynamics_plan import dynamics_phases, machines_of, phase_names, within_limits
 from ocp.motion.builders.space.capture import Capture, solve_capture
 from ocp.motion.builders.standing.plan import solve_steps
 from ocp.motion.builders.standing.stances import Steps
 from ocp.motion.builders.standing.steps import StepWeights
+from ocp.motion.builders.torques import checked_motors
 from ocp.motion.local.inverse_kinematics import Unreachable, inverse_kinematics
+from ocp.motion.plan.goal_plan import GoalRequest, plan_to_goal
 from ocp.motion.result.candidate import Candidate, Stage
-from ocp.motion.result.solved_plan import PhasedPlan, parts_of_phases
+from ocp.motion.result.solved_plan import PhasedPlan, SolvedPlan, parts_of_phases
 from ocp.motion.tasks.checks import checked_numbers, clip_to_limits
 from ocp.motion.tasks.equations import bind
 from ocp.motion.tasks.goals import Cost, Goal, Start
@@ -28,7 +31,7 @@ from ocp.motion.tasks.limits import Limits
 from ocp.problem.problem import Problem
 from ocp.solution import Solution
 
-__all__ = ["goal_configurations", "plan_capture", "plan_sequence", "plan_steps"]
+__all__ = ["goal_configurations", "plan_capture", "plan_goal", "plan_sequence", "plan_steps", "with_joints"]
 
 REGION_SAMPLES = 8
 """Random places of the tip in the region of a goal, besides its centre."""
@@ -75,7 +78,7 @@ def plan_sequence(
     for goal in goals:
         if goal.has_pose:
             near = nearest_configuration(goal.machine or motors, goal, near, limits=own_limits, seed=seed)
-            goal = _with_joints(goal, near)
+            goal = with_joints(goal, near)
         elif goal.joints is not None:
             near = np.where(np.isnan(np.asarray(goal.joints, dtype=float)), near, goal.joints)
         resolved.append(goal)
@@ -91,6 +94,81 @@ def plan_sequence(
     limited = {name: (each, own_limits) for name, each in zip(phase_names(resolved), machines, strict=True)}
     solution = within_limits(declare, constraints, None, (), None, None, limited)
     return _phased(motors, solution, joints)
+
+
+def plan_goal(
+    machine: Machine,
+    goal: Goal,
+    horizon: Any,
+    *,
+    start: Any,
+    cost: Cost | None,
+    limits: Limits | None,
+    constraints: ClearanceConstraints | None,
+    seed: int,
+) -> SolvedPlan:
+    """Plan the motion to one goal: around obstacles, or with its tasks, machine and base as one phase of a problem.
+
+    Args:
+        machine: Arm on a fixed or floating base.
+        goal: The goal.
+        horizon: s, "free", or None for the duration of the goal.
+        start, cost, limits, constraints, seed: As in `plan_sequence`.
+
+    Raises:
+        ProblemError, SolveError: As `plan_to_goal` or `plan_sequence`.
+    """
+    options: dict[str, Any] = {"start": start, "cost": cost, "limits": limits, "constraints": constraints, "seed": seed}
+    if isinstance(machine, FixedBase) and _is_simple(goal):
+        return plan_to_goal(_goal_request(machine, goal, horizon, **options))
+    return plan_sequence(machine, (goal,), horizon, **options)
+
+
+def _is_simple(goal: Goal) -> bool:
+    """Return whether nothing is asked on the way to a goal, and the machine stays as it is."""
+    has_tasks = not (isinstance(goal.tasks, Sequence) and not goal.tasks)
+    return not has_tasks and goal.machine is None and goal.base is None
+
+
+def _goal_request(
+    machine: FixedBase,
+    goal: Goal,
+    horizon: Any,
+    *,
+    start: Any,
+    cost: Cost | None,
+    limits: Limits | None,
+    constraints: ClearanceConstraints | None,
+    seed: int,
+) -> GoalRequest:
+    """Return the request for a motion to one goal.
+
+    Raises:
+        ProblemError: The start is missing, or as in `goal_configurations`.
+    """
+    state, joints, _ = Start.of(start, machine)
+    if joints is None:
+        raise ProblemError("start is missing: a goal is reached from somewhere; give plan(..., start=)", name="start")
+    own_limits = Limits() if limits is None else checked_instance("limits", limits, Limits)
+    places: dict[str, Any] = {"limits": own_limits, "constraints": constraints, "seed": seed}
+    is_free = isinstance(horizon, str)
+    if is_free:
+        checked_choice("horizon", horizon, ("free",))
+    own_cost = Cost(time=float(is_free)) if cost is None else checked_instance("cost", cost, Cost)
+    return GoalRequest(
+        machine,
+        joints,
+        goal_configurations(machine, goal, joints, **places),
+        horizon=goal.duration if horizon is None or is_free else horizon,
+        limits=own_limits,
+        cost=own_cost,
+        start_velocity=state.velocity,
+        end_velocity=goal.velocity,
+        clearance_constraints=constraints,
+        seed=seed,
+        time_limit=time_left() if np.isfinite(time_left()) else None,
+        progress=report,
+    )
 
 
 def plan_steps(
@@ -138,7 +216,7 @@ def plan_capture(
     return _phased(chaser, solution, np.asarray(Start.of(start, chaser)[1]))
 
 
-def _with_joints(goal: Goal, joints: Array) -> Goal:
+def with_joints(goal: Goal, joints: Array) -> Goal:
     """Return a goal with joints in place of its pose."""
     no_pose: dict[str, Any] = dict.fromkeys(("tip", "position", "orientation", "direction", "within", "region"))
     return replace(goal, joints=joints, **no_pose)

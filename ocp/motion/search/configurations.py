@@ -21,6 +21,7 @@ from ocp.motion.local.inverse_kinematics import Unreachable, describe_miss, inve
 from ocp.motion.local.rates import LocalMotion, track_tasks
 from ocp.motion.search.joint_space import all_turns, turning_joints, whole_turns_between, whole_turns_into
 from ocp.motion.tasks.equations import TaskEquations, bind
+from ocp.motion.tasks.goals import Cost
 from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.motion.tasks.tip_task import TipTask
 
@@ -112,6 +113,8 @@ class PlanRequest:
         limits: Limits of joint positions and rates.
         time_cost: Cost of a second if the horizon is free; else None.
         search: How the start is searched.
+        cost: Cost of the motion if more than the squared joint rates and the time are weighted, or less; else None.
+        rests: Whether the joints are at rest at the start and at the end, if their accelerations are planned.
         actuator_limits: Limits that include those of the actuators; None if these are not limited.
         clearance_constraints: Clearance constraints of the motion, or None.
         settings: Settings of the planner.
@@ -131,6 +134,8 @@ class PlanRequest:
     seed: int
     time_cost: float | None
     search: SearchKind = "configurations"
+    cost: Cost | None = None
+    rests: tuple[bool, bool] = (False, False)
     actuator_limits: Limits | None = None
     clearance_constraints: ClearanceConstraints | None = None
     settings: PlannerSettings = field(default_factory=PlannerSettings)
@@ -152,6 +157,7 @@ class PlanRequest:
             stretches=stretches_of(machine, self.tasks, self.horizon),
             start=None if self.start is None else self.start[free],
             weights=self.weights[free],
+            cost=None if self.cost is None else self.cost.of_joints(free),
             limits=self.limits.of_joints(free),
             actuator_limits=None if self.actuator_limits is None else self.actuator_limits.of_joints(free),
             clearance_constraints=constraints,
@@ -203,10 +209,8 @@ def start_collisions(
     """
     if request.clearance_constraints is None or pairs == []:
         return [None] * len(configurations)
-    scene = request.clearance_constraints.scene
-    distances = distances_along(scene, request.base, configurations, np.zeros(len(configurations)))
-    if pairs is not None:
-        distances[:, np.setdiff1d(np.arange(len(scene.pairs)), pairs)] = np.inf
+    scene, times = request.clearance_constraints.scene, np.zeros(len(configurations))
+    distances = distances_along(scene, request.base, configurations, times, scene.clearance, pairs=pairs)
     closest = zip(distances, distances.argmin(axis=1).tolist(), strict=True)
     collisions = [Collision(pair, scene.labels[pair], float(row[pair]), 0.0) for row, pair in closest]
     return [collision if collision.distance < scene.clearance else None for collision in collisions]
@@ -252,10 +256,9 @@ def describe_alternatives(count: int | Unreachable | None) -> list[str]:
 def local_motions_from(request: PlanRequest, configurations: Array) -> list[LocalMotion]:
     """Track the tasks from all configurations (K, n) by resolved-rate control; return one result per stretch.
 
-    Joints that can turn wholly within their limits are tracked without limits at first, since a motion is the same from
-    all turns of its start. It is then shifted by whole turns to the middle of the limits. A motion that does the tasks,
-    but leaves the limits from every turn, is tracked again within them from all turns of its start. There may
-    therefore be more than K motions, and they begin at `motions[0].joints[:, 0]`.
+    A motion is the same from all whole turns of its start. Joints that can make a turn within their limits are
+    therefore tracked without limits, and the motion is shifted to the middle of them. If it does the tasks, but fits
+    nowhere, it is tracked within the limits from all turns: there may be more than K motions.
 
     Raises:
         Unreachable: A pose that no joints within their limits reach.
@@ -263,8 +266,7 @@ def local_motions_from(request: PlanRequest, configurations: Array) -> list[Loca
     turning, lower, upper = request.turning_joints, request.bounds.lower.copy(), request.bounds.upper.copy()
     lower[turning], upper[turning] = -np.inf, np.inf
     motions = _track_within(request, configurations, lower, upper)
-    if turning.size:
-        motions = _within_limits(request, configurations, motions)
+    motions = _within_limits(request, configurations, motions) if turning.size else motions
     if min(largest_pose_errors(motions)) > REACH_TOLERANCE:
         _check_reach(request, motions)
     return motions
@@ -283,16 +285,16 @@ def _track_within(request: PlanRequest, configurations: Array, lower: Array, upp
                     motions[-1] = motions[-1].straight_to(joints)
             steps = int(np.ceil(settings.local_steps * stretch.duration / request.horizon))
             grid = np.linspace(stretch.begin, stretch.end, max(steps, settings.min_intervals) + 1)
-            times, equations = np.union1d(grid, stretch.breaks), stretch.equations
+            times, equations = np.union1d(grid, stretch.nodes), stretch.equations
             if equations is None:
                 motions.append(LocalMotion.stationary(times, base, joints))
             else:
                 options: dict[str, Any] = {"weights": request.weights, "damping": damping}
                 motions.append(track_tasks(equations, joints, base, times, lower=lower, upper=upper, **options))
             base, joints = motions[-1].base[:, -1], motions[-1].joints[:, -1]
-        least_damped = least_damped or motions
         if min(largest_pose_errors(motions)) <= REACH_TOLERANCE:
             return motions
+        least_damped = least_damped or motions
     return least_damped
 
 
@@ -312,7 +314,7 @@ def _within_limits(request: PlanRequest, configurations: Array, motions: Sequenc
     for row in np.flatnonzero(~inside & tracked):
         start = configurations[row, turning]
         turned = all_turns(start, np.where(fits[row], start + shifts[row], np.nan), *limits)
-        starts.append(np.repeat(configurations[row : row + 1], len(turned), axis=0))
+        starts.append(np.tile(configurations[row], (len(turned), 1)))
         starts[-1][:, turning] = turned
     others = _track_within(request, np.concatenate(starts), bounds.lower, bounds.upper)
     return [LocalMotion.joined(pair) for pair in zip(shifted, others, strict=True)]
@@ -323,8 +325,7 @@ def _joints_at_new_poses(
 ) -> Array:
     """Return the nearest joints (K, n) that meet the poses which begin in a stretch and the tasks until then."""
     before = request.stretches[request.stretches.index(stretch) - 1]
-    begins = [request.tasks[i].is_pose and new for i, new in zip(stretch.tasks, stretch.new, strict=True)]
-    if not any(begins):
+    if not any(request.tasks[i].is_pose and new for i, new in zip(stretch.tasks, stretch.new, strict=True)):
         return joints
     tasks = [request.tasks[i] for i in sorted({*before.tasks, *stretch.tasks})]
     options: dict[str, Any] = {"time": stretch.begin, "base": base[0], "near": joints, **request.ik_options}
@@ -336,8 +337,7 @@ def _joints_at_new_poses(
         raise locate_error(request, error, stretch.begin) from error
     turning, candidates = request.turning_joints, [solution.joints for solution in solutions]
     turned = np.tile(candidates, (len(joints), 1, 1))
-    limits = lower[turning], upper[turning]
-    turned[:, :, turning] += whole_turns_between(turned[:, :, turning], joints[:, None, turning], *limits)
+    turned[:, :, turning] += whole_turns_between(turned, joints[:, None], lower, upper)[:, :, turning]
     distances = (request.weights * (joints[:, None] - turned) ** 2).sum(axis=2)
     return np.asarray(turned[np.arange(len(joints)), distances.argmin(axis=1)])
 

@@ -115,7 +115,11 @@ def _place_idle_joints(whole: PlanRequest, request: PlanRequest, configurations:
     places = np.array([all_joints(robot, held, configurations[0]) for held in choices])
     apart = [collision is None for collision in start_collisions(whole, places, still)]
     allowed = [held for held, is_apart in zip(choices, apart, strict=True) if is_apart or not any(apart)]
-    pairs = np.setdiff1d(np.arange(len(whole.clearance_constraints.scene.pairs)), still).tolist()
+    by_held = whole.clearance_constraints.scene.levers.joints[:, [name in own for name in robot.joint_names]] > 0
+    pairs = np.setdiff1d(np.flatnonzero(by_held.any(axis=1)), still).tolist()
+    others = np.setdiff1d(np.flatnonzero(~by_held.any(axis=1)), still).tolist()
+    free = [each is None for each in start_collisions(whole, all_joints(robot, own, configurations), others)]
+    configurations = configurations[free] if any(free) else configurations
 
     def clear(held: Mapping[str, float]) -> bool:
         return None in start_collisions(whole, all_joints(robot, held, configurations), pairs)
@@ -190,7 +194,7 @@ def fix_ignorable_joints(request: PlanRequest, configurations: Array) -> tuple[A
 
     if ignorable.any() and not clear_count(start):
         samples = sample_starts(
-            request.machine, bounds.lower, bounds.upper, request.settings.ik_starts, None, request.seed
+            request.machine, bounds.lower, bounds.upper, request.settings.ik_starts, seed=request.seed
         )
         start[ignorable] = max((start, *configurations, *samples), key=clear_count)[ignorable]
     return start, np.where(ignorable, start, configurations)
@@ -252,7 +256,7 @@ def _obstructing(whole: PlanRequest, request: PlanRequest, error: SolveError) ->
 def _nearest_positions(whole: PlanRequest, held: Mapping[str, float]) -> list[dict[str, float]]:
     """Return random positions of held joints within their limits, the nearest to the present ones first."""
     names, bounds = whole.machine.robot.joint_names, whole.bounds
-    samples = sample_starts(whole.machine, bounds.lower, bounds.upper, whole.settings.ik_starts, None, whole.seed)
+    samples = sample_starts(whole.machine, bounds.lower, bounds.upper, whole.settings.ik_starts, seed=whole.seed)
     columns = [names.index(name) for name in held]
     order = np.argsort(np.abs(samples[:, columns] - np.array([*held.values()])).max(axis=1), kind="stable")
     return [_named(whole.machine, sample, columns) for sample in samples[order]]

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from models import Box, Machine, Sphere
 from models.arrays import Array, ArrayInput
@@ -214,6 +215,12 @@ class Cost:
     def terms(self) -> tuple[str, ...]:
         """Names of the terms whose weights are not zero."""
         return tuple(name for name in (*self._single, *PER_JOINT) if np.any(np.asarray(getattr(self, name))))
+
+    def of_joints(self, chosen: NDArray[np.bool_]) -> Cost:
+        """Return the cost of a machine with the chosen joints alone. Shape (n,)."""
+        names = ("effort", "acceleration", "weights")
+        own: dict[str, Any] = {name: floats(getattr(self, name)) for name in names if np.ndim(getattr(self, name))}
+        return replace(self, **{name: values[chosen] for name, values in own.items()})
 
     def joint_weights(self, size: int) -> Array:
         """Return the weights of the joints, `velocity` included. Shape (size,).

@@ -31,7 +31,7 @@ from ocp.console import interruptible
 from ocp.direct.collocation import Collocation
 from ocp.errors import NOT_NUMBERS, ProblemError, checked_flag, checked_instance, checked_positive, floats, real
 from ocp.motion.builders.clearance import ClearanceConstraints
-from ocp.motion.builders.dynamics import DynamicsSetup, JointFriction, dynamics_problem, end_velocities
+from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem, end_velocities
 from ocp.motion.builders.dynamics_plan import within_limits
 from ocp.motion.builders.space.pair import (
     State,
@@ -47,6 +47,7 @@ from ocp.motion.builders.space.pair import (
     wheel_capacity,
 )
 from ocp.motion.builders.standing.problem import FreeTime
+from ocp.motion.builders.torques import JointFriction
 from ocp.motion.tasks.checks import checked_configuration, checked_horizon
 from ocp.motion.tasks.goals import Cost, Start
 from ocp.motion.tasks.limits import Limits

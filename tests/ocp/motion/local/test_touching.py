@@ -101,7 +101,7 @@ def test_what_is_not_near_is_told_by_a_number_between(near: float) -> None:
     around = CollisionScene(machines()["slider"], (*OBSTACLES, MOVING, HalfSpace((3, 0, 4), (0.2, 0.1, 0.3))))
     base, joints = configurations(around.machine, len(TIMES), 4)
     exact = distances_along(around, base, joints, TIMES)
-    found = distances_along(around, base, joints, TIMES, near)
+    found = distances_along(around, base, joints, TIMES, cutoff=near)
     below = exact < near
     assert_allclose(found[below], exact[below], atol=1e-12)
     assert (found[~below] >= near).all()
