@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from models.arrays import Array
+from models.checks import Array
 from ocp.audit.audit import Audit, Finding
 from ocp.audit.clearance import ClosestPair
 from ocp.direct.collocation import Collocation
@@ -344,11 +344,9 @@ class CandidateSolver(Solver):
         if _refinable_failures(audit):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", RefinementWarning)
-                current_mesh = _mesh_of(mesh, solution)
-                options = self._options(motion, current_mesh, solution.cost, self.settings.fine_options)
-                solution, audit = refine_from(
-                    motion.problem, current_mesh, (solution, audit), options=options, check=check
-                )
+                current, plan = _mesh_of(mesh, solution), (solution, audit)
+                options = self._options(motion, current, solution.cost, self.settings.fine_options)
+                solution, audit = refine_from(motion.problem, current, plan, options=options, check=check)
             if not _refinable_failures(audit):
                 refined_solution = self._refine_for_tasks(motion, mesh, solution, check)
                 if refined_solution is not solution:
@@ -478,13 +476,11 @@ class CandidateSolver(Solver):
 
     def plan(self, candidates: Sequence[Candidate]) -> SolvedPlan:
         """Return the plan of the first candidate, with the others."""
-        best = candidates[0]
+        best, parts = candidates[0], parts_of(self.motion.stretches)
         assert best.solution is not None
-        parts = parts_of(self.motion.stretches)
         if self.request.time_cost is not None:
             parts = (parts[0]._replace(end=float(best.solution[CLOCK][-1, 0])),)
-        request = self.request
-        whole = request.whole or request.machine
+        request, whole = self.request, self.request.whole or self.request.machine
         extended = [replace(c, start=all_joints(whole.robot, request.held, c.start)) for c in candidates]
         audits = {} if best.audit is None else {audit_key(): best.audit}
         plan = SolvedPlan(whole, best.solution, parts, tuple(extended), held=request.held, _audits=audits)

@@ -18,17 +18,9 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from models import CollisionScene, Machine, ModelError
-from models.arrays import Array
+from models.checks import Array
 from ocp.console import report
-from ocp.errors import (
-    ProblemError,
-    SolveError,
-    checked_choice,
-    checked_count,
-    checked_each,
-    checked_flag,
-    checked_instance,
-)
+from ocp.errors import ProblemError, SolveError, require
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.tool_motion import stretches_of
 from ocp.motion.builders.torques import checked_motors
@@ -265,22 +257,23 @@ def _try_alternatives(queue: CandidateQueue, solver: CandidateSolver, seeds: lis
     request, max_tries = solver.request, solver.settings.max_failures
     finished_by_seed = {id(candidate.seed): candidate for candidate in queue.candidates}
     rerouted = []
+    local = {id(seed): solver.local_collisions(seed.seed) for seed in seeds}
+    distances = {key: min((each.distance for each in found), default=np.inf) for key, found in local.items()}
     for seed in seeds:
         finished = finished_by_seed[id(seed.seed)]
         colliding = solver.collisions(finished)
         if finished.constraints is not None and (colliding or finished.constraints.margins):
-            local = solver.local_collisions(seed.seed)
-            constraints = finished.constraints.separating([*colliding, *local])
-            distance = min((collision.distance for collision in local), default=np.inf)
-            rerouted.append((distance, replace(seed, constraints=constraints)))
-    alternatives = [seed for _, seed in sorted(rerouted, key=lambda entry: -entry[0])[:max_tries]]
+            constraints = finished.constraints.separating([*colliding, *local[id(seed)]])
+            rerouted.append((distances[id(seed)], replace(seed, constraints=constraints)))
+    alternatives = sorted(rerouted, key=lambda entry: -entry[0])[:max_tries]
     if request.start is None:
         collisions = start_collisions(request, np.array([seed.start for seed in seeds]))
         clear_starts = [seed for seed, collision in zip(seeds, collisions, strict=True) if collision is None]
         tracked = [c for c in clear_starts if max(largest_pose_errors([*c.seed.local])) <= REACH_TOLERANCE]
         tracked.sort(key=lambda candidate: candidate.seed.cost)
-        alternatives += [replace(c, seed=replace(c.seed, direct=True, fixed=True)) for c in tracked[:max_tries]]
-    for seed in alternatives:
+        fixed = [(c, replace(c.seed, direct=True, fixed=True)) for c in tracked[:max_tries]]
+        alternatives += [(distances[id(c)], replace(c, seed=seed)) for c, seed in fixed]
+    for _, seed in sorted(alternatives, key=lambda entry: -entry[0]):
         start = seed.start
         queue.candidates = [c for c in queue.candidates if c.start is not start]  # it finishes again
         queue.run([seed])
@@ -338,7 +331,7 @@ def clearance_for(
     """
     if scene is False:
         return None
-    own = Scene() if scene is None else checked_instance("scene", scene, Scene)
+    own = Scene() if scene is None else require.instance("scene", scene, Scene)
     joint_limits = not isinstance(limits, Limits) or limits.joints
     report("collision scene")
     try:
@@ -367,15 +360,15 @@ def checked_request(
     Raises:
         ProblemError: As in `plan`.
     """
-    checked_choice("search", search, get_args(SearchKind))
-    checked_flag("cyclic", cyclic)
-    checked_count("seed", seed, 0, LARGEST_SEED)
-    all_tasks = (tasks,) if isinstance(tasks, TipTask) else checked_each("tasks", tasks, TipTask)
+    require.choice("search", search, get_args(SearchKind))
+    require.flag("cyclic", cyclic)
+    require.count("seed", seed, 0, LARGEST_SEED)
+    all_tasks = (tasks,) if isinstance(tasks, TipTask) else require.each("tasks", tasks, TipTask)
     bind(machine, all_tasks)  # checks the tasks against the machine
-    checked_limits = Limits() if limits is None else checked_instance("limits", limits, Limits)
+    checked_limits = Limits() if limits is None else require.instance("limits", limits, Limits)
     free = isinstance(horizon, str)
     if free:
-        checked_choice("horizon", horizon, ("free",))
+        require.choice("horizon", horizon, ("free",))
         if search == "global":
             words = "search='global' needs a fixed horizon; give it in s, or use search='configurations'"
             raise ProblemError(words, name="search", value="global")
@@ -417,7 +410,7 @@ def _checked_cost(machine: Machine, cost: Any, free: bool) -> Cost:
     """
     if cost is None:
         return Cost(time=float(free))
-    own = checked_instance("cost", cost, Cost)
+    own = require.instance("cost", cost, Cost)
     if weights_actuators(own):
         checked_motors("plan: cost", machine)
     if own.turning and not machine.base_size:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models import Machine
-from models.arrays import Array
+from models.checks import Array
 from models.machines.machine import hold_joints
 from ocp.errors import ProblemError
 from ocp.motion.builders.clearance import ClearanceConstraints

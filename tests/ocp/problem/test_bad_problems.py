@@ -226,7 +226,6 @@ DECLARATIONS = [
     about_phases("minimize", {"terminal": 0.0}, running={"one": 1.0}, terminal=EXPRESSION | {"two": [1.0, 2.0]}),
     about_phases("__getitem__", {"name": "one"}, name=NAME | {"unknown": "three"}),
     about_phases("of", {"phase": "one"}, phase=NAME | {"unknown": "three"}),
-    about_phases("guess", {"plans": {}}, plans=MAPPING | {"no plan": {"one": 1.0}, "unknown": {"three": None}}),
     about_blank("minimize", {"running": "the state"}, running=EXPRESSION | {"two": [1.0, 2.0]}, terminal=EXPRESSION),
 ]
 

@@ -157,6 +157,8 @@ def test_balls_about_bodies_are_no_farther_apart_than_the_bodies() -> None:
     places = np.concatenate([np.swapaxes(turns(rng, 150), 1, 2).reshape(-1, 9), rng.normal(size=(150, 3))], axis=1)
     frames = frames_of(places.reshape(50, 36))
     bodies = BodyPairs([*hulls, ground], pairs, {})
+    together = [bodies.balls(frames, np.arange(50), np.full(50, pair)) for pair in range(len(pairs))]
+    assert_allclose(bodies.all_balls(frames), np.transpose(together), atol=1e-12)
     for kind in group_pairs([*hulls, ground], pairs):
         for pair in np.flatnonzero(kind.has):
             one, other = ([*hulls, ground][k] for k in pairs[pair, :2])
