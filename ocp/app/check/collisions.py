@@ -116,7 +116,7 @@ def _with_beginnings(scene: CollisionScene, motion: Motion, faults: list[Fault])
     worst_times = np.array([fault.time for fault in faults])
     times = np.unique(np.concatenate([motion.t[:: len(motion.t) // 1000 + 1], worst_times]))
     base = scene.machine.base_home()
-    distances = distances_along(scene, base, motion.position.at(times), times, scene.clearance)
+    distances = distances_along(scene, base, motion.position.at(times), times, cutoff=scene.clearance)
     columns = {" and ".join(pair): k for k, pair in enumerate(scene.labels)}
     dated_faults = []
     for fault in faults:

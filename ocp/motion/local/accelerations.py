@@ -107,7 +107,7 @@ class _TaskHierarchy:
         self.accelerations = self.accelerations + ca.mtimes(self.projector, direction)
 
 
-def checked_law(machine: Standing, size: int, law: Law, layers: Sequence[Layer], damping: float) -> None:
+def checked_law(machine: Standing, size: int, law: Law, layers: Sequence[Layer], *, damping: float) -> None:
     """Raise ProblemError if a law is unknown or needs more joints than the machine has.
 
     Args:
@@ -344,7 +344,7 @@ def resolve_accelerations(
     )
     require.flag("stop_at_lift_off", stop_at_lift_off)
     joints, base = checked_configuration(machine, start_joints, None)
-    checked_law(machine, equations.size, law, layers, null_damping)
+    checked_law(machine, equations.size, law, layers, damping=null_damping)
     for name, number in (("step", step), ("tolerance", tolerance), ("speed_limit", speed_limit)):
         require.positive(name, number)
     require.choice("integrator", integrator, ("rk4", "cvodes"))

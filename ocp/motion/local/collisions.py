@@ -98,7 +98,7 @@ def find_collisions(scene: CollisionScene, base: Array, joints: Array, times: Ar
 
     The arguments are those of `distances_along`.
     """
-    distances = distances_along(scene, base, joints, times, scene.clearance)
+    distances = distances_along(scene, base, joints, times, cutoff=scene.clearance)
     if not distances.size:
         return []
     closest, labels, collisions = distances.argmin(axis=0), scene.labels, list[Collision]()

@@ -128,11 +128,11 @@ def inverse_kinematics(
 ) -> list[IkSolution]:
     """Return distinct joint positions at which the machine does its pose tasks, the best first.
 
-    If the task is one pose of the tip of an arm on a fixed base, its solutions are listed on all branches (see
-    `ik_configurations`, which also tells whether they are all). If there are more joints than rows, the solutions form
-    families, of which members at samples of the free parameters are listed. For other tasks and machines, and where the
-    list is not certain to be complete or has fewer than `starts` members because few samples keep the limits, damped
-    Gauss-Newton iterations begin at random starts, of which each gives one solution at most.
+    If the task is one pose of the tip of an arm on a fixed base, its solutions are listed on all branches, see
+    `ik_configurations`. With more joints than rows they form families, of which members at samples of the free
+    parameters are listed. Damped Gauss-Newton iterations from random starts, each of which leads to one solution at
+    most, solve other tasks and machines. They complete lists that may be incomplete, or that have too few members
+    because few samples keep the limits.
 
     Args:
         machine: Any machine; a floating base stays at `base`.
@@ -161,10 +161,8 @@ def inverse_kinematics(
     """
     equations = bind(machine, task)
     if not machine.joint_size:
-        words = "inverse_kinematics: the robot has no moving joint"
-        raise ProblemError(words, name="machine", value=machine)
-    pose_tasks = tuple(part for part in equations.bound if part.task.is_pose)
-    if not pose_tasks:
+        raise ProblemError("inverse_kinematics: the robot has no moving joint", name="machine", value=machine)
+    if not (pose_tasks := tuple(part for part in equations.bound if part.task.is_pose)):
         words = "inverse kinematics need a pose: task=TipTask(position=..., orientation=... or direction=...)"
         raise ProblemError(words, name="task")
     equations = TaskEquations(machine, pose_tasks)
@@ -182,7 +180,7 @@ def inverse_kinematics(
     base_values = checked_configuration(machine, np.zeros(size), base)[1]
     unbounded = np.full(size, np.inf)
     lower, upper = (machine.robot.lower, machine.robot.upper) if limits else (-unbounded, unbounded)
-    first = sample_starts(machine, lower, upper, int(starts), near, seed)
+    first = sample_starts(machine, lower, upper, int(starts), near=near, seed=seed)
     targets = np.array(equations.target_function()(float(time))).ravel()
     if not np.isfinite(targets).all():
         words = f"the task's targets are not finite at {time:g} s"
@@ -230,7 +228,7 @@ def inverse_kinematics_at(
     """
     machine, unbounded = equations.machine, np.full(equations.machine.joint_size, np.inf)
     lower, upper = (machine.robot.lower, machine.robot.upper) if limits else (-unbounded, unbounded)
-    first = sample_starts(machine, lower, upper, starts, near, seed)
+    first = sample_starts(machine, lower, upper, starts, near=near, seed=seed)
     return _MultiStart(equations, np.zeros(0), targets, lower, upper, tolerance).solve(first, starts)
 
 
@@ -262,7 +260,8 @@ class _MultiStart:
         if not (error <= self.tolerance).any():
             nearest = int(error.argmin())
             misses = self.equations.misses(self.base, q[nearest], self.targets)
-            raise unreachable_error(self.equations, q[nearest], float(error[nearest]), lower, upper, misses=misses)
+            details: Any = {"lower": lower, "upper": upper, "misses": misses}
+            raise unreachable_error(self.equations, q[nearest], float(error[nearest]), **details)
         return self.rank(q, error)
 
     def list_branches(self, count: int, seed: int) -> tuple[Array, int]:
@@ -282,7 +281,8 @@ class _MultiStart:
         """Return joints (K, n) and largest pose errors (K,) after the iterations from these joints."""
         fixed = ca.DM(self.base), ca.DM(self.targets)
         function = self.equations.pose_residual_function
-        return gauss_newton(function, joints, self.lower, self.upper, self.tolerance, self.iterations, fixed)
+        options: Any = {"tolerance": self.tolerance, "iterations": self.iterations, "fixed": fixed}
+        return gauss_newton(function, joints, self.lower, self.upper, **options)
 
     def rank(self, joints: Array, errors: Array) -> list[IkSolution]:
         """Return the distinct solutions among candidates, the best first."""
@@ -305,7 +305,7 @@ class _MultiStart:
         return np.array([joint.kind != "prismatic" for joint in self.equations.machine.robot.moving_joints])
 
 
-def equivalent_pose(machine: Machine, task: TipTask, start: Array, time: float, base: Any = ()) -> TipTask | None:
+def equivalent_pose(machine: Machine, task: TipTask, start: Array, time: float, *, base: Any = ()) -> TipTask | None:
     """Return a task as a pose task at a time; None if its pose depends on the path or has a start gap to close.
 
     Args:
@@ -330,7 +330,7 @@ def equivalent_pose(machine: Machine, task: TipTask, start: Array, time: float, 
     return replace(task, velocity=None, rows=rows, position=np.array(ca.DM(origin)).ravel() + displacement)
 
 
-def sample_starts(machine: Machine, lower: Array, upper: Array, count: int, near: Any, seed: int) -> Array:
+def sample_starts(machine: Machine, lower: Array, upper: Array, count: int, *, near: Any = None, seed: int) -> Array:
     """Return the starts: those of `near`, then `count` random ones between the limits. Shape (K, n)."""
     size, rng = machine.joint_size, np.random.default_rng(seed)
     prismatic = np.array([joint.kind == "prismatic" for joint in machine.robot.moving_joints])
@@ -355,6 +355,7 @@ def gauss_newton(
     starts: Array,
     lower: Array,
     upper: Array,
+    *,
     tolerance: float,
     iterations: int,
     fixed: Sequence[Any] = (),
@@ -363,7 +364,7 @@ def gauss_newton(
 
     Args:
         function: CasADi Function of the joints and `fixed` -> (residual, its Jacobian).
-        first: Starts. Shape (K, n).
+        starts: Starts. Shape (K, n).
         lower, upper: Limits of the joints. Shape (n,).
         tolerance: Largest residual of a solution.
         iterations: Largest number of iterations.
@@ -396,11 +397,8 @@ def gauss_newton(
         better = active & (new_cost < cost)
         q[better], residual[better], jacobian[better] = trial[better], new_residual[better], new_jacobian[better]
         cost[better] = new_cost[better]
-        decreased, increased = (
-            np.maximum(IK_SETTINGS.shrinkage * damping, IK_SETTINGS.least_damping),
-            IK_SETTINGS.growth * damping,
-        )
-        damping = np.where(better, decreased, np.where(active, increased, damping))
+        decreased = np.maximum(IK_SETTINGS.shrinkage * damping, IK_SETTINGS.least_damping)
+        damping = np.where(better, decreased, np.where(active, IK_SETTINGS.growth * damping, damping))
     return q, np.abs(residual).max(axis=1)
 
 
@@ -466,9 +464,9 @@ def unreachable_error(
     equations: TaskEquations,
     joints: Array,
     pose_error: float,
+    *,
     lower: Array,
     upper: Array,
-    *,
     misses: tuple[float, float],
 ) -> Unreachable:
     """Return the error for a pose without solution, with the nearest miss.

@@ -476,13 +476,11 @@ class CandidateSolver(Solver):
 
     def plan(self, candidates: Sequence[Candidate]) -> SolvedPlan:
         """Return the plan of the first candidate, with the others."""
-        best = candidates[0]
+        best, parts = candidates[0], parts_of(self.motion.stretches)
         assert best.solution is not None
-        parts = parts_of(self.motion.stretches)
         if self.request.time_cost is not None:
             parts = (parts[0]._replace(end=float(best.solution[CLOCK][-1, 0])),)
-        request = self.request
-        whole = request.whole or request.machine
+        request, whole = self.request, self.request.whole or self.request.machine
         extended = [replace(c, start=all_joints(whole.robot, request.held, c.start)) for c in candidates]
         audits = {} if best.audit is None else {audit_key(): best.audit}
         plan = SolvedPlan(whole, best.solution, parts, tuple(extended), held=request.held, _audits=audits)

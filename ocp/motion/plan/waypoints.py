@@ -434,7 +434,7 @@ class _WaypointPlanner:
         colliding: NDArray[np.bool_] = np.zeros(len(joints), dtype=bool)
         if self.scene is not None:
             times, clearance = indices.astype(float), self.scene.clearance
-            distances = distances_along(self.scene, np.zeros(0), joints, times, clearance)
+            distances = distances_along(self.scene, np.zeros(0), joints, times, cutoff=clearance)
             colliding = np.asarray((distances < clearance).any(axis=1))
         words = ""
         if errors.max() > self.settings.pose_tolerance:

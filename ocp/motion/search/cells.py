@@ -326,7 +326,9 @@ class _CellPass:
             valid &= cone_violations.max(axis=1, initial=0.0) <= REACH_TOLERANCE
         if self.request.clearance_constraints is not None and valid.any():
             scene, rows = self.request.clearance_constraints.scene, np.flatnonzero(valid)
-            distances = distances_along(scene, layer.base[rows], layer.joints[rows], times[rows], scene.clearance)
+            distances = distances_along(
+                scene, layer.base[rows], layer.joints[rows], times[rows], cutoff=scene.clearance
+            )
             valid[rows] = (distances >= scene.clearance).all(axis=1)
         return np.asarray(valid)
 

@@ -255,10 +255,9 @@ def describe_alternatives(count: int | Unreachable | None) -> list[str]:
 def local_motions_from(request: PlanRequest, configurations: Array) -> list[LocalMotion]:
     """Track the tasks from all configurations (K, n) by resolved-rate control; return one result per stretch.
 
-    Joints that can turn wholly within their limits are tracked without limits at first, since a motion is the same from
-    all turns of its start. It is then shifted by whole turns to the middle of the limits. A motion that does the tasks,
-    but leaves the limits from every turn, is tracked again within them from all turns of its start. There may
-    therefore be more than K motions, and they begin at `motions[0].joints[:, 0]`.
+    A motion is the same from all whole turns of its start. Joints that can make a turn within their limits are
+    therefore tracked without limits, and the motion is shifted to the middle of them. If it does the tasks, but fits
+    nowhere, it is tracked within the limits from all turns: there may be more than K motions.
 
     Raises:
         Unreachable: A pose that no joints within their limits reach.
@@ -266,8 +265,7 @@ def local_motions_from(request: PlanRequest, configurations: Array) -> list[Loca
     turning, lower, upper = request.turning_joints, request.bounds.lower.copy(), request.bounds.upper.copy()
     lower[turning], upper[turning] = -np.inf, np.inf
     motions = _track_within(request, configurations, lower, upper)
-    if turning.size:
-        motions = _within_limits(request, configurations, motions)
+    motions = _within_limits(request, configurations, motions) if turning.size else motions
     if min(largest_pose_errors(motions)) > REACH_TOLERANCE:
         _check_reach(request, motions)
     return motions
@@ -293,9 +291,9 @@ def _track_within(request: PlanRequest, configurations: Array, lower: Array, upp
                 options: dict[str, Any] = {"weights": request.weights, "damping": damping}
                 motions.append(track_tasks(equations, joints, base, times, lower=lower, upper=upper, **options))
             base, joints = motions[-1].base[:, -1], motions[-1].joints[:, -1]
-        least_damped = least_damped or motions
         if min(largest_pose_errors(motions)) <= REACH_TOLERANCE:
             return motions
+        least_damped = least_damped or motions
     return least_damped
 
 
@@ -315,7 +313,7 @@ def _within_limits(request: PlanRequest, configurations: Array, motions: Sequenc
     for row in np.flatnonzero(~inside & tracked):
         start = configurations[row, turning]
         turned = all_turns(start, np.where(fits[row], start + shifts[row], np.nan), *limits)
-        starts.append(np.repeat(configurations[row : row + 1], len(turned), axis=0))
+        starts.append(np.tile(configurations[row], (len(turned), 1)))
         starts[-1][:, turning] = turned
     others = _track_within(request, np.concatenate(starts), bounds.lower, bounds.upper)
     return [LocalMotion.joined(pair) for pair in zip(shifted, others, strict=True)]
@@ -326,8 +324,7 @@ def _joints_at_new_poses(
 ) -> Array:
     """Return the nearest joints (K, n) that meet the poses which begin in a stretch and the tasks until then."""
     before = request.stretches[request.stretches.index(stretch) - 1]
-    begins = [request.tasks[i].is_pose and new for i, new in zip(stretch.tasks, stretch.new, strict=True)]
-    if not any(begins):
+    if not any(request.tasks[i].is_pose and new for i, new in zip(stretch.tasks, stretch.new, strict=True)):
         return joints
     tasks = [request.tasks[i] for i in sorted({*before.tasks, *stretch.tasks})]
     options: dict[str, Any] = {"time": stretch.begin, "base": base[0], "near": joints, **request.ik_options}
@@ -339,8 +336,7 @@ def _joints_at_new_poses(
         raise locate_error(request, error, stretch.begin) from error
     turning, candidates = request.turning_joints, [solution.joints for solution in solutions]
     turned = np.tile(candidates, (len(joints), 1, 1))
-    limits = lower[turning], upper[turning]
-    turned[:, :, turning] += whole_turns_between(turned[:, :, turning], joints[:, None, turning], *limits)
+    turned[:, :, turning] += whole_turns_between(turned, joints[:, None], lower, upper)[:, :, turning]
     distances = (request.weights * (joints[:, None] - turned) ** 2).sum(axis=2)
     return np.asarray(turned[np.arange(len(joints)), distances.argmin(axis=1)])
 

@@ -301,7 +301,7 @@ def _find_obstructions(search: AtlasSearch, front: _Propagation) -> list[Obstruc
     distances = np.full((len(targets), 1), np.inf)
     if scene is not None:
         times = np.full(len(targets), search.times[next_sample])
-        distances = distances_along(scene, np.zeros(0), targets, times, clearance)
+        distances = distances_along(scene, np.zeros(0), targets, times, cutoff=clearance)
     displacements = np.abs(targets - before)
     over, under = targets - space.upper, space.lower - targets
     excess = np.column_stack([pose_errors, over, under, displacements - limits, clearance - distances])

@@ -197,7 +197,7 @@ def fix_ignorable_joints(request: PlanRequest, configurations: Array) -> tuple[A
 
     if ignorable.any() and not clear_count(start):
         samples = sample_starts(
-            request.machine, bounds.lower, bounds.upper, request.settings.ik_starts, None, request.seed
+            request.machine, bounds.lower, bounds.upper, request.settings.ik_starts, seed=request.seed
         )
         start[ignorable] = max((start, *configurations, *samples), key=clear_count)[ignorable]
     return start, np.where(ignorable, start, configurations)
@@ -259,7 +259,7 @@ def _obstructing(whole: PlanRequest, request: PlanRequest, error: SolveError) ->
 def _nearest_positions(whole: PlanRequest, held: Mapping[str, float]) -> list[dict[str, float]]:
     """Return random positions of held joints within their limits, the nearest to the present ones first."""
     names, bounds = whole.machine.robot.joint_names, whole.bounds
-    samples = sample_starts(whole.machine, bounds.lower, bounds.upper, whole.settings.ik_starts, None, whole.seed)
+    samples = sample_starts(whole.machine, bounds.lower, bounds.upper, whole.settings.ik_starts, seed=whole.seed)
     columns = [names.index(name) for name in held]
     order = np.argsort(np.abs(samples[:, columns] - np.array([*held.values()])).max(axis=1), kind="stable")
     return [_named(whole.machine, sample, columns) for sample in samples[order]]

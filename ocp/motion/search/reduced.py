@@ -305,7 +305,7 @@ def check_floating_reach(
     n, attitude_size = machine.joint_size, 1 if machine.base_size == 3 else 4
     rng = np.random.default_rng(seed)
     attitudes = rng.normal(size=(STARTS, 4)) if attitude_size == 4 else rng.uniform(-np.pi, np.pi, (STARTS, 1))
-    starts = np.hstack([sample_starts(machine, lower, upper, STARTS, None, seed), attitudes])
+    starts = np.hstack([sample_starts(machine, lower, upper, STARTS, seed=seed), attitudes])
     unlimited = np.full(attitude_size, np.inf)
     limits = np.concatenate([lower, -unlimited]), np.concatenate([upper, unlimited])
     solutions = np.zeros((0, n + attitude_size))  # solutions at the preceding time
@@ -316,7 +316,7 @@ def check_floating_reach(
         poses = []
         for task in tasks:
             if task.begin <= time <= task.end and (task.is_pose or not task.begin):
-                pose = equivalent_pose(machine, task, start, time, base)
+                pose = equivalent_pose(machine, task, start, time, base=base)
                 poses += [] if pose is None else [pose]
         if not poses:
             return None
@@ -326,7 +326,9 @@ def check_floating_reach(
         base_then = _base_about_center_of_mass(machine, base, start, z, time)
         residual = equations.pose_residual(base_then, z[:n], ca.SX(ca.DM(targets)))
         function = ca.Function("pose_residual", [z], [residual, ca.densify(ca.jacobian(residual, z))], {"cse": True})
-        candidates, errors = gauss_newton(function, np.vstack([solutions, starts]), *limits, PLACE_TOLERANCE, 100)
+        candidates, errors = gauss_newton(
+            function, np.vstack([solutions, starts]), *limits, tolerance=PLACE_TOLERANCE, iterations=100
+        )
         reached = errors <= PLACE_TOLERANCE
         if reached.any():
             solutions = candidates[reached][:STARTS]
@@ -334,7 +336,8 @@ def check_floating_reach(
         best = int(errors.argmin())
         place = ca.Function("base", [z], [base_then])(candidates[best])
         misses = equations.misses(place, candidates[best, :n], targets)
-        return unreachable_error(equations, candidates[best, :n], float(errors[best]), lower, upper, misses=misses)
+        details: dict[str, Any] = {"lower": lower, "upper": upper, "misses": misses}
+        return unreachable_error(equations, candidates[best, :n], float(errors[best]), **details)
 
     reached = begin
     for time in np.linspace(begin, end, CHECKED_TIMES).tolist():

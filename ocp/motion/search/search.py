@@ -159,7 +159,7 @@ class AtlasSearch:
         if scene is None or not len(charts):
             return np.ones(len(charts), dtype=bool)
         times, base = np.full(len(charts), self.times[k]), np.zeros(0)
-        distances = distances_along(scene, base, charts.centers, times, scene.clearance)
+        distances = distances_along(scene, base, charts.centers, times, cutoff=scene.clearance)
         return np.asarray((distances + charts.spans @ scene.levers.joints.T >= scene.clearance).all(axis=1))
 
     def graph(self, layers: list[Charts], max_costs: Any = np.inf) -> ChartGraph:
@@ -419,7 +419,7 @@ class AtlasSearch:
         if scene is not None:
             rows = np.flatnonzero(valid)
             times = np.full(len(rows), self.times[k])
-            distances = distances_along(scene, np.zeros(0), joints[rows], times, scene.clearance)
+            distances = distances_along(scene, np.zeros(0), joints[rows], times, cutoff=scene.clearance)
             valid[rows] = (distances >= scene.clearance).all(axis=1)
         return valid
 

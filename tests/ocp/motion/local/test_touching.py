@@ -105,7 +105,7 @@ def test_distances_that_are_not_small_are_bounded_from_both_sides(near: float) -
     around = CollisionScene(machines()["slider"], (*OBSTACLES, MOVING, HalfSpace((3, 0, 4), (0.2, 0.1, 0.3))))
     base, joints = configurations(around.machine, len(TIMES), 4)
     exact = distances_along(around, base, joints, TIMES)
-    result = distances_along(around, base, joints, TIMES, near)
+    result = distances_along(around, base, joints, TIMES, cutoff=near)
     below = exact < near
     assert_allclose(result[below], exact[below], atol=1e-12)
     assert (result[~below] >= near).all()
