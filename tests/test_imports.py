@@ -23,7 +23,7 @@ Rule: TypeAlias = Callable[["Architecture"], list[str]]
 LAYERS = {
     "models": [
         ["errors", "files"],
-        ["arrays"],
+        ["checks"],
         ["spatial"],
         ["robot", "paths"],
         ["shapes"],
@@ -49,7 +49,7 @@ LAYERS = {
 """Packages and single modules of each package, from the lowest layer up: each may import from lower layers only."""
 MACHINES = {"ocp.motion", "ocp.app"}
 """What may import `models`: all else knows no machine, beyond the modules of MATHEMATICS."""
-MATHEMATICS = {"models.arrays", "models.errors", "models.files", "models.shapes.hull"}
+MATHEMATICS = {"models.checks", "models.errors", "models.files", "models.shapes.hull"}
 FOREIGN = {"models": {"casadi", "collada", "numpy", "scipy"}}
 LARGEST_PACKAGE = 14
 LARGEST_MODULE = 500
@@ -338,8 +338,8 @@ PLANTED: list[tuple[Rule, str, dict[str, str]]] = [
 ]
 
 
-@pytest.mark.parametrize(("rule", "told", "lines"), PLANTED, ids=[f"{p[0].__name__}: {p[1]}" for p in PLANTED])
-def test_a_planted_violation_is_named(rule: Rule, told: str, lines: dict[str, str], tmp_path: Path) -> None:
+@pytest.mark.parametrize(("rule", "report", "lines"), PLANTED, ids=[f"{p[0].__name__}: {p[1]}" for p in PLANTED])
+def test_a_planted_violation_is_named(rule: Rule, report: str, lines: dict[str, str], tmp_path: Path) -> None:
     files = {file: SOUND.get(file, "") + line + "\n" for file, line in lines.items()}
     broken = rule(architecture_of(tmp_path, {**SOUND, **files}))
-    assert any(told in message for message in broken), broken
+    assert any(report in message for message in broken), broken

@@ -1,7 +1,4 @@
-"""Optimal control problems, declared variable by variable and equation by equation. Declaring solves nothing.
-
-``str(problem)`` shows all declarations, one a line.
-"""
+"""Optimal control problems, declared variable by variable and equation by equation. Declaring solves nothing."""
 
 from __future__ import annotations
 
@@ -15,7 +12,7 @@ from typing import Any, ParamSpec, TypeVar, cast
 import casadi as ca
 import numpy as np
 
-from ocp.errors import ProblemError, checked_count, checked_text, error_names, unknown_name
+from ocp.errors import ProblemError, error_names, require
 from ocp.problem.declarations import (
     ENDS,
     Constraint,
@@ -96,7 +93,7 @@ class Problem:
         if symbols not in (ca.SX, ca.MX):
             words = f"problem {name!r}: symbols must be casadi.SX or casadi.MX, not {symbols!r}"
             raise ProblemError(words, name="symbols", value=symbols)
-        if not checked_text("problem: its name", name):
+        if not require.text("problem: its name", name):
             raise ProblemError("a problem needs a name", name="name", value=name)
         self.name = name
         self.symbols = symbols
@@ -164,8 +161,7 @@ class Problem:
             guess: A value, or a function ``time -> value``.
             unit: Shown beside the values, "rad" or "m/s"; for mixed entries all units, "rad, m".
             scale: Typical size of the entries, by which the solver divides them; nan for an entry, None for all,
-                derives it from the other values and does not scale values of ordinary size. Give it if the entries of
-                one vector differ by orders of magnitude, such as the speeds of a rotor and of an arm.
+                derives it. Give it if entries of one vector differ by orders of magnitude, as rotor and arm speeds do.
         """
         what, values = f"state {name!r}", {"initial": initial, "terminal": terminal, "lower": lower, "upper": upper}
         variable = self._variable("state", name, size, values, guess, unit, scale)
@@ -196,7 +192,7 @@ class Problem:
     @_about_its_name
     def parameter(self, name: str, size: int = 1) -> Any:
         """Declare a parameter, whose value is given to the solve, and return its symbol, shape (n, 1)."""
-        size = checked_count(f"parameter {name!r}: size", size)
+        size = require.count(f"parameter {name!r}: size", size)
         self.declared.parameters[name] = Variable(name, self._symbol("parameter", name, size))
         return self.declared.parameters[name].symbol
 
@@ -445,7 +441,7 @@ class Problem:
         self, kind: str, name: str, size: int | None, values: dict[str, Value], guess: Guess, unit: str, scale: Value
     ) -> Variable:
         what = f"{kind} {name!r}"
-        checked_text(f"{what}: unit", unit)
+        require.text(f"{what}: unit", unit)
         size = number_of_entries(what, size, {**values, "guess": guess})
         symbol = self._symbol(kind, name, size)
         low, high = self._reader.bounds(what, size, values["lower"], values["upper"])
@@ -474,18 +470,15 @@ class Problem:
         if isinstance(symbol, str):
             if symbol in pool:
                 return pool[symbol]
-            raise unknown_name(f"variable in {what}", symbol, pool)
+            raise require.unknown(f"variable in {what}", symbol, pool)
         if isinstance(symbol, self.symbols) and symbol.is_valid_input():
             identities = [identity(s) for s in ca.symvar(symbol)]
             for variable in pool.values():
                 if [identity(s) for s in ca.symvar(variable.symbol)] == identities:
                     return variable
-        raise ProblemError(
-            f"{what}: {symbol!r} is not a declared {'state' if what == 'dynamics' else 'state or control'} of "
-            f"problem {self.name!r}; known: {', '.join(pool) or 'none'}",
-            name="state" if what == "dynamics" else "variable",
-            limit=tuple(pool),
-        )
+        kind, name = ("state", "state") if what == "dynamics" else ("state or control", "variable")
+        words = f"{what}: {symbol!r} is not a declared {kind} of problem {self.name!r}"
+        raise ProblemError(f"{words}; known: {', '.join(pool) or 'none'}", name=name, limit=tuple(pool))
 
     def _constraint(
         self,

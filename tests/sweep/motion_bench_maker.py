@@ -22,7 +22,7 @@ import numpy as np
 import pinocchio as pin
 
 from models import Box, CollisionScene, Cylinder, FixedBase, Robot, Sphere
-from models.arrays import Array
+from models.checks import Array
 from ocp import Cost, Limits, Plan, SolveError
 from ocp.app.files.safe_files import read_tree
 from ocp.motion.builders.clearance import ClearanceConstraints
@@ -173,7 +173,7 @@ def main() -> None:
     for row in sweep.rows(lambda kind, seed, _: result(options.data, kind, seed)):
         rows.append(row)
         print(row, flush=True)
-    print(sweep.told(rows))
+    print(sweep.summary(rows))
     for mode in ("", " time"):
         planned = [row for row in rows if row["kind"].endswith(" time") == bool(mode) and "length" in row]
         if planned:

@@ -28,7 +28,7 @@ import casadi as ca
 import numpy as np
 
 from models import FixedBase
-from models.arrays import Array
+from models.checks import Array
 from ocp.curves import PiecewisePolynomial
 from ocp.errors import SolveError, SolverStatus
 from ocp.motion.builders.torques import joint_torques

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from models import FixedBase
-from models.arrays import Array
+from models.checks import Array
 from ocp.console import TimeLimitReached, time_left, time_limited
 from ocp.direct.guess import Samples
 from ocp.errors import SolveError

@@ -27,7 +27,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.interpolate import BSpline
 
-from models.arrays import Array
+from models.checks import Array
 from ocp.console import TimeLimitReached, check_time
 from ocp.errors import SolveError
 from ocp.motion.builders.constant_jerk import ConstantJerkMotion, TorqueLimits

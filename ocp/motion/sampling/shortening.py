@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from models.arrays import Array
+from models.checks import Array
 from ocp.console import check_time
 from ocp.motion.sampling.straight import StraightMotions
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from models import SmoothPath
-from models.arrays import Array
+from models.checks import Array
 from models.paths import Blend, gauss_newton, march, predictor_corrector
 from models.paths.blends import BlendKind, arc_length, polynomial
 from ocp.motion.schedule import Schedule, SpeedProfile
@@ -47,8 +47,8 @@ def mapping_errors(blend: Blend, distances: Array, period: float, mapping: Any) 
 
 def samples_in(blend: Blend, profile: SpeedProfile, period: float) -> Array:
     """Distances from a blend's start of the control instants inside it. Shape (M,), m."""
-    instants = np.arange(int(profile.duration / period) + 1) * period
-    along = profile.at(instants).distance - blend.start
+    time_samples = np.arange(int(profile.duration / period) + 1) * period
+    along = profile.at(time_samples).distance - blend.start
     # the first sample at the very start would be a step of rounding size
     return np.asarray(along[(along > 1e-12) & (along < blend.length)])
 

@@ -42,7 +42,7 @@ def test_forward_kinematics_are_those_of_the_arm_as_a_tree_of_links(seed: int) -
 
 
 @given(seeds, st.sampled_from(["left", "right"]), st.sampled_from(["inside", "stretched", "folded"]))
-def test_the_inverse_leads_back_to_the_point_with_the_elbow_asked(seed: int, elbow: Any, where: str) -> None:
+def test_the_inverse_leads_back_to_the_point_with_the_requested_elbow(seed: int, elbow: Any, where: str) -> None:
     rng = np.random.default_rng(seed)
     arm = Scara(10 ** rng.uniform(-1, 1), 10 ** rng.uniform(-1, 1), mount=rng.normal(size=3))
     radius = {"inside": rng.uniform(arm.inner, arm.outer), "stretched": arm.outer, "folded": arm.inner}[where]
@@ -76,8 +76,8 @@ def test_the_turn_is_the_smallest_that_brings_a_range_within_its_limits_and_none
     quill = arm.robot.moving_joints[joint].kind == "prismatic"
     turns = [0.0] if quill else sorted((2 * np.pi * k for k in range(-9, 10)), key=abs)
     held = [turn for turn in turns if low[joint] <= least + turn and most + turn <= high[joint]]
-    found = arm.whole_turn(joint, least, most)
-    assert found == (pytest.approx(held[0], abs=1e-12) if held else None)
+    result = arm.whole_turn(joint, least, most)
+    assert result == (pytest.approx(held[0], abs=1e-12) if held else None)
 
 
 @settings(max_examples=40)
@@ -139,27 +139,27 @@ TILTED = Path.through([(0.5, 0, 0), (0.5, 0.2, 0)], [turned((0, 0, 0)), turned((
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Scara(0.0, 1.0), "upper_arm 0.0 m is not positive"),
-        (lambda: Scara(1.0, NAN), "forearm nan"),
+        (lambda: Scara(0.0, 1.0), r"upper_arm must be positive and finite \(in m\), not 0.0"),
+        (lambda: Scara(1.0, NAN), "forearm must be .*, not nan"),
         (lambda: Scara(1.0, 1.0, lower=(1, 0, 0, 0), upper=(0, 0, 0, 0)), "'shoulder'"),
         (lambda: Scara(1.0, 1.0, names=("a", "a", "b", "c")), "four that differ"),
         (lambda: EVEN.inverse((0.81, 0, 0)), "unreachable"),
         (lambda: Scara(0.4, 0.3).inverse((0.05, 0, 0)), r"unreachable.*from 0\.1 to 0\.7"),
         (lambda: EVEN.inverse((NAN, 0, 0)), "not finite"),
         (lambda: EVEN.inverse((0.5, 0, 0), NAN), "yaw"),
-        (lambda: EVEN.inverse((0.5, 0, 0), 0.0, "up"), "elbow 'up'"),  # type: ignore[arg-type]
+        (lambda: EVEN.inverse((0.5, 0, 0), 0.0, "up"), "elbow must be .*, not 'up'"),  # type: ignore[arg-type]
         (lambda: EVEN.forward((0, 0, 0)), r"joints has shape \(3, 1\)"),
         (lambda: along((0.5, 0, 0), (-0.5, 0, 0)), r"at 0\.5 m.*singular column"),
         (lambda: along((0.5, 5e-4, 0), (-0.5, 5e-4, 0)), "singular column"),
         (lambda: along((0.5, 0, 0), (0.9, 0, 0)), "unreachable"),
         (lambda: along((0.5, 0, 0), (0.8, 0, 0)), "stretched arm is singular"),
-        (lambda: along((0.5, 0, 0), (0.5, 0.2, 0), clearance=NAN), "clearance nan"),
-        (lambda: along((0.5, 0, 0), (0.5, 0.2, 0), elbow="up"), "elbow 'up'"),
+        (lambda: along((0.5, 0, 0), (0.5, 0.2, 0), clearance=NAN), "clearance must be .*, not nan"),
+        (lambda: along((0.5, 0, 0), (0.5, 0.2, 0), elbow="up"), "elbow must be .*, not 'up'"),
         (lambda: scara_along(EVEN, smooth(TILTED, 0.1)), "tilts its tool"),
         (lambda: along((0.5, 0, 0), (0.5, 0.3, 0), (-0.5, -0.3 + 1e-5, 0)), "singular column"),  # between the samples
     ],
 )
-def test_what_the_arm_cannot_do_is_a_named_error(make: Callable[[], Any], message: str) -> None:
+def test_infeasible_targets_of_the_arm_are_named_errors(make: Callable[[], Any], message: str) -> None:
     with pytest.raises(ModelError, match=message):
         make()
 

@@ -30,15 +30,15 @@ METHODS: dict[str, Any] = {
 
 def differences(prepared: Any, solution: Solution, parameters: dict[str, Any]) -> dict[str, Array]:
     """Central differences of the optimal cost in every parameter."""
-    found = {}
+    by_name = {}
     for name, value in parameters.items():
         entries = np.atleast_1d(np.asarray(value, dtype=float))
         slopes = []
         for shift in STEP * np.eye(entries.size):
             ahead, behind = (prepared.solve({**parameters, name: entries + s * shift}, solution) for s in (1, -1))
             slopes.append((ahead.cost - behind.cost) / (2 * STEP))
-        found[name] = np.array(slopes)
-    return found
+        by_name[name] = np.array(slopes)
+    return by_name
 
 
 def assert_gradients(prepared: Any, parameters: dict[str, Any], tolerance: float) -> Solution:
@@ -233,7 +233,7 @@ def test_gradients_in_levels_of_active_inequalities(solver: str) -> None:
 
 def test_an_unknown_parameter_is_an_error_that_names_the_near_ones() -> None:
     solution = solve(regulator(), Indirect(), parameters={"a": 0.5, "x0": 1.0, "h": 1.0})
-    with pytest.raises(ProblemError, match=r"unknown parameter 'x00'; did you mean x0\?"):
+    with pytest.raises(ProblemError, match=r"parameter 'x00' does not exist; did you mean 'x0'\?"):
         solution.cost_gradient("x00")
     with pytest.raises(ProblemError, match="unknown parameter"):
         solution.cost_gradient("x")  # a state

@@ -69,7 +69,7 @@ def test_costates_of_shooting_converge(control: str) -> None:
 
 
 @pytest.mark.parametrize("n", [2, 5, 50])
-def test_held_controls_of_the_double_integrator_cost_exactly_what_they_must(n: int) -> None:
+def test_piecewise_constant_controls_of_the_double_integrator_have_their_exact_cost(n: int) -> None:
     """The best N held controls cost 6 N^2 / (N^2 - 1)."""
     assert solve(energy(), MultipleShooting(n)).cost == pytest.approx(6 * n**2 / (n**2 - 1), abs=1e-9)
 
@@ -211,11 +211,11 @@ def test_active_path_constraints_are_kept_where_they_are_imposed(integrator: str
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ((0,), "intervals must be a positive integer, not 0"),
+        ((0,), "intervals must be a whole number, 1 to 1000000, not 0"),
         ((1.0,), "intervals"),
         ((3, "euler"), "integrator must be 'rk4' or 'cvodes', not 'euler'"),
         ((3, None), "integrator"),
-        ((3, "rk4", 0), "steps must be a positive integer, not 0"),
+        ((3, "rk4", 0), "steps must be a whole number, 1 to 1000000, not 0"),
         ((3, "rk4", 2.0), "steps"),
         ((3, "rk4", True), "steps"),
         ((3, "rk4", None), "steps"),

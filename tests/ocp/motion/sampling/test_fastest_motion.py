@@ -9,7 +9,7 @@ import pytest
 from ruckig import InputParameter, Result, Ruckig, Trajectory
 
 from models import Box, CollisionScene, FixedBase
-from models.arrays import Array
+from models.checks import Array
 from models.examples import example_robot
 from ocp import Limits, SolveError
 from ocp.motion.builders.constant_jerk import TorqueLimits, least_durations, stopping_motion
