@@ -57,7 +57,8 @@ class FastestMotionSettings:
         widening, narrowing: Factors of the trust region after an accepted and after a refused step.
         violation: Weight of the slack over the duration.
         penalty: Weight of the excess of the usages in the merit of a motion, beside the logarithm of its duration.
-        least_gain: Relative decrease of the duration below which the search ends.
+        gains: Relative decrease of the duration in a step below which a round ends; the last one serves all further
+            rounds.
         most_steps: Largest number of linear programs in a round.
         finer, most_rounds: Samples of an interval at which the clearance is checked after a round, and the largest
             number of rounds. The closest approaches that are not clear become samples of the next round.
@@ -79,7 +80,7 @@ class FastestMotionSettings:
     narrowing: float = 1 / 3
     violation: float = 10.0
     penalty: float = 0.1
-    least_gain: float = 1e-3
+    gains: tuple[float, ...] = (1e-2, 1e-3)
     most_steps: int = 60
     finer: int = 16
     most_rounds: int = 6
@@ -129,12 +130,12 @@ def fastest_motion_near(
     """
     search = _Search(limits, path, settings)
     state, region = search.evaluate(*search.guess(path)), settings.first
-    for _ in range(settings.most_rounds):
-        state, region = _local_optimum(search, state, region)
+    for number in range(settings.most_rounds):
+        state, region = _local_optimum(search, state, region, settings.gains[min(number, len(settings.gains) - 1)])
         if not state.is_feasible:
             words = f"no motion within the limits was found near a path, they are exceeded by {state.excess:.2g}"
             raise SolveError(words, name="limits", value=state.excess, limit=1.0)
-        if not search.add_places(state):
+        if not search.add_places(state) and number + 1 >= len(settings.gains):
             break
         state = search.evaluate(state.points, state.duration)
     motion = search.motion(state)
@@ -142,10 +143,10 @@ def fastest_motion_near(
     return limits.torques.slowed(motion) if rests else motion
 
 
-def _local_optimum(search: _Search, state: _State, region: float) -> tuple[_State, float]:
+def _local_optimum(search: _Search, state: _State, region: float, least_gain: float) -> tuple[_State, float]:
     """Return the fastest feasible motion of a sequence of linear programs, and the last trust region.
 
-    It is the last motion if none is feasible.
+    It is the last motion if none is feasible. The sequence ends when the duration decreases by less than `least_gain`.
 
     Raises:
         TimeLimitReached: The time limit has passed before one was feasible.
@@ -168,7 +169,7 @@ def _local_optimum(search: _Search, state: _State, region: float) -> tuple[_Stat
                 break
             continue
         region = min(region * settings.widening, settings.largest)
-        idle = idle + 1 if trial.is_feasible and gain < settings.least_gain else 0
+        idle = idle + 1 if trial.is_feasible and gain < least_gain else 0
         state = trial
         if state.is_feasible and (best is None or state.duration < best.duration):
             best = state
