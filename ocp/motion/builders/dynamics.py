@@ -290,10 +290,8 @@ def dynamics_problem(
     if equations is not None:
         _declare_tasks(problem, equations, ends, motion, duration)
     if setup.clearance_constraints is not None:
-        name = "base" if machine.base_size else ""
-        setup.clearance_constraints.declare(
-            problem, motion.base, motion.joints, base_name=name, horizon=None if free else duration
-        )
+        base = "base" if machine.base_size else machine.base_home()
+        setup.clearance_constraints.declare(problem, base, horizon=None if free else duration)
     problem.minimize(running=running, terminal=cost.time * final)
     return problem
 

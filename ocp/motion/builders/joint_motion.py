@@ -22,7 +22,7 @@ from ocp.console import interruptible
 from ocp.curves import PiecewisePolynomial
 from ocp.errors import ProblemError, SolverStatus, checked_each, checked_flag, checked_instance, checked_positive
 from ocp.motion.builders.clearance import ClearanceConstraints
-from ocp.motion.builders.tool_motion import ToolMotion, stretches_of, tool_motion_problem
+from ocp.motion.builders.tool_motion import ToolMotion, ToolMotionSetup, stretches_of, tool_motion_problem
 from ocp.motion.local.inverse_kinematics import inverse_kinematics
 from ocp.motion.local.rates import LocalMotion, track_tasks
 from ocp.motion.tasks.checks import (
@@ -91,7 +91,7 @@ def joint_motion_problem(
     rates = problem.control("rates", n, lower=-fastest, upper=fastest, unit=machine.robot.unit("/s"))
     problem.dynamics(joints, rates)
     if clearance_constraints is not None:
-        clearance_constraints.declare(problem, machine.base_home(), joints, horizon=horizon)
+        clearance_constraints.declare(problem, machine.base_home(), horizon=horizon)
     square = ca.dot(rates, scale * rates)
     problem.minimize(running=ca.sqrt(square) if length else square / 2)
     return problem
@@ -259,10 +259,11 @@ def minimum_velocity_problem(
     joints = clip_to_limits("start", names, joints, bounds.lower, bounds.upper, "start inside them")
     if clearance_constraints is not None:
         checked_instance("clearance_constraints", clearance_constraints, ClearanceConstraints)
-    motion = tool_motion_problem(
-        machine, stretches, base=base, start=None if start is None else joints, reference=joints,
-        cyclic=cyclic, weights=weights, bounds=bounds, clearance_constraints=clearance_constraints,
+    setup = ToolMotionSetup(
+        base=base, start=None if start is None else joints, reference=joints, cyclic=cyclic, weights=weights,
+        bounds=bounds, clearance_constraints=clearance_constraints,
     )  # fmt: skip
+    motion = tool_motion_problem(machine, stretches, setup)
     _attach_guess(motion, base, joints, weights, bounds, guess_damping)
     return motion.problem
 

@@ -132,7 +132,7 @@ def solve_within_actuator_limits(
             return motion.problem
 
         joints = {"": (request.machine, limits)}
-        return within_limits(declare, request.clearance_constraints, None, breaks, None, None, joints)
+        return within_limits(declare, request.clearance_constraints, joints, breaks=breaks)
 
     try:
         solution = solve_from(start)

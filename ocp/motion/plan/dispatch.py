@@ -268,8 +268,8 @@ def plan_problem(
         return _goal_problem(machine, goals, horizon, start=start, cost=own, **shared)
     _, joints, base = Start.of(start, machine)
     if isinstance(machine, Standing):
-        setup, zmp = StandingSetup(clearance_constraints=constraints), None if limits is None else limits.zmp
-        options: dict[str, Any] = {"start": joints, "zmp": zmp, "weights": own, "limits": limits, "setup": setup}
+        setup = StandingSetup(clearance_constraints=constraints)
+        options: dict[str, Any] = {"start": joints, "weights": own, "limits": limits, "setup": setup}
         return standing_problem(machine, goals, horizon, **options)
     weights = None if own is None else checked_instance("cost", own, Cost).joint_weights(machine.joint_size)
     options = {"start": joints, "start_base": base, "cyclic": cyclic, "weights": weights}

@@ -32,7 +32,7 @@ from ocp.direct.collocation import Collocation
 from ocp.errors import NOT_NUMBERS, ProblemError, checked_flag, checked_instance, checked_positive, floats, real
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.dynamics import DynamicsSetup, JointFriction, dynamics_problem, end_velocities
-from ocp.motion.builders.dynamics_plan import within_limits
+from ocp.motion.builders.dynamics_plan import SolveSettings, within_limits
 from ocp.motion.builders.space.pair import (
     State,
     checked_pair,
@@ -243,7 +243,8 @@ def solve_capture(
 
     machines = dict.fromkeys((APPROACH, DETUMBLE), (chaser, limits))
     mesh = POINTS if method is None else method
-    return within_limits(declare, clearance_constraints, mesh, (), None, tolerances, machines)
+    settings = SolveSettings(mesh, tolerances=tolerances)
+    return within_limits(declare, clearance_constraints, machines, settings=settings)
 
 
 @interruptible
@@ -275,7 +276,8 @@ def chained_capture(
         own.guess_approach(problem)
         return problem
 
-    first = within_limits(declare_approach, clearance_constraints, mesh, (), None, tolerances, {"": (chaser, limits)})
+    settings = SolveSettings(mesh, tolerances=tolerances)
+    first = within_limits(declare_approach, clearance_constraints, {"": (chaser, limits)}, settings=settings)
     end = dict(first.at_fraction(1.0))
     end["joints"] = own.arm * end["joints"]
     end["base"] = np.array(ca.DM(_of_unit_length(chaser, end["base"]))).ravel()
@@ -285,7 +287,7 @@ def chained_capture(
         guess_braking(problem, own.pair, end["joints"], end["velocities"], end["base"])
         return problem
 
-    return first, within_limits(declare_detumbling, None, mesh, (), None, tolerances, {"": (own.pair, limits)})
+    return first, within_limits(declare_detumbling, None, {"": (own.pair, limits)}, settings=settings)
 
 
 def capture_machines(chaser: FreeFloating, target: FreeFloating) -> tuple[FreeFloating, FreeFloating]:

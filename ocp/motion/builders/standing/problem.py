@@ -188,7 +188,7 @@ def standing_problem(
         tasks: A TipTask, or several that are done at once, functions of the time in s or of the path parameter.
         horizon: Final time, s, or FreeTime(...).
         start: Joints at the start. Shape (n,), rad or m.
-        zmp: Where the zero moment point may be: InFoot(margin) (the default, margin 0), IndexAtLeast(value),
+        zmp: Where the zero moment point may be; by default the rule of the limits. InFoot(margin), IndexAtLeast(value),
             Pinned(point), Following(reference) or Anywhere().
         weights: Weights of the parts of the cost.
         limits: Limits of joints and ground.
@@ -204,9 +204,9 @@ def standing_problem(
             leave the support; no freedom is left to come to rest; the start is singular while the cost contains the
             manipulability.
     """
-    zmp = InFoot() if zmp is None else zmp
     weights = Weights() if weights is None else checked_instance("standing_problem: weights", weights, Weights)
     limits = Limits() if limits is None else checked_instance("standing_problem: limits", limits, Limits)
+    zmp = limits.zmp or InFoot() if zmp is None else zmp
     checked_instance("standing_problem: machine", machine, Standing)
     if limits.power is not None:
         words = "limits: standing plans have no limit of power; limit the torques"
@@ -265,7 +265,7 @@ def standing_problem(
     none = ca.DM(0, 1)
     if setup.clearance_constraints is not None:
         known = None if isinstance(horizon, FreeTime) else duration
-        setup.clearance_constraints.declare(problem, none, joints, horizon=known)
+        setup.clearance_constraints.declare(problem, none, horizon=known)
     running = weights.acceleration * ca.sumsqr(accelerations) + weights.velocity * ca.sumsqr(velocities)
     if weights.joint_limits:
         running += weights.joint_limits * joint_limit_index(machine.robot, joints)

@@ -69,7 +69,7 @@ def test_what_is_declared_is_the_rounded_distance_at_the_time_of_the_surrounding
     q = problem.state("joints", 4, lower=ARM.robot.lower, upper=ARM.robot.upper)
     problem.dynamics(q, problem.control("u", 4))
     problem.horizon(2.0)
-    clearance_constraints.declare(problem, ARM.base_home(), q, begin=3.0, pace=0.5, horizon=2.0, suffix=" b")
+    clearance_constraints.declare(problem, ARM.base_home(), begin=3.0, pace=0.5, horizon=2.0, suffix=" b")
     held, apart = problem.declared.path["apart b"], problem.declared.apart["clearance b"]
     assert_allclose(constant(held.lower), [0.02 + 0.3, 0.02 + 0.1])
     function = ca.Function("held", [q, problem.time], [held.expression, apart.placements])
@@ -93,9 +93,9 @@ def test_what_moves_by_itself_needs_a_horizon_and_joints_their_limits() -> None:
     around = CollisionScene(ARM, [BALL])
     for limit, horizon, name in ((2.9, None, "obstacles"), (3.0, 1.0, "joint1")):
         problem = Problem("free")
-        q = problem.state("joints", 4, lower=-limit, upper=limit)
+        problem.state("joints", 4, lower=-limit, upper=limit)
         with pytest.raises(ProblemError) as caught:
-            ClearanceConstraints(around).declare(problem, ARM.base_home(), q, horizon=horizon)
+            ClearanceConstraints(around).declare(problem, ARM.base_home(), horizon=horizon)
         assert caught.value.name == name
 
 
@@ -272,7 +272,7 @@ def test_a_held_pair_of_a_solved_motion_keeps_its_margin_at_its_points() -> None
     problem.dynamics(q, u)
     problem.horizon(1.0)
     problem.minimize(u**2 / 100, -(q**1))
-    ClearanceConstraints(around, {0: 2e-3}).declare(problem, crane_.base_home(), q, horizon=1.0)
+    ClearanceConstraints(around, {0: 2e-3}).declare(problem, crane_.base_home(), horizon=1.0)
     solution = solve(problem, Collocation(6, 2))
     apart = 2 * np.sin((0.5 - float(solution.at(1.0)["joints"][0])) / 2) - 0.15
     assert apart == pytest.approx(0.012, abs=1e-6)
