@@ -100,10 +100,10 @@ def test_a_failure_says_what_became_of_every_attempt() -> None:
     with pytest.raises(SolveError, match=message) as caught:
         table_request(settings=SolveSettings(Collocation(8, degree=3, scheme="legendre"), options), limits=limits)
     assert caught.value.name == caught.value.conflicts[0].label
+    mesh = Collocation(4, degree=1, scheme="legendre", control="held")
     with pytest.raises(
         SolveError, match=r"tip position, 4 intervals: .*fails"
     ) as caught:  # too coarse, and not refined
-        mesh = Collocation(4, degree=1, scheme="legendre", control="held")
         table_request(settings=SolveSettings(mesh, tolerances={"tip": 0.0}))
     assert str(caught.value).count("\n") == 3
     assert (caught.value.name or "unnamed") in str(caught.value)
