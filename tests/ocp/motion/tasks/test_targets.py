@@ -21,15 +21,15 @@ MACHINE = FixedBase(planar_chain([0.5, 0.4, 0.3], [1.0, 1.0, 1.0]))
 
 
 def circle(count: int) -> SmoothPath:
-    """Three quarters of a circle about (0, 0.6, 0.2) m in the plane of the arm, in equal arcs."""
-    sweep, center = 1.5 * np.pi / count, np.array([0.0, 0.6, 0.2])
-    starts = [center + 0.15 * np.array([0.0, np.cos(a), np.sin(a)]) for a in sweep * np.arange(count)]
-    return smooth(Path(tuple(Arc(start, center, [1.0, 0.0, 0.0], sweep) for start in starts)), deviation=1e-5)
+    """Three quarters of a circle about (0.6, 0.2, 0) m in the plane of the arm, in equal arcs."""
+    sweep, center = 1.5 * np.pi / count, np.array([0.6, 0.2, 0.0])
+    starts = [center + 0.15 * np.array([np.cos(a), np.sin(a), 0.0]) for a in sweep * np.arange(count)]
+    return smooth(Path(tuple(Arc(start, center, [0.0, 0.0, 1.0], sweep) for start in starts)), deviation=1e-5)
 
 
 def along(path: SmoothPath) -> tuple[TipTask, TaskEquations, Array]:
     """A task along a path in the plane of the arm, its equations, and the times where segments meet."""
-    task = TipTask.along(path, SPEED, rows=(4, 5))
+    task = TipTask.along(path, SPEED, rows=(3, 4))
     return task, bind(MACHINE, task), np.asarray(task.breaks)
 
 
@@ -55,7 +55,7 @@ def test_between_nodes_interpolants_follow_the_targets_at_every_place() -> None:
 
 
 def test_a_corner_has_nodes_where_it_begins_and_ends() -> None:
-    corners = np.array([[0.0, 0.5, 0.1], [0.0, 0.7, 0.1], [0.0, 0.7, 0.3], [0.0, 0.5, 0.3], [0.0, 0.5, 0.4]])
+    corners = np.array([[0.5, 0.1, 0.0], [0.7, 0.1, 0.0], [0.7, 0.3, 0.0], [0.5, 0.3, 0.0], [0.5, 0.4, 0.0]])
     lines = [Line(a + (b - a) * k / 20, a + (b - a) * (k + 1) / 20) for a, b in pairwise(corners) for k in range(20)]
     path = smooth(Path(tuple(lines)), deviation=1e-3)
     _, equations, breaks = along(path)
@@ -69,7 +69,7 @@ def test_a_corner_has_nodes_where_it_begins_and_ends() -> None:
 
 def test_tasks_of_a_velocity_and_few_segments_keep_all_breaks() -> None:
     breaks = np.linspace(0.0, 1.0, 31)
-    task = TipTask(rows=(4, 5), velocity=(0.1, 0.0), duration=1.0, breaks=breaks)
+    task = TipTask(rows=(3, 4), velocity=(0.1, 0.0), duration=1.0, breaks=breaks)
     np.testing.assert_array_equal(required_nodes(bind(MACHINE, task), breaks), breaks)
     few, _, ends = along(circle(4))
     (stretch,) = stretches_of(MACHINE, [few], float(few.duration or 0.0))
