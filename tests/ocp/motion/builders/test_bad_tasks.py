@@ -44,6 +44,7 @@ from ocp import (
     Steps,
     StepWeights,
     TipTask,
+    VelocitySetup,
     Weights,
     capture_problem,
     chained_capture,
@@ -151,6 +152,15 @@ ASKED: dict[str, Bad] = {
     "weights": RATES,
     "start_base": but(BASE, "empty"),
 }
+
+
+def with_velocity_setup(options: dict[str, Any]) -> dict[str, Any]:
+    """Arguments of minimum_velocity_problem, those that belong to its setup collected there."""
+    own = {field.name: options[field.name] for field in fields(VelocitySetup) if field.name in options}
+    rest = {name: value for name, value in options.items() if name not in own}
+    return {"setup": VelocitySetup(**own)} | rest
+
+
 GIVEN = {"machine": ARM, "tasks": FORWARD, "start_joints": START, "horizon": 1.0}
 BUILT = {"machine": ARM, "tasks": FORWARD, "start": START, "horizon": 1.0}
 STOOD = {"machine": STANDING, "tasks": STILL, "start_joints": UP, "horizon": 0.2}
@@ -301,13 +311,14 @@ VELOCITIES = [
     ),
     Case(
         "minimum_velocity_problem",
-        minimum_velocity_problem,
+        lambda **options: minimum_velocity_problem(**with_velocity_setup(options)),
         BUILT,
         {
             **{"start" if name == "start_joints" else name: bad for name, bad in ASKED.items()},
             "tasks": TASK,
             "cyclic": FLAG,
             "limits": but(INSTANCE, "None"),
+            "setup": but(INSTANCE, "None"),
             "guess_damping": POSITIVE | NOTHING,
             "clearance_constraints": but(INSTANCE, "None"),
         },
