@@ -191,7 +191,7 @@ def motion_of(solution: Solution) -> Motion:
 def torque_function(machine: FixedBase) -> Any:
     """Joints, velocities and accelerations to torques, columns side by side."""
     symbols = [ca.SX.sym(name, machine.joint_size) for name in ("q", "v", "a")]
-    return ca.Function("torques", symbols, [joint_torques(machine, ca.DM(0, 1), *symbols)])
+    return ca.Function("torques", symbols, [joint_torques(machine, (ca.DM(0, 1), *symbols))])
 
 
 def scene_of(name: str, example: PickAndPlace) -> Scene:

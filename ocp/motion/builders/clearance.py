@@ -183,6 +183,7 @@ def clearance_of(
     joints: Callable[[Array], Array],
     breaks: Array,
     horizon: float,
+    *,
     rates: Array,
     seconds: Array,
     smooth: bool,

@@ -94,10 +94,7 @@ class JointFriction:
 
 def joint_torques(
     machine: Motors,
-    base: Any,
-    joints: Any,
-    rates: Any,
-    accelerations: Any,
+    motion: tuple[Any, Any, Any, Any],
     *,
     friction: JointFriction | None = None,
     wrenches: Sequence[Wrench] = (),
@@ -107,9 +104,8 @@ def joint_torques(
 
     Args:
         machine: Machine on a fixed base, or floating freely.
-        base, joints, rates: Configuration of the base, joints and their rates. Shapes (base_size, 1) and (n, 1).
+        motion: Configuration of the base, joints, their rates and accelerations. Shapes (base_size, 1) and (n, 1).
             Symbols for a floating machine, because they are differentiated.
-        accelerations: Joint accelerations. Shape (n, 1).
         friction: Friction in the joints; None for none.
         wrenches: External wrenches, on a fixed base only.
         gravity: Acceleration of free fall, m/s^2, on a fixed base only; GRAVITY if None.
@@ -118,6 +114,7 @@ def joint_torques(
         ProblemError: The machine is of another kind, or external forces act on a floating one.
     """
     robot = checked_motors("joint_torques", machine).robot
+    base, joints, rates, accelerations = motion
     if isinstance(machine, FixedBase):
         fall = GRAVITY if gravity is None else gravity
         torques = inverse_dynamics(robot, joints, rates, accelerations, wrenches, fall, machine.world_from_base(base))
@@ -171,7 +168,7 @@ def declare_actuators(
         smooth = ca.sumsqr(second)
     problem.dynamics(rates, pace * second)
     if np.isfinite([bounds.torque, bounds.power]).any():
-        torques = joint_torques(checked_motors("limits", machine), base, joints, rates, second)
+        torques = joint_torques(checked_motors("limits", machine), (base, joints, rates, second))
         _limit_torques(problem, robot, torques, bounds.torque, suffix)
         if rows := np.flatnonzero(np.isfinite(bounds.power)).tolist():
             problem.path(f"power{suffix}", (torques * rates)[rows], upper=bounds.power[rows], unit="W")
@@ -285,7 +282,7 @@ def dynamics_problem(
     if setup.end_base is not None:
         _declare_end_base(problem, machine, motion.base, setup.end_base)
     loads: dict[str, Any] = {"friction": setup.friction, "wrenches": setup.wrenches, "gravity": setup.gravity}
-    torques = joint_torques(machine, *motion[:4], **loads)
+    torques = joint_torques(machine, motion[:4], **loads)
     running = _declare_actuators(problem, machine, motion, torques, bounds, cost)
     if equations is not None:
         _declare_tasks(problem, equations, ends, motion, duration)
@@ -489,7 +486,7 @@ def _declare_tasks(problem: Problem, equations: TaskEquations, ends: _Ends, moti
     if not ends.rests[0]:
         residual = equations.residual(base, joints, rates, targets)
         problem.start("tip velocity", residual, lower=0, upper=0, unit=equations.unit())
-    gap = equations.acceleration(base, joints, rates, second, problem.time)
+    gap = equations.acceleration(base, joints, rates, second, progress=(problem.time,))
     problem.path("tip", gap, lower=0, upper=0, unit=equations.unit("/s^2", "/s^2"))
     for name, deviation in equations.deviations(base, joints, rates, targets).items():
         problem.watch(name, **deviation)

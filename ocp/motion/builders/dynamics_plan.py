@@ -236,8 +236,8 @@ class SolveSettings:
 
     def __post_init__(self) -> None:
         if self.method is not None:
-            checked_instance("settings: method", self.method, Collocation)
-        checked_mapping("settings: options", self.options)
+            checked_instance("method", self.method, Collocation)
+        checked_mapping("options", self.options)
 
     @property
     def ipopt_options(self) -> dict[str, Any]:

@@ -206,7 +206,7 @@ def _straight(first: Array, change: Array, bounds: JointBounds) -> list[Phase]:
 def _torques(machine: FixedBase) -> Sampler:
     """Return the joint torques as a function of joints, rates and accelerations at many samples."""
     symbols = [ca.SX.sym("v", machine.joint_size) for _ in range(3)]
-    return Sampler(symbols, [joint_torques(machine, machine.base_home(), *symbols)])
+    return Sampler(symbols, [joint_torques(machine, (machine.base_home(), *symbols))])
 
 
 def _slowdown(machine: FixedBase, torques: Sampler, phases: list[Phase], largest: Array) -> float:

@@ -299,7 +299,7 @@ def test_what_is_asked_for_is_told_in_the_world(robot: Robot, tmp_path: Path) ->
         TipTask(position=(0.1, 0.2, 0.3), orientation=(1.0, 0, 0, 0), link="hand", relative_to="upper/arm"),
         TipTask(rows=(3, 4), velocity=(0.1, 0.0)),
     ]
-    first, second = targets_along(machine, tasks, times, np.zeros((21, 0)), joints)
+    first, second = targets_along(machine, tasks, times, base=np.zeros((21, 0)), joints=joints)
     inside = (times >= 0.5) & (times <= 1.5)
     assert np.isnan(first.position[~inside]).all()
     np.testing.assert_allclose(

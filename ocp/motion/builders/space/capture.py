@@ -195,7 +195,7 @@ def capture_problem(
     own = _Capture.take(chaser, capture, start, {"limits": limits, "cost": cost}, clearance_constraints)
     first, second = own.approach(), own.detumbling(None)
     own.guess_approach(first)
-    guess_braking(second, own.pair, *_end_of(first))
+    guess_braking(second, own.pair, _end_of(first))
     problem = Phases("capture", {APPROACH: first, DETUMBLE: second})
     before, after = problem[APPROACH], problem[DETUMBLE]
     end = {name: before.at_end(name) for name in ("base", "target", "joints")}
@@ -284,7 +284,7 @@ def chained_capture(
 
     def declare_detumbling(_: ClearanceConstraints | None) -> Problem:
         problem = own.detumbling(end)
-        guess_braking(problem, own.pair, end["joints"], end["velocities"], end["base"])
+        guess_braking(problem, own.pair, (end["joints"], end["velocities"], end["base"]))
         return problem
 
     return first, within_limits(declare_detumbling, None, {"": (own.pair, limits)}, settings=settings)
@@ -325,7 +325,9 @@ class _Capture:
         if joints is None:
             raise ProblemError("capture: start is missing; give the joints of the chaser", name="start")
         target_base = checked_configuration(target, np.zeros(0), capture.target_base)[1]
-        momentum = np.array(ca.DM(pair_momentum(chaser, target, base, target_base, joints))).ravel()
+        momentum = np.array(
+            ca.DM(pair_momentum(chaser, target, base=base, target_base=target_base, joints=joints))
+        ).ravel()
         pair = replace(chaser, robot=robot, conserved_momentum=momentum)
         rates = end_velocities("start_velocity", begin.velocity, chaser.joint_size)
         times = (capture.approach, capture.detumble)
@@ -442,7 +444,7 @@ class _Capture:
         """Set the guess of an approach."""
         cone = self.capture.cone
         out = np.zeros(3) if cone is None else cone.length * cone.direction
-        guess_approach(problem, self.chaser, self.capture.target, self.start, out)
+        guess_approach(problem, self.chaser, self.capture.target, self.start, out=out)
 
 
 def _end_of(problem: Problem) -> tuple[Array, Array, Array]:

@@ -446,7 +446,7 @@ def _pose_error(
 ) -> SolveError | None:
     """Return an error if a tip of the re-integrated motion deviates from its task, else None."""
     progress = audit.states["path"][:, 0] if along_parameter else audit.t
-    errors = np.abs(task_errors(machine, tasks, progress, None, audit.states["joints"])).max(axis=0)
+    errors = np.abs(task_errors(machine, tasks, progress, audit.states["joints"])).max(axis=0)
     parts = bind(machine, tasks).bound
     gaps = np.repeat([part.task.start_gap for part in parts], [part.task.size for part in parts])
     if (errors > np.maximum(gaps, POSE_TOLERANCE)).any():

@@ -238,8 +238,9 @@ def standing_problem(
         acting = wrenches_at(external, ca.DM(0.0), ca.DM(tip))
         # with tip_level "position" the tip is on its path at the nodes alone
         demand = task_demand(equations, begin, along_parameter) if tip_level == "acceleration" else None
-        check_loads(machine, begin, acting, zmp, limits.least_force(machine), bounds, demand)
-    guess = local_guess(machine, equations, begin, duration, along_parameter, external)
+        least_force = limits.least_force(machine)
+        check_loads(machine, begin, acting, zmp=zmp, least_force=least_force, bounds=bounds, demand=demand)
+    guess = local_guess(machine, equations, begin, duration, by_parameter=along_parameter, external=external)
 
     problem = Problem("standing plan", symbols=setup.symbols)
     final = declare_horizon(problem, horizon)
@@ -294,7 +295,7 @@ def _constrain_tips(
     if moving:
         residual = equations.residual(none, joints, velocities, targets)
         problem.start("tip velocity", residual, lower=0, upper=0, unit=equations.unit())
-    gap = equations.acceleration(none, joints, velocities, accelerations, *progress)
+    gap = equations.acceleration(none, joints, velocities, accelerations, progress=progress)
     problem.path("tip", gap, lower=0, upper=0, unit=equations.unit("/s^2", "/s^2"))
     for name, deviation in equations.deviations(none, joints, velocities, targets).items():
         problem.watch(name, **deviation)

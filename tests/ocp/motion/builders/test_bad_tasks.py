@@ -65,7 +65,7 @@ from ocp import (
     steps_problem,
     walk,
 )
-from ocp.motion.builders.dynamics_plan import solve_dynamics
+from ocp.motion.builders.dynamics_plan import SolveSettings, solve_dynamics
 from ocp.motion.builders.space.capture import solve_capture
 from ocp.motion.builders.standing.plan import solve_standing, solve_steps
 from ocp.motion.tasks.tracks import path_tracks, pose_line
@@ -154,11 +154,11 @@ ASKED: dict[str, Bad] = {
 }
 
 
-def with_velocity_setup(options: dict[str, Any]) -> dict[str, Any]:
-    """Arguments of minimum_velocity_problem, those that belong to its setup collected there."""
-    own = {field.name: options[field.name] for field in fields(VelocitySetup) if field.name in options}
+def with_setup_of(kind: Any, argument: str, options: dict[str, Any]) -> dict[str, Any]:
+    """Return the arguments of a builder, those that are fields of the dataclass `kind` collected in one argument."""
+    own = {field.name: options[field.name] for field in fields(kind) if field.name in options}
     rest = {name: value for name, value in options.items() if name not in own}
-    return {"setup": VelocitySetup(**own)} | rest
+    return {argument: kind(**own)} | rest
 
 
 GIVEN = {"machine": ARM, "tasks": FORWARD, "start_joints": START, "horizon": 1.0}
@@ -311,7 +311,7 @@ VELOCITIES = [
     ),
     Case(
         "minimum_velocity_problem",
-        lambda **options: minimum_velocity_problem(**with_velocity_setup(options)),
+        lambda **options: minimum_velocity_problem(**with_setup_of(VelocitySetup, "setup", options)),
         BUILT,
         {
             **{"start" if name == "start_joints" else name: bad for name, bad in ASKED.items()},
@@ -380,12 +380,13 @@ STANDINGS = [
     ),
     Case(
         "solve_standing",
-        solve_standing,
+        lambda **options: solve_standing(**with_setup_of(SolveSettings, "settings", options)),
         {"machine": STANDING, "tasks": STILL, "start": UP, "horizon": 0.2},
         {
             "machine": ASKED["machine"] | {"bolted": ARM},
             "tasks": TASK,
             "setup": but(INSTANCE, "None"),
+            "settings": but(INSTANCE, "None"),
             "start": array(3) | NOTHING,
             "horizon": HORIZON,
             "method": but(INSTANCE, "None") | {"indirect": Indirect()},
@@ -559,14 +560,13 @@ DYNAMICS = [
     ),
     Case(
         "solve_dynamics",
-        solve_dynamics,
-        {**MOVED, "end": [0.3, 0.2, 0.1]},
+        lambda **options: solve_dynamics(**with_setup_of(SolveSettings, "settings", options)),
+        {**MOVED, "tasks": Goal(joints=[0.3, 0.2, 0.1])},
         {
-            "total": but(HORIZON, "None"),
             "machine": INSTANCE | {"standing": STANDING},
             "horizon": HORIZON,
-            "end": but(array(3), "nan"),
-            "tasks": but(INSTANCE, "list", "dictionary"),
+            "tasks": but(INSTANCE, "list", "dictionary") | {"a joint too few": Goal(joints=[0.3, 0.2])},
+            "settings": but(INSTANCE, "None"),
             "method": but(INSTANCE, "None") | {"indirect": Indirect()},
             "options": MAPPING,
             "tolerances": MAPPING | {"unknown": {"nothing": 1.0}},
@@ -574,7 +574,7 @@ DYNAMICS = [
     ),
     Case(
         "joint_torques",
-        lambda machine: joint_torques(machine, (), ca.SX.sym("q", 3), ca.SX.sym("v", 3), ca.SX.sym("a", 3)),
+        lambda machine: joint_torques(machine, ((), ca.SX.sym("q", 3), ca.SX.sym("v", 3), ca.SX.sym("a", 3))),
         {"machine": ARM},
         {"machine": INSTANCE | {"standing": STANDING}},
     ),

@@ -111,7 +111,7 @@ def test_a_ball_that_swings_past_a_post_is_as_near_as_a_chord() -> None:
     rates, seconds = np.full((4, 1), 1.3 / 2.0), np.zeros((4, 1))
     for end, least in ((0.3, 2 * np.sin(0.05) - 0.105), (0.7, -0.105)):
         swing = partial(swung, end=end)
-        found = clearance_of(around, swing, breaks, 2.0, rates * (end + 1.0) / 1.3, seconds, True)
+        found = clearance_of(around, swing, breaks, 2.0, rates=rates * (end + 1.0) / 1.3, seconds=seconds, smooth=True)
         assert found.settled
         assert found.worst is not None
         assert found.worst.distance == pytest.approx(least, abs=2e-3)
@@ -143,7 +143,7 @@ def test_no_proof_claims_more_than_a_fine_sampling_shows(seed: int) -> None:
     breaks = np.linspace(0, 1, pieces + 1)
     within = breaks[:-1, None] + np.linspace(0, 1, 400) / pieces
     rates, seconds = (np.abs(joints(within, k)).max(axis=1) * 1.001 / horizon**k for k in (1, 2))
-    found = clearance_of(around, joints, breaks, horizon, rates, seconds, True)
+    found = clearance_of(around, joints, breaks, horizon, rates=rates, seconds=seconds, smooth=True)
     assert found.settled
     times = np.linspace(0, 1, 2001)
     sampled = distances_along(around, np.zeros(0), joints(times), times * horizon).min(axis=0)

@@ -198,5 +198,5 @@ def test_a_plan_closes_a_gap_at_its_start_critically_damped() -> None:
     _, y, z = tip_at(standing, start)
     task = TipTask(position=(y + 0.003, z - 0.004), rows=(4, 5), gain=4.0, start_gap=0.01)
     plan = solve_standing(standing, task, PLANAR_HORIZON, start=start, limits=Limits(zmp=InFoot(0.01)))
-    errors = np.linalg.norm(task_errors(standing, task, plan.t, None, plan["joints"]), axis=1)
+    errors = np.linalg.norm(task_errors(standing, task, plan.t, plan["joints"]), axis=1)
     np.testing.assert_allclose(errors, 0.005 * (1 + 4 * plan.t) * np.exp(-4 * plan.t), atol=1e-6)

@@ -113,7 +113,7 @@ def test_every_way_does_its_task_keeps_limits_and_moves_the_base_as_momentum_has
     for (found,) in CellSearch(asked, START[None]).local_motions():
         count, times = len(found.cost), found.t
         for base, at, rates in zip(found.base, found.joints, found.rates, strict=True):
-            assert np.abs(task_errors(machine, place, times, base, at)).max() < 5e-3
+            assert np.abs(task_errors(machine, place, times, at, base=base)).max() < 5e-3
             assert (np.abs(at) <= 2.0).all()
             assert np.abs(rates).max() < 1.5 * 1.1  # a limit is kept by the rates that a step begins with
             drift = np.array(center.map(len(times))(base.T, at.T))[:2].T - np.outer(times, pushed)

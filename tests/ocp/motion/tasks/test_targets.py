@@ -84,7 +84,7 @@ def test_a_path_of_a_thousand_segments_is_planned_as_one_of_ten() -> None:
         motion = plan(MACHINE, task, scene=False)
         assert motion.audit().passed
         times = np.union1d(breaks, np.linspace(0.0, breaks[-1], 5001))
-        errors = task_errors(MACHINE, task, times, None, motion.at(times)["joints"])
+        errors = task_errors(MACHINE, task, times, motion.at(times)["joints"])
         assert np.abs(errors).max() < 1e-5
         costs.append(motion.cost)
     assert costs[1] == pytest.approx(costs[0], rel=1e-4)
