@@ -22,16 +22,7 @@ from ocp.console import interruptible, time_limited
 from ocp.direct.collocation import Collocation
 from ocp.direct.guess import Samples
 from ocp.direct.shooting import MultipleShooting
-from ocp.errors import (
-    ProblemError,
-    SolveError,
-    SolverStatus,
-    checked_each,
-    checked_flag,
-    checked_mapping,
-    checked_positive,
-    checked_time_limit,
-)
+from ocp.errors import ProblemError, SolveError, SolverStatus, checked_time_limit, require
 from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.problem import Problem, checked_problem
 from ocp.solution import ByName, Guess, Solution, check_variables_match
@@ -118,8 +109,8 @@ def prepare(
         raise ProblemError(
             f"a method such as Collocation(...) is expected, not {method!r}", name="method", value=method
         )
-    checked_flag("prepare: compiled", compiled)
-    checked_flag("prepare: scaling", scaling)
+    require.flag("prepare: compiled", compiled)
+    require.flag("prepare: scaling", scaling)
     return method.prepare(problem, solver=solver, options=options, compiled=compiled, scaling=scaling)
 
 
@@ -162,7 +153,7 @@ def solve(
             worst residuals by constraint, state and time. Or the plan is not a minimum, and no minimum was found near
             it.
     """
-    checked_flag("solve: check", check)
+    require.flag("solve: check", check)
     with time_limited(checked_time_limit(time_limit)):
         prepared = prepare(problem, method, solver=solver, options=options)
         solution = prepared.solve(parameters, guess, check)
@@ -185,7 +176,7 @@ def descend(prepared: PreparedProblem, solution: Solution) -> Solution:
         if not curvature.least < -FLAT_SHARE:
             break
         attempts = [
-            prepared.solve(solution.parameters, displaced_guess(form, solution, curvature, bounds, sign), check=False)
+            prepared.solve(solution.parameters, _displaced_guess(form, solution, curvature, bounds, sign), check=False)
             for sign in (1.0, -1.0)
         ]
         plans = [attempt for attempt in attempts if attempt.success]
@@ -207,7 +198,7 @@ def descend(prepared: PreparedProblem, solution: Solution) -> Solution:
     return solution
 
 
-def displaced_guess(
+def _displaced_guess(
     form: Formulation, solution: Solution, curvature: Curvature, bounds: Bounds, sign: float
 ) -> dict[str, Any]:
     """Return the plan displaced along the variation that lowers its cost, by a visible share of its size.
@@ -354,9 +345,9 @@ def certificate(
         ProblemError: Fewer than two solutions, solutions of other problems or other parameters; no direct one for a
             second solver.
     """
-    checked_positive("certificate: tolerance", tolerance)
+    require.positive("certificate: tolerance", tolerance)
     named = checked_solutions(solutions)
-    if checked_flag("certificate: second_solver", second_solver):
+    if require.flag("certificate: second_solver", second_solver):
         direct = [name for name, solution in named.items() if solution.method["type"] in METHODS]
         if not direct:
             words = "a second solver confirms plans of Collocation(...) and MultipleShooting(...); there is none"
@@ -385,8 +376,8 @@ def certificate(
     for name in order:
         solution = named[name]
         reported = solution.t[:-1] / solution.horizon  # costates are best where they are reported
-        values, _, _ = sample(form, solution, p, fractions, reported)
-        expected, hamiltonian_size, running_size = sample(form, first, p, fractions, reported)
+        values, _, _ = _sample(form, solution, p, fractions, reported)
+        expected, hamiltonian_size, running_size = _sample(form, first, p, fractions, reported)
         differences = [difference(a, b) for a, b in zip(values[:3], expected[:3], strict=True)]
         differences.append(np.abs(values[3] - expected[3]) / (hamiltonian_size or 1.0))
         size = max(abs(first.cost), running_size * first.horizon) or 1.0
@@ -410,9 +401,9 @@ def certificate(
 def checked_solutions(solutions: Any) -> dict[str, Solution]:
     """Return solutions by name, those of a sequence by their methods; raise ProblemError for anything else."""
     if not isinstance(solutions, Mapping):
-        return name_by_method(checked_each("certificate: solutions", solutions, Solution))
-    named = checked_mapping("certificate: solutions", solutions)
-    checked_each("certificate: solutions", named.values(), Solution)
+        return name_by_method(require.each("certificate: solutions", solutions, Solution))
+    named = require.mapping("certificate: solutions", solutions)
+    require.each("certificate: solutions", named.values(), Solution)
     return named
 
 
@@ -435,7 +426,7 @@ def name_by_method(solutions: Sequence[Solution]) -> dict[str, Solution]:
     return named
 
 
-def sample(
+def _sample(
     form: Formulation, solution: Solution, p: np.ndarray, fractions: np.ndarray, reported: np.ndarray
 ) -> tuple[list[np.ndarray], float, float]:
     """Return states and controls at ``fractions``, costates and Hamiltonian at ``reported`` fractions, and two sizes.

@@ -15,7 +15,7 @@ from ocp.curves import integrator, rk4_step
 from ocp.direct.assembly import SIZES, Block, Interpolants, Transcription
 from ocp.direct.prepared import DirectMethod
 from ocp.direct.transcription import TranscriptionBuilder
-from ocp.errors import checked_choice
+from ocp.errors import require
 from ocp.problem.formulation import Formulation
 from ocp.problem.values import symbols_of
 
@@ -48,8 +48,8 @@ class MultipleShooting(DirectMethod):
 
     def __post_init__(self) -> None:
         self._check_mesh("steps")
-        checked_choice("MultipleShooting: integrator", self.integrator, ("rk4", "cvodes"))
-        checked_choice("MultipleShooting: control", self.control, ("held", "linear"))
+        require.choice("MultipleShooting: integrator", self.integrator, ("rk4", "cvodes"))
+        require.choice("MultipleShooting: control", self.control, ("held", "linear"))
 
     @property
     def order(self) -> int:
@@ -94,9 +94,9 @@ def transcribe(method: MultipleShooting, form: Formulation, staged: bool) -> Tra
         build.ends(ends, layout.node[nx:, 0][None], layout.node[nx:, -1][None], at_nodes=True)
     else:
         controls_inside = layout.interval
-        build.path_rows(form.path.select(~without_control), first, controls_inside, stages, mesh[:-1])
+        build.path_rows(form.path.select(~without_control), first, controls_inside, stages, at=mesh[:-1])
         build.path_rows(
-            form.path.select(~without_control & ~form.path.equality), last, controls_inside, stages, mesh[1:]
+            form.path.select(~without_control & ~form.path.equality), last, controls_inside, stages, at=mesh[1:]
         )
         build.node_rows(form.path.select(without_control), np.column_stack([controls_inside, controls_inside[:, -1]]))
         build.ends((np.ones(1), np.ones(1)), controls_inside[:, 0][None], controls_inside[:, -1][None], at_nodes=False)
@@ -109,7 +109,14 @@ def transcribe(method: MultipleShooting, form: Formulation, staged: bool) -> Tra
     dense = dense_function(form, method)
     interpolants = Interpolants(breaks, THIRDS, inputs, mesh, control_nodes, np.vstack([*controls]), data, dense)
     nodes = np.arange(n + 1)
-    return build.finish(report, layout.node[:nx].T, costate_rows, nodes, costate_scale, interpolants)
+    return build.finish(
+        report,
+        layout.node[:nx].T,
+        costate_rows,
+        costate_nodes=nodes,
+        costate_scale=costate_scale,
+        interpolants=interpolants,
+    )
 
 
 # ---- integration of one interval -----------------------------------------------------------------------------

@@ -15,7 +15,7 @@ from typing import Any, ParamSpec, TypeVar, cast
 import casadi as ca
 import numpy as np
 
-from ocp.errors import ProblemError, checked_count, checked_text, error_names, unknown_name
+from ocp.errors import ProblemError, error_names, require
 from ocp.problem.declarations import (
     ENDS,
     Constraint,
@@ -96,7 +96,7 @@ class Problem:
         if symbols not in (ca.SX, ca.MX):
             words = f"problem {name!r}: symbols must be casadi.SX or casadi.MX, not {symbols!r}"
             raise ProblemError(words, name="symbols", value=symbols)
-        if not checked_text("problem: its name", name):
+        if not require.text("problem: its name", name):
             raise ProblemError("a problem needs a name", name="name", value=name)
         self.name = name
         self.symbols = symbols
@@ -196,7 +196,7 @@ class Problem:
     @_about_its_name
     def parameter(self, name: str, size: int = 1) -> Any:
         """Declare a parameter, whose value is given to the solve, and return its symbol, shape (n, 1)."""
-        size = checked_count(f"parameter {name!r}: size", size)
+        size = require.count(f"parameter {name!r}: size", size)
         self.declared.parameters[name] = Variable(name, self._symbol("parameter", name, size))
         return self.declared.parameters[name].symbol
 
@@ -273,7 +273,7 @@ class Problem:
         with error_names("horizon"):
             if self.declared.horizon is not None:
                 raise ProblemError(f"{what} is declared twice")
-            self.declared.horizon = self._reader.horizon(what, value, lower, upper, guess)
+            self.declared.horizon = self._reader.horizon(what, value, lower, upper, guess=guess)
         return self.declared.horizon.symbol
 
     def at_start(self, variable: Any) -> Any:
@@ -402,7 +402,9 @@ class Problem:
         parts |= {"covers": {} if covers is None else covers, "assumed": {} if assumed is None else assumed}
         separation = Separation(name, frames, dict(hulls), pairs, least, movers, **parts)
         zeros = [ca.DM.zeros(parameter.shape) for parameter in parameters]
-        PrescribedMotion(separation, frames, self.time, parameters, zeros)  # raises if a motion has no bounds
+        PrescribedMotion(
+            separation, frames, self.time, parameters=parameters, values=zeros
+        )  # raises if a motion has no bounds
         self.declared.apart[name] = separation
 
     def minimize(self, running: Value = 0, terminal: Value = 0) -> None:
@@ -443,7 +445,7 @@ class Problem:
         self, kind: str, name: str, size: int | None, values: dict[str, Value], guess: Guess, unit: str, scale: Value
     ) -> Variable:
         what = f"{kind} {name!r}"
-        checked_text(f"{what}: unit", unit)
+        require.text(f"{what}: unit", unit)
         size = number_of_entries(what, size, {**values, "guess": guess})
         symbol = self._symbol(kind, name, size)
         low, high = self._reader.bounds(what, size, values["lower"], values["upper"])
@@ -472,7 +474,7 @@ class Problem:
         if isinstance(symbol, str):
             if symbol in pool:
                 return pool[symbol]
-            raise unknown_name(f"variable in {what}", symbol, pool)
+            raise require.unknown(f"variable in {what}", symbol, pool)
         if isinstance(symbol, self.symbols) and symbol.is_valid_input():
             identities = [identity(s) for s in ca.symvar(symbol)]
             for variable in pool.values():
@@ -497,4 +499,6 @@ class Problem:
     ) -> Constraint:
         """Return a new constraint on the symbols inside the horizon and on the ``known`` ones."""
         self.declared.check_new_constraint(f"{kind} constraint", name)
-        return self._reader.constraint(kind, name, expression, [*self._inner(), *known], bounds, unit, tolerance)
+        return self._reader.constraint(
+            kind, name, expression, [*self._inner(), *known], bounds=bounds, unit=unit, tolerance=tolerance
+        )

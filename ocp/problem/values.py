@@ -8,7 +8,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ocp.errors import NOT_NUMBERS, ProblemError, floats, format_distinct
+from models.checks import NOT_NUMBERS, floats
+from ocp.errors import ProblemError, format_distinct
 
 
 def is_symbolic(value: Any) -> bool:
@@ -147,7 +148,7 @@ class Sampler:
 
 
 def evaluate_in_blocks(
-    function: Any, size: int, inputs: np.ndarray, outputs: list[np.ndarray], previous: np.ndarray | None = None
+    function: Any, size: int, inputs: np.ndarray, outputs: list[np.ndarray], *, previous: np.ndarray | None = None
 ) -> None:
     """Call a casadi function of ``size`` columns side by side, block by block, into existing arrays.
 

@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 
 from models import FixedBase, Link, Robot, VisualShape, attach_tool, with_load
-from models.arrays import Array
+from models.checks import Array
 from ocp import Audit, Collocation, Cost, Goal, Solution, TipTask, inverse_kinematics, joint_torques
 from ocp.app.view.appearance import TIP_FRAME, Frames, frames_along
 from ocp.motion.builders.dynamics_plan import SolveSettings, solve_dynamics

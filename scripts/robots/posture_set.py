@@ -17,7 +17,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from models import CollisionScene, FixedBase, Robot
-from models.arrays import Array
+from models.checks import Array
 from models.paths import rest_to_rest
 from ocp import Limits, SolveError, TipTask, inverse_kinematics, resolve
 from ocp import plan as planned

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 import ocp
 from models import CollisionScene, FixedBase
-from models.arrays import Array
+from models.checks import Array
 from models.paths import rest_to_rest
 from ocp import Audit, Limits, Reconfiguration, TipTask, inverse_kinematics
 from ocp.app.view.appearance import frames_along

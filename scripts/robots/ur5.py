@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from models import FixedBase, Machine
-from models.arrays import Array
+from models.checks import Array
 from models.paths import rest_to_rest
 from ocp import (
     Collocation,

@@ -14,7 +14,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from models.arrays import Array
+from models.checks import Array
 from ocp import TipTask, inverse_kinematics
 from ocp.motion.local.inverse_kinematics import Unreachable
 from ocp.motion.search.charts import SelfMotionManifolds, TimeSample

@@ -22,7 +22,7 @@ import numpy as np
 import pinocchio as pin
 
 from models import Box, CollisionScene, Cylinder, FixedBase, Robot, Sphere
-from models.arrays import Array
+from models.checks import Array
 from ocp import Cost, Limits, Plan, SolveError
 from ocp.app.files.safe_files import read_tree
 from ocp.motion.builders.clearance import ClearanceConstraints

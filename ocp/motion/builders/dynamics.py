@@ -21,166 +21,38 @@ from typing import Any, Literal, NamedTuple
 import casadi as ca
 import numpy as np
 
-from models import FixedBase, FreeFloating, Machine, Robot, Standing, find_wheels
-from models.arrays import Array
-from models.robot.dynamics import GRAVITY, Wrench, inverse_dynamics
+from models import Robot, find_wheels
+from models.checks import NOT_NUMBERS, Array, floats
+from models.robot.dynamics import Wrench
 from models.spatial import quaternion_product
 from ocp.console import interruptible
-from ocp.errors import (
-    NOT_NUMBERS,
-    ProblemError,
-    checked_choice,
-    checked_each,
-    checked_instance,
-    checked_nonnegative,
-    floats,
-)  # fmt: skip
+from ocp.errors import ProblemError, require
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.standing.problem import FreeTime, declare_horizon
+from ocp.motion.builders.torques import (
+    JointFriction,
+    Motors,
+    checked_motors,
+    joint_torques,
+    limit_torques,
+    positive_power,
+    running_cost,
+)
 from ocp.motion.tasks.checks import (
     check_length,
     check_rest,
     checked_configuration,
-    checked_horizon,
     checked_tasks,
     clip_to_limits,
-    nonnegative_each,
     rates_at_rest,
-)  # fmt: skip
+)
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.goals import Cost
 from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.problem import Problem, remembers_request
 
-__all__ = [
-    "DynamicsSetup", "JointFriction", "Motors", "checked_motors", "declare_actuators", "dynamics_problem",
-    "end_velocities", "joint_torques",
-]  # fmt: skip
-
-Motors = FixedBase | FreeFloating
-"""Machines that are moved by the torques of their joints alone."""
-
-
-@dataclass(frozen=True)
-class JointFriction:
-    """Friction in the joints.
-
-    Attributes:
-        viscous: Viscous coefficient, one number or one for each joint, N m s/rad or N s/m.
-        coulomb: Coulomb friction, one number or one for each joint, N m or N.
-        slip: Speed at which the smoothed Coulomb friction reaches three quarters of its value, rad/s or m/s.
-
-    Raises:
-        ProblemError: A coefficient is negative, or `slip` is not positive.
-    """
-
-    viscous: Any = 0.0
-    coulomb: Any = 0.0
-    slip: float = 0.01
-
-    def __post_init__(self) -> None:
-        for name in ("viscous", "coulomb"):
-            nonnegative_each(f"friction: {name}", getattr(self, name), None)
-        if not checked_nonnegative("friction: slip", self.slip) > 0:
-            raise ProblemError("friction: slip must be positive", name="slip", value=self.slip, limit=0.0)
-
-    def torques(self, rates: Any) -> Any:
-        """Return the joint torques that overcome the friction. Shape (n, 1)."""
-        n = rates.numel()
-        viscous = ca.DM(nonnegative_each("friction: viscous", self.viscous, n))
-        return viscous * rates + nonnegative_each("friction: coulomb", self.coulomb, n) * ca.tanh(rates / self.slip)
-
-
-def joint_torques(
-    machine: Motors,
-    motion: tuple[Any, Any, Any, Any],
-    *,
-    friction: JointFriction | None = None,
-    wrenches: Sequence[Wrench] = (),
-    gravity: Any = None,
-) -> Any:
-    """Return the joint torques (forces of prismatic joints) of a motion. Shape (n, 1), N m or N.
-
-    Args:
-        machine: Machine on a fixed base, or floating freely.
-        motion: Configuration of the base, joints, their rates and accelerations. Shapes (base_size, 1) and (n, 1).
-            Symbols for a floating machine, because they are differentiated.
-        friction: Friction in the joints; None for none.
-        wrenches: External wrenches, on a fixed base only.
-        gravity: Acceleration of free fall, m/s^2, on a fixed base only; GRAVITY if None.
-
-    Raises:
-        ProblemError: The machine is of another kind, or external forces act on a floating one.
-    """
-    robot = checked_motors("joint_torques", machine).robot
-    base, joints, rates, accelerations = motion
-    if isinstance(machine, FixedBase):
-        fall = GRAVITY if gravity is None else gravity
-        torques = inverse_dynamics(robot, joints, rates, accelerations, wrenches, fall, machine.world_from_base(base))
-    else:
-        if wrenches or gravity is not None:
-            words = "external wrenches and gravity need a fixed base: a free-floating machine conserves its momentum"
-            raise ProblemError(words, name="wrenches" if wrenches else "gravity", value=wrenches or gravity)
-        torques = machine.joint_torques(base, joints, rates, accelerations)
-    return torques if friction is None else torques + friction.torques(rates)
-
-
-def checked_motors(name: str, machine: Any) -> Motors:
-    """Return the machine; raise ProblemError unless its joint torques alone move it."""
-    if not isinstance(machine, FixedBase | FreeFloating) or isinstance(machine, Standing):
-        words = f"{name}: a FixedBase or a FreeFloating is expected, not a {type(machine).__name__}; use "
-        words += "standing_problem for a standing machine"
-        raise ProblemError(words, name="machine", value=machine)
-    return machine
-
-
-def declare_actuators(
-    problem: Problem,
-    machine: Machine,
-    motion: tuple[Any, Any, Any],
-    bounds: JointBounds,
-    *,
-    suffix: str,
-    pace: float,
-    smoothing: float,
-) -> tuple[Any, Any]:
-    """Declare accelerations within the actuator limits, and return them and the smoothing cost, (rad/s)^2.
-
-    The cost is half the squared accelerations or jerks, times powers of a duration.
-
-    Args:
-        motion: Base, joints and rates as symbols.
-        bounds: Limits of acceleration, jerk, torque and power.
-        suffix: Suffix of the declared names.
-        pace: Seconds of the motion in a second of the problem.
-        smoothing: Duration in which a control passes from limit to limit instead of jumping, s.
-    """
-    (base, joints, rates), robot, n = motion, machine.robot, machine.joint_size
-    options: dict[str, Any] = {"lower": -bounds.acceleration, "upper": bounds.acceleration, "unit": robot.unit("/s^2")}
-    if np.isfinite(bounds.jerk).any():
-        second = problem.state(f"accelerations{suffix}", n, **options)
-        jerks = problem.control(f"jerks{suffix}", n, lower=-bounds.jerk, upper=bounds.jerk, unit=robot.unit("/s^3"))
-        problem.dynamics(second, pace * jerks)
-        smooth = smoothing**2 * ca.sumsqr(jerks)
-    else:
-        second = problem.control(f"accelerations{suffix}", n, **options)
-        smooth = ca.sumsqr(second)
-    problem.dynamics(rates, pace * second)
-    if np.isfinite([bounds.torque, bounds.power]).any():
-        torques = joint_torques(checked_motors("limits", machine), (base, joints, rates, second))
-        _limit_torques(problem, robot, torques, bounds.torque, suffix)
-        if rows := np.flatnonzero(np.isfinite(bounds.power)).tolist():
-            problem.path(f"power{suffix}", (torques * rates)[rows], upper=bounds.power[rows], unit="W")
-    return second, smoothing**2 / 2 * smooth
-
-
-def _limit_torques(problem: Problem, robot: Robot, torques: Any, largest: Array, suffix: str = "") -> None:
-    """Declare the path constraint of the joints whose torque is limited."""
-    if rows := np.flatnonzero(np.isfinite(largest)).tolist():
-        bounds = {"lower": -largest[rows], "upper": largest[rows]}
-        problem.path(f"torques{suffix}", torques[rows], unit=robot.effort_unit, **bounds)
-
+__all__ = ["DynamicsSetup", "dynamics_problem", "end_velocities"]
 
 QUINTIC = np.polynomial.Polynomial([0, 0, 0, 10, -15, 6])
 
@@ -251,24 +123,24 @@ def dynamics_problem(
             although tasks fix the time.
     """
     checked_motors("dynamics_problem", machine)
-    limits = Limits() if limits is None else checked_instance("dynamics_problem: limits", limits, Limits)
-    cost = Cost(velocity=0.0, effort=1.0) if cost is None else checked_instance("dynamics_problem: cost", cost, Cost)
-    setup = DynamicsSetup() if setup is None else checked_instance("dynamics_problem: setup", setup, DynamicsSetup)
+    limits = Limits() if limits is None else require.instance("dynamics_problem: limits", limits, Limits)
+    cost = Cost(velocity=0.0, effort=1.0) if cost is None else require.instance("dynamics_problem: cost", cost, Cost)
+    setup = DynamicsSetup() if setup is None else require.instance("dynamics_problem: setup", setup, DynamicsSetup)
     for option, kind in (("friction", JointFriction), ("clearance_constraints", ClearanceConstraints)):
         if getattr(setup, option) is not None:
-            checked_instance(f"dynamics_problem: {option}", getattr(setup, option), kind)
+            require.instance(f"dynamics_problem: {option}", getattr(setup, option), kind)
     if cost.length:
         words = "cost: the length of a motion under dynamics is not smooth at rest; weight its velocity instead"
         raise ProblemError(words, name="length", value=cost.length, limit=0.0)
-    control = checked_choice("control", setup.control, ("acceleration", "jerk"))
+    control = require.choice("control", setup.control, ("acceleration", "jerk"))
     bounds = limits.bounds(machine, ("velocity", "torque"))
     if control == "acceleration" and (np.isfinite(bounds.jerk).any() or cost.jerk):
         words = "the jerk is limited or weighted, but the control is the acceleration; set control='jerk'"
         raise ProblemError(words, name="control", value=control, limit="jerk")
     free = isinstance(horizon, FreeTime)
-    duration = checked_horizon(horizon.guess if isinstance(horizon, FreeTime) else horizon)
+    duration = require.positive("horizon", horizon.guess if isinstance(horizon, FreeTime) else horizon)
     ends = _Ends.take(machine, bounds, (start, end), (setup.start_velocity, setup.end_velocity), setup.start_base)
-    tasks = (tasks,) if isinstance(tasks, TipTask) else checked_each("tasks", tasks, TipTask)
+    tasks = (tasks,) if isinstance(tasks, TipTask) else require.each("tasks", tasks, TipTask)
     equations = bind(machine, tasks) if tasks else None
     if equations is not None:
         if free:
@@ -400,20 +272,10 @@ def _declare_actuators(
     problem: Problem, machine: Motors, motion: _Motion, torques: Any, bounds: JointBounds, cost: Cost
 ) -> Any:
     """Declare the limits of torque and power, and return the running cost."""
-    n = machine.joint_size
-    _limit_torques(problem, machine.robot, torques, bounds.torque)
-    running = ca.dot(ca.DM(nonnegative_each("cost: acceleration", cost.acceleration, n)), motion.second**2)
-    if cost.velocity:
-        running += ca.dot(ca.DM(cost.joint_weights(n)), motion.rates**2) / 2
-    running += cost.jerk * ca.sumsqr(motion.jerks)
-    if cost.turning and isinstance(machine, FreeFloating):
-        spin = [k for k, row in enumerate(machine.twist_rows) if row < 3]
-        running += cost.turning * ca.sumsqr(machine.base_twist(motion.base, motion.joints, motion.rates)[spin])
-    running += ca.dot(ca.DM(nonnegative_each("cost: effort", cost.effort, n)), torques**2)
+    limit_torques(problem, machine.robot, torques, bounds.torque)
+    running = running_cost(machine, cost, motion[:4], jerks=motion.jerks, torques=torques)
     if cost.energy or np.isfinite(bounds.power).any():
-        power = problem.control("power", n, lower=0.0, upper=bounds.power, unit="W")
-        problem.path("power", power - torques * motion.rates, lower=0.0, unit="W")
-        running += cost.energy * ca.sum1(power)
+        running += cost.energy * positive_power(problem, torques * motion.rates, bounds)
     return running
 
 
@@ -451,7 +313,7 @@ def _wheel_scales(robot: Robot, bounds: JointBounds, duration: float) -> Array:
 def end_velocities(name: str, value: Any, n: int) -> Array:
     """Return joint velocities at an end, nan where free, shape (n,); ProblemError unless numbers, "rest" or "free"."""
     if isinstance(value, str):
-        return np.full(n, 0.0 if checked_choice(name, value, ("rest", "free")) == "rest" else np.nan)
+        return np.full(n, 0.0 if require.choice(name, value, ("rest", "free")) == "rest" else np.nan)
     if value is None:
         raise ProblemError(f"{name} must be 'rest', 'free' or velocities, not None", name=name, value=value)
     return _checked_end(name, value, n)

@@ -26,7 +26,7 @@ from models import FreeFloating, Machine
 from ocp.audit.audit import Audit
 from ocp.console import interruptible
 from ocp.direct.collocation import Collocation
-from ocp.errors import ProblemError, SolveError, checked_each, checked_instance, checked_mapping
+from ocp.errors import ProblemError, SolveError, require
 from ocp.methods import solve
 from ocp.motion.builders.clearance import (
     ClearanceConstraints,
@@ -35,9 +35,9 @@ from ocp.motion.builders.clearance import (
     is_clearance,
     solve_with_clearance,
 )
-from ocp.motion.builders.dynamics import DynamicsSetup, Motors, checked_motors, dynamics_problem
+from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem
 from ocp.motion.builders.standing.problem import FreeTime
-from ocp.motion.tasks.checks import checked_horizon
+from ocp.motion.builders.torques import Motors, checked_motors
 from ocp.motion.tasks.goals import Cost, Goal
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.tip_task import TipTask
@@ -83,11 +83,11 @@ def dynamics_phases(
             `end_velocity`.
     """
     goals = checked_goals(goals)
-    setup = DynamicsSetup() if setup is None else checked_instance("dynamics_phases: setup", setup, DynamicsSetup)
+    setup = DynamicsSetup() if setup is None else require.instance("dynamics_phases: setup", setup, DynamicsSetup)
     _check_end_velocity(setup)
     clearance = setup.clearance_constraints
     if clearance is not None:
-        checked_instance("dynamics_phases: clearance_constraints", clearance, ClearanceConstraints)
+        require.instance("dynamics_phases: clearance_constraints", clearance, ClearanceConstraints)
     names = phase_names(goals)
     machines, problems = machines_of(machine, goals), {}
     begin: Any = start
@@ -112,7 +112,7 @@ def dynamics_phases(
     for k in range(1, len(goals)):
         _join(phases, names[k - 1], names[k], goals[k - 1])
     if total is not None:
-        duration = checked_horizon(total)
+        duration = require.positive("horizon", total)
         if not any(isinstance(goal.duration, FreeTime) for goal in goals):
             words = "total: every goal has a fixed duration; give one of them FreeTime(...)"
             raise ProblemError(words, name="total", value=total)
@@ -127,7 +127,7 @@ def checked_goals(goals: Any) -> tuple[Goal, ...]:
     Raises:
         ProblemError: There are none; one is no Goal, is a pose, or has no duration; two have the same name.
     """
-    checked = tuple(checked_each("goals", goals, Goal))
+    checked = tuple(require.each("goals", goals, Goal))
     if not checked:
         raise ProblemError("goals: at least one is needed", name="goals", value=goals)
     names = phase_names(checked)
@@ -236,8 +236,8 @@ class SolveSettings:
 
     def __post_init__(self) -> None:
         if self.method is not None:
-            checked_instance("method", self.method, Collocation)
-        checked_mapping("options", self.options)
+            require.instance("method", self.method, Collocation)
+        require.mapping("options", self.options)
 
     @property
     def ipopt_options(self) -> dict[str, Any]:
@@ -281,7 +281,7 @@ def solve_dynamics(
             and the limit that is violated.
         ProblemError: As `dynamics_problem` and `dynamics_phases`.
     """
-    own_setup = DynamicsSetup() if setup is None else checked_instance("solve_dynamics: setup", setup, DynamicsSetup)
+    own_setup = DynamicsSetup() if setup is None else require.instance("solve_dynamics: setup", setup, DynamicsSetup)
     shared: dict[str, Any] = {"start": start, "limits": limits, "cost": cost}
     clearance, total = own_setup.clearance_constraints, cast(Any, horizon)
     if isinstance(tasks, Sequence) and isinstance(next(iter(tasks), None), Goal):
@@ -307,7 +307,7 @@ def solve_dynamics(
         own = replace(own_setup, clearance_constraints=clearance)
         return dynamics_problem(machine, tip_tasks, duration, setup=own, **shared)
 
-    duration: float | FreeTime = horizon if isinstance(horizon, FreeTime) else checked_horizon(horizon)
+    duration: float | FreeTime = horizon if isinstance(horizon, FreeTime) else require.positive("horizon", horizon)
     at = () if isinstance(duration, FreeTime) else breaks_of(tip_tasks, duration)
     return within_limits(declare, clearance, {"": (machine, limits)}, breaks=at, settings=settings)
 
@@ -321,7 +321,7 @@ def _check_end_velocity(setup: DynamicsSetup) -> None:
 
 def breaks_of(tasks: TipTask | Sequence[TipTask], horizon: float) -> Sequence[float]:
     """Return the fractions of a horizon at which tasks are less smooth."""
-    tasks = (tasks,) if isinstance(tasks, TipTask) else checked_each("tasks", tasks, TipTask)
+    tasks = (tasks,) if isinstance(tasks, TipTask) else require.each("tasks", tasks, TipTask)
     times = np.unique(np.concatenate([np.zeros(0), *(task.begin + np.asarray(task.breaks) for task in tasks)]))
     return [float(at) for at in times / horizon if 0 < at < 1]
 
@@ -351,7 +351,7 @@ def within_limits(
         settings: First mesh, solver options and audit tolerances.
         guess: Guess of the first solve; that of the problem if None.
     """
-    own = SolveSettings() if settings is None else checked_instance("settings", settings, SolveSettings)
+    own = SolveSettings() if settings is None else require.instance("settings", settings, SolveSettings)
     mesh = (own.method or POINTS).with_nodes_at(breaks)
 
     in_collision: Solution | None = None  # the last plan, if only its clearance failed

@@ -17,22 +17,15 @@ import casadi as ca
 import numpy as np
 
 from models import FixedBase, Machine
-from models.arrays import Array
+from models.checks import Array
 from ocp.console import interruptible
 from ocp.curves import PiecewisePolynomial
-from ocp.errors import ProblemError, SolverStatus, checked_each, checked_flag, checked_instance, checked_positive
+from ocp.errors import ProblemError, SolverStatus, require
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.tool_motion import ToolMotion, ToolMotionSetup, stretches_of, tool_motion_problem
 from ocp.motion.local.inverse_kinematics import inverse_kinematics
 from ocp.motion.local.rates import LocalMotion, track_tasks
-from ocp.motion.tasks.checks import (
-    checked_configuration,
-    checked_horizon,
-    checked_tasks,
-    checked_weights,
-    clip_to_limits,
-    horizon_of,
-)
+from ocp.motion.tasks.checks import checked_configuration, checked_tasks, checked_weights, clip_to_limits, horizon_of
 from ocp.motion.tasks.equations import bind
 from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.motion.tasks.tip_task import TipTask
@@ -82,7 +75,7 @@ def joint_motion_problem(
         ends.append(clip_to_limits(name, machine.robot.joint_names, joints, bounds.lower, bounds.upper, hint))
     scale = ca.DM(checked_weights(weights, n))
     problem = Problem("joint motion")
-    problem.horizon(checked_horizon(horizon))
+    problem.horizon(require.positive("horizon", horizon))
     joints = problem.state(
         "joints", n, initial=ends[0], terminal=ends[1], lower=bounds.lower, upper=bounds.upper,
         unit=machine.robot.unit(),
@@ -209,9 +202,9 @@ class VelocitySetup:
     clearance_constraints: ClearanceConstraints | None = None
 
     def __post_init__(self) -> None:
-        checked_positive("guess_damping", self.guess_damping)
+        require.positive("guess_damping", self.guess_damping)
         if self.clearance_constraints is not None:
-            checked_instance("clearance_constraints", self.clearance_constraints, ClearanceConstraints)
+            require.instance("clearance_constraints", self.clearance_constraints, ClearanceConstraints)
 
 
 @interruptible
@@ -254,12 +247,12 @@ def minimum_velocity_problem(
             horizon or the damping is not positive.
         Unreachable: A free start was not found (a ProblemError).
     """
-    setup = VelocitySetup() if setup is None else checked_instance("setup", setup, VelocitySetup)
-    checked_flag("cyclic", cyclic)
-    tasks = (tasks,) if isinstance(tasks, TipTask) else checked_each("tasks", tasks, TipTask)
+    setup = VelocitySetup() if setup is None else require.instance("setup", setup, VelocitySetup)
+    require.flag("cyclic", cyclic)
+    tasks = (tasks,) if isinstance(tasks, TipTask) else require.each("tasks", tasks, TipTask)
     bind(machine, tasks)
     duration = horizon_of(tasks, horizon)
-    limits = Limits() if limits is None else checked_instance("limits", limits, Limits)
+    limits = Limits() if limits is None else require.instance("limits", limits, Limits)
     reference = setup.near if start is None else start
     if reference is None:
         first = [task for task in tasks if task.is_pose and task.begin == 0]

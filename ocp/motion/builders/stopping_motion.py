@@ -19,10 +19,10 @@ import casadi as ca
 import numpy as np
 
 from models import FixedBase
-from models.arrays import Array
+from models.checks import Array
 from ocp.curves import PiecewisePolynomial
 from ocp.errors import SolveError, SolverStatus
-from ocp.motion.builders.dynamics import joint_torques
+from ocp.motion.builders.torques import joint_torques
 from ocp.motion.schedule.ramps import fastest_motion
 from ocp.motion.tasks.limits import JointBounds
 from ocp.problem.formulation import Formulation
@@ -123,7 +123,7 @@ class StoppingMotion:
         shares = (np.diff(breaks)[:, None] * weights / 2).ravel()
         x, u = state_curve(at), control_curve(at)
         running = form.sampled([form.running], x, u, at * horizon, horizon, p)[0][:, 0]
-        final = form.terminal_cost(rows[-1], rows[0], controls[0], horizon, p)
+        final = form.terminal_cost(rows[-1], rows[0], controls[0], horizon=horizon, p=p)
         columns = {name: slice(*entries.indices(form.nx)) for name, entries in form.states.items()}
         return Solution(
             name=problem.name,

@@ -18,14 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models import Machine
-from models.arrays import Array
+from models.checks import Array
 from ocp.direct.guess import Samples
 from ocp.errors import ProblemError
 from ocp.motion.builders.clearance import ClearanceConstraints
-from ocp.motion.builders.dynamics import declare_actuators
+from ocp.motion.builders.torques import Actuation, declare_actuators
 from ocp.motion.local.rates import LocalMotion
 from ocp.motion.tasks.checks import check_closed, check_speed
 from ocp.motion.tasks.equations import TaskEquations, bind
+from ocp.motion.tasks.goals import Cost
 from ocp.motion.tasks.limits import JointBounds
 from ocp.motion.tasks.targets import required_nodes
 from ocp.motion.tasks.tip_task import TipTask, is_holonomic
@@ -42,7 +43,7 @@ ERRORS, START_ERRORS = "task errors", "start errors"
 
 @dataclass(frozen=True)
 class FeedbackSettings:
-    """Settings of the pose-error feedback and of the smoothness of accelerations.
+    """Settings of the pose-error feedback and of relaxed tasks.
 
     Attributes:
         decay: Largest decay of a pose error over an interval of the mesh, as a power of e. Faster feedback would need a
@@ -50,14 +51,12 @@ class FeedbackSettings:
         intervals: Least number of intervals of the mesh in a stretch.
         closed_gap: Pose error at the beginning of a task below which there is no gap to close, m and rad.
         relaxation: Velocity error of a relaxed task, m/s or rad/s, that costs as much as a joint rate of 1 rad/s.
-        smoothing: Share of the horizon in which controlled accelerations pass from limit to limit instead of jumping.
     """
 
     decay: float = 4.0
     intervals: int = 8
     closed_gap: float = 1e-6
     relaxation: float = 1e-5
-    smoothing: float = 1e-3
 
 
 FEEDBACK = FeedbackSettings()
@@ -175,18 +174,15 @@ class ToolMotionSetup:
         weights: Weights of the squared joint rates. Shape (joint_size,).
         bounds: Limits of joint positions and rates.
         time_cost: Cost of a second, if the tasks may be executed more slowly. The horizon of the problem is then the
-            tasks' own. Its states over it are "joints", "base" and CLOCK, the time; its controls are SLOPES, the
-            derivatives of the joints, and PACE, that of the time, at least 1. None keeps the tasks' own time.
-        actuated: Whether accelerations (jerks if these are limited) are the control, within the actuator limits. States
-            "velocities" (and "accelerations") with the suffix of each stretch replace the rates, path constraints
-            "torques" and "power" are added, and the tasks are constrained by their accelerations. Velocities are
-            continuous between stretches, and free at both ends like the rates. A small weight in the cost smooths
-            accelerations (jerks), see FeedbackSettings.
-        relaxed: Whether tasks may deviate at a quadratic cost, J u - b = relaxation S with the cost |S|^2 / 2 and the
-            control S, ERRORS. The constraints then stay independent where the rows of J depend on each other. If a
-            motion of cost c does the tasks within the limits, the errors of the optimum satisfy |S|^2 / 2 <= c when
-            integrated, so that a tip deviates by less than relaxation sqrt(2 c horizon). Only with the tasks' own time
-            and without actuator limits.
+            tasks' own, with the further state CLOCK, the time, and the controls SLOPES, the derivatives of the joints,
+            and PACE, that of the time, at least 1. None keeps the tasks' own time.
+        actuation: Options of a motion with accelerations (jerks) as the control, within the limits of the actuators;
+            None for rates as the control. The states "velocities" replace the rates, the tasks are constrained by their
+            accelerations, and velocities are continuous between stretches.
+        relaxed: Whether tasks may deviate, J u - b = relaxation S, by the control S, ERRORS, at the cost |S|^2 / 2. The
+            constraints then stay independent where the rows of J depend on each other. If a motion of cost c does the
+            tasks within the limits, the optimum deviates by less than relaxation sqrt(2 c horizon). Only with the
+            tasks' own time and without actuator limits.
         clearance_constraints: Collision avoidance, see `ocp.motion.builders.clearance`; None for none.
     """
 
@@ -197,7 +193,7 @@ class ToolMotionSetup:
     weights: Array
     bounds: JointBounds
     time_cost: float | None = None
-    actuated: bool = False
+    actuation: Actuation | None = None
     relaxed: bool = False
     clearance_constraints: ClearanceConstraints | None = None
 
@@ -226,17 +222,16 @@ def tool_motion_problem(machine: Machine, stretches: Sequence[Stretch], setup: T
     motion = _Motion(problem, machine, tuple(stretches), setup)
     if setup.time_cost is not None:
         return _in_free_time(motion, setup.time_cost)
-    for stretch in stretches:
-        if stretch.equations is not None:
-            check_speed(stretch.equations, setup.bounds.velocity, stretch.begin, stretch.end)
     running: Any = 0
     before, first, known = None, None, None
     for stretch in stretches:
+        if stretch.equations is not None:
+            check_speed(stretch.equations, setup.bounds.velocity, stretch.begin, stretch.end)
         states, cost, known = _declare_stretch(motion, stretch, known)
         running += cost
         if before is not None:
             here = ca.vertcat(*[problem.at_start(state) for state in states])
-            unit = "" if machine.base_size or setup.actuated else machine.robot.unit()
+            unit = "" if machine.base_size or setup.actuation else machine.robot.unit()
             problem.end(f"passage at {stretch.begin:g} s", here - ca.vertcat(*before), 0, 0, unit=unit)
         before, first = states, first or states
     if setup.cyclic and setup.free and before and first:
@@ -244,7 +239,7 @@ def tool_motion_problem(machine: Machine, stretches: Sequence[Stretch], setup: T
         problem.end("cyclic", before[place] - problem.at_start(first[place]), 0, 0, unit=machine.robot.unit())
     start_errors = [state.symbol for name, state in problem.declared.states.items() if name.startswith(START_ERRORS)]
     problem.minimize(running=running, terminal=sum((ca.sumsqr(errors) / 2 for errors in start_errors), start=0))
-    times = [stretch.breaks if setup.actuated else stretch.nodes for stretch in stretches]
+    times = [stretch.breaks if setup.actuation else stretch.nodes for stretch in stretches]
     inside = [(at - stretch.begin) / stretch.duration for stretch, at in zip(stretches, times, strict=True)]
     return ToolMotion(problem, tuple(stretches), horizon, np.unique(np.concatenate(inside)))
 
@@ -269,21 +264,27 @@ class _Motion:
 
     def states(self, stretch: Stretch) -> tuple[Any, Any]:
         """Declare the joints, and the base if it moves."""
-        machine, setup = self.machine, self.setup
-        begins, ends = stretch is self.stretches[0], stretch is self.stretches[-1]
+        machine, begins, ends = self.machine, stretch is self.stretches[0], stretch is self.stretches[-1]
         place: Any = np.zeros(0)
         if machine.base_size:
             unit = "m, rad" if machine.base_size == 3 else "m, 1"  # a quaternion has none
-            initial = setup.base if begins else None
+            initial = self.setup.base if begins else None
             place = self.problem.state(f"base{stretch.suffix}", machine.base_size, initial=initial, unit=unit)
-        returns = setup.cyclic and ends and begins and not setup.free
-        options: dict[str, Any] = {
-            "lower": setup.bounds.lower,
-            "upper": setup.bounds.upper,
-            "unit": machine.robot.unit(),
-        }
-        options |= {"initial": setup.start if begins else None, "terminal": setup.start if returns else None}
+        returns = self.setup.cyclic and ends and begins and not self.setup.free
+        bounds, unit = self.setup.bounds, machine.robot.unit()
+        options: dict[str, Any] = {"lower": bounds.lower, "upper": bounds.upper, "unit": unit}
+        options |= {"initial": self.setup.start if begins else None, "terminal": self.setup.start if returns else None}
         return place, self.problem.state(f"joints{stretch.suffix}", machine.joint_size, **options)
+
+    def velocities(self, stretch: Stretch, place: Any, joints: Any, pace: Any) -> tuple[Any, Any, Any]:
+        """Declare velocities as states; return them, the accelerations and the cost in a second of motion."""
+        assert self.setup.actuation is not None
+        begins, ends = (rests and stretch is self.stretches[-k] for k, rests in enumerate(self.setup.actuation.rests))
+        cost = self.setup.actuation.cost or Cost(weights=self.setup.weights)
+        own = replace(self.setup.actuation, cost=cost, rests=(begins, ends))
+        options: dict[str, Any] = {"horizon": self.horizon, "pace": pace, "suffix": stretch.suffix}
+        options |= {"actuation": own}
+        return declare_actuators(self.problem, self.machine, (place, joints), self.setup.bounds, **options)
 
     def task_errors(self, stretch: Stretch) -> tuple[Any, Any]:
         """Declare and return the velocities by which tasks may deviate, and their running cost; 0, 0 if not relaxed."""
@@ -306,29 +307,21 @@ class _Motion:
 def _declare_stretch(motion: _Motion, stretch: Stretch, known: Array | None) -> tuple[list[Any], Any, Array | None]:
     """Declare one of several stretches.
 
-    Args:
-        known: Slopes of the positions fixed at the end of the stretch before, see `_slopes`; None without.
-
-    Returns:
-        States that are continuous with the next stretch, the running cost, and the slopes of the positions that this
-        stretch fixes at its end.
+    `known` has the slopes of the positions that the stretch before fixes at its end, see `_slopes`, or is None. Returns
+    the states that continue in the next stretch, the running cost, and the slopes of the positions fixed here.
     """
     problem, machine, bounds, pace = motion.problem, motion.machine, motion.setup.bounds, motion.pace(stretch)
     begins, ends = stretch is motion.stretches[0], stretch is motion.stretches[-1]
     place, joints = motion.states(stretch)
-    unit = machine.robot.unit("/s")
-    options: dict[str, Any] = {"lower": -bounds.velocity, "upper": bounds.velocity, "unit": unit}
-    second, smooth = None, 0
-    if motion.setup.actuated:
-        rates = problem.state(f"velocities{stretch.suffix}", machine.joint_size, **options)
-        variables = problem, machine, (place, joints, rates)
-        duration = FEEDBACK.smoothing * motion.horizon
-        second, smooth = declare_actuators(*variables, bounds, suffix=stretch.suffix, pace=pace, smoothing=duration)
+    second: Any = None
+    if motion.setup.actuation is not None:
+        rates, second, running = motion.velocities(stretch, place, joints, pace)
     else:
-        rates = problem.control(f"rates{stretch.suffix}", machine.joint_size, **options)
-    slack = _closure(motion) if motion.setup.cyclic and ends else 0
-    ends_at: Array | None = None
-    error_cost: Any = 0
+        limits: dict[str, Any] = {"lower": -bounds.velocity, "upper": bounds.velocity}
+        rates = problem.control(f"rates{stretch.suffix}", machine.joint_size, unit=machine.robot.unit("/s"), **limits)
+        running = ca.dot(rates, ca.DM(motion.setup.weights) * rates) / 2
+    slack: Any = _closure(motion) if motion.setup.cyclic and ends else 0
+    ends_at, error_cost = None, 0
     if stretch.equations is not None:
         error, error_cost = motion.task_errors(stretch)
         slack = slack + error
@@ -337,9 +330,11 @@ def _declare_stretch(motion: _Motion, stretch: Stretch, known: Array | None) -> 
         if known is not None:
             rest = slopes - slopes @ np.linalg.pinv(known, rcond=ROUNDING_SHARE) @ known  # not led there before
             required = ~(np.linalg.norm(rest, axis=1) <= ROUNDING_SHARE * np.linalg.norm(slopes, axis=1))
-        rate_derivatives = None if second is None else (second, machine.base_rate(place, joints, rates))
+        derivatives = None
+        if second is not None:
+            derivatives = [(joints, rates), (rates, second), (place, machine.base_rate(place, joints, rates))]
         free = not begins or motion.setup.free
-        _declare_tasks(motion, stretch, (place, joints, rates), pace, slack, free, required, rate_derivatives)
+        _declare_tasks(motion, stretch, (place, joints, rates), pace, slack, free, required, derivatives)
         placed = np.concatenate([is_holonomic(part) for part in stretch.equations.bound]).astype(bool)
         ends_at = slopes[stretch.equations.pose_rows | (placed & (begins | ~required))]
     if machine.base_size:
@@ -347,10 +342,9 @@ def _declare_stretch(motion: _Motion, stretch: Stretch, known: Array | None) -> 
     problem.dynamics(joints, pace * rates)
     motion.constrain_clearance(stretch, motion.horizon)
     states = [*([place] if machine.base_size else []), joints]
-    if motion.setup.actuated:
+    if motion.setup.actuation is not None:
         states += [rates, *([second] if f"jerks{stretch.suffix}" in problem.declared.controls else [])]
-    cost = pace * (ca.dot(rates, ca.DM(motion.setup.weights) * rates) / 2 + error_cost + smooth)
-    return states, cost, ends_at
+    return states, pace * (running + error_cost), ends_at
 
 
 def _in_free_time(motion: _Motion, time_cost: float) -> ToolMotion:
@@ -358,36 +352,44 @@ def _in_free_time(motion: _Motion, time_cost: float) -> ToolMotion:
 
     With q' = dq/ds and z = dt/ds the cost is the integral of (time_cost + q. W q. / 2) dt = (time_cost z + q' W q'/(2
     z)) ds, which is convex in q' and z. The tasks, J q' = v(s), and the rate limits, |q'| <= v z, are linear in them.
+    With accelerations as the control, z is a state, and q' = z q.
     """
     machine, problem, stretches, bounds = motion.machine, motion.problem, motion.stretches, motion.setup.bounds
-    if motion.setup.actuated:
-        words = "a free horizon excludes actuator limits; give a horizon in s, or limits of velocity alone"
-        raise ProblemError(words, name="horizon")
     if len(stretches) > 1 or stretches[0].equations is None:
         words = "with a free horizon all tasks must begin and end together; give a horizon in s, or one task"
         raise ProblemError(words, name="horizon", value=len(stretches))
-    momentum = getattr(machine, "conserved_momentum", None)
-    if momentum is not None and np.any(np.asarray(momentum) != 0):
+    momentum = getattr(machine, "conserved_momentum", 0)
+    if np.any(np.asarray(momentum) != 0):
         words = "with a free horizon the base must not drift, but it has momentum; give a horizon in s"
         raise ProblemError(words, name="conserved_momentum", value=momentum)
     (stretch,) = stretches
     clock = problem.state(CLOCK, initial=0.0, lower=0.0, unit="s", guess=lambda s: s)
     place, joints = motion.states(stretch)
-    unit = machine.robot.unit("/s")
-    slopes = problem.control(SLOPES, machine.joint_size, unit=unit)
-    pace = problem.control(PACE, lower=1.0, guess=1.0)
     slack = _closure(motion) if motion.setup.cyclic else 0
-    _declare_tasks(motion, stretch, (place, joints, slopes), 1.0, slack, motion.setup.free)
-    limited = np.flatnonzero(np.isfinite(bounds.velocity)).tolist()
-    if limited:
-        largest = ca.DM(bounds.velocity[limited]) * pace
-        problem.path("rates", ca.vertcat(largest - slopes[limited], largest + slopes[limited]), lower=0, unit=unit)
+    if motion.setup.actuation is None:
+        pace = problem.control(PACE, lower=1.0, guess=1.0)
+        slopes = problem.control(SLOPES, machine.joint_size, unit=machine.robot.unit("/s"))
+        _declare_tasks(motion, stretch, (place, joints, slopes), 1.0, slack, motion.setup.free)
+        if limited := np.flatnonzero(np.isfinite(bounds.velocity)).tolist():
+            own, largest = slopes[limited], ca.DM(bounds.velocity[limited]) * pace
+            problem.path("rates", ca.vertcat(largest - own, largest + own), lower=0, unit=machine.robot.unit("/s"))
+        running = ca.dot(slopes, ca.DM(motion.setup.weights) * slopes) / (2 * pace)
+    else:
+        pace = problem.state(PACE, lower=1.0, guess=1.0)
+        change = problem.control("pace change", guess=0.0, unit="1/s")
+        problem.dynamics(pace, change)
+        rates, second, running = motion.velocities(stretch, place, joints, pace)
+        slopes = pace * rates
+        drift = machine.base_rate(place, joints, slopes)
+        derivatives = [(joints, slopes), (rates, pace * second), (pace, change), (place, drift)]
+        _declare_tasks(motion, stretch, (place, joints, slopes), 1.0, slack, motion.setup.free, derivatives=derivatives)
+        running = pace * running + (motion.setup.actuation.smoothing * motion.horizon * change) ** 2 / 2
     problem.dynamics(clock, pace)
     if machine.base_size:
         problem.dynamics(place, machine.base_rate(place, joints, slopes))
     problem.dynamics(joints, slopes)
     motion.constrain_clearance(stretch, None)
-    problem.minimize(running=time_cost * pace + ca.dot(slopes, ca.DM(motion.setup.weights) * slopes) / (2 * pace))
+    problem.minimize(running=time_cost * pace + running)
     if motion.setup.cyclic and motion.setup.free:
         problem.end("cyclic", joints - problem.at_start(joints), 0, 0, unit=machine.robot.unit())
     return ToolMotion(problem, stretches, stretch.end, stretch.nodes / stretch.end)
@@ -423,14 +425,13 @@ def _declare_tasks(
     closure: Any,
     free: bool,
     required: NDArray[np.bool_] | None = None,
-    rate_derivatives: tuple[Any, Any] | None = None,
+    derivatives: Sequence[tuple[Any, Any]] | None = None,
 ) -> None:
     """Constrain a stretch to its tasks, with base, joints and rates as symbols.
 
     `closure` is the deviation of a closed task. If `free`, the tasks that begin here must be at their start poses,
-    except in rows that are not `required`, (size,), to which the stretch before leads. With `rate_derivatives`, the
-    joint accelerations and the base rate, accelerations constrain the tasks, and tasks begin with their velocities,
-    too.
+    except in rows that are not `required`, (size,), to which the stretch before leads. With `derivatives`, of states by
+    the time of the tasks, the base last, accelerations constrain the tasks, and tasks begin with their velocities, too.
     """
     problem, equations, suffix, (base, joints, rates) = motion.problem, stretch.equations, stretch.suffix, symbols
     assert equations is not None
@@ -442,20 +443,20 @@ def _declare_tasks(
     residual = ca.cse(equations.residual(base, joints, rates, targets))
     begins = np.repeat(stretch.new, [part.task.size for part in equations.bound])
     begins &= True if required is None else required
-    if equations.size and rate_derivatives is not None:
-        second, drift = rate_derivatives
-        at, along = [joints, rates], [rates, second]
+    if equations.size and derivatives is not None:
+        moving = derivatives if equations.machine.base_size else derivatives[:-1]
+        at, along = [state for state, _ in moving], [derivative for _, derivative in moving]
         if not constant:
             time = ca.MX.sym("time")
             change_at = ca.Function("change", [time], [ca.jtimes(targets_at(time), time, 1)])
             at.append(targets)
             along.append(problem.signal(f"target rates{suffix}", lambda t: change_at(stretch.begin + pace * t)))
-        if equations.machine.base_size:
-            at, along = [base, *at], [drift, *along]
         gains = np.repeat([float(part.task.gain) for part in equations.bound], [p.task.size for p in equations.bound])
         gap = ca.jtimes(residual, ca.vertcat(*at), ca.vertcat(*along)) + ca.DM(gains) * (residual - closure)
         problem.path(f"task{suffix}", ca.cse(gap), lower=0, upper=0, unit=equations.unit("/s^2", "/s^2"))
-        if begins.any():
+        actuation = motion.setup.actuation
+        at_rest = actuation is not None and actuation.rests[0] and stretch is motion.stretches[0]
+        if begins.any() and not at_rest:
             rows = np.flatnonzero(begins).tolist()
             problem.start(f"start velocity{suffix}", (residual - closure)[rows], 0, 0, unit=equations.unit())
     elif equations.size:

@@ -8,13 +8,13 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from models import FixedBase, Machine, ModelError
-from models.arrays import Array, ArrayInput, checked_array
+from models.checks import Array, ArrayInput, real
 from models.machines.machine import with_tip
-from ocp.errors import ProblemError, checked_count, checked_flag, checked_instance, checked_positive, real
+from ocp.errors import ProblemError, require
 from ocp.motion.local.arm_solver import ARM, ArmSolver, arm_solver, sample_shares
 from ocp.motion.local.chain import TURN, Chain
 from ocp.motion.local.closed_forms import SIX, PoseSolver, is_scara
@@ -132,15 +132,15 @@ class IkSolver:
             ProblemError: The machine has a moving base, no six of its joints determine the pose of the tip, or an
                 argument is invalid.
         """
-        checked_instance("machine", machine, FixedBase)
-        checked_instance("free", free, ToolFreedom)
+        require.instance("machine", machine, FixedBase)
+        require.instance("free", free, ToolFreedom)
         if free is ToolFreedom.CONE:
-            checked_positive("within", within, below=np.pi)
-        checked_flag("limits", limits)
-        checked_count("samples", samples, 1)
+            require.positive("within", within, below=np.pi)
+        require.flag("limits", limits)
+        require.count("samples", samples, 1)
         try:
-            tip = machine if link is None else with_tip(machine, link, checked_array(point, (3,), "IkSolver", "point"))
-            axis = checked_array(tool_axis, (3,), "IkSolver", "tool_axis")
+            tip = machine if link is None else with_tip(machine, link, require.array("IkSolver: point", point, (3,)))
+            axis = require.array("IkSolver: tool_axis", tool_axis, (3,))
         except ModelError as error:
             raise ProblemError(str(error), **vars(error)) from error
         if not np.linalg.norm(axis) > 0:
@@ -242,7 +242,9 @@ class PreparedArm:
         if (
             self.free is ToolFreedom.ROTATION
         ):  # any rotation will do, but not one at which the added joints are singular
-            rotations = np.tile(Rotation.from_rotvec([0.3, 0.5, 0.7]).as_matrix(), (count, 1, 1))
+            rotations = np.tile(
+                scipy.spatial.transform.Rotation.from_rotvec([0.3, 0.5, 0.7]).as_matrix(), (count, 1, 1)
+            )
         redundant = self.arm.redundant_positions(solver, shares[:, : len(solver.redundant)])
         if self.sampled_angles:
             rotations = (rotations[:, None] @ self._rotations(shares[:, len(solver.redundant) :])).reshape(-1, 3, 3)
@@ -273,14 +275,16 @@ class PreparedArm:
 
     def _rotations(self, shares: Array) -> Array:
         """Return rotations of the tip in its own frame at shares of the open angles. Shape (S, 3, 3)."""
-        rolled = Rotation.from_rotvec(TURN * shares[:, :1] * self.tool_axis)
+        rolled = scipy.spatial.transform.Rotation.from_rotvec(TURN * shares[:, :1] * self.tool_axis)
         if self.free is ToolFreedom.ROLL:
             return np.asarray(rolled.as_matrix())
         across = np.eye(3)[np.abs(self.tool_axis).argmin()]
         across = np.cross(self.tool_axis, across) / np.linalg.norm(np.cross(self.tool_axis, across))
-        azimuths = Rotation.from_rotvec(TURN * shares[:, 1:2] * self.tool_axis)
+        azimuths = scipy.spatial.transform.Rotation.from_rotvec(TURN * shares[:, 1:2] * self.tool_axis)
         tilts = np.arccos(1 - shares[:, 2:3] * (1 - np.cos(self.within)))  # uniform on the cap of the sphere
-        return np.asarray((Rotation.from_rotvec(tilts * azimuths.apply(across)) * rolled).as_matrix())
+        return np.asarray(
+            (scipy.spatial.transform.Rotation.from_rotvec(tilts * azimuths.apply(across)) * rolled).as_matrix()
+        )
 
 
 def _checked_poses(positions: Any, rotations: Any) -> tuple[Array, Array]:
@@ -346,7 +350,9 @@ class IkBranches:
         """Return a rotation of the tip that does the task. Shape (3, 3)."""
         if self._task.direction is not None:
             axis, direction = np.array(self._task.tool_axis), targets[6:9] / np.linalg.norm(targets[6:9])
-            return np.asarray(Rotation.align_vectors(direction[None], axis[None])[0].as_matrix())
+            return np.asarray(
+                scipy.spatial.transform.Rotation.align_vectors(direction[None], axis[None])[0].as_matrix()
+            )
         if self._task.orientation is not None and set(self._task.chosen) & set(ANGULAR):
             return np.asarray(targets[6:15].reshape(3, 3).T)
         return self.arm.arm.chain.rotation
@@ -401,8 +407,8 @@ def ik_configurations(
     Raises:
         ProblemError: The task is not of this kind, or the machine has no such solver: use `inverse_kinematics`.
     """
-    checked_count("samples", samples, 1)
-    checked_flag("limits", limits)
+    require.count("samples", samples, 1)
+    require.flag("limits", limits)
     if not np.isfinite(real(time)):
         raise ProblemError(f"time must be a finite number of seconds, not {time!r}", name="time", value=time)
     equations, unbounded = bind(machine, task), np.full(machine.joint_size, np.inf)

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models import CollisionScene, Machine
-from models.arrays import Array
+from models.checks import NOT_NUMBERS, Array, floats, real
 from ocp.console import interruptible
-from ocp.errors import NOT_NUMBERS, ProblemError, checked_count, checked_flag, checked_positive, floats, real
+from ocp.errors import ProblemError, require
 from ocp.motion.local.collisions import Collision, checked_collision_scene, find_collisions, slide_apart
 from ocp.motion.local.ik_solver import ik_branches
 from ocp.motion.tasks.checks import checked_configuration
@@ -169,11 +169,11 @@ def inverse_kinematics(
         raise ProblemError(words, name="task")
     equations = TaskEquations(machine, pose_tasks)
     for name, number in (("starts", starts), ("iterations", iterations)):
-        checked_count(name, number, least=int(name == "iterations"))
+        require.count(name, number, least=int(name == "iterations"))
     for name, value in (("tolerance", tolerance), ("apart", apart)):
-        checked_positive(name, value)
-    checked_count("seed", seed, 0, LARGEST_SEED)
-    checked_flag("limits", limits)
+        require.positive(name, value)
+    require.count("seed", seed, 0, LARGEST_SEED)
+    require.flag("limits", limits)
     if scene is not None:
         checked_collision_scene(scene, machine, limits)
     if not np.isfinite(real(time)):
@@ -189,8 +189,7 @@ def inverse_kinematics(
         raise ProblemError(words, name="task", value=targets, time=float(time))
 
     search = _MultiStart(equations, base_values, targets, lower, upper, tolerance, apart, int(iterations))
-    listed, certain = search.list_branches(int(starts), int(seed))
-    random = 0 if certain else int(starts)
+    listed, random = search.list_branches(int(starts), int(seed))
     first = first[: len(first) - int(starts) + random]
     solutions = search.solve(np.vstack([first[: len(first) - random], listed, first[len(first) - random :]]), random)
     if scene is None:
@@ -266,17 +265,22 @@ class _MultiStart:
             raise unreachable_error(self.equations, q[nearest], float(error[nearest]), lower, upper, misses=misses)
         return self.rank(q, error)
 
-    def list_branches(self, count: int, seed: int) -> tuple[Array, bool]:
-        """Return solutions on all branches, (K, n), and whether no random start is needed besides."""
+    def list_branches(self, count: int, seed: int) -> tuple[Array, int]:
+        """Return solutions on all branches, (K, n), and how many random starts are needed besides.
+
+        Of a redundant arm with several free parameters, few samples of these may keep the limits. Iterations under the
+        limits from random starts then make up the number.
+        """
         branches = ik_branches(self.equations, self.lower, self.upper) if count else None
         if branches is None:
-            return np.zeros((0, len(self.lower))), False
+            return np.zeros((0, len(self.lower))), count
         configurations = branches.configurations(self.targets, count, seed * count, turns=False)
         joints = configurations.joints
         if len(joints) > count and not branches.complete:
             joints = joints[spread_points(np.where(self._revolute, np.sin(joints), joints), count)]
-        certain = bool(configurations.complete[0]) if branches.complete else True
-        return joints, certain and len(joints) > 0
+        if branches.complete:
+            return joints, 0 if configurations.complete[0] and len(joints) else count
+        return joints, count - len(joints)
 
     def iterate(self, joints: Array) -> tuple[Array, Array]:
         """Return joints (K, n) and largest pose errors (K,) after the iterations from these joints."""

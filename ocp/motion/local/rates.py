@@ -17,11 +17,12 @@ import casadi as ca
 import numpy as np
 
 from models import CollisionScene, Machine
-from models.arrays import Array
+from models.checks import NOT_NUMBERS, Array, floats, real
+from models.files import INPUT_LIMITS
 from models.spatial import solve_spd
 from ocp.console import interruptible
 from ocp.curves import integrator
-from ocp.errors import MAX_COUNT, NOT_NUMBERS, ProblemError, checked_nonnegative, checked_positive, floats, real
+from ocp.errors import ProblemError, require
 from ocp.motion.local.collisions import checked_collision_scene, distances_along
 from ocp.motion.tasks.checks import checked_configuration, checked_tasks, checked_weights, dependent_rows, horizon_of
 from ocp.motion.tasks.equations import TaskEquations, bind
@@ -137,8 +138,8 @@ def resolve(
     duration = horizon_of([part.task for part in equations.bound], horizon)
     rate_weights = checked_weights(weights, machine.joint_size)
     checked_tasks(equations, base, joints, duration)
-    checked_nonnegative("damping", damping)
-    checked_positive("tolerance", tolerance)
+    require.nonnegative("damping", damping)
+    require.positive("tolerance", tolerance)
     times = _times(samples, duration)
     if damping == 0 and (rows_dependent := dependent_rows(equations, base, joints)):
         words = (
@@ -179,7 +180,7 @@ def _times(samples: Any, horizon: float) -> Array:
     """Return the times of the samples, checked."""
     if not isinstance(samples, list | tuple | np.ndarray):
         count = real(samples)
-        if not (2 <= count <= MAX_COUNT and count == int(count)):
+        if not (2 <= count <= INPUT_LIMITS.count and count == int(count)):
             words = f"samples must be at least 2 points or an array of times, not {samples!r}"
             raise ProblemError(words, name="samples", value=samples, limit=2)
         return np.linspace(0.0, horizon, int(count))

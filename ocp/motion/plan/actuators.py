@@ -1,6 +1,10 @@
-"""Motions within actuator limits: torque, power, acceleration and jerk.
+"""Motions along tasks within limits of torque, power, acceleration and jerk, or at a cost beside the squared rates.
 
-A motion without these limits is the guess of the same problem with accelerations as controls and the same cost.
+The guess is a motion without these limits, of least squared rates, whose problem has the rates as controls. The problem
+solved from it has accelerations as controls.
+
+Limits can only increase the cost of a motion. With another cost, that of the guess bounds nothing: every local minimum
+of the squared rates is then the guess of one motion, and the lowest of their costs is that of the plan.
 """
 
 from __future__ import annotations
@@ -11,24 +15,32 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from models.arrays import Array
+from models.checks import Array
 from models.machines.machine import hold_joints
 from ocp.direct.guess import Samples
 from ocp.errors import SolveError
 from ocp.motion.builders.clearance import ClearanceConstraints
-from ocp.motion.builders.dynamics import checked_motors, joint_torques
 from ocp.motion.builders.dynamics_plan import within_limits
-from ocp.motion.builders.tool_motion import ToolMotion
+from ocp.motion.builders.tool_motion import CLOCK, PACE, SLOPES, ToolMotion
+from ocp.motion.builders.torques import Actuation, checked_motors, joint_torques, running_cost, weights_torques
 from ocp.motion.result.plan import CHECKED_TIMES
 from ocp.motion.result.request import declared_motion
 from ocp.motion.result.solved_plan import SolvedPlan
 from ocp.motion.search.configurations import PlanRequest
 from ocp.motion.search.held_joints import all_joints
+from ocp.motion.tasks.goals import Cost
 from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.problem.problem import Problem
 from ocp.solution import Solution
 
-__all__ = ["ActuatorDemand", "limits_actuators", "solve_within_actuator_limits", "without_actuators"]
+__all__ = [
+    "ActuatorDemand",
+    "cost_of_motion",
+    "limits_actuators",
+    "solve_with_accelerations",
+    "weights_actuators",
+    "without_actuators",
+]
 
 ACTUATOR_LIMITS = ("acceleration", "jerk", "torque", "power")
 
@@ -38,9 +50,34 @@ def limits_actuators(limits: Limits) -> bool:
     return any(getattr(limits, quantity) is not None for quantity in ACTUATOR_LIMITS)
 
 
+def weights_actuators(cost: Cost) -> bool:
+    """Return whether a cost weights torques, work, accelerations or jerks."""
+    return bool({"effort", "energy", "acceleration", "jerk"} & set(cost.terms))
+
+
 def without_actuators(limits: Limits) -> Limits:
     """Return the limits of positions and rates alone."""
     return replace(limits, acceleration=None, jerk=None, torque=None, power=None)
+
+
+def cost_of_motion(plan: SolvedPlan, cost: Cost) -> float:
+    """Return the cost of the motion of a plan by the trapezoidal rule, without the joints that it holds."""
+    machine = hold_joints(plan.machine, plan.held) if plan.held else plan.machine
+    sample = plan.sampled(np.linspace(0.0, plan.horizon, CHECKED_TIMES))
+    free = [name not in plan.held for name in plan.names]
+    bases = plan.at(sample.t)["base"] if machine.base_size else np.zeros((CHECKED_TIMES, 0))
+    base, *motion = (ca.SX.sym("v", size) for size in (machine.base_size, *[machine.joint_size] * 4))
+    torques: Any = None
+    if weights_torques(cost):
+        torques = joint_torques(checked_motors("cost", machine), base, *motion[:3])
+    running = running_cost(machine, cost, (base, *motion[:3]), jerks=motion[3], torques=torques)
+    if cost.energy:
+        running += cost.energy * ca.sum1(ca.fmax(torques * motion[1], 0.0))
+    running_at = ca.Function("cost", [base, *motion], [running])
+    joints, rates, accelerations = (values[:, free] for values in sample[1:4])
+    jerks = np.gradient(accelerations, sample.t, axis=0)
+    values = running_at.map(CHECKED_TIMES)(bases.T, joints.T, rates.T, accelerations.T, jerks.T)
+    return float(np.trapezoid(np.array(values)[0], sample.t) + cost.time * plan.horizon)
 
 
 @dataclass(frozen=True)
@@ -101,24 +138,22 @@ class ActuatorDemand:
         return None if largest is None else largest[1]
 
 
-def solve_within_actuator_limits(
-    request: PlanRequest, start: Array, reference: Array, unlimited: SolvedPlan
-) -> Solution:
-    """Return a motion within the actuator limits, from one without; from its own start if many are equally good.
+def solve_with_accelerations(request: PlanRequest, start: Array, reference: Array, unlimited: SolvedPlan) -> Solution:
+    """Return a motion within the actuator limits and at the cost of a request, from one without.
 
     Args:
-        request: The request.
+        request: The request. If many starts are equally good, the motion has its own start.
         start, reference: As in `tool_motion_problem`.
         unlimited: Motion without actuator limits.
 
     Raises:
         SolveError: None was found. Names the joint, the time, the demand without the limit, and the limit.
     """
-    limits = request.actuator_limits
-    assert limits is not None
+    limits = request.actuator_limits or request.limits
+    first = request.stretches[0]
     if request.start is None:
         # a joint that started elsewhere separates bodies and is not ignorable
-        initial = unlimited.solution[f"joints{request.stretches[0].suffix}"][0]
+        initial = unlimited.solution[f"joints{first.suffix}"][0]
         start = np.where(np.isclose(initial, start, rtol=0.0), start, np.nan)
 
     fractions = [(stretch.breaks - stretch.begin) / stretch.duration for stretch in request.stretches]
@@ -127,7 +162,8 @@ def solve_within_actuator_limits(
     def solve_from(initial: Array) -> Solution:
         def declare(constraints: ClearanceConstraints | None) -> Problem:
             guess: dict[str, Any] = {"start": initial, "reference": reference}
-            motion = declared_motion(request, **guess, constraints=constraints, limits=limits)
+            actuation = Actuation(request.cost, request.rests)
+            motion = declared_motion(request, **guess, constraints=constraints, actuation=actuation)
             _set_guess(motion, unlimited)
             return motion.problem
 
@@ -138,7 +174,7 @@ def solve_within_actuator_limits(
         solution = solve_from(start)
         audit = solution.audit()
         if audit.feasible and audit.optimal is None and np.isnan(start).any():
-            fixed_solution = solve_from(solution[f"joints{request.stretches[0].suffix}"][0])
+            fixed_solution = solve_from(solution[f"joints{first.suffix}"][0])
             if fixed_solution.audit().passed:
                 return fixed_solution
     except SolveError as error:
@@ -163,14 +199,16 @@ def _set_guess(motion: ToolMotion, unlimited: SolvedPlan) -> None:
     """Set the guess of the states and controls of a problem to a motion without actuator limits."""
     fractions = np.linspace(0.0, 1.0, CHECKED_TIMES)
     sample = unlimited.solution.at_fraction(fractions)
+    pace = sample[PACE] if unlimited.rate_name == SLOPES else 1.0
     for stretch, part in zip(motion.stretches, unlimited.parts, strict=True):
         values_by_name = {
             "base": sample.get(f"base{stretch.suffix}"),
             "joints": sample[f"joints{stretch.suffix}"],
-            "velocities": sample[unlimited.rate_name + stretch.suffix],
+            "velocities": sample[unlimited.rate_name + stretch.suffix] / pace,
             "accelerations": unlimited.accelerations(part, fractions),
         }
-        for name, values in values_by_name.items():
+        named = {name + stretch.suffix: values for name, values in values_by_name.items()}
+        for name, values in {**named, CLOCK: sample.get(CLOCK), PACE: sample.get(PACE)}.items():
             for pool in (motion.problem.declared.states, motion.problem.declared.controls):
-                if values is not None and (variable := pool.get(name + stretch.suffix)) is not None:
+                if values is not None and (variable := pool.get(name)) is not None:
                     pool[variable.name] = replace(variable, guess=Samples(fractions * motion.horizon, values))

@@ -90,8 +90,15 @@ class CandidateQueue:
         candidates: Finished candidates, which passed or were rejected.
     """
 
-    def __init__(self, solver: Solver, settings: PlannerSettings) -> None:
+    def __init__(self, solver: Solver, settings: PlannerSettings, *, include_costlier: bool = False) -> None:
+        """
+        Args:
+            solver: Solver of the candidates.
+            settings: Settings of the planner.
+            include_costlier: Whether all batches include costlier motions, see `run`.
+        """
         self.solver, self.settings, self._began = solver, settings, time.thread_time()
+        self._always_costlier = include_costlier
         self.candidates: list[Candidate] = []
 
     @property
@@ -126,7 +133,7 @@ class CandidateQueue:
         self._heap: list[tuple[float, int, int, Candidate]] = []
         self._motions: list[_Motion] = []
         self._pushed = self._failures = self._audits = 0
-        self._least, self._coarse_error, self._include_costlier = np.inf, 0.0, include_costlier
+        self._least, self._coarse_error, self._include_costlier = np.inf, 0.0, include_costlier or self._always_costlier
         for seed in seeds:
             self._push(seed)
         while self._heap:

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import replace
 from operator import attrgetter
 from typing import Any
 
 import numpy as np
 
-from models.arrays import Array
+from models.checks import Array
 from ocp.audit.audit import Audit, Finding
 from ocp.audit.clearance import ClosestPair
 from ocp.direct.collocation import Collocation
@@ -26,7 +27,7 @@ from ocp.motion.builders.tool_motion import CLOCK, SLOPES, ToolMotion
 from ocp.motion.local.collisions import Collision
 from ocp.motion.local.inverse_kinematics import Unreachable
 from ocp.motion.local.rates import LocalMotion
-from ocp.motion.plan.actuators import solve_within_actuator_limits
+from ocp.motion.plan.actuators import cost_of_motion, solve_with_accelerations
 from ocp.motion.plan.candidate_queue import Solver
 from ocp.motion.plan.singular import MotionSample, describe_shortfall, is_nearly_singular, limit_reason
 from ocp.motion.result.candidate import Candidate, Reason, Rejection, Seed, Stage, collision_reason
@@ -65,7 +66,8 @@ class CandidateSolver(Solver):
         self.request, self.settings, self.start, self.reference = request, request.settings, start, reference
         constraints = request.clearance_constraints
         self.motion = declared_motion(request, start=start, reference=reference, constraints=constraints)
-        self.last = Stage.AUDITED if request.actuator_limits is None else Stage.ACTUATED
+        actuated = request.cost is None and (request.actuator_limits is not None or any(request.rests))
+        self.last = Stage.ACTUATED if actuated else Stage.AUDITED
         self._clear_counts: dict[float, int | Unreachable | None] = {}
         self._prepared: dict[Any, tuple[ToolMotion, Collocation, Prepared]] = {}
         self._collisions: tuple[Solution | None, list[Collision]] = None, []
@@ -93,6 +95,17 @@ class CandidateSolver(Solver):
         if self._may_relax(advanced):
             return [Candidate(candidate.start, candidate.seed.cost, seed=replace(candidate.seed, relaxed=True))]
         return [advanced, *self._free_start(advanced)]
+
+    def with_own_cost(self) -> CandidateSolver:
+        """Return the solver whose last stage is the solve at the cost of the request."""
+        solver = copy(self)
+        solver.last = Stage.ACTUATED
+        return solver
+
+    def own_cost(self, candidate: Candidate) -> float:
+        """Return the cost of the request for the motion of an audited candidate."""
+        assert self.request.cost is not None
+        return cost_of_motion(self.plan([candidate]), self.request.cost)
 
     def is_nearly_singular(self, local: Sequence[LocalMotion]) -> bool:
         """Return whether the tasks along a local motion are nearly dependent, so that its candidate relaxes them."""
@@ -219,7 +232,7 @@ class CandidateSolver(Solver):
 
     def _limit_actuators(self, candidate: Candidate) -> Candidate:
         """Solve a candidate again within the actuator limits."""
-        solution = solve_within_actuator_limits(self.request, self.start, self.reference, self.plan([candidate]))
+        solution = solve_with_accelerations(self.request, self.start, self.reference, self.plan([candidate]))
         return replace(candidate, stage=Stage.ACTUATED, cost=solution.cost, solution=solution)
 
     def _free_start(self, candidate: Candidate) -> list[Candidate]:
@@ -228,7 +241,7 @@ class CandidateSolver(Solver):
             return []
         constraints = self.request.clearance_constraints
         if constraints is not None:
-            constraints = constraints.holding([collision.pair for collision in self.local_collisions(candidate.seed)])
+            constraints = constraints.separating(self.local_collisions(candidate.seed))
         seed = Seed(candidate.solution, local=candidate.seed.local, direct=True)
         return [Candidate(candidate.start, seed=seed, constraints=constraints)]
 
@@ -246,7 +259,7 @@ class CandidateSolver(Solver):
     def _separate_pairs(self, candidate: Candidate, stage: Stage, collisions: list[Collision]) -> Candidate:
         """Solve a candidate again with more separated pairs."""
         assert candidate.constraints is not None
-        constraints = candidate.constraints.holding([collision.pair for collision in collisions])
+        constraints = candidate.constraints.separating(collisions)
         reason = self._collision_reason(collisions[0])
         return self._solve_again(replace(candidate, constraints=constraints), stage, reason)
 

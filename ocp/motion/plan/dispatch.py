@@ -7,19 +7,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, Literal, TypeAlias, get_args
 
-import numpy as np
-
 from models import FixedBase, FreeFloating, Machine, Standing
-from ocp.console import TimeLimitReached, interruptible, report, shown_progress, time_left, time_limited
-from ocp.errors import (
-    ProblemError,
-    SolveError,
-    checked_choice,
-    checked_count,
-    checked_flag,
-    checked_instance,
-    checked_time_limit,
-)
+from ocp.console import TimeLimitReached, interruptible, shown_progress, time_limited
+from ocp.errors import ProblemError, SolveError, checked_time_limit, require
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem
 from ocp.motion.builders.dynamics_plan import dynamics_phases
@@ -30,15 +20,14 @@ from ocp.motion.builders.standing.stances import Steps
 from ocp.motion.builders.standing.steps import StepWeights, steps_problem
 from ocp.motion.local.inverse_kinematics import LARGEST_SEED
 from ocp.motion.plan.actuators import limits_actuators
-from ocp.motion.plan.goal_plan import GoalRequest, plan_to_goal
-from ocp.motion.plan.goal_sequence import goal_configurations, plan_capture, plan_sequence, plan_steps
+from ocp.motion.plan.goal_sequence import plan_capture, plan_goal, plan_sequence, plan_steps
 from ocp.motion.plan.planner import checked_request, clearance_for, plan_request
-from ocp.motion.plan.sequence import plan_in_segments
+from ocp.motion.plan.sequence import SequenceRequest, plan_consecutive, plan_in_segments
 from ocp.motion.plan.standing import plan_to_stand
 from ocp.motion.plan.waypoints import plan_path
 from ocp.motion.result.path_plan import PathPlan
 from ocp.motion.result.plan import Plan
-from ocp.motion.result.segmented_plan import SegmentedPlan
+from ocp.motion.result.segmented_plan import SegmentedPlan, SequencePlan
 from ocp.motion.result.solved_plan import PHASED, PhasedPlan, SolvedPlan
 from ocp.motion.tasks.goals import Cost, Goal, Scene, Start, Waypoints
 from ocp.motion.tasks.limits import Limits
@@ -49,7 +38,8 @@ from ocp.storage import read_arrays
 __all__ = ["Search", "load_plan", "plan", "plan_problem"]
 
 Search: TypeAlias = Literal["start", "configurations", "global", "segments"]
-Tasks: TypeAlias = TipTask | Goal | Waypoints | Steps | Capture | Sequence[TipTask] | Sequence[Goal]
+Parts: TypeAlias = Sequence[Goal | TipTask | Sequence[TipTask]]
+Tasks: TypeAlias = TipTask | Goal | Waypoints | Steps | Capture | Sequence[TipTask] | Sequence[Goal] | Parts
 
 
 @interruptible
@@ -113,9 +103,9 @@ def plan(
             the motions of a global search end, what obstructs them, by how much the tasks would have to be relaxed, and
             in how few segments they may be done (search="segments").
     """
-    checked_choice("search", search, get_args(Search))
-    checked_flag("cyclic", cyclic)
-    checked_count("seed", seed, 0, LARGEST_SEED)
+    require.choice("search", search, get_args(Search))
+    require.flag("cyclic", cyclic)
+    require.count("seed", seed, 0, LARGEST_SEED)
     with time_limited(checked_time_limit(time_limit)), shown_progress("plan", progress):
         try:
             return _plan(machine, tasks, horizon, start, cyclic, cost, limits, scene, search, seed)
@@ -142,17 +132,23 @@ def _plan(
     options: dict[str, Any] = {"cost": cost, "limits": limits, "seed": seed}
     if isinstance(tasks, Waypoints):
         _check_unused("a path through waypoints", horizon=horizon, start=start, cyclic=cyclic or None)
-        arm = checked_instance("machine", machine, FixedBase)
+        arm = require.instance("machine", machine, FixedBase)
         return plan_path(arm, tasks, scene=scene, **options)
     options["start"] = start
     if search == "segments":
         _check_unused("search='segments'", cyclic=cyclic or None)
-        arm = checked_instance("machine", machine, FixedBase)
+        arm = require.instance("machine", machine, FixedBase)
         return plan_in_segments(arm, tasks, horizon, scene=scene, **options)
     if isinstance(tasks, Steps):
         _check_unused("a walk, whose phases have durations", horizon=horizon, cyclic=cyclic or None)
         _check_unused("a walk, whose feet stand on footholds,", scene=scene or None)
         return plan_steps(machine, tasks, start=start, cost=cost, limits=limits)
+    if _is_sequence(tasks):
+        if horizon is not None:
+            require.choice("horizon", horizon, ("free",))
+        _check_unused("a sequence of goals and tasks", cyclic=cyclic or None)
+        own = SequenceRequest(machine, start, horizon is not None, cost, limits, scene, search, seed)
+        return plan_consecutive(own, tasks)
     constraints = clearance_for(machine, limits, scene)
     if isinstance(tasks, Capture):
         _check_unused("a capture, whose phases have durations", horizon=horizon, cyclic=cyclic or None)
@@ -160,8 +156,8 @@ def _plan(
     goals = (tasks,) if isinstance(tasks, Goal) else tasks
     if isinstance(goals, Sequence) and isinstance(next(iter(goals), None), Goal):
         _check_unused("a motion to goals", cyclic=cyclic or None)
-        if len(goals) == 1 and isinstance(machine, FixedBase) and _is_simple(goals[0]):
-            return plan_to_goal(_goal_request(machine, goals[0], horizon, constraints=constraints, **options))
+        if len(goals) == 1:
+            return plan_goal(machine, goals[0], horizon, constraints=constraints, **options)
         return plan_sequence(machine, goals, horizon, constraints=constraints, **options)
     options |= {"search": search, "cyclic": cyclic}
     if isinstance(machine, Standing):
@@ -170,51 +166,26 @@ def _plan(
     return plan_request(replace(request, clearance_constraints=constraints))
 
 
-def _is_simple(goal: Goal) -> bool:
-    """Return whether nothing is asked on the way to a goal, and the machine stays as it is."""
-    has_tasks = not (isinstance(goal.tasks, Sequence) and not goal.tasks)
-    return not has_tasks and goal.machine is None and goal.base is None
-
-
-def _goal_request(
-    machine: FixedBase,
-    goal: Goal,
-    horizon: Any,
-    *,
-    start: Any,
-    cost: Cost | None,
-    limits: Limits | None,
-    constraints: ClearanceConstraints | None,
-    seed: int,
-) -> GoalRequest:
-    """Return the request for a motion to one goal.
+def _is_sequence(tasks: Any) -> bool:
+    """Return whether parts are done one after the other of which not all are goals, or which are tasks at once.
 
     Raises:
-        ProblemError: The start is missing, or as in `goal_configurations`.
+        ProblemError: A part is neither a goal nor tasks.
     """
-    state, joints, _ = Start.of(start, machine)
-    if joints is None:
-        raise ProblemError("start is missing: a goal is reached from somewhere; give plan(..., start=)", name="start")
-    own_limits = Limits() if limits is None else checked_instance("limits", limits, Limits)
-    places: dict[str, Any] = {"limits": own_limits, "constraints": constraints, "seed": seed}
-    is_free = isinstance(horizon, str)
-    if is_free:
-        checked_choice("horizon", horizon, ("free",))
-    own_cost = Cost(time=float(is_free)) if cost is None else checked_instance("cost", cost, Cost)
-    return GoalRequest(
-        machine,
-        joints,
-        goal_configurations(machine, goal, joints, **places),
-        horizon=goal.duration if horizon is None or is_free else horizon,
-        limits=own_limits,
-        cost=own_cost,
-        start_velocity=state.velocity,
-        end_velocity=goal.velocity,
-        clearance_constraints=constraints,
-        seed=seed,
-        time_limit=time_left() if np.isfinite(time_left()) else None,
-        progress=report,
-    )
+    if not isinstance(tasks, Sequence) or isinstance(tasks, str):
+        return False
+    goals = [isinstance(part, Goal) for part in tasks]
+    if all(goals) or all(isinstance(part, TipTask) for part in tasks):
+        return False
+    if not any(goals) and not all(isinstance(part, TipTask | Sequence) for part in tasks):
+        return False  # refused as tasks
+    for number, part in enumerate(tasks, 1):
+        each = part if isinstance(part, Sequence) and not isinstance(part, str) else (part,)
+        if not each or not (isinstance(part, Goal) or all(isinstance(task, TipTask) for task in each)):
+            words = f"part {number} of the sequence is neither a Goal nor TipTasks, but {part!r}; waypoints have no "
+            words += "times: give a TipTask.along(smooth(path), speed) through them, or plan them alone"
+            raise ProblemError(words, name=f"part {number}", value=part)
+    return True
 
 
 def _check_unused(reason: str, **arguments: Any) -> None:
@@ -253,7 +224,7 @@ def plan_problem(
     if not isinstance(machine, FixedBase | FreeFloating):
         raise ProblemError(f"a machine is expected, not a {type(machine).__name__}", name="machine", value=machine)
     if limits is not None:
-        checked_instance("limits", limits, Limits)
+        require.instance("limits", limits, Limits)
     if isinstance(tasks, Steps):
         joints = Start.of(start, tasks.stances[0])[1]
         begin = None if joints is None else tasks.in_order(tasks.stances[0], joints[None])[0]
@@ -261,7 +232,7 @@ def plan_problem(
     constraints = clearance_for(machine, limits, scene)
     shared: dict[str, Any] = {"limits": limits, "clearance_constraints": constraints}
     if isinstance(tasks, Capture):
-        chaser = checked_instance("machine", machine, FreeFloating)
+        chaser = require.instance("machine", machine, FreeFloating)
         return capture_problem(chaser, tasks, start=start, cost=own, **shared)
     goals: Any = (tasks,) if isinstance(tasks, Goal) else tasks
     if isinstance(goals, Sequence) and isinstance(next(iter(goals), None), Goal):
@@ -271,7 +242,7 @@ def plan_problem(
         setup = StandingSetup(clearance_constraints=constraints)
         options: dict[str, Any] = {"start": joints, "weights": own, "limits": limits, "setup": setup}
         return standing_problem(machine, goals, horizon, **options)
-    weights = None if own is None else checked_instance("cost", own, Cost).joint_weights(machine.joint_size)
+    weights = None if own is None else require.instance("cost", own, Cost).joint_weights(machine.joint_size)
     own_setup = VelocitySetup(start_base=base, clearance_constraints=constraints)
     options = {"start": joints, "cyclic": cyclic, "weights": weights, "limits": limits, "setup": own_setup}
     return minimum_velocity_problem(machine, goals, horizon, **options)
@@ -319,6 +290,7 @@ def load_plan(path: str | os.PathLike[str]) -> Plan:
     arrays = read_arrays(path)
     if "path" in arrays:
         return PathPlan.of_arrays(path, arrays)
-    if "segments" in arrays:
-        return SegmentedPlan.of_arrays(path, arrays)
+    for kind in (SegmentedPlan, SequencePlan):
+        if kind.kind in arrays:
+            return kind.of_arrays(path, arrays)
     return (PhasedPlan if PHASED in arrays else SolvedPlan).of_arrays(path, arrays)

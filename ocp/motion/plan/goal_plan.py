@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 
 from models import FixedBase
-from models.arrays import Array
+from models.checks import Array
 from ocp.console import TimeLimitReached, interruptible, time_limited
 from ocp.direct.guess import Samples
-from ocp.errors import ProblemError, SolveError, checked_instance, checked_positive
+from ocp.errors import ProblemError, SolveError, require
 from ocp.motion.builders.clearance import ClearanceConstraints, collision_error
 from ocp.motion.builders.dynamics import QUINTIC, DynamicsSetup, dynamics_problem
 from ocp.motion.builders.dynamics_plan import audit_error, within_limits
@@ -34,7 +34,7 @@ from ocp.motion.sampling.shortening import points_along, shortest_through_corner
 from ocp.motion.sampling.straight import StraightMotions
 from ocp.motion.search.joint_space import FULL_TURN, JointSpace
 from ocp.motion.search.search import checked_bound
-from ocp.motion.tasks.checks import checked_configuration, checked_horizon, checked_weights, clip_to_limits
+from ocp.motion.tasks.checks import checked_configuration, checked_weights, clip_to_limits
 from ocp.motion.tasks.goals import Cost
 from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.problem.problem import Problem
@@ -158,7 +158,7 @@ def plan_to_goal(request: GoalRequest) -> SolvedPlan:
     """
     task = _checked(request)
     seconds = request.settings.time_limit if request.time_limit is None else request.time_limit
-    with time_limited(checked_positive("time_limit", seconds)):
+    with time_limited(require.positive("time_limit", seconds)):
         with time_limited(request.settings.search_share * seconds):
             paths = _paths(task, seconds)
         task.report(f"{len(paths)} paths, the shortest of length {paths[0].length:.4g}")
@@ -173,14 +173,14 @@ def _checked(request: GoalRequest) -> _Task:
     Raises:
         ProblemError: As `plan_to_goal`.
     """
-    machine = checked_instance("machine", request.machine, FixedBase)
-    limits = Limits() if request.limits is None else checked_instance("limits", request.limits, Limits)
+    machine = require.instance("machine", request.machine, FixedBase)
+    limits = Limits() if request.limits is None else require.instance("limits", request.limits, Limits)
     bounds = limits.bounds(machine, ("velocity",))
     if request.horizon is not None:
-        checked_horizon(request.horizon)
+        require.positive("horizon", request.horizon)
     scene = None if request.clearance_constraints is None else request.clearance_constraints.scene
     motions = StraightMotions(scene)
-    cost = checked_instance("cost", request.cost, Cost)
+    cost = require.instance("cost", request.cost, Cost)
     if cost.length and cost.terms != ("length",):
         words = f"cost: the length of a motion is weighted alone, Cost(velocity=0, length=1), not in {cost}"
         raise ProblemError(words, name="length", value=cost.length)

@@ -8,27 +8,30 @@ from typing import Any, Literal
 
 import numpy as np
 
-from models import Box, FreeFloating, Machine, Sphere, Stance
-from models.arrays import Array
-from ocp.errors import ProblemError, checked_each, checked_instance, floats
+from models import Box, FixedBase, FreeFloating, Machine, Sphere, Stance
+from models.checks import Array, floats
+from ocp.console import report, time_left
+from ocp.errors import ProblemError, require
 from ocp.motion.builders.clearance import ClearanceConstraints
-from ocp.motion.builders.dynamics import DynamicsSetup, checked_motors
+from ocp.motion.builders.dynamics import DynamicsSetup
 from ocp.motion.builders.dynamics_plan import dynamics_phases, machines_of, phase_names, within_limits
 from ocp.motion.builders.space.capture import Capture, solve_capture
 from ocp.motion.builders.standing.plan import solve_steps
 from ocp.motion.builders.standing.stances import Steps
 from ocp.motion.builders.standing.steps import StepWeights
+from ocp.motion.builders.torques import checked_motors
 from ocp.motion.local.inverse_kinematics import Unreachable, inverse_kinematics
+from ocp.motion.plan.goal_plan import GoalRequest, plan_to_goal
 from ocp.motion.result.candidate import Candidate, Stage
-from ocp.motion.result.solved_plan import PhasedPlan, parts_of_phases
-from ocp.motion.tasks.checks import checked_numbers, clip_to_limits
+from ocp.motion.result.solved_plan import PhasedPlan, SolvedPlan, parts_of_phases
+from ocp.motion.tasks.checks import clip_to_limits
 from ocp.motion.tasks.equations import bind
 from ocp.motion.tasks.goals import Cost, Goal, Start
 from ocp.motion.tasks.limits import Limits
 from ocp.problem.problem import Problem
 from ocp.solution import Solution
 
-__all__ = ["goal_configurations", "plan_capture", "plan_sequence", "plan_steps"]
+__all__ = ["goal_configurations", "plan_capture", "plan_goal", "plan_sequence", "plan_steps", "with_joints"]
 
 REGION_SAMPLES = 8
 """Random places of the tip in the region of a goal, besides its centre."""
@@ -63,19 +66,19 @@ def plan_sequence(
         ProblemError: As `dynamics_phases`; or the start is missing.
         SolveError: No motion satisfies its limits.
     """
-    motors, goals = checked_motors("plan", machine), checked_each("goals", goals, Goal)
+    motors, goals = checked_motors("plan", machine), require.each("goals", goals, Goal)
     state, joints, base = Start.of(start, motors)
     if joints is None:
         raise ProblemError("start is missing: a goal is reached from somewhere; give plan(..., start=)", name="start")
-    own_limits = Limits() if limits is None else checked_instance("limits", limits, Limits)
-    own_cost = None if cost is None else checked_instance("cost", cost, Cost)
+    own_limits = Limits() if limits is None else require.instance("limits", limits, Limits)
+    own_cost = None if cost is None else require.instance("cost", cost, Cost)
     if len(goals) == 1 and goals[0].duration is None:  # one motion has the horizon
         goals, total = [replace(goals[0], duration=total)], None
     near, resolved = joints, list[Goal]()
     for goal in goals:
         if goal.has_pose:
             near = nearest_configuration(goal.machine or motors, goal, near, limits=own_limits, seed=seed)
-            goal = _with_joints(goal, near)
+            goal = with_joints(goal, near)
         elif goal.joints is not None:
             near = np.where(np.isnan(np.asarray(goal.joints, dtype=float)), near, goal.joints)
         resolved.append(goal)
@@ -91,6 +94,81 @@ def plan_sequence(
     limited = {name: (each, own_limits) for name, each in zip(phase_names(resolved), machines, strict=True)}
     solution = within_limits(declare, constraints, limited)
     return _phased(motors, solution, joints)
+
+
+def plan_goal(
+    machine: Machine,
+    goal: Goal,
+    horizon: Any,
+    *,
+    start: Any,
+    cost: Cost | None,
+    limits: Limits | None,
+    constraints: ClearanceConstraints | None,
+    seed: int,
+) -> SolvedPlan:
+    """Plan the motion to one goal: around obstacles, or with its tasks, machine and base as one phase of a problem.
+
+    Args:
+        machine: Arm on a fixed or floating base.
+        goal: The goal.
+        horizon: s, "free", or None for the duration of the goal.
+        start, cost, limits, constraints, seed: As in `plan_sequence`.
+
+    Raises:
+        ProblemError, SolveError: As `plan_to_goal` or `plan_sequence`.
+    """
+    options: dict[str, Any] = {"start": start, "cost": cost, "limits": limits, "constraints": constraints, "seed": seed}
+    if isinstance(machine, FixedBase) and _is_simple(goal):
+        return plan_to_goal(_goal_request(machine, goal, horizon, **options))
+    return plan_sequence(machine, (goal,), horizon, **options)
+
+
+def _is_simple(goal: Goal) -> bool:
+    """Return whether nothing is asked on the way to a goal, and the machine stays as it is."""
+    has_tasks = not (isinstance(goal.tasks, Sequence) and not goal.tasks)
+    return not has_tasks and goal.machine is None and goal.base is None
+
+
+def _goal_request(
+    machine: FixedBase,
+    goal: Goal,
+    horizon: Any,
+    *,
+    start: Any,
+    cost: Cost | None,
+    limits: Limits | None,
+    constraints: ClearanceConstraints | None,
+    seed: int,
+) -> GoalRequest:
+    """Return the request for a motion to one goal.
+
+    Raises:
+        ProblemError: The start is missing, or as in `goal_configurations`.
+    """
+    state, joints, _ = Start.of(start, machine)
+    if joints is None:
+        raise ProblemError("start is missing: a goal is reached from somewhere; give plan(..., start=)", name="start")
+    own_limits = Limits() if limits is None else require.instance("limits", limits, Limits)
+    places: dict[str, Any] = {"limits": own_limits, "constraints": constraints, "seed": seed}
+    is_free = isinstance(horizon, str)
+    if is_free:
+        require.choice("horizon", horizon, ("free",))
+    own_cost = Cost(time=float(is_free)) if cost is None else require.instance("cost", cost, Cost)
+    return GoalRequest(
+        machine,
+        joints,
+        goal_configurations(machine, goal, joints, **places),
+        horizon=goal.duration if horizon is None or is_free else horizon,
+        limits=own_limits,
+        cost=own_cost,
+        start_velocity=state.velocity,
+        end_velocity=goal.velocity,
+        clearance_constraints=constraints,
+        seed=seed,
+        time_limit=time_left() if np.isfinite(time_left()) else None,
+        progress=report,
+    )
 
 
 def plan_steps(
@@ -132,13 +210,13 @@ def plan_capture(
         ProblemError: As `capture_problem`.
         SolveError: No motion satisfies its limits.
     """
-    chaser = checked_instance("machine", machine, FreeFloating)
+    chaser = require.instance("machine", machine, FreeFloating)
     options: dict[str, Any] = {"cost": cost, "limits": limits, "clearance_constraints": constraints}
     solution = solve_capture(chaser, capture, start=start, **options)
     return _phased(chaser, solution, np.asarray(Start.of(start, chaser)[1]))
 
 
-def _with_joints(goal: Goal, joints: Array) -> Goal:
+def with_joints(goal: Goal, joints: Array) -> Goal:
     """Return a goal with joints in place of its pose."""
     no_pose: dict[str, Any] = dict.fromkeys(("tip", "position", "orientation", "direction", "within", "region"))
     return replace(goal, joints=joints, **no_pose)
@@ -180,7 +258,7 @@ def goal_configurations(
     if not goal.has_pose:
         if goal.joints is None:
             raise ProblemError("a goal needs joints or a pose", name="joints", value=None)
-        values = checked_numbers(np.nan_to_num(floats(goal.joints)), len(near), "goal", "one for each joint")
+        values = require.array("goal", np.nan_to_num(floats(goal.joints)), (len(near),), meaning="one for each joint")
         joints = np.where(np.isnan(floats(goal.joints).ravel()), near, values)
         return clip_to_limits("end", names, joints, bounds.lower, bounds.upper, "end inside them")[None]
     scene = None if constraints is None else constraints.scene

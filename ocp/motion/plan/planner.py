@@ -18,23 +18,15 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from models import CollisionScene, Machine, ModelError
-from models.arrays import Array
+from models.checks import Array
 from ocp.console import report
-from ocp.errors import (
-    ProblemError,
-    SolveError,
-    checked_choice,
-    checked_count,
-    checked_each,
-    checked_flag,
-    checked_instance,
-)
+from ocp.errors import ProblemError, SolveError, require
 from ocp.motion.builders.clearance import ClearanceConstraints
-from ocp.motion.builders.dynamics import checked_motors
 from ocp.motion.builders.tool_motion import stretches_of
+from ocp.motion.builders.torques import checked_motors
 from ocp.motion.local.inverse_kinematics import LARGEST_SEED, Unreachable
 from ocp.motion.local.rates import LocalMotion
-from ocp.motion.plan.actuators import limits_actuators, without_actuators
+from ocp.motion.plan.actuators import limits_actuators, weights_actuators, without_actuators
 from ocp.motion.plan.candidate_queue import CandidateQueue
 from ocp.motion.plan.candidate_solver import CandidateSolver
 from ocp.motion.result.candidate import Candidate, Reason, Rejection, Seed
@@ -81,34 +73,53 @@ def plan_from_configurations(
     Raises:
         ProblemError, SolveError: As in `ocp.motion.plan.plan`.
     """
-    queue = CandidateQueue(solver, request.settings)
+    # the lowest cost of the squared rates is not that of another cost
+    queue = CandidateQueue(solver, request.settings, include_costlier=request.cost is not None)
     floating, single = request.machine.base_size > 0, len(configurations) == 1
     if request.search == "start" or (request.search == "configurations" and single):
         _try_one_by_one(queue, solver, configurations, thorough=single and not floating)
         if queue.passed or queue.exhausted or (single and not floating):
-            return queue.plan(), None
+            return _finished(queue, solver), None
     report(f"local motions from {len(configurations)} starts")
     motions = local_motions_from(request, configurations)
     if floating and (request.search == "global" or single):
         _search_cells(queue, solver, motions, configurations)
-        return queue.plan(), None
+        return _finished(queue, solver), None
     if request.search == "global":
         report("global search")
     search = TaskSearch(request, motions) if request.search == "global" else None
     if search is not None:
         _search_globally(queue, solver, search)
         if queue.passed:
-            return queue.plan(), search.bound
+            return _finished(queue, solver), search.bound
     seeds = candidates_from(solver, motions, configurations)
     queue.run(seeds)
     if not queue.passed:
         _repair(queue, solver, motions, configurations, seeds)
     try:
-        return queue.plan(), None if search is None else search.bound
+        return _finished(queue, solver), None if search is None else search.bound
     except SolveError as error:
         if search is not None and (dead_end := search.dead_end()) is not None:
             raise dead_end from error
         raise
+
+
+def _finished(queue: CandidateQueue, solver: CandidateSolver) -> SolvedPlan:
+    """Return the plan of least cost.
+
+    If the request has another cost than the squared rates, all motions that passed are solved again at that cost, in
+    the order of the cost that they have without a change.
+
+    Raises:
+        SolveError: No motion passed.
+    """
+    if solver.request.cost is None or not queue.passed:
+        return queue.plan()
+    passed = [replace(c, cost=solver.own_cost(c)) for c in queue.candidates if c.passed]
+    weighted = CandidateQueue(solver.with_own_cost(), queue.settings, include_costlier=True)
+    weighted.run(passed)
+    weighted.candidates += [replace(c, cost=np.nan) for c in queue.candidates if not c.passed]
+    return weighted.plan()
 
 
 def candidates_from(
@@ -255,8 +266,7 @@ def _try_alternatives(queue: CandidateQueue, solver: CandidateSolver, seeds: lis
         colliding = solver.collisions(finished)
         if finished.constraints is not None and (colliding or finished.constraints.margins):
             local = solver.local_collisions(seed.seed)
-            pairs = [collision.pair for collision in (*colliding, *local)]
-            constraints = finished.constraints.holding(pairs)
+            constraints = finished.constraints.separating([*colliding, *local])
             distance = min((collision.distance for collision in local), default=np.inf)
             rerouted.append((distance, replace(seed, constraints=constraints)))
     alternatives = [seed for _, seed in sorted(rerouted, key=lambda entry: -entry[0])[:max_tries]]
@@ -309,7 +319,9 @@ def _plan_attempt(whole: PlanRequest, request: PlanRequest) -> SolvedPlan:
         result, bound = plan_from_configurations(request, configurations, solver)
     except (SolveError, Unreachable) as error:
         raise restore_error(error, request) from error.__cause__
-    return result if bound is None else replace(result, bound=checked_bound(bound, result.cost))
+    if bound is None or (request.cost is not None and not request.cost.velocity):
+        return result
+    return replace(result, bound=checked_bound(bound, result.cost))
 
 
 def clearance_for(
@@ -322,7 +334,7 @@ def clearance_for(
     """
     if scene is False:
         return None
-    own = Scene() if scene is None else checked_instance("scene", scene, Scene)
+    own = Scene() if scene is None else require.instance("scene", scene, Scene)
     joint_limits = not isinstance(limits, Limits) or limits.joints
     report("collision scene")
     try:
@@ -351,15 +363,15 @@ def checked_request(
     Raises:
         ProblemError: As in `plan`.
     """
-    checked_choice("search", search, get_args(SearchKind))
-    checked_flag("cyclic", cyclic)
-    checked_count("seed", seed, 0, LARGEST_SEED)
-    all_tasks = (tasks,) if isinstance(tasks, TipTask) else checked_each("tasks", tasks, TipTask)
+    require.choice("search", search, get_args(SearchKind))
+    require.flag("cyclic", cyclic)
+    require.count("seed", seed, 0, LARGEST_SEED)
+    all_tasks = (tasks,) if isinstance(tasks, TipTask) else require.each("tasks", tasks, TipTask)
     bind(machine, all_tasks)  # checks the tasks against the machine
-    checked_limits = Limits() if limits is None else checked_instance("limits", limits, Limits)
+    checked_limits = Limits() if limits is None else require.instance("limits", limits, Limits)
     free = isinstance(horizon, str)
     if free:
-        checked_choice("horizon", horizon, ("free",))
+        require.choice("horizon", horizon, ("free",))
         if search == "global":
             words = "search='global' needs a fixed horizon; give it in s, or use search='configurations'"
             raise ProblemError(words, name="search", value="global")
@@ -367,9 +379,6 @@ def checked_request(
     checked_limits.bounds(machine, ("velocity", "torque") if limits_actuators(checked_limits) else ("velocity",))
     if limits_actuators(checked_limits):
         checked_motors("plan: actuator limits", machine)
-        if free:
-            words = "actuator limits need a fixed horizon; give it in s, or limit the rates alone"
-            raise ProblemError(words, name="horizon", value=horizon)
     duration = horizon_of(all_tasks, None if free else horizon)
     joints, base = Start.of(start, machine)[1:]
     stretches = stretches_of(machine, all_tasks, duration)
@@ -382,10 +391,12 @@ def checked_request(
         bounds = checked_limits.bounds(machine)
         names, hint = machine.robot.joint_names, "start inside them"
         joints = clip_to_limits("start", names, joints, bounds.lower, bounds.upper, hint)
+    squares = own_cost if own_cost.velocity else replace(own_cost, velocity=1.0)
     return PlanRequest(
-        *(machine, all_tasks, duration, stretches, joints, base, own_cost.joint_weights(machine.joint_size)),
+        *(machine, all_tasks, duration, stretches, joints, base, squares.joint_weights(machine.joint_size)),
         *(without_actuators(checked_limits), cyclic, int(seed), float(own_cost.time) if free else None),
         search=search,
+        cost=None if own_cost.velocity and set(own_cost.terms) <= {"velocity", "time"} else own_cost,
         actuator_limits=checked_limits if limits_actuators(checked_limits) else None,
     )
 
@@ -397,17 +408,17 @@ def _checked_cost(machine: Machine, cost: Any, free: bool) -> Cost:
         free: Whether the horizon is free.
 
     Raises:
-        ProblemError: The cost has a term that tip tasks do not take.
+        ProblemError: The time is weighted but fixed, or free without a weight; the machine has no base to turn, or its
+            torques are not known.
     """
     if cost is None:
         return Cost(time=float(free))
-    own = checked_instance("cost", cost, Cost)
-    if not own.velocity:
-        words = "cost: motions of tip tasks weight the squared joint velocities; give Cost(velocity=...) above 0"
-        raise ProblemError(words, name="velocity", value=own.velocity, limit=0.0)
-    for term in set(own.terms) - {"velocity", "time"}:
-        words = f"cost: {term} is not weighted by motions of tip tasks; velocity and time are"
-        raise ProblemError(words, name=term, value=getattr(own, term), limit=0.0)
+    own = require.instance("cost", cost, Cost)
+    if weights_actuators(own):
+        checked_motors("plan: cost", machine)
+    if own.turning and not machine.base_size:
+        words = "cost: turning weights the rotation of a floating base, and this base is fixed; leave it out"
+        raise ProblemError(words, name="turning", value=own.turning, limit=0.0)
     if free != bool(own.time):
         words = "cost: a free horizon costs time" if free else "cost: time is fixed by the horizon"
         words += "; give Cost(time=...) above 0" if free else "; give horizon='free', or leave time out"

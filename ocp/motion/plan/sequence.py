@@ -1,35 +1,287 @@
-"""Plans in the fewest segments, for tasks that no single motion does, with reconfigurations between the segments.
+"""Motions one after the other: to goals and along tasks in sequence, and along tasks in the fewest segments.
 
-Where a branch of inverse kinematics ends, the tool stops, leaves the task, and returns to the same place in another
-configuration. Planned are the segments, each a plan of its part of the tasks' time, and a collision-free motion from
-the end of each to the start of the next, while the tasks wait.
+In a sequence, each motion starts where the one before ends. The start of a task is searched as for a task alone, and a
+motion of its own leads there, unless the goal before is there. A task is therefore planned before the goal that leads
+to it.
+
+Tasks that no single motion does are planned in segments. Where a branch of inverse kinematics ends, the tool stops,
+leaves the task, and returns to the same place in another configuration. Each segment is a plan of its part of the
+tasks' time; while the tasks wait, a collision-free motion leads from its end to the start of the next segment.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
-from typing import Any, Literal
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from itertools import zip_longest
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from models import FixedBase
-from models.arrays import Array
-from ocp.errors import ProblemError, SolveError, checked_instance
-from ocp.motion.builders.tool_motion import stretches_of
+from models import FixedBase, Machine
+from models.checks import Array, floats
+from ocp.errors import ProblemError, SolveError, require
+from ocp.motion.builders.clearance import ClearanceConstraints
+from ocp.motion.builders.tool_motion import Stretch, stretches_of
+from ocp.motion.builders.torques import checked_motors
 from ocp.motion.local.inverse_kinematics import Unreachable
+from ocp.motion.plan.actuators import limits_actuators, weights_actuators
 from ocp.motion.plan.goal_plan import GoalRequest, plan_to_goal
+from ocp.motion.plan.goal_sequence import plan_goal, with_joints
 from ocp.motion.plan.planner import checked_request, clearance_for, plan_request
-from ocp.motion.result.segmented_plan import Reconfiguration, SegmentedPlan
+from ocp.motion.result.segmented_plan import JUMP_TOLERANCE, Reconfiguration, SegmentedPlan, SequencePlan
 from ocp.motion.result.solved_plan import SolvedPlan
 from ocp.motion.search.configurations import PlanRequest, local_motions_from
 from ocp.motion.search.held_joints import fix_ignorable_joints, hold_idle_joints, place_held_joints
 from ocp.motion.search.task_search import TaskSearch
-from ocp.motion.tasks.goals import Cost, Scene
+from ocp.motion.tasks.checks import check_rest
+from ocp.motion.tasks.equations import TaskEquations, bind
+from ocp.motion.tasks.goals import Cost, Goal, Scene, Start
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.tip_task import TipTask, timed
 
-__all__ = ["plan_in_segments"]
+__all__ = ["SequenceRequest", "plan_consecutive", "plan_in_segments"]
+
+AT_START = 1e-6
+"""Largest pose error with which a configuration is the start of a task or at a goal, m and rad."""
+
+
+@dataclass(frozen=True, eq=False)
+class SequenceRequest:
+    """Options of all motions of a sequence.
+
+    Attributes:
+        machine: Machine on a fixed or floating base.
+        start: Start of the first motion, as in `plan`; None if that is along a task.
+        free: Whether the planner chooses the durations.
+        cost, limits, scene, search, seed: As in `plan`.
+    """
+
+    machine: Machine
+    start: Any
+    free: bool
+    cost: Cost | None
+    limits: Limits | None
+    scene: Scene | Literal[False] | None
+    search: str
+    seed: int
+
+    @property
+    def smooth(self) -> bool:
+        """Whether rates must be continuous, since actuators are limited or weighted."""
+        limits = self.limits or Limits()
+        return limits_actuators(limits) or (self.cost is not None and weights_actuators(self.cost))
+
+
+class _State(NamedTuple):
+    """Configuration and joint velocities between two motions; None where they are not known yet."""
+
+    joints: Array | None
+    base: Array
+    rates: Any
+
+    @classmethod
+    def end_of(cls, plan: SolvedPlan, smooth: bool) -> _State:
+        """Return the state at the end of a motion, at rest if rates may jump."""
+        at = plan.at(plan.horizon)
+        return cls(at["joints"], at.get("base", np.zeros(0)), _velocity(at["rates"], smooth))
+
+
+def _velocity(rates: Array, smooth: bool) -> Any:
+    """Return the velocity at a junction, "rest" if it is zero or may jump."""
+    return rates if smooth and np.abs(rates).max(initial=0.0) > JUMP_TOLERANCE else "rest"
+
+
+def plan_consecutive(request: SequenceRequest, parts: Sequence[Goal | TipTask | Sequence[TipTask]]) -> SequencePlan:
+    """Plan motions to goals and along tasks one after the other.
+
+    Args:
+        request: The options.
+        parts: Goals and tasks in their order. Tasks that are done at once form a sequence of their own.
+
+    Raises:
+        ProblemError: The parts cannot be planned in sequence; names the part. Or as `plan` for each part.
+        SolveError: A part has no motion; names the part.
+    """
+    return _Sequence(request, tuple(parts)).plan()
+
+
+@dataclass(eq=False)
+class _Sequence:
+    """Motions of a sequence that have been planned so far, with the state at their end."""
+
+    request: SequenceRequest
+    parts: tuple[Any, ...]
+    machine: Machine = field(init=False)
+    state: _State = field(init=False)
+    plans: list[SolvedPlan] = field(default_factory=list)
+    names: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.machine = checked_motors("plan", self.request.machine)
+        start, joints, base = Start.of(self.request.start, self.machine)
+        self.state = _State(joints, base, start.velocity)
+        if joints is None and isinstance(self.parts[0], Goal):
+            words = "start is missing: a goal is reached from somewhere; give plan(..., start=)"
+            raise ProblemError(words, name="start")
+
+    def plan(self) -> SequencePlan:
+        """Plan all parts."""
+        led: SolvedPlan | None = None  # the next part, if the goal before it has been chosen for it
+        for number, (part, following) in enumerate(zip_longest(self.parts, self.parts[1:]), 1):
+            if isinstance(part, Goal):
+                name = part.name or f"goal {number}"
+                if following is not None and not isinstance(following, Goal) and not self.machine.base_size:
+                    with _named(f"task {number + 1}"):
+                        led = self._plan_tasks(following, self._joints_near(part))
+                    part = _led_to(self.machine, part, led, self.request.smooth)
+                with _named(name):
+                    self._append(self._plan_goal(part), name)
+                continue
+            with _named(f"task {number}"):
+                plan = led or self._plan_tasks(part, self.state.joints)
+            with _named(f"approach to task {number}"):
+                plan = self._approach(plan, part, f"approach to task {number}")
+            self._append(plan, f"task {number}")
+            led = None
+        return SequencePlan(self.plans[0].machine, tuple(self.plans), tuple(self.names), self.request.smooth)
+
+    def _append(self, plan: SolvedPlan, name: str) -> None:
+        self.plans.append(plan)
+        self.names.append(name)
+        self.state = _State.end_of(plan, self.request.smooth)
+
+    def _joints_near(self, goal: Goal) -> Array | None:
+        """Return the joints of a goal as far as they are known, the others as they are before it."""
+        if goal.joints is None or self.state.joints is None:
+            return self.state.joints
+        joints = floats(goal.joints).ravel()
+        if joints.shape != self.state.joints.shape:
+            return None
+        return np.where(np.isnan(joints), self.state.joints, joints)
+
+    def _plan_goal(self, goal: Goal) -> SolvedPlan:
+        """Return the motion to a goal from the present state."""
+        request = self.request
+        own = self.machine if goal.machine is None else checked_motors("goal: machine", goal.machine)
+        if own.robot.joint_names != self.machine.robot.joint_names:
+            words = "all machines of a sequence need the joints of the first one"
+            raise ProblemError(words, name="machine", value=own.robot.joint_names, limit=self.machine.robot.joint_names)
+        if own is not self.machine and not isinstance(self.state.rates, str):
+            raise ProblemError("a load is picked up or put down at rest", name="machine", value=goal.machine)
+        self.machine = own
+        start = Start(self.state.joints, self.state.base if own.base_size else None, self.state.rates)
+        options: dict[str, Any] = {"cost": request.cost, "limits": request.limits, "seed": request.seed}
+        constraints = self._constraints()
+        goal = replace(goal, machine=None)
+        horizon = "free" if request.free else None
+        return plan_goal(own, goal, horizon, start=start, constraints=constraints, **options)
+
+    def _plan_tasks(self, tasks: Any, near: Array | None) -> SolvedPlan:
+        """Return the motion along tasks: from the joints `near` if these are at their start, else from any joints."""
+        request, machine = self.request, self.machine
+        options: dict[str, Any] = {"cost": request.cost, "limits": request.limits, "seed": request.seed}
+        options |= {"search": request.search, "start": None}
+        horizon = "free" if request.free else None
+        if machine.base_size or (near is not None and _is_at_start(machine, tasks, near)):
+            options["start"] = Start(near, self.state.base if machine.base_size else None)
+        checked = checked_request(machine, tasks, horizon, **options)
+        rests = _rests(checked) if request.smooth else (False, False)
+        checked = replace(checked, clearance_constraints=self._constraints(), rests=rests)
+        if options["start"] is None and near is not None:
+            idle = bind(machine, checked.tasks).idle
+            names = np.array(machine.robot.joint_names)[idle].tolist()
+            checked = checked.with_held(dict(zip(names, near[idle].tolist(), strict=True)))
+        return plan_request(checked)
+
+    def _approach(self, plan: SolvedPlan, tasks: Any, name: str) -> SolvedPlan:
+        """Add the motion to the start of a task, and return the motion along the task."""
+        state, first = self.state, plan.at(0.0)
+        if state.joints is None:
+            return plan
+        rates = _velocity(first["rates"], self.request.smooth)
+        if np.abs(first["joints"] - state.joints).max() <= JUMP_TOLERANCE:
+            jump = np.abs(_numbers(rates, first) - _numbers(state.rates, first)).max()
+            if not self.request.smooth or jump <= JUMP_TOLERANCE:
+                return plan
+            fastest = int(np.abs(first["rates"]).argmax())
+            words = f"its joints move where it begins, {self.machine.robot.joint_names[fastest]!r} at "
+            words += f"{first['rates'][fastest]:.4g}, but the machine arrives there at another velocity; let the task "
+            words += "begin at rest, give the goal before it velocity='free', or place that goal before the task"
+            raise ProblemError(words, name="velocity", value=state.rates, limit=first["rates"], time=0.0)
+        approach = self._plan_goal(Goal(joints=first["joints"], velocity=rates))
+        self._append(approach, name)
+        joints = approach.at(approach.horizon)["joints"]
+        turned = np.abs(joints - first["joints"]).max() > JUMP_TOLERANCE  # unlimited joints, by full turns
+        return self._plan_tasks(tasks, joints) if turned else plan
+
+    def _constraints(self) -> ClearanceConstraints | None:
+        """Return the clearance constraints of the present machine.
+
+        Raises:
+            ProblemError: An obstacle moves.
+        """
+        constraints = clearance_for(self.machine, self.request.limits, self.request.scene)
+        if constraints is not None and constraints.scene.has_moving_obstacles:
+            words = "obstacles of a sequence may not move, since it is not known when each part begins"
+            raise ProblemError(words, name="obstacles", value=constraints.scene.obstacles)
+        return constraints
+
+
+def _is_at_start(machine: Machine, tasks: Any, joints: Array) -> bool:
+    """Return whether joints are where the tasks at the start of a motion begin; velocity tasks begin anywhere."""
+    first = [task for task in ((tasks,) if isinstance(tasks, TipTask) else tasks) if not task.begin]
+    return _misses(bind(machine, first), joints) <= AT_START if first else True
+
+
+def _misses(equations: TaskEquations, joints: Array) -> float:
+    """Return the largest pose error of joints at the time 0, m and rad; axes may lie in their cones."""
+    at: tuple[Any, ...] = np.zeros(1), None, joints[None]
+    errors = equations.errors(*at), equations.cone_violations(*at)
+    return max(float(np.abs(each).max(initial=0.0)) for each in errors)
+
+
+def _led_to(machine: Machine, goal: Goal, plan: SolvedPlan, smooth: bool) -> Goal:
+    """Return a goal with the joints and the velocity at the start of a task, if these are at the goal."""
+    first = plan.at(0.0)
+    if goal.region is not None or (goal.has_pose and _misses(bind(machine, goal.task), first["joints"]) > AT_START):
+        return goal
+    apart = 0.0 if goal.has_pose else float(np.nanmax(np.abs(floats(goal.joints).ravel() - first["joints"])))
+    if not apart <= JUMP_TOLERANCE:
+        return goal
+    passes = isinstance(goal.velocity, str) and goal.velocity == "free"
+    velocity = _velocity(first["rates"], smooth) if passes else goal.velocity
+    return replace(with_joints(goal, first["joints"]), velocity=velocity)
+
+
+def _rests(request: PlanRequest) -> tuple[bool, bool]:
+    """Return whether the tips are at rest at the start and at the end of a motion along tasks."""
+
+    def rest(stretch: Stretch, time: float) -> bool:
+        try:
+            if stretch.equations is not None:
+                check_rest(stretch.equations, time)
+        except ProblemError:
+            return False
+        return True
+
+    return rest(request.stretches[0], 0.0), rest(request.stretches[-1], request.horizon)
+
+
+def _numbers(velocity: Any, like: Mapping[str, Array]) -> Array:
+    """Return a velocity as numbers; zeros for "rest"."""
+    return np.zeros_like(like["rates"]) if isinstance(velocity, str) else floats(velocity)
+
+
+@contextmanager
+def _named(part: str) -> Iterator[None]:
+    """Name the part of a sequence in the errors of its planner."""
+    try:
+        yield
+    except (ProblemError, SolveError) as error:
+        error.args = (f"{part}: {error}",)
+        raise
 
 
 def plan_in_segments(
@@ -63,7 +315,7 @@ def plan_in_segments(
         DeadEnd: At some time no motion does the tasks even for the shortest while, in any configuration.
         SolveError: No segment could be planned, however the tasks were divided.
     """
-    checked_instance("machine", machine, FixedBase)
+    require.instance("machine", machine, FixedBase)
     options: dict[str, Any] = {"start": start, "cost": cost, "limits": limits, "seed": seed}
     request = checked_request(machine, tasks, horizon, search="global", **options)
     constraints = clearance_for(machine, limits, scene)
@@ -130,7 +382,7 @@ def _task_between(task: TipTask, begin: float, end: float) -> TipTask | None:
 
 def _plan_reconfiguration(request: PlanRequest, time: float, before: Array, after: Array) -> Reconfiguration:
     """Return a motion between two configurations of all joints: straight, or around obstacles."""
-    machine, whole = checked_instance("machine", request.machine, FixedBase), request.whole or request.machine
+    machine, whole = require.instance("machine", request.machine, FixedBase), request.whole or request.machine
     free = [name not in request.held for name in whole.robot.joint_names]
     goal = GoalRequest(
         machine,

@@ -9,8 +9,9 @@ from typing import Any, Literal
 import casadi as ca
 
 from models import Standing
-from models.arrays import Array
-from ocp.errors import ProblemError, SolveError, checked_flag, checked_instance
+from models.checks import Array
+from models.machines.standing import External
+from ocp.errors import ProblemError, SolveError, require
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.standing.plan import solve_standing
 from ocp.motion.builders.standing.problem import StandingSetup, Weights
@@ -39,6 +40,7 @@ def plan_to_stand(
     search: str,
     seed: int,
     clearance_constraints: ClearanceConstraints | None,
+    wrenches: External | None,
 ) -> SolvedPlan:
     """Plan a motion that does the tasks with the zero moment point inside the foot, at the cost of `solve_standing`.
 
@@ -52,18 +54,19 @@ def plan_to_stand(
         cyclic: Must be False.
         cost: Weights of the terms of the cost.
         clearance_constraints: Clearance constraints, or None.
+        wrenches: External wrenches as a function of time and tip position, or None.
 
     Raises:
         ProblemError: A cyclic motion, tasks that are active only a part of the time, a horizon that is no number, or as
             in `solve_standing`.
         SolveError: No start leads to a plan that passes its audit.
     """
-    checked_flag("cyclic", cyclic)
+    require.flag("cyclic", cyclic)
     if cyclic:
         words = "a standing motion cannot be cyclic; declare standing_problem with StandingSetup(end=...)"
         raise ProblemError(words, name="cyclic", value=cyclic)
     if cost is not None:
-        checked_instance("cost", cost, Weights)
+        require.instance("cost", cost, Weights)
     all_tasks = [part.task for part in bind(machine, tasks).bound]
     duration = horizon_of(all_tasks, horizon)
     for number, task in enumerate(all_tasks):
@@ -74,6 +77,7 @@ def plan_to_stand(
     setup = StandingSetup(
         start_velocity=_rest(equations, 0.0),
         end_velocity=_rest(equations, duration),
+        external=wrenches,
         clearance_constraints=clearance_constraints,
         symbols=ca.SX if _takes_scalars(equations) else ca.MX,
     )

@@ -18,8 +18,8 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from models import FixedBase
-from models.arrays import Array
-from ocp.errors import NOT_NUMBERS, ProblemError, SolveError, checked_choice, checked_count, checked_instance, floats
+from models.checks import NOT_NUMBERS, Array, floats
+from ocp.errors import ProblemError, SolveError, require
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.local.collisions import Collision, distances_along, find_collisions
 from ocp.motion.local.ik_solver import idle_positions
@@ -34,7 +34,6 @@ from ocp.motion.search.reconfigurations import SectionSearch, SectionSettings, S
 from ocp.motion.search.search import MAX_FREE_DIRECTIONS, AtlasSearch, SearchSettings, checked_bound
 from ocp.motion.search.steps import Homogeneous, LargestMotion, PathLength
 from ocp.motion.search.value import shorten_path
-from ocp.motion.tasks.checks import checked_numbers
 from ocp.motion.tasks.equations import bind
 from ocp.motion.tasks.goals import Cost, Scene, Waypoints
 from ocp.motion.tasks.limits import Limits
@@ -122,12 +121,12 @@ def plan_path(
             end, what obstructs them, and by how much the poses or the clearance would have to be relaxed.
         SolveError: No path was found, though some pass a part of the waypoints.
     """
-    checked_instance("machine", machine, FixedBase)
-    checked_count("seed", seed, 0, LARGEST_SEED)
+    require.instance("machine", machine, FixedBase)
+    require.count("seed", seed, 0, LARGEST_SEED)
     positions, rotations = _poses(waypoints.positions, waypoints.quaternions)
     n = machine.joint_size
-    checked_limits = Limits() if limits is None else checked_instance("limits", limits, Limits)
-    own_cost = Cost(velocity=0, length=1) if cost is None else checked_instance("cost", cost, Cost)
+    checked_limits = Limits() if limits is None else require.instance("limits", limits, Limits)
+    own_cost = Cost(velocity=0, length=1) if cost is None else require.instance("cost", cost, Cost)
     if own_cost.terms not in (("length",), ("time",)):
         words = "cost: a path through waypoints costs its length or its time, Cost(velocity=0, length=1) or "
         words += f"Cost(velocity=0, time=1), not {own_cost}"
@@ -137,7 +136,7 @@ def plan_path(
         if getattr(checked_limits, quantity) is not None and not (quantity == "velocity" and is_timed):
             words = f"limits: a path through waypoints has no time, hence no {quantity}; leave it out, or give a step"
             raise ProblemError(words, name=quantity, value=getattr(checked_limits, quantity))
-    checked_choice("reconfigurations", waypoints.reconfigurations, get_args(Reconfigurations))
+    require.choice("reconfigurations", waypoints.reconfigurations, get_args(Reconfigurations))
     if is_timed:
         if own_cost.weights is not None:
             words = "cost: the time of a path takes no weights; leave them out"
@@ -454,7 +453,7 @@ def _path_weights(weights: Any, size: int) -> Array:
     """Return the weights of the joints in a length, 0 for joints that do not count. Shape (size,)."""
     if weights is None:
         return np.ones(size)
-    array = checked_numbers(weights, size, "weights", "one for each joint")
+    array = require.array("weights", weights, (size,), meaning="one for each joint")
     if not ((array >= 0).all() and array.any()):
         words = f"weights {array.tolist()} must be non-negative and not all 0"
         raise ProblemError(words, name="weights", value=array, limit=0.0)

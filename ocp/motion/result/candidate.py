@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from models.arrays import Array
+from models.checks import Array
 from ocp.audit.clearance import ClosestPair
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.local.collisions import Collision

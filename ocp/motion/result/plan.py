@@ -17,10 +17,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from models import Machine
-from models.arrays import MAX_LISTED, Array
+from models.checks import MAX_LISTED, NOT_NUMBERS, Array, floats
 from ocp.audit.audit import Audit, Finding
 from ocp.console import interruptible
-from ocp.errors import NOT_NUMBERS, ProblemError, floats, sample_times, unknown_name
+from ocp.errors import ProblemError, require, sample_times
 from ocp.motion.result.candidate import Candidate
 from ocp.motion.schedule.trajectory import JointTrajectory
 from ocp.motion.tasks.targets import Target, tip_poses
@@ -121,7 +121,7 @@ class Plan(ABC):
     def __getitem__(self, name: str) -> Array:
         """Return "joints", "rates" or "base" at the times `t`. Shape (M, n)."""
         if name not in self._names():
-            raise unknown_name("name in a plan", name, self._names())
+            raise require.unknown("name in a plan", name, self._names())
         return self._values(name)
 
     def at(self, time: Any) -> dict[str, Array]:

@@ -44,7 +44,7 @@ from models.shapes.bodies import Body, LinkMesh
 from models.spatial import expression
 from ocp.errors import ProblemError
 from ocp.motion.builders.clearance import ClearanceConstraints
-from ocp.motion.builders.dynamics import DynamicsSetup, JointFriction, dynamics_problem
+from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem
 from ocp.motion.builders.dynamics_plan import dynamics_phases, machines_of
 from ocp.motion.builders.joint_motion import joint_motion_problem
 from ocp.motion.builders.space.capture import Capture, Cone, Grasp, capture_machines, capture_problem
@@ -52,6 +52,7 @@ from ocp.motion.builders.standing.problem import FreeTime, StandingSetup, Weight
 from ocp.motion.builders.standing.stances import StancePhase, Steps
 from ocp.motion.builders.standing.steps import StepWeights, steps_problem
 from ocp.motion.builders.tool_motion import ToolMotion, ToolMotionSetup, stretches_of, tool_motion_problem
+from ocp.motion.builders.torques import Actuation, JointFriction
 from ocp.motion.search.configurations import PlanRequest
 from ocp.motion.tasks.goals import Cost, Goal, Start
 from ocp.motion.tasks.limits import IndexAtLeast, InFoot, Limits, Pinned
@@ -67,7 +68,7 @@ SHAPES = (Box, Capsule, Cylinder, HalfSpace, Mesh, Sphere)
 PARTS = (Robot, Link, Joint, Mimic, CollisionShape, VisualShape, Support)
 STANDING = (Weights, FreeTime, InFoot, Pinned, IndexAtLeast, StandingSetup)
 STEPS = (Steps, StancePhase, StepWeights, Foot, Foothold)
-DYNAMICS = (ClearanceConstraints, JointFriction, DynamicsSetup, Capture, Cone, Grasp)
+DYNAMICS = (Actuation, ClearanceConstraints, JointFriction, DynamicsSetup, Capture, Cone, Grasp)
 ARGUMENTS = (TipTask, Goal, Start, Limits, Cost, *DYNAMICS, *STANDING, *STEPS)
 MACHINES = (FixedBase, FreeFloating, Standing, Stance)
 KINDS = {kind.__name__: kind for kind in (*MACHINES, *PARTS, *SHAPES, *ARGUMENTS, MovingObstacle, Body)}
@@ -135,7 +136,7 @@ def declared_motion(
     start: Any,
     reference: Any,
     constraints: ClearanceConstraints | None,
-    limits: Limits | None = None,
+    actuation: Actuation | None = None,
     relaxed: bool = False,
 ) -> ToolMotion:
     """Declare the problem of a motion, which keeps its origin.
@@ -143,8 +144,7 @@ def declared_motion(
     Args:
         request: The request.
         start, reference, constraints: As in `ToolMotionSetup`.
-        limits: Limits that include those of the actuators, if these are limited; else None.
-        relaxed: As in `ToolMotionSetup`.
+        actuation, relaxed: As in `ToolMotionSetup`.
     """
     options: dict[str, Any] = {
         "base": request.base,
@@ -153,14 +153,15 @@ def declared_motion(
         "cyclic": request.cyclic,
         "weights": request.weights,
         "time_cost": request.time_cost,
-        "actuated": limits is not None,
+        "actuation": actuation,
         "relaxed": relaxed,
         "clearance_constraints": constraints,
     }
-    bounds = (limits or request.limits).bounds(request.machine)
+    limits = request.limits if actuation is None else request.actuator_limits or request.limits
+    bounds = limits.bounds(request.machine)
     motion = tool_motion_problem(request.machine, request.stretches, ToolMotionSetup(bounds=bounds, **options))
     arguments = {"machine": request.whole or request.machine, "tasks": request.tasks, "horizon": request.horizon}
-    arguments |= {"held": dict(request.held), "limits": limits or request.limits, **options}
+    arguments |= {"held": dict(request.held), "limits": limits, **options}
     motion.problem.origin = MotionRequest("tool motion", arguments)
     return motion
 

@@ -1,30 +1,32 @@
-"""Several plans one after the other, with motions to another configuration between them, as one plan."""
+"""Several plans one after the other as one plan: goals and tasks in sequence, or segments with reconfigurations."""
 
 from __future__ import annotations
 
 import json
 import os
+from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from models import FixedBase
-from models.arrays import Array
+from models import FixedBase, Machine
+from models.checks import Array
 from ocp.audit.audit import COST_LOST, Audit, Finding
 from ocp.audit.clearance import Clearance
 from ocp.errors import ProblemError
 from ocp.motion.result.candidate import Candidate
 from ocp.motion.result.plan import Plan
-from ocp.motion.result.solved_plan import SolvedPlan
+from ocp.motion.result.solved_plan import PHASED, PhasedPlan, SolvedPlan
 from ocp.motion.tasks.targets import Target
 from ocp.problem.record_reader import ARRAY_NAMES, RECORD_ERRORS, unpack_record
 from ocp.problem.record_writer import pack_record
 from ocp.solution import Solution, read_head
 
-__all__ = ["Piece", "Reconfiguration", "SegmentedPlan"]
+__all__ = ["JUMP_TOLERANCE", "ConsecutivePlans", "Piece", "Reconfiguration", "SegmentedPlan", "SequencePlan"]
 
 NO_MOTION = "reconfigurations without a motion"
 JUMP_TOLERANCE = 1e-6
@@ -63,90 +65,73 @@ class Reconfiguration:
 
 
 class Piece(NamedTuple):
-    """Plan that begins at a time of the whole, s."""
+    """Plan that begins at a time of the whole, s, with its name."""
 
     begin: float
     plan: SolvedPlan
+    name: str
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class SegmentedPlan(Plan):
-    """Motions that do the tasks one after the other, and reconfigurations between them while the tasks wait.
+class ConsecutivePlans(Plan):
+    """Plan that consists of other plans, each from where the one before ends.
 
     Attributes:
-        machine: The arm.
-        segments: Audited plans of parts of the tasks; the time of each starts at 0.
-        start_times: Time of the tasks at which each segment starts, s; each ends where the next one starts.
-        reconfigurations: Motions between segments.
-        fewest: Lower bound of the number of reconfigurations, under the assumptions of `ocp.motion.search.search`.
+        machine, candidates, bound, targets: As in `Plan`.
+        kind: Name of this kind of plan in files and in its audit.
     """
 
-    machine: FixedBase
-    segments: tuple[SolvedPlan, ...]
-    start_times: tuple[float, ...]
-    reconfigurations: tuple[Reconfiguration, ...]
-    fewest: int
-    _audits: dict[str, Any] = field(default_factory=dict, repr=False)
+    kind: ClassVar[str]
+
+    @property
+    @abstractmethod
+    def pieces(self) -> tuple[Piece, ...]:
+        """The plans, in order, with the times at which they begin."""
+
+    @property
+    def _plans(self) -> tuple[SolvedPlan, ...]:
+        """Plans whose costs, bounds and candidates are those of the whole."""
+        return tuple(piece.plan for piece in self.pieces)
 
     # ---- values ------------------------------------------------------------------------------------------------------
 
     @property
     def cost(self) -> float:
-        """Cost of all segments, without reconfigurations."""
-        return float(sum(segment.cost for segment in self.segments))
+        """Sum of the costs."""
+        return float(sum(plan.cost for plan in self._plans))
 
     @property
     def bound(self) -> float | None:  # type: ignore[override]
-        """Lower bound of the cost in the same segments; None if that of a segment is not known."""
-        bounds = [segment.bound for segment in self.segments]
+        """Lower bound of the cost with the same ends of all plans; None if that of a plan is not known."""
+        bounds = [plan.bound for plan in self._plans]
         return None if None in bounds else float(sum(bounds))  # type: ignore[arg-type]
 
     @property
-    def held(self) -> Mapping[str, float]:  # type: ignore[override]
-        """Joints that stand still in all segments."""
-        return self.segments[0].held
-
-    @property
     def candidates(self) -> tuple[Candidate, ...]:  # type: ignore[override]
-        """Candidates of all segments."""
-        return tuple(candidate for segment in self.segments for candidate in segment.candidates)
+        """Candidates of all plans."""
+        return tuple(candidate for plan in self._plans for candidate in plan.candidates)
 
     @property
     def targets(self) -> tuple[Target, ...]:  # type: ignore[override]
-        """Targets of all segments."""
+        """Targets of all plans."""
         return tuple(
             target._replace(t=target.t + piece.begin) for piece in self.pieces for target in piece.plan.targets
         )
 
     @property
     def solution(self) -> Solution:  # type: ignore[override]
-        """The solution, if there is one segment.
+        """The solution, if there is one plan.
 
         Raises:
             ProblemError: There are several.
         """
-        if len(self.segments) == 1:
-            return self.segments[0].solution
-        words = f"the plan has {len(self.segments)} segments, each with a solution: plan.segments[0].solution"
-        raise ProblemError(words, name="solution", value=len(self.segments), limit=1)
-
-    @property
-    def task_horizon(self) -> float:
-        """Duration of the tasks, without reconfigurations, s."""
-        return self.start_times[-1] + self.segments[-1].horizon
-
-    @property
-    def pieces(self) -> tuple[Piece, ...]:
-        """Segments and motions between them, in order, with the times at which they begin."""
-        plans: list[SolvedPlan] = [self.segments[0]]
-        for reconfiguration, segment in zip(self.reconfigurations, self.segments[1:], strict=True):
-            plans += [*((reconfiguration.motion,) if reconfiguration.motion is not None else ()), segment]
-        begins = np.concatenate([[0.0], np.cumsum([plan.horizon for plan in plans])])
-        return tuple(Piece(float(begin), plan) for begin, plan in zip(begins, plans, strict=False))
+        if len(self.pieces) == 1:
+            return self.pieces[0].plan.solution
+        words = f"the plan has {len(self.pieces)} parts, each with a solution: plan.pieces[0].plan.solution"
+        raise ProblemError(words, name="solution", value=len(self.pieces), limit=1)
 
     @property
     def horizon(self) -> float:
-        """Duration of segments and reconfigurations, s."""
+        """Duration of all plans, s."""
         last = self.pieces[-1]
         return last.begin + last.plan.horizon
 
@@ -168,15 +153,6 @@ class SegmentedPlan(Plan):
             values[rows] = piece.plan._values_at(name, local)
         return values
 
-    def task_share(self, times: Any) -> Array:
-        """Return the share of the tasks' own time that has passed; they wait during reconfigurations."""
-        pieces = self.pieces
-        waits = [piece.plan.horizon * all(piece.plan is not segment for segment in self.segments) for piece in pieces]
-        ends, lost = [piece.begin + piece.plan.horizon for piece in pieces], np.cumsum(waits)
-        t = np.atleast_1d(self._checked_times(times))
-        task_times = np.interp(t, [0.0, *ends], [0.0, *(np.array(ends) - lost)])
-        return np.asarray(np.minimum(task_times / self.task_horizon, 1.0))
-
     def solved_parts(self, times: Array) -> list[tuple[Solution, str, Array]]:
         """Return the parts of all pieces; see `Plan.solved_parts`."""
         pieces = self.pieces
@@ -193,8 +169,8 @@ class SegmentedPlan(Plan):
         """Return the findings of the audits of all pieces, of the joints between them, and of the cost lost."""
         findings: list[Finding] = []
         undecided, clearances, losses = "", dict[str, Clearance](), list[float]()
-        for number, piece in enumerate(self.pieces, 1):
-            audit, label = piece.plan.audit(**settings), f"motion {number}: "
+        for piece in self.pieces:
+            audit, label = piece.plan.audit(**settings), f"{piece.name}: "
             findings += [
                 replace(
                     finding,
@@ -206,25 +182,166 @@ class SegmentedPlan(Plan):
             clearances |= {label + name: clearance for name, clearance in audit.clearances.items()}
             undecided = undecided or (audit.undecided and label + audit.undecided)
             losses += [finding.value * piece.plan.cost for finding in audit.findings if finding.name == COST_LOST]
-        missing = [each for each in self.reconfigurations if each.motion is None]
-        if self.reconfigurations:
-            note = missing[0].failure if missing else ""
-            findings += [Finding(NO_MOTION, float(len(missing)), 0.0, None, note), self._jump_finding()]
+        findings += self._junction_findings()
         if len(losses) == len(self.pieces):
             total = sum(piece.plan.cost for piece in self.pieces)
             findings.append(Finding(COST_LOST, sum(losses) / total if total > 0 else 0.0, verdict="optimal"))
-        return Audit("segments", tuple(findings), undecided, clearances=clearances)
+        return Audit(self.kind, tuple(findings), undecided, clearances=clearances)
 
-    def _jump_finding(self) -> Finding:
-        """Return the largest difference of the joints where one motion ends and the next one begins."""
-        pieces = self.pieces
+    def _junction_findings(self) -> list[Finding]:
+        """Return the findings of the junctions: by how much joints and base jump there."""
+        names = ("joints", *(("base",) if self.machine.base_size else ()))
+        return [self._jump_finding(name) for name in names] if len(self.pieces) > 1 else []
+
+    def _jump_finding(self, name: str) -> Finding:
+        """Return the largest difference of "joints", "rates" or "base" from the end of a motion to the next one."""
         jumps = [
-            np.abs(after.plan.at(0.0)["joints"] - before.plan.at(before.plan.horizon)["joints"])
-            for before, after in pairwise(pieces)
+            np.abs(after.plan.at(0.0)[name] - before.plan.at(before.plan.horizon)[name])
+            for before, after in pairwise(self.pieces)
         ]
-        row, joint = np.unravel_index(int(np.argmax(jumps)), np.shape(jumps))
-        label = f"joints between motions, {self.names[joint]!r}"
-        return Finding(label, float(jumps[row][joint]), JUMP_TOLERANCE, pieces[row + 1].begin)
+        row, column = np.unravel_index(int(np.argmax(jumps)), np.shape(jumps))
+        label = f"{name} between motions" + ("" if name == "base" else f", {self.names[column]!r}")
+        return Finding(label, float(jumps[row][column]), JUMP_TOLERANCE, self.pieces[row + 1].begin)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class SequencePlan(ConsecutivePlans):
+    """Motions to goals and along tasks in sequence, with the motions that lead to the tasks.
+
+    Attributes:
+        machine: Machine of the first motion; all motions have its joints.
+        parts: Audited plans in order; the time of each starts at 0.
+        phases: Names of the plans.
+        smooth: Whether the rates are continuous, since actuators are limited.
+    """
+
+    machine: Machine
+    parts: tuple[SolvedPlan, ...]
+    phases: tuple[str, ...]
+    smooth: bool
+    kind: ClassVar[str] = "sequence"
+    _audits: dict[str, Any] = field(default_factory=dict, repr=False)
+
+    @cached_property
+    def pieces(self) -> tuple[Piece, ...]:
+        """The motions, in order, with the times at which they begin."""
+        begins = np.cumsum([0.0, *(plan.horizon for plan in self.parts[:-1])]).tolist()
+        return tuple(map(Piece, begins, self.parts, self.phases))
+
+    def _tips_at(self, times: Array, bases: Array, joints: Array) -> Array:
+        pieces, poses = self.pieces, np.zeros((len(times), 7))
+        which = np.searchsorted([piece.begin for piece in pieces], times, side="right") - 1
+        for number in np.unique(which):
+            rows, own = which == number, pieces[number]
+            poses[rows] = own.plan._tips_at(times[rows] - own.begin, bases[rows], joints[rows])
+        return poses
+
+    def _junction_findings(self) -> list[Finding]:
+        """Return the findings of the junctions: by how much joints and base jump, and rates where they may not."""
+        rates = [self._jump_finding("rates")] if self.smooth and len(self.parts) > 1 else []
+        return super()._junction_findings() + rates
+
+    def __str__(self) -> str:
+        lines = [f"plan of {self.horizon:.6g} s for {', '.join(self.names)}: {len(self.parts)} motions, {self._costs}"]
+        for piece in self.pieces:
+            end = piece.begin + piece.plan.horizon
+            lines.append(f"  {piece.begin:.4g} to {end:.4g} s, {piece.name}: {piece.plan._costs}")
+        return "\n".join(lines)
+
+    # ---- files -------------------------------------------------------------------------------------------------------
+
+    def arrays(self, path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
+        """Return the arrays of the file of the plan; those of each motion are named after it."""
+        head = {"phases": list(self.phases), "smooth": self.smooth}
+        arrays = {self.kind: np.frombuffer(json.dumps(head).encode(), np.uint8)}
+        for number, plan in enumerate(self.parts):
+            arrays |= {f"part {number}/{name}": array for name, array in plan.arrays(path).items()}
+        return arrays
+
+    @classmethod
+    def of_arrays(cls, path: str | os.PathLike[str], arrays: dict[str, np.ndarray]) -> SequencePlan:
+        """Return the plan of the arrays of a file, which are not trusted; raise as `Plan.load`."""
+        try:
+            head = read_head(path, arrays[cls.kind])
+            phases = tuple(str(name) for name in head["phases"])
+            parts = tuple(_plan_of(path, arrays, f"part {number}/") for number in range(len(phases)))
+            machine, smooth = parts[0].machine, head["smooth"]
+            if not all(plan.names == parts[0].names for plan in parts) or not isinstance(smooth, bool):
+                raise ValueError("its motions do not fit together")
+            return cls(machine, parts, phases, smooth)
+        except RECORD_ERRORS as error:
+            words = f"{path}: the plan in it is damaged: {error}"
+            raise ProblemError(words, name="path", value=str(path)) from error
+
+
+def _plan_of(path: str | os.PathLike[str], arrays: dict[str, np.ndarray], prefix: str) -> SolvedPlan:
+    """Return the plan whose arrays in a file have names with a prefix."""
+    own = {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
+    return (PhasedPlan if PHASED in own else SolvedPlan).of_arrays(path, own)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class SegmentedPlan(ConsecutivePlans):
+    """Motions that do the tasks one after the other, and reconfigurations between them while the tasks wait.
+
+    Attributes:
+        machine: The arm.
+        segments: Audited plans of parts of the tasks; the time of each starts at 0.
+        start_times: Time of the tasks at which each segment starts, s; each ends where the next one starts.
+        reconfigurations: Motions between segments.
+        fewest: Lower bound of the number of reconfigurations, under the assumptions of `ocp.motion.search.search`.
+    """
+
+    machine: FixedBase
+    segments: tuple[SolvedPlan, ...]
+    start_times: tuple[float, ...]
+    reconfigurations: tuple[Reconfiguration, ...]
+    fewest: int
+    kind: ClassVar[str] = "segments"
+    _audits: dict[str, Any] = field(default_factory=dict, repr=False)
+
+    # ---- values ------------------------------------------------------------------------------------------------------
+
+    @property
+    def _plans(self) -> tuple[SolvedPlan, ...]:
+        return self.segments  # reconfigurations cost nothing
+
+    @property
+    def held(self) -> Mapping[str, float]:  # type: ignore[override]
+        """Joints that stand still in all segments."""
+        return self.segments[0].held
+
+    @property
+    def task_horizon(self) -> float:
+        """Duration of the tasks, without reconfigurations, s."""
+        return self.start_times[-1] + self.segments[-1].horizon
+
+    @property
+    def pieces(self) -> tuple[Piece, ...]:
+        """Segments and motions between them, in order, with the times at which they begin."""
+        plans: list[SolvedPlan] = [self.segments[0]]
+        for reconfiguration, segment in zip(self.reconfigurations, self.segments[1:], strict=True):
+            plans += [*((reconfiguration.motion,) if reconfiguration.motion is not None else ()), segment]
+        begins = np.cumsum([0.0, *(plan.horizon for plan in plans[:-1])]).tolist()
+        names = [f"motion {number}" for number in range(1, len(plans) + 1)]
+        return tuple(map(Piece, begins, plans, names))
+
+    def task_share(self, times: Any) -> Array:
+        """Return the share of the tasks' own time that has passed; they wait during reconfigurations."""
+        pieces = self.pieces
+        waits = [piece.plan.horizon * all(piece.plan is not segment for segment in self.segments) for piece in pieces]
+        ends, lost = [piece.begin + piece.plan.horizon for piece in pieces], np.cumsum(waits)
+        t = np.atleast_1d(self._checked_times(times))
+        task_times = np.interp(t, [0.0, *ends], [0.0, *(np.array(ends) - lost)])
+        return np.asarray(np.minimum(task_times / self.task_horizon, 1.0))
+
+    def _junction_findings(self) -> list[Finding]:
+        """Return the number of reconfigurations without a motion, and by how much joints jump."""
+        if not self.reconfigurations:
+            return []
+        missing = [each for each in self.reconfigurations if each.motion is None]
+        note = missing[0].failure if missing else ""
+        return [Finding(NO_MOTION, float(len(missing)), 0.0, None, note), *super()._junction_findings()]
 
     def __str__(self) -> str:
         count = len(self.reconfigurations)
@@ -253,7 +370,7 @@ class SegmentedPlan(Plan):
                 "fewest": self.fewest,
             }
         )
-        arrays = {"segments": np.frombuffer(json.dumps(head).encode(), np.uint8)}
+        arrays = {self.kind: np.frombuffer(json.dumps(head).encode(), np.uint8)}
         arrays |= {f"segments.{name}": values for name, values in numbers.items()}
         motions = [each.motion for each in self.reconfigurations]
         for kind, plans in (("segment", self.segments), ("reconfiguration", motions)):
@@ -265,21 +382,15 @@ class SegmentedPlan(Plan):
     @classmethod
     def of_arrays(cls, path: str | os.PathLike[str], arrays: dict[str, np.ndarray]) -> SegmentedPlan:
         """Return the plan of the arrays of a file, which are not trusted; raise as `Plan.load`."""
-
-        def plan_of(kind: str, number: int) -> SolvedPlan:
-            prefix = f"{kind} {number}/"
-            own = {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
-            return SolvedPlan.of_arrays(path, own)
-
         try:
             numbers = {name: arrays[f"segments.{name}"] for name in ARRAY_NAMES}
             head = unpack_record(read_head(path, arrays["segments"]), numbers)
             times = tuple(float(time) for time in head["start_times"])
-            segments = tuple(plan_of("segment", number) for number in range(len(times)))
+            segments = tuple(_plan_of(path, arrays, f"segment {number}/") for number in range(len(times)))
             changes = tuple(
                 Reconfiguration(
                     *(float(time), np.asarray(before, dtype=float), np.asarray(after, dtype=float)),
-                    *(plan_of("reconfiguration", number) if has_motion else None, str(failure)),
+                    *(_plan_of(path, arrays, f"reconfiguration {number}/") if has_motion else None, str(failure)),
                 )
                 for number, (time, before, after, has_motion, failure) in enumerate(head["reconfigurations"])
             )

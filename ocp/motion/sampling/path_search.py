@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from models.arrays import Array
+from models.checks import Array
 from ocp.console import TimeLimitReached, check_time
 from ocp.motion.sampling.shortening import (
     LengthSettings,

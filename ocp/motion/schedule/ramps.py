@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from ruckig import InputParameter, Result, Ruckig, RuckigError, Trajectory
 
-from ocp.errors import ProblemError, checked_nonnegative, checked_positive
+from ocp.errors import ProblemError, require
 from ocp.motion.schedule.profile import Array, SpeedProfile, integrate_jerk
 from ocp.tolerances import ROUNDING_SHARE
 
@@ -59,9 +59,9 @@ def ramp_time(change: float, acceleration: float, jerk: float) -> float:
     Raises:
         ProblemError: The change is negative, or a limit is not positive.
     """
-    checked_nonnegative("ramp: change", change)
+    require.nonnegative("ramp: change", change)
     for name, value in (("acceleration", acceleration), ("jerk", jerk)):
-        checked_positive(f"ramp: {name}", value)
+        require.positive(f"ramp: {name}", value)
     if change * jerk >= acceleration**2:
         return change / acceleration + acceleration / jerk
     return 2 * sqrt(change / jerk)
@@ -70,7 +70,7 @@ def ramp_time(change: float, acceleration: float, jerk: float) -> float:
 def ramp_distance(first: float, last: float, acceleration: float, jerk: float) -> float:
     """Return the distance (m) of the shortest change from one speed to another; raises as ramp_time."""
     for name, value in (("first", first), ("last", last)):
-        checked_nonnegative(f"ramp: {name}", value)
+        require.nonnegative(f"ramp: {name}", value)
     return (first + last) / 2 * ramp_time(abs(last - first), acceleration, jerk)
 
 
@@ -101,7 +101,7 @@ def peak_acceleration(mean: float, speed: float, jerk: float) -> float:
         ProblemError: A value is not positive, or the jerk is too low for that mean.
     """
     for name, value in (("mean", mean), ("speed", speed), ("jerk", jerk)):
-        checked_positive(f"peak_acceleration: {name}", value)
+        require.positive(f"peak_acceleration: {name}", value)
     time = speed / mean
     square = time * time - 4 * speed / jerk
     if square < 0:

@@ -24,7 +24,7 @@ import scipy
 from numpy.typing import NDArray
 
 from models import FreeFloating
-from models.arrays import Array
+from models.checks import Array
 from ocp.motion.local.collisions import distances_along
 from ocp.motion.local.inverse_kinematics import Unreachable
 from ocp.motion.local.rates import LocalMotion

@@ -10,7 +10,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from models import Machine
-from models.arrays import Array
+from models.checks import Array
 from models.machines.machine import hold_joints
 from ocp.errors import ProblemError
 from ocp.motion.builders.clearance import ClearanceConstraints
@@ -19,6 +19,7 @@ from ocp.motion.local.collisions import Collision, distances_along
 from ocp.motion.local.inverse_kinematics import Unreachable, describe_miss, inverse_kinematics, inverse_kinematics_at
 from ocp.motion.local.rates import LocalMotion, track_tasks
 from ocp.motion.tasks.equations import TaskEquations, bind
+from ocp.motion.tasks.goals import Cost
 from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.motion.tasks.tip_task import TipTask
 
@@ -110,6 +111,8 @@ class PlanRequest:
         limits: Limits of joint positions and rates.
         time_cost: Cost of a second if the horizon is free; else None.
         search: How the start is searched.
+        cost: Cost of the motion if more than the squared joint rates and the time are weighted, or less; else None.
+        rests: Whether the joints are at rest at the start and at the end, if their accelerations are planned.
         actuator_limits: Limits that include those of the actuators; None if these are not limited.
         clearance_constraints: Clearance constraints of the motion, or None.
         settings: Settings of the planner.
@@ -129,6 +132,8 @@ class PlanRequest:
     seed: int
     time_cost: float | None
     search: SearchKind = "configurations"
+    cost: Cost | None = None
+    rests: tuple[bool, bool] = (False, False)
     actuator_limits: Limits | None = None
     clearance_constraints: ClearanceConstraints | None = None
     settings: PlannerSettings = field(default_factory=PlannerSettings)
@@ -150,6 +155,7 @@ class PlanRequest:
             stretches=stretches_of(machine, self.tasks, self.horizon),
             start=None if self.start is None else self.start[free],
             weights=self.weights[free],
+            cost=None if self.cost is None else self.cost.of_joints(free),
             limits=self.limits.of_joints(free),
             actuator_limits=None if self.actuator_limits is None else self.actuator_limits.of_joints(free),
             clearance_constraints=constraints,
@@ -194,10 +200,8 @@ def start_collisions(
     """
     if request.clearance_constraints is None or pairs == []:
         return [None] * len(configurations)
-    scene = request.clearance_constraints.scene
-    distances = distances_along(scene, request.base, configurations, np.zeros(len(configurations)))
-    if pairs is not None:
-        distances[:, np.setdiff1d(np.arange(len(scene.pairs)), pairs)] = np.inf
+    scene, times = request.clearance_constraints.scene, np.zeros(len(configurations))
+    distances = distances_along(scene, request.base, configurations, times, scene.clearance, pairs=pairs)
     closest = zip(distances, distances.argmin(axis=1).tolist(), strict=True)
     collisions = [Collision(pair, scene.labels[pair], float(row[pair]), 0.0) for row, pair in closest]
     return [collision if collision.distance < scene.clearance else None for collision in collisions]

@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from models.arrays import Array
+from models.checks import Array
 from ocp.errors import SolveError
 from ocp.motion.builders.clearance import LOOKS, MARGIN, ROUNDING
 from ocp.motion.local.collisions import distances_along, find_collisions

@@ -11,7 +11,7 @@ import scipy
 from numpy.typing import NDArray
 
 from models import Machine
-from models.arrays import Array
+from models.checks import Array
 from ocp.motion.tasks.equations import TaskEquations
 
 __all__ = ["FULL_TURN", "MAX_STEP", "TOLERANCE", "JointSpace", "TasksWithFixedJoints"]

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from models.arrays import Array
+from models.checks import Array
 from ocp.motion.search.charts import Charts, SelfMotionManifolds, SplitCharts
 from ocp.motion.search.joint_space import FULL_TURN, TasksWithFixedJoints
 from ocp.motion.search.search import AtlasSearch

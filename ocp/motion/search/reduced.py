@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models import FreeFloating, Machine, center_of_mass
-from models.arrays import Array
+from models.checks import Array
 from models.spatial import rotation, rotation_from_quaternion
 from ocp.motion.local.inverse_kinematics import (
     Unreachable,

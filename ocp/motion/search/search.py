@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models import CollisionScene
-from models.arrays import Array
+from models.checks import Array
 from ocp.errors import BoundWarning
 from ocp.motion.local.collisions import distances_along
 from ocp.motion.local.inverse_kinematics import Unreachable

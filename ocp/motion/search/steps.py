@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from models.arrays import Array
+from models.checks import Array
 from ocp.motion.search.charts import Charts
 
 __all__ = [

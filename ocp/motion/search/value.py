@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models import CollisionScene
-from models.arrays import Array
+from models.checks import Array
 from ocp.motion.local.collisions import distances_along
 from ocp.motion.search.charts import Charts, TimeSample
 from ocp.motion.search.joint_space import MAX_STEP, JointSpace

@@ -3,23 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from models import Box, Machine, Sphere
-from models.arrays import Array, ArrayInput
-from ocp.errors import (
-    NOT_NUMBERS,
-    ProblemError,
-    checked_choice,
-    checked_nonnegative,
-    checked_positive,
-    checked_text,
-    floats,
-)
-from ocp.motion.tasks.checks import checked_configuration, checked_weights, nonnegative_each
+from models.checks import NOT_NUMBERS, Array, ArrayInput, floats
+from ocp.errors import ProblemError, require
+from ocp.motion.tasks.checks import checked_configuration, checked_weights
 from ocp.motion.tasks.tip_task import TipTask
 
 __all__ = ["Cost", "Goal", "Scene", "Start", "Waypoints"]
@@ -97,7 +90,7 @@ class Goal:
     name: str = ""
 
     def __post_init__(self) -> None:
-        checked_text("goal: name", self.name)
+        require.text("goal: name", self.name)
         pose = {name: getattr(self, name) for name in ("position", "orientation", "direction", "region")}
         named = [name for name, value in pose.items() if value is not None]
         if self.joints is not None and named:
@@ -113,9 +106,9 @@ class Goal:
             words = f"goal: region must be a Box or a Sphere in world, not a {type(self.region).__name__}"
             raise ProblemError(words, name="region", value=self.region)
         if self.within is not None:
-            checked_positive("goal: within", self.within, below=np.pi)
+            require.positive("goal: within", self.within, below=np.pi)
         if isinstance(self.velocity, str):
-            checked_choice("goal: velocity", self.velocity, ("rest", "free"))
+            require.choice("goal: velocity", self.velocity, ("rest", "free"))
         else:
             try:
                 floats(self.velocity)
@@ -201,8 +194,10 @@ class Cost:
     weights: Any = None
 
     def __post_init__(self) -> None:
-        each = [nonnegative_each(f"cost: {name}", getattr(self, name), None) for name in PER_JOINT]
-        single = [checked_nonnegative(f"cost: {name}", getattr(self, name)) for name in self._single]
+        each = [
+            require.array(f"cost: {name}", getattr(self, name), ("joints",), sign="nonnegative") for name in PER_JOINT
+        ]
+        single = [require.nonnegative(f"cost: {name}", getattr(self, name)) for name in self._single]
         if not (any(single) or np.concatenate(each).any()):
             raise ProblemError("cost: at least one weight must be above zero", name="cost", value=self, limit=0.0)
 
@@ -214,6 +209,12 @@ class Cost:
     def terms(self) -> tuple[str, ...]:
         """Names of the terms whose weights are not zero."""
         return tuple(name for name in (*self._single, *PER_JOINT) if np.any(np.asarray(getattr(self, name))))
+
+    def of_joints(self, chosen: NDArray[np.bool_]) -> Cost:
+        """Return the cost of a machine with the chosen joints alone. Shape (n,)."""
+        names = ("effort", "acceleration", "weights")
+        own: dict[str, Any] = {name: floats(getattr(self, name)) for name in names if np.ndim(getattr(self, name))}
+        return replace(self, **{name: values[chosen] for name, values in own.items()})
 
     def joint_weights(self, size: int) -> Array:
         """Return the weights of the joints, `velocity` included. Shape (size,).

@@ -7,7 +7,7 @@ import pytest
 from ruckig import InputParameter, Result, Ruckig, Trajectory
 
 from models import FixedBase
-from models.arrays import Array
+from models.checks import Array
 from models.examples import example_robot
 from ocp import Limits
 from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from models import FixedBase, FreeFloating, Link, planar_chain
 from ocp import Collocation, Limits, ProblemError, TipTask, solve
 from ocp.motion.builders.tool_motion import ToolMotionSetup, stretches_of, tool_motion_problem
+from ocp.motion.builders.torques import Actuation
 from ocp.motion.tasks.checks import ignorable_joints
 from ocp.motion.tasks.equations import bind
 from tests.ocp.motion.tasks.space_tasks import floating_panda, panda, ur5
@@ -143,7 +144,7 @@ def test_accelerations_hold_a_velocity_that_changes_in_each_stretch_of_the_time(
             cyclic=False,
             weights=np.ones(2),
             bounds=Limits(acceleration=50.0).bounds(machine),
-            actuated=True,
+            actuation=Actuation(),
         ),
     )
     found = solve(motion.problem, Collocation(8), options={"max_iter": 60})

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from models import Box, CollisionScene, CollisionShape, FixedBase, Joint, Link, Robot
-from models.arrays import Array
+from models.checks import Array
 from models.examples import example_robot
 from ocp import Limits, Plan, ProblemError, SolveError
 from ocp.motion.builders.clearance import ClearanceConstraints

@@ -106,7 +106,7 @@ def test_the_gap_is_that_of_the_segments() -> None:
 
 
 def test_of_several_segments_there_is_no_one_solution() -> None:
-    with pytest.raises(ProblemError, match=r"plan\.segments\[0\]\.solution"):
+    with pytest.raises(ProblemError, match=r"plan\.pieces\[0\]\.plan\.solution"):
         _ = made().solution
     assert len(made().candidates) == sum(len(segment.candidates) for segment in made().segments)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from models import Box, CollisionScene
-from models.arrays import Array
+from models.checks import Array
 from ocp.console import TimeLimitReached, time_limited
 from ocp.motion.sampling.path_search import JointPath, PathSearchSettings, TreeSearch, connect, find_paths
 from ocp.motion.sampling.shortening import optimise_length, path_length, points_along, same_class, shorten

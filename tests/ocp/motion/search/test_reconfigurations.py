@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from models import FixedBase
-from models.arrays import Array
+from models.checks import Array
 from models.robot.rebuild import lock_joints
 from ocp import DeadEnd, ProblemError, Scene, TipTask, Waypoints, inverse_kinematics, plan
 from ocp.audit.clearance import ClosestPair

@@ -11,7 +11,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from models import CollisionScene, CollisionShape, FixedBase, MovingObstacle, Sphere
-from models.arrays import Array
+from models.checks import Array
 from ocp.motion.local.collisions import distances_along
 from ocp.motion.search.charts import TimeSample
 from ocp.motion.search.steps import PathLength, SquaredRates

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from models import FixedBase
-from models.arrays import Array
+from models.checks import Array
 from ocp import TipTask, inverse_kinematics
 from ocp.motion.search.charts import Charts, SelfMotionManifolds, TimeSample, _rim
 from ocp.motion.search.joint_space import JointSpace

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from models import FixedBase, SmoothPath, planar_chain, smooth
-from models.arrays import Array
+from models.checks import Array
 from models.paths import Arc, Line, Path
 from ocp import TipTask, plan
 from ocp.curves import lagrange

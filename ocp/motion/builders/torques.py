@@ -1,0 +1,225 @@
+"""Joint torques of a machine, and motions whose controls are accelerations: limits of actuators, and costs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from models import FixedBase, FreeFloating, Machine, Robot, Standing
+from models.checks import Array
+from models.robot.dynamics import GRAVITY, Wrench, inverse_dynamics
+from ocp.errors import ProblemError, require
+from ocp.motion.tasks.checks import checked_weights
+from ocp.motion.tasks.goals import Cost
+from ocp.motion.tasks.limits import JointBounds
+from ocp.problem.problem import Problem
+
+__all__ = [
+    "Actuation", "JointFriction", "Motors", "checked_motors", "declare_actuators", "joint_torques", "limit_torques",
+    "positive_power", "running_cost", "weights_torques",
+]  # fmt: skip
+
+LENGTH_RATE = 1e-2
+"""Joint rate below which the length of a path is smoothed, rad/s: sqrt(|q'|^2 + LENGTH_RATE^2) exceeds |q'| by 0.02 %
+at 0.5 rad/s, and by LENGTH_RATE at rest."""
+
+Motors = FixedBase | FreeFloating
+"""Machines that are moved by the torques of their joints alone."""
+
+
+@dataclass(frozen=True)
+class JointFriction:
+    """Friction in the joints.
+
+    Attributes:
+        viscous: Viscous coefficient, one number or one for each joint, N m s/rad or N s/m.
+        coulomb: Coulomb friction, one number or one for each joint, N m or N.
+        slip: Speed at which the smoothed Coulomb friction reaches three quarters of its value, rad/s or m/s.
+
+    Raises:
+        ProblemError: A coefficient is negative, or `slip` is not positive.
+    """
+
+    viscous: Any = 0.0
+    coulomb: Any = 0.0
+    slip: float = 0.01
+
+    def __post_init__(self) -> None:
+        for name in ("viscous", "coulomb"):
+            require.array(f"friction: {name}", getattr(self, name), ("joints",), sign="nonnegative")
+        if not require.nonnegative("friction: slip", self.slip) > 0:
+            raise ProblemError("friction: slip must be positive", name="slip", value=self.slip, limit=0.0)
+
+    def torques(self, rates: Any) -> Any:
+        """Return the joint torques that overcome the friction. Shape (n, 1)."""
+        n = rates.numel()
+        viscous = ca.DM(require.broadcast("friction: viscous", self.viscous, n, "joints", sign="nonnegative"))
+        coulomb = ca.DM(require.broadcast("friction: coulomb", self.coulomb, n, "joints", sign="nonnegative"))
+        return viscous * rates + coulomb * ca.tanh(rates / self.slip)
+
+
+def joint_torques(
+    machine: Motors,
+    motion: tuple[Any, Any, Any, Any],
+    *,
+    friction: JointFriction | None = None,
+    wrenches: Sequence[Wrench] = (),
+    gravity: Any = None,
+) -> Any:
+    """Return the joint torques (forces of prismatic joints) of a motion. Shape (n, 1), N m or N.
+
+    Args:
+        machine: Machine on a fixed base, or floating freely.
+        motion: Configuration of the base, joints, their rates and accelerations. Shapes (base_size, 1) and (n, 1).
+            Symbols for a floating machine, because they are differentiated.
+        friction: Friction in the joints; None for none.
+        wrenches: External wrenches, on a fixed base only.
+        gravity: Acceleration of free fall, m/s^2, on a fixed base only; GRAVITY if None.
+
+    Raises:
+        ProblemError: The machine is of another kind, or external forces act on a floating one.
+    """
+    robot = checked_motors("joint_torques", machine).robot
+    base, joints, rates, accelerations = motion
+    if isinstance(machine, FixedBase):
+        fall = GRAVITY if gravity is None else gravity
+        torques = inverse_dynamics(robot, joints, rates, accelerations, wrenches, fall, machine.world_from_base(base))
+    else:
+        if wrenches or gravity is not None:
+            words = "external wrenches and gravity need a fixed base: a free-floating machine conserves its momentum"
+            raise ProblemError(words, name="wrenches" if wrenches else "gravity", value=wrenches or gravity)
+        torques = machine.joint_torques(base, joints, rates, accelerations)
+    return torques if friction is None else torques + friction.torques(rates)
+
+
+def checked_motors(name: str, machine: Any) -> Motors:
+    """Return the machine; raise ProblemError unless its joint torques alone move it."""
+    if not isinstance(machine, FixedBase | FreeFloating) or isinstance(machine, Standing):
+        words = f"{name}: a FixedBase or a FreeFloating is expected, not a {type(machine).__name__}; use "
+        words += "standing_problem for a standing machine"
+        raise ProblemError(words, name="machine", value=machine)
+    return machine
+
+
+@dataclass(frozen=True, eq=False)
+class Actuation:
+    """Options of a motion whose controls are accelerations, or jerks if these are limited or weighted.
+
+    Attributes:
+        cost: Weights of all terms but the time; None for half the squared rates.
+        rests: Whether the joints are at rest at the start and at the end; else they are free to move there.
+        smoothing: Duration in which a control passes from limit to limit instead of jumping, as a share of the horizon.
+            A small term of the cost, half the squared accelerations or jerks, smooths them.
+    """
+
+    cost: Cost | None = None
+    rests: tuple[bool, bool] = (False, False)
+    smoothing: float = 1e-3
+
+
+def declare_actuators(
+    problem: Problem,
+    machine: Machine,
+    place: tuple[Any, Any],
+    bounds: JointBounds,
+    *,
+    actuation: Actuation,
+    horizon: float,
+    pace: Any,
+    suffix: str = "",
+) -> tuple[Any, Any, Any]:
+    """Declare velocities as states and accelerations within the limits; return them, and the cost of a second.
+
+    The states are "velocities", and "accelerations" if the controls are "jerks". The path constraints are "torques" and
+    "power" where these are limited or weighted.
+
+    Args:
+        problem: Problem with a horizon.
+        place: Base and joints as symbols.
+        bounds: Limits of the joints and of the actuators.
+        actuation: Cost, smoothness, and whether the joints are at rest where these states start and end.
+        horizon: Horizon of the problem, s.
+        pace: Seconds of the motion in a second of the problem.
+        suffix: Suffix of the declared names.
+
+    Raises:
+        ProblemError: Torques are limited or weighted, but the joint torques alone do not move the machine.
+    """
+    (base, joints), robot, n = place, machine.robot, machine.joint_size
+    cost = Cost() if actuation.cost is None else actuation.cost
+    smoothing, (initial, terminal) = actuation.smoothing * horizon, (0.0 if rest else None for rest in actuation.rests)
+    limits: dict[str, Any] = {"lower": -bounds.velocity, "upper": bounds.velocity, "unit": robot.unit("/s")}
+    rates = problem.state(f"velocities{suffix}", n, initial=initial, terminal=terminal, **limits)
+    limits = {"lower": -bounds.acceleration, "upper": bounds.acceleration, "unit": robot.unit("/s^2")}
+    jerks: Any = ca.DM(0, 1)
+    if np.isfinite(bounds.jerk).any() or cost.jerk:
+        second = problem.state(f"accelerations{suffix}", n, **limits)
+        jerks = problem.control(f"jerks{suffix}", n, lower=-bounds.jerk, upper=bounds.jerk, unit=robot.unit("/s^3"))
+        problem.dynamics(second, pace * jerks)
+        smooth = smoothing**2 * ca.sumsqr(jerks)
+    else:
+        second = problem.control(f"accelerations{suffix}", n, **limits)
+        smooth = ca.sumsqr(second)
+    problem.dynamics(rates, pace * second)
+    torques: Any = None
+    if np.isfinite([bounds.torque, bounds.power]).any() or weights_torques(cost):
+        torques = joint_torques(checked_motors("limits", machine), (base, joints, rates, second))
+        limit_torques(problem, robot, torques, bounds.torque, suffix)
+        if (rows := np.flatnonzero(np.isfinite(bounds.power)).tolist()) and not cost.energy:
+            problem.path(f"power{suffix}", (torques * rates)[rows], upper=bounds.power[rows], unit="W")
+    running = running_cost(machine, cost, (base, joints, rates, second), jerks=jerks, torques=torques)
+    if cost.energy:
+        running += cost.energy * positive_power(problem, torques * rates, bounds, suffix)
+    return rates, second, running + smoothing**2 / 2 * smooth
+
+
+def weights_torques(cost: Cost) -> bool:
+    """Return whether a cost depends on the joint torques."""
+    return bool(np.any(np.asarray(cost.effort))) or bool(cost.energy)
+
+
+def running_cost(machine: Machine, cost: Cost, motion: tuple[Any, Any, Any, Any], *, jerks: Any, torques: Any) -> Any:
+    """Return the cost of a second of a motion, without those of the time and of the positive power.
+
+    Args:
+        machine: The machine.
+        cost: Weights of the cost.
+        motion: Base, joints, rates and accelerations as symbols.
+        jerks, torques: Used if they are weighted. Shape (n, 1).
+    """
+    (base, joints, rates, second), n = motion, machine.joint_size
+    running = ca.dot(
+        ca.DM(require.broadcast("cost: acceleration", cost.acceleration, n, "joints", sign="nonnegative")), second**2
+    )
+    if cost.velocity:
+        running += ca.dot(ca.DM(cost.joint_weights(n)), rates**2) / 2
+    if cost.length:
+        running += cost.length * ca.sqrt(ca.dot(ca.DM(checked_weights(cost.weights, n)), rates**2) + LENGTH_RATE**2)
+    if cost.jerk:
+        running += cost.jerk * ca.sumsqr(jerks)
+    if cost.turning and isinstance(machine, FreeFloating):
+        spin = [k for k, row in enumerate(machine.twist_rows) if row < 3]
+        running += cost.turning * ca.sumsqr(machine.base_twist(base, joints, rates)[spin])
+    if np.any(np.asarray(cost.effort)):
+        running += ca.dot(
+            ca.DM(require.broadcast("cost: effort", cost.effort, n, "joints", sign="nonnegative")), torques**2
+        )
+    return running
+
+
+def positive_power(problem: Problem, powers: Any, bounds: JointBounds, suffix: str = "") -> Any:
+    """Declare the positive power of each actuator as a control within its limit, W, and return the sum."""
+    power = problem.control(f"power{suffix}", powers.numel(), lower=0.0, upper=bounds.power, unit="W")
+    problem.path(f"power{suffix}", power - powers, lower=0.0, unit="W")
+    return ca.sum1(power)
+
+
+def limit_torques(problem: Problem, robot: Robot, torques: Any, largest: Array, suffix: str = "") -> None:
+    """Declare the path constraint of the joints whose torque is limited."""
+    if rows := np.flatnonzero(np.isfinite(largest)).tolist():
+        bounds = {"lower": -largest[rows], "upper": largest[rows]}
+        problem.path(f"torques{suffix}", torques[rows], unit=robot.effort_unit, **bounds)
