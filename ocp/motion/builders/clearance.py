@@ -72,7 +72,7 @@ class ClearanceConstraints:
 
     def __post_init__(self) -> None:
         require.instance("clearance_constraints: scene", self.scene, CollisionScene)
-        for pair, margin in require.mapping("clearance_constraints: margins", self.margins).items():
+        for pair, margin in require.mapping("clearance_constraints: margins", self.margins, object).items():
             if not np.isfinite(real(margin)):
                 words = f"clearance_constraints: margins must be finite numbers in m, not {margin!r}"
                 raise ProblemError(words, name="margins", value=margin)
