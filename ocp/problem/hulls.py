@@ -458,7 +458,7 @@ class Separation:
 def _checked_covers(what: str, covers: Any, count: int) -> dict[int, np.ndarray]:
     """Return the covering pairs by the index of the covered pair, without empty entries."""
     covering: dict[int, np.ndarray] = {}
-    for pair, rows in require.mapping(f"{what}: covers", covers).items():
+    for pair, rows in require.mapping(f"{what}: covers", covers, object).items():
         if isinstance(pair, bool) or not isinstance(pair, int | np.integer) or not 0 <= pair < count:
             words = f"{what}: covers: pair {pair!r} does not exist, there are {count}"
             raise ProblemError(words, name="covers", value=pair, limit=count)
