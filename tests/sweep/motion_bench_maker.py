@@ -26,7 +26,8 @@ from models.checks import Array
 from ocp import Cost, Limits, Plan, SolveError
 from ocp.app.files.safe_files import read_tree
 from ocp.motion.builders.clearance import ClearanceConstraints
-from ocp.motion.plan.goal_plan import GoalRequest, plan_to_goal
+from ocp.motion.plan.goal_motions import GoalRequest
+from ocp.motion.plan.goal_plan import plan_to_goal
 from ocp.motion.sampling.straight import StraightMotions
 from tests.sweep.results import Row, Sweep, parser
 
@@ -135,7 +136,7 @@ def result(data: str, kind: str, seed: int) -> Row:
     moved = float(np.abs(np.array(ends) - np.vstack([start, goals])).max())
     options: dict[str, Any] = {"cost": Cost(velocity=0.0, length=1.0), "time_limit": SECONDS - 1.0}
     if mode:
-        options = {"limits": PANDA, "cost": Cost(velocity=0.0, time=1.0), "time_limit": SECONDS / 2}
+        options = {"limits": PANDA, "cost": Cost(velocity=0.0, time=1.0), "time_limit": SECONDS - 1.0}
     begin, used = time.perf_counter(), time.process_time()
     row, wrong = Row(), list[str]()
     try:
@@ -172,7 +173,7 @@ def main() -> None:
     for row in sweep.rows(lambda kind, seed, _: result(options.data, kind, seed)):
         rows.append(row)
         print(row, flush=True)
-    print(sweep.told(rows))
+    print(sweep.summary(rows))
     for mode in ("", " time"):
         planned = [row for row in rows if row["kind"].endswith(" time") == bool(mode) and "length" in row]
         if planned:

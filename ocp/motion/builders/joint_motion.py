@@ -32,7 +32,7 @@ from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.problem import Problem, remembers_request
 from ocp.solution import Solution
 
-__all__ = ["VelocitySetup", "joint_motion_problem", "least_durations", "minimum_velocity_problem", "motion_along"]
+__all__ = ["VelocitySetup", "joint_motion_problem", "minimum_velocity_problem", "motion_along"]
 
 RATE_SLACK = 1e-9
 """Relative excess allowed over a rate limit, since a motion at constant speed may be at its limit all the time."""
@@ -143,37 +143,6 @@ def motion_along(problem: Problem, path: Array, scale: Array, horizon: float, *,
         seconds={"build": 0.0, "solve": 0.0},
         problem=problem,
     )
-
-
-def least_durations(distances: Array, bounds: JointBounds) -> Array:
-    """Return the least times from rest to rest of joints by themselves, within velocity, acceleration and jerk limits.
-
-    With peak velocity V, each ramp lasts r = V / a + a / j, or 2 sqrt(V / j) if it does not reach the acceleration a.
-    Both ramps together cover V r. The rest of the distance is covered at V.
-
-    Args:
-        distances: Absolute distances, rad or m. Shape (..., n).
-        bounds: Limits of the joints.
-
-    Returns:
-        s; 0 for a joint without limits. Shape (..., n).
-    """
-    velocity, acceleration, jerk = bounds.velocity, bounds.acceleration, bounds.jerk
-    with np.errstate(divide="ignore", invalid="ignore"):
-        rounded = np.where(np.isfinite(acceleration), acceleration / jerk, 0.0)  # s until the acceleration is reached
-        short = np.where(np.isfinite(jerk), (distances * np.sqrt(jerk) / 2) ** (2 / 3), np.inf)
-        # V^2 / a + V a / j = distance
-        root = np.sqrt(rounded**2 + 4 * distances / acceleration)
-        long = np.where(np.isfinite(acceleration), 2 * distances / (rounded + root), np.inf)
-        peak = np.where(short <= acceleration * rounded, short, long)
-        peak = np.where(np.isfinite(acceleration), peak, short)
-        peak = np.minimum(peak, velocity)
-        reaches = np.isfinite(acceleration) & (peak > acceleration * rounded)
-        ramp = np.where(reaches, peak / acceleration + rounded, 2 * np.sqrt(peak / jerk))
-        ramp = np.where(np.isfinite(acceleration) | np.isfinite(jerk), ramp, 0.0)
-        cruise = np.maximum(distances / peak - ramp, 0.0)
-        times = 2 * ramp + np.where(np.isfinite(peak), cruise, 0.0)
-    return np.where(distances > 0, times, 0.0)
 
 
 GUESS_STEPS = 64

@@ -131,8 +131,8 @@ def inverse_kinematics(
     If the task is one pose of the tip of an arm on a fixed base, its solutions are listed on all branches (see
     `ik_configurations`, which also tells whether they are all). If there are more joints than rows, the solutions form
     families, of which members at samples of the free parameters are listed. For other tasks and machines, and where the
-    list is not certain to be complete, damped Gauss-Newton iterations begin at random starts, of which each gives one
-    solution at most.
+    list is not certain to be complete or has fewer than `starts` members because few samples keep the limits, damped
+    Gauss-Newton iterations begin at random starts, of which each gives one solution at most.
 
     Args:
         machine: Any machine; a floating base stays at `base`.
@@ -266,11 +266,7 @@ class _MultiStart:
         return self.rank(q, error)
 
     def list_branches(self, count: int, seed: int) -> tuple[Array, int]:
-        """Return solutions on all branches, (K, n), and how many random starts are needed besides.
-
-        Of a redundant arm with several free parameters, few samples of these may keep the limits. Iterations under the
-        limits from random starts then make up the number.
-        """
+        """Return solutions on all branches, (K, n), and how many random starts make up for missing ones."""
         branches = ik_branches(self.equations, self.lower, self.upper) if count else None
         if branches is None:
             return np.zeros((0, len(self.lower))), count

@@ -21,7 +21,8 @@ from ocp.motion.builders.standing.stances import Steps
 from ocp.motion.builders.standing.steps import StepWeights
 from ocp.motion.builders.torques import checked_motors
 from ocp.motion.local.inverse_kinematics import Unreachable, inverse_kinematics
-from ocp.motion.plan.goal_plan import GoalRequest, plan_to_goal
+from ocp.motion.plan.goal_motions import GoalRequest
+from ocp.motion.plan.goal_plan import plan_to_goal
 from ocp.motion.result.candidate import Candidate, Stage
 from ocp.motion.result.solved_plan import PhasedPlan, SolvedPlan, parts_of_phases
 from ocp.motion.tasks.checks import clip_to_limits

@@ -32,7 +32,7 @@ from ocp.motion.search.dead_end import RelaxationKind, dead_end
 from ocp.motion.search.joint_space import TOLERANCE, JointSpace, TasksWithFixedJoints
 from ocp.motion.search.reconfigurations import SectionSearch, SectionSettings, Segment, fewest_segments, section_values
 from ocp.motion.search.search import MAX_FREE_DIRECTIONS, AtlasSearch, SearchSettings, checked_bound
-from ocp.motion.search.steps import Homogeneous, LargestMotion, PathLength
+from ocp.motion.search.steps import Homogeneous, LargestMotion, PathLength, Steps
 from ocp.motion.search.value import shorten_path
 from ocp.motion.tasks.equations import bind
 from ocp.motion.tasks.goals import Cost, Scene, Waypoints
@@ -329,13 +329,15 @@ class _WaypointPlanner:
         options: dict[str, Any] = {"seeds": lambda k: self._seeds(int(chosen[k])), "scene": self.scene}
         samples = [TimeSample(manifolds, k) for k in range(len(chosen))]
         joint = self._section_joint
-        arguments = self.space, samples, chosen.astype(float), self.cost, distances * self.step
+        arguments = self.space, samples, Steps(chosen.astype(float), self.cost, distances * self.step)
         if joint is None:
             return AtlasSearch(*arguments, **options, settings=self.settings.search)
         prismatic = self.machine.robot.moving_joints[joint].kind == "prismatic"
         section_settings, limit = self.settings.sections, float((distances * self.step)[:, joint].min())
         sections: dict[str, Any] = {"radius": section_settings.radii[coarse], "charts": section_settings.charts}
-        sections["values"] = section_values(prismatic, self.lower[joint], self.upper[joint], limit, section_settings)
+        sections["values"] = section_values(
+            prismatic, self.lower[joint], self.upper[joint], limit, settings=section_settings
+        )
         return SectionSearch(*arguments, **options, **sections, joint=joint)
 
     def _dead_end_error(self, search: AtlasSearch) -> SolveError:
@@ -386,8 +388,8 @@ class _WaypointPlanner:
             samples = [TimeSample(self.manifolds, k) for k in range(len(self.positions))[rows]]
             limits, bounds = np.repeat(self.step[None], len(samples) - 1, axis=0), (self.lower, self.upper)
             times = np.arange(len(self.positions), dtype=float)[rows]
-            options = self.cost, times, limits, bounds, self.scene, self.settings.widths
-            paths.append(shorten_path(joints[rows], samples, *options))
+            options: dict[str, Any] = {"bounds": bounds, "scene": self.scene, "widths": self.settings.widths}
+            paths.append(shorten_path(joints[rows], samples, Steps(times, self.cost, limits), **options))
         joints = np.concatenate(paths)
         steps = np.delete(self.cost.evaluate(np.diff(joints, axis=0), 1.0), list(break_numbers))
         return _Path(float(steps.sum()), *self._check_path(joints, break_numbers), joints, break_numbers)

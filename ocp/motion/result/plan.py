@@ -176,7 +176,7 @@ class Plan(ABC):
     @interruptible
     def audit(self, **settings: Any) -> Audit:
         """Check the motion independently of its solver; see `ocp.audit.audit.audit`. Results are cached by settings."""
-        key = repr(sorted(settings.items()))
+        key = audit_key(**settings)
         if key not in self._audits:
             self._audits[key] = self._audit(**settings)
         audit: Audit = self._audits[key]
@@ -341,3 +341,8 @@ class Plan(ABC):
     def _tips_at(self, times: Array, bases: Array, joints: Array) -> Array:
         """Return the poses of the tip at checked times (M,). Shape (M, 7)."""
         return tip_poses(self.machine, bases, joints)
+
+
+def audit_key(**settings: Any) -> str:
+    """Return the key under which a plan caches its audit with these settings."""
+    return repr(sorted(settings.items()))

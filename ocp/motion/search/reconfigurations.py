@@ -238,7 +238,7 @@ class SectionSettings:
 
 
 def section_values(
-    prismatic: bool, lower: float, upper: float, max_step: float, settings: SectionSettings = SectionSettings()
+    prismatic: bool, lower: float, upper: float, max_step: float, *, settings: SectionSettings = SectionSettings()
 ) -> Array:
     """Return the values at which a joint is fixed: evenly spaced over its range. Shape (V,), rad or m.
 

@@ -11,10 +11,12 @@ import pytest
 from models import Box, CollisionScene, CollisionShape, FixedBase, Joint, Link, Robot
 from models.checks import Array
 from models.examples import example_robot
-from ocp import Limits, Plan, ProblemError, SolveError
+from ocp import Goal, Limits, Plan, ProblemError, SolveError
+from ocp import plan as plan_motion
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.local.collisions import distances_along
-from ocp.motion.plan.goal_plan import GoalRequest, GoalSettings, plan_to_goal
+from ocp.motion.plan.goal_motions import GoalRequest, GoalSettings
+from ocp.motion.plan.goal_plan import plan_to_goal
 from ocp.motion.result.candidate import Rejection
 from ocp.motion.sampling.path_search import PathSearchSettings
 from ocp.motion.sampling.straight import StraightMotions
@@ -38,7 +40,7 @@ def sampled(plan: Plan) -> Array:
 
 
 @pytest.mark.parametrize("length", [True, False])
-def test_of_the_ways_around_a_box_the_shorter_is_the_plan_and_the_other_a_candidate(length: bool) -> None:
+def test_the_shorter_path_around_a_box_is_the_plan_and_the_longer_a_candidate(length: bool) -> None:
     settings = GoalSettings(search=PathSearchSettings(classes=8))
     plan = plan_to_goal(request_of(BOX, cost=Cost(velocity=0.0, length=1.0) if length else Cost(), settings=settings))
     audit = plan.audit()
@@ -87,7 +89,7 @@ def test_of_goals_in_collision_and_clear_ones_the_clear_ones_are_planned() -> No
     np.testing.assert_allclose(sampled(plan)[-1], [-1.0, 1.5], atol=1e-12)
 
 
-def test_a_closed_wall_is_refused_in_time_with_what_blocks_and_without_a_claim() -> None:
+def test_a_closed_wall_is_refused_in_time_with_the_obstacle_named() -> None:
     wall = Box((0.2, 5.0, 1.0), (0.0, 0.0, 0.0))
     with pytest.raises(SolveError, match="does not prove that there is none") as caught:
         plan_to_goal(request_of(wall, time_limit=1.5))
@@ -95,7 +97,7 @@ def test_a_closed_wall_is_refused_in_time_with_what_blocks_and_without_a_claim()
     assert "ball and obstacle 0 overlap by up to 0.2 m" in str(caught.value)
 
 
-def test_an_unlimited_joint_goes_the_other_way_round_if_an_obstacle_is_in_the_near_one() -> None:
+def test_an_unlimited_joint_avoids_an_obstacle_by_the_larger_angle() -> None:
     arm = Link("arm", 1.0, collisions=(CollisionShape("sphere", (RADIUS,), translation=(1.0, 0.0, 0.0)),))
     joint = Joint("turn", kind="continuous", parent="base", child="arm", axis=(0, 0, 1), velocity=1.0)
     machine = FixedBase(Robot((Link("base"), arm), (joint,), tip="arm"))
@@ -119,11 +121,11 @@ def test_a_plan_is_read_from_its_file_and_audited_again(tmp_path: Path) -> None:
     np.testing.assert_array_equal(sampled(read), sampled(plan))
 
 
-def test_the_same_seed_gives_the_same_plan_and_stages_are_told() -> None:
-    told: list[str] = []
-    first, again = (plan_to_goal(request_of(BOX, seed=3, progress=told.append)) for _ in range(2))
+def test_the_same_seed_gives_the_same_plan_and_stages_are_reported() -> None:
+    results: list[str] = []
+    first, again = (plan_to_goal(request_of(BOX, seed=3, progress=results.append)) for _ in range(2))
     np.testing.assert_array_equal(sampled(first), sampled(again))
-    assert len(told) >= 4
+    assert len(results) >= 4
 
 
 @pytest.mark.parametrize("horizon", [None, 6.0])
@@ -149,6 +151,44 @@ def test_a_goal_at_the_start_is_reached_by_rest(limits: Limits | None) -> None:
     np.testing.assert_allclose(sampled(plan), np.tile(START, (2001, 1)), atol=1e-12)
 
 
+LEAST_TIME = Cost(velocity=0.0, time=1.0)
+
+
+@pytest.mark.parametrize("jerk", [np.inf, 30.0])
+def test_without_obstacles_the_least_time_is_the_bound_of_the_slowest_joint(jerk: float) -> None:
+    limits = Limits(velocity=[1.0, 0.3], acceleration=[2.0, 4.0], jerk=jerk, torque=np.inf)
+    plan = plan_motion(slider(), Goal(joints=GOAL), start=[-1.0, 0.4], cost=LEAST_TIME, limits=limits, scene=False)
+    build_up = 2.0 / jerk
+    expected = 2.0 / 1.0 + 1.0 / 2.0 + build_up  # 2 m at 1 m/s and 2 m/s^2; the other joint has time to spare
+    assert plan.cost == plan.horizon == pytest.approx(expected, rel=1e-9)
+    assert plan.bound == pytest.approx(plan.cost, rel=1e-9)
+    assert plan.audit().feasible
+
+
+def test_around_a_box_the_least_time_needs_no_stop() -> None:
+    limits = Limits(acceleration=4.0, jerk=40.0, torque=np.inf)
+    plan = plan_to_goal(request_of(BOX, cost=LEAST_TIME, limits=limits))
+    assert plan.audit().feasible
+    assert plan.bound is not None
+    assert plan.bound == pytest.approx(2.0 + 0.25 + 0.1)
+    assert plan.bound <= plan.cost < 1.01 * plan.bound
+    sample = plan.sampled(np.linspace(0.0, plan.horizon, 2001))
+    assert gap(sample.joints, [BOX]).min() >= -1e-6
+    assert np.linalg.norm(sample.rates, axis=1)[200:-200].min() > 0.3
+    assert (np.abs(sample.accelerations) <= 4.001).all()
+
+
+def test_a_moving_end_is_reached_at_its_velocity_in_less_time_than_rest() -> None:
+    limits = Limits(acceleration=2.0, jerk=40.0, torque=np.inf)
+    plan = plan_to_goal(request_of(cost=LEAST_TIME, limits=limits, end_velocity=[1.0, 0.0]))
+    assert plan.audit().feasible
+    expected = 2.0 + (1.0 / 2.0 + 0.05) / 2  # one ramp instead of two: half of its time is lost
+    assert expected * (1 - 1e-6) <= plan.cost <= 1.01 * expected
+    sample = plan.sampled(np.linspace(0.0, plan.horizon, 101))
+    np.testing.assert_allclose(sample.rates[[0, -1]], [[0.0, 0.0], [1.0, 0.0]], atol=1e-6)
+    np.testing.assert_allclose(sample.joints[-1], GOAL, atol=1e-6)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("jerk", [None, 400.0])
 def test_least_time_of_an_arm_among_boxes_keeps_all_limits_and_its_clearance(jerk: float | None) -> None:
@@ -167,6 +207,7 @@ def test_least_time_of_an_arm_among_boxes_keeps_all_limits_and_its_clearance(jer
     assert plan.audit().feasible
     assert plan.bound is not None
     assert plan.bound <= plan.cost == pytest.approx(plan.horizon)
+    assert plan.cost < 1.1 * plan.bound
     sample = plan.sampled(np.linspace(0.0, plan.horizon, 2001))
     assert distances_along(scene, np.zeros(0), sample.joints, sample.t).min() >= -1e-6
     assert (np.abs(sample.rates) <= machine.robot.velocity * 1.001).all()

@@ -73,7 +73,7 @@ def test_a_window_a_fifth_wider_than_the_ball_is_found_and_a_narrower_one_is_not
         find_paths(closed, start, goal[None], limits=LIMITS, seed=seed, settings=PathSearchSettings(attempts=100))
 
 
-def test_a_clear_straight_motion_to_the_nearest_goal_is_the_path_and_the_goal_is_told() -> None:
+def test_a_clear_straight_motion_to_the_nearest_goal_is_the_path() -> None:
     goals = np.array([[1.5, 1.5], [0.5, 1.0], [-1.0, -1.8]])
     boxes = [Box((0.2, 0.2, 1.0), (1.0, -1.0, 0.0))]
     paths = find_paths(search_of(boxes), np.zeros(2), goals, limits=LIMITS, seed=0)
@@ -100,14 +100,14 @@ def test_shortening_and_optimisation_never_lengthen_and_keep_ends_and_clearance(
     free = random.uniform(-2, 2, (200, 2))
     free = free[gap(free, boxes) > 0.02]
     scale = np.array([1.0, 2.0])
-    path = connect(search, free[0], free[1:2], random, 4000)
+    path = connect(search, free[0], free[1:2], random=random, most_samples=4000)
     assert path is not None
     lengths = [path_length(path, scale)]
     for step in ("shorten", "optimise"):
         path = (
-            shorten(search.motions, path, scale, random)
+            shorten(search.motions, path, scale, random=random)
             if step == "shorten"
-            else optimise_length(search.motions, path, scale, LIMITS)
+            else optimise_length(search.motions, path, scale, limits=LIMITS)
         )
         lengths.append(path_length(path, scale))
         np.testing.assert_array_equal(path[[0, -1]], free[:2])
