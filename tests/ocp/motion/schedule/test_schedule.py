@@ -110,14 +110,14 @@ def change(sample: tuple[float, ...]) -> tuple[float, ...]:
 
 
 @given(changes)
-def test_the_fastest_motion_ends_where_it_must_whether_ruckig_finds_it_or_two_ramps_make_it(drawn: Any) -> None:
-    distance, first, last, *limits = change(drawn)
+def test_the_fastest_motion_ends_where_it_must_whether_ruckig_finds_it_or_two_ramps_make_it(sample: Any) -> None:
+    distance, first, last, *limits = change(sample)
     top, acceleration, jerk = limits
-    found = ramps.fastest_motion(distance, first, last, (top, acceleration, jerk))
+    result = ramps.fastest_motion(distance, first, last, (top, acceleration, jerk))
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(ramps, "Ruckig", lambda _: SimpleNamespace(calculate=lambda *_: None))
-        made = ramps.fastest_motion(distance, first, last, (top, acceleration, jerk))
-    for phases in (found, made):
+        by_ramps = ramps.fastest_motion(distance, first, last, (top, acceleration, jerk))
+    for phases in (result, by_ramps):
         s, v, a = 0.0, first, 0.0
         for t, j in phases:
             assert t > 0
@@ -126,7 +126,7 @@ def test_the_fastest_motion_ends_where_it_must_whether_ruckig_finds_it_or_two_ra
             assert abs(a) <= acceleration * (1 + 1e-9)
             assert min(first, last) - 1e-9 <= v <= top + 1e-9
         assert (s, v, a) == pytest.approx((distance, last, 0.0), abs=1e-8 * (1 + acceleration + distance))
-    assert sum(t for t, _ in instance) == pytest.approx(sum(t for t, _ in result), rel=1e-6)
+    assert sum(t for t, _ in by_ramps) == pytest.approx(sum(t for t, _ in result), rel=1e-6)
 
 
 @given(st.floats(0, 5), st.floats(1e-3, 5), st.floats(-1, 2), st.floats(-1, 3))

@@ -65,7 +65,7 @@ def tight(obstacle: Any = None, later: float = 0.0) -> Array:
     far, bounds = np.full((len(TIMES) - 1, robot.dof), 1.0), (robot.lower, robot.upper)
     cost = PathLength(np.ones(robot.dof))
     return shorten_path(
-        followed(), INSTANTS, Steps(TIMES + later, cost, far), bounds=bounds, scene=around, widths=(0.1, 1e-3)
+        followed(), TIME_SAMPLES, Steps(TIMES + later, cost, far), bounds=bounds, scene=around, widths=(0.1, 1e-3)
     )
 
 
@@ -78,7 +78,7 @@ def random_problem(
     bounds = np.maximum(robot.lower, lower), np.minimum(robot.upper, upper)
     cost = cost or PathLength(np.ones(robot.dof))
     return shorten_path(
-        followed(start), INSTANTS, Steps(times, cost, steps), bounds=bounds, scene=None, widths=(0.1, 1e-3)
+        followed(start), TIME_SAMPLES, Steps(times, cost, steps), bounds=bounds, scene=None, widths=(0.1, 1e-3)
     )
 
 

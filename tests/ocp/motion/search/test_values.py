@@ -94,7 +94,9 @@ def search_of(machine: FixedBase, places: Array, cost: StepCost) -> AtlasSearch:
         return np.array([one.joints for one in inverse_kinematics(machine, at, starts=16, seed=k)])
 
     limits = robot.velocity * np.diff(times)[:, None]
-    return AtlasSearch(space, [TimeSample(sets, k) for k in range(INSTANTS)], Steps(times, cost, limits), seeds=seeds)
+    return AtlasSearch(
+        space, [TimeSample(sets, k) for k in range(TIME_SAMPLES)], Steps(times, cost, limits), seeds=seeds
+    )
 
 
 @pytest.mark.parametrize("kind", [SquaredRates, PathLength, LargestMotion])
