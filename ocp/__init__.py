@@ -18,7 +18,7 @@ from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.cts import RollObstacles, RollSettings, roll_problem, spline_targets
 from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem
 from ocp.motion.builders.dynamics_plan import dynamics_phases
-from ocp.motion.builders.joint_motion import minimum_velocity_problem
+from ocp.motion.builders.joint_motion import VelocitySetup, minimum_velocity_problem
 from ocp.motion.builders.joint_spline import joint_path
 from ocp.motion.builders.space.capture import Capture, Cone, Grasp, capture_problem, chained_capture
 from ocp.motion.builders.standing.problem import FreeTime, StandingSetup, Weights, standing_problem
@@ -105,6 +105,7 @@ __all__ = [
     "TipTask",
     "ToolFreedom",
     "Unreachable",
+    "VelocitySetup",
     "Waypoints",
     "Weights",
     "capture_problem",

@@ -167,8 +167,8 @@ def bearing(example: CaptureExample, along: dict[str, Array]) -> tuple[Array, Ar
 def together(example: CaptureExample) -> FreeFloating:
     """Both as one machine."""
     one, other = example.chaser, example.capture.target
-    start = (one.base_home(), example.capture.target_base, example.options["start"])
-    carried = np.array(ca.DM(pair_momentum(one, other, *start))).ravel()
+    start = {"base": one.base_home(), "target_base": example.capture.target_base, "joints": example.options["start"]}
+    carried = np.array(ca.DM(pair_momentum(one, other, **start))).ravel()
     return FreeFloating(joined(one.robot, other.robot), conserved_momentum=carried)
 
 

@@ -46,7 +46,7 @@ class StandingExample:
         found = self.results
         motion = found.motion
         nearest = self.nearest
-        errors = task_errors(found.machine, self.task, motion.t, None, motion.joints)
+        errors = task_errors(found.machine, self.task, motion.t, motion.joints)
         return {
             "robot": self.name,
             "dof": found.robot.dof,

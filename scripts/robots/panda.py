@@ -10,7 +10,7 @@ import numpy as np
 
 from models import FixedBase
 from models.checks import Array
-from ocp import Collocation, TipTask, inverse_kinematics, minimum_velocity_problem, resolve, solve
+from ocp import Collocation, TipTask, VelocitySetup, inverse_kinematics, minimum_velocity_problem, resolve, solve
 from ocp.app.view.appearance import frames_along
 from scripts.drawing import COLORS
 from scripts.robots.drawing import Scene, animate, joint_curves, page
@@ -51,7 +51,7 @@ def plan(coarse: bool = False) -> Example:
     machine, task, laps = FixedBase(PANDA.read()), circling(), 3 if coarse else LAPS
     start = inverse_kinematics(machine, task, near=HOME, starts=0)[0].joints
     local = resolve(machine, tasks=task, start_joints=start, horizon=laps * LAP, samples=laps * SAMPLES + 1)
-    problem = minimum_velocity_problem(machine, task, horizon=LAP, near=start, cyclic=True)
+    problem = minimum_velocity_problem(machine, task, horizon=LAP, cyclic=True, setup=VelocitySetup(near=start))
     solution = solve(problem, Collocation(intervals=24 if coarse else 40, degree=4))
     drift = drifts(local.joints)
     facts = {

@@ -19,7 +19,7 @@ from models import FixedBase, Link, Robot, VisualShape, attach_tool, with_load
 from models.checks import Array
 from ocp import Audit, Collocation, Cost, Goal, Solution, TipTask, inverse_kinematics, joint_torques
 from ocp.app.view.appearance import TIP_FRAME, Frames, frames_along
-from ocp.motion.builders.dynamics_plan import solve_dynamics
+from ocp.motion.builders.dynamics_plan import SolveSettings, solve_dynamics
 from scripts.drawing import COLORS
 from scripts.robots.drawing import Scene, animate, joint_curves, page
 from scripts.robots.panda import HOME
@@ -34,7 +34,7 @@ PICK, PLACE = (0.6, -0.7, 0.06), (0.6, 0.7, 0.26)
 ABOVE = 0.15  # m, of the points above the load and its place
 WAY, DOWN, ACROSS = 1.6, 0.4, 1.6  # durations of legs, s
 EFFORT = Cost(velocity=0.0, effort=1.0, acceleration=2.0)
-METHOD = Collocation(6, degree=5, scheme="legendre")
+SETTINGS = SolveSettings(Collocation(6, degree=5, scheme="legendre"))
 FINE = 81  # times of a leg
 HANDED = ("lift", "carry", "set down")
 """Legs with the load in hand."""
@@ -161,7 +161,7 @@ def plan(coarse: bool = False) -> PickAndPlace:
     """Both plans, audited; on one mesh only, `coarse` or not."""
     plans, motions, audits = {}, {}, {}
     for name in KINDS:
-        plans[name] = solve_dynamics(arm(), legs(name == "load known"), start=HOME, cost=EFFORT, method=METHOD)
+        plans[name] = solve_dynamics(arm(), legs(name == "load known"), start=HOME, cost=EFFORT, settings=SETTINGS)
         motions[name], audits[name] = motion_of(plans[name]), plans[name].audit()
     return PickAndPlace(plans, motions, audits)
 
@@ -191,7 +191,7 @@ def motion_of(solution: Solution) -> Motion:
 def torque_function(machine: FixedBase) -> Any:
     """Joints, velocities and accelerations to torques, columns side by side."""
     symbols = [ca.SX.sym(name, machine.joint_size) for name in ("q", "v", "a")]
-    return ca.Function("torques", symbols, [joint_torques(machine, ca.DM(0, 1), *symbols)])
+    return ca.Function("torques", symbols, [joint_torques(machine, (ca.DM(0, 1), *symbols))])
 
 
 def scene_of(name: str, example: PickAndPlace) -> Scene:

@@ -121,7 +121,7 @@ class InPieces:
     def _tip_error(self, number: int) -> float:
         piece, begin = self.made.segments[number], self.made.start_times[number]
         times = np.linspace(0.0, piece.horizon, FINE)
-        errors = task_errors(self.machine, self.task, begin + times, None, piece.at(times)["joints"])
+        errors = task_errors(self.machine, self.task, begin + times, piece.at(times)["joints"])
         return float(np.abs(errors).max())
 
 

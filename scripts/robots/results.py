@@ -93,7 +93,7 @@ def tip_error(machine: Machine, task: TipTask, plan: Solution) -> float:
     times = np.linspace(0.0, plan.horizon, FINE)
     at = plan.at(times)
     base = at["base"] if machine.base_size else None
-    return float(np.abs(task_errors(machine, task, times, base, at["joints"])).max())
+    return float(np.abs(task_errors(machine, task, times, at["joints"], base=base)).max())
 
 
 def joint_return(plan: Solution) -> float:

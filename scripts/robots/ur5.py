@@ -12,7 +12,17 @@ import numpy as np
 from models import FixedBase, Machine
 from models.checks import Array
 from models.paths import rest_to_rest
-from ocp import Collocation, Solution, SolveError, TipTask, inverse_kinematics, minimum_velocity_problem, resolve, solve
+from ocp import (
+    Collocation,
+    Solution,
+    SolveError,
+    TipTask,
+    VelocitySetup,
+    inverse_kinematics,
+    minimum_velocity_problem,
+    resolve,
+    solve,
+)
 from ocp.app.view.appearance import TIP_FRAME, Frames, frames_along
 from ocp.motion.local.inverse_kinematics import IkSolution
 from ocp.motion.local.rates import LocalSolution
@@ -110,7 +120,7 @@ def starts(machine: Machine, task: TipTask) -> list[IkSolution]:
 def _planned(
     machine: Machine, task: TipTask, start: IkSolution, method: Collocation, free_start: bool
 ) -> Solution | None:
-    begin: dict[str, Any] = {"near" if free_start else "start": start.joints}
+    begin: dict[str, Any] = {"setup": VelocitySetup(near=start.joints)} if free_start else {"start": start.joints}
     try:
         found = solve(minimum_velocity_problem(machine, task, horizon=DURATION, **begin), method)
     except SolveError:

@@ -75,7 +75,7 @@ def proven(around: CollisionScene, middle: Array, sizes: Array, speeds: Array, p
 
     breaks = np.linspace(0.0, 1.0, SEGMENT_COUNT + 1)
     rates, seconds = (np.tile((sizes * speeds**k).sum(axis=0), (SEGMENT_COUNT, 1)) for k in (1, 2))
-    return clearance_of(around, joints, breaks, SECONDS, rates, seconds, True)
+    return clearance_of(around, joints, breaks, SECONDS, rates=rates, seconds=seconds, smooth=True)
 
 
 def plans(case: str, repeats: int) -> list[dict[str, Any]]:

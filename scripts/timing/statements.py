@@ -17,7 +17,7 @@ import numpy as np
 
 from models import FixedBase
 from models.checks import Array
-from ocp import Collocation, Problem, inverse_kinematics, prepare
+from ocp import Collocation, Problem, VelocitySetup, inverse_kinematics, prepare
 from ocp.motion.builders.joint_motion import minimum_velocity_problem
 from ocp.problem.formulation import Formulation
 from scripts.papers.free_floating.formulations import problem as free_floating
@@ -189,7 +189,9 @@ def _arm() -> Statement:
 def _lap() -> Statement:
     machine = FixedBase(PANDA.read())
     start = inverse_kinematics(machine, circling(), near=HOME, starts=0)[0].joints
-    return _weighed(minimum_velocity_problem(machine, circling(), horizon=LAP, near=start, cyclic=True))
+    return _weighed(
+        minimum_velocity_problem(machine, circling(), horizon=LAP, cyclic=True, setup=VelocitySetup(near=start))
+    )
 
 
 def with_reference(statement: Statement, intervals: int = 80) -> Statement:

@@ -170,8 +170,8 @@ def proven(robot: str, options: Obstacle) -> tuple[CollisionScene, Clearance]:
     """What is proven of the motion beside an obstacle, of the pairs with it alone."""
     machine = ROBOTS[robot]()
     around = CollisionScene(machine, [options.moving])
-    problem, q = problem_of(machine, ENDS[robot])
-    ClearanceConstraints(around).declare(problem, machine.base_home(), q, horizon=SECONDS)
+    problem, _ = problem_of(machine, ENDS[robot])
+    ClearanceConstraints(around).declare(problem, machine.base_home(), horizon=SECONDS)
     beside = [k for k, pair in enumerate(around.labels) if "obstacle 0" in pair]
     apart = problem.declared.apart[CLEARANCE].of(beside)
     return around, clearance(Formulation.of(problem), apart, motion(robot), np.zeros(0))

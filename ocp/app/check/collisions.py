@@ -53,7 +53,13 @@ def prove_clearance(scene: CollisionScene, motion: Motion) -> Clearance:
     seconds = np.zeros_like(rates) if motion.acceleration is None else motion.acceleration.greatest
     smooth, breaks = motion.acceleration is not None, (motion.t - start) / horizon
     return clearance_of(
-        scene, lambda at: motion.position.at(start + at * horizon), breaks, horizon, rates, seconds, smooth
+        scene,
+        lambda at: motion.position.at(start + at * horizon),
+        breaks,
+        horizon,
+        rates=rates,
+        seconds=seconds,
+        smooth=smooth,
     )
 
 

@@ -105,10 +105,8 @@ class ClearanceConstraints:
         self,
         problem: Problem,
         base: Any,
-        joints: Any,
+        joints: str = "joints",
         *,
-        base_name: str = "",
-        joints_name: str = "joints",
         suffix: str = "",
         begin: float = 0.0,
         pace: float = 1.0,
@@ -117,9 +115,9 @@ class ClearanceConstraints:
         """Declare the proven clearances and the separation constraints of a machine.
 
         Args:
-            problem: Problem of SX symbols with the states below.
-            base, joints: Symbols of the states; numbers for a fixed base.
-            base_name, joints_name: Names of the states; "" if the base is no state.
+            problem: Problem with the states below.
+            base: Name of the state of the base, or the configuration of a fixed base.
+            joints: Name of the state of the joints.
             suffix: Suffix of the declared names.
             begin, pace: The time of the scene is begin + pace times the time of the problem.
             horizon: Horizon of the problem, s; None if it is free, which excludes moving obstacles.
@@ -128,8 +126,8 @@ class ClearanceConstraints:
             ProblemError: An obstacle moves and the horizon is free; the motion of an obstacle is not defined over the
                 whole horizon, or uses operations without interval bounds.
         """
-        scene, time = self.scene, begin + pace * problem.time
-        _check_limits(scene, problem.declared.states[joints_name])
+        scene, time, states = self.scene, begin + pace * problem.time, problem.declared.states
+        _check_limits(scene, states[joints])
         if horizon is not None:
             try:
                 scene.check_motions(begin, begin + pace * horizon)
@@ -139,12 +137,13 @@ class ClearanceConstraints:
             words = "a moving obstacle needs a known time; give a horizon in s, or a fixed obstacle"
             raise ProblemError(words, name="obstacles")
         levers = scene.levers
-        moved = {joints_name: (levers.joints, levers.joint_turns)}
-        if base_name:
-            moved[base_name] = (levers.base, levers.base_turns)
+        moved = {joints: (levers.joints, levers.joint_turns)}
+        if isinstance(base, str):
+            moved[base] = (levers.base, levers.base_turns)
+        at = states[base].symbol if isinstance(base, str) else base, states[joints].symbol, time
         problem.separate(
             f"{CLEARANCE}{suffix}",
-            _evaluated(scene.placements, base, joints, time),
+            _evaluated(scene.placements, *at),
             scene_hulls(scene),
             scene.pairs,
             least=np.full(len(scene.pairs), scene.clearance),
@@ -155,7 +154,7 @@ class ClearanceConstraints:
         )
         if self.margins:
             pairs = sorted(self.margins)
-            distances = _evaluated(partial(scene.distances, pairs=pairs, rounding=ROUNDING), base, joints, time)
+            distances = _evaluated(partial(scene.distances, pairs=pairs, rounding=ROUNDING), *at)
             least = [scene.clearance + self.margins[pair] for pair in pairs]
             problem.path(f"{APART}{suffix}", distances, lower=least, unit="m")
 
@@ -196,6 +195,7 @@ def clearance_of(
     joints: Callable[[Array], Array],
     breaks: Array,
     horizon: float,
+    *,
     rates: Array,
     seconds: Array,
     smooth: bool,

@@ -234,7 +234,7 @@ class TorqueLimits:
     def _sampler(self, linearised: bool) -> Sampler:
         if linearised not in self._samplers:
             symbols = [ca.SX.sym("v", self.machine.joint_size) for _ in range(3)]
-            torques = joint_torques(self.machine, self.machine.base_home(), *symbols)[self.limited.tolist()]
+            torques = joint_torques(self.machine, (self.machine.base_home(), *symbols))[self.limited.tolist()]
             outputs = [torques, *(ca.jacobian(torques, each) for each in symbols)] if linearised else [torques]
             self._samplers[linearised] = Sampler(symbols, outputs)
         return self._samplers[linearised]

@@ -154,15 +154,13 @@ def dynamics_problem(
     if setup.end_base is not None:
         _declare_end_base(problem, machine, motion.base, setup.end_base)
     loads: dict[str, Any] = {"friction": setup.friction, "wrenches": setup.wrenches, "gravity": setup.gravity}
-    torques = joint_torques(machine, *motion[:4], **loads)
+    torques = joint_torques(machine, motion[:4], **loads)
     running = _declare_actuators(problem, machine, motion, torques, bounds, cost)
     if equations is not None:
         _declare_tasks(problem, equations, ends, motion, duration)
     if setup.clearance_constraints is not None:
-        name = "base" if machine.base_size else ""
-        setup.clearance_constraints.declare(
-            problem, motion.base, motion.joints, base_name=name, horizon=None if free else duration
-        )
+        base = "base" if machine.base_size else machine.base_home()
+        setup.clearance_constraints.declare(problem, base, horizon=None if free else duration)
     problem.minimize(running=running, terminal=cost.time * final)
     return problem
 
@@ -350,7 +348,7 @@ def _declare_tasks(problem: Problem, equations: TaskEquations, ends: _Ends, moti
     if not ends.rests[0]:
         residual = equations.residual(base, joints, rates, targets)
         problem.start("tip velocity", residual, lower=0, upper=0, unit=equations.unit())
-    gap = equations.acceleration(base, joints, rates, second, problem.time)
+    gap = equations.acceleration(base, joints, rates, second, progress=(problem.time,))
     problem.path("tip", gap, lower=0, upper=0, unit=equations.unit("/s^2", "/s^2"))
     for name, deviation in equations.deviations(base, joints, rates, targets).items():
         problem.watch(name, **deviation)

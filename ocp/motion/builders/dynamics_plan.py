@@ -18,7 +18,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -48,8 +48,8 @@ from ocp.solution import Guess, Solution
 from ocp.tightening import WARM_START_OPTIONS, largest_excess, solve_at_switches, tighten
 
 __all__ = [
-    "audit_error", "breaks_of", "checked_goals", "dynamics_phases", "machines_of", "phase_names", "solve_dynamics",
-    "within_limits",
+    "SolveSettings", "audit_error", "breaks_of", "checked_goals", "dynamics_phases", "machines_of", "phase_names",
+    "solve_dynamics", "within_limits",
 ]  # fmt: skip
 
 
@@ -84,9 +84,7 @@ def dynamics_phases(
     """
     goals = checked_goals(goals)
     setup = DynamicsSetup() if setup is None else require.instance("dynamics_phases: setup", setup, DynamicsSetup)
-    if setup.end_velocity != "rest":
-        words = "end_velocity: every goal has its own; set Goal(velocity=...)"
-        raise ProblemError(words, name="end_velocity", value=setup.end_velocity)
+    _check_end_velocity(setup)
     clearance = setup.clearance_constraints
     if clearance is not None:
         require.instance("dynamics_phases: clearance_constraints", clearance, ClearanceConstraints)
@@ -219,21 +217,45 @@ class HoldingSettings:
 HOLDING = HoldingSettings()
 
 
+@dataclass(frozen=True, eq=False)
+class SolveSettings:
+    """Settings of a solve that is audited and repeated on finer meshes.
+
+    Attributes:
+        method: First mesh; None for that of the planner.
+        options: IPOPT options.
+        tolerances: Tolerances of the audit by name, see `ocp.audit.audit.audit`.
+
+    Raises:
+        ProblemError: The method is no collocation, or the options are no mapping.
+    """
+
+    method: Collocation | None = None
+    options: Mapping[str, Any] | None = None
+    tolerances: Mapping[str, float] | None = None
+
+    def __post_init__(self) -> None:
+        if self.method is not None:
+            require.instance("method", self.method, Collocation)
+        require.mapping("options", self.options)
+
+    @property
+    def ipopt_options(self) -> dict[str, Any]:
+        """IPOPT options, with the defaults of the planner."""
+        return {**IPOPT, **(self.options or {})}
+
+
 @interruptible
 def solve_dynamics(
     machine: Motors,
-    tasks: TipTask | Sequence[TipTask] | Sequence[Goal],
+    tasks: TipTask | Goal | Sequence[TipTask] | Sequence[Goal],
     horizon: float | FreeTime | None = None,
     *,
     start: Any,
-    end: Any = None,
     limits: Limits | None = None,
     cost: Cost | None = None,
     setup: DynamicsSetup | None = None,
-    total: float | None = None,
-    method: Collocation | None = None,
-    options: Mapping[str, Any] | None = None,
-    tolerances: Mapping[str, float] | None = None,
+    settings: SolveSettings | None = None,
 ) -> Solution:
     """Solve `dynamics_problem`, or the phases of `dynamics_phases`, and audit the plan.
 
@@ -244,49 +266,57 @@ def solve_dynamics(
     accelerations or torques.
 
     Args:
-        machine, start, end, limits, cost, setup: As for `dynamics_problem`.
-        tasks: Tip tasks as for `dynamics_problem`, or the goals of `dynamics_phases`. The solution has a phase for each
-            goal then, `solution.phase(name)`.
-        horizon: Final time, s, or FreeTime(...); None for goals, which have their own durations.
-        total: Duration of all phases together, see `dynamics_phases`.
-        method: First mesh, with controls at the points; None for 20 Legendre intervals of degree 5, with nodes at the
-            breaks of the tasks. Up to two more meshes are tried, each twice as fine, or refined where needed.
-        options: IPOPT options.
-        tolerances: Tolerances of the audit by name, see `ocp.audit.audit.audit`.
+        machine, start, limits, cost, setup: As for `dynamics_problem`.
+        tasks: Tip tasks as for `dynamics_problem`; one goal, which has joints and perhaps tasks on the way; or the
+            goals of `dynamics_phases`, for which the solution has a phase each, `solution.phase(name)`. Goals give
+            their velocities themselves.
+        horizon: Final time, s, or FreeTime(...). For several goals, which have their own durations, that of all phases
+            together; None leaves it free.
+        settings: First mesh, solver options and audit tolerances. By default, 20 Legendre intervals of degree 5 with
+            nodes at the breaks of the tasks. Up to two more meshes are tried, each twice as fine, or refined where
+            needed.
 
     Raises:
         SolveError: No plan satisfies its limits. The message has the result of each attempt, and the joint, the time
             and the limit that is violated.
         ProblemError: As `dynamics_problem` and `dynamics_phases`.
     """
-    setup = DynamicsSetup() if setup is None else require.instance("plan_dynamics: setup", setup, DynamicsSetup)
+    own_setup = DynamicsSetup() if setup is None else require.instance("solve_dynamics: setup", setup, DynamicsSetup)
     shared: dict[str, Any] = {"start": start, "limits": limits, "cost": cost}
-    tip_tasks: Any = tasks
+    clearance, total = own_setup.clearance_constraints, cast(Any, horizon)
     if isinstance(tasks, Sequence) and isinstance(next(iter(tasks), None), Goal):
         goals = checked_goals(tasks)
-        for name, value in (("horizon", horizon), ("end", end)):
-            if value is not None:
-                raise ProblemError(f"{name}: every goal has its own; set it in Goal(...)", name=name, value=value)
         phases = zip(phase_names(goals), machines_of(machine, goals), strict=True)
         limited_machines = {name: (own, limits) for name, own in phases}
 
         def declare_phases(clearance: ClearanceConstraints | None) -> Problem:
-            own = replace(setup, clearance_constraints=clearance)
+            own = replace(own_setup, clearance_constraints=clearance)
             return dynamics_phases(machine, goals, total=total, setup=own, **shared)
 
-        return within_limits(
-            declare_phases, setup.clearance_constraints, method, (), options, tolerances, limited_machines
-        )
-    if total is not None:
-        raise ProblemError("total is for several goals; set the horizon instead", name="total", value=total)
+        return within_limits(declare_phases, clearance, limited_machines, settings=settings)
+    if isinstance(tasks, Goal):
+        _check_end_velocity(own_setup)
+        horizon = tasks.duration if horizon is None else horizon
+        (goal,) = checked_goals([replace(tasks, duration=horizon)])
+        end_base = own_setup.end_base if goal.base is None else goal.base
+        own_setup = replace(own_setup, end_velocity=goal.velocity, end_base=end_base)
+        (machine,), shared["end"] = machines_of(machine, [goal]), goal.joints
+    tip_tasks: Any = tasks.tasks if isinstance(tasks, Goal) else tasks
 
     def declare(clearance: ClearanceConstraints | None) -> Problem:
-        own = replace(setup, clearance_constraints=clearance)
-        return dynamics_problem(machine, tip_tasks, duration, end=end, setup=own, **shared)
+        own = replace(own_setup, clearance_constraints=clearance)
+        return dynamics_problem(machine, tip_tasks, duration, setup=own, **shared)
 
     duration: float | FreeTime = horizon if isinstance(horizon, FreeTime) else require.positive("horizon", horizon)
     at = () if isinstance(duration, FreeTime) else breaks_of(tip_tasks, duration)
-    return within_limits(declare, setup.clearance_constraints, method, at, options, tolerances, {"": (machine, limits)})
+    return within_limits(declare, clearance, {"": (machine, limits)}, breaks=at, settings=settings)
+
+
+def _check_end_velocity(setup: DynamicsSetup) -> None:
+    """Raise ProblemError if the setup has the velocity at the end, which goals give themselves."""
+    if setup.end_velocity != "rest":
+        words = "end_velocity: every goal has its own; set Goal(velocity=...)"
+        raise ProblemError(words, name="end_velocity", value=setup.end_velocity)
 
 
 def breaks_of(tasks: TipTask | Sequence[TipTask], horizon: float) -> Sequence[float]:
@@ -306,32 +336,30 @@ def audit_error(audit: Audit, solution: Solution) -> SolveError:
 def within_limits(
     declare: Callable[[Constraints], Problem],
     clearance_constraints: Constraints,
-    method: Collocation | None,
-    breaks: Sequence[float],
-    options: Mapping[str, Any] | None,
-    tolerances: Mapping[str, float] | None,
     machines: Mapping[str, tuple[Machine, Limits | None]],
     *,
+    breaks: Sequence[float] = (),
+    settings: SolveSettings | None = None,
     guess: Guess = None,
 ) -> Solution:
     """Return a plan that satisfies its limits between the nodes and passes its audit; see `solve_dynamics`.
 
     Args:
         declare: Declares the problem under clearance constraints.
-        breaks: Fractions of the horizon that get nodes.
         machines: Machine and limits by the name of the phase, "" without phases. Messages take joint names from them.
+        breaks: Fractions of the horizon that get nodes.
+        settings: First mesh, solver options and audit tolerances.
         guess: Guess of the first solve; that of the problem if None.
     """
-    mesh = POINTS if method is None else require.instance("method", method, Collocation)
-    settings = {**IPOPT, **require.mapping("options", options)}
-    mesh = mesh.with_nodes_at(breaks)
+    own = SolveSettings() if settings is None else require.instance("settings", settings, SolveSettings)
+    mesh = (own.method or POINTS).with_nodes_at(breaks)
 
     in_collision: Solution | None = None  # the last plan, if only its clearance failed
 
     def solve_problem(problem: Problem, begin: Guess) -> Solution:
         nonlocal in_collision
         try:
-            return _first_within_limits(problem, mesh, settings, tolerances, begin)
+            return _first_within_limits(problem, mesh, own.ipopt_options, own.tolerances, begin)
         except SolveError as error:
             in_collision = error.solution if is_clearance(error.name) else None
             if begin is guess or in_collision is not None:

@@ -10,7 +10,7 @@ Kim and Kim 2011, for any machine on a fixed or floating base and any tasks.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi as ca
@@ -22,7 +22,7 @@ from ocp.console import interruptible
 from ocp.curves import PiecewisePolynomial
 from ocp.errors import ProblemError, SolverStatus, require
 from ocp.motion.builders.clearance import ClearanceConstraints
-from ocp.motion.builders.tool_motion import ToolMotion, stretches_of, tool_motion_problem
+from ocp.motion.builders.tool_motion import ToolMotion, ToolMotionSetup, stretches_of, tool_motion_problem
 from ocp.motion.local.inverse_kinematics import inverse_kinematics
 from ocp.motion.local.rates import LocalMotion, track_tasks
 from ocp.motion.tasks.checks import checked_configuration, checked_tasks, checked_weights, clip_to_limits, horizon_of
@@ -32,7 +32,7 @@ from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.problem import Problem, remembers_request
 from ocp.solution import Solution
 
-__all__ = ["joint_motion_problem", "minimum_velocity_problem", "motion_along"]
+__all__ = ["VelocitySetup", "joint_motion_problem", "minimum_velocity_problem", "motion_along"]
 
 RATE_SLACK = 1e-9
 """Relative excess allowed over a rate limit, since a motion at constant speed may be at its limit all the time."""
@@ -84,7 +84,7 @@ def joint_motion_problem(
     rates = problem.control("rates", n, lower=-fastest, upper=fastest, unit=machine.robot.unit("/s"))
     problem.dynamics(joints, rates)
     if clearance_constraints is not None:
-        clearance_constraints.declare(problem, machine.base_home(), joints, horizon=horizon)
+        clearance_constraints.declare(problem, machine.base_home(), horizon=horizon)
     square = ca.dot(rates, scale * rates)
     problem.minimize(running=ca.sqrt(square) if length else square / 2)
     return problem
@@ -149,6 +149,33 @@ GUESS_STEPS = 64
 """Steps of the local motion over the horizon, besides the breaks of the tasks."""
 
 
+@dataclass(frozen=True, eq=False)
+class VelocitySetup:
+    """Settings of `minimum_velocity_problem` that most motions leave at their defaults.
+
+    Attributes:
+        start_base: Base at the start, shape (base_size,); the machine's base_home() if None.
+        near: Joints from which the guess of a free start begins; from inverse kinematics if None.
+        guess_damping: Damping of the local motion used as the guess, relative to the root mean square of the singular
+            values of the tasks' Jacobian. With small values it is close to the pseudo-inverse; large ones avoid
+            singularities and may lead to another extremal.
+        clearance_constraints: Collision avoidance, see `ocp.motion.builders.clearance`; None for none.
+
+    Raises:
+        ProblemError: The damping is not positive, or the clearance constraints are of another type.
+    """
+
+    start_base: Any = None
+    near: Any = None
+    guess_damping: float = 0.01
+    clearance_constraints: ClearanceConstraints | None = None
+
+    def __post_init__(self) -> None:
+        require.positive("guess_damping", self.guess_damping)
+        if self.clearance_constraints is not None:
+            require.instance("clearance_constraints", self.clearance_constraints, ClearanceConstraints)
+
+
 @interruptible
 def minimum_velocity_problem(
     machine: Machine,
@@ -156,13 +183,10 @@ def minimum_velocity_problem(
     horizon: float | None = None,
     *,
     start: Any = None,
-    start_base: Any = None,
-    near: Any = None,
     cyclic: bool = False,
     weights: Any = None,
     limits: Limits | None = None,
-    guess_damping: float = 0.01,
-    clearance_constraints: ClearanceConstraints | None = None,
+    setup: VelocitySetup | None = None,
 ) -> Problem:
     """Declare a motion along tasks with the least integral of half the squared joint rates, 1/2 |x2'|^2 (27).
 
@@ -174,19 +198,14 @@ def minimum_velocity_problem(
         machine, tasks: As for `plan`.
         horizon: Final time, s; that of the tasks if None.
         start: Joints at the start. Shape (joint_size,), rad or m. None leaves them free wherever the tips are at the
-            beginning of their tasks. With a velocity task the tip is then where it is at `near`.
-        start_base: Base at the start, shape (base_size,); the machine's base_home() if None.
-        near: Joints from which the guess of a free start begins; from inverse kinematics if None.
+            beginning of their tasks. With a velocity task the tip is then where it is at `VelocitySetup.near`.
         cyclic: Whether the joints end where they started, after a closed task. The closure that already follows from
             the task is not required twice: the task may deviate by a constant velocity of the size of the
             discretisation error, the state "closure", so that the joints close exactly. A floating base closes only if
             the task requires it.
         weights: Weights of the squared joint rates, positive. Shape (joint_size,); all 1 if None.
         limits: Limits of joint positions and rates; the robot's own if None.
-        guess_damping: Damping of the local motion used as the guess, relative to the root mean square of the singular
-            values of the tasks' Jacobian. With small values it is close to the pseudo-inverse; large ones avoid
-            singularities and may lead to another extremal.
-        clearance_constraints: Collision avoidance, see `ocp.motion.builders.clearance`; None for none.
+        setup: Base at the start, guess and clearance; the defaults if None.
 
     Returns:
         The problem with its guess. Only the local motion is solved.
@@ -197,20 +216,20 @@ def minimum_velocity_problem(
             horizon or the damping is not positive.
         Unreachable: A free start was not found (a ProblemError).
     """
-    require.positive("guess_damping", guess_damping)
+    setup = VelocitySetup() if setup is None else require.instance("setup", setup, VelocitySetup)
     require.flag("cyclic", cyclic)
     tasks = (tasks,) if isinstance(tasks, TipTask) else require.each("tasks", tasks, TipTask)
     bind(machine, tasks)
     duration = horizon_of(tasks, horizon)
     limits = Limits() if limits is None else require.instance("limits", limits, Limits)
-    reference = near if start is None else start
+    reference = setup.near if start is None else start
     if reference is None:
         first = [task for task in tasks if task.is_pose and task.begin == 0]
         if not first:
             words = "start is missing; inverse_kinematics(machine, task) finds joints for a pose"
             raise ProblemError(words, name="start")
-        reference = inverse_kinematics(machine, first, base=start_base, limits=limits.joints)[0].joints
-    joints, base = checked_configuration(machine, reference, start_base)
+        reference = inverse_kinematics(machine, first, base=setup.start_base, limits=limits.joints)[0].joints
+    joints, base = checked_configuration(machine, reference, setup.start_base)
     weights = checked_weights(weights, machine.joint_size)
     stretches = stretches_of(machine, tasks, duration)
     for stretch in stretches:
@@ -219,13 +238,12 @@ def minimum_velocity_problem(
             checked_tasks(stretch.equations, base, joints, duration, start=begins)
     bounds, names = limits.bounds(machine, ("velocity",)), machine.robot.joint_names
     joints = clip_to_limits("start", names, joints, bounds.lower, bounds.upper, "start inside them")
-    if clearance_constraints is not None:
-        require.instance("clearance_constraints", clearance_constraints, ClearanceConstraints)
-    motion = tool_motion_problem(
-        machine, stretches, base=base, start=None if start is None else joints, reference=joints,
-        cyclic=cyclic, weights=weights, bounds=bounds, clearance_constraints=clearance_constraints,
+    options = ToolMotionSetup(
+        base=base, start=None if start is None else joints, reference=joints, cyclic=cyclic, weights=weights,
+        bounds=bounds, clearance_constraints=setup.clearance_constraints,
     )  # fmt: skip
-    _attach_guess(motion, base, joints, weights, bounds, guess_damping)
+    motion = tool_motion_problem(machine, stretches, options)
+    _attach_guess(motion, base, joints, weights, bounds, setup.guess_damping)
     return motion.problem
 
 

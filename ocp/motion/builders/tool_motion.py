@@ -33,7 +33,7 @@ from ocp.motion.tasks.tip_task import TipTask, is_holonomic
 from ocp.problem.problem import Problem
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = ["CLOCK", "PACE", "SLOPES", "Stretch", "ToolMotion", "stretches_of", "tool_motion_problem"]
+__all__ = ["CLOCK", "PACE", "SLOPES", "Stretch", "ToolMotion", "ToolMotionSetup", "stretches_of", "tool_motion_problem"]
 
 CLOCK, SLOPES, PACE = "clock", "slopes", "pace"
 """Names in free time: the time as a state, and the derivatives of joints and time by the tasks' own time."""
@@ -160,26 +160,11 @@ def stretches_of(machine: Machine, tasks: Sequence[TipTask], horizon: float) -> 
     return tuple(stretches)
 
 
-def tool_motion_problem(
-    machine: Machine,
-    stretches: Sequence[Stretch],
-    *,
-    base: Array,
-    start: Array | None,
-    reference: Array,
-    cyclic: bool,
-    weights: Array,
-    bounds: JointBounds,
-    time_cost: float | None = None,
-    actuation: Actuation | None = None,
-    relaxed: bool = False,
-    clearance_constraints: ClearanceConstraints | None = None,
-) -> ToolMotion:
-    """Declare a motion along tasks with the least integral of half the weighted squared joint rates.
+@dataclass(frozen=True, eq=False)
+class ToolMotionSetup:
+    """Boundary conditions, cost, limits and formulation of `tool_motion_problem`.
 
-    Args:
-        machine: Machine on a fixed or floating base.
-        stretches: Stretches of the horizon, see `stretches_of`.
+    Attributes:
         base: Configuration of the base at the start. Shape (base_size,).
         start: Joints at the start, rad or m. Where they are nan, or None, the start is free, and the tips must be where
             their tasks begin. Shape (joint_size,).
@@ -189,17 +174,42 @@ def tool_motion_problem(
         weights: Weights of the squared joint rates. Shape (joint_size,).
         bounds: Limits of joint positions and rates.
         time_cost: Cost of a second, if the tasks may be executed more slowly. The horizon of the problem is then the
-            tasks' own. Its states over it are "joints", "base" and CLOCK, the time; its controls are SLOPES, the
-            derivatives of the joints, and PACE, that of the time, at least 1. None keeps the tasks' own time.
+            tasks' own, with the further state CLOCK, the time, and the controls SLOPES, the derivatives of the joints,
+            and PACE, that of the time, at least 1. None keeps the tasks' own time.
         actuation: Options of a motion with accelerations (jerks) as the control, within the limits of the actuators;
             None for rates as the control. The states "velocities" replace the rates, the tasks are constrained by their
             accelerations, and velocities are continuous between stretches.
-        relaxed: Whether tasks may deviate at a quadratic cost, J u - b = relaxation S with the cost |S|^2 / 2 and the
-            control S, ERRORS. The constraints then stay independent where the rows of J depend on each other. If a
-            motion of cost c does the tasks within the limits, the errors of the optimum satisfy |S|^2 / 2 <= c when
-            integrated, so that a tip strays by less than relaxation sqrt(2 c horizon). Only with the tasks' own time
-            and without actuator limits.
+        relaxed: Whether tasks may deviate, J u - b = relaxation S, by the control S, ERRORS, at the cost |S|^2 / 2. The
+            constraints then stay independent where the rows of J depend on each other. If a motion of cost c does the
+            tasks within the limits, the optimum deviates by less than relaxation sqrt(2 c horizon). Only with the
+            tasks' own time and without actuator limits.
         clearance_constraints: Collision avoidance, see `ocp.motion.builders.clearance`; None for none.
+    """
+
+    base: Array
+    start: Array | None
+    reference: Array
+    cyclic: bool
+    weights: Array
+    bounds: JointBounds
+    time_cost: float | None = None
+    actuation: Actuation | None = None
+    relaxed: bool = False
+    clearance_constraints: ClearanceConstraints | None = None
+
+    @property
+    def free(self) -> bool:
+        """Whether the start is free, with the tips where their tasks begin."""
+        return self.start is None or bool(np.isnan(self.start).any())
+
+
+def tool_motion_problem(machine: Machine, stretches: Sequence[Stretch], setup: ToolMotionSetup) -> ToolMotion:
+    """Declare a motion along tasks with the least integral of half the weighted squared joint rates.
+
+    Args:
+        machine: Machine on a fixed or floating base.
+        stretches: Stretches of the horizon, see `stretches_of`.
+        setup: Boundary conditions, cost, limits and formulation.
 
     Raises:
         ProblemError: A cyclic motion has a task that is not closed, or several stretches with a task in the last; a
@@ -207,63 +217,46 @@ def tool_motion_problem(
             base drifts.
     """
     horizon = stretches[-1].end
-    problem = Problem("tool motion" if time_cost is None else "tool motion in free time")
+    problem = Problem("tool motion" if setup.time_cost is None else "tool motion in free time")
     problem.horizon(horizon)
-    motion = _Motion(
-        problem, machine, tuple(stretches), bounds, base, start, reference, cyclic, weights, clearance_constraints,
-        actuation, relaxed,
-    )  # fmt: skip
-    if time_cost is not None:
-        return _in_free_time(motion, time_cost)
-    for stretch in stretches:
-        if stretch.equations is not None:
-            check_speed(stretch.equations, bounds.velocity, stretch.begin, stretch.end)
+    motion = _Motion(problem, machine, tuple(stretches), setup)
+    if setup.time_cost is not None:
+        return _in_free_time(motion, setup.time_cost)
     running: Any = 0
     before, first, known = None, None, None
     for stretch in stretches:
+        if stretch.equations is not None:
+            check_speed(stretch.equations, setup.bounds.velocity, stretch.begin, stretch.end)
         states, cost, known = _declare_stretch(motion, stretch, known)
         running += cost
         if before is not None:
             here = ca.vertcat(*[problem.at_start(state) for state in states])
-            unit = "" if machine.base_size or actuation else machine.robot.unit()
+            unit = "" if machine.base_size or setup.actuation else machine.robot.unit()
             problem.end(f"passage at {stretch.begin:g} s", here - ca.vertcat(*before), 0, 0, unit=unit)
         before, first = states, first or states
-    if cyclic and motion.free and before and first:
+    if setup.cyclic and setup.free and before and first:
         place = 1 if machine.base_size else 0
         problem.end("cyclic", before[place] - problem.at_start(first[place]), 0, 0, unit=machine.robot.unit())
     start_errors = [state.symbol for name, state in problem.declared.states.items() if name.startswith(START_ERRORS)]
     problem.minimize(running=running, terminal=sum((ca.sumsqr(errors) / 2 for errors in start_errors), start=0))
-    times = [stretch.breaks if actuation else stretch.nodes for stretch in stretches]
+    times = [stretch.breaks if setup.actuation else stretch.nodes for stretch in stretches]
     inside = [(at - stretch.begin) / stretch.duration for stretch, at in zip(stretches, times, strict=True)]
     return ToolMotion(problem, tuple(stretches), horizon, np.unique(np.concatenate(inside)))
 
 
 @dataclass(frozen=True, eq=False)
 class _Motion:
-    """Data shared by all stretches of a motion; see `tool_motion_problem`."""
+    """A problem under declaration and the data that all stretches of its motion share."""
 
     problem: Problem
     machine: Machine
     stretches: tuple[Stretch, ...]
-    bounds: JointBounds
-    base: Array
-    start: Array | None
-    reference: Array
-    cyclic: bool
-    weights: Array
-    clearance_constraints: ClearanceConstraints | None
-    actuation: Actuation | None
-    relaxed: bool
+    setup: ToolMotionSetup
 
     @property
     def horizon(self) -> float:
         """Return the horizon, s."""
         return self.stretches[-1].end
-
-    @property
-    def free(self) -> bool:
-        """Return whether the start is free, with the tips where their tasks begin."""
-        return self.start is None or bool(np.isnan(self.start).any())
 
     def pace(self, stretch: Stretch) -> float:
         """Return the seconds of a stretch in a second of the problem."""
@@ -275,37 +268,38 @@ class _Motion:
         place: Any = np.zeros(0)
         if machine.base_size:
             unit = "m, rad" if machine.base_size == 3 else "m, 1"  # a quaternion has none
-            initial = self.base if begins else None
+            initial = self.setup.base if begins else None
             place = self.problem.state(f"base{stretch.suffix}", machine.base_size, initial=initial, unit=unit)
-        returns = self.cyclic and ends and begins and not self.free
-        options: dict[str, Any] = {"lower": self.bounds.lower, "upper": self.bounds.upper, "unit": machine.robot.unit()}
-        options |= {"initial": self.start if begins else None, "terminal": self.start if returns else None}
+        returns = self.setup.cyclic and ends and begins and not self.setup.free
+        bounds, unit = self.setup.bounds, machine.robot.unit()
+        options: dict[str, Any] = {"lower": bounds.lower, "upper": bounds.upper, "unit": unit}
+        options |= {"initial": self.setup.start if begins else None, "terminal": self.setup.start if returns else None}
         return place, self.problem.state(f"joints{stretch.suffix}", machine.joint_size, **options)
 
     def velocities(self, stretch: Stretch, place: Any, joints: Any, pace: Any) -> tuple[Any, Any, Any]:
         """Declare velocities as states; return them, the accelerations and the cost in a second of motion."""
-        assert self.actuation is not None
-        begins, ends = (rests and stretch is self.stretches[-k] for k, rests in enumerate(self.actuation.rests))
-        cost = self.actuation.cost or Cost(weights=self.weights)
-        own = replace(self.actuation, cost=cost, rests=(begins, ends))
+        assert self.setup.actuation is not None
+        begins, ends = (rests and stretch is self.stretches[-k] for k, rests in enumerate(self.setup.actuation.rests))
+        cost = self.setup.actuation.cost or Cost(weights=self.setup.weights)
+        own = replace(self.setup.actuation, cost=cost, rests=(begins, ends))
         options: dict[str, Any] = {"horizon": self.horizon, "pace": pace, "suffix": stretch.suffix}
-        return declare_actuators(self.problem, self.machine, (place, joints), self.bounds, actuation=own, **options)
+        options |= {"actuation": own}
+        return declare_actuators(self.problem, self.machine, (place, joints), self.setup.bounds, **options)
 
     def task_errors(self, stretch: Stretch) -> tuple[Any, Any]:
         """Declare and return the velocities by which tasks may deviate, and their running cost; 0, 0 if not relaxed."""
         assert stretch.equations is not None
-        if not self.relaxed or not stretch.equations.size:
+        if not self.setup.relaxed or not stretch.equations.size:
             return 0, 0
         errors = self.problem.control(f"{ERRORS}{stretch.suffix}", stretch.equations.size, guess=0.0)
         return FEEDBACK.relaxation * errors, ca.sumsqr(errors) / 2
 
-    def constrain_clearance(self, stretch: Stretch, base: Any, joints: Any, horizon: float | None) -> None:
+    def constrain_clearance(self, stretch: Stretch, horizon: float | None) -> None:
         """Declare the clearance constraints of a stretch; the horizon is None if the time is free."""
-        if self.clearance_constraints is not None:
-            suffix = stretch.suffix
-            self.clearance_constraints.declare(
-                self.problem, base, joints, base_name=f"base{suffix}" if self.machine.base_size else "",
-                joints_name=f"joints{suffix}", suffix=suffix, begin=stretch.begin,
+        if self.setup.clearance_constraints is not None:
+            base = f"base{stretch.suffix}" if self.machine.base_size else self.machine.base_home()
+            self.setup.clearance_constraints.declare(
+                self.problem, base, f"joints{stretch.suffix}", suffix=stretch.suffix, begin=stretch.begin,
                 pace=1.0 if horizon is None else self.pace(stretch), horizon=horizon,
             )  # fmt: skip
 
@@ -313,47 +307,42 @@ class _Motion:
 def _declare_stretch(motion: _Motion, stretch: Stretch, known: Array | None) -> tuple[list[Any], Any, Array | None]:
     """Declare one of several stretches.
 
-    Args:
-        known: Slopes of the positions fixed at the end of the stretch before, see `_slopes`; None without.
-
-    Returns:
-        States that are continuous with the next stretch, the running cost, and the slopes of the positions that this
-        stretch fixes at its end.
+    `known` has the slopes of the positions that the stretch before fixes at its end, see `_slopes`, or is None. Returns
+    the states that continue in the next stretch, the running cost, and the slopes of the positions fixed here.
     """
-    problem, machine, bounds, pace = motion.problem, motion.machine, motion.bounds, motion.pace(stretch)
+    problem, machine, bounds, pace = motion.problem, motion.machine, motion.setup.bounds, motion.pace(stretch)
     begins, ends = stretch is motion.stretches[0], stretch is motion.stretches[-1]
     place, joints = motion.states(stretch)
     second: Any = None
-    if motion.actuation is not None:
+    if motion.setup.actuation is not None:
         rates, second, running = motion.velocities(stretch, place, joints, pace)
     else:
         limits: dict[str, Any] = {"lower": -bounds.velocity, "upper": bounds.velocity}
         rates = problem.control(f"rates{stretch.suffix}", machine.joint_size, unit=machine.robot.unit("/s"), **limits)
-        running = ca.dot(rates, ca.DM(motion.weights) * rates) / 2
-    slack = _closure(motion) if motion.cyclic and ends else 0
-    ends_at: Array | None = None
-    error_cost: Any = 0
+        running = ca.dot(rates, ca.DM(motion.setup.weights) * rates) / 2
+    slack: Any = _closure(motion) if motion.setup.cyclic and ends else 0
+    ends_at, error_cost = None, 0
     if stretch.equations is not None:
         error, error_cost = motion.task_errors(stretch)
         slack = slack + error
         required = np.ones(stretch.equations.size, dtype=bool)
-        slopes = _slopes(stretch, motion.base, motion.reference)
+        slopes = _slopes(stretch, motion.setup.base, motion.setup.reference)
         if known is not None:
             rest = slopes - slopes @ np.linalg.pinv(known, rcond=ROUNDING_SHARE) @ known  # not led there before
             required = ~(np.linalg.norm(rest, axis=1) <= ROUNDING_SHARE * np.linalg.norm(slopes, axis=1))
         derivatives = None
         if second is not None:
             derivatives = [(joints, rates), (rates, second), (place, machine.base_rate(place, joints, rates))]
-        free = not begins or motion.free
+        free = not begins or motion.setup.free
         _declare_tasks(motion, stretch, (place, joints, rates), pace, slack, free, required, derivatives)
         placed = np.concatenate([is_holonomic(part) for part in stretch.equations.bound]).astype(bool)
         ends_at = slopes[stretch.equations.pose_rows | (placed & (begins | ~required))]
     if machine.base_size:
         problem.dynamics(place, pace * machine.base_rate(place, joints, rates))
     problem.dynamics(joints, pace * rates)
-    motion.constrain_clearance(stretch, place, joints, motion.horizon)
+    motion.constrain_clearance(stretch, motion.horizon)
     states = [*([place] if machine.base_size else []), joints]
-    if motion.actuation is not None:
+    if motion.setup.actuation is not None:
         states += [rates, *([second] if f"jerks{stretch.suffix}" in problem.declared.controls else [])]
     return states, pace * (running + error_cost), ends_at
 
@@ -365,7 +354,7 @@ def _in_free_time(motion: _Motion, time_cost: float) -> ToolMotion:
     z)) ds, which is convex in q' and z. The tasks, J q' = v(s), and the rate limits, |q'| <= v z, are linear in them.
     With accelerations as the control, z is a state, and q' = z q.
     """
-    machine, problem, stretches, bounds = motion.machine, motion.problem, motion.stretches, motion.bounds
+    machine, problem, stretches, bounds = motion.machine, motion.problem, motion.stretches, motion.setup.bounds
     if len(stretches) > 1 or stretches[0].equations is None:
         words = "with a free horizon all tasks must begin and end together; give a horizon in s, or one task"
         raise ProblemError(words, name="horizon", value=len(stretches))
@@ -376,15 +365,15 @@ def _in_free_time(motion: _Motion, time_cost: float) -> ToolMotion:
     (stretch,) = stretches
     clock = problem.state(CLOCK, initial=0.0, lower=0.0, unit="s", guess=lambda s: s)
     place, joints = motion.states(stretch)
-    slack = _closure(motion) if motion.cyclic else 0
-    if motion.actuation is None:
+    slack = _closure(motion) if motion.setup.cyclic else 0
+    if motion.setup.actuation is None:
         pace = problem.control(PACE, lower=1.0, guess=1.0)
         slopes = problem.control(SLOPES, machine.joint_size, unit=machine.robot.unit("/s"))
-        _declare_tasks(motion, stretch, (place, joints, slopes), 1.0, slack, motion.free)
+        _declare_tasks(motion, stretch, (place, joints, slopes), 1.0, slack, motion.setup.free)
         if limited := np.flatnonzero(np.isfinite(bounds.velocity)).tolist():
             own, largest = slopes[limited], ca.DM(bounds.velocity[limited]) * pace
             problem.path("rates", ca.vertcat(largest - own, largest + own), lower=0, unit=machine.robot.unit("/s"))
-        running = ca.dot(slopes, ca.DM(motion.weights) * slopes) / (2 * pace)
+        running = ca.dot(slopes, ca.DM(motion.setup.weights) * slopes) / (2 * pace)
     else:
         pace = problem.state(PACE, lower=1.0, guess=1.0)
         change = problem.control("pace change", guess=0.0, unit="1/s")
@@ -393,15 +382,15 @@ def _in_free_time(motion: _Motion, time_cost: float) -> ToolMotion:
         slopes = pace * rates
         drift = machine.base_rate(place, joints, slopes)
         derivatives = [(joints, slopes), (rates, pace * second), (pace, change), (place, drift)]
-        _declare_tasks(motion, stretch, (place, joints, slopes), 1.0, slack, motion.free, derivatives=derivatives)
-        running = pace * running + (motion.actuation.smoothing * motion.horizon * change) ** 2 / 2
+        _declare_tasks(motion, stretch, (place, joints, slopes), 1.0, slack, motion.setup.free, derivatives=derivatives)
+        running = pace * running + (motion.setup.actuation.smoothing * motion.horizon * change) ** 2 / 2
     problem.dynamics(clock, pace)
     if machine.base_size:
         problem.dynamics(place, machine.base_rate(place, joints, slopes))
     problem.dynamics(joints, slopes)
-    motion.constrain_clearance(stretch, place, joints, None)
+    motion.constrain_clearance(stretch, None)
     problem.minimize(running=time_cost * pace + running)
-    if motion.cyclic and motion.free:
+    if motion.setup.cyclic and motion.setup.free:
         problem.end("cyclic", joints - problem.at_start(joints), 0, 0, unit=machine.robot.unit())
     return ToolMotion(problem, stretches, stretch.end, stretch.nodes / stretch.end)
 
@@ -420,7 +409,7 @@ def _closure(motion: _Motion) -> Any:
         words = "a cyclic motion of several stretches must end without a task, so that the joints can return"
         raise ProblemError(words, name="cyclic", value=len(stretches))
     check_closed(equations, stretches[-1].end)
-    directions = equations.closing(motion.base, motion.reference)
+    directions = equations.closing(motion.setup.base, motion.setup.reference)
     if not directions.shape[1]:
         return 0
     slack = problem.state("closure", directions.shape[1], guess=0.0, unit=equations.unit())
@@ -465,7 +454,8 @@ def _declare_tasks(
         gains = np.repeat([float(part.task.gain) for part in equations.bound], [p.task.size for p in equations.bound])
         gap = ca.jtimes(residual, ca.vertcat(*at), ca.vertcat(*along)) + ca.DM(gains) * (residual - closure)
         problem.path(f"task{suffix}", ca.cse(gap), lower=0, upper=0, unit=equations.unit("/s^2", "/s^2"))
-        at_rest = motion.actuation is not None and motion.actuation.rests[0] and stretch is motion.stretches[0]
+        actuation = motion.setup.actuation
+        at_rest = actuation is not None and actuation.rests[0] and stretch is motion.stretches[0]
         if begins.any() and not at_rest:
             rows = np.flatnonzero(begins).tolist()
             problem.start(f"start velocity{suffix}", (residual - closure)[rows], 0, 0, unit=equations.unit())
@@ -482,9 +472,9 @@ def _declare_tasks(
         return
     error = equations.error(base, joints, targets)[np.flatnonzero(begins & equations.pose_rows).tolist()]
     # a velocity task has no pose: at the start of the motion its tip is where the reference has it
-    fixed = [] if stretch.begin else [equations.holding(base, joints, motion.base, motion.reference)]
+    fixed = [] if stretch.begin else [equations.holding(base, joints, motion.setup.base, motion.setup.reference)]
     if (condition := ca.vertcat(error, *fixed)).numel():
-        if motion.relaxed:
+        if motion.setup.relaxed:
             start_errors = problem.free_parameter(f"{START_ERRORS}{suffix}", condition.numel(), guess=0.0)
             condition -= FEEDBACK.relaxation * start_errors
         problem.start(f"start pose{suffix}", condition, 0, 0, unit=equations.unit("", ""))

@@ -64,10 +64,7 @@ class JointFriction:
 
 def joint_torques(
     machine: Motors,
-    base: Any,
-    joints: Any,
-    rates: Any,
-    accelerations: Any,
+    motion: tuple[Any, Any, Any, Any],
     *,
     friction: JointFriction | None = None,
     wrenches: Sequence[Wrench] = (),
@@ -77,9 +74,8 @@ def joint_torques(
 
     Args:
         machine: Machine on a fixed base, or floating freely.
-        base, joints, rates: Configuration of the base, joints and their rates. Shapes (base_size, 1) and (n, 1).
+        motion: Configuration of the base, joints, their rates and accelerations. Shapes (base_size, 1) and (n, 1).
             Symbols for a floating machine, because they are differentiated.
-        accelerations: Joint accelerations. Shape (n, 1).
         friction: Friction in the joints; None for none.
         wrenches: External wrenches, on a fixed base only.
         gravity: Acceleration of free fall, m/s^2, on a fixed base only; GRAVITY if None.
@@ -88,6 +84,7 @@ def joint_torques(
         ProblemError: The machine is of another kind, or external forces act on a floating one.
     """
     robot = checked_motors("joint_torques", machine).robot
+    base, joints, rates, accelerations = motion
     if isinstance(machine, FixedBase):
         load: dict[str, Any] = {"wrenches": wrenches, "gravity": GRAVITY if gravity is None else gravity}
         ground = machine.world_from_base(base)
@@ -171,7 +168,7 @@ def declare_actuators(
     problem.dynamics(rates, pace * second)
     torques: Any = None
     if np.isfinite([bounds.torque, bounds.power]).any() or weights_torques(cost):
-        torques = joint_torques(checked_motors("limits", machine), base, joints, rates, second)
+        torques = joint_torques(checked_motors("limits", machine), (base, joints, rates, second))
         limit_torques(problem, robot, torques, bounds.torque, suffix)
         if (rows := np.flatnonzero(np.isfinite(bounds.power)).tolist()) and not cost.energy:
             problem.path(f"power{suffix}", (torques * rates)[rows], upper=bounds.power[rows], unit="W")

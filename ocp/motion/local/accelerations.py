@@ -163,7 +163,7 @@ def accelerations(
     directions, no_base = ca.DM(machine.moving_directions), ca.DM(0, 1)
     wrenches = wrenches_at(external, time, machine.tip_pose((), q).position)
     jacobian = equations.jacobian(no_base, q)
-    task = -equations.acceleration(no_base, q, qd, ca.DM(machine.joint_size, 1), time)
+    task = -equations.acceleration(no_base, q, qd, ca.DM(machine.joint_size, 1), progress=(time,))
     place = zmp(time)
     zmp_rows = machine.zmp_rows(q, qd, place, wrenches)
     balance, needed = ca.mtimes(directions, zmp_rows.jacobian), ca.mtimes(directions, zmp_rows.needed(qd))

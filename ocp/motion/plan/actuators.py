@@ -117,7 +117,7 @@ class ActuatorDemand:
         sample = plan.sampled(np.linspace(0.0, plan.horizon, CHECKED_TIMES))
         bases = plan.at(sample.t)["base"] if machine.base_size else np.zeros((CHECKED_TIMES, 0))
         symbols = [ca.SX.sym("v", size) for size in (machine.base_size, *[machine.joint_size] * 3)]
-        torques_at = ca.Function("torques", symbols, [joint_torques(machine, *symbols)])
+        torques_at = ca.Function("torques", symbols, [joint_torques(machine, (*symbols,))])
         samples = bases.T, sample.joints.T, sample.rates.T, sample.accelerations.T
         torques = np.array(torques_at.map(CHECKED_TIMES)(*samples)).T
         largest: tuple[float, ActuatorDemand] | None = None
@@ -168,7 +168,7 @@ def solve_with_accelerations(request: PlanRequest, start: Array, reference: Arra
             return motion.problem
 
         joints = {"": (request.machine, limits)}
-        return within_limits(declare, request.clearance_constraints, None, breaks, None, None, joints)
+        return within_limits(declare, request.clearance_constraints, joints, breaks=breaks)
 
     try:
         solution = solve_from(start)

@@ -13,7 +13,7 @@ from ocp.errors import ProblemError, SolveError, checked_time_limit, require
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem
 from ocp.motion.builders.dynamics_plan import dynamics_phases
-from ocp.motion.builders.joint_motion import joint_motion_problem, minimum_velocity_problem
+from ocp.motion.builders.joint_motion import VelocitySetup, joint_motion_problem, minimum_velocity_problem
 from ocp.motion.builders.space.capture import Capture, capture_problem
 from ocp.motion.builders.standing.problem import StandingSetup, Weights, standing_problem
 from ocp.motion.builders.standing.stances import Steps
@@ -239,12 +239,13 @@ def plan_problem(
         return _goal_problem(machine, goals, horizon, start=start, cost=own, **shared)
     _, joints, base = Start.of(start, machine)
     if isinstance(machine, Standing):
-        setup, zmp = StandingSetup(clearance_constraints=constraints), None if limits is None else limits.zmp
-        options: dict[str, Any] = {"start": joints, "zmp": zmp, "weights": own, "limits": limits, "setup": setup}
+        setup = StandingSetup(clearance_constraints=constraints)
+        options: dict[str, Any] = {"start": joints, "weights": own, "limits": limits, "setup": setup}
         return standing_problem(machine, goals, horizon, **options)
     weights = None if own is None else require.instance("cost", own, Cost).joint_weights(machine.joint_size)
-    options = {"start": joints, "start_base": base, "cyclic": cyclic, "weights": weights}
-    return minimum_velocity_problem(machine, goals, horizon, **options, **shared)
+    own_setup = VelocitySetup(start_base=base, clearance_constraints=constraints)
+    options = {"start": joints, "cyclic": cyclic, "weights": weights, "limits": limits, "setup": own_setup}
+    return minimum_velocity_problem(machine, goals, horizon, **options)
 
 
 def _goal_problem(

@@ -346,7 +346,7 @@ class _ProblemOf:
             constraints = constraints.holding(np.unique(task.motions.near_pairs(places, settings.near)[1]).tolist())
         machines = {"": (task.request.machine, task.request.limits)}
         try:
-            solution = within_limits(self.declare, constraints, None, (), None, None, machines, guess=guess)
+            solution = within_limits(self.declare, constraints, machines, guess=guess)
         except (SolveError, TimeLimitReached) as error:
             if isinstance(error.__cause__, KeyboardInterrupt):
                 raise

@@ -93,7 +93,7 @@ def plan_sequence(
         return dynamics_phases(motors, resolved, start=joints, total=total, limits=own_limits, cost=cost, setup=own)
 
     limited = {name: (each, own_limits) for name, each in zip(phase_names(resolved), machines, strict=True)}
-    solution = within_limits(declare, constraints, None, (), None, None, limited)
+    solution = within_limits(declare, constraints, limited)
     return _phased(motors, solution, joints)
 
 

@@ -81,8 +81,7 @@ def plan_to_stand(
         clearance_constraints=clearance_constraints,
         symbols=ca.SX if _takes_scalars(equations) else ca.MX,
     )
-    zmp = None if limits is None else require.instance("limits", limits, Limits).zmp
-    options: dict[str, Any] = {"weights": cost, "limits": limits, "setup": setup, "zmp": zmp}
+    options: dict[str, Any] = {"weights": cost, "limits": limits, "setup": setup}
     queue = CandidateQueue(_StandingSolver(machine, all_tasks, duration, options, start is not None), PlannerSettings())
     seeds = [Candidate(joints) for joints in _start_configurations(machine, all_tasks, start, limits, seed)]
     for batch in [[candidate] for candidate in seeds] if search == "start" else [seeds]:

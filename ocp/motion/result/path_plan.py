@@ -155,7 +155,8 @@ class PathPlan(Plan):
             ends = t[interval + np.where(waiting, 0, 1)]
             return self._values_at("joints", np.clip(fractions * horizon, t[interval], ends))
 
-        return clearance_of(self.constraints.scene, joints_at, breaks, horizon, rates, np.zeros_like(rates), False)
+        bounds: dict[str, Any] = {"rates": rates, "seconds": np.zeros_like(rates), "smooth": False}
+        return clearance_of(self.constraints.scene, joints_at, breaks, horizon, **bounds)
 
     def _audit(self, **settings: Any) -> Audit:
         if settings:

@@ -51,7 +51,7 @@ from ocp.motion.builders.space.capture import Capture, Cone, Grasp, capture_mach
 from ocp.motion.builders.standing.problem import FreeTime, StandingSetup, Weights, standing_problem
 from ocp.motion.builders.standing.stances import StancePhase, Steps
 from ocp.motion.builders.standing.steps import StepWeights, steps_problem
-from ocp.motion.builders.tool_motion import ToolMotion, stretches_of, tool_motion_problem
+from ocp.motion.builders.tool_motion import ToolMotion, ToolMotionSetup, stretches_of, tool_motion_problem
 from ocp.motion.builders.torques import Actuation, JointFriction
 from ocp.motion.search.configurations import PlanRequest
 from ocp.motion.tasks.goals import Cost, Goal, Start
@@ -143,8 +143,8 @@ def declared_motion(
 
     Args:
         request: The request.
-        start, reference, constraints: As in `tool_motion_problem`.
-        actuation, relaxed: As in `tool_motion_problem`.
+        start, reference, constraints: As in `ToolMotionSetup`.
+        actuation, relaxed: As in `ToolMotionSetup`.
     """
     options: dict[str, Any] = {
         "base": request.base,
@@ -159,7 +159,7 @@ def declared_motion(
     }
     limits = request.limits if actuation is None else request.actuator_limits or request.limits
     bounds = limits.bounds(request.machine)
-    motion = tool_motion_problem(request.machine, request.stretches, bounds=bounds, **options)
+    motion = tool_motion_problem(request.machine, request.stretches, ToolMotionSetup(bounds=bounds, **options))
     arguments = {"machine": request.whole or request.machine, "tasks": request.tasks, "horizon": request.horizon}
     arguments |= {"held": dict(request.held), "limits": limits, **options}
     motion.problem.origin = MotionRequest("tool motion", arguments)
@@ -171,7 +171,8 @@ def _tool_motion(
 ) -> Problem:
     machine = hold_joints(machine, held) if held else machine
     stretches = stretches_of(machine, tasks, horizon)
-    return tool_motion_problem(machine, stretches, bounds=limits.bounds(machine), **options).problem
+    setup = ToolMotionSetup(bounds=limits.bounds(machine), **options)
+    return tool_motion_problem(machine, stretches, setup).problem
 
 
 BUILDERS: dict[str, Callable[..., Problem]] = {

@@ -148,7 +148,9 @@ class SolvedPlan(Plan):
             clock = self.task_share(times) * self.solution.horizon
         at = self.at(times)
         base = at["base"] if "base" in at else np.zeros((TARGET_TIMES, 0))
-        return replace(self, targets=targets_along(self.machine, tasks, clock, base, at["joints"], times))
+        return replace(
+            self, targets=targets_along(self.machine, tasks, clock, base=base, joints=at["joints"], shown_times=times)
+        )
 
     # ---- files -------------------------------------------------------------------------------------------------------
 

@@ -112,29 +112,31 @@ class TaskEquations:
         parts = []
         for task in (part.task for part in self.bound):
             if task.velocity is not None:
-                parts.append(pace * track_expression(task.velocity, time, (task.size, 1), "velocity", task.begin))
+                parts.append(
+                    pace * track_expression(task.velocity, time, (task.size, 1), what="velocity", begin=task.begin)
+                )
             if task.position is not None:
                 value = _position_of(task, task.position, time, "position")
                 rate = getattr(task.position, "rate", None)
                 velocity = derivative(value, time) if rate is None else _position_of(task, rate, time, "position rate")
                 parts += [value, pace * velocity]
             if task.orientation is not None:
-                value = track_expression(task.orientation, time, ((4, 1), (3, 3)), "orientation", task.begin)
+                value = track_expression(task.orientation, time, ((4, 1), (3, 3)), what="orientation", begin=task.begin)
                 rotation = rotation_of(value) if value.shape == (4, 1) else value
                 rate = getattr(task.orientation, "rate", None)
                 if rate is None:
                     angular = angular_velocity(rotation, ca.reshape(derivative(ca.vec(rotation), time), 3, 3))
                 else:
-                    angular = track_expression(rate, time, (3, 1), "orientation rate", task.begin)
+                    angular = track_expression(rate, time, (3, 1), what="orientation rate", begin=task.begin)
                 parts += [ca.vec(rotation), pace * angular]
             if task.direction is not None:
-                value = track_expression(task.direction, time, (3, 1), "direction", task.begin)
+                value = track_expression(task.direction, time, (3, 1), what="direction", begin=task.begin)
                 length = ca.norm_2(value)
                 unit, rate = value / length, getattr(task.direction, "rate", None)
                 if rate is None:
                     unit_rate = derivative(unit, time)
                 else:
-                    unit_rate = track_expression(rate, time, (3, 1), "direction rate", task.begin) / length
+                    unit_rate = track_expression(rate, time, (3, 1), what="direction rate", begin=task.begin) / length
                 parts += [unit, pace * cross_product(unit, unit_rate)]
         return ca.densify(ca.vertcat(*parts))
 
@@ -143,7 +145,7 @@ class TaskEquations:
         """Return the Jacobian J of the tasks. Shape (size, joint_size)."""
         rows = []
         for part in self.bound:
-            columns = relative_twist(part, base, joints, part.tip.tip_jacobian(base, joints), None)
+            columns = relative_twist(part, base, joints, part.tip.tip_jacobian(base, joints), rates=None)
             rows.append(task_rows(part, base, joints, columns))
         symbolic = isinstance(base, ca.SX) or isinstance(joints, ca.SX)
         return ca.densify(ca.cse(ca.vertcat(*rows)) if symbolic else ca.vertcat(*rows))
@@ -158,7 +160,7 @@ class TaskEquations:
         """Return J u - b. Shape (size, 1)."""
         rows = []
         for part, target in self._with_targets(targets):
-            twist = relative_twist(part, base, joints, part.tip.tip_twist(base, joints, rates), rates)
+            twist = relative_twist(part, base, joints, part.tip.tip_twist(base, joints, rates), rates=rates)
             if part.task.velocity is not None:
                 rows.append(task_rows(part, base, joints, twist) - target)
             else:
@@ -170,7 +172,7 @@ class TaskEquations:
         """Return the velocities of the tips in the rows of the tasks, rad/s and m/s. Shape (size, 1)."""
         rows = []
         for part in self.bound:
-            twist = relative_twist(part, base, joints, part.tip.tip_twist(base, joints, rates), rates)
+            twist = relative_twist(part, base, joints, part.tip.tip_twist(base, joints, rates), rates=rates)
             rows.append(task_rows(part, base, joints, twist))
         return ca.densify(ca.vertcat(*rows))
 
@@ -216,9 +218,7 @@ class TaskEquations:
             angular += [*([True, True] if task.tilts else []), *(row in ANGULAR for row in task.chosen)]
         return np.array(angular, dtype=bool)
 
-    def acceleration(
-        self, base: Any, joints: Any, rates: Any, second: Any, time: Any, pace: Any = 1, change: Any = 0
-    ) -> Any:
+    def acceleration(self, base: Any, joints: Any, rates: Any, second: Any, *, progress: Sequence[Any]) -> Any:
         """Return J u' - c with the feedback, by differentiating `residual` along the motion. Shape (size, 1).
 
         d/dt (J u - b) + gain (J u - b): the error of a pose decays as e'' + 2 gain e' + gain^2 e = 0.
@@ -226,9 +226,10 @@ class TaskEquations:
         Args:
             base, joints, rates: Symbols.
             second: Joint accelerations u', (joint_size, 1).
-            time, pace: As for `targets`; a pace other than 1 is a symbol too.
-            change: Rate of the pace, 1/s^2.
+            progress: The time, as for `targets`; or a path parameter, its pace, which is a symbol too, and the rate of
+                the pace, 1/s^2.
         """
+        time, pace, change = progress if len(progress) > 1 else (progress[0], 1, 0)
         residual = self.residual(base, joints, rates, self.targets(time, pace))
         symbols, rates_of = [joints, rates, time], [rates, second, 1]
         if self.machine.base_size:
@@ -436,14 +437,14 @@ class TaskEquations:
             return directions
         if not isinstance(self.machine, FreeFloating):
             return np.zeros((self.size, 0))
-        return directions @ closing_combinations(self.machine, self.bound, holonomic, base, joints)
+        return directions @ closing_combinations(self.machine, self.bound, holonomic, base=base, joints=joints)
 
 
 def _position_of(task: TipTask, track: Any, time: Any, name: str) -> Any:
     """Return a position track with all three coordinates, zero where the task leaves them out. Shape (3, 1)."""
     short = task.along_reference and len(task.linear) < 3
     shapes = ((3, 1), (len(task.linear), 1)) if short else ((3, 1),)
-    value = track_expression(track, time, shapes, name, task.begin)
+    value = track_expression(track, time, shapes, what=name, begin=task.begin)
     if value.shape[0] == 3:
         return value
     whole = type(value)(3, 1)
@@ -478,13 +479,15 @@ def bind(machine: Machine, tasks: TipTask | Sequence[TipTask]) -> TaskEquations:
     return TaskEquations(bound[0].tip if machine.robot.tip is None else machine, tuple(bound))
 
 
-def task_errors(machine: Machine, tasks: TipTask | Sequence[TipTask], t: Any, base: Any, joints: Any) -> Array:
+def task_errors(
+    machine: Machine, tasks: TipTask | Sequence[TipTask], t: Any, joints: Any, *, base: Any = None
+) -> Array:
     """Return target pose minus pose along a motion in the rows of the tasks, m and rad; zero for velocities.
 
     Args:
         t: Times, s. Shape (M,).
-        base: Shape (M, base_size), or None on a fixed base.
         joints: Shape (M, joint_size).
+        base: Shape (M, base_size), or None on a fixed base.
 
     Returns:
         Shape (M, rows of all tasks).

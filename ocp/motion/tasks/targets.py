@@ -60,6 +60,7 @@ def targets_along(
     machine: Machine,
     tasks: Sequence[TipTask],
     times: Array,
+    *,
     base: Array,
     joints: Array,
     shown_times: Array | None = None,

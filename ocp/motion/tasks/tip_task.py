@@ -282,7 +282,7 @@ def reference_pose(part: BoundTask, base: Any, joints: Any) -> Frame | None:
     return None if part.reference is None else part.reference.tip_pose(base, joints)
 
 
-def relative_twist(part: BoundTask, base: Any, joints: Any, twist: Any, rates: Any) -> Any:
+def relative_twist(part: BoundTask, base: Any, joints: Any, twist: Any, *, rates: Any) -> Any:
     """Return a twist, or columns of twists, relative to the reference frame at the tip of the task, in world axes.
 
     Args:
@@ -415,7 +415,7 @@ def angular_velocity(rotation: Any, rate: Any) -> Any:
 
 
 def closing_combinations(
-    machine: FreeFloating, bound_tasks: Sequence[BoundTask], selected: NDArray[np.bool_], base: Array, joints: Array
+    machine: FreeFloating, bound_tasks: Sequence[BoundTask], selected: NDArray[np.bool_], *, base: Array, joints: Array
 ) -> Array:
     """Return combinations of the selected rows that no base motion changes while the centre of mass stays. Shape (m,
     k).
@@ -425,7 +425,7 @@ def closing_combinations(
     """
     jacobians = []
     for bound in bound_tasks:
-        base_jacobian = relative_twist(bound, base, joints, bound.tip.jacobians(base, joints)[0], "base")  # type: ignore[attr-defined]
+        base_jacobian = relative_twist(bound, base, joints, bound.tip.jacobians(base, joints)[0], rates="base")  # type: ignore[attr-defined]
         jacobians.append(np.array(ca.DM(task_rows(bound, ca.DM(base), ca.DM(joints), base_jacobian))))
     frame = machine.world_from_base(base)
     lever = center_of_mass(machine.robot, joints, frame) - frame.position

@@ -222,6 +222,7 @@ def track_expression(
     track: Any,
     time: Any,
     shapes: tuple[int, int] | tuple[tuple[int, int], ...],
+    *,
     what: str = "track",
     begin: float = 0.0,
 ) -> Any:

@@ -190,7 +190,7 @@ def make(request: Request) -> Plan:
     """Solve, evaluate between the nodes and audit."""
     solution = solved(request)
     motion, progress = fine_motion(request, solution)
-    errors = task_errors(machine(), task_of(request.task), progress, None, motion.joints)
+    errors = task_errors(machine(), task_of(request.task), progress, motion.joints)
     error = float(np.linalg.norm(errors, axis=1).max())
     limits = {"joints": 1e-6, "velocities": 1e-6, "accelerations": 1e-6}
     if not isinstance(request.rule, Anywhere):

@@ -36,7 +36,7 @@ def printed_law(
     time, q, qd = ca.SX.sym("time"), ca.SX.sym("q", n), ca.SX.sym("qd", n)
     equations, none = bind(machine, task), ca.DM(0, 1)
     jacobian = equations.jacobian(none, q)
-    wanted = -equations.acceleration(none, q, qd, ca.DM(n, 1), time)
+    wanted = -equations.acceleration(none, q, qd, ca.DM(n, 1), progress=(time,))
     inverse = least_rates(jacobian, ca.DM.eye(task.size))
     free = ca.DM.eye(n) - ca.mtimes(inverse, jacobian)
     balance = machine.zmp_rows(q, qd, machine.most_stable_point)

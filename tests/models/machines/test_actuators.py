@@ -121,7 +121,7 @@ def test_torques_accelerate_the_joints_as_in_mujoco(arms: int, carried: tuple[fl
     base, joints, rates, accelerations = state(machine, 2)
     n = machine.joint_size
     b, q, v, a = (ca.SX.sym("z", size) for size in (7, n, n, n))
-    result = ca.Function("t", [b, q, v, a], [joint_torques(machine, b, q, v, a)])
+    result = ca.Function("t", [b, q, v, a], [joint_torques(machine, (b, q, v, a))])
     torques = np.array(result(base, joints, rates, accelerations)).ravel()
     model, data = moving(machine, base, joints, rates)
     order = [model.joint(name).dofadr[0] for name in machine.robot.joint_names]
@@ -129,7 +129,7 @@ def test_torques_accelerate_the_joints_as_in_mujoco(arms: int, carried: tuple[fl
     mujoco.mj_forward(model, data)
     assert data.qacc[order] == pytest.approx(accelerations, rel=1e-8, abs=1e-8)
     call = [ca.MX.sym("z", size) for size in (7, n, n, n)]
-    again = ca.Function("t", call, [joint_torques(machine, *call)])(base, joints, rates, accelerations)
+    again = ca.Function("t", call, [joint_torques(machine, (*call,))])(base, joints, rates, accelerations)
     assert np.array(again).ravel() == pytest.approx(torques, rel=1e-12, abs=1e-12)
 
 
@@ -139,7 +139,7 @@ def test_nothing_acts_from_outside_on_a_machine_that_floats(report: dict[str, An
     n = machine.joint_size
     b, q, v, a = (ca.SX.sym("z", size) for size in (7, n, n, n))
     with pytest.raises(ProblemError, match="conserves its momentum") as caught:
-        joint_torques(machine, b, q, v, a, **report)
+        joint_torques(machine, (b, q, v, a), **report)
     assert caught.value.name == next(iter(report))
 
 

@@ -49,6 +49,7 @@ from ocp import (
     ProblemError,
     Solution,
     TipTask,
+    VelocitySetup,
     minimum_velocity_problem,
     solve,
 )
@@ -298,7 +299,7 @@ def test_targets_are_given_in_world(robot: Robot, tmp_path: Path) -> None:
         TipTask(position=(0.1, 0.2, 0.3), orientation=(1.0, 0, 0, 0), link="hand", relative_to="upper/arm"),
         TipTask(rows=(3, 4), velocity=(0.1, 0.0)),
     ]
-    first, second = targets_along(machine, tasks, times, np.zeros((21, 0)), joints)
+    first, second = targets_along(machine, tasks, times, base=np.zeros((21, 0)), joints=joints)
     inside = (times >= 0.5) & (times <= 1.5)
     assert np.isnan(first.position[~inside]).all()
     np.testing.assert_allclose(
@@ -367,7 +368,7 @@ def test_the_nearest_bodies_are_those_of_the_plan_at_every_time(tmp_path: Path) 
         TipTask(rows=(3, 4, 5), velocity=(0.0, 0.1, 0.0)),
         1.0,
         start=start,
-        clearance_constraints=clearance_constraints,
+        setup=VelocitySetup(clearance_constraints=clearance_constraints),
     )
     plan = SolvedPlan(machine, solve(problem, Collocation(intervals=6, degree=3)), (Part(0.0, 1.0, ""),))
     near = animate_plan(plan).closest
@@ -405,7 +406,7 @@ def test_obstacles_that_move_are_shown_where_they_are_at_every_time_and_half_spa
         TipTask(rows=(3, 4, 5), velocity=(0.0, 0.1, 0.0)),
         1.0,
         start=start,
-        clearance_constraints=clearance_constraints,
+        setup=VelocitySetup(clearance_constraints=clearance_constraints),
     )
     plan = SolvedPlan(machine, solve(problem, Collocation(intervals=6, degree=3)), (Part(0.0, 1.0, ""),))
     shown = animate_plan(plan)

@@ -32,7 +32,7 @@ from ocp.direct.collocation import Collocation
 from ocp.errors import ProblemError, require
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem, end_velocities
-from ocp.motion.builders.dynamics_plan import within_limits
+from ocp.motion.builders.dynamics_plan import SolveSettings, within_limits
 from ocp.motion.builders.space.pair import (
     State,
     checked_pair,
@@ -196,7 +196,7 @@ def capture_problem(
     own = _Capture.take(chaser, capture, start, {"limits": limits, "cost": cost}, clearance_constraints)
     first, second = own.approach(), own.detumbling(None)
     own.guess_approach(first)
-    guess_braking(second, own.pair, *_end_of(first))
+    guess_braking(second, own.pair, _end_of(first))
     problem = Phases("capture", {APPROACH: first, DETUMBLE: second})
     before, after = problem[APPROACH], problem[DETUMBLE]
     end = {name: before.at_end(name) for name in ("base", "target", "joints")}
@@ -244,7 +244,8 @@ def solve_capture(
 
     machines = dict.fromkeys((APPROACH, DETUMBLE), (chaser, limits))
     mesh = POINTS if method is None else method
-    return within_limits(declare, clearance_constraints, mesh, (), None, tolerances, machines)
+    settings = SolveSettings(mesh, tolerances=tolerances)
+    return within_limits(declare, clearance_constraints, machines, settings=settings)
 
 
 @interruptible
@@ -276,17 +277,18 @@ def chained_capture(
         own.guess_approach(problem)
         return problem
 
-    first = within_limits(declare_approach, clearance_constraints, mesh, (), None, tolerances, {"": (chaser, limits)})
+    settings = SolveSettings(mesh, tolerances=tolerances)
+    first = within_limits(declare_approach, clearance_constraints, {"": (chaser, limits)}, settings=settings)
     end = dict(first.at_fraction(1.0))
     end["joints"] = own.arm * end["joints"]
     end["base"] = np.array(ca.DM(_of_unit_length(chaser, end["base"]))).ravel()
 
     def declare_detumbling(_: ClearanceConstraints | None) -> Problem:
         problem = own.detumbling(end)
-        guess_braking(problem, own.pair, end["joints"], end["velocities"], end["base"])
+        guess_braking(problem, own.pair, (end["joints"], end["velocities"], end["base"]))
         return problem
 
-    return first, within_limits(declare_detumbling, None, mesh, (), None, tolerances, {"": (own.pair, limits)})
+    return first, within_limits(declare_detumbling, None, {"": (own.pair, limits)}, settings=settings)
 
 
 def capture_machines(chaser: FreeFloating, target: FreeFloating) -> tuple[FreeFloating, FreeFloating]:
@@ -324,7 +326,9 @@ class _Capture:
         if joints is None:
             raise ProblemError("capture: start is missing; give the joints of the chaser", name="start")
         target_base = checked_configuration(target, np.zeros(0), capture.target_base)[1]
-        momentum = np.array(ca.DM(pair_momentum(chaser, target, base, target_base, joints))).ravel()
+        momentum = np.array(
+            ca.DM(pair_momentum(chaser, target, base=base, target_base=target_base, joints=joints))
+        ).ravel()
         pair = replace(chaser, robot=robot, conserved_momentum=momentum)
         rates = end_velocities("start_velocity", begin.velocity, chaser.joint_size)
         times = (capture.approach, capture.detumble)
@@ -441,7 +445,7 @@ class _Capture:
         """Set the guess of an approach."""
         cone = self.capture.cone
         out = np.zeros(3) if cone is None else cone.length * cone.direction
-        guess_approach(problem, self.chaser, self.capture.target, self.start, out)
+        guess_approach(problem, self.chaser, self.capture.target, self.start, out=out)
 
 
 def _end_of(problem: Problem) -> tuple[Array, Array, Array]:

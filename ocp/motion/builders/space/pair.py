@@ -84,7 +84,9 @@ def checked_pair(chaser: Any, target: Any) -> Robot:
         raise ProblemError(f"capture: {error}", name="target", value=error.value) from error
 
 
-def pair_momentum(chaser: FreeFloating, target: FreeFloating, base: Any, target_base: Any, joints: Any) -> Expression:
+def pair_momentum(
+    chaser: FreeFloating, target: FreeFloating, *, base: Any, target_base: Any, joints: Any
+) -> Expression:
     """Return the momentum of chaser and target about their common centre of mass.
 
     It has the order of `FreeFloating.conserved_momentum`.
@@ -172,7 +174,7 @@ def free_motion(target: FreeFloating, base: Array, times: Array) -> Array:
     return np.vstack([base, np.array(moved).T])
 
 
-def guess_approach(problem: Problem, chaser: FreeFloating, target: FreeFloating, start: State, out: Array) -> None:
+def guess_approach(problem: Problem, chaser: FreeFloating, target: FreeFloating, start: State, *, out: Array) -> None:
     """Set the guess of an approach; a free time gets the first duration that ends in the grasp, or the closest to it.
 
     Args:
@@ -283,11 +285,12 @@ def _tip_path(
     return places, turns.as_matrix()
 
 
-def guess_braking(problem: Problem, pair: FreeFloating, joints: Array, rates: Array, base: Array) -> None:
+def guess_braking(problem: Problem, pair: FreeFloating, begin: tuple[Array, Array, Array]) -> None:
     """Set the guess of a detumbling from its start: the arm slows down evenly, and the wheels take the momentum.
 
     The final wheel speeds follow from Newton's method, because the final attitude depends on them.
     """
+    joints, rates, base = begin
     robot, duration = pair.robot, guessed_horizon(problem)
     times = np.linspace(0.0, duration, GUESS.steps + 1)
     share = times[:, None] / duration

@@ -27,12 +27,12 @@ from ocp.direct.shooting import MultipleShooting
 from ocp.errors import ProblemError, SolveError, SolverStatus, checked_time_limit, require
 from ocp.methods import solve
 from ocp.motion.builders.clearance import ClearanceConstraints, collision_error, solve_with_clearance
-from ocp.motion.builders.dynamics_plan import audit_error, breaks_of
+from ocp.motion.builders.dynamics_plan import IPOPT, SolveSettings, audit_error, breaks_of
 from ocp.motion.builders.standing.problem import FreeTime, StandingSetup, Weights, standing_problem
 from ocp.motion.builders.standing.stances import Steps
 from ocp.motion.builders.standing.steps import StepWeights, steps_problem
 from ocp.motion.tasks.equations import bind, task_errors
-from ocp.motion.tasks.limits import Limits, ZmpRule
+from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.formulation import Formulation
 from ocp.problem.phases import DURATION, Phases
@@ -210,7 +210,6 @@ MESHES = 3
 """Largest number of meshes of each formulation, each twice as fine as the one before."""
 POSE_TOLERANCE = 1e-5
 """Largest pose error of the re-integrated plan, m and rad, if its task allows no gap at the start."""
-IPOPT = {"max_iter": 300}
 
 Level = Literal["position", "acceleration"]
 Trial = tuple[Level | None, Collocation | MultipleShooting]
@@ -242,13 +241,10 @@ def solve_standing(
     horizon: float | FreeTime,
     *,
     start: Any,
-    zmp: ZmpRule | None = None,
     weights: Weights | None = None,
     limits: Limits | None = None,
     setup: StandingSetup | None = None,
-    method: Collocation | None = None,
-    options: Mapping[str, Any] | None = None,
-    tolerances: Mapping[str, float] | None = None,
+    settings: SolveSettings | None = None,
 ) -> Solution:
     """Solve `standing_problem` and audit the plan, by the formulation that works for it.
 
@@ -258,39 +254,34 @@ def solve_standing(
     Other plans are solved again from themselves on up to two meshes, each twice as fine.
 
     Args:
-        machine, tasks, horizon, start, zmp, weights, limits: As for `standing_problem`.
+        machine, tasks, horizon, start, weights, limits: As for `standing_problem`; the rule for the zero moment point
+            is that of the limits.
         setup: As for `standing_problem`, but `tip_level` is chosen here. If bodies collide, they are separated by
             constraints and the motion is planned again.
-        method: First mesh; its `control` selects the only formulation that is tried.
-        options: IPOPT options.
-        tolerances: Tolerances of the audit by name, see `ocp.audit.audit.audit`.
+        settings: First mesh, solver options and audit tolerances. The `control` of a given mesh selects the only
+            formulation that is tried.
 
     Raises:
         SolveError: No attempt passes. The message has the result of each; the fields are those of the last failure.
         ProblemError: As `standing_problem`.
     """
-    if method is not None:
-        require.instance("method", method, Collocation)
-    options = require.mapping("options", options)
-    setup = StandingSetup() if setup is None else require.instance("plan_standing: setup", setup, StandingSetup)
+    solving = SolveSettings() if settings is None else require.instance("settings", settings, SolveSettings)
+    setup = StandingSetup() if setup is None else require.instance("solve_standing: setup", setup, StandingSetup)
     along_parameter = setup.along == "parameter"
-    judge = _Judge(tolerances, partial(_pose_error, machine, tasks, along_parameter))
-    settings = {**IPOPT, **options}
+    judge = _Judge(solving.tolerances, partial(_pose_error, machine, tasks, along_parameter))
     timed = not (isinstance(horizon, FreeTime) or along_parameter)
     breaks = breaks_of(tasks, require.positive("horizon", horizon)) if timed else []
     trials = [
         (level, mesh.with_nodes_at(breaks))
-        for level, mesh in _formulations(setup.control, isinstance(horizon, FreeTime), method)
+        for level, mesh in _formulations(setup.control, isinstance(horizon, FreeTime), solving.method)
     ]
 
     def run(clearance_constraints: ClearanceConstraints | None) -> Solution:
         def declare(level: Level | None) -> Problem:
             own = replace(setup, tip_level=level or "position", clearance_constraints=clearance_constraints)
-            return standing_problem(
-                machine, tasks, horizon, start=start, zmp=zmp, weights=weights, limits=limits, setup=own
-            )
+            return standing_problem(machine, tasks, horizon, start=start, weights=weights, limits=limits, setup=own)
 
-        return _first_accepted(declare, trials, settings, judge)
+        return _first_accepted(declare, trials, solving.ipopt_options, judge)
 
     return solve_with_clearance(setup.clearance_constraints, run)
 
@@ -455,7 +446,7 @@ def _pose_error(
 ) -> SolveError | None:
     """Return an error if a tip of the re-integrated motion deviates from its task, else None."""
     progress = audit.states["path"][:, 0] if along_parameter else audit.t
-    errors = np.abs(task_errors(machine, tasks, progress, None, audit.states["joints"])).max(axis=0)
+    errors = np.abs(task_errors(machine, tasks, progress, audit.states["joints"])).max(axis=0)
     parts = bind(machine, tasks).bound
     gaps = np.repeat([part.task.start_gap for part in parts], [part.task.size for part in parts])
     if (errors > np.maximum(gaps, POSE_TOLERANCE)).any():

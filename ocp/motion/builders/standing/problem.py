@@ -181,7 +181,7 @@ def standing_problem(
         tasks: A TipTask, or several that are done at once, functions of the time in s or of the path parameter.
         horizon: Final time, s, or FreeTime(...).
         start: Joints at the start. Shape (n,), rad or m.
-        zmp: Where the zero moment point may be: InFoot(margin) (the default, margin 0), IndexAtLeast(value),
+        zmp: Where the zero moment point may be; by default the rule of the limits. InFoot(margin), IndexAtLeast(value),
             Pinned(point), Following(reference) or Anywhere().
         weights: Weights of the parts of the cost.
         limits: Limits of joints and ground.
@@ -197,9 +197,9 @@ def standing_problem(
             leave the support; no freedom is left to come to rest; the start is singular while the cost contains the
             manipulability.
     """
-    zmp = InFoot() if zmp is None else zmp
     weights = Weights() if weights is None else require.instance("standing_problem: weights", weights, Weights)
     limits = Limits() if limits is None else require.instance("standing_problem: limits", limits, Limits)
+    zmp = limits.zmp or InFoot() if zmp is None else zmp
     require.instance("standing_problem: machine", machine, Standing)
     if limits.power is not None:
         words = "limits: standing plans have no limit of power; limit the torques"
@@ -231,8 +231,9 @@ def standing_problem(
         acting = wrenches_at(external, ca.DM(0.0), ca.DM(tip))
         # with tip_level "position" the tip is on its path at the nodes alone
         demand = task_demand(equations, begin, along_parameter) if tip_level == "acceleration" else None
-        check_loads(machine, begin, acting, zmp, limits.least_force(machine), bounds, demand)
-    guess = local_guess(machine, equations, begin, duration, along_parameter, external)
+        least_force = limits.least_force(machine)
+        check_loads(machine, begin, acting, zmp=zmp, least_force=least_force, bounds=bounds, demand=demand)
+    guess = local_guess(machine, equations, begin, duration, by_parameter=along_parameter, external=external)
 
     problem = Problem("standing plan", symbols=setup.symbols)
     final = declare_horizon(problem, horizon)
@@ -258,7 +259,7 @@ def standing_problem(
     none = ca.DM(0, 1)
     if setup.clearance_constraints is not None:
         known = None if isinstance(horizon, FreeTime) else duration
-        setup.clearance_constraints.declare(problem, none, joints, horizon=known)
+        setup.clearance_constraints.declare(problem, none, horizon=known)
     running = weights.acceleration * ca.sumsqr(accelerations) + weights.velocity * ca.sumsqr(velocities)
     if weights.joint_limits:
         running += weights.joint_limits * joint_limit_index(machine.robot, joints)
@@ -287,7 +288,7 @@ def _constrain_tips(
     if moving:
         residual = equations.residual(none, joints, velocities, targets)
         problem.start("tip velocity", residual, lower=0, upper=0, unit=equations.unit())
-    gap = equations.acceleration(none, joints, velocities, accelerations, *progress)
+    gap = equations.acceleration(none, joints, velocities, accelerations, progress=progress)
     problem.path("tip", gap, lower=0, upper=0, unit=equations.unit("/s^2", "/s^2"))
     for name, deviation in equations.deviations(none, joints, velocities, targets).items():
         problem.watch(name, **deviation)

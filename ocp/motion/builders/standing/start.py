@@ -102,6 +102,7 @@ def check_loads(
     machine: Standing,
     joints: Array,
     wrenches: Sequence[Wrench],
+    *,
     zmp: ZmpRule,
     least_force: float,
     bounds: JointBounds,
@@ -166,7 +167,7 @@ def task_demand(equations: TaskEquations, joints: Array, along_parameter: bool) 
         q, qd, time = symbols.sym("q", n), symbols.sym("qd", n), symbols.sym("time")
         pace, change = symbols.sym("pace"), symbols.sym("change")
         rates = (pace, change) if along_parameter else (1, 0)
-        required = -equations.acceleration(ca.DM(0, 1), q, qd, ca.DM(n, 1), time, *rates)
+        required = -equations.acceleration(ca.DM(0, 1), q, qd, ca.DM(n, 1), progress=(time, *rates))
         return ca.Function("required", [q, qd, time, pace, change], [required])
 
     jacobian, function = np.array(ca.DM(equations.jacobian(ca.DM(0, 1), joints))), on_symbols(function_of)
@@ -225,6 +226,7 @@ def local_guess(
     equations: TaskEquations,
     joints: Array,
     horizon: float,
+    *,
     by_parameter: bool,
     external: External | None,
 ) -> dict[str, Any]:

@@ -182,7 +182,7 @@ def _phase(steps: Steps, k: int, start: Array | None, guess: dict[str, Any], opt
     problem.dynamics(joints, rates)
     problem.dynamics(rates, second)
     if equations is not None:
-        gap = equations.acceleration(none, joints, rates, second, problem.time)
+        gap = equations.acceleration(none, joints, rates, second, progress=(problem.time,))
         problem.path("feet", gap, lower=0, upper=0, unit=equations.unit("/s^2", "/s^2"))
         for name, deviation in equations.deviations(none, joints, rates, equations.targets(problem.time)).items():
             problem.watch(name.replace("task", "feet"), **deviation)

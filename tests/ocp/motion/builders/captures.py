@@ -105,8 +105,8 @@ def replayed_momentum(request: dict[str, Any], plan: Solution, samples: int = 41
     """
     one, other = request["chaser"], request["target"]
     begin, after = (plan.phase(name).at_fraction(np.linspace(0, 1, samples)) for name in ("approach", "detumble"))
-    start = (begin[name][0] for name in ("base", "target", "joints"))
-    carried = np.array(ca.DM(pair_momentum(one, other, *start))).ravel()
+    base, target, joints = (begin[name][0] for name in ("base", "target", "joints"))
+    carried = np.array(ca.DM(pair_momentum(one, other, base=base, target_base=target, joints=joints))).ravel()
     pair = FreeFloating(joined(one.robot, other.robot), one.base, conserved_momentum=carried)
     nothing = np.zeros((samples, 0))
     parts = [

@@ -148,5 +148,5 @@ def _functions(machine: Any) -> tuple[Any, Any]:
     """Torques of columns of base, joints, rates and accelerations; twist of the base."""
     symbols = [ca.SX.sym("z", size) for size in (machine.base_size, *[machine.joint_size] * 3)]
     twist = machine.base_twist(*symbols[:3]) if machine.base_size else ca.DM(0, 1)
-    torques = ca.Function("torques", symbols, [joint_torques(machine, *symbols)])
+    torques = ca.Function("torques", symbols, [joint_torques(machine, (*symbols,))])
     return torques, ca.Function("twist", symbols[:3], [ca.densify(ca.SX(twist))])

@@ -178,4 +178,4 @@ def sampled(
 
 def tip_error(standing: Standing, motion: StandingMotion, task: Any) -> float:
     """Greatest norm of the pose errors, m and rad."""
-    return float(np.linalg.norm(task_errors(standing, task, motion.t, None, motion.joints), axis=1).max())
+    return float(np.linalg.norm(task_errors(standing, task, motion.t, motion.joints), axis=1).max())

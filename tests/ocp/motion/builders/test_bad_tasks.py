@@ -44,6 +44,7 @@ from ocp import (
     Steps,
     StepWeights,
     TipTask,
+    VelocitySetup,
     Weights,
     capture_problem,
     chained_capture,
@@ -64,7 +65,7 @@ from ocp import (
     steps_problem,
     walk,
 )
-from ocp.motion.builders.dynamics_plan import solve_dynamics
+from ocp.motion.builders.dynamics_plan import SolveSettings, solve_dynamics
 from ocp.motion.builders.space.capture import solve_capture
 from ocp.motion.builders.standing.plan import solve_standing, solve_steps
 from ocp.motion.tasks.tracks import path_tracks, pose_line
@@ -152,6 +153,15 @@ REQUEST_VALUES: dict[str, Bad] = {
     "start_base": but(BASE, "empty"),
 }
 ARGUMENTS = {"machine": ARM, "tasks": FORWARD, "start_joints": START, "horizon": 1.0}
+
+
+def with_setup_of(kind: Any, argument: str, options: dict[str, Any]) -> dict[str, Any]:
+    """Return the arguments of a builder, those that are fields of the dataclass `kind` collected in one argument."""
+    own = {field.name: options[field.name] for field in fields(kind) if field.name in options}
+    rest = {name: value for name, value in options.items() if name not in own}
+    return {argument: kind(**own)} | rest
+
+
 BUILT = {"machine": ARM, "tasks": FORWARD, "start": START, "horizon": 1.0}
 STOOD = {"machine": STANDING, "tasks": STILL, "start_joints": UP, "horizon": 0.2}
 EACH: Bad = LIMIT | {"one of them zero": [1.0, 0.0, 1.0], "table of words": [["a"]]}
@@ -301,13 +311,14 @@ VELOCITIES = [
     ),
     Case(
         "minimum_velocity_problem",
-        minimum_velocity_problem,
+        lambda **options: minimum_velocity_problem(**with_setup_of(VelocitySetup, "setup", options)),
         BUILT,
         {
             **{"start" if name == "start_joints" else name: bad for name, bad in REQUEST_VALUES.items()},
             "tasks": TASK,
             "cyclic": FLAG,
             "limits": but(INSTANCE, "None"),
+            "setup": but(INSTANCE, "None"),
             "guess_damping": POSITIVE | NOTHING,
             "clearance_constraints": but(INSTANCE, "None"),
         },
@@ -369,12 +380,13 @@ STANDINGS = [
     ),
     Case(
         "solve_standing",
-        solve_standing,
+        lambda **options: solve_standing(**with_setup_of(SolveSettings, "settings", options)),
         {"machine": STANDING, "tasks": STILL, "start": UP, "horizon": 0.2},
         {
             "machine": REQUEST_VALUES["machine"] | {"bolted": ARM},
             "tasks": TASK,
             "setup": but(INSTANCE, "None"),
+            "settings": but(INSTANCE, "None"),
             "start": array(3) | NOTHING,
             "horizon": HORIZON,
             "method": but(INSTANCE, "None") | {"indirect": Indirect()},
@@ -548,14 +560,13 @@ DYNAMICS = [
     ),
     Case(
         "solve_dynamics",
-        solve_dynamics,
-        {**MOVED, "end": [0.3, 0.2, 0.1]},
+        lambda **options: solve_dynamics(**with_setup_of(SolveSettings, "settings", options)),
+        {**MOVED, "tasks": Goal(joints=[0.3, 0.2, 0.1])},
         {
-            "total": but(HORIZON, "None"),
             "machine": INSTANCE | {"standing": STANDING},
             "horizon": HORIZON,
-            "end": but(array(3), "nan"),
-            "tasks": but(INSTANCE, "list", "dictionary"),
+            "tasks": but(INSTANCE, "list", "dictionary") | {"a joint too few": Goal(joints=[0.3, 0.2])},
+            "settings": but(INSTANCE, "None"),
             "method": but(INSTANCE, "None") | {"indirect": Indirect()},
             "options": MAPPING,
             "tolerances": MAPPING | {"unknown": {"nothing": 1.0}},
@@ -563,7 +574,7 @@ DYNAMICS = [
     ),
     Case(
         "joint_torques",
-        lambda machine: joint_torques(machine, (), ca.SX.sym("q", 3), ca.SX.sym("v", 3), ca.SX.sym("a", 3)),
+        lambda machine: joint_torques(machine, ((), ca.SX.sym("q", 3), ca.SX.sym("v", 3), ca.SX.sym("a", 3))),
         {"machine": ARM},
         {"machine": INSTANCE | {"standing": STANDING}},
     ),

@@ -218,7 +218,7 @@ def test_the_momentum_of_a_pair_that_drifts_is_that_of_both_about_their_common_c
         whole = np.zeros(6)
         whole[one.twist_rows] = momentum
         total += whole + np.concatenate([np.cross(place - middle, whole[3:]), np.zeros(3)])
-    result = np.array(ca.DM(pair_momentum(one, other, base, there, joints))).ravel()
+    result = np.array(ca.DM(pair_momentum(one, other, base=base, target_base=there, joints=joints))).ravel()
     assert result == pytest.approx(total[one.twist_rows], rel=1e-12, abs=1e-12)
 
 

@@ -80,7 +80,7 @@ def test_declared_distances_are_rounded_distances_at_the_time_of_the_scene(symbo
     q = problem.state("joints", 4, lower=ARM.robot.lower, upper=ARM.robot.upper)
     problem.dynamics(q, problem.control("u", 4))
     problem.horizon(2.0)
-    clearance_constraints.declare(problem, ARM.base_home(), q, begin=3.0, pace=0.5, horizon=2.0, suffix=" b")
+    clearance_constraints.declare(problem, ARM.base_home(), begin=3.0, pace=0.5, horizon=2.0, suffix=" b")
     held, apart = problem.declared.path["apart b"], problem.declared.apart["clearance b"]
     assert_allclose(constant(held.lower), [0.02 + 0.3, 0.02 + 0.1])
     function = ca.Function("held", [q, problem.time], [held.expression, apart.placements])
@@ -104,9 +104,9 @@ def test_moving_obstacles_need_a_horizon_and_joints_their_limits() -> None:
     around = CollisionScene(ARM, [BALL])
     for limit, horizon, name in ((2.9, None, "obstacles"), (3.0, 1.0, "joint1")):
         problem = Problem("free")
-        q = problem.state("joints", 4, lower=-limit, upper=limit)
+        problem.state("joints", 4, lower=-limit, upper=limit)
         with pytest.raises(ProblemError) as caught:
-            ClearanceConstraints(around).declare(problem, ARM.base_home(), q, horizon=horizon)
+            ClearanceConstraints(around).declare(problem, ARM.base_home(), horizon=horizon)
         assert caught.value.name == name
 
 
@@ -122,7 +122,7 @@ def test_a_ball_that_swings_past_a_post_is_as_near_as_a_chord() -> None:
     rates, seconds = np.full((4, 1), 1.3 / 2.0), np.zeros((4, 1))
     for end, least in ((0.3, 2 * np.sin(0.05) - 0.105), (0.7, -0.105)):
         swing = partial(swung, end=end)
-        result = clearance_of(around, swing, breaks, 2.0, rates * (end + 1.0) / 1.3, seconds, True)
+        result = clearance_of(around, swing, breaks, 2.0, rates=rates * (end + 1.0) / 1.3, seconds=seconds, smooth=True)
         assert result.settled
         assert result.worst is not None
         assert result.worst.distance == pytest.approx(least, abs=2e-3)
@@ -154,7 +154,7 @@ def test_no_proof_claims_more_than_a_fine_sampling_shows(seed: int) -> None:
     breaks = np.linspace(0, 1, segments + 1)
     within = breaks[:-1, None] + np.linspace(0, 1, 400) / segments
     rates, seconds = (np.abs(joints(within, k)).max(axis=1) * 1.001 / horizon**k for k in (1, 2))
-    result = clearance_of(around, joints, breaks, horizon, rates, seconds, True)
+    result = clearance_of(around, joints, breaks, horizon, rates=rates, seconds=seconds, smooth=True)
     assert result.settled
     times = np.linspace(0, 1, 2001)
     sampled = distances_along(around, np.zeros(0), joints(times), times * horizon).min(axis=0)
@@ -283,7 +283,7 @@ def test_a_held_pair_of_a_solved_motion_keeps_its_margin_at_its_points() -> None
     problem.dynamics(q, u)
     problem.horizon(1.0)
     problem.minimize(u**2 / 100, -(q**1))
-    ClearanceConstraints(around, {0: 2e-3}).declare(problem, crane_.base_home(), q, horizon=1.0)
+    ClearanceConstraints(around, {0: 2e-3}).declare(problem, crane_.base_home(), horizon=1.0)
     solution = solve(problem, Collocation(6, 2))
     apart = 2 * np.sin((0.5 - float(solution.at(1.0)["joints"][0])) / 2) - 0.15
     assert apart == pytest.approx(0.012, abs=1e-6)

@@ -48,7 +48,7 @@ def torques_along(
     """Torques of a plan at its reported points, or of samples of one. Shape (M, n)."""
     base, q, qd, qdd = (ca.SX.sym("z", n) for n in (machine.base_size, *[machine.joint_size] * 3))
     torques = ca.Function(
-        "t", [base, q, qd, qdd], [joint_torques(machine, base, q, qd, qdd, friction=friction, **more)]
+        "t", [base, q, qd, qdd], [joint_torques(machine, (base, q, qd, qdd), friction=friction, **more)]
     )
     at = plan["base"].T if machine.base_size else np.zeros((0, len(plan["joints"])))
     return np.array(torques(at, plan["joints"].T, plan["velocities"].T, plan["accelerations"].T)).T
@@ -79,7 +79,7 @@ def test_torques_of_a_floating_arm_are_those_of_pinocchio(name: str) -> None:
     second[:6] = -np.linalg.solve(inertia[:6, :6], inertia[:6, columns] @ state.qdd + bias[:6])
     theirs = (inertia @ second + bias)[columns]
     base, q, qd, qdd = (ca.SX.sym("z", n) for n in (7, *[robot.dof] * 3))
-    ours = ca.Function("t", [base, q, qd, qdd], [joint_torques(machine, base, q, qd, qdd)])
+    ours = ca.Function("t", [base, q, qd, qdd], [joint_torques(machine, (base, q, qd, qdd))])
     result = np.array(ours(state.base, state.q, state.qd, state.qdd)).ravel()
     assert result == pytest.approx(theirs, rel=1e-8, abs=1e-8)
     assert swapped(velocity[:6]).any()
@@ -90,8 +90,8 @@ def test_a_heavy_base_stands_still() -> None:
     fixed = FixedBase(arm())
     heavy = planar_chain([0.5, 0.4, 0.3], [2.0, 1.5, 1.0], base=Link("base", 1e9, (0, 0, 0), 1e9 * np.eye(3)))
     base, q, qd, qdd = (ca.SX.sym("z", n) for n in (3, 3, 3, 3))
-    one = joint_torques(FreeFloating(heavy, "planar"), base, q, qd, qdd)
-    other = joint_torques(fixed, (), q, qd, qdd, gravity=(0, 0, 0))
+    one = joint_torques(FreeFloating(heavy, "planar"), (base, q, qd, qdd))
+    other = joint_torques(fixed, ((), q, qd, qdd), gravity=(0, 0, 0))
     both = ca.Function("both", [base, q, qd, qdd], [one, other])
     rng = np.random.default_rng(1)
     left, right = (np.array(v).ravel() for v in both(np.zeros(3), *rng.normal(size=(3, 3))))
@@ -182,9 +182,9 @@ def test_energy_of_actuators_is_kinetic_or_lost_in_friction() -> None:
     plan = solve(problem, Collocation(30, 4))
     assert plan.audit().feasible
     q, qd, qdd = (ca.SX.sym("z", 3) for _ in range(3))
-    drive = joint_torques(machine, (), q, qd, qdd, friction=friction)
+    drive = joint_torques(machine, ((), q, qd, qdd), friction=friction)
     options = ca.dot(drive, qd) - 0.4 * ca.sumsqr(qd)
-    inertial = joint_torques(machine, (), q, ca.DM.zeros(3), qd, gravity=(0, 0, 0))
+    inertial = joint_torques(machine, ((), q, ca.DM.zeros(3), qd), gravity=(0, 0, 0))
     kinetic = ca.dot(inertial, qd) / 2
     power, energy = ca.Function("p", [q, qd, qdd], [options]), ca.Function("e", [q, qd], [kinetic])
     points, weights = np.polynomial.legendre.leggauss(8)

@@ -38,7 +38,7 @@ from ocp import (
     dynamics_phases,
 )
 from ocp.motion.builders.clearance import ClearanceConstraints
-from ocp.motion.builders.dynamics_plan import solve_dynamics
+from ocp.motion.builders.dynamics_plan import SolveSettings, solve_dynamics
 from tests.ocp.motion.builders.test_dynamics import DISPLACEMENT, MASS, slider, torques_along
 
 MACHINE = FixedBase(planar_chain([0.5, 0.4], [2.0, 1.5]))
@@ -46,6 +46,7 @@ START, END = np.array([0.0, 0.3]), np.array([1.0, -0.5])
 MOST = np.array([10.0, 4.0])
 LEAST_TIME = Cost(velocity=0.0, time=1.0)
 SOON = FreeTime(0.1, 5.0, 1.0)
+GOAL = Goal(joints=END)
 
 
 def demand(at: Array, toward: Array, perturbed: Array) -> tuple[Array, Array]:
@@ -87,7 +88,7 @@ def least_time_along(s: Array, at: Array) -> float:
 
 @pytest.fixture(scope="module")
 def fastest() -> Solution:
-    return solve_dynamics(MACHINE, (), SOON, start=START, end=END, limits=Limits(torque=MOST), cost=LEAST_TIME)
+    return solve_dynamics(MACHINE, GOAL, SOON, start=START, limits=Limits(torque=MOST), cost=LEAST_TIME)
 
 
 def fine(plan: Solution, times: int = 4001) -> Array:
@@ -136,11 +137,11 @@ def test_limits_that_no_mesh_meets_are_tightened_at_their_cost(
     mesh: tuple[int, int], most: float, tmp_path: Path
 ) -> None:
     """Three meshes of low degree are too coarse; what the plan costs too much is told, about as a fine one finds it."""
-    request: dict[str, Any] = {"end": END, "limits": Limits(torque=MOST, velocity=most)}
+    request: dict[str, Any] = {"limits": Limits(torque=MOST, velocity=most)}
     effort = Cost(velocity=0.0, effort=1e-4, time=1.0)
-    best = solve_dynamics(MACHINE, (), SOON, start=START, cost=effort, **request)
+    best = solve_dynamics(MACHINE, GOAL, SOON, start=START, cost=effort, **request)
     method = Collocation(mesh[0], degree=mesh[1], scheme="legendre")
-    plan = solve_dynamics(MACHINE, (), SOON, start=START, cost=effort, method=method, **request)
+    plan = solve_dynamics(MACHINE, GOAL, SOON, start=START, cost=effort, settings=SolveSettings(method), **request)
     audit = plan.audit()
     assert audit.feasible
     assert not audit.passed
@@ -153,9 +154,9 @@ def test_limits_that_no_mesh_meets_are_tightened_at_their_cost(
 
 
 def test_mixtures_lie_between_their_parts(fastest: Solution) -> None:
-    request: dict[str, Any] = {"end": END, "limits": Limits(torque=MOST)}
-    mixed = solve_dynamics(MACHINE, (), SOON, start=START, cost=Cost(velocity=0.0, effort=1e-3, time=1.0), **request)
-    easy = solve_dynamics(MACHINE, (), mixed.horizon, start=START, cost=Cost(velocity=0.0, effort=1e-3), **request)
+    request: dict[str, Any] = {"limits": Limits(torque=MOST)}
+    mixed = solve_dynamics(MACHINE, GOAL, SOON, start=START, cost=Cost(velocity=0.0, effort=1e-3, time=1.0), **request)
+    easy = solve_dynamics(MACHINE, GOAL, mixed.horizon, start=START, cost=Cost(velocity=0.0, effort=1e-3), **request)
     assert mixed.audit().passed
     assert mixed.horizon > fastest.horizon
     assert fine(mixed).max() <= 1 + 1e-5
@@ -164,7 +165,14 @@ def test_mixtures_lie_between_their_parts(fastest: Solution) -> None:
 
 def test_excessive_values_are_refused_by_name() -> None:
     with pytest.raises(SolveError, match="torques of 'joint1' would have to go") as caught:
-        solve_dynamics(MACHINE, (), 0.4, start=START, end=END, limits=Limits(torque=MOST), options={"max_iter": 60})
+        solve_dynamics(
+            MACHINE,
+            GOAL,
+            0.4,
+            start=START,
+            limits=Limits(torque=MOST),
+            settings=SolveSettings(options={"max_iter": 60}),
+        )
     assert str(caught.value.name).startswith("torques of 'joint")
     assert caught.value.time is not None
 
@@ -176,7 +184,7 @@ def test_a_point_that_is_passed_is_passed_without_a_stop() -> None:
     """A mass that passes 0.5 m at a free time on its way to 0.8 m: no dearer than straight on, which does so too."""
     passed = Goal(joints=[0.5], duration=FreeTime(0.1, 1.0, 0.6), velocity="free")
     last = Goal(joints=[0.8], duration=FreeTime(0.1, 1.0, 0.4))
-    plan = solve_dynamics(slider(), [passed, last], start=[0.0], total=1.0)
+    plan = solve_dynamics(slider(), [passed, last], 1.0, start=[0.0])
     assert plan.cost == pytest.approx(12 * MASS**2 * DISPLACEMENT**2, rel=1e-7)
     first, second = plan.phase("leg 1"), plan.phase("leg 2")
     assert first.horizon + second.horizon == pytest.approx(1.0, abs=1e-9)
@@ -243,7 +251,7 @@ def test_colliding_pairs_on_the_path_to_a_goal_are_separated() -> None:
             machine,
             legs,
             start=START,
-            method=Collocation(6, 4, scheme="legendre"),
+            settings=SolveSettings(Collocation(6, 4, scheme="legendre")),
             setup=DynamicsSetup(clearance_constraints=clearance_constraints),
         )
         assert plan.audit().passed

@@ -11,7 +11,18 @@ import pytest
 
 import models
 from models import FixedBase, FreeFloating, Joint, Link, Machine, Robot, paper_example, planar_chain
-from ocp import Collocation, Limits, Problem, ProblemError, Solution, TipTask, minimum_velocity_problem, resolve, solve
+from ocp import (
+    Collocation,
+    Limits,
+    Problem,
+    ProblemError,
+    Solution,
+    TipTask,
+    VelocitySetup,
+    minimum_velocity_problem,
+    resolve,
+    solve,
+)
 from ocp.motion.builders import joint_motion
 from ocp.motion.local.rates import LocalSolution
 from tests.models.robot.trees import numeric, seven_joint_arm
@@ -175,7 +186,9 @@ def test_the_guess_is_the_local_motion_in_steps_of_first_order(monkeypatch: pyte
     local = resolve(machine, TASK, PAPER_START, 5.0)
     for steps in (64, 256, 1024):
         monkeypatch.setattr(joint_motion, "GUESS_STEPS", steps)
-        states = minimum_velocity_problem(machine, TASK, 5.0, start=PAPER_START, guess_damping=1e-4).declared.states
+        states = minimum_velocity_problem(
+            machine, TASK, 5.0, start=PAPER_START, setup=VelocitySetup(guess_damping=1e-4)
+        ).declared.states
         apart = [
             np.abs(states[name].guess(time) - local.at(time)[name]).max()
             for time in (0.0, 0.5, 1.0)
@@ -212,7 +225,7 @@ def test_a_singular_start_is_planned() -> None:
     assert minimum_velocity_problem(machine, task, 0.2, start=np.zeros(3)).declared.path["task"].size == 2
 
 
-@pytest.mark.parametrize(("changes", "message"), [*REFUSED, ({"guess_damping": 0.0}, "guess_damping must be positive")])
+@pytest.mark.parametrize(("changes", "message"), REFUSED)
 def test_requests_that_cannot_be_right_are_refused(changes: dict[str, Any], message: str) -> None:
     request = {"start" if name == "start_joints" else name: value for name, value in {**PAPER_TASK, **changes}.items()}
     with pytest.raises(ProblemError, match=message) as caught:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -11,7 +12,7 @@ import pytest
 
 from models import FreeFloating, Path, center_of_mass, paper_example, smooth
 from models.machines.machine import with_tip
-from ocp import Collocation, ProblemError, TipTask, minimum_velocity_problem, solve
+from ocp import Collocation, ProblemError, TipTask, VelocitySetup, minimum_velocity_problem, solve
 from ocp.motion.tasks.equations import bind
 from ocp.motion.tasks.tracks import path_tracks
 from tests.models.robot.trees import numeric
@@ -35,6 +36,8 @@ from tests.ocp.motion.tasks.space_tasks import (
 
 pytestmark = pytest.mark.long
 
+AT_BASE = VelocitySetup(start_base=BASE)
+
 MANIPULATOR_START = np.array([0.3, -0.6, 0.4, 1.0, -0.4, 0.8, 0.2])
 FINE = Collocation(intervals=50, degree=4)
 
@@ -45,7 +48,7 @@ def test_a_space_manipulator_follows_a_pose_line_optimally(momentum: Any) -> Non
     machine = FreeFloating(floating_manipulator().robot, conserved_momentum=momentum)
     line = line_from(machine, BASE, MANIPULATOR_START, (0.1, -0.1, 0.05), (1, 2, 0.5), 0.3, 10.0)
     task = TipTask(position=line.position, orientation=line.orientation)
-    request: dict[str, Any] = {"tasks": task, "start": MANIPULATOR_START, "horizon": 10.0, "start_base": BASE}
+    request: dict[str, Any] = {"tasks": task, "start": MANIPULATOR_START, "horizon": 10.0, "setup": AT_BASE}
     solution = audited(machine, FINE, **request)
     assert sum(values.shape[1] for values in solution.states.values()) == 14
     assert largest_error(machine, task, solution) < 1e-6
@@ -59,7 +62,7 @@ def test_a_light_satellite_gains_by_planning_ahead() -> None:
     machine = floating_panda((0.05, -0.03, 0.04, 0.1, -0.2, 0.15))
     line = line_from(machine, BASE, PANDA_START, (0.1, -0.15, 0.1), (1, 2, 0.5), 0.5, 10.0)
     task = TipTask(position=line.position, direction=lambda time: line.orientation(time)[:, 2])
-    start: dict[str, Any] = {"start": PANDA_START, "horizon": 10.0, "start_base": BASE}
+    start: dict[str, Any] = {"start": PANDA_START, "horizon": 10.0, "setup": AT_BASE}
     solution = audited(machine, Collocation(intervals=30, degree=4), tasks=task, **start)
     assert largest_error(machine, task, solution) < 1e-6
     local = resolved(machine, tasks=task, **start)
@@ -87,7 +90,7 @@ def test_a_cyclic_plan_may_choose_where_to_start() -> None:
     start: dict[str, Any] = {"tasks": task, "start": PANDA_START, "horizon": 6.0, "cyclic": True}
     method = Collocation(intervals=30, degree=4)
     fixed = solve(minimum_velocity_problem(panda(), **start), method)
-    free = audited(panda(), method, **(start | {"start": None, "near": PANDA_START}))
+    free = audited(panda(), method, **(start | {"start": None, "setup": replace(AT_BASE, near=PANDA_START)}))
     assert free.cost < fixed.cost - 1e-4
     np.testing.assert_allclose(pose(panda(), (), free["joints"][0])[1], position, atol=1e-9)
     assert np.abs(free["joints"][-1] - free["joints"][0]).max() <= 1e-8
@@ -103,7 +106,7 @@ def test_a_free_start_is_found_by_inverse_kinematics_and_a_velocity_holds_its_po
     machine, start = chain(), np.deg2rad([30.0, 40.0, 50.0])
     request: dict[str, Any] = {"tasks": TipTask(rows=(3, 4), velocity=(-0.2, 0.1)), "horizon": 3.0}
     costs = []
-    for begin in ({"start": start}, {"near": start}):
+    for begin in ({"start": start}, {"setup": VelocitySetup(near=start)}):
         plan = audited(machine, Collocation(intervals=15), **begin, **request)
         np.testing.assert_allclose(pose(machine, (), plan["joints"][0])[1], pose(machine, (), start)[1], atol=1e-8)
         costs.append(plan.cost)
@@ -137,7 +140,7 @@ def test_a_floating_arm_returns_to_its_start_on_a_closed_path() -> None:
     machine = floating_panda()
     _, position = pose(machine, BASE, PANDA_START)
     task = TipTask(position=circle(position, 0.05, 6.0))
-    start: dict[str, Any] = {"tasks": task, "start": PANDA_START, "horizon": 6.0, "start_base": BASE}
+    start: dict[str, Any] = {"tasks": task, "start": PANDA_START, "horizon": 6.0, "setup": AT_BASE}
     solution = audited(machine, Collocation(intervals=20, degree=4), cyclic=True, **start)
     assert np.abs(solution["joints"][-1] - PANDA_START).max() <= 1e-8
     assert largest_error(machine, task, solution) < 1e-6
@@ -146,7 +149,7 @@ def test_a_floating_arm_returns_to_its_start_on_a_closed_path() -> None:
 def test_a_drifting_machine_cannot_return_in_the_world_but_relative_to_its_base() -> None:
     machine = floating_panda((0.0, 0.0, 0.0, 1.0, 0.0, 0.0))
     _, position = pose(machine, BASE, PANDA_START)
-    request: dict[str, Any] = {"start": PANDA_START, "horizon": 4.0, "start_base": BASE, "cyclic": True}
+    request: dict[str, Any] = {"start": PANDA_START, "horizon": 4.0, "setup": AT_BASE, "cyclic": True}
     with pytest.raises(ProblemError, match="the linear momentum moves the centre of mass"):
         minimum_velocity_problem(machine, tasks=TipTask(position=circle(position, 0.05, 4.0)), **request)
     frame = machine.world_from_base(BASE)

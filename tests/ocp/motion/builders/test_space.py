@@ -87,7 +87,7 @@ def test_the_work_of_the_actuators_is_kinetic_energy() -> None:
     energy = ca.dot(v, ca.mtimes(mass_matrix(machine.robot, q), v)) + ca.dot(at_origin, ca.mtimes(locked, twist))
     energy = energy / 2 + ca.dot(at_origin, ca.mtimes(coupled, v))
     rate = ca.jtimes(energy, ca.vertcat(b, q, v), ca.vertcat(machine.base_rate(b, q, v), v, a))
-    both = ca.Function("both", [b, q, v, a], [rate, ca.dot(joint_torques(machine, b, q, v, a), v)])
+    both = ca.Function("both", [b, q, v, a], [rate, ca.dot(joint_torques(machine, (b, q, v, a)), v)])
     for seed in range(5):
         result, options = (float(value) for value in both(*state(machine, seed)))
         assert result == pytest.approx(options, rel=1e-9, abs=1e-9)

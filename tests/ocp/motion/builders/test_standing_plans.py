@@ -13,10 +13,11 @@ from models import STANDING_STARTS
 from models.machines.machine import with_tip
 from models.paths import rest_to_rest
 from ocp import Collocation, ProblemError, Solution, SolveError, TipTask, resolve_accelerations, solve
+from ocp.motion.builders.dynamics_plan import SolveSettings
 from ocp.motion.builders.standing.plan import solve_standing
 from ocp.motion.builders.standing.problem import FreeTime, StandingSetup, standing_problem
 from ocp.motion.tasks.equations import task_errors
-from ocp.motion.tasks.limits import IndexAtLeast, InFoot, Pinned, ZmpRule
+from ocp.motion.tasks.limits import IndexAtLeast, InFoot, Limits, Pinned, ZmpRule
 from ocp.motion.tasks.tip_task import timed
 from ocp.motion.tasks.tracks import pose_line
 from tests.models.machines.standing_machines import planar_machine
@@ -53,8 +54,8 @@ IN_RANGE = InFoot(0.02)
 SWING, ASIDE = 1.5, (0.2, 0.15, -0.05)  # s; m, of the arm with a load at its tip
 
 
-def table_request(**changes: Any) -> Solution:
-    settings = with_setup({"zmp": IN_RANGE, "limits": LIMITS, **changes})
+def table_request(*, zmp: ZmpRule = IN_RANGE, limits: Limits = LIMITS, **changes: Any) -> Solution:
+    settings = with_setup({"limits": replace(limits, zmp=zmp), **changes})
     return solve_standing(machine(), table_task(1), HORIZON, start=STANDING_STARTS[1], **settings)
 
 
@@ -82,7 +83,7 @@ def test_the_formulation_that_works_is_found(
 
 
 def test_the_fastest_lift_is_planned_with_linear_accelerations() -> None:
-    settings: dict[str, Any] = {"limits": LIFT_LIMITS, "weights": LIFT_WEIGHTS, "zmp": IN_RANGE}
+    settings: dict[str, Any] = {"limits": replace(LIFT_LIMITS, zmp=IN_RANGE), "weights": LIFT_WEIGHTS}
     settings["setup"] = StandingSetup(along="parameter")
     horizon = FreeTime(0.2, 3.0, 1.0)
     solution = solve_standing(machine(), straight(0.0, 0.8), horizon, start=STANDING_STARTS[1], **settings)
@@ -94,15 +95,16 @@ def test_the_fastest_lift_is_planned_with_linear_accelerations() -> None:
 
 
 def test_a_failure_reports_the_outcome_of_every_attempt() -> None:
-    slow = {"limits": replace(LIMITS, velocity=0.2), "options": {"max_iter": 60}}
+    limits, options = replace(LIMITS, velocity=0.2), {"max_iter": 60}
     message = r"(?s)no standing plan .*\ntip acceleration, 8 intervals: .*velocities\[\d\]"
     with pytest.raises(SolveError, match=message) as caught:
-        table_request(method=Collocation(8, degree=3, scheme="legendre"), **slow)
+        table_request(settings=SolveSettings(Collocation(8, degree=3, scheme="legendre"), options), limits=limits)
     assert caught.value.name == caught.value.conflicts[0].label
+    mesh = Collocation(4, degree=1, scheme="legendre", control="held")
     with pytest.raises(
         SolveError, match=r"tip position, 4 intervals: .*fails"
     ) as caught:  # too coarse, and not refined
-        table_request(method=Collocation(4, degree=1, scheme="legendre", control="held"), tolerances={"tip": 0.0})
+        table_request(settings=SolveSettings(mesh, tolerances={"tip": 0.0}))
     assert str(caught.value).count("\n") == 3
     assert (caught.value.name or "unnamed") in str(caught.value)
     assert caught.value.solution is not None
@@ -119,7 +121,7 @@ def test_an_arm_holds_its_hand_level_where_the_local_method_tips(kind: str) -> N
     local = resolve_accelerations(arm(), task, ARM_START, SWING, step=5e-3, external=tool).motion
     assert not local.stands
     solution = solve_standing(
-        arm(), task, SWING, start=ARM_START, zmp=InFoot(0.005), setup=StandingSetup(external=tool)
+        arm(), task, SWING, start=ARM_START, limits=Limits(zmp=InFoot(0.005)), setup=StandingSetup(external=tool)
     )
     assert solution.audit().passed
     motion = sampled(arm(), solution, tool)
@@ -139,7 +141,7 @@ def test_two_arms_stand_where_the_local_method_tips() -> None:
     local = resolve_accelerations(two(), tasks, TWO_START, TWO_HORIZON, step=5e-3)
     assert local.tip_error.max() < 1e-8
     assert not local.motion.stands
-    solution = solve_standing(two(), tasks, TWO_HORIZON, start=TWO_START, zmp=InFoot(0.005))
+    solution = solve_standing(two(), tasks, TWO_HORIZON, start=TWO_START, limits=Limits(zmp=InFoot(0.005)))
     assert solution.audit().passed
     motion = sampled(two(), solution)
     assert motion.foot_margin.min() > 0.004
@@ -181,7 +183,9 @@ def test_a_rotating_hand_costs_less_with_a_free_time_law() -> None:
     cost = {}
     for along, what in (("time", options), ("parameter", task)):
         setup = StandingSetup(along=along)  # type: ignore[arg-type]
-        result = solve_standing(standing, what, PLANAR_HORIZON, start=start, zmp=InFoot(0.01), setup=setup)
+        result = solve_standing(
+            standing, what, PLANAR_HORIZON, start=start, limits=Limits(zmp=InFoot(0.01)), setup=setup
+        )
         cost[along] = result.cost
         for ours, theirs in zip(pose(standing, (), result["joints"][-1]), goal, strict=True):
             np.testing.assert_allclose(ours, theirs, atol=1e-5)
@@ -193,6 +197,6 @@ def test_a_plan_closes_a_gap_at_its_start_critically_damped() -> None:
     standing, start = planar_machine(5), planar_start(5)
     _, y, z = tip_at(standing, start)
     task = TipTask(position=(y + 0.003, z - 0.004), rows=(4, 5), gain=4.0, start_gap=0.01)
-    plan = solve_standing(standing, task, PLANAR_HORIZON, start=start, zmp=InFoot(0.01))
-    errors = np.linalg.norm(task_errors(standing, task, plan.t, None, plan["joints"]), axis=1)
+    plan = solve_standing(standing, task, PLANAR_HORIZON, start=start, limits=Limits(zmp=InFoot(0.01)))
+    errors = np.linalg.norm(task_errors(standing, task, plan.t, plan["joints"]), axis=1)
     np.testing.assert_allclose(errors, 0.005 * (1 + 4 * plan.t) * np.exp(-4 * plan.t), atol=1e-6)

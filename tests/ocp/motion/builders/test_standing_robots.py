@@ -152,7 +152,7 @@ def test_tiago_with_its_time_law_free_costs_less(tiago: gallery.Results) -> None
     audit = solution.audit(tolerances=gallery.TOLERANCES)
     assert audit.passed, str(audit)
     shares = solution.at_fraction(np.linspace(0, 1, len(motion.t)))["path"][:, 0]
-    errors = task_errors(tiago.machine, gallery.circle(tiago.machine), shares, None, motion.joints)
+    errors = task_errors(tiago.machine, gallery.circle(tiago.machine), shares, motion.joints)
     assert np.abs(errors).max() < 1e-5
 
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from models import FixedBase, FreeFloating, Link, planar_chain
 from ocp import Collocation, Limits, ProblemError, TipTask, solve
-from ocp.motion.builders.tool_motion import stretches_of, tool_motion_problem
+from ocp.motion.builders.tool_motion import ToolMotionSetup, stretches_of, tool_motion_problem
 from ocp.motion.builders.torques import Actuation
 from ocp.motion.tasks.checks import ignorable_joints
 from ocp.motion.tasks.equations import bind
@@ -137,13 +137,15 @@ def test_accelerations_hold_a_velocity_that_changes_in_each_stretch_of_the_time(
     motion = tool_motion_problem(
         machine,
         stretches_of(machine, tasks, 1.5),
-        base=np.zeros(0),
-        start=np.array([0.4, 0.9]),
-        reference=np.array([0.4, 0.9]),
-        cyclic=False,
-        weights=np.ones(2),
-        bounds=Limits(acceleration=50.0).bounds(machine),
-        actuation=Actuation(),
+        ToolMotionSetup(
+            base=np.zeros(0),
+            start=np.array([0.4, 0.9]),
+            reference=np.array([0.4, 0.9]),
+            cyclic=False,
+            weights=np.ones(2),
+            bounds=Limits(acceleration=50.0).bounds(machine),
+            actuation=Actuation(),
+        ),
     )
     solution = solve(motion.problem, Collocation(8), options={"max_iter": 60})
     for stretch in motion.stretches:

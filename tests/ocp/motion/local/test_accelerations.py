@@ -488,6 +488,6 @@ def test_two_tips_are_led_at_once() -> None:
     tasks = two_tasks((0.1, 0.0, 0.1), (0.0, -0.1, 0.0))
     one, both = (resolve_accelerations(two(), some, TWO_START, 0.5, step=0.01) for some in (tasks[0], tasks))
     np.testing.assert_allclose(both.tip_error, 0, atol=1e-8)
-    errors = task_errors(two(), tasks, one.motion.t, None, one.motion.joints)
+    errors = task_errors(two(), tasks, one.motion.t, one.motion.joints)
     assert np.abs(errors[:, :3]).max() < 1e-8
     assert np.abs(errors[:, 3:]).max() > 1e-3

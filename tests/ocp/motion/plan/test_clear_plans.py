@@ -36,6 +36,7 @@ from ocp import (
     SolveError,
     TipTask,
     Unreachable,
+    VelocitySetup,
     inverse_kinematics,
     minimum_velocity_problem,
     plan,
@@ -58,6 +59,10 @@ ARM = FixedBase(armoured_arm())
 START = np.array([0.1, 0.6, 0.1, 1.0, 0.1, 0.8, 0.0])
 SECONDS = 2.0
 DISPLACEMENT = np.array([0.0, 0.5, 0.0])
+
+
+def avoiding(scene: CollisionScene) -> VelocitySetup:
+    return VelocitySetup(clearance_constraints=ClearanceConstraints(scene))
 
 
 def tip_at(machine: Any, joints: Any) -> np.ndarray:
@@ -313,11 +318,13 @@ def test_pairs_clear_within_limits_are_checked_without_limits() -> None:
     required: dict[str, Any] = {"tasks": line(), "start": START, "horizon": SECONDS, "limits": free_of_limits}
     around = CollisionScene(ARM)
     with pytest.raises(ProblemError, match="limits=False"):
-        minimum_velocity_problem(ARM, **required, clearance_constraints=ClearanceConstraints(around))
+        minimum_velocity_problem(ARM, **required, setup=avoiding(around))
     with pytest.raises(ProblemError, match="limits=False"):
         inverse_kinematics(ARM, TipTask(position=FIRST), limits=False, scene=around)
     free = CollisionScene(ARM, limits=False)
-    assert minimum_velocity_problem(ARM, **required, clearance_constraints=ClearanceConstraints(free)).declared.apart
+    assert minimum_velocity_problem(
+        ARM, **required, setup=VelocitySetup(clearance_constraints=ClearanceConstraints(free))
+    ).declared.apart
     wide = plan(ARM, line(), start=START, search="start", limits=Limits(joints=False))
     assert wide.audit().passed
 
@@ -387,9 +394,7 @@ def test_a_local_motion_tells_how_near_it_comes() -> None:
 @pytest.mark.long
 def test_builders_accept_clearance_constraints() -> None:
     around = CollisionScene(ARM, [POST])
-    problem = minimum_velocity_problem(
-        ARM, line(), SECONDS, start=START, clearance_constraints=ClearanceConstraints(around)
-    )
+    problem = minimum_velocity_problem(ARM, line(), SECONDS, start=START, setup=avoiding(around))
     colliding = solve(problem, Collocation(16, 4)).audit()
     assert not colliding["clearance"].passed
     assert not colliding.feasible

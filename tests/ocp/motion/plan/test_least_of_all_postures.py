@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from ocp import Collocation, inverse_kinematics, minimum_velocity_problem, solve
+from ocp import Collocation, VelocitySetup, inverse_kinematics, minimum_velocity_problem, solve
 from ocp.motion.plan import Plan
 from tests.models.robot.trees import Array
 from tests.ocp.motion.plan.motions import PLAN_CASES, plan_bare, planned
@@ -43,7 +43,7 @@ def test_no_configuration_leads_to_a_less_costly_seam() -> None:
     mesh = Collocation(8, 7).with_nodes_at(task.breaks / task.duration)
     costs = []
     for joints in other_configurations():
-        problem = minimum_velocity_problem(what.machine, task, near=joints)
+        problem = minimum_velocity_problem(what.machine, task, setup=VelocitySetup(near=joints))
         motion = solve(problem, mesh, options={"max_iter": 60}, check=False)
         if motion.success:  # or the posture is lost on its way
             costs.append(motion.cost)

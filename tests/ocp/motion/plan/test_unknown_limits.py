@@ -18,6 +18,7 @@ from models.spatial import quaternion_from_rotation
 from ocp import (
     Collocation,
     Cost,
+    Goal,
     Limits,
     ProblemError,
     TipTask,
@@ -73,7 +74,7 @@ def least_velocities(machine: FixedBase) -> Any:
 
 
 def moved(machine: FixedBase, **options: Any) -> Any:
-    solution = solve_dynamics(machine, (), 1.0, start=START, end=END, **options)
+    solution = solve_dynamics(machine, Goal(joints=END), 1.0, start=START, **options)
     return solution.cost
 
 

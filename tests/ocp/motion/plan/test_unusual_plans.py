@@ -117,7 +117,7 @@ def test_the_motion_passes_and_does_its_tasks(make: Callable[[], PlanCase]) -> N
     for task in [tasks] if isinstance(tasks, TipTask) else tasks:
         times = np.linspace(task.begin, task.end, 401)[1:-1]
         at = result.at(times)
-        errors = task_errors(machine, task, times, at.get("base"), at["joints"])
+        errors = task_errors(machine, task, times, at["joints"], base=at.get("base"))
         assert np.linalg.norm(errors, axis=1).max() < 1e-6
 
 

@@ -113,7 +113,7 @@ def test_every_motion_does_its_task_within_limits_and_conserves_momentum(report:
     for (result,) in CellSearch(request, START[None]).local_motions():
         count, times = len(result.cost), result.t
         for base, at, rates in zip(result.base, result.joints, result.rates, strict=True):
-            assert np.abs(task_errors(machine, place, times, base, at)).max() < 5e-3
+            assert np.abs(task_errors(machine, place, times, at, base=base)).max() < 5e-3
             assert (np.abs(at) <= 2.0).all()
             assert np.abs(rates).max() < 1.5 * 1.1  # a limit is kept by the rates that a step begins with
             drift = np.array(center.map(len(times))(base.T, at.T))[:2].T - np.outer(times, pushed)

@@ -95,7 +95,7 @@ def largest_error(machine: Machine, task: Any, plan: Solution) -> float:
     times = np.linspace(0.0, plan.horizon, 501)
     at = plan.at(times)
     base = at["base"] if machine.base_size else None
-    return float(np.abs(task_errors(machine, task, times, base, at["joints"])).max())
+    return float(np.abs(task_errors(machine, task, times, at["joints"], base=base)).max())
 
 
 def largest_momentum_error(machine: FreeFloating, plan: Solution) -> float:

@@ -231,7 +231,7 @@ def test_quaternion_and_matrix_tracks_say_the_same() -> None:
 def test_errors_are_reported_for_any_motion() -> None:
     rotation, position = pose(panda(), (), PANDA_START)
     task = TipTask(position=position, orientation=rotation, rows=(2, 3))
-    errors = task_errors(panda(), task, [0.0, 1.0], None, [PANDA_START, PANDA_START])
+    errors = task_errors(panda(), task, [0.0, 1.0], [PANDA_START, PANDA_START])
     np.testing.assert_allclose(errors, np.zeros((2, 2)), atol=1e-14)
 
 
@@ -327,7 +327,7 @@ def test_equations_of_accelerations_are_those_of_velocities_differentiated(name:
     q, u, second, time = (ca.SX.sym(what, size) for what, size in (("q", n), ("u", n), ("s", n), ("t", 1)))
     residual = equations.residual(ca.DM(0, 1), q, u, equations.targets(time))
     twist_level = ca.Function("twist", [q, u, time], [residual])
-    level = equations.acceleration(ca.DM(0, 1), q, u, second, time)
+    level = equations.acceleration(ca.DM(0, 1), q, u, second, progress=(time,))
     slope = ca.Function("slope", [q, u, time], [ca.jacobian(level, second) - equations.jacobian(ca.DM(0, 1), q)])
     acceleration_level = ca.Function("acceleration", [q, u, second, time], [level])
     motion, h = motion_of(ca.SX, n, 3), 1e-5
@@ -352,10 +352,10 @@ def test_a_task_of_a_path_parameter_run_by_a_clock_is_the_timed_task(name: str) 
     none = ca.DM(0, 1)
     over_parameter = ca.Function("over", [q, u, second, time, pace, change], [
         equations.residual(none, q, u, equations.targets(time, pace)),
-        equations.acceleration(none, q, u, second, time, pace, change),
+        equations.acceleration(none, q, u, second, progress=(time, pace, change)),
     ])  # fmt: skip
     over_time = ca.Function("time", [q, u, second, time], [
-        both.residual(none, q, u, both.targets(time)), both.acceleration(none, q, u, second, time)
+        both.residual(none, q, u, both.targets(time)), both.acceleration(none, q, u, second, progress=(time,))
     ])  # fmt: skip
     rng = np.random.default_rng(4)
     for at in (0.4, 1.3):
