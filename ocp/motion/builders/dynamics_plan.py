@@ -49,8 +49,8 @@ from ocp.solution import Guess, Solution
 from ocp.tightening import WARM_START_OPTIONS, largest_excess, solve_at_switches, tighten
 
 __all__ = [
-    "audit_error", "breaks_of", "checked_goals", "dynamics_phases", "machines_of", "phase_names", "solve_dynamics",
-    "within_limits",
+    "POINTS", "audit_error", "breaks_of", "checked_goals", "dynamics_phases", "machines_of", "phase_names",
+    "solve_dynamics", "within_limits",
 ]  # fmt: skip
 
 

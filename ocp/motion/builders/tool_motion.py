@@ -295,12 +295,11 @@ class _Motion:
     def constrain_clearance(self, stretch: Stretch, base: Any, joints: Any, horizon: float | None) -> None:
         """Declare the clearance constraints of a stretch; the horizon is None if the time is free."""
         if self.clearance_constraints is not None:
-            suffix = stretch.suffix
-            self.clearance_constraints.declare(
-                self.problem, base, joints, base_name=f"base{suffix}" if self.machine.base_size else "",
-                joints_name=f"joints{suffix}", suffix=suffix, begin=stretch.begin,
-                pace=1.0 if horizon is None else self.pace(stretch), horizon=horizon,
-            )  # fmt: skip
+            suffix, base_name = stretch.suffix, f"base{stretch.suffix}" if self.machine.base_size else ""
+            names: dict[str, Any] = {"base_name": base_name, "joints_name": f"joints{suffix}", "suffix": suffix}
+            pace = 1.0 if horizon is None else self.pace(stretch)
+            times: dict[str, Any] = {"begin": stretch.begin, "pace": pace, "horizon": horizon}
+            self.clearance_constraints.declare(self.problem, base, joints, **names, **times)
 
 
 def _declare_stretch(motion: _Motion, stretch: Stretch, known: Array | None) -> tuple[list[Any], Any, Array | None]:
@@ -324,11 +323,9 @@ def _declare_stretch(motion: _Motion, stretch: Stretch, known: Array | None) -> 
         rates = problem.control(f"rates{stretch.suffix}", machine.joint_size, unit=machine.robot.unit("/s"), **limits)
         running = ca.dot(rates, ca.DM(motion.weights) * rates) / 2
     slack = _closure(motion) if motion.cyclic and ends else 0
-    ends_at: Array | None = None
-    error_cost: Any = 0
+    ends_at, error_cost = None, 0
     if stretch.equations is not None:
         error, error_cost = motion.task_errors(stretch)
-        slack = slack + error
         required = np.ones(stretch.equations.size, dtype=bool)
         slopes = _slopes(stretch, motion.base, motion.reference)
         if known is not None:
@@ -338,7 +335,7 @@ def _declare_stretch(motion: _Motion, stretch: Stretch, known: Array | None) -> 
         if second is not None:
             derivatives = [(joints, rates), (rates, second), (place, machine.base_rate(place, joints, rates))]
         free = not begins or motion.free
-        _declare_tasks(motion, stretch, (place, joints, rates), pace, slack, free, required, derivatives)
+        _declare_tasks(motion, stretch, (place, joints, rates), pace, slack + error, free, required, derivatives)
         placed = np.concatenate([is_holonomic(part) for part in stretch.equations.bound]).astype(bool)
         ends_at = slopes[stretch.equations.pose_rows | (placed & (begins | ~required))]
     if machine.base_size:
@@ -488,8 +485,7 @@ def _slopes(stretch: Stretch, base: Array, reference: Array) -> Array:
 
     A rank found there holds everywhere but on a set of measure zero. Shape (size, base_size + joint_size).
     """
-    equations = stretch.equations
-    assert equations is not None
+    equations: Any = stretch.equations
     b, q = ca.SX.sym("base", len(base)), ca.SX.sym("joints", len(reference))
     error = equations.error(b, q, equations.target_function()(stretch.begin))
     fixed, at, rows = equations.holding(b, q, base, reference), 0, []
