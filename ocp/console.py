@@ -23,7 +23,6 @@ from typing import Any, ParamSpec, Self, TypeVar
 
 import casadi as ca
 import numpy as np
-from tqdm import tqdm
 
 from ocp.errors import ProblemError, SolverStatus
 
@@ -182,98 +181,6 @@ def check_time() -> None:
         raise TimeLimitReached(str(SolverStatus.TIME_LIMIT))
 
 
-# ---- solver iterations -------------------------------------------------------------------------------------------
-
-
-class IterationMonitor(ca.Callback):  # type: ignore[misc]
-    """Iteration callback: shows one line on the terminal, can stop the solver, and stores the iterate."""
-
-    def __init__(self, n: int, m: int, np_: int, title: str, show: bool) -> None:
-        ca.Callback.__init__(self)
-        self.sizes = {"x": n, "f": 1, "g": m, "lam_x": n, "lam_g": m, "lam_p": np_}
-        self.title, self.show = title, show
-        self.stopped: SolverStatus | None = None
-        self.iterate, self.iterations = np.zeros(n), 0
-        self.bar: Any = None
-        self.construct("progress", {})
-
-    def open(self, lower: np.ndarray, upper: np.ndarray) -> None:
-        """Begin a solve with these bounds of the rows. The line appears after a second, on a terminal only."""
-        self.lower, self.upper = lower, upper
-        self.stopped, self.iterations = None, 0
-        disable = None if self.show else True
-        form = "{desc}: {n_fmt} iterations, {elapsed}{postfix}"
-        self.bar = tqdm(desc=self.title, bar_format=form, disable=disable, delay=1.0, leave=False, file=sys.stderr)
-
-    def get_n_in(self) -> int:
-        return int(ca.nlpsol_n_out())
-
-    def get_n_out(self) -> int:
-        return 1
-
-    def get_name_in(self, i: int) -> str:
-        return str(ca.nlpsol_out(i))
-
-    def get_sparsity_in(self, i: int) -> Any:
-        return ca.Sparsity.dense(self.sizes[ca.nlpsol_out(i)], 1)
-
-    def eval(self, arguments: list[Any]) -> list[int]:
-        try:
-            if self.bar is not None and not self.bar.disable:
-                g = np.asarray(arguments[2].full()).reshape(-1)
-                worst = float(np.max(np.maximum(self.lower - g, g - self.upper), initial=0.0))
-                words = f"cost {float(arguments[1]):.6g}, infeasibility {worst:.1e}"
-                self.bar.set_postfix_str(words, refresh=False)
-                self.bar.update()
-            self.stopped = reason_to_stop()
-        except KeyboardInterrupt:  # CasADi would turn it into another error
-            self.stopped = SolverStatus.INTERRUPTED
-        self.iterations, self.iterate = self.iterations + 1, np.asarray(arguments[0].full()).reshape(-1)
-        return [int(bool(self.stopped))]
-
-    def close(self) -> None:
-        if self.bar is not None:
-            self.bar.close()
-
-
-class FatropMonitor(ca.Callback):  # type: ignore[misc]
-    """Function of an iterate that is 1 to continue and 0 to stop the solver, and stores the iterate.
-
-    It serves fatrop's plugin, which has no iteration callback.
-    """
-
-    def __init__(self, n: int, title: str) -> None:
-        ca.Callback.__init__(self)
-        self.n, self.title = n, title
-        self.stopped: SolverStatus | None = None
-        self.iterate, self.iterations = np.zeros(n), 0
-        self.construct("watch", {})
-
-    def open(self, lower: np.ndarray, upper: np.ndarray) -> None:
-        """Begin a solve."""
-        self.stopped, self.iterations = None, 0
-
-    def close(self) -> None:
-        """End a solve."""
-
-    def get_n_in(self) -> int:
-        return 1
-
-    def get_n_out(self) -> int:
-        return 1
-
-    def get_sparsity_in(self, i: int) -> Any:
-        return ca.Sparsity.dense(self.n, 1)
-
-    def eval(self, arguments: list[Any]) -> list[float]:
-        try:
-            self.stopped = self.stopped or reason_to_stop()
-        except KeyboardInterrupt:
-            self.stopped = SolverStatus.INTERRUPTED
-        self.iterations, self.iterate = self.iterations + 1, np.asarray(arguments[0].full()).reshape(-1)
-        return [float(not self.stopped)]
-
-
 # ---- CasADi's output --------------------------------------------------------------------------------------------
 
 
@@ -328,6 +235,8 @@ LOG_PERIOD_S = 30.0
 """Time between two lines in a log."""
 TERMINAL_DELAY_S = 0.5
 """Time before the line of a command appears on a terminal, and between its updates."""
+SOLVE_DELAY_S = 1.0
+"""Time before the line of a solver appears."""
 CALL_DELAY_S = 2.0
 """Time before the line of a call appears."""
 
@@ -442,3 +351,89 @@ class Progress:
         if self.shown:
             print("\r\x1b[K", end="", file=sys.stderr, flush=True)
             self.shown = False
+
+
+# ---- solver iterations -------------------------------------------------------------------------------------------
+
+
+class _Monitor(ca.Callback):  # type: ignore[misc]
+    """Callback of a solver: it stores the iterate, and stops the solver on Ctrl-C or at the time limit."""
+
+    def __init__(self, n: int, title: str, name: str) -> None:
+        ca.Callback.__init__(self)
+        self.title, self.iterate, self.iterations = title, np.zeros(n), 0
+        self.stopped: SolverStatus | None = None
+        self.construct(name, {})
+
+    def open(self, lower: np.ndarray, upper: np.ndarray) -> None:
+        """Begin a solve with these bounds of the rows."""
+        self.lower, self.upper = lower, upper
+        self.stopped, self.iterations = None, 0
+
+    def close(self) -> None:
+        """End a solve."""
+
+    def get_n_out(self) -> int:
+        return 1
+
+    def _store(self, iterate: Any) -> None:
+        """Store an iterate, and whether the solver is to stop."""
+        try:
+            self.stopped = self.stopped or reason_to_stop()
+        except KeyboardInterrupt:  # CasADi would turn it into another error
+            self.stopped = SolverStatus.INTERRUPTED
+        self.iterations, self.iterate = self.iterations + 1, np.asarray(iterate.full()).reshape(-1)
+
+
+class IterationMonitor(_Monitor):
+    """Iteration callback, which also shows a line on a terminal after a second, unless a listener shows the call."""
+
+    def __init__(self, n: int, m: int, np_: int, *, title: str, show: bool) -> None:
+        self.sizes = {"x": n, "f": 1, "g": m, "lam_x": n, "lam_g": m, "lam_p": np_}
+        self.show, self.line = show, Progress(title, quiet=True)
+        super().__init__(n, title, "progress")
+
+    def open(self, lower: np.ndarray, upper: np.ndarray) -> None:
+        super().open(lower, upper)
+        quiet = not self.show or not _is_interactive() or _LISTENER.get() is not None
+        self.line = Progress(self.title, quiet=quiet, delay=SOLVE_DELAY_S)
+        self.line.__enter__()
+
+    def close(self) -> None:
+        self.line.__exit__(None, None, None)
+
+    def get_n_in(self) -> int:
+        return int(ca.nlpsol_n_out())
+
+    def get_name_in(self, i: int) -> str:
+        return str(ca.nlpsol_out(i))
+
+    def get_sparsity_in(self, i: int) -> Any:
+        return ca.Sparsity.dense(self.sizes[ca.nlpsol_out(i)], 1)
+
+    def eval(self, arguments: list[Any]) -> list[int]:
+        if not self.line.quiet:
+            g = np.asarray(arguments[2].full()).reshape(-1)
+            worst = float(np.max(np.maximum(self.lower - g, g - self.upper), initial=0.0))
+            cost = f"cost {float(arguments[1]):.6g}, infeasibility {worst:.1e}"
+            self.line.stage = f"{self.iterations + 1} iterations, {cost}"
+        self._store(arguments[0])
+        return [int(bool(self.stopped))]
+
+
+class FatropMonitor(_Monitor):
+    """Function of an iterate that is 1 to continue and 0 to stop the solver: fatrop has no iteration callback."""
+
+    def __init__(self, n: int, title: str) -> None:
+        self.size = n
+        super().__init__(n, title, "watch")
+
+    def get_n_in(self) -> int:
+        return 1
+
+    def get_sparsity_in(self, i: int) -> Any:
+        return ca.Sparsity.dense(self.size, 1)
+
+    def eval(self, arguments: list[Any]) -> list[float]:
+        self._store(arguments[0])
+        return [float(not self.stopped)]

@@ -185,7 +185,7 @@ def descend(prepared: PreparedProblem, solution: Solution) -> Solution:
         if not curvature.least < -FLAT_SHARE:
             break
         attempts = [
-            prepared.solve(solution.parameters, displaced_guess(form, solution, curvature, bounds, sign), check=False)
+            prepared.solve(solution.parameters, _displaced_guess(form, solution, curvature, bounds, sign), check=False)
             for sign in (1.0, -1.0)
         ]
         plans = [attempt for attempt in attempts if attempt.success]
@@ -207,7 +207,7 @@ def descend(prepared: PreparedProblem, solution: Solution) -> Solution:
     return solution
 
 
-def displaced_guess(
+def _displaced_guess(
     form: Formulation, solution: Solution, curvature: Curvature, bounds: Bounds, sign: float
 ) -> dict[str, Any]:
     """Return the plan displaced along the variation that lowers its cost, by a visible share of its size.
@@ -385,8 +385,8 @@ def certificate(
     for name in order:
         solution = named[name]
         reported = solution.t[:-1] / solution.horizon  # costates are best where they are reported
-        values, _, _ = sample(form, solution, p, fractions, reported)
-        expected, hamiltonian_size, running_size = sample(form, first, p, fractions, reported)
+        values, _, _ = _sample(form, solution, p, fractions, reported)
+        expected, hamiltonian_size, running_size = _sample(form, first, p, fractions, reported)
         differences = [difference(a, b) for a, b in zip(values[:3], expected[:3], strict=True)]
         differences.append(np.abs(values[3] - expected[3]) / (hamiltonian_size or 1.0))
         size = max(abs(first.cost), running_size * first.horizon) or 1.0
@@ -435,7 +435,7 @@ def name_by_method(solutions: Sequence[Solution]) -> dict[str, Solution]:
     return named
 
 
-def sample(
+def _sample(
     form: Formulation, solution: Solution, p: np.ndarray, fractions: np.ndarray, reported: np.ndarray
 ) -> tuple[list[np.ndarray], float, float]:
     """Return states and controls at ``fractions``, costates and Hamiltonian at ``reported`` fractions, and two sizes.

@@ -72,6 +72,7 @@ class CollisionScene:
         pairs: Two bodies and the reference frame of each pair, -1 for the world. Shape (n, 3).
         covers: For pairs of hulls, by index, all pairs of bodies that cover the two meshes, shape (m, 2), or none if
             some of them always collide. Hulls are at least as far apart as the nearest of these.
+        cover_pairs: The pairs of bodies, by the index of their pair, whose distances stand for it in `distances`.
         left: Reason why each pair of names is not checked.
 
     Raises:
@@ -91,10 +92,10 @@ class CollisionScene:
     bodies: tuple[PlacedShape, ...] = field(init=False, repr=False)
     pairs: Array = field(init=False, repr=False)
     covers: dict[int, Array] = field(init=False, repr=False)
+    cover_pairs: dict[int, tuple[tuple[int, int], ...]] = field(init=False, repr=False)
     left: dict[tuple[str, str], Reason] = field(init=False, repr=False)
     _parts: RigidParts = field(init=False, repr=False)
     _carriers: tuple[str, ...] = field(init=False, repr=False)
-    _cover_pairs: dict[int, tuple[tuple[int, int], ...]] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         single = isinstance(self.obstacles, (*KINDS, MovingObstacle))
@@ -187,23 +188,26 @@ class CollisionScene:
         cover_pairs: dict[int, tuple[tuple[int, int], ...]] = {}
         covers: dict[int, Array] = {}
         hulls: dict[LinkMesh, int] = {}
-        for (mesh_a, mesh_b), replaced_pairs in close.items():
+        for geometries, replaced_pairs in close.items():
+            sides, covering = [], []
+            for geometry, k in zip(geometries, replaced_pairs[0], strict=True):
+                if isinstance(geometry, LinkMesh) and geometry not in hulls:
+                    hulls[geometry] = len(bodies)
+                    name = f"{own[k].link} hull {len(hulls)}"
+                    bodies.append(PlacedShape(name, geometry.hull, indices[own[k].link]))
+                sides.append(hulls[geometry] if isinstance(geometry, LinkMesh) else k)
+                covering.append([n for n, body in enumerate(own) if geometry in (body, body.mesh)])
             first, second = (own[k] for k in replaced_pairs[0])
-            for mesh, body in ((mesh_a, first), (mesh_b, second)):
-                if mesh not in hulls:
-                    hulls[mesh] = len(bodies)
-                    bodies.append(PlacedShape(f"{body.link} hull {len(hulls)}", mesh.hull, indices[body.link]))
             cover_pairs[len(pairs)] = tuple(replaced_pairs)
             if self.left.get((first.link, second.link)) not in ASSUMED:
-                covering = [[k for k, body in enumerate(own) if body.mesh is mesh] for mesh in (mesh_a, mesh_b)]
                 covers[len(pairs)] = np.array([(i, j) for i in covering[0] for j in covering[1]])
-            pairs.append((hulls[mesh_a], hulls[mesh_b], indices[self._reference_link(first, second)]))
+            pairs.append((sides[0], sides[1], indices[self._reference_link(first, second)]))
         pairs += [(i, len(own) + number, WORLD) for i, number in with_obstacles]
         object.__setattr__(self, "_carriers", tuple(frames))
         object.__setattr__(self, "bodies", tuple(bodies))
         object.__setattr__(self, "pairs", np.array(pairs, dtype=int).reshape(-1, 3))
         object.__setattr__(self, "covers", covers)
-        object.__setattr__(self, "_cover_pairs", cover_pairs)
+        object.__setattr__(self, "cover_pairs", cover_pairs)
 
     def _reference_link(self, first: Body, second: Body) -> str:
         """Return the last link that carries both bodies."""
@@ -229,7 +233,7 @@ class CollisionScene:
     @property
     def assumed(self) -> dict[str, str]:
         """Reason by pair of links, "A and B", for pairs that are excluded by assumption, without proof."""
-        checked_by_hull = {frozenset(self.pair_names(pair)) for pair in self._cover_pairs}
+        checked_by_hull = {frozenset(self.pair_names(pair)) for pair in self.cover_pairs}
         return {
             " and ".join(pair): reason.value
             for pair, reason in self.left.items()
@@ -288,7 +292,7 @@ class CollisionScene:
 
         distances = []
         for pair in indices:
-            gaps = [pair_distance(*bodies) for bodies in self._cover_pairs.get(pair, (self.pairs[pair, :2].tolist(),))]
+            gaps = [pair_distance(*bodies) for bodies in self.cover_pairs.get(pair, (self.pairs[pair, :2].tolist(),))]
             distances.append(gaps[0] if len(gaps) == 1 else soft_minimum(gaps, rounding / 4 + MIN_SOFTNESS_M))
         return ca.vertcat(*distances) if distances else expression(q)[:0]
 
@@ -303,7 +307,7 @@ class CollisionScene:
         Args, Raises: As in `distances`.
         """
         indices, rounding = self._checked_request(pairs, rounding)
-        groups = [self._cover_pairs.get(pair, (tuple(self.pairs[pair, :2].tolist()),)) for pair in indices]
+        groups = [self.cover_pairs.get(pair, (tuple(self.pairs[pair, :2].tolist()),)) for pair in indices]
         softness = rounding / 4 + MIN_SOFTNESS_M
         return distance_gradients(self.machine, self.bodies, self._carriers, self._moving, groups, rounding, softness)
 
@@ -354,19 +358,19 @@ class CollisionScene:
 
     def _close_meshes(
         self, own: Sequence[Body], checked: Sequence[tuple[int, int]]
-    ) -> dict[tuple[LinkMesh, LinkMesh], list[tuple[int, int]]]:
-        """Return pairs of bodies by the two meshes that they cover, for links with at most three joints between them.
+    ) -> dict[tuple[LinkMesh | Body, LinkMesh | Body], list[tuple[int, int]]]:
+        """Return pairs of bodies by what they cover or are, for links with at most three joints between them.
 
-        Such meshes may be only millimetres apart by design, closer than their covers allow. So their hulls are checked,
-        as are those of meshes whose covers always collide.
+        Such links may be only millimetres apart by design, closer than the covers of their meshes allow. So the hulls
+        of meshes are checked, as are those of meshes whose covers always collide.
         """
-        pairs: dict[tuple[LinkMesh, LinkMesh], list[tuple[int, int]]] = {}
+        pairs: dict[tuple[LinkMesh | Body, LinkMesh | Body], list[tuple[int, int]]] = {}
         for i, j in checked:
             first, second = own[i], own[j]
             up, down = self._parts.path(*(self._parts.of_link[body.link] for body in (first, second)))
             is_close = len(up) + len(down) <= 3 or self.left.get((first.link, second.link)) == COVERED
-            if is_close and first.mesh is not None and second.mesh is not None:
-                pairs.setdefault((first.mesh, second.mesh), []).append((i, j))
+            if is_close and (first.mesh is not None or second.mesh is not None):
+                pairs.setdefault((first.mesh or first, second.mesh or second), []).append((i, j))
         return pairs
 
     def _moves(self, link: str) -> bool:

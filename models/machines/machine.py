@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
+from functools import cached_property
 from typing import Any, Protocol, cast
 
 import casadi as ca
@@ -133,15 +134,27 @@ class FixedBase:
         checked_vector(base, 0, "base", "a fixed base has no configuration")
         return Frame(expression(self.rotation), expression(self.translation))
 
-    @on_scalars
     def tip_pose(self, base: Expression, q: Expression) -> Frame:
         """Return the frame of the tip in the world."""
-        return Frame(*map(ca.densify, tip_pose(self.robot, q, self.world_from_base(base))))
+        self.world_from_base(base)
+        return Frame(*self._pose_function(joint_vector(self.robot, q)))
 
-    @on_scalars
     def tip_jacobian(self, base: Expression, q: Expression) -> Expression:
         """Return the geometric Jacobian of the tip. Shape (6, joint_size)."""
-        return tip_jacobian(self.robot, q, self.world_from_base(base))
+        self.world_from_base(base)
+        return self._jacobian_function(joint_vector(self.robot, q))
+
+    @cached_property
+    def _pose_function(self) -> Any:
+        """Function of the joints -> pose of the tip. To inline a function is faster than to build its expressions."""
+        q = ca.SX.sym("q", self.joint_size)
+        return ca.Function("tip_pose", [q], [*map(ca.densify, tip_pose(self.robot, q, self.world_from_base()))])
+
+    @cached_property
+    def _jacobian_function(self) -> Any:
+        """Function of the joints -> Jacobian of the tip."""
+        q = ca.SX.sym("q", self.joint_size)
+        return ca.Function("tip_jacobian", [q], [tip_jacobian(self.robot, q, self.world_from_base())])
 
     @on_scalars
     def tip_twist(self, base: Expression, q: Expression, joint_rates: Expression) -> Expression:

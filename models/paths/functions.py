@@ -46,8 +46,7 @@ def path_function(path: SmoothPath) -> Any:
     knots, columns = _cell_table(checked_instance(path, SmoothPath, "path_function", "path"))
     s = ca.MX.sym("distance")
     clamped = _clamp(s, path.length)
-    cell = ca.low(ca.DM(knots), clamped, {"lookup_mode": "binary"}) if len(knots) > 2 else ca.MX(0)
-    outputs = _cell_function()(ca.MX(ca.DM(columns))[:, cell], clamped)
+    outputs = _cell_function()(_column_at(knots, columns, clamped), clamped)
     return ca.Function("path", [s], list(outputs), ["distance"], ["position", "tangent", "curvature", "curvature_rate"])
 
 
@@ -60,10 +59,22 @@ def turn_function(path: SmoothPath) -> Any:
     columns = np.column_stack([reference, theta.reshape(-1, 18), path.piece_lengths, path.bounds[:-1]]).T
     s = ca.MX.sym("distance")
     clamped = _clamp(s, path.length)
-    piece = ca.low(ca.DM(path.bounds), clamped, {"lookup_mode": "binary"}) if len(path.bounds) > 2 else ca.MX(0)
-    column = ca.MX(ca.DM(columns))[:, piece]
+    column = _column_at(path.bounds, columns, clamped)
     outputs = orientation_function()(column[:4], column[4:22], column[22], (clamped - column[23]) / column[22])
     return ca.Function("turn", [s], list(outputs), ["distance"], ["quaternion", "rate", "acceleration", "jerk"])
+
+
+def _column_at(knots: Array, columns: Array, distance: Any) -> Any:
+    """Return the column of the cell between two knots that contains a distance, by binary search.
+
+    The tables are interpolants, since CasADi copies a constant matrix whenever it evaluates a function.
+    """
+    count = len(knots) - 1
+    if count == 1:
+        return ca.MX(ca.DM(columns))
+    place = ca.interpolant("place", "linear", [knots], np.arange(count + 1.0), {"lookup_mode": ["binary"]})
+    table = ca.interpolant("table", "linear", [np.arange(count)], columns.ravel("F"), {"lookup_mode": ["exact"]})
+    return table(ca.fmin(ca.floor(place(distance)), count - 1))
 
 
 def _clamp(distance: Any, length: float) -> Any:

@@ -11,8 +11,10 @@ from a point between two planes of a split, a line parallel to the planes meets 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -168,7 +170,7 @@ def _fit_capsule(points: Array) -> Capsule:
     k = int(volumes.argmin())
     own, start = extreme_points @ bases[k], np.array([0.0, 0.0, *centres[k], np.sqrt(excess[k])])
     result = scipy.optimize.minimize(
-        lambda x: float(_evaluate_capsules(own, x[None])[0][0]),
+        lambda x: _evaluate_capsule(own, x)[0],
         start,
         method="Nelder-Mead",
         options={
@@ -180,60 +182,58 @@ def _fit_capsule(points: Array) -> Capsule:
     return _enclosing_capsule(_capsule_from_parameters(extreme_points, result.x, bases[k]), points)
 
 
-def _evaluate_capsules(points: Array, parameters: Array) -> tuple[Array, Array, Array, Array, Array, Array]:
-    """Return volume, radius, both ends along the axis, the axis and a point on it for capsules with axes near z.
+def _evaluate_capsule(points: Array, parameters: Array) -> tuple[float, float, float, float, Array, Array]:
+    """Return volume, radius, both ends along the axis, the axis and a point on it for a capsule with its axis near z.
 
-    The parameters, shape (k, 5), are two slopes of the axis, its position across, and the root of the excess radius. A
+    The parameters, shape (5,), are two slopes of the axis, its position across, and the root of the excess radius. A
     radius larger than the enclosing cylinder's lets the caps begin earlier.
     """
-    a, b, x, y, fat = parameters.T
-    one, none, length, width = np.ones_like(a), np.zeros_like(a), np.sqrt(a**2 + b**2 + 1), np.sqrt(1 + a**2)
-    axis = (np.array([a, b, one]) / length).T
-    side = (np.array([one, none, -a]) / width).T
-    other = (np.array([-a * b, width**2, -b]) / (length * width)).T  # axis x side
-    along = axis @ points.T
-    across = (side @ points.T - x[:, None]) ** 2 + (other @ points.T - y[:, None]) ** 2
-    radius = np.sqrt(across.max(axis=1)) * (1 + fat**2)
-    caps = np.sqrt(np.maximum(radius[:, None] ** 2 - across, 0))
-    low, high = (along + caps).min(axis=1), (along - caps).max(axis=1)
-    middle = (low + high) / 2
-    low, high = np.where(low > high, middle, low), np.where(low > high, middle, high)  # a ball encloses all points
-    volume = np.pi * radius**2 * (high - low + 4 / 3 * radius)
-    return volume, radius, low, high, axis, side * x[:, None] + other * y[:, None]
+    a, b, x, y, fat = parameters.tolist()
+    length, width = math.sqrt(a * a + b * b + 1), math.sqrt(1 + a * a)
+    axis = np.array([a, b, 1.0]) / length
+    side = np.array([1.0, 0.0, -a]) / width
+    other = np.array([-a * b, width * width, -b]) / (length * width)  # axis x side
+    along = (axis[None] @ points.T)[0]
+    across = ((side[None] @ points.T)[0] - x) ** 2 + ((other[None] @ points.T)[0] - y) ** 2
+    radius = math.sqrt(across.max()) * (1 + fat * fat)
+    caps = np.sqrt(np.maximum(radius * radius - across, 0))
+    low, high = float((along + caps).min()), float((along - caps).max())
+    if low > high:  # a ball encloses all points
+        low = high = (low + high) / 2
+    volume = np.pi * (radius * radius) * (high - low + 4 / 3 * radius)
+    return volume, radius, low, high, axis, side * x + other * y
 
 
 def _approximate_capsules(points: Array, bases: Array) -> tuple[Array, Array, Array]:
     """Return the volumes of capsules about the last axes of bases (k, 3, 3), positions across and excess radii."""
-    own = np.einsum("pi,kij->kpj", points, bases)
-    across, along = own[:, :, :2], own[:, :, 2]
-    centres = (across.min(axis=1) + across.max(axis=1)) / 2
+    x, y, along = np.einsum("pi,kij->jkp", points, bases)
+    centre_x, centre_y = ((part.min(axis=1) + part.max(axis=1)) / 2 for part in (x, y))
     rows = np.arange(len(bases))
     for k in range(24):  # shrinking steps towards the farthest point: smallest circle (Badoiu & Clarkson 2003)
-        farthest = ((across - centres[:, None]) ** 2).sum(axis=2).argmax(axis=1)
-        centres = centres + (across[rows, farthest] - centres) / (k + 4)
-    distances = ((across - centres[:, None]) ** 2).sum(axis=2)
-    by_factor = []
-    for factor in SETTINGS.radii:
-        radius = np.sqrt(distances.max(axis=1)) * factor
-        caps = np.sqrt(np.maximum(radius[:, None] ** 2 - distances, 0))
-        length = np.maximum((along - caps).max(axis=1) - (along + caps).min(axis=1), 0)
-        by_factor.append(np.pi * radius**2 * (length + 4 / 3 * radius))
-    volumes = np.array(by_factor)
+        farthest = rows, ((x - centre_x[:, None]) ** 2 + (y - centre_y[:, None]) ** 2).argmax(axis=1)
+        centre_x, centre_y = (
+            centre_x + (x[farthest] - centre_x) / (k + 4),
+            centre_y + (y[farthest] - centre_y) / (k + 4),
+        )
+    distances = (x - centre_x[:, None]) ** 2 + (y - centre_y[:, None]) ** 2
+    radius = np.sqrt(distances.max(axis=1)) * np.array(SETTINGS.radii)[:, None]
+    caps = np.sqrt(np.maximum(radius[:, :, None] ** 2 - distances, 0))
+    length = np.maximum((along - caps).max(axis=2) - (along + caps).min(axis=2), 0)
+    volumes = np.pi * radius**2 * (length + 4 / 3 * radius)
     best = volumes.argmin(axis=0)
-    return volumes[best, rows], centres, np.array(SETTINGS.radii)[best] - 1
+    return volumes[best, rows], np.stack([centre_x, centre_y], axis=1), np.array(SETTINGS.radii)[best] - 1
 
 
 def _approximate_capsule(points: Array, bases: Array) -> Capsule:
     """Return the best capsule about any of the last axes of bases."""
     volumes, centres, excess = _approximate_capsules(points, bases)
     k = int(volumes.argmin())
-    start = np.array([[0.0, 0.0, *centres[k], np.sqrt(excess[k])]])
-    return _capsule_from_parameters(points, start[0], bases[k])
+    return _capsule_from_parameters(points, np.array([0.0, 0.0, *centres[k], np.sqrt(excess[k])]), bases[k])
 
 
 def _capsule_from_parameters(points: Array, parameters: Array, basis: Array) -> Capsule:
-    _, radius, low, high, axis, place = (each[0] for each in _evaluate_capsules(points @ basis, parameters[None]))
-    return Capsule(float(radius) + SETTINGS.growth, basis @ (place + low * axis), basis @ (place + high * axis))
+    _, radius, low, high, axis, place = _evaluate_capsule(points @ basis, parameters)
+    return Capsule(radius + SETTINGS.growth, basis @ (place + low * axis), basis @ (place + high * axis))
 
 
 def _enclosing_capsule(capsule: Capsule, points: Array) -> Capsule:
@@ -246,7 +246,8 @@ def _enclosing_capsule(capsule: Capsule, points: Array) -> Capsule:
 def _segment_distances(points: Array, start: Array, end: Array) -> Array:
     along = end - start
     share = np.clip((points - start) @ along / max(float(along @ along), 1e-300), 0, 1)
-    return np.asarray(np.linalg.norm(points - start - share[:, None] * along, axis=1))
+    square = (points - start - share[:, None] * along) ** 2
+    return np.asarray(np.sqrt(square[:, 0] + square[:, 1] + square[:, 2]))  # faster than a norm of three columns
 
 
 # ------------------------------------------------------------------------------------------------------- cuts
@@ -438,6 +439,7 @@ def _bases(axes: Array) -> Array:
     return np.stack([side, np.cross(axes, side), axes], axis=2)
 
 
+@cache
 def _sphere_points(count: int, half: bool = False) -> Array:
     """Return unit vectors spread evenly over a sphere or hemisphere by the golden angle. Shape (count, 3)."""
     k = np.arange(count) + 0.5
@@ -452,7 +454,7 @@ def _extreme_indices(points: Array, frame: Array, count: int = SETTINGS.extremes
     if len(points) <= count:
         return np.arange(len(points))
     directions = np.split(_sphere_points(count) @ frame.T, count // 32)  # in blocks, which bounds the memory
-    return np.unique(np.concatenate([(points @ each.T).argmax(axis=0) for each in directions]))
+    return np.unique(np.concatenate([(each @ points.T).argmax(axis=1) for each in directions]))
 
 
 def _to_mesh_units(shape: CoverShape, middle: Array, size: float) -> CoverShape:

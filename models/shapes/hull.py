@@ -253,7 +253,7 @@ def _between_hulls(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, n
         if not active.size:
             break
         rows = np.arange(active.size)
-        p, q = first[active], second[active]
+        p, q = (first, second) if active.size == len(first) else (first[active], second[active])
         support_first = p[rows, (p @ v[:, :, None])[:, :, 0].argmax(axis=1)]
         support_second = q[rows, (q @ v[:, :, None])[:, :, 0].argmin(axis=1)]
         square = (v * v).sum(axis=1)

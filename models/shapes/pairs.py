@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from itertools import combinations
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 from warnings import warn
 
 import numpy as np
@@ -233,6 +233,10 @@ def _random_configurations(robot: Robot, low: Array, high: Array, count: int, rn
 # ------------------------------------------------------------------------------------------------- one pair of bodies
 
 
+Poses: TypeAlias = tuple[Array, Array]
+"""Rotations and positions of a rigid part at k configurations. Shapes (k, 3, 3) and (k, 3), m."""
+
+
 class _Lever(NamedTuple):
     """A moving joint between two bodies.
 
@@ -263,22 +267,25 @@ class _PairClassifier:
     configurations: Array
     margin: float
     _by_hulls: dict[tuple[int, int], Reason | None] = field(default_factory=dict)
+    _placed: dict[tuple[str, int], _PlacedBody] = field(default_factory=dict)
+    _poses: dict[str, Poses] = field(default_factory=dict)
 
     def reason(self, first: Body, second: Body) -> tuple[Reason | None, bool]:
         """Return why a pair need not be checked, or None, and whether it is checked although its covers always collide.
 
-        Covers of meshes protrude. Pairs of meshes that are two joints apart, or whose covers always collide, are
-        therefore classified by their convex hulls.
+        Covers of meshes protrude. Pairs with a mesh that are two joints apart, or whose covers always collide, are
+        therefore classified by the convex hulls of meshes.
         """
         pair = self._pair(first.link, first.shape, second.link, second.shape)
         overhang = first.overhang + second.overhang
         reason = pair.classify(self.low, self.high, self.configurations, self.margin, overhang)
         two_joints = len(pair.up) + len(pair.down) == 2
-        if first.mesh is None or second.mesh is None or not (reason != NEVER if two_joints else reason == COVERED):
+        if not (first.mesh or second.mesh) or not (reason != NEVER if two_joints else reason == COVERED):
             return reason, False
-        key = id(first.mesh), id(second.mesh)
+        key = id(first.mesh or first), id(second.mesh or second)
         if key not in self._by_hulls:
-            hulls = self._pair(first.link, first.mesh.hull, second.link, second.mesh.hull)
+            shapes = [each.mesh.hull if each.mesh else each.shape for each in (first, second)]
+            hulls = self._pair(first.link, shapes[0], second.link, shapes[1])
             if two_joints:
                 self._by_hulls[key] = hulls.check_on_grid(self.low, self.high)
             else:
@@ -292,23 +299,50 @@ class _PairClassifier:
     def _pair(self, first_link: str, first: Shape, second_link: str, second: Shape) -> _BodyPair:
         parts = self.parts
         up, down = parts.path(parts.of_link[first_link], parts.of_link[second_link])
-        first, second = first.placed(*parts.pose[first_link]), second.placed(*parts.pose[second_link])
-        return _BodyPair(self.robot, first, second, up, down)
+        poses = [self._pose(parts.of_link[link]) for link in (first_link, second_link)]
+        bodies = self._place(first_link, first), self._place(second_link, second)
+        return _BodyPair(self.robot, *bodies, up, down, _relative_poses(*poses))
+
+    def _place(self, link: str, shape: Shape) -> _PlacedBody:
+        """Return a shape of a link in the frame of its rigid part."""
+        key = link, id(shape)
+        if key not in self._placed:
+            self._placed[key] = _PlacedBody(shape.placed(*self.parts.pose[link]))
+        return self._placed[key]
+
+    def _pose(self, part: str) -> Poses:
+        """Return the poses of a rigid part in the root's at the first configurations."""
+        if part not in self._poses:
+            q = self.configurations[: SETTINGS.first_configurations]
+            step = self.parts.step.get(part)
+            origin = np.tile(np.eye(3), (len(q), 1, 1)), np.zeros((len(q), 3))
+            self._poses[part] = origin if step is None else _moved(self.robot, self._pose(step.above), step, q)
+        return self._poses[part]
+
+
+class _PlacedBody:
+    """A body in the frame of its rigid part, and a ball around it, given by its centre and radius."""
+
+    def __init__(self, shape: Shape) -> None:
+        self.shape, core = shape, shape.core
+        self.centre = (core.min(axis=0) + core.max(axis=0)) / 2
+        self.radius = shape.reach(self.centre)
 
 
 @dataclass(frozen=True)
 class _BodyPair:
-    """Two bodies, in the frames of their rigid parts, and the joints between them."""
+    """Two bodies, the joints between their rigid parts, and their relative poses at the first configurations."""
 
     robot: Robot
-    first: Shape
-    second: Shape
+    first: _PlacedBody
+    second: _PlacedBody
     up: list[JointStep]
     down: list[JointStep]
+    start: Poses = (np.eye(3)[None], np.zeros((1, 3)))
 
     def classify(self, low: Array, high: Array, configurations: Array, margin: float, overhang: float) -> Reason | None:
         """Return ALWAYS, COVERED or NEVER, or None for bodies that are to be checked."""
-        colliding = self.bounds(configurations[: SETTINGS.first_configurations])[0] <= 0
+        colliding = self.bounds_at(self.start)[0] <= 0
         if colliding.all():
             largest = float(self.distance_bounds(*self._relative(configurations)).max())
             if largest <= 0:
@@ -346,9 +380,12 @@ class _BodyPair:
 
         Bounding balls suffice where they prove a distance greater than `above`, m.
         """
-        turn, shift = self._relative(q)
-        (a, radius_a), (b, radius_b) = _bounding_ball(self.first), _bounding_ball(self.second)
-        bounds = np.linalg.norm(shift + turn @ b - a, axis=1) - radius_a - radius_b
+        return self.bounds_at(self._relative(q), above)
+
+    def bounds_at(self, poses: Poses, above: float | Array = 0.0) -> tuple[Array, NDArray[np.bool_]]:
+        """Return the same as `bounds` for poses of the second body's rigid part in the first body's."""
+        (turn, shift), first, second = poses, self.first, self.second
+        bounds = np.linalg.norm(shift + turn @ second.centre - first.centre, axis=1) - first.radius - second.radius
         close: NDArray[np.bool_] = np.asarray(bounds <= above + MARGIN_M)
         if close.any():
             bounds[close] = np.maximum(bounds[close], self.distance_bounds(turn[close], shift[close]))
@@ -356,38 +393,31 @@ class _BodyPair:
 
     def distance_bounds(self, turn: Array, shift: Array) -> Array:
         """Return lower bounds of the distances for poses of the second body, exact where the search has converged."""
-        first, second = (np.repeat(p, 2, axis=0) if len(p) == 1 else p for p in (self.first.core, self.second.core))
+        shapes = self.first.shape, self.second.shape
+        first, second = (np.repeat(each.core, 2, axis=0) if len(each.core) == 1 else each.core for each in shapes)
         first, second = (
             np.broadcast_to(first, (len(turn), *first.shape)),
             second @ turn.transpose(0, 2, 1) + shift[:, None],
         )
-        direction = nearest_directions(first, second, (isinstance(self.first, Box), isinstance(self.second, Box)))[0]
-        return gap_along(direction, first, second) - (self.first.swept_radius + self.second.swept_radius)
+        direction = nearest_directions(first, second, (isinstance(shapes[0], Box), isinstance(shapes[1], Box)))[0]
+        return gap_along(direction, first, second) - (shapes[0].swept_radius + shapes[1].swept_radius)
 
-    def _relative(self, q: Array) -> tuple[Array, Array]:
-        """Return the pose of the second body's rigid part in the first body's. Shapes (k, 3, 3) and (k, 3)."""
-        turn, shift = self._chain(self.down, q)
-        back, away = self._chain(self.up[::-1], q)
-        back = back.transpose(0, 2, 1)
-        return back @ turn, np.einsum("kij,kj->ki", back, shift - away)
-
-    def _chain(self, steps: Sequence[JointStep], q: Array) -> tuple[Array, Array]:
-        turn, shift = np.tile(np.eye(3), (len(q), 1, 1)), np.zeros((len(q), 3))
-        for step in steps:
-            column, ratio, offset = self.robot.couplings[step.joint.name]
-            position = ratio * q[:, column] + offset
-            shift = shift + turn @ step.translation
-            turn = turn @ step.rotation
-            if step.joint.kind == "prismatic":
-                shift = shift + position[:, None] * (turn @ step.joint.axis)
-            else:
-                turn = turn @ _axis_rotations(np.asarray(step.joint.axis), position)
-        return turn, shift
+    def _relative(self, q: Array) -> Poses:
+        """Return the pose of the second body's rigid part in the first body's."""
+        first = second = np.tile(np.eye(3), (len(q), 1, 1)), np.zeros((len(q), 3))
+        for step in self.up[::-1]:
+            first = _moved(self.robot, first, step, q)
+        for step in self.down:
+            second = _moved(self.robot, second, step, q)
+        return _relative_poses(first, second)
 
     def _proves_apart(self, low: Array, high: Array, margin: float) -> bool:
         """Return whether the distance is proven to stay above `margin`, m, by bisection of the joint space."""
+        columns = sorted({self.robot.couplings[step.joint.name].column for step in (*self.up, *self.down)})
+        budget = SETTINGS.boxes // 4 ** max(0, len(columns) - 3)  # bisection of many joints rarely succeeds
+        if not budget:
+            return False
         levers = self._levers(low, high)
-        columns = sorted({lever.column for lever in levers})
         start, end = low.copy(), high.copy()
         for column in columns:
             own = [lever for lever in levers if lever.column == column]
@@ -398,7 +428,6 @@ class _BodyPair:
         centre, half = np.zeros((1, len(low))), np.zeros((1, len(low)))
         centre[0, columns] = (start[columns] + end[columns]) / 2
         half[0, columns] = (end[columns] - start[columns]) / 2
-        budget = SETTINGS.boxes // 4 ** max(0, len(columns) - 3)  # bisection of many joints rarely succeeds
         for _ in range(SETTINGS.rounds):
             slack = np.array([lever.moved(half[:, lever.column]) for lever in levers])  # (levers, boxes)
             need = slack.sum(axis=0)
@@ -426,8 +455,8 @@ class _BodyPair:
         """Return the levers of the joints between the bodies, each with the shorter arm of both sides."""
         chain = [*((step, False) for step in self.up), *((step, True) for step in self.down)]
         reverse = [(step, not down) for step, down in chain[::-1]]
-        arms_second, _ = lever_arms(self.robot, chain, self.second, low, high)
-        arms_first = lever_arms(self.robot, reverse, self.first, low, high)[0][::-1]
+        arms_second, _ = lever_arms(self.robot, chain, self.second.shape, low, high)
+        arms_first = lever_arms(self.robot, reverse, self.first.shape, low, high)[0][::-1]
         levers = []
         for (step, _), *arms in zip(chain, arms_second, arms_first, strict=True):
             column, ratio, _ = self.robot.couplings[step.joint.name]
@@ -448,8 +477,18 @@ def _axis_rotations(axis: Array, angle: Array) -> Array:
     return np.asarray(np.eye(3) + sine * cross + rest * (cross @ cross))
 
 
-def _bounding_ball(shape: Shape) -> tuple[Array, float]:
-    """Return centre and radius of a ball around a shape."""
-    core = shape.core
-    centre = (core.min(axis=0) + core.max(axis=0)) / 2
-    return centre, shape.reach(centre)
+def _moved(robot: Robot, above: Poses, step: JointStep, q: Array) -> Poses:
+    """Return the poses of the part below a joint from those of the part above."""
+    (turn, shift), (column, ratio, offset) = above, robot.couplings[step.joint.name]
+    position = ratio * q[:, column] + offset
+    shift = shift + turn @ step.translation
+    turn = turn @ step.rotation
+    if step.joint.kind == "prismatic":
+        return turn, shift + position[:, None] * (turn @ step.joint.axis)
+    return turn @ _axis_rotations(np.asarray(step.joint.axis), position), shift
+
+
+def _relative_poses(first: Poses, second: Poses) -> Poses:
+    """Return the second poses in the frames of the first."""
+    back = first[0].transpose(0, 2, 1)
+    return back @ second[0], (back @ (second[1] - first[1])[:, :, None])[:, :, 0]

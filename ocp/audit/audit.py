@@ -230,18 +230,18 @@ def audit(
     p = form.parameter_vector(solution.parameters)
     bounds = form.bound_values(p)
     grid = fine_grid(solution)
-    size = sizes_along(form, grid, solution.horizon, p, bounds)
-    along = Linearisation(form, solution, p, bounds, size)
+    size = sizes_along(form, grid, solution.horizon, p=p, bounds=bounds)
+    along = Linearisation(form, solution, p, bounds, sizes=size)
     motion = reintegrate(along, grid)
     check_time()
 
     findings = []
     is_unstable = motion.is_unstable(integration)
     findings.append(integration_finding(motion, integration, is_unstable))
-    findings.append(worst("integration error of one interval", motion.local_errors, motion.t, integration))
+    findings.append(_worst("integration error of one interval", motion.local_errors, motion.t, integration))
     judged_states, running = (motion.local, motion.local_cost) if is_unstable else (motion.states, motion.cost)
-    final = form.terminal_cost(judged_states[-1], judged_states[0], motion.controls[0], solution.horizon, p)
-    cost = cost_finding(solution, running, final, size, integration)
+    final = form.terminal_cost(judged_states[-1], judged_states[0], motion.controls[0], horizon=solution.horizon, p=p)
+    cost = _cost_finding(solution, running, final, size, integration)
     findings.append(cost)
     findings.append(reported_finding(solution, size, integration))
     findings.append(horizon_finding(form, solution, bounds))
@@ -259,8 +259,10 @@ def audit(
 
     clearances = {name: clearance(form, each, solution, p) for name, each in problem.declared.apart.items()}
     findings += [clearance_finding(each, limits.get(name, CLEARANCE_TOLERANCE_M)) for name, each in clearances.items()]
-    findings.append(jump("state jump, relative", solution.state_interpolant, solution.horizon, size.state, integration))
-    findings.append(jump("control jump, relative", solution.control_interpolant, solution.horizon, size.control, None))
+    findings.append(
+        _jump("state jump, relative", solution.state_interpolant, solution.horizon, size.state, integration)
+    )
+    findings.append(_jump("control jump, relative", solution.control_interpolant, solution.horizon, size.control, None))
     is_sound = all(finding.passed for finding in findings)
     # an infeasible plan needs no best multipliers
     optimum = optimality(form, solution, p, bounds, along=along, allowed=lost if is_sound else np.inf)
@@ -311,7 +313,7 @@ def optimality_findings(
         Finding(COST_LOST, share, lost, None, f"{optimum.lost.sum():.3g} of the cost"),
         Finding("costate equation, relative", optimum.adjoint.total / errors, costates),
         Finding("costates beside the best, relative", optimum.costate_error, best_costates),
-        worst(
+        _worst(
             "costates between the nodes, relative", optimum.adjoint.between / errors, optimum.adjoint.t[:-1], costates
         ),
         Finding("transversality, relative", optimum.adjoint.ends.transversality / errors, costates),
@@ -324,7 +326,7 @@ def optimality_findings(
     limit = None if second.upwards is None or not share <= lost else 0.0
     rows.append(Finding("curvature downwards, relative", downwards, limit, second.time, note))
     if form.nu:
-        rows.append(worst("stationarity, relative", optimum.stationarity, optimum.t, None))
+        rows.append(_worst("stationarity, relative", optimum.stationarity, optimum.t, None))
     change = optimum.hamiltonian.drift
     name = "Hamiltonian drift, relative" if form.autonomous else "Hamiltonian change, relative"
     note = f"{change:.2e} in cost per second" + ("" if form.autonomous else "; time enters the problem")
@@ -345,19 +347,19 @@ def integration_finding(motion: Reintegration, limit: float, is_unstable: bool) 
     if is_unstable:
         notes.append(f"unstable dynamics amplify {motion.added[-1]:.2g}, the sum of the defects of the intervals")
     effective_limit = None if is_unstable else limit
-    return worst("integration error, relative", motion.errors, motion.t, effective_limit, "; ".join(notes))
+    return _worst("integration error, relative", motion.errors, motion.t, effective_limit, "; ".join(notes))
 
 
 def violation_finding(violation: Violation, constraints: float, tolerance: float | None) -> Finding:
     """Return the largest violation, relative to the size or, with a given tolerance, in its own unit."""
     if tolerance is not None:
-        return worst(violation.label, violation.excess, violation.t, tolerance)
+        return _worst(violation.label, violation.excess, violation.t, tolerance)
     k = int(np.argmax(violation.shares))
     size, share = float(violation.sizes[k]), float(violation.shares[k])
     return Finding(violation.label, share * size, constraints * size, float(violation.t[k]) if share > 0 else None)
 
 
-def worst(name: str, values: np.ndarray, times: np.ndarray, limit: float | None, note: str = "") -> Finding:
+def _worst(name: str, values: np.ndarray, times: np.ndarray, limit: float | None, note: str = "") -> Finding:
     """Return the finding of the largest value; nan counts as the largest."""
     if values.size == 0:
         return Finding(name, 0.0, limit, None, note)
@@ -366,7 +368,7 @@ def worst(name: str, values: np.ndarray, times: np.ndarray, limit: float | None,
     return Finding(name, float(clean[k]), limit, float(times[k]) if clean[k] > 0 else None, note)
 
 
-def cost_finding(solution: Solution, running: float, final: float, sizes: Sizes, limit: float) -> Finding:
+def _cost_finding(solution: Solution, running: float, final: float, sizes: Sizes, limit: float) -> Finding:
     """Compare the cost of the re-integrated plan, along it and at its end, with the reported cost."""
     cost = running + final
     size = max(abs(cost), abs(final), abs(solution.cost), sizes.cost)  # parts of the cost may cancel
@@ -387,10 +389,10 @@ def reported_finding(solution: Solution, sizes: Sizes, limit: float) -> Finding:
         values = stack(pool, len(errors))
         sides = np.abs(curve(at).reshape(2, len(errors), -1 if values.size else 0) - values) / size
         errors = np.maximum(errors, sides.max(axis=2, initial=0.0).min(axis=0))
-    return worst("reported values, relative", errors, solution.t, limit)
+    return _worst("reported values, relative", errors, solution.t, limit)
 
 
-def jump(
+def _jump(
     name: str, interpolant: PiecewisePolynomial, horizon: float, sizes: np.ndarray, limit: float | None
 ) -> Finding:
     """Return the largest jump between two segments of a curve, relative to the sizes of its entries."""
@@ -400,4 +402,4 @@ def jump(
     right = interpolant.within(segments[1:], np.zeros(n - 1))
     jumps = np.abs(right - left)
     note = f"{np.max(jumps, initial=0.0):.3g} in its own unit"
-    return worst(name, (jumps / sizes).max(axis=1, initial=0.0), interpolant.breaks[1:-1] * horizon, limit, note)
+    return _worst(name, (jumps / sizes).max(axis=1, initial=0.0), interpolant.breaks[1:-1] * horizon, limit, note)

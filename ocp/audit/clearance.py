@@ -232,7 +232,7 @@ def _track_of(form: Formulation, apart: Separation, solution: Solution, p: np.nd
         controls = np.zeros((len(at), form.nu))
         return frames_of(form.sampled(outputs, curve(at), controls, at * horizon, horizon, p, cache_as=kept)[0])
 
-    prescribed = PrescribedMotion(apart, form.separations[apart.name], form.t, [form.p], [p])
+    prescribed = PrescribedMotion(apart, form.separations[apart.name], form.t, parameters=[form.p], values=[p])
     return Track(curve.breaks, horizon, *_rate_bounds(curve, columns, horizon), False, frames, prescribed)
 
 

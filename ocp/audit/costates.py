@@ -383,9 +383,11 @@ def end_limits(along: Linearisation) -> EndLimits:
     size = np.concatenate([sizes.end, sizes.start])
     horizon, place = along.solution.horizon, form.bounds.places["horizon"]
     horizon_limits = Limits(
-        np.array([[horizon]]), low[place], high[place], low[place] == high[place], np.array([horizon])
+        np.array([[horizon]]), low[place], high[place], low[place] == high[place], size=np.array([horizon])
     )
-    parts = [(Limits(along.end_row[None], low[index], high[index], equal, size), along.end_y, np.arange(len(index)))]
+    parts = [
+        (Limits(along.end_row[None], low[index], high[index], equal, size=size), along.end_y, np.arange(len(index)))
+    ]
     parts.append((horizon_limits, np.eye(2 * nx + 1)[-1:], np.array([-1])))
     for k, entries in ((-1, [*range(nx), 2 * nx]), (0, [*range(nx, 2 * nx), 2 * nx])):
         slope = np.zeros((along.node_limits_x.shape[1], 2 * nx + 1))

@@ -48,6 +48,7 @@ class Limits:
         low: np.ndarray,
         high: np.ndarray,
         equal: np.ndarray,
+        *,
         size: np.ndarray,
         tightened: Any = (0.0, 0.0),
     ) -> None:
@@ -114,7 +115,7 @@ class Linearisation:
         pseudo_inverses: Cache of :func:`ocp.audit.principle.pseudo_inverse_of`.
     """
 
-    def __init__(self, form: Formulation, solution: Solution, p: np.ndarray, bounds: Bounds, sizes: Sizes) -> None:
+    def __init__(self, form: Formulation, solution: Solution, p: np.ndarray, bounds: Bounds, *, sizes: Sizes) -> None:
         self.form, self.solution, self.p, self.bounds, self.sizes = form, solution, p, bounds, sizes
         mesh = solution.control_interpolant.breaks
         self.mesh, self.width = mesh, np.diff(mesh)
@@ -257,7 +258,8 @@ class Linearisation:
         value = np.hstack([self.x, self.u, self.row])
         by_point = np.repeat(tightening, q, axis=1)
         self.control_limits, self.state_limits = (
-            Limits(value[:, k], low[k], high[k], equal[k], size[k], by_point[:, :, k]) for k in (controls, states)
+            Limits(value[:, k], low[k], high[k], equal[k], size=size[k], tightened=by_point[:, :, k])
+            for k in (controls, states)
         )
         self.low, self.high = (np.tile(side[nx : nx + nu], (n * q, 1)) for side in (low, high))
         eye = np.broadcast_to(np.eye(nu), (n * q, nu, nu))
@@ -277,7 +279,9 @@ class Linearisation:
         row, row_y = form.sampled(still, *point, cache_as="rows of the states")
         before, after = np.maximum(np.arange(n + 1) - 1, 0), np.minimum(np.arange(n + 1), n - 1)
         at_nodes = np.maximum(tightening[:, before], tightening[:, after])[:, :, states]
-        self.node_limits = Limits(np.hstack([x, row]), low[states], high[states], equal[states], size[states], at_nodes)
+        self.node_limits = Limits(
+            np.hstack([x, row]), low[states], high[states], equal[states], size=size[states], tightened=at_nodes
+        )
         self.node_limits_x = np.zeros((n + 1, len(states), nx + 1))
         self.node_limits_x[:, :nx, :nx] = np.eye(nx)
         self.node_limits_x[:, nx:] = row_y.reshape(n + 1, nx + 1, len(self.still)).transpose(0, 2, 1)

@@ -358,7 +358,7 @@ def optimality(
         along: Its linearisation, if known.
         allowed: Share of the cost above which multipliers are searched that fit better than the reported costates.
     """
-    along = along or Linearisation(form, solution, p, bounds, sizes(form, solution, p, bounds))
+    along = along or Linearisation(form, solution, p, bounds, sizes=sizes(form, solution, p, bounds))
     if not (along.finite and np.isfinite(solution.cost)):
         return undefined(along, hamiltonian(form, solution, p))
     cost = abs(solution.cost) or along.slope_size or 1.0

@@ -83,7 +83,7 @@ def find_control_multipliers(
     unit, control_limits, mixed = along.control_size, along.control_limits, along.mixed.size
     gradient, directions = slope(along, costate) * unit, along.control_limits_u * unit
     inverse = pseudo_inverse_of(along, control_limits.near)
-    multipliers = balance(gradient, directions, control_limits.lower, control_limits.upper, inverse)
+    multipliers = balance(gradient, directions, control_limits.lower, control_limits.upper, inverse=inverse)
     across = np.zeros(len(multipliers), bool)
     if curved is None or along.form.path.equality[along.mixed].all():
         return multipliers, across
@@ -141,7 +141,7 @@ def pseudo_inverses(rows: np.ndarray, active: np.ndarray) -> np.ndarray:
 
 
 def balance(
-    gradient: np.ndarray, directions: np.ndarray, lower: np.ndarray, upper: np.ndarray, inverse: np.ndarray
+    gradient: np.ndarray, directions: np.ndarray, lower: np.ndarray, upper: np.ndarray, *, inverse: np.ndarray
 ) -> np.ndarray:
     """Return the multipliers (M, m) that minimise |gradient (M, n) + directions (M, m, n)' multipliers| at each point.
 

@@ -214,7 +214,7 @@ class Flow:
         for at in range(0, padded, SETTINGS.blocks * SETTINGS.block):
             check_time()
             part = slice(at, at + SETTINGS.blocks * SETTINGS.block)
-            evaluate_in_blocks(self._step, SETTINGS.block, data[part], [after[part], errors[part]], state)
+            evaluate_in_blocks(self._step, SETTINGS.block, data[part], [after[part], errors[part]], previous=state)
         return after[:count], np.abs(errors[:count])
 
 
@@ -289,7 +289,7 @@ def violations(along: Linearisation, motion: Reintegration, states: np.ndarray, 
                 bounded = low == high
             if np.any(bounded):
                 excess = excess_over(values[at][:, place][:, bounded], low[bounded], high[bounded])
-                results.append(violation_of(f"{description} {name}", name, motion.t[at], excess, size[place][bounded]))
+                results.append(_violation_of(f"{description} {name}", name, motion.t[at], excess, size[place][bounded]))
     initial = states[0], motion.controls[0]
     entries = LIMIT_SHARE * np.concatenate([sizes.state, sizes.control])
     point = states, motion.controls, motion.t, horizon, p, (form.x0, initial[0]), (form.u0, initial[1])
@@ -317,14 +317,14 @@ def violations(along: Linearisation, motion: Reintegration, states: np.ndarray, 
         # judge a violation by its local rate of change
         if kind != "watch" and np.any(excess[at_max] > SOLVER_SHARE * size[at_max]):
             samples = x[at_max[0]], u[at_max[0]], t[at_max[0]]
-            _, change = row_changes(form, kind, samples, initial, horizon, p, entries)
+            _, change = row_changes(form, kind, samples, initial, horizon=horizon, p=p, moves=entries)
             local_size = change.sum(axis=0)[at_max[1], at_max[1]] / LIMIT_SHARE
             size[at_max] = np.clip(local_size, SOLVER_SHARE * size[at_max], size[at_max])
         with np.errstate(divide="ignore"):
             size = np.minimum(size, rows.tolerance / share)
         for name in rows.names:
             own_rows = rows.of(name)
-            results.append(violation_of(name, name, t, excess[:, own_rows], size[:, own_rows]))
+            results.append(_violation_of(name, name, t, excess[:, own_rows], size[:, own_rows]))
     return results
 
 
@@ -338,7 +338,7 @@ def excess_over(values: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.
     return np.where(np.isnan(values), np.inf, np.maximum(np.maximum(lower - values, values - upper), 0.0))
 
 
-def violation_of(label: str, name: str, t: np.ndarray, excess: np.ndarray, sizes: np.ndarray) -> Violation:
+def _violation_of(label: str, name: str, t: np.ndarray, excess: np.ndarray, sizes: np.ndarray) -> Violation:
     """Return the violation of a constraint from its excess (K, m), relative to sizes (m,) or (K, m)."""
     shares = excess / sizes
     largest = np.argmax(shares, axis=1)[:, None]

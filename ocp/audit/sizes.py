@@ -125,10 +125,10 @@ def sizes(form: Formulation, solution: Solution, p: np.ndarray, bounds: Bounds) 
     its change along the plan, or the sum of its changes when single entries of the states or controls, also of those at
     the start, change by their sizes.
     """
-    return sizes_along(form, fine_grid(solution), solution.horizon, p, bounds)
+    return sizes_along(form, fine_grid(solution), solution.horizon, p=p, bounds=bounds)
 
 
-def sizes_along(form: Formulation, grid: FineGrid, horizon: float, p: np.ndarray, bounds: Bounds) -> Sizes:
+def sizes_along(form: Formulation, grid: FineGrid, horizon: float, *, p: np.ndarray, bounds: Bounds) -> Sizes:
     """Return the sizes as `sizes` does, for a plan on its fine grid."""
     places = form.bounds.places
     fixed = (_select(bounds, places[kind]) for kind in ("initial", "terminal"))
@@ -310,7 +310,7 @@ def _change_by_variables(
     """
     x, u = grid.states[samples], grid.controls[samples]
     initial = grid.states[0], grid.controls[0]
-    values, change = row_changes(form, kind, (x, u, grid.t[samples]), initial, horizon, p, entries[0])
+    values, change = row_changes(form, kind, (x, u, grid.t[samples]), initial, horizon=horizon, p=p, moves=entries[0])
     change = change.max(axis=1)
     moves = np.resize(entries[1], len(change))
     by_moving, by_all = change[moves].sum(axis=0), change.sum(axis=0)
@@ -323,6 +323,7 @@ def row_changes(
     kind: str,
     samples: tuple[np.ndarray, np.ndarray, np.ndarray],
     begin: tuple[np.ndarray, np.ndarray],
+    *,
     horizon: float,
     p: np.ndarray,
     moves: np.ndarray,

@@ -99,7 +99,13 @@ def active_sides(program: Program, outcome: Outcome, arguments: dict[str, np.nda
 
 
 def next_active_set(
-    program: Program, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales, sides: Sides, tolerance: float
+    program: Program,
+    outcome: Outcome,
+    arguments: dict[str, np.ndarray],
+    scales: Scales,
+    *,
+    sides: Sides,
+    tolerance: float,
 ) -> Sides | None:
     """Return the active sides for the next iteration: limits with a multiplier of the right sign, and violated limits.
 
@@ -208,7 +214,7 @@ class Newton:
             if root is None:
                 return None
             steps, start = steps + root.iterations, root
-            next_sides = next_active_set(self._program, root, arguments, scales, sides, ROUNDING_SHARE)
+            next_sides = next_active_set(self._program, root, arguments, scales, sides=sides, tolerance=ROUNDING_SHARE)
             if next_sides is None:
                 return None
             if _same(next_sides, sides):

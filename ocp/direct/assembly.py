@@ -366,7 +366,7 @@ def assemble(transcription: Transcription, parameters: int, functions: Sequence[
         (block.rows[row].ravel(order="F"), block.variables[column].ravel(order="F"))
         for block, (row, column) in zip(blocks, entries, strict=True)
     ]
-    jac = scatter_matrix(entries, parts, transcription.linear, (m, n))
+    jac = _scatter_matrix(entries, parts, transcription.linear, (m, n))
 
     parts = []
     for block, function, call in calls:
@@ -374,7 +374,7 @@ def assemble(transcription: Transcription, parameters: int, functions: Sequence[
         parts += mapped(function.hessian, block, [*call, *weights])
     no_constants = (np.zeros(0, int), np.zeros(0, int), np.zeros(0))
     upper = [hessian_at(function.hessian.sparsity_out(0), block) for block, function, _ in calls]
-    hess = scatter_matrix([at for at, _ in upper], parts, no_constants, (n, n), [factors for _, factors in upper])
+    hess = _scatter_matrix([at for at, _ in upper], parts, no_constants, (n, n), [factors for _, factors in upper])
 
     slope = ca.MX.zeros(parameters)
     if parameters:
@@ -466,7 +466,7 @@ def scatter(places: list[np.ndarray], matrices: list[Any], size: int) -> Any:
     return ca.densify(ca.mtimes(collect, values))  # solvers ask for dense vectors
 
 
-def scatter_matrix(
+def _scatter_matrix(
     places: list[tuple[np.ndarray, np.ndarray]],
     matrices: list[Any],
     constant: tuple[np.ndarray, np.ndarray, np.ndarray],

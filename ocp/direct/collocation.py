@@ -116,12 +116,12 @@ def transcribe(method: Collocation, form: Formulation, staged: bool) -> Transcri
     without_control = ~form.path.uses_control
     nearest = np.concatenate([controls[:, 0], controls[-1:, 0]]).T  # arbitrary controls, for rows without controls
     if piecewise_constant:
-        start = (layout.node[:, :-1], controls[:, 0].T, stages, mesh[:-1])
-        build.path_rows(form.path.select(~without_control), *start)
+        start = controls[:, 0].T
+        build.path_rows(form.path.select(~without_control), layout.node[:, :-1], start, stages, at=mesh[:-1])
         build.node_rows(form.path.select(without_control & form.path.equality), nearest)
         if not radau:
             build.path_rows(
-                form.path.select(~without_control & ~form.path.equality), layout.node_end, start[1], stages, mesh[1:]
+                form.path.select(~without_control & ~form.path.equality), layout.node_end, start, stages, at=mesh[1:]
             )
     inequality = form.path.select(without_control & ~form.path.equality)
     build.node_rows(inequality, nearest, first_only=radau)
@@ -160,4 +160,11 @@ def transcribe(method: Collocation, form: Formulation, staged: bool) -> Transcri
     by_point, by_sample = states.reshape(n, -1).T, controls.reshape(n, -1).T
     interpolants = Interpolants(mesh, nodes, by_point, mesh, samples, by_sample, np.zeros((0, n)))
     costate_nodes = report[0] + (report[1] == 1.0)
-    return build.finish(report, report_states, costate_rows, costate_nodes, costate_scale, interpolants)
+    return build.finish(
+        report,
+        report_states,
+        costate_rows,
+        costate_nodes=costate_nodes,
+        costate_scale=costate_scale,
+        interpolants=interpolants,
+    )

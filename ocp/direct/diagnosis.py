@@ -66,6 +66,7 @@ def diagnosis(
     built: Built,
     outcome: Outcome,
     arguments: dict[str, np.ndarray],
+    *,
     horizon: float,
     solution: Any,
     elastic: Elastic | None,
@@ -220,7 +221,7 @@ class Elastic:
 
 
 def elastic_plan(
-    built: Built, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales, horizon: float
+    built: Built, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales, *, horizon: float
 ) -> Elastic | None:
     """Return the plan that satisfies dynamics and fixed ends and violates the other constraints least.
 
@@ -257,7 +258,7 @@ def elastic_plan(
     jac = ca.horzcat(ca.mtimes(rows, jacobian), ca.DM(rows.shape[0], k)) + columns
     hessian = program.hessian(v, p, weight * sigma, ca.mtimes(rows.T, lam))
     title = f"conflicts in {built.problem.name}"
-    progress = IterationMonitor(n + k, rows.shape[0], p.numel(), title, show=True)
+    progress = IterationMonitor(n + k, rows.shape[0], p.numel(), title=title, show=True)
     options = {
         "grad_f": ca.Function("g", [x, p], [f, ca.vertcat(weight * slope, soft.prices)], ["x", "p"], ["f", "g"]),
         "jac_g": ca.Function("j", [x, p], [g, jac], ["x", "p"], ["g", "j"]),

@@ -75,7 +75,7 @@ def initial_point(form: Formulation, transcription: Transcription, guess: Guess,
                 curve = default(form, role, entries, bounds)
             else:
                 with error_names(name):
-                    curve = trajectory(name, value, entries.stop - entries.start, horizon, times)
+                    curve = _trajectory(name, value, entries.stop - entries.start, horizon, times)
             with error_names(name):
                 table[:, entries] = curve(fractions)
             for i in np.flatnonzero(~np.isfinite(table[:, entries]).all(axis=1)):
@@ -117,7 +117,7 @@ def shifted_indices(transcription: Transcription, intervals: int) -> tuple[np.nd
     return indices[0], indices[1]
 
 
-def trajectory(name: str, value: Any, size: int, horizon: float, times: Any) -> Trajectory:
+def _trajectory(name: str, value: Any, size: int, horizon: float, times: Any) -> Trajectory:
     """Return a guess as a function of the fraction: from a function of time, from samples (M, n) or from a value."""
     if isinstance(value, Samples) and value.values.shape[1] == size:
         return lambda at: value.over(at * horizon)
@@ -249,6 +249,7 @@ def alternative_starts(
     transcription: Transcription,
     point: np.ndarray,
     p: np.ndarray,
+    *,
     bounds: tuple[np.ndarray, np.ndarray],
 ) -> Iterator[tuple[str, np.ndarray]]:
     """Yield the name and the variables of each alternative start, computed on demand.

@@ -105,7 +105,7 @@ class Outcome:
 
 
 def build_solver(
-    program: Program, solver: str, options: dict[str, Any], stages: Stages | None, title: str
+    program: Program, solver: str, options: dict[str, Any], *, stages: Stages | None, title: str
 ) -> tuple[Any, IterationMonitor | FatropMonitor]:
     """Return the casadi solver of a program, and the callback that stops it.
 
@@ -121,7 +121,7 @@ def build_solver(
     nlp = program.nlp
     progress: IterationMonitor | FatropMonitor
     if solver in ("ipopt", "sleqp"):
-        progress = IterationMonitor(n, m, n_p, title, not solver_options["print_level"])
+        progress = IterationMonitor(n, m, n_p, title=title, show=not solver_options["print_level"])
         settings["iteration_callback"] = progress
     if solver == "ipopt":
         settings["no_nlp_grad"] = True  # compiled functions only have the given derivatives
@@ -305,7 +305,7 @@ def horizon_of(form: Formulation, transcription: Transcription, outcome: Outcome
 
 
 def solution_of(
-    form: Formulation, transcription: Transcription, program: Program, outcome: Outcome, p: np.ndarray, **fields: Any
+    form: Formulation, transcription: Transcription, program: Program, outcome: Outcome, *, p: np.ndarray, **fields: Any
 ) -> Solution:
     """Return the solution that belongs to an outcome.
 
@@ -320,7 +320,7 @@ def solution_of(
     at = mesh[interval] + np.diff(mesh)[interval] * place
     at[-1] = 1.0
     costates = costates_of(program, transcription, outcome, p)
-    gradient = cost_gradient(form, program, transcription, outcome, p) if form.np else np.zeros(0)
+    gradient = _cost_gradient(form, program, transcription, outcome, p) if form.np else np.zeros(0)
     x, u = v[transcription.report_states], controls_at(controls, transcription, interval, place)
     return Solution(
         name=form.name,
@@ -375,7 +375,7 @@ def costates_of(program: Program, transcription: Transcription, outcome: Outcome
     return np.asarray(costates)
 
 
-def cost_gradient(
+def _cost_gradient(
     form: Formulation, program: Program, transcription: Transcription, outcome: Outcome, p: np.ndarray
 ) -> np.ndarray:
     """Return the derivative of the optimal cost in the parameters, also through every active bound."""

@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -79,7 +79,7 @@ class DirectMethod(MeshedMethod):
             SolveError: The time limit of an enclosing call is over.
         """
         try:
-            return Prepared(problem, self, solver, options, compiled, scaling)
+            return Prepared(problem, self, solver, options, compiled=compiled, scaling=scaling)
         except TimeLimitReached as error:
             words = f"problem {problem.name!r} was still being built: {SolverStatus.TIME_LIMIT}: raise time_limit"
             raise SolveError(words, name="time_limit") from error
@@ -101,6 +101,7 @@ class Prepared:
         method: DirectMethod,
         solver: str,
         options: ByName,
+        *,
         compiled: bool = False,
         scaling: bool = True,
     ) -> None:
@@ -121,7 +122,7 @@ class Prepared:
         self._pattern = Pattern(self.formulation, self.transcription, self.program)
         self._known = Predetermined(self.formulation, self.transcription, self.program)
         self._max_iterations = iteration_limit(self.solver_name, own)
-        self._arguments = problem, method, solver, options, compiled, scaling
+        self._arguments, self._compiled = (problem, method, solver, options), compiled
         self._lock = threading.RLock()  # casadi functions are not reentrant
         self.seconds = time.monotonic() - began
 
@@ -132,11 +133,13 @@ class Prepared:
 
     def _built_solver(self, options: dict[str, Any]) -> tuple[Any, Any]:
         """Build the solver with options, and the callback that stops it."""
-        return build_solver(self.scaled, self.solver_name, options, self.transcription.stages, self.problem.name)
+        return build_solver(
+            self.scaled, self.solver_name, options, stages=self.transcription.stages, title=self.problem.name
+        )
 
     def __reduce__(self) -> Any:
         """Pickle and copy as the arguments, to be prepared again."""
-        return type(self), self._arguments
+        return partial(type(self), compiled=self._compiled, scaling=self._scaling), self._arguments
 
     @interruptible
     def solve(
@@ -144,9 +147,9 @@ class Prepared:
         parameters: ByName = None,
         guess: Guess = None,
         check: bool = True,
+        *,
         tighter: Mapping[str, np.ndarray] | None = None,
         time_limit: float | None = None,
-        *,
         shift: int = 0,
     ) -> Solution:
         """Solve with these parameters from this guess, after solves in other threads; see :func:`ocp.methods.solve`.
@@ -231,16 +234,16 @@ class Prepared:
                 return attempts[-1].plan
         decisive = attempts[-1] if attempts[-1].is_final else first
         point = decisive.arguments["x0"]
-        sizes = sizes_along(self._pattern, point, decisive.names, bounds, p)
+        sizes = sizes_along(self._pattern, point, decisive.names, bounds=bounds, p=p)
         raise diagnosis(
             self,
             decisive.outcome,
             decisive.arguments,
-            horizon_of(form, transcription, decisive.outcome, p),
-            decisive.solution,
-            elastic,
-            [str(attempt) for attempt in attempts],
-            scaling_fault(self._pattern, point, p, decisive.scales, sizes),
+            horizon=horizon_of(form, transcription, decisive.outcome, p),
+            solution=decisive.solution,
+            elastic=elastic,
+            attempts=[str(attempt) for attempt in attempts],
+            badly_scaled=scaling_fault(self._pattern, point, p, scales=decisive.scales, sizes=sizes),
         ) from decisive.error
 
     def _alternative_attempts(self, first: Attempt, arguments: dict[str, np.ndarray], bounds: Bounds) -> list[Attempt]:
@@ -253,7 +256,7 @@ class Prepared:
         if first.is_final:
             return attempts
         limits = arguments["lbx"], arguments["ubx"]
-        for start, point in alternative_starts(self.formulation, self.transcription, x0, arguments["p"], limits):
+        for start, point in alternative_starts(self.formulation, self.transcription, x0, arguments["p"], bounds=limits):
             if remaining <= 0 or np.array_equal(point, x0):
                 continue
             attempts.append(self._attempt(start, point, first.names, arguments, bounds, self._short_solver))
@@ -266,7 +269,7 @@ class Prepared:
         """Return the plan with the smallest violation; Ctrl-C raises with the last iterate of the first attempt."""
         horizon = horizon_of(self.formulation, self.transcription, first.outcome, first.arguments["p"])
         try:
-            return elastic_plan(self, first.outcome, first.arguments, first.scales, horizon)
+            return elastic_plan(self, first.outcome, first.arguments, first.scales, horizon=horizon)
         except Interrupted as error:
             raise Interrupted(str(error), first.solution) from error
 
@@ -352,7 +355,7 @@ class Prepared:
         """Return the scales for the sizes along a start; see :func:`sizes_along` for ``names``."""
         if not self._scaling:
             return unit_scales(self.transcription)
-        scales = compute_scales(self._pattern, sizes_along(self._pattern, point, names, bounds, p), point, p)
+        scales = compute_scales(self._pattern, sizes_along(self._pattern, point, names, bounds=bounds, p=p), point, p)
         if getattr(self.method, "integrator", "") == "cvodes":
             # its tolerances are absolute: do not enlarge the adjoint variables
             return dataclasses.replace(scales, cost=max(scales.cost, 1.0))
@@ -367,7 +370,7 @@ class Prepared:
         """Return the solution that belongs to an outcome."""
         seconds = {"build": self.seconds, "solve": outcome.seconds}
         fields = {"method": self.method.settings, "seconds": seconds, "start": start}
-        return solution_of(self.formulation, self.transcription, self.program, outcome, p, **fields)
+        return solution_of(self.formulation, self.transcription, self.program, outcome, p=p, **fields)
 
 
 @dataclass(frozen=True)

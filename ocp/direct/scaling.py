@@ -175,7 +175,9 @@ def scaled_program(program: Program) -> Program:
 # ---- sizes -------------------------------------------------------------------------------------------------------
 
 
-def sizes_along(pattern: Pattern, point: np.ndarray, intended: Collection[str], bounds: Bounds, p: np.ndarray) -> Sizes:
+def sizes_along(
+    pattern: Pattern, point: np.ndarray, intended: Collection[str], *, bounds: Bounds, p: np.ndarray
+) -> Sizes:
     """Return the sizes of the variables along a start.
 
     Args:
@@ -266,7 +268,7 @@ def compute_scales(pattern: Pattern, sizes: Sizes, point: np.ndarray, p: np.ndar
     return Scales(variables, _powers(largest[pattern.label]), float(2.0 ** np.round(np.log2(cost))))
 
 
-def scaling_fault(pattern: Pattern, point: np.ndarray, p: np.ndarray, scales: Scales, sizes: Sizes) -> str:
+def scaling_fault(pattern: Pattern, point: np.ndarray, p: np.ndarray, *, scales: Scales, sizes: Sizes) -> str:
     """Return a description of bad scaling in a program as it was solved, or ""."""
     form, transcription = pattern.form, pattern.transcription
     scaled_size = sizes.of_variables(transcription) / scales.variables

@@ -50,13 +50,13 @@ def sensitivity(solution: Solution, name: str) -> Sensitivity:
     arguments = transcription.arguments(p, bounds)
     pattern = Pattern(form, transcription, program)
     names = {*form.states, *form.controls, "horizon"}
-    scales = compute_scales(pattern, sizes_along(pattern, v, names, bounds, p), v, p)
+    scales = compute_scales(pattern, sizes_along(pattern, v, names, bounds=bounds, p=p), v, p)
     a, b, c = scales.variables, scales.rows, scales.cost
     rows = np.asarray(program.values(v, p)[1].full()).ravel()
     outcome = Outcome(v, solution.cost, rows, lam, solution.status, solution.message, 0, 0.0)
     at = conditions(program, outcome, arguments, scales)
 
-    slope, change = by_parameters(transcription, v, p, lam, columns)
+    slope, change = _by_parameters(transcription, v, p, lam, columns)
     slope, change = slope * a[:, None] / c, change / b[:, None]
     q = ca.MX.sym("p", len(p))
     moves = ca.Function("moves", [q], [ca.jacobian(side, q)[:, columns] for side in form.bounds.function(q)])(p)
@@ -65,7 +65,7 @@ def sensitivity(solution: Solution, name: str) -> Sensitivity:
     low_g, high_g = (side[transcription.row_bounds] / b[:, None] for side in (low, high))
     at_x = np.where((at.of_bounds > 0)[:, None], high_x, low_x)
     at_g = np.where((at.of_rows > 0)[:, None], high_g, low_g)
-    dv, of_rows, of_bounds = solve_system(at, slope, change, at_x, at_g)
+    dv, of_rows, of_bounds = _solve_system(at, slope, change, at_x, at_g)
 
     # distance to the next limit, and of multipliers to zero
     dg = at.jacobian @ dv + change
@@ -142,7 +142,7 @@ def program_of(solution: Solution) -> tuple[Formulation, Transcription, Program]
     return form, transcription, assemble(transcription, form.np)
 
 
-def by_parameters(
+def _by_parameters(
     transcription: Transcription, v: np.ndarray, p: np.ndarray, lam: np.ndarray, columns: list[int]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return derivatives in some parameters of the gradient of the Lagrangian (n, k) and of the rows (m, k)."""
@@ -163,7 +163,7 @@ def by_parameters(
     return slope, change
 
 
-def solve_system(
+def _solve_system(
     at: Conditions, slope: np.ndarray, change: np.ndarray, at_x: np.ndarray, at_g: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return derivatives of the variables (n, k) and of the multipliers of rows (m, k) and bounds (n, k), scaled.

@@ -94,9 +94,9 @@ def transcribe(method: MultipleShooting, form: Formulation, staged: bool) -> Tra
         build.ends(ends, layout.node[nx:, 0][None], layout.node[nx:, -1][None], at_nodes=True)
     else:
         controls_inside = layout.interval
-        build.path_rows(form.path.select(~without_control), first, controls_inside, stages, mesh[:-1])
+        build.path_rows(form.path.select(~without_control), first, controls_inside, stages, at=mesh[:-1])
         build.path_rows(
-            form.path.select(~without_control & ~form.path.equality), last, controls_inside, stages, mesh[1:]
+            form.path.select(~without_control & ~form.path.equality), last, controls_inside, stages, at=mesh[1:]
         )
         build.node_rows(form.path.select(without_control), np.column_stack([controls_inside, controls_inside[:, -1]]))
         build.ends((np.ones(1), np.ones(1)), controls_inside[:, 0][None], controls_inside[:, -1][None], at_nodes=False)
@@ -109,7 +109,14 @@ def transcribe(method: MultipleShooting, form: Formulation, staged: bool) -> Tra
     dense = dense_function(form, method)
     interpolants = Interpolants(breaks, THIRDS, inputs, mesh, control_nodes, np.vstack([*controls]), data, dense)
     nodes = np.arange(n + 1)
-    return build.finish(report, layout.node[:nx].T, costate_rows, nodes, costate_scale, interpolants)
+    return build.finish(
+        report,
+        layout.node[:nx].T,
+        costate_rows,
+        costate_nodes=nodes,
+        costate_scale=costate_scale,
+        interpolants=interpolants,
+    )
 
 
 # ---- integration of one interval -----------------------------------------------------------------------------

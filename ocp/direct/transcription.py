@@ -63,7 +63,9 @@ def plain_layout(intervals: int, node_size: int, interval_size: int, free_horizo
     return Layout(size + free_horizon, node, node[:, 1:], grid[node_size:], horizon, initial)
 
 
-def staged_layout(intervals: int, node_size: int, interval_size: int, free_horizon: bool, keep_initial: bool) -> Layout:
+def _staged_layout(
+    intervals: int, node_size: int, interval_size: int, free_horizon: bool, keep_initial: bool
+) -> Layout:
     """Return the layout by stages: node k, copies of horizon and start, interval k, copy of its end."""
     carried = node_size + free_horizon + node_size * keep_initial
     inputs = interval_size + node_size
@@ -113,7 +115,7 @@ class TranscriptionBuilder:
         form = self.formulation
         size = form.nx + self.node_controls
         shape = (self.intervals, size, self.interval_size, form.horizon_is_free)
-        self.layout: Layout = staged_layout(*shape, form.ties_ends) if self.staged else plain_layout(*shape)
+        self.layout: Layout = _staged_layout(*shape, form.ties_ends) if self.staged else plain_layout(*shape)
         self.variable_bounds = np.full(self.layout.size, form.bounds.places["free"][0])
         self.variable_role = np.full(self.layout.size, "", dtype="<U8")
         self.variable_entry = np.zeros(self.layout.size, dtype=int)
@@ -200,7 +202,7 @@ class TranscriptionBuilder:
         self._linear.append((targets.ravel(), variables.ravel(), entries.ravel().astype(float)))
 
     def path_rows(
-        self, rows: Rows, states: np.ndarray, controls: np.ndarray, stages: np.ndarray, at: np.ndarray
+        self, rows: Rows, states: np.ndarray, controls: np.ndarray, stages: np.ndarray, *, at: np.ndarray
     ) -> None:
         """Impose path rows at K points with fractions ``at``, states (nx, K) and controls (nu, K)."""
         if len(rows) == 0 or len(at) == 0:
@@ -220,9 +222,9 @@ class TranscriptionBuilder:
         states = self.layout.node[: self.formulation.nx]
         undetermined = (rows.uses_state & ~self.formulation.initial_is_fixed).any(axis=1) | rows.uses_control
         first = nodes[:1]
-        self.path_rows(rows.select(undetermined), states[:, first], controls[:, first], first, self.mesh[first])
+        self.path_rows(rows.select(undetermined), states[:, first], controls[:, first], first, at=self.mesh[first])
         if not first_only:
-            self.path_rows(rows, states[:, 1:], controls[:, 1:], nodes[1:], self.mesh[1:])
+            self.path_rows(rows, states[:, 1:], controls[:, 1:], nodes[1:], at=self.mesh[1:])
 
     def ends(
         self, basis: tuple[np.ndarray, np.ndarray], first: np.ndarray, last: np.ndarray, *, at_nodes: bool
@@ -295,6 +297,7 @@ class TranscriptionBuilder:
         report: tuple[np.ndarray, np.ndarray],
         report_states: np.ndarray,
         costate_rows: np.ndarray,
+        *,
         costate_nodes: np.ndarray,
         costate_scale: np.ndarray,
         interpolants: Interpolants,

@@ -304,6 +304,7 @@ def newton(
     system: tuple[Any, ...],
     start: np.ndarray,
     data: np.ndarray,
+    *,
     scale: float,
     tolerance: float,
     settings: NewtonSettings = NewtonSettings(),

@@ -91,7 +91,7 @@ class Hamiltonian:
         return self._eliminate("outputs", [self.form.u, self.mu, self.value, switching])
 
     def multipliers(
-        self, free: np.ndarray, x: np.ndarray, u: np.ndarray, lam: np.ndarray, t: np.ndarray, horizon: float, p: Any
+        self, free: np.ndarray, x: np.ndarray, u: np.ndarray, lam: np.ndarray, *, t: np.ndarray, horizon: float, p: Any
     ) -> np.ndarray:
         """Return the multipliers of the path equalities of least-squares stationarity in the free controls. Shape (K,
         m).
@@ -117,7 +117,7 @@ class Hamiltonian:
         form = self.form
         sym = form.sym
         w, bang = sym("w", self.sizes[-1]), sym("bang", self.sizes[-2])
-        control = assemble_control(form, self.smooth, self.linear, w, bang)
+        control = _assemble_control(form, self.smooth, self.linear, w, bang)
         outputs = [ca.densify(out) for out in outputs]
         outputs = ca.substitute(outputs, [form.u, self.mu], [control, w[len(self.smooth) :, :]])
         inner = ca.Function(name, [form.x, self.lam, form.t, form.T, form.p, bang, w], outputs, {"cse": True})
@@ -165,7 +165,7 @@ class Hamiltonian:
         n = len(self.smooth)
         gradient = ca.gradient(self.value, self.form.u)[list(self.smooth)] if n else self.form.problem.symbols(0, 1)
         stacked = ca.densify(ca.vertcat(gradient, self.rows))
-        control = assemble_control(self.form, self.smooth, self.linear, w, bang)
+        control = _assemble_control(self.form, self.smooth, self.linear, w, bang)
         return ca.substitute([stacked], [self.form.u, self.mu], [control, w[n:, :]])[0]
 
     def _has_bounds(self) -> bool:
@@ -202,7 +202,7 @@ class Hamiltonian:
             )
 
 
-def assemble_control(form: Formulation, smooth: Any, linear: Any, w: Any, bang: Any) -> Any:
+def _assemble_control(form: Formulation, smooth: Any, linear: Any, w: Any, bang: Any) -> Any:
     """Return all controls from the smooth ones (first entries of ``w``) and those at their bounds."""
     order = {index: w[i] for i, index in enumerate(smooth)} | {index: bang[i] for i, index in enumerate(linear)}
     return ca.densify(ca.vertcat(form.problem.symbols(0, 1), *[order[i] for i in range(form.nu)]))
@@ -333,7 +333,7 @@ def cost_gradient(ham: Hamiltonian, path: Extremal, p: np.ndarray, bounds: Bound
     weights = (path.widths[:, None] * quadrature_weights(path.places)).ravel()
 
     x0, x1 = path.states[0, 0], path.states[-1, -1]
-    phi_p, phi_horizon, phi_x0, phi_x1 = end_gradients(ham, path, x0, x1, p)
+    phi_p, phi_horizon, phi_x0, phi_x1 = _end_gradients(ham, path, x0, x1, p)
     places = form.bounds.places
     multipliers = np.zeros((2, len(bounds[0])))  # multipliers of lower and upper bounds, with the sign of f + lam . g
     controls = path.controls.reshape(len(weights), -1)
@@ -351,7 +351,7 @@ def cost_gradient(ham: Hamiltonian, path: Extremal, p: np.ndarray, bounds: Bound
     return np.asarray(weights @ by_p + phi_p - form.bounds.pullback(p, multipliers))
 
 
-def end_gradients(
+def _end_gradients(
     ham: Hamiltonian, path: Extremal, x0: np.ndarray, x1: np.ndarray, p: np.ndarray
 ) -> tuple[np.ndarray, float, np.ndarray, np.ndarray]:
     """Return gradients of Phi = terminal cost + nu . end constraints in p, T, the first and the last state."""

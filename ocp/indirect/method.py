@@ -242,12 +242,14 @@ class PreparedIndirect:
             note = f"; seeded by its own direct solution ({seed.method['type']}, {direct.intervals} intervals)"
         began = time.monotonic()
         try:
-            arcs = read_arcs(self.hamiltonian, self.boundary.outputs, seed, p, bounds, self.method.segments)
+            arcs = read_arcs(
+                self.hamiltonian, self.boundary.outputs, seed, p, bounds=bounds, segments=self.method.segments
+            )
         except SolveError as error:
             return self._no_seed("", error, seed, check)
         system = self.boundary.system(arcs)
-        start, data = read_unknowns(self.hamiltonian, seed, arcs, p, bounds, backward=self.boundary.backward)
-        root = newton(system, start, data, float(max(1.0, np.max(np.abs(start)))), self.method.residual)
+        start, data = read_unknowns(self.hamiltonian, seed, arcs, p, bounds=bounds, backward=self.boundary.backward)
+        root = newton(system, start, data, scale=float(max(1.0, np.max(np.abs(start)))), tolerance=self.method.residual)
         root = self._check_order(root, arcs, bounds)
         solution = self._solution(root, arcs, data, p, bounds, note, time.monotonic() - began)
         if root.status is SolverStatus.INTERRUPTED:
@@ -327,7 +329,7 @@ class PreparedIndirect:
         columns = [value.T if np.ndim(value) else value for value in arguments]
         control, multiplier = evaluate_at_samples(self.boundary.outputs, *columns)[:2]
         ends = flat[-1, : form.nx], flat[0, : form.nx], np.zeros(form.nu)
-        cost += form.terminal_cost(*ends, horizon, p)
+        cost += form.terminal_cost(*ends, horizon=horizon, p=p)
 
         shape = (len(segments), len(LOBATTO))
         nu_start, nu_end = self.boundary.end_multipliers(root.unknowns, arcs)

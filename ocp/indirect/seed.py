@@ -68,7 +68,7 @@ class ControlArcs:
 
 
 def read_arcs(
-    ham: Hamiltonian, outputs: Any, seed: Solution, p: np.ndarray, bounds: Bounds, segments: int
+    ham: Hamiltonian, outputs: Any, seed: Solution, p: np.ndarray, *, bounds: Bounds, segments: int
 ) -> ControlArcs:
     """Return the arcs from the signs of dH/du along a seed: a positive slope means the lower bound.
 
@@ -183,7 +183,7 @@ def check_chattering(ham: Hamiltonian, events: list[tuple[float, int]], seed: So
 
 
 def read_unknowns(
-    ham: Hamiltonian, seed: Solution, arcs: ControlArcs, p: np.ndarray, bounds: Bounds, *, backward: bool
+    ham: Hamiltonian, seed: Solution, arcs: ControlArcs, p: np.ndarray, *, bounds: Bounds, backward: bool
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return unknowns and data from a seed, in the layout of :class:`ocp.indirect.boundary.BoundaryProblem`.
 
@@ -200,7 +200,7 @@ def read_unknowns(
     for end in ("initial", "terminal"):
         fixed = bounds[0][places[end]] == bounds[1][places[end]]
         ends += [fixed, np.where(fixed, bounds[0][places[end]], 0.0)]
-    guess = control_guess(ham, seed, 0.5 * (fractions[:-1] + fractions[1:]), horizon, p, bounds)
+    guess = control_guess(ham, seed, 0.5 * (fractions[:-1] + fractions[1:]), horizon=horizon, p=p, bounds=bounds)
     data = np.concatenate([[horizon], p, *ends, arcs.bang.ravel(), guess.ravel()])
     if backward:
         return x[-1], data
@@ -219,7 +219,7 @@ def sampled(form: Formulation, seed: Solution, fractions: np.ndarray) -> tuple[n
 
 
 def control_guess(
-    ham: Hamiltonian, seed: Solution, fractions: np.ndarray, horizon: float, p: np.ndarray, bounds: Bounds
+    ham: Hamiltonian, seed: Solution, fractions: np.ndarray, *, horizon: float, p: np.ndarray, bounds: Bounds
 ) -> np.ndarray:
     """Return smooth controls and multipliers of the path equalities at fractions of the horizon. Shape (K, n + m).
 
@@ -231,5 +231,5 @@ def control_guess(
     if len(form.path):
         low, high = (bound[form.bounds.places["control"]] for bound in bounds)
         free = (control > low + RESOLVED_SHARE) & (control < high - RESOLVED_SHARE)
-        mu = ham.multipliers(free, x, control, lam, fractions * horizon, horizon, p)
+        mu = ham.multipliers(free, x, control, lam, t=fractions * horizon, horizon=horizon, p=p)
     return np.hstack([control[:, list(ham.smooth)], mu])

@@ -394,6 +394,7 @@ class ExpressionReader:
         name: str,
         expression: Value,
         known: Sequence[Any],
+        *,
         bounds: tuple[Value, Value],
         unit: str,
         tolerance: Value,
@@ -409,7 +410,7 @@ class ExpressionReader:
         low, high = self.bounds(what, vector.numel(), *bounds)
         return Constraint(name, vector, low, high, unit, read_tolerance(what, tolerance, vector.numel()))
 
-    def horizon(self, what: str, value: Value, lower: Value, upper: Value, guess: float | None) -> Horizon:
+    def horizon(self, what: str, value: Value, lower: Value, upper: Value, *, guess: float | None) -> Horizon:
         """Return a horizon fixed at ``value``, or free from ``lower`` to ``upper``."""
         for label, bound in (("value", value), ("lower", lower), ("upper", upper)):
             _check_number(what, label, bound)

@@ -254,7 +254,7 @@ class PrescribedMotion:
     """
 
     def __init__(
-        self, separation: Separation, placements: Any, time: Any, parameters: Sequence[Any], values: Sequence[Any]
+        self, separation: Separation, placements: Any, time: Any, *, parameters: Sequence[Any], values: Sequence[Any]
     ) -> None:
         what = f"separation {separation.name!r}"
         parts = [placements[k : k + FRAME_ENTRIES] for k in range(0, placements.numel(), FRAME_ENTRIES)]

@@ -233,29 +233,17 @@ class Formulation:
         return float(self.horizon_value) if self.signals else 1.0
 
     def sampled(
-        self,
-        outputs: list[Any] | Callable[[], list[Any]],
-        x: Any,
-        u: Any,
-        t: Any,
-        horizon: Any,
-        p: Any,
-        *more: tuple[Any, Any],
-        cache_as: Any = None,
+        self, outputs: list[Any] | Callable[[], list[Any]], *point: Any, cache_as: Any = None
     ) -> list[np.ndarray]:
-        """Return expressions of (x, u, t, T, p) and of ``more`` symbols at M samples. Shape (M, number of entries)
-        each.
-
-        A matrix is read column by column.
+        """Return expressions of (x, u, t, T, p) at M samples. Shape (M, number of entries) each, column by column.
 
         Args:
-            outputs: Expressions of the symbols of the formulation and of those in ``more``, or a function that returns
-                them.
-            x, u: States (M, nx), controls (M, nu). t: Times, s. Shape (M,).
-            horizon: s. p: Parameters. Shape (np,).
-            more: Pairs of another symbol and its values, (M, n), or (n,) if they are constant.
+            outputs: Expressions of the symbols, or a function that returns them.
+            point: States (M, nx), controls (M, nu), times (M,), s, horizon, s, and parameters (np,); then pairs of
+                another symbol and its values, (M, n), or (n,) if they are constant.
             cache_as: Name under which the compiled function is cached; it must identify the outputs.
         """
+        x, u, t, horizon, p, *more = point
 
         def make() -> Sampler:
             return self.sampler(outputs() if callable(outputs) else outputs, *(symbol for symbol, _ in more))
@@ -271,7 +259,7 @@ class Formulation:
         inputs = [self.x, self.u, self.t, self.T, self.p, self.w, *more]
         return Sampler(inputs, [symbols(output) for output in outputs])
 
-    def terminal_cost(self, x: np.ndarray, x0: np.ndarray, u0: np.ndarray, horizon: float, p: np.ndarray) -> float:
+    def terminal_cost(self, x: np.ndarray, x0: np.ndarray, u0: np.ndarray, *, horizon: float, p: np.ndarray) -> float:
         """Return the terminal cost of a final state, given the state and controls at the start."""
         symbols = [self.x, self.x0, self.u0, self.t, self.T, self.p]
         function = self.cached("terminal", lambda: ca.Function("terminal", symbols, [self.terminal]))

@@ -257,14 +257,19 @@ class BodyPairs:
         first, second = (self._in_world(frames, at, self._middles[k], self._frames[k]) for k in bodies)
         return self._ball_distance(second - first, pair)
 
-    def distances(self, frames: Frames, near: float = np.inf) -> np.ndarray:
+    def distances(self, frames: Frames, near: float = np.inf, pairs: Sequence[int] | None = None) -> np.ndarray:
         """Return distances of all pairs at all samples, shape (M, n), m; those above `near` may be lower bounds above
-        `near`.
+        `near`. With `pairs`, the indices of the only pairs that count, the others are infinite.
         """
         distances = self.all_balls(frames)
+        count = distances.shape[1]
+        excluded = np.setdiff1d(np.arange(count), np.arange(count) if pairs is None else pairs)
+        distances[:, excluded] = np.inf
         at, pair = np.nonzero(~(distances >= near))
         distances[at, pair] = self.gaps(frames, at, pair, near)
-        return np.where(np.isfinite(distances), distances, -np.inf)
+        distances = np.where(np.isfinite(distances), distances, -np.inf)
+        distances[:, excluded] = np.inf
+        return distances
 
     def all_balls(self, frames: Frames) -> np.ndarray:
         """Return the gaps between the balls that contain the bodies of all pairs at all samples. Shape (M, n), m."""

@@ -161,20 +161,6 @@ class Phases(Problem):
         for what, (gap, unit) in rows.items():
             self.end(what, gap, lower=0.0, upper=0.0, unit=unit)
 
-    def guess(self, plans: Mapping[str, Any]) -> dict[str, Any]:
-        """Return a guess of the whole from plans of single phases, :class:`ocp.solution.Solution`, by name."""
-        guesses: dict[str, Any] = {}
-        for phase, plan in _by_name("plans", plans).items():
-            own = self.of(phase)
-            if not all(hasattr(plan, part) for part in ("states", "controls", "at_fraction")):
-                raise ProblemError(f"phase {phase!r}: a plan is expected, not {plan!r}", name=phase, value=plan)
-            for name in own:
-                if name in plan.states or name in plan.controls:
-                    guesses[f"{phase}.{name}"] = lambda s, plan=plan, name=name: plan.at_fraction(s)[name]
-            if DURATION in own and DURATION not in plan.states:
-                guesses[f"{phase}.{DURATION}"] = plan.horizon
-        return guesses
-
     def minimize(self, running: Any = 0, terminal: Any = 0) -> None:
         """Declare a terminal cost of ends of phases, which is added to the phases' own costs.
 

@@ -273,7 +273,7 @@ class Problem:
         with error_names("horizon"):
             if self.declared.horizon is not None:
                 raise ProblemError(f"{what} is declared twice")
-            self.declared.horizon = self._reader.horizon(what, value, lower, upper, guess)
+            self.declared.horizon = self._reader.horizon(what, value, lower, upper, guess=guess)
         return self.declared.horizon.symbol
 
     def at_start(self, variable: Any) -> Any:
@@ -402,7 +402,9 @@ class Problem:
         parts |= {"covers": {} if covers is None else covers, "assumed": {} if assumed is None else assumed}
         separation = Separation(name, frames, dict(hulls), pairs, least, movers, **parts)
         zeros = [ca.DM.zeros(parameter.shape) for parameter in parameters]
-        PrescribedMotion(separation, frames, self.time, parameters, zeros)  # raises if a motion has no bounds
+        PrescribedMotion(
+            separation, frames, self.time, parameters=parameters, values=zeros
+        )  # raises if a motion has no bounds
         self.declared.apart[name] = separation
 
     def minimize(self, running: Value = 0, terminal: Value = 0) -> None:
@@ -497,4 +499,6 @@ class Problem:
     ) -> Constraint:
         """Return a new constraint on the symbols inside the horizon and on the ``known`` ones."""
         self.declared.check_new_constraint(f"{kind} constraint", name)
-        return self._reader.constraint(kind, name, expression, [*self._inner(), *known], bounds, unit, tolerance)
+        return self._reader.constraint(
+            kind, name, expression, [*self._inner(), *known], bounds=bounds, unit=unit, tolerance=tolerance
+        )

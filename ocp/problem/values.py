@@ -147,7 +147,7 @@ class Sampler:
 
 
 def evaluate_in_blocks(
-    function: Any, size: int, inputs: np.ndarray, outputs: list[np.ndarray], previous: np.ndarray | None = None
+    function: Any, size: int, inputs: np.ndarray, outputs: list[np.ndarray], *, previous: np.ndarray | None = None
 ) -> None:
     """Call a casadi function of ``size`` columns side by side, block by block, into existing arrays.
 

@@ -248,7 +248,7 @@ def measured(given: Subject, plan: Solution) -> float:
         there = plan.state_interpolant(mesh[:-1] + width * (k + 1) * step - 1e-13).T
         off.append(float((np.abs(y[:-1] - there).max(axis=1) / np.where(size_x > 0, size_x, np.inf)).max()))
     ends = plan.state_interpolant(np.array([0.0, 1.0]))
-    final = form.terminal_cost(ends[1], ends[0], plan.control_interpolant(np.zeros(1))[0], horizon, p)
+    final = form.terminal_cost(ends[1], ends[0], plan.control_interpolant(np.zeros(1))[0], horizon=horizon, p=p)
     cost = float(y[-1].sum()) + final
     shares = [max(off), abs(plan.cost - cost) / abs(given.optimum), (cost - given.optimum) / abs(given.optimum)]
 

@@ -20,7 +20,7 @@ from models import CollisionScene, ModelError
 from models.arrays import Array
 from ocp.audit.audit import Audit
 from ocp.audit.clearance import Clearance, Track, clearance_along
-from ocp.errors import ProblemError, SolveError, checked_instance, checked_mapping, checked_nonnegative
+from ocp.errors import ProblemError, SolveError, checked_instance, checked_mapping, real
 from ocp.motion.local.collisions import Collision, find_collisions, scene_hulls
 from ocp.problem.declarations import Variable
 from ocp.problem.hulls import Separation, frames_of
@@ -60,7 +60,8 @@ class ClearanceConstraints:
 
     Attributes:
         scene: Collision scene of the machine, with the clearance of every pair.
-        margins: Separated pairs, by index, with the distance beyond the clearance that they keep, m.
+        margins: Separated pairs, by index, with the distance beyond the clearance that they keep, m. Of meshes it is
+            that of the covers, and negative where these protrude.
 
     Raises:
         ProblemError: The scene is none, a pair does not exist, or a margin is no number.
@@ -72,7 +73,9 @@ class ClearanceConstraints:
     def __post_init__(self) -> None:
         checked_instance("clearance_constraints: scene", self.scene, CollisionScene)
         for pair, margin in checked_mapping("clearance_constraints: margins", self.margins).items():
-            checked_nonnegative("clearance_constraints: margins", margin)
+            if not np.isfinite(real(margin)):
+                words = f"clearance_constraints: margins must be finite numbers in m, not {margin!r}"
+                raise ProblemError(words, name="margins", value=margin)
             if (
                 isinstance(pair, bool)
                 or not isinstance(pair, int | np.integer)
@@ -84,6 +87,15 @@ class ClearanceConstraints:
     def holding(self, pairs: Sequence[int]) -> ClearanceConstraints:
         """Return these constraints with more pairs separated."""
         return replace(self, margins={**{int(pair): MARGIN for pair in pairs}, **self.margins})
+
+    def separating(self, collisions: Sequence[Collision]) -> ClearanceConstraints:
+        """Return these constraints with the pairs of collisions separated.
+
+        Two hulls of meshes are separated by their covers, which protrude and may overlap in every configuration. The
+        covers have to gain as much distance as the hulls lack where these are closest.
+        """
+        margins = {each.pair: MARGIN - each.protrusion for each in reversed(collisions)}
+        return replace(self, margins={**margins, **self.margins})
 
     def widened(self, proofs: Sequence[Clearance]) -> ClearanceConstraints:
         """Return these constraints with the violating pairs separated, by their violation more."""

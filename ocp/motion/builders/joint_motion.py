@@ -275,7 +275,7 @@ def _attach_guess(
     place, at = base[None], joints[None]
     for stretch in motion.stretches:
         steps = max(int(np.ceil(GUESS_STEPS * stretch.duration / motion.horizon)), 1)
-        times = np.union1d(np.linspace(stretch.begin, stretch.end, steps + 1), stretch.breaks)
+        times = np.union1d(np.linspace(stretch.begin, stretch.end, steps + 1), stretch.nodes)
         if stretch.equations is None:
             motions.append(LocalMotion.stationary(times, place, at))
         else:

@@ -123,7 +123,7 @@ class StoppingMotion:
         shares = (np.diff(breaks)[:, None] * weights / 2).ravel()
         x, u = state_curve(at), control_curve(at)
         running = form.sampled([form.running], x, u, at * horizon, horizon, p)[0][:, 0]
-        final = form.terminal_cost(rows[-1], rows[0], controls[0], horizon, p)
+        final = form.terminal_cost(rows[-1], rows[0], controls[0], horizon=horizon, p=p)
         columns = {name: slice(*entries.indices(form.nx)) for name, entries in form.states.items()}
         return Solution(
             name=problem.name,

@@ -28,6 +28,7 @@ from ocp.motion.tasks.checks import check_closed, check_speed
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.goals import Cost
 from ocp.motion.tasks.limits import JointBounds
+from ocp.motion.tasks.targets import required_nodes
 from ocp.motion.tasks.tip_task import TipTask, is_holonomic
 from ocp.problem.problem import Problem
 from ocp.tolerances import ROUNDING_SHARE
@@ -71,6 +72,7 @@ class Stretch:
         equations: Their equations; None if there are none and the machine is free.
         new: Whether each of these tasks begins here. Shape (len(tasks),).
         breaks: Times between begin and end at which the tasks are less smooth. Shape (k,), s.
+        nodes: Those of them at which a mesh needs nodes for joint rates that do the tasks. Shape (m,), s.
         suffix: Suffix of the names of its states and controls.
     """
 
@@ -80,6 +82,7 @@ class Stretch:
     equations: TaskEquations | None
     new: tuple[bool, ...]
     breaks: Array
+    nodes: Array
     suffix: str
 
     @property
@@ -140,8 +143,11 @@ def stretches_of(machine: Machine, tasks: Sequence[TipTask], horizon: float) -> 
         inside = [tasks[i].begin + np.asarray(tasks[i].breaks) for i in active]
         breaks = np.unique(np.concatenate([np.zeros(0), *inside]))
         breaks = breaks[(breaks > begin + slack) & (breaks < end - slack)]
-        count = FEEDBACK.intervals
-        intervals = np.diff([begin, *breaks, end]) if len(breaks) >= count else np.array([(end - begin) / count])
+        nodes, count = breaks, FEEDBACK.intervals
+        if active and len(breaks) > count:
+            ends = np.array([begin, *breaks, end])
+            nodes = required_nodes(bind(machine, [tasks[i] for i in active]), ends)[1:-1]
+        intervals = np.diff([begin, *nodes, end]) if len(nodes) >= count else np.array([(end - begin) / count])
         gain = FEEDBACK.decay / float(intervals.max())
         limited = [  # unless there is a gap to close at the start
             task if task.gain <= gain or task.start_gap > FEEDBACK.closed_gap else replace(task, gain=gain)
@@ -150,7 +156,7 @@ def stretches_of(machine: Machine, tasks: Sequence[TipTask], horizon: float) -> 
         equations = bind(machine, limited) if active else None
         suffix = f" {len(stretches) + 1}" if len(bounds) > 2 else ""
         new = tuple(i not in before for i in active)
-        stretches.append(Stretch(begin, end, active, equations, new, breaks, suffix))
+        stretches.append(Stretch(begin, end, active, equations, new, breaks, nodes, suffix))
     return tuple(stretches)
 
 
@@ -227,7 +233,8 @@ def tool_motion_problem(
         problem.end("cyclic", before[place] - problem.at_start(first[place]), 0, 0, unit=machine.robot.unit())
     start_errors = [state.symbol for name, state in problem.declared.states.items() if name.startswith(START_ERRORS)]
     problem.minimize(running=running, terminal=sum((ca.sumsqr(errors) / 2 for errors in start_errors), start=0))
-    inside = [(stretch.breaks - stretch.begin) / stretch.duration for stretch in stretches]
+    times = [stretch.breaks if actuation else stretch.nodes for stretch in stretches]
+    inside = [(at - stretch.begin) / stretch.duration for stretch, at in zip(stretches, times, strict=True)]
     return ToolMotion(problem, tuple(stretches), horizon, np.unique(np.concatenate(inside)))
 
 
@@ -393,7 +400,7 @@ def _in_free_time(motion: _Motion, time_cost: float) -> ToolMotion:
     problem.minimize(running=time_cost * pace + running)
     if motion.cyclic and motion.free:
         problem.end("cyclic", joints - problem.at_start(joints), 0, 0, unit=machine.robot.unit())
-    return ToolMotion(problem, stretches, stretch.end, stretch.breaks / stretch.end)
+    return ToolMotion(problem, stretches, stretch.end, stretch.nodes / stretch.end)
 
 
 def _closure(motion: _Motion) -> Any:

@@ -23,8 +23,8 @@ from typing import Any, NamedTuple, TypeAlias
 
 import casadi as ca
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from models.arrays import Array
 from models.cts.trigonometric import Harmonics, polish, roots, square_of_first_harmonic
@@ -114,7 +114,7 @@ class PoseSolver(ABC):
         for _ in range(NEARBY.pairs):
             turn, shift = NEARBY.distance * rng.normal(size=(2, 3))
             for sign in (1.0, -1.0):
-                rotation = Rotation.from_rotvec(sign * turn).as_matrix()
+                rotation = scipy.spatial.transform.Rotation.from_rotvec(sign * turn).as_matrix()
                 yield Motion(tips.turn @ rotation, tips.shift + sign * self.chain.size * shift)
 
     def solutions(self, positions: Array, rotations: Array, redundant: Array) -> tuple[NDArray[np.intp], Array]:

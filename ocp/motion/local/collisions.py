@@ -8,7 +8,7 @@ distances are finite differences, since penetration depths of hulls have no bett
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -40,12 +40,14 @@ class Collision(NamedTuple):
         bodies: Names of the bodies.
         distance: Distance, m, negative if they overlap.
         time: Time, s.
+        protrusion: How much closer the bodies are that cover meshes and that separation constraints use instead, m.
     """
 
     pair: int
     bodies: tuple[str, str]
     distance: float
     time: float
+    protrusion: float = 0.0
 
     def __str__(self) -> str:
         how = f"overlap by {-self.distance:.3g} m" if self.distance < 0 else f"are {self.distance:.3g} m apart"
@@ -62,7 +64,15 @@ def scene_hulls(scene: CollisionScene) -> dict[str, Hull]:
     }
 
 
-def distances_along(scene: CollisionScene, base: Array, joints: Array, times: Array, cutoff: float = np.inf) -> Array:
+def distances_along(
+    scene: CollisionScene,
+    base: Array,
+    joints: Array,
+    times: Array,
+    cutoff: float = np.inf,
+    *,
+    pairs: Sequence[int] | None = None,
+) -> Array:
     """Return the distances of all pairs at samples of a motion. Shape (M, n), m.
 
     The penetration depth of a pair with a mesh or a cylinder is an estimate.
@@ -73,13 +83,14 @@ def distances_along(scene: CollisionScene, base: Array, joints: Array, times: Ar
         joints: Joint positions. Shape (M, joint_size).
         times: Times, s. Shape (M,).
         cutoff: For pairs farther apart than this, m, a lower bound of at least `cutoff` may be returned.
+        pairs: Indices of the only pairs that count; the distances of the others are infinite. All if None.
     """
     count = len(joints)
     if not len(scene.pairs):
         return np.zeros((count, 0))
     placements, bodies = prepared_pairs(scene)
     bases = np.broadcast_to(base, (count, scene.machine.base_size))
-    return bodies.distances(frames_of(placements(bases, joints, np.reshape(times, (-1, 1)))[0]), cutoff)
+    return bodies.distances(frames_of(placements(bases, joints, np.reshape(times, (-1, 1)))[0]), cutoff, pairs)
 
 
 def find_collisions(scene: CollisionScene, base: Array, joints: Array, times: Array) -> list[Collision]:
@@ -90,12 +101,22 @@ def find_collisions(scene: CollisionScene, base: Array, joints: Array, times: Ar
     distances = distances_along(scene, base, joints, times, scene.clearance)
     if not distances.size:
         return []
-    closest, labels = distances.argmin(axis=0), scene.labels
-    collisions = [
-        Collision(pair, labels[pair], float(distances[closest[pair], pair]), float(np.ravel(times)[closest[pair]]))
-        for pair in np.flatnonzero(distances.min(axis=0) < scene.clearance).tolist()
-    ]
+    closest, labels, collisions = distances.argmin(axis=0), scene.labels, list[Collision]()
+    bases = np.broadcast_to(base, (len(joints), scene.machine.base_size))
+    for pair in np.flatnonzero(distances.min(axis=0) < scene.clearance).tolist():
+        at = closest[pair]
+        distance, time = float(distances[at, pair]), float(np.ravel(times)[at])
+        covers = pair in scene.cover_pairs
+        protrusion = distance - _cover_distance(scene, pair, bases[at], joints[at], time) if covers else 0.0
+        collisions.append(Collision(pair, labels[pair], distance, time, protrusion))
     return sorted(collisions, key=lambda collision: collision.distance)
+
+
+def _cover_distance(scene: CollisionScene, pair: int, base: Array, joints: Array, time: float) -> float:
+    """Return the least distance of the bodies that cover the two bodies of a pair, m."""
+    frames = frames_of(prepared_pairs(scene)[0](base[None], joints[None], np.full((1, 1), time))[0])
+    rows = np.array([(*covers, scene.pairs[pair, 2]) for covers in scene.cover_pairs[pair]])
+    return float(BodyPairs([*scene_hulls(scene).values()], rows, {}).distances(frames).min())
 
 
 def prepared_pairs(scene: CollisionScene) -> tuple[Sampler, BodyPairs]:

@@ -8,8 +8,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from models import FixedBase, Machine, ModelError
 from models.arrays import Array, ArrayInput, checked_array
@@ -242,7 +242,9 @@ class PreparedArm:
         if (
             self.free is ToolFreedom.ROTATION
         ):  # any rotation will do, but not one at which the added joints are singular
-            rotations = np.tile(Rotation.from_rotvec([0.3, 0.5, 0.7]).as_matrix(), (count, 1, 1))
+            rotations = np.tile(
+                scipy.spatial.transform.Rotation.from_rotvec([0.3, 0.5, 0.7]).as_matrix(), (count, 1, 1)
+            )
         redundant = self.arm.redundant_positions(solver, shares[:, : len(solver.redundant)])
         if self.sampled_angles:
             rotations = (rotations[:, None] @ self._rotations(shares[:, len(solver.redundant) :])).reshape(-1, 3, 3)
@@ -273,14 +275,16 @@ class PreparedArm:
 
     def _rotations(self, shares: Array) -> Array:
         """Return rotations of the tip in its own frame at shares of the open angles. Shape (S, 3, 3)."""
-        rolled = Rotation.from_rotvec(TURN * shares[:, :1] * self.tool_axis)
+        rolled = scipy.spatial.transform.Rotation.from_rotvec(TURN * shares[:, :1] * self.tool_axis)
         if self.free is ToolFreedom.ROLL:
             return np.asarray(rolled.as_matrix())
         across = np.eye(3)[np.abs(self.tool_axis).argmin()]
         across = np.cross(self.tool_axis, across) / np.linalg.norm(np.cross(self.tool_axis, across))
-        azimuths = Rotation.from_rotvec(TURN * shares[:, 1:2] * self.tool_axis)
+        azimuths = scipy.spatial.transform.Rotation.from_rotvec(TURN * shares[:, 1:2] * self.tool_axis)
         tilts = np.arccos(1 - shares[:, 2:3] * (1 - np.cos(self.within)))  # uniform on the cap of the sphere
-        return np.asarray((Rotation.from_rotvec(tilts * azimuths.apply(across)) * rolled).as_matrix())
+        return np.asarray(
+            (scipy.spatial.transform.Rotation.from_rotvec(tilts * azimuths.apply(across)) * rolled).as_matrix()
+        )
 
 
 def _checked_poses(positions: Any, rotations: Any) -> tuple[Array, Array]:
@@ -346,7 +350,9 @@ class IkBranches:
         """Return a rotation of the tip that does the task. Shape (3, 3)."""
         if self._task.direction is not None:
             axis, direction = np.array(self._task.tool_axis), targets[6:9] / np.linalg.norm(targets[6:9])
-            return np.asarray(Rotation.align_vectors(direction[None], axis[None])[0].as_matrix())
+            return np.asarray(
+                scipy.spatial.transform.Rotation.align_vectors(direction[None], axis[None])[0].as_matrix()
+            )
         if self._task.orientation is not None and set(self._task.chosen) & set(ANGULAR):
             return np.asarray(targets[6:15].reshape(3, 3).T)
         return self.arm.arm.chain.rotation

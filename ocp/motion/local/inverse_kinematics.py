@@ -189,8 +189,7 @@ def inverse_kinematics(
         raise ProblemError(words, name="task", value=targets, time=float(time))
 
     search = _MultiStart(equations, base_values, targets, lower, upper, tolerance, apart, int(iterations))
-    listed, certain = search.list_branches(int(starts), int(seed))
-    random = 0 if certain else int(starts)
+    listed, random = search.list_branches(int(starts), int(seed))
     first = first[: len(first) - int(starts) + random]
     solutions = search.solve(np.vstack([first[: len(first) - random], listed, first[len(first) - random :]]), random)
     if scene is None:
@@ -266,17 +265,22 @@ class _MultiStart:
             raise unreachable_error(self.equations, q[nearest], float(error[nearest]), lower, upper, misses=misses)
         return self.rank(q, error)
 
-    def list_branches(self, count: int, seed: int) -> tuple[Array, bool]:
-        """Return solutions on all branches, (K, n), and whether no random start is needed besides."""
+    def list_branches(self, count: int, seed: int) -> tuple[Array, int]:
+        """Return solutions on all branches, (K, n), and how many random starts are needed besides.
+
+        Of a redundant arm with several free parameters, few samples of these may keep the limits. Iterations under the
+        limits from random starts then make up the number.
+        """
         branches = ik_branches(self.equations, self.lower, self.upper) if count else None
         if branches is None:
-            return np.zeros((0, len(self.lower))), False
+            return np.zeros((0, len(self.lower))), count
         configurations = branches.configurations(self.targets, count, seed * count, turns=False)
         joints = configurations.joints
         if len(joints) > count and not branches.complete:
             joints = joints[spread_points(np.where(self._revolute, np.sin(joints), joints), count)]
-        certain = bool(configurations.complete[0]) if branches.complete else True
-        return joints, certain and len(joints) > 0
+        if branches.complete:
+            return joints, 0 if configurations.complete[0] and len(joints) else count
+        return joints, count - len(joints)
 
     def iterate(self, joints: Array) -> tuple[Array, Array]:
         """Return joints (K, n) and largest pose errors (K,) after the iterations from these joints."""

@@ -241,7 +241,7 @@ class CandidateSolver(Solver):
             return []
         constraints = self.request.clearance_constraints
         if constraints is not None:
-            constraints = constraints.holding([collision.pair for collision in self.local_collisions(candidate.seed)])
+            constraints = constraints.separating(self.local_collisions(candidate.seed))
         seed = Seed(candidate.solution, local=candidate.seed.local, direct=True)
         return [Candidate(candidate.start, seed=seed, constraints=constraints)]
 
@@ -259,7 +259,7 @@ class CandidateSolver(Solver):
     def _separate_pairs(self, candidate: Candidate, stage: Stage, collisions: list[Collision]) -> Candidate:
         """Solve a candidate again with more separated pairs."""
         assert candidate.constraints is not None
-        constraints = candidate.constraints.holding([collision.pair for collision in collisions])
+        constraints = candidate.constraints.separating(collisions)
         reason = self._collision_reason(collisions[0])
         return self._solve_again(replace(candidate, constraints=constraints), stage, reason)
 

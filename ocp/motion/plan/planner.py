@@ -274,8 +274,7 @@ def _try_alternatives(queue: CandidateQueue, solver: CandidateSolver, seeds: lis
         colliding = solver.collisions(finished)
         if finished.constraints is not None and (colliding or finished.constraints.margins):
             local = solver.local_collisions(seed.seed)
-            pairs = [collision.pair for collision in (*colliding, *local)]
-            constraints = finished.constraints.holding(pairs)
+            constraints = finished.constraints.separating([*colliding, *local])
             distance = min((collision.distance for collision in local), default=np.inf)
             rerouted.append((distance, replace(seed, constraints=constraints)))
     alternatives = [seed for _, seed in sorted(rerouted, key=lambda entry: -entry[0])[:max_tries]]

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from models import FixedBase, ModelError
 from models.arrays import Array
@@ -182,7 +182,9 @@ class PathPlan(Plan):
         """Return the largest pose errors, and the largest excess of a displacement."""
         t, tips = self.t, tip_poses(self.machine, np.zeros((len(self.joints), 0)), self.joints)
         misses = np.abs(tips[:, :3] - poses.positions)
-        turns = Rotation.from_quat(tips[:, [4, 5, 6, 3]]).inv() * Rotation.from_matrix(poses.rotations)
+        turns = scipy.spatial.transform.Rotation.from_quat(
+            tips[:, [4, 5, 6, 3]]
+        ).inv() * scipy.spatial.transform.Rotation.from_matrix(poses.rotations)
         steps = np.abs(np.diff(self.joints, axis=0)) - poses.step
         steps[list(self.reconfigurations)] = 0.0
         return [

@@ -19,7 +19,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import nnls
+import scipy
 
 from models.arrays import Array
 from ocp.console import check_time
@@ -294,7 +294,7 @@ def _nearest_point(target: Array, rows: Array, least: Array) -> Array:
     size = float(np.abs(needed).max())
     matrix = np.vstack([rows.T, needed[None] / size])
     right = np.append(np.zeros(len(target)), 1.0)
-    multipliers, _ = nnls(matrix, right, maxiter=10 * matrix.shape[1])
+    multipliers, _ = scipy.optimize.nnls(matrix, right, maxiter=10 * matrix.shape[1])
     residual = matrix @ multipliers - right
     if residual[-1] >= 0:
         return np.zeros_like(target)

@@ -225,7 +225,7 @@ class _CellPass:
                 layers.append(self._states_at_new_poses(layers[-1], kinematics))
             self._stretch_layers.append(len(layers) - 1)
             steps = max(int(np.ceil(self._settings.steps * stretch.duration / request.horizon)), 1)
-            remaining = np.union1d(np.linspace(stretch.begin, stretch.end, steps + 1), stretch.breaks)[:0:-1].tolist()
+            remaining = np.union1d(np.linspace(stretch.begin, stretch.end, steps + 1), stretch.nodes)[:0:-1].tolist()
             shortest = stretch.duration / steps / 2**self._settings.halvings
             task = kinematics.at(layers[-1].base, layers[-1].joints, stretch.begin)
             while remaining:

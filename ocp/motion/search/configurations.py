@@ -200,10 +200,8 @@ def start_collisions(
     """
     if request.clearance_constraints is None or pairs == []:
         return [None] * len(configurations)
-    scene = request.clearance_constraints.scene
-    distances = distances_along(scene, request.base, configurations, np.zeros(len(configurations)))
-    if pairs is not None:
-        distances[:, np.setdiff1d(np.arange(len(scene.pairs)), pairs)] = np.inf
+    scene, times = request.clearance_constraints.scene, np.zeros(len(configurations))
+    distances = distances_along(scene, request.base, configurations, times, scene.clearance, pairs=pairs)
     closest = zip(distances, distances.argmin(axis=1).tolist(), strict=True)
     collisions = [Collision(pair, scene.labels[pair], float(row[pair]), 0.0) for row, pair in closest]
     return [collision if collision.distance < scene.clearance else None for collision in collisions]
@@ -266,7 +264,7 @@ def local_motions_from(request: PlanRequest, configurations: Array) -> list[Loca
                     motions[-1] = _straight_motion(motions[-1], joints)
             steps = int(np.ceil(settings.local_steps * stretch.duration / request.horizon))
             steps = max(steps, settings.min_intervals)
-            times = np.union1d(np.linspace(stretch.begin, stretch.end, steps + 1), stretch.breaks)
+            times = np.union1d(np.linspace(stretch.begin, stretch.end, steps + 1), stretch.nodes)
             equations = stretch.equations
             if equations is None:
                 motions.append(LocalMotion.stationary(times, base, joints))

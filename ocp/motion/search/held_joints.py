@@ -115,7 +115,11 @@ def _place_idle_joints(whole: PlanRequest, request: PlanRequest, configurations:
     places = np.array([all_joints(robot, held, configurations[0]) for held in choices])
     apart = [collision is None for collision in start_collisions(whole, places, still)]
     allowed = [held for held, is_apart in zip(choices, apart, strict=True) if is_apart or not any(apart)]
-    pairs = np.setdiff1d(np.arange(len(whole.clearance_constraints.scene.pairs)), still).tolist()
+    by_held = whole.clearance_constraints.scene.levers.joints[:, [name in own for name in robot.joint_names]] > 0
+    pairs = np.setdiff1d(np.flatnonzero(by_held.any(axis=1)), still).tolist()
+    others = np.setdiff1d(np.flatnonzero(~by_held.any(axis=1)), still).tolist()
+    free = [each is None for each in start_collisions(whole, all_joints(robot, own, configurations), others)]
+    configurations = configurations[free] if any(free) else configurations
 
     def clear(held: Mapping[str, float]) -> bool:
         return None in start_collisions(whole, all_joints(robot, held, configurations), pairs)

@@ -236,7 +236,7 @@ class TaskSearch:
         for stretch in request.stretches:
             steps = int(np.ceil(settings.motion_steps * stretch.duration / request.horizon))
             steps = max(steps, settings.steps)
-            times = np.union1d(np.linspace(stretch.begin, stretch.end, steps + 1), stretch.breaks)
+            times = np.union1d(np.linspace(stretch.begin, stretch.end, steps + 1), stretch.nodes)
             samples = np.array([[np.interp(times, self.times, path[:, j]) for j in range(n)] for path in paths])
             samples = samples.reshape(count, n, len(times)).transpose(0, 2, 1)
             if stretch.equations is not None:

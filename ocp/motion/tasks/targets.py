@@ -1,8 +1,9 @@
-"""Poses along a motion in the world: those that tasks require, for display next to the motion, and the tip's."""
+"""Targets of tasks over time: their poses in the world next to a motion, and the nodes that a mesh needs for them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -11,10 +12,33 @@ import numpy as np
 from models import Machine
 from models.arrays import Array
 from models.spatial import quaternion_from_rotation
-from ocp.motion.tasks.equations import bind
+from ocp.curves import lagrange
+from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.tip_task import TipTask, target_size
+from ocp.problem.values import Sampler
+from ocp.tolerances import LIMIT_SHARE
 
-__all__ = ["Target", "targets_along", "tip_poses"]
+__all__ = ["Target", "required_nodes", "targets_along", "tip_poses"]
+
+
+@dataclass(frozen=True)
+class NodeSettings:
+    """Settings of the choice of nodes.
+
+    Attributes:
+        points: Points of an interval of the mesh at which the targets determine the motion.
+        samples: Samples between two breaks at which the targets are compared with their interpolants.
+        pose_error: Largest error of an interpolated position, rotation matrix or direction, m and 1.
+        rate_error: Largest error of an interpolated velocity, relative to its largest value.
+    """
+
+    points: int = 7
+    samples: int = 4
+    pose_error: float = 1e-6
+    rate_error: float = LIMIT_SHARE / 2
+
+
+NODES = NodeSettings()
 
 
 class Target(NamedTuple):
@@ -75,6 +99,56 @@ def targets_along(
         position[~active], rotation[~active] = np.nan, np.nan
         targets.append(Target(times if shown_times is None else shown_times, position, rotation))
     return tuple(targets)
+
+
+def required_nodes(equations: TaskEquations, breaks: Array) -> Array:
+    """Return the breaks at which a mesh needs nodes to follow the targets of pose tasks; the first and last are kept.
+
+    Between two nodes, the interpolants of the targets at the points of an interval deviate by no more than `NODES`
+    allows. Intervals with larger deviations are bisected at the break nearest to their middle. A path of many short
+    segments thus needs no more nodes than a smooth path of the same shape. Tasks of a velocity need all breaks, since
+    velocity errors accumulate to a pose error.
+
+    Args:
+        equations: Equations of the tasks.
+        breaks: Increasing times at which the tasks are less smooth, s. Shape (k,), k >= 2.
+    """
+    if not all(part.task.is_pose for part in equations.bound):
+        return breaks
+    time = ca.MX.sym("time")
+    sampler = Sampler([time], [equations.target_function()(time)])
+    inner = breaks[:-1, None] + np.diff(breaks)[:, None] * np.arange(NODES.samples) / NODES.samples
+    values = sampler(inner.reshape(-1, 1))[0]
+    largest = _largest_errors(equations, values)
+    points = np.array(ca.collocation_points(NODES.points, "radau"))
+    ends, open_intervals = {0, len(breaks) - 1}, [(0, len(breaks) - 1)]
+    while open_intervals:
+        first, last = np.transpose(sorted(open_intervals))
+        width = breaks[last] - breaks[first]
+        fits = sampler((breaks[first, None] + width[:, None] * points).reshape(-1, 1))[0]
+        open_intervals = []
+        for k, fit in enumerate(fits.reshape(len(first), len(points), -1)):
+            inside = slice(first[k] * NODES.samples, last[k] * NODES.samples)
+            basis = lagrange(points, (inner.ravel()[inside] - breaks[first[k]]) / width[k])
+            if last[k] - first[k] > 1 and (np.abs(basis @ fit - values[inside]) > largest).any():
+                middle = int(np.abs(breaks[first[k] + 1 : last[k]] - breaks[first[k]] - width[k] / 2).argmin())
+                split = int(first[k]) + 1 + middle
+                ends.add(split)
+                open_intervals += [(int(first[k]), split), (split, int(last[k]))]
+    return breaks[sorted(ends)]
+
+
+def _largest_errors(equations: TaskEquations, values: Array) -> Array:
+    """Return the largest error of each entry of the targets of pose tasks, from samples (M, size). Shape (size,)."""
+    largest, at = np.full(values.shape[1], NODES.pose_error), 0
+    for bound in equations.bound:
+        task = bound.task
+        for track, size in ((task.position, 3), (task.orientation, 9), (task.direction, 3)):
+            if track is not None:
+                rates = slice(at + size, at + size + 3)
+                largest[rates] = NODES.rate_error * np.linalg.norm(values[:, rates], axis=1).max()
+                at += size + 3
+    return largest
 
 
 def _frames(machine: Machine, base: Array, joints: Array) -> tuple[Array, Array]:

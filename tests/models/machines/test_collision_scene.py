@@ -32,6 +32,7 @@ from models import (
 )
 from models.shapes.distance import distance
 from models.shapes.hull import convex_hull, gap_along, nearest_directions
+from ocp.motion.local.collisions import distances_along, find_collisions
 from tests.models.machines.armoured import armoured_arm
 
 OBSTACLES = (
@@ -331,6 +332,31 @@ def hooked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FixedBase:
     limits: dict[str, Any] = {"axis": (0, 1, 0), "translation": (0, 0, 0.45), "lower": -2.5, "upper": 2.5}
     joints = tuple(Joint(f"joint{k}", "revolute", f"link{k - 1}", f"link{k}", **limits) for k in range(1, 5))
     return FixedBase(Robot(links, joints, tip="link4"))
+
+
+def test_a_mesh_near_a_primitive_is_checked_by_its_hull(hooked: FixedBase, tmp_path: Path) -> None:
+    """Its distance is at least that of the covers, and more where they fill the notch less than the hull."""
+    links = [replace(link, collisions=(CollisionShape("sphere", (0.05,), translation=(0, 0, 0.4)),)) if k == 2 else link
+             for k, link in enumerate(hooked.robot.links)]  # fmt: skip
+    machine = FixedBase(Robot(tuple(links), hooked.robot.joints, tip="link4"))
+    scene = CollisionScene(machine, folders=[tmp_path])
+    pair = next(k for k, label in enumerate(scene.labels) if label[0].startswith("link0") and label[1] == "link2")
+    assert isinstance(scene.bodies[scene.pairs[pair, 0]].shape, Mesh)
+    assert [scene.bodies[j].name for _, j in scene.cover_pairs[pair]] == ["link2", "link2"]
+    postures = np.random.default_rng(4).uniform(-2.5, 2.5, (40, 4))
+    q = ca.SX.sym("q", 4)
+    covers = ca.Function("covers", [q], [scene.distances((), q, pairs=[pair])])
+    by_covers = np.array(covers.map(40)(postures.T)).ravel()
+    distances = distances_along(scene, np.zeros(0), postures, np.zeros(40))
+    assert (distances[:, pair] >= by_covers - 1e-5).all()
+    only = distances_along(scene, np.zeros(0), postures, np.zeros(40), pairs=[pair])
+    assert_allclose(only[:, pair], distances[:, pair], atol=1e-12)
+    assert np.isinf(np.delete(only, pair, axis=1)).all()
+    for posture, expected in zip(postures, distances[:, pair], strict=True):
+        for collision in find_collisions(scene, np.zeros(0), posture[None], np.zeros(1)):
+            if collision.pair == pair:
+                least = float(covers(posture))
+                assert collision.protrusion == pytest.approx(expected - least, abs=1e-5)
 
 
 def test_meshes_up_to_three_joints_apart_are_looked_at_as_their_hulls(hooked: FixedBase, tmp_path: Path) -> None:

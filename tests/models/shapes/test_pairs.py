@@ -27,6 +27,7 @@ from models.shapes.pairs import (
     SRDF,
     Pairs,
     _BodyPair,
+    _PlacedBody,
     _random_configurations,
     checked_pairs,
 )
@@ -146,7 +147,8 @@ def test_bodies_are_where_the_kinematics_have_them(seed: int) -> None:
     known = gaps(robot, bodies, every, 10)
     for (i, j), row in zip(every, known, strict=True):
         one, other = bodies[i].shape, bodies[j].shape
-        between = _BodyPair(robot, one, other, *parts.path(bodies[i].link, bodies[j].link))
+        placed = _PlacedBody(one), _PlacedBody(other)
+        between = _BodyPair(robot, *placed, *parts.path(bodies[i].link, bodies[j].link))
         turn, shift = between._relative(postures)
         np.testing.assert_allclose(exact_distances(one, other, turn, shift), row, atol=1e-9)
         assert (between.bounds(postures)[0] <= row + 1e-9).all()
@@ -227,7 +229,7 @@ def test_a_mesh_on_a_link_that_is_fixed_lies_where_it_is_fixed(shift: tuple[floa
 
 def bound(one: Shape, other: Shape, turn: Array, shift: Array) -> Array:
     """Distances as the proof has them."""
-    return _BodyPair(chain(0.1)[0], one, other, [], []).distance_bounds(turn, shift)
+    return _BodyPair(chain(0.1)[0], _PlacedBody(one), _PlacedBody(other), [], []).distance_bounds(turn, shift)
 
 
 def exact_distances(one: Shape, other: Shape, turn: Array, shift: Array) -> Array:
@@ -523,6 +525,8 @@ def far_meshes(gap: float) -> tuple[Robot, tuple[Body, ...]]:
 def test_meshes_are_checked_where_their_covers_always_touch_and_their_hulls_do_not() -> None:
     robot, bodies = far_meshes(0.02)
     assert (0, 3) in checked_pairs(robot, bodies).checked
+    beside = Body("link3", Sphere(0.05, (0.0, 0.0, 0.12)))  # beside a mesh, 0.02 m from its hull
+    assert (0, 3) in checked_pairs(robot, (*bodies[:3], beside)).checked
     robot, bodies = far_meshes(-0.02)
     found = checked_pairs(robot, bodies)
     assert (0, 3) not in found.checked

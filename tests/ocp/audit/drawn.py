@@ -66,7 +66,7 @@ def drawn(
     running = form.sampled([form.running], curves[0](fine), curves[1](fine), fine * horizon, horizon, p)[0]
     spent = float(np.dot(np.outer(np.diff(breaks), weight / 2).ravel() * horizon, running[:, 0]))
     ends = [curves[0](np.array([end]))[0] for end in (1.0, 0.0)]
-    cost = spent + form.terminal_cost(ends[0], ends[1], curves[1](np.zeros(1))[0], horizon, p)
+    cost = spent + form.terminal_cost(ends[0], ends[1], curves[1](np.zeros(1))[0], horizon=horizon, p=p)
     keep = np.tile(np.arange(d) < d - 1, n)
     keep[-1] = True
     return Solution(

@@ -31,7 +31,7 @@ def second_order(problem: Problem, solution: Solution) -> Curvature:
     form = Formulation(problem)
     p = form.parameter_vector(solution.parameters)
     bounds = form.bound_values(p)
-    along = Linearisation(form, solution, p, bounds, sizes(form, solution, p, bounds))
+    along = Linearisation(form, solution, p, bounds, sizes=sizes(form, solution, p, bounds))
     return curvature(AccessoryProblem(along, adjoint(along, None, abs(solution.cost) or 1.0)))
 
 
@@ -246,7 +246,9 @@ def test_multipliers_have_the_sign_of_the_bound_that_they_hold() -> None:
     lower = np.array([[False, False], [True, True], [True, True]])
     upper = np.array([[True, True], [False, False], [True, True]])
     expected = [[2.0, 0.0], [0.0, -3.0], [2.0, -3.0]]  # an upper bound pushes back only
-    np.testing.assert_allclose(balance(gradient, eye, lower, upper, pseudo_inverses(eye, lower | upper)), expected)
+    np.testing.assert_allclose(
+        balance(gradient, eye, lower, upper, inverse=pseudo_inverses(eye, lower | upper)), expected
+    )
 
 
 def test_multipliers_leave_the_least_that_their_signs_allow() -> None:
@@ -254,7 +256,7 @@ def test_multipliers_leave_the_least_that_their_signs_allow() -> None:
     rng = np.random.default_rng(5)
     gradient, rows = rng.normal(size=(200, 3)), rng.normal(size=(200, 2, 3))
     upper = rng.random((200, 2)) < 0.7
-    found = balance(gradient, rows, np.zeros_like(upper), upper, pseudo_inverses(rows, upper))
+    found = balance(gradient, rows, np.zeros_like(upper), upper, inverse=pseudo_inverses(rows, upper))
     assert (found >= 0).all()
     assert (found[~upper] == 0).all()
     for k in range(200):

@@ -57,7 +57,7 @@ def fitted(plan: Solution) -> Fit:
     form = Formulation(problem)
     p = form.parameter_vector(plan.parameters)
     bounds = form.bound_values(p)
-    along = Linearisation(form, plan, p, bounds, sizes(form, plan, p, bounds))
+    along = Linearisation(form, plan, p, bounds, sizes=sizes(form, plan, p, bounds))
     known = adjoint(along, None if along.form.path.equality.all() and not along.nodal else bent(along), abs(plan.cost))
     found = best_multipliers(along, known, AccessoryProblem(along, known).curved, abs(plan.cost))
     assert found is not None

@@ -34,7 +34,7 @@ def linearised(problem: Problem, solution: Solution) -> tuple[Linearisation, Fin
     p = form.parameter_vector(solution.parameters)
     bounds = form.bound_values(p)
     found = sizes(form, solution, p, bounds)
-    return Linearisation(form, solution, p, bounds, found), fine_grid(solution)
+    return Linearisation(form, solution, p, bounds, sizes=found), fine_grid(solution)
 
 
 def again(problem: Problem, solution: Solution) -> Reintegration:

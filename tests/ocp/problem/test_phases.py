@@ -325,19 +325,6 @@ def test_phases_are_kept_in_files_and_copies(tmp_path: Path) -> None:
     assert solve(regulator(1.0, initial=1.0), Collocation(4)).phases == {}
 
 
-def test_plans_of_phases_are_a_guess_of_the_whole() -> None:
-    on, off = fast(True, False), fast(False, True)
-    on.end("speed", on.declared.states["v"].symbol, 1.0, 1.0)
-    off.start("speed", off.declared.states["v"].symbol, 1.0, 1.0)
-    alone = {"on": solve(on, Collocation(6, 3)), "off": solve(off, Collocation(6, 3))}
-    phases = Phases("fast", {"on": on, "off": off})
-    phases.join("on", "off")
-    guess = phases.guess(alone)
-    assert guess["on.duration"] == alone["on"].horizon
-    assert guess["off.v"](0.25) == pytest.approx(alone["off"].at_fraction(0.25)["v"])
-    assert solve(phases, Collocation(6, 3), guess=guess).cost == pytest.approx(2.0, abs=1e-7)
-
-
 def test_a_part_of_a_plan_is_a_plan_over_its_own_time() -> None:
     part = interior().phase("second")
     assert (part.t[0], part.t[-1]) == (0.0, 0.25)

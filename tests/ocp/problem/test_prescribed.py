@@ -41,7 +41,7 @@ def motion_of(frame: Any) -> PrescribedMotion:
     hulls = {"body": Hull(0, CORE, 0.02), "post": Hull(-1, np.zeros((1, 3)))}
     nothing = np.zeros((1, 0))
     apart = Separation("apart", frame, hulls, np.array([[0, 1, -1]]), np.zeros(1), {}, nothing, nothing)
-    return PrescribedMotion(apart, frame, T, [], [])
+    return PrescribedMotion(apart, frame, T, parameters=[], values=[])
 
 
 @pytest.mark.parametrize("name", MOTIONS)

@@ -29,7 +29,7 @@ from ocp import ClearanceConstraints, Collocation, Problem, ProblemError, SolveE
 from ocp.audit.audit import Finding
 from ocp.audit.clearance import Clearance, ClosestPair
 from ocp.motion.builders.clearance import LOOKS, MARGIN, ROUNDING, clearance_of, collision_error, solve_with_clearance
-from ocp.motion.local.collisions import distances_along
+from ocp.motion.local.collisions import Collision, distances_along
 from ocp.problem.values import constant
 from tests.models.machines.armoured import armoured_arm
 
@@ -46,6 +46,17 @@ def crane() -> FixedBase:
 
 def nearest(around: CollisionScene, pair: int, least: float, asked: float = 0.02) -> ClosestPair:
     return ClosestPair(around.labels[pair], least, least, 0.5, np.zeros((2, 3)), asked)
+
+
+def test_covers_gain_what_hulls_lack() -> None:
+    """Covers that protrude by 0.3 m keep the distance at which the hulls that overlap by 1 mm are apart."""
+    scene = CollisionScene(ARM, [Sphere(0.1, (0.5, 0, 0.5))])
+    collisions = [Collision(0, scene.labels[0], -1e-3, 0.2, 0.3), Collision(1, scene.labels[1], -2e-3, 0.7)]
+    margins = ClearanceConstraints(scene, {2: 0.1}).separating(collisions).margins
+    assert margins == {0: MARGIN - 0.3, 1: MARGIN, 2: 0.1}
+    assert (
+        ClearanceConstraints(scene, margins).separating([Collision(0, scene.labels[0], -1e-3, 0.2)]).margins == margins
+    )
 
 
 def test_what_came_too_near_is_held_and_what_is_held_farther_by_what_it_missed() -> None:

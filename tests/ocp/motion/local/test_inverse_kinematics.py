@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from ocp import ProblemError, TipTask, Unreachable, inverse_kinematics
 from ocp.motion.local.inverse_kinematics import inverse_kinematics_at
 from ocp.motion.tasks.equations import bind
 from tests.models.robot.trees import seeds
+from tests.ocp.motion.local.arms import build
 from tests.ocp.motion.tasks.space_tasks import (
     BASE,
     PANDA_START,
@@ -45,6 +47,24 @@ def test_a_six_joint_arm_has_its_eight_postures() -> None:
         assert_poses(ur5(), posture.joints, rotation, position)
     nearest = min(np.abs(np.sin((posture.joints - UR5_START) / 2)).max() for posture in found)
     assert nearest < 1e-9
+
+
+def test_random_starts_make_up_for_samples_outside_narrow_limits() -> None:
+    """Of an arm on a gantry whose tool may roll, hardly any sample of the three free parameters keeps the limits."""
+    machine, rng = build("CRX on a gantry"), np.random.default_rng(5)
+    middle = np.concatenate([np.zeros(2), rng.uniform(-1, 1, 6)])
+    narrow = [
+        replace(joint, kind="revolute", lower=q - 0.4, upper=q + 0.4) if joint.kind == "continuous" else joint
+        for joint, q in zip(machine.robot.moving_joints, middle, strict=True)
+    ]
+    joints = (*narrow, *(joint for joint in machine.robot.joints if not joint.moves))
+    arm = FixedBase(Robot(machine.robot.links, joints, tip="tip"))
+    rotation, position = pose(arm, (), middle)
+    solutions = inverse_kinematics(arm, TipTask(position=position, direction=rotation[:, 2]), starts=64)
+    assert len(solutions) >= 48
+    for solution in solutions:
+        assert_poses(arm, solution.joints, rotation[:, 2], position)
+        assert ((solution.joints >= arm.robot.lower) & (solution.joints <= arm.robot.upper)).all()
 
 
 @pytest.mark.parametrize("limits", [True, False])
