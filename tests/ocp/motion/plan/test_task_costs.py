@@ -73,9 +73,13 @@ def test_where_the_tasks_leave_no_freedom_the_cost_is_that_of_the_only_motion() 
 
 
 def test_of_all_configurations_the_one_of_least_effort_is_chosen() -> None:
-    cost = Cost(velocity=0.0, effort=1.0)
-    whole = plan(TWO, SWINGING, cost=cost, scene=False)
-    each = [plan(TWO, SWINGING, cost=cost, scene=False, start=candidate.start) for candidate in starts_of(whole)]
+    def place(t: Any) -> Any:
+        share = 3 * t**2 - 2 * t**3
+        return ca.vertcat(0.7 - 0.4 * share, 0.3 * share, 0.0)
+
+    cost, task = Cost(velocity=0.0, effort=1.0), TipTask(position=place, rows=(3, 4), duration=1.0)
+    whole = plan(TWO, task, cost=cost, scene=False)
+    each = [plan(TWO, task, cost=cost, scene=False, start=candidate.start) for candidate in starts_of(whole)]
     assert len(each) == 2
     assert whole.cost == pytest.approx(min(one.cost for one in each), rel=1e-6)
     assert max(one.cost for one in each) > whole.cost * 1.01
@@ -107,14 +111,14 @@ def slide() -> FixedBase:
 def test_in_free_time_a_uniform_motion_takes_the_time_of_the_closed_form() -> None:
     """At pace z the cost is time z + 1 / (2 z), least at z = (2 time)^-1/2: 2 s and 0.5 for time = 1/8."""
     task = TipTask(position=lambda t: ca.vertcat(t, 0.0, 0.0), rows=(3,), duration=1.0)
-    for limits in (None, Limits(acceleration=3.0), Limits(acceleration=3.0, jerk=50.0, torque=20.0, power=30.0)):
+    for limits in (None, Limits(acceleration=3.0)):
         planned = plan(slide(), task, "free", cost=Cost(time=0.125), limits=limits, scene=False)
         assert planned.horizon == pytest.approx(2.0, rel=1e-3)
         assert planned.cost == pytest.approx(0.5, rel=1e-3)
         assert planned.audit().passed
 
 
-@pytest.mark.parametrize("limits", [Limits(acceleration=1.5), Limits(torque=3.0)])
+@pytest.mark.parametrize("limits", [Limits(acceleration=1.5), Limits(torque=3.0), Limits(1.5, 1.5, 40.0, 4.0, 9.0)])
 def test_in_free_time_a_tool_is_slowed_down_until_its_actuators_can_follow(limits: Limits) -> None:
     """x = (1 - cos 2 pi s) / 2 needs 2 pi^2 m/s^2 of a mass of 2 kg in 1 s, and a quarter of it in 2 s."""
     task = TipTask(position=lambda t: ca.vertcat((1 - ca.cos(2 * np.pi * t)) / 2, 0.0, 0.0), rows=(3,), duration=1.0)
