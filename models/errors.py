@@ -1,20 +1,19 @@
-"""The exception and the warning that the whole package raises."""
+"""Exceptions and warnings of the package, and the fields that they carry."""
 
 from __future__ import annotations
 
+import pickle
 from typing import Any
 
 
-class ModelError(ValueError):
-    """An impossible machine, or an argument that does not fit it.
-
-    The message names the offending link, joint or argument, its value, and the remedy.
+class DetailedError(Exception):
+    """An exception that carries the data of its message as fields, also through pickling.
 
     Attributes:
-        name: Name of the link, joint or argument, or None.
-        value: The offending value, or None.
+        name: Name of the faulty argument, option, joint, link, state or constraint; None if there is none.
+        value: The value at fault.
         limit: What the value violates: a bound, a pair of bounds, a shape or the allowed choices.
-        time: Time at which it does, s, or None.
+        time: When, s, or where along a path, m. This and the two above are None if the message states none.
     """
 
     def __init__(
@@ -23,14 +22,23 @@ class ModelError(ValueError):
         super().__init__(message)
         self.name, self.value, self.limit, self.time = name, value, limit, time
 
+    def __reduce__(self) -> Any:
+        """Pickle all fields; a field that cannot be pickled, such as an expression, is replaced by its `repr`."""
+        return type(self), self.args, {key: _pickled(value) for key, value in self.__dict__.items()}
 
-class ModelWarning(UserWarning):
-    """A suspicious but usable description of a machine; the message says where.
 
-    Attributes:
-        name, value, limit: As in ModelError; each None if there is none, or if the warning concerns several.
-    """
+class ModelError(DetailedError, ValueError):
+    """An impossible machine, or an argument that does not fit it."""
 
-    def __init__(self, message: str = "", *, name: str | None = None, value: Any = None, limit: Any = None) -> None:
-        super().__init__(message)
-        self.name, self.value, self.limit = name, value, limit
+
+class ModelWarning(DetailedError, UserWarning):
+    """A suspicious but usable description of a machine; the message says where."""
+
+
+def _pickled(value: Any) -> Any:
+    """Return a value, or its `repr` if it cannot be pickled."""
+    try:
+        pickle.dumps(value)
+    except Exception:  # pickling raises errors of many kinds
+        return repr(value)
+    return value

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from models.arrays import checked_choice
+from models.checks import require
 from models.cts.rig import INCH, Rig, Tunnel
 from models.machines.free_floating import FreeFloating
 from models.machines.standing import Standing
@@ -106,7 +106,7 @@ def example_robot(name: str) -> Robot:
     Raises:
         ModelError: Another name.
     """
-    rows = ROWS[checked_choice(name, ROWS, "example_robot", "name")]
+    rows = ROWS[require.choice("example_robot: name", name, ROWS)]
     links, joints = [_cylinder("base", Z, 0.0, 0.12 if name == "seven_axis" else 0.03, 0.07, 4.0)], []
     for k, (link, place, axis, limit, velocity, effort, *body) in enumerate(rows, 1):
         limits = {"lower": -limit, "upper": limit, "velocity": velocity, "effort": effort}

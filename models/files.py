@@ -61,7 +61,7 @@ class InputLimits:
         log_message_bytes: Bytes of all joint messages of a log, which take five times as much memory.
     """
 
-    count: int = 100_000
+    count: int = 1_000_000
     array_entries: int = 2**22
     name_characters: int = 500
     description_bytes: int = 2**23

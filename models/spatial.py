@@ -22,7 +22,7 @@ import casadi as ca
 import numpy as np
 import scipy
 
-from models.arrays import NOT_NUMBERS, ROUNDING, Array, floats
+from models.checks import NOT_NUMBERS, ROUNDING, Array, floats
 from models.errors import ModelError
 
 Expression = Any

@@ -22,16 +22,7 @@ from ocp.console import interruptible, time_limited
 from ocp.direct.collocation import Collocation
 from ocp.direct.guess import Samples
 from ocp.direct.shooting import MultipleShooting
-from ocp.errors import (
-    ProblemError,
-    SolveError,
-    SolverStatus,
-    checked_each,
-    checked_flag,
-    checked_mapping,
-    checked_positive,
-    checked_time_limit,
-)
+from ocp.errors import ProblemError, SolveError, SolverStatus, checked_time_limit, require
 from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.problem import Problem, checked_problem
 from ocp.solution import ByName, Guess, Solution, check_variables_match
@@ -118,8 +109,8 @@ def prepare(
         raise ProblemError(
             f"a method such as Collocation(...) is expected, not {method!r}", name="method", value=method
         )
-    checked_flag("prepare: compiled", compiled)
-    checked_flag("prepare: scaling", scaling)
+    require.flag("prepare: compiled", compiled)
+    require.flag("prepare: scaling", scaling)
     return method.prepare(problem, solver=solver, options=options, compiled=compiled, scaling=scaling)
 
 
@@ -162,7 +153,7 @@ def solve(
             worst residuals by constraint, state and time. Or the plan is not a minimum, and no minimum was found near
             it.
     """
-    checked_flag("solve: check", check)
+    require.flag("solve: check", check)
     with time_limited(checked_time_limit(time_limit)):
         prepared = prepare(problem, method, solver=solver, options=options)
         solution = prepared.solve(parameters, guess, check)
@@ -354,9 +345,9 @@ def certificate(
         ProblemError: Fewer than two solutions, solutions of other problems or other parameters; no direct one for a
             second solver.
     """
-    checked_positive("certificate: tolerance", tolerance)
+    require.positive("certificate: tolerance", tolerance)
     named = checked_solutions(solutions)
-    if checked_flag("certificate: second_solver", second_solver):
+    if require.flag("certificate: second_solver", second_solver):
         direct = [name for name, solution in named.items() if solution.method["type"] in METHODS]
         if not direct:
             words = "a second solver confirms plans of Collocation(...) and MultipleShooting(...); there is none"
@@ -410,9 +401,9 @@ def certificate(
 def checked_solutions(solutions: Any) -> dict[str, Solution]:
     """Return solutions by name, those of a sequence by their methods; raise ProblemError for anything else."""
     if not isinstance(solutions, Mapping):
-        return name_by_method(checked_each("certificate: solutions", solutions, Solution))
-    named = checked_mapping("certificate: solutions", solutions)
-    checked_each("certificate: solutions", named.values(), Solution)
+        return name_by_method(require.each("certificate: solutions", solutions, Solution))
+    named = require.mapping("certificate: solutions", solutions)
+    require.each("certificate: solutions", named.values(), Solution)
     return named
 
 

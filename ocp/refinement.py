@@ -15,17 +15,7 @@ from ocp.audit.audit import audit as judge
 from ocp.console import TimeLimitReached, time_left, time_limited
 from ocp.direct.prepared import DirectMethod
 from ocp.direct.transcription import check_meshed
-from ocp.errors import (
-    ProblemError,
-    RefinementWarning,
-    SolveError,
-    SolverStatus,
-    checked_count,
-    checked_instance,
-    checked_mapping,
-    checked_time_limit,
-    unknown_name,
-)
+from ocp.errors import ProblemError, RefinementWarning, SolveError, SolverStatus, checked_time_limit, require
 from ocp.methods import solve
 from ocp.problem.formulation import Formulation
 from ocp.problem.problem import Problem
@@ -70,10 +60,10 @@ class RefinementSettings:
     nearer: float = 0.8
 
     def __post_init__(self) -> None:
-        for name in checked_mapping("RefinementSettings: limits", self.limits):
+        for name in require.mapping("RefinementSettings: limits", self.limits):
             if name not in LIMITS:
-                raise unknown_name("limit of the audit", name, LIMITS)
-        checked_count("RefinementSettings: max_intervals", self.max_intervals)
+                raise require.unknown("limit of the audit", name, LIMITS)
+        require.count("RefinementSettings: max_intervals", self.max_intervals)
 
 
 def refine(
@@ -121,7 +111,7 @@ def refine(
     """
     check_meshed("refine", method, tolerance)
     checked_time_limit(time_limit)
-    checked_instance("refine: settings", settings, RefinementSettings)
+    require.instance("refine: settings", settings, RefinementSettings)
     if settings.max_intervals < method.intervals:
         raise ProblemError(
             f"refine: max_intervals {settings.max_intervals} is below the {method.intervals} intervals given",

@@ -13,9 +13,10 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from models.checks import NOT_NUMBERS, floats
 from ocp.console import interruptible
 from ocp.curves import PiecewisePolynomial
-from ocp.errors import NOT_NUMBERS, AuditError, ProblemError, SolverStatus, StorageWarning, floats
+from ocp.errors import AuditError, ProblemError, SolverStatus, StorageWarning
 from ocp.problem.formulation import Formulation
 from ocp.problem.phases import parts_of_phase
 from ocp.problem.problem import Problem

@@ -15,7 +15,7 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from ocp.errors import ProblemError, SolverStatus, unknown_name
+from ocp.errors import ProblemError, SolverStatus, require
 from ocp.tolerances import ROUNDING_SHARE
 
 __all__ = ["call_registered", "register"]
@@ -49,7 +49,7 @@ class Sample(dict[str, np.ndarray]):
     """States and controls at one time (each (n,)) or at several (each (M, n)), by name."""
 
     def __missing__(self, name: str) -> np.ndarray:
-        raise unknown_name("state or control", name, self)
+        raise require.unknown("state or control", name, self)
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ def read_status(path: Any, word: Any) -> SolverStatus:
 def entry_named(kind: str, name: Any, pool: Mapping[str, T]) -> T:
     """Return an entry of a pool; raise ProblemError, which lists similar names, if there is none."""
     if not isinstance(name, str) or name not in pool:
-        raise unknown_name(kind, name, pool)
+        raise require.unknown(kind, name, pool)
     return pool[name]
 
 

@@ -23,7 +23,7 @@ from ocp.direct.assembly import Transcription
 from ocp.direct.collocation import Collocation
 from ocp.direct.prepared import DirectMethod
 from ocp.direct.transcription import check_meshed
-from ocp.errors import SolveError, SolverStatus, checked_mapping, checked_time_limit
+from ocp.errors import SolveError, SolverStatus, checked_time_limit, require
 from ocp.methods import solve
 from ocp.problem.formulation import Formulation
 from ocp.problem.problem import Problem
@@ -90,7 +90,7 @@ def tighten(
     with time_limited(checked_time_limit(time_limit)):
         prepared = method.prepare(problem, options=options)
         form, transcription = prepared.formulation, prepared.transcription
-        p = form.parameter_vector(checked_mapping("tighten: parameters", parameters))
+        p = form.parameter_vector(require.mapping("tighten: parameters", parameters))
         bounds = form.bound_values(p)
         index = np.concatenate([form.bounds.places[kind] for kind in ("state", "control", "path")])
         low, high = bounds[0][index], bounds[1][index]

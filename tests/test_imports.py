@@ -23,7 +23,7 @@ Rule: TypeAlias = Callable[["Architecture"], list[str]]
 LAYERS = {
     "models": [
         ["errors", "files"],
-        ["arrays"],
+        ["checks"],
         ["spatial"],
         ["robot", "paths"],
         ["shapes"],
@@ -49,7 +49,7 @@ LAYERS = {
 """Packages and single modules of each package, from the lowest layer up: each may import from lower layers only."""
 MACHINES = {"ocp.motion", "ocp.app"}
 """What may import `models`: all else knows no machine, beyond the modules of MATHEMATICS."""
-MATHEMATICS = {"models.arrays", "models.errors", "models.files", "models.shapes.hull"}
+MATHEMATICS = {"models.checks", "models.errors", "models.files", "models.shapes.hull"}
 FOREIGN = {"models": {"casadi", "collada", "numpy", "scipy"}}
 LARGEST_PACKAGE = 14
 LARGEST_MODULE = 500

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from models import Robot
-from models.arrays import check_entries, floats
+from models.checks import check_entries, floats
 from models.files import INPUT_LIMITS
 from ocp import Solution
 from tests.bad_values import WHOLE, Bad, Case, refusal

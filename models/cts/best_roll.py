@@ -23,7 +23,7 @@ from typing import Any, NamedTuple, TypeVar
 import casadi as ca
 import numpy as np
 
-from models.arrays import checked_flag, checked_instance
+from models.checks import require
 from models.cts.rig import HOME, Branch, Rig, RigConfiguration, Tunnel, checked_branch, configuration_at, joints_of
 from models.cts.roll import (
     Candidate,
@@ -158,9 +158,9 @@ def optimal_inverse(
     Raises:
         ModelError: The rate weight is negative or not finite, or limits=False has a rate weight.
     """
-    checked_instance(rig, Rig, "rig", "rig")
-    checked_instance(tunnel, Tunnel, "rig", "tunnel")
-    branch, limits = checked_branch(branch), checked_flag(limits, "rig", "limits")
+    require.instance("rig: rig", rig, Rig)
+    require.instance("rig: tunnel", tunnel, Tunnel)
+    branch, limits = checked_branch(branch), require.flag("rig: limits", limits)
     gain = checked_gain(rate_weight)
     if gain and not limits:
         message = "limits=False is for the closed form of I1; with a rate weight leave limits on"

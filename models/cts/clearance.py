@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from models.arrays import checked_count, checked_each, checked_instance, checked_nonnegative, checked_number
+from models.checks import require
 from models.cts.best_roll import optimal_inverse
 from models.cts.rig import HOME, INCH, Branch, Rig, Tunnel, checked_branch, configuration_at, dh_frames, joints_of
 from models.cts.roll import ACTIVE, STATUS, check_constraints, checked_gain, index_harmonics, unwrap_roll
@@ -154,7 +154,7 @@ class Radii:
 
     def __post_init__(self) -> None:
         for what, radius in vars(self).items():
-            checked_nonnegative(radius, "radii", what, "m")
+            require.nonnegative(f"radii: {what}", radius, unit="m")
 
 
 @dataclass(frozen=True)
@@ -173,16 +173,16 @@ class CollisionScene:
 
     def __post_init__(self) -> None:
         if self.walls is not None:
-            checked_instance(self.walls, Box, "scene", "walls")
+            require.instance("scene: walls", self.walls, Box)
         for what, kind in (("solids", Box), ("capsules", Capsule)):
-            object.__setattr__(self, what, checked_each(getattr(self, what), kind, "scene", what))
+            object.__setattr__(self, what, require.each(f"scene: {what}", getattr(self, what), kind))
 
 
 def rig_capsules(rig: Rig, q: Expression, radii: Radii | None = None) -> dict[str, LinkCapsule]:
     """Return the links of the rig as capsules, by name, from joint 2 to the store."""
-    checked_instance(rig, Rig, "rig", "rig")
-    radii = Radii() if radii is None else checked_instance(radii, Radii, "rig", "radii")
-    frames = dh_frames(rig, checked_vector(q, 6, "q", "one entry for each joint of the rig"))
+    require.instance("rig: rig", rig, Rig)
+    radii = Radii() if radii is None else require.instance("rig: radii", radii, Radii)
+    frames = dh_frames(rig, checked_vector("q", q, 6, "one entry for each joint of the rig"))
     joint2, joint3, joint4 = (frames[k].position for k in (1, 2, 3))
     side = frames[3].point((0, 0, rig.yaw_offset))
     corner, tool = frames[4].position, frames[7]
@@ -205,7 +205,7 @@ def clearances(
     Raises:
         ModelError: The scene is empty.
     """
-    checked_instance(scene, CollisionScene, "clearances", "scene")
+    require.instance("clearances: scene", scene, CollisionScene)
     distances: dict[tuple[str, str], Expression] = {}
     for name, capsule in rig_capsules(rig, q, radii).items():
         if scene.walls is not None:
@@ -226,14 +226,14 @@ def proximity_cost(gap: Expression, weight: float, width: float) -> Expression:
     Raises:
         ModelError: The weight is negative or not finite, or the width is not positive.
     """
-    checked_nonnegative(weight, "clearance", "weight")
-    checked_number(width, "clearance", "width", positive=True, unit="m")
+    require.nonnegative("clearance: weight", weight)
+    require.positive("clearance: width", width, unit="m")
     return weight * ca.exp(-gap / width)
 
 
 def checked_clearance(clearance: float) -> float:
     """Return `clearance` itself, m; raise a ModelError unless it is a finite distance or -inf for none."""
-    if checked_number(clearance, "rig", "clearance", finite=False) == np.inf:
+    if require.number("rig: clearance", clearance, finite=False) == np.inf:
         message = f"clearance {clearance} m must be a finite distance or -inf for none"
         raise ModelError(message, name="clearance", value=clearance)
     return clearance
@@ -272,11 +272,11 @@ def collision_free_inverse(
         ModelError: A weight, width, clearance or number of samples is out of range.
     """
     gain = checked_gain(rate_weight)
-    checked_instance(rig, Rig, "rig", "rig")
-    checked_instance(tunnel, Tunnel, "rig", "tunnel")
+    require.instance("rig: rig", rig, Rig)
+    require.instance("rig: tunnel", tunnel, Tunnel)
     branch = checked_branch(branch)
     checked_clearance(clearance)
-    checked_count(samples, "rig", "samples", 8)
+    require.count("rig: samples", samples, 8)
     target, previous, angle = ca.SX.sym("target", 5), ca.SX.sym("previous"), ca.SX.sym("angle")
     c, s = ca.cos(angle), ca.sin(angle)
     configuration = configuration_at(rig, target, c, s, branch)

@@ -16,15 +16,7 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
-from models.arrays import (
-    Array,
-    ArrayInput,
-    checked_array,
-    checked_choice,
-    checked_number,
-    warn_of_degrees,
-    warn_of_millimetres,
-)
+from models.checks import Array, ArrayInput, Sign, require, warn_of_degrees, warn_of_millimetres
 from models.errors import ModelError
 from models.spatial import FULL_TURN, Expression, Frame, expression, rotation
 
@@ -61,11 +53,11 @@ class Rig:
 
     def __post_init__(self) -> None:
         for name in LENGTHS:
-            length = checked_number(getattr(self, name), "rig", name, positive=True, unit="m")
+            length = require.positive(f"rig: {name}", getattr(self, name), unit="m")
             object.__setattr__(self, name, length)
-            warn_of_millimetres(length, "rig", name, name)
+            warn_of_millimetres(f"rig: {name}", length)
         for name in ("lower", "upper"):
-            object.__setattr__(self, name, checked_array(getattr(self, name), (6,), "rig", name, finite=False))
+            object.__setattr__(self, name, require.array(f"rig: {name}", getattr(self, name), (6,), entries="numbers"))
         for joint, (low, high) in enumerate(zip(self.lower, self.upper, strict=True), 1):
             if not low < high:
                 message = f"rig: joint {joint} has lower limit {low} not below its upper limit {high}"
@@ -74,7 +66,7 @@ class Rig:
                 message = f"rig: joint {joint} has limits {low} .. {high}; give a revolute joint both or none"
                 raise ModelError(message, name=f"joint {joint}", limit=(low, high))
             if joint > 1:
-                warn_of_degrees((low, high), "rig", f"joint {joint}", f"limit of joint {joint}")
+                warn_of_degrees(f"rig: limit of joint {joint}", (low, high), f"joint {joint}")
 
     def limited(self, joint: int) -> bool:
         """Return whether the limits of revolute joint 2..6 (counted from 1) are less than a full turn apart."""
@@ -112,13 +104,9 @@ class Tunnel:
     weights: ArrayInput = (1.0, 1.0, 1.0)
 
     def __post_init__(self) -> None:
-        for name in ("center", "ranges", "weights"):
-            positive = name == "ranges"
-            value = checked_array(getattr(self, name), (3,), "tunnel", name, positive=positive, unit="m")
-            object.__setattr__(self, name, value)
-        if not (self.weights >= 0).all():
-            message = f"tunnel: weights {self.weights.tolist()} must not be negative"
-            raise ModelError(message, name="weights", value=self.weights, limit=0.0)
+        signs: dict[str, Sign] = {"center": "any", "ranges": "positive", "weights": "nonnegative"}
+        for name, sign in signs.items():
+            object.__setattr__(self, name, require.array(f"tunnel: {name}", getattr(self, name), (3,), sign=sign))
 
     @property
     def scale(self) -> Array:
@@ -144,7 +132,7 @@ HOME = BRANCHES[0]
 
 def checked_branch(branch: Branch) -> Branch:
     """Return the branch itself; raise a ModelError unless it is one of the four."""
-    return Branch(*checked_choice(branch, BRANCHES, "rig", "branch"))
+    return Branch(*require.choice("rig: branch", branch, BRANCHES))
 
 
 class RigConfiguration(NamedTuple):

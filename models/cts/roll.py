@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from models.arrays import checked_nonnegative
+from models.checks import require
 from models.cts.rig import (
     Branch,
     Rig,
@@ -367,7 +367,7 @@ def slide_points(rig: Rig, upper: bool) -> Any:
 
 def checked_gain(rate_weight: float) -> float:
     """Return w4 / (2 pi); raise a ModelError for a weight that is negative or not finite."""
-    return checked_nonnegative(rate_weight, "rig", "rate_weight") / FULL_TURN
+    return require.nonnegative("rig: rate_weight", rate_weight) / FULL_TURN
 
 
 def unwrap_roll(rig: Rig, c: Expression, s: Expression, previous: Expression) -> Expression:

@@ -17,17 +17,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from models.arrays import (
-    Array,
-    ArrayInput,
-    checked_array,
-    checked_broadcast,
-    checked_each,
-    checked_flag,
-    checked_instance,
-    checked_number,
-    warn_of_degrees,
-)
+from models.checks import Array, ArrayInput, require, warn_of_degrees
 from models.cts.best_roll import optimal_inverse
 from models.cts.clearance import CollisionScene, collision_free_inverse
 from models.cts.rig import (
@@ -103,16 +93,16 @@ def solve_table(
         ModelError: The table is empty or has a wrong shape, there is no branch or an unknown one, or a previous roll is
             not finite.
     """
-    checked_instance(rig, Rig, "rig", "rig")
-    checked_instance(tunnel, Tunnel, "rig", "tunnel")
-    checked_flag(in_sequence, "table", "in_sequence")
+    require.instance("rig: rig", rig, Rig)
+    require.instance("rig: tunnel", tunnel, Tunnel)
+    require.flag("table: in_sequence", in_sequence)
     rows = checked_targets(targets, finite=False)
-    branches = tuple(checked_branch(branch) for branch in checked_each(branches, Branch, "table", "branches"))
+    branches = tuple(checked_branch(branch) for branch in require.each("table: branches", branches, Branch))
     if not branches:
         message = "table: branches is empty; give at least one, for example (HOME,)"
         raise ModelError(message, name="branches", value=branches)
     count = len(rows)
-    before = checked_broadcast(previous, count, "table", "previous", "targets")
+    before = require.broadcast("table: previous", previous, count, "targets")
     if scene is None:
         functions = [optimal_inverse(rig, tunnel, branch, rate_weight=rate_weight) for branch in branches]
     else:
@@ -177,7 +167,7 @@ def reachable_rolls(rig: Rig, target: ArrayInput, branch: Branch = HOME) -> list
     Raises:
         ModelError: The target has a wrong shape or is not finite.
     """
-    checked_instance(rig, Rig, "rig", "rig")
+    require.instance("rig: rig", rig, Rig)
     row = checked_targets([target])[0]
     ends, feasible = roll_interval_functions(rig, checked_branch(branch))
     points = np.array(ends(row))
@@ -225,9 +215,9 @@ def all_joint_sets(rig: Rig, target: ArrayInput, roll: float) -> list[tuple[Bran
     Raises:
         ModelError: The target or roll is not finite, or no branch reaches the pose (names the link).
     """
-    checked_instance(rig, Rig, "rig", "rig")
+    require.instance("rig: rig", rig, Rig)
     row = checked_targets([target])[0]
-    checked_number(roll, "rig", "roll")
+    require.number("rig: roll", roll)
     solutions, margins = [], []
     for branch in BRANCHES:
         joints, reach = inverse(rig, ca.DM(row), ca.DM(roll), branch)
@@ -244,8 +234,8 @@ def all_joint_sets(rig: Rig, target: ArrayInput, roll: float) -> list[tuple[Bran
 
 def checked_targets(targets: ArrayInput, finite: bool = True) -> Array:
     """Return targets (x, y, z, yaw, pitch), shape (samples, 5); raise a ModelError for the first wrong row."""
-    rows = checked_array(targets, ("samples", 5), "table", "targets", finite=finite, nan=not finite)
-    warn_of_degrees(rows[:, 3:], "table", "targets", "yaw or pitch")
+    rows = require.array("table: targets", targets, ("samples", 5), entries="finite" if finite else "any")
+    warn_of_degrees("table: yaw or pitch", rows[:, 3:], "targets")
     return rows
 
 

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from models.arrays import Array, checked_flag, checked_indices, checked_nonnegative
+from models.checks import Array, require
 from models.errors import ModelError
 from models.files import INPUT_LIMITS
 from models.machines.machine import Machine
@@ -102,12 +102,14 @@ class CollisionScene:
         obstacles = _checked_list((self.obstacles,) if single else self.obstacles, "obstacles")
         for number, obstacle in enumerate(obstacles):
             name = f"obstacles[{number}]"
-            shape = obstacle.shape if isinstance(obstacle, MovingObstacle) else checked_shape(obstacle, "scene", name)
+            shape = (
+                obstacle.shape if isinstance(obstacle, MovingObstacle) else checked_shape(f"scene: {name}", obstacle)
+            )
             if isinstance(shape, Box) and not np.isfinite(shape.size).all():
                 message = f"scene: {name} is an infinite box; give its size, or a HalfSpace"
                 raise ModelError(message, name=name, value=shape.size)
         object.__setattr__(self, "obstacles", obstacles)
-        clearance = checked_nonnegative(self.clearance, "scene", "clearance", "m")
+        clearance = require.nonnegative("scene: clearance", self.clearance, unit="m")
         object.__setattr__(self, "clearance", clearance)
         robot = getattr(self.machine, "robot", None)
         if not isinstance(robot, Robot):
@@ -118,7 +120,7 @@ class CollisionScene:
         object.__setattr__(self, "covered", _by_mesh(robot, own))
         link_pairs, obstacle_pairs = self._ignored_pairs()
         unlimited: dict[str, Any] = {"lower": -np.inf, "upper": np.inf}
-        limits = {} if checked_flag(self.limits, "scene", "limits") else unlimited
+        limits = {} if require.flag("scene: limits", self.limits) else unlimited
         known = self.classified
         if known is None:
             known = checked_pairs(robot, own, ignored=link_pairs, srdf=self.srdf, clearance=clearance, **limits)
@@ -317,8 +319,8 @@ class CollisionScene:
         if isinstance(pairs, list | tuple) and not pairs:
             indices = indices[:0]
         elif pairs is not None:
-            indices = checked_indices(pairs, len(indices), "scene", "pairs").ravel()
-        return indices.tolist(), checked_nonnegative(rounding, "scene", "rounding", "m")
+            indices = require.indices("scene: pairs", pairs, len(indices)).ravel()
+        return indices.tolist(), require.nonnegative("scene: rounding", rounding, unit="m")
 
     @cached_property
     def levers(self) -> Levers:

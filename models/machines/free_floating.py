@@ -22,7 +22,7 @@ from typing import Literal, NamedTuple, TypeAlias, get_args
 import casadi as ca
 import numpy as np
 
-from models.arrays import Array, ArrayInput, checked_array, checked_choice, checked_instance
+from models.checks import Array, ArrayInput, require
 from models.errors import ModelError
 from models.robot.dynamics import inverse_dynamics, joint_momenta, robot_inertia, subtree_moments
 from models.robot.dynamics import momentum_matrix as joint_momentum_matrix
@@ -84,14 +84,14 @@ class FreeFloating:
     conserved_momentum: ArrayInput | None = None
 
     def __post_init__(self) -> None:
-        checked_choice(self.base, get_args(BaseKind), "free-floating machine", "base")
-        checked_instance(self.robot, Robot, "machine", "robot")
+        require.choice("free-floating machine: base", self.base, get_args(BaseKind))
+        require.instance("machine: robot", self.robot, Robot)
         if self.base == "planar":
             _require_planar(self.robot)
         _require_inertia(self.robot, self.twist_rows)
         size = len(self.twist_rows)
         momentum = np.zeros(size) if self.conserved_momentum is None else self.conserved_momentum
-        momentum = checked_array(momentum, (size,), f"{self.base} free-floating base", "conserved_momentum")
+        momentum = require.array(f"{self.base} free-floating base: conserved_momentum", momentum, (size,))
         object.__setattr__(self, "conserved_momentum", momentum)
 
     @property
@@ -166,7 +166,7 @@ class FreeFloating:
     @on_scalars
     def twist_of_rate(self, base: Expression, base_rate: Expression) -> Expression:
         """Return the base twist for a rate of the base configuration. Shape (6, 1), or (3, 1) if planar."""
-        rate = checked_vector(base_rate, self.base_size, "base_rate", "the derivative of the base configuration")
+        rate = checked_vector("base_rate", base_rate, self.base_size, "the derivative of the base configuration")
         base = self._checked_base(base)
         if self.base == "planar":
             return ca.vertcat(rate[2], rate[0:2])
@@ -194,7 +194,7 @@ class FreeFloating:
         Shape (6, 1) or (3, 1).
         """
         locked, joints = self.momentum_matrices(base, q)
-        twist = checked_vector(base_twist, len(self.twist_rows), "base_twist", "angular velocity, then linear")
+        twist = checked_vector("base_twist", base_twist, len(self.twist_rows), "angular velocity, then linear")
         return ca.mtimes(locked, twist) + ca.mtimes(joints, joint_vector(self.robot, joint_rates, "joint_rates"))
 
     @on_scalars
@@ -277,7 +277,7 @@ class FreeFloating:
     def _checked_base(self, base: Expression) -> Expression:
         """Return the base configuration as a column; raise ModelError for another size."""
         meaning = "(x, y, angle)" if self.base == "planar" else "(x, y, z, qw, qx, qy, qz)"
-        return checked_vector(base, self.base_size, "base", meaning)
+        return checked_vector("base", base, self.base_size, meaning)
 
     def _spatial_momentum(self) -> tuple[Expression, Expression] | None:
         """Return the conserved momentum (angular about the centre of mass, linear) in world axes; None if it is zero.

@@ -15,16 +15,7 @@ from typing import Any, Protocol, cast
 import casadi as ca
 import numpy as np
 
-from models.arrays import (
-    ROUNDING,
-    Array,
-    ArrayInput,
-    checked_array,
-    checked_broadcast,
-    checked_instance,
-    checked_rotation,
-    checked_text,
-)
+from models.checks import ROUNDING, Array, ArrayInput, require
 from models.errors import ModelError
 from models.robot.kinematics import (
     TWIST_SIZE,
@@ -112,8 +103,8 @@ class FixedBase:
     def __post_init__(self) -> None:
         require_joints(self.robot)
         owner = "fixed base"
-        object.__setattr__(self, "translation", checked_array(self.translation, (3,), owner, "translation"))
-        object.__setattr__(self, "rotation", checked_rotation(self.rotation, owner, "rotation"))
+        object.__setattr__(self, "translation", require.array(f"{owner}: translation", self.translation, (3,)))
+        object.__setattr__(self, "rotation", require.rotation(f"{owner}: rotation", self.rotation))
 
     @property
     def base_size(self) -> int:
@@ -131,7 +122,7 @@ class FixedBase:
 
     def world_from_base(self, base: Expression = ()) -> Frame:
         """Return the constant pose of the root link's frame in the world."""
-        checked_vector(base, 0, "base", "a fixed base has no configuration")
+        checked_vector("base", base, 0, "a fixed base has no configuration")
         return Frame(expression(self.rotation), expression(self.translation))
 
     def tip_pose(self, base: Expression, q: Expression) -> Frame:
@@ -207,7 +198,7 @@ def _with_robot(machine: Machine) -> Any:
 
 def require_joints(robot: Robot) -> None:
     """Raise ModelError unless the argument is a robot with a moving joint."""
-    checked_instance(robot, Robot, "machine", "robot")
+    require.instance("machine: robot", robot, Robot)
     if robot.dof == 0:
         names = [link.name for link in robot.links]
         raise ModelError(f"the robot of the links {names} has no moving joint", name="robot", value=names)
@@ -243,25 +234,25 @@ def with_wheels(
         ModelError: Sizes that differ, an axis of zero length, numbers that are not positive, names that already exist.
     """
     owner = "reaction wheels"
-    robot = checked_instance(robot, Robot, owner, "robot")
-    directions = checked_array(axes, ("wheels", 3), owner, "axes")
+    robot = require.instance(f"{owner}: robot", robot, Robot)
+    directions = require.array(f"{owner}: axes", axes, ("wheels", 3))
     for axis in directions:
         if not np.linalg.norm(axis) > 0:
             raise ModelError(f"{owner}: axis {axis.tolist()} has no direction", name="axes", value=axis)
     count = len(directions)
-    checked_text(prefix, owner, "prefix")
+    require.text(f"{owner}: prefix", prefix)
     carrier = robot.root if link is None else robot.link(link).name
-    inertias = checked_broadcast(inertia, count, owner, "inertia", "wheels", positive=True)
-    speeds = checked_broadcast(momentum, count, owner, "momentum", "wheels", finite=False, positive=True) / inertias
-    torques = checked_broadcast(torque, count, owner, "torque", "wheels", finite=False, positive=True)
-    masses = checked_broadcast(mass, count, owner, "mass", "wheels", least=0)
+    inertias = require.broadcast(f"{owner}: inertia", inertia, count, "wheels", sign="positive")
+    momenta = require.broadcast(f"{owner}: momentum", momentum, count, "wheels", entries="numbers", sign="positive")
+    torques = require.broadcast(f"{owner}: torque", torque, count, "wheels", entries="numbers", sign="positive")
+    masses = require.broadcast(f"{owner}: mass", mass, count, "wheels")
     positions = np.zeros((count, 3)) if translations is None else translations
-    positions = checked_array(positions, (count, 3), owner, "translations")
+    positions = require.array(f"{owner}: translations", positions, (count, 3))
     links, joints = [*robot.links], [*robot.joints]
     for k in range(count):
         name = f"{prefix}{k + 1}"
         joint = Joint(name, "continuous", carrier, f"{name}_rotor", positions[k], axis=directions[k])
-        joints.append(replace(joint, velocity=float(speeds[k]), effort=float(torques[k])))
+        joints.append(replace(joint, velocity=float(momenta[k] / inertias[k]), effort=float(torques[k])))
         transverse = np.eye(3) - np.outer(joint.axis, joint.axis)
         links.append(Link(joint.child, masses[k], (0.0, 0.0, 0.0), inertias[k] * (np.eye(3) - (1 - 0.6) * transverse)))
     return replace(robot, links=tuple(links), joints=tuple(joints))
@@ -273,7 +264,7 @@ def find_wheels(robot: Robot) -> dict[str, float]:
     Such a joint is unbounded and moves a single body, symmetric about the joint axis with its centre of mass on it,
     that carries neither the tip nor a collision shape.
     """
-    robot = checked_instance(robot, Robot, "wheels", "robot")
+    robot = require.instance("wheels: robot", robot, Robot)
     carriers = {joint.parent for joint in robot.joints} | {robot.tip}
     leaders = {joint.mimic.joint for joint in robot.joints if joint.mimic is not None}
     wheels = {}

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from models.arrays import Array
+from models.checks import Array
 from models.machines.machine import Machine
 from models.robot.kinematics import frames_and_axes
 from models.shapes.distance import COLUMNS, column, distance, pair_wrenches, soft_minimum

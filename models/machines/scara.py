@@ -19,18 +19,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 import casadi as ca
 import numpy as np
 
-from models.arrays import (
-    Array,
-    ArrayInput,
-    checked_array,
-    checked_choice,
-    checked_each,
-    checked_instance,
-    checked_nonnegative,
-    checked_number,
-    warn_of_degrees,
-    warn_of_millimetres,
-)
+from models.checks import Array, ArrayInput, require, warn_of_degrees, warn_of_millimetres
 from models.errors import ModelError
 from models.paths import SmoothPath
 from models.robot.kinematics import checked_vector
@@ -68,13 +57,15 @@ class Scara:
 
     def __post_init__(self) -> None:
         for field in ("upper_arm", "forearm"):
-            length = checked_number(getattr(self, field), "scara", field, positive=True, unit="m")
+            length = require.positive(f"scara: {field}", getattr(self, field), unit="m")
             object.__setattr__(self, field, length)
-            warn_of_millimetres(length, "scara", field, field)
-        object.__setattr__(self, "mount", checked_array(self.mount, (3,), "scara", "mount"))
+            warn_of_millimetres(f"scara: {field}", length)
+        object.__setattr__(self, "mount", require.array("scara: mount", self.mount, (3,)))
         for field in ("lower", "upper"):
-            object.__setattr__(self, field, checked_array(getattr(self, field), (4,), "scara", field, finite=False))
-        names = () if isinstance(self.names, str) else checked_each(self.names, str, "scara", "names")
+            object.__setattr__(
+                self, field, require.array(f"scara: {field}", getattr(self, field), (4,), entries="numbers")
+            )
+        names = () if isinstance(self.names, str) else require.each("scara: names", self.names, str)
         if len(set(names) - {""}) != 4 or len(names) != 4:
             message = f"scara: joint names {list(self.names)} must be four that differ"
             raise ModelError(message, name="names", value=self.names)
@@ -84,7 +75,7 @@ class Scara:
                 raise ModelError(message, name=name, value=low, limit=high)
         for joint, name in enumerate(self.names):
             if joint != QUILL:
-                warn_of_degrees((self.lower[joint], self.upper[joint]), "scara", name, f"limit of {name!r}")
+                warn_of_degrees(f"scara: limit of {name!r}", (self.lower[joint], self.upper[joint]), name)
 
     @property
     def outer(self) -> float:
@@ -110,7 +101,7 @@ class Scara:
 
     def forward(self, joints: Expression) -> Frame:
         """Return the frame of the tool in world. `joints` has shape (4,), CasADi or numbers."""
-        q = checked_vector(joints, 4, "joints", f"one entry for each of {list(self.names)}")
+        q = checked_vector("joints", joints, 4, f"one entry for each of {list(self.names)}")
         bend = q[0] + q[1]
         x = self.upper_arm * ca.cos(q[0]) + self.forearm * ca.cos(bend)
         y = self.upper_arm * ca.sin(q[0]) + self.forearm * ca.sin(bend)
@@ -131,8 +122,8 @@ class Scara:
         Raises:
             ModelError: nan, a point out of reach (the message gives the distance), joint limits.
         """
-        point = checked_array(position, (3,), "scara", "position")
-        angle = checked_number(yaw, "scara", "yaw")
+        point = require.array("scara: position", position, (3,))
+        angle = require.number("scara: yaw", yaw)
         self.check_reach(float(np.hypot(*(point - self.mount)[:2])), f"point {point.tolist()} m")
         q = np.array(ca.DM(self.inverse_expression(np.append(point, angle), elbow))).ravel()
         for joint, name in enumerate(self.names):
@@ -169,8 +160,8 @@ class Scara:
 
         sin q2 is computed from the product of the distances to both ends of the reach, which is accurate near them.
         """
-        checked_choice(elbow, get_args(Elbow), "scara", "elbow")
-        p = checked_vector(pose, 4, "pose", "x, y, z and yaw")
+        require.choice("scara: elbow", elbow, get_args(Elbow))
+        p = checked_vector("pose", pose, 4, "x, y, z and yaw")
         x, y, z = (p[i] - float(self.mount[i]) for i in range(3))
         a, b = self.upper_arm, self.forearm
         square = x**2 + y**2
@@ -271,9 +262,9 @@ def scara_along(scara: Scara, path: SmoothPath, elbow: Elbow = "left", *, cleara
         ModelError: A path out of reach or within `clearance` of a singularity (the message says where); a tool that
             tilts; joint limits.
     """
-    checked_instance(scara, Scara, "scara", "scara")
-    checked_instance(path, SmoothPath, "scara", "path")
-    checked_nonnegative(clearance, "scara", "clearance", "m")
+    require.instance("scara: scara", scara, Scara)
+    require.instance("scara: path", path, SmoothPath)
+    require.nonnegative("scara: clearance", clearance, unit="m")
     _check_reach(scara, path, clearance)
     rates = scara.inverse_rates(elbow)
     s = path.sample_distances(8, 16)

@@ -15,17 +15,7 @@ from typing import Self
 import casadi as ca
 import numpy as np
 
-from models.arrays import (
-    ROUNDING,
-    Array,
-    ArrayInput,
-    checked_array,
-    checked_instance,
-    checked_mapping,
-    checked_name,
-    checked_number,
-    checked_rotation,
-)
+from models.checks import ROUNDING, Array, ArrayInput, require
 from models.errors import ModelError
 from models.machines.machine import FixedBase
 from models.machines.support import Support, convex_hull, footprint
@@ -34,7 +24,6 @@ from models.robot.kinematics import center_of_mass, checked_vector, frame_jacobi
 from models.robot.parts import massless_error
 from models.robot.rebuild import reroot, simplify, subtree
 from models.robot.robot import Robot
-from models.robot.tree import unknown_name
 from models.spatial import Expression, Frame, cross
 
 __all__ = ["Foot", "Foothold", "Stance"]
@@ -63,11 +52,11 @@ class Foot:
     rotation: ArrayInput = field(default_factory=lambda: np.eye(3))
 
     def __post_init__(self) -> None:
-        owner = f"foot {checked_name(self.link, 'foot', 'link')!r}"
+        owner = f"foot {require.name('foot: link', self.link)!r}"
         if self.sole is not None:
-            checked_instance(self.sole, Support, owner, "sole")
-        object.__setattr__(self, "translation", checked_array(self.translation, (3,), owner, "translation"))
-        object.__setattr__(self, "rotation", checked_rotation(self.rotation, owner, "rotation"))
+            require.instance(f"{owner}: sole", self.sole, Support)
+        object.__setattr__(self, "translation", require.array(f"{owner}: translation", self.translation, (3,)))
+        object.__setattr__(self, "rotation", require.rotation(f"{owner}: rotation", self.rotation))
 
     @classmethod
     def of(cls, robot: Robot, link: str, rotation: ArrayInput = None) -> Self:
@@ -106,14 +95,14 @@ class Foothold:
     rotation: ArrayInput = field(default_factory=lambda: np.eye(3))
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "position", checked_array(self.position, (3,), "foothold", "position", unit="m"))
-        object.__setattr__(self, "rotation", checked_rotation(self.rotation, "foothold", "rotation"))
+        object.__setattr__(self, "position", require.array("foothold: position", self.position, (3,), unit="m"))
+        object.__setattr__(self, "rotation", require.rotation("foothold: rotation", self.rotation))
 
     @classmethod
     def level(cls, x: float, y: float, heading: float = 0.0, height: float = 0.0) -> Self:
         """Return a foothold on level ground: x, y (m), turned left by a heading (rad), a height (m) above z = 0."""
         numbers = {"x": x, "y": y, "heading": heading, "height": height}
-        x, y, heading, height = (checked_number(value, "foothold", name) for name, value in numbers.items())
+        x, y, heading, height = (require.number(f"foothold: {name}", value) for name, value in numbers.items())
         turn = [[np.cos(heading), -np.sin(heading), 0.0], [np.sin(heading), np.cos(heading), 0.0], [0.0, 0.0, 1.0]]
         return cls((x, y, height), turn)
 
@@ -147,15 +136,15 @@ class Stance(FixedBase):
                 mass or moving joints, a gravity that is not positive.
         """
         owner = "stance"
-        checked_instance(robot, Robot, owner, "robot")
+        require.instance(f"{owner}: robot", robot, Robot)
         for argument, mapping, kind in (("feet", feet, Foot), ("footholds", footholds, Foothold)):
-            for name, value in checked_mapping(mapping, owner, argument).items():
-                checked_instance(value, kind, f"{owner}: {name!r}", argument)
+            for name, value in require.mapping(f"{owner}: {argument}", mapping).items():
+                require.instance(f"{owner}: {name!r}: {argument}", value, kind)
         if not footholds:
             raise ModelError(f"{owner}: no footholds are given; give at least one", name="footholds")
         for name in footholds:
             if name not in feet:
-                raise unknown_name("foot", name, feet)
+                raise require.unknown("foot", name, feet)
         links = [robot.link(foot.link).name for foot in feet.values()]
         if shared := [link for link in links if links.count(link) > 1]:
             raise ModelError(f"{owner}: link {shared[0]!r} is two feet; join their soles", name="feet", value=shared)
@@ -170,7 +159,7 @@ class Stance(FixedBase):
             rotation=turn,
             feet=dict(feet),
             footholds=dict(footholds),
-            gravity=checked_number(gravity, owner, "gravity", positive=True, unit="m/s^2"),
+            gravity=require.positive(f"{owner}: gravity", gravity, unit="m/s^2"),
         )
 
     @property
@@ -186,7 +175,7 @@ class Stance(FixedBase):
     def foot(self, name: str) -> Foot:
         """Return a foot by its name; raise ModelError, with similar names, if there is none."""
         if not isinstance(name, str) or name not in self.feet:
-            raise unknown_name("foot", name, self.feet)
+            raise require.unknown("foot", name, self.feet)
         return self.feet[name]
 
     @property
@@ -231,13 +220,13 @@ class Stance(FixedBase):
         return np.array([0.0, 0.0, -self.gravity])
 
     def _wrenches(self, others: Mapping[str, Expression]) -> list[Wrench]:
-        others = checked_mapping(others, "stance", "others")
+        others = require.mapping("stance: others", others)
         if set(others) != set(self.other_feet):
             message = f"stance: loads of the feet {list(self.other_feet)} are needed, not of {list(others)}"
             raise ModelError(message, name="others", value=tuple(others), limit=self.other_feet)
         wrenches = []
         for name, load in others.items():
-            load = checked_vector(load, 6, f"load of {name!r}", "moment about the sole's origin and force")
+            load = checked_vector(f"load of {name!r}", load, 6, "moment about the sole's origin and force")
             foot = self.feet[name]
             wrenches.append(Wrench(foot.link, load[3:], load[:3], foot.translation))
         return wrenches

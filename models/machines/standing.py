@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, TypeAlias
 import casadi as ca
 import numpy as np
 
-from models.arrays import ROUNDING, Array, ArrayInput, checked_array, checked_instance, checked_number
+from models.checks import ROUNDING, Array, ArrayInput, require
 from models.errors import ModelError
 from models.machines.machine import FixedBase
 from models.machines.support import Support
@@ -99,12 +99,13 @@ class Standing(FixedBase):
             raise ModelError(message, name="support", value=self.support)
         if self.robot.total_mass == 0:
             raise massless_error("nothing presses its foot on the ground")
-        gravity = checked_number(self.gravity, owner, "gravity", positive=True, unit="m/s^2")
+        gravity = require.positive(f"{owner}: gravity", self.gravity, unit="m/s^2")
         object.__setattr__(self, "gravity", gravity)
-        for name, default in (("most_stable_point", self.support.center), ("half_widths", self.support.half_widths)):
-            value = default if getattr(self, name) is None else getattr(self, name)
-            value = checked_array(value, (2,), owner, name, positive=name == "half_widths", unit="m")
-            object.__setattr__(self, name, value)
+        point = self.support.center if self.most_stable_point is None else self.most_stable_point
+        widths = self.support.half_widths if self.half_widths is None else self.half_widths
+        object.__setattr__(self, "most_stable_point", require.array(f"{owner}: most_stable_point", point, (2,)))
+        widths = require.array(f"{owner}: half_widths", widths, (2,), sign="positive", unit="m")
+        object.__setattr__(self, "half_widths", widths)
 
     @property
     def weight(self) -> float:
@@ -152,7 +153,7 @@ class Standing(FixedBase):
 
     def stability_index(self, point: Expression) -> Expression:
         """Return 1 - ((point - most stable point) / half-width)^2 for x and y, (5)-(6). Shape (2, 1)."""
-        offset = checked_vector(point, 2, "point", "x and y on the ground") - ca.DM(self.most_stable_point)
+        offset = checked_vector("point", point, 2, "x and y on the ground") - ca.DM(self.most_stable_point)
         return 1 - (offset / ca.DM(self.half_widths)) ** 2
 
     def zmp_rows(self, q: Expression, qd: Expression, point: Expression, wrenches: Sequence[Wrench] = ()) -> ZmpRows:
@@ -164,7 +165,7 @@ class Standing(FixedBase):
             wrenches: External wrenches; they enter C.
         """
         external = external_wrench(self.robot, q, wrenches, self.world_from_base())
-        point = checked_vector(point, 2, "point", "x and y on the ground")
+        point = checked_vector("point", point, 2, "x and y on the ground")
         q, qd = joint_vector(self.robot, q), joint_vector(self.robot, qd, "qd")
         jacobian, first, second, right = self._zmp_rows(q, qd, point, external)
         return ZmpRows(jacobian, (first, second), right)
@@ -215,7 +216,7 @@ class Standing(FixedBase):
 
     def nearest_reachable(self, point: ArrayInput) -> Array:
         """Return the point nearest to `point` to which motion can shift the zero moment point. Shape (2,), m."""
-        target = checked_array(point, (2,), "standing machine", "point")
+        target = require.array("standing machine: point", point, (2,))
         projection = self.moving_directions.T @ self.moving_directions
         return np.asarray(projection @ target + (np.eye(2) - projection) @ self._sampled_points.mean(axis=0))
 
@@ -226,7 +227,7 @@ class Standing(FixedBase):
 
 def center_of_pressure(reaction: Expression) -> Expression:
     """Return the zero moment point (x, y) of a reaction (moment about the world's origin, force). Shape (2, 1), m."""
-    reaction = checked_vector(reaction, 6, "reaction", "moment about the world's origin and force")
+    reaction = checked_vector("reaction", reaction, 6, "moment about the world's origin and force")
     return ca.vertcat(-reaction[1], reaction[0]) / reaction[5]
 
 
@@ -237,9 +238,9 @@ def tip_spring(machine: Standing, stiffness: ArrayInput, rest: ArrayInput) -> Ex
         stiffness: Along world x, y, z. Shape (3,), N/m.
         rest: Position of the tip at which the spring is relaxed. Shape (3,), m.
     """
-    checked_instance(machine, Standing, "tip spring", "machine")
-    k = checked_array(stiffness, (3,), "tip spring", "stiffness")
-    relaxed = checked_array(rest, (3,), "tip spring", "rest")
+    require.instance("tip spring: machine", machine, Standing)
+    k = require.array("tip spring: stiffness", stiffness, (3,))
+    relaxed = require.array("tip spring: rest", rest, (3,))
     return lambda time, tip: [machine.tip_wrench(-ca.DM(k) * (tip - ca.DM(relaxed)))]
 
 
@@ -387,10 +388,10 @@ def standing_motion(
     Raises:
         ModelError: No times, shapes that do not match, nan.
     """
-    times = checked_array(t, ("times",), "motion", "t")
+    times = require.array("motion: t", t, ("times",))
     arrays = {"joints": joints, "joint_velocities": joint_velocities, "joint_accelerations": joint_accelerations}
     shape = (len(times), machine.joint_size)
-    parts = [checked_array(part, shape, "motion", name, finite=False) for name, part in arrays.items()]
+    parts = [require.array(f"motion: {name}", part, shape, entries="numbers") for name, part in arrays.items()]
     return StandingMotion(times, *parts, **evaluate_motion(motion_function(machine, external, rows), times, *parts))
 
 

@@ -12,17 +12,7 @@ import casadi as ca
 import numpy as np
 import scipy
 
-from models.arrays import (
-    ROUNDING,
-    Array,
-    ArrayInput,
-    checked_array,
-    checked_each,
-    checked_instance,
-    checked_nonnegative,
-    checked_rotation,
-    frozen,
-)
+from models.checks import ROUNDING, Array, ArrayInput, frozen, require
 from models.errors import ModelError
 from models.robot.kinematics import checked_vector, link_frames
 from models.robot.parts import CollisionShape
@@ -45,7 +35,7 @@ class Support:
     vertices: ArrayInput
 
     def __post_init__(self) -> None:
-        corners: Array = checked_array(self.vertices, ("corners", 2), "support", "vertices", least=3, unit="m")
+        corners: Array = require.array("support: vertices", self.vertices, ("corners", 2), least=3, unit="m")
         size = float(np.ptp(corners, axis=0).max())
         area = _area(corners)
         if abs(area) <= ROUNDING * size**2:
@@ -112,7 +102,7 @@ class Support:
 
     def distances(self, point: Expression) -> Expression:
         """Return the signed distance of a point from each edge's line, positive inside. Shape (k, 1), m."""
-        point = checked_vector(point, 2, "point", "x and y on the ground")
+        point = checked_vector("point", point, 2, "x and y on the ground")
         offsets = (self.normals * self.vertices).sum(axis=1)
         return ca.mtimes(ca.sparsify(ca.DM(self.normals)), point) - ca.DM(offsets)
 
@@ -131,7 +121,7 @@ def rectangle(x: ArrayInput, y: ArrayInput) -> Support:
     Raises:
         ModelError: Not two numbers each, or a side without length.
     """
-    x, y = checked_array(x, (2,), "rectangle", "x"), checked_array(y, (2,), "rectangle", "y")
+    x, y = require.array("rectangle: x", x, (2,)), require.array("rectangle: y", y, (2,))
     for name, (lower, upper) in (("x", x), ("y", y)):
         if not lower < upper:
             message = f"rectangle: {name} from {lower:g} to {upper:g} m has no length; give the lower bound first"
@@ -194,12 +184,12 @@ def footprint(
         ModelError: Unknown links, only mesh shapes, a mesh whose origin is below all other shapes, collinear contact
             points, a negative depth, an invalid rotation.
     """
-    checked_instance(robot, Robot, "footprint", "robot")
-    checked_nonnegative(depth, "footprint", "depth", "m")
+    require.instance("footprint: robot", robot, Robot)
+    require.nonnegative("footprint: depth", depth, unit="m")
     if links is not None:
-        links = checked_each(links, str, "footprint", "links")
+        links = require.each("footprint: links", links, str)
     candidates = robot.links if links is None else [robot.link(name) for name in links]
-    upright = checked_rotation(np.eye(3) if rotation is None else rotation, "footprint", "rotation")
+    upright = require.rotation("footprint: rotation", np.eye(3) if rotation is None else rotation)
     frames = link_frames(robot, np.zeros(robot.dof) if q is None else q, Frame(ca.DM(upright), ca.DM.zeros(3)))
     owners: list[str] = []
     points: list[Array] = []

@@ -32,7 +32,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from models.arrays import Array, ArrayInput, checked_broadcast, checked_choice, checked_number, checked_numbers
+from models.checks import Array, ArrayInput, require
 from models.errors import ModelError
 from models.spatial import Expression
 
@@ -76,9 +76,9 @@ def checked_shape(shape: ArrayInput, kind: str, count: int = 1) -> Array:
         ModelError: A factor is not positive or reaches that of the cusp (cubic 6, quintic 30/7), or the kind is
             unknown.
     """
-    checked_choice(kind, get_args(BlendKind), "blend", "kind")
+    require.choice("blend: kind", kind, get_args(BlendKind))
     cusp = LARGEST_SHAPE[kind]
-    factors = checked_broadcast(shape, count, f"{kind} blend", "shape factor", "vertices", positive=True)
+    factors = require.broadcast(f"{kind} blend: shape", shape, count, "vertices", sign="positive")
     if (factors >= cusp).any():
         largest = float(factors.max())
         message = f"shape factor {largest:g} of a {kind} blend must be below {cusp:.6g}, where the curve has a cusp"
@@ -93,7 +93,7 @@ def rest_to_rest(s: Expression) -> Expression:
     and expressions.
     """
     if not isinstance(s, ca.SX | ca.MX | ca.DM):
-        s = checked_numbers(s, "rest_to_rest", "s")
+        s = require.array("rest_to_rest: s", s)
     return s**3 * (10 - 15 * s + 6 * s**2)
 
 
@@ -147,11 +147,11 @@ def gamma(shape: float, angle: float, kind: str = "cubic") -> float:
     |1 - shape/4| cos(angle/2) for the cubic, |1 - 5 shape/16| cos(angle/2) for the quintic: the distance at u = 1/2,
     which is the closest point for shapes up to 4 (cubic) and 3.2 (quintic).
     """
-    for name, value in (("shape factor", shape), ("angle", angle)):
-        checked_number(value, "corner", name, positive=True)
+    for name, value in (("shape", shape), ("angle", angle)):
+        require.positive(f"corner: {name}", value)
     if angle > np.pi:
         raise ModelError(f"corner: angle {angle:g} rad is above pi", name="angle", value=angle, limit=np.pi)
-    factor = MIDDLE_FACTORS[checked_choice(kind, get_args(BlendKind), "blend", "kind")]
+    factor = MIDDLE_FACTORS[require.choice("blend: kind", kind, get_args(BlendKind))]
     return float(abs(1 - factor * shape) * np.cos(angle / 2))
 
 

@@ -15,15 +15,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from models.arrays import (
-    Array,
-    ArrayInput,
-    checked_array,
-    checked_choice,
-    checked_count,
-    checked_each,
-    checked_instance,
-)
+from models.checks import Array, ArrayInput, require
 from models.errors import ModelError
 from models.paths.blends import GAUSS_NODES, GAUSS_WEIGHTS, gauss_rule, speed
 from models.paths.segments import screw_axes
@@ -43,7 +35,7 @@ def path_function(path: SmoothPath) -> Any:
     the same as `SmoothPath.at`, with a binary search for the cell, so that `generate` writes C without any library.
     casadi differentiates inside a cell only.
     """
-    knots, columns = _cell_table(checked_instance(path, SmoothPath, "path_function", "path"))
+    knots, columns = _cell_table(require.instance("path_function: path", path, SmoothPath))
     s = ca.MX.sym("distance")
     clamped = _clamp(s, path.length)
     outputs = _cell_function()(_column_at(knots, columns, clamped), clamped)
@@ -55,7 +47,7 @@ def turn_function(path: SmoothPath) -> Any:
 
     Tool orientation in world and its rates, as `SmoothPath.turn`; an MX function like `path_function`.
     """
-    reference, theta = checked_instance(path, SmoothPath, "turn_function", "path").charts
+    reference, theta = require.instance("turn_function: path", path, SmoothPath).charts
     columns = np.column_stack([reference, theta.reshape(-1, 18), path.piece_lengths, path.bounds[:-1]]).T
     s = ca.MX.sym("distance")
     clamped = _clamp(s, path.length)
@@ -181,8 +173,8 @@ def predictor_corrector(degree: int = 3, corrections: int = 3) -> Any:
         casadi Function (state (2), coefficients (3 (degree + 1)), steps (2, m)) -> state (2). Coefficients are in
         ascending order, three entries a power: the first rows of `Blend.coefficients`, flattened.
     """
-    number = checked_count(corrections, "mapping", "corrections", 0, MAX_TERMS)
-    return _predictor_corrector(checked_choice(degree, (3, 5), "blend", "degree"), number)
+    number = require.count("mapping: corrections", corrections, 0, MAX_TERMS)
+    return _predictor_corrector(require.choice("blend: degree", degree, (3, 5)), number)
 
 
 @lru_cache(maxsize=16)
@@ -203,11 +195,11 @@ def gauss_newton(degree: int = 3, nodes: tuple[int, ...] = (2, 3, 4, 8)) -> Any:
     step, for each Newton step. The first steps need few nodes; the last one determines the drift.
     """
     numbers = tuple(
-        checked_count(n, "mapping", "nodes", 1, MAX_TERMS) for n in checked_each(nodes, int, "mapping", "nodes")
+        require.count("mapping: nodes", n, 1, MAX_TERMS) for n in require.each("mapping: nodes", nodes, int)
     )
     if not numbers:
         raise ModelError("mapping: nodes is empty; give one number for each Newton step", name="nodes", value=nodes)
-    return _gauss_newton(checked_choice(degree, (3, 5), "blend", "degree"), numbers)
+    return _gauss_newton(require.choice("blend: degree", degree, (3, 5)), numbers)
 
 
 @lru_cache(maxsize=16)
@@ -233,13 +225,13 @@ def march(mapping: Any, coefficients: Array, distances: ArrayInput) -> Array:
     Raises:
         ModelError: A shape is wrong, an entry is nan, or the distances do not increase from 0.
     """
-    checked_instance(mapping, ca.Function, "march", "mapping")
-    s = checked_array(distances, ("samples",), "march", "distances", least=0)
+    require.instance("march: mapping", mapping, ca.Function)
+    s = require.array("march: distances", distances, ("samples",), least=0)
     increments = np.diff(s, prepend=0.0)
     if (increments < 0).any():
         wrong = float(s[int((increments < 0).argmax())])
         raise ModelError(f"march: distances must increase from 0, not to {wrong:g} m", name="distances", value=wrong)
-    curve = checked_array(coefficients, (6, 3), "blend", "coefficients")
+    curve = require.array("blend: coefficients", coefficients, (6, 3))
     count = len(s)
     if not count:
         return s

@@ -16,17 +16,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from models.arrays import (
-    NOT_NUMBERS,
-    ROUNDING,
-    Array,
-    ArrayInput,
-    check_entries,
-    checked_array,
-    checked_indices,
-    checked_number,
-    checked_numbers,
-)
+from models.checks import NOT_NUMBERS, ROUNDING, Array, ArrayInput, check_entries, require
 from models.errors import ModelError
 from models.paths.segments import Arc, Helix, Line, Segment, product, rotation_vector, screw, unit_quaternion
 from models.spatial import rotation_from_quaternion
@@ -88,10 +78,10 @@ class Path:
         Raises:
             ModelError: Wrong sizes or values; or two successive points are equal, and the tool does not turn there.
         """
-        corners = checked_array(points, ("points", 3), "path", "points", least=2)
+        corners = require.array("path: points", points, ("points", 3), least=2)
         ends: list[Any] = [corners[:-1], corners[1:]]
         if orientations is not None:
-            turns = checked_array(orientations, (len(corners), 4), "path", "orientations")
+            turns = require.array("path: orientations", orientations, (len(corners), 4))
             ends += [turns[:-1], turns[1:]]
         lines = []
         for number, each in enumerate(zip(*ends, strict=True)):
@@ -122,8 +112,8 @@ class Path:
 
         Shapes: index (M,) of int, distance (M,), each result (M, 3).
         """
-        index = checked_indices(index, len(self.segments), "path", "index")
-        along = checked_numbers(distance, "path", "distance")
+        index = require.indices("path: index", index, len(self.segments))
+        along = require.array("path: distance", distance)
         frame = self.start[index], self.tangent[index], self.normal[index]
         return screw(*frame, self.curvature[index], self.torsion[index], along)
 
@@ -139,7 +129,7 @@ class Path:
             position: Origin of the path's axes in that world. Shape (3,), m.
             orientation: Orientation of the path's axes in that world, unit quaternion. Shape (4,).
         """
-        origin = checked_array(position, (3,), "path", "position")
+        origin = require.array("path: position", position, (3,))
         rotation = unit_quaternion(orientation, "path: orientation")
         matrix = np.array(ca.DM(rotation_from_quaternion(rotation)))
         moved_segments: list[Segment] = []
@@ -263,7 +253,7 @@ def split_at_reversals(
             message = f"path: reversal {reversal!r} is unknown; use 'split' or a width in m"
             raise ModelError(message, name="reversal", value=reversal, limit=("split",))
     else:
-        width = checked_number(reversal, "path", "reversal", positive=True, unit="m")
+        width = require.positive("path: reversal", reversal, unit="m")
     reversals = (np.flatnonzero(interior_angles(segments) < SMALLEST_ANGLE) + 1).tolist()
     if not width:
         parts = [np.arange(first, last) for first, last in pairwise([0, *reversals, len(segments)])]

@@ -9,7 +9,7 @@ from warnings import warn
 import numpy as np
 from numpy.typing import NDArray
 
-from models.arrays import Array, ArrayInput, checked_broadcast, checked_choice, checked_instance
+from models.checks import Array, ArrayInput, require
 from models.errors import ModelError, ModelWarning
 from models.paths.blends import (
     PAPER_SHAPE,
@@ -116,17 +116,17 @@ def _remaining_distances(
 
     Arguments as for `smooth`.
     """
-    checked_choice(overlap, get_args(Overlap), "path", "overlap")
+    require.choice("path: overlap", overlap, get_args(Overlap))
     if (remaining is None) == (deviation is None):
         message = "give either the remaining distance or the deviation, and not both"
         raise ModelError(message, name="deviation", value=deviation)
     path, count = corners.path, len(corners.vertices)
     if remaining is not None:
-        requested = checked_broadcast(remaining, count, "path", "remaining", "vertices", positive=True, unit="m")
+        requested = require.broadcast("path: remaining", remaining, count, "vertices", unit="m", sign="positive")
         distances = _without_overlap(path, requested, overlap)
         _warn_if_smaller(path, requested, distances)
         return corners.with_best_shape(distances) if free else corners, distances
-    tolerance = checked_broadcast(deviation, count, "path", "deviation", "vertices", positive=True, unit="m")
+    tolerance = require.broadcast("path: deviation", deviation, count, "vertices", unit="m", sign="positive")
     distances = _within_tolerance(corners, tolerance, overlap)
     if free and corners.curved.size:
         corners = corners.with_best_shape(distances)
@@ -371,8 +371,8 @@ def smooth(
         ModelWarning: Blends are smaller than `remaining`; `value` has their vertices. With a `deviation` there is no
             warning, since smaller blends keep it too.
     """
-    count = len(checked_instance(path, Path, "smooth", "path").segments)
-    checked_choice(kind, get_args(BlendKind), "blend", "kind")
+    count = len(require.instance("smooth: path", path, Path).segments)
+    require.choice("blend: kind", kind, get_args(BlendKind))
     free = shape is None and kind == "quintic"
     angles = path.corner_angles()
     factors = corner_shape(angles) if free else checked_shape(PAPER_SHAPE if shape is None else shape, kind, count - 1)

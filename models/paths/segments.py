@@ -17,7 +17,7 @@ from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 
-from models.arrays import Array, ArrayInput, checked_array, checked_number, frozen
+from models.checks import Array, ArrayInput, frozen, require
 from models.errors import ModelError
 from models.spatial import FULL_TURN
 
@@ -51,7 +51,7 @@ class Line:
 
     def __post_init__(self) -> None:
         for name in ("start", "end"):
-            object.__setattr__(self, name, checked_array(getattr(self, name), (3,), "line", name))
+            object.__setattr__(self, name, require.array(f"line: {name}", getattr(self, name), (3,)))
         _set_orientations(self, "line")
         if self.length <= SHORTEST_SEGMENT:
             message = (
@@ -126,7 +126,7 @@ class Arc(_Circular):
 
     def __post_init__(self) -> None:
         radius = _set_circle(self, "arc")
-        sweep = checked_number(self.sweep, "arc", "sweep")
+        sweep = require.number("arc: sweep", self.sweep)
         if not 0 < sweep <= FULL_TURN * (1 + 1e-12) or radius * sweep <= SHORTEST_SEGMENT:
             message = (
                 f"arc: sweep {sweep:g} rad is outside (0, 2 pi] or its length {radius * sweep:g} m is zero; "
@@ -147,8 +147,8 @@ class Arc(_Circular):
         end_orientation: ArrayInput | None = None,
     ) -> Arc:
         """Return the arc from `start` around `center`, turning by `sweep` rad about `axis`; negative: the other way."""
-        turn = checked_number(sweep, "arc", "sweep")
-        vector = checked_array(axis, (3,), "arc", "axis")
+        turn = require.number("arc: sweep", sweep)
+        vector = require.array("arc: axis", axis, (3,))
         return cls(start, center, vector if turn >= 0 else -vector, abs(turn), start_orientation, end_orientation)
 
     @classmethod
@@ -166,7 +166,7 @@ class Arc(_Circular):
             ModelError: Points coincide or are collinear.
         """
         points = {"start": start, "via": via, "end": end}
-        a, b, c = (checked_array(point, (3,), "arc", what) for what, point in points.items())
+        a, b, c = (require.array(f"arc: {what}", point, (3,)) for what, point in points.items())
         ab, ac = b - a, c - a
         axis = np.cross(ab, ac)
         area, size = float(np.linalg.norm(axis)), float(np.linalg.norm(ab) * np.linalg.norm(ac))
@@ -225,9 +225,9 @@ class Helix(_Circular):
 
     def __post_init__(self) -> None:
         radius = _set_circle(self, "helix")
-        sweep = checked_number(self.sweep, "helix", "sweep", positive=True, unit="rad")
+        sweep = require.positive("helix: sweep", self.sweep, unit="rad")
         object.__setattr__(self, "sweep", sweep)
-        object.__setattr__(self, "rise", checked_number(self.rise, "helix", "rise"))
+        object.__setattr__(self, "rise", require.number("helix: rise", self.rise))
         if self.length <= SHORTEST_SEGMENT:
             message = f"helix: sweep {sweep:g} rad at radius {radius:g} m has the length {self.length:g} m; remove it"
             raise ModelError(message, name="sweep", value=sweep, limit=SHORTEST_SEGMENT)
@@ -308,7 +308,7 @@ def screw_axes(
 def _set_circle(segment: Any, owner: str) -> float:
     """Check and set start, center and axis. Return the radius, m."""
     for name in ("start", "center", "axis"):
-        object.__setattr__(segment, name, checked_array(getattr(segment, name), (3,), owner, name))
+        object.__setattr__(segment, name, require.array(f"{owner}: {name}", getattr(segment, name), (3,)))
     norm = float(np.linalg.norm(segment.axis))
     if norm == 0:
         message = f"{owner}: axis [0, 0, 0] has no direction; give the axis of rotation"
@@ -343,7 +343,7 @@ LARGEST_TURN = np.pi - 1e-3
 
 def unit_quaternion(value: ArrayInput, what: str) -> Array:
     """Return `value` as a read-only unit quaternion [w, x, y, z]; raise a ModelError if its norm is not 1."""
-    quaternion = checked_array(value, (4,), what, "quaternion")
+    quaternion = require.array(f"{what}: quaternion", value, (4,))
     norm = float(np.linalg.norm(quaternion))
     if abs(norm - 1) > 1e-6:
         message = f"{what}: quaternion {quaternion.tolist()} has the norm {norm:g}; give a unit quaternion"

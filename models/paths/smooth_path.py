@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from models.arrays import Array, ArrayInput, checked_array, checked_broadcast, checked_count
+from models.checks import Array, ArrayInput, require
 from models.errors import ModelError
 from models.paths.blends import BlendKind, Cells, curvature, derivatives_by_arc_length, parameter, polynomial, quintic
 from models.paths.path import Path
@@ -190,7 +190,7 @@ class SmoothPath:
         Shape (M,), m.
         """
         for name, number in (("per_cell", per_cell), ("per_segment", per_segment)):
-            checked_count(number, "path", name)
+            require.count(f"path: {name}", number)
         on_segment = np.flatnonzero(self.piece_segment >= 0)
         starts = np.concatenate([self.bounds[on_segment], self.cell_bounds])
         lengths = np.concatenate([self.piece_lengths[on_segment], self.cells.length])
@@ -211,7 +211,7 @@ class SmoothPath:
             ModelError: The number of values differs from the number of segments.
         """
         count = len(self.path.segments)
-        values = checked_broadcast(of_segments, count, "path", "speed", "segments", finite=False)
+        values = require.broadcast("path: speed", of_segments, count, "segments", entries="numbers")
         blends = np.minimum(values[self.piece_blend], values[np.minimum(self.piece_blend + 1, count - 1)])
         return np.where(self.piece_blend >= 0, blends, values[self.piece_segment])
 
@@ -222,7 +222,7 @@ class SmoothPath:
 
     def checked_distance(self, distance: ArrayInput) -> Array:
         """Return `distance` as an array within the path; raise a ModelError if it is outside."""
-        s = checked_array(distance, ("distances",), "path", "distance", finite=False, nan=True, least=0)
+        s = require.array("path: distance", distance, ("distances",), least=0, entries="any")
         slack = 1e-9 * self.length
         wrong = s[~((s >= -slack) & (s <= self.length + slack))]
         if wrong.size:

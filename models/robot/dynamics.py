@@ -18,7 +18,7 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
-from models.arrays import checked_array, checked_each, checked_instance, checked_name
+from models.checks import require
 from models.robot.kinematics import (
     Placement,
     by_joint_vector,
@@ -62,12 +62,12 @@ class Wrench:
     point: Expression = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        checked_name(self.link, "wrench", "link")
+        require.name("wrench: link", self.link)
         owner = f"wrench on link {self.link!r}"
         for part in ("force", "moment", "point"):
-            value = checked_vector(getattr(self, part), 3, f"{owner}: {part}", "x, y and z")
+            value = checked_vector(f"{owner}: {part}", getattr(self, part), 3, "x, y and z")
             if isinstance(value, ca.DM):
-                checked_array(np.array(value).ravel(), (3,), owner, part)
+                require.array(f"{owner}: {part}", np.array(value).ravel(), (3,))
             object.__setattr__(self, part, value)
 
 
@@ -155,12 +155,12 @@ def external_wrench(
 
 def checked_wrenches(wrenches: Sequence[Wrench]) -> tuple[Wrench, ...]:
     """Return `wrenches` as a tuple; raise ModelError unless all are wrenches."""
-    return checked_each(wrenches, Wrench, "dynamics", "wrenches")
+    return require.each("dynamics: wrenches", wrenches, Wrench)
 
 
 def stacked_wrenches(robot: Robot, wrenches: Sequence[Wrench]) -> Expression:
     """Return moment, force and point of every wrench, one column each. Shape (9, k)."""
-    checked_instance(robot, Robot, "dynamics", "robot")
+    require.instance("dynamics: robot", robot, Robot)
     columns = []
     for wrench in checked_wrenches(wrenches):
         robot.link(wrench.link)
@@ -238,10 +238,10 @@ def _motions_in_links(
 ) -> dict[str, tuple[Expression, Expression]]:
     """Return a less gravity, shape (3, 1), and U, shape (3, 3), of each link in its own axes, by name; see _efforts."""
     rates, accelerations = each_joint(robot, qd, "qd"), each_joint(robot, qdd, "qdd")
-    g = checked_vector(gravity, 3, "gravity", "x, y and z")
+    g = checked_vector("gravity", gravity, 3, "x, y and z")
     meaning = "angular, then of the origin of the root link's frame"
     twist, push = (
-        ca.DM(6, 1) if vector is None else checked_vector(vector, 6, name, meaning)
+        ca.DM(6, 1) if vector is None else checked_vector(name, vector, 6, meaning)
         for vector, name in ((base_twist, "base_twist"), (base_acceleration, "base_acceleration"))
     )
     # angular velocity, angular acceleration, acceleration of the origin less gravity
@@ -367,7 +367,7 @@ def momentum(
     """Return (moment of momentum about a point of the world, linear momentum). Shape (6, 1), N m s and N s."""
     frames, axes = frames_and_axes(robot, q, world_from_base)
     motions = propagate_motions(robot, frames, axes, qd, ca.DM(robot.dof, 1))
-    place = checked_vector(about, 3, "about", "a point of the world")
+    place = checked_vector("about", about, 3, "a point of the world")
     total: Expression = ca.DM(6, 1)
     for link in robot.links:
         motion, inertia = motions[link.name], inertia_in_world(link, frames)
@@ -392,7 +392,7 @@ def momentum_rate(
     """
     frames, axes = frames_and_axes(robot, q, world_from_base)
     motions = propagate_motions(robot, frames, axes, qd, qdd)
-    place = checked_vector(about, 3, "about", "a point of the world")
+    place = checked_vector("about", about, 3, "a point of the world")
     total: Expression = ca.DM(6, 1)
     for link in robot.links:
         motion, inertia = motions[link.name], inertia_in_world(link, frames)

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
-from models.arrays import NOT_NUMBERS, Array, check_entries, checked_instance, floats
+from models.checks import NOT_NUMBERS, Array, argument_of, check_entries, floats, require
 from models.errors import ModelError
 from models.robot.parts import massless_error
 from models.robot.robot import Robot
@@ -35,31 +35,31 @@ class _Turn(NamedTuple):
 
 def joint_vector(robot: Robot, q: Expression, name: str = "q") -> Expression:
     """Return `q` as a column; raise ModelError unless it has one entry for each moving joint."""
-    checked_instance(robot, Robot, "kinematics", "robot")
-    return checked_vector(q, robot.dof, name, f"one entry for each of the joints {list(robot.joint_names)}")
+    require.instance("kinematics: robot", robot, Robot)
+    return checked_vector(name, q, robot.dof, f"one entry for each of the joints {list(robot.joint_names)}")
 
 
-def checked_vector(value: Expression, size: int, what: str, meaning: str) -> Expression:
+def checked_vector(label: str, value: Expression, size: int, meaning: str) -> Expression:
     """Return `value` as a column of `size` entries.
 
     Args:
-        what: Name of the argument, for messages, which may be preceded by its owner.
+        label: As in `models.checks.Checks`.
         meaning: Meaning of the entries, for messages.
 
     Raises:
         ModelError: Another size, or a value that is not numeric or not finite.
     """
-    name, limit = what.rpartition(" ")[2], (size, 1)
+    name, limit = argument_of(label), (size, 1)
     try:
         value = expression(value)
     except NOT_NUMBERS as error:
-        message = f"{what} {value!r} is not numeric; {limit} expected: {meaning}"
+        message = f"{label} {value!r} is not numeric; {limit} expected: {meaning}"
         raise ModelError(message, name=name, value=value, limit=limit) from error
     if value.shape != limit and not (size == 0 and value.numel() == 0):
-        message = f"{what} has shape {tuple(value.shape)}, expected {limit}: {meaning}"
+        message = f"{label} has shape {tuple(value.shape)}, expected {limit}: {meaning}"
         raise ModelError(message, name=name, value=tuple(value.shape), limit=limit)
     if isinstance(value, ca.DM) and not value.is_regular():
-        raise ModelError(f"{what} {value} is not finite", name=name, value=np.array(value).ravel())
+        raise ModelError(f"{label} {value} is not finite", name=name, value=np.array(value).ravel())
     return value
 
 
@@ -156,7 +156,7 @@ def frame_jacobian(
     """
     frames, axes = frames_and_axes(robot, q, world_from_base)
     robot.link(link)
-    place = frames[link].point(checked_vector(point, 3, "point", "x, y and z in the frame of the link"))
+    place = frames[link].point(checked_vector("point", point, 3, "x, y and z in the frame of the link"))
     return ca.densify(point_jacobian(robot, axes, link, place))
 
 
@@ -171,7 +171,7 @@ def tip_jacobian(robot: Robot, q: Expression, world_from_base: Placement | None 
 
     It maps joint rates to (angular, linear) velocity in world axes. Shape (6, dof).
     """
-    tip = checked_instance(robot, Robot, "kinematics", "robot").tip_link
+    tip = require.instance("kinematics: robot", robot, Robot).tip_link
     return frame_jacobian(robot, q, tip, robot.tip_translation, world_from_base)
 
 
@@ -287,7 +287,7 @@ def center_of_mass_motion(
     robot: Robot, q: Expression, qd: Expression, qdd: Expression, world_from_base: Placement | None = None
 ) -> CenterOfMassMotion:
     """Return the motion of the centre of mass; raise ModelError if the robot has no mass."""
-    if checked_instance(robot, Robot, "kinematics", "robot").total_mass == 0:
+    if require.instance("kinematics: robot", robot, Robot).total_mass == 0:
         raise massless_error("hence no centre of mass")
     motions = link_motions(robot, q, qd, qdd, world_from_base)
     weighted = [[link.mass * part for part in motions[link.name][:3]] for link in robot.links]

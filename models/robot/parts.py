@@ -11,23 +11,7 @@ from typing import Literal, Self, TypeAlias, get_args
 import casadi as ca
 import numpy as np
 
-from models.arrays import (
-    Array,
-    ArrayInput,
-    checked_array,
-    checked_choice,
-    checked_each,
-    checked_flag,
-    checked_instance,
-    checked_name,
-    checked_nonnegative,
-    checked_number,
-    checked_rotation,
-    checked_text,
-    frozen,
-    warn_of_degrees,
-    warn_of_millimetres,
-)
+from models.checks import Array, ArrayInput, frozen, require, warn_of_degrees, warn_of_millimetres
 from models.errors import ModelError
 from models.spatial import rotation
 
@@ -65,29 +49,29 @@ class CollisionShape:
     folder: str = ""
 
     def __post_init__(self) -> None:
-        size_length = SHAPES[checked_choice(self.kind, SHAPES, "collision shape", "kind")]
+        size_length = SHAPES[require.choice("collision shape: kind", self.kind, SHAPES)]
         for argument in ("file", "folder"):
-            checked_text(getattr(self, argument), "collision shape", argument)
+            require.text(f"collision shape: {argument}", getattr(self, argument))
         owner, mesh = f"collision {self.kind}", self.kind == "mesh"
-        size = checked_array(self.size, (size_length,), owner, "size", positive=not mesh)
+        size = require.array(f"{owner}: size", self.size, (size_length,), sign="positive" if not mesh else "any")
         if mesh and not self.file:
             raise ModelError(f"{owner}: a mesh needs the name of its file", name="file", value=self.file)
         if not size.all():
             raise ModelError(f"{owner}: size {size.tolist()} scales it to nothing", name="size", value=size)
         object.__setattr__(self, "size", size)
-        object.__setattr__(self, "translation", checked_array(self.translation, (3,), owner, "translation"))
+        object.__setattr__(self, "translation", require.array(f"{owner}: translation", self.translation, (3,)))
         if not mesh:
             self._check_size(size, owner)
-        object.__setattr__(self, "rotation", checked_rotation(self.rotation, owner, "rotation"))
+        object.__setattr__(self, "rotation", require.rotation(f"{owner}: rotation", self.rotation))
 
     def _check_size(self, size: Array, owner: str) -> None:
         """Warn of sizes that look like millimetres."""
-        warn_of_millimetres(size, owner, "size", "size")
+        warn_of_millimetres(f"{owner}: size", size)
 
     def placed(self, rotation: Array, translation: Array) -> Self:
         """Return the same shape in a frame, given the pose of its link in it. Shape (3, 3) and (3,)."""
-        turn = checked_rotation(rotation, "placed shape", "rotation")
-        shift = checked_array(translation, (3,), "placed shape", "translation") + turn @ self.translation
+        turn = require.rotation("placed shape: rotation", rotation)
+        shift = require.array("placed shape: translation", translation, (3,)) + turn @ self.translation
         return replace(self, translation=shift, rotation=turn @ self.rotation)
 
 
@@ -109,7 +93,7 @@ class VisualShape(CollisionShape):
         super().__post_init__()
         if self.color is None:
             return
-        color = checked_array(self.color, (4,), f"visual {self.kind}", "color")
+        color = require.array(f"visual {self.kind}: color", self.color, (4,))
         if not ((color >= 0) & (color <= 1)).all():
             message = f"visual {self.kind}: color {color.tolist()} has entries outside 0 to 1"
             raise ModelError(message, name="color", value=color, limit=(0.0, 1.0))
@@ -146,17 +130,17 @@ class Link:
     visuals: tuple[VisualShape, ...] = ()
 
     def __post_init__(self) -> None:
-        owner = f"link {checked_name(self.name, 'link', 'name')!r}"
-        checked_flag(self.any_inertia, owner, "any_inertia")
-        mass = checked_nonnegative(self.mass, owner, "mass", "kg")
-        inertia = checked_array(self.inertia, (3, 3), owner, "inertia")
+        owner = f"link {require.name('link: name', self.name)!r}"
+        require.flag(f"{owner}: any_inertia", self.any_inertia)
+        mass = require.nonnegative(f"{owner}: mass", self.mass, unit="kg")
+        inertia = require.array(f"{owner}: inertia", self.inertia, (3, 3))
         _check_inertia(inertia, owner, self.any_inertia)
         object.__setattr__(self, "mass", mass)
-        object.__setattr__(self, "center_of_mass", checked_array(self.center_of_mass, (3,), owner, "center_of_mass"))
-        warn_of_millimetres(self.center_of_mass, owner, self.name, "center_of_mass")
+        object.__setattr__(self, "center_of_mass", require.array(f"{owner}: center_of_mass", self.center_of_mass, (3,)))
+        warn_of_millimetres(f"{owner}: center_of_mass", self.center_of_mass, self.name)
         object.__setattr__(self, "inertia", frozen((inertia + inertia.T) / 2))
-        object.__setattr__(self, "collisions", checked_each(self.collisions, CollisionShape, owner, "collisions"))
-        object.__setattr__(self, "visuals", checked_each(self.visuals, VisualShape, owner, "visuals"))
+        object.__setattr__(self, "collisions", require.each(f"{owner}: collisions", self.collisions, CollisionShape))
+        object.__setattr__(self, "visuals", require.each(f"{owner}: visuals", self.visuals, VisualShape))
 
 
 @dataclass(frozen=True)
@@ -177,9 +161,9 @@ class Mimic:
     offset: float = 0.0
 
     def __post_init__(self) -> None:
-        owner = f"mimic of joint {checked_name(self.joint, 'mimic', 'joint')!r}"
+        owner = f"mimic of joint {require.name('mimic: joint', self.joint)!r}"
         for argument in ("multiplier", "offset"):
-            number = checked_number(getattr(self, argument), owner, argument)
+            number = require.number(f"{owner}: {argument}", getattr(self, argument))
             object.__setattr__(self, argument, number)
 
 
@@ -226,21 +210,21 @@ class Joint:
     mimic: Mimic | None = None
 
     def __post_init__(self) -> None:
-        owner = f"joint {checked_name(self.name, 'joint', 'name')!r}"
-        checked_choice(self.kind, get_args(Kind), owner, "kind")
+        owner = f"joint {require.name('joint: name', self.name)!r}"
+        require.choice(f"{owner}: kind", self.kind, get_args(Kind))
         for role in ("parent", "child"):
-            checked_name(getattr(self, role), owner, role)
+            require.name(f"{owner}: {role}", getattr(self, role))
         if self.mimic is not None:
-            checked_instance(self.mimic, Mimic, owner, "mimic")
-        axis = checked_array(self.axis, (3,), owner, "axis")
+            require.instance(f"{owner}: mimic", self.mimic, Mimic)
+        axis = require.array(f"{owner}: axis", self.axis, (3,))
         length = float(np.linalg.norm(axis))
         if not length > 0:
             raise ModelError(f"{owner}: axis {axis.tolist()} has no direction", name="axis", value=axis)
         object.__setattr__(self, "axis", frozen(axis / length))
-        object.__setattr__(self, "translation", checked_array(self.translation, (3,), owner, "translation"))
-        object.__setattr__(self, "rotation", checked_rotation(self.rotation, owner, "rotation"))
+        object.__setattr__(self, "translation", require.array(f"{owner}: translation", self.translation, (3,)))
+        object.__setattr__(self, "rotation", require.rotation(f"{owner}: rotation", self.rotation))
         for name in ("lower", "upper", "velocity", "effort"):
-            limit = checked_number(getattr(self, name), owner, name, finite=False)
+            limit = require.number(f"{owner}: {name}", getattr(self, name), finite=False)
             object.__setattr__(self, name, limit)
             if name in ("velocity", "effort") and limit < 0:
                 raise ModelError(f"{owner}: {name} limit {limit} is negative", name=name, value=limit, limit=0.0)
@@ -257,9 +241,9 @@ class Joint:
                 "given; make it revolute or leave them out"
             )
             raise ModelError(message, name="limits", value=limits, limit=(-np.inf, np.inf))
-        warn_of_millimetres(self.translation, owner, self.name, "translation")
+        warn_of_millimetres(f"{owner}: translation", self.translation, self.name)
         if self.kind == "revolute":
-            warn_of_degrees(limits, owner, self.name, "limit")
+            warn_of_degrees(f"{owner}: limit", limits, self.name)
         if self.mimic is not None and not self.moves:
             message = f"{owner} is fixed and cannot follow joint {self.mimic.joint!r}"
             raise ModelError(message, name=self.name, value=self.mimic.joint)
@@ -282,7 +266,7 @@ class Joint:
     def placed(self, position: float) -> tuple[Array, Array]:
         """Return the pose of the child link in the parent link at a position (rad or m): rotation, translation."""
         turn, shift = self.rotation, self.translation
-        position = checked_number(position, f"joint {self.name!r}", "position")
+        position = require.number(f"joint {self.name!r}: position", position)
         if self.kind == "prismatic":
             return turn, shift + position * (turn @ self.axis)
         return (turn @ np.array(ca.DM(rotation(self.axis, position))) if self.moves else turn), shift
@@ -296,7 +280,7 @@ class Joint:
         if not self.moves:
             message = f"joint {self.name!r} is fixed; only a joint that moves can be locked"
             raise ModelError(message, name=self.name, value=self.kind)
-        turn, shift = self.placed(checked_number(position, f"joint {self.name!r}", "locked position"))
+        turn, shift = self.placed(require.number(f"joint {self.name!r}: locked position", position))
         return Joint(self.name, "fixed", self.parent, self.child, shift, turn, self.axis)
 
 

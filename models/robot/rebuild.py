@@ -12,17 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from models.arrays import (
-    Array,
-    ArrayInput,
-    checked_array,
-    checked_each,
-    checked_flag,
-    checked_instance,
-    checked_mapping,
-    checked_rotation,
-    checked_text,
-)
+from models.checks import Array, ArrayInput, require
 from models.errors import ModelError
 from models.robot.parts import Joint, Link
 from models.robot.robot import Robot
@@ -38,7 +28,7 @@ def lock_joints(robot: Robot, positions: Mapping[str, float]) -> Robot:
     Raises:
         ModelError: A joint that is already fixed, or a position that is not finite.
     """
-    positions = checked_mapping(positions, "lock_joints", "positions")
+    positions = require.mapping("lock_joints: positions", positions)
     joints = lock_with_followers(_robot(robot).joints, {robot.joint(name).name: positions[name] for name in positions})
     return replace(robot, joints=joints)
 
@@ -98,11 +88,11 @@ def attach_tool(
         keep_tip: Keep the robot's tip; otherwise the tool's tip becomes that of the robot.
     """
     owner = "attached tool"
-    added = tool if isinstance(tool, Robot) else Robot((checked_instance(tool, Link, owner, "tool"),))
+    added = tool if isinstance(tool, Robot) else Robot((require.instance(f"{owner}: tool", tool, Link),))
     added, robot = add_prefix(added, prefix), _robot(robot)
-    checked_flag(keep_tip, owner, "keep_tip")
-    shift = checked_array(translation, (3,), owner, "translation")
-    turn = checked_rotation(_turn(rotation), owner, "rotation")
+    require.flag(f"{owner}: keep_tip", keep_tip)
+    shift = require.array(f"{owner}: translation", translation, (3,))
+    turn = require.rotation(f"{owner}: rotation", _turn(rotation))
     if link is None:
         link = robot.tip_link
         shift, turn = robot.tip_translation + robot.tip_rotation @ shift, robot.tip_rotation @ turn
@@ -132,22 +122,20 @@ def merge_robots(
         ModelError: No arms, or a pose for an unknown prefix.
     """
     owner = "merged robots"
-    arms = checked_mapping(arms, owner, "arms")
+    arms = require.mapping(f"{owner}: arms", arms)
     if not arms:
         raise ModelError(f"{owner}: no arms are given", name="arms", value=arms)
     mappings = {"links": links, "translations": translations, "rotations": rotations}
-    poses = [
-        {} if mapping is None else checked_mapping(mapping, owner, argument) for argument, mapping in mappings.items()
-    ]
+    poses = [require.mapping(f"{owner}: {argument}", mapping) for argument, mapping in mappings.items()]
     if unknown := [prefix for mapping in poses for prefix in mapping if prefix not in arms]:
         message = f"{owner}: {unknown} are no prefixes of the arms, which are {list(arms)}"
         raise ModelError(message, name=unknown[0], value=unknown, limit=tuple(arms))
-    merged = base if isinstance(base, Robot) else Robot((checked_instance(base, Link, owner, "base"),), name=base.name)
+    merged = base if isinstance(base, Robot) else Robot((require.instance("merge: base", base, Link),), name=base.name)
     root, first = merged.root, next(iter(arms))
     for prefix, arm in arms.items():
         carrier, shift, turn = (mapping.get(prefix) for mapping in poses)
         carrier, shift = root if carrier is None else carrier, np.zeros(3) if shift is None else shift
-        checked_instance(arm, Robot, f"{owner}: {prefix!r}", "arm")
+        require.instance(f"{owner}: {prefix!r}: arm", arm, Robot)
         merged = attach_tool(merged, arm, carrier, shift, rotation=turn, prefix=prefix, keep_tip=prefix != first)
     return merged
 
@@ -155,7 +143,7 @@ def merge_robots(
 def add_prefix(robot: Robot, prefix: str) -> Robot:
     """Put a prefix before the names of the robot and of all its links and joints."""
     robot = _robot(robot)
-    if not checked_text(prefix, "add_prefix", "prefix"):
+    if not require.text("add_prefix: prefix", prefix):
         return robot
     links = tuple(replace(link, name=prefix + link.name) for link in robot.links)
     joints = []
@@ -277,8 +265,8 @@ def _turn(rotation: ArrayInput | None) -> ArrayInput:
 
 
 def _names(names: Iterable[str]) -> tuple[str, ...]:
-    return (names,) if isinstance(names, str) else checked_each(names, str, "links", "keep")
+    return (names,) if isinstance(names, str) else require.each("links: keep", names, str)
 
 
 def _robot(robot: Robot) -> Robot:
-    return checked_instance(robot, Robot, "rebuilt robot", "robot")
+    return require.instance("rebuilt robot: robot", robot, Robot)

@@ -14,19 +14,7 @@ from warnings import warn
 
 import numpy as np
 
-from models.arrays import (
-    Array,
-    ArrayInput,
-    checked_array,
-    checked_choice,
-    checked_each,
-    checked_instance,
-    checked_mapping,
-    checked_name,
-    checked_rotation,
-    checked_text,
-    warn_of_millimetres,
-)
+from models.checks import Array, ArrayInput, require, warn_of_millimetres
 from models.errors import ModelError, ModelWarning
 from models.robot.parts import Joint, Link
 from models.robot.tree import (
@@ -39,7 +27,6 @@ from models.robot.tree import (
     reroot_tree,
     ties_to_leaders,
     tree_order,
-    unknown_name,
 )
 from models.robot.urdf import InertiaRule, Source, read_urdf, urdf_text
 
@@ -74,10 +61,10 @@ class Robot:
 
     def __post_init__(self) -> None:
         owner = "robot"
-        links = checked_each(self.links, Link, owner, "links")
-        joints = checked_each(self.joints, Joint, owner, "joints")
+        links = require.each(f"{owner}: links", self.links, Link)
+        joints = require.each(f"{owner}: joints", self.joints, Joint)
         if not (isinstance(self.name, str) and self.name == ""):  # descriptions may omit it
-            checked_name(self.name, owner, "name")
+            require.name(f"{owner}: name", self.name)
         require_unique((link.name for link in links), "link")
         require_unique((joint.name for joint in joints), "joint")
         joints = lock_with_followers(joints, {})
@@ -87,15 +74,17 @@ class Robot:
         object.__setattr__(self, "links", links)
         object.__setattr__(self, "joints", tuple(joints[i] for i in tree_order(root, edges)))
         object.__setattr__(self, "tip", self._find_tip())
-        object.__setattr__(self, "tip_translation", checked_array(self.tip_translation, (3,), owner, "tip_translation"))
-        object.__setattr__(self, "tip_rotation", checked_rotation(self.tip_rotation, owner, "tip_rotation"))
-        warn_of_millimetres(self.tip_translation, owner, "tip_translation", "tip_translation")
+        object.__setattr__(
+            self, "tip_translation", require.array(f"{owner}: tip_translation", self.tip_translation, (3,))
+        )
+        object.__setattr__(self, "tip_rotation", require.rotation(f"{owner}: tip_rotation", self.tip_rotation))
+        warn_of_millimetres(f"{owner}: tip_translation", self.tip_translation)
         _ = self._limits  # raises if followers leave a joint no position
 
     def _find_tip(self) -> str | None:
         names = [link.name for link in self.links]
         if self.tip is not None and (not isinstance(self.tip, str) or self.tip not in names):
-            raise unknown_name("tip link", self.tip, names)
+            raise require.unknown("tip link", self.tip, names)
         leaves = self._leaves
         return self.tip if self.tip is not None else leaves[0] if len(leaves) == 1 else None
 
@@ -151,16 +140,16 @@ class Robot:
             ModelWarning: Physically impossible inertias, attributes without meaning in URDF, joints whose followers'
                 limits leave them a single position.
         """
-        checked_choice(mimic, get_args(MimicRule), "URDF", "mimic")
+        require.choice("URDF: mimic", mimic, get_args(MimicRule))
         description = read_urdf(source, inertia=inertia)
         joints = description.joints
         if mimic == "free":
             joints = tuple(replace(joint, mimic=None) for joint in joints)
         names = {joint.name: None for joint in joints}
-        positions = {} if lock is None else checked_mapping(lock, "URDF", "lock")
+        positions = {} if lock is None else require.mapping("URDF: lock", lock)
         for name in positions:
             if name not in names:
-                raise unknown_name("joint", name, names)
+                raise require.unknown("joint", name, names)
         joints = lock_with_followers(joints, positions)
         if mimic == "lock":
             joints = lock_with_followers(joints, {name: tie.offset for name, tie in ties_to_leaders(joints).items()})
@@ -208,7 +197,7 @@ class Robot:
 
     def unit(self, per: str = "") -> str:
         """Return the unit of the joint vector, or of its rates with `per` "/s": "rad", "m" or "rad, m" in its order."""
-        return ", ".join(dict.fromkeys(joint.unit + checked_text(per, "unit", "per") for joint in self.moving_joints))
+        return ", ".join(dict.fromkeys(joint.unit + require.text("unit: per", per) for joint in self.moving_joints))
 
     @property
     def effort_unit(self) -> str:
@@ -264,13 +253,13 @@ class Robot:
     def link(self, name: str) -> Link:
         """Return the link of that name; raise ModelError, with similar names, if there is none."""
         if not isinstance(name, str) or name not in self._links_by_name:
-            raise unknown_name("link", name, self._links_by_name)
+            raise require.unknown("link", name, self._links_by_name)
         return self._links_by_name[name]
 
     def joint(self, name: str) -> Joint:
         """Return the moving or fixed joint of that name; raise ModelError, with similar names, if there is none."""
         if not isinstance(name, str) or name not in self._joints_by_name:
-            raise unknown_name("joint", name, self._joints_by_name)
+            raise require.unknown("joint", name, self._joints_by_name)
         return self._joints_by_name[name]
 
     def path_to(self, name: str) -> tuple[Joint, ...]:
@@ -351,12 +340,12 @@ def planar_chain(
         ModelError: Sizes that differ, no link, an impossible mass or inertia.
     """
     owner = "planar chain"
-    lengths = checked_array(lengths, ("links",), owner, "lengths", positive=True, unit="m")
+    lengths = require.array(f"{owner}: lengths", lengths, ("links",), unit="m", sign="positive")
     count = len(lengths)
-    masses = checked_array(masses, (count,), owner, "masses")
-    moments = checked_array(masses * lengths**2 / 12 if inertias is None else inertias, (count,), owner, "inertias")
-    mount = checked_array(mount, (2,), owner, "mount")
-    root = Link("base") if base is None else checked_instance(base, Link, owner, "base")
+    masses = require.array(f"{owner}: masses", masses, (count,))
+    moments = require.array(f"{owner}: inertias", masses * lengths**2 / 12 if inertias is None else inertias, (count,))
+    mount = require.array(f"{owner}: mount", mount, (2,))
+    root = Link("base") if base is None else require.instance(f"{owner}: base", base, Link)
     links, joints = [root], []
     for i in range(count):
         # Only the moment about z affects a planar machine; the others are those of a lamina.

@@ -14,25 +14,13 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import replace
-from difflib import get_close_matches
 from typing import NamedTuple
 
 import numpy as np
 
-from models.arrays import MAX_LISTED, Array
+from models.checks import Array, require
 from models.errors import ModelError
 from models.robot.parts import Joint, Kind, Link, Mimic
-
-
-def unknown_name(kind: str, name: object, known: Iterable[str]) -> ModelError:
-    """Return the error for a name that does not exist, with similar names as suggestions."""
-    names = list(known)
-    by_case = {each.casefold(): each for each in reversed(names)}
-    similar = [by_case[each] for each in get_close_matches(str(name).casefold(), by_case, n=3, cutoff=0.5)]
-    hint = f"did you mean {' or '.join(repr(each) for each in similar)}? " if similar else ""
-    listed = f"{names[:MAX_LISTED]} and {len(names) - MAX_LISTED} more" if len(names) > MAX_LISTED else f"{names}"
-    message = f"{kind} {name!r} does not exist; {hint}there are {listed if names else 'none'}"
-    return ModelError(message, name=str(name) or kind, value=name, limit=tuple(names))
 
 
 def require_unique(names: Iterable[str], kind: str) -> None:
@@ -60,7 +48,7 @@ def find_root(links: Sequence[str], edges: Sequence[tuple[str, str, str]]) -> st
     for joint, parent, child in edges:
         for role, link in (("parent", parent), ("child", child)):
             if link not in known:
-                raise unknown_name(f"joint {joint!r}: {role} link", link, links)
+                raise require.unknown(f"joint {joint!r}: {role} link", link, links)
         if parent == child:
             raise ModelError(f"joint {joint!r} connects link {child!r} to itself: a loop", name=joint, value=child)
         if child in parent_joint:
@@ -119,7 +107,7 @@ def reroot_tree(
     """
     names = [link.name for link in links]
     if not isinstance(new, str) or new not in names:
-        raise unknown_name("root link", new, names)
+        raise require.unknown("root link", new, names)
     parent_joint = {joint.child: joint for joint in joints}
     reversed_joints: dict[str, list[Joint]] = {}
     frames: list[Link] = []
@@ -177,7 +165,7 @@ def ties_to_leaders(joints: Sequence[Joint]) -> dict[str, Mimic]:
         chain = [name]
         while True:
             if tie.joint not in names:
-                raise unknown_name(f"joint {chain[-1]!r}: mimicked joint", tie.joint, names)
+                raise require.unknown(f"joint {chain[-1]!r}: mimicked joint", tie.joint, names)
             if tie.joint in chain:
                 message = f"joints {chain} mimic each other in a ring; let one of them mimic none"
                 raise ModelError(message, name="joints", value=tuple(chain))

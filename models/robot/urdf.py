@@ -21,7 +21,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from models.arrays import Array, checked_choice, warn_of_degrees
+from models.checks import Array, require, warn_of_degrees
 from models.errors import ModelError, ModelWarning
 from models.files import INPUT_LIMITS, parse_xml, read_regular
 from models.robot.parts import SHAPES, CollisionShape, Joint, Kind, Link, Mimic, VisualShape
@@ -91,10 +91,10 @@ def read_urdf(source: Source, *, inertia: InertiaRule = "warn") -> Description:
 
     Warns:
         ModelWarning: Physically impossible inertias; attributes without meaning in URDF; angles that look like degrees,
-            lengths that look like millimetres (see `models.arrays.warn_of_degrees`); collision shapes of an omitted
+            lengths that look like millimetres (see `models.checks.warn_of_degrees`); collision shapes of an omitted
             root link.
     """
-    checked_choice(inertia, get_args(InertiaRule), "URDF", "inertia")
+    require.choice("URDF: inertia", inertia, get_args(InertiaRule))
     tree = parse_urdf(source)
     is_file = isinstance(source, os.PathLike) or not source.lstrip(BLANK).startswith("<")
     folder = str(Path(source).resolve().parent) if is_file else ""
@@ -346,7 +346,7 @@ def _shape(element: ElementTree.Element, owner: str, folder: str, shape_type: ty
         message = f"{owner}: <geometry> has {len(shapes)} shapes, not one"
         raise ModelError(message, name="geometry", value=len(shapes), limit=1)
     (shape,) = shapes
-    kind = checked_choice(shape.tag, SHAPES, owner, "shape")
+    kind = require.choice(f"{owner}: shape", shape.tag, SHAPES)
     file = text_of(shape, "filename", owner) if kind == "mesh" else ""
     if kind in ("box", "mesh"):
         key = "size" if kind == "box" else "scale"
@@ -425,7 +425,7 @@ def origin_of(element: ElementTree.Element, owner: str) -> tuple[Array, Array]:
     if origin is not None:
         shift = numbers_of(origin, "xyz", owner, 3) if "xyz" in origin.attrib else shift
         angles = numbers_of(origin, "rpy", owner, 3) if "rpy" in origin.attrib else angles
-    warn_of_degrees(angles, owner, owner.partition(" ")[2].strip("'"), "rpy")
+    warn_of_degrees(f"{owner}: rpy", angles, owner.partition(" ")[2].strip("'"))
     (cr, sr), (cp, sp), (cy, sy) = ((cos(angle), sin(angle)) for angle in angles.tolist())  # a file has hundreds
     rotation = [
         [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],

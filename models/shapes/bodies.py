@@ -17,7 +17,7 @@ from warnings import warn
 
 import numpy as np
 
-from models.arrays import Array, checked_choice, checked_instance, checked_name, checked_nonnegative
+from models.checks import Array, require
 from models.errors import ModelError, ModelWarning
 from models.robot.parts import CollisionShape, Joint, Link
 from models.robot.robot import Robot
@@ -75,12 +75,12 @@ class Body:
     mesh: LinkMesh | None = None
 
     def __post_init__(self) -> None:
-        owner = f"body of link {checked_name(self.link, 'body', 'link')!r}"
-        reach = checked_shape(self.shape, owner, "shape").reach(np.zeros(3))
+        owner = f"body of link {require.name('body: link', self.link)!r}"
+        reach = checked_shape(f"{owner}: shape", self.shape).reach(np.zeros(3))
         if not np.isfinite(reach):
             message = f"{owner}: shape {self.shape!r} is unbounded; give a bounded one"
             raise ModelError(message, name="shape", value=self.shape)
-        object.__setattr__(self, "overhang", checked_nonnegative(self.overhang, owner, "overhang", "m"))
+        object.__setattr__(self, "overhang", require.nonnegative(f"{owner}: overhang", self.overhang, unit="m"))
 
 
 def collision_bodies(
@@ -109,8 +109,8 @@ def collision_bodies(
     Warns:
         ModelWarning: Meshes were skipped; names each with its link and the reason.
     """
-    checked_instance(robot, Robot, "collision_bodies", "robot")
-    checked_choice(missing, get_args(MissingRule), "collision_bodies", "missing")
+    require.instance("collision_bodies: robot", robot, Robot)
+    require.choice("collision_bodies: missing", missing, get_args(MissingRule))
     if isinstance(folders, str | os.PathLike) or not isinstance(folders, Sequence):
         message = f"collision_bodies: folders must be a list of paths, not {folders!r}"
         raise ModelError(message, name="folders", value=folders)

@@ -20,7 +20,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import scipy
 
-from models.arrays import Array, ArrayInput, checked_array, checked_indices
+from models.checks import Array, ArrayInput, require
 from models.errors import ModelError
 from models.files import cache_key, load_value, source_version, store_value
 from models.shapes.hull import convex_hull, nearest_directions
@@ -101,8 +101,8 @@ def cover(vertices: ArrayInput, faces: ArrayInput) -> tuple[Cover, ...]:
     Raises:
         ModelError: A shape is wrong, an entry is not finite, a face has an unknown vertex, or there is no triangle.
     """
-    points = checked_array(vertices, ("vertices", 3), "cover", "vertices")
-    corners = checked_indices(faces, len(points), "cover", "faces")
+    points = require.array("cover: vertices", vertices, ("vertices", 3))
+    corners = require.indices("cover: faces", faces, len(points))
     if corners.ndim != 2 or corners.shape[1] != 3 or not len(corners):
         message = f"cover: faces have shape {corners.shape}, expected (m, 3)"
         raise ModelError(message, name="faces", value=faces, limit=("m", 3))

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple, TypeAlias
 import casadi as ca
 import numpy as np
 
-from models.arrays import Array, checked_array, checked_instance, checked_nonnegative, checked_number
+from models.checks import Array, require
 from models.errors import ModelError
 from models.files import INPUT_LIMITS
 from models.shapes.cores import (
@@ -107,12 +107,12 @@ def distance(
         ModelError: An argument is no shape, both are half-spaces, a box is infinite, a frame is invalid, or the
             rounding is negative.
     """
-    checked_shape(first, "distance", "first")
-    checked_shape(second, "distance", "second")
+    checked_shape("distance: first", first)
+    checked_shape("distance: second", second)
     if {type(first), type(second)} <= COLUMNS.keys():
         function = pair_function(type(first), type(second), rounding)
         return function(column(first, first_frame), column(second, second_frame))
-    checked_nonnegative(rounding, "distance", "rounding", "m")
+    require.nonnegative("distance: rounding", rounding, unit="m")
     places = [*_placement(first_frame, "first_frame"), *_placement(second_frame, "second_frame")]
     return expression(_distance_with_hull(*places, first=first, second=second, rounding=float(rounding)))
 
@@ -126,7 +126,7 @@ def column(shape: Shape, frame: Frame | None = None) -> Expression:
     Raises:
         ModelError: The shape is a mesh or a cylinder, which have no column, or is invalid for `distance`.
     """
-    checked_shape(shape, "column", "shape")
+    checked_shape("column: shape", shape)
     _check_kind(type(shape), "shape")
     turn, place = _placement(frame, "frame")
     if isinstance(shape, Sphere | Capsule):
@@ -134,7 +134,7 @@ def column(shape: Shape, frame: Frame | None = None) -> Expression:
     if isinstance(shape, HalfSpace):
         return ca.vertcat(place + ca.mtimes(turn, ca.DM(shape.point)), ca.mtimes(turn, ca.DM(shape.normal)))
     assert isinstance(shape, Box)
-    half = checked_array(shape.size, (3,), "distance", "size", unit="m") / 2
+    half = require.array("distance: size", shape.size, (3,), unit="m") / 2
     return ca.vertcat(
         place + ca.mtimes(turn, ca.DM(shape.position)), ca.vec(ca.mtimes(turn, ca.DM(shape.rotation))), half
     )
@@ -151,7 +151,7 @@ def pair_function(first: type[Shape], second: type[Shape], rounding: float = 0.0
     """
     for what, kind in (("first", first), ("second", second)):
         _check_kind(kind, what)
-    checked_nonnegative(rounding, "distance", "rounding", "m")
+    require.nonnegative("distance: rounding", rounding, unit="m")
     if first is HalfSpace and second is HalfSpace:
         raise ModelError("distance: two half-spaces have no distance", name="second", value=second)
     return _pair_function((first, second), float(rounding))
@@ -239,10 +239,10 @@ def soft_minimum(values: Sequence[Expression], width: float) -> Expression:
     if not isinstance(values, list | tuple) or not 0 < len(values) <= INPUT_LIMITS.count:
         message = f"soft_minimum: values must be a list of 1 to {INPUT_LIMITS.count} numbers, not {repr(values)[:80]}"
         raise ModelError(message, name="values", value=values, limit=INPUT_LIMITS.count)
-    checked_number(width, "soft_minimum", "width", positive=True)
+    require.positive("soft_minimum: width", width)
     for value in values:
         if not isinstance(value, ca.SX | ca.MX | ca.DM):
-            checked_number(value, "soft_minimum", "values")
+            require.number("soft_minimum: values", value)
         elif value.shape != (1, 1):
             message = f"soft_minimum: values must be numbers, not of shape {value.shape}"
             raise ModelError(message, name="values", value=value.shape, limit=(1, 1))
@@ -253,7 +253,7 @@ def soft_minimum(values: Sequence[Expression], width: float) -> Expression:
 def _placement(frame: Frame | None, what: str) -> tuple[Expression, Expression]:
     if frame is None:
         return ca.DM.eye(3), ca.DM(3, 1)
-    checked_instance(frame, tuple, "distance", what)
+    require.instance(f"distance: {what}", frame, tuple)
     parts = tuple(map(expression, frame))
     shapes = [part.shape for part in parts]
     if shapes != [(3, 3), (3, 1)]:

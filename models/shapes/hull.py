@@ -17,7 +17,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from models.arrays import ROUNDING, Array, frozen
+from models.checks import ROUNDING, Array, frozen
 from models.errors import ModelError
 
 __all__ = ["gap_along", "is_box", "nearest_directions"]

@@ -27,7 +27,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from models.arrays import Array, checked_text
+from models.checks import Array, require
 from models.errors import ModelError
 from models.files import INPUT_LIMITS, UnfitFile, parse_xml, read_regular
 
@@ -111,7 +111,7 @@ def find_mesh(
     Raises:
         ModelError: The name is no text, or a folder is no path.
     """
-    checked_text(file, "mesh", "file")
+    require.text("mesh: file", file)
     try:
         searched = [Path(each) for each in folders]
         urdf_folders = [] if not folder else [Path(folder).resolve(), *Path(folder).resolve().parents]

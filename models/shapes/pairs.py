@@ -13,15 +13,7 @@ from warnings import warn
 import numpy as np
 from numpy.typing import NDArray
 
-from models.arrays import (
-    Array,
-    ArrayInput,
-    checked_broadcast,
-    checked_count,
-    checked_each,
-    checked_instance,
-    checked_nonnegative,
-)
+from models.checks import Array, ArrayInput, require
 from models.errors import ModelError, ModelWarning
 from models.files import cache_key, load_value, source_version, store_value
 from models.robot.robot import Robot
@@ -133,19 +125,22 @@ def checked_pairs(
         ModelWarning: The SRDF file names links that the robot does not have.
     """
     owner = "checked_pairs"
-    checked_instance(robot, Robot, owner, "robot")
-    bodies = checked_each(bodies, Body, owner, "bodies")
+    require.instance(f"{owner}: robot", robot, Robot)
+    bodies = require.each(f"{owner}: bodies", bodies, Body)
     for body in bodies:
         robot.link(body.link)
-    low = robot.lower if lower is None else checked_broadcast(lower, robot.dof, owner, "lower", "joints", finite=False)
-    high = robot.upper if upper is None else checked_broadcast(upper, robot.dof, owner, "upper", "joints", finite=False)
+    limits = {"lower": robot.lower if lower is None else lower, "upper": robot.upper if upper is None else upper}
+    low, high = (
+        require.broadcast(f"{owner}: {name}", limit, robot.dof, "joints", entries="numbers")
+        for name, limit in limits.items()
+    )
     if (low > high).any():
         k = int(np.flatnonzero(low > high)[0])
         message = f"{owner}: lower {low[k]} of joint {robot.joint_names[k]!r} is above upper {high[k]}"
         raise ModelError(message, name="lower", value=float(low[k]), limit=float(high[k]))
-    count = checked_count(samples, owner, "samples")
-    margin = checked_nonnegative(clearance, owner, "clearance", "m") + MARGIN_M
-    rng = np.random.default_rng(checked_count(seed, owner, "seed", least=0, most=2**63))
+    count = require.count(f"{owner}: samples", samples)
+    margin = require.nonnegative(f"{owner}: clearance", clearance, unit="m") + MARGIN_M
+    rng = np.random.default_rng(require.count(f"{owner}: seed", seed, least=0, most=2**63))
     named = dict.fromkeys([] if srdf is None else _disabled(robot, srdf), SRDF)
     named |= dict.fromkeys(_ignored_pairs(robot, ignored), IGNORED)
 
@@ -202,7 +197,7 @@ def _read(value: Any, bodies: Sequence[Body]) -> Pairs | None:
 
 def _ignored_pairs(robot: Robot, pairs: Any) -> list[frozenset[str]]:
     names = []
-    for pair in [pairs] if isinstance(pairs, str) else checked_each(pairs, tuple, "checked_pairs", "ignored"):
+    for pair in [pairs] if isinstance(pairs, str) else require.each("checked_pairs: ignored", pairs, tuple):
         if not isinstance(pair, tuple) or len(pair) != 2:
             message = f"checked_pairs: ignored must be pairs of links, not {pair!r}"
             raise ModelError(message, name="ignored", value=pair, limit=2)

@@ -18,17 +18,7 @@ from typing import Any, Self, TypeAlias, cast
 import casadi as ca
 import numpy as np
 
-from models.arrays import (
-    Array,
-    ArrayInput,
-    checked_array,
-    checked_broadcast,
-    checked_indices,
-    checked_nonnegative,
-    checked_number,
-    checked_rotation,
-    frozen,
-)
+from models.checks import Array, ArrayInput, frozen, require
 from models.errors import ModelError
 from models.shapes.hull import Hull, convex_hull
 from models.spatial import Expression, Frame, expand_tables, expression
@@ -54,7 +44,7 @@ class _SweptCore:
 
     def reach(self, point: ArrayInput) -> float:
         """Return the largest distance of the shape's points from a point. Shape (3,), m; inf if it is unbounded."""
-        centre = checked_array(point, (3,), "shape", "point")
+        centre = require.array("shape: point", point, (3,))
         return float(np.linalg.norm(self.core - centre, axis=1).max()) + self.swept_radius
 
 
@@ -86,7 +76,7 @@ class Sphere(_SweptCore):
     position: ArrayInput = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "radius", checked_number(self.radius, "sphere", "radius", positive=True, unit="m"))
+        object.__setattr__(self, "radius", require.positive("sphere: radius", self.radius, unit="m"))
         object.__setattr__(self, "position", _place(self.position, "sphere"))
 
     @property
@@ -122,9 +112,9 @@ class Capsule(_SweptCore):
     end: ArrayInput
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "radius", checked_nonnegative(self.radius, "capsule", "radius", "m"))
+        object.__setattr__(self, "radius", require.nonnegative("capsule: radius", self.radius, unit="m"))
         for name in ("start", "end"):
-            object.__setattr__(self, name, checked_array(getattr(self, name), (3,), "capsule", name))
+            object.__setattr__(self, name, require.array(f"capsule: {name}", getattr(self, name), (3,)))
         if self.radius == 0 and (self.start == self.end).all():
             message = "capsule: radius and length are zero; give a positive radius or two different ends"
             raise ModelError(message, name="radius", value=0.0, limit=0.0)
@@ -170,10 +160,10 @@ class Cylinder(_Posed):
 
     def __post_init__(self) -> None:
         for name in ("radius", "length"):
-            size = checked_number(getattr(self, name), "cylinder", name, positive=True, unit="m")
+            size = require.positive(f"cylinder: {name}", getattr(self, name), unit="m")
             object.__setattr__(self, name, size)
         object.__setattr__(self, "position", _place(self.position, "cylinder"))
-        object.__setattr__(self, "rotation", checked_rotation(self.rotation, "cylinder", "rotation"))
+        object.__setattr__(self, "rotation", require.rotation("cylinder: rotation", self.rotation))
 
     @property
     def core(self) -> Array:
@@ -209,10 +199,10 @@ class Box(_Posed):
     rotation: ArrayInput = field(default_factory=lambda: np.eye(3))
 
     def __post_init__(self) -> None:
-        size = checked_array(self.size, (3,), "box", "size", finite=False, positive=True, unit="m")
+        size = require.array("box: size", self.size, (3,), unit="m", entries="numbers", sign="positive")
         object.__setattr__(self, "size", size)
         object.__setattr__(self, "position", _place(self.position, "box"))
-        object.__setattr__(self, "rotation", checked_rotation(self.rotation, "box", "rotation"))
+        object.__setattr__(self, "rotation", require.rotation("box: rotation", self.rotation))
         if np.isinf(size).all():
             raise ModelError("box: every edge is infinite; there is no outside", name="size", value=size)
 
@@ -223,7 +213,7 @@ class Box(_Posed):
         Raises:
             ModelError: An edge is infinite.
         """
-        size = checked_array(self.size, (3,), "box", "size", unit="m")
+        size = require.array("box: size", self.size, (3,), unit="m")
         return np.asarray(self.position + (CORNERS * size / 2) @ self.rotation.T)
 
     def reach(self, point: ArrayInput) -> float:
@@ -247,7 +237,7 @@ class HalfSpace(_SweptCore):
     point: ArrayInput = None
 
     def __post_init__(self) -> None:
-        normal = checked_array(self.normal, (3,), "half-space", "normal")
+        normal = require.array("half-space: normal", self.normal, (3,))
         length = float(np.linalg.norm(normal))
         if not 0 < length < np.inf:
             raise ModelError(f"half-space: normal {normal.tolist()} has no direction", name="normal", value=normal)
@@ -266,7 +256,7 @@ class HalfSpace(_SweptCore):
 
     def reach(self, point: ArrayInput) -> float:
         """Return inf: a half-space is unbounded."""
-        checked_array(point, (3,), "half-space", "point")
+        require.array("half-space: point", point, (3,))
         return np.inf
 
 
@@ -308,21 +298,21 @@ class Mesh(_Posed):
                 object.__setattr__(self, name, value)
         elif self.vertices is None:
             raise ModelError("mesh: vertices are missing; give vertices or a file", name="vertices", value=None)
-        vertices = checked_array(self.vertices, ("vertices", 3), "mesh", "vertices", least=4)
+        vertices = require.array("mesh: vertices", self.vertices, ("vertices", 3), least=4)
         object.__setattr__(self, "vertices", vertices)
         if self.faces is not None:
-            faces = checked_indices(self.faces, len(vertices), "mesh", "faces")
+            faces = require.indices("mesh: faces", self.faces, len(vertices))
             if faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0:
                 message = f"mesh: faces have shape {faces.shape}, expected (m, 3)"
                 raise ModelError(message, name="faces", value=self.faces, limit=("m", 3))
             object.__setattr__(self, "faces", faces)
-        scale = checked_broadcast(self.scale, 3, "mesh", "scale", "axes")
+        scale = require.broadcast("mesh: scale", self.scale, 3, "axes")
         if not scale.all():
             message = f"mesh: scale {scale.tolist()} has a zero; every axis needs a nonzero factor"
             raise ModelError(message, name="scale", value=scale, limit=0.0)
         object.__setattr__(self, "scale", scale)
         object.__setattr__(self, "position", _place(self.position, "mesh"))
-        object.__setattr__(self, "rotation", checked_rotation(self.rotation, "mesh", "rotation"))
+        object.__setattr__(self, "rotation", require.rotation("mesh: rotation", self.rotation))
         used = vertices if self.faces is None else vertices[np.unique(self.faces)]
         object.__setattr__(self, "hull", convex_hull(used * scale))
 
@@ -346,24 +336,23 @@ Shape: TypeAlias = Sphere | Capsule | Cylinder | Box | HalfSpace | Mesh
 KINDS = (Sphere, Capsule, Cylinder, Box, HalfSpace, Mesh)
 
 
-def checked_shape(value: Any, owner: str, what: str) -> Shape:
-    """Return `value` itself; raise a ModelError that names `owner` and `what` if it is not a shape."""
+def checked_shape(label: str, value: Any) -> Shape:
+    """Return `value`; raise ModelError unless it is a shape."""
     if not isinstance(value, KINDS):
         names = ", ".join(kind.__name__ for kind in KINDS)
-        message = f"{owner}: {what} must be a shape ({names}), not {value!r}"
-        raise ModelError(message, name=what, value=value, limit=names)
+        raise require.invalid(label, f"a shape ({names})", value, names)
     return value
 
 
 def _place(value: ArrayInput, owner: str, what: str = "position") -> Array:
     if value is None:
         raise ModelError(f"{owner}: {what} is missing; give its coordinates, shape (3,), m", name=what, value=None)
-    return checked_array(value, (3,), owner, what)
+    return require.array(f"{owner}: {what}", value, (3,))
 
 
 def _motion(rotation: ArrayInput, translation: ArrayInput) -> tuple[Array, Array]:
-    turn = checked_rotation(rotation, "shape", "rotation")
-    return turn, checked_array(translation, (3,), "shape", "translation")
+    turn = require.rotation("shape: rotation", rotation)
+    return turn, require.array("shape: translation", translation, (3,))
 
 
 @dataclass(frozen=True, eq=False)
@@ -387,7 +376,7 @@ class MovingObstacle:
     _at: Any = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        if isinstance(checked_shape(self.shape, "moving", "shape"), HalfSpace):
+        if isinstance(checked_shape("moving: shape", self.shape), HalfSpace):
             message = "moving: a half-space cannot move; give a box that is large enough"
             raise ModelError(message, name="shape", value=self.shape)
         time = ca.SX.sym("time")
@@ -413,10 +402,10 @@ class MovingObstacle:
         object.__setattr__(self, "_at", ca.Function("moving", [time], [parts[1], parts[0]]))
         for name, part in zip(("position", "rotation"), parts, strict=True):
             if not ca.symvar(part):
-                checked_array(ca.DM(part).full(), part.shape, "moving", name)
+                require.array(f"moving: {name}", ca.DM(part).full(), part.shape)
         turn = self._at(0.0)[0].full()
         if np.isfinite(turn).all():
-            checked_rotation(turn, "moving", "rotation")
+            require.rotation("moving: rotation", turn)
 
     def frame(self, time: Expression) -> Frame:
         """Return the frame of the shape in world at a time (s)."""
@@ -434,6 +423,6 @@ class MovingObstacle:
             raise ModelError(message, name="position", value=value, time=time)
         for turn, time in zip(turns.reshape(3, -1, 3).transpose(1, 0, 2), times.tolist(), strict=True):
             try:
-                checked_rotation(turn, "moving", "rotation")
+                require.rotation("moving: rotation", turn)
             except ModelError as error:
                 raise ModelError(f"{error}, at {time:g} s", **{**vars(error), "time": time}) from error

@@ -33,7 +33,7 @@ from ocp.app.subcommands import (
     run_view,
 )
 from ocp.console import Progress
-from ocp.errors import AuditError, ProblemError, SolveError, checked_each
+from ocp.errors import AuditError, ProblemError, SolveError, require
 from ocp.tolerances import LIMIT_SHARE, ORIENTATION_TOLERANCE_RAD
 
 __all__ = ["main", "parser"]
@@ -84,7 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     if isinstance(arguments, str):
         raise ProblemError(f"arguments must be a list of texts, not {arguments!r}", name="arguments", value=arguments)
-    arguments = None if arguments is None else checked_each("arguments", arguments, str)
+    arguments = None if arguments is None else require.each("arguments", arguments, str)
     options = parser().parse_args(arguments)
     try:
         return _run(options)

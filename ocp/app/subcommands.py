@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from models import FixedBase, FreeFloating, Machine, Robot, Standing, footprint, lock_joints, rectangle, with_load
-from models.arrays import Array
-from models.files import cache_files, cache_folder
+from models.checks import Array
+from models.files import INPUT_LIMITS, cache_files, cache_folder
 from models.spatial import rotation_from_rpy
 from ocp.app.check.data_checks import PLANAR_BASE, clean_trajectory
 from ocp.app.check.joint_limits import limits_by_name
@@ -24,7 +24,7 @@ from ocp.app.files import RawTrajectory, read_trajectory, read_waypoints, write_
 from ocp.app.files.safe_files import MARK, SUFFIXES, checked_output, missing_package
 from ocp.app.files.task_file import Task, read_obstacles, read_task
 from ocp.console import Progress
-from ocp.errors import MAX_COUNT, ProblemError, checked_positive
+from ocp.errors import ProblemError, require
 from ocp.motion.plan import Plan, plan
 from ocp.motion.result.segmented_plan import SegmentedPlan
 from ocp.motion.tasks.goals import Scene
@@ -341,12 +341,11 @@ def export_plan(plan: Plan, file: Path, period: float, force: bool = False) -> N
 
 def check_period(plan: Plan, period: float) -> None:
     """Raise ProblemError if a sampling period is not positive or gives more than MOST samples."""
-    checked_positive("period", period)
-    if plan.horizon / period > MAX_COUNT:
-        words = (
-            f"a period of {period:g} s gives {plan.horizon / period:.3g} samples; at most {MAX_COUNT} can be written"
-        )
-        raise ProblemError(words, name="period", value=period, limit=plan.horizon / MAX_COUNT)
+    require.positive("period", period)
+    most = INPUT_LIMITS.count
+    if plan.horizon / period > most:
+        words = f"a period of {period:g} s gives {plan.horizon / period:.3g} samples; at most {most} can be written"
+        raise ProblemError(words, name="period", value=period, limit=plan.horizon / most)
 
 
 def _yaml(plan: Plan, file: Path, period: float) -> None:

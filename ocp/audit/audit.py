@@ -18,7 +18,7 @@ from ocp.audit.reintegration import Reintegration, Violation, reintegrate, viola
 from ocp.audit.sizes import Sizes, fine_grid, sizes_along
 from ocp.console import check_time, interruptible
 from ocp.curves import PiecewisePolynomial
-from ocp.errors import ProblemError, checked_mapping, unknown_name
+from ocp.errors import ProblemError, require
 from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.problem import Problem
 from ocp.solution import Solution, check_structure, check_variables_match, match_order, stack, unstack
@@ -129,7 +129,7 @@ class Audit:
         for finding in self.findings:
             if finding.name == name:
                 return finding
-        raise unknown_name("finding", name, [finding.name for finding in self.findings])
+        raise require.unknown("finding", name, [finding.name for finding in self.findings])
 
     @property
     def sentence(self) -> str:
@@ -217,7 +217,7 @@ def audit(
             unknown.
         TimeLimitReached: Only inside :func:`ocp.console.time_limited`, after its limit.
     """
-    limits = checked_mapping("audit: tolerances", tolerances)
+    limits = require.mapping("audit: tolerances", tolerances)
     judged = {"integration": integration, "constraints": constraints, "lost": lost, **limits}
     for name, limit in {**judged, **({} if costates is None else {"costates": costates})}.items():
         if isinstance(limit, bool) or not isinstance(limit, int | float | np.number) or not limit >= 0:
@@ -250,7 +250,7 @@ def audit(
     names = [*form.states, *form.controls, *form.separations, *[name for kind in rows for name in kind.names]]
     for name in limits:
         if name not in names:
-            raise unknown_name("name in tolerances", name, names)
+            raise require.unknown("name in tolerances", name, names)
     constraint_values: dict[str, float] = {}
     for check in violations(along, motion, judged_states, constraints):
         finding = violation_finding(check, constraints, limits.get(check.name))

@@ -16,7 +16,7 @@ from ocp.curves import differentiation_matrix, lagrange, quadrature_weights
 from ocp.direct.assembly import Block, Interpolants, Transcription
 from ocp.direct.prepared import DirectMethod
 from ocp.direct.transcription import TranscriptionBuilder
-from ocp.errors import checked_choice
+from ocp.errors import require
 from ocp.problem.formulation import Formulation
 
 __all__ = ["Collocation"]
@@ -46,8 +46,8 @@ class Collocation(DirectMethod):
 
     def __post_init__(self) -> None:
         self._check_mesh("degree", largest=9)
-        checked_choice("Collocation: scheme", self.scheme, ("radau", "legendre"))
-        checked_choice("Collocation: control", self.control, ("points", "held"))
+        require.choice("Collocation: scheme", self.scheme, ("radau", "legendre"))
+        require.choice("Collocation: control", self.control, ("points", "held"))
 
     @property
     def order(self) -> int:

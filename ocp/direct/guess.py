@@ -14,7 +14,7 @@ import numpy as np
 
 from ocp.curves import rk4_step
 from ocp.direct.assembly import Transcription
-from ocp.errors import ProblemError, error_names, unknown_name
+from ocp.errors import ProblemError, error_names, require
 from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.values import numeric, table
 from ocp.solution import Guess, Solution
@@ -46,7 +46,7 @@ def initial_point(form: Formulation, transcription: Transcription, guess: Guess,
         known = [*form.states, *form.controls, "horizon", "t"]
         for name in values:
             if name not in known:
-                raise unknown_name("variable in guess", name, known)
+                raise require.unknown("variable in guess", name, known)
     elif guess is not None:
         text = f"guess must be a Solution, a dictionary or None, not {type(guess).__name__}"
         raise ProblemError(text, name="guess", value=guess)

@@ -41,16 +41,7 @@ from ocp.direct.scaling import (
     unit_scales,
 )
 from ocp.direct.transcription import MeshedMethod
-from ocp.errors import (
-    Interrupted,
-    ProblemError,
-    SolveError,
-    SolverStatus,
-    checked_choice,
-    checked_count,
-    checked_mapping,
-    checked_time_limit,
-)
+from ocp.errors import Interrupted, ProblemError, SolveError, SolverStatus, checked_time_limit, require
 from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.invariants import bounds_to_solve
 from ocp.problem.problem import Problem
@@ -108,8 +99,8 @@ class Prepared:
         began = time.monotonic()
         self.problem, self.method = problem, method
         self.formulation = Formulation.of(problem)
-        checked_choice("solver", solver, SOLVERS)
-        own = checked_mapping("options", options)
+        require.choice("solver", solver, SOLVERS)
+        own = require.mapping("options", options)
         self._options, self._scaling = own, scaling
         self.solver_name = solver
         self.transcription = method.transcribe(self.formulation, staged=solver == "fatrop")
@@ -172,7 +163,7 @@ class Prepared:
             ProblemError: Wrong arguments.
             SolveError: No plan was found, with the reasons.
         """
-        ahead = checked_count("solve: shift", shift, least=0, most=self.method.intervals - 1)
+        ahead = require.count("solve: shift", shift, least=0, most=self.method.intervals - 1)
         if ahead and not (self._is_own_plan(guess) and self.method.mesh is None):
             words = "solve: shift requires as guess a plan of this problem, method and mesh, with equal intervals"
             raise ProblemError(words, name="shift", value=shift)
@@ -194,7 +185,7 @@ class Prepared:
         """
         form, transcription = self.formulation, self.transcription
         place = Path(checked_path(folder))
-        bounds = form.bound_values(form.parameter_vector(checked_mapping("parameters", parameters)))
+        bounds = form.bound_values(form.parameter_vector(require.mapping("parameters", parameters)))
         with self._lock:
             point = initial_point(form, transcription, guess, bounds)
             if isinstance(guess, Solution) and guess.method == self.method.settings:
@@ -207,7 +198,7 @@ class Prepared:
     ) -> Solution:
         """Solve from the plan given as guess, from the guess, from alternative starts, then from the elastic plan."""
         form, transcription = self.formulation, self.transcription
-        p = form.parameter_vector(checked_mapping("parameters", parameters))
+        p = form.parameter_vector(require.mapping("parameters", parameters))
         bounds = form.bound_values(p)
         arguments = transcription.arguments(p, bounds_to_solve(form, p))
         if tighter is not None:

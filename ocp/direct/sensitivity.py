@@ -18,7 +18,7 @@ from ocp.direct.diagnosis import variable_names
 from ocp.direct.nlp import Outcome, controls_at
 from ocp.direct.scaling import Pattern, compute_scales, sizes_along
 from ocp.direct.shooting import MultipleShooting
-from ocp.errors import ProblemError, unknown_name
+from ocp.errors import ProblemError, require
 from ocp.problem.formulation import Formulation
 from ocp.problem.invariants import bounds_to_solve
 from ocp.problem.values import symbols_of
@@ -42,7 +42,7 @@ def sensitivity(solution: Solution, name: str) -> Sensitivity:
     """
     form, transcription, program = program_of(solution)
     if not isinstance(name, str) or name not in form.parameters:
-        raise unknown_name("parameter", name, form.parameters)
+        raise require.unknown("parameter", name, form.parameters)
     place = form.parameters[name]
     columns = list(range(place.start, place.stop))
     v, lam, p = solution.variables, solution.multipliers, form.parameter_vector(solution.parameters)

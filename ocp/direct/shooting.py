@@ -15,7 +15,7 @@ from ocp.curves import integrator, rk4_step
 from ocp.direct.assembly import SIZES, Block, Interpolants, Transcription
 from ocp.direct.prepared import DirectMethod
 from ocp.direct.transcription import TranscriptionBuilder
-from ocp.errors import checked_choice
+from ocp.errors import require
 from ocp.problem.formulation import Formulation
 from ocp.problem.values import symbols_of
 
@@ -48,8 +48,8 @@ class MultipleShooting(DirectMethod):
 
     def __post_init__(self) -> None:
         self._check_mesh("steps")
-        checked_choice("MultipleShooting: integrator", self.integrator, ("rk4", "cvodes"))
-        checked_choice("MultipleShooting: control", self.control, ("held", "linear"))
+        require.choice("MultipleShooting: integrator", self.integrator, ("rk4", "cvodes"))
+        require.choice("MultipleShooting: control", self.control, ("held", "linear"))
 
     @property
     def order(self) -> int:

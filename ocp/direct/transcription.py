@@ -14,8 +14,10 @@ from typing import Any, Self
 import casadi as ca
 import numpy as np
 
+from models.checks import NOT_NUMBERS, floats
+from models.files import INPUT_LIMITS
 from ocp.direct.assembly import Block, Interpolants, Stages, Transcription
-from ocp.errors import NOT_NUMBERS, ProblemError, checked_count, checked_positive, error_names, floats
+from ocp.errors import ProblemError, error_names, require
 from ocp.problem.formulation import Formulation, Rows
 from ocp.problem.values import numeric
 from ocp.tolerances import ROUNDING_SHARE
@@ -416,7 +418,7 @@ class MeshedMethod(ABC):
             nodes = np.concatenate([*segments, [1.0]])
         return self.with_mesh(nodes)
 
-    def _check_mesh(self, count: str, largest: int | None = None) -> None:
+    def _check_mesh(self, count: str, largest: int = INPUT_LIMITS.count) -> None:
         """Check the mesh and the whole number named ``count``, and convert them to plain Python for storage.
 
         Raises:
@@ -424,8 +426,8 @@ class MeshedMethod(ABC):
                 intervals.
         """
         name_of_method = type(self).__name__
-        for name, limit in (("intervals", None), (count, largest)):
-            object.__setattr__(self, name, checked_count(f"{name_of_method}: {name}", getattr(self, name), most=limit))
+        for name, most in (("intervals", INPUT_LIMITS.count), (count, largest)):
+            object.__setattr__(self, name, require.count(f"{name_of_method}: {name}", getattr(self, name), most=most))
         if self.mesh is None:
             return
         details: dict[str, Any] = {"name": "mesh", "value": self.mesh}
@@ -447,4 +449,4 @@ def check_meshed(caller: str, method: Any, tolerance: Any) -> None:
     if not isinstance(method, MeshedMethod):
         words = f"{caller}: Collocation(...) or MultipleShooting(...) is expected, not {method!r}"
         raise ProblemError(words, name="method", value=method)
-    checked_positive(f"{caller}: tolerance", tolerance)
+    require.positive(f"{caller}: tolerance", tolerance)

@@ -25,17 +25,7 @@ from ocp.console import interruptible, time_limited
 from ocp.curves import PiecewisePolynomial
 from ocp.direct.collocation import Collocation
 from ocp.direct.nlp import SOLVERS
-from ocp.errors import (
-    Interrupted,
-    ProblemError,
-    SolveError,
-    SolverStatus,
-    checked_choice,
-    checked_count,
-    checked_mapping,
-    checked_positive,
-    checked_time_limit,
-)
+from ocp.errors import Interrupted, ProblemError, SolveError, SolverStatus, checked_time_limit, require
 from ocp.indirect.boundary import LOBATTO, BoundaryProblem, NewtonResult, newton
 from ocp.indirect.hamiltonian import Extremal, Hamiltonian, cost_gradient
 from ocp.indirect.seed import ControlArcs, read_arcs, read_unknowns
@@ -148,10 +138,10 @@ class Indirect:
     seed: Collocation = dataclasses.field(default_factory=lambda: Collocation(40))
 
     def __post_init__(self) -> None:
-        checked_count("Indirect: segments", self.segments)
-        checked_choice("Indirect: shooting", self.shooting, ("multiple", "backward"))
+        require.count("Indirect: segments", self.segments)
+        require.choice("Indirect: shooting", self.shooting, ("multiple", "backward"))
         for name in ("tolerance", "residual"):
-            checked_positive(f"Indirect: {name}", getattr(self, name), below=1.0)
+            require.positive(f"Indirect: {name}", getattr(self, name), below=1.0)
         if not isinstance(self.seed, Collocation):
             raise ProblemError(
                 f"Indirect: seed must be a Collocation(...), not {self.seed!r}", name="seed", value=self.seed
@@ -171,10 +161,10 @@ class Indirect:
 
         ``solver``, ``options``, ``compiled`` and ``scaling`` apply to the direct solution that seeds it.
         """
-        checked_choice("solver", solver, SOLVERS)
+        require.choice("solver", solver, SOLVERS)
         how = {
             "solver": solver,
-            "options": checked_mapping("options", options),
+            "options": require.mapping("options", options),
             "compiled": compiled,
             "scaling": scaling,
         }
@@ -221,7 +211,7 @@ class PreparedIndirect:
 
     def _solve(self, parameters: ByName, guess: Guess, check: bool) -> Solution:
         form = self.formulation
-        p = form.parameter_vector(checked_mapping("parameters", parameters))
+        p = form.parameter_vector(require.mapping("parameters", parameters))
         bounds = bounds_to_solve(form, p)
         note = ""
         if isinstance(guess, Solution):

@@ -9,7 +9,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ocp.errors import ProblemError, checked_count, checked_text
+from ocp.errors import ProblemError, require
 from ocp.problem.hulls import Separation
 from ocp.problem.values import (
     check_finite,
@@ -401,7 +401,7 @@ class ExpressionReader:
     ) -> Constraint:
         """Return a constraint on an expression of the ``known`` symbols; ``kind`` is for messages."""
         what = f"{kind} constraint {name!r}"
-        checked_text(f"{what}: unit", unit)
+        require.text(f"{what}: unit", unit)
         vector = self.expression(what, expression, known)
         if vector.numel() == 0:
             raise ProblemError(f"{what} is empty")
@@ -438,7 +438,7 @@ class ExpressionReader:
 def number_of_entries(what: str, size: int | None, values: dict[str, Value]) -> int:
     """Return the given size, or the common size of the labelled values; 1 if all are scalars."""
     if size is not None:
-        return checked_count(f"{what}: size", size)
+        return require.count(f"{what}: size", size)
     labelled = {f"{what}: {k}": v for k, v in values.items() if v is not None and not callable(v)}
     lengths = {k: stacked(k, v).numel() if is_symbolic(v) else numeric(k, v).size for k, v in labelled.items()}
     for label, n in lengths.items():

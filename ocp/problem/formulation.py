@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 import casadi as ca
 import numpy as np
 
-from ocp.errors import ProblemError, error_names, unknown_name
+from ocp.errors import ProblemError, error_names, require
 from ocp.problem.declarations import Constraint, Declarations, Signal, Variable
 from ocp.problem.problem import Problem, checked_problem
 from ocp.problem.values import Sampler, check_finite, check_horizon, check_inside, check_order, constant, numeric
@@ -292,7 +292,7 @@ class Formulation:
         entries = dict(values or {})
         for name in entries:
             if name not in self.parameters:
-                raise unknown_name("parameter", name, self.parameters)
+                raise require.unknown("parameter", name, self.parameters)
         vector = np.zeros(self.np)
         for name, place in self.parameters.items():
             what, size = f"parameter {name!r}", place.stop - place.start

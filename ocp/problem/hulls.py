@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from models.shapes.hull import gap_along, is_box, nearest_directions
-from ocp.errors import ProblemError, checked_mapping, checked_text
+from ocp.errors import ProblemError, require
 from ocp.problem.values import check_finite, table
 
 __all__ = ["Separation", "index_rows", "stack_motion_bounds"]
@@ -402,12 +402,12 @@ class Separation:
     assumed: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        what = f"separation {checked_text('separation: its name', self.name)!r}"
+        what = f"separation {require.text('separation: its name', self.name)!r}"
         pairs = index_rows(what, "pairs", self.pairs, 3)
         object.__setattr__(self, "pairs", pairs)
         object.__setattr__(self, "covers", _checked_covers(what, self.covers, len(pairs)))
-        for text in (part for item in checked_mapping(f"{what}: assumed", self.assumed).items() for part in item):
-            checked_text(f"{what}: assumed", text)
+        for text in (part for item in require.mapping(f"{what}: assumed", self.assumed).items() for part in item):
+            require.text(f"{what}: assumed", text)
         self._check_bodies(what)
         n, k = len(pairs), sum(self.movers.values())
         for label, shape in {"least": (n,), "levers": (n, k), "turns": (n, k)}.items():
@@ -458,7 +458,7 @@ class Separation:
 def _checked_covers(what: str, covers: Any, count: int) -> dict[int, np.ndarray]:
     """Return the covering pairs by the index of the covered pair, without empty entries."""
     covering: dict[int, np.ndarray] = {}
-    for pair, rows in checked_mapping(f"{what}: covers", covers).items():
+    for pair, rows in require.mapping(f"{what}: covers", covers).items():
         if isinstance(pair, bool) or not isinstance(pair, int | np.integer) or not 0 <= pair < count:
             words = f"{what}: covers: pair {pair!r} does not exist, there are {count}"
             raise ProblemError(words, name="covers", value=pair, limit=count)

@@ -25,7 +25,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ocp.errors import ProblemError, checked_text, error_names, unknown_name
+from ocp.errors import ProblemError, error_names, require
 from ocp.problem.declarations import Constraint, PhaseTimes, Variable
 from ocp.problem.hulls import Separation
 from ocp.problem.problem import Problem, checked_problem
@@ -62,7 +62,7 @@ class Phase:
     def _symbol(self, name: str) -> Any:
         own = self._whole.of(self.name)
         if name not in own:
-            raise unknown_name(f"state or control of phase {self.name!r}", name, own)
+            raise require.unknown(f"state or control of phase {self.name!r}", name, own)
         return own[name].symbol
 
 
@@ -88,7 +88,7 @@ class Phases(Problem):
         if not _by_name("phases", phases):
             raise ProblemError(f"problem {name!r}: phases must not be empty", name="phases")
         for phase, problem in phases.items():
-            if not checked_text(f"problem {name!r}: name of a phase", phase) or "." in phase:
+            if not require.text(f"problem {name!r}: name of a phase", phase) or "." in phase:
                 words = f"problem {name!r}: a phase needs a name without a dot, not {phase!r}"
                 raise ProblemError(words, name="phases", value=phase)
             if checked_problem(problem).declared.phases:
@@ -108,7 +108,7 @@ class Phases(Problem):
     def __getitem__(self, name: str) -> Phase:
         """Return a phase by its name."""
         if not isinstance(name, str) or name not in self.declared.phases:
-            raise unknown_name("phase", name, self.declared.phases)
+            raise require.unknown("phase", name, self.declared.phases)
         times = self.declared.phases[name]
         return Phase(name, times.begin, times.duration, self)
 
@@ -135,7 +135,7 @@ class Phases(Problem):
         ends = parts_of_phase(before, self.declared.states)
         for name in values:
             if name not in begins:
-                raise unknown_name(f"state of phase {after!r}", name, begins)
+                raise require.unknown(f"state of phase {after!r}", name, begins)
         label = f"{before} to {after}"
         for name in ends:
             if name in begins and name not in values:

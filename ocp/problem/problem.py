@@ -15,7 +15,7 @@ from typing import Any, ParamSpec, TypeVar, cast
 import casadi as ca
 import numpy as np
 
-from ocp.errors import ProblemError, checked_count, checked_text, error_names, unknown_name
+from ocp.errors import ProblemError, error_names, require
 from ocp.problem.declarations import (
     ENDS,
     Constraint,
@@ -96,7 +96,7 @@ class Problem:
         if symbols not in (ca.SX, ca.MX):
             words = f"problem {name!r}: symbols must be casadi.SX or casadi.MX, not {symbols!r}"
             raise ProblemError(words, name="symbols", value=symbols)
-        if not checked_text("problem: its name", name):
+        if not require.text("problem: its name", name):
             raise ProblemError("a problem needs a name", name="name", value=name)
         self.name = name
         self.symbols = symbols
@@ -196,7 +196,7 @@ class Problem:
     @_about_its_name
     def parameter(self, name: str, size: int = 1) -> Any:
         """Declare a parameter, whose value is given to the solve, and return its symbol, shape (n, 1)."""
-        size = checked_count(f"parameter {name!r}: size", size)
+        size = require.count(f"parameter {name!r}: size", size)
         self.declared.parameters[name] = Variable(name, self._symbol("parameter", name, size))
         return self.declared.parameters[name].symbol
 
@@ -445,7 +445,7 @@ class Problem:
         self, kind: str, name: str, size: int | None, values: dict[str, Value], guess: Guess, unit: str, scale: Value
     ) -> Variable:
         what = f"{kind} {name!r}"
-        checked_text(f"{what}: unit", unit)
+        require.text(f"{what}: unit", unit)
         size = number_of_entries(what, size, {**values, "guess": guess})
         symbol = self._symbol(kind, name, size)
         low, high = self._reader.bounds(what, size, values["lower"], values["upper"])
@@ -474,7 +474,7 @@ class Problem:
         if isinstance(symbol, str):
             if symbol in pool:
                 return pool[symbol]
-            raise unknown_name(f"variable in {what}", symbol, pool)
+            raise require.unknown(f"variable in {what}", symbol, pool)
         if isinstance(symbol, self.symbols) and symbol.is_valid_input():
             identities = [identity(s) for s in ca.symvar(symbol)]
             for variable in pool.values():

@@ -8,7 +8,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ocp.errors import NOT_NUMBERS, ProblemError, floats, format_distinct
+from models.checks import NOT_NUMBERS, floats
+from ocp.errors import ProblemError, format_distinct
 
 
 def is_symbolic(value: Any) -> bool:

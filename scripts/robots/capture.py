@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 import ocp
 from models import FreeFloating, Link, Robot, VisualShape, with_wheels
-from models.arrays import Array
+from models.checks import Array
 from ocp import Audit, Capture, Cone, Cost, DynamicsSetup, FreeTime, Grasp, Limits, Solution, dynamics_problem
 from ocp.app.view.appearance import Frames, frames_along
 from ocp.motion.builders.space.pair import grasp_wrench, joined, motion_of, pair_momentum

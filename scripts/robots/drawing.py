@@ -20,7 +20,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from models import Robot
-from models.arrays import Array
+from models.checks import Array
 from ocp.app.view.appearance import SURFACE_STYLE, Appearance, Frames, Part, appearance_of, part_of, rod
 from ocp.app.view.rendering import Camera, Floor, Layer, parts_in_world, render, tube
 from scripts.drawing import COLORS, DASHES, add_note, gif, sheet

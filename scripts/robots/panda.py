@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from models import FixedBase
-from models.arrays import Array
+from models.checks import Array
 from ocp import Collocation, TipTask, inverse_kinematics, minimum_velocity_problem, resolve, solve
 from ocp.app.view.appearance import frames_along
 from scripts.drawing import COLORS

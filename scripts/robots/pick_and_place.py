@@ -17,7 +17,7 @@ import numpy as np
 
 import ocp
 from models import FixedBase, Link, Robot, VisualShape, attach_tool, with_load
-from models.arrays import Array
+from models.checks import Array
 from ocp import Audit, Cost, Goal, Solution, TipTask, inverse_kinematics, joint_torques
 from ocp.app.view.appearance import TIP_FRAME, Frames, frames_along
 from scripts.drawing import COLORS

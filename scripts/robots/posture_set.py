@@ -17,7 +17,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from models import CollisionScene, FixedBase, Robot
-from models.arrays import Array
+from models.checks import Array
 from models.paths import rest_to_rest
 from ocp import Limits, SolveError, TipTask, inverse_kinematics, resolve
 from ocp import plan as planned
@@ -25,7 +25,7 @@ from ocp.app.view.appearance import frames_along
 from ocp.motion.search.charts import Charts, SelfMotionManifolds, TimeSample
 from ocp.motion.search.joint_space import JointSpace
 from ocp.motion.search.search import AtlasSearch
-from ocp.motion.search.steps import SquaredRates
+from ocp.motion.search.steps import SquaredRates, Steps
 from ocp.motion.tasks.equations import bind
 from scripts.drawing import COLORS, VIRIDIS, sheet
 from scripts.robots.results import FINE, Example
@@ -99,7 +99,7 @@ def landscape(machine: FixedBase, task: TipTask, count: int, known: float) -> tu
     limits = bounds.velocity * np.diff(times)[:, None]
     told: dict[str, Any] = {"seeds": seeds, "scene": CollisionScene(machine)}
     instants = [TimeSample(sets, k) for k in range(count)]
-    search = AtlasSearch(space, instants, times, SquaredRates(np.ones(robot.dof)), limits, **told)
+    search = AtlasSearch(space, instants, Steps(times, SquaredRates(np.ones(robot.dof)), limits), **told)
     layers = search.layers
     for _ in range(HALVINGS):
         layers = [search.without_collisions(search.split_charts(charts, k), k) for k, charts in enumerate(layers)]

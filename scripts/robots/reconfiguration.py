@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 import ocp
 from models import CollisionScene, FixedBase
-from models.arrays import Array
+from models.checks import Array
 from models.paths import rest_to_rest
 from ocp import Audit, Limits, Reconfiguration, TipTask, inverse_kinematics
 from ocp.app.view.appearance import frames_along
@@ -31,7 +31,7 @@ from ocp.motion.result.segmented_plan import SegmentedPlan
 from ocp.motion.search.charts import Charts, SelfMotionManifolds, TimeSample
 from ocp.motion.search.joint_space import JointSpace
 from ocp.motion.search.search import AtlasSearch
-from ocp.motion.search.steps import SquaredRates
+from ocp.motion.search.steps import SquaredRates, Steps
 from ocp.motion.search.value import ChartGraph
 from ocp.motion.tasks.equations import bind, task_errors
 from scripts.drawing import COLORS, DASHES, sheet
@@ -157,7 +157,7 @@ def postures(machine: FixedBase, task: TipTask, count: int) -> Reached:
     limits = bounds.velocity * np.diff(times)[:, None]
     told: dict[str, Any] = {"seeds": seeds, "scene": CollisionScene(machine)}
     search = AtlasSearch(
-        space, [TimeSample(sets, k) for k in range(count)], times, SquaredRates(np.ones(n)), limits, **told
+        space, [TimeSample(sets, k) for k in range(count)], Steps(times, SquaredRates(np.ones(n)), limits), **told
     )
     layers = [search.without_collisions(search.split_charts(charts, k), k) for k, charts in enumerate(search.layers)]
     graph = search.graph(layers, np.full(count - 1, np.inf))

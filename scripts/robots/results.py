@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 
 from models import FreeFloating, Machine
-from models.arrays import Array
+from models.checks import Array
 from ocp import Audit, Solution, TipTask
 from ocp.curves import differentiation_matrix
 from ocp.motion.local.rates import LocalSolution

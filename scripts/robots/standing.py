@@ -17,7 +17,7 @@ import casadi as ca
 import numpy as np
 
 from models import CollisionScene, Footprint, Robot, Standing, Wrench, footprint, lock_joints, with_load
-from models.arrays import Array
+from models.checks import Array
 from models.machines.standing import External, StandingMotion, standing_motion
 from models.paths import rest_to_rest
 from ocp import ClearanceConstraints, Collocation, Problem, Solution, TipTask, resolve_accelerations, solve

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 import ocp
 from models import Foot, Foothold, FreeFloating, Joint, Link, Robot, VisualShape, rectangle
-from models.arrays import Array
+from models.checks import Array
 from ocp import Audit, Limits, Solution
 from ocp.app.view.appearance import frames_along
 from ocp.motion.builders.standing.resolved import StepsMotion, resolve_steps, steps_motion

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from models import Foot, Robot
-from models.arrays import Array
+from models.checks import Array
 from ocp.motion.builders.standing.resolved import StepsMotion
 from ocp.motion.builders.standing.stances import Steps
 from scripts.drawing import COLORS

@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from models import FixedBase, Machine
-from models.arrays import Array
+from models.checks import Array
 from models.paths import rest_to_rest
 from ocp import Collocation, Solution, SolveError, TipTask, inverse_kinematics, minimum_velocity_problem, resolve, solve
 from ocp.app.view.appearance import TIP_FRAME, Frames, frames_along

@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 
 from models import FixedBase, paths, smooth
-from models.arrays import Array
+from models.checks import Array
 from ocp import TipTask, Unreachable, inverse_kinematics, resolve
 from ocp.motion.schedule import JointLimits, LineLimits, schedule
 from scripts import drawing

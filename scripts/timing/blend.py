@@ -15,7 +15,7 @@ import casadi as ca
 import numpy as np
 
 from models import SmoothPath, paths, scara_along, smooth
-from models.arrays import Array
+from models.checks import Array
 from models.paths import gauss_newton, march, path_function, predictor_corrector
 from models.paths.blends import arc_length, speed
 from ocp.motion.builders.timing import solve_minimum_time

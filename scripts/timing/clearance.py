@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 
 from models import Box, CollisionScene, FixedBase, Robot, Sphere, link_frames
-from models.arrays import Array
+from models.checks import Array
 from models.shapes.shapes import Shape
 from ocp import Plan, Scene, plan
 from ocp.audit.clearance import Clearance

@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 
 from models import optimal_inverse, reference_rig, reference_tunnel
-from models.arrays import Array
+from models.checks import Array
 from models.cts.rig import HOME, forward, inverse
 from scripts import drawing
 from scripts.papers.cts.iterations import combined, null_space

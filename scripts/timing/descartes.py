@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from models.arrays import Array
+    from models.checks import Array
 
 KIN = """kinematic_plugins:
   search_paths: [{libraries}]

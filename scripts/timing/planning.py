@@ -10,7 +10,7 @@ import numpy as np
 
 import models
 from models import FixedBase, Machine, Robot, smooth
-from models.arrays import Array
+from models.checks import Array
 from ocp import Plan, TipTask, plan
 from ocp.motion.search.configurations import SearchKind
 from scripts import drawing

@@ -25,7 +25,7 @@ from models import (
     simplify,
     tip_jacobian,
 )
-from models.arrays import Array
+from models.checks import Array
 from scripts import drawing
 from scripts.papers.run import text_table
 from scripts.robots.robots import packaged

@@ -18,7 +18,7 @@ import casadi as ca
 import numpy as np
 
 from models import FixedBase, SmoothPath, paths, smooth
-from models.arrays import Array
+from models.checks import Array
 from ocp import joint_path
 from ocp.motion.builders.joint_spline import PlannedJoints
 from ocp.motion.builders.timing import solve_minimum_time

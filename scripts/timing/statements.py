@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 
 from models import FixedBase
-from models.arrays import Array
+from models.checks import Array
 from ocp import Collocation, Problem, inverse_kinematics, prepare
 from ocp.motion.builders.joint_motion import minimum_velocity_problem
 from ocp.problem.formulation import Formulation

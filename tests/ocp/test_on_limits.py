@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from models import FixedBase, Joint, Robot, planar_chain
-from models.arrays import Array
+from models.checks import Array
 from ocp import DynamicsSetup, Limits, Problem, ProblemError, TipTask, minimum_velocity_problem, plan
 from ocp.errors import format_distinct
 from ocp.motion.builders.dynamics_plan import solve_dynamics

@@ -133,10 +133,10 @@ def test_times_outside_are_named(time: Any) -> None:
 @pytest.mark.parametrize(
     ("ask", "message"),
     [
-        (lambda s: s["y"], "unknown state or control 'y'; known: x, w, u, b"),
-        (lambda s: s.at(0.1)["y"], "unknown state or control 'y'"),
-        (lambda s: s.costate("u"), "unknown state 'u'; known: x, w"),
-        (lambda s: s.cost_gradient("q"), "unknown parameter 'q'; known: k"),
+        (lambda s: s["y"], "state or control 'y' does not exist; known: x, w, u, b"),
+        (lambda s: s.at(0.1)["y"], "state or control 'y' does not exist"),
+        (lambda s: s.costate("u"), "state 'u' does not exist; known: x, w"),
+        (lambda s: s.cost_gradient("q"), "parameter 'q' does not exist; known: k"),
     ],
 )
 def test_unknown_names_are_named(ask: Callable[[Solution], Any], message: str) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from models import Box, CollisionShape, FixedBase, ModelWarning, Robot, link_frames
-from models.arrays import Array
+from models.checks import Array
 from models.robot.rebuild import lock_joints
 
 FOLDER = Path(__file__).resolve().parent

@@ -16,7 +16,7 @@ import pytest
 from PIL import Image
 
 from models import FixedBase, FreeFloating, with_wheels
-from models.arrays import Array
+from models.checks import Array
 from models.paths import rest_to_rest
 from ocp import Plan, Solution, SolveError, resolve_accelerations
 from ocp.app.files import read_trajectory

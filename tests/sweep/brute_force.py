@@ -14,13 +14,13 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from models.arrays import Array
+from models.checks import Array
 from ocp import TipTask, inverse_kinematics
 from ocp.motion.local.inverse_kinematics import Unreachable
 from ocp.motion.search.charts import SelfMotionManifolds, TimeSample
 from ocp.motion.search.joint_space import FULL_TURN, JointSpace
 from ocp.motion.search.search import AtlasSearch
-from ocp.motion.search.steps import PathLength, SquaredRates, StepCost
+from ocp.motion.search.steps import PathLength, SquaredRates, StepCost, Steps
 from ocp.motion.tasks.equations import bind
 from tests.ocp.motion.search.test_charts import planar
 from tests.ocp.motion.search.test_values import INSTANTS, SECONDS, reached
@@ -72,7 +72,9 @@ def judged(kind: str, seed: int) -> dict[str, Any]:
     begun, steps, bound = time.process_time(), np.inf, np.inf
     try:
         instants = [TimeSample(sets, k) for k in range(INSTANTS)]
-        search = AtlasSearch(space, instants, times, price, np.repeat(most[None], INSTANTS - 1, axis=0), seeds=seeds)
+        search = AtlasSearch(
+            space, instants, Steps(times, price, np.repeat(most[None], INSTANTS - 1, axis=0)), seeds=seeds
+        )
         path, bound = search.solve(np.inf)
         steps = np.inf if path is None else search.path_cost(path)
     except Unreachable:

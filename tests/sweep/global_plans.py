@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 
 from models import FixedBase
-from models.arrays import Array
+from models.checks import Array
 from ocp import ProblemError, SolveError, TipTask, inverse_kinematics, plan
 from ocp.motion.local.inverse_kinematics import Unreachable
 from tests.ocp.motion.search.test_charts import planar

@@ -22,11 +22,12 @@ import numpy as np
 import pinocchio as pin
 
 from models import Box, CollisionScene, Cylinder, FixedBase, Robot, Sphere
-from models.arrays import Array
+from models.checks import Array
 from ocp import Cost, Limits, Plan, SolveError
 from ocp.app.files.safe_files import read_tree
 from ocp.motion.builders.clearance import ClearanceConstraints
-from ocp.motion.plan.goal_plan import GoalRequest, plan_to_goal
+from ocp.motion.plan.goal_motions import GoalRequest
+from ocp.motion.plan.goal_plan import plan_to_goal
 from ocp.motion.sampling.straight import StraightMotions
 from tests.sweep.results import Row, Sweep, parser
 
@@ -135,7 +136,7 @@ def result(data: str, kind: str, seed: int) -> Row:
     moved = float(np.abs(np.array(ends) - np.vstack([start, goals])).max())
     options: dict[str, Any] = {"cost": Cost(velocity=0.0, length=1.0), "time_limit": SECONDS - 1.0}
     if mode:
-        options = {"limits": PANDA, "cost": Cost(velocity=0.0, time=1.0), "time_limit": SECONDS / 2}
+        options = {"limits": PANDA, "cost": Cost(velocity=0.0, time=1.0), "time_limit": SECONDS - 1.0}
     begin, used = time.perf_counter(), time.process_time()
     row, wrong = Row(), list[str]()
     try:

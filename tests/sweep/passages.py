@@ -20,7 +20,7 @@ from numpy.polynomial import Chebyshev
 from scipy.integrate import solve_ivp
 
 from models import FreeFloating
-from models.arrays import Array
+from models.checks import Array
 from models.spatial import quaternion_from_rotation
 from ocp import Plan, ProblemError, SolveError, TipTask, plan, resolve
 from tests.models.robot.trees import seven_joint_arm

@@ -16,7 +16,7 @@ from multiprocessing import get_context
 import numpy as np
 import pinocchio as pin
 
-from models.arrays import Array
+from models.checks import Array
 from ocp import Scene, SolveError, Waypoints, plan
 from ocp.motion.result.path_plan import PathPlan
 from tests.models.machines.test_redundancy_benchmark import by_coal

@@ -19,7 +19,7 @@ import numpy as np
 import pinocchio as pin
 
 from models import FixedBase, Robot, lock_joints
-from models.arrays import Array
+from models.checks import Array
 from ocp import SolveError, TipTask
 from ocp.errors import ProblemError
 from tests.ocp.motion.plan.motions import plan_bare

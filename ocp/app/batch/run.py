@@ -18,20 +18,12 @@ import numpy as np
 from scipy.spatial import cKDTree
 from tqdm import tqdm
 
-from models.arrays import Array
+from models.checks import NOT_NUMBERS, Array, check_entries, floats
+from models.files import INPUT_LIMITS
 from ocp.app.batch.engine import Engine, Function, Job, checked_cluster, failed
 from ocp.app.batch.result_store import STATUSES, Payload, ResultStore, canonical_text, digest_of, key_of
 from ocp.app.batch.table import Batch, Result, row_of
-from ocp.errors import (
-    MAX_COUNT,
-    NOT_NUMBERS,
-    ProblemError,
-    check_entries,
-    checked_choice,
-    checked_count,
-    checked_text,
-    floats,
-)
+from ocp.errors import ProblemError, require
 
 __all__ = ["neighbours", "run_batch"]
 
@@ -98,9 +90,9 @@ def run_batch(
     names = names_of("near", near)
     statuses = names_of("again", (again,) if isinstance(again, str) else again)
     for status in statuses:
-        checked_choice("again", status, STATUSES[1:])
-    checked_choice("failures", failures, ("raise", "return"))
-    function_version = source_version(function) if version is None else checked_text("version", version)
+        require.choice("again", status, STATUSES[1:])
+    require.choice("failures", failures, ("raise", "return"))
+    function_version = source_version(function) if version is None else require.text("version", version)
     store = ResultStore.of(folder, name, function_version, version is not None)
     parents: dict[str, str | None] = dict.fromkeys(texts)
     if names:
@@ -246,8 +238,9 @@ def texts_of(tasks: Any) -> dict[str, str]:
     try:
         check_entries(tasks)
         for i, task in enumerate(tasks):
-            if i >= MAX_COUNT:
-                raise ProblemError(f"tasks: at most {MAX_COUNT} at a time", name="tasks", limit=MAX_COUNT)
+            if i >= INPUT_LIMITS.count:
+                words = f"tasks: at most {INPUT_LIMITS.count} at a time"
+                raise ProblemError(words, name="tasks", limit=INPUT_LIMITS.count)
             text = canonical_text(task, f"tasks[{i}]")
             texts[key_of(text)] = text
     except ProblemError:
@@ -261,7 +254,7 @@ def worker_count(count: int | None) -> int:
     """Return the number of processes to start; None: one for each core that this process may use."""
     if count is None:
         return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    checked_count("cluster", count, 1, MAX_WORKERS)
+    require.count("cluster", count, 1, MAX_WORKERS)
     return count
 
 
@@ -269,7 +262,7 @@ def names_of(argument: str, names: Any) -> tuple[str, ...]:
     """Return a tuple of names."""
     if isinstance(names, str) or not isinstance(names, Collection):
         raise ProblemError(f"{argument} must be a list of names, not {names!r}", name=argument, value=names)
-    return tuple(checked_text(argument, name) for name in names)
+    return tuple(require.text(argument, name) for name in names)
 
 
 def name_of(function: Any) -> str:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ocp.app.batch.result_store import ResultStore
-from ocp.errors import DetailedError, ProblemError, SolveError, checked_each, checked_instance, unknown_name
+from ocp.errors import DetailedError, ProblemError, SolveError, require
 from ocp.storage import cell, checked_path, write_text, write_whole
 
 __all__ = ["Batch", "BatchError", "Result", "read_batch", "row_of"]
@@ -108,8 +108,8 @@ class Batch:
     """
 
     def __init__(self, store: ResultStore, results: Sequence[Result]) -> None:
-        self.folder = checked_instance("Batch: ledger", store, ResultStore).folder
-        self.results = checked_each("Batch: results", results, Result)
+        self.folder = require.instance("Batch: ledger", store, ResultStore).folder
+        self.results = require.each("Batch: results", results, Result)
 
     def __len__(self) -> int:
         return len(self.results)
@@ -232,7 +232,7 @@ def read_batch(folder: str | os.PathLike[str]) -> Batch:
 def entry(task: Any, name: str) -> Any:
     """Return an entry of a task."""
     if not isinstance(task, dict) or name not in task:
-        raise unknown_name("entry of a task", name, task if isinstance(task, dict) else ())
+        raise require.unknown("entry of a task", name, task if isinstance(task, dict) else ())
     return task[name]
 
 

@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 
 from models import CollisionScene, Machine
-from models.arrays import Array
+from models.checks import Array
 from ocp.app.check.data_checks import Fault
 from ocp.app.check.interpolation import Motion
 from ocp.app.check.joint_limits import Row, RowVerdict

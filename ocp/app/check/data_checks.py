@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from models import Robot
-from models.arrays import Array
+from models.checks import Array
 from ocp.app.check.interpolation import Indices, Motion, half_digits
 from ocp.app.files import RawTrajectory
 from ocp.errors import ProblemError

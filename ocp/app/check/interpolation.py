@@ -23,7 +23,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from models.arrays import Array
+from models.checks import Array
 from ocp.errors import ProblemError
 
 __all__ = ["Indices", "Motion", "MotionQuantity", "PiecewisePolynomial", "Rule", "half_digits", "polynomial_maxima"]

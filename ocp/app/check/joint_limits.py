@@ -19,7 +19,7 @@ import casadi as ca
 import numpy as np
 
 from models import FixedBase, FreeFloating, Robot, Standing, inverse_dynamics, momentum, robot_inertia, simplify
-from models.arrays import Array
+from models.checks import Array, real
 from models.machines.standing import center_of_pressure
 from models.robot.dynamics import GRAVITY
 from models.spatial import cross, rotation_from_quaternion
@@ -27,7 +27,7 @@ from ocp.app.check.data_checks import CleanedTrajectory, Fault
 from ocp.app.check.interpolation import Indices, Motion, MotionQuantity, polynomial_maxima
 from ocp.audit.audit import Audit
 from ocp.console import check_time
-from ocp.errors import ProblemError, real, unknown_name
+from ocp.errors import ProblemError, require
 from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.problem.values import Sampler
 from ocp.tolerances import MOMENTUM_SHARE, ROUNDING_SHARE
@@ -111,7 +111,7 @@ def limits_by_name(robot: Robot, limits: Mapping[str, Mapping[str, float]]) -> L
                 words = f"{quantity} of {name or 'all joints'} must be a number above 0, not {value!r}"
                 raise ProblemError(words, name=quantity, value=value, limit=0.0)
             if name and name not in robot.joint_names:
-                raise unknown_name(f"joint in {quantity}", name, robot.joint_names)
+                raise require.unknown(f"joint in {quantity}", name, robot.joint_names)
         defaults = zip(robot.joint_names, getattr(own, quantity), strict=True)
         values[quantity] = np.array([by_name.get(name, by_name.get("", default)) for name, default in defaults])
     return Limits(**values)

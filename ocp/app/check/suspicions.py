@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 
 from models import FixedBase, Robot
-from models.arrays import Array
+from models.checks import Array
 from ocp.app.check.data_checks import SMALL_UNITS, THRESHOLDS, Fault, likely_unit
 from ocp.app.check.interpolation import Indices, Motion
 from ocp.problem.values import Sampler

@@ -10,7 +10,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from models import CollisionScene, FixedBase, FreeFloating, Machine, Robot, Standing
-from models.arrays import Array
+from models.checks import Array, real
 from models.shapes.mesh_files import find_mesh
 from ocp.app.check.collisions import clearance_rows, path_rows, with_wide_limits
 from ocp.app.check.data_checks import CleanedTrajectory, Fault, clean_trajectory
@@ -29,7 +29,7 @@ from ocp.app.files import RawTrajectory, Waypoints
 from ocp.app.files.trajectory import UNITS
 from ocp.audit.audit import Audit
 from ocp.console import check_time, interruptible
-from ocp.errors import ProblemError, checked_choice, checked_instance, checked_nonnegative, checked_positive, real
+from ocp.errors import ProblemError, require
 from ocp.motion.plan import Plan, PlanSample
 from ocp.motion.result.path_plan import PathPlan
 from ocp.motion.result.segmented_plan import ConsecutivePlans, Piece
@@ -171,11 +171,11 @@ class Interpretation:
 
     def __post_init__(self) -> None:
         if self.rule is not None:
-            checked_choice("rule", self.rule, get_args(Rule))
+            require.choice("rule", self.rule, get_args(Rule))
         if isinstance(self.time_unit, str):
-            checked_choice("time_unit", self.time_unit, ("s", "ms", "us", "ns"))
+            require.choice("time_unit", self.time_unit, ("s", "ms", "us", "ns"))
         elif self.time_unit is not None:
-            checked_positive("time_unit", self.time_unit)
+            require.positive("time_unit", self.time_unit)
 
     @property
     def seconds(self) -> float:
@@ -203,9 +203,9 @@ class CheckTolerances:
     tip_angle: float = ORIENTATION_TOLERANCE_RAD
 
     def __post_init__(self) -> None:
-        checked_nonnegative("share", self.share)
+        require.nonnegative("share", self.share)
         if self.tip_distance is not None:
-            checked_positive("tip_distance", self.tip_distance)
+            require.positive("tip_distance", self.tip_distance)
         if not real(self.tip_angle) > 0:  # infinity is allowed
             words = f"tip_angle must be a number above 0, not {self.tip_angle!r}"
             raise ProblemError(words, name="tip_angle", value=self.tip_angle, limit=0.0)
@@ -251,8 +251,8 @@ def check_trajectory(
     if not isinstance(machine, FixedBase | FreeFloating | Standing):
         words = f"machine must be a robot on a fixed, floating or standing base, not {machine!r}"
         raise ProblemError(words, name="machine", value=machine)
-    checked_instance("trajectory", trajectory, RawTrajectory)
-    robot, limits = machine.robot, checked_instance("limits", Limits() if limits is None else limits, Limits)
+    require.instance("trajectory", trajectory, RawTrajectory)
+    robot, limits = machine.robot, require.instance("limits", Limits() if limits is None else limits, Limits)
     bounds = limits.bounds(machine)
     notes = [
         f"the robot gives {', '.join(names)} a {quantity} limit of 0: treated as none"
@@ -313,9 +313,9 @@ def check_trajectory(
         elif not any(link.collisions for link in robot.links):
             unchecked.append("clearance, because the robot has no collision shapes")
         else:
-            place: Scene = checked_instance("scene", Scene() if scene is None else scene, Scene)
+            place: Scene = require.instance("scene", Scene() if scene is None else scene, Scene)
             unchecked += _missing_meshes(robot, place.folders) if place.missing == "skip" else []
-            collisions = CollisionScene(with_wide_limits(machine, motion), **vars(place))
+            collisions = CollisionScene(with_wide_limits(machine, motion), **place.collision_options)
             add(clearance_rows(collisions, motion, bases if collisions.obstacles else None))
     suspicions: list[Fault] = []
     if not unit_known and not any(fault.kind == "units" and fault.name == "time" for fault in faults):

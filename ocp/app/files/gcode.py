@@ -15,7 +15,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from models import Line, ModelError, ModelWarning
-from models.arrays import Array, ArrayInput, checked_array
+from models.checks import Array, ArrayInput
 from models.paths import Segment, split_at_reversals
 from models.paths.path import Reversal
 from models.paths.segments import SHORTEST_SEGMENT
@@ -38,7 +38,7 @@ from ocp.app.files.gcode_words import (
 )
 from ocp.app.files.program import Cut, Note, Pause, Program, Rapid, Section, checked_reversal
 from ocp.app.files.safe_files import FileName, line_error, read_lines
-from ocp.errors import ProblemError, checked_choice, checked_flag, checked_positive
+from ocp.errors import ProblemError, require
 
 __all__ = ["read_gcode"]
 
@@ -85,21 +85,21 @@ def read_gcode(
         ModelWarning: Neither the file nor the caller gives the unit of lengths.
     """
     if unit is not None:
-        checked_choice("G-code: unit", unit, tuple(UNITS))
+        require.choice("G-code: unit", unit, tuple(UNITS))
     try:
-        origin = checked_array(start, (3,), "G-code", "start")
-        home_position = None if home is None else checked_array(home, (3,), "G-code", "home")
+        origin = require.array("G-code: start", start, (3,))
+        home_position = None if home is None else require.array("G-code: home", home, (3,))
     except ModelError as error:
         raise ProblemError(str(error), **vars(error)) from error
     reader = _Reader(
         file,
         unit,
-        None if feed is None else checked_positive("G-code: feed", feed),
+        None if feed is None else require.positive("G-code: feed", feed),
         origin,
         home_position,
         checked_reversal("G-code", reversal),
-        None if gap is None else checked_positive("G-code: gap", gap),
-        checked_flag("G-code: block_delete", block_delete),
+        None if gap is None else require.positive("G-code: gap", gap),
+        require.flag("G-code: block_delete", block_delete),
     )
     return reader.read(read_lines(file))
 

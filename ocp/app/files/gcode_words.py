@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from models.arrays import Array
+from models.checks import Array
 from models.files import INPUT_LIMITS
 from models.paths import Arc, Helix
 from models.paths.segments import SHORTEST_SEGMENT

@@ -18,7 +18,7 @@ import numpy as np
 
 from models.files import INPUT_LIMITS, open_regular
 from ocp.app.files.safe_files import missing_package
-from ocp.errors import ProblemError, checked_instance, checked_text
+from ocp.errors import ProblemError, require
 from ocp.motion.plan import Plan
 from ocp.storage import write_whole
 
@@ -67,8 +67,8 @@ def write_mcap(plan: Plan, file: str | os.PathLike[str], period: float = 0.01, *
         ProblemError: An argument is invalid, or mcap-ros2-support is not installed.
         OSError: The file cannot be written.
     """
-    checked_instance("plan", plan, Plan)  # type: ignore[type-abstract]
-    checked_text("frame", frame)
+    require.instance("plan", plan, Plan)  # type: ignore[type-abstract]
+    require.text("frame", frame)
     try:
         from mcap_ros2.writer import Writer
     except ImportError as error:
@@ -231,9 +231,9 @@ def log_rerun(plan: Plan, rerun: Any, period: float = 0.01, *, entity: str = "pl
     Raises:
         ProblemError: The plan or the period is invalid, or `rerun` lacks a required name.
     """
-    checked_instance("plan", plan, Plan)  # type: ignore[type-abstract]
-    checked_text("entity", entity)
-    checked_text("timeline", timeline)
+    require.instance("plan", plan, Plan)  # type: ignore[type-abstract]
+    require.text("entity", entity)
+    require.text("timeline", timeline)
     missing = [name for name in REQUIRED_NAMES if not callable(getattr(rerun, name, None))]
     if missing:
         words = f"the module rerun (0.23 or later) is expected, not {rerun!r}, which has no {', '.join(missing)}"

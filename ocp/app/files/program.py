@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from models import ModelError, Path, SmoothPath, smooth
-from models.arrays import Array, ArrayInput
+from models.checks import NOT_NUMBERS, Array, ArrayInput, floats
 from models.paths.path import NO_ROTATION, Reversal
-from ocp.errors import NOT_NUMBERS, ProblemError, checked_choice, checked_instance, checked_positive, floats
+from ocp.errors import ProblemError, require
 from ocp.motion.schedule import LineLimits, Schedule, schedule
 
 __all__ = [
@@ -75,7 +75,7 @@ class Cut:
         """Return the path with rounded corners, see `Program.smooth`."""
         deviation = np.fmin(self.tolerances[:-1], self.tolerances[1:])
         if tolerance is not None:
-            deviation = np.fmin(deviation, checked_positive("tolerance", tolerance))
+            deviation = np.fmin(deviation, require.positive("tolerance", tolerance))
         return smoothed(self.path, np.where(np.isnan(deviation), DEFAULT_TOLERANCE_M, deviation), options)
 
 
@@ -209,13 +209,13 @@ class Program:
         Raises:
             ProblemError: The limits are invalid, include joint limits, or have one speed per segment.
         """
-        checked_instance("limits", limits, LineLimits)
+        require.instance("limits", limits, LineLimits)
         if np.ndim(limits.speed) or limits.joints is not None:
             name = "joints" if limits.joints is not None else "speed"
             message = f"limits of a program: {name} must be {'None' if name == 'joints' else 'one number, m/s'}"
             raise ProblemError(message, name=name, value=getattr(limits, name))
         fastest = float(np.asarray(limits.speed))
-        rapid_speed = fastest if rapid is None else checked_positive("rapid", rapid)
+        rapid_speed = fastest if rapid is None else require.positive("rapid", rapid)
         schedules: list[Schedule | None] = []
         for each in self.sections:
             if isinstance(each, Cut):
@@ -232,9 +232,9 @@ class Program:
 def checked_reversal(owner: str, value: Any) -> Reversal:
     """Return `value`; raise ProblemError unless it is "split" or a width, m."""
     if isinstance(value, str):
-        checked_choice(f"{owner}: reversal", value, ("split",))
+        require.choice(f"{owner}: reversal", value, ("split",))
         return "split"
-    return float(checked_positive(f"{owner}: reversal", value))
+    return float(require.positive(f"{owner}: reversal", value))
 
 
 def _counted(number: int, noun: str) -> str:

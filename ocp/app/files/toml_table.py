@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from models.checks import NOT_NUMBERS, floats, real
 from models.files import INPUT_LIMITS
 from ocp.app.files.safe_files import FileName, checked_depth, line_error, read_lines
-from ocp.errors import NOT_NUMBERS, ProblemError, floats, real
+from ocp.errors import ProblemError
 
 __all__ = ["TomlTable", "read_toml"]
 

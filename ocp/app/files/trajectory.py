@@ -19,10 +19,10 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from models.arrays import Array
+from models.checks import NOT_NUMBERS, Array
 from ocp.app.files.mcap import read_joint_messages
 from ocp.app.files.safe_files import FileName, children_of, is_number, line_error, read_lines, read_tree, split_cells
-from ocp.errors import NOT_NUMBERS, ProblemError, checked_choice, checked_each, checked_positive, checked_text
+from ocp.errors import ProblemError, require
 from ocp.storage import table_joints
 
 Indices: TypeAlias = NDArray[np.intp]
@@ -99,14 +99,14 @@ def read_trajectory(
         raise ProblemError(f"a file name is expected, not {file!r}", name="file", value=file)
     if kind is None:
         kind = FORMATS.get(Path(file).suffix.lower(), "csv")
-    checked_choice("kind", kind, ("csv", "json", "yaml", "mcap"))
+    require.choice("kind", kind, ("csv", "json", "yaml", "mcap"))
     if topic is not None:
-        checked_text("topic", topic)
+        require.text("topic", topic)
     if period is not None:
-        checked_positive("period", period)
+        require.positive("period", period)
     if columns is not None:
-        columns = checked_each("columns", columns, str)
-    known = frozenset(checked_each("joints", joints, str))
+        columns = require.each("columns", columns, str)
+    known = frozenset(require.each("joints", joints, str))
     if isinstance(joints, str):
         raise ProblemError(f"joints must be a list of names, not {joints!r}", name="joints", value=joints)
     if kind == "csv":

@@ -25,13 +25,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models import ModelError, Path, SmoothPath
-from models.arrays import ROUNDING, Array, warn_of_degrees, warn_of_millimetres
+from models.checks import ROUNDING, Array, warn_of_degrees, warn_of_millimetres
 from models.paths import Line, split_at_reversals
 from models.paths.path import Reversal
 from models.paths.segments import SHORTEST_SEGMENT, product, rotation_vector
 from ocp.app.files.program import DEFAULT_TOLERANCE_M, checked_reversal, smoothed
 from ocp.app.files.safe_files import FileName, is_number, line_error, read_lines, split_cells
-from ocp.errors import ProblemError, checked_choice, checked_each, checked_positive
+from ocp.errors import ProblemError, require
 
 __all__ = ["Waypoints", "read_waypoints"]
 
@@ -150,7 +150,7 @@ class Waypoints:
         Raises:
             ProblemError: As `path`; the tolerance is not positive; an option is unknown.
         """
-        return smoothed(self.path(reversal=reversal), checked_positive("tolerance", tolerance), options)
+        return smoothed(self.path(reversal=reversal), require.positive("tolerance", tolerance), options)
 
     def _check_still(self, last: int, i: int) -> None:
         """Raise ProblemError if the tool turns while its position stays."""
@@ -185,7 +185,7 @@ def read_waypoints(file: FileName, *, unit: str | None = None, columns: Sequence
         ModelWarning: Positions look like millimetres, or angles like degrees.
     """
     if unit is not None:
-        checked_choice("waypoints: unit", unit, tuple(LENGTHS))
+        require.choice("waypoints: unit", unit, tuple(LENGTHS))
     rows = _rows(file)
     head, first = _head(file, rows, columns)
     names, scales, ignored = _columns(file, head, unit)
@@ -205,13 +205,13 @@ def read_waypoints(file: FileName, *, unit: str | None = None, columns: Sequence
     positions = parts[POSITION]
     if unit is None and not any(_unit(cell) for cell, name in zip(head, names, strict=True) if name in POSITION):
         extent = np.ptp(positions, axis=0).max()
-        warn_of_millimetres(extent, str(file), "unit", "an extent of the waypoints of")
+        warn_of_millimetres(f"{file!s}: an extent of the waypoints of", extent, "unit")
     axes = _axes(file, parts[AXIS], lines, row_texts) if AXIS in parts else None
     orientations = None
     if QUATERNION in parts:
         orientations = _aligned(_quaternions(file, parts[QUATERNION], lines, row_texts))
     elif VECTOR in parts:
-        warn_of_degrees(parts[VECTOR], str(file), "rx, ry, rz", "an angle of the waypoints of")
+        warn_of_degrees(f"{file!s}: an angle of the waypoints of", parts[VECTOR], "rx, ry, rz")
         orientations = _aligned(_from_vectors(parts[VECTOR]))
     elif axes is not None:
         orientations = _aligned(_least_roll(file, axes, lines, row_texts))
@@ -256,7 +256,7 @@ def _head(
     cells = rows[0][2]
     has_header = any(cell and not is_number(cell) for cell in cells)
     if columns is not None:
-        names = [] if isinstance(columns, str) else list(checked_each("columns", columns, str))
+        names = [] if isinstance(columns, str) else list(require.each("columns", columns, str))
         if len(names) != len(cells):
             message = f"{file}: {len(names)} columns are named, the first row has {len(cells)}; name every column"
             raise ProblemError(message, name="columns", value=columns, limit=len(cells))

@@ -14,7 +14,7 @@ import casadi as ca
 import numpy as np
 
 from models import FreeFloating, Machine, Standing, inverse_dynamics, simplify
-from models.arrays import Array
+from models.checks import Array
 from models.machines.standing import center_of_pressure
 from models.robot.dynamics import GRAVITY
 from ocp.app.check.data_checks import clean_trajectory
@@ -24,7 +24,7 @@ from ocp.app.files import RawTrajectory
 from ocp.app.view.appearance import Obstacle, obstacles_of, obstacles_of_plan
 from ocp.audit.audit import Audit
 from ocp.audit.clearance import closest_pairs_along
-from ocp.errors import ProblemError, unknown_name
+from ocp.errors import ProblemError, require
 from ocp.motion.plan import Plan
 from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.motion.tasks.targets import Target
@@ -323,7 +323,7 @@ def animate_solution(
     sizes = {joints: machine.joint_size} | ({base: machine.base_size} if machine.base_size else {})
     for state, size in sizes.items():
         if state not in solution.states:
-            raise unknown_name("state", state, list(solution.states))
+            raise require.unknown("state", state, list(solution.states))
         actual = solution.states[state].shape[1]
         if actual != size:
             words = f"state {state!r} has {actual} entries, the machine {size}: {list(machine.robot.joint_names)}"

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models import CollisionShape, HalfSpace, Machine, ModelError, MovingObstacle, Robot, link_frames
-from models.arrays import Array
+from models.checks import Array
 from models.shapes.hull import convex_hull
 from models.shapes.mesh_files import Triangles, find_mesh, join_meshes, read_painted_mesh, without_colors
 from models.shapes.shapes import Shape

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models import Robot
-from models.arrays import Array
+from models.checks import Array
 from models.spatial import quaternion_from_rotation
 from ocp.app.view.animation import PAGE_SETTINGS, Animation
 from ocp.app.view.appearance import TIP_FRAME, Appearance, Frames, appearance_of, frames_along, part_of

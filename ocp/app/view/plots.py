@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from models.arrays import Array
+from models.checks import Array
 from ocp.app.check.interpolation import Motion
 from ocp.app.view.appearance import COMPARED, FAULT, LIMIT, PLAN
 from ocp.app.view.rendering import PICTURE_STYLE
-from ocp.errors import ProblemError, checked_instance
+from ocp.errors import ProblemError, require
 from ocp.motion.local.accelerations import AccelerationSolution
 from ocp.motion.local.rates import LocalSolution
 from ocp.motion.result.plan import Plan
@@ -380,7 +380,7 @@ def _figure(figure: Any, size: tuple[float, float]) -> Any:
     """Return a new figure, or the given one if it is empty; raise ProblemError if it is invalid."""
     if figure is None:
         return Picture(figsize=size, layout="constrained")
-    checked_instance("plot: figure", figure, Figure)
+    require.instance("plot: figure", figure, Figure)
     if figure.axes:
         words = "plot: the figure already has axes; pass an empty one"
         raise ProblemError(words, name="figure", value=figure)

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from models.arrays import Array
+from models.checks import Array
 from ocp.app.view.appearance import Appearance, Frames, Part
 from ocp.errors import ProblemError
 

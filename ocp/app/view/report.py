@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from models import Machine
-from models.arrays import Array
+from models.checks import Array
 from ocp.app.check.interpolation import Motion
 from ocp.app.check.joint_limits import Row, RowVerdict, audit_rows
 from ocp.app.check.verdict import Check, verdict_of

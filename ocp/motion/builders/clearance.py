@@ -17,10 +17,10 @@ import casadi as ca
 import numpy as np
 
 from models import CollisionScene, ModelError
-from models.arrays import Array
+from models.checks import Array, real
 from ocp.audit.audit import Audit
 from ocp.audit.clearance import Clearance, Track, clearance_along
-from ocp.errors import ProblemError, SolveError, checked_instance, checked_mapping, real
+from ocp.errors import ProblemError, SolveError, require
 from ocp.motion.local.collisions import Collision, find_collisions, scene_hulls
 from ocp.problem.declarations import Variable
 from ocp.problem.hulls import Separation, frames_of
@@ -71,8 +71,8 @@ class ClearanceConstraints:
     margins: Mapping[int, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        checked_instance("clearance_constraints: scene", self.scene, CollisionScene)
-        for pair, margin in checked_mapping("clearance_constraints: margins", self.margins).items():
+        require.instance("clearance_constraints: scene", self.scene, CollisionScene)
+        for pair, margin in require.mapping("clearance_constraints: margins", self.margins).items():
             if not np.isfinite(real(margin)):
                 words = f"clearance_constraints: margins must be finite numbers in m, not {margin!r}"
                 raise ProblemError(words, name="margins", value=margin)

@@ -20,7 +20,7 @@ import casadi as ca
 import numpy as np
 
 from models import ModelError
-from models.arrays import Array
+from models.checks import NOT_NUMBERS, Array, floats, real
 from models.cts.best_roll import optimal_inverse
 from models.cts.clearance import CollisionScene, Radii, checked_clearance, clearances, proximity_cost
 from models.cts.rig import HOME, Branch, Rig, Tunnel, checked_branch, configuration_at, joints_of
@@ -30,7 +30,7 @@ from models.shapes.distance import soft_minimum
 from models.spatial import FULL_TURN, expression
 from ocp.console import interruptible
 from ocp.direct.guess import Samples
-from ocp.errors import NOT_NUMBERS, ProblemError, checked_instance, checked_positive, floats, real
+from ocp.errors import ProblemError, require
 from ocp.problem.problem import Problem
 
 __all__ = ["RollObstacles", "RollSettings", "least_cost_roll", "roll_problem", "spline_targets"]
@@ -152,12 +152,12 @@ class RollObstacles:
     radii: Radii | None = None
 
     def __post_init__(self) -> None:
-        checked_instance("roll_problem: scene", self.scene, CollisionScene)
+        require.instance("roll_problem: scene", self.scene, CollisionScene)
         _check_nonnegative("clearance_weight", self.clearance_weight, finite=True)
-        checked_positive("roll_problem: clearance_width", self.clearance_width)
-        checked_positive("roll_problem: softness", self.softness)
+        require.positive("roll_problem: clearance_width", self.clearance_width)
+        require.positive("roll_problem: softness", self.softness)
         if self.radii is not None:
-            checked_instance("roll_problem: radii", self.radii, Radii)
+            require.instance("roll_problem: radii", self.radii, Radii)
         try:
             checked_clearance(self.clearance)
         except ModelError as error:
@@ -204,15 +204,15 @@ def roll_problem(
     Raises:
         ProblemError: The horizon is not positive; no roll reaches one of the targets; the start is outside the limits.
     """
-    checked_positive("roll_problem: horizon", horizon)
+    require.positive("roll_problem: horizon", horizon)
     for name, number in (("start_roll", start_roll), ("start_rate", start_rate)):
         if number is not None and not np.isfinite(real(number)):
             raise ProblemError(f"roll_problem: {name} {number!r} must be a finite number", name=name, value=number)
-    checked_instance("roll_problem: rig", rig, Rig)
-    checked_instance("roll_problem: tunnel", tunnel, Tunnel)
-    settings = RollSettings() if settings is None else checked_instance("settings", settings, RollSettings)
+    require.instance("roll_problem: rig", rig, Rig)
+    require.instance("roll_problem: tunnel", tunnel, Tunnel)
+    settings = RollSettings() if settings is None else require.instance("settings", settings, RollSettings)
     if obstacles is not None:
-        checked_instance("obstacles", obstacles, RollObstacles)
+        require.instance("obstacles", obstacles, RollObstacles)
     symbols, largest, fastest = settings.symbols, settings.acceleration_limit, settings.rate_limit
     x, phi = ca.SX.sym("target", 5), ca.SX.sym("roll")
     c, s = ca.cos(phi), ca.sin(phi)

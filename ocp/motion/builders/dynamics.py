@@ -17,11 +17,11 @@ import casadi as ca
 import numpy as np
 
 from models import Robot, find_wheels
-from models.arrays import Array
+from models.checks import NOT_NUMBERS, Array, floats
 from models.robot.dynamics import Wrench
 from models.spatial import quaternion_product
 from ocp.console import interruptible
-from ocp.errors import NOT_NUMBERS, ProblemError, checked_choice, checked_each, checked_instance, floats  # fmt: skip
+from ocp.errors import ProblemError, require
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.standing.problem import FreeTime, declare_horizon
 from ocp.motion.builders.torques import (
@@ -37,11 +37,10 @@ from ocp.motion.tasks.checks import (
     check_length,
     check_rest,
     checked_configuration,
-    checked_horizon,
     checked_tasks,
     clip_to_limits,
     rates_at_rest,
-)  # fmt: skip
+)
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.goals import Cost
 from ocp.motion.tasks.limits import JointBounds, Limits
@@ -119,24 +118,24 @@ def dynamics_problem(
             although tasks fix the time.
     """
     checked_motors("dynamics_problem", machine)
-    limits = Limits() if limits is None else checked_instance("dynamics_problem: limits", limits, Limits)
-    cost = Cost(velocity=0.0, effort=1.0) if cost is None else checked_instance("dynamics_problem: cost", cost, Cost)
-    setup = DynamicsSetup() if setup is None else checked_instance("dynamics_problem: setup", setup, DynamicsSetup)
+    limits = Limits() if limits is None else require.instance("dynamics_problem: limits", limits, Limits)
+    cost = Cost(velocity=0.0, effort=1.0) if cost is None else require.instance("dynamics_problem: cost", cost, Cost)
+    setup = DynamicsSetup() if setup is None else require.instance("dynamics_problem: setup", setup, DynamicsSetup)
     for option, kind in (("friction", JointFriction), ("clearance_constraints", ClearanceConstraints)):
         if getattr(setup, option) is not None:
-            checked_instance(f"dynamics_problem: {option}", getattr(setup, option), kind)
+            require.instance(f"dynamics_problem: {option}", getattr(setup, option), kind)
     if cost.length:
         words = "cost: the length of a motion under dynamics is not smooth at rest; weight its velocity instead"
         raise ProblemError(words, name="length", value=cost.length, limit=0.0)
-    control = checked_choice("control", setup.control, ("acceleration", "jerk"))
+    control = require.choice("control", setup.control, ("acceleration", "jerk"))
     bounds = limits.bounds(machine, ("velocity", "torque"))
     if control == "acceleration" and (np.isfinite(bounds.jerk).any() or cost.jerk):
         words = "the jerk is limited or weighted, but the control is the acceleration; set control='jerk'"
         raise ProblemError(words, name="control", value=control, limit="jerk")
     free = isinstance(horizon, FreeTime)
-    duration = checked_horizon(horizon.guess if isinstance(horizon, FreeTime) else horizon)
+    duration = require.positive("horizon", horizon.guess if isinstance(horizon, FreeTime) else horizon)
     ends = _Ends.take(machine, bounds, (start, end), (setup.start_velocity, setup.end_velocity), setup.start_base)
-    tasks = (tasks,) if isinstance(tasks, TipTask) else checked_each("tasks", tasks, TipTask)
+    tasks = (tasks,) if isinstance(tasks, TipTask) else require.each("tasks", tasks, TipTask)
     equations = bind(machine, tasks) if tasks else None
     if equations is not None:
         if free:
@@ -311,7 +310,7 @@ def _wheel_scales(robot: Robot, bounds: JointBounds, duration: float) -> Array:
 def end_velocities(name: str, value: Any, n: int) -> Array:
     """Return joint velocities at an end, nan where free, shape (n,); ProblemError unless numbers, "rest" or "free"."""
     if isinstance(value, str):
-        return np.full(n, 0.0 if checked_choice(name, value, ("rest", "free")) == "rest" else np.nan)
+        return np.full(n, 0.0 if require.choice(name, value, ("rest", "free")) == "rest" else np.nan)
     if value is None:
         raise ProblemError(f"{name} must be 'rest', 'free' or velocities, not None", name=name, value=value)
     return _checked_end(name, value, n)

@@ -26,7 +26,7 @@ from models import FreeFloating, Machine
 from ocp.audit.audit import Audit
 from ocp.console import interruptible
 from ocp.direct.collocation import Collocation
-from ocp.errors import ProblemError, SolveError, checked_each, checked_instance, checked_mapping
+from ocp.errors import ProblemError, SolveError, require
 from ocp.methods import solve
 from ocp.motion.builders.clearance import (
     ClearanceConstraints,
@@ -38,7 +38,6 @@ from ocp.motion.builders.clearance import (
 from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem
 from ocp.motion.builders.standing.problem import FreeTime
 from ocp.motion.builders.torques import Motors, checked_motors
-from ocp.motion.tasks.checks import checked_horizon
 from ocp.motion.tasks.goals import Cost, Goal
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.tip_task import TipTask
@@ -84,13 +83,13 @@ def dynamics_phases(
             `end_velocity`.
     """
     goals = checked_goals(goals)
-    setup = DynamicsSetup() if setup is None else checked_instance("dynamics_phases: setup", setup, DynamicsSetup)
+    setup = DynamicsSetup() if setup is None else require.instance("dynamics_phases: setup", setup, DynamicsSetup)
     if setup.end_velocity != "rest":
         words = "end_velocity: every goal has its own; set Goal(velocity=...)"
         raise ProblemError(words, name="end_velocity", value=setup.end_velocity)
     clearance = setup.clearance_constraints
     if clearance is not None:
-        checked_instance("dynamics_phases: clearance_constraints", clearance, ClearanceConstraints)
+        require.instance("dynamics_phases: clearance_constraints", clearance, ClearanceConstraints)
     names = phase_names(goals)
     machines, problems = machines_of(machine, goals), {}
     begin: Any = start
@@ -115,7 +114,7 @@ def dynamics_phases(
     for k in range(1, len(goals)):
         _join(phases, names[k - 1], names[k], goals[k - 1])
     if total is not None:
-        duration = checked_horizon(total)
+        duration = require.positive("horizon", total)
         if not any(isinstance(goal.duration, FreeTime) for goal in goals):
             words = "total: every goal has a fixed duration; give one of them FreeTime(...)"
             raise ProblemError(words, name="total", value=total)
@@ -130,7 +129,7 @@ def checked_goals(goals: Any) -> tuple[Goal, ...]:
     Raises:
         ProblemError: There are none; one is no Goal, is a pose, or has no duration; two have the same name.
     """
-    checked = tuple(checked_each("goals", goals, Goal))
+    checked = tuple(require.each("goals", goals, Goal))
     if not checked:
         raise ProblemError("goals: at least one is needed", name="goals", value=goals)
     names = phase_names(checked)
@@ -260,7 +259,7 @@ def solve_dynamics(
             and the limit that is violated.
         ProblemError: As `dynamics_problem` and `dynamics_phases`.
     """
-    setup = DynamicsSetup() if setup is None else checked_instance("plan_dynamics: setup", setup, DynamicsSetup)
+    setup = DynamicsSetup() if setup is None else require.instance("plan_dynamics: setup", setup, DynamicsSetup)
     shared: dict[str, Any] = {"start": start, "limits": limits, "cost": cost}
     tip_tasks: Any = tasks
     if isinstance(tasks, Sequence) and isinstance(next(iter(tasks), None), Goal):
@@ -285,14 +284,14 @@ def solve_dynamics(
         own = replace(setup, clearance_constraints=clearance)
         return dynamics_problem(machine, tip_tasks, duration, end=end, setup=own, **shared)
 
-    duration: float | FreeTime = horizon if isinstance(horizon, FreeTime) else checked_horizon(horizon)
+    duration: float | FreeTime = horizon if isinstance(horizon, FreeTime) else require.positive("horizon", horizon)
     at = () if isinstance(duration, FreeTime) else breaks_of(tip_tasks, duration)
     return within_limits(declare, setup.clearance_constraints, method, at, options, tolerances, {"": (machine, limits)})
 
 
 def breaks_of(tasks: TipTask | Sequence[TipTask], horizon: float) -> Sequence[float]:
     """Return the fractions of a horizon at which tasks are less smooth."""
-    tasks = (tasks,) if isinstance(tasks, TipTask) else checked_each("tasks", tasks, TipTask)
+    tasks = (tasks,) if isinstance(tasks, TipTask) else require.each("tasks", tasks, TipTask)
     times = np.unique(np.concatenate([np.zeros(0), *(task.begin + np.asarray(task.breaks) for task in tasks)]))
     return [float(at) for at in times / horizon if 0 < at < 1]
 
@@ -323,8 +322,8 @@ def within_limits(
         machines: Machine and limits by the name of the phase, "" without phases. Messages take joint names from them.
         guess: Guess of the first solve; that of the problem if None.
     """
-    mesh = POINTS if method is None else checked_instance("method", method, Collocation)
-    settings = {**IPOPT, **checked_mapping("options", options)}
+    mesh = POINTS if method is None else require.instance("method", method, Collocation)
+    settings = {**IPOPT, **require.mapping("options", options)}
     mesh = mesh.with_nodes_at(breaks)
 
     in_collision: Solution | None = None  # the last plan, if only its clearance failed

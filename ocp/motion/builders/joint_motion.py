@@ -17,29 +17,22 @@ import casadi as ca
 import numpy as np
 
 from models import FixedBase, Machine
-from models.arrays import Array
+from models.checks import Array
 from ocp.console import interruptible
 from ocp.curves import PiecewisePolynomial
-from ocp.errors import ProblemError, SolverStatus, checked_each, checked_flag, checked_instance, checked_positive
+from ocp.errors import ProblemError, SolverStatus, require
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.tool_motion import ToolMotion, stretches_of, tool_motion_problem
 from ocp.motion.local.inverse_kinematics import inverse_kinematics
 from ocp.motion.local.rates import LocalMotion, track_tasks
-from ocp.motion.tasks.checks import (
-    checked_configuration,
-    checked_horizon,
-    checked_tasks,
-    checked_weights,
-    clip_to_limits,
-    horizon_of,
-)
+from ocp.motion.tasks.checks import checked_configuration, checked_tasks, checked_weights, clip_to_limits, horizon_of
 from ocp.motion.tasks.equations import bind
 from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.problem import Problem, remembers_request
 from ocp.solution import Solution
 
-__all__ = ["joint_motion_problem", "least_durations", "minimum_velocity_problem", "motion_along"]
+__all__ = ["joint_motion_problem", "minimum_velocity_problem", "motion_along"]
 
 RATE_SLACK = 1e-9
 """Relative excess allowed over a rate limit, since a motion at constant speed may be at its limit all the time."""
@@ -82,7 +75,7 @@ def joint_motion_problem(
         ends.append(clip_to_limits(name, machine.robot.joint_names, joints, bounds.lower, bounds.upper, hint))
     scale = ca.DM(checked_weights(weights, n))
     problem = Problem("joint motion")
-    problem.horizon(checked_horizon(horizon))
+    problem.horizon(require.positive("horizon", horizon))
     joints = problem.state(
         "joints", n, initial=ends[0], terminal=ends[1], lower=bounds.lower, upper=bounds.upper,
         unit=machine.robot.unit(),
@@ -152,37 +145,6 @@ def motion_along(problem: Problem, path: Array, scale: Array, horizon: float, *,
     )
 
 
-def least_durations(distances: Array, bounds: JointBounds) -> Array:
-    """Return the least times from rest to rest of joints by themselves, within velocity, acceleration and jerk limits.
-
-    With peak velocity V, each ramp lasts r = V / a + a / j, or 2 sqrt(V / j) if it does not reach the acceleration a.
-    Both ramps together cover V r. The rest of the distance is covered at V.
-
-    Args:
-        distances: Absolute distances, rad or m. Shape (..., n).
-        bounds: Limits of the joints.
-
-    Returns:
-        s; 0 for a joint without limits. Shape (..., n).
-    """
-    velocity, acceleration, jerk = bounds.velocity, bounds.acceleration, bounds.jerk
-    with np.errstate(divide="ignore", invalid="ignore"):
-        rounded = np.where(np.isfinite(acceleration), acceleration / jerk, 0.0)  # s until the acceleration is reached
-        short = np.where(np.isfinite(jerk), (distances * np.sqrt(jerk) / 2) ** (2 / 3), np.inf)
-        # V^2 / a + V a / j = distance
-        root = np.sqrt(rounded**2 + 4 * distances / acceleration)
-        long = np.where(np.isfinite(acceleration), 2 * distances / (rounded + root), np.inf)
-        peak = np.where(short <= acceleration * rounded, short, long)
-        peak = np.where(np.isfinite(acceleration), peak, short)
-        peak = np.minimum(peak, velocity)
-        reaches = np.isfinite(acceleration) & (peak > acceleration * rounded)
-        ramp = np.where(reaches, peak / acceleration + rounded, 2 * np.sqrt(peak / jerk))
-        ramp = np.where(np.isfinite(acceleration) | np.isfinite(jerk), ramp, 0.0)
-        cruise = np.maximum(distances / peak - ramp, 0.0)
-        times = 2 * ramp + np.where(np.isfinite(peak), cruise, 0.0)
-    return np.where(distances > 0, times, 0.0)
-
-
 GUESS_STEPS = 64
 """Steps of the local motion over the horizon, besides the breaks of the tasks."""
 
@@ -235,12 +197,12 @@ def minimum_velocity_problem(
             horizon or the damping is not positive.
         Unreachable: A free start was not found (a ProblemError).
     """
-    checked_positive("guess_damping", guess_damping)
-    checked_flag("cyclic", cyclic)
-    tasks = (tasks,) if isinstance(tasks, TipTask) else checked_each("tasks", tasks, TipTask)
+    require.positive("guess_damping", guess_damping)
+    require.flag("cyclic", cyclic)
+    tasks = (tasks,) if isinstance(tasks, TipTask) else require.each("tasks", tasks, TipTask)
     bind(machine, tasks)
     duration = horizon_of(tasks, horizon)
-    limits = Limits() if limits is None else checked_instance("limits", limits, Limits)
+    limits = Limits() if limits is None else require.instance("limits", limits, Limits)
     reference = near if start is None else start
     if reference is None:
         first = [task for task in tasks if task.is_pose and task.begin == 0]
@@ -258,7 +220,7 @@ def minimum_velocity_problem(
     bounds, names = limits.bounds(machine, ("velocity",)), machine.robot.joint_names
     joints = clip_to_limits("start", names, joints, bounds.lower, bounds.upper, "start inside them")
     if clearance_constraints is not None:
-        checked_instance("clearance_constraints", clearance_constraints, ClearanceConstraints)
+        require.instance("clearance_constraints", clearance_constraints, ClearanceConstraints)
     motion = tool_motion_problem(
         machine, stretches, base=base, start=None if start is None else joints, reference=joints,
         cyclic=cyclic, weights=weights, bounds=bounds, clearance_constraints=clearance_constraints,

@@ -18,8 +18,9 @@ import casadi as ca
 import numpy as np
 
 from models import FixedBase, Machine
+from models.checks import NOT_NUMBERS, floats
 from models.robot.dynamics import GRAVITY, inverse_dynamics
-from ocp.errors import NOT_NUMBERS, ProblemError, checked_count, checked_each, checked_instance, floats
+from ocp.errors import ProblemError, require
 from ocp.motion.schedule import PathLike
 from ocp.motion.schedule.profile import Array
 from ocp.solution import Solution
@@ -163,7 +164,7 @@ def joint_path(
         ProblemError: The plan has no joints, or its tasks do not run along the path at constant speed; the samples have
             other shapes, are too few, do not increase, or do not reach both ends.
     """
-    checked_count("samples", samples, 2 * DEGREE + 3)
+    require.count("samples", samples, 2 * DEGREE + 3)
     for attribute in ("robot", "joint_size"):
         if isinstance(machine, type) or not hasattr(machine, attribute):
             raise ProblemError(f"{machine!r} is no machine; it has no {attribute}", name="machine", value=machine)
@@ -173,7 +174,7 @@ def joint_path(
     if hasattr(plan, "task_share"):
         plan = _samples_of_plan(plan, path, float(length), samples)
     s, joints = _checked_samples(plan, float(length), samples, machine.joint_size)
-    own = checked_each("joints along a path: names", machine.robot.joint_names if names is None else names, str)
+    own = require.each("joints along a path: names", machine.robot.joint_names if names is None else names, str)
     if len(own) != machine.joint_size:
         message = f"{len(own)} names for {machine.joint_size} joints"
         raise ProblemError(message, name="names", value=own, limit=machine.joint_size)
@@ -212,7 +213,7 @@ def _checked_samples(plan: Any, length: float, samples: int, size: int) -> tuple
         except NOT_NUMBERS as error:
             raise ProblemError(f"samples are not numeric: {error}", name="plan", value=plan) from error
     else:
-        checked_instance("plan", plan, Solution)
+        require.instance("plan", plan, Solution)
         fractions = np.linspace(0.0, 1.0, samples)
         try:
             joints = np.asarray(plan.at_fraction(fractions)["joints"], dtype=float)

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from ocp.console import interruptible
 from ocp.direct.collocation import Collocation
-from ocp.errors import ProblemError, checked_count, checked_instance, checked_mapping
+from ocp.errors import ProblemError, require
 from ocp.methods import solve
 from ocp.motion.builders.timing_tables import (
     demand_of_intervals,
@@ -174,8 +174,8 @@ def solve_minimum_time(
         ProblemError: As `minimum_time_problem`.
         SolveError: The solver failed; names the worst residuals.
     """
-    checked_count("rounds", rounds, 0)
-    options = checked_mapping("options", options)
+    require.count("rounds", rounds, 0)
+    options = require.mapping("options", options)
     timing = minimum_time_problem(path, limits, joints, guess=guess, intervals=intervals)
     solution: Solution | None = None
     for number in range(rounds + 1):
@@ -213,10 +213,10 @@ def minimum_time_problem(
         ProblemError: Joint limits are given without joints; the joint jerk is limited on a path whose curvature jumps;
             curvature or joints are not finite; the guess is for another path; there are fewer than 10 intervals.
     """
-    checked_count("intervals", intervals, 10)
+    require.count("intervals", intervals, 10)
     limited = check_line(path, limits, joints)
     if guess is not None:
-        checked_instance("guess", guess, Schedule)
+        require.instance("guess", guess, Schedule)
     if guess is not None and abs(guess.path.length - path.length) > 1e-9 * path.length:
         message = f"the guess is for a path of {guess.path.length:g} m, but this path has {path.length:g} m"
         raise ProblemError(message, name="guess", value=guess.path.length, limit=path.length)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models import Machine
-from models.arrays import Array
+from models.checks import Array
 from ocp.direct.guess import Samples
 from ocp.errors import ProblemError
 from ocp.motion.builders.clearance import ClearanceConstraints

@@ -18,10 +18,10 @@ import casadi as ca
 import numpy as np
 
 from models import FixedBase, FreeFloating, Machine, Robot, Standing
-from models.arrays import Array
+from models.checks import Array
 from models.robot.dynamics import GRAVITY, Wrench, inverse_dynamics
-from ocp.errors import ProblemError, checked_nonnegative
-from ocp.motion.tasks.checks import checked_weights, nonnegative_each
+from ocp.errors import ProblemError, require
+from ocp.motion.tasks.checks import checked_weights
 from ocp.motion.tasks.goals import Cost
 from ocp.motion.tasks.limits import JointBounds
 from ocp.problem.problem import Problem
@@ -58,15 +58,16 @@ class JointFriction:
 
     def __post_init__(self) -> None:
         for name in ("viscous", "coulomb"):
-            nonnegative_each(f"friction: {name}", getattr(self, name), None)
-        if not checked_nonnegative("friction: slip", self.slip) > 0:
+            require.array(f"friction: {name}", getattr(self, name), ("joints",), sign="nonnegative")
+        if not require.nonnegative("friction: slip", self.slip) > 0:
             raise ProblemError("friction: slip must be positive", name="slip", value=self.slip, limit=0.0)
 
     def torques(self, rates: Any) -> Any:
         """Return the joint torques that overcome the friction. Shape (n, 1)."""
         n = rates.numel()
-        viscous = ca.DM(nonnegative_each("friction: viscous", self.viscous, n))
-        return viscous * rates + nonnegative_each("friction: coulomb", self.coulomb, n) * ca.tanh(rates / self.slip)
+        viscous = ca.DM(require.broadcast("friction: viscous", self.viscous, n, "joints", sign="nonnegative"))
+        coulomb = ca.DM(require.broadcast("friction: coulomb", self.coulomb, n, "joints", sign="nonnegative"))
+        return viscous * rates + coulomb * ca.tanh(rates / self.slip)
 
 
 def joint_torques(
@@ -202,7 +203,9 @@ def running_cost(machine: Machine, cost: Cost, motion: tuple[Any, Any, Any, Any]
         jerks, torques: Used if they are weighted. Shape (n, 1).
     """
     (base, joints, rates, second), n = motion, machine.joint_size
-    running = ca.dot(ca.DM(nonnegative_each("cost: acceleration", cost.acceleration, n)), second**2)
+    running = ca.dot(
+        ca.DM(require.broadcast("cost: acceleration", cost.acceleration, n, "joints", sign="nonnegative")), second**2
+    )
     if cost.velocity:
         running += ca.dot(ca.DM(cost.joint_weights(n)), rates**2) / 2
     if cost.length:
@@ -213,7 +216,9 @@ def running_cost(machine: Machine, cost: Cost, motion: tuple[Any, Any, Any, Any]
         spin = [k for k, row in enumerate(machine.twist_rows) if row < 3]
         running += cost.turning * ca.sumsqr(machine.base_twist(base, joints, rates)[spin])
     if np.any(np.asarray(cost.effort)):
-        running += ca.dot(ca.DM(nonnegative_each("cost: effort", cost.effort, n)), torques**2)
+        running += ca.dot(
+            ca.DM(require.broadcast("cost: effort", cost.effort, n, "joints", sign="nonnegative")), torques**2
+        )
     return running
 
 

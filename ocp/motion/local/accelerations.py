@@ -15,22 +15,15 @@ from typing import Any, Literal, TypeAlias, get_args
 import casadi as ca
 import numpy as np
 
-from models.arrays import Array
+from models.checks import Array
 from models.machines.standing import External, Standing, StandingMotion, evaluate_motion, motion_function, wrenches_at
 from models.robot.dynamics import momentum
 from models.robot.kinematics import center_of_mass_motion, joint_limit_index, manipulability_of
 from ocp.console import interruptible
 from ocp.curves import rk4_step
-from ocp.errors import (
-    ProblemError,
-    checked_choice,
-    checked_flag,
-    checked_instance,
-    checked_nonnegative,
-    checked_positive,
-)
+from ocp.errors import ProblemError, require
 from ocp.motion.local.rates import least_rates
-from ocp.motion.tasks.checks import check_length, checked_configuration, checked_horizon, checked_numbers, checked_tasks
+from ocp.motion.tasks.checks import check_length, checked_configuration, checked_tasks
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.limits import checked_point, is_finite
 from ocp.motion.tasks.tip_task import TipTask
@@ -62,8 +55,8 @@ class Layer:
     form: Literal["assigned", "gradient"] = "assigned"
 
     def __post_init__(self) -> None:
-        checked_choice("layer: index", self.index, ("joint_limits", "manipulability"))
-        checked_choice("layer: form", self.form, ("assigned", "gradient"))
+        require.choice("layer: index", self.index, ("joint_limits", "manipulability"))
+        require.choice("layer: form", self.form, ("assigned", "gradient"))
         if not is_finite(self.demand):
             words = f"layer {self.index!r}: demand must be a number, not {self.demand!r}"
             raise ProblemError(words, name="demand", value=self.demand)
@@ -92,7 +85,7 @@ class Stabiliser:
             words = f"stabiliser: poles must be three positive numbers, not {self.poles!r}"
             raise ProblemError(words, name="poles", value=self.poles, limit=0.0)
         for gain in ("damping", "gradient"):
-            checked_nonnegative(f"stabiliser: {gain}", getattr(self, gain))
+            require.nonnegative(f"stabiliser: {gain}", getattr(self, gain))
 
 
 class _TaskHierarchy:
@@ -122,8 +115,8 @@ def checked_law(machine: Standing, size: int, law: Law, layers: Sequence[Layer],
         size: Number of rows of all tasks.
         law, layers, damping: As for `resolve_accelerations`.
     """
-    checked_choice("law", law, get_args(Law))
-    checked_nonnegative("null_damping", damping)
+    require.choice("law", law, get_args(Law))
+    require.nonnegative("null_damping", damping)
     if not isinstance(layers, list | tuple) or not all(isinstance(layer, Layer) for layer in layers):
         raise ProblemError(f"layers must be a list of Layer(...), not {layers!r}", name="layers", value=layers)
     axes = len(machine.moving_directions)
@@ -345,18 +338,21 @@ def resolve_accelerations(
     Raises:
         ProblemError: An argument does not fit the machine, or the tasks cannot be done at the start.
     """
-    equations, duration = bind(checked_instance("machine", machine, Standing), tasks), checked_horizon(horizon)
-    checked_flag("stop_at_lift_off", stop_at_lift_off)
+    equations, duration = (
+        bind(require.instance("machine", machine, Standing), tasks),
+        require.positive("horizon", horizon),
+    )
+    require.flag("stop_at_lift_off", stop_at_lift_off)
     joints, base = checked_configuration(machine, start_joints, None)
     checked_law(machine, equations.size, law, layers, null_damping)
     for name, number in (("step", step), ("tolerance", tolerance), ("speed_limit", speed_limit)):
-        checked_positive(name, number)
-    checked_choice("integrator", integrator, ("rk4", "cvodes"))
+        require.positive(name, number)
+    require.choice("integrator", integrator, ("rk4", "cvodes"))
     checked_tasks(equations, base, joints, duration)
     check_length(equations, base, duration)
     n = machine.joint_size
     start = np.zeros(n) if start_velocities is None else start_velocities
-    velocities = checked_numbers(start, n, "start_velocities", "one entry for each joint")
+    velocities = require.array("start_velocities", start, (n,), meaning="one entry for each joint")
     if not isinstance(stabiliser, Stabiliser | None):
         words = f"stabiliser must be a Stabiliser(...), not {stabiliser!r}"
         raise ProblemError(words, name="stabiliser", value=stabiliser)

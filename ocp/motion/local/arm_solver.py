@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from models.arrays import Array
+from models.checks import Array
 from ocp.motion.local.chain import TURN, Chain, Motion, Solutions
 from ocp.motion.local.closed_forms import SCARA, SIX, PoseSolver, closed_forms
 from ocp.motion.local.elimination import elimination_of

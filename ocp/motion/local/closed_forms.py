@@ -26,7 +26,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from models.arrays import Array
+from models.checks import Array
 from models.cts.trigonometric import Harmonics, polish, roots, square_of_first_harmonic
 from models.spatial import Frame, cross
 from ocp.motion.local.chain import Chain, Motion, Solutions, SymbolicAxis, compose, inverse

@@ -16,8 +16,8 @@ import casadi as ca
 import numpy as np
 
 from models import CollisionScene, Machine
-from models.arrays import Array
-from ocp.errors import ProblemError, checked_instance
+from models.checks import Array
+from ocp.errors import ProblemError, require
 from ocp.problem.hulls import BodyPairs, Hull, frames_of
 from ocp.problem.values import Sampler
 
@@ -135,7 +135,7 @@ def prepared_pairs(scene: CollisionScene) -> tuple[Sampler, BodyPairs]:
 
 def checked_collision_scene(value: Any, machine: Machine, limits: bool = True) -> CollisionScene:
     """Return a collision scene; ProblemError unless it is of the machine and treats joint limits as `limits` says."""
-    if checked_instance("scene", value, CollisionScene).machine is not machine:
+    if require.instance("scene", value, CollisionScene).machine is not machine:
         words = "scene belongs to another machine; build it from this one: CollisionScene(machine, ...)"
         raise ProblemError(words, name="scene", value=value)
     if value.limits and not limits:

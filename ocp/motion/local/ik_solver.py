@@ -12,9 +12,9 @@ import scipy
 from numpy.typing import NDArray
 
 from models import FixedBase, Machine, ModelError
-from models.arrays import Array, ArrayInput, checked_array
+from models.checks import Array, ArrayInput, real
 from models.machines.machine import with_tip
-from ocp.errors import ProblemError, checked_count, checked_flag, checked_instance, checked_positive, real
+from ocp.errors import ProblemError, require
 from ocp.motion.local.arm_solver import ARM, ArmSolver, arm_solver, sample_shares
 from ocp.motion.local.chain import TURN, Chain
 from ocp.motion.local.closed_forms import SIX, PoseSolver, is_scara
@@ -132,15 +132,15 @@ class IkSolver:
             ProblemError: The machine has a moving base, no six of its joints determine the pose of the tip, or an
                 argument is invalid.
         """
-        checked_instance("machine", machine, FixedBase)
-        checked_instance("free", free, ToolFreedom)
+        require.instance("machine", machine, FixedBase)
+        require.instance("free", free, ToolFreedom)
         if free is ToolFreedom.CONE:
-            checked_positive("within", within, below=np.pi)
-        checked_flag("limits", limits)
-        checked_count("samples", samples, 1)
+            require.positive("within", within, below=np.pi)
+        require.flag("limits", limits)
+        require.count("samples", samples, 1)
         try:
-            tip = machine if link is None else with_tip(machine, link, checked_array(point, (3,), "IkSolver", "point"))
-            axis = checked_array(tool_axis, (3,), "IkSolver", "tool_axis")
+            tip = machine if link is None else with_tip(machine, link, require.array("IkSolver: point", point, (3,)))
+            axis = require.array("IkSolver: tool_axis", tool_axis, (3,))
         except ModelError as error:
             raise ProblemError(str(error), **vars(error)) from error
         if not np.linalg.norm(axis) > 0:
@@ -407,8 +407,8 @@ def ik_configurations(
     Raises:
         ProblemError: The task is not of this kind, or the machine has no such solver: use `inverse_kinematics`.
     """
-    checked_count("samples", samples, 1)
-    checked_flag("limits", limits)
+    require.count("samples", samples, 1)
+    require.flag("limits", limits)
     if not np.isfinite(real(time)):
         raise ProblemError(f"time must be a finite number of seconds, not {time!r}", name="time", value=time)
     equations, unbounded = bind(machine, task), np.full(machine.joint_size, np.inf)

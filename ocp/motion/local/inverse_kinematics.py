@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models import CollisionScene, Machine
-from models.arrays import Array
+from models.checks import NOT_NUMBERS, Array, floats, real
 from ocp.console import interruptible
-from ocp.errors import NOT_NUMBERS, ProblemError, checked_count, checked_flag, checked_positive, floats, real
+from ocp.errors import ProblemError, require
 from ocp.motion.local.collisions import Collision, checked_collision_scene, find_collisions, slide_apart
 from ocp.motion.local.ik_solver import ik_branches
 from ocp.motion.tasks.checks import checked_configuration
@@ -131,8 +131,8 @@ def inverse_kinematics(
     If the task is one pose of the tip of an arm on a fixed base, its solutions are listed on all branches (see
     `ik_configurations`, which also tells whether they are all). If there are more joints than rows, the solutions form
     families, of which members at samples of the free parameters are listed. For other tasks and machines, and where the
-    list is not certain to be complete, damped Gauss-Newton iterations begin at random starts, of which each gives one
-    solution at most.
+    list is not certain to be complete or has fewer than `starts` members because few samples keep the limits, damped
+    Gauss-Newton iterations begin at random starts, of which each gives one solution at most.
 
     Args:
         machine: Any machine; a floating base stays at `base`.
@@ -169,11 +169,11 @@ def inverse_kinematics(
         raise ProblemError(words, name="task")
     equations = TaskEquations(machine, pose_tasks)
     for name, number in (("starts", starts), ("iterations", iterations)):
-        checked_count(name, number, least=int(name == "iterations"))
+        require.count(name, number, least=int(name == "iterations"))
     for name, value in (("tolerance", tolerance), ("apart", apart)):
-        checked_positive(name, value)
-    checked_count("seed", seed, 0, LARGEST_SEED)
-    checked_flag("limits", limits)
+        require.positive(name, value)
+    require.count("seed", seed, 0, LARGEST_SEED)
+    require.flag("limits", limits)
     if scene is not None:
         checked_collision_scene(scene, machine, limits)
     if not np.isfinite(real(time)):
@@ -266,11 +266,7 @@ class _MultiStart:
         return self.rank(q, error)
 
     def list_branches(self, count: int, seed: int) -> tuple[Array, int]:
-        """Return solutions on all branches, (K, n), and how many random starts are needed besides.
-
-        Of a redundant arm with several free parameters, few samples of these may keep the limits. Iterations under the
-        limits from random starts then make up the number.
-        """
+        """Return solutions on all branches, (K, n), and how many random starts make up for missing ones."""
         branches = ik_branches(self.equations, self.lower, self.upper) if count else None
         if branches is None:
             return np.zeros((0, len(self.lower))), count

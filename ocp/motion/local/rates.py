@@ -17,16 +17,18 @@ import casadi as ca
 import numpy as np
 
 from models import CollisionScene, Machine
-from models.arrays import Array
+from models.checks import NOT_NUMBERS, Array, floats, real
+from models.files import INPUT_LIMITS
 from models.spatial import solve_spd
 from ocp.console import interruptible
 from ocp.curves import integrator
-from ocp.errors import MAX_COUNT, NOT_NUMBERS, ProblemError, checked_nonnegative, checked_positive, floats, real
+from ocp.errors import ProblemError, require
 from ocp.motion.local.collisions import checked_collision_scene, distances_along
 from ocp.motion.tasks.checks import checked_configuration, checked_tasks, checked_weights, dependent_rows, horizon_of
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.motion.tasks.tracks import on_symbols
+from ocp.problem.values import Sampler, symbols_of
 
 __all__ = ["LocalMotion", "LocalSolution", "least_rates", "resolve", "track_tasks"]
 
@@ -137,8 +139,8 @@ def resolve(
     duration = horizon_of([part.task for part in equations.bound], horizon)
     rate_weights = checked_weights(weights, machine.joint_size)
     checked_tasks(equations, base, joints, duration)
-    checked_nonnegative("damping", damping)
-    checked_positive("tolerance", tolerance)
+    require.nonnegative("damping", damping)
+    require.positive("tolerance", tolerance)
     times = _times(samples, duration)
     if damping == 0 and (rows_dependent := dependent_rows(equations, base, joints)):
         words = (
@@ -179,7 +181,7 @@ def _times(samples: Any, horizon: float) -> Array:
     """Return the times of the samples, checked."""
     if not isinstance(samples, list | tuple | np.ndarray):
         count = real(samples)
-        if not (2 <= count <= MAX_COUNT and count == int(count)):
+        if not (2 <= count <= INPUT_LIMITS.count and count == int(count)):
             words = f"samples must be at least 2 points or an array of times, not {samples!r}"
             raise ProblemError(words, name="samples", value=samples, limit=2)
         return np.linspace(0.0, horizon, int(count))
@@ -332,6 +334,27 @@ class LocalMotion:
         bases, positions = (np.repeat(each[:, None], samples, axis=1) for each in (base, joints))
         return cls(times, bases, positions, rates, zeros, zeros, zeros)
 
+    @classmethod
+    def through(cls, times: Array, base: Array, joints: Array, weights: Array) -> LocalMotion:
+        """Return motions through configurations (K, M, n) at times (M,), with rates by forward differences."""
+        rates = np.diff(joints, axis=1) / np.diff(times)[:, None]
+        cost = np.einsum("kmn,n,m->k", rates**2, weights, np.diff(times)) / 2
+        rates, zeros = np.concatenate([rates, rates[:, -1:]], axis=1), np.zeros(len(joints))
+        return cls(times, base, joints, rates, np.asarray(cost), zeros, zeros)
+
+    @classmethod
+    def joined(cls, motions: Sequence[LocalMotion]) -> LocalMotion:
+        """Return the motions of several sets over the same times as one set."""
+        names = ("base", "joints", "rates", "cost", "pose_error", "worst_time")
+        return cls(motions[0].t, *(np.concatenate([getattr(motion, name) for motion in motions]) for name in names))
+
+    def straight_to(self, joints: Array) -> LocalMotion:
+        """Return motions that lead from the same starts straight to joints (K, joint_size), without a task."""
+        share = ((self.t - self.t[0]) / (self.t[-1] - self.t[0]))[:, None]
+        displacement = (joints - self.joints[:, 0])[:, None]
+        rates = np.repeat(displacement / (self.t[-1] - self.t[0]), len(self.t), axis=1)
+        return replace(self, joints=self.joints[:, :1] + share * displacement, rates=rates)
+
     def take(self, rows: Any) -> LocalMotion:
         """Return the motions at these indices."""
         fields = (self.base, self.joints, self.rates, self.cost, self.pose_error, self.worst_time)
@@ -362,28 +385,27 @@ def track_tasks(
     """
     machine, count, steps = equations.machine, len(joints), np.diff(times)
     targets = np.array(equations.target_function().map(len(times))(times[None, :]))
-    task = equations.function.map(count)
     b, q, u = ca.SX.sym("b", machine.base_size), ca.SX.sym("q", machine.joint_size), ca.SX.sym("u", machine.joint_size)
     motion = ca.Function("moves", [b, q, u], [machine.base_rate(b, q, u)]).map(count) if machine.base_size else None
     pose_rows, min_cosines = equations.pose_rows, np.cos(equations.cone_angles)
-    cones = _cone_function(equations).map(count) if min_cosines.size else None
+    functions = [equations.function, *([_cone_function(equations)] if min_cosines.size else [])]
+    symbols = [
+        symbols_of(*functions).sym("input", size) for size in (machine.base_size, machine.joint_size, len(targets))
+    ]
+    task = Sampler(symbols, [output for function in functions for output in function.call(symbols)])
     base_now, joints_now = np.array(base, dtype=float), np.clip(joints, lower, upper)
     bases, configurations, errors = [base_now], [joints_now], list[Array]()
 
     def linearise(k: int) -> tuple[Array, Array, Array, Array]:
         """Return Jacobians (K, m, n), task velocities (K, m), pose errors (K, m) and largest residuals (K,)."""
-        jacobian, right, error, residual = (
-            np.array(part) for part in task(base_now.T, joints_now.T, np.repeat(targets[:, k : k + 1], count, axis=1))
-        )
-        matrix = jacobian.reshape(equations.size, count, machine.joint_size).transpose(1, 0, 2)
-        errors_along = np.abs(residual).max(axis=0, initial=0.0)
-        right, error = right.T, np.where(pose_rows, error.T, 0.0)
-        if cones is not None:  # axes outside their cones are turned back, others are free
-            cosines, columns = (
-                np.array(part) for part in cones(base_now.T, joints_now.T, np.repeat(targets[:, k : k + 1], count, 1))
-            )
-            violation = np.maximum(min_cosines - cosines.T, 0.0)
-            gradients = columns.reshape(min_cosines.size, count, machine.joint_size).transpose(1, 0, 2)
+        jacobian, right, error, residual, *leaning = task(base_now, joints_now, targets[:, k])
+        matrix = jacobian.reshape(count, machine.joint_size, equations.size).transpose(0, 2, 1)
+        errors_along = np.abs(residual).max(axis=1, initial=0.0)
+        error = np.where(pose_rows, error, 0.0)
+        if leaning:  # axes outside their cones are turned back, others are free
+            cosines, columns = leaning
+            violation = np.maximum(min_cosines - cosines, 0.0)
+            gradients = columns.reshape(count, machine.joint_size, min_cosines.size).transpose(0, 2, 1)
             matrix = np.concatenate([matrix, np.where((violation > 0)[:, :, None], gradients, 0.0)], axis=1)
             right, error = np.hstack([right, np.zeros_like(violation)]), np.hstack([error, violation])
         return matrix, right, error, np.where(np.isfinite(errors_along), errors_along, np.inf)

@@ -15,7 +15,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from models.arrays import Array
+from models.checks import Array
 from models.machines.machine import hold_joints
 from ocp.direct.guess import Samples
 from ocp.errors import SolveError

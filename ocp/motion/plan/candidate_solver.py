@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from models.arrays import Array
+from models.checks import Array
 from ocp.audit.audit import Audit, Finding
 from ocp.audit.clearance import ClosestPair
 from ocp.direct.collocation import Collocation
@@ -31,6 +31,7 @@ from ocp.motion.plan.actuators import cost_of_motion, solve_with_accelerations
 from ocp.motion.plan.candidate_queue import Solver
 from ocp.motion.plan.singular import MotionSample, describe_shortfall, is_nearly_singular, limit_reason
 from ocp.motion.result.candidate import Candidate, Reason, Rejection, Seed, Stage, collision_reason
+from ocp.motion.result.plan import audit_key
 from ocp.motion.result.request import declared_motion
 from ocp.motion.result.solved_plan import SolvedPlan, parts_of
 from ocp.motion.search.configurations import (
@@ -219,7 +220,7 @@ class CandidateSolver(Solver):
             widened = replace(candidate, constraints=constraints.widened(proofs))
             return self._solve_again(widened, Stage.FINE, self._collision_reason(closest))
         if audit.passed:
-            return replace(candidate, stage=Stage.AUDITED)
+            return replace(candidate, stage=Stage.AUDITED, audit=audit)
         if not audit.failures:
             return candidate.rejected(Reason(Rejection.UNDETERMINED, audit.undecided))
         worst = audit.failures[0]
@@ -233,7 +234,7 @@ class CandidateSolver(Solver):
     def _limit_actuators(self, candidate: Candidate) -> Candidate:
         """Solve a candidate again within the actuator limits."""
         solution = solve_with_accelerations(self.request, self.start, self.reference, self.plan([candidate]))
-        return replace(candidate, stage=Stage.ACTUATED, cost=solution.cost, solution=solution)
+        return replace(candidate, stage=Stage.ACTUATED, cost=solution.cost, solution=solution, audit=None)
 
     def _free_start(self, candidate: Candidate) -> list[Candidate]:
         """Return a new candidate with a free start for one that passed with a fixed start."""
@@ -485,7 +486,8 @@ class CandidateSolver(Solver):
         request = self.request
         whole = request.whole or request.machine
         extended = [replace(c, start=all_joints(whole.robot, request.held, c.start)) for c in candidates]
-        plan = SolvedPlan(whole, best.solution, parts, tuple(extended), held=request.held)
+        audits = {} if best.audit is None else {audit_key(): best.audit}
+        plan = SolvedPlan(whole, best.solution, parts, tuple(extended), held=request.held, _audits=audits)
         return plan.with_targets(request.tasks)
 
 

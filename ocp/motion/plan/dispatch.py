@@ -9,15 +9,7 @@ from typing import Any, Literal, TypeAlias, get_args
 
 from models import FixedBase, FreeFloating, Machine, Standing
 from ocp.console import TimeLimitReached, interruptible, shown_progress, time_limited
-from ocp.errors import (
-    ProblemError,
-    SolveError,
-    checked_choice,
-    checked_count,
-    checked_flag,
-    checked_instance,
-    checked_time_limit,
-)
+from ocp.errors import ProblemError, SolveError, checked_time_limit, require
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem
 from ocp.motion.builders.dynamics_plan import dynamics_phases
@@ -113,9 +105,9 @@ def plan(
             the motions of a global search end, what obstructs them, by how much the tasks would have to be relaxed, and
             in how few segments they may be done (search="segments").
     """
-    checked_choice("search", search, get_args(Search))
-    checked_flag("cyclic", cyclic)
-    checked_count("seed", seed, 0, LARGEST_SEED)
+    require.choice("search", search, get_args(Search))
+    require.flag("cyclic", cyclic)
+    require.count("seed", seed, 0, LARGEST_SEED)
     with time_limited(checked_time_limit(time_limit)), shown_progress("plan", progress):
         try:
             return _plan(machine, tasks, horizon, start, cyclic, cost, limits, scene, search, seed)
@@ -147,12 +139,12 @@ def _plan(
         raise ProblemError(words, name="wrenches", value=wrenches)
     if isinstance(tasks, Waypoints):
         _check_unused("a path through waypoints", horizon=horizon, start=start, cyclic=cyclic or None)
-        arm = checked_instance("machine", machine, FixedBase)
+        arm = require.instance("machine", machine, FixedBase)
         return plan_path(arm, tasks, scene=scene, **options)
     options["start"] = start
     if search == "segments":
         _check_unused("search='segments'", cyclic=cyclic or None)
-        arm = checked_instance("machine", machine, FixedBase)
+        arm = require.instance("machine", machine, FixedBase)
         return plan_in_segments(arm, tasks, horizon, scene=scene, **options)
     if isinstance(tasks, Steps):
         _check_unused("a walk, whose phases have durations", horizon=horizon, cyclic=cyclic or None)
@@ -160,7 +152,7 @@ def _plan(
         return plan_steps(machine, tasks, start=start, cost=cost, limits=limits)
     if _is_sequence(tasks):
         if horizon is not None:
-            checked_choice("horizon", horizon, ("free",))
+            require.choice("horizon", horizon, ("free",))
         _check_unused("a sequence of goals and tasks", cyclic=cyclic or None)
         own = SequenceRequest(machine, start, horizon is not None, cost, limits, scene, search, seed)
         return plan_consecutive(own, tasks)
@@ -239,7 +231,7 @@ def plan_problem(
     if not isinstance(machine, FixedBase | FreeFloating):
         raise ProblemError(f"a machine is expected, not a {type(machine).__name__}", name="machine", value=machine)
     if limits is not None:
-        checked_instance("limits", limits, Limits)
+        require.instance("limits", limits, Limits)
     if isinstance(tasks, Steps):
         joints = Start.of(start, tasks.stances[0])[1]
         begin = None if joints is None else tasks.in_order(tasks.stances[0], joints[None])[0]
@@ -247,7 +239,7 @@ def plan_problem(
     constraints = clearance_for(machine, limits, scene)
     shared: dict[str, Any] = {"limits": limits, "clearance_constraints": constraints}
     if isinstance(tasks, Capture):
-        chaser = checked_instance("machine", machine, FreeFloating)
+        chaser = require.instance("machine", machine, FreeFloating)
         return capture_problem(chaser, tasks, start=start, cost=own, **shared)
     goals: Any = (tasks,) if isinstance(tasks, Goal) else tasks
     if isinstance(goals, Sequence) and isinstance(next(iter(goals), None), Goal):
@@ -259,7 +251,7 @@ def plan_problem(
         zmp = None if limits is None else limits.zmp
         options: dict[str, Any] = {"start": joints, "zmp": zmp, "weights": own, "limits": limits, "setup": setup}
         return standing_problem(machine, goals, horizon, **options)
-    weights = None if own is None else checked_instance("cost", own, Cost).joint_weights(machine.joint_size)
+    weights = None if own is None else require.instance("cost", own, Cost).joint_weights(machine.joint_size)
     options = {"start": joints, "start_base": base, "cyclic": cyclic, "weights": weights}
     return minimum_velocity_problem(machine, goals, horizon, **options, **shared)
 

@@ -9,9 +9,9 @@ from typing import Any, Literal
 import numpy as np
 
 from models import Box, FixedBase, FreeFloating, Machine, Sphere, Stance
-from models.arrays import Array
+from models.checks import Array, floats
 from ocp.console import report, time_left
-from ocp.errors import ProblemError, checked_choice, checked_each, checked_instance, floats
+from ocp.errors import ProblemError, require
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.dynamics import DynamicsSetup
 from ocp.motion.builders.dynamics_plan import POINTS, dynamics_phases, machines_of, phase_names, within_limits
@@ -21,10 +21,11 @@ from ocp.motion.builders.standing.stances import Steps
 from ocp.motion.builders.standing.steps import StepWeights
 from ocp.motion.builders.torques import checked_motors
 from ocp.motion.local.inverse_kinematics import Unreachable, inverse_kinematics
-from ocp.motion.plan.goal_plan import GoalRequest, plan_to_goal
+from ocp.motion.plan.goal_motions import GoalRequest
+from ocp.motion.plan.goal_plan import plan_to_goal
 from ocp.motion.result.candidate import Candidate, Stage
 from ocp.motion.result.solved_plan import PhasedPlan, SolvedPlan, parts_of_phases
-from ocp.motion.tasks.checks import checked_numbers, clip_to_limits
+from ocp.motion.tasks.checks import clip_to_limits
 from ocp.motion.tasks.equations import bind
 from ocp.motion.tasks.goals import Cost, Goal, Start
 from ocp.motion.tasks.limits import Limits
@@ -68,12 +69,12 @@ def plan_sequence(
         ProblemError: As `dynamics_phases`; or the start is missing.
         SolveError: No motion satisfies its limits.
     """
-    motors, goals = checked_motors("plan", machine), checked_each("goals", goals, Goal)
+    motors, goals = checked_motors("plan", machine), require.each("goals", goals, Goal)
     state, joints, base = Start.of(start, motors)
     if joints is None:
         raise ProblemError("start is missing: a goal is reached from somewhere; give plan(..., start=)", name="start")
-    own_limits = Limits() if limits is None else checked_instance("limits", limits, Limits)
-    own_cost = None if cost is None else checked_instance("cost", cost, Cost)
+    own_limits = Limits() if limits is None else require.instance("limits", limits, Limits)
+    own_cost = None if cost is None else require.instance("cost", cost, Cost)
     if len(goals) == 1 and goals[0].duration is None:  # one motion has the horizon
         goals, total = [replace(goals[0], duration=total)], None
     near, resolved = joints, list[Goal]()
@@ -152,12 +153,12 @@ def _goal_request(
     state, joints, _ = Start.of(start, machine)
     if joints is None:
         raise ProblemError("start is missing: a goal is reached from somewhere; give plan(..., start=)", name="start")
-    own_limits = Limits() if limits is None else checked_instance("limits", limits, Limits)
+    own_limits = Limits() if limits is None else require.instance("limits", limits, Limits)
     places: dict[str, Any] = {"limits": own_limits, "constraints": constraints, "seed": seed}
     is_free = isinstance(horizon, str)
     if is_free:
-        checked_choice("horizon", horizon, ("free",))
-    own_cost = Cost(time=float(is_free)) if cost is None else checked_instance("cost", cost, Cost)
+        require.choice("horizon", horizon, ("free",))
+    own_cost = Cost(time=float(is_free)) if cost is None else require.instance("cost", cost, Cost)
     return GoalRequest(
         machine,
         joints,
@@ -213,7 +214,7 @@ def plan_capture(
         ProblemError: As `capture_problem`.
         SolveError: No motion satisfies its limits.
     """
-    chaser = checked_instance("machine", machine, FreeFloating)
+    chaser = require.instance("machine", machine, FreeFloating)
     options: dict[str, Any] = {"cost": cost, "limits": limits, "clearance_constraints": constraints}
     solution = solve_capture(chaser, capture, start=start, **options)
     return _phased(chaser, solution, np.asarray(Start.of(start, chaser)[1]))
@@ -261,7 +262,7 @@ def goal_configurations(
     if not goal.has_pose:
         if goal.joints is None:
             raise ProblemError("a goal needs joints or a pose", name="joints", value=None)
-        values = checked_numbers(np.nan_to_num(floats(goal.joints)), len(near), "goal", "one for each joint")
+        values = require.array("goal", np.nan_to_num(floats(goal.joints)), (len(near),), meaning="one for each joint")
         joints = np.where(np.isnan(floats(goal.joints).ravel()), near, values)
         return clip_to_limits("end", names, joints, bounds.lower, bounds.upper, "end inside them")[None]
     scene = None if constraints is None else constraints.scene

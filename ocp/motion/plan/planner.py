@@ -18,17 +18,9 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from models import CollisionScene, Machine, ModelError
-from models.arrays import Array
+from models.checks import Array
 from ocp.console import report
-from ocp.errors import (
-    ProblemError,
-    SolveError,
-    checked_choice,
-    checked_count,
-    checked_each,
-    checked_flag,
-    checked_instance,
-)
+from ocp.errors import ProblemError, SolveError, require
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.tool_motion import stretches_of
 from ocp.motion.builders.torques import checked_motors
@@ -100,7 +92,7 @@ def plan_from_configurations(
         _search_globally(queue, solver, search)
         if queue.passed:
             return _finished(queue, solver), search.bound
-    seeds = candidates_from(solver, motions, configurations)
+    seeds = candidates_from(solver, motions)
     queue.run(seeds)
     if not queue.passed:
         _repair(queue, solver, motions, configurations, seeds)
@@ -130,14 +122,11 @@ def _finished(queue: CandidateQueue, solver: CandidateSolver) -> SolvedPlan:
     return weighted.plan()
 
 
-def candidates_from(
-    solver: CandidateSolver, motions: Sequence[LocalMotion], configurations: Array, **options: bool
-) -> list[Candidate]:
+def candidates_from(solver: CandidateSolver, motions: Sequence[LocalMotion], **options: bool) -> list[Candidate]:
     """Return candidates of local motions: those that do their tasks first, then by rising cost.
 
     Args:
         motions: K local motions through each stretch.
-        configurations: Their start configurations. Shape (K, n).
         options: Further fields of `Seed`.
     """
     errors, costs = np.array(largest_pose_errors([*motions])), np.sum([motion.cost for motion in motions], axis=0)
@@ -149,7 +138,7 @@ def candidates_from(
         relaxed = solver.is_nearly_singular(local)
         seed = Seed(guess, float(costs[index]), local, bool(tracked[index]), relaxed=relaxed, **options)
         constraints = solver.request.clearance_constraints
-        candidates.append(Candidate(configurations[index], seed.cost, seed=seed, constraints=constraints))
+        candidates.append(Candidate(motions[0].joints[index, 0], seed.cost, seed=seed, constraints=constraints))
     return candidates
 
 
@@ -169,7 +158,7 @@ def _repair(
         _search_cells(queue, solver, motions, configurations)
     else:
         motions = local_motions_from(solver.request, configurations[:1])
-        queue.run(candidates_from(solver, motions, configurations[:1], direct=True, thorough=True))
+        queue.run(candidates_from(solver, motions, direct=True, thorough=True))
 
 
 def _try_one_by_one(queue: CandidateQueue, solver: CandidateSolver, configurations: Array, thorough: bool) -> None:
@@ -183,7 +172,7 @@ def _try_one_by_one(queue: CandidateQueue, solver: CandidateSolver, configuratio
         motions = local_motions_from(request, joints[None])
         if request.machine.base_size and not tracks_tasks(request, motions)[0]:
             continue  # solving from such a guess is slow and fails
-        queue.run(candidates_from(solver, motions, joints[None], direct=True, thorough=thorough))
+        queue.run(candidates_from(solver, motions, direct=True, thorough=thorough))
         if queue.passed or queue.exhausted:
             return
 
@@ -202,10 +191,9 @@ def _search_globally(queue: CandidateQueue, solver: CandidateSolver, search: Tas
     for include_costlier in (False, True):
         motions = search.local_motions(include_costlier)
         if motions[0].cost.size:
-            starts = motions[0].joints[:, 0]
-            queue.run(candidates_from(solver, motions, starts))
+            queue.run(candidates_from(solver, motions))
             fixed = solver.request.start is None
-            for seed in candidates_from(solver, motions, starts, direct=True, fixed=fixed):
+            for seed in candidates_from(solver, motions, direct=True, fixed=fixed):
                 near_bound = queue.cost <= settings.near_bound * search.bound
                 if near_bound or seed.cost >= (1 - settings.gain) * queue.cost:
                     break
@@ -232,7 +220,7 @@ def _search_cells(
     request, include_costlier = solver.request, solver.request.search == "global"
     tracked = np.flatnonzero(tracks_tasks(request, motions))
     motions = [motion.take(tracked) for motion in motions]
-    local = candidates_from(solver, motions, configurations[tracked], direct=include_costlier)
+    local = candidates_from(solver, motions, direct=include_costlier)
     try:
         passes = CellSearch(request, configurations).local_motions()
     except DeadEnd:
@@ -240,7 +228,7 @@ def _search_cells(
         if not queue.passed:
             raise
         return
-    batches = [candidates_from(solver, motions, motions[0].joints[:, 0], direct=True) for motions in passes]
+    batches = [candidates_from(solver, motions, direct=True) for motions in passes]
     if include_costlier:
         lowest_costs = [min((seed.cost for seed in batch), default=np.inf) for batch in batches]
         lower = [batch for batch, cost in zip(batches, lowest_costs, strict=True) if cost < lowest_costs[0]]
@@ -269,22 +257,23 @@ def _try_alternatives(queue: CandidateQueue, solver: CandidateSolver, seeds: lis
     request, max_tries = solver.request, solver.settings.max_failures
     finished_by_seed = {id(candidate.seed): candidate for candidate in queue.candidates}
     rerouted = []
+    local = {id(seed): solver.local_collisions(seed.seed) for seed in seeds}
+    distances = {key: min((each.distance for each in found), default=np.inf) for key, found in local.items()}
     for seed in seeds:
         finished = finished_by_seed[id(seed.seed)]
         colliding = solver.collisions(finished)
         if finished.constraints is not None and (colliding or finished.constraints.margins):
-            local = solver.local_collisions(seed.seed)
-            constraints = finished.constraints.separating([*colliding, *local])
-            distance = min((collision.distance for collision in local), default=np.inf)
-            rerouted.append((distance, replace(seed, constraints=constraints)))
-    alternatives = [seed for _, seed in sorted(rerouted, key=lambda entry: -entry[0])[:max_tries]]
+            constraints = finished.constraints.separating([*colliding, *local[id(seed)]])
+            rerouted.append((distances[id(seed)], replace(seed, constraints=constraints)))
+    alternatives = sorted(rerouted, key=lambda entry: -entry[0])[:max_tries]
     if request.start is None:
         collisions = start_collisions(request, np.array([seed.start for seed in seeds]))
         clear_starts = [seed for seed, collision in zip(seeds, collisions, strict=True) if collision is None]
         tracked = [c for c in clear_starts if max(largest_pose_errors([*c.seed.local])) <= REACH_TOLERANCE]
         tracked.sort(key=lambda candidate: candidate.seed.cost)
-        alternatives += [replace(c, seed=replace(c.seed, direct=True, fixed=True)) for c in tracked[:max_tries]]
-    for seed in alternatives:
+        fixed = [(c, replace(c.seed, direct=True, fixed=True)) for c in tracked[:max_tries]]
+        alternatives += [(distances[id(c)], replace(c, seed=seed)) for c, seed in fixed]
+    for _, seed in sorted(alternatives, key=lambda entry: -entry[0]):
         start = seed.start
         queue.candidates = [c for c in queue.candidates if c.start is not start]  # it finishes again
         queue.run([seed])
@@ -342,7 +331,7 @@ def clearance_for(
     """
     if scene is False:
         return None
-    own = Scene() if scene is None else checked_instance("scene", scene, Scene)
+    own = Scene() if scene is None else require.instance("scene", scene, Scene)
     joint_limits = not isinstance(limits, Limits) or limits.joints
     report("collision scene")
     try:
@@ -371,15 +360,15 @@ def checked_request(
     Raises:
         ProblemError: As in `plan`.
     """
-    checked_choice("search", search, get_args(SearchKind))
-    checked_flag("cyclic", cyclic)
-    checked_count("seed", seed, 0, LARGEST_SEED)
-    all_tasks = (tasks,) if isinstance(tasks, TipTask) else checked_each("tasks", tasks, TipTask)
+    require.choice("search", search, get_args(SearchKind))
+    require.flag("cyclic", cyclic)
+    require.count("seed", seed, 0, LARGEST_SEED)
+    all_tasks = (tasks,) if isinstance(tasks, TipTask) else require.each("tasks", tasks, TipTask)
     bind(machine, all_tasks)  # checks the tasks against the machine
-    checked_limits = Limits() if limits is None else checked_instance("limits", limits, Limits)
+    checked_limits = Limits() if limits is None else require.instance("limits", limits, Limits)
     free = isinstance(horizon, str)
     if free:
-        checked_choice("horizon", horizon, ("free",))
+        require.choice("horizon", horizon, ("free",))
         if search == "global":
             words = "search='global' needs a fixed horizon; give it in s, or use search='configurations'"
             raise ProblemError(words, name="search", value="global")
@@ -421,7 +410,7 @@ def _checked_cost(machine: Machine, cost: Any, free: bool) -> Cost:
     """
     if cost is None:
         return Cost(time=float(free))
-    own = checked_instance("cost", cost, Cost)
+    own = require.instance("cost", cost, Cost)
     if weights_actuators(own):
         checked_motors("plan: cost", machine)
     if own.turning and not machine.base_size:

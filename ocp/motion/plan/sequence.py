@@ -20,14 +20,15 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from models import FixedBase, Machine
-from models.arrays import Array
-from ocp.errors import ProblemError, SolveError, checked_instance, floats
+from models.checks import Array, floats
+from ocp.errors import ProblemError, SolveError, require
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.tool_motion import Stretch, stretches_of
 from ocp.motion.builders.torques import checked_motors
 from ocp.motion.local.inverse_kinematics import Unreachable
 from ocp.motion.plan.actuators import limits_actuators, weights_actuators
-from ocp.motion.plan.goal_plan import GoalRequest, plan_to_goal
+from ocp.motion.plan.goal_motions import GoalRequest
+from ocp.motion.plan.goal_plan import plan_to_goal
 from ocp.motion.plan.goal_sequence import plan_goal, with_joints
 from ocp.motion.plan.planner import checked_request, clearance_for, plan_request
 from ocp.motion.result.segmented_plan import JUMP_TOLERANCE, Reconfiguration, SegmentedPlan, SequencePlan
@@ -315,7 +316,7 @@ def plan_in_segments(
         DeadEnd: At some time no motion does the tasks even for the shortest while, in any configuration.
         SolveError: No segment could be planned, however the tasks were divided.
     """
-    checked_instance("machine", machine, FixedBase)
+    require.instance("machine", machine, FixedBase)
     options: dict[str, Any] = {"start": start, "cost": cost, "limits": limits, "seed": seed}
     request = checked_request(machine, tasks, horizon, search="global", **options)
     constraints = clearance_for(machine, limits, scene)
@@ -382,7 +383,7 @@ def _task_between(task: TipTask, begin: float, end: float) -> TipTask | None:
 
 def _plan_reconfiguration(request: PlanRequest, time: float, before: Array, after: Array) -> Reconfiguration:
     """Return a motion between two configurations of all joints: straight, or around obstacles."""
-    machine, whole = checked_instance("machine", request.machine, FixedBase), request.whole or request.machine
+    machine, whole = require.instance("machine", request.machine, FixedBase), request.whole or request.machine
     free = [name not in request.held for name in whole.robot.joint_names]
     goal = GoalRequest(
         machine,

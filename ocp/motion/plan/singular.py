@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from models.arrays import Array
+from models.checks import Array
 from ocp.motion.builders.tool_motion import Stretch
 from ocp.motion.local.inverse_kinematics import describe_miss
 from ocp.motion.local.rates import LocalMotion

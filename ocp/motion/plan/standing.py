@@ -9,9 +9,9 @@ from typing import Any, Literal
 import casadi as ca
 
 from models import Standing
-from models.arrays import Array
+from models.checks import Array
 from models.machines.standing import External
-from ocp.errors import ProblemError, SolveError, checked_flag, checked_instance
+from ocp.errors import ProblemError, SolveError, require
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.standing.plan import solve_standing
 from ocp.motion.builders.standing.problem import StandingSetup, Weights
@@ -61,12 +61,12 @@ def plan_to_stand(
             in `solve_standing`.
         SolveError: No start leads to a plan that passes its audit.
     """
-    checked_flag("cyclic", cyclic)
+    require.flag("cyclic", cyclic)
     if cyclic:
         words = "a standing motion cannot be cyclic; declare standing_problem with StandingSetup(end=...)"
         raise ProblemError(words, name="cyclic", value=cyclic)
     if cost is not None:
-        checked_instance("cost", cost, Weights)
+        require.instance("cost", cost, Weights)
     all_tasks = [part.task for part in bind(machine, tasks).bound]
     duration = horizon_of(all_tasks, horizon)
     for number, task in enumerate(all_tasks):
@@ -81,7 +81,7 @@ def plan_to_stand(
         clearance_constraints=clearance_constraints,
         symbols=ca.SX if _takes_scalars(equations) else ca.MX,
     )
-    zmp = None if limits is None else checked_instance("limits", limits, Limits).zmp
+    zmp = None if limits is None else require.instance("limits", limits, Limits).zmp
     options: dict[str, Any] = {"weights": cost, "limits": limits, "setup": setup, "zmp": zmp}
     queue = CandidateQueue(_StandingSolver(machine, all_tasks, duration, options, start is not None), PlannerSettings())
     seeds = [Candidate(joints) for joints in _start_configurations(machine, all_tasks, start, limits, seed)]

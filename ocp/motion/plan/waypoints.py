@@ -18,8 +18,8 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from models import FixedBase
-from models.arrays import Array
-from ocp.errors import NOT_NUMBERS, ProblemError, SolveError, checked_choice, checked_count, checked_instance, floats
+from models.checks import NOT_NUMBERS, Array, floats
+from ocp.errors import ProblemError, SolveError, require
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.local.collisions import Collision, distances_along, find_collisions
 from ocp.motion.local.ik_solver import idle_positions
@@ -32,9 +32,8 @@ from ocp.motion.search.dead_end import RelaxationKind, dead_end
 from ocp.motion.search.joint_space import TOLERANCE, JointSpace, TasksWithFixedJoints
 from ocp.motion.search.reconfigurations import SectionSearch, SectionSettings, Segment, fewest_segments, section_values
 from ocp.motion.search.search import MAX_FREE_DIRECTIONS, AtlasSearch, SearchSettings, checked_bound
-from ocp.motion.search.steps import Homogeneous, LargestMotion, PathLength
+from ocp.motion.search.steps import Homogeneous, LargestMotion, PathLength, Steps
 from ocp.motion.search.value import shorten_path
-from ocp.motion.tasks.checks import checked_numbers
 from ocp.motion.tasks.equations import bind
 from ocp.motion.tasks.goals import Cost, Scene, Waypoints
 from ocp.motion.tasks.limits import Limits
@@ -122,12 +121,12 @@ def plan_path(
             end, what obstructs them, and by how much the poses or the clearance would have to be relaxed.
         SolveError: No path was found, though some pass a part of the waypoints.
     """
-    checked_instance("machine", machine, FixedBase)
-    checked_count("seed", seed, 0, LARGEST_SEED)
+    require.instance("machine", machine, FixedBase)
+    require.count("seed", seed, 0, LARGEST_SEED)
     positions, rotations = _poses(waypoints.positions, waypoints.quaternions)
     n = machine.joint_size
-    checked_limits = Limits() if limits is None else checked_instance("limits", limits, Limits)
-    own_cost = Cost(velocity=0, length=1) if cost is None else checked_instance("cost", cost, Cost)
+    checked_limits = Limits() if limits is None else require.instance("limits", limits, Limits)
+    own_cost = Cost(velocity=0, length=1) if cost is None else require.instance("cost", cost, Cost)
     if own_cost.terms not in (("length",), ("time",)):
         words = "cost: a path through waypoints costs its length or its time, Cost(velocity=0, length=1) or "
         words += f"Cost(velocity=0, time=1), not {own_cost}"
@@ -137,7 +136,7 @@ def plan_path(
         if getattr(checked_limits, quantity) is not None and not (quantity == "velocity" and is_timed):
             words = f"limits: a path through waypoints has no time, hence no {quantity}; leave it out, or give a step"
             raise ProblemError(words, name=quantity, value=getattr(checked_limits, quantity))
-    checked_choice("reconfigurations", waypoints.reconfigurations, get_args(Reconfigurations))
+    require.choice("reconfigurations", waypoints.reconfigurations, get_args(Reconfigurations))
     if is_timed:
         if own_cost.weights is not None:
             words = "cost: the time of a path takes no weights; leave them out"
@@ -330,13 +329,15 @@ class _WaypointPlanner:
         options: dict[str, Any] = {"seeds": lambda k: self._seeds(int(chosen[k])), "scene": self.scene}
         samples = [TimeSample(manifolds, k) for k in range(len(chosen))]
         joint = self._section_joint
-        arguments = self.space, samples, chosen.astype(float), self.cost, distances * self.step
+        arguments = self.space, samples, Steps(chosen.astype(float), self.cost, distances * self.step)
         if joint is None:
             return AtlasSearch(*arguments, **options, settings=self.settings.search)
         prismatic = self.machine.robot.moving_joints[joint].kind == "prismatic"
         section_settings, limit = self.settings.sections, float((distances * self.step)[:, joint].min())
         sections: dict[str, Any] = {"radius": section_settings.radii[coarse], "charts": section_settings.charts}
-        sections["values"] = section_values(prismatic, self.lower[joint], self.upper[joint], limit, section_settings)
+        sections["values"] = section_values(
+            prismatic, self.lower[joint], self.upper[joint], limit, settings=section_settings
+        )
         return SectionSearch(*arguments, **options, **sections, joint=joint)
 
     def _dead_end_error(self, search: AtlasSearch) -> SolveError:
@@ -387,8 +388,8 @@ class _WaypointPlanner:
             samples = [TimeSample(self.manifolds, k) for k in range(len(self.positions))[rows]]
             limits, bounds = np.repeat(self.step[None], len(samples) - 1, axis=0), (self.lower, self.upper)
             times = np.arange(len(self.positions), dtype=float)[rows]
-            options = self.cost, times, limits, bounds, self.scene, self.settings.widths
-            paths.append(shorten_path(joints[rows], samples, *options))
+            options: dict[str, Any] = {"bounds": bounds, "scene": self.scene, "widths": self.settings.widths}
+            paths.append(shorten_path(joints[rows], samples, Steps(times, self.cost, limits), **options))
         joints = np.concatenate(paths)
         steps = np.delete(self.cost.evaluate(np.diff(joints, axis=0), 1.0), list(break_numbers))
         return _Path(float(steps.sum()), *self._check_path(joints, break_numbers), joints, break_numbers)
@@ -454,7 +455,7 @@ def _path_weights(weights: Any, size: int) -> Array:
     """Return the weights of the joints in a length, 0 for joints that do not count. Shape (size,)."""
     if weights is None:
         return np.ones(size)
-    array = checked_numbers(weights, size, "weights", "one for each joint")
+    array = require.array("weights", weights, (size,), meaning="one for each joint")
     if not ((array >= 0).all() and array.any()):
         words = f"weights {array.tolist()} must be non-negative and not all 0"
         raise ProblemError(words, name="weights", value=array, limit=0.0)

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from models.arrays import Array
+from models.checks import Array
+from ocp.audit.audit import Audit
 from ocp.audit.clearance import ClosestPair
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.local.collisions import Collision
@@ -136,6 +137,7 @@ class Candidate:
         constraints: Clearance constraints with the separated pairs.
         separations: Number of solves that separated pairs, or separated them farther.
         separated: Reason of the last separation.
+        audit: Audit of the solution that passed.
     """
 
     start: Array
@@ -147,6 +149,7 @@ class Candidate:
     constraints: ClearanceConstraints | None = field(default=None, repr=False)
     separations: int = field(default=0, repr=False)
     separated: Reason | None = field(default=None, repr=False)
+    audit: Audit | None = field(default=None, repr=False)
 
     def __repr__(self) -> str:
         start = np.array2string(self.start, precision=3, separator=", ", max_line_width=200)
@@ -181,4 +184,4 @@ class Candidate:
     def finished(self) -> Candidate:
         """Return the candidate as a plan lists it."""
         solution = self.solution if self.stage >= Stage.FINE else None
-        return Candidate(self.start, self.cost, self.reason, self.stage, solution)
+        return Candidate(self.start, self.cost, self.reason, self.stage, solution, audit=self.audit)

@@ -12,7 +12,7 @@ import numpy as np
 import scipy
 
 from models import FixedBase, ModelError
-from models.arrays import Array
+from models.checks import Array
 from ocp.audit.audit import Audit, Finding, clearance_finding
 from ocp.audit.clearance import Clearance
 from ocp.errors import ProblemError

@@ -17,10 +17,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from models import Machine
-from models.arrays import MAX_LISTED, Array
+from models.checks import MAX_LISTED, NOT_NUMBERS, Array, floats
 from ocp.audit.audit import Audit, Finding
 from ocp.console import interruptible
-from ocp.errors import NOT_NUMBERS, ProblemError, floats, sample_times, unknown_name
+from ocp.errors import ProblemError, require, sample_times
 from ocp.motion.result.candidate import Candidate
 from ocp.motion.schedule.trajectory import JointTrajectory
 from ocp.motion.tasks.targets import Target, tip_poses
@@ -121,7 +121,7 @@ class Plan(ABC):
     def __getitem__(self, name: str) -> Array:
         """Return "joints", "rates" or "base" at the times `t`. Shape (M, n)."""
         if name not in self._names():
-            raise unknown_name("name in a plan", name, self._names())
+            raise require.unknown("name in a plan", name, self._names())
         return self._values(name)
 
     def at(self, time: Any) -> dict[str, Array]:
@@ -176,7 +176,7 @@ class Plan(ABC):
     @interruptible
     def audit(self, **settings: Any) -> Audit:
         """Check the motion independently of its solver; see `ocp.audit.audit.audit`. Results are cached by settings."""
-        key = repr(sorted(settings.items()))
+        key = audit_key(**settings)
         if key not in self._audits:
             self._audits[key] = self._audit(**settings)
         audit: Audit = self._audits[key]
@@ -341,3 +341,8 @@ class Plan(ABC):
     def _tips_at(self, times: Array, bases: Array, joints: Array) -> Array:
         """Return the poses of the tip at checked times (M,). Shape (M, 7)."""
         return tip_poses(self.machine, bases, joints)
+
+
+def audit_key(**settings: Any) -> str:
+    """Return the key under which a plan caches its audit with these settings."""
+    return repr(sorted(settings.items()))

@@ -14,7 +14,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from models import FixedBase, Machine
-from models.arrays import Array
+from models.checks import Array
 from ocp.audit.audit import COST_LOST, Audit, Finding
 from ocp.audit.clearance import Clearance
 from ocp.errors import ProblemError

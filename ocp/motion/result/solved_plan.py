@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models import Machine, ModelError
-from models.arrays import Array
+from models.checks import Array
 from ocp.audit.audit import Audit
 from ocp.errors import ProblemError, StorageWarning
 from ocp.motion.builders.tool_motion import CLOCK, PACE, SLOPES, Stretch

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from models.arrays import Array
+from models.checks import Array
 from ocp.console import TimeLimitReached, check_time
 from ocp.motion.sampling.shortening import (
     LengthSettings,
@@ -92,7 +92,7 @@ class _Tree:
 
 
 def connect(
-    search: TreeSearch, start: Array, goals: Array, random: np.random.Generator, most_samples: int
+    search: TreeSearch, start: Array, goals: Array, *, random: np.random.Generator, most_samples: int
 ) -> Array | None:
     """Return a path of straight motions, each proven clear, from the start to a goal; None if none was found.
 
@@ -227,16 +227,16 @@ def find_paths(
         number, last, samples = 0, settings.attempts, settings.first
         while number < last:
             random = np.random.default_rng([seed, number])
-            joints = connect(search, start, goals, random, samples)
+            joints = connect(search, start, goals, random=random, most_samples=samples)
             if joints is not None:
-                joints = shorten(motions, joints, scale, random, settings.shortening)
+                joints = shorten(motions, joints, scale, random=random, settings=settings.shortening)
                 paths = _with_path(search, paths, _path_of(joints, goals, scale))
                 last = min(last, number + 1 + settings.classes)
             number += 1
             if not paths and number % 2 == 0:
                 samples *= 2
         for path in paths[: settings.most_paths]:
-            joints = optimise_length(motions, path.joints, scale, limits, settings.optimisation)
+            joints = optimise_length(motions, path.joints, scale, limits=limits, settings=settings.optimisation)
             paths = _with_path(search, [p for p in paths if p is not path], _path_of(joints, goals, scale))
     except TimeLimitReached:
         if not paths:

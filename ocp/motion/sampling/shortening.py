@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from models.arrays import Array
+from models.checks import Array
 from ocp.console import check_time
 from ocp.motion.sampling.straight import StraightMotions
 
@@ -63,6 +63,7 @@ def shorten(
     motions: StraightMotions,
     path: Array,
     scale: Array,
+    *,
     random: np.random.Generator,
     settings: ShorteningSettings = ShorteningSettings(),
 ) -> Array:
@@ -93,7 +94,7 @@ def shorten(
     return path
 
 
-def same_class(motions: StraightMotions, first: Array, second: Array, scale: Array, rungs: int = 32) -> bool:
+def same_class(motions: StraightMotions, first: Array, second: Array, scale: Array, *, rungs: int = 32) -> bool:
     """Return whether straight motions from one path (M, n) to another (K, n) are clear at equal shares of their length.
 
     Paths of one homotopy class need not satisfy this; paths that do can replace each other as guesses. They are
@@ -194,6 +195,7 @@ def optimise_length(
     motions: StraightMotions,
     path: Array,
     scale: Array,
+    *,
     limits: tuple[Array, Array],
     settings: LengthSettings = LengthSettings(),
 ) -> Array:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models import CollisionScene
-from models.arrays import Array
+from models.checks import Array
 from ocp.console import check_time
 from ocp.motion.local.collisions import Collision, find_collisions, prepared_pairs
 from ocp.problem.hulls import Frames, frames_of

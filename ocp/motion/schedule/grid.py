@@ -248,7 +248,7 @@ def _uneven(left: Rows, middle: Rows, right: Rows, top: Array) -> NDArray[np.boo
 
 
 def reachable_bounds(
-    distance: Array, caps: Array, left: Rows, right: Rows, at_rest: tuple[bool, bool]
+    distance: Array, caps: Array, *, left: Rows, right: Rows, at_rest: tuple[bool, bool]
 ) -> tuple[Array, Array]:
     """Return upper bounds of the squared speeds at nodes (N + 1,) and of the accelerations in intervals (N,).
 

@@ -18,7 +18,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ocp.errors import NOT_NUMBERS, ProblemError, checked_instance, floats
+from models.checks import NOT_NUMBERS, floats
+from ocp.errors import ProblemError, require
 from ocp.motion.schedule.profile import Array, LineMotion
 from ocp.tolerances import ROUNDING_SHARE
 
@@ -154,7 +155,7 @@ class LineLimits:
             _check(name, getattr(self, name), finite, 1 if name == "speed" else 0)
         for name, kind in (("joints", JointLimits), ("tool", ToolLimits)):
             if getattr(self, name) is not None:
-                checked_instance("joint limits" if name == "joints" else "tool limits", getattr(self, name), kind)
+                require.instance("joint limits" if name == "joints" else "tool limits", getattr(self, name), kind)
 
     def of_joints(self, count: int) -> Array:
         """Return velocity, acceleration and jerk limits of `count` joints, infinite instead of 0. Shape (3, count).
@@ -217,7 +218,7 @@ def check_line(path: PathLike, limits: LineLimits, joints: JointPath | None) -> 
     if missing:
         hint = "give a SmoothPath, as models.smooth makes it"
         raise ProblemError(f"the path {path!r} has no {missing[0]}; {hint}", name="path", value=path)
-    checked_instance("limits", limits, LineLimits)
+    require.instance("limits", limits, LineLimits)
     if joints is not None:
         check_joints(joints)
         _check_still(path, limits, joints)

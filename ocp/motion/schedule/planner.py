@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ocp.console import interruptible
-from ocp.errors import ProblemError, checked_flag, sample_times
+from ocp.errors import ProblemError, require, sample_times
 from ocp.motion.schedule.grid import Grid, coarse_grid, make_grid
 from ocp.motion.schedule.limits import (
     BLOCK_SIZE,
@@ -279,7 +279,7 @@ def schedule(path: PathLike, limits: LineLimits, *, joints: JointPath | None = N
             speed violates a limit.
     """
     limited = check_line(path, limits, joints)
-    checked_flag("strict", strict)
+    require.flag("strict", strict)
     line_profile = None
     if np.isfinite(limits.jerk):
         line_profile = plan_zones(_constant_zones(np.asarray(path.bounds), path.by_piece(limits.speed), limits), {})

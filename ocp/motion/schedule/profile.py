@@ -10,7 +10,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ocp.errors import NOT_NUMBERS, ProblemError, floats
+from models.checks import NOT_NUMBERS, floats
+from ocp.errors import ProblemError
 
 __all__ = ["Array", "LineMotion", "SpeedProfile", "integrate_jerk", "join_profiles", "profile_through", "segment_index"]
 

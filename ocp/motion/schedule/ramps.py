@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from ruckig import InputParameter, Result, Ruckig, RuckigError, Trajectory
 
-from ocp.errors import ProblemError, checked_nonnegative, checked_positive
+from ocp.errors import ProblemError, require
 from ocp.motion.schedule.profile import Array, SpeedProfile, integrate_jerk
 from ocp.tolerances import ROUNDING_SHARE
 
@@ -59,9 +59,9 @@ def ramp_time(change: float, acceleration: float, jerk: float) -> float:
     Raises:
         ProblemError: The change is negative, or a limit is not positive.
     """
-    checked_nonnegative("ramp: change", change)
+    require.nonnegative("ramp: change", change)
     for name, value in (("acceleration", acceleration), ("jerk", jerk)):
-        checked_positive(f"ramp: {name}", value)
+        require.positive(f"ramp: {name}", value)
     if change * jerk >= acceleration**2:
         return change / acceleration + acceleration / jerk
     return 2 * sqrt(change / jerk)
@@ -70,7 +70,7 @@ def ramp_time(change: float, acceleration: float, jerk: float) -> float:
 def ramp_distance(first: float, last: float, acceleration: float, jerk: float) -> float:
     """Return the distance (m) of the shortest change from one speed to another; raises as ramp_time."""
     for name, value in (("first", first), ("last", last)):
-        checked_nonnegative(f"ramp: {name}", value)
+        require.nonnegative(f"ramp: {name}", value)
     return (first + last) / 2 * ramp_time(abs(last - first), acceleration, jerk)
 
 
@@ -101,7 +101,7 @@ def peak_acceleration(mean: float, speed: float, jerk: float) -> float:
         ProblemError: A value is not positive, or the jerk is too low for that mean.
     """
     for name, value in (("mean", mean), ("speed", speed), ("jerk", jerk)):
-        checked_positive(f"peak_acceleration: {name}", value)
+        require.positive(f"peak_acceleration: {name}", value)
     time = speed / mean
     square = time * time - 4 * speed / jerk
     if square < 0:
@@ -111,7 +111,7 @@ def peak_acceleration(mean: float, speed: float, jerk: float) -> float:
     return jerk * (time - sqrt(square)) / 2
 
 
-def fastest_motion(distance: float, first: float, last: float, top: float, acceleration: float, jerk: float) -> Phases:
+def fastest_motion(distance: float, first: float, last: float, limits: tuple[float, float, float]) -> Phases:
     """Return the fastest motion over a distance (m) between two speeds, with zero acceleration at both ends.
 
     ruckig computes it, in units of the distance and of the time to cover it at top speed. If its result does not close,
@@ -120,8 +120,9 @@ def fastest_motion(distance: float, first: float, last: float, top: float, accel
     Args:
         distance: m; at least the ramp_distance of the change of speed.
         first, last: Speeds, m/s, at most `top`.
-        top, acceleration, jerk: Limits, m/s, m/s^2, m/s^3.
+        limits: Largest speed `top`, acceleration and jerk, m/s, m/s^2, m/s^3.
     """
+    top, acceleration, jerk = limits
     unit = distance / top
     request = InputParameter(1)
     request.current_position, request.target_position = [0.0], [1.0]
@@ -206,12 +207,14 @@ def plan_zones(zones: Zones, cache: Memory) -> SpeedProfile:
             ends[i] = _limited(ends[i], ends[i + 1], lengths[i], limits[i])
 
     motions: list[Phases] = []
-    for (top, acceleration, jerk), length, first, last in zip(limits, lengths, ends[:-1], ends[1:], strict=True):
-        key = (length, first, last, top, acceleration, jerk)
-        if first == last == top:
-            motions.append(((length / top, 0.0),))
+    for largest, length, first, last in zip(limits, lengths, ends[:-1], ends[1:], strict=True):
+        key = (length, first, last, *largest)
+        if first == last == largest[0]:
+            motions.append(((length / first, 0.0),))
         else:
-            motions.append(cache[key] if key in cache else cache.setdefault(key, fastest_motion(*key)))
+            motions.append(
+                cache[key] if key in cache else cache.setdefault(key, fastest_motion(length, first, last, largest))
+            )
     return _profile(zones, np.array(ends), motions)
 
 
@@ -242,7 +245,7 @@ def _limited(speed: float, other_end: float, length: float, limits: tuple[float,
     return min(speed, reachable_speed(other_end, length * (1 - REACH_MARGIN), *limits[1:]))
 
 
-def reachability_passes(distance: Array, caps: Array, p: Array, q: Array, low: Array, high: Array) -> Array:
+def reachability_passes(distance: Array, caps: Array, *, p: Array, q: Array, low: Array, high: Array) -> Array:
     """Return the greatest squared speeds at nodes, from rest to rest. Shape (N + 1,).
 
     Args:

@@ -196,7 +196,7 @@ def _without_jerk(window: Window, margins: Margins) -> Array:
     q, rest = (np.concatenate([side[:, :, seat] for side in rows], axis=1) for seat in (1, 2))
     bound = np.concatenate([margins.acceleration] * 2, axis=1)
     caps[[0, -1]] = 0.0
-    return reachability_passes(window.nodes, caps, p, q, -bound - rest, bound - rest)
+    return reachability_passes(window.nodes, caps, p=p, q=q, low=-bound - rest, high=bound - rest)
 
 
 def _row_speed_caps(window: Window) -> Array:
@@ -222,7 +222,7 @@ def _with_jerk(
     shares = enforced.margins.times(seam_shares)
     requested = grid.requested[begin:end] ** 2 * seam_shares**2
     caps = np.minimum(_node_minimum(requested), _row_speed_caps(window) * _node_minimum(shares.speed) ** 2)
-    reachable, rates = reachable_bounds(nodes, caps, left, right, at_rest)
+    reachable, rates = reachable_bounds(nodes, caps, left=left, right=right, at_rest=at_rest)
     # an interval next to rest has constant jerk and is not part of the program
     low, high = int(at_rest[0]), len(nodes) - int(at_rest[1])
     rest = [0.0, 0.0]

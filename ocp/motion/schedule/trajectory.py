@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from models.checks import NOT_NUMBERS, floats
 from models.files import read_regular
-from ocp.errors import NOT_NUMBERS, ProblemError, checked_each, checked_instance, floats
+from ocp.errors import ProblemError, require
 from ocp.motion.schedule.limits import JointPath, check_joints, rates_along
 from ocp.motion.schedule.planner import Schedule
 from ocp.motion.schedule.profile import Array, LineMotion
@@ -42,7 +43,7 @@ class JointTrajectory:
     accelerations: Array
 
     def __post_init__(self) -> None:
-        names = checked_each("trajectory: names", self.names, str)
+        names = require.each("trajectory: names", self.names, str)
         if isinstance(self.names, str) or not names or len(set(names)) != len(names):
             message = f"trajectory: joint names {list(names)} must be given and distinct"
             raise ProblemError(message, name="names", value=names)
@@ -140,7 +141,7 @@ def joint_motion(joints: JointPath, motion: LineMotion) -> tuple[Array, Array, A
 
     q' v, q'' v^2 + q' a, q''' v^3 + 3 q'' v a + q' j.
     """
-    checked_instance("motion", motion, LineMotion)
+    require.instance("motion", motion, LineMotion)
     rates = rates_along(joints, motion.distance)
     v, a, j = (value[:, None] for value in (motion.speed, motion.acceleration, motion.jerk))
     velocity = rates.first * v
@@ -154,7 +155,7 @@ def joint_trajectory(schedule: Schedule, joints: JointPath, period: float) -> Jo
     Times are whole nanoseconds, those of the ROS message, and the joints are those at these times. The last time is the
     first one at or after the end, at rest.
     """
-    checked_instance("schedule", schedule, Schedule)
+    require.instance("schedule", schedule, Schedule)
     check_joints(joints)
     whole = np.round(schedule.sample(period).t * 1e9)
     whole[-1] = np.ceil(schedule.duration * 1e9)

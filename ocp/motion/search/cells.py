@@ -24,17 +24,11 @@ import scipy
 from numpy.typing import NDArray
 
 from models import FreeFloating
-from models.arrays import Array
+from models.checks import Array
 from ocp.motion.local.collisions import distances_along
 from ocp.motion.local.inverse_kinematics import Unreachable
 from ocp.motion.local.rates import LocalMotion
-from ocp.motion.search.configurations import (
-    REACH_TOLERANCE,
-    PlanRequest,
-    largest_pose_errors,
-    locate_error,
-    sampled_motions,
-)
+from ocp.motion.search.configurations import REACH_TOLERANCE, PlanRequest, largest_pose_errors, locate_error
 from ocp.motion.search.dead_end import DeadEnd
 from ocp.motion.search.reduced import LimitSide, ReducedKinematics, TaskKinematics, check_floating_reach, limit_rates
 
@@ -161,8 +155,8 @@ class CellSearch:
         request, machine, bounds = self.request, self.request.machine, self.request.bounds
         if request.start is None or not isinstance(machine, FreeFloating):
             return  # the path of the centre of mass depends on the start
-        options: dict[str, Any] = {"lower": bounds.lower, "upper": bounds.upper, "seed": request.seed}
-        options |= {"begin": error.time, "end": request.horizon}
+        assert error.time is not None
+        options: dict[str, Any] = {"interval": (error.time, request.horizon), "bounds": bounds, "seed": request.seed}
         try:
             check_floating_reach(machine, request.tasks, request.base, request.start, **options)
         except Unreachable as unreachable:
@@ -260,7 +254,7 @@ class _CellPass:
             max_rates = bounds.velocity * root
             lower = np.maximum(-max_rates, (bounds.lower - joints) / step * root)
             upper = np.minimum(max_rates, (bounds.upper - joints) / step * root)
-            rates, violations = limit_rates(rates, task.null[parents], lower, upper, max_rates)
+            rates, violations = limit_rates(rates, task.null[parents], lower, upper, max_rates=max_rates)
             limit_counts.update(map(tuple, violations[violations[:, 0] >= 0].tolist()))
             rates[violations[:, 0] >= 0] = np.nan
         displacement = np.abs(rates / root).max(axis=1) * step
@@ -274,7 +268,9 @@ class _CellPass:
         parents, rates = parents[best], rates[best]
         start_base, start_joints = layer.base[parents], layer.joints[parents]
         states = start_base, start_joints, task.select(parents)
-        base, joints, error = kinematics.step(*states, rates, layer.time, time, REACH_TOLERANCE / 10)
+        base, joints, error = kinematics.step(
+            *states, rates, interval=(layer.time, time), tolerance=REACH_TOLERANCE / 10
+        )
         cost = layer.cost[parents] + ((root * (joints - start_joints)) ** 2).sum(axis=1) / (2 * step)
         finite = np.isfinite(base).all(axis=1) & (np.abs(joints - start_joints).max(axis=1) <= self._settings.longest)
         expanded = _Layer(time, base, joints, cost, parents)
@@ -395,4 +391,4 @@ class _CellPass:
         base = np.stack([layer.base[row] for layer, row in zip(layers, paths, strict=True)], axis=1)
         joints = np.stack([layer.joints[row] for layer, row in zip(layers, paths, strict=True)], axis=1)
         joints = np.clip(joints, self.request.bounds.lower, self.request.bounds.upper)
-        return sampled_motions(times, base, joints, self.request.weights)
+        return LocalMotion.through(times, base, joints, self.request.weights)

@@ -21,7 +21,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from models.arrays import Array
+from models.checks import Array
 from ocp.errors import ProblemError
 from ocp.motion.local.ik_solver import IkBranches, ik_branches
 from ocp.motion.local.inverse_kinematics import Unreachable, inverse_kinematics_at

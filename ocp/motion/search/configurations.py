@@ -8,9 +8,10 @@ from functools import cached_property
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from models import Machine
-from models.arrays import Array
+from models.checks import Array
 from models.machines.machine import hold_joints
 from ocp.errors import ProblemError
 from ocp.motion.builders.clearance import ClearanceConstraints
@@ -18,6 +19,7 @@ from ocp.motion.builders.tool_motion import Stretch, stretches_of
 from ocp.motion.local.collisions import Collision, distances_along
 from ocp.motion.local.inverse_kinematics import Unreachable, describe_miss, inverse_kinematics, inverse_kinematics_at
 from ocp.motion.local.rates import LocalMotion, track_tasks
+from ocp.motion.search.joint_space import all_turns, turning_joints, whole_turns_between, whole_turns_into
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.goals import Cost
 from ocp.motion.tasks.limits import JointBounds, Limits
@@ -26,7 +28,7 @@ from ocp.motion.tasks.tip_task import TipTask
 __all__ = [
     "REACH_TOLERANCE", "PlanRequest", "PlannerSettings", "SearchKind", "check_clear_start",
     "count_clear_configurations", "describe_alternatives", "largest_pose_errors", "local_motions_from", "locate_error",
-    "sampled_motions", "start_collisions", "start_configurations",
+    "start_collisions", "start_configurations",
 ]  # fmt: skip
 
 SearchKind: TypeAlias = Literal["start", "configurations", "global"]
@@ -173,6 +175,13 @@ class PlanRequest:
         """Bounds of the joints."""
         return self.limits.bounds(self.machine)
 
+    @cached_property
+    def turning_joints(self) -> NDArray[np.intp]:
+        """Numbers of the joints of which whole turns are to be chosen; none if the start is given."""
+        if self.start is not None:
+            return np.zeros(0, dtype=np.intp)
+        return turning_joints(self.machine.robot, self.bounds.lower, self.bounds.upper)
+
 
 def start_configurations(request: PlanRequest) -> Array:
     """Return joint vectors at the start: collision-free ones first, then by condition. Shape (K, n)."""
@@ -247,40 +256,75 @@ def describe_alternatives(count: int | Unreachable | None) -> list[str]:
 def local_motions_from(request: PlanRequest, configurations: Array) -> list[LocalMotion]:
     """Track the tasks from all configurations (K, n) by resolved-rate control; return one result per stretch.
 
-    The damping is the least with which one of them reaches its poses.
+    Joints that can turn wholly within their limits are tracked without limits at first, since a motion is the same from
+    all turns of its start. It is then shifted by whole turns to the middle of the limits. A motion that does the tasks,
+    but leaves the limits from every turn, is tracked again within them from all turns of its start. There may
+    therefore be more than K motions, and they begin at `motions[0].joints[:, 0]`.
 
     Raises:
         Unreachable: A pose that no joints within their limits reach.
     """
-    bounds, settings = request.bounds, request.settings
-    least_damped: list[LocalMotion] = []
+    turning, lower, upper = request.turning_joints, request.bounds.lower.copy(), request.bounds.upper.copy()
+    lower[turning], upper[turning] = -np.inf, np.inf
+    motions = _track_within(request, configurations, lower, upper)
+    if turning.size:
+        motions = _within_limits(request, configurations, motions)
+    if min(largest_pose_errors(motions)) > REACH_TOLERANCE:
+        _check_reach(request, motions)
+    return motions
+
+
+def _track_within(request: PlanRequest, configurations: Array, lower: Array, upper: Array) -> list[LocalMotion]:
+    """Return local motions within limits, with the least damping for which one of them reaches its poses."""
+    settings, least_damped = request.settings, list[LocalMotion]()
     for damping in settings.dampings:
         motions: list[LocalMotion] = []
         base, joints = np.tile(request.base, (len(configurations), 1)), configurations
         for stretch in request.stretches:
             if stretch.begin > 0:
-                joints = _joints_at_new_poses(request, stretch, base, joints)
+                joints = _joints_at_new_poses(request, stretch, base, joints, lower, upper)
                 if request.stretches[len(motions) - 1].equations is None:
-                    motions[-1] = _straight_motion(motions[-1], joints)
+                    motions[-1] = motions[-1].straight_to(joints)
             steps = int(np.ceil(settings.local_steps * stretch.duration / request.horizon))
-            steps = max(steps, settings.min_intervals)
-            times = np.union1d(np.linspace(stretch.begin, stretch.end, steps + 1), stretch.nodes)
-            equations = stretch.equations
+            grid = np.linspace(stretch.begin, stretch.end, max(steps, settings.min_intervals) + 1)
+            times, equations = np.union1d(grid, stretch.nodes), stretch.equations
             if equations is None:
                 motions.append(LocalMotion.stationary(times, base, joints))
             else:
                 options: dict[str, Any] = {"weights": request.weights, "damping": damping}
-                options |= {"lower": bounds.lower, "upper": bounds.upper}
-                motions.append(track_tasks(equations, joints, base, times, **options))
+                motions.append(track_tasks(equations, joints, base, times, lower=lower, upper=upper, **options))
             base, joints = motions[-1].base[:, -1], motions[-1].joints[:, -1]
         least_damped = least_damped or motions
         if min(largest_pose_errors(motions)) <= REACH_TOLERANCE:
             return motions
-    _check_reach(request, least_damped)
     return least_damped
 
 
-def _joints_at_new_poses(request: PlanRequest, stretch: Stretch, base: Array, joints: Array) -> Array:
+def _within_limits(request: PlanRequest, configurations: Array, motions: Sequence[LocalMotion]) -> list[LocalMotion]:
+    """Return motions shifted by whole turns into the limits, or tracked again; see `local_motions_from`."""
+    turning, bounds = request.turning_joints, request.bounds
+    limits = bounds.lower[turning], bounds.upper[turning]
+    joints = np.concatenate([motion.joints for motion in motions], axis=1)[:, :, turning]
+    shifts, fits = whole_turns_into(joints, *limits)
+    tracked, inside = np.array(largest_pose_errors(motions)) <= REACH_TOLERANCE, fits.all(axis=1)
+    shifted = [motion.take(inside) for motion in motions]
+    for motion in shifted:
+        motion.joints[:, :, turning] += shifts[inside, None]
+    if inside.all():
+        return shifted
+    starts = [configurations[~inside & ~tracked]]
+    for row in np.flatnonzero(~inside & tracked):
+        start = configurations[row, turning]
+        turned = all_turns(start, np.where(fits[row], start + shifts[row], np.nan), *limits)
+        starts.append(np.repeat(configurations[row : row + 1], len(turned), axis=0))
+        starts[-1][:, turning] = turned
+    others = _track_within(request, np.concatenate(starts), bounds.lower, bounds.upper)
+    return [LocalMotion.joined(pair) for pair in zip(shifted, others, strict=True)]
+
+
+def _joints_at_new_poses(
+    request: PlanRequest, stretch: Stretch, base: Array, joints: Array, lower: Array, upper: Array
+) -> Array:
     """Return the nearest joints (K, n) that meet the poses which begin in a stretch and the tasks until then."""
     before = request.stretches[request.stretches.index(stretch) - 1]
     begins = [request.tasks[i].is_pose and new for i, new in zip(stretch.tasks, stretch.new, strict=True)]
@@ -294,25 +338,12 @@ def _joints_at_new_poses(request: PlanRequest, stretch: Stretch, base: Array, jo
         if request.machine.base_size:  # the base may bring the pose into reach
             return joints
         raise locate_error(request, error, stretch.begin) from error
-    candidates = np.array([solution.joints for solution in solutions])
-    distances = (request.weights * (joints[:, None] - candidates) ** 2).sum(axis=2)
-    return np.asarray(candidates[distances.argmin(axis=1)])
-
-
-def _straight_motion(motion: LocalMotion, joints: Array) -> LocalMotion:
-    """Return a motion without a task that leads straight to joints (K, n)."""
-    share = ((motion.t - motion.t[0]) / (motion.t[-1] - motion.t[0]))[:, None]
-    displacement = (joints - motion.joints[:, 0])[:, None]
-    rates = np.repeat(displacement / (motion.t[-1] - motion.t[0]), len(motion.t), axis=1)
-    return replace(motion, joints=motion.joints[:, :1] + share * displacement, rates=rates)
-
-
-def sampled_motions(times: Array, base: Array, joints: Array, weights: Array) -> LocalMotion:
-    """Return K motions through configurations (K, M, n) at times (M,), with rates by forward differences."""
-    rates = np.diff(joints, axis=1) / np.diff(times)[:, None]
-    cost = np.einsum("kmn,n,m->k", rates**2, weights, np.diff(times)) / 2
-    rates, zeros = np.concatenate([rates, rates[:, -1:]], axis=1), np.zeros(len(joints))
-    return LocalMotion(times, base, joints, rates, np.asarray(cost), zeros, zeros)
+    turning, candidates = request.turning_joints, [solution.joints for solution in solutions]
+    turned = np.tile(candidates, (len(joints), 1, 1))
+    limits = lower[turning], upper[turning]
+    turned[:, :, turning] += whole_turns_between(turned[:, :, turning], joints[:, None, turning], *limits)
+    distances = (request.weights * (joints[:, None] - turned) ** 2).sum(axis=2)
+    return np.asarray(turned[np.arange(len(joints)), distances.argmin(axis=1)])
 
 
 def largest_pose_errors(motions: Sequence[LocalMotion]) -> list[float]:
@@ -346,9 +377,6 @@ def locate_error(request: PlanRequest, error: Unreachable, time: float) -> Unrea
             places.append(f"task {number} is at {np.round(targets[:3], 6).tolist()} m")
     where = f" ({', '.join(places)})" if places else ""
     return Unreachable(f"at {time:.4g} s{where}: {error}", **{**vars(error), "time": time})
-
-
-# ---- end of the reach ------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

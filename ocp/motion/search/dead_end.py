@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from models.arrays import Array
+from models.checks import Array
 from ocp.errors import SolveError
 from ocp.motion.builders.clearance import LOOKS, MARGIN, ROUNDING
 from ocp.motion.local.collisions import distances_along, find_collisions
@@ -134,6 +134,7 @@ class DeadEnd(SolveError):
         until: float = np.nan,
         obstructions: tuple[Obstruction, ...] = (),
         relaxations: tuple[Relaxation, ...] = (),
+        *,
         segments: int | None = None,
         **details: Any,
     ) -> None:
@@ -142,7 +143,7 @@ class DeadEnd(SolveError):
 
     def __reduce__(self) -> Any:
         """Pickle the error with its arguments and fields."""
-        return type(self), (*self.args, self.until, self.obstructions, self.relaxations, self.segments), self.__dict__
+        return type(self), (*self.args, self.until, self.obstructions, self.relaxations), self.__dict__
 
 
 def dead_end(
@@ -184,7 +185,7 @@ def dead_end(
         words += f"; with {count} on the way one may: search='segments'"
     time, until = float(search.times[max(last, 0)]), float(search.times[last + 1])
     details = {"name": smallest.name, "value": smallest.value, "limit": smallest.limit, "time": time}
-    return DeadEnd(words, until, tuple(obstructions), tuple(relaxations), segments, **details)
+    return DeadEnd(words, until, tuple(obstructions), tuple(relaxations), segments=segments, **details)
 
 
 class _Propagation:

@@ -7,6 +7,7 @@ motion.
 
 A torso that carries the arm of a task carries other limbs as well. A global search of an arm that has more free
 directions than it can cover holds such joints, so that its lower bound holds for motions with the torso where it is.
+The last joint of an arm whose roll is free may change nothing but itself. It is fixed at the start only.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from warnings import warn
 import numpy as np
 
 from models import Machine, ModelWarning, Robot
-from models.arrays import Array
+from models.checks import Array
 from models.shapes.bodies import RigidParts
 from ocp.errors import ProblemError, SolveError
 from ocp.motion.local.ik_solver import idle_positions
@@ -83,8 +84,9 @@ def hold_idle_joints(request: PlanRequest) -> PlanRequest:
 def place_held_joints(whole: PlanRequest, request: PlanRequest) -> tuple[PlanRequest, Array]:
     """Return the request with its held joints well placed, and its configurations at the start, (K, m).
 
-    Held joints stay where they are if any configuration is collision-free there, and else take the nearest positions
-    found with one. A global search may hold further joints, see `_hold_shared_joints`.
+    Held joints stay where they are if any configuration is collision-free there. Otherwise they take the nearest
+    sampled positions with a collision-free configuration. A global search may hold further joints, see
+    `_hold_shared_joints`.
 
     Args:
         whole: Request before joints were held.
@@ -105,7 +107,8 @@ def place_held_joints(whole: PlanRequest, request: PlanRequest) -> tuple[PlanReq
 def _place_idle_joints(whole: PlanRequest, request: PlanRequest, configurations: Array) -> PlanRequest:
     """Return the request with its held joints at the nearest positions with a collision-free configuration of (K, m).
 
-    If held bodies of the machine collide with each other wherever they are, that is ignored.
+    If held bodies of the machine collide with each other wherever they are, that is ignored. So are configurations that
+    collide wherever the held joints are, unless all do.
     """
     robot, own = whole.machine.robot, _own_held(whole, request)
     if whole.clearance_constraints is None or whole.start is not None or not own:
@@ -201,7 +204,7 @@ def fix_ignorable_joints(request: PlanRequest, configurations: Array) -> tuple[A
 
 
 def moved_aside(whole: PlanRequest, request: PlanRequest, error: SolveError) -> PlanRequest | None:
-    """Return the request with those joints elsewhere that move a body of a collision, clear of a local motion.
+    """Return the request with those held joints elsewhere that move a body of a collision, clear of a local motion.
 
     Args:
         whole: Request before joints were held.
@@ -265,8 +268,8 @@ def _nearest_positions(whole: PlanRequest, held: Mapping[str, float]) -> list[di
 def _hold_shared_joints(request: PlanRequest, configurations: Array) -> PlanRequest:
     """Return the request with so many joints held that a global search can cover the other free directions.
 
-    Only joints that carry a limb of which no task asks anything are held, those nearest to the root first: at the
-    start, or where the lowest-cost local motion begins that leaves them nearly still.
+    Only joints that carry a limb without a task are held, those nearest to the root first. They are held at the start
+    of the motion if it is given, otherwise where the lowest-cost local motion begins that leaves them nearly still.
 
     Args:
         request: The request, without idle joints.
@@ -285,7 +288,7 @@ def _hold_shared_joints(request: PlanRequest, configurations: Array) -> PlanRequ
     costs = np.sum([motion.cost for motion in motions], axis=0)
     tracked = np.array(largest_pose_errors(motions)) <= REACH_TOLERANCE
     best = int(np.where(tracked | ~tracked.any(), costs, np.inf).argmin())
-    return request.with_held(_named(request.machine, configurations[best], columns))
+    return request.with_held(_named(request.machine, motions[0].joints[best, 0], columns))
 
 
 def _shared_joints(request: PlanRequest) -> list[int]:

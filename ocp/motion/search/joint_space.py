@@ -10,11 +10,21 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from models import Machine
-from models.arrays import Array
+from models import Machine, Robot
+from models.checks import Array
 from ocp.motion.tasks.equations import TaskEquations
 
-__all__ = ["FULL_TURN", "MAX_STEP", "TOLERANCE", "JointSpace", "TasksWithFixedJoints"]
+__all__ = [
+    "FULL_TURN",
+    "MAX_STEP",
+    "TOLERANCE",
+    "JointSpace",
+    "TasksWithFixedJoints",
+    "all_turns",
+    "turning_joints",
+    "whole_turns_between",
+    "whole_turns_into",
+]
 
 Indices = NDArray[np.intp]
 
@@ -112,3 +122,67 @@ class TasksWithFixedJoints(TaskEquations):
     def _symbols(self) -> tuple[Any, Any, Any]:
         base, joints, targets = super()._symbols
         return base, joints, ca.SX.sym("targets", targets.numel() + len(self.fixed))
+
+
+# ---- whole turns of limited joints -----------------------------------------------------------------------------------
+
+
+def turning_joints(robot: Robot, lower: Array, upper: Array) -> NDArray[np.intp]:
+    """Return the numbers of the joints that a whole turn does not change, though they have limits.
+
+    They are revolute, have no followers, and their limits are at least a whole turn apart.
+
+    Args:
+        robot: The robot.
+        lower, upper: Limits. Shape (n,), rad or m.
+    """
+    leaders = np.bincount([coupling.column for coupling in robot.couplings.values()], minlength=robot.dof)
+    revolute = np.array([joint.kind != "prismatic" for joint in robot.moving_joints])
+    limited = np.isfinite(lower) | np.isfinite(upper)
+    return np.flatnonzero(revolute & (leaders == 1) & limited & (upper - lower >= FULL_TURN - TOLERANCE))
+
+
+def whole_turns_between(start: Array, end: Array, lower: Any = -np.inf, upper: Any = np.inf) -> Array:
+    """Return the whole turns within limits that move angles as close as possible to others, rad."""
+    least, greatest = np.ceil((lower - start) / FULL_TURN), np.floor((upper - start) / FULL_TURN)
+    return np.asarray(FULL_TURN * np.clip(np.round((end - start) / FULL_TURN), least, greatest))
+
+
+def whole_turns_into(joints: Array, lower: Array, upper: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Return the whole turns that move motions to the middle of the limits, and for which joints they then fit.
+
+    Args:
+        joints: Motions of k joints. Shape (K, M, k), rad.
+        lower, upper: Limits, at least one of each joint finite. Shape (k,).
+
+    Returns:
+        Shapes (K, k): turns, rad; whether all samples are within the limits. No other turns fit where these do not.
+    """
+    least, greatest = joints.min(axis=1), joints.max(axis=1)
+    # away from a limit without a counterpart, a motion has room as between limits that are far apart
+    low = np.where(np.isfinite(lower), lower, upper - (greatest - least) - 2 * FULL_TURN)
+    high = np.where(np.isfinite(upper), upper, lower + (greatest - least) + 2 * FULL_TURN)
+    with np.errstate(invalid="ignore"):  # a motion that diverges fits nowhere
+        turns = whole_turns_between((least + greatest) / 2, (low + high) / 2)
+        return turns, (least + turns >= lower - TOLERANCE) & (greatest + turns <= upper + TOLERANCE)
+
+
+def all_turns(joints: Array, known: Array, lower: Array, upper: Array) -> Array:
+    """Return a configuration with all combinations of whole turns of its joints within the limits.
+
+    Args:
+        joints: Angles. Shape (k,), rad.
+        known: Angles of joints that keep their turn; nan for the others. Shape (k,).
+        lower, upper: Limits, at least one of each joint finite. Shape (k,).
+
+    Returns:
+        Shape (m, k), rad. A joint with one limit has the two turns next to it.
+    """
+    turns = list[Array]()
+    for angle, fixed, low, high in zip(joints, known, lower, upper, strict=True):
+        least = np.ceil((low - angle) / FULL_TURN - TOLERANCE)
+        greatest = np.floor((high - angle) / FULL_TURN + TOLERANCE)
+        least = greatest - 1 if np.isinf(least) else least
+        greatest = least + 1 if np.isinf(greatest) else greatest
+        turns.append(angle + FULL_TURN * np.arange(least, greatest + 1) if np.isnan(fixed) else np.array([fixed]))
+    return np.stack(np.meshgrid(*turns, indexing="ij"), axis=-1).reshape(-1, len(joints))

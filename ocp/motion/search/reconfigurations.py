@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from models.arrays import Array
+from models.checks import Array
 from ocp.motion.search.charts import Charts, SelfMotionManifolds, SplitCharts
 from ocp.motion.search.joint_space import FULL_TURN, TasksWithFixedJoints
 from ocp.motion.search.search import AtlasSearch
@@ -238,7 +238,7 @@ class SectionSettings:
 
 
 def section_values(
-    prismatic: bool, lower: float, upper: float, max_step: float, settings: SectionSettings = SectionSettings()
+    prismatic: bool, lower: float, upper: float, max_step: float, *, settings: SectionSettings = SectionSettings()
 ) -> Array:
     """Return the values at which a joint is fixed: evenly spaced over its range. Shape (V,), rad or m.
 

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models import FreeFloating, Machine, center_of_mass
-from models.arrays import Array
+from models.checks import Array
 from models.spatial import rotation, rotation_from_quaternion
 from ocp.motion.local.inverse_kinematics import (
     Unreachable,
@@ -32,6 +32,7 @@ from ocp.motion.local.inverse_kinematics import (
 )
 from ocp.motion.search.joint_space import TOLERANCE
 from ocp.motion.tasks.equations import TaskEquations, bind
+from ocp.motion.tasks.limits import JointBounds
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.values import Sampler
 from ocp.tolerances import ROUNDING_SHARE
@@ -154,14 +155,22 @@ class ReducedKinematics:
         return np.linalg.norm(errors, axis=1), np.linalg.norm(task.right[:, rows], axis=1)
 
     def step(
-        self, base: Array, joints: Array, task: TaskKinematics, rates: Array, begin: float, end: float, tolerance: float
+        self,
+        base: Array,
+        joints: Array,
+        task: TaskKinematics,
+        rates: Array,
+        *,
+        interval: tuple[float, float],
+        tolerance: float,
     ) -> tuple[Array, Array, Array]:
-        """Advance states by the midpoint rule with the self-motions of scaled rates (K, n).
+        """Advance states over an interval of time by the midpoint rule with the self-motions of scaled rates (K, n).
 
         Returns:
             Base (K, b), joints (K, n) and remaining pose errors (K,), which are corrected down to the tolerance.
         """
-        duration, start_joints = end - begin, joints
+        (begin, end), start_joints = interval, joints
+        duration = end - begin
         half_base = base + duration / 2 * (task.base_rates(rates) + task.drift)
         middle = self.at(_normalize(half_base), joints + duration / 2 * rates / self.root, begin + duration / 2)
         rates = middle.least_rates(middle.right) + middle.null_rates(task.null_rates(rates))
@@ -184,6 +193,7 @@ class ReducedKinematics:
         joints: Array,
         time: float,
         tolerance: float,
+        *,
         max_steps: int = 3,
         remaining: Callable[[TaskKinematics, Array], Array] | None = None,
     ) -> tuple[Array, Array, Array]:
@@ -220,7 +230,7 @@ def _normalize(base: Array) -> Array:
 
 
 def limit_rates(
-    rates: Array, null: Array, lower: Array, upper: Array, max_rates: Array
+    rates: Array, null: Array, lower: Array, upper: Array, *, max_rates: Array
 ) -> tuple[Array, NDArray[np.intp]]:
     """Change scaled rates (K, n) along self-motions so that each joint keeps its limits.
 
@@ -261,6 +271,8 @@ STARTS = 64
 """Random joints and attitudes from which inverse kinematics starts at each time."""
 PLACE_TOLERANCE = 1e-4
 """m or rad: largest error of a pose that is reached."""
+CHECKED_TIMES = 17
+"""Times at which the reach is evaluated before the bisection."""
 
 
 def check_floating_reach(
@@ -268,13 +280,10 @@ def check_floating_reach(
     tasks: Sequence[TipTask],
     base: Array,
     start: Array,
-    begin: float,
-    end: float,
     *,
-    lower: Array,
-    upper: Array,
+    interval: tuple[float, float],
+    bounds: JointBounds,
     seed: int = 0,
-    samples: int = 17,
 ) -> None:
     """Raise Unreachable if a pose is out of reach for any attitude, by multi-start inverse kinematics.
 
@@ -284,14 +293,15 @@ def check_floating_reach(
         machine: Free-floating machine with conserved momentum.
         tasks: All tasks, each in its own time.
         base, start: Base and joints at 0 s. Shapes (base_size,), (n,).
-        begin, end: Checked interval of time, s.
-        lower, upper: Limits of the joints. Shape (n,).
+        interval: Begin and end of the time that is checked, s, at CHECKED_TIMES samples. The interval before an
+            unreachable pose is bisected to a 2**10th.
+        bounds: Limits of the joints.
         seed: Seed of the random starts.
-        samples: Checked times. The interval before an unreachable pose is bisected to a 2**10th.
 
     Raises:
         Unreachable: Names the time from which a pose is out of reach, and the least pose error.
     """
+    (begin, end), lower, upper = interval, bounds.lower, bounds.upper
     n, attitude_size = machine.joint_size, 1 if machine.base_size == 3 else 4
     rng = np.random.default_rng(seed)
     attitudes = rng.normal(size=(STARTS, 4)) if attitude_size == 4 else rng.uniform(-np.pi, np.pi, (STARTS, 1))
@@ -327,11 +337,11 @@ def check_floating_reach(
         return unreachable_error(equations, candidates[best, :n], float(errors[best]), lower, upper, misses=misses)
 
     reached = begin
-    for time in np.linspace(begin, end, samples).tolist():
+    for time in np.linspace(begin, end, CHECKED_TIMES).tolist():
         if (error := unreachable_at(time)) is None:
             reached = time
             continue
-        while time - reached > (end - begin) / (samples - 1) / 2**10:
+        while time - reached > (end - begin) / (CHECKED_TIMES - 1) / 2**10:
             middle = (reached + time) / 2
             if (unreachable_then := unreachable_at(middle)) is None:
                 reached = middle

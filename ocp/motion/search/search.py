@@ -24,13 +24,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models import CollisionScene
-from models.arrays import Array
+from models.checks import Array
 from ocp.errors import BoundWarning
 from ocp.motion.local.collisions import distances_along
 from ocp.motion.local.inverse_kinematics import Unreachable
 from ocp.motion.search.charts import Charts, SplitCharts, TimeSample, point_chart
 from ocp.motion.search.joint_space import MAX_STEP, TOLERANCE, JointSpace
-from ocp.motion.search.steps import QuadraticBounds, StepCost
+from ocp.motion.search.steps import QuadraticBounds, Steps
 from ocp.motion.search.value import PENALTY, ChartGraph, shorten_path
 from ocp.tolerances import ROUNDING_SHARE
 
@@ -93,9 +93,7 @@ class AtlasSearch:
         self,
         space: JointSpace,
         samples: Sequence[TimeSample],
-        times: Array,
-        cost: StepCost,
-        limits: Array,
+        steps: Steps,
         *,
         seeds: Callable[[int], Array],
         start: Array | None = None,
@@ -104,21 +102,20 @@ class AtlasSearch:
     ) -> None:
         """
         Args:
-                space: Joint space.
-                samples: Manifolds of the time samples, by rising time.
-                times: Times of the samples, s. Shape (K,).
-                cost: Cost of a step between two samples.
-                limits: Largest step of each joint between samples. Shape (K - 1, n).
-                seeds: Returns configurations (M, n) at a sample, on as many components as possible; raises Unreachable.
-                start: Configuration at the first sample, if given. Shape (n,).
-                scene: Collision scene, or None.
-                settings: Settings of the search.
+            space: Joint space.
+            samples: Manifolds of the time samples, by rising time.
+            steps: Steps between the samples.
+            seeds: Returns configurations (M, n) at a sample, on as many components as possible; raises Unreachable.
+            start: Configuration at the first sample, if given. Shape (n,).
+            scene: Collision scene, or None.
+            settings: Settings of the search.
 
         Raises:
             Unreachable: At some sample no configuration does the tasks within limits.
             ProblemError: The atlas needs too many charts.
         """
-        self.space, self.samples, self.times, self.cost, self.limits = space, samples, times, cost, limits
+        self.space, self.samples = space, samples
+        self.times, self.cost, self.limits = steps.times, steps.cost, steps.limits
         self.start, self.scene, self.settings = start, scene, settings
         self._cost_bounds: tuple[ChartGraph, list[QuadraticBounds], list[QuadraticBounds] | None] | None = None
         self.atlas = self._build_atlas(seeds)
@@ -168,7 +165,11 @@ class AtlasSearch:
     def graph(self, layers: list[Charts], max_costs: Any = np.inf) -> ChartGraph:
         """Return the graph of steps between charts, each step costing at most `max_costs`, one or shape (K - 1,)."""
         max_costs = np.broadcast_to(max_costs, len(self.times) - 1)
-        return ChartGraph(self.space, layers, np.diff(self.times), self.cost, self.limits, max_costs)
+        return ChartGraph(self.space, layers, self._steps, max_costs)
+
+    @property
+    def _steps(self) -> Steps:
+        return Steps(self.times, self.cost, self.limits)
 
     def full_graph(self) -> ChartGraph:
         """Return the graph of all steps between the initial charts."""
@@ -425,12 +426,12 @@ class AtlasSearch:
     def _shorten(self, path: Array | None, layers: list[Charts]) -> Array | None:
         """Shorten a path within its charts unless that causes a collision; return None if it is too fast."""
         bounds = self.space.lower, self.space.upper
-        steps = self.cost, self.times, self.limits
         if path is None:
             return None
         if self.start is None:
             radius = max(float(charts.radii.max()) for charts in layers)
-            shortened = shorten_path(path, self.samples, *steps, bounds, self.scene, (radius / 2, radius / 64))
+            options: dict[str, Any] = {"bounds": bounds, "scene": self.scene, "widths": (radius / 2, radius / 64)}
+            shortened = shorten_path(path, self.samples, self._steps, **options)
             valid = all(self._project(k, joints) is not None for k, joints in enumerate(shortened))
             path = shortened if valid else path
         return path if (np.abs(np.diff(path, axis=0)) <= self.limits + TOLERANCE).all() else None

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from models.arrays import Array
+from models.checks import Array
 from ocp.motion.search.charts import Charts
 
 __all__ = [
@@ -61,6 +61,21 @@ class QuadraticBounds(NamedTuple):
         return np.asarray(self.least + (places * (self.slope + products / 2)).sum(axis=1))
 
 
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """Steps of motions from each of K time samples to the next.
+
+    Attributes:
+        times: Times of the samples, s. Shape (K,).
+        cost: Cost of a step.
+        limits: Largest step of each joint. Shape (K - 1, n).
+    """
+
+    times: Array
+    cost: StepCost
+    limits: Array
+
+
 class CurvedCharts(NamedTuple):
     """Charts with the quadratic deviation of the manifold, bends[t, t] / 2, and its residuals.
 
@@ -90,7 +105,7 @@ class StepCost(ABC):
 
     @abstractmethod
     def lower_bounds(
-        self, delta: Array, source: CurvedCharts, target: CurvedCharts, after: QuadraticBounds, seconds: float
+        self, delta: Array, source: CurvedCharts, target: CurvedCharts, after: QuadraticBounds, *, seconds: float
     ) -> StepBounds:
         """Return lower bounds of P steps between charts whose centres are `delta` (P, n) apart."""
 
@@ -131,7 +146,7 @@ class SquaredRates(StepCost):
         return self.evaluate(delta, seconds) + after.least + least, place
 
     def lower_bounds(
-        self, delta: Array, source: CurvedCharts, target: CurvedCharts, after: QuadraticBounds, seconds: float
+        self, delta: Array, source: CurvedCharts, target: CurvedCharts, after: QuadraticBounds, *, seconds: float
     ) -> StepBounds:
         start, end = source.charts, target.charts
         displacement, column_weights = _rows_last(delta), self.weights[:, None]
@@ -339,7 +354,7 @@ class Homogeneous(StepCost):
         return cost, place
 
     def lower_bounds(
-        self, delta: Array, source: CurvedCharts, target: CurvedCharts, after: QuadraticBounds, seconds: float
+        self, delta: Array, source: CurvedCharts, target: CurvedCharts, after: QuadraticBounds, *, seconds: float
     ) -> StepBounds:
         return HomogeneousBounds(self, delta, source, target, after)
 

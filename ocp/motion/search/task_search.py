@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from models.arrays import Array
+from models.checks import Array
 from ocp.errors import ProblemError
 from ocp.motion.local.inverse_kinematics import Unreachable
 from ocp.motion.local.rates import LocalMotion
@@ -21,13 +21,12 @@ from ocp.motion.search.configurations import (
     largest_pose_errors,
     local_motions_from,
     locate_error,
-    sampled_motions,
 )
 from ocp.motion.search.dead_end import DeadEnd, dead_end
 from ocp.motion.search.joint_space import FULL_TURN, JointSpace
 from ocp.motion.search.reconfigurations import fewest_segments, segment_ends
 from ocp.motion.search.search import MAX_FREE_DIRECTIONS, AtlasSearch
-from ocp.motion.search.steps import SquaredRates
+from ocp.motion.search.steps import SquaredRates, Steps
 from ocp.motion.tasks.equations import TaskEquations
 
 __all__ = ["TaskSearch"]
@@ -117,7 +116,7 @@ class TaskSearch:
             steps = int(np.ceil(settings.steps * stretch.duration / request.horizon))
             lost = settings.lost[max(free_directions, 0)]
             joints, periodic = motion.joints[best], self.space.periodic
-            chosen = choose_samples(motion.t, joints, request.weights, lost, steps, periodic=periodic)
+            chosen = choose_samples(motion.t, joints, request.weights, lost, min_steps=steps, periodic=periodic)
             shared = bool(times) and chosen[0] <= times[-1][-1]  # the stretch before ends there
             times.append(chosen[1:] if shared else chosen)
         if not times:
@@ -143,7 +142,8 @@ class TaskSearch:
         scene = None if request.clearance_constraints is None else request.clearance_constraints.scene
         limits = request.bounds.velocity * np.diff(self.times)[:, None]
         options: dict[str, Any] = {"seeds": self._seeds, "start": request.start, "scene": scene}
-        self._search = AtlasSearch(self.space, samples, self.times, SquaredRates(request.weights), limits, **options)
+        steps = Steps(self.times, SquaredRates(request.weights), limits)
+        self._search = AtlasSearch(self.space, samples, steps, **options)
 
     def _manifolds(self, equations: TaskEquations, times: Array) -> SelfMotionManifolds:
         """Return the self-motion manifolds at some times."""
@@ -245,12 +245,12 @@ class TaskSearch:
                 samples = manifolds.project(indices, samples.reshape(-1, n))[0].reshape(samples.shape)
             samples = np.clip(samples, request.bounds.lower, request.bounds.upper)
             base = np.zeros((count, len(times), 0))
-            motions.append(sampled_motions(times, base, samples, request.weights))
+            motions.append(LocalMotion.through(times, base, samples, request.weights))
         return motions
 
 
 def choose_samples(
-    t: Array, joints: Array, weights: Array, share: float, min_steps: int, *, periodic: NDArray[np.bool_]
+    t: Array, joints: Array, weights: Array, share: float, *, min_steps: int, periodic: NDArray[np.bool_]
 ) -> Array:
     """Return as few times of a motion (M,) as possible such that straight steps lose at most a share of its cost.
 

@@ -29,11 +29,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models import CollisionScene
-from models.arrays import Array
+from models.checks import Array
 from ocp.motion.local.collisions import distances_along
 from ocp.motion.search.charts import Charts, TimeSample
 from ocp.motion.search.joint_space import MAX_STEP, JointSpace
-from ocp.motion.search.steps import CurvedCharts, QuadraticBounds, StepBounds, StepCost
+from ocp.motion.search.steps import CurvedCharts, QuadraticBounds, StepBounds, Steps
 from ocp.tolerances import CLEARANCE_TOLERANCE_M
 
 __all__ = ["PENALTY", "ChartGraph", "GraphSettings", "ShorteningSettings", "shorten_path"]
@@ -67,23 +67,21 @@ class ChartGraph:
         self,
         space: JointSpace,
         layers: list[Charts],
-        seconds: Array,
-        cost: StepCost,
-        limits: Array,
+        steps: Steps,
         max_costs: Array,
+        *,
         settings: GraphSettings = GraphSettings(),
     ) -> None:
         """
         Args:
             space: Joint space.
             layers: Charts of each time sample.
-            seconds: Durations from each sample to the next, s. Shape (K - 1,).
-            cost: Cost of a step.
-            limits: Largest step of each joint. Shape (K - 1, n).
+            steps: Steps between the samples.
             max_costs: Largest cost of a step. Shape (K - 1,).
             settings: Settings of the graph.
         """
-        self.space, self.layers, self.seconds, self.cost, self.limits = space, layers, seconds, cost, limits
+        self.space, self.layers, self.seconds = space, layers, np.diff(steps.times)
+        self.cost, self.limits = steps.cost, steps.limits
         self.max_costs, self.settings = max_costs, settings
 
     @cached_property
@@ -216,7 +214,7 @@ class ChartGraph:
             promising = (lower <= _least_of_groups(upper, i)) & (known_costs[i] + lower < max_cost)
             i, j, delta = i[promising], j[promising], delta[promising]
             ends = self.curved[k].select(i), self.curved[neighbour].select(j)
-            steps = self.cost.lower_bounds(delta, *ends, after.select(j), seconds)
+            steps = self.cost.lower_bounds(delta, *ends, after.select(j), seconds=seconds)
             if known_bounds is not None:
                 affordable = np.flatnonzero(
                     _bound_with_rest(steps, source.select(i), known_bounds.select(i)) < max_cost
@@ -398,9 +396,8 @@ class ShorteningSettings:
 def shorten_path(
     path: Array,
     samples: Sequence[TimeSample],
-    cost: StepCost,
-    times: Array,
-    limits: Array,
+    steps: Steps,
+    *,
     bounds: tuple[Array, Array],
     scene: CollisionScene | None,
     widths: tuple[float, float],
@@ -411,14 +408,13 @@ def shorten_path(
     Args:
         path: Configurations that do the tasks at the samples. Shape (K, n).
         samples: Manifolds of the samples, all of dimension one or all of two; others leave the path unchanged.
-        cost: Cost of a step.
-        times: Times of the samples, s. Shape (K,).
-        limits: Largest step of each joint. Shape (K - 1, n).
+        steps: Steps between the samples.
         bounds: Lower and upper limits of the joints. Shape (n,) each.
         scene: Collision scene, or None.
         widths: Initial and final spacing of the configurations, in the metric.
     """
     joints, (width, finest), best_cost, moves = path, widths, np.inf, 0
+    times, cost, limits = steps.times, steps.cost, steps.limits
     manifolds = {sample.manifolds for sample in samples}
     sizes = {manifold.size for manifold in manifolds}
     if sizes not in ({1}, {2}):
@@ -445,9 +441,9 @@ def shorten_path(
         for k in range(1, len(joints)):
             displacements = candidates[k][None] - candidates[k - 1][:, None]
             excess = np.maximum(np.abs(displacements) - limits[k - 1], 0.0).sum(axis=2)
-            steps = values[:, None] + cost.evaluate(displacements, times[k] - times[k - 1]) + PENALTY * excess
-            back_pointers.append(steps.argmin(axis=0))
-            values = steps.min(axis=0) + PENALTY * violations[k]
+            costs = values[:, None] + cost.evaluate(displacements, times[k] - times[k - 1]) + PENALTY * excess
+            back_pointers.append(costs.argmin(axis=0))
+            values = costs.min(axis=0) + PENALTY * violations[k]
         choice = [int(values.argmin())]
         for pointers in reversed(back_pointers):
             choice.append(int(pointers[choice[-1]]))

@@ -11,15 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models import Joint, Machine
-from models.arrays import Array, warn_of_degrees
-from ocp.errors import NOT_NUMBERS, ProblemError, checked_positive, floats, format_distinct
+from models.checks import Array, warn_of_degrees
+from ocp.errors import ProblemError, format_distinct, require
 from ocp.motion.tasks.equations import TaskEquations
 from ocp.motion.tasks.tip_task import ANGULAR, BoundTask, TipTask, is_holonomic, target_size
 
 __all__ = [
-    "check_closed", "check_length", "check_rest", "check_speed", "checked_configuration", "checked_horizon",
-    "checked_numbers", "checked_tasks", "checked_weights", "clip_to_limits", "dependent_rows", "horizon_of",
-    "ignorable_joints", "nonnegative_each", "rates_at_rest",
+    "check_closed", "check_length", "check_rest", "check_speed", "checked_configuration",
+    "checked_tasks", "checked_weights", "clip_to_limits", "dependent_rows", "horizon_of",
+    "ignorable_joints", "rates_at_rest",
 ]  # fmt: skip
 
 
@@ -50,11 +50,6 @@ class CheckSettings:
 CHECKS = CheckSettings()
 
 
-def checked_horizon(horizon: Any) -> float:
-    """Return the horizon; ProblemError unless it is a positive, finite number."""
-    return float(checked_positive("horizon", horizon))
-
-
 def horizon_of(tasks: Sequence[TipTask], horizon: Any) -> float:
     """Return the horizon, s; None stands for the time at which the last task ends.
 
@@ -67,7 +62,7 @@ def horizon_of(tasks: Sequence[TipTask], horizon: Any) -> float:
             words = "horizon is missing: no task has a duration; give horizon=... in s"
             raise ProblemError(words, name="horizon")
         horizon = max(ends)
-    return checked_horizon(horizon)
+    return require.positive("horizon", horizon)
 
 
 def checked_configuration(machine: Machine, joints: Any, base: Any) -> tuple[Array, Array]:
@@ -82,12 +77,12 @@ def checked_configuration(machine: Machine, joints: Any, base: Any) -> tuple[Arr
     if joints is None:
         words = "start_joints are missing; inverse_kinematics(machine, task) finds some for a pose"
         raise ProblemError(words, name="start_joints")
-    positions = checked_numbers(joints, machine.joint_size, "start_joints", "one entry for each joint")
+    positions = require.array("start_joints", joints, (machine.joint_size,), meaning="one entry for each joint")
     for joint, angle in zip(machine.robot.moving_joints, positions, strict=True):
         if joint.kind != "prismatic":
-            warn_of_degrees(angle, "start_joints", joint.name, f"joint {joint.name!r} at")
+            warn_of_degrees(f"start_joints: joint {joint.name!r} at", angle, joint.name)
     home = machine.base_home() if base is None else base
-    base_values = checked_numbers(home, machine.base_size, "start_base", "the machine's base configuration")
+    base_values = require.array("start_base", home, (machine.base_size,), meaning="the machine's base configuration")
     if machine.base_size == 7 and abs(np.linalg.norm(base_values[3:]) - 1) > 1e-9:
         words = f"start_base has the quaternion {base_values[3:].tolist()}, which is not of unit length"
         raise ProblemError(words, name="start_base", value=base_values[3:])
@@ -120,41 +115,9 @@ def checked_weights(weights: Any, size: int) -> Array:
     """Return weights of the squared joint rates, ones if None; ProblemError unless all are positive. Shape (size,)."""
     if weights is None:
         return np.ones(size)
-    array = checked_numbers(weights, size, "weights", "one for each joint")
+    array = require.array("weights", weights, (size,), meaning="one for each joint")
     if not (array > 0).all():
         raise ProblemError(f"weights {array.tolist()} must be positive", name="weights", value=array, limit=0.0)
-    return array
-
-
-def nonnegative_each(label: str, value: Any, size: int | None) -> Array:
-    """Return nonnegative finite numbers, one or with a size that many; raise ProblemError for others."""
-    name = label.rpartition(" ")[2]
-    try:
-        numbers = floats(value).reshape(-1)
-    except NOT_NUMBERS as error:
-        words = f"{label} must be one number or one for each joint, not {value!r}"
-        raise ProblemError(words, name=name, value=value) from error
-    if not numbers.size or not (np.isfinite(numbers) & (numbers >= 0)).all():
-        raise ProblemError(f"{label} must be zero or above, and finite: {value!r}", name=name, value=value, limit=0.0)
-    if size is None:
-        return numbers
-    if numbers.size not in (1, size):
-        words = f"{label} must have one number or {size}, not {numbers.size}"
-        raise ProblemError(words, name=name, value=numbers.size, limit=size)
-    return np.array(np.broadcast_to(numbers, size))
-
-
-def checked_numbers(value: Any, size: int, what: str, meaning: str) -> Array:
-    """Return `size` finite numbers as a flat array; ProblemError with name and meaning if they are not."""
-    try:
-        array = floats(value).ravel()
-    except NOT_NUMBERS as error:
-        raise ProblemError(f"{what} {value!r} is not numeric", name=what, value=value) from error
-    if array.shape != (size,):
-        words = f"{what} has {array.size} entries, expected {size}: {meaning}"
-        raise ProblemError(words, name=what, value=array, limit=size)
-    if not np.isfinite(array).all():
-        raise ProblemError(f"{what} {array.tolist()} is not finite", name=what, value=array)
     return array
 
 

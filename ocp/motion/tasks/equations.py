@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models import FixedBase, FreeFloating, Machine, ModelError, Robot, Standing
-from models.arrays import Array
+from models.checks import Array
 from models.machines.machine import with_tip
 from models.robot.kinematics import manipulability_of
 from models.spatial import on_scalars
-from ocp.errors import ProblemError, checked_each
+from ocp.errors import ProblemError, require
 from ocp.motion.tasks.tip_task import (
     ANGULAR,
     BoundTask,
@@ -463,7 +463,7 @@ def bind(machine: Machine, tasks: TipTask | Sequence[TipTask]) -> TaskEquations:
     if isinstance(machine, type) or not isinstance(getattr(machine, "robot", None), Robot):
         words = f"machine must be a FixedBase(robot), FreeFloating(robot) or Standing(robot, ...), not {machine!r}"
         raise ProblemError(words, name="machine", value=machine)
-    listed = (tasks,) if isinstance(tasks, TipTask) else checked_each("task", tasks, TipTask)
+    listed = (tasks,) if isinstance(tasks, TipTask) else require.each("task", tasks, TipTask)
     if not listed:
         raise ProblemError("task is an empty list; give a TipTask, or several", name="task", value=listed)
     bound = []

@@ -10,17 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models import Box, Machine, Sphere
-from models.arrays import Array, ArrayInput
-from ocp.errors import (
-    NOT_NUMBERS,
-    ProblemError,
-    checked_choice,
-    checked_nonnegative,
-    checked_positive,
-    checked_text,
-    floats,
-)
-from ocp.motion.tasks.checks import checked_configuration, checked_weights, nonnegative_each
+from models.checks import NOT_NUMBERS, Array, ArrayInput, floats
+from ocp.errors import ProblemError, require
+from ocp.motion.tasks.checks import checked_configuration, checked_weights
 from ocp.motion.tasks.tip_task import TipTask
 
 __all__ = ["Cost", "Goal", "Scene", "Start", "Waypoints"]
@@ -98,7 +90,7 @@ class Goal:
     name: str = ""
 
     def __post_init__(self) -> None:
-        checked_text("goal: name", self.name)
+        require.text("goal: name", self.name)
         pose = {name: getattr(self, name) for name in ("position", "orientation", "direction", "region")}
         named = [name for name, value in pose.items() if value is not None]
         if self.joints is not None and named:
@@ -114,9 +106,9 @@ class Goal:
             words = f"goal: region must be a Box or a Sphere in world, not a {type(self.region).__name__}"
             raise ProblemError(words, name="region", value=self.region)
         if self.within is not None:
-            checked_positive("goal: within", self.within, below=np.pi)
+            require.positive("goal: within", self.within, below=np.pi)
         if isinstance(self.velocity, str):
-            checked_choice("goal: velocity", self.velocity, ("rest", "free"))
+            require.choice("goal: velocity", self.velocity, ("rest", "free"))
         else:
             try:
                 floats(self.velocity)
@@ -202,8 +194,10 @@ class Cost:
     weights: Any = None
 
     def __post_init__(self) -> None:
-        each = [nonnegative_each(f"cost: {name}", getattr(self, name), None) for name in PER_JOINT]
-        single = [checked_nonnegative(f"cost: {name}", getattr(self, name)) for name in self._single]
+        each = [
+            require.array(f"cost: {name}", getattr(self, name), ("joints",), sign="nonnegative") for name in PER_JOINT
+        ]
+        single = [require.nonnegative(f"cost: {name}", getattr(self, name)) for name in self._single]
         if not (any(single) or np.concatenate(each).any()):
             raise ProblemError("cost: at least one weight must be above zero", name="cost", value=self, limit=0.0)
 
@@ -260,3 +254,8 @@ class Scene:
     folders: Any = ()
     missing: Literal["raise", "skip"] = "raise"
     wrenches: Callable[[Any, Any], Sequence[Any]] | None = None
+
+    @property
+    def collision_options(self) -> dict[str, Any]:
+        """Arguments of `models.CollisionScene` besides the machine and its limits, by name."""
+        return {name: value for name, value in vars(self).items() if name != "wrenches"}

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models import Machine, ModelWarning, Robot, Standing
-from models.arrays import Array
+from models.checks import NOT_NUMBERS, Array, floats, real
 from models.spatial import expression
-from ocp.errors import NOT_NUMBERS, ProblemError, checked_flag, checked_positive, floats, real
+from ocp.errors import ProblemError, require
 
 __all__ = [
     "Anywhere", "Following", "InFoot", "IndexAtLeast", "JointBounds", "Limits", "Pinned", "ZmpRule", "check_rule",
@@ -277,8 +277,8 @@ class Limits:
                 words = f"limits: {kind} must be positive, one number or one for each joint, not {value!r}"
                 raise ProblemError(words, name=kind, value=value, limit=0.0)
         if self.vertical_force is not None:
-            checked_positive("limits: vertical_force", self.vertical_force)
-        checked_flag("limits: joints", self.joints)
+            require.positive("limits: vertical_force", self.vertical_force)
+        require.flag("limits: joints", self.joints)
         if self.zmp is not None and not isinstance(self.zmp, ZmpRule):
             words = f"limits: zmp must be a rule such as InFoot(), not {self.zmp!r}"
             raise ProblemError(words, name="zmp", value=self.zmp)

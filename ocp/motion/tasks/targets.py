@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from models import Machine
-from models.arrays import Array
+from models.checks import Array
 from models.spatial import quaternion_from_rotation
 from ocp.curves import lagrange
 from ocp.motion.tasks.equations import TaskEquations, bind

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models import FreeFloating, Machine, ModelError, SmoothPath, center_of_mass
-from models.arrays import Array, ArrayInput, checked_array
+from models.checks import Array, ArrayInput
 from models.robot.kinematics import checked_rows
 from models.spatial import Frame, expression, on_scalars, rotation_from_quaternion, skew
-from ocp.errors import ProblemError, checked_choice, checked_nonnegative, checked_positive, checked_text
+from ocp.errors import ProblemError, require
 from ocp.motion.tasks.tracks import Track, path_tracks, reparametrized
 from ocp.tolerances import ORIENTATION_TOLERANCE_RAD, POSITION_TOLERANCE_M
 
@@ -100,26 +100,26 @@ class TipTask:
         if self.orientation is not None and self.direction is not None:
             words = "a tip task takes an orientation or a direction of its tool axis, not both"
             raise ProblemError(words, name="direction")
-        checked_choice("axes", self.axes, get_args(Axes))
+        require.choice("axes", self.axes, get_args(Axes))
         for attribute in ("link", "relative_to"):
             name = getattr(self, attribute)
-            if name is not None and not checked_text(f"tip task: {attribute}", name):
+            if name is not None and not require.text(f"tip task: {attribute}", name):
                 raise ProblemError(f"tip task: {attribute} is an empty name", name=attribute, value=name)
         for attribute in ("gain", "start_gap", "begin"):
-            checked_nonnegative(attribute, getattr(self, attribute))
+            require.nonnegative(attribute, getattr(self, attribute))
         if self.duration is not None:
-            checked_positive("duration", self.duration)
+            require.positive("duration", self.duration)
         if self.within is not None:
-            checked_positive("within", self.within, below=np.pi)
+            require.positive("within", self.within, below=np.pi)
             if self.direction is None:
                 words = "within is an angle about a direction: give direction=... too"
                 raise ProblemError(words, name="within", value=self.within)
         try:
-            axis = checked_array(self.tool_axis, (3,), "tip task", "tool_axis")
-            object.__setattr__(self, "point", checked_array(self.point, (3,), "tip task", "point"))
+            axis = require.array("tip task: tool_axis", self.tool_axis, (3,))
+            object.__setattr__(self, "point", require.array("tip task: point", self.point, (3,)))
             object.__setattr__(self, "rows", self._checked_rows())
             object.__setattr__(self, "breaks", self._checked_breaks())
-            pair = checked_array(self.tolerance, (2,), "tip task", "tolerance")
+            pair = require.array("tip task: tolerance", self.tolerance, (2,))
         except ModelError as error:
             raise ProblemError(str(error), **vars(error)) from error
         if not np.linalg.norm(axis) > 0:
@@ -160,17 +160,17 @@ class TipTask:
         Raises:
             ProblemError: `path` is not a path, the speed is not positive, or an attribute is invalid.
         """
-        checked_choice("roll", roll, get_args(Roll))
+        require.choice("roll", roll, get_args(Roll))
         tracks = path_tracks(path, speed)
         attributes: dict[str, Any] = {"position": tracks.position, "duration": tracks.duration, "breaks": tracks.breaks}
         if path.path.oriented and not {"direction", "orientation"} & set(others):
-            axis = checked_array(tool_axis, (3,), "tip task", "tool_axis")
+            axis = require.array("tip task: tool_axis", tool_axis, (3,))
             whole = roll == "given"
             attributes |= {"orientation": tracks.orientation} if whole else {"direction": tracks.axis(axis)}
         return cls(tool_axis=tool_axis, **{**attributes, **others})
 
     def _checked_breaks(self) -> Array:
-        times = np.unique(checked_array(self.breaks, ("times",), "tip task", "breaks", least=0))
+        times = np.unique(require.array("tip task: breaks", self.breaks, ("times",), least=0))
         last = np.inf if self.duration is None else float(self.duration)
         if not ((times >= 0).all() and (times <= last * (1 + 1e-9)).all()):
             words = f"breaks must be times from the task's beginning to its end, 0 to {last:g} s, not {times.tolist()}"

@@ -14,12 +14,12 @@ import casadi as ca
 import numpy as np
 
 from models import ModelError
-from models.arrays import Array, ArrayInput
+from models.checks import NOT_NUMBERS, Array, ArrayInput, floats, real
 from models.paths.blends import rest_to_rest
 from models.paths.functions import exponential, path_function, turn_function
 from models.paths.smooth_path import SmoothPath
 from models.spatial import expression, rotation_from_quaternion
-from ocp.errors import NOT_NUMBERS, ProblemError, checked_choice, checked_positive, floats, real
+from ocp.errors import ProblemError, require
 
 __all__ = [
     "PathTracks", "PoseLine", "Track", "TrackWithRate", "on_symbols", "path_tracks", "pose_line", "reparametrized",
@@ -61,8 +61,8 @@ def pose_line(
         ProblemError: Wrong sizes, a matrix that is no rotation, half a turn, whose sense is ambiguous, or a duration
             that is not positive.
     """
-    checked_choice("pace", pace, ("constant", "rest"))
-    checked_positive("duration", duration)
+    require.choice("pace", pace, ("constant", "rest"))
+    require.positive("duration", duration)
     (rotation, origin), (turned, end) = (_pose(pose, name) for pose, name in ((first, "first"), (second, "second")))
     change = rotation.T @ turned
     axial = np.array([change[2, 1] - change[1, 2], change[0, 2] - change[2, 0], change[1, 0] - change[0, 1]])

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from models import SmoothPath
-from models.arrays import Array
+from models.checks import Array
 from models.paths.blends import BlendKind, polynomial
 from ocp.motion.schedule import joint_motion
 from scripts.drawing import ASSUMING, COLORS, DASHES, add_note, caption, gif, legend_below, sheet

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from models import SmoothPath
-from models.arrays import Array
+from models.checks import Array
 from models.paths import Blend, gauss_newton, march, predictor_corrector
 from models.paths.blends import BlendKind, arc_length, polynomial
 from ocp.motion.schedule import Schedule, SpeedProfile

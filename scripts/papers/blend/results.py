@@ -9,7 +9,7 @@ import numpy as np
 from tqdm import tqdm
 
 from models import SmoothPath, scara_along, smooth
-from models.arrays import Array
+from models.checks import Array
 from models.machines.scara import ScaraPath
 from models.paths import gamma
 from models.paths.blends import BlendKind, polynomial

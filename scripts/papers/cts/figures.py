@@ -12,7 +12,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from models import Rig
-from models.arrays import Array
+from models.checks import Array
 from models.cts.clearance import rig_capsules
 from models.cts.rig import INCH
 from ocp.app.view.appearance import Part, part_of, rod

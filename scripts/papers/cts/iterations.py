@@ -15,7 +15,7 @@ import casadi as ca
 import numpy as np
 
 from models import ModelError, Rig, Tunnel
-from models.arrays import Array, ArrayInput, checked_array
+from models.checks import Array, ArrayInput, require
 from models.cts.rig import HOME, INCH, Branch, forward, inverse, task_jacobian
 from models.cts.roll import checked_gain, index_harmonics
 from models.cts.table import checked_targets
@@ -147,7 +147,7 @@ def null_space(
     units = np.array([unit, 1, 1, 1, 1, 1])
     return _iterated(
         rows,
-        np.array(checked_array(start, (6,), "null_space", "start")),
+        np.array(require.array("null_space: start", start, (6,))),
         lambda target, q, before: np.array(step(target, q, before[5])[0]).ravel(),
         lambda moved: (np.abs(moved) / units).max() < TOLERANCE,
         lambda q: not np.abs(q).max() < 1e6,

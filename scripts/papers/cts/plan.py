@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from models import Box, Rig, Tunnel, optimal_inverse
-from models.arrays import Array
+from models.checks import Array
 from models.cts.clearance import CollisionScene, clearances
 from models.cts.rig import INCH, inverse
 from models.cts.roll import index_harmonics

@@ -15,7 +15,7 @@ import casadi as ca
 import numpy as np
 
 from models import Link, ModelError
-from models.arrays import Array, ArrayInput, checked_array
+from models.checks import Array, ArrayInput, require
 from models.spatial import Expression, cross, expression, quaternion_product, rotation_from_quaternion
 from ocp.curves import rk4_step
 
@@ -45,11 +45,11 @@ class Ejector:
 
     def __post_init__(self) -> None:
         for name in ("force", "duration"):
-            value = checked_array(getattr(self, name), (), "ejector", name).item()
+            value = require.array(f"ejector: {name}", getattr(self, name), ()).item()
             if value <= 0:
                 raise ModelError(f"ejector: {name} {value} must be positive")
-        point = checked_array(self.point, (3,), "ejector", "point")
-        direction = checked_array(self.direction, (3,), "ejector", "direction")
+        point = require.array("ejector: point", self.point, (3,))
+        direction = require.array("ejector: direction", self.direction, (3,))
         length = float(np.linalg.norm(direction))
         if length <= 0:
             raise ModelError("ejector: direction (0, 0, 0) points nowhere")
@@ -156,7 +156,7 @@ def release(store: Store, start: ArrayInput, times: ArrayInput, steps: int = 4) 
     Raises:
         ModelError: Wrong shapes, a zero quaternion, times that do not increase, no step.
     """
-    state = checked_array(start, (STATES,), "release", "start")
+    state = require.array("release: start", start, (STATES,))
     t = np.asarray(times, dtype=float)
     if t.ndim != 1 or t.size < 2 or not (np.diff(t) > 0).all():
         raise ModelError("release: times must be at least two and increase")

@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 
 from models import Box, Link, Rig, Tunnel, optimal_inverse, reference_rig, reference_tunnel, solve_table
-from models.arrays import Array
+from models.checks import Array
 from models.cts.clearance import CollisionScene, clearances
 from models.cts.rig import HOME, INCH, forward, goose_neck_corner, inverse
 from models.cts.roll import index_harmonics

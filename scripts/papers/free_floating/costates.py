@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from models import ModelError
-from models.arrays import Array, ArrayInput, checked_array
+from models.checks import Array, ArrayInput, require
 from models.robot.kinematics import checked_rows
 from scripts.papers.free_floating.recursion import D, J, dD, dJ
 from scripts.papers.free_floating.virtual_chain import VirtualChain
@@ -95,7 +95,7 @@ def resolution(chain: VirtualChain, x: ArrayInput, tip_velocity: ArrayInput, row
         ModelError: Wrong shapes or rows; E1 singular (the base's Euler angle b is +-pi/2); G of too low a rank.
     """
     rows = checked_rows(rows)
-    v_E = checked_array(tip_velocity, (len(rows),), "tip", "tip_velocity")
+    v_E = require.array("tip: tip_velocity", tip_velocity, (len(rows),))
     E1, E2, reaction = _base_reaction(chain, x)
     F = J(chain, x)[rows]
     F1, F2 = F[:, : chain.n], F[:, chain.n :]
@@ -202,4 +202,4 @@ def _base_reaction(chain: VirtualChain, x: ArrayInput) -> tuple[Array, Array, Ar
 
 
 def _checked_costates(chain: VirtualChain, lam: ArrayInput) -> Array:
-    return checked_array(lam, (chain.N,), "costates", "lam")
+    return require.array("costates: lam", lam, (chain.N,))

@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from models.arrays import Array
+from models.checks import Array
 from ocp import Collocation, Indirect, Problem, Solution, certificate, solve
 from scripts.papers.free_floating.false_optima import INTERVALS, MAX_ITERATIONS, Settled, Solvers, first_guess, settle
 from scripts.papers.run import Row

@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from models.arrays import Array
+from models.checks import Array
 from ocp import Collocation, Problem, Solution, prepare
 
 HORIZON = 4.0  # s

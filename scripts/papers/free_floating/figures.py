@@ -15,7 +15,7 @@ from matplotlib.artist import Artist
 from matplotlib.figure import Figure
 
 from models import FreeFloating
-from models.arrays import Array
+from models.checks import Array
 from scripts.drawing import ASSUMING, COLORS, DASHES, TIME_COLORS, add_note, caption, gif, posture, sheet, time_bar
 from scripts.papers.free_floating.extremals import CONFIRMED, NOT_GLOBAL, Search
 from scripts.papers.free_floating.false_optima import EXTREMAL, FALSE, HORIZON, Trial

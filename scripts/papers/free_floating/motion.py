@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from models import FreeFloating, centers_of_mass, link_frames
-from models.arrays import Array
+from models.checks import Array
 from ocp import Audit, Solution
 from ocp.curves import PiecewisePolynomial, differentiation_matrix
 from ocp.motion.local.rates import LocalSolution, least_rates

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from models.arrays import Array
+from models.checks import Array
 from ocp import Certificate, Collocation, Indirect, MultipleShooting, Problem, Solution, certificate, solve
 from scripts.papers.run import Row
 

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from models.arrays import Array, ArrayInput
+from models.checks import Array, ArrayInput
 from scripts.papers.free_floating.virtual_chain import VirtualChain, motion_cross, transforms
 
 ONE = np.eye(6)

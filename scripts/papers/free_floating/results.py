@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from models import FreeFloating, paper_example
-from models.arrays import Array
+from models.checks import Array
 from ocp import Audit, Collocation, MultipleShooting, Problem, Solution, resolve, solve
 from scripts.papers.free_floating import extremals, false_optima
 from scripts.papers.free_floating.extremals import Search

@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from models import FreeFloating, Joint, Link, ModelError, Robot
-from models.arrays import Array, ArrayInput, checked_array
+from models.checks import Array, ArrayInput, require
 from models.machines.free_floating import PLANAR_ROWS
 
 
@@ -48,7 +48,7 @@ class VirtualChain:
             raise ModelError(f"virtual chain: {count} joints, {self.n} of them virtual, leave none to the arm")
         shapes = {"S": (count, 6), "X_tree": (count, 6, 6), "H": (count, 6, 6), "X_tip": (6, 6)}
         for field in fields(self)[1:]:
-            array = checked_array(getattr(self, field.name), shapes[field.name], "virtual chain", field.name)
+            array = require.array(f"virtual chain: {field.name}", getattr(self, field.name), shapes[field.name])
             object.__setattr__(self, field.name, array)
 
     @classmethod
@@ -94,7 +94,7 @@ def transforms(chain: VirtualChain, q: ArrayInput) -> Array:
     Raises:
         ModelError: `q` is not of shape (N,) or not finite.
     """
-    q = checked_array(q, (chain.N,), "virtual chain", "q")
+    q = require.array("virtual chain: q", q, (chain.N,))
     return np.array([joint_transform(S, qi) @ X for S, qi, X in zip(chain.S, q, chain.X_tree, strict=True)])
 
 

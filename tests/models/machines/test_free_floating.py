@@ -300,7 +300,7 @@ def pair(kind: Any = "revolute", axis: Any = (0, 0, 1), base: Link | None = None
     [
         (pair(axis=(0, 1, 1)), "planar", r"joint 'j' turns about .* not about z"),
         (pair("prismatic"), "planar", r"joint 'j' moves along .* out of the plane"),
-        (pair(), "orbital", r"base 'orbital' is unknown; use one of \['planar', 'spatial'\]"),
+        (pair(), "orbital", r"base must be 'planar' or 'spatial', not 'orbital'"),
         (Robot((Link("a"), Link("b")), (Joint("j", "revolute", "a", "b"),)), "spatial", "no mass"),
         # point masses on the axis: nothing resists turning about it
         (pair(base=Link("base", 1.0)), "planar", "no rotational inertia"),

@@ -12,7 +12,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from models import CollisionScene, link_frames
-from models.arrays import Array
+from models.checks import Array
 from models.shapes.bodies import collision_bodies
 from models.shapes.pairs import ALWAYS, NEIGHBOURS, NEVER, RIGID
 from ocp import TipTask, inverse_kinematics

@@ -139,22 +139,22 @@ TILTED = Path.through([(0.5, 0, 0), (0.5, 0.2, 0)], [turned((0, 0, 0)), turned((
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Scara(0.0, 1.0), "upper_arm 0.0 m is not positive"),
-        (lambda: Scara(1.0, NAN), "forearm nan"),
+        (lambda: Scara(0.0, 1.0), r"upper_arm must be positive and finite \(in m\), not 0.0"),
+        (lambda: Scara(1.0, NAN), "forearm must be .*, not nan"),
         (lambda: Scara(1.0, 1.0, lower=(1, 0, 0, 0), upper=(0, 0, 0, 0)), "'shoulder'"),
         (lambda: Scara(1.0, 1.0, names=("a", "a", "b", "c")), "four that differ"),
         (lambda: EVEN.inverse((0.81, 0, 0)), "unreachable"),
         (lambda: Scara(0.4, 0.3).inverse((0.05, 0, 0)), r"unreachable.*from 0\.1 to 0\.7"),
         (lambda: EVEN.inverse((NAN, 0, 0)), "not finite"),
         (lambda: EVEN.inverse((0.5, 0, 0), NAN), "yaw"),
-        (lambda: EVEN.inverse((0.5, 0, 0), 0.0, "up"), "elbow 'up'"),  # type: ignore[arg-type]
+        (lambda: EVEN.inverse((0.5, 0, 0), 0.0, "up"), "elbow must be .*, not 'up'"),  # type: ignore[arg-type]
         (lambda: EVEN.forward((0, 0, 0)), r"joints has shape \(3, 1\)"),
         (lambda: along((0.5, 0, 0), (-0.5, 0, 0)), r"at 0\.5 m.*singular column"),
         (lambda: along((0.5, 5e-4, 0), (-0.5, 5e-4, 0)), "singular column"),
         (lambda: along((0.5, 0, 0), (0.9, 0, 0)), "unreachable"),
         (lambda: along((0.5, 0, 0), (0.8, 0, 0)), "stretched arm is singular"),
-        (lambda: along((0.5, 0, 0), (0.5, 0.2, 0), clearance=NAN), "clearance nan"),
-        (lambda: along((0.5, 0, 0), (0.5, 0.2, 0), elbow="up"), "elbow 'up'"),
+        (lambda: along((0.5, 0, 0), (0.5, 0.2, 0), clearance=NAN), "clearance must be .*, not nan"),
+        (lambda: along((0.5, 0, 0), (0.5, 0.2, 0), elbow="up"), "elbow must be .*, not 'up'"),
         (lambda: scara_along(EVEN, smooth(TILTED, 0.1)), "tilts its tool"),
         (lambda: along((0.5, 0, 0), (0.5, 0.3, 0), (-0.5, -0.3 + 1e-5, 0)), "singular column"),  # between the samples
     ],

@@ -296,14 +296,14 @@ def test_a_joint_without_limits_adds_nothing_to_the_index() -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"gravity": 0.0}, "gravity 0.0 m/s.2 is not positive"),
+        ({"gravity": 0.0}, "gravity must be positive and finite .*, not 0.0"),
         ({"half_widths": (0.1, 0.0)}, "half_widths .* not positive"),
         ({"most_stable_point": (0.1,)}, "most_stable_point has shape"),
         ({"robot": planar_chain([1.0], [0.0])}, "has no mass"),
         ({"robot": Robot((Link("stone", 1.0),))}, "no moving joint"),
         ({"support": "wide"}, r"support must be a Support, .* not 'wide'"),
-        ({"gravity": -9.81}, "gravity -9.81 m/s.2 is not positive"),
-        ({"gravity": np.nan}, "gravity .*not finite"),
+        ({"gravity": -9.81}, "gravity must be positive and finite .*, not -9.81"),
+        ({"gravity": np.nan}, "gravity must be .*, not nan"),
     ],
 )
 def test_machines_that_cannot_stand_are_refused(changes: dict[str, Any], message: str) -> None:

@@ -245,9 +245,9 @@ CORNER = Path.through([(0, 0, 0), (1, 0, 0), (1, 1, 0)])
         ({"deviation": -1.0}, "deviation -1.0 m is not positive"),
         ({"remaining": 0.1, "kind": "septic"}, "septic"),
         ({"remaining": 0.1, "overlap": "cross"}, "cross"),
-        ({"remaining": 0.1, "shape": 0.0}, "shape factor 0.0 is not positive"),
+        ({"remaining": 0.1, "shape": 0.0}, "shape 0.0 is not positive"),
         ({"remaining": 0.1, "shape": 6.0, "kind": "cubic"}, "cusp"),
-        ({"remaining": 0.1, "shape": float("nan")}, "shape factor nan"),
+        ({"remaining": 0.1, "shape": float("nan")}, "shape nan"),
         ({"remaining": 0.1, "shape": "round"}, "not numeric"),
         ({"remaining": 0.1, "shape": [1.0, 2.0]}, "each of the 1 vertices"),
     ],
@@ -259,7 +259,7 @@ def test_a_blend_that_cannot_be_is_a_named_error(asked: dict[str, Any], message:
 
 @pytest.mark.parametrize("bad", [(0.0, 1.0), (3.0, 0.0), (3.0, 4.0), (3.0, float("nan"))])
 def test_closed_forms_refuse_what_is_no_corner(bad: tuple[float, float]) -> None:
-    with pytest.raises(ModelError, match=r"corner: .* is (not positive|not finite|above pi)"):
+    with pytest.raises(ModelError, match=r"corner: .* (must be positive and finite|is above pi)"):
         gamma(*bad)
 
 

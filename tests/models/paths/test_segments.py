@@ -177,13 +177,13 @@ TILTED = turned((1.0, 0, 0))
         (lambda: Arc.about((1, 0, 0), (0, 0, 0), (1, 0, 1), 1.0), "perpendicular"),
         (lambda: Arc.about((1, 0, 0), (0, 0, 0), (0, 0, 1), 0.0), "sweep 0"),
         (lambda: Arc.about((1, 0, 0), (0, 0, 0), (0, 0, 1), 7.0), "sweep 7"),
-        (lambda: Arc.about((1, 0, 0), (0, 0, 0), (0, 0, 1), NAN), "not finite"),
+        (lambda: Arc.about((1, 0, 0), (0, 0, 0), (0, 0, 1), NAN), "must be a finite number"),
         (lambda: Helix((1, 0, 0), (1, 0, 0), (0, 0, 1), 1.0, 0.1), "helix: .* radius"),
         (lambda: Helix((1, 0, 0), (0, 0, 0), (0, 0, 0), 1.0, 0.1), "helix: .* no direction"),
         (lambda: Helix((1, 0, 0), (0, 0, 0.1), (0, 0, 1), 1.0, 0.1), "helix: .* perpendicular"),
-        (lambda: Helix((1, 0, 0), (0, 0, 0), (0, 0, 1), -1.0, 0.1), "sweep -1.0 rad is not positive"),
+        (lambda: Helix((1, 0, 0), (0, 0, 0), (0, 0, 1), -1.0, 0.1), "sweep must be positive .*, not -1.0"),
         (lambda: Helix((1, 0, 0), (0, 0, 0), (0, 0, 1), 1e-10, 0.0), "remove it"),
-        (lambda: Helix((1, 0, 0), (0, 0, 0), (0, 0, 1), 1.0, NAN), "rise nan"),
+        (lambda: Helix((1, 0, 0), (0, 0, 0), (0, 0, 1), 1.0, NAN), "rise must be .*, not nan"),
         (lambda: Path(()), "no segment"),
         (lambda: Path(3), "no sequence"),  # type: ignore[arg-type]
         (lambda: Path(("line",)), "segment 0"),  # type: ignore[arg-type]

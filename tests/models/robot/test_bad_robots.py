@@ -183,8 +183,7 @@ REBUILT = [
     of(
         "lock_joints",
         {"positions": {"joint1": 0.1}},
-        positions=MAPPING
-        | NOTHING
+        positions=but(MAPPING | NOTHING, "None")
         | {"unknown": {"joint9": 0.0}, "nan": {"joint1": NAN}, "digits": {"joint1": "1"}, "number": {1: 0.0}},
     ),
     of("move_tip", {"tip": "link1"}, tip=UNKNOWN, translation=SPATIAL, rotation=rotation()),

@@ -11,7 +11,7 @@ import pytest
 import trimesh
 
 from models import CollisionScene, CollisionShape, FixedBase, Joint, Link, ModelError, ModelWarning, Robot
-from models.arrays import Array
+from models.checks import Array
 from models.shapes.bodies import Body, capsule_around, collision_bodies
 from models.shapes.covering import exceedance
 from models.shapes.mesh_files import find_mesh, read_mesh

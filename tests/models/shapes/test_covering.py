@@ -11,8 +11,9 @@ import pytest
 import trimesh
 from scipy import spatial
 
-from models import ModelError, files
-from models.arrays import Array
+from models import ModelError
+from models import files as cache
+from models.checks import Array
 from models.shapes import covering
 from models.shapes.bodies import capsule_around
 from models.shapes.covering import Cover, cover, exceedance, fit_cover, split_triangles
@@ -241,7 +242,7 @@ def test_a_cover_that_does_not_hold_the_mesh_is_not_taken(own_cache: Path) -> No
     vertices, faces = dumbbell()
     first = cover(vertices, faces)
     (file,) = own_cache.iterdir()
-    files.store_value(file.stem, [each | {"radius": 0.9 * each["radius"]} for each in files.load_value(file.stem)])
+    cache.store_value(file.stem, [each | {"radius": 0.9 * each["radius"]} for each in cache.load_value(file.stem)])
     assert same(cover(vertices, faces), first)
 
 
@@ -257,24 +258,24 @@ def test_an_unwritable_cache_is_no_error(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_what_cannot_be_written_leaves_nothing_behind(own_cache: Path) -> None:
-    files.store_value("a", {"x": [1.5, "y"]})
-    assert files.load_value("a") == {"x": [1.5, "y"]}
+    cache.store_value("a", {"x": [1.5, "y"]})
+    assert cache.load_value("a") == {"x": [1.5, "y"]}
     (own_cache / "b.json").mkdir()
-    files.store_value("b", 1)
-    assert files.load_value("b") is None
+    cache.store_value("b", 1)
+    assert cache.load_value("b") is None
     assert sorted(file.name for file in own_cache.iterdir()) == ["a.json", "b.json"]
 
 
 def test_keys_tell_contents_and_versions_apart() -> None:
     one = np.arange(6.0)
     keys = {
-        files.cache_key("1", one),
-        files.cache_key("2", one),
-        files.cache_key("1", one.reshape(2, 3)),
-        files.cache_key("1", one + 1),
+        cache.cache_key("1", one),
+        cache.cache_key("2", one),
+        cache.cache_key("1", one.reshape(2, 3)),
+        cache.cache_key("1", one + 1),
     }
     assert len(keys) == 4
-    assert files.cache_key("1", one) == files.cache_key("1", one.copy()[::1])
+    assert cache.cache_key("1", one) == cache.cache_key("1", one.copy()[::1])
 
 
 def test_a_version_changes_with_a_module_and_all_that_it_imports(
@@ -293,14 +294,14 @@ def test_a_version_changes_with_a_module_and_all_that_it_imports(
     }
     for name, text in texts.items():
         (package / f"{name}.py").write_text(text, encoding="utf-8")
-    found = [files.source_version("whole.a")]
+    found = [cache.source_version("whole.a")]
     for name in "abcd":
         (package / f"{name}.py").write_text(texts[name] + "\n", encoding="utf-8")
-        files.source_version.cache_clear()
-        found.append(files.source_version("whole.a"))
+        cache.source_version.cache_clear()
+        found.append(cache.source_version("whole.a"))
     assert len(set(found)) == 4
     assert found[3] == found[4]
-    kinds = [files.source_version(f"models.shapes.{name}") for name in ("hull", "covering", "pairs")]
+    kinds = [cache.source_version(f"models.shapes.{name}") for name in ("hull", "covering", "pairs")]
     assert len(set(kinds)) == 3
 
 

@@ -14,7 +14,7 @@ import pytest
 import trimesh
 
 from models import ModelError
-from models.arrays import Array
+from models.checks import Array
 from models.files import INPUT_LIMITS
 from models.shapes import mesh_files
 from models.shapes.mesh_files import Faces, find_mesh, read_mesh, read_painted_mesh

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from models import CollisionShape, Frame, Joint, Link, Mimic, ModelError, ModelWarning, Robot, add_prefix, link_frames
-from models.arrays import Array
+from models.checks import Array
 from models.shapes.bodies import Body, LinkMesh, RigidParts, collision_bodies
 from models.shapes.distance import distance
 from models.shapes.pairs import (

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from models import Joint, Link, Mimic, Robot, link_frames
-from models.arrays import Array
+from models.checks import Array
 from models.shapes.bodies import JointStep, RigidParts, lever_arms
 from models.shapes.shapes import Box, Capsule, Shape, Sphere
 

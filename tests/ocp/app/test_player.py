@@ -40,7 +40,7 @@ from models import (
     simplify,
     with_load,
 )
-from models.arrays import Array
+from models.checks import Array
 from models.robot.kinematics import centers_of_mass
 from ocp import (
     ClearanceConstraints,

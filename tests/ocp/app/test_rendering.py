@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from models.arrays import Array
+from models.checks import Array
 from ocp import ProblemError
 from ocp.app.view.appearance import Part, part_of
 from ocp.app.view.rendering import PICTURE_STYLE, Camera, Floor, Layer, render, tube

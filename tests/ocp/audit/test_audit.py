@@ -464,7 +464,7 @@ def test_the_table_ends_in_what_follows_from_it(
 def test_findings_are_found_by_name() -> None:
     audit = plan("radau").audit()
     assert audit[LOST].passed
-    with pytest.raises(ProblemError, match=r"unknown finding 'integratoin'"):
+    with pytest.raises(ProblemError, match=r"finding 'integratoin' does not exist"):
         audit["integratoin"]
 
 

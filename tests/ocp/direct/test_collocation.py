@@ -242,7 +242,7 @@ def test_degree_may_be_a_numpy_integer_and_the_mesh_an_array(scheme: str) -> Non
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ((0,), "intervals must be a positive integer, not 0"),
+        ((0,), "intervals must be a whole number, 1 to 1000000, not 0"),
         ((-3,), "intervals"),
         ((2.5,), "intervals"),
         (("4",), "intervals"),

@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from models.arrays import Array
+from models.checks import Array
 from ocp import Collocation, MultipleShooting, Problem, ProblemError, Solution, prepare
 from tests.ocp.problems import SWING, plant, swing, van_der_pol
 

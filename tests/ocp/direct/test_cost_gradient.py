@@ -233,7 +233,7 @@ def test_gradients_in_levels_of_active_inequalities(solver: str) -> None:
 
 def test_an_unknown_parameter_is_an_error_that_names_the_near_ones() -> None:
     solution = solve(regulator(), Indirect(), parameters={"a": 0.5, "x0": 1.0, "h": 1.0})
-    with pytest.raises(ProblemError, match=r"unknown parameter 'x00'; did you mean x0\?"):
+    with pytest.raises(ProblemError, match=r"parameter 'x00' does not exist; did you mean 'x0'\?"):
         solution.cost_gradient("x00")
     with pytest.raises(ProblemError, match="unknown parameter"):
         solution.cost_gradient("x")  # a state

@@ -183,8 +183,8 @@ def test_an_unsuccessful_or_loaded_solution_is_a_guess_too(tmp_path: Any) -> Non
 @pytest.mark.parametrize(
     ("guess", "message"),
     [
-        ({"z": 1.0}, "unknown variable in guess 'z'"),
-        ({"X": 1.0}, "unknown variable in guess 'X'; known: x, u, horizon, t"),
+        ({"z": 1.0}, "variable in guess 'z' does not exist"),
+        ({"X": 1.0}, "variable in guess 'X' does not exist; known: x, u, horizon, t"),
         ({3: 1.0}, "unknown variable in guess 3"),
         ([1.0], "guess must be a Solution, a dictionary or None, not list"),
         ("x", "guess must be a Solution, a dictionary or None, not str"),

@@ -211,11 +211,11 @@ def test_active_path_constraints_are_kept_where_they_are_imposed(integrator: str
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ((0,), "intervals must be a positive integer, not 0"),
+        ((0,), "intervals must be a whole number, 1 to 1000000, not 0"),
         ((1.0,), "intervals"),
         ((3, "euler"), "integrator must be 'rk4' or 'cvodes', not 'euler'"),
         ((3, None), "integrator"),
-        ((3, "rk4", 0), "steps must be a positive integer, not 0"),
+        ((3, "rk4", 0), "steps must be a whole number, 1 to 1000000, not 0"),
         ((3, "rk4", 2.0), "steps"),
         ((3, "rk4", True), "steps"),
         ((3, "rk4", None), "steps"),

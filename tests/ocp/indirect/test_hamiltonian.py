@@ -221,7 +221,7 @@ def test_backward_shooting_says_what_it_cannot_take(kind: str) -> None:
 
 
 BAD_ARGUMENTS: list[tuple[dict[str, Any], str]] = [
-    ({"segments": 0}, "segments must be a positive integer, not 0"),
+    ({"segments": 0}, "segments must be a whole number, 1 to 1000000, not 0"),
     ({"segments": 2.0}, "segments"),
     ({"segments": True}, "segments"),
     ({"segments": "many"}, "segments"),
@@ -251,7 +251,7 @@ def test_what_is_no_problem_and_no_solver_is_refused() -> None:
         prepare(energy(), Indirect(), solver="snopt")
     with pytest.raises(ProblemError, match="parameters must be a dictionary"):
         solve(energy(), Indirect(), parameters=3)  # type: ignore[arg-type]
-    with pytest.raises(ProblemError, match="unknown parameter 'mass'"):
+    with pytest.raises(ProblemError, match="parameter 'mass' does not exist"):
         solve(energy(), Indirect(), parameters={"mass": 1.0})
 
 
@@ -290,7 +290,7 @@ def test_a_guess_without_costates_is_refused() -> None:
         solve(energy(), Indirect(), guess=replace(seed, costates={"q": seed.costates["q"]}))
 
 
-@pytest.mark.parametrize(("guess", "message"), [(3, "guess must be"), ({"speed": 1.0}, "unknown variable in guess")])
+@pytest.mark.parametrize(("guess", "message"), [(3, "guess must be"), ({"speed": 1.0}, "variable in guess")])
 def test_what_is_no_guess_is_refused(guess: Any, message: str) -> None:
     with pytest.raises(ProblemError, match=message):
         solve(energy(), Indirect(), guess=guess)

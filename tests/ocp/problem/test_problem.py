@@ -248,11 +248,11 @@ VARIABLES: dict[str, tuple[Act, str]] = {
     "name horizon": (lambda: empty().state("horizon"), "reserved"),
     "name taken": (on(lambda p, x, u: p.control("x")), "control 'x': a state of this name exists already"),
     "name taken by a control": (on(lambda p, x, u: p.parameter("u")), "parameter 'u': a control of this name"),
-    "size zero": (lambda: empty().state("q", 0), "state 'q': size must be a positive integer, not 0"),
-    "size negative": (lambda: empty().control("q", -1), "size must be a positive integer, not -1"),
-    "size broken": (lambda: empty().parameter("q", 1.5), "size must be a positive integer, not 1.5"),  # type: ignore[arg-type]
-    "size a string": (lambda: empty().state("q", "2"), "size must be a positive integer"),  # type: ignore[arg-type]
-    "size a bool": (lambda: empty().state("q", True), "size must be a positive integer"),
+    "size zero": (lambda: empty().state("q", 0), "state 'q': size must be a whole number, 1 to 1000000, not 0"),
+    "size negative": (lambda: empty().control("q", -1), "size must be a whole number, 1 to 1000000, not -1"),
+    "size broken": (lambda: empty().parameter("q", 1.5), "size must be a whole number, 1 to 1000000, not 1.5"),  # type: ignore[arg-type]
+    "size a string": (lambda: empty().state("q", "2"), "size must be a whole number"),  # type: ignore[arg-type]
+    "size a bool": (lambda: empty().state("q", True), "size must be a whole number"),
     "sizes differ": (lambda: empty().state("q", lower=[1, 2], upper=[3, 4, 5]), "lower has 2, upper has 3"),
     "size and array differ": (lambda: empty().state("q", 3, lower=[1, 2]), "state 'q': lower has 2 entries, 3 exp"),
     "empty array": (lambda: empty().state("q", initial=[]), "state 'q'"),
@@ -309,7 +309,7 @@ EQUATIONS: dict[str, tuple[Act, str]] = {
     "dynamics of an entry": (on(lambda p, x, u: p.dynamics(x[0], u)), "not a declared state"),
     "dynamics of a number": (on(lambda p, x, u: p.dynamics(1.0, u)), "1.0 is not a declared state"),
     "dynamics of nothing": (on(lambda p, x, u: p.dynamics(None, u)), "None is not a declared state"),
-    "dynamics of an unknown name": (on(lambda p, x, u: p.dynamics("y", u)), "unknown variable in dynamics 'y'"),
+    "dynamics of an unknown name": (on(lambda p, x, u: p.dynamics("y", u)), "variable in dynamics 'y' does not exist"),
     "dynamics of wrong size": (on(lambda p, x, u: p.dynamics(x, u)), "dynamics of 'x' has 1 entries, the state has 2"),
     "dynamics None": (on(lambda p, x, u: p.dynamics(x, None)), "a number or an expression is expected, not None"),
     "dynamics a string": (on(lambda p, x, u: p.dynamics(x, "u")), "not 'u'"),

@@ -25,11 +25,11 @@ import casadi as ca
 import numpy as np
 
 from models import FreeFloating, center_of_mass, find_wheels
-from models.arrays import Array
+from models.checks import NOT_NUMBERS, Array, floats, real
 from models.spatial import Expression
 from ocp.console import interruptible
 from ocp.direct.collocation import Collocation
-from ocp.errors import NOT_NUMBERS, ProblemError, checked_flag, checked_instance, checked_positive, floats, real
+from ocp.errors import ProblemError, require
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem, end_velocities
 from ocp.motion.builders.dynamics_plan import within_limits
@@ -48,7 +48,7 @@ from ocp.motion.builders.space.pair import (
 )
 from ocp.motion.builders.standing.problem import FreeTime
 from ocp.motion.builders.torques import JointFriction
-from ocp.motion.tasks.checks import checked_configuration, checked_horizon
+from ocp.motion.tasks.checks import checked_configuration
 from ocp.motion.tasks.goals import Cost, Start
 from ocp.motion.tasks.limits import Limits
 from ocp.problem.phases import Phases
@@ -90,11 +90,11 @@ class Cone:
             words = f"cone: direction must be three numbers, not all zero, not {self.direction!r}"
             raise ProblemError(words, name="direction", value=self.direction)
         object.__setattr__(self, "direction", direction / np.linalg.norm(direction))
-        if not checked_positive("cone: half_angle", self.half_angle) < np.pi / 2:
+        if not require.positive("cone: half_angle", self.half_angle) < np.pi / 2:
             words = f"cone: half_angle must be below pi/2, not {self.half_angle}"
             raise ProblemError(words, name="half_angle", value=self.half_angle, limit=np.pi / 2)
-        checked_positive("cone: length", self.length)
-        checked_positive("cone: depth", self.depth)
+        require.positive("cone: length", self.length)
+        require.positive("cone: depth", self.depth)
 
     def inside(self, place: Expression) -> Expression:
         """Return a function that is not negative inside the cone, m. Shape (1, 1).
@@ -158,8 +158,8 @@ class Capture:
     def __post_init__(self) -> None:
         for name, kind in (("cone", Cone), ("grasp", Grasp), ("friction", JointFriction)):
             if getattr(self, name) is not None:
-                checked_instance(f"capture: {name}", getattr(self, name), kind)
-        checked_flag("capture: rest", self.rest)
+                require.instance(f"capture: {name}", getattr(self, name), kind)
+        require.flag("capture: rest", self.rest)
 
 
 @remembers_request("capture")
@@ -266,7 +266,7 @@ def chained_capture(
     Returns:
         Both solutions, each with its own audit.
     """
-    mesh = POINTS if method is None else checked_instance("method", method, Collocation)
+    mesh = POINTS if method is None else require.instance("method", method, Collocation)
     own = _Capture.take(chaser, capture, start, {"limits": limits, "cost": cost}, clearance_constraints)
     own.detumbling(None)  # raises before the approach is solved
 
@@ -318,7 +318,7 @@ class _Capture:
         shared: Mapping[str, Any],
         clearance_constraints: ClearanceConstraints | None,
     ) -> _Capture:
-        target = checked_instance("capture", capture, Capture).target
+        target = require.instance("capture", capture, Capture).target
         robot = checked_pair(chaser, target)
         begin, joints, base = Start.of(start, chaser)
         if joints is None:
@@ -328,7 +328,7 @@ class _Capture:
         pair = replace(chaser, robot=robot, conserved_momentum=momentum)
         rates = end_velocities("start_velocity", begin.velocity, chaser.joint_size)
         times = (capture.approach, capture.detumble)
-        latest = [time.upper if isinstance(time, FreeTime) else checked_horizon(time) for time in times]
+        latest = [time.upper if isinstance(time, FreeTime) else require.positive("horizon", time) for time in times]
         state = State(base, joints, rates, target_base, *latest)
         if capture.rest:
             bounds = (shared["limits"] or Limits()).bounds(chaser)

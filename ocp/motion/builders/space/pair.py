@@ -24,10 +24,10 @@ import numpy as np
 import scipy
 
 from models import FreeFloating, ModelError, Robot, attach_tool, center_of_mass, find_wheels, link_frames
-from models.arrays import Array
+from models.checks import Array
 from models.machines.machine import with_tip
 from models.spatial import Expression, cross
-from ocp.errors import ProblemError, checked_instance
+from ocp.errors import ProblemError, require
 from ocp.motion.builders.dynamics import QUINTIC
 from ocp.motion.tasks.limits import JointBounds
 from ocp.problem.problem import Problem
@@ -68,7 +68,7 @@ def checked_pair(chaser: Any, target: Any) -> Robot:
         ProblemError: Machines of other kinds, without tips, with links of the same name, or a target with joints.
     """
     for name, machine in (("chaser", chaser), ("target", target)):
-        if checked_instance(f"capture: {name}", machine, FreeFloating).robot.tip is None:
+        if require.instance(f"capture: {name}", machine, FreeFloating).robot.tip is None:
             raise ProblemError(f"capture: the robot of the {name} needs a tip", name=name, value=machine)
     if target.base != chaser.base:
         words = f"capture: the chaser floats on a {chaser.base} base, the target on a {target.base} one"

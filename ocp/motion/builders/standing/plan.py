@@ -24,14 +24,13 @@ from ocp.audit.audit import Audit
 from ocp.console import interruptible, time_left, time_limited
 from ocp.direct.collocation import Collocation
 from ocp.direct.shooting import MultipleShooting
-from ocp.errors import ProblemError, SolveError, SolverStatus, checked_instance, checked_mapping, checked_time_limit
+from ocp.errors import ProblemError, SolveError, SolverStatus, checked_time_limit, require
 from ocp.methods import solve
 from ocp.motion.builders.clearance import ClearanceConstraints, collision_error, solve_with_clearance
 from ocp.motion.builders.dynamics_plan import audit_error, breaks_of
 from ocp.motion.builders.standing.problem import FreeTime, StandingSetup, Weights, standing_problem
 from ocp.motion.builders.standing.stances import Steps
 from ocp.motion.builders.standing.steps import StepWeights, steps_problem
-from ocp.motion.tasks.checks import checked_horizon
 from ocp.motion.tasks.equations import bind, task_errors
 from ocp.motion.tasks.limits import Limits, ZmpRule
 from ocp.motion.tasks.tip_task import TipTask
@@ -271,13 +270,14 @@ def solve_standing(
         ProblemError: As `standing_problem`.
     """
     if method is not None:
-        checked_instance("method", method, Collocation)
-    options = checked_mapping("options", options)
-    setup = StandingSetup() if setup is None else checked_instance("plan_standing: setup", setup, StandingSetup)
+        require.instance("method", method, Collocation)
+    options = require.mapping("options", options)
+    setup = StandingSetup() if setup is None else require.instance("plan_standing: setup", setup, StandingSetup)
     along_parameter = setup.along == "parameter"
     judge = _Judge(tolerances, partial(_pose_error, machine, tasks, along_parameter))
     settings = {**IPOPT, **options}
-    breaks = [] if isinstance(horizon, FreeTime) or along_parameter else breaks_of(tasks, checked_horizon(horizon))
+    timed = not (isinstance(horizon, FreeTime) or along_parameter)
+    breaks = breaks_of(tasks, require.positive("horizon", horizon)) if timed else []
     trials = [
         (level, mesh.with_nodes_at(breaks))
         for level, mesh in _formulations(setup.control, isinstance(horizon, FreeTime), method)
@@ -324,9 +324,9 @@ def solve_steps(
         ProblemError: As `steps_problem`.
     """
     if method is not None:
-        checked_instance("method", method, Collocation)
-    checked_instance("solve_steps: steps", steps, Steps)
-    settings, step_options = {**IPOPT, **checked_mapping("options", options)}, {"cost": cost, "limits": limits}
+        require.instance("method", method, Collocation)
+    require.instance("solve_steps: steps", steps, Steps)
+    settings, step_options = {**IPOPT, **require.mapping("options", options)}, {"cost": cost, "limits": limits}
     trials: list[Trial] = [(None, method or STEPS)]
     judge = _Judge(tolerances, lambda _: None)
     with time_limited(checked_time_limit(time_limit)):

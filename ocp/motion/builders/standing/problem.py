@@ -34,13 +34,13 @@ from typing import Any, Literal
 import casadi as ca
 import numpy as np
 
-from models.arrays import Array
+from models.checks import Array
 from models.machines.standing import External, Standing, StandingMotion, center_of_pressure, wrenches_at
 from models.robot.dynamics import Wrench
 from models.robot.kinematics import joint_limit_index
 from models.robot.robot import Robot
 from ocp.console import interruptible
-from ocp.errors import ProblemError, checked_choice, checked_instance, checked_nonnegative
+from ocp.errors import ProblemError, require
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.standing.start import (
     check_freedom,
@@ -50,14 +50,7 @@ from ocp.motion.builders.standing.start import (
     start_inside,
     task_demand,
 )
-from ocp.motion.tasks.checks import (
-    check_length,
-    check_rest,
-    checked_configuration,
-    checked_horizon,
-    checked_tasks,
-    rates_at_rest,
-)
+from ocp.motion.tasks.checks import check_length, check_rest, checked_configuration, checked_tasks, rates_at_rest
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.limits import (
     Following,
@@ -98,7 +91,7 @@ class Weights:
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            checked_nonnegative(f"weights: {name}", value)
+            require.nonnegative(f"weights: {name}", value)
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,9 +130,9 @@ class StandingSetup:
             ("start_velocity", ("rest", "free")),
             ("end_velocity", ("rest", "free")),
         ):
-            checked_choice(option, getattr(self, option), choices)
+            require.choice(option, getattr(self, option), choices)
         if self.clearance_constraints is not None:
-            checked_instance("clearance_constraints", self.clearance_constraints, ClearanceConstraints)
+            require.instance("clearance_constraints", self.clearance_constraints, ClearanceConstraints)
 
 
 @dataclass(frozen=True)
@@ -205,20 +198,20 @@ def standing_problem(
             manipulability.
     """
     zmp = InFoot() if zmp is None else zmp
-    weights = Weights() if weights is None else checked_instance("standing_problem: weights", weights, Weights)
-    limits = Limits() if limits is None else checked_instance("standing_problem: limits", limits, Limits)
-    checked_instance("standing_problem: machine", machine, Standing)
+    weights = Weights() if weights is None else require.instance("standing_problem: weights", weights, Weights)
+    limits = Limits() if limits is None else require.instance("standing_problem: limits", limits, Limits)
+    require.instance("standing_problem: machine", machine, Standing)
     if limits.power is not None:
         words = "limits: standing plans have no limit of power; limit the torques"
         raise ProblemError(words, name="power", value=limits.power)
-    setup = StandingSetup() if setup is None else checked_instance("standing_problem: setup", setup, StandingSetup)
+    setup = StandingSetup() if setup is None else require.instance("standing_problem: setup", setup, StandingSetup)
     tip_level, along_parameter, external = setup.tip_level, setup.along == "parameter", setup.external
     if tip_level == "acceleration" and setup.control == "jerk":
         message = "tip_level 'acceleration' goes with control 'acceleration', not with 'jerk'"
         raise ProblemError(message, name="control", value=setup.control, limit="acceleration")
     rests = setup.start_velocity == "rest", setup.end_velocity == "rest"
     equations = bind(machine, tasks)
-    duration = checked_horizon(horizon.guess if isinstance(horizon, FreeTime) else horizon)
+    duration = require.positive("horizon", horizon.guess if isinstance(horizon, FreeTime) else horizon)
     begin, base = checked_configuration(machine, start, None)
     bounds = limits.bounds(machine, ("velocity", "torque"))
     begin = start_inside(machine, begin, bounds.lower, bounds.upper)

@@ -17,15 +17,14 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from models.arrays import Array
+from models.checks import Array
 from models.machines.stance import Stance
 from models.paths import rest_to_rest
 from models.robot.kinematics import link_frames
 from models.spatial import rotation
-from ocp.errors import ProblemError, SolveError, checked_count, checked_instance
+from ocp.errors import ProblemError, SolveError, require
 from ocp.motion.builders.standing.stances import Steps, Swing, check_placed, foot_task
 from ocp.motion.local.rates import resolve
-from ocp.motion.tasks.checks import checked_numbers
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.solution import Solution
 
@@ -123,9 +122,9 @@ def steps_motion(steps: Steps, solution: Solution, samples: int = SAMPLES) -> St
     Raises:
         ProblemError: The plan has other phases.
     """
-    checked_instance("steps_motion: steps", steps, Steps)
-    checked_instance("steps_motion: solution", solution, Solution)
-    count = checked_count("steps_motion: samples", samples, least=2)
+    require.instance("steps_motion: steps", steps, Steps)
+    require.instance("steps_motion: solution", solution, Solution)
+    count = require.count("steps_motion: samples", samples, least=2)
     times = solution.phases
     if tuple(times) != steps.names:
         words = f"steps_motion: the plan has the phases {list(times)}, the steps {list(steps.names)}"
@@ -225,9 +224,9 @@ def resolve_steps(steps: Steps, *, start: Any, samples: int = SAMPLES) -> StepsM
         ProblemError: Sizes or values do not fit, or a foot is off its foothold at the start.
         SolveError: The motion breaks down, for example at a stretched leg; names the phase and the time in it.
     """
-    checked_instance("resolve_steps: steps", steps, Steps)
-    count = checked_count("resolve_steps: samples", samples, least=2)
-    joints = checked_numbers(start, steps.robot.dof, "start", "one entry for each joint")
+    require.instance("resolve_steps: steps", steps, Steps)
+    count = require.count("resolve_steps: samples", samples, least=2)
+    joints = require.array("start", start, (steps.robot.dof,), meaning="one entry for each joint")
     check_placed(steps.stances[0], joints[steps.order(steps.stances[0])])
     parts, begin = [], 0.0
     for k, stance in enumerate(steps.stances):

@@ -18,20 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models import Foot, Foothold, ModelError, Robot, Stance
-from models.arrays import Array
+from models.checks import Array
 from models.paths import rest_to_rest
 from ocp.direct.guess import Samples
-from ocp.errors import (
-    ProblemError,
-    checked_choice,
-    checked_each,
-    checked_instance,
-    checked_mapping,
-    checked_nonnegative,
-    unknown_name,
-)
+from ocp.errors import ProblemError, require
 from ocp.motion.builders.standing.problem import FreeTime
-from ocp.motion.tasks.checks import checked_horizon, checked_numbers
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.tip_task import TipTask
 
@@ -65,13 +56,13 @@ class StancePhase:
     duration: float | FreeTime
 
     def __post_init__(self) -> None:
-        footholds = checked_mapping("stance phase: footholds", self.footholds)
+        footholds = require.mapping("stance phase: footholds", self.footholds)
         if not footholds:
             raise ProblemError("stance phase: footholds are missing; hold at least one foot", name="footholds")
         for name, foothold in footholds.items():
-            checked_instance(f"stance phase: foothold of {name!r}", foothold, Foothold)
+            require.instance(f"stance phase: foothold of {name!r}", foothold, Foothold)
         if not isinstance(self.duration, FreeTime):
-            checked_horizon(self.duration)
+            require.positive("horizon", self.duration)
         object.__setattr__(self, "footholds", footholds)
 
     @property
@@ -125,20 +116,20 @@ class Steps:
     clearance: float = 0.02
 
     def __post_init__(self) -> None:
-        checked_instance("steps: robot", self.robot, Robot)
-        checked_choice("steps: balance", self.balance, ("dynamic", "static"))
+        require.instance("steps: robot", self.robot, Robot)
+        require.choice("steps: balance", self.balance, ("dynamic", "static"))
         for name in ("margin", "clearance"):
-            checked_nonnegative(f"steps: {name}", getattr(self, name))
-        feet = checked_mapping("steps: feet", self.feet)
-        phases = checked_each("steps: phases", self.phases, StancePhase)
+            require.nonnegative(f"steps: {name}", getattr(self, name))
+        feet = require.mapping("steps: feet", self.feet)
+        phases = require.each("steps: phases", self.phases, StancePhase)
         if not phases:
             raise ProblemError("steps: no phases are given", name="phases")
         for name, foot in feet.items():
-            checked_instance(f"steps: foot {name!r}", foot, Foot)
+            require.instance(f"steps: foot {name!r}", foot, Foot)
         for phase in phases:
             for name in phase.footholds:
                 if name not in feet:
-                    raise unknown_name("foot", name, feet)
+                    raise require.unknown("foot", name, feet)
         for k, (before, after) in enumerate(pairwise(phases)):
             both = [name for name in before.footholds if name in after.footholds]
             if not both:
@@ -228,13 +219,13 @@ def walk(
     Raises:
         ProblemError: A foot has no foothold at the start, or no foot stays where another moves.
     """
-    footholds = checked_mapping("walk: footholds", footholds)
-    steps = checked_each("walk: steps", steps, tuple)
+    footholds = require.mapping("walk: footholds", footholds)
+    steps = require.each("walk: steps", steps, tuple)
     phases = [StancePhase(footholds, shift)]
     for step in steps:
         name, foothold = step if len(step) == 2 else (step, None)
         if not isinstance(name, str) or name not in footholds:
-            raise unknown_name("foot", name, footholds)
+            raise require.unknown("foot", name, footholds)
         rest = {each: place for each, place in footholds.items() if each != name}
         footholds = {**rest, name: foothold}
         phases += [StancePhase(rest, swing), StancePhase(footholds, shift)]
@@ -301,8 +292,8 @@ def standing_configuration(stance: Stance, near: Any, over: Any = None) -> Array
     Raises:
         ProblemError: No configuration within the limits puts the feet there.
     """
-    checked_instance("standing_configuration: stance", stance, Stance)
-    begin = checked_numbers(near, stance.joint_size, "near", "one entry for each joint")
+    require.instance("standing_configuration: stance", stance, Stance)
+    begin = require.array("near", near, (stance.joint_size,), meaning="one entry for each joint")
     lower, upper = stance.robot.lower, stance.robot.upper
     begin = np.clip(begin, lower, upper)
     q, none = ca.SX.sym("q", stance.joint_size), ca.DM(0, 1)
@@ -312,7 +303,7 @@ def standing_configuration(stance: Stance, near: Any, over: Any = None) -> Array
         gap = equations.error(none, q, ca.DM(equations.target_function()(0.0)))
     cost = CONFIGURATIONS.near * ca.sumsqr(q - begin)
     if over is not None:
-        wanted = checked_numbers(over, 2, "over", "x and y on the ground")
+        wanted = require.array("over", over, (2,), meaning="x and y on the ground")
         cost += CONFIGURATIONS.over * ca.sumsqr(stance.center_of_mass(q)[:2] - wanted)
     solver = ca.nlpsol("configuration", "ipopt", {"x": q, "f": cost, "g": gap}, {"print_time": False, "ipopt": IPOPT})
     result = solver(x0=begin, lbx=lower, ubx=upper, lbg=0.0, ubg=0.0)

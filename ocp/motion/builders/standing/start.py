@@ -13,7 +13,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from models.arrays import Array
+from models.checks import Array
 from models.machines.machine import Machine
 from models.machines.standing import External, Standing
 from models.paths import rest_to_rest

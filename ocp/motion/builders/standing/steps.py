@@ -22,17 +22,17 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from models.arrays import Array
+from models.checks import Array
 from models.errors import ModelError
 from models.machines.stance import Stance
 from models.paths import rest_to_rest
 from models.robot.kinematics import joint_limit_index
 from ocp.console import interruptible
-from ocp.errors import ProblemError, checked_instance, checked_nonnegative
+from ocp.errors import ProblemError, require
 from ocp.motion.builders.standing.problem import FreeTime, declare_horizon
 from ocp.motion.builders.standing.stances import PLACED, Steps, Swing, check_placed, first_guess, foothold_equations
 from ocp.motion.builders.standing.start import start_inside
-from ocp.motion.tasks.checks import checked_numbers, rates_at_rest
+from ocp.motion.tasks.checks import rates_at_rest
 from ocp.motion.tasks.limits import Limits
 from ocp.problem.phases import Phases
 from ocp.problem.problem import Problem, remembers_request
@@ -65,7 +65,7 @@ class StepWeights:
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            checked_nonnegative(f"step weights: {name}", value)
+            require.nonnegative(f"step weights: {name}", value)
 
 
 @dataclass(frozen=True)
@@ -109,14 +109,14 @@ def steps_problem(steps: Steps, *, start: Any, cost: StepWeights | None = None, 
         ProblemError: Sizes or values do not fit; the start is outside the limits, off the footholds or out of balance;
             no configuration reaches the footholds; the margin leaves no room; power or jerk is limited.
     """
-    checked_instance("steps_problem: steps", steps, Steps)
-    limits = Limits() if limits is None else checked_instance("steps_problem: limits", limits, Limits)
-    weights = StepWeights() if cost is None else checked_instance("steps_problem: cost", cost, StepWeights)
+    require.instance("steps_problem: steps", steps, Steps)
+    limits = Limits() if limits is None else require.instance("steps_problem: limits", limits, Limits)
+    weights = StepWeights() if cost is None else require.instance("steps_problem: cost", cost, StepWeights)
     for name in ("power", "jerk"):
         if getattr(limits, name) is not None:
             words = f"limits: steps have no limit of {name}; limit torques and accelerations"
             raise ProblemError(words, name=name, value=getattr(limits, name))
-    begin = checked_numbers(start, steps.robot.dof, "start", "one entry for each joint")
+    begin = require.array("start", start, (steps.robot.dof,), meaning="one entry for each joint")
     options = _Options(steps.balance, float(steps.margin), float(steps.clearance), weights, limits)
     first = steps.stances[0]
     own = start_inside(first, begin[steps.order(first)], first.robot.lower, first.robot.upper)

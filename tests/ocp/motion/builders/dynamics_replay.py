@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 
 from models import FixedBase, FreeFloating, simplify
-from models.arrays import Array
+from models.checks import Array
 from ocp import Solution, joint_torques
 from ocp.curves import quadrature_weights
 from tests.models.robot.oracles import mujoco_model

@@ -24,7 +24,7 @@ from models import (
     planar_chain,
     with_load,
 )
-from models.arrays import Array
+from models.checks import Array
 from ocp import (
     Collocation,
     Cost,

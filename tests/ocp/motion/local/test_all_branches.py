@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from models import FixedBase, lock_joints
-from models.arrays import Array
+from models.checks import Array
 from ocp import ProblemError, TipTask, inverse_kinematics
 from ocp.motion.local.chain import Chain, Motion
 from ocp.motion.local.elimination import Elimination, elimination_of, solve_opening

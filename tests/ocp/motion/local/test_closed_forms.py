@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from models import FixedBase, Joint, Mimic, Robot
-from models.arrays import Array
+from models.checks import Array
 from ocp import TipTask, inverse_kinematics
 from ocp.motion.local.chain import Chain
 from ocp.motion.local.closed_forms import ClosedForm

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from models import FreeFloating, Joint, Link, Robot
-from ocp import TipTask, Unreachable
+from ocp import Limits, TipTask, Unreachable
 from ocp.motion.search.reduced import check_floating_reach
 
 
@@ -22,10 +22,11 @@ def test_a_floating_arm_reaches_as_far_as_its_centre_of_mass_allows(share: float
     home = np.asarray(machine.base_home(), dtype=float)
     centre = (2.0 * np.zeros(3) + np.array([0.3 + 0.3 * np.cos(1.0), 0.3 * np.sin(1.0), 0.0])) / 3
     task = TipTask(position=centre + share * 0.7 * np.array([0.0, 0.6, 0.8]))
-    bounds: dict[str, Any] = {"lower": np.array([-np.pi]), "upper": np.array([np.pi])}
+    bounds = Limits().bounds(machine)._replace(lower=np.array([-np.pi]), upper=np.array([np.pi]))
+    options: dict[str, Any] = {"interval": (0.0, 1.0), "bounds": bounds}
     if share < 1:
-        check_floating_reach(machine, [task], home, np.array([1.0]), 0.0, 1.0, **bounds)
+        check_floating_reach(machine, [task], home, np.array([1.0]), **options)
         return
     with pytest.raises(Unreachable) as caught:
-        check_floating_reach(machine, [task], home, np.array([1.0]), 0.0, 1.0, **bounds)
+        check_floating_reach(machine, [task], home, np.array([1.0]), **options)
     assert 0.07 / np.sqrt(3) <= caught.value.pose_error <= 0.07  # the largest entry of a miss of 0.07 m

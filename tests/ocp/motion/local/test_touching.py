@@ -24,7 +24,7 @@ from models import (
     Robot,
     Sphere,
 )
-from models.arrays import Array
+from models.checks import Array
 from models.shapes.distance import COLUMNS
 from models.shapes.mesh_files import find_mesh, read_mesh
 from models.spatial import skew

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from models import FixedBase, FreeFloating, Link, Machine, planar_chain
-from models.arrays import Array
+from models.checks import Array
 from ocp import Limits, Plan, ProblemError, SolveError, TipTask, plan
 from ocp.app import main
 from ocp.motion.plan.actuators import ActuatorDemand

@@ -11,12 +11,14 @@ import pytest
 
 from models import CollisionScene, FixedBase, Robot
 from models.machines.machine import hold_joints
-from ocp import Scene, TipTask, plan
+from ocp import Limits, ProblemError, Scene, TipTask, plan
 from ocp.motion.local.collisions import distances_along
 from ocp.motion.local.ik_solver import idle_positions
 from ocp.motion.tasks.equations import bind
 from tests.models.robot.pinocchio_robots import DATA, urdf_file
 from tests.models.robot.trees import Array
+from tests.ocp.motion.local.arms import on_rail
+from tests.ocp.motion.tasks.space_tasks import ur5
 
 SPEED, LENGTH, CUTOFF, BATCH = 0.1, 0.3, 0.01, 100
 """m/s; m; m; configurations that are tried at once."""
@@ -124,3 +126,18 @@ def test_a_seam_is_planned_with_the_file_as_it_is(name: str, search: Any) -> Non
     assert (result.bound is not None) == (search == "global")
     if result.bound is not None:
         assert 0.5 * result.cost < result.bound <= result.cost
+
+
+def test_an_arm_on_a_gantry_plans_and_the_error_about_freedom_names_its_slides() -> None:
+    """Three slides and six joints leave four directions free, one more than the slides: the roll of the tool."""
+    machine = on_rail(ur5(), 3)
+    pose = machine.tip_pose((), np.array([0.1, -0.1, 0.05, 0.3, -1.2, 1.4, -1.7, -1.5, 0.0]))
+    first, axis = np.array(ca.DM(pose.position)).ravel(), np.array(ca.DM(pose.rotation))[:, 2]
+    task = TipTask(position=lambda t: ca.DM(first) + t * ca.DM([0, SPEED, 0]), direction=axis, duration=LENGTH / SPEED)
+    options: dict[str, Any] = {"limits": Limits(velocity=2.0), "scene": False}
+    result = plan(machine, task, **options)
+    assert result.audit().passed
+    assert result.cost <= 1.001 * SPEED**2 * LENGTH / SPEED / 2  # what the slides alone need
+    with pytest.raises(ProblemError, match="slide0, slide1, slide2, shoulder_pan_joint") as caught:
+        plan(machine, task, search="global", **options)
+    assert caught.value.value == 4

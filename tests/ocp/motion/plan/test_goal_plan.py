@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 
 from models import Box, CollisionScene, CollisionShape, FixedBase, Joint, Link, Robot
-from models.arrays import Array
+from models.checks import Array
 from models.examples import example_robot
-from ocp import Limits, Plan, ProblemError, SolveError
+from ocp import Goal, Limits, Plan, ProblemError, SolveError
+from ocp import plan as plan_motion
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.local.collisions import distances_along
-from ocp.motion.plan.goal_plan import GoalRequest, GoalSettings, plan_to_goal
+from ocp.motion.plan.goal_motions import GoalRequest, GoalSettings
+from ocp.motion.plan.goal_plan import plan_to_goal
 from ocp.motion.result.candidate import Rejection
 from ocp.motion.sampling.path_search import PathSearchSettings
 from ocp.motion.sampling.straight import StraightMotions
@@ -149,6 +151,44 @@ def test_a_goal_at_the_start_is_reached_by_rest(limits: Limits | None) -> None:
     np.testing.assert_allclose(sampled(plan), np.tile(START, (2001, 1)), atol=1e-12)
 
 
+LEAST_TIME = Cost(velocity=0.0, time=1.0)
+
+
+@pytest.mark.parametrize("jerk", [np.inf, 30.0])
+def test_without_obstacles_the_least_time_is_the_bound_of_the_slowest_joint(jerk: float) -> None:
+    limits = Limits(velocity=[1.0, 0.3], acceleration=[2.0, 4.0], jerk=jerk, torque=np.inf)
+    plan = plan_motion(slider(), Goal(joints=GOAL), start=[-1.0, 0.4], cost=LEAST_TIME, limits=limits, scene=False)
+    build_up = 2.0 / jerk
+    expected = 2.0 / 1.0 + 1.0 / 2.0 + build_up  # 2 m at 1 m/s and 2 m/s^2; the other joint has time to spare
+    assert plan.cost == plan.horizon == pytest.approx(expected, rel=1e-9)
+    assert plan.bound == pytest.approx(plan.cost, rel=1e-9)
+    assert plan.audit().feasible
+
+
+def test_around_a_box_the_least_time_needs_no_stop() -> None:
+    limits = Limits(acceleration=4.0, jerk=40.0, torque=np.inf)
+    plan = plan_to_goal(request_of(BOX, cost=LEAST_TIME, limits=limits))
+    assert plan.audit().feasible
+    assert plan.bound is not None
+    assert plan.bound == pytest.approx(2.0 + 0.25 + 0.1)
+    assert plan.bound <= plan.cost < 1.01 * plan.bound
+    sample = plan.sampled(np.linspace(0.0, plan.horizon, 2001))
+    assert gap(sample.joints, [BOX]).min() >= -1e-6
+    assert np.linalg.norm(sample.rates, axis=1)[200:-200].min() > 0.3
+    assert (np.abs(sample.accelerations) <= 4.001).all()
+
+
+def test_a_moving_end_is_reached_at_its_velocity_in_less_time_than_rest() -> None:
+    limits = Limits(acceleration=2.0, jerk=40.0, torque=np.inf)
+    plan = plan_to_goal(request_of(cost=LEAST_TIME, limits=limits, end_velocity=[1.0, 0.0]))
+    assert plan.audit().feasible
+    expected = 2.0 + (1.0 / 2.0 + 0.05) / 2  # one ramp instead of two: half of its time is lost
+    assert expected * (1 - 1e-6) <= plan.cost <= 1.01 * expected
+    sample = plan.sampled(np.linspace(0.0, plan.horizon, 101))
+    np.testing.assert_allclose(sample.rates[[0, -1]], [[0.0, 0.0], [1.0, 0.0]], atol=1e-6)
+    np.testing.assert_allclose(sample.joints[-1], GOAL, atol=1e-6)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("jerk", [None, 400.0])
 def test_least_time_of_an_arm_among_boxes_keeps_all_limits_and_its_clearance(jerk: float | None) -> None:
@@ -167,6 +207,7 @@ def test_least_time_of_an_arm_among_boxes_keeps_all_limits_and_its_clearance(jer
     assert plan.audit().feasible
     assert plan.bound is not None
     assert plan.bound <= plan.cost == pytest.approx(plan.horizon)
+    assert plan.cost < 1.1 * plan.bound
     sample = plan.sampled(np.linspace(0.0, plan.horizon, 2001))
     assert distances_along(scene, np.zeros(0), sample.joints, sample.t).min() >= -1e-6
     assert (np.abs(sample.rates) <= machine.robot.velocity * 1.001).all()

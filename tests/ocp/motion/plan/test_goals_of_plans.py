@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from models import Box, FixedBase, HalfSpace, Sphere, example_robot
-from models.arrays import Array
+from models.checks import Array
 from ocp import (
     Collocation,
     Cost,

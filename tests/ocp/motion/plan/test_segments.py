@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from models import CollisionShape, FixedBase, Path, Sphere, smooth
-from models.arrays import Array
+from models.checks import Array
 from models.shapes.shapes import MovingObstacle
 from ocp import DeadEnd, ProblemError, Scene, TipTask, plan
 from ocp.motion.plan import sequence

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from models import FixedBase, planar_chain
-from models.arrays import Array
+from models.checks import Array
 from ocp import SolveError, TipTask, Unreachable, inverse_kinematics
 from ocp.errors import ProblemError
 from ocp.motion.builders.tool_motion import ERRORS

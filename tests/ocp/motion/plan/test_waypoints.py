@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from models import Box, CollisionScene, FixedBase
-from models.arrays import Array
+from models.checks import Array
 from models.robot.rebuild import lock_joints
 from models.spatial import quaternion_from_rotation
 from ocp import Cost, DeadEnd, Limits, ProblemError, Scene, Unreachable, Waypoints, plan

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 
 from models import Box, CollisionShape, FixedBase, Joint, Link, Robot
-from models.arrays import Array
+from models.checks import Array
 
 RADIUS = 0.1
 """Of the ball, m."""

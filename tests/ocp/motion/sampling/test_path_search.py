@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from models import Box, CollisionScene
-from models.arrays import Array
+from models.checks import Array
 from ocp.console import TimeLimitReached, time_limited
 from ocp.motion.sampling.path_search import JointPath, PathSearchSettings, TreeSearch, connect, find_paths
 from ocp.motion.sampling.shortening import optimise_length, path_length, points_along, same_class, shorten
@@ -100,14 +100,14 @@ def test_shortening_and_optimisation_never_lengthen_and_keep_ends_and_clearance(
     free = random.uniform(-2, 2, (200, 2))
     free = free[gap(free, boxes) > 0.02]
     scale = np.array([1.0, 2.0])
-    path = connect(search, free[0], free[1:2], random, 4000)
+    path = connect(search, free[0], free[1:2], random=random, most_samples=4000)
     assert path is not None
     lengths = [path_length(path, scale)]
     for step in ("shorten", "optimise"):
         path = (
-            shorten(search.motions, path, scale, random)
+            shorten(search.motions, path, scale, random=random)
             if step == "shorten"
-            else optimise_length(search.motions, path, scale, LIMITS)
+            else optimise_length(search.motions, path, scale, limits=LIMITS)
         )
         lengths.append(path_length(path, scale))
         np.testing.assert_array_equal(path[[0, -1]], free[:2])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from models import Box, Capsule, CollisionScene, Cylinder, FixedBase, HalfSpace, Sphere
-from models.arrays import Array
+from models.checks import Array
 from models.examples import example_robot
 from models.shapes.shapes import Shape
 from ocp.motion.local.collisions import distances_along

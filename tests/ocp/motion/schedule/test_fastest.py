@@ -125,7 +125,9 @@ def test_the_passes_find_what_a_linear_program_finds(seed: int, rows: int) -> No
     p = size * np.cos(2 * np.pi * s[:-1, None] + phase[0])
     q = rng.uniform(0, 2) * np.sin(2 * np.pi * s[:-1, None] + phase[1])
     most = rng.uniform(0.5, 2, count + 1)
-    x = reachability_passes(s, np.where(np.isin(s, [0, 1]), 0.0, most), p, q, -np.ones_like(p), np.ones_like(p))
+    x = reachability_passes(
+        s, np.where(np.isin(s, [0, 1]), 0.0, most), p=p, q=q, low=-np.ones_like(p), high=np.ones_like(p)
+    )
     matrix, bounds = [], [(0, 0), *((0, top) for top in most[1:-1]), (0, 0)]
     for k in range(count):
         for r in range(rows):

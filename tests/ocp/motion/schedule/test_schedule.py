@@ -111,12 +111,12 @@ def change(drawn: tuple[float, ...]) -> tuple[float, ...]:
 
 @given(changes)
 def test_the_fastest_motion_ends_where_it_must_whether_ruckig_finds_it_or_two_ramps_make_it(drawn: Any) -> None:
-    asked = change(drawn)
-    distance, first, last, top, acceleration, jerk = asked
-    found = ramps.fastest_motion(*asked)
+    distance, first, last, *limits = change(drawn)
+    top, acceleration, jerk = limits
+    found = ramps.fastest_motion(distance, first, last, (top, acceleration, jerk))
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(ramps, "Ruckig", lambda _: SimpleNamespace(calculate=lambda *_: None))
-        made = ramps.fastest_motion(*asked)
+        made = ramps.fastest_motion(distance, first, last, (top, acceleration, jerk))
     for phases in (found, made):
         s, v, a = 0.0, first, 0.0
         for t, j in phases:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from models import FixedBase, Joint, Link, Robot
-from models.arrays import Array
+from models.checks import Array
 from ocp import ProblemError, TipTask, inverse_kinematics
 from ocp.motion.search.charts import Charts, SelfMotionManifolds
 from ocp.motion.search.joint_space import JointSpace

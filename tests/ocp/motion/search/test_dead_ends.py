@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from models import Box, FixedBase
-from models.arrays import Array
+from models.checks import Array
 from ocp import DeadEnd, Limits, Scene, TipTask, Waypoints, plan
 from tests.ocp.motion.plan.test_waypoints import poses
 from tests.ocp.motion.search.test_charts import planar

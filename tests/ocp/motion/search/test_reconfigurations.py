@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from models import FixedBase
-from models.arrays import Array
+from models.checks import Array
 from models.robot.rebuild import lock_joints
 from ocp import DeadEnd, ProblemError, Scene, TipTask, Waypoints, inverse_kinematics, plan
 from ocp.audit.clearance import ClosestPair
@@ -22,7 +22,7 @@ from ocp.motion.search.charts import SelfMotionManifolds, TimeSample
 from ocp.motion.search.joint_space import JointSpace
 from ocp.motion.search.reconfigurations import fewest_segments, segment_ends
 from ocp.motion.search.search import AtlasSearch
-from ocp.motion.search.steps import PathLength
+from ocp.motion.search.steps import PathLength, Steps
 from ocp.motion.tasks.equations import bind
 from tests.ocp.motion.local.test_closed_forms import chain_of
 from tests.ocp.motion.search.test_charts import planar
@@ -155,7 +155,7 @@ def searched(machine: FixedBase, places: Array, step: float) -> AtlasSearch:
 
     far = np.full((len(places) - 1, 3), step)
     instants, times = [TimeSample(sets, k) for k in range(len(places))], np.linspace(0, 1, len(places))
-    return AtlasSearch(space, instants, times, PathLength(np.ones(3)), far, seeds=seeds)
+    return AtlasSearch(space, instants, Steps(times, PathLength(np.ones(3)), far), seeds=seeds)
 
 
 @pytest.mark.parametrize(("reach", "count"), [(0.45, 1), pytest.param(0.1, 0, marks=pytest.mark.long)])

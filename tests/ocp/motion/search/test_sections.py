@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from models import Box, FixedBase
-from models.arrays import Array
+from models.checks import Array
 from models.robot.rebuild import lock_joints
 from ocp import Cost, DeadEnd, ProblemError, Scene, SolveError, Unreachable, Waypoints, plan
 from ocp.motion.plan import waypoints

@@ -11,10 +11,10 @@ import pytest
 from numpy.testing import assert_allclose
 
 from models import CollisionScene, CollisionShape, FixedBase, MovingObstacle, Sphere
-from models.arrays import Array
+from models.checks import Array
 from ocp.motion.local.collisions import distances_along
 from ocp.motion.search.charts import TimeSample
-from ocp.motion.search.steps import PathLength, SquaredRates
+from ocp.motion.search.steps import PathLength, SquaredRates, Steps
 from ocp.motion.search.value import shorten_path
 from tests.ocp.motion.search.test_charts import moved, planar, sets_of
 
@@ -64,7 +64,9 @@ def tight(obstacle: Any = None, later: float = 0.0) -> Array:
     around = None if obstacle is None else CollisionScene(MACHINE, [obstacle], clearance=CLEARANCE)
     far, bounds = np.full((len(TIMES) - 1, robot.dof), 1.0), (robot.lower, robot.upper)
     cost = PathLength(np.ones(robot.dof))
-    return shorten_path(followed(), INSTANTS, cost, TIMES + later, far, bounds, around, (0.1, 1e-3))
+    return shorten_path(
+        followed(), INSTANTS, Steps(TIMES + later, cost, far), bounds=bounds, scene=around, widths=(0.1, 1e-3)
+    )
 
 
 def drawn(
@@ -75,7 +77,9 @@ def drawn(
     steps = np.full((len(TIMES) - 1, robot.dof), far)
     bounds = np.maximum(robot.lower, lower), np.minimum(robot.upper, upper)
     cost = cost or PathLength(np.ones(robot.dof))
-    return shorten_path(followed(start), INSTANTS, cost, times, steps, bounds, None, (0.1, 1e-3))
+    return shorten_path(
+        followed(start), INSTANTS, Steps(times, cost, steps), bounds=bounds, scene=None, widths=(0.1, 1e-3)
+    )
 
 
 def length(path: Array) -> float:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from models import FixedBase
-from models.arrays import Array
+from models.checks import Array
 from ocp import TipTask, inverse_kinematics
 from ocp.motion.search.charts import Charts, SelfMotionManifolds, TimeSample, _rim
 from ocp.motion.search.joint_space import JointSpace
@@ -23,6 +23,7 @@ from ocp.motion.search.steps import (
     QuadraticBounds,
     SquaredRates,
     StepCost,
+    Steps,
     least_in_box,
 )
 from ocp.motion.search.value import GraphSettings, _bound_charts, _bound_with_rest, _secant_slopes
@@ -93,7 +94,7 @@ def search_of(machine: FixedBase, places: Array, cost: StepCost) -> AtlasSearch:
         return np.array([one.joints for one in inverse_kinematics(machine, at, starts=16, seed=k)])
 
     limits = robot.velocity * np.diff(times)[:, None]
-    return AtlasSearch(space, [TimeSample(sets, k) for k in range(INSTANTS)], times, cost, limits, seeds=seeds)
+    return AtlasSearch(space, [TimeSample(sets, k) for k in range(INSTANTS)], Steps(times, cost, limits), seeds=seeds)
 
 
 @pytest.mark.parametrize("kind", [SquaredRates, PathLength, LargestMotion])
@@ -188,7 +189,7 @@ def test_what_is_below_a_step_is_nowhere_above_it_and_touches_it(kind: Any, free
     after = QuadraticBounds(rng.normal(size=count), rng.normal(size=(count, free)), curve + curve.transpose(0, 2, 1))
     delta = 0.3 * rng.normal(size=(count, n))
     steps = cost.lower_bounds(
-        delta, CurvedCharts(out, *out.curvature()), CurvedCharts(into, *into.curvature()), after, seconds
+        delta, CurvedCharts(out, *out.curvature()), CurvedCharts(into, *into.curvature()), after, seconds=seconds
     )
     grid = np.array(list(product(np.linspace(0, 1, 41 if free > 1 else 1001), repeat=free)))
     there = into.low[:, None] + (into.high - into.low)[:, None] * grid
@@ -241,7 +242,7 @@ def test_what_is_below_a_step_is_so_where_the_sets_bend_away_from_their_charts_a
     after = QuadraticBounds(rng.normal(size=count), rng.normal(size=(count, free)), np.zeros((count, free, free)))
     delta = 0.3 * rng.normal(size=(count, n))
     steps = cost.lower_bounds(
-        delta, CurvedCharts(out, *out.curvature()), CurvedCharts(into, *into.curvature()), after, seconds
+        delta, CurvedCharts(out, *out.curvature()), CurvedCharts(into, *into.curvature()), after, seconds=seconds
     )
     grid = np.array(list(product(np.linspace(0, 1, 31 if free > 1 else 501), repeat=free)))
     there = into.low[:, None] + (into.high - into.low)[:, None] * grid
@@ -285,7 +286,7 @@ def test_what_is_lost_of_steps_between_sets_that_bend_is_of_higher_order_than_th
         after = QuadraticBounds(np.zeros(count), rng.normal(size=(count, free)), np.zeros((count, free, free)))
         delta, cost = 0.3 * rng.normal(size=(count, n)), SquaredRates(weights)
         steps = cost.lower_bounds(
-            delta, CurvedCharts(out, *out.curvature()), CurvedCharts(into, *into.curvature()), after, seconds
+            delta, CurvedCharts(out, *out.curvature()), CurvedCharts(into, *into.curvature()), after, seconds=seconds
         )
         grid = np.array(list(product(np.linspace(-half, half, 41 if free > 1 else 501), repeat=free)))
         there = np.broadcast_to(grid, (count, *grid.shape))
@@ -320,7 +321,7 @@ def test_bounds_on_a_chart_are_above_no_step_from_it_nor_with_what_is_known_of_t
     )
     delta = np.repeat(0.3 * rng.normal(size=(groups, n)), each, axis=0) + 0.05 * rng.normal(size=(count, n))
     steps = cost.lower_bounds(
-        delta, CurvedCharts(out, *out.curvature()), CurvedCharts(into, *into.curvature()), after, seconds
+        delta, CurvedCharts(out, *out.curvature()), CurvedCharts(into, *into.curvature()), after, seconds=seconds
     )
     starts = np.arange(0, count, each)
     found, boxes, gaps = (

@@ -1,4 +1,4 @@
-"""Motions that stop at corners, and least durations of joints, beside ruckig."""
+"""Motions of constant jerk beside ruckig and closed forms: least durations, synchronised joints, stops at corners."""
 
 from __future__ import annotations
 
@@ -7,13 +7,20 @@ import pytest
 from ruckig import InputParameter, Result, Ruckig, Trajectory
 
 from models import FixedBase
-from models.arrays import Array
+from models.checks import Array
 from models.examples import example_robot
 from ocp import Limits
+from ocp.motion.builders.constant_jerk import (
+    TorqueLimits,
+    least_durations,
+    segment_durations,
+    stopping_motion,
+    synchronised_motion,
+)  # fmt: skip
 from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem
-from ocp.motion.builders.joint_motion import joint_motion_problem, least_durations, motion_along
-from ocp.motion.builders.stopping_motion import segment_durations, stopping_motion
+from ocp.motion.builders.joint_motion import joint_motion_problem, motion_along
 from ocp.motion.tasks.goals import Cost
+from ocp.motion.tasks.limits import JointBounds
 
 INF = np.inf
 
@@ -49,6 +56,66 @@ def test_least_durations_are_those_of_ruckig(kinds: str) -> None:
     assert (least_durations(np.zeros(6), bounds) == 0).all()
 
 
+def double_s_duration(distance: float, velocity: float, acceleration: float, jerk: float) -> float:
+    """Return the least time of a rest-to-rest motion (Biagiotti & Melchiorri 2008, section 3.4.1)."""
+    if velocity * jerk >= acceleration**2:
+        ramp = acceleration / jerk + velocity / acceleration
+    else:
+        ramp = 2 * np.sqrt(velocity / jerk)
+    cruise = distance / velocity - ramp
+    if cruise < 0:
+        cruise = 0.0
+        if distance >= 2 * acceleration**3 / jerk**2:
+            build_up = acceleration / jerk
+            ramp = build_up / 2 + np.sqrt((build_up / 2) ** 2 + distance / acceleration)
+        else:
+            ramp = 2 * np.cbrt(distance / (2 * jerk))
+    return float(2 * ramp + cruise)
+
+
+@pytest.mark.parametrize("kinds", ["vaj", "va"])
+def test_synchronised_joints_take_the_time_of_the_slowest_one_and_are_straight_where_that_allows_it(kinds: str) -> None:
+    random, straight = np.random.default_rng(4), 0
+    for number in range(300):
+        n = int(random.integers(1, 8))
+        unlimited = np.full(n, INF)
+        velocity, acceleration, jerk = (10 ** random.uniform(-1, 1.5, n) * size for size in (1.0, 3.0, 30.0))
+        change = random.uniform(-3, 3, n) * (random.random(n) > 0.1)
+        change[0] += 3.5
+        if number % 3 == 0:  # the limits are in proportion: each joint has the profile of the others
+            velocity, acceleration, jerk = (np.abs(change + 1e-9) * size[0] for size in (velocity, acceleration, jerk))
+        jerk = jerk if "j" in kinds else unlimited
+        bounds = JointBounds(-unlimited, unlimited, velocity, acceleration, jerk, unlimited, unlimited)
+        start = random.uniform(-1, 1, n)
+        motion = synchronised_motion(start, start + change, bounds)
+        own = [
+            double_s_duration(abs(change[k]), velocity[k], acceleration[k], min(jerk[k], 1e15)) if change[k] else 0.0
+            for k in range(n)
+        ]
+        assert motion.duration == pytest.approx(max(own), rel=1e-6)
+        joints, rates, accelerations = motion.sampled(np.linspace(0.0, 1.0, 9))
+        np.testing.assert_allclose(joints[0, 0], start)
+        np.testing.assert_allclose(joints[-1, -1], start + change, atol=1e-9)
+        np.testing.assert_allclose(rates[[0, -1], [0, -1]], 0.0, atol=1e-9 * velocity.max())
+        np.testing.assert_allclose(joints[1:, 0], joints[:-1, -1], atol=1e-12)
+        np.testing.assert_allclose(rates[1:, 0], rates[:-1, -1], atol=1e-12 * velocity.max())
+        if "j" in kinds:
+            np.testing.assert_allclose(accelerations[1:, 0], accelerations[:-1, -1], atol=1e-9 * acceleration.max())
+        for values, largest in ((rates, velocity), (accelerations, acceleration), (motion.jerks, jerk)):
+            assert (np.abs(values) <= largest * (1 + 1e-9)).all()
+        shares = (joints.reshape(-1, n) - start)[:, :1] / change[0]
+        is_straight = np.abs(joints.reshape(-1, n) - start - shares * change).max() < 1e-9
+        straight += is_straight
+        assert is_straight or number % 3
+    assert 100 <= straight < 250
+
+
+def test_joints_that_stay_are_still_for_a_moment() -> None:
+    motion = synchronised_motion(np.ones(6), np.ones(6), Limits(acceleration=1.0, jerk=1.0).bounds(arm()))
+    assert 0 < motion.duration < 0.01
+    np.testing.assert_array_equal(motion.sampled(np.array([0.0, 1.0]))[0], np.ones((1, 2, 6)))
+
+
 @pytest.mark.parametrize("jerk", [INF, 100.0])
 def test_a_straight_motion_of_equal_joints_takes_the_time_of_one(jerk: float) -> None:
     bounds = Limits(velocity=1.0, acceleration=5.0, jerk=jerk, torque=INF).bounds(arm())
@@ -65,14 +132,15 @@ def test_a_motion_through_corners_passes_as_a_solution_within_all_limits(
     machine = arm()
     limits = Limits(acceleration=20.0, jerk=jerk, torque=[torque, torque, torque, 28.0, 28.0, 28.0])
     path = np.array([[0.0, 0.9, 0.5, 0.0, 0.3, 0.0], [0.5, 1.2, 0.2, 0.1, 0.0, 0.4], [0.2, 1.3, 0.4, 0.6, 0.2, 1.0]])
-    motion = stopping_motion(machine, path, limits.bounds(machine)).slower(factor)
+    bounds = limits.bounds(machine)
+    motion = stopping_motion(path, bounds, TorqueLimits(machine, bounds)).slower(factor)
     control = "jerk" if np.isfinite(jerk) else "acceleration"
     problem = dynamics_problem(
         machine, (), motion.duration, start=path[0], end=path[-1], limits=limits,
         cost=Cost(velocity=1.0, effort=1e-4, time=1.0, weights=[1.0, 2.0, 3.0, 1.0, 1.0, 1.0]),
         setup=DynamicsSetup(control=control),  # type: ignore[arg-type]
     )  # fmt: skip
-    audit = motion.solution(problem).audit()
+    audit = motion.solution(problem, "stops at corners").audit()
     assert audit.feasible, audit
     assert audit["cost, relative"].value < 1e-6
     durations = segment_durations(np.diff(path, axis=0), limits.bounds(machine))

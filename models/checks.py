@@ -1,0 +1,361 @@
+"""Checks of arguments: numbers, arrays, names, flags and typed values.
+
+`Checks(error)` holds the checks of a package, which raise its exception. `require` is that of `models`, and
+`ocp.errors.require` that of `ocp`. Every check takes a label and the value, and returns the value in its checked form.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from math import inf, isinf, isnan
+from numbers import Real
+from typing import Any, Literal, TypeAlias, TypeVar
+from warnings import warn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.errors import DetailedError, ModelError, ModelWarning
+from models.files import INPUT_LIMITS
+
+Array: TypeAlias = NDArray[np.float64]
+ArrayInput: TypeAlias = Any
+Entries: TypeAlias = Literal["finite", "numbers", "any"]
+Sign: TypeAlias = Literal["any", "positive", "nonnegative"]
+
+NOT_NUMBERS = (TypeError, ValueError, OverflowError, RuntimeError, NotImplementedError)
+"""Exceptions that NumPy and CasADi raise for values that are not numeric."""
+ROUNDING = 1e-9
+"""Relative tolerance (or absolute, in m or rad) below which a difference is attributed to rounding."""
+MAX_LISTED = 12
+"""Largest number of vector entries, or of names, that a message lists."""
+
+_Choice = TypeVar("_Choice")
+_Kind = TypeVar("_Kind")
+
+
+def check_entries(value: Any) -> None:
+    """Raise ValueError if `value` has more than `INPUT_LIMITS.array_entries` entries.
+
+    The size is estimated before anything is copied, since a view or a range may exceed the memory. The first entry of a
+    list stands for all its entries.
+    """
+    limit, entries, part = INPUT_LIMITS.array_entries, 1, value
+    for _ in range(INPUT_LIMITS.nesting):  # as many dimensions as numpy's arrays have at most
+        if isinstance(part, np.ndarray):
+            entries *= part.size
+        if not isinstance(part, Sequence) or isinstance(part, str | bytes):
+            break
+        entries *= len(part)
+        if not 0 < entries <= limit:
+            break
+        part = part[0]
+    if entries > limit:
+        raise ValueError(f"{entries} entries, at most {limit} are read")
+
+
+def floats(value: Any) -> Array:
+    """Return a value as a new array of floats.
+
+    Values that NumPy would silently convert are refused too: text, True, None, symbols (read as nan) and complex
+    numbers.
+
+    Raises:
+        TypeError, ValueError, ...: One of NOT_NUMBERS: the value is not numeric or has too many entries.
+    """
+    check_entries(value)
+    array = np.asarray(value)
+    if array.dtype.kind == "O":
+        numeric = all(isinstance(entry, Real) and not isinstance(entry, bool | np.bool_) for entry in array.flat)
+    else:
+        numeric = array.dtype.kind in "iuf"
+    if not numeric:
+        raise TypeError(f"{array.dtype} is no real number")
+    return np.array(array, dtype=float)
+
+
+def real(value: Any) -> float:
+    """Return a real number, or an array without dimensions, as a float; nan for any other value."""
+    value = value[()] if isinstance(value, np.ndarray) and value.ndim == 0 else value
+    if isinstance(value, bool | np.bool_) or not isinstance(value, Real):
+        return np.nan
+    try:
+        return float(value)
+    except OverflowError:
+        return np.nan
+
+
+def frozen(array: Array) -> Array:
+    """Make an array read-only and return it."""
+    array.setflags(write=False)
+    return array
+
+
+def argument_of(label: str) -> str:
+    """Return the name of the argument, `scheme`, from a label such as `Collocation: scheme`."""
+    return label.rpartition(" ")[2].strip("'")
+
+
+@dataclass(frozen=True)
+class Checks:
+    """Checks of arguments that raise the exception of one package.
+
+    The first argument of each check, `label`, is the name of the argument, behind its owner if that helps: "count" or
+    "box: size". Messages state the label, the requirement and the value; the fields of the exception are `name`, the
+    last word of the label, `value`, and `limit`, what is allowed.
+
+    Attributes:
+        error: Class of the exceptions.
+    """
+
+    error: type[DetailedError]
+
+    def invalid(self, label: str, requirement: str, value: Any, limit: Any = None) -> DetailedError:
+        """Return the error of an argument that violates a requirement."""
+        value = value.item() if isinstance(value, np.generic) else value
+        words = f"{label} must be {requirement}, not {value!r}"
+        return self.error(words, name=argument_of(label), value=value, limit=limit)
+
+    def unknown(self, kind: str, name: object, known: Iterable[str]) -> DetailedError:
+        """Return the error for a name that does not exist, with the most similar names, or else all."""
+        names = [str(item) for item in known]
+        by_case = {item.casefold(): item for item in reversed(names)}
+        similar = [by_case[item] for item in get_close_matches(str(name).casefold(), by_case, n=3, cutoff=0.5)]
+        listed = ", ".join(names[:MAX_LISTED]) or "none"
+        listed += f" and {len(names) - MAX_LISTED} more" if len(names) > MAX_LISTED else ""
+        hint = f"did you mean {' or '.join(map(repr, similar))}?" if similar else f"known: {listed}"
+        words = f"{kind} {name!r} does not exist; {hint}"
+        return self.error(words, name=str(name) or kind, value=name, limit=tuple(names))
+
+    def number(self, label: str, value: Any, *, finite: bool = True, unit: str = "") -> float:
+        """Return a number as a float; infinity is one unless `finite`."""
+        number = real(value)
+        if isnan(number) or (finite and isinf(number)):
+            raise self.invalid(label, ("a finite number" if finite else "a number") + _in(unit), value)
+        return number
+
+    def positive(self, label: str, value: Any, *, below: float = inf, unit: str = "") -> float:
+        """Return a number as a float that is above zero and less than `below`."""
+        number = real(value)
+        if not 0 < number < below:
+            kind = "positive and finite" if below == inf else f"between 0 and {below:g}"
+            raise self.invalid(label, kind + _in(unit), value, 0.0 if below == inf else (0.0, below))
+        return number
+
+    def nonnegative(self, label: str, value: Any, *, unit: str = "") -> float:
+        """Return a number as a float that is finite, zero or above."""
+        number = real(value)
+        if not 0 <= number < inf:
+            raise self.invalid(label, "a finite number, zero or above" + _in(unit), value, 0.0)
+        return number
+
+    def count(self, label: str, value: Any, least: int = 1, most: int = INPUT_LIMITS.count) -> int:
+        """Return an integer from `least` to `most`."""
+        if not isinstance(value, int | np.integer) or isinstance(value, bool) or not least <= value <= most:
+            raise self.invalid(label, f"a whole number, {least} to {most}", value, (least, most))
+        return int(value)
+
+    def choice(self, label: str, value: _Choice, choices: Iterable[Any]) -> _Choice:
+        """Return a value that is one of the choices, and of its type."""
+        allowed = tuple(choices)
+        if not any(isinstance(value, type(item)) and value == item for item in allowed):
+            raise self.invalid(label, " or ".join(map(repr, allowed)), value, allowed)
+        return value
+
+    def flag(self, label: str, value: Any) -> bool:
+        """Return True or False."""
+        if not isinstance(value, bool | np.bool_):
+            raise self.invalid(label, "True or False", value, (True, False))
+        return bool(value)
+
+    def text(self, label: str, value: Any) -> str:
+        """Return a string, which may be empty."""
+        if not isinstance(value, str):
+            raise self.invalid(label, "a string", value, "str")
+        return value
+
+    def name(self, label: str, value: Any) -> str:
+        """Return a string of printable characters, at least one, as terminals and shells act on others."""
+        limit = INPUT_LIMITS.name_characters
+        if not isinstance(value, str) or not value:
+            raise self.invalid(label, "a name, a string that is not empty", value)
+        if len(value) > limit or not value.isprintable():
+            raise self.invalid(label, f"at most {limit} printable characters", value[:limit], limit)
+        return value
+
+    def instance(self, label: str, value: Any, kind: type[_Kind]) -> _Kind:
+        """Return an instance of a class."""
+        if not isinstance(value, kind):
+            raise self.invalid(label, f"a {kind.__name__}", value, kind.__name__)
+        return value
+
+    def each(self, label: str, values: Any, kind: type[_Kind]) -> tuple[_Kind, ...]:
+        """Return instances of a class, none or more, as a tuple."""
+        try:
+            check_entries(values)
+            items = tuple(values)
+        except NOT_NUMBERS as error:
+            raise self.invalid(label, f"a list of {kind.__name__}", values, kind.__name__) from error
+        return tuple(self.instance(label, item, kind) for item in items)
+
+    def mapping(self, label: str, values: Any, keys: type = str) -> dict[Any, Any]:
+        """Return a copy of a dictionary with keys of one class, empty for None."""
+        if not isinstance(values, Mapping | None) or not all(isinstance(key, keys) for key in values or ()):
+            raise self.invalid(label, "a dictionary by name", values)
+        return dict(values or {})
+
+    def array(
+        self,
+        label: str,
+        value: ArrayInput,
+        shape: tuple[int | str, ...] | None = None,
+        *,
+        entries: Entries = "finite",
+        sign: Sign = "any",
+        least: int = 1,
+        unit: str = "",
+        meaning: str = "",
+    ) -> Array:
+        """Return a read-only array of floats.
+
+        Args:
+            value: Anything that NumPy reads as floats.
+            shape: Expected shape; any if None. A string stands for a free dimension: ("points", 3). A shape with one
+                free dimension also accepts a scalar, one of a vector also a column.
+            entries: "finite" ones only; "numbers" may be infinite; "any" may be nan as well.
+            sign: Sign of all entries.
+            least: Least size of a free dimension.
+            unit, meaning: Unit and meaning of the entries, for messages.
+        """
+        try:
+            array = floats(value)
+        except NOT_NUMBERS as error:
+            raise self._wrong(label, f"{value!r} is not numeric", value) from error
+        if shape is not None and array.shape != shape:
+            array = self._shaped(label, array, shape, least, meaning)
+        if entries != "any" and not np.isfinite(array).all():
+            wrong = ~np.isfinite(array) if entries == "finite" else np.isnan(array)
+            if wrong.any():
+                raise self._wrong(label, f"{_shown(array, wrong)} is not finite", array)
+        if sign != "any" and (wrong := array < 0 if sign == "nonnegative" else ~(array > 0)).any():
+            words = f"{_shown(array, wrong)} {unit}".rstrip()
+            raise self._wrong(
+                label, f"{words} is {'negative' if sign == 'nonnegative' else 'not positive'}", array, 0.0
+            )
+        return frozen(array)
+
+    def broadcast(
+        self,
+        label: str,
+        value: ArrayInput,
+        count: int,
+        items: str,
+        *,
+        entries: Entries = "finite",
+        sign: Sign = "any",
+        unit: str = "",
+    ) -> Array:
+        """Return one float for each of `count` items, from one number or from one each. Shape (count,).
+
+        Args:
+            items: Plural noun for messages.
+            entries, sign, unit: As in `array`.
+        """
+        array = self.array(label, value, entries=entries, sign=sign, unit=unit)
+        if array.ndim and array.shape != (count,):
+            words = f"has shape {array.shape}; give one number or one for each of the {count} {items}"
+            raise self._wrong(label, words, array, (count,))
+        return frozen(np.array(np.broadcast_to(array, (count,))))
+
+    def indices(self, label: str, value: Any, count: int) -> NDArray[np.intp]:
+        """Return an array of integers from 0, below `count`."""
+        try:
+            check_entries(value)
+            indices = np.asarray(value)
+        except NOT_NUMBERS:  # rejected below
+            indices = np.array(np.nan)
+        if indices.dtype.kind not in "iu" or ((indices < 0) | (indices >= count)).any():
+            raise self.invalid(label, f"whole numbers from 0, below {count}", value, (0, count))
+        return indices.astype(np.intp)
+
+    def rotation(self, label: str, value: ArrayInput) -> Array:
+        """Return a read-only rotation matrix. One printed with few digits is projected onto the nearest rotation."""
+        matrix = self.array(label, value, (3, 3))
+        error = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
+        (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()  # np.linalg.det would double the cost
+        if error > 1e-6 or a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) < 0:
+            words = f"{matrix.tolist()} is not a rotation matrix (orthonormal, determinant 1)"
+            raise self._wrong(label, words, matrix)
+        if error > 1e-12:
+            left, _, right = np.linalg.svd(matrix)
+            matrix = frozen(left @ right)
+        return matrix
+
+    def _wrong(self, label: str, words: str, value: Any, limit: Any = None) -> DetailedError:
+        return self.error(f"{label} {words}", name=argument_of(label), value=value, limit=limit)
+
+    def _shaped(self, label: str, array: Array, shape: tuple[int | str, ...], least: int, meaning: str) -> Array:
+        """Return the array in a shape with free dimensions; raise the error if it does not fit."""
+        if len(shape) == 1 and ((array.ndim == 0 and isinstance(shape[0], str)) or array.shape[1:] == (1,)):
+            array = array.reshape(-1)
+        fits = array.ndim == len(shape) and all(
+            size >= least if isinstance(expected, str) else size == expected
+            for size, expected in zip(array.shape, shape, strict=True)
+        )
+        if fits:
+            return array
+        hint = f", {least} at least" if any(isinstance(expected, str) for expected in shape) else ""
+        hint += f": {meaning}" if meaning else ""
+        words = f"has shape {array.shape}, expected {str(shape).replace(chr(39), '')}{hint}"
+        raise self._wrong(label, words, array, shape)
+
+
+require = Checks(ModelError)
+
+
+def _in(unit: str) -> str:
+    return f" (in {unit})" if unit else ""
+
+
+def _shown(array: Array, wrong: Any) -> str:
+    """Describe an invalid array: whole if it is a short vector, else by its first invalid entry or row."""
+    if array.ndim < 2 and array.size <= MAX_LISTED:
+        return f"{array.tolist()}"
+    if array.ndim == 1:
+        entry = int(np.flatnonzero(wrong)[0])
+        return f"(entry {entry}) {array[entry].item()}"
+    row = int(np.flatnonzero(wrong.reshape(len(array), -1).any(axis=1))[0])
+    return f"(row {row}) {array[row].tolist()}"
+
+
+def warn_of_degrees(label: str, angles: ArrayInput, name: str | None = None) -> None:
+    """Warn if an angle (rad) exceeds two turns and so looks like degrees. Values above 1e4 count as "no limit".
+
+    Python shows the same message only once.
+
+    Args:
+        label: As in `Checks`.
+        name: Field `name` of the warning; the last word of the label if None.
+
+    Warns:
+        ModelWarning: With the angle.
+    """
+    words = "rad is more than two turns; angles are in rad, is it in degrees?"
+    _warn_of_unit(label, angles, name, (4 * np.pi, 1e4), words)
+
+
+def warn_of_millimetres(label: str, lengths: ArrayInput, name: str | None = None) -> None:
+    """Warn if a length (m) exceeds 50 m and so looks like millimetres, as `warn_of_degrees` does for angles."""
+    _warn_of_unit(label, lengths, name, (50.0, inf), "m is long for a robot; lengths are in m, is it in millimetres?")
+
+
+def _warn_of_unit(label: str, values: ArrayInput, name: str | None, range_: tuple[float, float], words: str) -> None:
+    """Warn of the first entry whose magnitude is in a range."""
+    low, high = range_
+    for value in np.ravel(values).tolist():  # faster than array operations on few entries
+        if low < abs(value) < high:
+            name = argument_of(label) if name is None else name
+            warn(ModelWarning(f"{label} {value:g} {words}", name=name, value=value, limit=low), stacklevel=2)
+            return

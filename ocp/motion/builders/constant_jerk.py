@@ -1,0 +1,371 @@
+"""Motions that consist of phases of constant jerk, from rest to rest, in closed form and within torque limits.
+
+A joint that moves by d from rest to rest within limits V, A and J of velocity, acceleration and jerk is fastest if it
+builds up its acceleration for t_j, keeps it for t_a, and releases it for t_j; then it cruises for t_v, and brakes as it
+sped up. Its peak velocity is a (t_j + t_a) with acceleration a, and
+
+    d = peak (2 t_j + t_a + t_v).
+
+A motion of several joints takes at least as long as each joint by itself. `synchronised_motion` attains this bound: on
+a straight motion if the limits of one joint allow the profile of the slowest one to all, else by slowing down each
+joint to the common duration. Without jerk limits the phases have constant acceleration.
+
+Without friction, torques of a motion that is slowed down by a factor f are
+
+    torque(q, rate / f, acceleration / f^2) = rest(q) + (torque(q, rate, acceleration) - rest(q)) / f^2,
+
+with rest(q) those of gravity alone, so that the least factor within the torque limits follows directly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from models import FixedBase
+from models.checks import Array
+from ocp.curves import PiecewisePolynomial
+from ocp.errors import SolveError, SolverStatus
+from ocp.motion.builders.torques import joint_torques
+from ocp.motion.tasks.limits import JointBounds
+from ocp.problem.formulation import Formulation
+from ocp.problem.problem import Problem
+from ocp.problem.values import Sampler
+from ocp.solution import Solution
+from ocp.tolerances import ROUNDING_SHARE
+
+__all__ = [
+    "ConstantJerkMotion", "TorqueLimits", "least_durations", "segment_durations", "stopping_motion",
+    "synchronised_motion",
+]  # fmt: skip
+
+NODES = np.array([0.0, 1 / 3, 2 / 3, 1.0])
+"""Places of the values in a phase: joints are cubic."""
+
+
+@dataclass(frozen=True)
+class ConstantJerkSettings:
+    """Settings of the motions.
+
+    Attributes:
+        still: Duration of a motion that stays where it is, s, since problems have a positive one.
+        ramp_share: Time in which joints with neither an acceleration nor a jerk limit reach their largest rate, as a
+            share of the time at that rate.
+        unlimited_rate: Rate of joints without any of these limits, rad/s or m/s.
+        samples: Samples of each phase at which torques are evaluated.
+        torque_share: Share of the torque limits that is used there, since torques may be larger between the samples.
+    """
+
+    still: float = 1e-3
+    ramp_share: float = 5e-4
+    unlimited_rate: float = 1.0
+    samples: int = 16
+    torque_share: float = 0.995
+
+
+SETTINGS = ConstantJerkSettings()
+
+
+class _Ramps(NamedTuple):
+    """Fastest profiles from rest to rest: times t_j, t_a and t_v, s, and peak velocities. Shape (..., n) each."""
+
+    build_up: Array
+    steady: Array
+    cruise: Array
+    peak: Array
+
+    @property
+    def duration(self) -> Array:
+        """Duration of the whole profile, s."""
+        return 4 * self.build_up + 2 * self.steady + self.cruise
+
+
+def _ramps(distances: Array, velocity: Array, acceleration: Array, jerk: Array) -> _Ramps:
+    """Return the fastest profiles over absolute distances (..., n), zero for a joint that does not move.
+
+    With peak velocity V, each ramp lasts r = V / a + a / j, or 2 sqrt(V / j) if it does not reach the acceleration a.
+    Both ramps together cover V r. The rest of the distance is covered at V.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        limited = np.isfinite(acceleration)
+        full = np.where(limited, acceleration / jerk, 0.0)  # s until the acceleration is reached
+        short = np.where(np.isfinite(jerk), (distances * np.sqrt(jerk) / 2) ** (2 / 3), np.inf)
+        # V^2 / a + V a / j = distance
+        root = np.sqrt(full**2 + 4 * distances / acceleration)
+        long = np.where(limited, 2 * distances / (full + root), np.inf)
+        peak = np.minimum(np.where(limited & (short > acceleration * full), long, short), velocity)
+        reaches = limited & (peak > acceleration * full)
+        steady = np.where(reaches, peak / acceleration - full, 0.0)
+        build_up = np.where(reaches, full, np.where(np.isfinite(jerk), np.sqrt(peak / jerk), 0.0))
+        cruise = np.maximum(distances / peak - 2 * build_up - steady, 0.0)
+    moves = (distances > 0) & np.isfinite(peak)
+    return _Ramps(*(np.where(moves, each, 0.0) for each in (build_up, steady, cruise, peak)))
+
+
+def least_durations(distances: Array, bounds: JointBounds) -> Array:
+    """Return the least times from rest to rest of joints by themselves, within velocity, acceleration and jerk limits.
+
+    Args:
+        distances: Absolute distances, rad or m. Shape (..., n).
+        bounds: Limits of the joints.
+
+    Returns:
+        s; 0 for a joint without limits. Shape (..., n).
+    """
+    return _ramps(distances, bounds.velocity, bounds.acceleration, bounds.jerk).duration
+
+
+@dataclass(frozen=True, eq=False)
+class ConstantJerkMotion:
+    """Motion that consists of phases of constant jerk.
+
+    Attributes:
+        durations: Durations of the phases, s. Shape (K,).
+        joints, rates, accelerations, jerks: Joints and their derivatives at the start of each phase. Shape (K, n).
+    """
+
+    durations: Array
+    joints: Array
+    rates: Array
+    accelerations: Array
+    jerks: Array
+
+    @property
+    def duration(self) -> float:
+        """Duration, s."""
+        return float(self.durations.sum())
+
+    def slower(self, factor: float) -> ConstantJerkMotion:
+        """Return the motion slowed down by a factor."""
+        derivatives = self.rates / factor, self.accelerations / factor**2, self.jerks / factor**3
+        return ConstantJerkMotion(self.durations * factor, self.joints, *derivatives)
+
+    def sampled(self, places: Array) -> tuple[Array, Array, Array]:
+        """Return joints, rates and accelerations at places (M,), shares of each phase. Shape (K, M, n) each."""
+        t = (self.durations[:, None] * places)[:, :, None]
+        joints, rates, accelerations, jerks = (
+            each[:, None] for each in (self.joints, self.rates, self.accelerations, self.jerks)
+        )
+        return (
+            joints + t * (rates + t * (accelerations / 2 + t * jerks / 6)),
+            rates + t * (accelerations + t * jerks / 2),
+            accelerations + t * jerks,
+        )
+
+    def solution(self, problem: Problem, method: str) -> Solution:
+        """Return the motion as a solution of a `dynamics_problem` without power, without multipliers.
+
+        Args:
+            problem: The problem.
+            method: Phrase for what the motion does, such as "stops at the corners of a path".
+        """
+        form, horizon = Formulation.of(problem), self.duration
+        breaks = np.append(0.0, np.cumsum(self.durations)) / horizon
+        breaks[-1] = 1.0
+        curves = dict(zip(("joints", "velocities", "accelerations"), self.sampled(NODES), strict=True))
+        states = np.concatenate([curves[name] for name in form.states], axis=2)
+        constant = self.jerks if "jerks" in form.controls else self.accelerations
+        state_curve = PiecewisePolynomial(breaks, NODES, states)
+        control_curve = PiecewisePolynomial(breaks, np.array([0.5]), constant[:, None])
+        rows = np.concatenate([states[:, 0], states[-1:, -1]])
+        controls = np.concatenate([constant, constant[-1:]])
+        p = form.parameter_vector({})
+        nodes, weights = np.polynomial.legendre.leggauss(5)
+        at = (breaks[:-1, None] + np.diff(breaks)[:, None] * (nodes + 1) / 2).ravel()
+        shares = (np.diff(breaks)[:, None] * weights / 2).ravel()
+        running = form.sampled([form.running], state_curve(at), control_curve(at), at * horizon, horizon, p)[0][:, 0]
+        final = form.terminal_cost(rows[-1], rows[0], controls[0], horizon=horizon, p=p)
+        columns = {name: slice(*entries.indices(form.nx)) for name, entries in form.states.items()}
+        return Solution(
+            name=problem.name,
+            method={"type": method},
+            solver="path",
+            success=False,
+            status=SolverStatus.ACCEPTABLE,
+            message=f"it {method}, whose optimality no multipliers show",
+            cost=float(horizon * shares @ running + final),
+            iterations=0,
+            horizon=horizon,
+            t=breaks * horizon,
+            states={name: rows[:, part] for name, part in columns.items()},
+            controls=dict.fromkeys(form.controls, controls),
+            costates={name: np.zeros_like(rows[:, part]) for name, part in columns.items()},
+            parameters={},
+            cost_gradients={},
+            state_interpolant=state_curve,
+            control_interpolant=control_curve,
+            costate_interpolant=PiecewisePolynomial(breaks, NODES, np.zeros_like(states)),
+            variables=states.ravel(),
+            multipliers=np.zeros(0),
+            seconds={"build": 0.0, "solve": 0.0},
+            problem=problem,
+        )
+
+
+class TorqueLimits:
+    """Joint torques of a machine on a fixed base, and their limits.
+
+    Attributes:
+        limited: Joints with a torque limit. Shape (L,).
+        largest: Their limits, N m or N. Shape (L,).
+    """
+
+    def __init__(self, machine: FixedBase, bounds: JointBounds) -> None:
+        self.machine = machine
+        self.limited = np.flatnonzero(np.isfinite(bounds.torque))
+        self.largest = bounds.torque[self.limited]
+        self._samplers: dict[bool, Sampler] = {}
+
+    def torques(self, joints: Array, rates: Array, accelerations: Array) -> Array:
+        """Return the torques of the limited joints at samples (M, n). Shape (M, L)."""
+        return np.asarray(self._sampler(False)(joints, rates, accelerations)[0])
+
+    def linearised(self, joints: Array, rates: Array, accelerations: Array) -> tuple[Array, list[Array]]:
+        """Return the torques (M, L), and their derivatives by joints, rates and accelerations. Shape (M, L, n) each."""
+        torques, *slopes = self._sampler(True)(joints, rates, accelerations)
+        size = joints.shape[1]
+        return torques, [slope.reshape(len(joints), size, -1).swapaxes(1, 2) for slope in slopes]
+
+    def _sampler(self, linearised: bool) -> Sampler:
+        if linearised not in self._samplers:
+            symbols = [ca.SX.sym("v", self.machine.joint_size) for _ in range(3)]
+            torques = joint_torques(self.machine, self.machine.base_home(), *symbols)[self.limited.tolist()]
+            outputs = [torques, *(ca.jacobian(torques, each) for each in symbols)] if linearised else [torques]
+            self._samplers[linearised] = Sampler(symbols, outputs)
+        return self._samplers[linearised]
+
+    def slowed(self, motion: ConstantJerkMotion) -> ConstantJerkMotion:
+        """Return the motion slowed down by the least factor, at least 1, that keeps the limits at samples.
+
+        Raises:
+            SolveError: A joint cannot hold the machine at rest somewhere on the path.
+        """
+        if not len(self.limited):
+            return motion
+        places = np.linspace(0.0, 1.0, SETTINGS.samples)
+        joints, rates, accelerations = (each.reshape(-1, each.shape[-1]) for each in motion.sampled(places))
+        rest = self.torques(joints, np.zeros_like(joints), np.zeros_like(joints))
+        moving = self.torques(joints, rates, accelerations) - rest
+        allowed = SETTINGS.torque_share * self.largest
+        if (np.abs(rest) >= allowed).any():
+            row, column = np.argwhere(np.abs(rest) >= allowed)[0]
+            name, limit = self.machine.robot.joint_names[self.limited[column]], float(self.largest[column])
+            words = f"at rest on the path, joint {name!r} needs {abs(rest[row, column]):.4g}, {limit:.4g} allowed"
+            raise SolveError(words, name=name, value=float(rest[row, column]), limit=limit)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            room = np.where(moving > 0, (allowed - rest) / moving, (allowed + rest) / -moving)
+        return motion.slower(float(1 / np.sqrt(min(1.0, float(np.where(moving == 0, np.inf, room).min())))))
+
+
+def synchronised_motion(start: Array, goal: Array, bounds: JointBounds) -> ConstantJerkMotion:
+    """Return a fastest motion from rest to rest within velocity, acceleration and jerk limits.
+
+    It is straight if a straight motion attains the least time.
+
+    Args:
+        start, goal: Joints, rad or m. Shape (n,).
+        bounds: Limits of the joints.
+    """
+    change = goal - start
+    own = _profiles(np.abs(change), bounds)
+    duration = float(own.duration.max())
+    straight = _straight(start, change, bounds)
+    if duration == 0 or straight.duration <= (1 + ROUNDING_SHARE) * duration:
+        return straight
+    return _joint_phases(start, np.sign(change), own, duration)
+
+
+def stopping_motion(path: Array, bounds: JointBounds, torques: TorqueLimits) -> ConstantJerkMotion:
+    """Return the fastest motion along a path (M, n) that stops at its corners, within limits up to jerk and torque.
+
+    Raises:
+        SolveError: A joint cannot hold the machine at rest somewhere on the path.
+    """
+    moves = np.append(np.diff(path, axis=0).any(axis=1), True)
+    corners = path[moves] if moves.sum() > 1 else path[[0, -1]]
+    parts = [torques.slowed(_straight(first, last - first, bounds)) for first, last in pairwise(corners)]
+    return ConstantJerkMotion(*(np.concatenate(values) for values in zip(*map(_columns, parts), strict=True)))
+
+
+def segment_durations(changes: Array, bounds: JointBounds) -> Array:
+    """Return the durations of straight motions by changes (K, n) from rest to rest, s, without torque limits."""
+    return np.asarray(_straight_profile(changes, bounds).duration)
+
+
+def _columns(motion: ConstantJerkMotion) -> Sequence[Array]:
+    return motion.durations, motion.joints, motion.rates, motion.accelerations, motion.jerks
+
+
+def _effective(distances: Array, bounds: JointBounds) -> tuple[Array, Array, Array]:
+    """Return limits of velocity, acceleration and jerk, finite as far as a motion over these distances needs it."""
+    velocity, acceleration, jerk = bounds.velocity, bounds.acceleration, bounds.jerk
+    jumps = ~np.isfinite(acceleration) & ~np.isfinite(jerk)
+    velocity = np.where(jumps & ~np.isfinite(velocity), SETTINGS.unlimited_rate, velocity)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        steep = np.where(distances > 0, velocity**2 / (SETTINGS.ramp_share * distances), np.inf)
+    return velocity, np.where(jumps, steep, acceleration), jerk
+
+
+def _profiles(distances: Array, bounds: JointBounds) -> _Ramps:
+    """Return the profiles of joints by themselves over absolute distances (..., n)."""
+    return _ramps(distances, *_effective(distances, bounds))
+
+
+def _straight_profile(changes: Array, bounds: JointBounds) -> _Ramps:
+    """Return the profiles of the shares of straight motions by changes (K, n). Shape (K,) each."""
+    distances = np.abs(changes)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        least = [
+            np.where(distances > 0, each / distances, np.inf).min(axis=1) for each in _effective(distances, bounds)
+        ]
+    return _ramps(distances.any(axis=1).astype(float), *least)
+
+
+def _straight(start: Array, change: Array, bounds: JointBounds) -> ConstantJerkMotion:
+    """Return the fastest straight motion by a change (n,); one that stays where it is lasts for a moment."""
+    profile = _straight_profile(change[None], bounds)
+    duration = float(profile.duration[0])
+    if duration == 0:
+        still = np.zeros((1, len(start)))
+        return ConstantJerkMotion(np.array([SETTINGS.still]), start[None], still, still, still)
+    share = _joint_phases(np.zeros(1), np.ones(1), profile, duration)
+    derivatives = [each * change for each in (share.rates, share.accelerations, share.jerks)]
+    return ConstantJerkMotion(share.durations, start + share.joints * change, *derivatives)
+
+
+def _joint_phases(start: Array, signs: Array, profiles: _Ramps, duration: float) -> ConstantJerkMotion:
+    """Return the motion in which each joint follows its own profile, slowed down to a common duration.
+
+    Args:
+        start: Joints. Shape (n,).
+        signs: Directions of the joints, -1, 0 or 1. Shape (n,).
+        profiles: Profiles of the joints. Shape (n,) each.
+        duration: s, at least that of each profile.
+    """
+    build_up, steady, cruise, peak = profiles
+    with np.errstate(divide="ignore", invalid="ignore"):
+        factor = np.where(profiles.duration > 0, duration / profiles.duration, 1.0)
+        acceleration = np.where(peak > 0, peak / (build_up + steady), 0.0)
+        jerk = np.where(build_up > 0, acceleration / build_up, 0.0)
+    none = np.zeros_like(start)
+    lengths = np.array([build_up, steady, build_up, cruise, build_up, steady, build_up]) * factor  # (7, n)
+    begins = np.cumsum(np.vstack([none, lengths[:-1]]), axis=0)
+    of_phase = signs / factor**2 * np.array([none, *[acceleration] * 2, none, none, *[-acceleration] * 2])
+    jerk_of_phase = signs / factor**3 * np.array([jerk, none, -jerk, none, -jerk, none, jerk])
+    times = np.unique(np.append(begins.ravel(), duration))
+    times = np.append(times[:-1][np.diff(times) > ROUNDING_SHARE * duration], duration)
+    times[0] = 0.0
+    middles, columns = (times[:-1] + times[1:]) / 2, np.arange(len(start))
+    phase = (begins[None] <= middles[:, None, None]).sum(axis=1) - 1  # (K, n)
+    durations, jerks = np.diff(times), jerk_of_phase[phase, columns]
+    accelerations = of_phase[phase, columns] + jerks * (times[:-1, None] - begins[phase, columns])
+    t = durations[:, None]
+    rates = np.vstack([none, np.cumsum(t * (accelerations + t * jerks / 2), axis=0)])[:-1]
+    steps = t * (rates + t * (accelerations / 2 + t * jerks / 6))
+    joints = start + np.vstack([none, np.cumsum(steps, axis=0)])[:-1]
+    return ConstantJerkMotion(durations, joints, rates, accelerations, jerks)

@@ -1,0 +1,393 @@
+"""Motions from a start to a goal along collision-free paths, each audited as a candidate of a plan.
+
+Without actuator limits, a path at constant speed is a candidate whose clearance is proven. In least time, the fastest
+motion without obstacles is a candidate if it is clear, and a sequence of linear programs finds a locally fastest motion
+near each path (`ocp.motion.sampling.fastest_motion`). With another cost, each path is the guess of an optimal control
+problem, which stays in its class. A motion that stops at the corners of the path is the last resort.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from models import FixedBase
+from models.checks import Array
+from ocp.console import TimeLimitReached, time_left, time_limited
+from ocp.direct.guess import Samples
+from ocp.errors import SolveError
+from ocp.motion.builders.clearance import ClearanceConstraints
+from ocp.motion.builders.constant_jerk import (
+    ConstantJerkMotion,
+    TorqueLimits,
+    least_durations,
+    segment_durations,
+    stopping_motion,
+    synchronised_motion,
+)  # fmt: skip
+from ocp.motion.builders.dynamics import QUINTIC, DynamicsSetup, dynamics_problem, end_velocities
+from ocp.motion.builders.dynamics_plan import audit_error, within_limits
+from ocp.motion.builders.joint_motion import joint_motion_problem, motion_along
+from ocp.motion.builders.standing.problem import FreeTime
+from ocp.motion.plan.actuators import limits_actuators
+from ocp.motion.result.candidate import Candidate, Reason, Rejection, Stage
+from ocp.motion.sampling.fastest_motion import FastestMotionSettings, MotionLimits, fastest_motion_near
+from ocp.motion.sampling.path_search import JointPath, PathSearchSettings
+from ocp.motion.sampling.shortening import path_length, points_along, shortest_through_corners
+from ocp.motion.sampling.straight import StraightMotions
+from ocp.motion.search.joint_space import JointSpace
+from ocp.motion.tasks.goals import Cost
+from ocp.motion.tasks.limits import JointBounds, Limits
+from ocp.problem.problem import Problem
+from ocp.solution import Solution
+from ocp.tolerances import ROUNDING_SHARE
+
+__all__ = [
+    "GoalRequest", "GoalSettings", "GoalTask", "attains_bound", "cost_bound", "motions_along",
+    "synchronised_candidates",
+]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class GoalSettings:
+    """Settings of the motions to a goal.
+
+    Attributes:
+        search: Settings of the search for paths.
+        time_limit: Time after which a request without its own limit is refused, s.
+        search_share: Share of the time limit after which the search for further paths ends.
+        unlimited_rate: Rate of joints without a rate limit, rad/s or m/s, where the planner chooses the horizon.
+        spare: Horizon of a motion within actuator limits, where the planner chooses it, relative to the least time of a
+            motion that stops at corners.
+        longest: Largest and inverse of the least horizon in free time, relative to the same.
+        guess_times: Samples of a guess.
+        near_bound: Relative excess of the cost over its lower bound below which a motion counts as optimal.
+        phase_samples: Samples of each phase of a motion at which its clearance is checked before the audit.
+        margins: Largest number of margins, each twice the one before, that are tried for the clearance between samples.
+        fastest: Settings of the fastest motions near a path.
+        near: Pairs of bodies closer than the clearance plus this along a path are separated from the first solve on, m.
+        turns: Numbers of full turns by which goals of unlimited joints are shifted, beside the nearest one.
+    """
+
+    search: PathSearchSettings = field(default_factory=PathSearchSettings)
+    time_limit: float = 20.0
+    search_share: float = 0.75
+    unlimited_rate: float = 1.0
+    spare: float = 2.0
+    longest: float = 20.0
+    guess_times: int = 201
+    near_bound: float = 1e-3
+    phase_samples: int = 9
+    margins: int = 4
+    fastest: FastestMotionSettings = field(default_factory=FastestMotionSettings)
+    near: float = 0.02
+    turns: int = 1
+
+
+@dataclass(frozen=True, eq=False)
+class GoalRequest:
+    """Request for a motion from a start to one of several goals.
+
+    Attributes:
+        machine: Machine on a fixed base.
+        start: Joints at the start, rad or m. Shape (n,).
+        goals: Joints that all satisfy the goal. Shape (K, n), or (n,) for one.
+        horizon: Final time, s; None: as short as the limits of the rates allow for the path, or free if the cost
+            weights time.
+        limits: Limits of joints and actuators; the robot's own positions and rates if None.
+        cost: Weights of the cost. With velocity or length alone, and without actuator limits, the motion has constant
+            speed; else it is smooth. The weights of the joints are the metric of joint space.
+        start_velocity, end_velocity: "rest", "free", or the joint velocities there, shape (n,). For smooth motions.
+        clearance_constraints: Collision scene; None if collisions are not checked.
+        seed: Seed of the random searches.
+        time_limit: s; None for that of the settings.
+        progress: Function that is called with a text at each stage; None for none.
+        settings: Settings.
+    """
+
+    machine: FixedBase
+    start: Any
+    goals: Any
+    horizon: float | None = None
+    limits: Limits | None = None
+    cost: Cost = field(default_factory=Cost)
+    start_velocity: Any = "rest"
+    end_velocity: Any = "rest"
+    clearance_constraints: ClearanceConstraints | None = None
+    seed: int = 0
+    time_limit: float | None = None
+    progress: Callable[[str], None] | None = None
+    settings: GoalSettings = field(default_factory=GoalSettings)
+
+
+@dataclass(frozen=True, eq=False)
+class GoalTask:
+    """Checked request: bounds, start, goals with their turns, metric, and the proofs of clearance."""
+
+    request: GoalRequest
+    bounds: JointBounds
+    start: Array
+    goals: Array
+    scale: Array
+    motions: StraightMotions
+    space: JointSpace
+    torques: TorqueLimits
+
+    @property
+    def limits(self) -> Limits:
+        return self.request.limits or Limits()
+
+    @property
+    def is_dynamic(self) -> bool:
+        """Whether the motion is smooth: actuators are limited, or more than velocity or length is the cost."""
+        return limits_actuators(self.limits) or not set(self.request.cost.terms) <= {"velocity", "length"} or self.moves
+
+    @property
+    def moves(self) -> bool:
+        """Whether the machine moves at the start or at the end."""
+        return not all(isinstance(velocity, str) and velocity == "rest" for velocity in self.end_velocities)
+
+    @property
+    def end_velocities(self) -> tuple[Any, Any]:
+        """Requested joint velocities at the start and at the end."""
+        return self.request.start_velocity, self.request.end_velocity
+
+    @property
+    def is_fastest(self) -> bool:
+        """Whether the time alone is the cost, and free, and no power is limited."""
+        is_free = self.request.horizon is None and self.request.cost.terms == ("time",)
+        return is_free and not np.isfinite(self.bounds.power).any()
+
+    @property
+    def length(self) -> bool:
+        """Whether the length in joint space is the cost."""
+        return bool(self.request.cost.length)
+
+    def report(self, text: str) -> None:
+        if self.request.progress is not None:
+            self.request.progress(text)
+
+
+def _at_constant_speed(task: GoalTask, paths: list[JointPath]) -> list[Candidate]:
+    """Return the audited motions along paths at constant speed."""
+    request = task.request
+    fastest = np.where(np.isfinite(task.bounds.velocity), task.bounds.velocity, request.settings.unlimited_rate)
+    candidates = []
+    for path in paths:
+        horizon = request.horizon
+        if horizon is None:
+            changes = np.diff(path.joints, axis=0)
+            lengths = np.linalg.norm(changes * task.scale, axis=1)
+            moves = lengths > 0
+            slowest = (np.abs(changes[moves]) / fastest).max(axis=1) / lengths[moves]
+            horizon = path.length * float(slowest.max(initial=0.0)) or 1.0
+        options: dict[str, Any] = {"start": path.joints[0], "end": path.joints[-1], "length": task.length}
+        options |= {"limits": request.limits, "clearance_constraints": request.clearance_constraints}
+        problem = joint_motion_problem(request.machine, horizon, weights=task.scale**2, **options)
+        solution = motion_along(problem, path.joints, task.scale, horizon, length=task.length)
+        candidates.append(_audited(task, solution, path))
+    return candidates
+
+
+def motions_along(task: GoalTask, paths: list[JointPath]) -> list[Candidate]:
+    """Return the audited motions along paths."""
+    if task.is_fastest:
+        return [_fastest(task, path) for path in paths]
+    return _within_actuator_limits(task, paths) if task.is_dynamic else _at_constant_speed(task, paths)
+
+
+def synchronised_candidates(task: GoalTask) -> list[Candidate]:
+    """Return the audited fastest motion to a goal without obstacles if it is clear of them; a list of at most one.
+
+    No motion is faster unless torques slow it down.
+    """
+    durations = least_durations(np.abs(task.goals - task.start), task.bounds).max(axis=1)
+    for goal in np.argsort(durations, kind="stable").tolist():
+        if task.moves:
+            break
+        motion = synchronised_motion(task.start, task.goals[goal], task.bounds)
+        with suppress(SolveError):
+            motion = task.torques.slowed(motion)
+            samples = motion.sampled(np.linspace(0.0, 1.0, task.request.settings.phase_samples))[0]
+            samples = samples.reshape(-1, len(task.start))
+            if task.motions.are_clear(samples[:-1], samples[1:]).all():
+                joints = np.array([task.start, task.goals[goal]])
+                path = JointPath(joints, goal, path_length(samples, task.scale))
+                return [_ProblemOf(task, path, motion, None).candidate("synchronises the joints")]
+    return []
+
+
+def _fastest(task: GoalTask, path: JointPath) -> Candidate:
+    """Return the audited locally fastest motion near a path, or one that stops at corners if none is found."""
+    settings = task.request.settings.fastest
+    ends = (end_velocities("", velocity, len(task.start)) for velocity in task.end_velocities)
+    limits = MotionLimits(task.motions, task.bounds, task.torques, *ends)
+    try:
+        for _ in range(task.request.settings.margins):
+            with time_limited(task.request.settings.search_share * time_left()):
+                motion = fastest_motion_near(limits, path.joints, settings)
+            candidate = _ProblemOf(task, path, motion, None).candidate("is a locally fastest spline")
+            task.report(f"path of length {path.length:.4g}: {candidate}")
+            if candidate.passed or candidate.reason is None or candidate.reason.kind is not Rejection.COLLISION:
+                break
+            settings = replace(settings, margin=2 * settings.margin)
+    except (SolveError, TimeLimitReached) as error:
+        candidate = Candidate(path.joints[0], reason=Reason.of_error(Rejection.INFEASIBLE, error), stage=Stage.SEED)
+    if not candidate.passed:
+        with suppress(TimeLimitReached):
+            return next((other for other in _within_actuator_limits(task, [path]) if other.passed), candidate)
+    return candidate
+
+
+def _within_actuator_limits(task: GoalTask, paths: list[JointPath]) -> list[Candidate]:
+    """Return the audited motions within actuator limits: with stops at corners, and where time is left without."""
+    request, settings, bounds = task.request, task.request.settings, task.bounds
+    candidates, motions = list[Candidate](), list[tuple[JointPath, ConstantJerkMotion]]()
+    for path in paths:
+        corners = shortest_through_corners(
+            task.motions, path.joints, lambda changes: segment_durations(changes, bounds)
+        )
+        try:
+            motions.append((path, stopping_motion(corners, bounds, task.torques)))
+        except SolveError as error:
+            reason = Reason.of_error(Rejection.ACTUATORS, error)
+            candidates.append(Candidate(path.joints[0], reason=reason, stage=Stage.SEED))
+    is_free = request.horizon is None and request.cost.time > 0
+    shortest = min((motion.duration for _, motion in motions), default=0.0)
+    fixed = settings.spare * shortest if request.horizon is None else float(request.horizon)
+    problems = [_ProblemOf(task, path, motion, None if is_free else fixed) for path, motion in motions]
+    stopping = [(problem, problem.stopping()) for problem in problems]
+    for problem, candidate in sorted(stopping, key=lambda pair: (not pair[1].passed, pair[1].cost)):
+        enough = attains_bound(task, candidate) or (candidate.passed and (problem.path.length == 0 or task.is_fastest))
+        best = candidate if enough else min(candidate, problem.smooth(), key=lambda c: (not c.passed, c.cost))
+        candidates.append(best)
+        task.report(f"path of length {problem.path.length:.4g}: {best}")
+    return candidates
+
+
+def attains_bound(task: GoalTask, candidate: Candidate) -> bool:
+    """Return whether a candidate passed its audit and costs hardly more than any motion does."""
+    if not candidate.passed or candidate.solution is None:
+        return False
+    bound = cost_bound(task, candidate.solution.horizon)
+    return bound is not None and candidate.cost <= (1 + task.request.settings.near_bound) * bound
+
+
+@dataclass(frozen=True, eq=False)
+class _ProblemOf:
+    """Motions within actuator limits along one path.
+
+    Attributes:
+        task: Checked request.
+        path: The path.
+        motion: Feasible motion, such as one that stops at corners of the path.
+        fixed: Fixed horizon, s; None if it is free.
+    """
+
+    task: GoalTask
+    path: JointPath
+    motion: ConstantJerkMotion
+    fixed: float | None
+
+    @property
+    def horizon_guess(self) -> float:
+        """Horizon, s, or its guess."""
+        return self.motion.duration if self.fixed is None else self.fixed
+
+    def declare(self, clearance: ClearanceConstraints | None) -> Problem:
+        """Declare the problem."""
+        task, ends = self.task, {"start": self.path.joints[0], "end": self.path.joints[-1]}
+        guess = self.horizon_guess
+        least = 0.0 if task.moves else least_durations(np.abs(ends["end"] - ends["start"]), task.bounds).max()
+        shortest = min(max(float(least), guess / task.request.settings.longest), guess)
+        horizon = FreeTime(shortest, task.request.settings.longest * guess, guess) if self.fixed is None else guess
+        uses_jerk = np.isfinite(task.bounds.jerk).any() or task.request.cost.jerk
+        setup = DynamicsSetup(
+            start_velocity=task.request.start_velocity,
+            end_velocity=task.request.end_velocity,
+            control="jerk" if uses_jerk else "acceleration",
+            clearance_constraints=clearance,
+        )
+        limits, cost = task.request.limits, task.request.cost
+        return dynamics_problem(task.request.machine, (), horizon, **ends, limits=limits, cost=cost, setup=setup)
+
+    def stopping(self) -> Candidate:
+        """Return the audited motion that stops at corners, slowed down to a fixed horizon."""
+        task, factor = self.task, self.horizon_guess / self.motion.duration
+        if task.request.cost.energy or np.isfinite(task.bounds.power).any() or task.moves:
+            words = "motions with stops are not offered where power counts, or the machine moves at an end"
+            reason = Reason(Rejection.NOT_TRIED, words)
+            return Candidate(self.path.joints[0], reason=reason)
+        if factor < 1 - ROUNDING_SHARE:
+            words = f"with stops it takes {self.motion.duration:.4g} s"
+            reason = Reason(Rejection.ACTUATORS, words, "horizon", self.motion.duration, self.horizon_guess)
+            return Candidate(self.path.joints[0], reason=reason)
+        return replace(self, motion=self.motion.slower(factor)).candidate("stops at the corners of a path")
+
+    def candidate(self, method: str) -> Candidate:
+        """Return the audited motion; `method` says what it does."""
+        problem = self.declare(self.task.request.clearance_constraints)
+        return _audited(self.task, self.motion.solution(problem, method), self.path)
+
+    def smooth(self) -> Candidate:
+        """Return the audited motion without stops that a solver finds from the path."""
+        task, joints = self.task, self.path.joints
+        settings, duration = task.request.settings, self.horizon_guess
+        times = np.linspace(0.0, duration, settings.guess_times)
+        places = points_along(joints, task.scale, QUINTIC(times / duration))
+        velocities = np.gradient(places, times, axis=0)
+        guess = {"joints": Samples(times, places), "velocities": Samples(times, velocities), "horizon": duration}
+        constraints = task.request.clearance_constraints
+        if constraints is not None:
+            constraints = constraints.holding(np.unique(task.motions.near_pairs(places, settings.near)[1]).tolist())
+        machines = {"": (task.request.machine, task.request.limits)}
+        try:
+            solution = within_limits(self.declare, constraints, None, (), None, None, machines, guess=guess)
+        except (SolveError, TimeLimitReached) as error:
+            if isinstance(error.__cause__, KeyboardInterrupt):
+                raise
+            return Candidate(joints[0], reason=Reason.of_error(Rejection.INFEASIBLE, error), stage=Stage.SEED)
+        return _audited(task, solution, self.path)
+
+
+def _audited(task: GoalTask, solution: Solution, path: JointPath) -> Candidate:
+    """Return the candidate of a solution, with a reason if it is not feasible or could not be audited in time."""
+    candidate = Candidate(path.joints[0], solution.cost, None, Stage.FINE, solution)
+    task.report(f"audit of a motion of cost {solution.cost:.4g} along a path of length {path.length:.4g}")
+    try:
+        audit = solution.audit()
+    except TimeLimitReached:
+        return candidate.rejected(Reason(Rejection.NOT_TRIED, "the time limit passed in its audit", "time_limit"))
+    if audit.feasible:
+        return replace(candidate, stage=Stage.AUDITED)
+    collision = next((row for row in audit.failures if row.name in audit.clearances), None)
+    if collision is not None:
+        words = f"{audit.clearances[collision.name].worst}"
+        reason = Reason(Rejection.COLLISION, words, collision.name, collision.value, collision.limit, collision.time)
+        return candidate.rejected(reason)
+    return candidate.rejected(Reason.of_error(Rejection.AUDIT, audit_error(audit, solution)))
+
+
+def cost_bound(task: GoalTask, horizon: float) -> float | None:
+    """Return a lower bound of the cost of any motion to one of the goals; None if it moves at an end.
+
+    Straight motions have the least length and squared rates. No joint reaches its goal faster than by itself.
+    """
+    cost = task.request.cost
+    if task.moves:
+        return None
+    lengths = np.linalg.norm((task.goals - task.start) * task.scale, axis=1)
+    if not task.is_dynamic:
+        return float(lengths.min() if task.length else lengths.min() ** 2 / (2 * horizon))
+    durations = least_durations(np.abs(task.goals - task.start), task.bounds).max(axis=1)
+    squares = lengths**2 if cost.velocity else np.zeros(len(lengths))
+    if task.request.horizon is not None or not cost.time:
+        return float(squares.min() / (2 * horizon) + cost.time * horizon)
+    # time and squared rates: time T + square / (2 T) is least at T = sqrt(square / (2 time))
+    best = np.maximum(durations, np.sqrt(squares / (2 * cost.time)))
+    totals = cost.time * best + np.where(best > 0, squares / (2 * np.maximum(best, 1e-300)), 0.0)
+    return float(totals.min())

@@ -1,0 +1,399 @@
+"""Locally fastest motions among obstacles within velocity, acceleration, jerk and torque limits, by linear programs.
+
+The joints are a B-spline of the share of the duration T, cubic if a jerk is limited, else quadratic. Derivatives by
+this share are splines too, with control points that are linear in those of the joints. A spline stays within the
+range of its control points (de Boor 2001, chapter XI), so that the limits of velocity, acceleration and jerk hold at
+all times if
+
+    |D1 c| <= T V,   |D2 c| <= T^2 A,   |D3 c| <= T^3 J
+
+hold for the control points c. The right sides are convex in T; their tangents are below them. Hence each step of c and
+T that keeps the tangents keeps the limits. Distances of bodies, at samples of the motion, and torques, at the knots,
+are linearised. A step minimises T by a linear program within a trust region; it shrinks if the linearisation was too
+coarse. A slack relaxes the constraints that the present motion violates, by as much as it does. An interior-point
+method without crossover solves the programs: joints that have time to spare then move in the middle of their freedom.
+
+The proof that the motion is clear between the samples is left to the audit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import casadi as ca
+import numpy as np
+import scipy.sparse as sp
+from scipy.interpolate import BSpline
+
+from models.checks import Array
+from ocp.console import TimeLimitReached, check_time
+from ocp.errors import SolveError
+from ocp.motion.builders.constant_jerk import ConstantJerkMotion, TorqueLimits
+from ocp.motion.sampling.shortening import points_along
+from ocp.motion.sampling.straight import StraightMotions
+from ocp.motion.tasks.limits import JointBounds
+
+__all__ = ["FastestMotionSettings", "MotionLimits", "fastest_motion_near"]
+
+
+@dataclass(frozen=True)
+class FastestMotionSettings:
+    """Settings of the fastest motions.
+
+    Attributes:
+        intervals: Number of intervals of the spline between the short ones at both ends.
+        growth: Ratio of neighbouring intervals at the ends, where the acceleration builds up within the first one.
+        shortest: Least share of the duration of the first interval.
+        ramp: Share of the duration in which the speed along the path of the first guess builds up.
+        margin: Distance beyond the clearance that is required at the samples, m, since bodies come closer between them.
+        reach: Distance beyond the clearance within which pairs of bodies are constrained, m.
+        torque_share: Share of the torque limits that is used at the knots.
+        first, smallest, largest: First, least and largest trust region: the share of the distance that a joint covers
+            at its rate limit within the duration.
+        again: Least trust region at the beginning of a further round.
+        change: Largest relative change of the duration in a step.
+        widening, narrowing: Factors of the trust region after an accepted and after a refused step.
+        violation: Weight of the slack over the duration.
+        penalty: Weight of the excess of the usages in the merit of a motion, beside the logarithm of its duration.
+        least_gain: Relative decrease of the duration below which the search ends.
+        most_steps: Largest number of linear programs in a round.
+        finer, most_rounds: Samples of an interval at which the clearance is checked after a round, and the largest
+            number of rounds. The closest approaches that are not clear become samples of the next round.
+    """
+
+    intervals: int = 40
+    growth: float = 1.6
+    shortest: float = 1e-3
+    ramp: float = 0.2
+    margin: float = 1e-3
+    reach: float = 0.08
+    torque_share: float = 0.985
+    first: float = 0.1
+    again: float = 0.01
+    smallest: float = 1e-4
+    largest: float = 0.3
+    change: float = 0.25
+    widening: float = 1.5
+    narrowing: float = 1 / 3
+    violation: float = 10.0
+    penalty: float = 0.1
+    least_gain: float = 1e-3
+    most_steps: int = 60
+    finer: int = 16
+    most_rounds: int = 6
+
+
+LIMIT_TOLERANCE = 1e-6
+"""Relative excess of velocity, acceleration and jerk that counts as rounding: the tolerance of the linear programs."""
+SOLVER: dict[str, Any] = {
+    "error_on_fail": False,
+    "highs": {"solver": "ipm", "run_crossover": "off", "output_flag": False},
+}
+
+
+@dataclass(frozen=True, eq=False)
+class MotionLimits:
+    """Constraints of a motion.
+
+    Attributes:
+        motions: Proofs of clearance.
+        bounds: Limits of the joints.
+        torques: Torques of the machine.
+        start_velocity, end_velocity: Rates at both ends, nan where free. Shape (n,).
+    """
+
+    motions: StraightMotions
+    bounds: JointBounds
+    torques: TorqueLimits
+    start_velocity: Array
+    end_velocity: Array
+
+
+def fastest_motion_near(
+    limits: MotionLimits, path: Array, settings: FastestMotionSettings = FastestMotionSettings()
+) -> ConstantJerkMotion:
+    """Return a locally fastest motion in the neighbourhood of a path, with the first and the last joints of the path.
+
+    A motion from rest to rest keeps the torque limits between the knots, too: it is slowed down where it does not.
+
+    Args:
+        limits: Limits, clearance and rates at the ends.
+        path: Configurations with straight motions between them. Shape (M, n).
+        settings: Settings.
+
+    Raises:
+        SolveError: No motion within the limits was found near the path.
+        TimeLimitReached: Nor was it before the time limit.
+    """
+    search = _Search(limits, path, settings)
+    state, region = search.evaluate(*search.guess(path)), settings.first
+    for _ in range(settings.most_rounds):
+        state, region = _local_optimum(search, state, region)
+        if not state.is_feasible:
+            words = f"no motion within the limits was found near a path, they are exceeded by {state.excess:.2g}"
+            raise SolveError(words, name="limits", value=state.excess, limit=1.0)
+        if not search.add_places(state):
+            break
+        state = search.evaluate(state.points, state.duration)
+    motion = search.motion(state)
+    rests = not (np.any(limits.start_velocity) or np.any(limits.end_velocity))
+    return limits.torques.slowed(motion) if rests else motion
+
+
+def _local_optimum(search: _Search, state: _State, region: float) -> tuple[_State, float]:
+    """Return the fastest feasible motion of a sequence of linear programs, and the last trust region.
+
+    It is the last motion if none is feasible.
+
+    Raises:
+        TimeLimitReached: The time limit has passed before one was feasible.
+    """
+    settings = search.settings
+    best: _State | None = state if state.is_feasible else None
+    idle = 0
+    for _ in range(settings.most_steps):
+        try:
+            check_time()
+        except TimeLimitReached:
+            if best is None:
+                raise
+            break
+        trial = search.step(state, region)
+        gain = 0.0 if trial is None else state.merit(settings.penalty) - trial.merit(settings.penalty)
+        if trial is None or gain <= 0:
+            region *= settings.narrowing
+            if region < settings.smallest:
+                break
+            continue
+        region = min(region * settings.widening, settings.largest)
+        idle = idle + 1 if trial.is_feasible and gain < settings.least_gain else 0
+        state = trial
+        if state.is_feasible and (best is None or state.duration < best.duration):
+            best = state
+        if idle > 1:
+            break
+    return state if best is None else best, max(region, settings.again)
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """Motion with its linearised constraints.
+
+    Attributes:
+        points: Control points. Shape (K, n).
+        duration: T, s.
+        rows, usages: Derivatives of the usages of all limits by the free control points and by log T, and the usages:
+            the limit is kept up to 1. Shape (R, F + 1) and (R,).
+        allowed: Largest usage at which the motion counts as feasible, by row. Shape (R,).
+    """
+
+    points: Array
+    duration: float
+    rows: Any
+    usages: Array
+    allowed: Array
+
+    @property
+    def excess(self) -> float:
+        """Largest usage beyond what is allowed, 0 if the motion is feasible."""
+        return max(0.0, float((self.usages - self.allowed).max(initial=0.0)))
+
+    @property
+    def is_feasible(self) -> bool:
+        return self.excess == 0
+
+    def merit(self, penalty: float) -> float:
+        """Return the logarithm of the duration and a penalty of the excess."""
+        return float(np.log(self.duration)) + penalty * self.excess
+
+
+_Rows: TypeAlias = tuple[Any, Array, Array, float]
+"""Derivatives of usages by all control points and by log T, the usages, and the excess that is allowed."""
+
+
+class _Search:
+    """Linear programs for the motions along one spline basis."""
+
+    def __init__(self, limits: MotionLimits, path: Array, settings: FastestMotionSettings) -> None:
+        self.limits, self.settings, bounds = limits, settings, limits.bounds
+        self.start, self.end, self.size = path[0], path[-1], path.shape[1]
+        self.degree = 3 if np.isfinite(bounds.jerk).any() else 2
+        spread = np.ptp(path, axis=0).max()
+        self.largest = (bounds.velocity, bounds.acceleration, bounds.jerk)[: self.degree]
+        self.has_rate_limit = np.isfinite(bounds.velocity)
+        self.spread = np.where(self.has_rate_limit, 0.0, spread)
+        self.breaks = self._breaks(path)
+        self.knots = np.concatenate([np.zeros(self.degree), self.breaks, np.ones(self.degree)])
+        self.count = len(self.breaks) - 1 + self.degree
+        self.derivatives = [sp.eye_array(self.count, format="csr")]
+        for order in range(1, self.degree + 1):
+            last = self.derivatives[-1]
+            first, ahead = np.arange(order, order + last.shape[0] - 1), self.degree + 1 - order
+            width = self.knots[first + ahead] - self.knots[first]
+            self.derivatives.append(sp.csr_array(sp.diags_array(ahead / width) @ (last[1:] - last[:-1])))
+        self.places = np.linspace(0.0, 1.0, 2 * settings.intervals + 2)[1:-1]
+        both = self.degree == 2  # the acceleration jumps at knots
+        sides = [self.breaks[:-1], (self.breaks[:-1] + self.breaks[1:]) / 2, self.breaks[1:]]
+        at = np.concatenate(sides) if both else np.unique(np.concatenate(sides))
+        second = sp.vstack([self.derivatives[2]] * len(sides)) if both else self._values(at, 2)
+        self.at_torques = self._values(at, 0), self._values(at, 1), second
+        self._fix_ends()
+
+    def _breaks(self, path: Array) -> Array:
+        """Return the bounds of the intervals, shares of the duration: short ones at both ends, equal ones between."""
+        bounds, settings = self.limits.bounds, self.settings
+        with np.errstate(divide="ignore", invalid="ignore"):
+            build_up = np.where(np.isfinite(bounds.acceleration), bounds.acceleration / bounds.jerk, 0.0).max()
+            least = np.where(self.has_rate_limit, np.abs(self.end - self.start) / bounds.velocity, 0.0).max()
+        first = min(max(build_up / least if least > 0 else 0.0, settings.shortest), 1 / settings.intervals)
+        short = [first]
+        while self.degree == 3 and short[-1] * settings.growth < 1 / settings.intervals:
+            short.append(short[-1] * settings.growth)
+        short = short if self.degree == 3 else []
+        rest = 1 - 2 * sum(short)
+        inner = max(round(rest * settings.intervals), 1)
+        lengths = np.concatenate([short, np.full(inner, rest / inner), short[::-1]])
+        breaks = np.append(0.0, np.cumsum(lengths))
+        return np.asarray(breaks / breaks[-1])
+
+    def _values(self, places: Array, order: int) -> Any:
+        """Return the matrix from control points to values of a derivative at places. Shape (M, K)."""
+        knots = self.knots[order : len(self.knots) - order]
+        return BSpline.design_matrix(places, knots, self.degree - order) @ self.derivatives[order]
+
+    def _fix_ends(self) -> None:
+        """Set the free control points, and the others as `fixed` + T `moving`: at rest, or at a constant velocity."""
+        free = np.ones((self.count, self.size), dtype=bool)
+        self.fixed, self.moving = np.zeros((self.count, self.size)), np.zeros((self.count, self.size))
+        away = np.append(0.0, np.cumsum(-1 / self.derivatives[1].diagonal()))[: self.degree]  # equal at both ends
+        limits, index = self.limits, np.arange(self.degree)
+        ends = (index, away, self.start, limits.start_velocity), (-1 - index, -away, self.end, limits.end_velocity)
+        for points, shares, joints, velocity in ends:
+            known = ~np.isnan(velocity)
+            free[points] = ~known
+            free[points[0]] = False
+            self.fixed[points] = joints
+            self.moving[points] = shares[:, None] * np.where(known, velocity, 0.0)
+        self.free = np.flatnonzero(free.ravel())
+        self.fixed[free], self.moving[free] = 0.0, 0.0
+
+    def guess(self, path: Array) -> tuple[Array, float]:
+        """Return control points along a path, and a duration that keeps the limits if both ends are at rest."""
+        p, ramp = self.degree, self.settings.ramp
+        at = np.array([self.knots[k + 1 : k + 1 + p].mean() for k in range(self.count)])
+        top = 1 / (1 - ramp)
+        share = top * np.where(at < ramp, at**2 / (2 * ramp), at - ramp / 2)
+        share = np.where(at > 1 - ramp, 1 - top * (1 - at) ** 2 / (2 * ramp), share)
+        speed = np.where(self.has_rate_limit, self.limits.bounds.velocity, 1.0)
+        points = points_along(path, 1 / speed, np.clip(share, 0.0, 1.0))
+        points[:p], points[-p:] = path[0], path[-1]
+        duration = 0.0
+        for order in range(1, p + 1):
+            used = np.abs(self.derivatives[order] @ points) / self.largest[order - 1]
+            duration = max(duration, float(used.max()) ** (1 / order))
+        return points, duration if duration > 0 else 1.0
+
+    def evaluate(self, points: Array, duration: float) -> _State:
+        """Return the state of control points, of which the free ones count, and a duration."""
+        inner = points.ravel()[self.free]
+        points = (self.fixed + duration * self.moving).ravel()
+        points[self.free] = inner
+        points = points.reshape(self.count, self.size)
+        parts = [*self._derivative_rows(points, duration), self._clearance_rows(points)]
+        if len(self.limits.torques.limited):
+            parts += self._torque_rows(points, duration)
+        rows, by_time, usages, tolerances = zip(*parts, strict=True)
+        matrix = sp.vstack(rows).tocsc()
+        by_duration = np.concatenate(by_time) + matrix @ (duration * self.moving).ravel()
+        matrix = sp.hstack([matrix[:, self.free], sp.csc_array(by_duration[:, None])])
+        allowed = np.concatenate(
+            [np.full(len(usage), 1 + most) for usage, most in zip(usages, tolerances, strict=True)]
+        )
+        return _State(points, duration, matrix.tocsr(), np.concatenate(usages), allowed)
+
+    def _derivative_rows(self, points: Array, duration: float) -> Iterator[_Rows]:
+        """Yield the rows of velocity, acceleration and jerk, each in both directions."""
+        for order in range(1, self.degree + 1):
+            limited = np.flatnonzero(np.isfinite(self.largest[order - 1]))
+            if not len(limited):
+                continue
+            derivative = self.derivatives[order]
+            scale = 1 / (self.largest[order - 1][limited] * duration**order)
+            pick = sp.csr_array((scale, (np.arange(len(limited)), limited)), shape=(len(limited), self.size))
+            matrix, usages = sp.kron(derivative, pick), ((derivative @ points)[:, limited] * scale).ravel()
+            by_duration = np.full(len(usages), -float(order))
+            for sign in (1.0, -1.0):
+                yield sign * matrix, by_duration, sign * usages, LIMIT_TOLERANCE
+
+    def _clearance_rows(self, points: Array) -> _Rows:
+        """Return the rows of the pairs of bodies near each other at the samples."""
+        margin, basis = self.settings.margin, self._values(self.places, 0)
+        at, _, distance, gradient = self.limits.motions.near_pairs(basis @ points, self.settings.reach)
+        matrix = self._row_matrix(basis[at], -gradient / margin)
+        return matrix, np.zeros(len(at)), 2 - distance / margin, 0.5
+
+    def _torque_rows(self, points: Array, duration: float) -> Iterator[_Rows]:
+        """Yield the rows of the torques at the knots in both directions."""
+        torques, share = self.limits.torques, self.settings.torque_share
+        first, second = self.at_torques[1] @ points / duration, self.at_torques[2] @ points / duration**2
+        values, slopes = torques.linearised(self.at_torques[0] @ points, first, second)
+        scale = 1 / (share * torques.largest)
+        at = np.repeat(np.arange(len(values)), len(scale))
+        matrix: Any = 0.0
+        for order, (basis, slope) in enumerate(zip(self.at_torques, slopes, strict=True)):
+            by_joint = slope * scale[:, None] / duration**order
+            matrix = matrix + self._row_matrix(basis[at], by_joint.reshape(len(at), self.size))
+        by_duration = -(slopes[1] @ first[:, :, None] + 2 * slopes[2] @ second[:, :, None])[:, :, 0] * scale
+        for sign in (1.0, -1.0):
+            yield sign * matrix, sign * by_duration.ravel(), sign * (values * scale).ravel(), (1 - share) / 2
+
+    def _row_matrix(self, basis: Any, by_joint: Array) -> Any:
+        """Return rows by all control points, from their weights in each row (R, K) and slopes by joints (R, n)."""
+        weights = sp.coo_array(basis)
+        row = np.repeat(weights.row, self.size)
+        column = (weights.col[:, None] * self.size + np.arange(self.size)).ravel()
+        values = (weights.data[:, None] * by_joint[weights.row]).ravel()
+        return sp.csr_array((values, (row, column)), shape=(len(by_joint), self.count * self.size))
+
+    def step(self, state: _State, region: float) -> _State | None:
+        """Return the motion after a step within a trust region; None if the program has no solution."""
+        settings, bounds, count = self.settings, self.limits.bounds, len(self.free)
+        travel = np.where(self.has_rate_limit, bounds.velocity * state.duration, self.spread) * region
+        points = state.points.ravel()[self.free]
+        joint = self.free % self.size
+        lower = np.concatenate([np.maximum(-travel[joint], bounds.lower[joint] - points), [-settings.change, 0.0]])
+        upper = np.concatenate([np.minimum(travel[joint], bounds.upper[joint] - points), [settings.change, 1.0]])
+        reachable = state.usages + abs(state.rows) @ np.maximum(-lower, upper)[:-1]
+        kept = np.flatnonzero(reachable > 1)
+        excess = np.maximum(state.usages[kept] - 1, 0.0)
+        matrix = ca.DM(sp.hstack([state.rows[kept], sp.csr_array(-excess[:, None])]).tocsc())
+        cost = np.concatenate([np.zeros(count), [1.0, settings.violation]])
+        shape = {"h": ca.Sparsity(count + 2, count + 2), "a": matrix.sparsity()}
+        solver = ca.conic("step", "highs", shape, SOLVER)
+        solution = solver(
+            g=cost, a=matrix, lba=-np.inf, uba=1 - state.usages[kept], lbx=np.minimum(lower, 0.0), ubx=upper
+        )["x"]
+        if not solver.stats()["success"]:
+            return None
+        change = solution.full().ravel()
+        moved = state.points.ravel().copy()
+        moved[self.free] += change[:count]
+        return self.evaluate(moved.reshape(self.count, self.size), state.duration * (1 + change[count]))
+
+    def add_places(self, state: _State) -> bool:
+        """Add the closest approaches between the samples that are not clear enough; return whether there were any."""
+        dense = np.linspace(0.0, 1.0, self.settings.finer * (len(self.breaks) - 1) + 1)[1:-1]
+        at, pair, distance, _ = self.limits.motions.near_pairs(self._values(dense, 0) @ state.points, 0.0)
+        worst = {each: at[pair == each][distance[pair == each].argmin()] for each in np.unique(pair).tolist()}
+        self.places = np.union1d(self.places, dense[list(worst.values())])
+        return bool(worst)
+
+    def motion(self, state: _State) -> ConstantJerkMotion:
+        """Return the motion of a state."""
+        duration = state.duration
+        joints, rates = (self._values(self.breaks[:-1], order) @ state.points for order in (0, 1))
+        accelerations = (self.derivatives[2] @ state.points)[: len(self.breaks) - 1] / duration**2
+        jerks = self.derivatives[3] @ state.points / duration**3 if self.degree == 3 else np.zeros_like(joints)
+        return ConstantJerkMotion(np.diff(self.breaks) * duration, joints, rates / duration, accelerations, jerks)

@@ -1,0 +1,126 @@
+"""Fastest motions of a ball among boxes, and of an arm within torque limits, beside bounds, ruckig and closed forms."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from ruckig import InputParameter, Result, Ruckig, Trajectory
+
+from models import Box, CollisionScene, FixedBase
+from models.checks import Array
+from models.examples import example_robot
+from ocp import Limits, SolveError
+from ocp.motion.builders.constant_jerk import TorqueLimits, least_durations, stopping_motion
+from ocp.motion.sampling.fastest_motion import FastestMotionSettings, MotionLimits, fastest_motion_near
+from ocp.motion.sampling.straight import StraightMotions
+from tests.ocp.motion.sampling.sliders import gap, slider
+
+REST = np.zeros(2)
+BOX = Box((0.4, 1.4, 1.0), (0.0, 0.0, 0.0))
+AROUND = np.array([[-1.0, 0.1], [-0.3, 0.801], [0.3, 0.801], [1.0, 0.1]])
+"""Path around the box with corners near it."""
+
+
+def limits_of(*boxes: Box, ends: tuple[Array, Array] = (REST, REST), **limits: Any) -> MotionLimits:
+    machine = slider()
+    bounds = Limits(**{"torque": np.inf, **limits}).bounds(machine)
+    scene = CollisionScene(machine, boxes) if boxes else None
+    return MotionLimits(StraightMotions(scene), bounds, TorqueLimits(machine, bounds), *ends)
+
+
+def kept(limits: MotionLimits, motion: Any) -> Array:
+    """Return dense samples of the joints after a check of all limits."""
+    joints, rates, accelerations = motion.sampled(np.linspace(0.0, 1.0, 33))
+    bounds = limits.bounds
+    for values, largest in (
+        (rates, bounds.velocity),
+        (accelerations, bounds.acceleration),
+        (motion.jerks, bounds.jerk),
+    ):
+        assert (np.abs(values) <= largest * (1 + 2e-6)).all()
+    np.testing.assert_allclose(joints[1:, 0], joints[:-1, -1], atol=1e-9)
+    np.testing.assert_allclose(rates[1:, 0], rates[:-1, -1], atol=1e-9)
+    samples: Array = joints.reshape(-1, joints.shape[-1])
+    return samples
+
+
+@pytest.mark.parametrize("jerk", [np.inf, 40.0])
+def test_without_obstacles_the_time_is_that_of_the_slowest_joint(jerk: float) -> None:
+    random = np.random.default_rng(1)
+    for _ in range(4):
+        path = random.uniform(-2, 2, (2, 2))
+        limits = limits_of(acceleration=[4.0, 2.0], jerk=jerk)
+        motion = fastest_motion_near(limits, path)
+        least = least_durations(np.abs(path[1] - path[0]), limits.bounds).max()
+        assert least * (1 - 1e-6) <= motion.duration <= 1.01 * least
+        np.testing.assert_allclose(kept(limits, motion)[[0, -1]], path, atol=1e-9)
+
+
+def ruckig_duration(path: Array, ends: tuple[Array, Array], bounds: Any) -> float:
+    request = InputParameter(2)
+    request.current_position, request.target_position = path.tolist()
+    request.current_velocity, request.target_velocity = (end.tolist() for end in ends)
+    request.max_velocity, request.max_acceleration, request.max_jerk = (
+        each.tolist() for each in (bounds.velocity, bounds.acceleration, bounds.jerk)
+    )
+    trajectory = Trajectory(2)
+    assert Ruckig(2).calculate(request, trajectory) == Result.Working
+    return float(trajectory.duration)
+
+
+def test_moving_ends_are_reached_in_the_time_of_ruckig() -> None:
+    random = np.random.default_rng(2)
+    for _ in range(5):
+        path, ends = random.uniform(-1, 1, (2, 2)), (random.uniform(-0.4, 0.4, 2), random.uniform(-0.4, 0.4, 2))
+        limits = limits_of(acceleration=[4.0, 2.0], jerk=[40.0, 60.0], ends=ends)
+        motion = fastest_motion_near(limits, path)
+        expected = ruckig_duration(path, ends, limits.bounds)
+        assert expected * (1 - 1e-5) <= motion.duration <= 1.02 * expected
+        kept(limits, motion)
+        _, rates, accelerations = motion.sampled(np.array([0.0, 1.0]))
+        np.testing.assert_allclose(rates[[0, -1], [0, -1]], ends, atol=1e-9)
+        np.testing.assert_allclose(accelerations[[0, -1], [0, -1]], 0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("jerk", [np.inf, 40.0])
+def test_around_a_box_it_neither_stops_nor_comes_nearer_than_the_clearance(jerk: float) -> None:
+    limits = limits_of(BOX, acceleration=4.0, jerk=jerk)
+    motion = fastest_motion_near(limits, AROUND)
+    stopping = stopping_motion(AROUND, limits.bounds, limits.torques)
+    least = least_durations(np.array([2.0, 0.0]), limits.bounds).max()
+    assert least <= motion.duration < 1.01 * least < 0.85 * stopping.duration
+    assert gap(kept(limits, motion), [BOX]).min() >= 0
+    speeds = np.linalg.norm(motion.rates[np.abs(motion.joints[:, 0]) < 0.5], axis=1)
+    assert speeds.min() > 0.5
+
+
+def test_a_finer_spline_is_hardly_faster() -> None:
+    limits = limits_of(BOX, acceleration=4.0, jerk=40.0)
+    coarse, fine = (
+        fastest_motion_near(limits, AROUND, FastestMotionSettings(intervals=count)).duration for count in (40, 120)
+    )
+    assert 0.98 * coarse < fine < 1.002 * coarse
+
+
+def test_torques_of_an_arm_are_at_their_limits_and_not_beyond() -> None:
+    machine = FixedBase(example_robot("six_axis"))
+    path = np.array([[0.0, 0.9, 0.5, 0.0, 0.3, 0.0], [0.8, 0.3, 1.1, 0.5, 0.0, 0.4]])
+    bounds = Limits(velocity=3.0, acceleration=60.0, jerk=3000.0, torque=[55.0] * 3 + [28.0] * 3).bounds(machine)
+    torques, rest = TorqueLimits(machine, bounds), np.zeros(6)
+    limits = MotionLimits(StraightMotions(None), bounds, torques, rest, rest)
+    motion = fastest_motion_near(limits, path)
+    straight = torques.slowed(stopping_motion(path, bounds, torques))
+    assert motion.duration < 0.95 * straight.duration
+    samples = (each.reshape(-1, 6) for each in motion.sampled(np.linspace(0.0, 1.0, 33)))
+    usage = np.abs(torques.torques(*samples)) / torques.largest
+    assert 0.97 < usage.max() <= 1.0
+    kept(limits, motion)
+
+
+def test_a_path_through_a_wall_is_refused() -> None:
+    wall = Box((0.2, 5.0, 1.0), (0.0, 0.0, 0.0))
+    with pytest.raises(SolveError, match="no motion within the limits") as caught:
+        fastest_motion_near(limits_of(wall, acceleration=4.0, jerk=40.0), np.array([[-1.0, 0.0], [1.0, 0.0]]))
+    assert caught.value.name == "limits"
